@@ -1,0 +1,23 @@
+"""Deep reinforcement learning that you can read in an evening, leave alone overnight, and fly in half a minute."""
+
+from lemniscate.errors import NonFiniteError, UserError
+from lemniscate.front import TrainedPolicy, TrainedRun, config_for, evaluate, load, make_envs, resume, train
+from lemniscate.run.evaluate import Evaluation
+from lemniscate.run.run import Stopped
+from lemniscate.run.seeding import set_seeds
+
+__all__ = [
+    "Evaluation",
+    "NonFiniteError",
+    "Stopped",
+    "TrainedPolicy",
+    "TrainedRun",
+    "UserError",
+    "config_for",
+    "evaluate",
+    "load",
+    "make_envs",
+    "resume",
+    "set_seeds",
+    "train",
+]

@@ -1,0 +1,1 @@
+"""From steps to rollouts to minibatches."""

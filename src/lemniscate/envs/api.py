@@ -1,0 +1,159 @@
+"""The contract of the env floor, and the table of who fulfils it.
+
+A backend is one file with a class that has `spec`, `num_envs`, `device`, `restart`, `step` and `close`, and one line in
+`BACKENDS`. `VecEnv` wraps any of them and is what the floors above see.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import gymnasium as gym
+import torch
+from torch import Tensor
+
+from lemniscate.errors import UserError, unknown
+from lemniscate.types import Spec, Step
+
+
+class Backend(Protocol):
+    """N copies of an environment, stepped together."""
+
+    spec: Spec
+    num_envs: int
+    device: torch.device
+    whole: Tensor
+    """[N] bool: the copy's present episode began at its beginning; a staggered one is a fragment"""
+
+    def restart(self, seed: int) -> Tensor:
+        """Begin anew, as if just built from `seed`: nothing of the past remains. Returns obs [N, O]."""
+        ...
+
+    def step(self, action: Tensor) -> Step:
+        """Act in every copy: Box actions float [N, A] in [-1, 1], Discrete ones int64 [N]."""
+        ...
+
+    def close(self) -> None:
+        """Give back processes and windows."""
+        ...
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """Whole episodes that ended, in the order of their ends."""
+
+    returns: list[float]
+    lengths: list[int]
+
+
+class VecEnv:
+    """A backend with its current observation and the books of its episodes.
+
+    Fragments (episodes that staggering began late or cut early) are learned from but not counted; ignored actions
+    (`valid` False) count nowhere.
+    """
+
+    def __init__(self, backend: Backend) -> None:
+        self._backend = backend
+        self.spec = backend.spec
+        self.num_envs = backend.num_envs
+        self.device = backend.device
+        self.obs = torch.empty(0)
+        self._ended: list[tuple[Tensor, Tensor]] = []
+
+    def restart(self, seed: int, steps: int = 0) -> Tensor:
+        """Begin anew from `seed`; also stored as `obs`, [N, O]. `steps` is what the run has taken so far."""
+        self.steps = steps
+        zeros = torch.zeros(self.num_envs, device=self.device)
+        self._return, self._length, self._ended = zeros, zeros.clone(), []
+        self.obs = self._backend.restart(seed)
+        return self.obs
+
+    def step(self, action: Tensor) -> Step:
+        """Act in every copy and move `obs` on."""
+        whole = self._backend.whole
+        step = self._backend.step(action)
+        self.obs = step.obs
+        self.steps += self.num_envs
+        self._return = self._return + step.reward * step.valid
+        self._length = self._length + step.valid
+        done = (step.terminated | step.truncated) & step.valid
+        if done.any():
+            counted = done & whole
+            self._ended.append((self._return[counted], self._length[counted]))
+            self._return, self._length = self._return * ~done, self._length * ~done
+        return step
+
+    def take_episodes(self) -> Episodes:
+        """The whole episodes that ended since the last call."""
+        ended, self._ended = self._ended, []
+        if not ended:
+            return Episodes([], [])
+        returns, lengths = (torch.cat(column) for column in zip(*ended, strict=True))
+        return Episodes(returns.tolist(), lengths.int().tolist())
+
+    def close(self) -> None:
+        """Give back processes and windows."""
+        self._backend.close()
+
+
+def _gymnasium(env_id: str, num_envs: int, device: torch.device, stagger: bool) -> Backend:
+    from lemniscate.envs.gymnasium import GymnasiumBackend
+
+    return GymnasiumBackend(env_id, num_envs, device, stagger=stagger)
+
+
+def _gymnasium_async(env_id: str, num_envs: int, device: torch.device, stagger: bool) -> Backend:
+    from lemniscate.envs.gymnasium import GymnasiumBackend
+
+    return GymnasiumBackend(env_id, num_envs, device, stagger=stagger, workers=True)
+
+
+def _crazyflow(env_id: str, num_envs: int, device: torch.device, stagger: bool) -> Backend:
+    from lemniscate.envs.crazyflow import CrazyflowBackend
+
+    return CrazyflowBackend(env_id, num_envs, device, stagger=stagger)
+
+
+BACKENDS: dict[str, Callable[[str, int, torch.device, bool], Backend]] = {
+    "gymnasium": _gymnasium,
+    "gymnasium-async": _gymnasium_async,
+    "crazyflow": _crazyflow,
+}
+
+CRAZYFLOW_IDS = (
+    "DroneFigureEightTrajectory-v0",
+    "DroneLanding-v0",
+    "DroneReachPos-v0",
+    "DroneReachVel-v0",
+)
+
+
+def known_ids() -> list[str]:
+    """Every environment id that can be asked for, sorted."""
+    import lemniscate.envs.toy  # noqa: F401  (registers the toys)
+
+    return sorted({*gym.registry, *CRAZYFLOW_IDS})
+
+
+def backend_for(env_id: str) -> str:
+    """The backend that serves `env_id`. Raises `UserError` with the nearest names if there is none."""
+    if env_id not in known_ids():
+        raise unknown("environment", env_id, known_ids())
+    return "crazyflow" if env_id in CRAZYFLOW_IDS else "gymnasium"
+
+
+def make(
+    env_id: str, num_envs: int, *, device: str = "cpu", stagger: bool = False, backend: str | None = None
+) -> VecEnv:
+    """N copies of an environment on `device`; `restart` it before the first step.
+
+    Raises:
+        UserError: an unknown environment or backend, spaces nobody can act in, a missing extra.
+    """
+    served_by = backend_for(env_id)
+    if backend is not None and backend not in BACKENDS:
+        raise unknown("backend", backend, BACKENDS)
+    if backend is not None and (backend == "crazyflow") != (served_by == "crazyflow"):
+        raise UserError(f"{env_id} cannot be served by the {backend} backend; {served_by} serves it.")
+    return VecEnv(BACKENDS[backend or served_by](env_id, num_envs, torch.device(device), stagger))

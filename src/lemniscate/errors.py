@@ -1,0 +1,34 @@
+"""Mistakes a user can make, each told in one sentence.
+
+The command line prints a `UserError` as it is and exits with 2; anything else is our own mistake and keeps its
+traceback.
+"""
+
+from collections.abc import Iterable
+from difflib import get_close_matches
+
+
+class UserError(ValueError):
+    """A mistake of the user's: the message names what was wrong and what would be right."""
+
+
+class NonFiniteError(ArithmeticError):
+    """A NaN or an infinity where training would have learned from it: names quantity, environment and step."""
+
+
+def unknown(kind: str, name: str, known: Iterable[str]) -> UserError:
+    """The sentence for a name that is not in a table: the nearest names, or all of them when few."""
+    names = sorted(known)
+    near = get_close_matches(name, names, n=3, cutoff=0.5)
+    if near:
+        hint = f"did you mean {' or '.join(near)}?"
+    elif len(names) <= 12:
+        hint = f"there is {', '.join(names)}."
+    else:
+        hint = "nothing known is near it."
+    return UserError(f"There is no {kind} {name!r}: {hint}")
+
+
+def missing_extra(package: str, extra: str) -> UserError:
+    """The sentence for an optional package that is not installed."""
+    return UserError(f"{package} is not installed; it comes with: pip install 'lemniscate[{extra}]'")

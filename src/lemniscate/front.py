@@ -1,0 +1,254 @@
+"""The front door: train, resume, load, evaluate, make_envs."""
+
+from dataclasses import dataclass
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from lemniscate import presets
+from lemniscate.algos import ALGORITHMS
+from lemniscate.envs import api
+from lemniscate.envs.api import VecEnv
+from lemniscate.envs.spaces import physical_action
+from lemniscate.errors import UserError, unknown
+from lemniscate.nn.policies import Policy, policy_and_value
+from lemniscate.run import checkpoint
+from lemniscate.run.config import RunConfig
+from lemniscate.run.evaluate import Evaluation
+from lemniscate.run.evaluate import evaluate as evaluate_module
+from lemniscate.run.loggers import LOGGERS
+from lemniscate.run.run import Run, create_directory, newest, read_config
+from lemniscate.run.seeding import generator, set_seeds
+from lemniscate.types import Spec
+
+
+class TrainedPolicy:
+    """A policy from a run or a checkpoint: NumPy in, NumPy out."""
+
+    def __init__(self, module: Policy, spec: Spec, config: RunConfig, step: int) -> None:
+        self.module = module.eval()
+        self.spec, self.config, self.step = spec, config, step
+        self._noise = generator(config.seed, torch.device("cpu"), 4)
+
+    @torch.no_grad()
+    def act(self, obs: Any, deterministic: bool = True) -> np.ndarray:
+        """The action at one raw observation, or at each of a batch; ready for `env.step`.
+
+        Args:
+            obs: an array, or for a drone the environment's dictionary of arrays, as the environment returns it; or
+                the flat observation [O] or [B, O].
+            deterministic: the mode of the distribution; otherwise a sample.
+
+        Returns:
+            In the environment's own units: [A] or [B, A] for Box, a scalar array or [B] for Discrete.
+        """
+        flat, batched = self._flatten(obs)
+        distribution = self.module(torch.from_numpy(flat))
+        action = distribution.mode() if deterministic else distribution.sample(self._noise)
+        physical = physical_action(action, self.spec.action)
+        return physical if batched else physical[0]
+
+    def _flatten(self, obs: Any) -> tuple[np.ndarray, bool]:
+        size = self.spec.observation_size
+        if isinstance(obs, dict):
+            missing = [name for name, _ in self.spec.layout if name not in obs]
+            if missing:
+                raise UserError(f"The observation lacks {', '.join(missing)}; {self.spec.env_id} gives them.")
+            parts = [np.asarray(obs[name], dtype=np.float32) for name, _ in self.spec.layout]
+            batched = parts[0].size != self.spec.layout[0][1] or parts[0].ndim > 1
+            rows = len(parts[0]) if batched else 1
+            return np.concatenate([part.reshape(rows, -1) for part in parts], axis=-1), batched
+        flat = np.asarray(obs, dtype=np.float32)
+        if flat.size == size and (flat.ndim <= 1 or flat.shape[0] != 1):
+            return flat.reshape(1, size), False
+        if flat.ndim and len(flat) and flat.size == len(flat) * size:
+            return flat.reshape(len(flat), size), True
+        raise UserError(
+            f"{self.spec.env_id} has observations of {size} numbers; one of shape {flat.shape} cannot be acted on."
+        )
+
+
+@dataclass(frozen=True)
+class TrainedRun:
+    """What `train` leaves: `path`, the run directory, and `policy`, the final policy."""
+
+    path: Path
+    policy: TrainedPolicy
+
+
+def config_for(algorithm: str, env: str | None = None, preset: str | None = None, **fields: object) -> RunConfig:
+    """The Config of a preset, with some fields changed.
+
+    Raises:
+        UserError: an unknown algorithm, environment, preset or field, or a value out of range.
+    """
+    if algorithm not in ALGORITHMS:
+        raise unknown("algorithm", algorithm, ALGORITHMS)
+    name, config = presets.choose(algorithm, env, preset)
+    if name == "default" and env is None:
+        raise UserError("Which environment? Name one with env; `lemniscate envs` lists them.")
+    api.backend_for(config.env)
+    return config.replace(**fields)
+
+
+def make_envs(config: RunConfig) -> tuple[VecEnv, VecEnv]:
+    """Two vectors of `config.env` that share nothing: (for training, its copies staggered; for evaluation).
+
+    They are restarted with seeds of different streams, so no start of one is ever a start of the other.
+    """
+    device = str(_device(config.device))
+    train_env = api.make(config.env, config.num_envs, device=device, stagger=True, backend=config.backend)
+    return train_env, _evaluation_env(config.env, config, config.evaluate_episodes, device)
+
+
+def train(
+    algorithm: str,
+    env: str | None = None,
+    *,
+    run: str | Path | None = None,
+    preset: str | None = None,
+    track: str | None = None,
+    progress: bool = True,
+    **fields: object,
+) -> TrainedRun:
+    """Train a policy from nothing.
+
+    Args:
+        algorithm: a name in `lemniscate.algos.ALGORITHMS`.
+        env: the environment's id; a preset may have one of its own.
+        run: where to keep everything; by default a new directory under `runs/`.
+        preset: by name; the best known for the environment unless given.
+        track: a logger beside the local ones: "wandb".
+        progress: the live line on standard error.
+        **fields: any field of the algorithm's Config, such as seed or total_steps.
+
+    Raises:
+        UserError: see `config_for`; a run directory that exists.
+    """
+    config = config_for(algorithm, env, preset, **fields)
+    path = Path(run) if run is not None else _fresh_directory(algorithm, config)
+    loggers = _loggers(track)
+    envs = make_envs(config)  # before the directory: an environment that cannot be made leaves nothing behind
+    create_directory(path, algorithm, config)
+    return _train(path, algorithm, config, envs, loggers, progress)
+
+
+def resume(run: str | Path, *, track: str | None = None, progress: bool = True) -> TrainedRun:
+    """Go on with an interrupted run, from its newest planned checkpoint that is whole, to its end."""
+    path = Path(run)
+    algorithm, fields = read_config(path)
+    config = ALGORITHMS[algorithm].Config.from_json(fields)
+    return _train(path, algorithm, config, make_envs(config), _loggers(track), progress)
+
+
+def load(path: str | Path) -> TrainedPolicy:
+    """The policy of a run (its newest whole checkpoint) or of one checkpoint. Nothing in the files is executed.
+
+    Raises:
+        UserError: neither a run nor a checkpoint, or a run without a whole checkpoint; a damaged checkpoint.
+    """
+    path = Path(path)
+    if (path / "manifest.json").exists():
+        found = checkpoint.read(path)
+    else:
+        read_config(path)
+        found = newest(path)
+        if found is None:
+            raise UserError(f"{path} has no checkpoint that can be read yet.")
+    record = found.record
+    spec = checkpoint.spec_from_json(record["spec"])
+    config = ALGORITHMS[record["algorithm"]].Config.from_json(record["config"])
+    policy = _empty_policy(spec, config)
+    policy.load_state_dict(found.module("policy"))
+    return TrainedPolicy(policy, spec, config, found.numbers["step"])
+
+
+def evaluate(
+    policy: TrainedPolicy,
+    env: str | None = None,
+    episodes: int = 100,
+    seed: int = 0,
+    *,
+    deterministic: bool = True,
+    backend: str | None = None,
+) -> Evaluation:
+    """Play whole episodes from starts drawn with `seed`, none of which training ever saw.
+
+    Args:
+        policy: from `load` or `train`.
+        env: by default the environment it was trained on.
+        episodes: how many.
+        seed: of the starts.
+        deterministic: act by the mode of the distribution.
+        backend: who steps the environments; chosen by the id unless named.
+    """
+    if episodes < 1:
+        raise UserError(f"episodes must be a whole number at least 1, not {episodes}.")
+    vec = _evaluation_env(env or policy.spec.env_id, policy.config, episodes, "cpu", backend)
+    if vec.spec.layout != policy.spec.layout or vec.spec.action != policy.spec.action:
+        raise UserError(
+            f"A policy for {policy.spec.env_id} cannot act in {vec.spec.env_id}: its spaces are others."
+        )
+    try:
+        return evaluate_module(policy.module, vec, episodes, seed, deterministic)
+    finally:
+        vec.close()
+
+
+def _train(
+    path: Path,
+    algorithm: str,
+    config: RunConfig,
+    envs: tuple[VecEnv, VecEnv],
+    loggers: tuple[str, ...],
+    progress: bool,
+) -> TrainedRun:
+    set_seeds(config.seed)
+    torch.set_num_threads(config.threads)
+    run = Run(path, algorithm, config, envs, loggers=loggers, progress=progress)
+    try:
+        state = ALGORITHMS[algorithm].train(config, run)
+    finally:
+        run.close()
+    return TrainedRun(path, TrainedPolicy(state.policy.cpu(), run.spec, config, state.step))
+
+
+def _evaluation_env(
+    env_id: str, config: RunConfig, episodes: int, device: str, backend: str | None = None
+) -> VecEnv:
+    """As many copies as training has for a drone, whose compiled program they share; else a few."""
+    copies = config.num_envs if env_id in api.CRAZYFLOW_IDS else min(episodes, 16)
+    return api.make(env_id, copies, device=device, backend=backend or config.backend)
+
+
+def _empty_policy(spec: Spec, config: Any) -> Policy:
+    policy, _ = policy_and_value(
+        spec,
+        config.hidden,
+        config.activation,
+        normalize_observations=config.normalize_observations,
+    )
+    return policy
+
+
+def _loggers(track: str | None) -> tuple[str, ...]:
+    if track is not None and track not in LOGGERS:
+        raise unknown("tracker", track, LOGGERS)
+    return ("jsonl", "tensorboard", *([track] if track else []))
+
+
+def _device(name: str) -> torch.device:
+    if name == "cuda" and not torch.cuda.is_available():
+        raise UserError("device is cuda, but torch sees no GPU; use cpu or auto.")
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    return torch.device(name)
+
+
+def _fresh_directory(algorithm: str, config: RunConfig) -> Path:
+    stem = f"{config.env.replace('/', '_').replace(':', '_')}-{algorithm}-{config.seed}"
+    names = (Path("runs") / (stem if n == 1 else f"{stem}-{n}") for n in count(1))
+    return next(path for path in names if not path.exists())

@@ -1,0 +1,28 @@
+"""What can be wrong, once: pure functions on tensors, each with its equation and its oracle in `tests/maths`."""
+
+from lemniscate.maths.distributions import Categorical, Distribution, Gaussian
+from lemniscate.maths.losses import clipped_surrogate, value_loss
+from lemniscate.maths.returns import gae
+from lemniscate.maths.stats import (
+    clip_fraction,
+    explained_variance,
+    kl_k1,
+    kl_k3,
+    merge_moments,
+    standardize,
+)
+
+__all__ = [
+    "Categorical",
+    "Distribution",
+    "Gaussian",
+    "clip_fraction",
+    "clipped_surrogate",
+    "explained_variance",
+    "gae",
+    "kl_k1",
+    "kl_k3",
+    "merge_moments",
+    "standardize",
+    "value_loss",
+]

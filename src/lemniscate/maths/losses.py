@@ -1,0 +1,61 @@
+"""Losses: scalars to descend."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+def clipped_surrogate(
+    log_ratio: Float[Tensor, " B"], advantage: Float[Tensor, " B"], clip: float = 0.2
+) -> Float[Tensor, ""]:
+    """PPO's clipped surrogate, negated: Schulman et al. 2017, arXiv:1707.06347, eq. 7.
+
+        L^CLIP = E[ min( r A, clip(r, 1−ε, 1+ε) A ) ],   r = exp(log_ratio) = π(a|s) / π_old(a|s)
+
+    Where A ≥ 0 the objective stops growing at r = 1+ε; where A < 0 it stops at r = 1−ε. The minimum keeps the
+    gradient wherever the ratio has moved to the wrong side, however far.
+
+    Args:
+        log_ratio: log π(a|s) − log π_old(a|s).
+        advantage: A, no gradient.
+        clip: ε > 0.
+
+    Returns:
+        −L^CLIP, a scalar.
+    """
+    ratio = log_ratio.exp()
+    return -torch.min(ratio * advantage, ratio.clamp(1 - clip, 1 + clip) * advantage).mean()
+
+
+def value_loss(
+    value: Float[Tensor, " B"],
+    target: Float[Tensor, " B"],
+    old_value: Float[Tensor, " B"] | None = None,
+    clip: float | None = None,
+) -> Float[Tensor, ""]:
+    """The critic's loss, L^VF of arXiv:1707.06347, eq. 9, with the conventional half: ½ E[(V − target)²].
+
+    With `clip`, the value may move only ε from what it was when the data was collected, and the larger of the two
+    errors counts, element by element (PPO's reference code, not its paper):
+
+        ½ E[ max( (V − target)², (V_old + clip(V − V_old, −ε, ε) − target)² ) ]
+
+    Args:
+        value: V(s) now.
+        target: what it should be, no gradient.
+        old_value: V(s) at collection; needed with `clip`.
+        clip: ε > 0, or None for the plain loss.
+
+    Returns:
+        A scalar.
+
+    Raises:
+        ValueError: `clip` without `old_value`.
+    """
+    error = (value - target).square()
+    if clip is not None:
+        if old_value is None:
+            raise ValueError("value_loss with clip needs old_value, the values at collection.")
+        clipped = old_value + (value - old_value).clamp(-clip, clip)
+        error = torch.max(error, (clipped - target).square())
+    return 0.5 * error.mean()

@@ -1,0 +1,46 @@
+"""Advantages and returns."""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+
+def gae(
+    reward: Float[Tensor, "T N"],
+    value: Float[Tensor, "T N"],
+    next_value: Float[Tensor, "T N"],
+    terminated: Bool[Tensor, "T N"],
+    done: Bool[Tensor, "T N"],
+    *,
+    gamma: float = 0.99,
+    lam: float = 0.95,
+) -> tuple[Float[Tensor, "T N"], Float[Tensor, "T N"]]:
+    """Generalized advantage estimation: Schulman et al. 2016, arXiv:1506.02438, eq. 16 cut where episodes end.
+
+        δ_t = r_t + γ V(s_{t+1}) − V(s_t)                                  (eq. 9, with V = 0 after a termination)
+        A_t = δ_t + γλ A_{t+1} = Σ_l (γλ)^l δ_{t+l}                        (eq. 16, up to the end of the episode)
+
+    Two flags, because there are two ends. A *termination* ends the value: nothing follows it. Any end (`done`:
+    terminated or truncated) ends the chain: the next row belongs to another episode. A time-out therefore bootstraps
+    from `next_value`, the value of the true final observation.
+
+    Args:
+        reward: r_t.
+        value: V(s_t).
+        next_value: V(s_{t+1}) of the true successor, before any reset.
+        terminated: the episode ended by its own rules at row t.
+        done: the episode ended at row t for any reason.
+        gamma: discount γ in [0, 1].
+        lam: trace decay λ in [0, 1]; 0 is the one-step TD error, 1 is Monte Carlo minus the baseline.
+
+    Returns:
+        (advantage, target), each [T, N]; target = advantage + value is the TD(λ) return the critic regresses on.
+    """
+    delta = reward + gamma * next_value * ~terminated - value
+    decay = gamma * lam * ~done
+    advantage = torch.empty_like(delta)
+    trace = torch.zeros_like(delta[0])
+    for t in reversed(range(len(delta))):
+        trace = delta[t] + decay[t] * trace
+        advantage[t] = trace
+    return advantage, advantage + value

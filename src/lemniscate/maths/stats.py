@@ -1,0 +1,52 @@
+"""Statistics of batches and of streams."""
+
+from jaxtyping import Float
+from torch import Tensor
+
+
+def standardize(x: Float[Tensor, " B"], eps: float = 1e-8) -> Float[Tensor, " B"]:
+    """(x − mean) / (std + eps), with the unbiased std; a constant batch becomes zeros."""
+    return (x - x.mean()) / (x.std() + eps)
+
+
+def explained_variance(prediction: Tensor, target: Tensor) -> Tensor:
+    """1 − Var[target − prediction] / Var[target]: 1 is perfect, 0 no better than the mean, below 0 worse.
+
+    NaN where the target is constant.
+    """
+    return 1 - (target - prediction).var() / target.var()
+
+
+def kl_k1(log_ratio: Tensor) -> Tensor:
+    """The estimate E_old[−log r] of KL(π_old ‖ π): unbiased, of high variance, sometimes negative.
+
+    Schulman 2020, "Approximating KL Divergence" (joschu.net/blog/kl-approx.html), k1.
+    """
+    return -log_ratio.mean()
+
+
+def kl_k3(log_ratio: Tensor) -> Tensor:
+    """The estimate E_old[(r − 1) − log r] of KL(π_old ‖ π): unbiased, of low variance, never negative.
+
+    Schulman 2020, "Approximating KL Divergence" (joschu.net/blog/kl-approx.html), k3.
+    """
+    return (log_ratio.exp() - 1 - log_ratio).mean()
+
+
+def clip_fraction(log_ratio: Tensor, clip: float) -> Tensor:
+    """The share of ratios outside [1−ε, 1+ε]."""
+    return ((log_ratio.exp() - 1).abs() > clip).float().mean()
+
+
+def merge_moments(
+    mean_a: Tensor, var_a: Tensor, count_a: Tensor, mean_b: Tensor, var_b: Tensor, count_b: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean, population variance and count of the union of two samples.
+
+    Chan, Golub & LeVeque 1983, eq. 2.1: exact, whatever the sizes.
+    """
+    count = count_a + count_b
+    delta = mean_b - mean_a
+    mean = mean_a + delta * (count_b / count)
+    scatter = var_a * count_a + var_b * count_b + delta.square() * (count_a * count_b / count)
+    return mean, scatter / count, count

@@ -1,0 +1,89 @@
+"""Tuned Configs, as Python values: where each came from, and when.
+
+`default` is what an environment without a preset of its own gets.
+"""
+
+from dataclasses import dataclass
+
+from lemniscate.algos import ppo
+from lemniscate.errors import unknown
+from lemniscate.run.config import RunConfig
+
+FIGURE_EIGHT = "DroneFigureEightTrajectory-v0"
+
+
+@dataclass(frozen=True)
+class Preset:
+    """A Config that has been tried, with its provenance."""
+
+    config: RunConfig
+    source: str
+    date: str
+
+
+PPO = {
+    "default": Preset(ppo.Config(), "Schulman et al. 2017, table 3, on 8 environments with a running normalizer", "2026-11"),
+    "figure-eight": Preset(
+        ppo.Config(
+            env=FIGURE_EIGHT,
+            num_envs=256,
+            num_steps=32,
+            total_steps=1_000_000,
+            epochs=4,
+            num_minibatches=8,
+            learning_rate=3e-3,
+            final_learning_rate=0.02,
+            gamma=0.97,
+            gae_lambda=0.95,
+            clip=0.25,
+            initial_log_std=-1.0,
+            threads=2,
+            evaluate_episodes=64,
+            checkpoint_every=1_000_000,
+        ),
+        "random search of 100 runs on training seeds above 100",
+        "2026-11",
+    ),
+    "course": Preset(
+        ppo.Config(
+            env=FIGURE_EIGHT,
+            num_envs=1024,
+            num_steps=16,
+            total_steps=1_000_000,
+            epochs=15,
+            num_minibatches=16,
+            learning_rate=1.5e-3,
+            final_learning_rate=0.2,
+            gamma=0.9,
+            gae_lambda=0.95,
+            clip=0.25,
+            clip_value=0.25,
+            entropy_coef=0.01,
+            value_coef=0.5,
+            max_grad_norm=5.0,
+            threads=2,
+            evaluate_episodes=64,
+            checkpoint_every=1_000_000,
+        ),
+        "the drone course's notebook: its settings, on the corrected algorithm",
+        "2026-11",
+    ),
+}
+
+PRESETS: dict[str, dict[str, Preset]] = {"ppo": PPO}
+
+BEST: dict[tuple[str, str], str] = {("ppo", FIGURE_EIGHT): "figure-eight"}
+"""the preset that an environment gets unasked"""
+
+
+def choose(algorithm: str, env_id: str | None, name: str | None) -> tuple[str, RunConfig]:
+    """The preset asked for, or the best known for the environment, or the default: (its name, its Config).
+
+    The Config's `env` is `env_id` if one is given. Raises `UserError` with the nearest names for an unknown preset.
+    """
+    table = PRESETS[algorithm]
+    name = name or BEST.get((algorithm, env_id or ""), "default")
+    if name not in table:
+        raise unknown("preset", name, table)
+    config = table[name].config
+    return name, config.replace(env=env_id) if env_id else config

@@ -1,0 +1,208 @@
+"""Checkpoints: a directory of raw tensors and JSON, no pickle, a sha256 for each file.
+
+    step-N/tensors.safetensors   every tensor of the State
+    step-N/state.json            every number of it, the Spec, the Config
+    step-N/manifest.json         format version, sha256 of the two
+
+Written under another name, synced, then renamed: under its own name a checkpoint is whole or absent. The hashes find
+damage, not malice; but nothing in these files can be executed.
+"""
+
+import dataclasses
+import hashlib
+import json
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load as tensors_from_bytes
+from safetensors.torch import save as tensors_to_bytes
+from torch import Tensor
+
+from lemniscate.errors import UserError
+from lemniscate.types import Box, Discrete, Spec
+
+FORMAT = 1
+PARTS = ("tensors.safetensors", "state.json")
+
+
+class DamagedCheckpointError(UserError):
+    """A checkpoint whose files are missing, or not what their hashes say."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Checkpoint:
+    """What `read` found: tensors and numbers by name, and the record that `write` was given."""
+
+    path: Path
+    tensors: dict[str, Tensor]
+    numbers: dict[str, Any]
+    record: dict[str, Any]
+
+    def restore(self, state: Any) -> None:
+        """Put everything back into a State of the same make: modules, optimizers, generators, numbers."""
+        for name, value in _parts(state):
+            prefix = f"{name}."
+            mine = {key.removeprefix(prefix): t for key, t in self.tensors.items() if key.startswith(prefix)}
+            if isinstance(value, torch.nn.Module):
+                value.load_state_dict(mine)
+            elif isinstance(value, torch.optim.Optimizer):
+                _load_optimizer(value, mine, self.numbers[name])
+            elif isinstance(value, torch.Generator):
+                value.set_state(mine["state"])
+            else:
+                setattr(state, name, self.numbers[name])
+
+    def module(self, name: str) -> dict[str, Tensor]:
+        """The state_dict of one module of the State."""
+        prefix = f"{name}."
+        return {key.removeprefix(prefix): t for key, t in self.tensors.items() if key.startswith(prefix)}
+
+
+def write(directory: Path, state: Any, step: int, record: dict[str, Any], keep: int) -> Path:
+    """Write `directory/step-N` with every field of the dataclass `state`, and delete all but the newest `keep`.
+
+    `record` is any JSON: what a reader needs to know beside the state. A checkpoint of the same step that is whole is
+    left as it is: a run arrives at a step in the same bits or not at all.
+    """
+    final = directory / f"step-{step}"
+    tensors: dict[str, Tensor] = {}
+    numbers: dict[str, Any] = {}
+    for name, value in _parts(state):
+        if isinstance(value, torch.nn.Module):
+            tensors |= {f"{name}.{key}": t for key, t in value.state_dict().items()}
+        elif isinstance(value, torch.optim.Optimizer):
+            saved = value.state_dict()
+            numbers[name] = saved["param_groups"]
+            tensors |= {
+                f"{name}.{index}.{key}": torch.as_tensor(t)
+                for index, slot in saved["state"].items()
+                for key, t in slot.items()
+            }
+        elif isinstance(value, torch.Generator):
+            tensors[f"{name}.state"] = value.get_state()
+        else:
+            numbers[name] = value
+    contents = {
+        # Clones, because modules may share a normalizer and safetensors refuses shared memory.
+        PARTS[0]: tensors_to_bytes({k: t.detach().cpu().clone().contiguous() for k, t in tensors.items()}),
+        PARTS[1]: _json({"numbers": numbers, "record": record}),
+    }
+    hashes = {name: hashlib.sha256(data).hexdigest() for name, data in contents.items()}
+    contents["manifest.json"] = _json({"format": FORMAT, "sha256": hashes})
+
+    directory.mkdir(parents=True, exist_ok=True)
+    for stale in directory.glob("*.tmp"):
+        shutil.rmtree(stale)
+    temporary = directory / f"step-{step}.tmp"
+    temporary.mkdir()
+    for name, data in contents.items():
+        with (temporary / name).open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+    _sync(temporary)
+    if final.exists():
+        shutil.rmtree(final)
+    temporary.rename(final)
+    _sync(directory)
+    for old in list_steps(directory)[:-keep]:
+        shutil.rmtree(directory / f"step-{old}")
+    return final
+
+
+def read(path: Path) -> Checkpoint:
+    """Read one checkpoint directory, every byte of it checked.
+
+    Raises:
+        DamagedCheckpointError: naming the file and what is wrong with it.
+    """
+    manifest = _parse(path / "manifest.json")
+    if manifest.get("format") != FORMAT:
+        raise DamagedCheckpointError(f"{path} has format {manifest.get('format')!r}; this version reads {FORMAT}.")
+    contents = {}
+    for name in PARTS:
+        contents[name] = _bytes(path / name)
+        if hashlib.sha256(contents[name]).hexdigest() != manifest.get("sha256", {}).get(name):
+            raise DamagedCheckpointError(f"{path / name} is not what was written: its sha256 differs.")
+    try:
+        tensors = tensors_from_bytes(contents[PARTS[0]])
+        state = json.loads(contents[PARTS[1]])
+        return Checkpoint(path, tensors, state["numbers"], state["record"])
+    except (SafetensorError, ValueError, KeyError, TypeError) as error:
+        raise DamagedCheckpointError(f"{path} cannot be read: {error}.") from error
+
+
+def list_steps(directory: Path) -> list[int]:
+    """The steps of the checkpoints in a run's `checkpoints`, ascending."""
+    names = (p.name.removeprefix("step-") for p in directory.glob("step-*") if p.is_dir())
+    return sorted(int(name) for name in names if name.isdigit())
+
+
+def record_of(path: Path) -> dict[str, Any]:
+    """The record alone of a checkpoint, or {} where it cannot be read."""
+    try:
+        return json.loads((path / PARTS[1]).read_bytes())["record"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
+
+
+def spec_to_json(spec: Spec) -> dict[str, Any]:
+    """A Spec as JSON."""
+    return dataclasses.asdict(spec) | {"action": {"kind": type(spec.action).__name__, **dataclasses.asdict(spec.action)}}
+
+
+def spec_from_json(record: dict[str, Any]) -> Spec:
+    """The Spec that `spec_to_json` came from."""
+    action = dict(record["action"])
+    if action.pop("kind") == "Box":
+        kind: Box | Discrete = Box(tuple(action["low"]), tuple(action["high"]))
+    else:
+        kind = Discrete(**action)
+    layout = tuple((name, size) for name, size in record["layout"])
+    tracking = tuple(record["tracking"]) if record["tracking"] else None
+    return Spec(**{**record, "action": kind, "layout": layout, "tracking": tracking})
+
+
+def _parts(state: Any) -> list[tuple[str, Any]]:
+    return [(field.name, getattr(state, field.name)) for field in dataclasses.fields(state)]
+
+
+def _load_optimizer(optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor], groups: Any) -> None:
+    slots: dict[int, dict[str, Tensor]] = {}
+    for key, tensor in tensors.items():
+        index, _, name = key.partition(".")
+        slots.setdefault(int(index), {})[name] = tensor
+    groups = [{k: tuple(v) if k == "betas" else v for k, v in group.items()} for group in groups]
+    optimizer.load_state_dict({"state": slots, "param_groups": groups})
+
+
+def _json(record: Any) -> bytes:
+    return json.dumps(record, indent=1).encode()
+
+
+def _bytes(path: Path) -> bytes:
+    if not path.is_file():
+        raise DamagedCheckpointError(f"{path} is missing.")
+    return path.read_bytes()
+
+
+def _parse(path: Path) -> dict[str, Any]:
+    try:
+        parsed = json.loads(_bytes(path))
+        if isinstance(parsed, dict):
+            return parsed
+    except ValueError:
+        pass
+    raise DamagedCheckpointError(f"{path} is not JSON any more.")
+
+
+def _sync(directory: Path) -> None:
+    handle = os.open(directory, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

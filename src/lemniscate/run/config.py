@@ -1,0 +1,106 @@
+"""What every algorithm's Config shares, and the ranges that all of them are held to."""
+
+import dataclasses
+import json
+import math
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal, Self, get_args, get_origin, get_type_hints
+
+from lemniscate.errors import UserError, unknown
+
+
+@dataclass(frozen=True)
+class Range:
+    """A closed interval, or with `above` one open at its lower end."""
+
+    low: float = -math.inf
+    high: float = math.inf
+    above: bool = False
+
+    def __contains__(self, x: float) -> bool:
+        return (self.low < x if self.above else self.low <= x) and x <= self.high
+
+    def __str__(self) -> str:
+        if self.high < math.inf:
+            return f"{'above' if self.above else 'from'} {self.low:g} to {self.high:g}"
+        return f"{'above' if self.above else 'at least'} {self.low:g}"
+
+
+Count = Annotated[int, Range(1)]
+Natural = Annotated[int, Range(0)]
+Fraction = Annotated[float, Range(0, 1)]
+Positive = Annotated[float, Range(0, above=True)]
+NonNegative = Annotated[float, Range(0)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunConfig:
+    """The fields that every algorithm has. Checked at construction: a value out of range is named in a `UserError`."""
+
+    env: str = "CartPole-v1"
+    """environment id; `lemniscate envs` lists them"""
+    backend: str | None = None
+    """who steps the environments; chosen by the id unless named"""
+    num_envs: Count = 8
+    """copies of the environment, N"""
+    seed: Natural = 1
+    """the one seed; every other is derived from it"""
+    total_steps: Count = 1_000_000
+    """environment steps of the whole run, summed over the copies"""
+    device: Literal["auto", "cpu", "cuda"] = "cpu"
+    """where networks, and simulators that can, live; auto takes cuda if there is one"""
+    threads: Count = 1
+    """torch's threads on the CPU; results of one number differ in rounding from another's"""
+    checkpoint_every: Natural = 0
+    """steps between checkpoints, at each of which the environments restart; 0 makes five of the run"""
+    keep_checkpoints: Count = 3
+    """older ones are deleted"""
+    evaluate_every: Natural = 0
+    """steps between evaluations during training; 0 leaves it to the end"""
+    evaluate_episodes: Count = 20
+    """episodes of each evaluation"""
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            self._check(field.name, get_type_hints(type(self), include_extras=True)[field.name])
+
+    def _check(self, name: str, hint: Any) -> None:
+        value = getattr(self, name)
+        options = [hint] if get_origin(hint) in (Annotated, Literal) else get_args(hint)
+        if value is None and type(None) in options:
+            return
+        for option in options:
+            if get_origin(option) is Literal and value not in get_args(option):
+                raise UserError(f"{name} must be one of {', '.join(get_args(option))}, not {value!r}.")
+            if get_origin(option) is Annotated:
+                kind, limits = get_args(option)
+                number = isinstance(value, int if kind is int else (int, float)) and not isinstance(value, bool)
+                if not (number and value in limits):
+                    what = "a whole number" if kind is int else "a number"
+                    raise UserError(f"{name} must be {what} {limits}, not {value!r}.")
+
+    @property
+    def checkpoint_interval(self) -> int:
+        """Steps between checkpoints."""
+        return self.checkpoint_every or -(-self.total_steps // 5)
+
+    def replace(self, **changes: object) -> Self:
+        """A copy with some fields changed. Raises `UserError` for an unknown field or a value out of range."""
+        for name in changes:
+            if name not in self.names():
+                raise unknown("field", name, self.names())
+        return dataclasses.replace(self, **changes)
+
+    @classmethod
+    def names(cls) -> list[str]:
+        """The names of all fields."""
+        return [field.name for field in dataclasses.fields(cls)]
+
+    def to_json(self) -> dict[str, Any]:
+        """A dictionary that survives JSON."""
+        return json.loads(json.dumps(dataclasses.asdict(self)))
+
+    @classmethod
+    def from_json(cls, record: dict[str, Any]) -> Self:
+        """The Config that `to_json` came from."""
+        return cls().replace(**{k: tuple(v) if isinstance(v, list) else v for k, v in record.items()})

@@ -1,0 +1,89 @@
+"""Flying a policy without learning. Nothing here is shared with training: not environments, nor random numbers."""
+
+import math
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+
+import torch
+from torch import Tensor
+
+from lemniscate.envs.api import VecEnv
+from lemniscate.nn.policies import Policy
+from lemniscate.run.seeding import derive, generator
+from lemniscate.types import Step
+
+EVALUATION = 1
+"""the stream of seeds that training never draws from"""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """What a policy achieved. `rmse_mm` and the rest of the last group are for environments with a reference to track."""
+
+    env_id: str
+    episodes: int
+    mean_return: float
+    std_return: float
+    returns: list[float]
+    lengths: list[int]
+    terminated: int
+    rmse_mm: float | None = None
+    rmse_after_1s_mm: float | None = None
+
+    def to_json(self) -> dict[str, object]:
+        """Without what the environment does not have."""
+        return {name: value for name, value in asdict(self).items() if value is not None}
+
+
+@torch.no_grad()
+def fly(policy: Policy, env: VecEnv, episodes: int, seed: int, deterministic: bool = True) -> Iterator[tuple[Step, Tensor]]:
+    """Play `episodes` whole episodes; yields each step with the mask [N] of the copies that still count.
+
+    Every copy has its own share of the episodes, fixed beforehand: taking the first that end would favour short ones.
+    """
+    noise = generator(seed, env.device, EVALUATION, 1)
+    copies = torch.arange(env.num_envs, device=env.device)
+    left = episodes // env.num_envs + (copies < episodes % env.num_envs).int()
+    env.restart(derive(seed, EVALUATION, 0))
+    while (left > 0).any():
+        distribution = policy(env.obs)
+        step = env.step(distribution.mode() if deterministic else distribution.sample(noise))
+        yield step, (left > 0) & step.valid
+        left = left - ((step.terminated | step.truncated) & step.valid).int()
+
+
+def evaluate(policy: Policy, env: VecEnv, episodes: int, seed: int, deterministic: bool = True) -> Evaluation:
+    """Mean return over `episodes` whole episodes from starts drawn with `seed`; for drones the tracking error too."""
+    running = torch.zeros(2, env.num_envs, device=env.device)
+    ended: list[Tensor] = []
+    errors: list[Tensor] = []
+    terminated = 0
+    for step, counts in fly(policy, env, episodes, seed, deterministic):
+        if env.spec.tracking:
+            error = step.next_obs[:, slice(*env.spec.tracking)].square().sum(-1)
+            errors.append(torch.stack([error, running[1]], dim=-1)[counts])
+        running = running + torch.stack([step.reward, torch.ones_like(step.reward)]) * counts
+        done = (step.terminated | step.truncated) & counts
+        if done.any():
+            ended.append(torch.stack([*running[:, done], torch.nonzero(done)[:, 0]]))
+            terminated += int((step.terminated & counts).sum())
+            running = running * ~done
+    table = torch.cat(ended, dim=1)
+    returns, lengths = table[:2, table[2].argsort(stable=True)]  # by copy, then by time
+    mean, std = returns.mean().item(), returns.std(correction=0).item()
+    scores = Evaluation(env.spec.env_id, episodes, mean, std, returns.tolist(), lengths.int().tolist(), terminated)
+    if not errors or env.spec.time_step is None:
+        return scores
+    squared, step_index = torch.cat(errors).unbind(-1)
+    late = squared[step_index >= 1 / env.spec.time_step]
+    return Evaluation(
+        **{
+            **asdict(scores),
+            "rmse_mm": _root_mean_mm(squared),
+            "rmse_after_1s_mm": _root_mean_mm(late) if len(late) else math.nan,
+        }
+    )
+
+
+def _root_mean_mm(squared_m: Tensor) -> float:
+    return 1000 * squared_m.mean().sqrt().item()

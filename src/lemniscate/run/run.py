@@ -1,0 +1,251 @@
+"""What surrounds a training loop: the run directory, and the generator that the loop is written over.
+
+    for env in run.until(config.total_steps, state):
+        ...one update...
+
+Between two bodies the generator logs, evaluates, saves and stops; the loop knows nothing of it.
+
+A checkpoint is a place where the run starts anew: there the environments restart from a seed derived from (run seed,
+step), in a run that goes on as in one that is resumed. So both end in the same bits, whatever the simulator.
+"""
+
+import json
+import os
+import shutil
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Any, Protocol, TypeVar
+
+import torch
+from filelock import FileLock, Timeout
+
+from lemniscate.envs.api import Episodes, VecEnv
+from lemniscate.errors import NonFiniteError, UserError
+from lemniscate.nn.policies import Policy
+from lemniscate.run import checkpoint
+from lemniscate.run.config import RunConfig
+from lemniscate.run.evaluate import evaluate
+from lemniscate.run.loggers import LOGGERS
+from lemniscate.run.progress import ProgressBar
+from lemniscate.run.seeding import derive
+
+TRAINING = 0
+"""the stream of seeds that training environments restart from"""
+
+
+class AnyState(Protocol):
+    """What a run needs to know of an algorithm's State: how far it is, and whom to evaluate."""
+
+    step: int
+    policy: Policy
+
+
+S = TypeVar("S", bound=AnyState)
+
+
+class Stopped(KeyboardInterrupt):
+    """The run was asked to stop (Ctrl-C, SIGTERM), and has saved itself."""
+
+    def __init__(self, message: str, signum: int) -> None:
+        super().__init__(message)
+        self.signum = signum
+
+
+class Run:
+    """A run directory, its loggers, and its environments."""
+
+    def __init__(
+        self,
+        path: Path,
+        algorithm: str,
+        config: RunConfig,
+        envs: tuple[VecEnv, VecEnv],
+        *,
+        loggers: tuple[str, ...] = ("jsonl", "tensorboard"),
+        progress: bool = True,
+    ) -> None:
+        self.path, self.algorithm, self.config = path, algorithm, config
+        self.env, self.eval_env = envs
+        self.spec = self.env.spec
+        self._logger_names, self._visible = loggers, progress
+        self._stop_signal = 0
+        self._recent: list[float] = []
+        self._lock = FileLock(path / ".lock", timeout=0)
+        try:
+            self._lock.acquire()
+        except Timeout:
+            raise UserError(f"{path} is being trained by another process.") from None
+
+    def restore(self, state: S) -> S:
+        """Fill `state` from the newest checkpoint to resume from, if there is one; then open the loggers."""
+        found = newest_resumable(self.path)
+        if found:
+            found.restore(state)
+        self._forget_after(state.step)
+        config = {"algorithm": self.algorithm, **self.config.to_json()}
+        self._loggers = [LOGGERS[name](self.path, config, state.step) for name in self._logger_names]
+        return state
+
+    def until(self, total_steps: int, state: AnyState) -> Iterator[VecEnv]:
+        """The environments, once for each update, until `total_steps` are taken.
+
+        Raises:
+            Stopped: after a signal, when the current update is done and saved.
+        """
+        self._bar = ProgressBar(total_steps, state.step, self._visible)
+        self._clock, self._clock_step = time.monotonic(), state.step
+        try:
+            with self._catching_signals():
+                self._restart(state)
+                while state.step < total_steps:
+                    before = state.step
+                    yield self.env
+                    self._between(state, before, total_steps)
+        finally:
+            self._bar.close()
+
+    def log(self, state: AnyState, metrics: Mapping[str, torch.Tensor | float], episodes: Episodes) -> None:
+        """Write one line of metrics.
+
+        Raises:
+            NonFiniteError: a loss or the gradient is NaN or infinite; the last checkpoint is untouched.
+        """
+        numbers = {name: float(value) for name, value in metrics.items()}
+        for name, value in numbers.items():
+            if name.startswith(("losses/", "gradient")) and not -float("inf") < value < float("inf"):
+                raise NonFiniteError(f"{name} is {value} in the update that ends at step {state.step:,}.")
+        if episodes.returns:
+            self._recent = (self._recent + episodes.returns)[-100:]
+            numbers["episode/return"] = sum(episodes.returns) / len(episodes.returns)
+            numbers["episode/length"] = sum(episodes.lengths) / len(episodes.lengths)
+        now = time.monotonic()
+        numbers["time/steps_per_second"] = (state.step - self._clock_step) / max(now - self._clock, 1e-9)
+        self._clock, self._clock_step = now, state.step
+        self._write(state.step, numbers)
+        self._bar.update(state.step, sum(self._recent) / len(self._recent) if self._recent else None)
+
+    def close(self, pictures: list[Path] | None = None) -> None:
+        """Close loggers and environments, and give the directory free."""
+        for logger in getattr(self, "_loggers", []):
+            logger.close(pictures or [])
+        self.env.close()
+        self.eval_env.close()
+        self._lock.release()
+
+    def _restart(self, state: AnyState) -> None:
+        self._recent = []
+        self.env.restart(derive(self.config.seed, TRAINING, state.step), state.step)
+
+    def _between(self, state: AnyState, before: int, total_steps: int) -> None:
+        every, interval = self.config.evaluate_every, self.config.checkpoint_interval
+        if every and state.step // every > before // every:
+            self._evaluate(state)
+        finished = state.step >= total_steps
+        if finished or state.step // interval > before // interval:
+            self._save(state, planned=True)
+            if not finished:
+                self._restart(state)
+        if self._stop_signal and not finished:
+            self._save(state, planned=False)
+            last = newest_resumable(self.path)
+            message = (
+                f"Stopped at step {state.step:,}; the policy is saved. Go on with: lemniscate resume {self.path}\n"
+                f"It takes up the run at step {last.numbers['step'] if last else 0:,}, the last planned checkpoint, and"
+                " ends in the bits of a run that was never stopped."
+            )
+            raise Stopped(message, self._stop_signal)
+
+    def _evaluate(self, state: AnyState) -> None:
+        scores = evaluate(state.policy, self.eval_env, self.config.evaluate_episodes, self.config.seed)
+        metrics = {"evaluation/return": scores.mean_return, "evaluation/length": sum(scores.lengths) / scores.episodes}
+        if scores.rmse_after_1s_mm is not None:
+            metrics["evaluation/rmse_after_1s_mm"] = scores.rmse_after_1s_mm
+        self._write(state.step, metrics)
+
+    def _write(self, step: int, numbers: dict[str, float]) -> None:
+        for logger in self._loggers:
+            logger.write(step, numbers)
+
+    def _save(self, state: AnyState, planned: bool) -> None:
+        record = {
+            "algorithm": self.algorithm,
+            "planned": planned,
+            "config": self.config.to_json(),
+            "spec": checkpoint.spec_to_json(self.spec),
+        }
+        try:
+            checkpoint.write(self.path / "checkpoints", state, state.step, record, self.config.keep_checkpoints)
+        except OSError as error:  # a full disk costs this checkpoint, not the run, and not the checkpoints before it
+            print(f"The checkpoint at step {state.step:,} could not be written: {error}.", file=sys.stderr)
+
+    def _forget_after(self, step: int) -> None:
+        """Checkpoints beyond the one resumed from are damaged or unplanned; the run will come by there again."""
+        for later in checkpoint.list_steps(self.path / "checkpoints"):
+            if later > step:
+                shutil.rmtree(self.path / "checkpoints" / f"step-{later}")
+
+    @contextmanager
+    def _catching_signals(self) -> Iterator[None]:
+        """Ctrl-C and SIGTERM wait for the end of the update; a second Ctrl-C does not wait."""
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
+
+        def remember(signum: int, _frame: FrameType | None) -> None:
+            if self._stop_signal:
+                raise KeyboardInterrupt
+            self._stop_signal = signum
+
+        previous = {signum: signal.signal(signum, remember) for signum in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield
+        finally:
+            for signum, handler in previous.items():
+                signal.signal(signum, handler)
+
+
+def create_directory(path: Path, algorithm: str, config: RunConfig) -> None:
+    """Make a run directory and write its `config.json`. Raises `UserError` if there is something already."""
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        raise UserError(f"{path} exists already; go on with it (lemniscate resume {path}) or choose another --run.")
+    path.mkdir(parents=True, exist_ok=True)
+    temporary = path / "config.json.tmp"
+    temporary.write_text(json.dumps({"algorithm": algorithm, "config": config.to_json()}, indent=1) + "\n")
+    os.replace(temporary, path / "config.json")
+
+
+def read_config(path: Path) -> tuple[str, dict[str, Any]]:
+    """The algorithm's name and its config, from a run directory. Raises `UserError` if it is none."""
+    try:
+        record = json.loads((path / "config.json").read_text())
+        return record["algorithm"], record["config"]
+    except (OSError, ValueError, KeyError, TypeError):
+        raise UserError(f"{path} is not a run directory: it holds no config.json that can be read.") from None
+
+
+def newest_resumable(path: Path) -> checkpoint.Checkpoint | None:
+    """The newest planned checkpoint of a run that is whole; damaged ones are named on standard error."""
+    return _newest(path, planned_only=True)
+
+
+def newest(path: Path) -> checkpoint.Checkpoint | None:
+    """The newest whole checkpoint of a run, a stopped run's last one included."""
+    return _newest(path, planned_only=False)
+
+
+def _newest(path: Path, planned_only: bool) -> checkpoint.Checkpoint | None:
+    for step in reversed(checkpoint.list_steps(path / "checkpoints")):
+        try:
+            found = checkpoint.read(path / "checkpoints" / f"step-{step}")
+        except checkpoint.DamagedCheckpointError as error:
+            print(f"{error} Taking the one before.", file=sys.stderr)
+            continue
+        if found.record["planned"] or not planned_only:
+            return found
+    return None
