@@ -189,9 +189,7 @@ def evaluate(
         raise UserError(f"episodes must be a whole number at least 1, not {episodes}.")
     vec = _evaluation_env(env or policy.spec.env_id, policy.config, episodes, "cpu", backend)
     if vec.spec.layout != policy.spec.layout or vec.spec.action != policy.spec.action:
-        raise UserError(
-            f"A policy for {policy.spec.env_id} cannot act in {vec.spec.env_id}: its spaces are others."
-        )
+        raise UserError(f"A policy for {policy.spec.env_id} cannot act in {vec.spec.env_id}: its spaces are others.")
     try:
         return evaluate_module(policy.module, vec, episodes, seed, deterministic)
     finally:
@@ -216,9 +214,12 @@ def _train(
     return TrainedRun(path, TrainedPolicy(state.policy.cpu(), run.spec, config, state.step))
 
 
-def _evaluation_env(
-    env_id: str, config: RunConfig, episodes: int, device: str, backend: str | None = None
-) -> VecEnv:
+def evaluation_env(policy: TrainedPolicy, episodes: int) -> VecEnv:
+    """The environments that `evaluate` would play `episodes` in."""
+    return _evaluation_env(policy.spec.env_id, policy.config, episodes, "cpu")
+
+
+def _evaluation_env(env_id: str, config: RunConfig, episodes: int, device: str, backend: str | None = None) -> VecEnv:
     """As many copies as training has for a drone, whose compiled program they share; else a few."""
     copies = config.num_envs if env_id in api.CRAZYFLOW_IDS else min(episodes, 16)
     return api.make(env_id, copies, device=device, backend=backend or config.backend)

@@ -22,7 +22,7 @@ class Preset:
 
 
 PPO = {
-    "default": Preset(ppo.Config(), "Schulman et al. 2017, table 3, on 8 environments with a running normalizer", "2026-11"),
+    "default": Preset(ppo.Config(), "Schulman et al. 2017, table 3, on 8 copies with a running normalizer", "2026-11"),
     "figure-eight": Preset(
         ppo.Config(
             env=FIGURE_EIGHT,

@@ -89,7 +89,9 @@ class Config(RunConfig):
                 f"minibatch_size must divide num_envs · num_steps = {rows}, and {self.minibatch_size} does not."
             )
         if rows // self.parts < 2 and self.normalize_advantage:
-            raise UserError(f"normalize_advantage needs minibatches of 2 rows or more; these have {rows // self.parts}.")
+            raise UserError(
+                f"normalize_advantage needs minibatches of 2 rows or more; these have {rows // self.parts}."
+            )
 
     @property
     def parts(self) -> int:
@@ -126,7 +128,8 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
         initial_log_std=config.initial_log_std,
         normalize_observations=config.normalize_observations,
     )
-    policy.to(device), value.to(device)
+    policy.to(device)
+    value.to(device)
     parameters = [*policy.parameters(), *value.parameters()]
     optimizer = Adam(parameters, lr=config.learning_rate, eps=config.adam_eps, fused=True)
     return State(policy, value, optimizer, generator(config.seed, device, 2), generator(config.seed, device, 3))

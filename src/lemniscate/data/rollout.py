@@ -23,9 +23,7 @@ def collect(env: VecEnv, policy: Policy, num_steps: int, generator: Generator) -
         obs = env.obs
         action = policy(obs).sample(generator)
         step = env.step(action)
-        rows.append(
-            Rollout(obs, action, step.reward, step.next_obs, step.terminated, step.truncated, step.valid)
-        )
+        rows.append(Rollout(obs, action, step.reward, step.next_obs, step.terminated, step.truncated, step.valid))
     rollout = Rollout.stack(rows)
     for name, values in (("observation", rollout.obs), ("reward", rollout.reward), ("observation", rollout.next_obs)):
         _require_finite(name, values, env.steps)
@@ -43,7 +41,7 @@ def _require_finite(name: str, values: Tensor, steps: int) -> None:
 
 
 def minibatches(size: int, count: int, epochs: int, generator: Generator) -> Iterator[list[Tensor]]:
-    """For each epoch, a fresh permutation of 0 … size-1 cut into `count` equal parts; a remainder sits this epoch out."""
+    """For each epoch, a new permutation of 0 … size-1 in `count` equal parts; a remainder sits this epoch out."""
     part = size // count
     for _ in range(epochs):
         rows = torch.randperm(size, generator=generator, device=generator.device)

@@ -1,3 +1,4 @@
+# pyright: reportAttributeAccessIssue=false
 """crazyflow's drones: one compiled call a step, JAX to torch without a copy.
 
 crazyflow's environments are NEXT_STEP: they simulate, then reset what ended one step earlier, then compute a reward at
@@ -59,7 +60,7 @@ class Simulator:
 
     def __init__(self, env_id: str, num_envs: int, device: str) -> None:
         with _quietly():
-            env = gym.make_vec(env_id, num_envs=num_envs, freq=CONTROL_HZ, device=device).unwrapped
+            env: Any = gym.make_vec(env_id, num_envs=num_envs, freq=CONTROL_HZ, device=device).unwrapped
         for name, value in vars(env).items():
             if isinstance(value, np.ndarray):  # the reference trajectory: NumPy cannot be indexed by a tracer
                 setattr(env, name, jnp.asarray(value, device=env.device))
@@ -154,7 +155,9 @@ class CrazyflowBackend:
     def __init__(self, env_id: str, num_envs: int, device: torch.device, *, stagger: bool = False) -> None:
         self.num_envs, self.device = num_envs, device
         if device.type == "cuda" and not any(d.platform == "gpu" for d in jax.devices()):
-            raise UserError("JAX sees no GPU, so crazyflow cannot fly on cuda; it comes with: pip install 'jax[cuda12]'")
+            raise UserError(
+                "JAX sees no GPU, so crazyflow cannot fly on cuda; it comes with: pip install 'jax[cuda12]'"
+            )
         self._simulator = simulator(env_id, num_envs, "gpu" if device.type == "cuda" else "cpu")
         kind = action_kind(self._simulator.env.single_action_space, env_id)
         assert isinstance(kind, Box)

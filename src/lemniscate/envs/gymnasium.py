@@ -1,5 +1,7 @@
 """Gymnasium vector environments, in all three autoreset modes."""
 
+from typing import Any
+
 import gymnasium as gym
 import numpy as np
 import torch
@@ -33,7 +35,7 @@ class GymnasiumBackend:
         *,
         stagger: bool = False,
         workers: bool = False,
-        **kwargs: object,
+        **kwargs: Any,
     ) -> None:
         self._id, self._workers, self._kwargs = env_id, workers, kwargs
         self.num_envs, self.device = num_envs, device

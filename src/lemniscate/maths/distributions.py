@@ -22,7 +22,7 @@ class Distribution(Protocol):
         ...
 
     def log_prob(self, action: Tensor) -> Tensor:
-        """log π(a|s), [B]."""
+        """Log π(a|s), [B]."""
         ...
 
     def entropy(self) -> Tensor:

@@ -11,7 +11,7 @@ from torch.nn.utils import clip_grad_norm_
 def descend(
     optimizer: torch.optim.Optimizer, parameters: Iterable[Parameter], loss: Tensor, max_grad_norm: float
 ) -> Tensor:
-    """Back-propagate `loss`, clip the global gradient norm to `max_grad_norm`, step; returns the norm before the clip."""
+    """Back-propagate, clip the global gradient norm to `max_grad_norm`, step; returns the norm before the clip."""
     optimizer.zero_grad(set_to_none=True)
     loss.backward()
     norm = clip_grad_norm_(parameters, max_grad_norm, foreach=True)

@@ -152,7 +152,9 @@ def record_of(path: Path) -> dict[str, Any]:
 
 def spec_to_json(spec: Spec) -> dict[str, Any]:
     """A Spec as JSON."""
-    return dataclasses.asdict(spec) | {"action": {"kind": type(spec.action).__name__, **dataclasses.asdict(spec.action)}}
+    return dataclasses.asdict(spec) | {
+        "action": {"kind": type(spec.action).__name__, **dataclasses.asdict(spec.action)}
+    }
 
 
 def spec_from_json(record: dict[str, Any]) -> Spec:

@@ -18,7 +18,7 @@ EVALUATION = 1
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What a policy achieved. `rmse_mm` and the rest of the last group are for environments with a reference to track."""
+    """What a policy achieved; the tracking errors only where there is a reference to track."""
 
     env_id: str
     episodes: int
@@ -36,7 +36,9 @@ class Evaluation:
 
 
 @torch.no_grad()
-def fly(policy: Policy, env: VecEnv, episodes: int, seed: int, deterministic: bool = True) -> Iterator[tuple[Step, Tensor]]:
+def fly(
+    policy: Policy, env: VecEnv, episodes: int, seed: int, deterministic: bool = True
+) -> Iterator[tuple[Step, Tensor]]:
     """Play `episodes` whole episodes; yields each step with the mask [N] of the copies that still count.
 
     Every copy has its own share of the episodes, fixed beforehand: taking the first that end would favour short ones.

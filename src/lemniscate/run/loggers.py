@@ -70,7 +70,7 @@ class WeightsAndBiases:
 
     def __init__(self, path: Path, config: Mapping[str, Any], step: int) -> None:
         try:
-            import wandb
+            import wandb  # pyright: ignore[reportMissingImports]
         except ModuleNotFoundError as error:
             raise missing_extra("wandb", "wandb") from error
         self._wandb = wandb
@@ -103,7 +103,9 @@ class WeightsAndBiases:
     def close(self, pictures: list[Path]) -> None:
         """Upload the pictures and finish."""
         if pictures:
-            self._run.log({picture.stem: self._wandb.Image(str(picture)) for picture in pictures if picture.suffix == ".png"})
+            self._run.log(
+                {picture.stem: self._wandb.Image(str(picture)) for picture in pictures if picture.suffix == ".png"}
+            )
         self._run.finish()
 
 

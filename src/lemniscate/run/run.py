@@ -10,7 +10,6 @@ step), in a run that goes on as in one that is resumed. So both end in the same 
 """
 
 import json
-import os
 import shutil
 import signal
 import sys
@@ -217,7 +216,7 @@ def create_directory(path: Path, algorithm: str, config: RunConfig) -> None:
     path.mkdir(parents=True, exist_ok=True)
     temporary = path / "config.json.tmp"
     temporary.write_text(json.dumps({"algorithm": algorithm, "config": config.to_json()}, indent=1) + "\n")
-    os.replace(temporary, path / "config.json")
+    temporary.replace(path / "config.json")
 
 
 def read_config(path: Path) -> tuple[str, dict[str, Any]]:

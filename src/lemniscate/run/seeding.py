@@ -5,6 +5,7 @@ import random
 
 import numpy as np
 import torch
+import torch.utils.deterministic as deterministic_mode
 
 
 def set_seeds(seed: int, deterministic: bool = True) -> None:
@@ -25,7 +26,8 @@ def set_seeds(seed: int, deterministic: bool = True) -> None:
     torch.backends.cudnn.deterministic = deterministic
     torch.backends.cudnn.benchmark = False
     torch.use_deterministic_algorithms(deterministic, warn_only=True)
-    torch.utils.deterministic.fill_uninitialized_memory = False  # costs time, and nothing here reads it
+    # It costs time, and nothing here reads uninitialized memory.
+    deterministic_mode.fill_uninitialized_memory = False  # pyright: ignore[reportAttributeAccessIssue]
     if deterministic:
         os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
         flags = os.environ.get("XLA_FLAGS", "")

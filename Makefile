@@ -1,0 +1,40 @@
+# One command for each chore. Everything runs in .venv, which `make setup` makes from requirements.lock.
+PYTHON ?= python3
+BIN := .venv/bin
+export PIP_DISABLE_PIP_VERSION_CHECK = 1
+
+.PHONY: setup fly test test-long check bench lock clean
+
+setup: .venv/.ready
+
+.venv/.ready: requirements.lock pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Python 3.11 or newer is needed; name one with make PYTHON=python3.12"; exit 2; }
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --requirement requirements.lock
+	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
+	touch $@
+
+fly: setup  ## train a drone to fly the figure eight, fly it from unseen starts, draw it
+	$(BIN)/lemniscate train ppo --env DroneFigureEightTrajectory-v0 --report
+
+test: setup  ## the whole suite but the long ones
+	$(BIN)/python -m pytest -n auto -m "not long"
+
+test-long: setup  ## the tests that train for minutes
+	$(BIN)/python -m pytest -m long
+
+check: setup  ## style, types, floors
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright
+	$(BIN)/lint-imports
+
+bench: setup  ## the README's numbers: five seeds of each drone preset
+	$(BIN)/python benchmarks/figure_eight.py
+
+lock: setup  ## renew requirements.lock from pyproject.toml
+	$(BIN)/pip-compile --quiet --strip-extras --extra drone --extra dev --no-emit-index-url --no-emit-find-links --no-emit-trusted-host --no-header --allow-unsafe --annotation-style=line --constraint constraints.txt --output-file requirements.lock pyproject.toml
+	sed -i 's/+cpu//' requirements.lock
+
+clean:
+	rm -rf .venv build dist

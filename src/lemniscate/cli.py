@@ -1,0 +1,218 @@
+"""The commands. What a program reads goes to standard output (`evaluate --json`), what a person reads to the error one.
+
+Exit codes: 0 done, 1 training could not go on, 2 a mistake in what was asked, 130 stopped by Ctrl-C, 143 by SIGTERM.
+"""
+
+import argparse
+import contextlib
+import io
+import json
+import re
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NoReturn
+
+import tyro
+
+from lemniscate import front
+from lemniscate.algos import ALGORITHMS
+from lemniscate.envs import api
+from lemniscate.errors import NonFiniteError, UserError, unknown
+from lemniscate.presets import BEST, PRESETS
+from lemniscate.report import curves, pictures
+from lemniscate.run.config import RunConfig
+from lemniscate.run.loggers import LOGGERS
+from lemniscate.run.run import Stopped
+
+Command = Callable[[argparse.Namespace, list[str]], None]
+
+COMMANDS = ("train", "resume", "evaluate", "watch", "plot", "envs")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit code."""
+    try:
+        given, rest = _parser().parse_known_args(arguments)
+        given.run_command(given, rest)
+    except UserError as error:
+        return _say(error, 2)
+    except NonFiniteError as error:
+        return _say(f"{error} Training stopped; the last checkpoint is as it was.", 1)
+    except Stopped as stopped:
+        return _say(stopped, 128 + stopped.signum)
+    except KeyboardInterrupt:
+        return _say("Interrupted.", 130)
+    return 0
+
+
+def train(given: argparse.Namespace, rest: list[str]) -> None:
+    """Train a policy; with --report also evaluate it and draw pictures."""
+    config = _with_fields(front.config_for(given.algorithm, given.env, given.preset), rest)
+    started = time.monotonic()
+    fields = {name: getattr(config, name) for name in config.names() if name != "env"}
+    run = front.train(given.algorithm, config.env, run=given.run, preset=given.preset, track=given.track, **fields)
+    _say(f"Trained in {time.monotonic() - started:.1f} s. Everything is in {run.path}")
+    if given.report:
+        _report(run)
+
+
+def resume(given: argparse.Namespace, rest: list[str]) -> None:
+    """Go on with an interrupted run."""
+    _nothing_left(rest)
+    run = front.resume(given.run, track=given.track)
+    _say(f"Done. Everything is in {run.path}")
+
+
+def evaluate(given: argparse.Namespace, rest: list[str]) -> None:
+    """Play whole episodes with the newest policy of a run."""
+    _nothing_left(rest)
+    scores = front.evaluate(front.load(given.run), episodes=given.episodes, seed=given.seed)
+    if given.json:
+        print(json.dumps(scores.to_json()))
+    else:
+        _say(pictures.sentence(scores))
+
+
+def watch(given: argparse.Namespace, rest: list[str]) -> None:
+    """Show one episode in a window, or record it."""
+    _nothing_left(rest)
+    policy = front.load(given.run)
+    if given.video is None:
+        pictures.show_episode(policy.act, policy.spec, given.seed)
+    elif policy.spec.tracking:
+        env = front.evaluation_env(policy, policy.config.evaluate_episodes)
+        _say(pictures.film_flight(policy.module, env, given.video, given.seed))
+    else:
+        _say(pictures.film_episode(policy.act, policy.spec, given.video, given.seed))
+
+
+def plot(given: argparse.Namespace, rest: list[str]) -> None:
+    """Draw the curves of one run, or of several side by side."""
+    _nothing_left(rest)
+    _draw(given.runs, front.load(given.runs[0]) if len(given.runs) == 1 else None)
+
+
+def envs(given: argparse.Namespace, rest: list[str]) -> None:
+    """List the environments, who serves each, and the preset that fits."""
+    _nothing_left(rest)
+    for env_id in api.known_ids():
+        if given.filter.lower() in env_id.lower():
+            fitting = [f"{algorithm}: {BEST.get((algorithm, env_id), 'default')}" for algorithm in ALGORITHMS]
+            _say(f"{env_id:<40} {api.backend_for(env_id):<12} {', '.join(fitting)}")
+
+
+def _report(run: front.TrainedRun) -> None:
+    """Evaluate from unseen starts, say how it went, and leave pictures."""
+    policy, episodes = run.policy, run.policy.config.evaluate_episodes
+    _say(pictures.sentence(front.evaluate(policy, episodes=episodes)))
+    _draw([run.path], policy)
+    if policy.spec.tracking:
+        env = front.evaluation_env(policy, episodes)
+        _say(pictures.film_flight(policy.module, env, run.path / "videos" / "flight.gif", seed=0))
+
+
+def _draw(runs: list[Path], policy: front.TrainedPolicy | None) -> None:
+    """Plot the curves, and the flights of `policy` if it has a reference to track."""
+    files = curves.plot_runs(runs)
+    if policy and policy.spec.tracking:
+        episodes = policy.config.evaluate_episodes
+        env = front.evaluation_env(policy, episodes)
+        files += pictures.draw_flight(policy.module, env, files[0].parent, episodes, seed=0)
+    for file in files:
+        _say(file)
+
+
+def _with_fields(config: RunConfig, arguments: list[str]) -> RunConfig:
+    """`config` with the fields that the command line sets, such as --learning-rate 1e-3."""
+    known = {f"--{name.replace('_', '-')}" for name in config.names()}
+    for argument in arguments:
+        flag = argument.partition("=")[0].replace("_", "-")
+        if flag.startswith("--") and flag not in known and flag.replace("--no-", "--", 1) not in known:
+            raise unknown("field", flag, known)
+    complaint = io.StringIO()
+    try:
+        with contextlib.redirect_stdout(complaint), contextlib.redirect_stderr(complaint):
+            return tyro.cli(type(config), args=arguments, default=config, add_help=False)
+    except SystemExit:
+        raise UserError(_first_sentence(complaint.getvalue())) from None
+
+
+def _first_sentence(box: str) -> str:
+    """What tyro wrote in the first compartment of the box that it draws around an error."""
+    flat = " ".join(re.sub("[│╭╮╰╯]", " ", box).split())
+    compartment = re.split("[-─]{5,}", flat)[1 if re.search("[-─]{5,}", flat) else 0]
+    return compartment.replace("Error parsing Config: ", "").strip().rstrip(".") + "."
+
+
+def _nothing_left(rest: list[str]) -> None:
+    if rest:
+        raise UserError(f"{rest[0]} is not understood here; --help lists what is.")
+
+
+def _say(text: object, code: int = 0) -> int:
+    print(text, file=sys.stderr, flush=True)
+    return code
+
+
+class _Parser(argparse.ArgumentParser):
+    """argparse, but a mistake is one sentence."""
+
+    def error(self, message: str) -> NoReturn:
+        raise UserError(f"{message[0].upper()}{message[1:]}; --help lists what there is.")
+
+
+class _TrainParser(_Parser):
+    """Its help goes on with the fields of each algorithm's Config, which are options too."""
+
+    def format_help(self) -> str:
+        fields = [tyro.extras.get_parser(module.Config, prog=name).format_help() for name, module in ALGORITHMS.items()]
+        return "\n".join([super().format_help(), "And every field of the algorithm's Config:\n", *fields])
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(prog="lemniscate", description="Train, fly and watch reinforcement-learning policies.")
+    commands = parser.add_subparsers(required=True, metavar=" | ".join(COMMANDS))
+
+    def command(function: Command, kind: type[_Parser] = _Parser) -> argparse.ArgumentParser:
+        commands._parser_class = kind
+        sub = commands.add_parser(
+            function.__name__, help=function.__doc__, description=function.__doc__, allow_abbrev=False
+        )
+        sub.set_defaults(run_command=function)
+        return sub
+
+    sub = command(train, _TrainParser)
+    sub.add_argument("algorithm", help=", ".join(ALGORITHMS))
+    sub.add_argument("--env", help="environment id; a preset may have one")
+    sub.add_argument("--run", type=Path, metavar="DIR", help="run directory; must not exist (default: runs/…)")
+    sub.add_argument("--preset", help="; ".join(f"{a}: {', '.join(PRESETS[a])}" for a in ALGORITHMS))
+    sub.add_argument("--track", metavar="LOGGER", help=f"a logger beside the local ones: {', '.join(LOGGERS)}")
+    sub.add_argument("--report", action="store_true", help="evaluate the result and leave pictures")
+
+    sub = command(resume)
+    sub.add_argument("run", type=Path)
+    sub.add_argument("--track", metavar="LOGGER")
+
+    sub = command(evaluate)
+    sub.add_argument("run", type=Path, help="a run or a checkpoint")
+    sub.add_argument("--episodes", type=int, default=100)
+    sub.add_argument("--seed", type=int, default=0, help="of the starts")
+    sub.add_argument("--json", action="store_true", help="one JSON object on standard output")
+
+    sub = command(watch)
+    sub.add_argument("run", type=Path, help="a run or a checkpoint")
+    sub.add_argument("--video", type=Path, metavar="FILE", help=".gif, .webp or .mp4 instead of a window")
+    sub.add_argument("--seed", type=int, default=0)
+
+    sub = command(plot)
+    sub.add_argument("runs", type=Path, nargs="+")
+
+    sub = command(envs)
+    sub.add_argument("filter", nargs="?", default="", help="a part of the id")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,87 @@
+"""Learning curves, of one run or of several side by side."""
+
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
+
+from lemniscate.errors import UserError
+from lemniscate.run.loggers import read_metrics
+from lemniscate.run.run import read_config
+
+DIAGNOSTICS = ("losses/value", "explained_variance", "approx_kl", "clip_fraction", "losses/entropy", "gradient_norm")
+COLORS = mpl.colormaps["tab10"].colors  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def learning_curve(runs: list[Path], file: Path) -> Path:
+    """Return of whole training episodes against steps, a curve for each run."""
+    figure = Figure(figsize=(7, 4), layout="constrained")
+    axes = figure.subplots()
+    for i, run in enumerate(runs):
+        _curve(axes, run, "episode/return", COLORS[i % 10], smooth=True)
+    axes.set(xlabel="environment steps", ylabel="return of an episode")
+    axes.set_title(_title(runs), loc="left")
+    _finish(axes, len(runs))
+    return _save(figure, file)
+
+
+def diagnostics(runs: list[Path], file: Path) -> Path:
+    """What was watched in the updates: value loss, explained variance, KL, clip fraction, entropy, gradient norm."""
+    figure = Figure(figsize=(10, 5.5), layout="constrained")
+    grid = figure.subplots(2, 3)
+    for axes, name in zip(grid.flat, DIAGNOSTICS, strict=True):
+        for i, run in enumerate(runs):
+            _curve(axes, run, name, COLORS[i % 10], smooth=False)
+        axes.set_title(name, loc="left", fontsize=10)
+        _finish(axes, len(runs) if axes is grid.flat[0] else 1)
+    return _save(figure, file)
+
+
+def plot_runs(runs: list[Path]) -> list[Path]:
+    """Draw the pictures of one run into its `plots/`, or of several into `plots/` here. Returns the files."""
+    for run in runs:
+        read_config(run)
+        if not any("episode/return" in line for line in read_metrics(run)):
+            raise UserError(f"{run} has no finished training episode to plot yet.")
+    folder = runs[0] / "plots" if len(runs) == 1 else Path("plots")
+    return [learning_curve(runs, folder / "learning_curve.png"), diagnostics(runs, folder / "diagnostics.png")]
+
+
+def _curve(axes: Axes, run: Path, name: str, color: object, smooth: bool) -> None:
+    rows = [(line["step"], line[name]) for line in read_metrics(run) if name in line]
+    if not rows:
+        return
+    steps, values = np.array(rows).T
+    if smooth:
+        axes.plot(steps, values, color=color, alpha=0.25, linewidth=1)
+        values = _moving_average(values, max(1, len(values) // 20))
+    axes.plot(steps, values, color=color, linewidth=1.5, label=run.name)
+
+
+def _moving_average(values: np.ndarray, window: int) -> np.ndarray:
+    """The mean of the last `window` values at each place, of fewer at the beginning."""
+    total = np.cumsum(np.insert(values, 0, 0.0))
+    start = np.maximum(0, np.arange(1, len(values) + 1) - window)
+    return (total[1:] - total[start]) / (np.arange(1, len(values) + 1) - start)
+
+
+def _title(runs: list[Path]) -> str:
+    algorithm, config = read_config(runs[0])
+    return f"{algorithm.upper()} on {config['env']}" if len(runs) == 1 else f"{len(runs)} runs"
+
+
+def _finish(axes: Axes, runs: int) -> None:
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(alpha=0.3)
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    if runs > 1:
+        axes.legend(frameon=False)
+
+
+def _save(figure: Figure, file: Path) -> Path:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(file, dpi=150)
+    return file

@@ -1,0 +1,158 @@
+"""A drone's flight along its reference: the path, the error, an animation."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from PIL import Image
+
+from lemniscate.envs.api import VecEnv
+from lemniscate.errors import UserError
+from lemniscate.nn.policies import Policy
+from lemniscate.run.evaluate import fly
+
+BLUE, ORANGE, GREY = "#1f5fa8", "#e07b1a", "#9aa0a6"
+
+
+@dataclass(frozen=True)
+class Flight:
+    """M flights of T steps: `position` and `reference` [T, M, 3] in metres, `attitude` [T, M, 4] (xyzw).
+
+    After the end of a flight that was cut short its rows are NaN.
+    """
+
+    position: np.ndarray
+    reference: np.ndarray
+    attitude: np.ndarray
+    time_step: float
+
+    @property
+    def error_mm(self) -> np.ndarray:
+        """Distance to the reference, [T, M]."""
+        return 1000 * np.linalg.norm(self.position - self.reference, axis=-1)
+
+    @property
+    def time(self) -> np.ndarray:
+        """Seconds since the start, [T]."""
+        return self.time_step * np.arange(1, len(self.position) + 1)
+
+
+def record(policy: Policy, env: VecEnv, flights: int, seed: int) -> Flight:
+    """Fly from the starts that `evaluate` flies from, and keep the tracks."""
+    spec = env.spec
+    if spec.tracking is None or spec.time_step is None:
+        raise UserError(f"{spec.env_id} has no reference to track, so no flight can be drawn against one.")
+    flights = min(flights, env.num_envs)
+    rows = []
+    for step, counts in fly(policy, env, flights, seed):
+        row = torch.where(counts[:, None], step.next_obs, torch.nan)[:flights]
+        rows.append(row.cpu().numpy())
+    track = np.stack(rows)
+    position, attitude, error = track[..., 0:3], track[..., 3:7], track[..., slice(*spec.tracking)]
+    return Flight(position, position + error, attitude, spec.time_step)
+
+
+def draw_path(flight: Flight, file: Path) -> Path:
+    """The first flight over the reference, seen from the side (x, z); the others' first second faintly."""
+    figure = Figure(figsize=(7, 4.4), layout="constrained")
+    axes = figure.subplots()
+    reference, path = flight.reference[:, 0], flight.position[:, 0]
+    first_second = flight.time <= 1
+    axes.plot(*reference[:, [0, 2]].T, color=ORANGE, linewidth=5, alpha=0.35, label="reference")
+    for other in range(1, flight.position.shape[1]):
+        axes.plot(*flight.position[first_second, other][:, [0, 2]].T, color=GREY, linewidth=0.6, alpha=0.6)
+    axes.plot([], [], color=GREY, linewidth=0.8, label=f"first second of {flight.position.shape[1] - 1} other starts")
+    axes.plot(*path[:, [0, 2]].T, color=BLUE, linewidth=1.2, label="flown")
+    axes.plot(*path[0, [0, 2]], "o", color=BLUE, markersize=5)
+    late = flight.error_mm[flight.time > 1]
+    axes.set_title(f"Tracking error after the first second: {_rms(late):.1f} mm", loc="left")
+    axes.set(xlabel="x / m", ylabel="z / m", aspect="equal")
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=3)
+    return _save(figure, file)
+
+
+def draw_error(flight: Flight, file: Path) -> Path:
+    """Distance to the reference over time: median, 10 % to 90 %, and the worst flight."""
+    figure = Figure(figsize=(7, 3.6), layout="constrained")
+    axes = figure.subplots()
+    error = flight.error_mm
+    low, middle, high = np.nanpercentile(error, [10, 50, 90], axis=1)
+    axes.fill_between(flight.time, low, high, color=BLUE, alpha=0.25, linewidth=0, label="10 % to 90 %")
+    axes.plot(flight.time, middle, color=BLUE, label="median")
+    axes.plot(flight.time, np.nanmax(error, axis=1), color=GREY, linewidth=0.8, label="worst")
+    axes.set(xlabel="time / s", ylabel="tracking error / mm", yscale="log", xlim=(0, flight.time[-1]))
+    axes.set_title(f"{error.shape[1]} flights from unseen starts", loc="left")
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.grid(alpha=0.3)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False, ncols=3)
+    return _save(figure, file)
+
+
+def animate(flight: Flight, every: int = 4) -> list[np.ndarray]:
+    """Frames of the first flight drawn with matplotlib, one each `every` steps: [H, W, 3] uint8."""
+    figure = Figure(figsize=(6, 3.6), dpi=90, layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    path, reference = flight.position[:, 0, [0, 2]], flight.reference[:, 0, [0, 2]]
+    axes.plot(*reference.T, color=ORANGE, linewidth=4, alpha=0.3)
+    axes.set(xlabel="x / m", ylabel="z / m", aspect="equal", xlim=(-1.3, 1.3), ylim=(0.3, 1.7))
+    axes.spines[["top", "right"]].set_visible(False)
+    canvas.draw()
+    background = canvas.copy_from_bbox(figure.bbox)
+    (trail,) = axes.plot([], [], color=BLUE, linewidth=1.5)
+    (arms,) = axes.plot([], [], color="black", linewidth=3, solid_capstyle="round")
+    (goal,) = axes.plot([], [], "o", color=ORANGE, markersize=5)
+    clock = axes.text(0.01, 0.95, "", transform=axes.transAxes)
+    frames = []
+    for t in range(0, len(path), every):
+        body_x = _rotate_x_axis(flight.attitude[t, 0])[[0, 2]]
+        arms.set_data(*np.stack([path[t] - 0.07 * body_x, path[t] + 0.07 * body_x]).T)
+        trail.set_data(*path[max(0, t - 100) : t + 1].T)
+        goal.set_data(*reference[[t]].T)
+        clock.set_text(f"{flight.time[t]:4.1f} s   {flight.error_mm[t, 0]:5.1f} mm")
+        canvas.restore_region(background)
+        for artist in (trail, goal, arms, clock):
+            axes.draw_artist(artist)
+        frames.append(np.asarray(canvas.buffer_rgba())[..., :3].copy())
+    return frames
+
+
+def save_frames(frames: list[np.ndarray], file: Path, fps: float) -> Path:
+    """An animated picture (.gif, .webp) from frames, or a film (.mp4, extra `video`)."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    if file.suffix == ".mp4":
+        try:
+            import imageio_ffmpeg  # noqa: F401  # pyright: ignore[reportMissingImports]
+            from imageio import v3 as imageio
+        except ModuleNotFoundError:
+            raise UserError(
+                f"{file} needs ffmpeg (pip install 'lemniscate[video]'); a .gif or .webp does not."
+            ) from None
+        imageio.imwrite(file, np.stack(frames), fps=fps)
+    elif file.suffix in (".gif", ".webp"):
+        images = [Image.fromarray(frame) for frame in frames]
+        images[0].save(file, save_all=True, append_images=images[1:], duration=1000 / fps, loop=0)
+    else:
+        raise UserError(f"{file} must end in .gif, .webp or .mp4.")
+    return file
+
+
+def _rotate_x_axis(quaternion: np.ndarray) -> np.ndarray:
+    """Where the body's x axis points in the world; quaternion xyzw."""
+    x, y, z, w = quaternion
+    return np.array([1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)])
+
+
+def _rms(error: np.ndarray) -> float:
+    return float(np.sqrt(np.nanmean(np.square(error))))
+
+
+def _save(figure: Figure, file: Path) -> Path:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(file, dpi=150)
+    return file

@@ -1,0 +1,92 @@
+"""Everything a finished run is shown with: numbers in a sentence, plots, an animation."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+
+from lemniscate.envs import api
+from lemniscate.envs.api import VecEnv
+from lemniscate.errors import UserError
+from lemniscate.nn.policies import Policy
+from lemniscate.report import flight
+from lemniscate.run.evaluate import Evaluation
+from lemniscate.types import Spec
+
+Act = Callable[[object], np.ndarray]
+
+
+def sentence(scores: Evaluation) -> str:
+    """What an evaluation says to a person."""
+    said = (
+        f"{scores.mean_return:.1f} ± {scores.std_return:.1f} return over {scores.episodes} episodes of {scores.env_id}"
+    )
+    if scores.rmse_mm is not None and scores.rmse_after_1s_mm is not None:
+        said += (
+            f", {scores.terminated} crashes; tracking error {scores.rmse_mm:.1f} mm over the whole flight,"
+            f" {scores.rmse_after_1s_mm:.2f} mm after the first second"
+        )
+    return said + "."
+
+
+def draw_flight(policy: Policy, env: VecEnv, folder: Path, flights: int, seed: int) -> list[Path]:
+    """Path and error of some flights, into `folder`."""
+    track = flight.record(policy, env, flights, seed)
+    return [flight.draw_path(track, folder / "flight.png"), flight.draw_error(track, folder / "error.png")]
+
+
+def film_flight(policy: Policy, env: VecEnv, file: Path, seed: int) -> str:
+    """Animate one flight into `file`; returns a sentence on how it was drawn."""
+    track = flight.record(policy, env, env.num_envs, seed)
+    every = 5
+    try:
+        from lemniscate.report import scene
+
+        frames = scene.render(track, env.spec.env_id, env.num_envs, every)
+        how = "rendered by MuJoCo"
+    except RuntimeError:
+        frames = flight.animate(track, every)
+        how = (
+            "drawn with matplotlib, since there is no off-screen OpenGL; for a MuJoCo rendering install EGL or OSMesa"
+            " (Debian: libegl1 or libosmesa6) and set MUJOCO_GL=egl or osmesa"
+        )
+    flight.save_frames(frames, file, 1 / (every * track.time_step))
+    return f"{file}: {how}."
+
+
+def film_episode(act: Act, spec: Spec, file: Path, seed: int) -> str:
+    """Record one episode of a Gymnasium environment into `file`."""
+    env = _rendered(spec.env_id, "rgb_array")
+    obs, _ = env.reset(seed=seed)
+    frames, over = [np.asarray(env.render())], False
+    while not over:
+        obs, _, terminated, truncated, _ = env.step(act(obs))
+        frames.append(np.asarray(env.render()))
+        over = terminated or truncated
+    fps = float(env.metadata.get("render_fps", 30))
+    env.close()
+    flight.save_frames(frames, file, fps)
+    return f"{file}: {len(frames) - 1} steps."
+
+
+def show_episode(act: Act, spec: Spec, seed: int) -> None:
+    """Play one episode in a window, at its own speed."""
+    if spec.env_id in api.CRAZYFLOW_IDS:
+        raise UserError("A drone is watched as a film: lemniscate watch RUN --video flight.gif")
+    env = _rendered(spec.env_id, "human")
+    obs, _ = env.reset(seed=seed)
+    over = False
+    while not over:
+        obs, _, terminated, truncated, _ = env.step(act(obs))
+        over = terminated or truncated
+    env.close()
+
+
+def _rendered(env_id: str, mode: str) -> gym.Env:
+    try:
+        env = gym.make(env_id, render_mode=mode)
+        env.reset(seed=0)
+        return env
+    except gym.error.Error as error:
+        raise UserError(f"{env_id} cannot be shown: {error}") from error
