@@ -12,7 +12,7 @@ import gymnasium as gym
 import torch
 from torch import Tensor
 
-from lemniscate.errors import UserError, unknown
+from lemniscate.errors import NonFiniteError, UserError, unknown
 from lemniscate.types import Spec, Step
 
 
@@ -70,9 +70,16 @@ class VecEnv:
         return self.obs
 
     def step(self, action: Tensor) -> Step:
-        """Act in every copy and move `obs` on."""
+        """Act in every copy and move `obs` on.
+
+        Raises:
+            NonFiniteError: an observation or a reward is NaN or infinite; nothing has learned from it yet.
+        """
         whole = self._backend.whole
         step = self._backend.step(action)
+        # One NaN or infinity shows in the sum of all, and the sum is cheap.
+        if not torch.isfinite(step.next_obs.sum() + step.obs.sum() + step.reward.sum()):
+            self._name_non_finite(step)
         self.obs = step.obs
         self.steps += self.num_envs
         self._return = self._return + step.reward * step.valid
@@ -83,6 +90,15 @@ class VecEnv:
             self._ended.append((self._return[counted], self._length[counted]))
             self._return, self._length = self._return * ~done, self._length * ~done
         return step
+
+    def _name_non_finite(self, step: Step) -> None:
+        for name, values in (("observation", step.next_obs), ("reward", step.reward), ("observation", step.obs)):
+            bad = torch.nonzero(~torch.isfinite(values))
+            if len(bad):
+                value = values[tuple(bad[0])].item()
+                raise NonFiniteError(
+                    f"The {name} of environment {int(bad[0, 0])} is {value} in the step after step {self.steps:,}."
+                )
 
     def take_episodes(self) -> Episodes:
         """The whole episodes that ended since the last call."""

@@ -1,5 +1,6 @@
 """Gymnasium vector environments, in all three autoreset modes."""
 
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -56,7 +57,7 @@ class GymnasiumBackend:
     def _build(self) -> VectorEnv:
         if gym.spec(self._id).entry_point is None:
             return gym.make_vec(self._id, self.num_envs, **self._kwargs)
-        copies = [lambda: gym.make(self._id, **self._kwargs)] * self.num_envs
+        copies = [partial(gym.make, self._id, **self._kwargs)] * self.num_envs
         if self._workers:
             return AsyncVectorEnv(copies, context="forkserver", autoreset_mode=AutoresetMode.DISABLED)
         return SyncVectorEnv(copies, autoreset_mode=AutoresetMode.DISABLED)

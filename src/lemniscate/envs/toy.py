@@ -113,4 +113,4 @@ class Matching(ToyEnv):
 
 
 gym.register("Countdown-v0", vector_entry_point="lemniscate.envs.toy:Countdown")
-gym.register("Matching-v0", vector_entry_point="lemniscate.envs.toy:Matching", max_episode_steps=20)
+gym.register("Matching-v0", vector_entry_point="lemniscate.envs.toy:Matching")

@@ -37,7 +37,7 @@ def gae(
         (advantage, target), each [T, N]; target = advantage + value is the TD(λ) return the critic regresses on.
     """
     delta = reward + gamma * next_value * ~terminated - value
-    decay = gamma * lam * ~done
+    decay = gamma * lam * (~done).to(delta.dtype)
     advantage = torch.empty_like(delta)
     trace = torch.zeros_like(delta[0])
     for t in reversed(range(len(delta))):

@@ -12,7 +12,7 @@ def standardize(x: Float[Tensor, " B"], eps: float = 1e-8) -> Float[Tensor, " B"
 def explained_variance(prediction: Tensor, target: Tensor) -> Tensor:
     """1 − Var[target − prediction] / Var[target]: 1 is perfect, 0 no better than the mean, below 0 worse.
 
-    NaN where the target is constant.
+    Not finite where the target is constant.
     """
     return 1 - (target - prediction).var() / target.var()
 

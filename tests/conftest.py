@@ -1,0 +1,47 @@
+"""Shared fixtures. Everything is small: one thread, few environments, float64 where an oracle is compared."""
+
+import os
+
+os.environ.setdefault("MPLBACKEND", "Agg")
+os.environ.setdefault("SCIPY_ARRAY_API", "1")
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+
+import pytest
+import torch
+from hypothesis import settings
+
+settings.register_profile("lemniscate", deadline=None)  # no test waits for a clock
+settings.load_profile("lemniscate")
+
+
+@pytest.fixture(autouse=True)
+def _one_thread():
+    torch.set_num_threads(1)
+
+
+@pytest.fixture
+def rng():
+    return torch.Generator().manual_seed(0)
+
+
+def tiny(env="Countdown-v0", **fields):
+    """A Config that trains in a moment."""
+    from lemniscate.algos.ppo import Config
+
+    defaults = {
+        "env": env,
+        "num_envs": 4,
+        "num_steps": 8,
+        "total_steps": 256,
+        "epochs": 2,
+        "num_minibatches": 2,
+        "hidden": (16,),
+        "evaluate_episodes": 4,
+    }
+    return Config(**{**defaults, **fields})
+
+
+def tiny_fields(env="Countdown-v0", **fields):
+    """The same as keyword arguments of `lem.train`."""
+    config = tiny(env, **fields)
+    return {name: getattr(config, name) for name in config.names() if name != "env"}

@@ -1,0 +1,172 @@
+"""The contract of the env floor, over every backend and every autoreset mode."""
+
+import numpy as np
+import pytest
+import torch
+from gymnasium.vector import AutoresetMode
+
+from lemniscate.data.rollout import collect
+from lemniscate.envs import api, toy
+from lemniscate.envs.api import VecEnv
+from lemniscate.envs.gymnasium import GymnasiumBackend
+from lemniscate.errors import NonFiniteError, UserError
+from lemniscate.nn.policies import policy_and_value
+from lemniscate.types import Box
+
+CPU = torch.device("cpu")
+MODES = [mode.name for mode in AutoresetMode]
+EVERY = [
+    ("CartPole-v1", "gymnasium"),
+    ("CartPole-v1", "gymnasium-async"),
+    ("Pendulum-v1", "gymnasium"),
+    ("Countdown-v0", "gymnasium"),
+    ("Matching-v0", "gymnasium"),
+    ("DroneFigureEightTrajectory-v0", "crazyflow"),
+    ("DroneReachPos-v0", "crazyflow"),
+    ("DroneReachVel-v0", "crazyflow"),
+    ("DroneLanding-v0", "crazyflow"),
+]
+
+
+def countdown(mode, num_envs=3, **kwargs):
+    return VecEnv(GymnasiumBackend("Countdown-v0", num_envs, CPU, mode=mode, **kwargs))
+
+
+def play(env, num_steps, seed=0):
+    """A rollout of a fresh policy, from a restart."""
+    policy, _ = policy_and_value(env.spec, (8,))
+    env.restart(seed)
+    return collect(env, policy, num_steps, torch.Generator().manual_seed(seed))
+
+
+@pytest.mark.parametrize(("env_id", "backend"), EVERY)
+def test_every_backend(env_id, backend):
+    env = api.make(env_id, 4, backend=backend, stagger=True)
+    try:
+        torch.manual_seed(0)
+        first = play(env, 70)
+        torch.manual_seed(0)
+        again = play(env, 70)
+    finally:
+        env.close()
+    assert first.obs.shape == first.next_obs.shape == (70, 4, env.spec.observation_size)
+    assert first.obs.dtype == first.reward.dtype == torch.float32
+    assert first.terminated.dtype == first.truncated.dtype == first.valid.dtype == torch.bool
+    assert first.action.shape == ((70, 4, env.spec.action.size) if isinstance(env.spec.action, Box) else (70, 4))
+    assert not (first.terminated & first.truncated).any()
+    for name in ("obs", "action", "reward", "next_obs", "terminated", "truncated"):  # a restart forgets everything
+        assert torch.equal(getattr(first, name), getattr(again, name)), name
+    inside = first.valid[:-1] & ~first.done[:-1]
+    assert torch.equal(first.next_obs[:-1][inside], first.obs[1:][inside])  # where no episode ends, rows join up
+    assert first.done.any() or "Drone" in env_id or env_id == "Pendulum-v1"
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_each_row_is_what_its_action_caused(mode):
+    """Countdown's observations are (copy, episode, step), so every row says who it is."""
+    rollout = play(countdown(mode, length=4), 23)
+    copy, episode, step = rollout.obs.unbind(-1)
+    next_copy, next_episode, next_step = rollout.next_obs.unbind(-1)
+    valid = rollout.valid
+    assert (copy == torch.arange(3)).all()
+    assert (next_copy == copy).all()
+    assert (next_episode == episode)[valid].all()  # the true successor belongs to the same episode
+    assert (next_step == step + 1)[valid].all()
+    assert (rollout.terminated == (next_step == 4))[valid].all()
+    assert (rollout.reward[valid] == 1).all()
+    assert not rollout.truncated.any()
+    reset_rows = (~valid).sum().item()
+    assert reset_rows == (3 * 4 if mode == "NEXT_STEP" else 0)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_truncation_is_not_termination(mode):
+    rollout = play(countdown(mode, length=None, horizon=4), 10)
+    assert rollout.truncated.any()
+    assert not rollout.terminated.any()
+    ends = rollout.truncated & rollout.valid
+    assert (rollout.next_obs[ends][:, 2] == 4).all()  # the true final observation, not the reset one
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_episodes_are_counted_without_the_reset_rows(mode):
+    env = countdown(mode, length=5)
+    play(env, 30)
+    episodes = env.take_episodes()
+    assert set(episodes.returns) == {5.0}
+    assert set(episodes.lengths) == {5}
+    assert env.take_episodes().returns == []
+
+
+class HidesFinalObs(toy.Countdown):
+    def step(self, actions):
+        *rest, _ = super().step(actions)
+        return (*rest, {})
+
+
+def test_an_environment_that_hides_the_final_observation_is_refused(monkeypatch):
+    monkeypatch.setattr(toy, "Countdown", HidesFinalObs)
+    with pytest.raises(UserError, match="hides the final observation"):
+        play(countdown("SAME_STEP", length=3), 10)
+
+
+class SaysNothing(toy.Countdown):
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.metadata = {}
+
+
+@pytest.mark.filterwarnings("ignore:.*missing AutoresetMode")
+def test_an_environment_that_does_not_say_when_it_resets_is_refused(monkeypatch):
+    monkeypatch.setattr(toy, "Countdown", SaysNothing)
+    with pytest.raises(UserError, match="autoreset_mode"):
+        countdown("NEXT_STEP")
+
+
+@pytest.mark.parametrize("quantity", ["observation", "reward"])
+def test_a_nan_is_named_with_environment_and_step(monkeypatch, quantity):
+    class Breaks(toy.Countdown):
+        def step(self, actions):
+            obs, reward, *rest = super().step(actions)
+            if self.t[0] == 3:
+                (obs if quantity == "observation" else reward)[1] = np.nan
+            return obs, reward, *rest
+
+    monkeypatch.setattr(toy, "Countdown", Breaks)
+    env = countdown("DISABLED", length=10)
+    with pytest.raises(NonFiniteError, match=rf"The {quantity} of environment 1 is nan in the step after step \d+"):
+        play(env, 8)
+
+
+def test_staggering_spreads_the_first_episodes():
+    env = api.make("Pendulum-v1", 16, stagger=True)
+    rollout = play(env, 200)
+    first_end = rollout.truncated.int().argmax(0)
+    assert len(set(first_end.tolist())) > 8
+    assert env.take_episodes().returns == []  # the first are fragments
+    env.close()
+
+
+def test_two_copies_differ_and_two_seeds_differ():
+    env = api.make("CartPole-v1", 2)
+    a, b = env.restart(0), env.restart(1)
+    assert not torch.equal(a[0], a[1])
+    assert not torch.equal(a, b)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("CartPol-v1", 2), "CartPole-v1"),
+        (("Blackjack-v1", 2), "Blackjack-v1 observes Tuple"),
+        (("DroneLanding-v1", 2), "DroneLanding-v0"),
+    ],
+)
+def test_what_cannot_be_made_is_said(arguments, said):
+    with pytest.raises(UserError, match=said):
+        api.make(*arguments)
+
+
+def test_a_backend_that_does_not_serve_an_environment_is_refused():
+    with pytest.raises(UserError, match="cannot be served by the crazyflow backend"):
+        api.make("CartPole-v1", 2, backend="crazyflow")

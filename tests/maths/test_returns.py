@@ -1,0 +1,99 @@
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lemniscate.maths import gae
+
+
+def brute_force(reward, value, next_value, terminated, done, gamma, lam):
+    """Eq. 16 as a double sum over each episode, one number at a time."""
+    T, N = reward.shape
+    advantage = torch.zeros(T, N, dtype=torch.float64)
+    for n in range(N):
+        for t in range(T):
+            weight = 1.0
+            for k in range(t, T):
+                bootstrap = 0.0 if terminated[k, n] else next_value[k, n].item()
+                delta = reward[k, n].item() + gamma * bootstrap - value[k, n].item()
+                advantage[t, n] += weight * delta
+                if done[k, n]:
+                    break
+                weight *= gamma * lam
+    return advantage
+
+
+@st.composite
+def rollouts(draw):
+    T, N = draw(st.integers(1, 12)), draw(st.integers(1, 4))
+    g = torch.Generator().manual_seed(draw(st.integers(0, 2**31)))
+    reward, value, next_value = (torch.randn(T, N, generator=g, dtype=torch.float64) for _ in range(3))
+    terminated = torch.rand(T, N, generator=g) < draw(st.floats(0, 0.5))
+    truncated = torch.rand(T, N, generator=g) < draw(st.floats(0, 0.5))
+    return reward, value, next_value, terminated, terminated | truncated
+
+
+@given(rollouts(), st.floats(0, 1), st.floats(0, 1))
+def test_gae_is_the_double_sum(rollout, gamma, lam):
+    advantage, target = gae(*rollout, gamma=gamma, lam=lam)
+    expected = brute_force(*rollout, gamma, lam)
+    torch.testing.assert_close(advantage, expected, rtol=1e-10, atol=1e-10)
+    torch.testing.assert_close(target, expected + rollout[1], rtol=1e-10, atol=1e-10)
+
+
+def test_the_course_example():
+    """Rewards 1, values .5 .6 .7 .8, the last row terminal; the course's own fixture is off by one here."""
+    column = torch.tensor([[0.5], [0.6], [0.7], [0.8]])
+    last = torch.tensor([[False], [False], [False], [True]])
+    next_value = torch.tensor([[0.6], [0.7], [0.8], [0.0]])
+    advantage, _ = gae(torch.ones(4, 1), column, next_value, last, last, gamma=0.99, lam=0.95)
+    expected = torch.tensor([3.25427, 2.29693, 1.2801, 0.2])
+    torch.testing.assert_close(advantage[:, 0], expected, rtol=0, atol=5e-6)
+
+
+@given(rollouts(), st.floats(0, 1))
+def test_lambda_zero_is_the_td_error(rollout, gamma):
+    reward, value, next_value, terminated, _ = rollout
+    advantage, _ = gae(*rollout, gamma=gamma, lam=0.0)
+    torch.testing.assert_close(advantage, reward + gamma * next_value * ~terminated - value)
+
+
+@given(rollouts(), st.floats(0, 1))
+def test_lambda_one_is_monte_carlo_minus_the_baseline(rollout, gamma):
+    reward, value, next_value, terminated, done = rollout
+    next_value = next_value.clone()
+    next_value[:-1] = torch.where(done[:-1], next_value[:-1], value[1:])  # the chain telescopes only if V agrees
+    advantage, _ = gae(reward, value, next_value, terminated, done, gamma=gamma, lam=1.0)
+    T, N = reward.shape
+    for n in range(N):
+        for t in range(T):
+            total, weight = 0.0, 1.0
+            for k in range(t, T):
+                total += weight * reward[k, n].item()
+                weight *= gamma
+                if done[k, n] or k == T - 1:
+                    total += 0.0 if terminated[k, n] else weight * next_value[k, n].item()
+                    break
+            assert advantage[t, n].item() == pytest.approx(total - value[t, n].item(), abs=1e-9)
+
+
+@given(rollouts())
+def test_permuting_the_environments_permutes_the_result(rollout):
+    order = torch.arange(rollout[0].shape[1]).flip(0)
+    straight, _ = gae(*rollout)
+    permuted, _ = gae(*(column[:, order] for column in rollout))
+    torch.testing.assert_close(straight[:, order], permuted)
+
+
+@given(rollouts())
+def test_cutting_a_rollout_at_an_end_changes_nothing(rollout):
+    reward, value, next_value, terminated, done = rollout
+    done = done.clone()
+    cut = len(reward) // 2
+    if cut == 0:
+        return
+    done[cut - 1] = True
+    whole, _ = gae(reward, value, next_value, terminated, done)
+    head, _ = gae(*(c[:cut] for c in (reward, value, next_value, terminated, done)))
+    tail, _ = gae(*(c[cut:] for c in (reward, value, next_value, terminated, done)))
+    torch.testing.assert_close(whole, torch.cat([head, tail]))
