@@ -42,7 +42,7 @@ class GymnasiumBackend:
         self.num_envs, self.device = num_envs, device
         self._envs = self._build()
         self.mode = self._envs.metadata.get("autoreset_mode")
-        if self.mode not in AutoresetMode:
+        if not isinstance(self.mode, AutoresetMode):
             raise UserError(f"{env_id} does not say when it resets: its metadata needs an autoreset_mode.")
         self._space = self._envs.single_observation_space
         limit = gym.spec(env_id).max_episode_steps

@@ -1,0 +1,145 @@
+"""The drone behind the contract, held against crazyflow's own step."""
+
+import os
+
+os.environ.setdefault("SCIPY_ARRAY_API", "1")
+
+import numpy as np
+import pytest
+import torch
+
+crazyflow = pytest.importorskip("lemniscate.envs.crazyflow")
+
+from lemniscate.envs import api
+from lemniscate.envs.spaces import scale_action
+
+FIGURE_EIGHT = "DroneFigureEightTrajectory-v0"
+N = 8
+
+
+@pytest.fixture(scope="module")
+def env():
+    return api.make(FIGURE_EIGHT, N)
+
+
+@pytest.fixture(scope="module")
+def staggered():
+    return api.make(FIGURE_EIGHT, N, stagger=True)
+
+
+def test_the_layout_is_the_documented_one(env):
+    assert env.spec.layout == (("pos", 3), ("quat", 4), ("vel", 3), ("ang_vel", 3), ("local_samples", 30))
+    assert env.spec.observation_size == 43
+    assert env.spec.tracking == (13, 16)
+    assert env.spec.time_step == 0.02
+    assert env.spec.max_episode_steps == 500
+
+
+def test_the_first_observation_is_a_start_of_the_task(env):
+    obs = env.restart(3)
+    assert (obs[:, 0:2].abs() <= 0.1).all()
+    assert ((obs[:, 2] >= 1.1) & (obs[:, 2] <= 1.3)).all()
+    assert torch.equal(obs[:, 3:7], torch.tensor([0.0, 0.0, 0.0, 1.0]).expand(N, 4))
+    curve_start = torch.tensor([0.0, 0.0, 1.0])  # right after a reset crazyflow looks at the curve's last point
+    torch.testing.assert_close(obs[:, 0:3] + obs[:, 13:16], curve_start.expand(N, 3), atol=1e-4, rtol=0)
+
+
+def test_every_step_is_crazyflows_own_step(env):
+    """Same state, same physical actions: same observations and rewards, until an episode ends."""
+    import jax
+
+    env.restart(5)
+    backend = env._backend
+    with crazyflow._quietly():
+        native = crazyflow.gym.make_vec(FIGURE_EIGHT, num_envs=N, freq=50, device="cpu").unwrapped
+        native.reset(seed=0)
+    native.sim.data = jax.tree.map(lambda x: x, backend._state[0])
+    low, high = torch.tensor(env.spec.action.low), torch.tensor(env.spec.action.high)
+    g = torch.Generator().manual_seed(0)
+    for _ in range(20):
+        action = 0.3 * torch.randn(N, 4, generator=g)
+        step = env.step(action)
+        obs, reward, terminated, truncated, _ = native.step(scale_action(action, low, high).numpy())
+        assert not (terminated | truncated).any()
+        flat = np.concatenate([np.asarray(obs[name]) for name, _ in env.spec.layout], axis=-1)
+        np.testing.assert_allclose(step.next_obs.numpy(), flat, rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(step.reward.numpy(), np.asarray(reward), rtol=1e-4, atol=1e-5)
+
+
+def test_a_crash_ends_with_the_true_final_observation_and_a_real_reward(env):
+    env.restart(1)
+    down = torch.tensor([0.0, 0.0, 0.0, -1.0]).expand(N, 4)
+    for _ in range(100):
+        step = env.step(down)
+        done = step.terminated | step.truncated
+        if done.any():
+            break
+    assert step.terminated[done].all()
+    assert (step.next_obs[done][:, 2] < 0).all()  # under the floor: the end itself
+    assert ((step.obs[done][:, 2] >= 1.1) & (step.obs[done][:, 2] <= 1.3)).all()  # and a new start
+    assert (step.reward[done] == -1).all()
+    assert torch.equal(step.obs[~done], step.next_obs[~done])
+    following = env.step(torch.zeros(N, 4))
+    assert not (following.terminated | following.truncated)[done].any()
+    assert following.valid.all()
+
+
+def test_a_time_out_is_a_truncation_after_500_steps(env):
+    env.restart(2)
+    for t in range(1, 501):
+        pos, vel = env.obs[:, 0:3], env.obs[:, 7:10]
+        tilt = torch.stack([-pos[:, 1] - vel[:, 1], pos[:, 0] + vel[:, 0]], -1).clamp(-0.5, 0.5) * -0.2
+        lift = (0.236 + 0.4 * (1 - pos[:, 2]) - 0.3 * vel[:, 2]).unsqueeze(-1)
+        step = env.step(torch.cat([tilt, torch.zeros(N, 1), lift], -1))  # a crude hover
+        assert step.truncated.all() == (t == 500) or step.terminated.any()
+    assert step.truncated.any()
+    assert not (step.truncated & step.terminated).any()
+
+
+def test_staggered_drones_are_spread_over_the_curve_and_stay_beside_it(staggered):
+    env = api.make(FIGURE_EIGHT, 256, stagger=True)
+    obs = env.restart(0)
+    offset = obs[:, 13:16]
+    assert (offset[:, :2].abs() <= 0.1 + 1e-4).all()
+    assert ((offset[:, 2] <= -0.1 + 1e-4) & (offset[:, 2] >= -0.3 - 1e-4)).all()
+    goal = obs[:, 0:3] + offset
+    assert goal[:, 0].min() < -0.9
+    assert goal[:, 0].max() > 0.9
+    whole = env._backend.whole
+    assert 0.1 < whole.float().mean() < 0.4  # a quarter begins at the beginning
+    assert ((goal[whole] - torch.tensor([0.0, 0.0, 1.0])).norm(dim=-1) < 1e-3).all()
+
+
+def test_only_whole_episodes_are_counted(staggered):
+    staggered.restart(0)
+    down = torch.tensor([0.0, 0.0, 0.0, -1.0]).expand(N, 4)
+    ends = 0
+    for _ in range(200):
+        step = staggered.step(down)
+        ends += int((step.terminated | step.truncated).sum())
+    assert 0 < len(staggered.take_episodes().returns) < ends
+
+
+def test_no_copy_is_made_on_the_way_to_torch(env):
+    import jax
+
+    obs = jax.numpy.ones((N, 43))
+    assert torch.from_dlpack(obs).data_ptr() == obs.unsafe_buffer_pointer()
+
+
+@pytest.mark.parametrize("env_id", ["DroneReachPos-v0", "DroneReachVel-v0"])
+def test_goals_come_from_the_seed_too(env_id):
+    env = api.make(env_id, 4)
+    first, second, again = env.restart(1), env.restart(2), env.restart(1)
+    assert not torch.equal(first, second)
+    assert torch.equal(first, again)
+    assert first[:, -3:].std(0).min() > 0.01
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_on_a_gpu_nothing_leaves_it():
+    env = api.make(FIGURE_EIGHT, N, device="cuda")
+    env.restart(0)
+    step = env.step(torch.zeros(N, 4, device="cuda"))
+    assert step.obs.is_cuda
+    assert step.reward.is_cuda

@@ -1,0 +1,75 @@
+import pytest
+import torch
+
+from lemniscate.maths import Categorical, Gaussian
+from lemniscate.nn.descent import descend
+from lemniscate.nn.networks import Tanh, mlp
+from lemniscate.nn.normalizer import RunningNorm
+from lemniscate.nn.policies import policy_and_value
+from lemniscate.types import Box, Discrete, Spec
+
+BOX = Spec("x", (("obs", 5),), Box((-1.0, -1.0), (1.0, 1.0)))
+DISCRETE = Spec("x", (("obs", 5),), Discrete(3))
+
+
+def test_orthogonal_layers_with_their_gains():
+    first, _, last = mlp((6, 4, 2), "tanh", last_gain=0.01)
+    torch.testing.assert_close(first.weight @ first.weight.T, 2 * torch.eye(4))
+    torch.testing.assert_close(last.weight @ last.weight.T, 1e-4 * torch.eye(2))
+    assert not first.bias.any()
+    assert not last.bias.any()
+
+
+def test_the_fast_tanh_is_tanh():
+    x = torch.linspace(-20, 20, 10_001)
+    torch.testing.assert_close(Tanh()(x), torch.tanh(x), atol=2e-7, rtol=0)
+    y = torch.linspace(-5, 5, 101, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(Tanh(), y)
+
+
+def test_a_policy_starts_near_the_centre_and_a_value_has_one_number():
+    policy, value = policy_and_value(BOX, initial_log_std=-0.5)
+    obs = torch.randn(20, 5)
+    distribution = policy(obs)
+    assert isinstance(distribution, Gaussian)
+    assert distribution.mean.abs().max() < 0.1
+    torch.testing.assert_close(distribution.log_std, torch.full((2,), -0.5))
+    assert value(obs).shape == (20,)
+    assert value(obs.view(4, 5, 5)).shape == (4, 5)
+    assert isinstance(policy_and_value(DISCRETE)[0](obs), Categorical)
+
+
+def test_the_normalizer_standardizes_what_it_has_seen_and_clips():
+    norm = RunningNorm(2, clip=5.0)
+    data = torch.randn(5000, 2) * torch.tensor([3.0, 0.1]) + torch.tensor([10.0, -4.0])
+    assert torch.equal(norm(data[:3]).clamp(-5, 5), data[:3].clamp(-5, 5))  # nothing seen: nothing changed
+    for part in data.split(500):
+        norm.update(part)
+    out = norm(data)
+    torch.testing.assert_close(out.mean(0), torch.zeros(2), atol=1e-3, rtol=0)
+    torch.testing.assert_close(out.std(0), torch.ones(2), atol=1e-2, rtol=0)
+    assert norm(torch.tensor([[1e6, -1e6]])).tolist() == [[5.0, -5.0]]
+
+
+def test_looking_through_the_normalizer_never_moves_it():
+    norm = RunningNorm(2)
+    norm.update(torch.randn(10, 2))
+    before = {k: v.clone() for k, v in norm.state_dict().items()}
+    norm.train()(torch.randn(100, 2))
+    norm.eval()(torch.randn(100, 2))
+    assert all(torch.equal(v, before[k]) for k, v in norm.state_dict().items())
+
+
+def test_policy_and_value_see_through_one_normalizer():
+    policy, value = policy_and_value(BOX, normalize_observations=True)
+    assert policy.normalizer is value.normalizer
+
+
+@pytest.mark.parametrize("limit", [0.1, 1e6])
+def test_descend_clips_the_global_norm(limit):
+    weight = torch.nn.Parameter(torch.tensor([3.0, 4.0]))
+    optimizer = torch.optim.SGD([weight], lr=1.0)
+    norm = descend(optimizer, [weight], 0.5 * weight.square().sum(), limit)
+    assert norm.item() == pytest.approx(5.0)
+    taken = (torch.tensor([3.0, 4.0]) - weight.detach()).norm().item()
+    assert taken == pytest.approx(min(limit, 5.0), rel=1e-4)

@@ -1,0 +1,167 @@
+"""PPO on environments whose answers are known."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from conftest import tiny
+
+from lemniscate.algos import ppo
+from lemniscate.data.rollout import collect, minibatches
+from lemniscate.envs import toy
+from lemniscate.envs.api import VecEnv
+from lemniscate.envs.gymnasium import GymnasiumBackend
+from lemniscate.errors import UserError
+
+CPU = torch.device("cpu")
+MODES = ["NEXT_STEP", "SAME_STEP", "DISABLED"]
+
+
+class Endless(toy.Countdown):
+    """Reward 1 for ever, truncated every 4 steps, nothing to see: V = 1 / (1 − γ)."""
+
+    def _observe(self):
+        return np.ones((self.num_envs, 3), dtype=np.float32)
+
+
+def learned_value(mode, spoil=lambda rollout: rollout):
+    """V(s) after enough updates with γ = 0.9; the truth is 10."""
+    config = tiny(hidden=(), learning_rate=0.05, gamma=0.9, epochs=20, normalize_observations=False, max_grad_norm=1e3)
+    torch.manual_seed(0)
+    env = VecEnv(GymnasiumBackend("Countdown-v0", 4, CPU, mode=mode, length=None, horizon=4))
+    env.restart(0)
+    state = ppo.init(config, env.spec, CPU)
+    for _ in range(25):
+        rollout = collect(env, state.policy, config.num_steps, state.noise)
+        ppo.update(config, state, spoil(rollout))
+        state.step = 0  # no annealing
+    return state.value(torch.ones(1, 3)).item()
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_time_outs_bootstrap_and_reset_rows_teach_nothing(monkeypatch, mode):
+    monkeypatch.setattr(toy, "Countdown", Endless)
+    assert learned_value(mode) == pytest.approx(10.0, abs=0.4)
+
+
+def test_without_the_bootstrap_the_value_is_wrong(monkeypatch):
+    monkeypatch.setattr(toy, "Countdown", Endless)
+    death = lambda r: dataclasses.replace(r, terminated=r.truncated)  # noqa: E731
+    assert learned_value("DISABLED", death) < 5
+
+
+def test_with_reset_rows_the_value_is_wrong(monkeypatch):
+    monkeypatch.setattr(toy, "Countdown", Endless)
+    everything = lambda r: dataclasses.replace(r, valid=torch.ones_like(r.valid))  # noqa: E731
+    assert learned_value("NEXT_STEP", everything) > 15
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_it_learns_to_match(mode):
+    config = tiny("Matching-v0", num_envs=16, num_steps=16, total_steps=16 * 16 * 25, learning_rate=0.01, epochs=4)
+    torch.manual_seed(1)
+    env = VecEnv(GymnasiumBackend("Matching-v0", 16, CPU, mode=mode))
+    env.restart(0)
+    state = ppo.init(config, env.spec, CPU)
+    returns = []
+    for _ in range(25):
+        rollout = collect(env, state.policy, config.num_steps, state.noise)
+        ppo.update(config, state, rollout)
+        returns += env.take_episodes().returns
+    assert 7 < np.mean(returns[:16]) < 13  # guessing
+    assert np.mean(returns[-16:]) > 19
+
+
+def one_update(**fields):
+    config = tiny("Pendulum-v1", **fields)
+    torch.manual_seed(0)
+    env = VecEnv(GymnasiumBackend("Pendulum-v1", 4, CPU))
+    env.restart(0)
+    state = ppo.init(config, env.spec, CPU)
+    rollout = collect(env, state.policy, config.num_steps, state.noise)
+    return config, state, rollout
+
+
+def test_the_first_ratio_is_one():
+    config, state, rollout = one_update(normalize_observations=True)
+    batch = ppo.advantages(config, state, rollout)
+    _, watched = ppo.loss(config, state, batch)
+    assert watched["approx_kl"].abs() < 1e-6
+    assert watched["clip_fraction"] == 0
+
+
+def test_the_loss_is_equation_9():
+    config, state, rollout = one_update(entropy_coef=0.1, value_coef=0.7, normalize_advantage=False)
+    batch = ppo.advantages(config, state, rollout)
+    total, parts = ppo.loss(config, state, batch)
+    expected = parts["losses/policy"] + 0.7 * parts["losses/value"] - 0.1 * parts["losses/entropy"]
+    torch.testing.assert_close(total.detach(), expected)
+
+
+def test_the_value_clip_is_passed_on():
+    config, state, rollout = one_update(clip_value=1e-3)
+    batch = ppo.advantages(config, state, rollout)
+    shifted = dataclasses.replace(batch, value=batch.value + 1)
+    _, plain = ppo.loss(config.replace(clip_value=None), state, shifted)
+    _, clipped = ppo.loss(config, state, shifted)
+    assert plain["losses/value"] != clipped["losses/value"]
+
+
+def test_target_kl_stops_the_epochs():
+    many = {"epochs": 30, "learning_rate": 0.05}
+    config, state, rollout = one_update(**many)
+    ppo.update(config, state, rollout)
+    without = state.optimizer.state_dict()["state"][0]["step"].item()
+    config, state, rollout = one_update(**many, target_kl=0.01)
+    ppo.update(config, state, rollout)
+    assert state.optimizer.state_dict()["state"][0]["step"].item() < without == 60
+
+
+def test_the_learning_rate_falls_linearly_to_its_fraction():
+    config = tiny(learning_rate=1e-3, final_learning_rate=0.2, total_steps=1000)
+    assert [ppo.anneal(config, step) for step in (0, 500, 1000)] == pytest.approx([1e-3, 6e-4, 2e-4])
+
+
+def test_the_normalizer_moves_in_training_only_and_sees_only_real_rows():
+    config, state, rollout = one_update(normalize_observations=True)
+    ppo.advantages(config, state, rollout)
+    assert state.policy.normalizer.count == 0
+    ppo.update(config, state, rollout)
+    assert state.policy.normalizer.count == rollout.valid.sum()
+
+
+def test_minibatches_cover_everything_once_an_epoch(rng):
+    epochs = list(minibatches(24, 4, 3, rng))
+    assert len(epochs) == 3
+    for parts in epochs:
+        assert [len(part) for part in parts] == [6] * 4
+        assert torch.cat(parts).sort().values.tolist() == list(range(24))
+    assert not torch.equal(epochs[0][0], epochs[1][0])
+
+
+
+
+@pytest.mark.parametrize(
+    ("fields", "said"),
+    [
+        ({"num_minibatches": 3}, "num_minibatches must divide"),
+        ({"minibatch_size": 5}, "minibatch_size must divide"),
+        ({"num_minibatches": 32}, "normalize_advantage needs"),
+        ({"gamma": 1.5}, "gamma must be a number from 0 to 1, not 1.5"),
+        ({"clip": 0.0}, "clip must be a number above 0"),
+        ({"num_envs": 0}, "num_envs must be a whole number at least 1"),
+        ({"epochs": 2.5}, "epochs must be a whole number"),
+        ({"learning_rate": float("nan")}, "learning_rate must be"),
+        ({"activation": "foo"}, "activation must be one of"),
+        ({"device": "tpu"}, "device must be one of"),
+    ],
+)
+def test_a_value_out_of_range_is_named(fields, said):
+    with pytest.raises(UserError, match=said):
+        tiny(**fields)
+
+
+def test_a_config_survives_json():
+    config = tiny(target_kl=0.02, minibatch_size=8)
+    assert ppo.Config.from_json(config.to_json()) == config
