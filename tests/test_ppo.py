@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
-from conftest import tiny
 
+from conftest import tiny
 from lemniscate.algos import ppo
 from lemniscate.data.rollout import collect, minibatches
 from lemniscate.envs import toy
@@ -138,8 +138,6 @@ def test_minibatches_cover_everything_once_an_epoch(rng):
         assert [len(part) for part in parts] == [6] * 4
         assert torch.cat(parts).sort().values.tolist() == list(range(24))
     assert not torch.equal(epochs[0][0], epochs[1][0])
-
-
 
 
 @pytest.mark.parametrize(

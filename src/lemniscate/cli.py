@@ -22,6 +22,7 @@ from lemniscate.envs import api
 from lemniscate.errors import NonFiniteError, UserError, unknown
 from lemniscate.presets import BEST, PRESETS
 from lemniscate.report import curves, pictures
+from lemniscate.report.flight import check_film
 from lemniscate.run.config import RunConfig
 from lemniscate.run.loggers import LOGGERS
 from lemniscate.run.run import Stopped
@@ -78,6 +79,8 @@ def evaluate(given: argparse.Namespace, rest: list[str]) -> None:
 def watch(given: argparse.Namespace, rest: list[str]) -> None:
     """Show one episode in a window, or record it."""
     _nothing_left(rest)
+    if given.video is not None:
+        check_film(given.video)
     policy = front.load(given.run)
     if given.video is None:
         pictures.show_episode(policy.act, policy.spec, given.seed)

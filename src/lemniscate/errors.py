@@ -6,6 +6,7 @@ traceback.
 
 from collections.abc import Iterable
 from difflib import get_close_matches
+from importlib.util import find_spec
 
 
 class UserError(ValueError):
@@ -27,6 +28,14 @@ def unknown(kind: str, name: str, known: Iterable[str]) -> UserError:
     else:
         hint = "nothing known is near it."
     return UserError(f"There is no {kind} {name!r}: {hint}")
+
+
+def is_installed(package: str) -> bool:
+    """Whether an optional package can be imported."""
+    try:
+        return find_spec(package) is not None
+    except ValueError:
+        return False
 
 
 def missing_extra(package: str, extra: str) -> UserError:

@@ -13,7 +13,7 @@ from lemniscate.algos import ALGORITHMS
 from lemniscate.envs import api
 from lemniscate.envs.api import VecEnv
 from lemniscate.envs.spaces import physical_action
-from lemniscate.errors import UserError, unknown
+from lemniscate.errors import UserError, is_installed, missing_extra, unknown
 from lemniscate.nn.policies import Policy, policy_and_value
 from lemniscate.run import checkpoint
 from lemniscate.run.config import RunConfig
@@ -238,6 +238,8 @@ def _empty_policy(spec: Spec, config: Any) -> Policy:
 def _loggers(track: str | None) -> tuple[str, ...]:
     if track is not None and track not in LOGGERS:
         raise unknown("tracker", track, LOGGERS)
+    if track == "wandb" and not is_installed("wandb"):
+        raise missing_extra("wandb", "wandb")
     return ("jsonl", "tensorboard", *([track] if track else []))
 
 

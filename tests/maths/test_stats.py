@@ -48,7 +48,12 @@ def test_merged_moments_are_those_of_the_union(a, b, seed):
     x = torch.randn(a, 3, generator=g, dtype=torch.float64) * 3 + 7
     y = torch.randn(b, 3, generator=g, dtype=torch.float64) - 2
     merged = merge_moments(
-        x.mean(0), x.var(0, correction=0), torch.tensor(float(a)).double(), y.mean(0), y.var(0, correction=0), torch.tensor(float(b)).double()
+        x.mean(0),
+        x.var(0, correction=0),
+        torch.tensor(float(a)).double(),
+        y.mean(0),
+        y.var(0, correction=0),
+        torch.tensor(float(b)).double(),
     )
     union = torch.cat([x, y])
     torch.testing.assert_close(merged[0], union.mean(0))

@@ -50,6 +50,8 @@ class Config(RunConfig):
     """fraction of learning_rate that it falls to, linearly over the run; 1 keeps it constant"""
     adam_eps: Positive = 1e-5
     """Adam's ε"""
+    adam_beta2: Fraction = 0.999
+    """Adam's memory of squared gradients; shorter follows a fast run better"""
     gamma: Fraction = 0.99
     """discount γ"""
     gae_lambda: Fraction = 0.95
@@ -131,7 +133,8 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
     policy.to(device)
     value.to(device)
     parameters = [*policy.parameters(), *value.parameters()]
-    optimizer = Adam(parameters, lr=config.learning_rate, eps=config.adam_eps, fused=True)
+    betas = (0.9, config.adam_beta2)
+    optimizer = Adam(parameters, lr=config.learning_rate, betas=betas, eps=config.adam_eps, fused=True)
     return State(policy, value, optimizer, generator(config.seed, device, 2), generator(config.seed, device, 3))
 
 

@@ -13,8 +13,9 @@ import contextlib
 import io
 import os
 import warnings
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -25,7 +26,6 @@ from lemniscate.errors import UserError, missing_extra
 from lemniscate.types import Box, Spec, Step
 
 os.environ.setdefault("SCIPY_ARRAY_API", "1")  # crazyflow insists, and before SciPy is first imported
-os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # XLA takes tuning hints in its own cache for missing instructions
 try:
     with contextlib.redirect_stdout(io.StringIO()):  # MJX announces optional packages that it does not find
         import crazyflow  # noqa: F401  (registers the environments)
@@ -36,11 +36,6 @@ try:
         import numpy as np
 except ModuleNotFoundError as error:
     raise missing_extra("crazyflow", "drone") from error
-
-# What XLA compiled once on this machine it need not compile again.
-_CACHE = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "lemniscate" / "xla"
-jax.config.update("jax_compilation_cache_dir", str(_CACHE))
-jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
 
 CONTROL_HZ = 50
 AHEAD = 0.75
@@ -67,9 +62,19 @@ class Simulator:
         self.env, self.num_envs = env, num_envs
         self.low, self.high = env.single_action_space.low, env.single_action_space.high
         self._initial = self._take()
-        self.restart = jax.jit(self._restart)
-        self.step = jax.jit(self._step)
-        self.layout = tuple((name, part.shape[-1]) for name, part in self._observations().items())
+        self.restart, self.step = self._compile()
+
+    def _compile(self) -> tuple[Callable, Callable]:
+        """Both programs: traced one after the other, since tracing uses the environment, but compiled side by side."""
+        device = self.env.device
+        seed, stagger = jax.device_put((np.uint32(0), np.bool_(False)), device)
+        action = jax.device_put(np.zeros((self.num_envs, self.low.size), np.float32), device)
+        restart = jax.jit(self._restart).lower(seed, stagger)
+        step = jax.jit(self._step).lower(restart.out_info[0], action, stagger)
+        self._put(self._initial)  # tracing leaves its own placeholders behind
+        with ThreadPoolExecutor(2) as pool:
+            programs = list(pool.map(lambda lowered: lowered.compile(), (restart, step)))
+        return programs[0], programs[1]
 
     def _take(self) -> State:
         arrays = {name: value for name, value in vars(self.env).items() if isinstance(value, jax.Array)}
@@ -80,13 +85,12 @@ class Simulator:
         for name, value in state[1].items():
             setattr(self.env, name, value)
 
-    def _observations(self) -> dict[str, jax.Array]:
-        """The parts of the observation in their documented order: the state first, then the task's."""
-        parts = self.env.obs()
-        return {name: parts[name] for name in (*STATE_PARTS, *(n for n in parts if n not in STATE_PARTS))}
-
     def _flat(self) -> jax.Array:
-        return jnp.concatenate(list(self._observations().values()), axis=-1)
+        """The observation in its documented order: the drone's state first, then the task's own parts."""
+        parts = self.env.obs()
+        names = (*STATE_PARTS, *(name for name in parts if name not in STATE_PARTS))
+        self.layout = tuple((name, parts[name].shape[-1]) for name in names)
+        return jnp.concatenate([parts[name] for name in names], axis=-1)
 
     def _restart(self, seed: jax.Array, stagger: jax.Array) -> tuple[State, jax.Array, jax.Array]:
         data, arrays = self._initial

@@ -17,8 +17,8 @@ def gae(
 ) -> tuple[Float[Tensor, "T N"], Float[Tensor, "T N"]]:
     """Generalized advantage estimation: Schulman et al. 2016, arXiv:1506.02438, eq. 16 cut where episodes end.
 
-        δ_t = r_t + γ V(s_{t+1}) − V(s_t)                                  (eq. 9, with V = 0 after a termination)
-        A_t = δ_t + γλ A_{t+1} = Σ_l (γλ)^l δ_{t+l}                        (eq. 16, up to the end of the episode)
+        δ_t = r_t + γ V(s_{t+1}) − V(s_t)               V = 0 after a termination; arXiv:1707.06347, eq. 12
+        A_t = δ_t + γλ A_{t+1} = Σ_l (γλ)^l δ_{t+l}     up to the end of the episode; eq. 16
 
     Two flags, because there are two ends. A *termination* ends the value: nothing follows it. Any end (`done`:
     terminated or truncated) ends the chain: the next row belongs to another episode. A time-out therefore bootstraps

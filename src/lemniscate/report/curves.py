@@ -22,6 +22,8 @@ def learning_curve(runs: list[Path], file: Path) -> Path:
     axes = figure.subplots()
     for i, run in enumerate(runs):
         _curve(axes, run, "episode/return", COLORS[i % 10], smooth=True)
+    if not axes.has_data():
+        axes.text(0.5, 0.5, "no whole training episode yet", transform=axes.transAxes, ha="center", color="grey")
     axes.set(xlabel="environment steps", ylabel="return of an episode")
     axes.set_title(_title(runs), loc="left")
     _finish(axes, len(runs))
@@ -44,8 +46,8 @@ def plot_runs(runs: list[Path]) -> list[Path]:
     """Draw the pictures of one run into its `plots/`, or of several into `plots/` here. Returns the files."""
     for run in runs:
         read_config(run)
-        if not any("episode/return" in line for line in read_metrics(run)):
-            raise UserError(f"{run} has no finished training episode to plot yet.")
+        if not read_metrics(run):
+            raise UserError(f"{run} has no metrics to plot yet.")
     folder = runs[0] / "plots" if len(runs) == 1 else Path("plots")
     return [learning_curve(runs, folder / "learning_curve.png"), diagnostics(runs, folder / "diagnostics.png")]
 

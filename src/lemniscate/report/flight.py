@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from lemniscate.envs.api import VecEnv
-from lemniscate.errors import UserError
+from lemniscate.errors import UserError, is_installed
 from lemniscate.nn.policies import Policy
 from lemniscate.run.evaluate import fly
 
@@ -124,22 +124,24 @@ def animate(flight: Flight, every: int = 4) -> list[np.ndarray]:
 
 def save_frames(frames: list[np.ndarray], file: Path, fps: float) -> Path:
     """An animated picture (.gif, .webp) from frames, or a film (.mp4, extra `video`)."""
+    check_film(file)
     file.parent.mkdir(parents=True, exist_ok=True)
     if file.suffix == ".mp4":
-        try:
-            import imageio_ffmpeg  # noqa: F401  # pyright: ignore[reportMissingImports]
-            from imageio import v3 as imageio
-        except ModuleNotFoundError:
-            raise UserError(
-                f"{file} needs ffmpeg (pip install 'lemniscate[video]'); a .gif or .webp does not."
-            ) from None
+        from imageio import v3 as imageio
+
         imageio.imwrite(file, np.stack(frames), fps=fps)
-    elif file.suffix in (".gif", ".webp"):
+    else:
         images = [Image.fromarray(frame) for frame in frames]
         images[0].save(file, save_all=True, append_images=images[1:], duration=1000 / fps, loop=0)
-    else:
-        raise UserError(f"{file} must end in .gif, .webp or .mp4.")
     return file
+
+
+def check_film(file: Path) -> None:
+    """Raise `UserError` for a film that could not be written, before anything is flown for it."""
+    if file.suffix not in (".gif", ".webp", ".mp4"):
+        raise UserError(f"{file} must end in .gif, .webp or .mp4.")
+    if file.suffix == ".mp4" and not is_installed("imageio_ffmpeg"):
+        raise UserError(f"{file} needs ffmpeg (pip install 'lemniscate[video]'); a .gif or .webp does not.")
 
 
 def _rotate_x_axis(quaternion: np.ndarray) -> np.ndarray:

@@ -87,6 +87,7 @@ def _rendered(env_id: str, mode: str) -> gym.Env:
     try:
         env = gym.make(env_id, render_mode=mode)
         env.reset(seed=0)
+        env.render()
         return env
-    except gym.error.Error as error:
-        raise UserError(f"{env_id} cannot be shown: {error}") from error
+    except Exception as error:  # pygame, GLFW and MuJoCo each have their own
+        raise UserError(f"{env_id} cannot be shown here: {error}") from error

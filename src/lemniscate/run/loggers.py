@@ -7,8 +7,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
-from lemniscate.errors import missing_extra
-
 Metrics = Mapping[str, float]
 
 
@@ -69,10 +67,8 @@ class WeightsAndBiases:
     """W&B (extra `wandb`). Without a key or a network it records offline, and says how to upload later."""
 
     def __init__(self, path: Path, config: Mapping[str, Any], step: int) -> None:
-        try:
-            import wandb  # pyright: ignore[reportMissingImports]
-        except ModuleNotFoundError as error:
-            raise missing_extra("wandb", "wandb") from error
+        import wandb  # pyright: ignore[reportMissingImports]
+
         self._wandb = wandb
         mode = os.environ.get("WANDB_MODE") or ("online" if self._has_key() else "offline")
         options = {

@@ -30,7 +30,7 @@ from lemniscate.nn.policies import Policy
 from lemniscate.run import checkpoint
 from lemniscate.run.config import RunConfig
 from lemniscate.run.evaluate import evaluate
-from lemniscate.run.loggers import LOGGERS
+from lemniscate.run.loggers import LOGGERS, Logger
 from lemniscate.run.progress import ProgressBar
 from lemniscate.run.seeding import derive
 
@@ -73,6 +73,7 @@ class Run:
         self.env, self.eval_env = envs
         self.spec = self.env.spec
         self._logger_names, self._visible = loggers, progress
+        self._loggers: list[Logger] = []
         self._stop_signal = 0
         self._recent: list[float] = []
         self._lock = FileLock(path / ".lock", timeout=0)
@@ -88,7 +89,8 @@ class Run:
             found.restore(state)
         self._forget_after(state.step)
         config = {"algorithm": self.algorithm, **self.config.to_json()}
-        self._loggers = [LOGGERS[name](self.path, config, state.step) for name in self._logger_names]
+        for name in self._logger_names:
+            self._loggers.append(LOGGERS[name](self.path, config, state.step))
         return state
 
     def until(self, total_steps: int, state: AnyState) -> Iterator[VecEnv]:
@@ -131,7 +133,7 @@ class Run:
 
     def close(self, pictures: list[Path] | None = None) -> None:
         """Close loggers and environments, and give the directory free."""
-        for logger in getattr(self, "_loggers", []):
+        for logger in self._loggers:
             logger.close(pictures or [])
         self.env.close()
         self.eval_env.close()

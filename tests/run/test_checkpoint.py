@@ -1,0 +1,143 @@
+"""Checkpoints: whole or absent, every damaged byte seen, nothing executed."""
+
+import json
+import os
+import pickle
+import random
+import shutil
+
+import pytest
+import torch
+
+from conftest import tiny
+from lemniscate.algos import ppo
+from lemniscate.run import checkpoint
+from lemniscate.run.checkpoint import DamagedCheckpointError
+from lemniscate.types import Box, Discrete, Spec
+
+SPEC = Spec("x", (("obs", 3),), Box((-1.0,), (1.0,)), 500, 0.02, (0, 3))
+CPU = torch.device("cpu")
+
+
+def state_with_history(seed=0):
+    """A State whose optimizer, normalizer and generators have all moved."""
+    torch.manual_seed(seed)
+    state = ppo.init(tiny(normalize_observations=True), SPEC, CPU)
+    loss = state.value(torch.randn(4, 3)).sum() + state.policy(torch.randn(4, 3)).log_prob(torch.randn(4, 1)).sum()
+    loss.backward()
+    state.optimizer.step()
+    state.policy.observe(torch.randn(7, 3))
+    torch.rand(5, generator=state.noise)
+    state.step = 123
+    return state
+
+
+def write(folder, state, step=123, keep=3):
+    return checkpoint.write(folder, state, step, {"planned": True}, keep)
+
+
+def same(a, b):
+    """Equal in every bit that a checkpoint holds."""
+    for name, value in checkpoint._parts(a):
+        other = getattr(b, name)
+        if isinstance(value, torch.nn.Module):
+            assert all(torch.equal(t, other.state_dict()[k]) for k, t in value.state_dict().items())
+        elif isinstance(value, torch.optim.Optimizer):
+            one, two = value.state_dict(), other.state_dict()
+            assert one["param_groups"] == two["param_groups"]
+            for index, slot in one["state"].items():
+                assert all(torch.equal(t, two["state"][index][k]) for k, t in slot.items())
+        elif isinstance(value, torch.Generator):
+            assert torch.equal(value.get_state(), other.get_state())
+        else:
+            assert value == other
+    return True
+
+
+def test_a_state_comes_back_in_every_bit(tmp_path):
+    state, other = state_with_history(0), state_with_history(1)
+    checkpoint.read(write(tmp_path, state)).restore(other)
+    assert same(state, other)
+    for s in (state, other):  # and goes on alike
+        s.optimizer.zero_grad()
+        s.value(torch.ones(2, 3)).sum().backward()
+        s.optimizer.step()
+    assert same(state, other)
+
+
+def test_the_policy_and_the_value_still_share_their_normalizer(tmp_path):
+    other = state_with_history(1)
+    checkpoint.read(write(tmp_path, state_with_history(0))).restore(other)
+    other.policy.observe(torch.randn(4, 3))
+    assert torch.equal(other.policy.normalizer.mean, other.value.normalizer.mean)
+
+
+@pytest.mark.parametrize("spec", [SPEC, Spec("y", (("a", 1), ("b", 2)), Discrete(4, 1))])
+def test_a_spec_survives_json(spec):
+    assert checkpoint.spec_from_json(json.loads(json.dumps(checkpoint.spec_to_json(spec)))) == spec
+
+
+def test_only_the_newest_are_kept(tmp_path):
+    state = state_with_history()
+    for step in range(5):
+        write(tmp_path, state, step, keep=2)
+    assert checkpoint.list_steps(tmp_path) == [3, 4]
+
+
+def test_every_flipped_bit_is_seen(tmp_path):
+    path = write(tmp_path / "good", state_with_history())
+    rng = random.Random(0)
+    for trial in range(150):
+        bad = tmp_path / f"bad{trial}"
+        shutil.copytree(path, bad)
+        victim = bad / rng.choice([*checkpoint.PARTS])
+        data = bytearray(victim.read_bytes())
+        data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
+        victim.write_bytes(data)
+        with pytest.raises(DamagedCheckpointError, match=victim.name):
+            checkpoint.read(bad)
+
+
+@pytest.mark.parametrize("name", [*checkpoint.PARTS, "manifest.json"])
+def test_missing_truncated_and_foreign_files_are_named(tmp_path, name):
+    path = write(tmp_path / "c", state_with_history())
+    for damage in (lambda f: f.unlink(), lambda f: f.write_bytes(f.read_bytes()[:10]) if f.exists() else f.touch()):
+        damage(path / name)
+        with pytest.raises(DamagedCheckpointError, match=name):
+            checkpoint.read(path)
+
+
+def test_a_pickle_is_never_executed(tmp_path):
+    marker = tmp_path / "marker"
+
+    class Evil:
+        def __reduce__(self):
+            return (os.system, (f"touch {marker}",))
+
+    path = write(tmp_path / "c", state_with_history())
+    evil = pickle.dumps(Evil())
+    for name in (*checkpoint.PARTS, "manifest.json"):
+        kept = (path / name).read_bytes()
+        (path / name).write_bytes(evil)
+        with pytest.raises(DamagedCheckpointError):
+            checkpoint.read(path)
+        (path / name).write_bytes(kept)
+    assert not marker.exists()
+    checkpoint.read(path)
+
+
+def test_a_full_disk_leaves_the_checkpoint_before(tmp_path, monkeypatch):
+    state = state_with_history()
+    write(tmp_path, state, 1)
+
+    def full(_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        write(tmp_path, state, 2)
+    monkeypatch.undo()
+    assert checkpoint.list_steps(tmp_path) == [1]
+    checkpoint.read(tmp_path / "step-1")
+    write(tmp_path, state, 3)
+    assert not list(tmp_path.glob("*.tmp"))

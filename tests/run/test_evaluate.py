@@ -1,0 +1,45 @@
+import pytest
+import torch
+
+from lemniscate.envs import toy
+from lemniscate.envs.api import VecEnv
+from lemniscate.envs.gymnasium import GymnasiumBackend
+from lemniscate.nn.policies import policy_and_value
+from lemniscate.run.evaluate import evaluate
+
+CPU = torch.device("cpu")
+
+
+class Uneven(toy.Countdown):
+    """Copy i's episodes last i + 1 steps."""
+
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.length = 1 + torch.arange(self.num_envs).numpy()
+
+
+@pytest.mark.parametrize("mode", ["NEXT_STEP", "SAME_STEP", "DISABLED"])
+@pytest.mark.parametrize("episodes", [3, 4, 10])
+def test_every_copy_plays_its_own_share(monkeypatch, mode, episodes):
+    """Taking the first that end would fill the list with the short ones."""
+    monkeypatch.setattr(toy, "Countdown", Uneven)
+    env = VecEnv(GymnasiumBackend("Countdown-v0", 4, CPU, mode=mode))
+    policy, _ = policy_and_value(env.spec, (4,))
+    scores = evaluate(policy, env, episodes, seed=0)
+    shares = [episodes // 4 + (copy < episodes % 4) for copy in range(4)]
+    expected = [copy + 1 for copy in range(4) for _ in range(shares[copy])]
+    assert scores.lengths == expected
+    assert scores.returns == [float(length) for length in expected]
+    assert scores.terminated == episodes
+    assert scores.mean_return == pytest.approx(sum(expected) / episodes)
+
+
+def test_the_same_seed_gives_the_same_scores_and_another_does_not():
+    env = VecEnv(GymnasiumBackend("CartPole-v1", 4, CPU))
+    torch.manual_seed(0)
+    policy, _ = policy_and_value(env.spec, (4,))
+    first, again, other = (evaluate(policy, env, 6, seed, deterministic=False) for seed in (1, 1, 2))
+    assert first == again
+    assert first.returns != other.returns
+    assert first.rmse_mm is None
+    assert "rmse_mm" not in first.to_json()

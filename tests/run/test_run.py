@@ -1,0 +1,255 @@
+"""Runs: the same bits however they are interrupted, watched or logged."""
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import lemniscate as lem
+from conftest import tiny_fields
+from lemniscate.envs import toy
+from lemniscate.run import checkpoint
+from lemniscate.run.loggers import read_metrics
+from lemniscate.run.seeding import derive
+
+LOUD = "import sys, lemniscate.cli; sys.exit(lemniscate.cli.main())"
+
+
+def train(path, env="Countdown-v0", **fields):
+    return lem.train("ppo", env, run=path, progress=False, **tiny_fields(env, **fields))
+
+
+def final_hashes(path: Path) -> dict[str, str]:
+    """sha256 of every file of the last checkpoint."""
+    last = checkpoint.list_steps(path / "checkpoints")[-1]
+    return {"step": last, **json.loads((path / "checkpoints" / f"step-{last}" / "manifest.json").read_text())["sha256"]}
+
+
+def history(path: Path) -> list[dict]:
+    """The metrics, without what the wall clock decides."""
+    return [{k: v for k, v in line.items() if not k.startswith("time/")} for line in read_metrics(path)]
+
+
+@pytest.mark.parametrize("env", ["Countdown-v0", "Matching-v0", "CartPole-v1", "Pendulum-v1"])
+def test_the_same_seed_gives_the_same_bits_and_another_does_not(tmp_path, env):
+    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
+        train(tmp_path / name, env, seed=seed)
+    assert final_hashes(tmp_path / "a")["tensors.safetensors"] == final_hashes(tmp_path / "b")["tensors.safetensors"]
+    assert history(tmp_path / "a") == history(tmp_path / "b")
+    assert final_hashes(tmp_path / "a")["tensors.safetensors"] != final_hashes(tmp_path / "c")["tensors.safetensors"]
+
+
+def test_evaluation_changes_no_bit_of_training(tmp_path):
+    train(tmp_path / "without", "CartPole-v1")
+    train(tmp_path / "with", "CartPole-v1", evaluate_every=32)
+    tensors = "tensors.safetensors"
+    assert final_hashes(tmp_path / "without")[tensors] == final_hashes(tmp_path / "with")[tensors]
+    assert sum("evaluation/return" in line for line in read_metrics(tmp_path / "with")) == 8
+    losses = [
+        [line["losses/policy"] for line in read_metrics(tmp_path / n) if "losses/policy" in line]
+        for n in ("with", "without")
+    ]
+    assert losses[0] == losses[1]
+
+
+def test_two_seeds_of_neighbouring_runs_share_no_start():
+    starts = {derive(seed, stream, step) for seed in range(50) for stream in range(2) for step in range(50)}
+    assert len(starts) == 50 * 2 * 50
+
+
+def test_training_and_evaluation_are_separate_and_differently_seeded():
+    config = lem.config_for("ppo", "CartPole-v1", num_envs=4, evaluate_episodes=4)
+    train_env, eval_env = lem.make_envs(config)
+    assert train_env is not eval_env
+    a = train_env.restart(derive(config.seed, 0, 0))
+    b = eval_env.restart(derive(config.seed, 1, 0))
+    assert not torch.equal(a, b)
+    before = train_env.obs.clone()
+    eval_env.step(torch.zeros(4, dtype=torch.int64))
+    assert torch.equal(train_env.obs, before)
+
+
+def test_a_run_resumed_from_any_checkpoint_ends_in_the_same_bits(tmp_path):
+    fields = {"checkpoint_every": 64, "keep_checkpoints": 10}
+    train(tmp_path / "whole", "CartPole-v1", **fields)
+    for back in (1, 2, 3):
+        path = tmp_path / f"back{back}"
+        train(path, "CartPole-v1", **fields)
+        for step in checkpoint.list_steps(path / "checkpoints")[-back:]:
+            (path / "checkpoints" / f"step-{step}" / "manifest.json").unlink()
+        lem.resume(path, progress=False)
+        assert final_hashes(path) == final_hashes(tmp_path / "whole")
+        assert history(path) == history(tmp_path / "whole")
+
+
+def test_a_damaged_checkpoint_is_named_and_the_one_before_is_taken(tmp_path, capsys):
+    fields = {"checkpoint_every": 64, "keep_checkpoints": 10}
+    train(tmp_path / "r", "CartPole-v1", **fields)
+    expected = final_hashes(tmp_path / "r")
+    newest = tmp_path / "r" / "checkpoints" / "step-256" / "tensors.safetensors"
+    data = bytearray(newest.read_bytes())
+    data[len(data) // 2] ^= 1
+    newest.write_bytes(data)
+    assert lem.load(tmp_path / "r").step == 192
+    assert "step-256/tensors.safetensors is not what was written" in capsys.readouterr().err
+    lem.resume(tmp_path / "r", progress=False)
+    assert final_hashes(tmp_path / "r") == expected
+
+
+def test_a_nan_in_training_stops_it_and_spares_the_checkpoint(tmp_path, monkeypatch):
+    class Breaks(toy.Countdown):
+        count = 0
+
+        def step(self, actions):
+            obs, reward, *rest = super().step(actions)
+            Breaks.count += 1
+            if Breaks.count == 30:
+                reward[2] = np.inf
+            return obs, reward, *rest
+
+    monkeypatch.setattr(toy, "Countdown", Breaks)
+    with pytest.raises(lem.NonFiniteError, match="reward of environment 2 is inf in the step after step 1"):
+        train(tmp_path / "r", checkpoint_every=64)
+    policy = lem.load(tmp_path / "r")
+    assert policy.step == 64
+    assert all(torch.isfinite(t).all() for t in policy.module.state_dict().values())
+
+
+def test_a_loss_that_is_not_finite_stops_training(tmp_path, monkeypatch):
+    from lemniscate.algos import ppo
+
+    monkeypatch.setattr(ppo, "value_loss", lambda value, *_: value.mean() * float("nan"))
+    with pytest.raises(lem.NonFiniteError, match=r"losses/\w+ is nan in the update that ends at step 32"):
+        train(tmp_path / "r")
+
+
+def test_a_full_disk_costs_a_checkpoint_and_not_the_run(tmp_path, monkeypatch, capsys):
+    calls = []
+
+    def sometimes_full(fd):
+        calls.append(fd)
+        if len(calls) == 1:
+            raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", sometimes_full)
+    train(tmp_path / "r", checkpoint_every=64)
+    assert "checkpoint at step 64 could not be written" in capsys.readouterr().err
+    assert checkpoint.list_steps(tmp_path / "r" / "checkpoints")[-1] == 256
+
+
+def test_two_processes_do_not_share_a_directory(tmp_path):
+    train(tmp_path / "r")
+    from filelock import FileLock
+
+    with FileLock(tmp_path / "r" / ".lock"), pytest.raises(lem.UserError, match="being trained by another process"):
+        lem.resume(tmp_path / "r", progress=False)
+
+
+def command(*arguments, stderr=subprocess.DEVNULL):
+    environment = {**os.environ, "COLUMNS": "200"}
+    return subprocess.Popen(
+        [sys.executable, "-c", LOUD, *map(str, arguments)], stderr=stderr, text=True, env=environment
+    )
+
+
+def long_run(path, env, updates=150):
+    """Arguments of a run of some seconds with a checkpoint every eighth update."""
+    fields = tiny_fields(env, hidden=(32, 32), total_steps=32 * updates, checkpoint_every=32 * 8, epochs=4)
+    flags = ["--run", path]
+    for name in ("num_envs", "num_steps", "total_steps", "epochs", "num_minibatches", "checkpoint_every"):
+        flags += [f"--{name.replace('_', '-')}", fields[name]]
+    return ["train", "ppo", "--env", env, "--preset", "default", "--hidden", "32", "32", *flags]
+
+
+def wait_for(condition, process=None):
+    while not condition():
+        assert process is None or process.poll() is None
+        time.sleep(0.005)
+
+
+@pytest.mark.parametrize("env", ["Countdown-v0", "CartPole-v1"])
+def test_killed_at_random_and_resumed_it_ends_in_the_same_bits(tmp_path, env):
+    """SIGKILL on real processes, several times in one run, at times drawn anew in each test run."""
+    check_kills(tmp_path, long_run(tmp_path / "whole", env), long_run(tmp_path / "killed", env), kills=3)
+
+
+def check_kills(tmp_path, whole, killed, kills):
+    assert command(*whole).wait() == 0
+    path, arguments = tmp_path / "killed", killed
+    seed = random.SystemRandom().randrange(10**6)
+    rng = random.Random(seed)
+    for _ in range(kills):
+        process = command(*arguments)
+        reached = len(read_metrics(path))
+        wait_for(lambda: len(read_metrics(path)) > reached or process.poll() is not None)  # noqa: B023
+        try:
+            process.wait(rng.uniform(0, 0.6))
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+        arguments = ["resume", path]
+    assert command(*arguments).wait() == 0
+    assert final_hashes(path) == final_hashes(tmp_path / "whole"), f"kill times from seed {seed}"
+    assert history(path) == history(tmp_path / "whole"), f"kill times from seed {seed}"
+
+
+@pytest.mark.parametrize(("signum", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_leaves_a_checkpoint_and_says_how_to_go_on(tmp_path, signum, code):
+    path = tmp_path / "r"
+    process = command(*long_run(path, "CartPole-v1", updates=3000), stderr=subprocess.PIPE)
+    wait_for(lambda: len(read_metrics(path)) > 20, process)
+    process.send_signal(signum)
+    said = process.communicate()[1]
+    assert process.returncode == code
+    assert f"lemniscate resume {path}" in said
+    assert "Traceback" not in said
+    stopped = lem.load(path).step
+    assert stopped >= 20 * 32
+    assert checkpoint.list_steps(path / "checkpoints")[-1] == stopped
+
+
+def test_stopped_and_resumed_it_ends_in_the_same_bits(tmp_path):
+    whole, path = tmp_path / "whole", tmp_path / "stopped"
+    assert command(*long_run(whole, "Countdown-v0")).wait() == 0
+    process = command(*long_run(path, "Countdown-v0"))
+    wait_for(lambda: len(read_metrics(path)) > 20, process)
+    process.terminate()
+    assert process.wait() == 143
+    assert command("resume", path).wait() == 0
+    assert final_hashes(path) == final_hashes(whole)
+    assert history(path) == history(whole)
+
+
+def test_training_off_the_main_thread_leaves_signals_alone(tmp_path):
+    failures = []
+
+    def work():
+        try:
+            train(tmp_path / "r")
+        except BaseException as error:
+            failures.append(error)
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert not failures
+
+
+@pytest.mark.long
+def test_a_drone_killed_at_random_ends_in_the_same_bits(tmp_path):
+    pytest.importorskip("lemniscate.envs.crazyflow")
+
+    def arguments(path):
+        fields = ["--total-steps", 400_000, "--checkpoint-every", 50_000]
+        return ["train", "ppo", "--env", "DroneFigureEightTrajectory-v0", "--run", path, *fields]
+
+    check_kills(tmp_path, arguments(tmp_path / "whole"), arguments(tmp_path / "killed"), kills=4)

@@ -1,0 +1,108 @@
+"""The commands, as a person types them."""
+
+import json
+
+import pytest
+
+from conftest import tiny_fields
+from lemniscate.cli import main
+
+TINY = [
+    str(part)
+    for name, value in tiny_fields("CartPole-v1").items()
+    if name in {"num_envs", "num_steps", "total_steps", "epochs", "num_minibatches", "evaluate_episodes"}
+    for part in (f"--{name.replace('_', '-')}", value)
+]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    path = tmp_path_factory.mktemp("cli") / "run"
+    assert main(["train", "ppo", "--env", "CartPole-v1", "--run", str(path), *TINY]) == 0
+    return path
+
+
+def test_evaluate_prints_one_json_object_on_standard_output(run, capsys):
+    assert main(["evaluate", str(run), "--episodes", "3", "--seed", "5", "--json"]) == 0
+    out, _ = capsys.readouterr()
+    scores = json.loads(out)
+    assert {"env_id", "episodes", "mean_return", "std_return", "returns", "lengths"} <= set(scores)
+    assert scores["env_id"] == "CartPole-v1"
+    assert len(scores["returns"]) == 3
+
+
+def test_what_a_person_reads_goes_to_standard_error(run, capsys):
+    assert main(["evaluate", str(run), "--episodes", "3"]) == 0
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "over 3 episodes" in err
+
+
+def test_fields_reach_the_config(run):
+    config = json.loads((run / "config.json").read_text())["config"]
+    assert config["num_envs"] == 4
+    assert config["total_steps"] == 256
+
+
+def test_train_with_a_report_leaves_pictures(tmp_path, capsys):
+    path = tmp_path / "r"
+    assert main(["train", "ppo", "--env", "CartPole-v1", "--run", str(path), "--report", *TINY]) == 0
+    assert (path / "plots" / "learning_curve.png").stat().st_size > 5000
+    assert "over 4 episodes" in capsys.readouterr().err
+
+
+def test_plot_of_several_runs(run, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["plot", str(run), str(run)]) == 0
+    assert (tmp_path / "plots" / "learning_curve.png").exists()
+
+
+def test_envs_lists_backend_and_preset(capsys):
+    assert main(["envs", "figure"]) == 0
+    err = capsys.readouterr().err
+    assert "DroneFigureEightTrajectory-v0" in err
+    assert "crazyflow" in err
+    assert "figure-eight" in err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["train", "pp", "--env", "CartPole-v1"], "There is no algorithm 'pp': did you mean ppo?"),
+        (["train", "ppo", "--env", "CartPol-v1"], "There is no environment 'CartPol-v1': did you mean CartPole-v1"),
+        (
+            ["train", "ppo", "--env", "CartPole-v1", "--preset", "corse"],
+            "There is no preset 'corse': did you mean course",
+        ),
+        (["train", "ppo", "--env", "CartPole-v1", "--gama", "1"], "There is no field '--gama': did you mean --gamma"),
+        (["train", "ppo", "--env", "CartPole-v1", "--gamma", "x"], "Error parsing --gamma: could not convert"),
+        (["train", "ppo", "--env", "CartPole-v1", "--gamma", "3"], "gamma must be a number from 0 to 1, not 3.0."),
+        (
+            ["train", "ppo", "--env", "CartPole-v1", "--num-minibatches", "7"],
+            "num_minibatches must divide num_envs · num_steps",
+        ),
+        (["train", "ppo", "--env", "CartPole-v1", "--activation", "x"], "Expected one of"),
+        (["evaluate", "nowhere"], "nowhere is not a run directory"),
+        (["evaluate", "nowhere", "--episods", "3"], "--episods is not understood here"),
+        (["resume", "nowhere"], "nowhere is not a run directory"),
+        (["watch"], "The following arguments are required"),
+        (["evaluat"], "Invalid choice: 'evaluat'"),
+    ],
+)
+def test_a_mistake_is_one_line_and_exit_code_2(capsys, arguments, said):
+    assert main(arguments) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert said in err or said.lower() in err.lower()
+    assert len(err.strip().splitlines()) == 1
+
+
+def test_an_episode_is_filmed(run, capsys):
+    film = run / "videos" / "episode.gif"
+    assert main(["watch", str(run), "--video", str(film)]) == 0
+    assert film.stat().st_size > 5000
+
+
+def test_a_film_that_cannot_be_written_is_a_sentence(run, capsys):
+    assert main(["watch", str(run), "--video", str(run / "film.avi")]) == 2
+    assert "must end in .gif, .webp or .mp4" in capsys.readouterr().err

@@ -1,0 +1,170 @@
+"""The front door, from Python."""
+
+import json
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+import lemniscate as lem
+from conftest import tiny_fields
+
+
+@pytest.fixture(scope="module")
+def cartpole(tmp_path_factory):
+    path = tmp_path_factory.mktemp("runs") / "cartpole"
+    return lem.train("ppo", "CartPole-v1", run=path, progress=False, **tiny_fields("CartPole-v1"))
+
+
+@pytest.fixture(scope="module")
+def pendulum(tmp_path_factory):
+    path = tmp_path_factory.mktemp("runs") / "pendulum"
+    return lem.train("ppo", "Pendulum-v1", run=path, progress=False, **tiny_fields("Pendulum-v1"))
+
+
+def test_a_run_directory_holds_what_is_promised(cartpole):
+    names = {p.name for p in cartpole.path.iterdir()}
+    assert {"config.json", "metrics.jsonl", "tensorboard", "checkpoints"} <= names
+    record = json.loads((cartpole.path / "config.json").read_text())
+    assert record["algorithm"] == "ppo"
+    assert record["config"]["env"] == "CartPole-v1"
+    lines = [json.loads(line) for line in (cartpole.path / "metrics.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines] == list(range(32, 257, 32))
+    watched = {"losses/policy", "losses/value", "losses/entropy", "approx_kl", "old_approx_kl", "clip_fraction"}
+    assert watched | {"explained_variance", "gradient_norm", "learning_rate"} <= set(lines[0])
+
+
+def test_tensorboard_holds_the_metrics_and_the_config(cartpole):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    events = EventAccumulator(str(cartpole.path / "tensorboard")).Reload()
+    assert "losses/policy" in events.Tags()["scalars"]
+    assert len(events.Scalars("losses/policy")) == 8
+    text = events.Tensors("config/text_summary")[0].tensor_proto.string_val[0].decode()
+    assert "|gamma|0.99|" in text
+
+
+def test_a_discrete_policy_acts_on_one_observation_and_on_a_batch(cartpole):
+    policy = lem.load(cartpole.path)
+    env = gym.make("CartPole-v1")
+    obs, _ = env.reset(seed=0)
+    action = policy.act(obs)
+    env.step(action)
+    assert np.shape(action) == ()
+    assert policy.act(np.stack([obs] * 3)).shape == (3,)
+    assert policy.act(obs[None]).shape == (1,)
+
+
+def test_a_box_policy_acts_in_physical_units(pendulum):
+    policy = lem.load(pendulum.path)
+    env = gym.make("Pendulum-v1")
+    obs, _ = env.reset(seed=0)
+    noisy = np.stack([policy.act(obs, deterministic=False) for _ in range(50)])
+    assert noisy.shape == (50, 1)
+    assert np.abs(noisy).max() <= 2.0
+    assert np.abs(noisy).max() > 1.0
+    env.step(policy.act(obs))
+
+
+def test_loading_gives_the_policy_that_was_trained(pendulum):
+    loaded = lem.load(pendulum.path)
+    obs = np.random.default_rng(0).normal(size=(20, 3)).astype(np.float32)
+    np.testing.assert_array_equal(loaded.act(obs), pendulum.policy.act(obs))
+    assert loaded.step == 256
+    newest = sorted((pendulum.path / "checkpoints").iterdir())[0]
+    assert lem.load(newest).step <= 256
+
+
+def test_an_observation_of_the_wrong_size_is_named(cartpole):
+    with pytest.raises(lem.UserError, match=r"observations of 4 numbers; one of shape \(3,\)"):
+        cartpole.policy.act(np.zeros(3))
+
+
+def test_evaluate(cartpole):
+    scores = lem.evaluate(cartpole.policy, episodes=5, seed=0)
+    assert scores.episodes == len(scores.returns) == 5
+    assert scores.returns == [float(length) for length in scores.lengths]
+    assert lem.evaluate(cartpole.policy, env="CartPole-v1", episodes=5, seed=0) == scores
+    with pytest.raises(lem.UserError, match="cannot act in Pendulum-v1"):
+        lem.evaluate(cartpole.policy, env="Pendulum-v1", episodes=2)
+    with pytest.raises(lem.UserError, match="episodes must be"):
+        lem.evaluate(cartpole.policy, episodes=0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "fields", "said"),
+    [
+        (("pop", "CartPole-v1"), {}, "no algorithm 'pop': did you mean ppo"),
+        (("ppo",), {}, "Which environment"),
+        (("ppo", "CartPol-v1"), {}, "did you mean CartPole-v1"),
+        (("ppo", "CartPole-v1"), {"preset": "cours"}, "did you mean course"),
+        (("ppo", "CartPole-v1"), {"gama": 0.9}, "no field 'gama': did you mean gamma"),
+        (("ppo", "CartPole-v1"), {"gamma": 2}, "gamma must be a number from 0 to 1, not 2"),
+        (("ppo", "CartPole-v1"), {"track": "wandbb"}, "did you mean wandb"),
+        (("ppo", "CartPole-v1"), {"device": "cuda"}, "torch sees no GPU"),
+        (("ppo", "CartPole-v1"), {"backend": "crazyflow"}, "cannot be served"),
+    ],
+)
+@pytest.mark.skipif(torch.cuda.is_available(), reason="one of these is about its absence")
+def test_a_mistake_is_one_sentence_and_leaves_nothing_behind(tmp_path, arguments, fields, said):
+    with pytest.raises(lem.UserError, match=said):
+        lem.train(*arguments, run=tmp_path / "r", **fields)
+    assert not (tmp_path / "r").exists()
+
+
+def test_a_run_that_exists_is_refused(cartpole):
+    with pytest.raises(lem.UserError, match="exists already"):
+        lem.train("ppo", "CartPole-v1", run=cartpole.path)
+
+
+def test_without_a_name_runs_are_numbered(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    paths = [lem.train("ppo", "Countdown-v0", progress=False, **tiny_fields()).path for _ in range(2)]
+    assert [path.name for path in paths] == ["Countdown-v0-ppo-1", "Countdown-v0-ppo-1-2"]
+
+
+def test_resuming_a_finished_run_changes_nothing(cartpole):
+    before = (cartpole.path / "metrics.jsonl").read_text()
+    assert lem.resume(cartpole.path, progress=False).policy.step == 256
+    assert (cartpole.path / "metrics.jsonl").read_text() == before
+
+
+def test_what_is_not_a_run_is_said(tmp_path):
+    for use in (lem.load, lem.resume):
+        with pytest.raises(lem.UserError, match="is not a run directory"):
+            use(tmp_path)
+
+
+def test_wandb_missing_is_said_with_its_install_line(tmp_path, monkeypatch):
+    import sys
+
+    monkeypatch.setitem(sys.modules, "wandb", None)
+    with pytest.raises(lem.UserError, match=r"pip install 'lemniscate\[wandb\]'"):
+        lem.train("ppo", "Countdown-v0", run=tmp_path / "r", track="wandb", progress=False, **tiny_fields())
+
+
+def test_set_seeds_covers_every_generator():
+    import random
+
+    lem.set_seeds(42)
+    assert random.randint(0, 9999) == 1824
+    assert np.random.randint(0, 9999) == 7270  # noqa: NPY002
+    assert torch.initial_seed() == 42
+    assert torch.backends.cudnn.deterministic
+    assert not torch.backends.cudnn.benchmark
+    first = torch.rand(3)
+    lem.set_seeds(42)
+    assert torch.equal(first, torch.rand(3))
+
+
+def test_the_public_names_are_sorted_and_exist():
+    assert lem.__all__ == sorted(lem.__all__)
+    assert all(hasattr(lem, name) for name in lem.__all__)
+
+
+def test_a_config_has_dot_access_and_is_frozen():
+    config = lem.config_for("ppo", "CartPole-v1", seed=7)
+    assert config.seed == 7
+    with pytest.raises(AttributeError):
+        config.seed = 8

@@ -1,0 +1,91 @@
+"""Wrong versions of the maths that the suite must kill: each is written into a copy of the package and tested."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+MUTANTS = [
+    # what goes wrong, file, the right line, the wrong line, the tests that must notice
+    ("a time-out ends the value", "maths/returns.py", "next_value * ~terminated", "next_value * ~done", "maths"),
+    ("a death does not", "maths/returns.py", "next_value * ~terminated", "next_value", "maths"),
+    ("the chain runs on", "maths/returns.py", "(~done).to(delta.dtype)", "(~terminated).to(delta.dtype)", "maths"),
+    ("the chain is off by one", "maths/returns.py", "decay[t] * trace", "decay[max(t - 1, 0)] * trace", "maths"),
+    ("lambda is forgotten", "maths/returns.py", "gamma * lam * (", "gamma * (", "maths"),
+    ("the target is the advantage", "maths/returns.py", "return advantage, advantage + value", "return advantage, advantage", "maths"),
+    ("the sign of the surrogate", "maths/losses.py", "return -torch.min(", "return torch.min(", "maths"),
+    ("an optimistic bound", "maths/losses.py", "-torch.min(ratio", "-torch.max(ratio", "maths"),
+    ("the clip is one-sided", "maths/losses.py", "clamp(1 - clip, 1 + clip)", "clamp(max=1 + clip)", "maths"),
+    ("the smaller value error", "maths/losses.py", "error = torch.max(", "error = torch.min(", "maths"),
+    ("no half in the value loss", "maths/losses.py", "0.5 * error.mean()", "error.mean()", "maths"),
+    ("k3 without its control variate", "maths/stats.py", "log_ratio.exp() - 1 - log_ratio", "-log_ratio", "maths"),
+    ("moments forget the distance of means", "maths/stats.py", " + delta.square() *", " + 0 * delta *", "maths"),
+    ("log-prob without the std", "maths/distributions.py", "(self.log_std.sum(-1) +", "(", "maths"),
+    ("actions scaled to half their range", "envs/spaces.py", "base + 0.5 *", "base + 0.25 *", "envs/test_spaces.py"),
+    ("reset rows are real", "envs/gymnasium.py", "~self._resetting, done", "valid, done", "envs/test_contract.py"),
+    (
+        "the reset observation is the final one",
+        "envs/gymnasium.py",
+        "rows = np.flatnonzero(done)",
+        "rows = np.flatnonzero(done & False)",
+        "envs/test_contract.py",
+    ),
+    (
+        "reset rows reach the batch",
+        "algos/ppo.py",
+        "[rollout.valid]",
+        "[torch.ones_like(rollout.valid)]",
+        "test_ppo.py",
+    ),
+    ("the entropy bonus is a penalty", "algos/ppo.py", "- config.entropy_coef", "+ config.entropy_coef", "test_ppo.py"),
+    (
+        "the normalizer moves before the update",
+        "algos/ppo.py",
+        "    batch = advantages(",
+        "    state.policy.observe(rollout.obs[rollout.valid])\n    batch = advantages(",
+        "test_ppo.py",
+    ),
+    (
+        "evaluation takes the first that end",
+        "run/evaluate.py",
+        "(left > 0) & step.valid",
+        "step.valid",
+        "run/test_evaluate.py",
+    ),
+    (
+        "the environments go on over a checkpoint",
+        "run/run.py",
+        "                self._restart(state)\n        if",
+        "                pass\n        if",
+        "run/test_run.py",
+    ),
+    (
+        "optimizer slots are not restored",
+        "run/checkpoint.py",
+        '{"state": slots,',
+        '{"state": {},',
+        "run/test_checkpoint.py",
+    ),
+]
+
+
+@pytest.mark.parametrize("mutant", MUTANTS, ids=[mutant[0].replace(" ", "-") for mutant in MUTANTS])
+def test_the_suite_kills(tmp_path, mutant):
+    _, name, right, wrong, tests = mutant
+    shutil.copytree(ROOT / "src" / "lemniscate", tmp_path / "lemniscate")
+    file = tmp_path / "lemniscate" / name
+    text = file.read_text()
+    assert text.count(right) == 1, f"{name} no longer has this line once: {right}"
+    file.write_text(text.replace(right, wrong))
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path), "PYTHONDONTWRITEBYTECODE": "1"}
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", "-m", "not long"]
+    done = subprocess.run(
+        [*command, str(ROOT / "tests" / tests)], env=environment, cwd=ROOT, capture_output=True, text=True
+    )
+    assert done.returncode == 1, done.stdout[-2000:]
+    assert "1 failed" in done.stdout
