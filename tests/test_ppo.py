@@ -146,6 +146,7 @@ def test_minibatches_cover_everything_once_an_epoch(rng):
         ({"num_minibatches": 3}, "num_minibatches must divide"),
         ({"minibatch_size": 5}, "minibatch_size must divide"),
         ({"num_minibatches": 32}, "normalize_advantage needs"),
+        ({"minibatch_size": 1}, "normalize_advantage needs"),
         ({"gamma": 1.5}, "gamma must be a number from 0 to 1, not 1.5"),
         ({"clip": 0.0}, "clip must be a number above 0"),
         ({"num_envs": 0}, "num_envs must be a whole number at least 1"),

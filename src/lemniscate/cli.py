@@ -9,7 +9,6 @@ import io
 import json
 import re
 import sys
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NoReturn
@@ -51,18 +50,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def train(given: argparse.Namespace, rest: list[str]) -> None:
     """Train a policy; with --report also evaluate it and draw pictures."""
     config = _with_fields(front.config_for(given.algorithm, given.env, given.preset), rest)
-    started = time.monotonic()
     fields = {name: getattr(config, name) for name in config.names() if name != "env"}
-    run = front.train(given.algorithm, config.env, run=given.run, preset=given.preset, track=given.track, **fields)
-    _say(f"Trained in {time.monotonic() - started:.1f} s. Everything is in {run.path}")
-    if given.report:
-        _report(run)
+    run = front.train(
+        given.algorithm,
+        config.env,
+        run=given.run,
+        preset=given.preset,
+        track=given.track,
+        report=given.report,
+        **fields,
+    )
+    _say(f"Trained in {run.seconds:.1f} s. Everything is in {run.path}")
 
 
 def resume(given: argparse.Namespace, rest: list[str]) -> None:
     """Go on with an interrupted run."""
     _nothing_left(rest)
-    run = front.resume(given.run, track=given.track)
+    run = front.resume(given.run, track=given.track, report=given.report)
     _say(f"Done. Everything is in {run.path}")
 
 
@@ -104,16 +108,6 @@ def envs(given: argparse.Namespace, rest: list[str]) -> None:
         if given.filter.lower() in env_id.lower():
             fitting = [f"{algorithm}: {BEST.get((algorithm, env_id), 'default')}" for algorithm in ALGORITHMS]
             _say(f"{env_id:<40} {api.backend_for(env_id):<12} {', '.join(fitting)}")
-
-
-def _report(run: front.TrainedRun) -> None:
-    """Evaluate from unseen starts, say how it went, and leave pictures."""
-    policy, episodes = run.policy, run.policy.config.evaluate_episodes
-    _say(pictures.sentence(front.evaluate(policy, episodes=episodes)))
-    _draw([run.path], policy)
-    if policy.spec.tracking:
-        env = front.evaluation_env(policy, episodes)
-        _say(pictures.film_flight(policy.module, env, run.path / "videos" / "flight.gif", seed=0))
 
 
 def _draw(runs: list[Path], policy: front.TrainedPolicy | None) -> None:
@@ -196,7 +190,8 @@ def _parser() -> argparse.ArgumentParser:
 
     sub = command(resume)
     sub.add_argument("run", type=Path)
-    sub.add_argument("--track", metavar="LOGGER")
+    sub.add_argument("--track", metavar="LOGGER", help="a logger beside the local ones")
+    sub.add_argument("--report", action="store_true", help="evaluate the result and leave pictures")
 
     sub = command(evaluate)
     sub.add_argument("run", type=Path, help="a run or a checkpoint")

@@ -15,6 +15,7 @@ from lemniscate.envs.api import VecEnv
 from lemniscate.envs.spaces import physical_action
 from lemniscate.errors import UserError, is_installed, missing_extra, unknown
 from lemniscate.nn.policies import Policy, policy_and_value
+from lemniscate.report import pictures as pictures_of
 from lemniscate.run import checkpoint
 from lemniscate.run.config import RunConfig
 from lemniscate.run.evaluate import Evaluation
@@ -73,10 +74,11 @@ class TrainedPolicy:
 
 @dataclass(frozen=True)
 class TrainedRun:
-    """What `train` leaves: `path`, the run directory, and `policy`, the final policy."""
+    """What `train` leaves: the run directory, the final policy, and how long the training loop took."""
 
     path: Path
     policy: TrainedPolicy
+    seconds: float
 
 
 def config_for(algorithm: str, env: str | None = None, preset: str | None = None, **fields: object) -> RunConfig:
@@ -111,6 +113,7 @@ def train(
     run: str | Path | None = None,
     preset: str | None = None,
     track: str | None = None,
+    report: bool = False,
     progress: bool = True,
     **fields: object,
 ) -> TrainedRun:
@@ -121,7 +124,8 @@ def train(
         env: the environment's id; a preset may have one of its own.
         run: where to keep everything; by default a new directory under `runs/`.
         preset: by name; the best known for the environment unless given.
-        track: a logger beside the local ones: "wandb".
+        track: a logger beside the local ones: "wandb"; it gets the final pictures too.
+        report: evaluate the result, and draw it into `plots/` and `videos/`.
         progress: the live line on standard error.
         **fields: any field of the algorithm's Config, such as seed or total_steps.
 
@@ -133,15 +137,16 @@ def train(
     loggers = _loggers(track)
     envs = make_envs(config)  # before the directory: an environment that cannot be made leaves nothing behind
     create_directory(path, algorithm, config)
-    return _train(path, algorithm, config, envs, loggers, progress)
+    return _train(path, algorithm, config, envs, loggers, report or track is not None, progress)
 
 
-def resume(run: str | Path, *, track: str | None = None, progress: bool = True) -> TrainedRun:
+def resume(run: str | Path, *, track: str | None = None, report: bool = False, progress: bool = True) -> TrainedRun:
     """Go on with an interrupted run, from its newest planned checkpoint that is whole, to its end."""
     path = Path(run)
     algorithm, fields = read_config(path)
     config = ALGORITHMS[algorithm].Config.from_json(fields)
-    return _train(path, algorithm, config, make_envs(config), _loggers(track), progress)
+    loggers = _loggers(track)
+    return _train(path, algorithm, config, make_envs(config), loggers, report or track is not None, progress)
 
 
 def load(path: str | Path) -> TrainedPolicy:
@@ -202,16 +207,20 @@ def _train(
     config: RunConfig,
     envs: tuple[VecEnv, VecEnv],
     loggers: tuple[str, ...],
+    draw: bool,
     progress: bool,
 ) -> TrainedRun:
     set_seeds(config.seed)
     torch.set_num_threads(config.threads)
     run = Run(path, algorithm, config, envs, loggers=loggers, progress=progress)
+    pictures: list[Path] = []
     try:
         state = ALGORITHMS[algorithm].train(config, run)
+        if draw:
+            pictures = pictures_of.report(state.policy, run.eval_env, path, config.evaluate_episodes)
     finally:
-        run.close()
-    return TrainedRun(path, TrainedPolicy(state.policy.cpu(), run.spec, config, state.step))
+        run.close(pictures)
+    return TrainedRun(path, TrainedPolicy(state.policy.cpu(), run.spec, config, state.step), run.seconds)
 
 
 def evaluation_env(policy: TrainedPolicy, episodes: int) -> VecEnv:

@@ -81,29 +81,17 @@ class Config(RunConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        rows = self.num_envs * self.num_steps
-        if self.minibatch_size is None and rows % self.num_minibatches:
-            raise UserError(
-                f"num_minibatches must divide num_envs · num_steps = {rows}, and {self.num_minibatches} does not."
-            )
-        if self.minibatch_size is not None and rows % self.minibatch_size:
-            raise UserError(
-                f"minibatch_size must divide num_envs · num_steps = {rows}, and {self.minibatch_size} does not."
-            )
-        if rows // self.parts < 2 and self.normalize_advantage:
-            raise UserError(
-                f"normalize_advantage needs minibatches of 2 rows or more; these have {rows // self.parts}."
-            )
+        name = "num_minibatches" if self.minibatch_size is None else "minibatch_size"
+        rows, cut = self.num_envs * self.num_steps, getattr(self, name)
+        if rows % cut:
+            raise UserError(f"{name} must divide num_envs · num_steps = {rows}, and {cut} does not.")
+        if rows == self.parts and self.normalize_advantage:
+            raise UserError("normalize_advantage needs minibatches of 2 rows or more; these have 1.")
 
     @property
     def parts(self) -> int:
         """Minibatches in an epoch."""
-        return self.num_minibatches if self.minibatch_size is None else self.rollout_size // self.minibatch_size
-
-    @property
-    def rollout_size(self) -> int:
-        """T · N."""
-        return self.num_envs * self.num_steps
+        return self.num_envs * self.num_steps // self.minibatch_size if self.minibatch_size else self.num_minibatches
 
 
 @dataclass
@@ -143,15 +131,8 @@ def advantages(config: Config, state: State, rollout: Rollout) -> Batch:
     """Row t's log π_old(a|s), V(s), A (eq. 11) and value target; only the rows that were really played."""
     value, next_value = state.value(rollout.obs), state.value(rollout.next_obs)
     log_prob = state.policy(rollout.obs).log_prob(rollout.action)
-    advantage, target = gae(
-        rollout.reward,
-        value,
-        next_value,
-        rollout.terminated,
-        rollout.done,
-        gamma=config.gamma,
-        lam=config.gae_lambda,
-    )
+    ends = rollout.terminated, rollout.done
+    advantage, target = gae(rollout.reward, value, next_value, *ends, gamma=config.gamma, lam=config.gae_lambda)
     return Batch(rollout.obs, rollout.action, log_prob, value, advantage, target)[rollout.valid]  # [T, N] -> [B]
 
 
@@ -193,15 +174,10 @@ def update(config: Config, state: State, rollout: Rollout) -> Mapping[str, Tenso
     state.policy.observe(batch.obs)  # afterwards: old and new probabilities are taken through the same normalizer
     state.step += rollout.num_steps
     means = {name: torch.stack([row[name] for row in watched]).mean() for name in watched[0]}
-    return {**means, **summary(state, batch), "learning_rate": learning_rate}
-
-
-def summary(state: State, batch: Batch) -> dict[str, Tensor]:
-    """What is worth knowing once an update."""
-    metrics = {"explained_variance": explained_variance(batch.value, batch.target)}
     if isinstance(state.policy, GaussianPolicy):
-        metrics["policy_std"] = state.policy.log_std.detach().exp().mean()
-    return metrics
+        means["policy_std"] = state.policy.log_std.detach().exp().mean()
+    explained = explained_variance(batch.value, batch.target)
+    return {**means, "explained_variance": explained, "learning_rate": learning_rate}
 
 
 def anneal(config: Config, step: int) -> float:

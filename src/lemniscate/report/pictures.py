@@ -1,5 +1,6 @@
 """Everything a finished run is shown with: numbers in a sentence, plots, an animation."""
 
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,8 +11,8 @@ from lemniscate.envs import api
 from lemniscate.envs.api import VecEnv
 from lemniscate.errors import UserError
 from lemniscate.nn.policies import Policy
-from lemniscate.report import flight
-from lemniscate.run.evaluate import Evaluation
+from lemniscate.report import curves, flight
+from lemniscate.run.evaluate import Evaluation, evaluate
 from lemniscate.types import Spec
 
 Act = Callable[[object], np.ndarray]
@@ -28,6 +29,24 @@ def sentence(scores: Evaluation) -> str:
             f" {scores.rmse_after_1s_mm:.2f} mm after the first second"
         )
     return said + "."
+
+
+def report(policy: Policy, env: VecEnv, path: Path, episodes: int) -> list[Path]:
+    """Evaluate from unseen starts, draw everything there is to draw; says what it did, returns the pictures."""
+    say(sentence(evaluate(policy, env, episodes, seed=0)))
+    pictures = curves.plot_runs([path])
+    if env.spec.tracking:
+        pictures += draw_flight(policy, env, path / "plots", episodes, seed=0)
+    for picture in pictures:
+        say(picture)
+    if env.spec.tracking:
+        say(film_flight(policy, env, path / "videos" / "flight.gif", seed=0))
+    return pictures
+
+
+def say(text: object) -> None:
+    """Tell a person."""
+    print(text, file=sys.stderr, flush=True)
 
 
 def draw_flight(policy: Policy, env: VecEnv, folder: Path, flights: int, seed: int) -> list[Path]:

@@ -74,7 +74,7 @@ class WeightsAndBiases:
         options = {
             "project": os.environ.get("WANDB_PROJECT", "lemniscate"),
             "name": os.environ.get("WANDB_NAME", path.name),
-            "tags": [str(config["env"])],
+            "tags": [str(config["env"]), *filter(None, os.environ.get("WANDB_TAGS", "").split(","))],
             "config": dict(config),
             "dir": str(path),
             "id": _stable_id(path),

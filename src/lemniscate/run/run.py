@@ -100,7 +100,8 @@ class Run:
             Stopped: after a signal, when the current update is done and saved.
         """
         self._bar = ProgressBar(total_steps, state.step, self._visible)
-        self._clock, self._clock_step = time.monotonic(), state.step
+        started = time.monotonic()
+        self._clock, self._clock_step = started, state.step
         try:
             with self._catching_signals():
                 self._restart(state)
@@ -109,6 +110,7 @@ class Run:
                     yield self.env
                     self._between(state, before, total_steps)
         finally:
+            self.seconds = time.monotonic() - started
             self._bar.close()
 
     def log(self, state: AnyState, metrics: Mapping[str, torch.Tensor | float], episodes: Episodes) -> None:

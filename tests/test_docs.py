@@ -1,0 +1,78 @@
+"""What the documents say is in the code, and what they show runs."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+SOURCE = ROOT / "src" / "lemniscate"
+
+
+def equation_rows():
+    """(file, line of code) of each row of the table in docs/notes/ppo.md that maps equations to lines."""
+    rows = []
+    for line in (ROOT / "docs" / "notes" / "ppo.md").read_text().splitlines():
+        cells = re.findall(r"`([^`]+)`", line)
+        files = [cell for cell in cells if re.fullmatch(r"\w+/\w+\.py", cell)]
+        if line.startswith("|") and files and cells[-1] != files[0]:
+            rows.append((files[0], cells[-1]))
+    return rows
+
+
+def test_the_table_has_its_equations():
+    assert len(equation_rows()) >= 20
+
+
+@pytest.mark.parametrize(("file", "code"), equation_rows())
+def test_every_line_that_the_notes_quote_is_there(file, code):
+    assert code in (SOURCE / file).read_text()
+
+
+@pytest.mark.parametrize(
+    "page", ["README.md", "CONTRIBUTING.md", *(str(p.relative_to(ROOT)) for p in ROOT.glob("docs/**/*.md"))]
+)
+def test_every_link_leads_somewhere(page):
+    links = re.findall(r"\]\(([^)#]+)\)", (ROOT / page).read_text())
+    for link in links:
+        assert link.startswith("https://") or ((ROOT / page).parent / link).exists(), link
+
+
+def test_the_python_of_the_readme_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    scope = {}
+    exec(code.replace("total_steps=20_000", "total_steps=2_048, progress=False"), scope)
+    assert scope["action"] in (0, 1)
+
+
+def test_every_command_of_the_readme_is_understood():
+    from lemniscate.cli import _parser
+
+    lines = re.findall(r"^lemniscate ([^#\n]+)", (ROOT / "README.md").read_text(), re.MULTILINE)
+    assert len(lines) >= 6
+    for line in lines:
+        _parser().parse_known_args(line.split())
+
+
+def test_every_field_has_its_docstring():
+    from lemniscate.algos import ALGORITHMS
+
+    for module in ALGORITHMS.values():
+        for config in module.Config.__mro__[:-1]:
+            source = (SOURCE / (config.__module__.replace("lemniscate.", "").replace(".", "/") + ".py")).read_text()
+            for name in config.__annotations__:
+                assert re.search(rf'^    {name}: [^\n]+\n    """', source, re.MULTILINE), name
+
+
+def test_algorithm_files_have_the_same_names_in_the_same_order():
+    from lemniscate.algos import ALGORITHMS
+
+    for name, module in ALGORITHMS.items():
+        text = (SOURCE / "algos" / f"{name}.py").read_text()
+        order = [
+            text.index(f"\n{mark}") for mark in ("class Config", "class State", "def init", "def update", "def train")
+        ]
+        assert order == sorted(order)
+        assert 60 <= len(text.splitlines()) <= 240
+        assert module.__doc__
