@@ -77,9 +77,7 @@ def main():
             print(
                 row["preset"], row["seed"], f"{row['mean_return']:.1f}", f"{row['rmse_after_1s_mm']:.2f} mm", flush=True
             )
-    print(
-        "\n| preset | return of 500, mean (worst seed) | error after 1 s | crashes | training | from start to evaluated |"
-    )
+    print("\n| preset | return of 500, mean (worst seed) | error after 1 s | crashes | training | from start |")
     print("|---|---|---|---|---|---|")
     for preset in given.presets:
         of = [row for row in rows if row["preset"] == preset]

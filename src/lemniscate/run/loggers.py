@@ -70,7 +70,9 @@ class WeightsAndBiases:
         import wandb  # pyright: ignore[reportMissingImports]
 
         self._wandb = wandb
-        mode = os.environ.get("WANDB_MODE") or ("online" if self._has_key() else "offline")
+        mode = os.environ.get("WANDB_MODE", "online")
+        if mode == "online" and not os.environ.get("WANDB_API_KEY") and not wandb.login(prompt=False):
+            mode = "offline"
         options = {
             "project": os.environ.get("WANDB_PROJECT", "lemniscate"),
             "name": os.environ.get("WANDB_NAME", path.name),
@@ -85,12 +87,10 @@ class WeightsAndBiases:
             self._run = wandb.init(mode=mode, settings=settings, **options)
         except (wandb.errors.CommError, wandb.errors.AuthenticationError):
             mode = "offline"
-            self._run = wandb.init(mode=mode, settings=settings, **options)
+            wandb.teardown()
+            self._run = wandb.init(mode=mode, settings=settings, **{**options, "resume": None})
         if mode == "offline":
             print(f"W&B records offline; upload later with: wandb sync {path}/wandb/offline-run-*", file=sys.stderr)
-
-    def _has_key(self) -> bool:
-        return bool(os.environ.get("WANDB_API_KEY") or self._wandb.api.api_key)
 
     def write(self, step: int, metrics: Metrics) -> None:
         """Log one row."""
