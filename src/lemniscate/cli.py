@@ -19,7 +19,7 @@ from lemniscate import front
 from lemniscate.algos import ALGORITHMS
 from lemniscate.envs import api
 from lemniscate.errors import NonFiniteError, UserError, unknown
-from lemniscate.presets import BEST, PRESETS
+from lemniscate.presets import BEST, PRESETS, choose
 from lemniscate.report import curves, pictures
 from lemniscate.report.flight import check_film
 from lemniscate.run.config import RunConfig
@@ -50,6 +50,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def train(given: argparse.Namespace, rest: list[str]) -> None:
     """Train a policy; with --report also evaluate it and draw pictures."""
     config = _with_fields(front.config_for(given.algorithm, given.env, given.preset), rest)
+    preset, _ = choose(given.algorithm, config.env, given.preset)
+    served_by = config.backend or api.backend_for(config.env)
+    _say(
+        f"{given.algorithm} on {config.env} ({config.num_envs} copies by {served_by}), preset {preset}, seed {config.seed}"
+    )
     fields = {name: getattr(config, name) for name in config.names() if name != "env"}
     run = front.train(
         given.algorithm,

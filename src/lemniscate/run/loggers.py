@@ -4,6 +4,7 @@ import json
 import os
 import sys
 from collections.abc import Callable, Mapping
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -67,8 +68,7 @@ class WeightsAndBiases:
     """W&B (extra `wandb`). Without a key or a network it records offline, and says how to upload later."""
 
     def __init__(self, path: Path, config: Mapping[str, Any], step: int) -> None:
-        import wandb  # pyright: ignore[reportMissingImports]
-
+        wandb: Any = import_module("wandb")
         self._wandb = wandb
         mode = os.environ.get("WANDB_MODE", "online")
         if mode == "online" and not os.environ.get("WANDB_API_KEY") and not wandb.login(prompt=False):

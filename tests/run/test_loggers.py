@@ -1,0 +1,81 @@
+import json
+import sys
+from types import ModuleType, SimpleNamespace
+
+import pytest
+
+from lemniscate.run.loggers import JsonLines, WeightsAndBiases, read_metrics
+
+
+def test_a_resumed_log_drops_what_it_will_write_again(tmp_path):
+    log = JsonLines(tmp_path, {}, 0)
+    for step in (10, 20, 30):
+        log.write(step, {"x": step / 3})
+    log.close([])
+    log = JsonLines(tmp_path, {}, 20)
+    log.write(30, {"x": 0.5})
+    log.close([])
+    assert read_metrics(tmp_path) == [{"step": 10, "x": 10 / 3}, {"step": 20, "x": 20 / 3}, {"step": 30, "x": 0.5}]
+
+
+def test_a_line_that_a_crash_cut_off_is_left_out(tmp_path):
+    (tmp_path / "metrics.jsonl").write_text(json.dumps({"step": 1}) + '\n{"step": 2, "x"')
+    assert read_metrics(tmp_path) == [{"step": 1}]
+
+
+class FakeWandb(ModuleType):
+    """Enough of W&B to see what it is told."""
+
+    def __init__(self, has_key, reachable):
+        super().__init__("wandb")
+        self.said, self.started = [], []
+        self.errors = SimpleNamespace(CommError=ConnectionError, AuthenticationError=PermissionError)
+        self.has_key, self.reachable = has_key, reachable
+        self.Settings, self.Image = SimpleNamespace, lambda path: f"image of {path}"
+
+    def login(self, prompt):
+        return self.has_key
+
+    def init(self, **options):
+        if options["mode"] == "online" and not self.reachable:
+            raise ConnectionError
+        self.started.append(options)
+        return SimpleNamespace(log=lambda row, step=None: self.said.append((step, row)), finish=lambda: None)
+
+    def teardown(self):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("has_key", "reachable", "mode"), [(True, True, "online"), (True, False, "offline"), (False, True, "offline")]
+)
+def test_wandb_gets_everything_and_works_offline(tmp_path, monkeypatch, capsys, has_key, reachable, mode):
+    fake = FakeWandb(has_key, reachable)
+    monkeypatch.setitem(sys.modules, "wandb", fake)
+    for name, value in {"WANDB_PROJECT": "course", "WANDB_NAME": "first", "WANDB_TAGS": "a,b"}.items():
+        monkeypatch.setenv(name, value)
+    for name in ("WANDB_API_KEY", "WANDB_MODE"):
+        monkeypatch.delenv(name, raising=False)
+    logger = WeightsAndBiases(tmp_path, {"env": "CartPole-v1", "gamma": 0.9}, 0)
+    logger.write(7, {"losses/policy": 0.5})
+    logger.close([tmp_path / "curve.png"])
+    (started,) = fake.started
+    assert started["mode"] == mode
+    assert (started["project"], started["name"]) == ("course", "first")
+    assert started["tags"] == ["CartPole-v1", "a", "b"]
+    assert started["config"] == {"env": "CartPole-v1", "gamma": 0.9}
+    assert fake.said == [(7, {"losses/policy": 0.5}), (None, {"curve": f"image of {tmp_path / 'curve.png'}"})]
+    assert ("upload later with: wandb sync" in capsys.readouterr().err) == (mode == "offline")
+
+
+def test_no_secret_of_the_environment_is_written(tmp_path, monkeypatch):
+    import lemniscate as lem
+    from conftest import tiny_fields
+
+    secret = "canary-0123456789"
+    for name in ("WANDB_API_KEY", "HF_TOKEN", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.setenv(name, secret)
+    run = lem.train("ppo", "Countdown-v0", run=tmp_path / "r", progress=False, **tiny_fields())
+    files = [file for file in run.path.rglob("*") if file.is_file()]
+    assert len(files) > 5
+    assert not any(secret.encode() in file.read_bytes() for file in files)
