@@ -52,9 +52,7 @@ def train(given: argparse.Namespace, rest: list[str]) -> None:
     config = _with_fields(front.config_for(given.algorithm, given.env, given.preset), rest)
     preset, _ = choose(given.algorithm, config.env, given.preset)
     served_by = config.backend or api.backend_for(config.env)
-    _say(
-        f"{given.algorithm} on {config.env} ({config.num_envs} copies by {served_by}), preset {preset}, seed {config.seed}"
-    )
+    _say(f"{given.algorithm} on {config.num_envs} × {config.env} by {served_by}: preset {preset}, seed {config.seed}")
     fields = {name: getattr(config, name) for name in config.names() if name != "env"}
     run = front.train(
         given.algorithm,

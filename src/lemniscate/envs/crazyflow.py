@@ -133,6 +133,11 @@ class Simulator:
         return state, (obs, next_obs, reward, terminated, truncated, ahead)
 
     @property
+    def model(self) -> Any:
+        """The scene with the drone, a MuJoCo model, for rendering."""
+        return self.env.sim.mj_model
+
+    @property
     def episode_steps(self) -> int:
         """The time limit, in control steps."""
         return round(self.env.max_episode_time * self.env.freq)
@@ -140,8 +145,8 @@ class Simulator:
 
 @lru_cache(maxsize=4)
 def simulator(env_id: str, num_envs: int, device: str) -> Simulator:
-    """The compiled program for so many drones, built once a process: training and evaluation share it."""
-    return Simulator(env_id, num_envs, device)
+    """The compiled program for so many drones on cpu or cuda, built once a process: all vectors of a size share it."""
+    return Simulator(env_id, num_envs, "gpu" if device == "cuda" else "cpu")
 
 
 class CrazyflowBackend:
@@ -162,7 +167,7 @@ class CrazyflowBackend:
             raise UserError(
                 "JAX sees no GPU, so crazyflow cannot fly on cuda; it comes with: pip install 'jax[cuda12]'"
             )
-        self._simulator = simulator(env_id, num_envs, "gpu" if device.type == "cuda" else "cpu")
+        self._simulator = simulator(env_id, num_envs, device.type)
         kind = action_kind(self._simulator.env.single_action_space, env_id)
         assert isinstance(kind, Box)
         layout = self._simulator.layout

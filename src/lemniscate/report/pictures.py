@@ -59,16 +59,17 @@ def film_flight(policy: Policy, env: VecEnv, file: Path, seed: int) -> str:
     """Animate one flight into `file`; returns a sentence on how it was drawn."""
     track = flight.record(policy, env, env.num_envs, seed)
     every = 5
-    try:
-        from lemniscate.report import scene
+    from lemniscate.envs.crazyflow import simulator
+    from lemniscate.report import scene
 
-        frames = scene.render(track, env.spec.env_id, env.num_envs, every)
-        how = "rendered by MuJoCo"
-    except RuntimeError:
+    rendered = scene.render(track, simulator(env.spec.env_id, env.num_envs, env.device.type).model, every)
+    if rendered is not None:
+        frames, how = list(rendered), "rendered by MuJoCo"
+    else:
         frames = flight.animate(track, every)
         how = (
             "drawn with matplotlib, since there is no off-screen OpenGL; for a MuJoCo rendering install EGL or OSMesa"
-            " (Debian: libegl1 or libosmesa6) and set MUJOCO_GL=egl or osmesa"
+            " (Debian: libegl1 and libgl1-mesa-dri, or libosmesa6)"
         )
     flight.save_frames(frames, file, 1 / (every * track.time_step))
     return f"{file}: {how}."

@@ -1,13 +1,21 @@
-"""A drone's flight rendered by MuJoCo, off screen."""
+"""A drone's flight rendered by MuJoCo, off screen.
+
+OpenGL is chosen when MuJoCo is imported, and a driver that does not work can take the process with it. So the rendering
+happens in a process of its own: `python -m lemniscate.report.scene FOLDER`.
+"""
 
 # pyright: reportAttributeAccessIssue=false
 
+import os
+import subprocess
+import sys
+import tempfile
 from itertools import pairwise
+from pathlib import Path
 
 import mujoco
 import numpy as np
 
-from lemniscate.envs.crazyflow import simulator
 from lemniscate.report.flight import Flight
 
 SIZE = (360, 600)
@@ -15,35 +23,43 @@ REFERENCE = np.array([0.9, 0.5, 0.1, 0.4], dtype=np.float32)
 TRAIL = np.array([0.2, 0.9, 1.0, 1.0], dtype=np.float32)
 
 
-def render(flight: Flight, env_id: str, num_envs: int, every: int = 4) -> list[np.ndarray]:
-    """Frames of the first flight, one each `every` steps: [H, W, 3] uint8.
+def render(flight: Flight, model: mujoco.MjModel, every: int) -> np.ndarray | None:
+    """Frames of the first flight, one each `every` steps, [F, H, W, 3] uint8; None without an off-screen OpenGL.
 
-    Raises:
-        RuntimeError: there is no off-screen OpenGL (EGL or OSMesa).
+    The OpenGL is that of MUJOCO_GL, or else the first of EGL and OSMesa that works.
     """
-    model = simulator(env_id, num_envs, "cpu").env.sim.mj_model
+    with tempfile.TemporaryDirectory() as folder:
+        mujoco.mj_saveModel(model, f"{folder}/model.mjb")
+        tracks = {name: getattr(flight, name)[:, 0] for name in ("position", "attitude", "reference")}
+        np.savez(f"{folder}/flight.npz", every=every, **tracks)
+        for backend in [os.environ["MUJOCO_GL"]] if "MUJOCO_GL" in os.environ else ["egl", "osmesa"]:
+            command = [sys.executable, "-m", "lemniscate.report.scene", folder]
+            done = subprocess.run(command, env={**os.environ, "MUJOCO_GL": backend}, capture_output=True)
+            if done.returncode == 0:
+                return np.load(f"{folder}/frames.npy")
+    return None
+
+
+def _render_here(folder: Path) -> None:
+    model = mujoco.MjModel.from_binary_path(str(folder / "model.mjb"))
+    flight = np.load(folder / "flight.npz")
+    path, attitude, reference = flight["position"], flight["attitude"], flight["reference"]
     model.vis.global_.offheight, model.vis.global_.offwidth = SIZE
     data = mujoco.MjData(model)
-    try:
-        renderer = mujoco.Renderer(model, *SIZE)
-    except Exception as error:  # each OpenGL backend fails with exceptions of its own
-        raise RuntimeError(f"no off-screen OpenGL: {error}") from error
     camera = mujoco.MjvCamera()
-    camera.lookat[:], camera.azimuth, camera.elevation = (0, 0, 0.95), 90, -8
-    camera.distance = 2.3
-    path, reference = flight.position[:, 0], flight.reference[:, 0]
+    camera.lookat[:], camera.azimuth, camera.elevation, camera.distance = (0, 0, 0.95), 90, -8, 2.3
     frames = []
-    for t in range(0, len(path), every):
-        data.mocap_pos[0] = path[t]
-        data.mocap_quat[0] = np.roll(flight.attitude[t, 0], 1)  # ours xyzw, MuJoCo's wxyz
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_camlight(model, data)
-        renderer.update_scene(data, camera)
-        _line(renderer.scene, reference[::5], REFERENCE, width=3)
-        _line(renderer.scene, path[max(0, t - 100) : t + 1 : 2], TRAIL, width=4)
-        frames.append(renderer.render())
-    renderer.close()
-    return frames
+    with mujoco.Renderer(model, *SIZE) as renderer:
+        for t in range(0, len(path), int(flight["every"])):
+            data.mocap_pos[0] = path[t]
+            data.mocap_quat[0] = np.roll(attitude[t], 1)  # ours xyzw, MuJoCo's wxyz
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_camlight(model, data)
+            renderer.update_scene(data, camera)
+            _line(renderer.scene, reference[::5], REFERENCE, width=3)
+            _line(renderer.scene, path[max(0, t - 100) : t + 1 : 2], TRAIL, width=4)
+            frames.append(renderer.render())
+    np.save(folder / "frames.npy", np.stack(frames))
 
 
 def _line(scene: mujoco.MjvScene, points: np.ndarray, color: np.ndarray, width: float) -> None:
@@ -52,3 +68,7 @@ def _line(scene: mujoco.MjvScene, points: np.ndarray, color: np.ndarray, width: 
         mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_LINE, np.zeros(3), np.zeros(3), np.zeros(9), color)
         mujoco.mjv_connector(geom, mujoco.mjtGeom.mjGEOM_LINE, width, start, end)
         scene.ngeom += 1
+
+
+if __name__ == "__main__":
+    _render_here(Path(sys.argv[1]))
