@@ -23,7 +23,6 @@ from lemniscate.presets import BEST, PRESETS, choose
 from lemniscate.report import curves, pictures
 from lemniscate.report.flight import check_film
 from lemniscate.run.config import RunConfig
-from lemniscate.run.loggers import LOGGERS
 from lemniscate.run.run import Stopped
 
 Command = Callable[[argparse.Namespace, list[str]], None]
@@ -101,7 +100,8 @@ def watch(given: argparse.Namespace, rest: list[str]) -> None:
 def plot(given: argparse.Namespace, rest: list[str]) -> None:
     """Draw the curves of one run, or of several side by side."""
     _nothing_left(rest)
-    _draw(given.runs, front.load(given.runs[0]) if len(given.runs) == 1 else None)
+    trained = len(given.runs) == 1 and any((given.runs[0] / "checkpoints").glob("step-*"))
+    _draw(given.runs, front.load(given.runs[0]) if trained else None)
 
 
 def envs(given: argparse.Namespace, rest: list[str]) -> None:
@@ -188,7 +188,7 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--env", help="environment id; a preset may have one")
     sub.add_argument("--run", type=Path, metavar="DIR", help="run directory; must not exist (default: runs/…)")
     sub.add_argument("--preset", help="; ".join(f"{a}: {', '.join(PRESETS[a])}" for a in ALGORITHMS))
-    sub.add_argument("--track", metavar="LOGGER", help=f"a logger beside the local ones: {', '.join(LOGGERS)}")
+    sub.add_argument("--track", metavar="LOGGER", help="a logger beside the local ones: wandb")
     sub.add_argument("--report", action="store_true", help="evaluate the result and leave pictures")
 
     sub = command(resume)

@@ -14,7 +14,7 @@ from lemniscate.envs import api
 from lemniscate.envs.api import VecEnv
 from lemniscate.envs.spaces import physical_action
 from lemniscate.errors import UserError, is_installed, missing_extra, unknown
-from lemniscate.nn.policies import Policy, policy_and_value
+from lemniscate.nn.policies import Policy
 from lemniscate.report import pictures as pictures_of
 from lemniscate.run import checkpoint
 from lemniscate.run.config import RunConfig
@@ -59,9 +59,12 @@ class TrainedPolicy:
             if missing:
                 raise UserError(f"The observation lacks {', '.join(missing)}; {self.spec.env_id} gives them.")
             parts = [np.asarray(obs[name], dtype=np.float32) for name, _ in self.spec.layout]
-            batched = parts[0].size != self.spec.layout[0][1] or parts[0].ndim > 1
+            batched = parts[0].size != self.spec.layout[0][1] or (parts[0].ndim > 1 and len(parts[0]) == 1)
             rows = len(parts[0]) if batched else 1
             return np.concatenate([part.reshape(rows, -1) for part in parts], axis=-1), batched
+        if self.spec.one_hot_from is not None:
+            index = np.asarray(obs) - self.spec.one_hot_from
+            return np.eye(size, dtype=np.float32)[np.atleast_1d(index)], index.ndim > 0
         flat = np.asarray(obs, dtype=np.float32)
         if flat.size == size and (flat.ndim <= 1 or flat.shape[0] != 1):
             return flat.reshape(1, size), False
@@ -135,6 +138,7 @@ def train(
     config = config_for(algorithm, env, preset, **fields)
     path = Path(run) if run is not None else _fresh_directory(algorithm, config)
     loggers = _loggers(track)
+    set_seeds(config.seed)  # before JAX starts, which reads its flags then
     envs = make_envs(config)  # before the directory: an environment that cannot be made leaves nothing behind
     create_directory(path, algorithm, config)
     return _train(path, algorithm, config, envs, loggers, report or track is not None, progress)
@@ -144,8 +148,11 @@ def resume(run: str | Path, *, track: str | None = None, report: bool = False, p
     """Go on with an interrupted run, from its newest planned checkpoint that is whole, to its end."""
     path = Path(run)
     algorithm, fields = read_config(path)
+    if algorithm not in ALGORITHMS:
+        raise unknown("algorithm", algorithm, ALGORITHMS)
     config = ALGORITHMS[algorithm].Config.from_json(fields)
     loggers = _loggers(track)
+    set_seeds(config.seed)
     return _train(path, algorithm, config, make_envs(config), loggers, report or track is not None, progress)
 
 
@@ -166,8 +173,8 @@ def load(path: str | Path) -> TrainedPolicy:
     record = found.record
     spec = checkpoint.spec_from_json(record["spec"])
     config = ALGORITHMS[record["algorithm"]].Config.from_json(record["config"])
-    policy = _empty_policy(spec, config)
-    policy.load_state_dict(found.module("policy"))
+    policy = ALGORITHMS[record["algorithm"]].init(config, spec, torch.device("cpu")).policy
+    policy.load_state_dict(found.part("policy"))
     return TrainedPolicy(policy, spec, config, found.numbers["step"])
 
 
@@ -192,6 +199,8 @@ def evaluate(
     """
     if episodes < 1:
         raise UserError(f"episodes must be a whole number at least 1, not {episodes}.")
+    if seed < 0:
+        raise UserError(f"seed must be a whole number at least 0, not {seed}.")
     vec = _evaluation_env(env or policy.spec.env_id, policy.config, episodes, "cpu", backend)
     if vec.spec.layout != policy.spec.layout or vec.spec.action != policy.spec.action:
         raise UserError(f"A policy for {policy.spec.env_id} cannot act in {vec.spec.env_id}: its spaces are others.")
@@ -210,7 +219,6 @@ def _train(
     draw: bool,
     progress: bool,
 ) -> TrainedRun:
-    set_seeds(config.seed)
     torch.set_num_threads(config.threads)
     run = Run(path, algorithm, config, envs, loggers=loggers, progress=progress)
     pictures: list[Path] = []
@@ -234,22 +242,16 @@ def _evaluation_env(env_id: str, config: RunConfig, episodes: int, device: str, 
     return api.make(env_id, copies, device=device, backend=backend or config.backend)
 
 
-def _empty_policy(spec: Spec, config: Any) -> Policy:
-    policy, _ = policy_and_value(
-        spec,
-        config.hidden,
-        config.activation,
-        normalize_observations=config.normalize_observations,
-    )
-    return policy
-
-
 def _loggers(track: str | None) -> tuple[str, ...]:
-    if track is not None and track not in LOGGERS:
-        raise unknown("tracker", track, LOGGERS)
-    if track == "wandb" and not is_installed("wandb"):
-        raise missing_extra("wandb", "wandb")
-    return ("jsonl", "tensorboard", *([track] if track else []))
+    always = ("jsonl", "tensorboard")
+    trackers = [name for name in LOGGERS if name not in always]
+    if track is None:
+        return always
+    if track not in trackers:
+        raise unknown("tracker", track, trackers)
+    if not is_installed(track):
+        raise missing_extra(track, track)
+    return (*always, track)
 
 
 def _device(name: str) -> torch.device:

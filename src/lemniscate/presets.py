@@ -40,7 +40,7 @@ PPO = {
             initial_log_std=-0.8,
             threads=2,
             evaluate_episodes=64,
-            checkpoint_every=1_000_000,
+            checkpoint_every=250_000,
         ),
         "random search, some 200 runs, none with the seeds 1 to 5 that it is evaluated on",
         "2026-11",

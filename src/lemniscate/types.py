@@ -37,6 +37,7 @@ class Spec:
 
     `layout` names the parts of the flat observation in their order, with their sizes; their sum is O.
     `time_step` is the control period in seconds, where the environment has one.
+    `one_hot_from` is the smallest value of a Discrete observation, which reaches the policy as a one-hot vector.
     `tracking` is where the tracking error (x, y, z in metres) stands in the observation, as (start, stop).
     """
 
@@ -45,6 +46,7 @@ class Spec:
     action: Box | Discrete
     max_episode_steps: int | None = None
     time_step: float | None = None
+    one_hot_from: int | None = None
     tracking: tuple[int, int] | None = None
 
     @property

@@ -134,7 +134,7 @@ def test_a_nan_is_named_with_environment_and_step(monkeypatch, quantity):
 
     monkeypatch.setattr(toy, "Countdown", Breaks)
     env = countdown("DISABLED", length=10)
-    with pytest.raises(NonFiniteError, match=rf"The {quantity} of environment 1 is nan in the step after step \d+"):
+    with pytest.raises(NonFiniteError, match=rf"The {quantity} of environment 1 is nan in the step after \d+"):
         play(env, 8)
 
 

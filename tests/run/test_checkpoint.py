@@ -15,7 +15,7 @@ from lemniscate.run import checkpoint
 from lemniscate.run.checkpoint import DamagedCheckpointError
 from lemniscate.types import Box, Discrete, Spec
 
-SPEC = Spec("x", (("obs", 3),), Box((-1.0,), (1.0,)), 500, 0.02, (0, 3))
+SPEC = Spec("x", (("obs", 3),), Box((-1.0,), (1.0,)), 500, 0.02, None, (0, 3))
 CPU = torch.device("cpu")
 
 

@@ -117,7 +117,7 @@ def test_a_nan_in_training_stops_it_and_spares_the_checkpoint(tmp_path, monkeypa
             return obs, reward, *rest
 
     monkeypatch.setattr(toy, "Countdown", Breaks)
-    with pytest.raises(lem.NonFiniteError, match="reward of environment 2 is inf in the step after step 1"):
+    with pytest.raises(lem.NonFiniteError, match="reward of environment 2 is inf in the step after 1"):
         train(tmp_path / "r", checkpoint_every=64)
     policy = lem.load(tmp_path / "r")
     assert policy.step == 64

@@ -6,6 +6,7 @@ Departures from the paper, and why: docs/notes/ppo.md.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from torch import Generator, Tensor
@@ -26,7 +27,7 @@ from lemniscate.maths import (
 from lemniscate.nn.descent import descend
 from lemniscate.nn.networks import Activation
 from lemniscate.nn.policies import GaussianPolicy, Policy, Value, policy_and_value
-from lemniscate.run.config import Count, Fraction, NonNegative, Positive, RunConfig
+from lemniscate.run.config import Count, Fraction, NonNegative, Positive, Range, RunConfig
 from lemniscate.run.run import Run
 from lemniscate.run.seeding import generator
 from lemniscate.types import Batch, Rollout, Spec
@@ -70,11 +71,11 @@ class Config(RunConfig):
     """global gradient norm that is clipped to"""
     target_kl: Positive | None = None
     """stop the epochs of an update once the approximate KL has passed this"""
-    hidden: tuple[int, ...] = (64, 64)
+    hidden: tuple[Count, ...] = (64, 64)
     """widths of the hidden layers, the same for policy and value"""
     activation: Activation = "tanh"
     """between the layers"""
-    initial_log_std: float = 0.0
+    initial_log_std: Annotated[float, Range(-10, 5)] = 0.0
     """log σ at the start, in units of half the action range"""
     normalize_observations: bool = True
     """a running normalizer inside the policy"""

@@ -67,6 +67,7 @@ class VecEnv:
         zeros = torch.zeros(self.num_envs, device=self.device)
         self._return, self._length, self._ended = zeros, zeros.clone(), []
         self.obs = self._backend.restart(seed)
+        self._require_finite(observation=self.obs)
         return self.obs
 
     def step(self, action: Tensor) -> Step:
@@ -77,9 +78,7 @@ class VecEnv:
         """
         whole = self._backend.whole
         step = self._backend.step(action)
-        # One NaN or infinity shows in the sum of all, and the sum is cheap.
-        if not torch.isfinite(step.next_obs.sum() + step.obs.sum() + step.reward.sum()):
-            self._name_non_finite(step)
+        self._require_finite(observation=step.next_obs, reward=step.reward)
         self.obs = step.obs
         self.steps += self.num_envs
         self._return = self._return + step.reward * step.valid
@@ -91,14 +90,14 @@ class VecEnv:
             self._return, self._length = self._return * ~done, self._length * ~done
         return step
 
-    def _name_non_finite(self, step: Step) -> None:
-        for name, values in (("observation", step.next_obs), ("reward", step.reward), ("observation", step.obs)):
+    def _require_finite(self, **quantities: Tensor) -> None:
+        for name, values in quantities.items():
+            if torch.isfinite(values.sum()):  # one NaN or infinity shows in the sum of all, and the sum is cheap
+                continue
             bad = torch.nonzero(~torch.isfinite(values))
             if len(bad):
-                value = values[tuple(bad[0])].item()
-                raise NonFiniteError(
-                    f"The {name} of environment {int(bad[0, 0])} is {value} in the step after step {self.steps:,}."
-                )
+                value, copy = values[tuple(bad[0])].item(), int(bad[0, 0])
+                raise NonFiniteError(f"The {name} of environment {copy} is {value} in the step after {self.steps:,}.")
 
     def take_episodes(self) -> Episodes:
         """The whole episodes that ended since the last call."""

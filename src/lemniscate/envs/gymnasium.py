@@ -1,6 +1,8 @@
 """Gymnasium vector environments, in all three autoreset modes."""
 
+import signal
 from functools import partial
+from multiprocessing import parent_process
 from typing import Any
 
 import gymnasium as gym
@@ -40,7 +42,10 @@ class GymnasiumBackend:
     ) -> None:
         self._id, self._workers, self._kwargs = env_id, workers, kwargs
         self.num_envs, self.device = num_envs, device
-        self._envs = self._build()
+        try:
+            self._envs = self._build()
+        except (gym.error.Error, ModuleNotFoundError) as error:
+            raise UserError(f"{env_id} cannot be made: {error}") from error
         self.mode = self._envs.metadata.get("autoreset_mode")
         if not isinstance(self.mode, AutoresetMode):
             raise UserError(f"{env_id} does not say when it resets: its metadata needs an autoreset_mode.")
@@ -52,12 +57,13 @@ class GymnasiumBackend:
             layout=observation_layout(self._space, env_id),
             action=action_kind(self._envs.single_action_space, env_id),
             max_episode_steps=limit,
+            one_hot_from=int(self._space.start) if isinstance(self._space, gym.spaces.Discrete) else None,
         )
 
     def _build(self) -> VectorEnv:
         if gym.spec(self._id).entry_point is None:
             return gym.make_vec(self._id, self.num_envs, **self._kwargs)
-        copies = [partial(gym.make, self._id, **self._kwargs)] * self.num_envs
+        copies = [partial(_make, self._id, **self._kwargs)] * self.num_envs
         if self._workers:
             return AsyncVectorEnv(copies, context="forkserver", autoreset_mode=AutoresetMode.DISABLED)
         return SyncVectorEnv(copies, autoreset_mode=AutoresetMode.DISABLED)
@@ -125,3 +131,10 @@ class GymnasiumBackend:
 
     def _tensor(self, array: np.ndarray) -> Tensor:
         return torch.from_numpy(array).to(self.device)
+
+
+def _make(env_id: str, **kwargs: Any) -> gym.Env:
+    """One environment. In a worker process Ctrl-C is left to the parent, which stops the run in order."""
+    if parent_process() is not None:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    return gym.make(env_id, **kwargs)

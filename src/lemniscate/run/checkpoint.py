@@ -45,8 +45,7 @@ class Checkpoint:
     def restore(self, state: Any) -> None:
         """Put everything back into a State of the same make: modules, optimizers, generators, numbers."""
         for name, value in _parts(state):
-            prefix = f"{name}."
-            mine = {key.removeprefix(prefix): t for key, t in self.tensors.items() if key.startswith(prefix)}
+            mine = self.part(name)
             if isinstance(value, torch.nn.Module):
                 value.load_state_dict(mine)
             elif isinstance(value, torch.optim.Optimizer):
@@ -56,8 +55,8 @@ class Checkpoint:
             else:
                 setattr(state, name, self.numbers[name])
 
-    def module(self, name: str) -> dict[str, Tensor]:
-        """The state_dict of one module of the State."""
+    def part(self, name: str) -> dict[str, Tensor]:
+        """The tensors of one field of the State; of a module, its state_dict."""
         prefix = f"{name}."
         return {key.removeprefix(prefix): t for key, t in self.tensors.items() if key.startswith(prefix)}
 
@@ -65,8 +64,7 @@ class Checkpoint:
 def write(directory: Path, state: Any, step: int, record: dict[str, Any], keep: int) -> Path:
     """Write `directory/step-N` with every field of the dataclass `state`, and delete all but the newest `keep`.
 
-    `record` is any JSON: what a reader needs to know beside the state. A checkpoint of the same step that is whole is
-    left as it is: a run arrives at a step in the same bits or not at all.
+    `record` is any JSON: what a reader needs to know beside the state.
     """
     final = directory / f"step-{step}"
     tensors: dict[str, Tensor] = {}
@@ -122,7 +120,7 @@ def read(path: Path) -> Checkpoint:
     """
     manifest = _parse(path / "manifest.json")
     if manifest.get("format") != FORMAT:
-        raise DamagedCheckpointError(f"{path} has format {manifest.get('format')!r}; this version reads {FORMAT}.")
+        raise UserError(f"{path} has format {manifest.get('format')!r}; this version of lemniscate reads {FORMAT}.")
     contents = {}
     for name in PARTS:
         contents[name] = _bytes(path / name)
@@ -140,14 +138,6 @@ def list_steps(directory: Path) -> list[int]:
     """The steps of the checkpoints in a run's `checkpoints`, ascending."""
     names = (p.name.removeprefix("step-") for p in directory.glob("step-*") if p.is_dir())
     return sorted(int(name) for name in names if name.isdigit())
-
-
-def record_of(path: Path) -> dict[str, Any]:
-    """The record alone of a checkpoint, or {} where it cannot be read."""
-    try:
-        return json.loads((path / PARTS[1]).read_bytes())["record"]
-    except (OSError, ValueError, KeyError, TypeError):
-        return {}
 
 
 def spec_to_json(spec: Spec) -> dict[str, Any]:

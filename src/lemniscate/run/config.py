@@ -18,7 +18,7 @@ class Range:
     above: bool = False
 
     def __contains__(self, x: float) -> bool:
-        return (self.low < x if self.above else self.low <= x) and x <= self.high
+        return math.isfinite(x) and (self.low < x if self.above else self.low <= x) and x <= self.high
 
     def __str__(self) -> str:
         if self.high < math.inf:
@@ -28,6 +28,7 @@ class Range:
 
 Count = Annotated[int, Range(1)]
 Natural = Annotated[int, Range(0)]
+Seed = Annotated[int, Range(0, 2**32 - 1)]
 Fraction = Annotated[float, Range(0, 1)]
 Positive = Annotated[float, Range(0, above=True)]
 NonNegative = Annotated[float, Range(0)]
@@ -43,7 +44,7 @@ class RunConfig:
     """who steps the environments; chosen by the id unless named"""
     num_envs: Count = 8
     """copies of the environment, N"""
-    seed: Natural = 1
+    seed: Seed = 1
     """the one seed; every other is derived from it"""
     total_steps: Count = 1_000_000
     """environment steps of the whole run, summed over the copies"""
@@ -61,11 +62,19 @@ class RunConfig:
     """episodes of each evaluation"""
 
     def __post_init__(self) -> None:
-        for field in dataclasses.fields(self):
-            self._check(field.name, get_type_hints(type(self), include_extras=True)[field.name])
+        hints = get_type_hints(type(self), include_extras=True)
+        for name in self.names():
+            value, hint = getattr(self, name), hints[name]
+            if get_origin(hint) is not tuple:
+                self._check(name, value, hint)
+            elif isinstance(value, (tuple, list)):
+                for item in value:
+                    self._check(name, item, get_args(hint)[0])
+            else:
+                raise UserError(f"{name} must be several numbers, such as (64, 64), not {value!r}.")
 
-    def _check(self, name: str, hint: Any) -> None:
-        value = getattr(self, name)
+    @staticmethod
+    def _check(name: str, value: Any, hint: Any) -> None:
         options = [hint] if get_origin(hint) in (Annotated, Literal) else get_args(hint)
         if value is None and type(None) in options:
             return

@@ -32,7 +32,7 @@ from lemniscate.run.config import RunConfig
 from lemniscate.run.evaluate import evaluate
 from lemniscate.run.loggers import LOGGERS, Logger
 from lemniscate.run.progress import ProgressBar
-from lemniscate.run.seeding import derive
+from lemniscate.run.seeding import derive, globals_undisturbed, seed_globals
 
 TRAINING = 0
 """the stream of seeds that training environments restart from"""
@@ -87,6 +87,8 @@ class Run:
         found = newest_resumable(self.path)
         if found:
             found.restore(state)
+        elif checkpoint.list_steps(self.path / "checkpoints"):
+            print(f"{self.path} has no planned checkpoint to go on from; it begins again at step 0.", file=sys.stderr)
         self._forget_after(state.step)
         config = {"algorithm": self.algorithm, **self.config.to_json()}
         for name in self._logger_names:
@@ -143,19 +145,23 @@ class Run:
 
     def _restart(self, state: AnyState) -> None:
         self._recent = []
-        self.env.restart(derive(self.config.seed, TRAINING, state.step), state.step)
+        seed = derive(self.config.seed, TRAINING, state.step)
+        seed_globals(seed)  # nothing here draws from them, but somebody's environment may
+        self.env.restart(seed, state.step)
 
     def _between(self, state: AnyState, before: int, total_steps: int) -> None:
         every, interval = self.config.evaluate_every, self.config.checkpoint_interval
         if every and state.step // every > before // every:
             self._evaluate(state)
         finished = state.step >= total_steps
-        if finished or state.step // interval > before // interval:
+        planned = finished or state.step // interval > before // interval
+        if planned:
             self._save(state, planned=True)
-            if not finished:
-                self._restart(state)
+        if planned and not finished:
+            self._restart(state)
         if self._stop_signal and not finished:
-            self._save(state, planned=False)
+            if not planned:
+                self._save(state, planned=False)
             last = newest_resumable(self.path)
             message = (
                 f"Stopped at step {state.step:,}; the policy is saved. Go on with: lemniscate resume {self.path}\n"
@@ -165,7 +171,8 @@ class Run:
             raise Stopped(message, self._stop_signal)
 
     def _evaluate(self, state: AnyState) -> None:
-        scores = evaluate(state.policy, self.eval_env, self.config.evaluate_episodes, self.config.seed)
+        with globals_undisturbed():
+            scores = evaluate(state.policy, self.eval_env, self.config.evaluate_episodes, self.config.seed)
         metrics = {"evaluation/return": scores.mean_return, "evaluation/length": sum(scores.lengths) / scores.episodes}
         if scores.rmse_after_1s_mm is not None:
             metrics["evaluation/rmse_after_1s_mm"] = scores.rmse_after_1s_mm
@@ -183,7 +190,9 @@ class Run:
             "spec": checkpoint.spec_to_json(self.spec),
         }
         try:
-            checkpoint.write(self.path / "checkpoints", state, state.step, record, self.config.keep_checkpoints)
+            # An unplanned one is kept beside the planned ones, never in the place of one.
+            keep = self.config.keep_checkpoints + (not planned)
+            checkpoint.write(self.path / "checkpoints", state, state.step, record, keep)
         except OSError as error:  # a full disk costs this checkpoint, not the run, and not the checkpoints before it
             print(f"The checkpoint at step {state.step:,} could not be written: {error}.", file=sys.stderr)
 
@@ -215,12 +224,15 @@ class Run:
 
 def create_directory(path: Path, algorithm: str, config: RunConfig) -> None:
     """Make a run directory and write its `config.json`. Raises `UserError` if there is something already."""
-    if path.exists() and (not path.is_dir() or any(path.iterdir())):
-        raise UserError(f"{path} exists already; go on with it (lemniscate resume {path}) or choose another --run.")
-    path.mkdir(parents=True, exist_ok=True)
     temporary = path / "config.json.tmp"
-    temporary.write_text(json.dumps({"algorithm": algorithm, "config": config.to_json()}, indent=1) + "\n")
-    temporary.replace(path / "config.json")
+    if path.exists() and (not path.is_dir() or set(path.iterdir()) - {temporary}):
+        raise UserError(f"{path} exists already; go on with it (lemniscate resume {path}) or choose another --run.")
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        temporary.write_text(json.dumps({"algorithm": algorithm, "config": config.to_json()}, indent=1) + "\n")
+        temporary.replace(path / "config.json")
+    except OSError as error:
+        raise UserError(f"{path} cannot be made: {error.strerror}.") from error
 
 
 def read_config(path: Path) -> tuple[str, dict[str, Any]]:

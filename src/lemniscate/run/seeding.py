@@ -2,6 +2,8 @@
 
 import os
 import random
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
 import torch
@@ -19,10 +21,7 @@ def set_seeds(seed: int, deterministic: bool = True) -> None:
         deterministic: cuDNN's deterministic kernels without benchmarking, torch's deterministic algorithms (a warning
             where there is none), cuBLAS's fixed workspace.
     """
-    random.seed(seed)
-    np.random.seed(seed)  # noqa: NPY002  (the legacy generator too: other people's environments use it)
-    torch.manual_seed(seed)
-    torch.cuda.manual_seed_all(seed)
+    seed_globals(seed)
     torch.backends.cudnn.deterministic = deterministic
     torch.backends.cudnn.benchmark = False
     torch.use_deterministic_algorithms(deterministic, warn_only=True)
@@ -35,9 +34,29 @@ def set_seeds(seed: int, deterministic: bool = True) -> None:
             os.environ["XLA_FLAGS"] = f"{flags} --xla_gpu_deterministic_ops=true".strip()
 
 
+def seed_globals(seed: int) -> None:
+    """The generators that belong to nobody: Python's, NumPy's old one, torch's on every device."""
+    random.seed(seed)
+    np.random.seed(seed)  # noqa: NPY002  (other people's environments use it)
+    torch.manual_seed(seed)
+    torch.cuda.manual_seed_all(seed)
+
+
+@contextmanager
+def globals_undisturbed() -> Iterator[None]:
+    """Whatever happens inside, Python's, NumPy's and torch's CPU generators go on afterwards as if it had not."""
+    states = random.getstate(), np.random.get_state(), torch.get_rng_state()  # noqa: NPY002
+    try:
+        yield
+    finally:
+        random.setstate(states[0])
+        np.random.set_state(states[1])  # noqa: NPY002
+        torch.set_rng_state(states[2])
+
+
 def derive(seed: int, *path: int) -> int:
-    """A seed in 0 … 2³¹ − 1 for one use, far from those of every other (seed, path): NumPy's SeedSequence."""
-    return int(np.random.SeedSequence((seed, *path)).generate_state(1)[0] >> 1)
+    """A seed in 0 … 2³¹ − 1 for one use, unrelated to that of any other (seed, path): NumPy's SeedSequence."""
+    return int(np.random.SeedSequence(seed, spawn_key=path).generate_state(1)[0] >> 1)
 
 
 def generator(seed: int, device: torch.device, *path: int) -> torch.Generator:
