@@ -76,6 +76,23 @@ def test_loading_gives_the_policy_that_was_trained(pendulum):
     assert lem.load(newest).step <= 256
 
 
+def test_a_policy_acts_on_discrete_observations(tmp_path):
+    run = lem.train("ppo", "FrozenLake-v1", run=tmp_path / "r", progress=False, **tiny_fields("FrozenLake-v1"))
+    env = gym.make("FrozenLake-v1")
+    obs, _ = env.reset(seed=0)
+    env.step(int(run.policy.act(obs)))
+    assert run.policy.act(np.array([0, 5, 15])).shape == (3,)
+
+
+def test_an_environment_whose_package_is_missing_is_said(monkeypatch):
+    def missing(*_, **__):
+        raise gym.error.DependencyNotInstalled("Box2D is not installed, run `pip install swig`")
+
+    monkeypatch.setattr(gym, "make", missing)
+    with pytest.raises(lem.UserError, match="CartPole-v1 cannot be made: Box2D is not installed"):
+        lem.train("ppo", "CartPole-v1")
+
+
 def test_an_observation_of_the_wrong_size_is_named(cartpole):
     with pytest.raises(lem.UserError, match=r"observations of 4 numbers; one of shape \(3,\)"):
         cartpole.policy.act(np.zeros(3))
@@ -90,6 +107,8 @@ def test_evaluate(cartpole):
         lem.evaluate(cartpole.policy, env="Pendulum-v1", episodes=2)
     with pytest.raises(lem.UserError, match="episodes must be"):
         lem.evaluate(cartpole.policy, episodes=0)
+    with pytest.raises(lem.UserError, match="seed must be"):
+        lem.evaluate(cartpole.policy, seed=-1)
 
 
 @pytest.mark.parametrize(

@@ -153,6 +153,11 @@ def test_minibatches_cover_everything_once_an_epoch(rng):
         ({"epochs": 2.5}, "epochs must be a whole number"),
         ({"learning_rate": float("nan")}, "learning_rate must be"),
         ({"activation": "foo"}, "activation must be one of"),
+        ({"hidden": 64}, "hidden must be several numbers"),
+        ({"hidden": (64, 0)}, "hidden must be a whole number at least 1"),
+        ({"learning_rate": float("inf")}, "learning_rate must be"),
+        ({"initial_log_std": float("nan")}, "initial_log_std must be"),
+        ({"seed": 2**32}, "seed must be a whole number from 0 to"),
         ({"device": "tpu"}, "device must be one of"),
     ],
 )

@@ -18,7 +18,9 @@ import lemniscate as lem
 from conftest import tiny_fields
 from lemniscate.envs import toy
 from lemniscate.run import checkpoint
+from lemniscate.run.evaluate import EVALUATION
 from lemniscate.run.loggers import read_metrics
+from lemniscate.run.run import TRAINING
 from lemniscate.run.seeding import derive
 
 LOUD = "import sys, lemniscate.cli; sys.exit(lemniscate.cli.main())"
@@ -70,8 +72,8 @@ def test_training_and_evaluation_are_separate_and_differently_seeded():
     config = lem.config_for("ppo", "CartPole-v1", num_envs=4, evaluate_episodes=4)
     train_env, eval_env = lem.make_envs(config)
     assert train_env is not eval_env
-    a = train_env.restart(derive(config.seed, 0, 0))
-    b = eval_env.restart(derive(config.seed, 1, 0))
+    a = train_env.restart(derive(config.seed, TRAINING, 0))
+    b = eval_env.restart(derive(config.seed, EVALUATION, 0))
     assert not torch.equal(a, b)
     before = train_env.obs.clone()
     eval_env.step(torch.zeros(4, dtype=torch.int64))
@@ -187,6 +189,7 @@ def check_kills(tmp_path, whole, killed, kills):
     path, arguments = tmp_path / "killed", killed
     seed = random.SystemRandom().randrange(10**6)
     rng = random.Random(seed)
+    killed_at = []
     for _ in range(kills):
         process = command(*arguments)
         reached = len(read_metrics(path))
@@ -196,7 +199,9 @@ def check_kills(tmp_path, whole, killed, kills):
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
+            killed_at.append(len(read_metrics(path)))
         arguments = ["resume", path]
+    assert killed_at, "the run was over before the first kill"
     assert command(*arguments).wait() == 0
     assert final_hashes(path) == final_hashes(tmp_path / "whole"), f"kill times from seed {seed}"
     assert history(path) == history(tmp_path / "whole"), f"kill times from seed {seed}"
@@ -227,6 +232,61 @@ def test_stopped_and_resumed_it_ends_in_the_same_bits(tmp_path):
     assert command("resume", path).wait() == 0
     assert final_hashes(path) == final_hashes(whole)
     assert history(path) == history(whole)
+
+
+def test_a_stop_on_a_planned_checkpoint_keeps_it(tmp_path, monkeypatch):
+    """The signal arrives in the update that ends at a planned checkpoint; with one kept, it must be that one."""
+    from lemniscate.algos import ppo
+
+    fields = {"checkpoint_every": 64, "keep_checkpoints": 1}
+    train(tmp_path / "whole", "CartPole-v1", **fields)
+    update = ppo.update
+
+    def stop_at(step):
+        def stopping(config, state, rollout):
+            metrics = update(config, state, rollout)
+            if state.step == step:
+                os.kill(os.getpid(), signal.SIGTERM)
+            return metrics
+
+        return stopping
+
+    for step in (128, 160):
+        path = tmp_path / f"stopped{step}"
+        monkeypatch.setattr(ppo, "update", stop_at(step))
+        with pytest.raises(lem.Stopped, match="at step 128"):
+            train(path, "CartPole-v1", **fields)
+        assert lem.load(path).step == step
+        monkeypatch.setattr(ppo, "update", update)
+        lem.resume(path, progress=False)
+        assert final_hashes(path) == final_hashes(tmp_path / "whole")
+
+
+def test_environments_that_draw_from_global_generators_resume_exactly_too(tmp_path, monkeypatch):
+    class Careless(toy.Matching):
+        def _draw(self, mask):
+            self.secret = np.where(mask, np.random.randint(0, 2, self.num_envs), self.secret)  # noqa: NPY002
+
+    monkeypatch.setattr(toy, "Matching", Careless)
+    fields = {"checkpoint_every": 64, "keep_checkpoints": 10}
+    train(tmp_path / "whole", "Matching-v0", **fields)
+    train(tmp_path / "evaluated", "Matching-v0", evaluate_every=32, **fields)
+    train(tmp_path / "back", "Matching-v0", **fields)
+    for step in checkpoint.list_steps(tmp_path / "back" / "checkpoints")[-2:]:
+        (tmp_path / "back" / "checkpoints" / f"step-{step}" / "manifest.json").unlink()
+    lem.resume(tmp_path / "back", progress=False)
+    assert final_hashes(tmp_path / "back") == final_hashes(tmp_path / "whole")
+    tensors = "tensors.safetensors"
+    assert final_hashes(tmp_path / "evaluated")[tensors] == final_hashes(tmp_path / "whole")[tensors]
+
+
+def test_a_checkpoint_of_a_newer_format_is_refused_and_not_deleted(tmp_path):
+    train(tmp_path / "r")
+    manifest = tmp_path / "r" / "checkpoints" / "step-256" / "manifest.json"
+    manifest.write_text(manifest.read_text().replace('"format": 1', '"format": 2'))
+    with pytest.raises(lem.UserError, match="has format 2; this version of lemniscate reads 1"):
+        lem.resume(tmp_path / "r", progress=False)
+    assert manifest.exists()
 
 
 def test_training_off_the_main_thread_leaves_signals_alone(tmp_path):

@@ -79,7 +79,7 @@ def _finish(axes: Axes, runs: int) -> None:
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(alpha=0.3)
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-    if runs > 1:
+    if runs > 1 and axes.has_data():
         axes.legend(frameon=False)
 
 
