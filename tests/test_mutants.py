@@ -66,8 +66,8 @@ MUTANTS = [
     (
         "the environments go on over a checkpoint",
         "run/run.py",
-        "                self._restart(state)\n        if",
-        "                pass\n        if",
+        "if planned and not finished:",
+        "if False:",
         "run/test_run.py",
     ),
     (
