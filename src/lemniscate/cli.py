@@ -88,11 +88,14 @@ def watch(given: argparse.Namespace, rest: list[str]) -> None:
     if given.video is not None:
         check_film(given.video)
     policy = front.load(given.run)
-    if given.video is None:
-        pictures.show_episode(policy.act, policy.spec, given.seed)
-    elif policy.spec.tracking:
+    if policy.spec.tracking:
         env = front.evaluation_env(policy, policy.config.evaluate_episodes)
-        _say(pictures.film_flight(policy.module, env, given.video, given.seed))
+        if given.video is None:
+            pictures.show_flight(policy.module, env, given.seed)
+        else:
+            _say(pictures.film_flight(policy.module, env, given.video, given.seed))
+    elif given.video is None:
+        pictures.show_episode(policy.act, policy.spec, given.seed)
     else:
         _say(pictures.film_episode(policy.act, policy.spec, given.video, given.seed))
 

@@ -1,5 +1,6 @@
 """Everything a finished run is shown with: numbers in a sentence, plots, an animation."""
 
+import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -7,7 +8,6 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 
-from lemniscate.envs import api
 from lemniscate.envs.api import VecEnv
 from lemniscate.errors import UserError
 from lemniscate.nn.policies import Policy
@@ -75,6 +75,17 @@ def film_flight(policy: Policy, env: VecEnv, file: Path, seed: int) -> str:
     return f"{file}: {how}."
 
 
+def show_flight(policy: Policy, env: VecEnv, seed: int) -> None:
+    """Play one flight in a window."""
+    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise UserError("There is no display for a window; record the flight instead: --video flight.gif")
+    from lemniscate.envs.crazyflow import simulator
+    from lemniscate.report import scene
+
+    track = flight.record(policy, env, env.num_envs, seed)
+    scene.show(track, simulator(env.spec.env_id, env.num_envs, env.device.type).model)
+
+
 def film_episode(act: Act, spec: Spec, file: Path, seed: int) -> str:
     """Record one episode of a Gymnasium environment into `file`."""
     env = _rendered(spec.env_id, "rgb_array")
@@ -92,8 +103,6 @@ def film_episode(act: Act, spec: Spec, file: Path, seed: int) -> str:
 
 def show_episode(act: Act, spec: Spec, seed: int) -> None:
     """Play one episode in a window, at its own speed."""
-    if spec.env_id in api.CRAZYFLOW_IDS:
-        raise UserError("A drone is watched as a film: lemniscate watch RUN --video flight.gif")
     env = _rendered(spec.env_id, "human")
     obs, _ = env.reset(seed=seed)
     over = False

@@ -1,7 +1,7 @@
-"""A drone's flight rendered by MuJoCo, off screen.
+"""A drone's flight in MuJoCo, off screen or in a window.
 
-OpenGL is chosen when MuJoCo is imported, and a driver that does not work can take the process with it. So the rendering
-happens in a process of its own: `python -m lemniscate.report.scene FOLDER`.
+OpenGL is chosen when MuJoCo is imported, and a driver that does not work can take the process with it. So what is
+rendered off screen is rendered in a process of its own: `python -m lemniscate.report.scene FOLDER`.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -10,6 +10,7 @@ import os
 import subprocess
 import sys
 import tempfile
+import time
 from itertools import pairwise
 from pathlib import Path
 
@@ -20,6 +21,8 @@ from lemniscate.report.flight import Flight
 
 SIZE = (360, 600)
 REFERENCE = np.array([0.9, 0.5, 0.1, 0.4], dtype=np.float32)
+CAMERA = ((0, 0, 0.95), 90, -8, 2.3)
+"""where it looks at, azimuth, elevation (degrees), distance (m)"""
 TRAIL = np.array([0.2, 0.9, 1.0, 1.0], dtype=np.float32)
 
 
@@ -40,6 +43,33 @@ def render(flight: Flight, model: mujoco.MjModel, every: int) -> np.ndarray | No
     return None
 
 
+def show(flight: Flight, model: mujoco.MjModel) -> None:
+    """Play the first flight in MuJoCo's window, at its own speed, until it ends or the window is closed."""
+    from mujoco import viewer
+
+    data = mujoco.MjData(model)
+    with viewer.launch_passive(model, data, show_left_ui=False, show_right_ui=False) as window:
+        assert window.user_scn is not None
+        window.cam.lookat[:], window.cam.azimuth = CAMERA[0], CAMERA[1]
+        window.cam.elevation, window.cam.distance = CAMERA[2], CAMERA[3]
+        for t, (position, attitude) in enumerate(zip(flight.position[:, 0], flight.attitude[:, 0], strict=True)):
+            if not window.is_running():
+                return
+            _place(model, data, position, attitude)
+            window.user_scn.ngeom = 0
+            _line(window.user_scn, flight.reference[::5, 0], REFERENCE, width=3)
+            _line(window.user_scn, flight.position[max(0, t - 100) : t + 1 : 2, 0], TRAIL, width=4)
+            window.sync()
+            time.sleep(flight.time_step)
+
+
+def _place(model: mujoco.MjModel, data: mujoco.MjData, position: np.ndarray, attitude: np.ndarray) -> None:
+    data.mocap_pos[0] = position
+    data.mocap_quat[0] = np.roll(attitude, 1)  # ours xyzw, MuJoCo's wxyz
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_camlight(model, data)
+
+
 def _render_here(folder: Path) -> None:
     model = mujoco.MjModel.from_binary_path(str(folder / "model.mjb"))
     flight = np.load(folder / "flight.npz")
@@ -47,14 +77,11 @@ def _render_here(folder: Path) -> None:
     model.vis.global_.offheight, model.vis.global_.offwidth = SIZE
     data = mujoco.MjData(model)
     camera = mujoco.MjvCamera()
-    camera.lookat[:], camera.azimuth, camera.elevation, camera.distance = (0, 0, 0.95), 90, -8, 2.3
+    camera.lookat[:], camera.azimuth, camera.elevation, camera.distance = CAMERA
     frames = []
     with mujoco.Renderer(model, *SIZE) as renderer:
         for t in range(0, len(path), int(flight["every"])):
-            data.mocap_pos[0] = path[t]
-            data.mocap_quat[0] = np.roll(attitude[t], 1)  # ours xyzw, MuJoCo's wxyz
-            mujoco.mj_kinematics(model, data)
-            mujoco.mj_camlight(model, data)
+            _place(model, data, path[t], attitude[t])
             renderer.update_scene(data, camera)
             _line(renderer.scene, reference[::5], REFERENCE, width=3)
             _line(renderer.scene, path[max(0, t - 100) : t + 1 : 2], TRAIL, width=4)
