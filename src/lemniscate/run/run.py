@@ -144,7 +144,6 @@ class Run:
         self._lock.release()
 
     def _restart(self, state: AnyState) -> None:
-        self._recent = []
         seed = derive(self.config.seed, TRAINING, state.step)
         seed_globals(seed)  # nothing here draws from them, but somebody's environment may
         self.env.restart(seed, state.step)
