@@ -156,10 +156,10 @@ def test_two_processes_do_not_share_a_directory(tmp_path):
         lem.resume(tmp_path / "r", progress=False)
 
 
-def command(*arguments, stderr=subprocess.DEVNULL):
+def command(*arguments, stderr=subprocess.DEVNULL, **options):
     environment = {**os.environ, "COLUMNS": "200"}
     return subprocess.Popen(
-        [sys.executable, "-c", LOUD, *map(str, arguments)], stderr=stderr, text=True, env=environment
+        [sys.executable, "-c", LOUD, *map(str, arguments)], stderr=stderr, text=True, env=environment, **options
     )
 
 
@@ -205,6 +205,18 @@ def check_kills(tmp_path, whole, killed, kills):
     assert command(*arguments).wait() == 0
     assert final_hashes(path) == final_hashes(tmp_path / "whole"), f"kill times from seed {seed}"
     assert history(path) == history(tmp_path / "whole"), f"kill times from seed {seed}"
+
+
+def test_ctrl_c_at_a_terminal_reaches_the_workers_too_and_harms_nothing(tmp_path):
+    path = tmp_path / "r"
+    arguments = [*long_run(path, "CartPole-v1", updates=3000), "--backend", "gymnasium-async"]
+    process = command(*arguments, stderr=subprocess.PIPE, start_new_session=True)
+    wait_for(lambda: len(read_metrics(path)) > 5, process)
+    os.killpg(process.pid, signal.SIGINT)
+    said = process.communicate()[1]
+    assert process.returncode == 130
+    assert f"lemniscate resume {path}" in said
+    assert "Traceback" not in said
 
 
 @pytest.mark.parametrize(("signum", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
