@@ -34,7 +34,7 @@ def tiny(env="Countdown-v0", **fields):
         "num_steps": 8,
         "total_steps": 256,
         "epochs": 2,
-        "num_minibatches": 2,
+        "minibatch_size": 16,
         "hidden": (16,),
         "evaluate_episodes": 4,
     }

@@ -10,7 +10,7 @@ from lemniscate.cli import main
 TINY = [
     str(part)
     for name, value in tiny_fields("CartPole-v1").items()
-    if name in {"num_envs", "num_steps", "total_steps", "epochs", "num_minibatches", "evaluate_episodes"}
+    if name in {"num_envs", "num_steps", "total_steps", "epochs", "minibatch_size", "evaluate_episodes"}
     for part in (f"--{name.replace('_', '-')}", value)
 ]
 
@@ -79,7 +79,7 @@ def test_envs_lists_backend_and_preset(capsys):
         (["train", "ppo", "--env", "CartPole-v1", "--gamma", "3"], "gamma must be a number from 0 to 1, not 3.0."),
         (
             ["train", "ppo", "--env", "CartPole-v1", "--num-minibatches", "7"],
-            "num_minibatches must divide num_envs · num_steps",
+            "minibatch_size must divide num_envs · num_steps",
         ),
         (["train", "ppo", "--env", "CartPole-v1", "--activation", "x"], "Expected one of"),
         (["evaluate", "nowhere"], "nowhere is not a run directory"),

@@ -44,16 +44,16 @@ MUTANTS = [
     (
         "reset rows reach the batch",
         "algos/ppo.py",
-        "[rollout.valid]",
-        "[torch.ones_like(rollout.valid)]",
+        "torch.nonzero(rollout.valid.flatten())[:, 0]",
+        "torch.arange(rollout.num_steps)",
         "test_ppo.py",
     ),
     ("the entropy bonus is a penalty", "algos/ppo.py", "- config.entropy_coef", "+ config.entropy_coef", "test_ppo.py"),
     (
         "the normalizer moves before the update",
         "algos/ppo.py",
-        "    batch = advantages(",
-        "    state.policy.observe(rollout.obs[rollout.valid])\n    batch = advantages(",
+        "    played = ",
+        "    state.policy.observe(rollout.obs[rollout.valid])\n    played = ",
         "test_ppo.py",
     ),
     (
@@ -71,12 +71,23 @@ MUTANTS = [
         "run/test_run.py",
     ),
     (
-        "optimizer slots are not restored",
-        "run/checkpoint.py",
-        '{"state": slots,',
-        '{"state": {},',
+        "the optimizer's moments are not restored",
+        "nn/descent.py",
+        'self._square.copy_(state["square"])',
+        "pass",
         "run/test_checkpoint.py",
     ),
+    (
+        "Adam without its bias correction",
+        "nn/descent.py",
+        "/ (1 - self._betas[0]",
+        "/ (1 - 0 * self._betas[0]",
+        "test_descent.py",
+    ),
+    ("the gradient is not clipped", "nn/descent.py", ".clamp(max=1)", ".clamp(min=1, max=1)", "test_descent.py"),
+    ("the gradient is added up", "nn/descent.py", "self._gradient.zero_()", "pass", "test_descent.py"),
+    ("returns run on over the end", "nn/normalizer.py", "self.running * ~done", "self.running * 1", "test_nn.py"),
+    ("the learning rate adapts the wrong way", "algos/ppo.py", "1 / 1.5 if kl > 2", "1 / 1.5 if kl < 2", "test_ppo.py"),
 ]
 
 

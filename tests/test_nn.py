@@ -1,15 +1,13 @@
-import pytest
 import torch
 
 from lemniscate.maths import Categorical, Gaussian
-from lemniscate.nn.descent import descend
 from lemniscate.nn.networks import Tanh, mlp
-from lemniscate.nn.normalizer import RunningNorm
-from lemniscate.nn.policies import policy_and_value
-from lemniscate.types import Box, Discrete, Spec
+from lemniscate.nn.normalizer import RewardScale, RunningNorm
+from lemniscate.nn.policies import ActorCritic
+from lemniscate.types import Box, Discrete, Part, Rollout, Spec
 
-BOX = Spec("x", (("obs", 5),), Box((-1.0, -1.0), (1.0, 1.0)))
-DISCRETE = Spec("x", (("obs", 5),), Discrete(3))
+BOX = Spec("x", (Part((), (5,)),), Box((-1.0, -1.0), (1.0, 1.0)))
+DISCRETE = Spec("x", (Part((), (5,)),), Discrete(3))
 
 
 def test_orthogonal_layers_with_their_gains():
@@ -28,7 +26,8 @@ def test_the_fast_tanh_is_tanh():
 
 
 def test_a_policy_starts_near_the_centre_and_a_value_has_one_number():
-    policy, value = policy_and_value(BOX, initial_log_std=-0.5)
+    networks = ActorCritic(BOX, initial_log_std=-0.5)
+    policy, value = networks.policy, networks.value
     obs = torch.randn(20, 5)
     distribution = policy(obs)
     assert isinstance(distribution, Gaussian)
@@ -36,7 +35,7 @@ def test_a_policy_starts_near_the_centre_and_a_value_has_one_number():
     torch.testing.assert_close(distribution.log_std, torch.full((2,), -0.5))
     assert value(obs).shape == (20,)
     assert value(obs.view(4, 5, 5)).shape == (4, 5)
-    assert isinstance(policy_and_value(DISCRETE)[0](obs), Categorical)
+    assert isinstance(ActorCritic(DISCRETE).policy(obs), Categorical)
 
 
 def test_the_normalizer_standardizes_what_it_has_seen_and_clips():
@@ -61,15 +60,25 @@ def test_looking_through_the_normalizer_never_moves_it():
 
 
 def test_policy_and_value_see_through_one_normalizer():
-    policy, value = policy_and_value(BOX, normalize_observations=True)
-    assert policy.normalizer is value.normalizer
+    networks = ActorCritic(BOX, normalize_observations=True)
+    assert networks.policy.normalizer is networks.value.normalizer
 
 
-@pytest.mark.parametrize("limit", [0.1, 1e6])
-def test_descend_clips_the_global_norm(limit):
-    weight = torch.nn.Parameter(torch.tensor([3.0, 4.0]))
-    optimizer = torch.optim.SGD([weight], lr=1.0)
-    norm = descend(optimizer, [weight], 0.5 * weight.square().sum(), limit)
-    assert norm.item() == pytest.approx(5.0)
-    taken = (torch.tensor([3.0, 4.0]) - weight.detach()).norm().item()
-    assert taken == pytest.approx(min(limit, 5.0), rel=1e-4)
+def test_rewards_are_divided_by_the_std_of_the_discounted_return(rng):
+    reward = torch.randn(3, 40, 2, generator=rng) + 1
+    done, ignored = (torch.rand(3, 40, 2, generator=rng) < share for share in (0.1, 0.05))
+    scale, expected, running = RewardScale(2, gamma=0.9), [], [0.0, 0.0]
+    assert torch.equal(scale(reward[0]), reward[0])
+    for part in range(3):
+        no = torch.zeros(40, 2, dtype=torch.bool)
+        scale.update(Rollout(no, no, reward[part], no, done[part], no, ~ignored[part]))
+        for t in range(40):
+            for n in range(2):
+                running[n] = 0.9 * running[n] + reward[part, t, n].item()
+                if not ignored[part, t, n]:
+                    expected.append(running[n])
+                if done[part, t, n]:
+                    running[n] = 0.0
+    std = torch.tensor(expected, dtype=torch.float64).std(correction=0)
+    torch.testing.assert_close(scale(reward[0]), reward[0] / std.float())
+    assert scale(torch.tensor([1e6, -1e6])).tolist() == [10.0, -10.0]

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+import worlds
 from conftest import tiny
 from lemniscate.algos import ppo
 from lemniscate.data.rollout import collect, minibatches
@@ -36,7 +37,7 @@ def learned_value(mode, spoil=lambda rollout: rollout):
         rollout = collect(env, state.policy, config.num_steps, state.noise)
         ppo.update(config, state, spoil(rollout))
         state.step = 0  # no annealing
-    return state.value(torch.ones(1, 3)).item()
+    return state.networks.value(torch.ones(1, 3)).item()
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -73,6 +74,25 @@ def test_it_learns_to_match(mode):
     assert np.mean(returns[-16:]) > 19
 
 
+@pytest.mark.parametrize("kind", worlds.KINDS)
+def test_it_learns_in_spaces_of_every_kind(kind):
+    knobs = {"minibatch_size": 64, "epochs": 6, "learning_rate": 0.01, "initial_log_std": -2.0}
+    config = tiny(
+        f"Copy-{kind}-v0", num_envs=16, num_steps=16, total_steps=30 * 256, normalize_observations=False, **knobs
+    )
+    torch.manual_seed(1)
+    env = VecEnv(GymnasiumBackend(config.env, 16, CPU))
+    env.restart(0)
+    state = ppo.init(config, env.spec, CPU)
+    means = []
+    for _ in range(30):
+        rollout = collect(env, state.policy, config.num_steps, state.noise)
+        ppo.update(config, state, rollout)
+        means.append(rollout.reward.mean().item())
+        assert rollout.reward.min() > -100  # no action that is masked
+    assert means[-1] > 0.85 > 0.75 > means[0]
+
+
 def one_update(**fields):
     config = tiny("Pendulum-v1", **fields)
     torch.manual_seed(0)
@@ -86,7 +106,7 @@ def one_update(**fields):
 def test_the_first_ratio_is_one():
     config, state, rollout = one_update(normalize_observations=True)
     batch = ppo.advantages(config, state, rollout)
-    _, watched = ppo.loss(config, state, batch)
+    _, watched = ppo.loss(config, state.networks, batch)
     assert watched["approx_kl"].abs() < 1e-6
     assert watched["clip_fraction"] == 0
 
@@ -94,7 +114,7 @@ def test_the_first_ratio_is_one():
 def test_the_loss_is_equation_9():
     config, state, rollout = one_update(entropy_coef=0.1, value_coef=0.7, normalize_advantage=False)
     batch = ppo.advantages(config, state, rollout)
-    total, parts = ppo.loss(config, state, batch)
+    total, parts = ppo.loss(config, state.networks, batch)
     expected = parts["losses/policy"] + 0.7 * parts["losses/value"] - 0.1 * parts["losses/entropy"]
     torch.testing.assert_close(total.detach(), expected)
 
@@ -103,8 +123,8 @@ def test_the_value_clip_is_passed_on():
     config, state, rollout = one_update(clip_value=1e-3)
     batch = ppo.advantages(config, state, rollout)
     shifted = dataclasses.replace(batch, value=batch.value + 1)
-    _, plain = ppo.loss(config.replace(clip_value=None), state, shifted)
-    _, clipped = ppo.loss(config, state, shifted)
+    _, plain = ppo.loss(config.replace(clip_value=None), state.networks, shifted)
+    _, clipped = ppo.loss(config, state.networks, shifted)
     assert plain["losses/value"] != clipped["losses/value"]
 
 
@@ -112,15 +132,45 @@ def test_target_kl_stops_the_epochs():
     many = {"epochs": 30, "learning_rate": 0.05}
     config, state, rollout = one_update(**many)
     ppo.update(config, state, rollout)
-    without = state.optimizer.state_dict()["state"][0]["step"].item()
+    without = state.optimizer.steps
     config, state, rollout = one_update(**many, target_kl=0.01)
     ppo.update(config, state, rollout)
-    assert state.optimizer.state_dict()["state"][0]["step"].item() < without == 60
+    assert state.optimizer.steps < without == 60
 
 
 def test_the_learning_rate_falls_linearly_to_its_fraction():
     config = tiny(learning_rate=1e-3, final_learning_rate=0.2, total_steps=1000)
     assert [ppo.anneal(config, step) for step in (0, 500, 1000)] == pytest.approx([1e-3, 6e-4, 2e-4])
+
+
+def test_the_learning_rate_adapts_to_the_kl():
+    assert ppo.adapt(1e-3, kl=0.05, desired_kl=0.02) == pytest.approx(1e-3 / 1.5)
+    assert ppo.adapt(1e-3, kl=0.03, desired_kl=0.02) == 1e-3
+    assert ppo.adapt(1e-3, kl=0.005, desired_kl=0.02) == pytest.approx(1.5e-3)
+    assert ppo.adapt(9e-3, kl=0.0, desired_kl=0.02) == 1e-2
+    config, state, rollout = one_update(desired_kl=1e-9, epochs=2)
+    ppo.update(config, state, rollout)
+    assert state.learning_rate == pytest.approx(config.learning_rate / 1.5**2)
+
+
+def test_advantages_are_estimated_anew_before_each_epoch(monkeypatch):
+    seen = []
+    original = ppo.advantages
+    monkeypatch.setattr(ppo, "advantages", lambda *given: seen.append(original(*given)) or seen[-1])
+    config, state, rollout = one_update(recompute_advantages=True, epochs=3)
+    ppo.update(config, state, rollout)
+    assert len(seen) == 3
+    assert not torch.equal(seen[0].value, seen[1].value)
+
+
+def test_scaled_rewards_shrink_the_targets():
+    config, state, rollout = one_update(scale_rewards=True)
+    before = ppo.advantages(config, state, rollout)
+    ppo.update(config, state, rollout)
+    std = state.reward_scale.var.sqrt()
+    assert std > 1
+    torch.testing.assert_close(state.reward_scale(rollout.reward), (rollout.reward / std).float())
+    assert ppo.advantages(config, state, rollout).target.abs().mean() < before.target.abs().mean()
 
 
 def test_the_normalizer_moves_in_training_only_and_sees_only_real_rows():
@@ -132,20 +182,27 @@ def test_the_normalizer_moves_in_training_only_and_sees_only_real_rows():
 
 
 def test_minibatches_cover_everything_once_an_epoch(rng):
-    epochs = list(minibatches(24, 4, 3, rng))
-    assert len(epochs) == 3
-    for parts in epochs:
+    first, second = (minibatches(torch.arange(24), 4, 6, rng) for _ in range(2))
+    for parts in (first, second):
         assert [len(part) for part in parts] == [6] * 4
         assert torch.cat(parts).sort().values.tolist() == list(range(24))
-    assert not torch.equal(epochs[0][0], epochs[1][0])
+    assert not torch.equal(first[0], second[0])
+
+
+def test_minibatches_keep_their_size_whatever_was_played(rng):
+    played = torch.tensor([3, 5, 8, 13, 21])
+    few = minibatches(played, 3, 4, rng)
+    assert [len(part) for part in few] == [4] * 3
+    assert set(torch.cat(few).tolist()) == set(played.tolist())
+    many = minibatches(played, 2, 2, rng)
+    assert len(set(torch.cat(many).tolist())) == 4
 
 
 @pytest.mark.parametrize(
     ("fields", "said"),
     [
-        ({"num_minibatches": 3}, "num_minibatches must divide"),
+        ({"minibatch_size": 3}, "minibatch_size must divide"),
         ({"minibatch_size": 5}, "minibatch_size must divide"),
-        ({"num_minibatches": 32}, "normalize_advantage needs"),
         ({"minibatch_size": 1}, "normalize_advantage needs"),
         ({"gamma": 1.5}, "gamma must be a number from 0 to 1, not 1.5"),
         ({"clip": 0.0}, "clip must be a number above 0"),
@@ -167,5 +224,5 @@ def test_a_value_out_of_range_is_named(fields, said):
 
 
 def test_a_config_survives_json():
-    config = tiny(target_kl=0.02, minibatch_size=8)
+    config = tiny(target_kl=0.02, minibatch_size=8, hidden=(8, 8))
     assert ppo.Config.from_json(config.to_json()) == config

@@ -18,7 +18,7 @@ import tyro
 from lemniscate import front
 from lemniscate.algos import ALGORITHMS
 from lemniscate.envs import api
-from lemniscate.errors import NonFiniteError, UserError, unknown
+from lemniscate.errors import NonFiniteError, UserError, WorkerError, unknown
 from lemniscate.presets import BEST, PRESETS, choose
 from lemniscate.report import curves, pictures
 from lemniscate.report.flight import check_film
@@ -37,7 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         given.run_command(given, rest)
     except UserError as error:
         return _say(error, 2)
-    except NonFiniteError as error:
+    except (NonFiniteError, WorkerError) as error:
         return _say(f"{error} Training stopped; the last checkpoint is as it was.", 1)
     except Stopped as stopped:
         return _say(stopped, 128 + stopped.signum)

@@ -17,6 +17,10 @@ class NonFiniteError(ArithmeticError):
     """A NaN or an infinity where training would have learned from it: names quantity, environment and step."""
 
 
+class WorkerError(RuntimeError):
+    """The process of an environment died, or does not answer: names which."""
+
+
 def unknown(kind: str, name: str, known: Iterable[str]) -> UserError:
     """The sentence for a name that is not in a table: the nearest names, or all of them when few."""
     names = sorted(known)

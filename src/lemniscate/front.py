@@ -12,7 +12,7 @@ from lemniscate import presets
 from lemniscate.algos import ALGORITHMS
 from lemniscate.envs import api
 from lemniscate.envs.api import VecEnv
-from lemniscate.envs.spaces import physical_action
+from lemniscate.envs.spaces import flatten_observation, physical_action
 from lemniscate.errors import UserError, is_installed, missing_extra, unknown
 from lemniscate.nn.policies import Policy
 from lemniscate.report import pictures as pictures_of
@@ -23,7 +23,7 @@ from lemniscate.run.evaluate import evaluate as evaluate_module
 from lemniscate.run.loggers import LOGGERS
 from lemniscate.run.run import Run, create_directory, newest, read_config
 from lemniscate.run.seeding import generator, set_seeds
-from lemniscate.types import Spec
+from lemniscate.types import Discrete, Spec
 
 
 class TrainedPolicy:
@@ -35,44 +35,51 @@ class TrainedPolicy:
         self._noise = generator(config.seed, torch.device("cpu"), 4)
 
     @torch.no_grad()
-    def act(self, obs: Any, deterministic: bool = True) -> np.ndarray:
+    def act(self, obs: Any, deterministic: bool = True, action_mask: Any = None) -> np.ndarray:
         """The action at one raw observation, or at each of a batch; ready for `env.step`.
 
         Args:
-            obs: an array, or for a drone the environment's dictionary of arrays, as the environment returns it; or
-                the flat observation [O] or [B, O].
+            obs: as the environment returns it: an array, a number, or a dictionary or tuple of these; or the flat
+                observation [O] or [B, O].
             deterministic: the mode of the distribution; otherwise a sample.
+            action_mask: `info["action_mask"]`, [n] or [B, n], where the environment gives one; all are valid otherwise.
 
         Returns:
-            In the environment's own units: [A] or [B, A] for Box, a scalar array or [B] for Discrete.
+            In the environment's own units and shape, [A] or [B, A] for Box; a scalar array or [B] for Discrete.
         """
         flat, batched = self._flatten(obs)
+        if isinstance(self.spec.action, Discrete) and self.spec.action.masked:
+            mask = np.ones(self.spec.action.n) if action_mask is None else np.asarray(action_mask)
+            mask = np.broadcast_to(mask, (len(flat), self.spec.action.n)).astype(flat.dtype)
+            flat = np.concatenate([flat, mask], axis=-1)
         distribution = self.module(torch.from_numpy(flat))
-        action = distribution.mode() if deterministic else distribution.sample(self._noise)
-        physical = physical_action(action, self.spec.action)
+        if deterministic:
+            action = distribution.mode()
+        else:
+            action = distribution.sample(self.module.noise((len(flat),), self._noise))
+        physical = physical_action(action.numpy(), self.spec.action)
         return physical if batched else physical[0]
 
     def _flatten(self, obs: Any) -> tuple[np.ndarray, bool]:
-        size = self.spec.observation_size
-        if isinstance(obs, dict):
-            missing = [name for name, _ in self.spec.layout if name not in obs]
-            if missing:
-                raise UserError(f"The observation lacks {', '.join(missing)}; {self.spec.env_id} gives them.")
-            parts = [np.asarray(obs[name], dtype=np.float32) for name, _ in self.spec.layout]
-            batched = parts[0].size != self.spec.layout[0][1] or (parts[0].ndim > 1 and len(parts[0]) == 1)
-            rows = len(parts[0]) if batched else 1
-            return np.concatenate([part.reshape(rows, -1) for part in parts], axis=-1), batched
-        if self.spec.one_hot_from is not None:
-            index = np.asarray(obs) - self.spec.one_hot_from
-            return np.eye(size, dtype=np.float32)[np.atleast_1d(index)], index.ndim > 0
-        flat = np.asarray(obs, dtype=np.float32)
-        if flat.size == size and (flat.ndim <= 1 or flat.shape[0] != 1):
-            return flat.reshape(1, size), False
-        if flat.ndim and len(flat) and flat.size == len(flat) * size:
-            return flat.reshape(len(flat), size), True
-        raise UserError(
-            f"{self.spec.env_id} has observations of {size} numbers; one of shape {flat.shape} cannot be acted on."
-        )
+        """([B, O], whether it was a batch)."""
+        size, layout, env_id = self.spec.observation_size, self.spec.layout, self.spec.env_id
+        shape = np.shape(obs) if not isinstance(obs, dict | tuple) else None
+        if shape is not None and shape != layout[0].shape and shape[-1:] == (size,) and len(shape) <= 2:
+            flat = np.asarray(obs, dtype=np.uint8 if self.spec.image else np.float32).reshape(-1, size)
+            return flat, len(shape) == 2
+        try:
+            flat = flatten_observation(layout, obs, image=self.spec.image)
+        except (KeyError, IndexError, TypeError, ValueError) as error:
+            parts = ", ".join(f"{part.name} {part.shape}" for part in layout)
+            raise UserError(f"{env_id} observes {parts}; this observation cannot be read: {error!r}.") from None
+        return flat, self._is_batch(obs)
+
+    def _is_batch(self, obs: Any) -> bool:
+        """Whether the first part of an observation has one dimension more than the environment gives it."""
+        part = self.spec.layout[0]
+        for step in part.path:
+            obs = obs[step]
+        return np.ndim(obs) > len(part.shape)
 
 
 @dataclass(frozen=True)
@@ -173,9 +180,9 @@ def load(path: str | Path) -> TrainedPolicy:
     record = found.record
     spec = checkpoint.spec_from_json(record["spec"])
     config = ALGORITHMS[record["algorithm"]].Config.from_json(record["config"])
-    policy = ALGORITHMS[record["algorithm"]].init(config, spec, torch.device("cpu")).policy
-    policy.load_state_dict(found.part("policy"))
-    return TrainedPolicy(policy, spec, config, found.numbers["step"])
+    state = ALGORITHMS[record["algorithm"]].init(config, spec, torch.device("cpu"))
+    state.networks.load_state_dict(found.part("networks"))
+    return TrainedPolicy(state.policy, spec, config, found.numbers["step"])
 
 
 def evaluate(

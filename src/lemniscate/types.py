@@ -1,5 +1,6 @@
 """The records that flow through the house. Shapes: T time, N environments, B batch, O observation, A action."""
 
+import math
 from dataclasses import dataclass, fields
 from typing import Self
 
@@ -12,10 +13,12 @@ class Box:
     """Continuous actions. A policy acts in [-1, 1]^A; the environment floor maps that onto [low, high].
 
     Where a bound is infinite there is nothing to scale to: that coordinate passes unchanged, clipped to the bounds.
+    `shape` is how the environment wants the A coordinates, if not in a row.
     """
 
     low: tuple[float, ...]
     high: tuple[float, ...]
+    shape: tuple[int, ...] | None = None
 
     @property
     def size(self) -> int:
@@ -25,34 +28,83 @@ class Box:
 
 @dataclass(frozen=True)
 class Discrete:
-    """One of n actions. A policy chooses 0 … n-1; the environment floor adds `start`."""
+    """One of n actions. A policy chooses 0 … n-1; the environment floor adds `start`.
+
+    With `masked`, the environment says at each step which of them are valid, and the observation ends in that mask:
+    n numbers, 1 or 0.
+    """
 
     n: int
     start: int = 0
+    masked: bool = False
+
+
+@dataclass(frozen=True)
+class MultiDiscrete:
+    """One of n_k actions for each of K levers; the environment floor adds `start`."""
+
+    nvec: tuple[int, ...]
+    start: tuple[int, ...]
+    shape: tuple[int, ...] | None = None
+
+
+@dataclass(frozen=True)
+class MultiBinary:
+    """n switches, each on or off."""
+
+    n: int
+    shape: tuple[int, ...] | None = None
+
+
+Action = Box | Discrete | MultiDiscrete | MultiBinary
+
+
+@dataclass(frozen=True)
+class Part:
+    """A piece of the flat observation: where it is in the environment's own, and its shape there.
+
+    `path` leads through Dict keys and Tuple indices; it is empty where the observation is the piece itself. With
+    `nvec`, each number of the piece becomes a one-hot vector, counted from `start`.
+    """
+
+    path: tuple[str | int, ...]
+    shape: tuple[int, ...]
+    nvec: tuple[int, ...] = ()
+    start: tuple[int, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """The path as one word."""
+        return "/".join(map(str, self.path)) or "obs"
+
+    @property
+    def size(self) -> int:
+        """How many numbers it is in the flat observation."""
+        return sum(self.nvec) if self.nvec else math.prod(self.shape)
 
 
 @dataclass(frozen=True)
 class Spec:
     """What a policy has to know of an environment; saved with every checkpoint.
 
-    `layout` names the parts of the flat observation in their order, with their sizes; their sum is O.
+    `layout` names the parts of the flat observation in their order; their sizes sum to O. With `image`, the only part
+    is an image of bytes, height × width × channels, and stays bytes.
     `time_step` is the control period in seconds, where the environment has one.
-    `one_hot_from` is the smallest value of a Discrete observation, which reaches the policy as a one-hot vector.
     `tracking` is where the tracking error (x, y, z in metres) stands in the observation, as (start, stop).
     """
 
     env_id: str
-    layout: tuple[tuple[str, int], ...]
-    action: Box | Discrete
+    layout: tuple[Part, ...]
+    action: Action
     max_episode_steps: int | None = None
     time_step: float | None = None
-    one_hot_from: int | None = None
     tracking: tuple[int, int] | None = None
+    image: bool = False
 
     @property
     def observation_size(self) -> int:
-        """O, the length of the flat observation."""
-        return sum(size for _, size in self.layout)
+        """O, the length of the flat observation, without the action mask."""
+        return sum(part.size for part in self.layout)
 
 
 @dataclass(frozen=True)
@@ -61,6 +113,10 @@ class _Record:
 
     def __getitem__(self, rows: Tensor | slice) -> Self:
         return type(self)(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
+
+    def flatten(self) -> Self:
+        """[T, N, …] to [T · N, …]."""
+        return type(self)(**{f.name: getattr(self, f.name).flatten(0, 1) for f in fields(self)})
 
     @classmethod
     def stack(cls, rows: list[Self]) -> Self:
@@ -109,7 +165,7 @@ class Rollout(_Record):
 
 @dataclass(frozen=True)
 class Batch(_Record):
-    """What an on-policy loss looks at, [B, …]: the rows of a rollout that were really played."""
+    """What an on-policy loss looks at, [B, …]: a rollout with its advantages."""
 
     obs: Tensor
     action: Tensor

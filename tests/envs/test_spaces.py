@@ -3,56 +3,121 @@ import math
 import gymnasium as gym
 import numpy as np
 import pytest
-import torch
+from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lemniscate.envs.spaces import action_kind, flatten_observation, observation_layout, physical_action, scale_action
+from lemniscate.envs.spaces import (
+    action_kind,
+    flatten_observation,
+    is_image,
+    observation_layout,
+    physical_action,
+    scale_action,
+)
 from lemniscate.errors import UserError
 from lemniscate.types import Box, Discrete
 
 
-@given(st.floats(-10, 10), st.floats(0.1, 10), st.floats(-3, 3))
+@given(st.floats(-10, 10, width=32), st.floats(0.125, 10, width=32), st.floats(-3, 3, width=32))
 def test_the_unit_interval_maps_onto_the_bounds(low, span, action):
-    low, high = torch.tensor([low], dtype=torch.float64), torch.tensor([low + span], dtype=torch.float64)
-    at = lambda a: scale_action(torch.tensor([a], dtype=torch.float64), low, high)  # noqa: E731
-    torch.testing.assert_close(at(-1.0), low)
-    torch.testing.assert_close(at(1.0), high)
-    torch.testing.assert_close(at(0.0), (low + high) / 2)
-    assert low - 1e-9 <= at(action) <= high + 1e-9
+    box = Box((low,), (low + span,))
+    at = lambda a: scale_action(np.array([[a]]), box).item()  # noqa: E731
+    assert at(-1.0) == pytest.approx(low, abs=1e-5)
+    assert at(1.0) == pytest.approx(low + span, abs=1e-5)
+    assert at(0.0) == pytest.approx(low + span / 2, abs=1e-5)
+    assert low - 1e-5 <= at(action) <= low + span + 1e-5
     if -1 <= action <= 1:
-        torch.testing.assert_close(at(action), low + (action + 1) / 2 * span)
+        assert at(action) == pytest.approx(low + (action + 1) / 2 * span, abs=1e-5)
 
 
 def test_an_infinite_bound_is_not_scaled_to():
-    low, high = torch.tensor([-math.inf, 0.0, -2.0]), torch.tensor([math.inf, math.inf, 2.0])
-    scaled = scale_action(torch.tensor([5.0, -5.0, 0.5]), low, high)
-    assert scaled.tolist() == [5.0, 0.0, 1.0]
+    box = Box((-math.inf, 0.0, -2.0), (math.inf, math.inf, 2.0))
+    assert scale_action(np.array([[5.0, -5.0, 0.5]]), box).tolist() == [[5.0, 0.0, 1.0]]
 
 
 def test_physical_actions():
-    box = physical_action(torch.tensor([[0.0, 2.0]]), Box((0.0, -4.0), (1.0, 4.0)))
+    box = physical_action(np.array([[0.0, 2.0]]), Box((0.0, -4.0), (1.0, 4.0)))
     assert box.tolist() == [[0.5, 4.0]]
-    assert physical_action(torch.tensor([0, 2]), Discrete(3, start=-1)).tolist() == [-1, 1]
+    assert physical_action(np.array([0, 2]), Discrete(3, start=-1)).tolist() == [-1, 1]
 
 
-def test_a_dict_is_flattened_in_the_order_of_its_layout():
-    space = gym.spaces.Dict({"b": gym.spaces.Box(-1, 1, (2,)), "a": gym.spaces.Box(-1, 1, (1, 2))})
-    obs = {"a": np.array([[[1.0, 2.0]]]), "b": np.array([[3.0, 4.0]])}
+EVERY_ACTION = [
+    spaces.Box(-2, 2, (3,)),
+    spaces.Box(-2, 2, (2, 2)),
+    spaces.Box(np.float32([-1, 0, -np.inf]), np.float32([3, np.inf, np.inf])),
+    spaces.Discrete(4, start=-2),
+    spaces.MultiDiscrete([2, 3], start=[5, -1]),
+    spaces.MultiDiscrete([[2, 3], [4, 2]]),
+    spaces.MultiBinary(4),
+    spaces.MultiBinary([2, 3]),
+]
+
+
+@pytest.mark.parametrize("space", EVERY_ACTION, ids=str)
+def test_what_a_policy_chooses_is_in_the_space(space):
+    kind = action_kind(space, "x")
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        if isinstance(space, spaces.Box):
+            chosen = rng.normal(0, 2, (1, kind.size)).astype(np.float32)
+        elif isinstance(space, spaces.Discrete):
+            chosen = rng.integers(kind.n, size=1)
+        else:
+            chosen = rng.integers(getattr(kind, "nvec", 2), size=(1, getattr(kind, "n", None) or len(kind.nvec)))
+        physical = physical_action(chosen, kind)[0]
+        assert space.contains(physical if isinstance(space, spaces.Discrete) else physical.astype(space.dtype))
+
+
+EVERY_OBSERVATION = [
+    spaces.Box(-1, 1, (2, 3)),
+    spaces.Box(0, 255, (4,), np.uint8),
+    spaces.Box(-5, 5, (), np.int64),
+    spaces.Discrete(3, start=1),
+    spaces.MultiDiscrete([2, 3]),
+    spaces.MultiBinary([2, 2]),
+    spaces.Dict({"b": spaces.Box(-1, 1, (2,)), "a": spaces.Discrete(2)}),
+    spaces.Tuple([spaces.Discrete(2), spaces.Dict({"z": spaces.Box(-1, 1, (1, 2)), "y": spaces.Tuple([spaces.Discrete(3)])})]),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("space", EVERY_OBSERVATION, ids=str)
+def test_observations_are_flattened_as_gymnasium_does(space):
+    """But by the batch, and as float32."""
+    space.seed(0)
     layout = observation_layout(space, "x")
-    flat = flatten_observation(space, obs)
-    expected = np.concatenate([obs[name].reshape(1, -1) for name, _ in layout], axis=1)
-    assert dict(layout) == {"a": 2, "b": 2}
-    assert flat.tolist() == expected.tolist()
+    samples = [space.sample() for _ in range(5)]
+    from gymnasium.vector.utils import batch_space, concatenate, create_empty_array
+
+    batch = concatenate(space, samples, create_empty_array(space, 5))
+    assert batch_space(space, 5).contains(batch)
+    flat = flatten_observation(layout, batch)
+    expected = np.stack([spaces.flatten(space, sample) for sample in samples])
+    assert flat.dtype == np.float32
+    assert flat.shape == (5, sum(part.size for part in layout))
+    np.testing.assert_allclose(flat, expected.astype(np.float32))
+    np.testing.assert_allclose(np.concatenate([flatten_observation(layout, s) for s in samples]), flat)
 
 
-def test_a_discrete_observation_is_one_hot():
-    space = gym.spaces.Discrete(3, start=1)
-    assert flatten_observation(space, np.array([1, 3])).tolist() == [[1, 0, 0], [0, 0, 1]]
+def test_parts_are_named_by_their_path():
+    layout = observation_layout(EVERY_OBSERVATION[-1], "x")
+    assert [(part.name, part.size) for part in layout] == [("0", 2), ("1/y/0", 3), ("1/z", 2)]
+
+
+def test_images_stay_bytes():
+    image = spaces.Box(0, 255, (4, 5, 3), np.uint8)
+    assert is_image(image)
+    assert not is_image(spaces.Box(0, 255, (60,), np.uint8))
+    assert not is_image(spaces.Box(0, 1, (4, 5, 3), np.float32))
+    flat = flatten_observation(observation_layout(image, "x"), image.sample()[None], image=True)
+    assert flat.dtype == np.uint8
+    assert flat.shape == (1, 60)
 
 
 def test_other_spaces_get_a_sentence():
-    with pytest.raises(UserError, match="myenv observes Tuple"):
-        observation_layout(gym.spaces.Tuple([gym.spaces.Discrete(2)]), "myenv")
-    with pytest.raises(UserError, match="myenv takes"):
-        action_kind(gym.spaces.MultiBinary(3), "myenv")
+    with pytest.raises(UserError, match="myenv observes a Sequence, whose size is not fixed"):
+        observation_layout(spaces.Sequence(spaces.Discrete(2)), "myenv")
+    with pytest.raises(UserError, match="what can be acted in is"):
+        action_kind(spaces.Dict({"a": spaces.Discrete(2)}), "myenv")
+    with pytest.raises(UserError, match="a Box of floating-point numbers"):
+        action_kind(gym.spaces.Box(0, 9, (2,), np.int64), "myenv")

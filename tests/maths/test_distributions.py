@@ -1,14 +1,16 @@
 """torch.distributions is the oracle."""
 
+import pytest
 import torch
+from torch import distributions
 
-from lemniscate.maths import Categorical, Gaussian
+from lemniscate.maths import Bernoulli, Categorical, Gaussian, MultiCategorical
 
 
 def test_gaussian(rng):
     mean, log_std = torch.randn(7, 3, generator=rng, dtype=torch.float64), torch.tensor([-1.0, 0.0, 0.7]).double()
-    ours, oracle = Gaussian(mean, log_std), torch.distributions.Normal(mean, log_std.exp())
-    action = ours.sample(rng)
+    ours, oracle = Gaussian(mean, log_std), distributions.Normal(mean, log_std.exp())
+    action = ours.sample(torch.randn(7, 3, generator=rng, dtype=torch.float64))
     torch.testing.assert_close(ours.log_prob(action), oracle.log_prob(action).sum(-1))
     torch.testing.assert_close(ours.entropy().expand(7), oracle.entropy().sum(-1))
     assert ours.mode() is mean
@@ -16,29 +18,57 @@ def test_gaussian(rng):
 
 def test_gaussian_samples_have_its_moments(rng):
     mean, log_std = torch.tensor([1.0, -2.0]), torch.tensor([0.5, -0.5])
-    sample = Gaussian(mean.expand(200_000, 2), log_std).sample(rng)
+    sample = Gaussian(mean.expand(200_000, 2), log_std).sample(torch.randn(200_000, 2, generator=rng))
     torch.testing.assert_close(sample.mean(0), mean, atol=0.02, rtol=0)
     torch.testing.assert_close(sample.std(0), log_std.exp(), atol=0.02, rtol=0)
 
 
 def test_categorical(rng):
     logits = torch.randn(7, 4, generator=rng, dtype=torch.float64) * 3
-    ours, oracle = Categorical(logits), torch.distributions.Categorical(logits=logits)
-    action = ours.sample(rng)
+    ours, oracle = Categorical(logits), distributions.Categorical(logits=logits)
+    action = ours.sample(torch.rand(7, generator=rng))
     torch.testing.assert_close(ours.log_prob(action), oracle.log_prob(action))
     torch.testing.assert_close(ours.entropy(), oracle.entropy())
     assert (ours.mode() == logits.argmax(-1)).all()
 
 
 def test_categorical_samples_have_its_frequencies(rng):
-    logits = torch.tensor([0.0, 1.0, -1.0])
-    sample = Categorical(logits.expand(200_000, 3)).sample(rng)
-    frequency = torch.bincount(sample, minlength=3) / len(sample)
+    logits = torch.tensor([0.0, 1.0, -1e9, -1.0])
+    sample = Categorical(logits.expand(200_000, 4)).sample(torch.rand(200_000, generator=rng))
+    frequency = torch.bincount(sample, minlength=4) / len(sample)
     torch.testing.assert_close(frequency, logits.softmax(-1), atol=0.01, rtol=0)
+    assert frequency[2] == 0
 
 
-def test_the_same_generator_state_draws_the_same_actions():
-    for distribution in (Gaussian(torch.zeros(5, 2), torch.zeros(2)), Categorical(torch.zeros(5, 3))):
-        first = distribution.sample(torch.Generator().manual_seed(3))
-        torch.rand(4)  # the global generator has no part in it
-        assert torch.equal(first, distribution.sample(torch.Generator().manual_seed(3)))
+@pytest.mark.parametrize("masked", range(4))
+def test_the_ends_of_the_noise_never_choose_what_is_impossible(masked):
+    """The smallest and the largest number that `torch.rand` gives."""
+    logits = torch.zeros(2, 4)
+    logits[:, masked] = -1e9
+    ours = Categorical(logits)
+    sample = ours.sample(torch.tensor([0.0, 1 - 2**-24]))
+    assert sample.tolist() == [[0, 1][masked == 0], [3, 2][masked == 3]]
+    assert torch.isfinite(ours.entropy()).all()
+
+
+def test_multi_categorical(rng):
+    logits = [torch.randn(7, n, generator=rng, dtype=torch.float64) for n in (2, 5)]
+    ours = MultiCategorical(tuple(Categorical(part) for part in logits))
+    oracle = [distributions.Categorical(logits=part) for part in logits]
+    action = ours.sample(torch.rand(7, 2, generator=rng))
+    assert action.shape == ours.mode().shape == (7, 2)
+    expected = sum(part.log_prob(column) for part, column in zip(oracle, action.unbind(-1), strict=True))
+    torch.testing.assert_close(ours.log_prob(action), expected)
+    torch.testing.assert_close(ours.entropy(), sum(part.entropy() for part in oracle))
+    assert torch.equal(ours.mode()[:, 1], logits[1].argmax(-1))
+
+
+def test_bernoulli(rng):
+    logits = torch.randn(7, 3, generator=rng, dtype=torch.float64) * 3
+    ours, oracle = Bernoulli(logits), distributions.Bernoulli(logits=logits)
+    action = ours.sample(torch.rand(7, 3, generator=rng))
+    torch.testing.assert_close(ours.log_prob(action), oracle.log_prob(action.double()).sum(-1))
+    torch.testing.assert_close(ours.entropy(), oracle.entropy().sum(-1))
+    assert torch.equal(ours.mode(), (logits > 0).long())
+    many = Bernoulli(logits[0].expand(200_000, 3)).sample(torch.rand(200_000, 3, generator=rng)).double().mean(0)
+    torch.testing.assert_close(many, logits[0].sigmoid(), atol=0.01, rtol=0)

@@ -4,7 +4,7 @@ import torch
 from lemniscate.envs import toy
 from lemniscate.envs.api import VecEnv
 from lemniscate.envs.gymnasium import GymnasiumBackend
-from lemniscate.nn.policies import policy_and_value
+from lemniscate.nn.policies import ActorCritic
 from lemniscate.run.evaluate import evaluate
 
 CPU = torch.device("cpu")
@@ -24,7 +24,7 @@ def test_every_copy_plays_its_own_share(monkeypatch, mode, episodes):
     """Taking the first that end would fill the list with the short ones."""
     monkeypatch.setattr(toy, "Countdown", Uneven)
     env = VecEnv(GymnasiumBackend("Countdown-v0", 4, CPU, mode=mode))
-    policy, _ = policy_and_value(env.spec, (4,))
+    policy = ActorCritic(env.spec, (4,)).policy
     scores = evaluate(policy, env, episodes, seed=0)
     shares = [episodes // 4 + (copy < episodes % 4) for copy in range(4)]
     expected = [copy + 1 for copy in range(4) for _ in range(shares[copy])]
@@ -37,7 +37,7 @@ def test_every_copy_plays_its_own_share(monkeypatch, mode, episodes):
 def test_the_same_seed_gives_the_same_scores_and_another_does_not():
     env = VecEnv(GymnasiumBackend("CartPole-v1", 4, CPU))
     torch.manual_seed(0)
-    policy, _ = policy_and_value(env.spec, (4,))
+    policy = ActorCritic(env.spec, (4,)).policy
     first, again, other = (evaluate(policy, env, 6, seed, deterministic=False) for seed in (1, 1, 2))
     assert first == again
     assert first.returns != other.returns

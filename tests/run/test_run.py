@@ -167,7 +167,7 @@ def long_run(path, env, updates=150):
     """Arguments of a run of some seconds with a checkpoint every eighth update."""
     fields = tiny_fields(env, hidden=(32, 32), total_steps=32 * updates, checkpoint_every=32 * 8, epochs=4)
     flags = ["--run", path]
-    for name in ("num_envs", "num_steps", "total_steps", "epochs", "num_minibatches", "checkpoint_every"):
+    for name in ("num_envs", "num_steps", "total_steps", "epochs", "minibatch_size", "checkpoint_every"):
         flags += [f"--{name.replace('_', '-')}", fields[name]]
     return ["train", "ppo", "--env", env, "--preset", "default", "--hidden", "32", "32", *flags]
 

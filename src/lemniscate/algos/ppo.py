@@ -5,12 +5,12 @@ Departures from the paper, and why: docs/notes/ppo.md.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Annotated
 
 import torch
 from torch import Generator, Tensor
-from torch.optim import Adam
 
 from lemniscate.data.rollout import collect, minibatches
 from lemniscate.errors import UserError
@@ -24,9 +24,10 @@ from lemniscate.maths import (
     standardize,
     value_loss,
 )
-from lemniscate.nn.descent import descend
+from lemniscate.nn.descent import Descent
 from lemniscate.nn.networks import Activation
-from lemniscate.nn.policies import GaussianPolicy, Policy, Value, policy_and_value
+from lemniscate.nn.normalizer import RewardScale
+from lemniscate.nn.policies import ActorCritic, GaussianPolicy, Policy
 from lemniscate.run.config import Count, Fraction, NonNegative, Positive, Range, RunConfig
 from lemniscate.run.run import Run
 from lemniscate.run.seeding import generator
@@ -41,14 +42,14 @@ class Config(RunConfig):
     """steps of each copy between updates, T"""
     epochs: Count = 10
     """passes over a rollout, K"""
-    num_minibatches: Count = 32
-    """equal parts that a rollout is cut into in each epoch"""
-    minibatch_size: Count | None = None
-    """rows of a minibatch; takes the place of num_minibatches"""
+    minibatch_size: Count = 64
+    """rows of each gradient step, M; divides T · N"""
     learning_rate: Positive = 3e-4
     """Adam's step size at the start"""
     final_learning_rate: Fraction = 0.0
     """fraction of learning_rate that it falls to, linearly over the run; 1 keeps it constant"""
+    desired_kl: Positive | None = None
+    """adapt the learning rate, by a factor of 1.5, to updates of about this KL; takes the place of the fall"""
     adam_eps: Positive = 1e-5
     """Adam's ε"""
     adam_beta2: Fraction = 0.999
@@ -71,6 +72,8 @@ class Config(RunConfig):
     """global gradient norm that is clipped to"""
     target_kl: Positive | None = None
     """stop the epochs of an update once the approximate KL has passed this"""
+    recompute_advantages: bool = False
+    """estimate advantages anew before each epoch, with the value network as it is by then"""
     hidden: tuple[Count, ...] = (64, 64)
     """widths of the hidden layers, the same for policy and value"""
     activation: Activation = "tanh"
@@ -79,71 +82,91 @@ class Config(RunConfig):
     """log σ at the start, in units of half the action range"""
     normalize_observations: bool = True
     """a running normalizer inside the policy"""
+    scale_rewards: bool = False
+    """divide rewards by the running standard deviation of the discounted return"""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        name = "num_minibatches" if self.minibatch_size is None else "minibatch_size"
-        rows, cut = self.num_envs * self.num_steps, getattr(self, name)
-        if rows % cut:
-            raise UserError(f"{name} must divide num_envs · num_steps = {rows}, and {cut} does not.")
-        if rows == self.parts and self.normalize_advantage:
+        rows = self.num_envs * self.num_steps
+        if rows % self.minibatch_size:
+            raise UserError(
+                f"minibatch_size must divide num_envs · num_steps = {rows}, and {self.minibatch_size} does not."
+            )
+        if self.minibatch_size == 1 and self.normalize_advantage:
             raise UserError("normalize_advantage needs minibatches of 2 rows or more; these have 1.")
 
     @property
-    def parts(self) -> int:
-        """Minibatches in an epoch."""
-        return self.num_envs * self.num_steps // self.minibatch_size if self.minibatch_size else self.num_minibatches
+    def num_minibatches(self) -> int:
+        """Gradient steps of an epoch."""
+        return self.num_envs * self.num_steps // self.minibatch_size
+
+    @property
+    def gradient_steps(self) -> int:
+        """Of the whole run."""
+        updates = -(-self.total_steps // (self.num_envs * self.num_steps))
+        return updates * self.epochs * self.num_minibatches
 
 
 @dataclass
 class State:
     """Everything a crash may not take from us."""
 
-    policy: Policy
-    value: Value
-    optimizer: Adam
+    networks: ActorCritic
+    optimizer: Descent[ActorCritic]
+    reward_scale: RewardScale
     noise: Generator
     """what actions are drawn with"""
     shuffle: Generator
     """what minibatches are drawn with"""
+    learning_rate: float
+    """α, as it is by now"""
     step: int = 0
     """environment steps taken"""
+
+    @property
+    def policy(self) -> Policy:
+        """π, the part of it that acts."""
+        return self.networks.policy
 
 
 def init(config: Config, spec: Spec, device: torch.device) -> State:
     """Fresh networks, a fresh optimizer, generators from the run's seed."""
-    policy, value = policy_and_value(
+    networks = ActorCritic(
         spec,
         config.hidden,
         config.activation,
         initial_log_std=config.initial_log_std,
         normalize_observations=config.normalize_observations,
-    )
-    policy.to(device)
-    value.to(device)
-    parameters = [*policy.parameters(), *value.parameters()]
+    ).to(device)
     betas = (0.9, config.adam_beta2)
-    optimizer = Adam(parameters, lr=config.learning_rate, betas=betas, eps=config.adam_eps, fused=True)
-    return State(policy, value, optimizer, generator(config.seed, device, 2), generator(config.seed, device, 3))
+    return State(
+        networks,
+        Descent(networks, partial(loss, config), betas=betas, eps=config.adam_eps, max_grad_norm=config.max_grad_norm),
+        RewardScale(config.num_envs, config.gamma).to(device),
+        noise=generator(config.seed, device, 2),
+        shuffle=generator(config.seed, device, 3),
+        learning_rate=config.learning_rate,
+    )
 
 
 @torch.no_grad()
 def advantages(config: Config, state: State, rollout: Rollout) -> Batch:
-    """Row t's log π_old(a|s), V(s), A (eq. 11) and value target; only the rows that were really played."""
-    value, next_value = state.value(rollout.obs), state.value(rollout.next_obs)
-    log_prob = state.policy(rollout.obs).log_prob(rollout.action)
-    ends = rollout.terminated, rollout.done
-    advantage, target = gae(rollout.reward, value, next_value, *ends, gamma=config.gamma, lam=config.gae_lambda)
-    return Batch(rollout.obs, rollout.action, log_prob, value, advantage, target)[rollout.valid]  # [T, N] -> [B]
+    """Row t's log π_old(a|s), V(s), A (eq. 11) and value target."""
+    policy, value_of = state.networks.policy, state.networks.value
+    value, next_value = value_of(rollout.obs), value_of(rollout.next_obs)
+    log_prob = policy(rollout.obs).log_prob(rollout.action)
+    reward, ends = state.reward_scale(rollout.reward), (rollout.terminated, rollout.done)
+    advantage, target = gae(reward, value, next_value, *ends, gamma=config.gamma, lam=config.gae_lambda)
+    return Batch(rollout.obs, rollout.action, log_prob, value, advantage, target).flatten()  # [T, N, …] -> [B, …]
 
 
-def loss(config: Config, state: State, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
+def loss(config: Config, networks: ActorCritic, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
     """The loss of one minibatch, eq. 9 with its sign turned, and what to watch of it."""
-    distribution = state.policy(batch.obs)
+    distribution = networks.policy(batch.obs)
     log_ratio = distribution.log_prob(batch.action) - batch.log_prob  # log r_t(θ), below eq. 6
     advantage = standardize(batch.advantage) if config.normalize_advantage else batch.advantage
     policy_loss = clipped_surrogate(log_ratio, advantage, config.clip)  # −L^CLIP, eq. 7
-    critic_loss = value_loss(state.value(batch.obs), batch.target, batch.value, config.clip_value)  # L^VF, eq. 9
+    critic_loss = value_loss(networks.value(batch.obs), batch.target, batch.value, config.clip_value)  # L^VF, eq. 9
     entropy = distribution.entropy().mean()  # S, eq. 9
     total = policy_loss + config.value_coef * critic_loss - config.entropy_coef * entropy  # −L^CLIP+VF+S, eq. 9
     log_ratio = log_ratio.detach()
@@ -159,32 +182,42 @@ def loss(config: Config, state: State, batch: Batch) -> tuple[Tensor, dict[str, 
 
 def update(config: Config, state: State, rollout: Rollout) -> Mapping[str, Tensor | float]:
     """K epochs of minibatch steps on one rollout (algorithm 1); returns the means of what was watched."""
-    batch = advantages(config, state, rollout)
-    parameters = [*state.policy.parameters(), *state.value.parameters()]
-    learning_rate = anneal(config, state.step)
-    for group in state.optimizer.param_groups:
-        group["lr"] = learning_rate
-    watched: list[dict[str, Tensor]] = []
-    for parts in minibatches(len(batch), config.parts, config.epochs, state.shuffle):
-        for rows in parts:
-            total, metrics = loss(config, state, batch[rows])
-            norm = descend(state.optimizer, parameters, total, config.max_grad_norm)
-            watched.append({**metrics, "gradient_norm": norm})
-        if config.target_kl is not None and watched[-1]["approx_kl"] > config.target_kl:
+    if config.desired_kl is None:
+        state.learning_rate = anneal(config, state.step)
+    if config.scale_rewards:
+        state.reward_scale.update(rollout)
+    batch = collected = advantages(config, state, rollout)
+    played = torch.nonzero(rollout.valid.flatten())[:, 0]  # without the rows in which no action was taken
+    watched: list[Mapping[str, Tensor]] = []
+    for epoch in range(config.epochs):
+        if config.recompute_advantages and epoch > 0:
+            batch = replace(advantages(config, state, rollout), log_prob=collected.log_prob)
+        parts = minibatches(played, config.num_minibatches, config.minibatch_size, state.shuffle)
+        watched += [state.optimizer(batch, rows, state.learning_rate) for rows in parts]
+        kl = torch.stack([row["approx_kl"] for row in watched[-len(parts) :]]).mean()
+        if config.desired_kl is not None:
+            state.learning_rate = adapt(state.learning_rate, kl.item(), config.desired_kl)
+        if config.target_kl is not None and kl > config.target_kl:
             break
-    state.policy.observe(batch.obs)  # afterwards: old and new probabilities are taken through the same normalizer
+    state.policy.observe(rollout.obs[rollout.valid])  # afterwards: both probabilities are taken through one normalizer
     state.step += rollout.num_steps
     means = {name: torch.stack([row[name] for row in watched]).mean() for name in watched[0]}
     if isinstance(state.policy, GaussianPolicy):
         means["policy_std"] = state.policy.log_std.detach().exp().mean()
-    explained = explained_variance(batch.value, batch.target)
-    return {**means, "explained_variance": explained, "learning_rate": learning_rate}
+    explained = explained_variance(collected.value[played], collected.target[played])
+    return {**means, "explained_variance": explained, "learning_rate": state.learning_rate}
 
 
 def anneal(config: Config, step: int) -> float:
     """The learning rate at `step`: linear from learning_rate to its final fraction."""
     progress = min(1.0, step / config.total_steps)
     return config.learning_rate * (1 - (1 - config.final_learning_rate) * progress)
+
+
+def adapt(learning_rate: float, kl: float, desired_kl: float) -> float:
+    """A smaller learning rate after an epoch that went twice too far, a larger one after one that went half as far."""
+    factor = 1 / 1.5 if kl > 2 * desired_kl else 1.5 if kl < desired_kl / 2 else 1.0
+    return min(max(learning_rate * factor, 1e-6), 1e-2)
 
 
 def train(config: Config, run: Run) -> State:

@@ -1,7 +1,5 @@
 """Collecting rollouts and cutting them into minibatches."""
 
-from collections.abc import Iterator
-
 import torch
 from torch import Generator, Tensor
 
@@ -14,17 +12,20 @@ from lemniscate.types import Rollout
 def collect(env: VecEnv, policy: Policy, num_steps: int, generator: Generator) -> Rollout:
     """Act `num_steps` times in every environment, from where it stands. Returns a rollout [T, N, …]."""
     rows = []
-    for _ in range(num_steps):
+    for noise in policy.noise((num_steps, env.num_envs), generator):
         obs = env.obs
-        action = policy(obs).sample(generator)
+        action = policy.act(obs, noise)
         step = env.step(action)
         rows.append(Rollout(obs, action, step.reward, step.next_obs, step.terminated, step.truncated, step.valid))
     return Rollout.stack(rows)
 
 
-def minibatches(size: int, count: int, epochs: int, generator: Generator) -> Iterator[list[Tensor]]:
-    """For each epoch, a new permutation of 0 … size-1 in `count` equal parts; a remainder sits this epoch out."""
-    part = size // count
-    for _ in range(epochs):
-        rows = torch.randperm(size, generator=generator, device=generator.device)
-        yield list(rows[: part * count].split(part))
+def minibatches(rows: Tensor, count: int, size: int, generator: Generator) -> list[Tensor]:
+    """`rows` in a new random order, cut into `count` parts of `size`.
+
+    Every part has the same size, whatever was played, so that one compiled program serves all: rows beyond
+    `count · size` sit this epoch out, and where rows are missing the first ones are taken again.
+    """
+    order = rows[torch.randperm(len(rows), generator=generator, device=generator.device)]
+    again = -(-count * size // len(rows))
+    return list(order.repeat(again)[: count * size].split(size))

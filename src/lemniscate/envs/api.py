@@ -4,6 +4,7 @@ A backend is one file with a class that has `spec`, `num_envs`, `device`, `resta
 `BACKENDS`. `VecEnv` wraps any of them and is what the floors above see.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
@@ -12,7 +13,7 @@ import gymnasium as gym
 import torch
 from torch import Tensor
 
-from lemniscate.errors import NonFiniteError, UserError, unknown
+from lemniscate.errors import NonFiniteError, UserError, is_installed, missing_extra, unknown
 from lemniscate.types import Spec, Step
 
 
@@ -92,7 +93,7 @@ class VecEnv:
 
     def _require_finite(self, **quantities: Tensor) -> None:
         for name, values in quantities.items():
-            if torch.isfinite(values.sum()):  # one NaN or infinity shows in the sum of all, and the sum is cheap
+            if math.isfinite(values.sum().item()):  # one NaN or infinity shows in the sum of all, and the sum is cheap
                 continue
             bad = torch.nonzero(~torch.isfinite(values))
             if len(bad):
@@ -124,6 +125,14 @@ def _gymnasium_async(env_id: str, num_envs: int, device: torch.device, stagger: 
     return GymnasiumBackend(env_id, num_envs, device, stagger=stagger, workers=True)
 
 
+def _envpool(env_id: str, num_envs: int, device: torch.device, stagger: bool) -> Backend:
+    if not is_installed("envpool"):
+        raise missing_extra("envpool", "envpool")
+    from lemniscate.envs.envpool import EnvpoolBackend
+
+    return EnvpoolBackend(env_id, num_envs, device, stagger=stagger)
+
+
 def _crazyflow(env_id: str, num_envs: int, device: torch.device, stagger: bool) -> Backend:
     from lemniscate.envs.crazyflow import CrazyflowBackend
 
@@ -133,6 +142,7 @@ def _crazyflow(env_id: str, num_envs: int, device: torch.device, stagger: bool) 
 BACKENDS: dict[str, Callable[[str, int, torch.device, bool], Backend]] = {
     "gymnasium": _gymnasium,
     "gymnasium-async": _gymnasium_async,
+    "envpool": _envpool,
     "crazyflow": _crazyflow,
 }
 
@@ -142,6 +152,17 @@ CRAZYFLOW_IDS = (
     "DroneReachPos-v0",
     "DroneReachVel-v0",
 )
+
+ENVPOOL_IDS = (
+    "Ant-v5",
+    "CartPole-v1",
+    "HalfCheetah-v5",
+    "Hopper-v5",
+    "Humanoid-v5",
+    "LunarLander-v3",
+    "Walker2d-v5",
+)
+"""those that behave in EnvPool as in Gymnasium: tests/envs/test_envpool.py compares them"""
 
 
 def known_ids() -> list[str]:
@@ -155,7 +176,9 @@ def backend_for(env_id: str) -> str:
     """The backend that serves `env_id`. Raises `UserError` with the nearest names if there is none."""
     if env_id not in known_ids():
         raise unknown("environment", env_id, known_ids())
-    return "crazyflow" if env_id in CRAZYFLOW_IDS else "gymnasium"
+    if env_id in CRAZYFLOW_IDS:
+        return "crazyflow"
+    return "envpool" if env_id in ENVPOOL_IDS and is_installed("envpool") else "gymnasium"
 
 
 def make(

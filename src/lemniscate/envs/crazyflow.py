@@ -23,7 +23,7 @@ from torch import Tensor
 
 from lemniscate.envs.spaces import action_kind
 from lemniscate.errors import UserError, missing_extra
-from lemniscate.types import Box, Spec, Step
+from lemniscate.types import Box, Part, Spec, Step
 
 os.environ.setdefault("SCIPY_ARRAY_API", "1")  # crazyflow insists, and before SciPy is first imported
 try:
@@ -89,7 +89,7 @@ class Simulator:
         """The observation in its documented order: the drone's state first, then the task's own parts."""
         parts = self.env.obs()
         names = (*STATE_PARTS, *(name for name in parts if name not in STATE_PARTS))
-        self.layout = tuple((name, parts[name].shape[-1]) for name in names)
+        self.layout = tuple(Part((name,), (parts[name].shape[-1],)) for name in names)
         return jnp.concatenate([parts[name] for name in names], axis=-1)
 
     def _restart(self, seed: jax.Array, stagger: jax.Array) -> tuple[State, jax.Array, jax.Array]:
@@ -171,14 +171,14 @@ class CrazyflowBackend:
         kind = action_kind(self._simulator.env.single_action_space, env_id)
         assert isinstance(kind, Box)
         layout = self._simulator.layout
-        start = sum(size for _, size in layout[: len(STATE_PARTS)])
+        start = sum(part.size for part in layout[: len(STATE_PARTS)])
         self.spec = Spec(
             env_id=env_id,
             layout=layout,
             action=kind,
             max_episode_steps=self._simulator.episode_steps,
             time_step=1 / CONTROL_HZ,
-            tracking=(start, start + 3) if "local_samples" in dict(layout) else None,
+            tracking=(start, start + 3) if any(part.name == "local_samples" for part in layout) else None,
         )
         self._stagger = jax.device_put(np.bool_(stagger), self._simulator.env.device)
         self._valid = torch.ones(num_envs, dtype=torch.bool, device=device)

@@ -1,6 +1,7 @@
 """Gymnasium vector environments, in all three autoreset modes."""
 
 import signal
+from dataclasses import replace
 from functools import partial
 from multiprocessing import parent_process
 from typing import Any
@@ -8,12 +9,14 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from torch import Tensor
 
-from lemniscate.envs.spaces import action_kind, flatten_observation, observation_layout, physical_action
+from lemniscate.envs.spaces import action_kind, flatten_observation, is_image, observation_layout, physical_action
+from lemniscate.envs.stagger import Cuts
+from lemniscate.envs.workers import WatchedVectorEnv
 from lemniscate.errors import UserError
-from lemniscate.types import Spec, Step
+from lemniscate.types import Discrete, Spec, Step
 
 
 class GymnasiumBackend:
@@ -26,8 +29,7 @@ class GymnasiumBackend:
     - SAME_STEP: the returned observation is of the next episode; the true final one is in `info["final_obs"]`.
     - NEXT_STEP: the returned observation is the true final one; the next action is ignored (`valid` False).
 
-    With `stagger`, the first episode of each copy is cut after a random number of steps, uniform up to the time
-    limit, where the environment can be reset at will (DISABLED) and has a limit. A cut counts as a truncation.
+    With `stagger`, first episodes are cut (see `Cuts`) where the environment can be reset at will (DISABLED).
     """
 
     def __init__(
@@ -49,23 +51,26 @@ class GymnasiumBackend:
         self.mode = self._envs.metadata.get("autoreset_mode")
         if not isinstance(self.mode, AutoresetMode):
             raise UserError(f"{env_id} does not say when it resets: its metadata needs an autoreset_mode.")
-        self._space = self._envs.single_observation_space
+        space = self._envs.single_observation_space
+        layout, action = observation_layout(space, env_id), action_kind(self._envs.single_action_space, env_id)
+        if isinstance(action, Discrete) and "action_mask" in self._envs.reset(seed=0)[1]:
+            action = replace(action, masked=True)
         limit = gym.spec(env_id).max_episode_steps
-        self._stagger = stagger and self.mode is AutoresetMode.DISABLED and limit is not None
+        self._stagger_up_to = limit if stagger and self.mode is AutoresetMode.DISABLED else None
         self.spec = Spec(
             env_id=env_id,
-            layout=observation_layout(self._space, env_id),
-            action=action_kind(self._envs.single_action_space, env_id),
+            layout=layout,
+            action=action,
             max_episode_steps=limit,
-            one_hot_from=int(self._space.start) if isinstance(self._space, gym.spaces.Discrete) else None,
+            image=is_image(space),
         )
 
     def _build(self) -> VectorEnv:
         if gym.spec(self._id).entry_point is None:
             return gym.make_vec(self._id, self.num_envs, **self._kwargs)
-        copies = [partial(_make, self._id, **self._kwargs)] * self.num_envs
+        copies = [partial(_make, gym.spec(self._id), **self._kwargs)] * self.num_envs
         if self._workers:
-            return AsyncVectorEnv(copies, context="forkserver", autoreset_mode=AutoresetMode.DISABLED)
+            return WatchedVectorEnv(copies, context="forkserver", autoreset_mode=AutoresetMode.DISABLED)
         return SyncVectorEnv(copies, autoreset_mode=AutoresetMode.DISABLED)
 
     def restart(self, seed: int) -> Tensor:
@@ -73,18 +78,17 @@ class GymnasiumBackend:
         self._envs.close()
         self._envs = self._build()
         self._resetting = np.zeros(self.num_envs, dtype=bool)
-        self._steps_to_cut = np.full(self.num_envs, -1)
-        self.whole = torch.full((self.num_envs,), not self._stagger, device=self.device)
-        if self._stagger:
-            rng = np.random.default_rng(seed)
-            self._steps_to_cut = rng.integers(1, self.spec.max_episode_steps, self.num_envs, endpoint=True)
-        obs, _ = self._envs.reset(seed=seed)
-        return self._tensor(flatten_observation(self._space, obs))
+        self._cuts = Cuts(self.num_envs, self._stagger_up_to, seed)
+        self.whole = self._tensor(self._cuts.whole)
+        if isinstance(self.spec.action, Discrete):
+            self._mask = np.ones((self.num_envs, self.spec.action.n), dtype=bool)
+        return self._tensor(self._seen(*self._envs.reset(seed=seed)))
 
     def step(self, action: Tensor) -> Step:
         """Step, then find the true successor of each row and where to act next, as the mode demands."""
-        raw, reward, terminated, truncated, info = self._envs.step(physical_action(action, self.spec.action))
-        obs = next_obs = flatten_observation(self._space, raw)
+        physical = physical_action(action.cpu().numpy(), self.spec.action)
+        raw, reward, terminated, truncated, info = self._envs.step(physical)
+        obs = next_obs = self._seen(raw, info)
         valid = np.ones(self.num_envs, dtype=bool)
         done = terminated | truncated
         if self.mode is AutoresetMode.NEXT_STEP:
@@ -92,14 +96,11 @@ class GymnasiumBackend:
         elif self.mode is AutoresetMode.SAME_STEP:
             next_obs = self._with_final(obs, info, done)
         else:
-            self._steps_to_cut -= 1
-            truncated = truncated | ((self._steps_to_cut == 0) & ~terminated)
+            truncated = self._cuts.apply(terminated, truncated)
             done = terminated | truncated
             if done.any():
-                self._steps_to_cut[done] = -1
-                raw, _ = self._envs.reset(options={"reset_mask": done.copy()})
-                obs = flatten_observation(self._space, raw)
-        self.whole = self.whole | self._tensor(done)
+                obs = self._seen(*self._envs.reset(options={"reset_mask": done.copy()}))
+        self.whole = self._tensor(self._cuts.whole)
         return Step(
             obs=self._tensor(obs),
             next_obs=self._tensor(next_obs),
@@ -121,20 +122,36 @@ class GymnasiumBackend:
                 f"{self._id} resets in the same step and hides the final observation (no info['final_obs']), so its"
                 " time-outs cannot be learned from; make it NEXT_STEP, DISABLED, or give final_obs."
             )
-        final, next_obs = info["final_obs"], obs.copy()
-        rows = np.flatnonzero(done)
-        if isinstance(final, dict):
-            next_obs[rows] = flatten_observation(self._space, {name: part[rows] for name, part in final.items()})
-        else:
-            next_obs[rows] = flatten_observation(self._space, np.stack([final[row] for row in rows]))
+        next_obs, size = obs.copy(), self.spec.observation_size
+        for row in np.flatnonzero(done):
+            final = _row(info["final_obs"], int(row))
+            next_obs[row, :size] = flatten_observation(self.spec.layout, final, image=self.spec.image)
         return next_obs
+
+    def _seen(self, raw: Any, info: dict) -> np.ndarray:
+        """The flat observation; after it the action mask, where there is one."""
+        flat = flatten_observation(self.spec.layout, raw, image=self.spec.image)
+        if not (isinstance(self.spec.action, Discrete) and self.spec.action.masked):
+            return flat
+        if "action_mask" in info:
+            told = info.get("_action_mask", np.ones(self.num_envs, dtype=bool))
+            self._mask = np.where(told[:, None], info["action_mask"], self._mask)
+        return np.concatenate([flat, self._mask.astype(flat.dtype)], axis=-1)
 
     def _tensor(self, array: np.ndarray) -> Tensor:
         return torch.from_numpy(array).to(self.device)
 
 
-def _make(env_id: str, **kwargs: Any) -> gym.Env:
-    """One environment. In a worker process Ctrl-C is left to the parent, which stops the run in order."""
+def _row(batch: Any, row: int) -> Any:
+    """One observation out of a batch of them, which may be a dictionary or an array of objects."""
+    return {name: _row(part, row) for name, part in batch.items()} if isinstance(batch, dict) else batch[row]
+
+
+def _make(spec: gym.envs.registration.EnvSpec, **kwargs: Any) -> gym.Env:
+    """One environment, from its spec: a worker process may not know the id.
+
+    There, Ctrl-C is left to the parent, which stops the run in order.
+    """
     if parent_process() is not None:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-    return gym.make(env_id, **kwargs)
+    return gym.make(spec, **kwargs)

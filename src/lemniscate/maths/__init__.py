@@ -1,6 +1,6 @@
 """What can be wrong, once: pure functions on tensors, each with its equation and its oracle in `tests/maths`."""
 
-from lemniscate.maths.distributions import Categorical, Distribution, Gaussian
+from lemniscate.maths.distributions import Bernoulli, Categorical, Distribution, Gaussian, MultiCategorical
 from lemniscate.maths.losses import clipped_surrogate, value_loss
 from lemniscate.maths.returns import gae
 from lemniscate.maths.stats import (
@@ -13,9 +13,11 @@ from lemniscate.maths.stats import (
 )
 
 __all__ = [
+    "Bernoulli",
     "Categorical",
     "Distribution",
     "Gaussian",
+    "MultiCategorical",
     "clip_fraction",
     "clipped_surrogate",
     "explained_variance",

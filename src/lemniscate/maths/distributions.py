@@ -1,11 +1,12 @@
-"""What a policy returns: distributions over actions, with sampling from a named generator."""
+"""What a policy returns: distributions over actions. The noise to sample with is drawn outside and passed in."""
 
 import math
 from dataclasses import dataclass
 from typing import Protocol
 
 import torch
-from torch import Generator, Tensor
+from torch import Tensor
+from torch.nn.functional import binary_cross_entropy_with_logits, logsigmoid
 
 LOG_2PI = math.log(2 * math.pi)
 
@@ -13,8 +14,8 @@ LOG_2PI = math.log(2 * math.pi)
 class Distribution(Protocol):
     """A distribution over actions for each of B observations."""
 
-    def sample(self, generator: Generator) -> Tensor:
-        """One action each, drawn with `generator`."""
+    def sample(self, noise: Tensor) -> Tensor:
+        """One action each, a function of `noise`."""
         ...
 
     def mode(self) -> Tensor:
@@ -37,9 +38,8 @@ class Gaussian:
     mean: Tensor
     log_std: Tensor
 
-    def sample(self, generator: Generator) -> Tensor:
-        """[B, A]."""
-        noise = torch.randn(self.mean.shape, generator=generator, device=self.mean.device, dtype=self.mean.dtype)
+    def sample(self, noise: Tensor) -> Tensor:
+        """[B, A], from standard normal noise [B, A]."""
         return self.mean + self.log_std.exp() * noise
 
     def mode(self) -> Tensor:
@@ -62,9 +62,10 @@ class Categorical:
 
     logits: Tensor
 
-    def sample(self, generator: Generator) -> Tensor:
-        """[B] int64."""
-        return torch.multinomial(self.logits.softmax(-1), 1, generator=generator).squeeze(-1)
+    def sample(self, noise: Tensor) -> Tensor:
+        """[B] int64, from noise [B] uniform in [0, 1): the first action at which Σ π exceeds it."""
+        cumulative = self.logits.softmax(-1).cumsum(-1)
+        return (cumulative <= noise.unsqueeze(-1) * cumulative[..., -1:]).sum(-1)
 
     def mode(self) -> Tensor:
         """[B] int64."""
@@ -78,3 +79,53 @@ class Categorical:
         """[B]: −Σ_a π_a log π_a."""
         log_p = self.logits.log_softmax(-1)
         return -(log_p.exp() * log_p).sum(-1)
+
+
+@dataclass(frozen=True)
+class MultiCategorical:
+    """K independent choices: `parts`, K categoricals."""
+
+    parts: tuple[Categorical, ...]
+
+    def sample(self, noise: Tensor) -> Tensor:
+        """[B, K] int64, from noise [B, K] uniform in [0, 1)."""
+        return torch.stack([part.sample(column) for part, column in self._with(noise)], dim=-1)
+
+    def mode(self) -> Tensor:
+        """[B, K] int64."""
+        return torch.stack([part.mode() for part in self.parts], dim=-1)
+
+    def log_prob(self, action: Tensor) -> Tensor:
+        """[B]: Σ_k log π_k(a_k)."""
+        return torch.stack([part.log_prob(column) for part, column in self._with(action)]).sum(0)
+
+    def entropy(self) -> Tensor:
+        """[B]: Σ_k H[π_k]."""
+        return torch.stack([part.entropy() for part in self.parts]).sum(0)
+
+    def _with(self, columns: Tensor) -> list[tuple[Categorical, Tensor]]:
+        return list(zip(self.parts, columns.unbind(-1), strict=True))
+
+
+@dataclass(frozen=True)
+class Bernoulli:
+    """n independent switches, on with probability σ(logit): logits [B, n]."""
+
+    logits: Tensor
+
+    def sample(self, noise: Tensor) -> Tensor:
+        """[B, n] of 0 and 1, int64, from noise [B, n] uniform in [0, 1)."""
+        return (noise < self.logits.sigmoid()).long()
+
+    def mode(self) -> Tensor:
+        """[B, n] of 0 and 1, int64."""
+        return (self.logits > 0).long()
+
+    def log_prob(self, action: Tensor) -> Tensor:
+        """[B]: Σ_i [ a_i log σ_i + (1 − a_i) log (1 − σ_i) ]."""
+        return -binary_cross_entropy_with_logits(self.logits, action.to(self.logits.dtype), reduction="none").sum(-1)
+
+    def entropy(self) -> Tensor:
+        """[B]: −Σ_i [ σ_i log σ_i + (1 − σ_i) log (1 − σ_i) ]."""
+        on, off = logsigmoid(self.logits), logsigmoid(-self.logits)
+        return -(on.exp() * on + off.exp() * off).sum(-1)

@@ -1,19 +1,149 @@
-"""One step down a gradient."""
+"""One step of Adam down a loss: the same loss on two engines.
 
-from collections.abc import Iterable
+Small networks on a CPU are bound by the overhead of single operations, not by arithmetic. So all parameters live in
+one vector, and the whole step (gather the rows, forward, backward, clip, Adam) is one pure function of it, which the
+compiler turns into one native call. Without the compiler the same loss goes through autograd. Both agree to rounding.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Generic, TypeVar
 
 import torch
-from torch import Tensor
-from torch.nn import Parameter
-from torch.nn.utils import clip_grad_norm_
+from torch import Tensor, nn
+from torch.func import functional_call, grad_and_value
+
+from lemniscate.nn.native import Native
+from lemniscate.types import Batch
+
+Networks = TypeVar("Networks", bound=nn.Module)
+Metrics = Mapping[str, Tensor]
 
 
-def descend(
-    optimizer: torch.optim.Optimizer, parameters: Iterable[Parameter], loss: Tensor, max_grad_norm: float
+def adam(
+    parameters: Tensor, gradient: Tensor, mean: Tensor, square: Tensor, scales: Tensor, betas: tuple[float, float]
 ) -> Tensor:
-    """Back-propagate, clip the global gradient norm to `max_grad_norm`, step; returns the norm before the clip."""
-    optimizer.zero_grad(set_to_none=True)
-    loss.backward()
-    norm = clip_grad_norm_(parameters, max_grad_norm, foreach=True)
-    optimizer.step()
+    """Clip the gradient's norm, then one step of Adam in place: Kingma & Ba 2015, arXiv:1412.6980, algorithm 1.
+
+        g ← g · min(1, c / ‖g‖)
+        m ← β₁ m + (1 − β₁) g        v ← β₂ v + (1 − β₂) g²
+        θ ← θ − α m̂ / (√v̂ + ε),      m̂ = m / (1 − β₁ᵗ),  v̂ = v / (1 − β₂ᵗ)
+
+    Args:
+        parameters: θ [P], changed.
+        gradient: g [P].
+        mean: m [P], changed.
+        square: v [P], changed.
+        scales: the numbers that differ from step to step, [4]: α / (1 − β₁ᵗ), 1 / √(1 − β₂ᵗ), ε, c.
+        betas: β₁ and β₂.
+
+    Returns:
+        ‖g‖ before the clip, a scalar.
+    """
+    rate, correction, eps, limit = scales.unbind()
+    norm = gradient.square().sum().sqrt()
+    gradient = gradient * (limit / (norm + 1e-6)).clamp(max=1)
+    mean.lerp_(gradient, 1 - betas[0])
+    square.lerp_(gradient.square(), 1 - betas[1])
+    parameters.sub_(rate * mean / (square.sqrt() * correction + eps))
     return norm
+
+
+class Descent(Generic[Networks]):
+    """Adam down `loss(networks, batch)`, one call for each minibatch.
+
+    From here on the parameters of `networks` are views of one vector; they stay ordinary parameters to everyone else.
+    Move the networks to their device before.
+    """
+
+    def __init__(
+        self,
+        networks: Networks,
+        loss: Callable[[Networks, Batch], tuple[Tensor, Metrics]],
+        *,
+        betas: tuple[float, float] = (0.9, 0.999),
+        eps: float = 1e-8,
+        max_grad_norm: float = math.inf,
+    ) -> None:
+        self._objective = _Objective(networks, loss)
+        self._betas, self._eps, self._max_grad_norm = betas, eps, max_grad_norm
+        named = list(self._objective.named_parameters())
+        self._names = [name for name, _ in named]
+        self._shapes = [parameter.shape for _, parameter in named]
+        self._sizes = [parameter.numel() for _, parameter in named]
+        self._vector = torch.cat([parameter.detach().flatten() for _, parameter in named])
+        self._gradient = torch.zeros_like(self._vector)
+        self._mean, self._square = torch.zeros_like(self._vector), torch.zeros_like(self._vector)
+        self.steps = 0
+        for (_, parameter), mine, gradient in zip(
+            named, self._cut(self._vector), self._cut(self._gradient), strict=True
+        ):
+            parameter.data, parameter.grad = mine, gradient
+        self._engine: Callable[..., dict[str, Tensor]] = self._eager
+
+    def __call__(self, batch: Batch, rows: Tensor, learning_rate: float) -> dict[str, Tensor]:
+        """Descend one step on `batch[rows]`.
+
+        Args:
+            batch: record of tensors [B, …].
+            rows: which of them, [b] int64. Once compiled, every call must have the same B and b.
+            learning_rate: α.
+
+        Returns:
+            What the loss watches, and "gradient_norm" before the clip.
+        """
+        self.steps += 1
+        rate = learning_rate / (1 - self._betas[0] ** self.steps)
+        correction = 1 / math.sqrt(1 - self._betas[1] ** self.steps)
+        scales = torch.tensor([rate, correction, self._eps, self._max_grad_norm], dtype=self._vector.dtype)
+        scales = scales.to(self._vector.device, non_blocking=True)
+        return self._engine(self._vector, self._mean, self._square, scales, batch, rows)
+
+    def make_native(self) -> None:
+        """From the next step on, a step is one native call."""
+        self._engine = Native(self._functional, self._eager, self._vector.device)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Adam's two moments and its count; the parameters belong to the networks."""
+        return {"mean": self._mean, "square": self._square, "steps": torch.tensor(self.steps)}
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Take up where `state_dict` was."""
+        self._mean.copy_(state["mean"])
+        self._square.copy_(state["square"])
+        self.steps = int(state["steps"])
+
+    def _eager(
+        self, vector: Tensor, mean: Tensor, square: Tensor, scales: Tensor, batch: Batch, rows: Tensor
+    ) -> dict[str, Tensor]:
+        self._gradient.zero_()
+        total, metrics = self._objective(batch[rows])
+        total.backward()
+        with torch.no_grad():
+            return {**metrics, "gradient_norm": adam(vector, self._gradient, mean, square, scales, self._betas)}
+
+    def _functional(
+        self, vector: Tensor, mean: Tensor, square: Tensor, scales: Tensor, batch: Batch, rows: Tensor
+    ) -> dict[str, Tensor]:
+        part = batch[rows]
+        parameters = dict(zip(self._names, self._cut(vector), strict=True))
+        differentiate = grad_and_value(lambda given: functional_call(self._objective, given, (part,)), has_aux=True)
+        gradients, (_, metrics) = differentiate(parameters)
+        gradient = torch.cat([gradients[name].flatten() for name in self._names])
+        return {**metrics, "gradient_norm": adam(vector, gradient, mean, square, scales, self._betas)}
+
+    def _cut(self, vector: Tensor) -> list[Tensor]:
+        parts = vector.split(self._sizes)
+        return [part.view(shape) for part, shape in zip(parts, self._shapes, strict=True)]
+
+
+class _Objective(nn.Module, Generic[Networks]):
+    """A loss as a module, so that `functional_call` can put other parameters under it."""
+
+    def __init__(self, networks: Networks, loss: Callable[[Networks, Batch], tuple[Tensor, Metrics]]) -> None:
+        super().__init__()
+        self.networks = networks
+        self._loss = loss
+
+    def forward(self, batch: Batch) -> tuple[Tensor, Metrics]:
+        return self._loss(self.networks, batch)

@@ -1,4 +1,4 @@
-"""Multi-layer perceptrons."""
+"""Multi-layer perceptrons, and a small convolutional network to look at images with."""
 
 from collections.abc import Sequence
 from typing import Literal
@@ -29,8 +29,37 @@ def mlp(sizes: Sequence[int], activation: Activation, last_gain: float) -> nn.Se
     layers: list[nn.Module] = []
     for i in range(len(sizes) - 1):
         last = i == len(sizes) - 2
-        linear = nn.Linear(sizes[i], sizes[i + 1])
-        nn.init.orthogonal_(linear.weight, last_gain if last else 2**0.5)
-        nn.init.zeros_(linear.bias)
+        linear = _orthogonal(nn.Linear(sizes[i], sizes[i + 1]), last_gain if last else 2**0.5)
         layers += [linear] if last else [linear, ACTIVATIONS[activation]()]
     return nn.Sequential(*layers)
+
+
+class ImageEncoder(nn.Module):
+    """Three strided 3 × 3 convolutions with ReLU (16, 32, 32 channels), each halving height and width."""
+
+    def __init__(self, shape: tuple[int, int, int]) -> None:
+        super().__init__()
+        self.shape = shape
+        channels = (shape[2], 16, 32, 32)
+        layers: list[nn.Module] = []
+        for i in range(3):
+            convolution = nn.Conv2d(channels[i], channels[i + 1], kernel_size=3, stride=2, padding=1)
+            layers += [_orthogonal(convolution, 2**0.5), nn.ReLU()]
+        self.layers = nn.Sequential(*layers, nn.Flatten())
+        height, width, _ = shape
+        for _ in range(3):
+            height, width = (height + 1) // 2, (width + 1) // 2
+        self.size = channels[-1] * height * width
+        """length of what comes out"""
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        """[…, H · W · C] in [0, 1] to […, `size`]."""
+        images = pixels.reshape(-1, *self.shape).movedim(-1, 1)
+        return self.layers(images).reshape(*pixels.shape[:-1], self.size)
+
+
+def _orthogonal(layer: nn.Linear | nn.Conv2d, gain: float) -> nn.Module:
+    nn.init.orthogonal_(layer.weight, gain)
+    assert layer.bias is not None
+    nn.init.zeros_(layer.bias)
+    return layer

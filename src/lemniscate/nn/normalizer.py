@@ -1,12 +1,36 @@
-"""The running observation normalizer: a module of the policy, so it is saved, moved and evaluated with it."""
+"""Running statistics: modules, so that they are saved and moved with the rest.
+
+The observation normalizer is part of the policy and so is evaluated with it; the reward's scale is for training only.
+"""
 
 import torch
 from torch import Tensor, nn
 
 from lemniscate.maths import merge_moments
+from lemniscate.types import Rollout
 
 
-class RunningNorm(nn.Module):
+class Observed(nn.Module):
+    """Observations as they are: the first `size` numbers, without an action mask that may follow them."""
+
+    def __init__(self, size: int) -> None:
+        super().__init__()
+        self.size = size
+
+    def forward(self, obs: Tensor) -> Tensor:
+        """[…, O or more] to […, O]."""
+        return obs[..., : self.size]
+
+
+class Pixels(Observed):
+    """Bytes to numbers from 0 to 1."""
+
+    def forward(self, obs: Tensor) -> Tensor:
+        """[…, O or more] uint8 to […, O]."""
+        return super().forward(obs).float() / 255
+
+
+class RunningNorm(Observed):
     """(x − mean) / std of everything seen in training, clipped to ±`clip`.
 
     The statistics are buffers and change in `update` only; calling the module never changes them. Before the first
@@ -18,22 +42,57 @@ class RunningNorm(nn.Module):
     count: Tensor
 
     def __init__(self, size: int, clip: float = 10.0) -> None:
-        super().__init__()
+        super().__init__(size)
         self.clip = clip
         self.register_buffer("mean", torch.zeros(size, dtype=torch.float64))
         self.register_buffer("var", torch.ones(size, dtype=torch.float64))
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))
 
     def forward(self, obs: Tensor) -> Tensor:
-        """[…, O] to […, O]."""
+        """[…, O or more] to […, O]."""
         mean, std = self.mean.to(obs.dtype), (self.var + 1e-8).sqrt().to(obs.dtype)
-        return ((obs - mean) / std).clamp(-self.clip, self.clip)
+        return ((super().forward(obs) - mean) / std).clamp(-self.clip, self.clip)
 
     @torch.no_grad()
     def update(self, obs: Tensor) -> None:
-        """Take [B, O] more observations into the statistics; all of them finite."""
-        obs = obs.double()
+        """Take [B, O or more] observations into the statistics; all of them finite."""
+        obs = super().forward(obs).double()
         count = torch.full_like(self.count, len(obs))
         moments = merge_moments(self.mean, self.var, self.count, obs.mean(0), obs.var(0, correction=0), count)
         for buffer, new in zip((self.mean, self.var, self.count), moments, strict=True):
             buffer.copy_(new)
+
+
+class RewardScale(nn.Module):
+    """r / std of the discounted return so far, clipped to ±`clip`; the returns are those of N running episodes.
+
+    The mean is left in: taking it out would pay for living or dying. Before the first update rewards pass unscaled.
+    """
+
+    running: Tensor
+    var: Tensor
+
+    def __init__(self, num_envs: int, gamma: float, clip: float = 10.0) -> None:
+        super().__init__()
+        self.gamma, self.clip = gamma, clip
+        self.register_buffer("running", torch.zeros(num_envs, dtype=torch.float64))
+        self.register_buffer("mean", torch.zeros((), dtype=torch.float64))
+        self.register_buffer("var", torch.ones((), dtype=torch.float64))
+        self.register_buffer("count", torch.zeros((), dtype=torch.float64))
+
+    def forward(self, reward: Tensor) -> Tensor:
+        """Any shape to the same shape."""
+        return (reward / (self.var + 1e-8).sqrt().to(reward.dtype)).clamp(-self.clip, self.clip)
+
+    @torch.no_grad()
+    def update(self, rollout: Rollout) -> None:
+        """Follow the discounted return Σ γ^k r_{t−k} of each episode through a rollout [T, N]."""
+        returns = []
+        for reward, done in zip(rollout.reward.double(), rollout.done, strict=True):
+            self.running = self.gamma * self.running + reward
+            returns.append(self.running)
+            self.running = self.running * ~done
+        seen = torch.stack(returns)[rollout.valid]
+        count = torch.full_like(self.count, len(seen))
+        moments = merge_moments(self.mean, self.var, self.count, seen.mean(), seen.var(correction=0), count)
+        self.mean, self.var, self.count = moments

@@ -14,7 +14,7 @@ import json
 import os
 import shutil
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import torch
 from safetensors import SafetensorError
@@ -23,7 +23,7 @@ from safetensors.torch import save as tensors_to_bytes
 from torch import Tensor
 
 from lemniscate.errors import UserError
-from lemniscate.types import Box, Discrete, Spec
+from lemniscate.types import Action, Part, Spec
 
 FORMAT = 1
 PARTS = ("tensors.safetensors", "state.json")
@@ -43,15 +43,13 @@ class Checkpoint:
     record: dict[str, Any]
 
     def restore(self, state: Any) -> None:
-        """Put everything back into a State of the same make: modules, optimizers, generators, numbers."""
+        """Put everything back into a State of the same make: generators, what has a `state_dict`, numbers."""
         for name, value in _parts(state):
             mine = self.part(name)
-            if isinstance(value, torch.nn.Module):
-                value.load_state_dict(mine)
-            elif isinstance(value, torch.optim.Optimizer):
-                _load_optimizer(value, mine, self.numbers[name])
-            elif isinstance(value, torch.Generator):
+            if isinstance(value, torch.Generator):
                 value.set_state(mine["state"])
+            elif hasattr(value, "load_state_dict"):
+                value.load_state_dict(mine)
             else:
                 setattr(state, name, self.numbers[name])
 
@@ -70,18 +68,10 @@ def write(directory: Path, state: Any, step: int, record: dict[str, Any], keep: 
     tensors: dict[str, Tensor] = {}
     numbers: dict[str, Any] = {}
     for name, value in _parts(state):
-        if isinstance(value, torch.nn.Module):
-            tensors |= {f"{name}.{key}": t for key, t in value.state_dict().items()}
-        elif isinstance(value, torch.optim.Optimizer):
-            saved = value.state_dict()
-            numbers[name] = saved["param_groups"]
-            tensors |= {
-                f"{name}.{index}.{key}": torch.as_tensor(t)
-                for index, slot in saved["state"].items()
-                for key, t in slot.items()
-            }
-        elif isinstance(value, torch.Generator):
+        if isinstance(value, torch.Generator):
             tensors[f"{name}.state"] = value.get_state()
+        elif hasattr(value, "state_dict"):
+            tensors |= {f"{name}.{key}": t for key, t in value.state_dict().items()}
         else:
             numbers[name] = value
     contents = {
@@ -149,27 +139,18 @@ def spec_to_json(spec: Spec) -> dict[str, Any]:
 
 def spec_from_json(record: dict[str, Any]) -> Spec:
     """The Spec that `spec_to_json` came from."""
-    action = dict(record["action"])
-    if action.pop("kind") == "Box":
-        kind: Box | Discrete = Box(tuple(action["low"]), tuple(action["high"]))
-    else:
-        kind = Discrete(**action)
-    layout = tuple((name, size) for name, size in record["layout"])
-    tracking = tuple(record["tracking"]) if record["tracking"] else None
-    return Spec(**{**record, "action": kind, "layout": layout, "tracking": tracking})
+    action = _tuples(record["action"])
+    kind = {k.__name__: k for k in get_args(Action)}[action.pop("kind")]
+    layout = tuple(Part(**_tuples(part)) for part in record["layout"])
+    return Spec(**{**_tuples(record), "action": kind(**action), "layout": layout})
+
+
+def _tuples(record: dict[str, Any]) -> dict[str, Any]:
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in record.items()}
 
 
 def _parts(state: Any) -> list[tuple[str, Any]]:
     return [(field.name, getattr(state, field.name)) for field in dataclasses.fields(state)]
-
-
-def _load_optimizer(optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor], groups: Any) -> None:
-    slots: dict[int, dict[str, Tensor]] = {}
-    for key, tensor in tensors.items():
-        index, _, name = key.partition(".")
-        slots.setdefault(int(index), {})[name] = tensor
-    groups = [{k: tuple(v) if k == "betas" else v for k, v in group.items()} for group in groups]
-    optimizer.load_state_dict({"state": slots, "param_groups": groups})
 
 
 def _json(record: Any) -> bytes:

@@ -52,6 +52,8 @@ class RunConfig:
     """where networks, and simulators that can, live; auto takes cuda if there is one"""
     threads: Count = 1
     """torch's threads on the CPU; results of one number differ in rounding from another's"""
+    engine: Literal["auto", "eager", "compiled"] = "auto"
+    """how gradient steps are taken: one by one through autograd, or as one native call; auto compiles long runs"""
     checkpoint_every: Natural = 0
     """steps between checkpoints, at each of which the environments restart; 0 makes five of the run"""
     keep_checkpoints: Count = 3
@@ -92,6 +94,11 @@ class RunConfig:
     def checkpoint_interval(self) -> int:
         """Steps between checkpoints."""
         return self.checkpoint_every or -(-self.total_steps // 5)
+
+    @property
+    def gradient_steps(self) -> int:
+        """Of the whole run."""
+        raise NotImplementedError
 
     def replace(self, **changes: object) -> Self:
         """A copy with some fields changed. Raises `UserError` for an unknown field or a value out of range."""

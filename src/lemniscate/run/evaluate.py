@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -43,13 +44,13 @@ def fly(
 
     Every copy has its own share of the episodes, fixed beforehand: taking the first that end would favour short ones.
     """
-    noise = generator(seed, env.device, EVALUATION, 1)
+    noise = partial(policy.noise, (env.num_envs,), generator(seed, env.device, EVALUATION, 1))
     copies = torch.arange(env.num_envs, device=env.device)
     left = episodes // env.num_envs + (copies < episodes % env.num_envs).int()
     env.restart(derive(seed, EVALUATION, 0))
     while (left > 0).any():
         distribution = policy(env.obs)
-        step = env.step(distribution.mode() if deterministic else distribution.sample(noise))
+        step = env.step(distribution.mode() if deterministic else distribution.sample(noise()))
         yield step, (left > 0) & step.valid
         left = left - ((step.terminated | step.truncated) & step.valid).int()
 

@@ -26,6 +26,7 @@ from filelock import FileLock, Timeout
 
 from lemniscate.envs.api import Episodes, VecEnv
 from lemniscate.errors import NonFiniteError, UserError
+from lemniscate.nn.descent import Descent
 from lemniscate.nn.policies import Policy
 from lemniscate.run import checkpoint
 from lemniscate.run.config import RunConfig
@@ -33,6 +34,9 @@ from lemniscate.run.evaluate import evaluate
 from lemniscate.run.loggers import LOGGERS, Logger
 from lemniscate.run.progress import ProgressBar
 from lemniscate.run.seeding import derive, globals_undisturbed, seed_globals
+
+WORTH_COMPILING = 20_000
+"""gradient steps of a run from which on a compiled one is sooner done"""
 
 TRAINING = 0
 """the stream of seeds that training environments restart from"""
@@ -42,7 +46,11 @@ class AnyState(Protocol):
     """What a run needs to know of an algorithm's State: how far it is, and whom to evaluate."""
 
     step: int
-    policy: Policy
+
+    @property
+    def policy(self) -> Policy:
+        """Whom to evaluate."""
+        ...
 
 
 S = TypeVar("S", bound=AnyState)
@@ -90,6 +98,7 @@ class Run:
         elif checkpoint.list_steps(self.path / "checkpoints"):
             print(f"{self.path} has no planned checkpoint to go on from; it begins again at step 0.", file=sys.stderr)
         self._forget_after(state.step)
+        self._choose_engine(state)
         config = {"algorithm": self.algorithm, **self.config.to_json()}
         for name in self._logger_names:
             self._loggers.append(LOGGERS[name](self.path, config, state.step))
@@ -142,6 +151,17 @@ class Run:
         self.env.close()
         self.eval_env.close()
         self._lock.release()
+
+    def _choose_engine(self, state: AnyState) -> None:
+        """Compile the gradient steps where that is asked for, or repaid."""
+        engine = self.config.engine
+        if engine == "compiled" or (engine == "auto" and self.config.gradient_steps >= WORTH_COMPILING):
+            if self._visible:
+                print("Compiling the update: some 10 s the first time, 3 s from then on.", file=sys.stderr)
+            state.policy.make_native()
+            for part in vars(state).values():
+                if isinstance(part, Descent):
+                    part.make_native()
 
     def _restart(self, state: AnyState) -> None:
         seed = derive(self.config.seed, TRAINING, state.step)

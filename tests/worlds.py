@@ -1,0 +1,88 @@
+"""Environments in which the right action is a copy of what is seen, in spaces of every kind."""
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+KINDS = {
+    # kind: (observation space, action space)
+    "box": (spaces.Box(-1, 1, (2, 1), np.float64), spaces.Box(np.float32([[-1], [0]]), np.float32([[3], [1]]))),
+    "discrete": (spaces.Discrete(3, start=5), spaces.Discrete(3, start=-1)),
+    "multi-discrete": (spaces.MultiDiscrete([2, 3]), spaces.MultiDiscrete([2, 3], start=[1, 0])),
+    "multi-binary": (spaces.MultiBinary(3), spaces.MultiBinary(3)),
+    "tuple": (spaces.Tuple([spaces.Discrete(2), spaces.Dict({"z": spaces.Box(0, 1, (3,)), "a": spaces.MultiBinary(1)})]), spaces.Discrete(2)),
+    "image": (spaces.Box(0, 255, (9, 12, 3), np.uint8), spaces.Discrete(2)),
+    "masked": (spaces.Discrete(3), spaces.Discrete(4)),
+}  # fmt: skip
+
+
+class Copy(gym.Env):
+    """Reward 1 for the copy of what is seen, else 0; an episode is 8 steps.
+
+    In "masked" exactly two actions are valid, the copy and the fourth; any other ends the episode with reward -100.
+    """
+
+    def __init__(self, kind: str):
+        self.kind = kind
+        self.observation_space, self.action_space = KINDS[kind]
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        return self._show(), self._info()
+
+    def step(self, action):
+        reward, self.t = self._reward(action), self.t + 1
+        return self._show(), reward, reward < 0 or self.t == 8, False, self._info()
+
+    def _info(self):
+        if self.kind != "masked":
+            return {}
+        mask = np.zeros(4, dtype=np.int8)
+        mask[[self.target, 3]] = 1
+        return {"action_mask": mask}
+
+    def _show(self):
+        draw = self.np_random.integers
+        self.target = draw(2)
+        if self.kind == "box":
+            self.target = self.np_random.uniform(-1, 1, (2, 1))
+        elif self.kind in ("discrete", "masked"):
+            self.target = draw(3)
+            return self.target + int(self.observation_space.start)
+        elif self.kind == "multi-discrete":
+            self.target = np.array([draw(2), draw(3)])
+        elif self.kind == "multi-binary":
+            self.target = draw(2, size=3).astype(np.int8)
+        elif self.kind == "tuple":
+            return self.target, {"a": np.array([1], dtype=np.int8), "z": np.zeros(3, dtype=np.float32)}
+        elif self.kind == "image":
+            picture = np.zeros((9, 12, 3), dtype=np.uint8)
+            picture[:, 6 * self.target : 6 * self.target + 6, 1] = 255
+            return picture
+        return self.target
+
+    def _reward(self, action):
+        assert self.action_space.contains(action.astype(self.action_space.dtype) if self.kind == "box" else action)
+        if self.kind == "box":
+            return 1 - float(np.abs((action - [[1], [0.5]]) / [[2], [0.5]] - self.target).mean())
+        if self.kind == "masked":
+            return {self.target: 1, 3: 0}.get(int(action), -100)
+        if self.kind in ("multi-discrete", "multi-binary"):
+            start = getattr(self.action_space, "start", 0)
+            return float((action - start == self.target).mean())
+        return float(action - int(getattr(self.action_space, "start", 0)) == self.target)
+
+
+for kind in KINDS:
+    gym.register(f"Copy-{kind}-v0", entry_point="worlds:Copy", max_episode_steps=100, kwargs={"kind": kind})
+
+
+class Unreadable(gym.Env):
+    """Observations of no fixed size."""
+
+    observation_space = spaces.Sequence(spaces.Discrete(2))
+    action_space = spaces.Discrete(2)
+
+
+gym.register("Unreadable-v0", entry_point="worlds:Unreadable")
