@@ -9,18 +9,15 @@ flies 64 starts that training never saw.
 
 import argparse
 import json
-import os
-import platform
 import subprocess
 import sys
 import tempfile
 import time
-from importlib.metadata import version
-from pathlib import Path
 from statistics import mean, median
 
+from common import append, provenance
+
 ENV = "DroneFigureEightTrajectory-v0"
-RESULTS = Path(__file__).parent / "results" / "figure_eight.jsonl"
 
 
 def one_run(preset, seed, device):
@@ -46,14 +43,6 @@ def one_run(preset, seed, device):
     )
 
 
-def provenance():
-    """Commit, versions and machine."""
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True).stdout.strip()
-    versions = {name: version(name) for name in ("torch", "jax", "crazyflow", "gymnasium", "numpy")}
-    machine = f"{platform.machine()}, {os.cpu_count()} cores, {platform.system()}"
-    return {"commit": commit, "versions": versions, "machine": machine, "date": time.strftime("%Y-%m-%d")}
-
-
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--presets", nargs="+", default=["figure-eight", "course"])
@@ -64,15 +53,13 @@ def main():
     if given.one_run:
         return one_run(given.presets[0], given.seeds[0], given.device)
     stamp, rows = provenance(), []
-    RESULTS.parent.mkdir(exist_ok=True)
     for preset in given.presets:
         for seed in given.seeds:
             command = [sys.executable, __file__, "--one-run", "--presets", preset, "--seeds", str(seed)]
             started = time.monotonic()
             done = subprocess.run([*command, "--device", given.device], stdout=subprocess.PIPE, text=True, check=True)
             row = json.loads(done.stdout.splitlines()[-1]) | {"total_s": time.monotonic() - started} | stamp
-            with RESULTS.open("a") as file:
-                file.write(json.dumps(row) + "\n")
+            append("figure_eight", row)
             rows.append(row)
             print(
                 row["preset"], row["seed"], f"{row['mean_return']:.1f}", f"{row['rmse_after_1s_mm']:.2f} mm", flush=True

@@ -76,7 +76,7 @@ def test_it_learns_to_match(mode):
 
 @pytest.mark.parametrize("kind", worlds.KINDS)
 def test_it_learns_in_spaces_of_every_kind(kind):
-    knobs = {"minibatch_size": 64, "epochs": 6, "learning_rate": 0.01, "initial_log_std": -2.0}
+    knobs = {"minibatch_size": 64, "epochs": 6, "learning_rate": 0.01, "initial_log_std": -1.0}
     config = tiny(
         f"Copy-{kind}-v0", num_envs=16, num_steps=16, total_steps=30 * 256, normalize_observations=False, **knobs
     )
@@ -90,7 +90,8 @@ def test_it_learns_in_spaces_of_every_kind(kind):
         ppo.update(config, state, rollout)
         means.append(rollout.reward.mean().item())
         assert rollout.reward.min() > -100  # no action that is masked
-    assert means[-1] > 0.85 > 0.75 > means[0]
+    assert means[0] < 0.65
+    assert means[-1] > (0.7 if kind == "box" else 0.85)  # σ = 0.37 costs a Gaussian that much
 
 
 def one_update(**fields):
@@ -184,18 +185,18 @@ def test_the_normalizer_moves_in_training_only_and_sees_only_real_rows():
 def test_minibatches_cover_everything_once_an_epoch(rng):
     first, second = (minibatches(torch.arange(24), 4, 6, rng) for _ in range(2))
     for parts in (first, second):
-        assert [len(part) for part in parts] == [6] * 4
-        assert torch.cat(parts).sort().values.tolist() == list(range(24))
+        assert parts.shape == (4, 6)
+        assert parts.flatten().sort().values.tolist() == list(range(24))
     assert not torch.equal(first[0], second[0])
 
 
 def test_minibatches_keep_their_size_whatever_was_played(rng):
     played = torch.tensor([3, 5, 8, 13, 21])
     few = minibatches(played, 3, 4, rng)
-    assert [len(part) for part in few] == [4] * 3
-    assert set(torch.cat(few).tolist()) == set(played.tolist())
+    assert few.shape == (3, 4)
+    assert set(few.flatten().tolist()) == set(played.tolist())
     many = minibatches(played, 2, 2, rng)
-    assert len(set(torch.cat(many).tolist())) == 4
+    assert len(set(many.flatten().tolist())) == 4
 
 
 @pytest.mark.parametrize(

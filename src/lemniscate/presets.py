@@ -21,6 +21,32 @@ class Preset:
     date: str
 
 
+ADAPTIVE = ppo.Config(
+    num_envs=64,
+    num_steps=64,
+    minibatch_size=512,
+    desired_kl=0.01,
+    max_grad_norm=1.0,
+    value_coef=1.0,
+    scale_rewards=True,
+    recompute_advantages=True,
+    initial_log_std=-0.5,
+    checkpoint_every=250_000,
+)
+"""many copies, and a learning rate that follows the KL; after rl_games and rsl_rl"""
+
+ANNEALED = ppo.Config(
+    num_steps=256,
+    minibatch_size=64,
+    value_coef=0.25,
+    scale_rewards=True,
+    recompute_advantages=True,
+    normalize_advantage=False,
+    initial_log_std=-0.5,
+    checkpoint_every=250_000,
+)
+"""few copies, small minibatches, and a learning rate that falls; after Tianshou"""
+
 PPO = {
     "default": Preset(ppo.Config(), "Schulman et al. 2017, table 3, on 8 copies with a running normalizer", "2026-11"),
     "figure-eight": Preset(
@@ -69,11 +95,67 @@ PPO = {
         "the drone course's notebook: its settings, on the corrected algorithm",
         "2026-11",
     ),
+    "cart-pole": Preset(
+        ppo.Config(
+            env="CartPole-v1",
+            total_steps=50_000,
+            num_steps=32,
+            minibatch_size=256,
+            epochs=20,
+            learning_rate=1e-3,
+            gamma=0.98,
+            gae_lambda=0.8,
+            normalize_observations=False,
+        ),
+        "the settings of rl-baselines3-zoo, in half the steps",
+        "2026-11",
+    ),
+    "lunar-lander": Preset(
+        ppo.Config(
+            env="LunarLander-v3",
+            num_envs=16,
+            minibatch_size=512,
+            epochs=8,
+            learning_rate=1e-3,
+            gamma=0.999,
+            gae_lambda=0.98,
+            entropy_coef=0.01,
+            scale_rewards=True,
+            checkpoint_every=250_000,
+        ),
+        "search by hand, on seed 101",
+        "2026-11",
+    ),
+    "half-cheetah": Preset(ADAPTIVE.replace(env="HalfCheetah-v5"), "search by hand, on seeds 101 and 102", "2026-11"),
+    "ant": Preset(ADAPTIVE.replace(env="Ant-v5"), "search by hand, on seeds 101 and 102", "2026-11"),
+    "humanoid": Preset(ADAPTIVE.replace(env="Humanoid-v5"), "search by hand, on seeds 101 and 102", "2026-11"),
+    "hopper": Preset(ANNEALED.replace(env="Hopper-v5"), "Tianshou's settings, on seeds 101 and 102", "2026-11"),
+    "walker2d": Preset(
+        ANNEALED.replace(
+            env="Walker2d-v5",
+            num_envs=16,
+            num_steps=128,
+            minibatch_size=256,
+            learning_rate=1e-3,
+            normalize_advantage=True,
+        ),
+        "search by hand, on seeds 101 and 102",
+        "2026-11",
+    ),
 }
 
 PRESETS: dict[str, dict[str, Preset]] = {"ppo": PPO}
 
-BEST: dict[tuple[str, str], str] = {("ppo", FIGURE_EIGHT): "figure-eight"}
+BEST: dict[tuple[str, str], str] = {
+    ("ppo", FIGURE_EIGHT): "figure-eight",
+    ("ppo", "CartPole-v1"): "cart-pole",
+    ("ppo", "LunarLander-v3"): "lunar-lander",
+    ("ppo", "HalfCheetah-v5"): "half-cheetah",
+    ("ppo", "Hopper-v5"): "hopper",
+    ("ppo", "Walker2d-v5"): "walker2d",
+    ("ppo", "Ant-v5"): "ant",
+    ("ppo", "Humanoid-v5"): "humanoid",
+}
 """the preset that an environment gets unasked"""
 
 

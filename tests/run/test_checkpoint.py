@@ -22,7 +22,7 @@ CPU = torch.device("cpu")
 def learn(state):
     """One gradient step on noise."""
     batch = Batch(torch.randn(4, 3), torch.randn(4, 1), *torch.randn(4, 4))
-    state.optimizer(batch, torch.arange(4), 1e-3)
+    state.optimizer(batch, torch.arange(4)[None], 1e-3)
 
 
 def state_with_history(seed=0):

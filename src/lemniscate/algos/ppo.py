@@ -193,10 +193,10 @@ def update(config: Config, state: State, rollout: Rollout) -> Mapping[str, Tenso
         if config.recompute_advantages and epoch > 0:
             batch = replace(advantages(config, state, rollout), log_prob=collected.log_prob)
         parts = minibatches(played, config.num_minibatches, config.minibatch_size, state.shuffle)
-        watched += [state.optimizer(batch, rows, state.learning_rate) for rows in parts]
-        kl = torch.stack([row["approx_kl"] for row in watched[-len(parts) :]]).mean()
+        watched.append(state.optimizer(batch, parts, state.learning_rate))
+        kl = watched[-1]["approx_kl"].item()
         if config.desired_kl is not None:
-            state.learning_rate = adapt(state.learning_rate, kl.item(), config.desired_kl)
+            state.learning_rate = adapt(state.learning_rate, kl, config.desired_kl)
         if config.target_kl is not None and kl > config.target_kl:
             break
     state.policy.observe(rollout.obs[rollout.valid])  # afterwards: both probabilities are taken through one normalizer

@@ -20,12 +20,12 @@ def collect(env: VecEnv, policy: Policy, num_steps: int, generator: Generator) -
     return Rollout.stack(rows)
 
 
-def minibatches(rows: Tensor, count: int, size: int, generator: Generator) -> list[Tensor]:
-    """`rows` in a new random order, cut into `count` parts of `size`.
+def minibatches(rows: Tensor, count: int, size: int, generator: Generator) -> Tensor:
+    """`rows` in a new random order, cut into `count` parts of `size`: [count, size].
 
     Every part has the same size, whatever was played, so that one compiled program serves all: rows beyond
     `count · size` sit this epoch out, and where rows are missing the first ones are taken again.
     """
     order = rows[torch.randperm(len(rows), generator=generator, device=generator.device)]
     again = -(-count * size // len(rows))
-    return list(order.repeat(again)[: count * size].split(size))
+    return order.repeat(again)[: count * size].view(count, size)

@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from torch import Tensor
 
@@ -147,7 +148,7 @@ def _row(batch: Any, row: int) -> Any:
     return {name: _row(part, row) for name, part in batch.items()} if isinstance(batch, dict) else batch[row]
 
 
-def _make(spec: gym.envs.registration.EnvSpec, **kwargs: Any) -> gym.Env:
+def _make(spec: EnvSpec, **kwargs: Any) -> gym.Env:
     """One environment, from its spec: a worker process may not know the id.
 
     There, Ctrl-C is left to the parent, which stops the run in order.

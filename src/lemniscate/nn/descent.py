@@ -7,6 +7,7 @@ compiler turns into one native call. Without the compiler the same loss goes thr
 
 import math
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Generic, TypeVar
 
 import torch
@@ -18,6 +19,9 @@ from lemniscate.types import Batch
 
 Networks = TypeVar("Networks", bound=nn.Module)
 Metrics = Mapping[str, Tensor]
+
+STEPS_PER_CALL = 4
+"""compiled into one native call, where the minibatches can be so grouped; more are hardly faster, and compile longer"""
 
 
 def adam(
@@ -50,7 +54,7 @@ def adam(
 
 
 class Descent(Generic[Networks]):
-    """Adam down `loss(networks, batch)`, one call for each minibatch.
+    """Adam down `loss(networks, batch)`, minibatch by minibatch.
 
     From here on the parameters of `networks` are views of one vector; they stay ordinary parameters to everyone else.
     Move the networks to their device before.
@@ -80,28 +84,39 @@ class Descent(Generic[Networks]):
         ):
             parameter.data, parameter.grad = mine, gradient
         self._engine: Callable[..., dict[str, Tensor]] = self._eager
+        self._steps_per_call = 1
 
-    def __call__(self, batch: Batch, rows: Tensor, learning_rate: float) -> dict[str, Tensor]:
-        """Descend one step on `batch[rows]`.
+    def __call__(self, batch: Batch, parts: Tensor, learning_rate: float) -> dict[str, Tensor]:
+        """Descend one step on `batch[rows]` for each `rows` in `parts`.
 
         Args:
             batch: record of tensors [B, …].
-            rows: which of them, [b] int64. Once compiled, every call must have the same B and b.
+            parts: K minibatches of b rows each, [K, b] int64. Once native, every call must have the same B, K and b.
             learning_rate: α.
 
         Returns:
-            What the loss watches, and "gradient_norm" before the clip.
+            Means over the K steps of what the loss watches, and of "gradient_norm" before the clip.
         """
-        self.steps += 1
-        rate = learning_rate / (1 - self._betas[0] ** self.steps)
-        correction = 1 / math.sqrt(1 - self._betas[1] ** self.steps)
-        scales = torch.tensor([rate, correction, self._eps, self._max_grad_norm], dtype=self._vector.dtype)
-        scales = scales.to(self._vector.device, non_blocking=True)
-        return self._engine(self._vector, self._mean, self._square, scales, batch, rows)
+        steps = range(self.steps + 1, self.steps + 1 + len(parts))
+        self.steps += len(parts)
+        scales = torch.tensor([self._scales(step, learning_rate) for step in steps], dtype=self._vector.dtype)
+        at_once = next(n for n in range(self._steps_per_call, 0, -1) if len(parts) % n == 0)
+        chunks = zip(scales.to(self._vector.device).split(at_once), parts.split(at_once), strict=True)
+        watched = [
+            self._engine(self._vector, self._mean, self._square, some_scales, batch, some_parts)
+            for some_scales, some_parts in chunks
+        ]
+        return _means(watched)
+
+    def _scales(self, step: int, learning_rate: float) -> tuple[float, float, float, float]:
+        beta_1, beta_2 = self._betas
+        rate, correction = learning_rate / (1 - beta_1**step), 1 / math.sqrt(1 - beta_2**step)
+        return rate, correction, self._eps, self._max_grad_norm
 
     def make_native(self) -> None:
-        """From the next step on, a step is one native call."""
+        """From the next step on, up to four steps are one native call."""
         self._engine = Native(self._functional, self._eager, self._vector.device)
+        self._steps_per_call = STEPS_PER_CALL
 
     def state_dict(self) -> dict[str, Tensor]:
         """Adam's two moments and its count; the parameters belong to the networks."""
@@ -114,27 +129,38 @@ class Descent(Generic[Networks]):
         self.steps = int(state["steps"])
 
     def _eager(
-        self, vector: Tensor, mean: Tensor, square: Tensor, scales: Tensor, batch: Batch, rows: Tensor
+        self, vector: Tensor, mean: Tensor, square: Tensor, scales: Tensor, batch: Batch, parts: Tensor
     ) -> dict[str, Tensor]:
-        self._gradient.zero_()
-        total, metrics = self._objective(batch[rows])
-        total.backward()
-        with torch.no_grad():
-            return {**metrics, "gradient_norm": adam(vector, self._gradient, mean, square, scales, self._betas)}
+        watched = []
+        for some_scales, rows in zip(scales, parts, strict=True):
+            self._gradient.zero_()
+            total, metrics = self._objective(batch[rows])
+            total.backward()
+            with torch.no_grad():
+                norm = adam(vector, self._gradient, mean, square, some_scales, self._betas)
+            watched.append({**metrics, "gradient_norm": norm})
+        return _means(watched)
 
     def _functional(
-        self, vector: Tensor, mean: Tensor, square: Tensor, scales: Tensor, batch: Batch, rows: Tensor
+        self, vector: Tensor, mean: Tensor, square: Tensor, scales: Tensor, batch: Batch, parts: Tensor
     ) -> dict[str, Tensor]:
-        part = batch[rows]
-        parameters = dict(zip(self._names, self._cut(vector), strict=True))
-        differentiate = grad_and_value(lambda given: functional_call(self._objective, given, (part,)), has_aux=True)
-        gradients, (_, metrics) = differentiate(parameters)
-        gradient = torch.cat([gradients[name].flatten() for name in self._names])
-        return {**metrics, "gradient_norm": adam(vector, gradient, mean, square, scales, self._betas)}
+        watched = []
+        for some_scales, rows in zip(scales.unbind(), parts.unbind(), strict=True):
+            part = batch[rows]
+            differentiate = grad_and_value(partial(functional_call, self._objective, args=(part,)), has_aux=True)
+            gradients, (_, metrics) = differentiate(dict(zip(self._names, self._cut(vector), strict=True)))
+            gradient = torch.cat([gradients[name].flatten() for name in self._names])
+            norm = adam(vector, gradient, mean, square, some_scales, self._betas)
+            watched.append({**metrics, "gradient_norm": norm})
+        return _means(watched)
 
     def _cut(self, vector: Tensor) -> list[Tensor]:
         parts = vector.split(self._sizes)
         return [part.view(shape) for part, shape in zip(parts, self._shapes, strict=True)]
+
+
+def _means(watched: list[dict[str, Tensor]]) -> dict[str, Tensor]:
+    return {name: torch.stack([row[name] for row in watched]).mean() for name in watched[0]}
 
 
 class _Objective(nn.Module, Generic[Networks]):

@@ -35,7 +35,7 @@ from lemniscate.run.loggers import LOGGERS, Logger
 from lemniscate.run.progress import ProgressBar
 from lemniscate.run.seeding import derive, globals_undisturbed, seed_globals
 
-WORTH_COMPILING = 20_000
+WORTH_COMPILING = 15_000
 """gradient steps of a run from which on a compiled one is sooner done"""
 
 TRAINING = 0
@@ -157,7 +157,7 @@ class Run:
         engine = self.config.engine
         if engine == "compiled" or (engine == "auto" and self.config.gradient_steps >= WORTH_COMPILING):
             if self._visible:
-                print("Compiling the update: some 10 s the first time, 3 s from then on.", file=sys.stderr)
+                print("Compiling: about half a minute the first time, 4 s from then on.", file=sys.stderr)
             state.policy.make_native()
             for part in vars(state).values():
                 if isinstance(part, Descent):

@@ -1,0 +1,125 @@
+"""Final returns of the presets over seeds: mean, std and IQM of the last policy, deterministic, in Gymnasium itself.
+
+    .venv/bin/python benchmarks/returns.py ppo                       every environment of the README, every seed
+    .venv/bin/python benchmarks/returns.py ppo --envs Hopper-v5 --seeds 1 2
+    .venv/bin/python benchmarks/returns.py ppo --table               the table of what has been run, and its picture
+
+Each row of `benchmarks/results/returns.jsonl` is one policy: 100 episodes from starts that training never saw. Where an
+environment has two numbers of steps, one run serves both: its checkpoint at the first, its last policy at the second.
+"""
+
+import argparse
+import json
+import tempfile
+
+import numpy as np
+from common import RESULTS, append, provenance, rows
+
+MILLION = 1_000_000
+RUNS = {
+    # algorithm: environment: (numbers of steps, seeds)
+    "ppo": {
+        "CartPole-v1": ((50_000,), 5),
+        "LunarLander-v3": ((MILLION,), 5),
+        "HalfCheetah-v5": ((MILLION, 3 * MILLION), 5),
+        "Hopper-v5": ((MILLION,), 5),
+        "Walker2d-v5": ((MILLION,), 5),
+        "Ant-v5": ((MILLION, 3 * MILLION), 5),
+        "Humanoid-v5": ((MILLION, 3 * MILLION), 3),
+    }
+}
+
+
+def one(algorithm, env, seed, marks):
+    """Train once; evaluate at each mark."""
+    import lemniscate as lem
+
+    with tempfile.TemporaryDirectory() as folder:
+        run = lem.train(
+            algorithm, env, seed=seed, total_steps=marks[-1], keep_checkpoints=50, run=f"{folder}/run", progress=False
+        )
+        lines = [json.loads(line) for line in (run.path / "metrics.jsonl").read_text().splitlines()]
+        curve = [(line["step"], round(line["episode/return"], 1)) for line in lines if "episode/return" in line]
+        points = curve[:: max(1, len(curve) // 60)]
+        checkpoints = sorted((run.path / "checkpoints").glob("step-*"), key=lambda path: int(path.name[5:]))
+        for mark in marks:
+            policy = lem.load(next(path for path in checkpoints if int(path.name[5:]) >= mark))
+            scores = lem.evaluate(policy, episodes=100, seed=0, backend="gymnasium")
+            row = {
+                "algorithm": algorithm,
+                "env": env,
+                "steps": mark,
+                "seed": seed,
+                "mean_return": scores.mean_return,
+                "std_return": scores.std_return,
+                "mean_length": sum(scores.lengths) / scores.episodes,
+                "training_s": run.seconds * policy.step / curve[-1][0],
+                "curve": [point for point in points if point[0] <= mark],
+            }
+            append("returns", row | provenance())
+            print(f"{env} {mark:,} seed {seed}: {scores.mean_return:.1f} ± {scores.std_return:.1f}", flush=True)
+
+
+def measured(algorithm, env, steps):
+    return [row for row in rows("returns") if (row["algorithm"], row["env"], row["steps"]) == (algorithm, env, steps)]
+
+
+def summary(algorithm):
+    """The README's table of what has been run."""
+    from lemniscate.report.seeds import bootstrap_interval, iqm
+
+    print("| environment | steps | return, mean ± std over seeds | IQM [95 %] | worst seed | seeds | training |")
+    print("|---|---|---|---|---|---|---|")
+    for env, (marks, _) in RUNS[algorithm].items():
+        for mark in marks:
+            of = [
+                row for row in rows("returns") if (row["algorithm"], row["env"], row["steps"]) == (algorithm, env, mark)
+            ]
+            if not of:
+                continue
+            means = [row["mean_return"] for row in of]
+            low, high = bootstrap_interval(means)
+            seconds = np.median([row["training_s"] for row in of])
+            spread = f"{np.mean(means):,.0f} ± {np.std(means):,.0f} | {iqm(means):,.0f} [{low:,.0f}, {high:,.0f}]"
+            print(f"| {env} | {mark:,} | {spread} | {min(means):,.0f} | {len(means)} | {seconds / 60:.1f} min |")
+
+
+def draw(algorithm):
+    """Training returns of every seed, one panel for each environment."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 5.5), layout="constrained")
+    panels = figure.subplots(2, 4).flat
+    for env, (marks, _) in RUNS[algorithm].items():
+        of = measured(algorithm, env, marks[-1])
+        axes = next(panels)
+        axes.set_title(env, fontsize=10)
+        for row in of:
+            steps, values = zip(*row["curve"], strict=True)
+            axes.plot(np.array(steps) / 1e6, values, color="#3465a4", alpha=0.5, linewidth=1)
+        axes.set_xlabel("million steps", fontsize=8)
+        axes.tick_params(labelsize=8)
+        axes.spines[["top", "right"]].set_visible(False)
+    for axes in panels:
+        axes.set_visible(False)
+    figure.savefig(RESULTS / f"returns-{algorithm}.png", dpi=120)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("algorithm", choices=RUNS)
+    parser.add_argument("--envs", nargs="+")
+    parser.add_argument("--seeds", nargs="+", type=int)
+    parser.add_argument("--table", action="store_true", help="run nothing")
+    given = parser.parse_args()
+    if not given.table:
+        for env in given.envs or RUNS[given.algorithm]:
+            marks, seeds = RUNS[given.algorithm][env]
+            for seed in given.seeds or range(1, seeds + 1):
+                one(given.algorithm, env, seed, marks)
+    summary(given.algorithm)
+    draw(given.algorithm)
+
+
+if __name__ == "__main__":
+    main()
