@@ -33,7 +33,7 @@ bench: setup  ## the README's numbers: five seeds of each drone preset
 	$(BIN)/python benchmarks/figure_eight.py
 
 lock: setup  ## renew requirements.lock from pyproject.toml
-	$(BIN)/pip-compile --quiet --strip-extras --extra drone --extra classic-control --extra dev --no-emit-index-url --no-emit-find-links --no-emit-trusted-host --no-header --allow-unsafe --annotation-style=line --constraint constraints.txt --output-file requirements.lock pyproject.toml
+	$(BIN)/pip-compile --quiet --strip-extras --extra box2d --extra classic-control --extra drone --extra envpool --extra mujoco --extra dev --no-emit-index-url --no-emit-find-links --no-emit-trusted-host --no-header --allow-unsafe --annotation-style=line --constraint constraints.txt --output-file requirements.lock pyproject.toml
 	sed -i 's/+cpu//' requirements.lock
 
 clean:

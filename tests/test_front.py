@@ -90,7 +90,7 @@ def test_an_environment_whose_package_is_missing_is_said(monkeypatch):
 
     monkeypatch.setattr(gym, "make", missing)
     with pytest.raises(lem.UserError, match="CartPole-v1 cannot be made: Box2D is not installed"):
-        lem.train("ppo", "CartPole-v1")
+        lem.train("ppo", "CartPole-v1", backend="gymnasium")
 
 
 def test_an_observation_of_the_wrong_size_is_named(cartpole):

@@ -87,7 +87,7 @@ MUTANTS = [
     ("the gradient is not clipped", "nn/descent.py", ".clamp(max=1)", ".clamp(min=1, max=1)", "test_descent.py"),
     ("the gradient is added up", "nn/descent.py", "self._gradient.zero_()", "pass", "test_descent.py"),
     ("returns run on over the end", "nn/normalizer.py", "self.running * ~done", "self.running * 1", "test_nn.py"),
-    ("the learning rate adapts the wrong way", "algos/ppo.py", "1 / 1.5 if kl > 2", "1 / 1.5 if kl < 2", "test_ppo.py"),
+    ("the learning rate adapts the wrong way", "maths/schedules.py", "1 / 1.5 if kl > 2", "1 / 1.5 if kl < 2", "maths"),
 ]
 
 

@@ -18,6 +18,7 @@ import tyro
 from lemniscate import front
 from lemniscate.algos import ALGORITHMS
 from lemniscate.envs import api
+from lemniscate.envs.check import check as check_environment
 from lemniscate.errors import NonFiniteError, UserError, WorkerError, unknown
 from lemniscate.presets import BEST, PRESETS, choose
 from lemniscate.report import curves, pictures
@@ -27,7 +28,9 @@ from lemniscate.run.run import Stopped
 
 Command = Callable[[argparse.Namespace, list[str]], None]
 
-COMMANDS = ("train", "resume", "evaluate", "watch", "plot", "envs")
+COMMANDS = ("train", "resume", "evaluate", "watch", "plot", "envs", "check")
+
+MARKS = {"good": "✓", "note": "·", "bad": "✗"}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -116,6 +119,17 @@ def envs(given: argparse.Namespace, rest: list[str]) -> None:
             _say(f"{env_id:<40} {api.backend_for(env_id):<12} {', '.join(fitting)}")
 
 
+def check(given: argparse.Namespace, rest: list[str]) -> None:
+    """Look whether an environment is fit to be learned in, and say so in words."""
+    _nothing_left(rest)
+    bad = 0
+    for finding in check_environment(given.env, given.backend):
+        bad += finding.grade == "bad"
+        _say(f"{MARKS[finding.grade]} {finding.sentence}")
+    if bad:
+        raise UserError(f"{given.env} is not fit to be learned in: {bad} finding{'s' * (bad > 1)} above.")
+
+
 def _draw(runs: list[Path], policy: front.TrainedPolicy | None) -> None:
     """Plot the curves, and the flights of `policy` if it has a reference to track."""
     files = curves.plot_runs(runs)
@@ -188,7 +202,7 @@ def _parser() -> argparse.ArgumentParser:
 
     sub = command(train, _TrainParser)
     sub.add_argument("algorithm", help=", ".join(ALGORITHMS))
-    sub.add_argument("--env", help="environment id; a preset may have one")
+    sub.add_argument("--env", help="environment id, or module:Class of your own; a preset may have one")
     sub.add_argument("--run", type=Path, metavar="DIR", help="run directory; must not exist (default: runs/…)")
     sub.add_argument("--preset", help="; ".join(f"{a}: {', '.join(PRESETS[a])}" for a in ALGORITHMS))
     sub.add_argument("--track", metavar="LOGGER", help="a logger beside the local ones: wandb")
@@ -212,6 +226,10 @@ def _parser() -> argparse.ArgumentParser:
 
     sub = command(plot)
     sub.add_argument("runs", type=Path, nargs="+")
+
+    sub = command(check)
+    sub.add_argument("env", help="an id, or module:Class of your own")
+    sub.add_argument("--backend", help="who steps it; chosen by the id unless named")
 
     sub = command(envs)
     sub.add_argument("filter", nargs="?", default="", help="a part of the id")

@@ -4,6 +4,7 @@ Collect a rollout, estimate advantages, take a few epochs of clipped minibatch s
 Departures from the paper, and why: docs/notes/ppo.md.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -15,19 +16,19 @@ from torch import Generator, Tensor
 from lemniscate.data.rollout import collect, minibatches
 from lemniscate.errors import UserError
 from lemniscate.maths import (
-    clip_fraction,
+    adapt_to_kl,
     clipped_surrogate,
     explained_variance,
     gae,
-    kl_k1,
-    kl_k3,
+    linear,
+    ratio_statistics,
     standardize,
     value_loss,
 )
 from lemniscate.nn.descent import Descent
 from lemniscate.nn.networks import Activation
 from lemniscate.nn.normalizer import RewardScale
-from lemniscate.nn.policies import ActorCritic, GaussianPolicy, Policy
+from lemniscate.nn.policies import ActorCritic, Policy
 from lemniscate.run.config import Count, Fraction, NonNegative, Positive, Range, RunConfig
 from lemniscate.run.run import Run
 from lemniscate.run.seeding import generator
@@ -43,7 +44,7 @@ class Config(RunConfig):
     epochs: Count = 10
     """passes over a rollout, K"""
     minibatch_size: Count = 64
-    """rows of each gradient step, M; divides T · N"""
+    """rows of each gradient step, M; at most N · T"""
     learning_rate: Positive = 3e-4
     """Adam's step size at the start"""
     final_learning_rate: Fraction = 0.0
@@ -87,24 +88,14 @@ class Config(RunConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        rows = self.num_envs * self.num_steps
-        if rows % self.minibatch_size:
-            raise UserError(
-                f"minibatch_size must divide num_envs · num_steps = {rows}, and {self.minibatch_size} does not."
-            )
-        if self.minibatch_size == 1 and self.normalize_advantage:
+        if min(self.minibatch_size, self.num_envs * self.num_steps) == 1 and self.normalize_advantage:
             raise UserError("normalize_advantage needs minibatches of 2 rows or more; these have 1.")
-
-    @property
-    def num_minibatches(self) -> int:
-        """Gradient steps of an epoch."""
-        return self.num_envs * self.num_steps // self.minibatch_size
 
     @property
     def gradient_steps(self) -> int:
         """Of the whole run."""
-        updates = -(-self.total_steps // (self.num_envs * self.num_steps))
-        return updates * self.epochs * self.num_minibatches
+        rows = self.num_envs * self.num_steps
+        return math.ceil(self.total_steps / rows) * self.epochs * math.ceil(rows / self.minibatch_size)
 
 
 @dataclass
@@ -132,11 +123,7 @@ class State:
 def init(config: Config, spec: Spec, device: torch.device) -> State:
     """Fresh networks, a fresh optimizer, generators from the run's seed."""
     networks = ActorCritic(
-        spec,
-        config.hidden,
-        config.activation,
-        initial_log_std=config.initial_log_std,
-        normalize_observations=config.normalize_observations,
+        spec, config.hidden, config.activation, config.initial_log_std, config.normalize_observations
     ).to(device)
     betas = (0.9, config.adam_beta2)
     return State(
@@ -169,21 +156,19 @@ def loss(config: Config, networks: ActorCritic, batch: Batch) -> tuple[Tensor, d
     critic_loss = value_loss(networks.value(batch.obs), batch.target, batch.value, config.clip_value)  # L^VF, eq. 9
     entropy = distribution.entropy().mean()  # S, eq. 9
     total = policy_loss + config.value_coef * critic_loss - config.entropy_coef * entropy  # −L^CLIP+VF+S, eq. 9
-    log_ratio = log_ratio.detach()
     return total, {
         "losses/policy": policy_loss.detach(),
         "losses/value": critic_loss.detach(),
         "losses/entropy": entropy.detach(),
-        "approx_kl": kl_k3(log_ratio),
-        "old_approx_kl": kl_k1(log_ratio),
-        "clip_fraction": clip_fraction(log_ratio, config.clip),
+        **ratio_statistics(log_ratio.detach(), config.clip),
     }
 
 
 def update(config: Config, state: State, rollout: Rollout) -> Mapping[str, Tensor | float]:
     """K epochs of minibatch steps on one rollout (algorithm 1); returns the means of what was watched."""
     if config.desired_kl is None:
-        state.learning_rate = anneal(config, state.step)
+        progress = state.step / config.total_steps
+        state.learning_rate = linear(config.learning_rate, config.final_learning_rate, progress)
     if config.scale_rewards:
         state.reward_scale.update(rollout)
     batch = collected = advantages(config, state, rollout)
@@ -192,32 +177,18 @@ def update(config: Config, state: State, rollout: Rollout) -> Mapping[str, Tenso
     for epoch in range(config.epochs):
         if config.recompute_advantages and epoch > 0:
             batch = replace(advantages(config, state, rollout), log_prob=collected.log_prob)
-        parts = minibatches(played, config.num_minibatches, config.minibatch_size, state.shuffle)
+        parts = minibatches(played, rollout.num_steps, config.minibatch_size, state.shuffle)
         watched.append(state.optimizer(batch, parts, state.learning_rate))
         kl = watched[-1]["approx_kl"].item()
         if config.desired_kl is not None:
-            state.learning_rate = adapt(state.learning_rate, kl, config.desired_kl)
+            state.learning_rate = adapt_to_kl(state.learning_rate, kl, config.desired_kl)
         if config.target_kl is not None and kl > config.target_kl:
             break
     state.policy.observe(rollout.obs[rollout.valid])  # afterwards: both probabilities are taken through one normalizer
     state.step += rollout.num_steps
     means = {name: torch.stack([row[name] for row in watched]).mean() for name in watched[0]}
-    if isinstance(state.policy, GaussianPolicy):
-        means["policy_std"] = state.policy.log_std.detach().exp().mean()
     explained = explained_variance(collected.value[played], collected.target[played])
-    return {**means, "explained_variance": explained, "learning_rate": state.learning_rate}
-
-
-def anneal(config: Config, step: int) -> float:
-    """The learning rate at `step`: linear from learning_rate to its final fraction."""
-    progress = min(1.0, step / config.total_steps)
-    return config.learning_rate * (1 - (1 - config.final_learning_rate) * progress)
-
-
-def adapt(learning_rate: float, kl: float, desired_kl: float) -> float:
-    """A smaller learning rate after an epoch that went twice too far, a larger one after one that went half as far."""
-    factor = 1 / 1.5 if kl > 2 * desired_kl else 1.5 if kl < desired_kl / 2 else 1.0
-    return min(max(learning_rate * factor, 1e-6), 1e-2)
+    return {**means, **state.policy.watch(), "explained_variance": explained, "learning_rate": state.learning_rate}
 
 
 def train(config: Config, run: Run) -> State:

@@ -1,5 +1,7 @@
 """Collecting rollouts and cutting them into minibatches."""
 
+import math
+
 import torch
 from torch import Generator, Tensor
 
@@ -20,12 +22,19 @@ def collect(env: VecEnv, policy: Policy, num_steps: int, generator: Generator) -
     return Rollout.stack(rows)
 
 
-def minibatches(rows: Tensor, count: int, size: int, generator: Generator) -> Tensor:
-    """`rows` in a new random order, cut into `count` parts of `size`: [count, size].
+def minibatches(played: Tensor, collected: int, size: int, generator: Generator) -> Tensor:
+    """The rows of an epoch in a new random order, cut into minibatches: indices [K, b].
 
-    Every part has the same size, whatever was played, so that one compiled program serves all: rows beyond
-    `count · size` sit this epoch out, and where rows are missing the first ones are taken again.
+    Every epoch of a run has the same K and b, whatever was played, so that one compiled program serves all. Where rows
+    are missing, the first ones of the order are taken again.
+
+    Args:
+        played: the rows to learn from, [B] int64, at most `collected`.
+        collected: how many rows a rollout has.
+        size: b; a rollout with fewer rows is one minibatch.
+        generator: draws the order.
     """
-    order = rows[torch.randperm(len(rows), generator=generator, device=generator.device)]
-    again = -(-count * size // len(rows))
-    return order.repeat(again)[: count * size].view(count, size)
+    size = min(size, collected)
+    wanted = math.ceil(collected / size) * size
+    order = played[torch.randperm(len(played), generator=generator, device=generator.device)]
+    return order.repeat(math.ceil(wanted / len(order)))[:wanted].view(-1, size)

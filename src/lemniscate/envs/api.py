@@ -173,7 +173,15 @@ def known_ids() -> list[str]:
 
 
 def backend_for(env_id: str) -> str:
-    """The backend that serves `env_id`. Raises `UserError` with the nearest names if there is none."""
+    """The backend that serves `env_id`, an id or somebody's own `module:Class`.
+
+    Raises `UserError` with the nearest names if there is none.
+    """
+    if ":" in env_id:
+        from lemniscate.envs.gymnasium import spec_of
+
+        spec_of(env_id)
+        return "gymnasium"
     if env_id not in known_ids():
         raise unknown("environment", env_id, known_ids())
     if env_id in CRAZYFLOW_IDS:

@@ -1,9 +1,12 @@
 """Gymnasium vector environments, in all three autoreset modes."""
 
+import importlib
 import signal
+import sys
 from dataclasses import replace
 from functools import partial
 from multiprocessing import parent_process
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -43,7 +46,7 @@ class GymnasiumBackend:
         workers: bool = False,
         **kwargs: Any,
     ) -> None:
-        self._id, self._workers, self._kwargs = env_id, workers, kwargs
+        self._gym_spec, self._workers, self._kwargs = spec_of(env_id), workers, kwargs
         self.num_envs, self.device = num_envs, device
         try:
             self._envs = self._build()
@@ -56,7 +59,7 @@ class GymnasiumBackend:
         layout, action = observation_layout(space, env_id), action_kind(self._envs.single_action_space, env_id)
         if isinstance(action, Discrete) and "action_mask" in self._envs.reset(seed=0)[1]:
             action = replace(action, masked=True)
-        limit = gym.spec(env_id).max_episode_steps
+        limit = self._gym_spec.max_episode_steps
         self._stagger_up_to = limit if stagger and self.mode is AutoresetMode.DISABLED else None
         self.spec = Spec(
             env_id=env_id,
@@ -67,9 +70,9 @@ class GymnasiumBackend:
         )
 
     def _build(self) -> VectorEnv:
-        if gym.spec(self._id).entry_point is None:
-            return gym.make_vec(self._id, self.num_envs, **self._kwargs)
-        copies = [partial(_make, gym.spec(self._id), **self._kwargs)] * self.num_envs
+        if self._gym_spec.entry_point is None:
+            return gym.make_vec(self._gym_spec, self.num_envs, **self._kwargs)
+        copies = [partial(make_one, self._gym_spec, **self._kwargs)] * self.num_envs
         if self._workers:
             return WatchedVectorEnv(copies, context="forkserver", autoreset_mode=AutoresetMode.DISABLED)
         return SyncVectorEnv(copies, autoreset_mode=AutoresetMode.DISABLED)
@@ -120,8 +123,8 @@ class GymnasiumBackend:
             return obs
         if "final_obs" not in info:
             raise UserError(
-                f"{self._id} resets in the same step and hides the final observation (no info['final_obs']), so its"
-                " time-outs cannot be learned from; make it NEXT_STEP, DISABLED, or give final_obs."
+                f"{self.spec.env_id} resets in the same step and hides the final observation (no info['final_obs']), so"
+                " its time-outs cannot be learned from; make it NEXT_STEP, DISABLED, or give final_obs."
             )
         next_obs, size = obs.copy(), self.spec.observation_size
         for row in np.flatnonzero(done):
@@ -148,7 +151,28 @@ def _row(batch: Any, row: int) -> Any:
     return {name: _row(part, row) for name, part in batch.items()} if isinstance(batch, dict) else batch[row]
 
 
-def _make(spec: EnvSpec, **kwargs: Any) -> gym.Env:
+def spec_of(env_id: str) -> EnvSpec:
+    """How Gymnasium makes an environment: a registered id, `module:id`, or `module:Class` of somebody's own.
+
+    A module is looked for in the working directory too. Raises `UserError` if it or the class is not there.
+    """
+    module_name, _, name = env_id.rpartition(":")
+    if not module_name:
+        return gym.spec(env_id)
+    if str(Path.cwd()) not in sys.path:
+        sys.path.insert(0, str(Path.cwd()))
+    try:
+        module = importlib.import_module(module_name)
+    except ImportError as error:
+        raise UserError(f"{env_id} cannot be made: {error}.") from error
+    if name in gym.registry:
+        return gym.spec(name)
+    if not (isinstance(getattr(module, name, None), type) and issubclass(getattr(module, name), gym.Env)):
+        raise UserError(f"{env_id} cannot be made: {module_name} has neither an environment class nor an id {name}.")
+    return EnvSpec(name, entry_point=f"{module_name}:{name}")
+
+
+def make_one(spec: EnvSpec, **kwargs: Any) -> gym.Env:
     """One environment, from its spec: a worker process may not know the id.
 
     There, Ctrl-C is left to the parent, which stops the run in order.

@@ -74,7 +74,7 @@ def action_kind(space: gym.Space, env_id: str) -> Action:
     if isinstance(space, spaces.MultiBinary):
         return MultiBinary(int(np.prod(space.shape)), tuple(map(int, space.shape)))
     if isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.floating):
-        low, high = (tuple(map(float, np.ravel(bound))) for bound in (space.low, space.high))
+        low, high = (tuple(map(float, np.ravel(np.float32(bound)))) for bound in (space.low, space.high))
         return Box(low, high, tuple(map(int, space.shape)))
     raise UserError(
         f"{env_id} takes {space} actions; what can be acted in is Discrete, MultiDiscrete, MultiBinary and a Box of"

@@ -3,12 +3,14 @@
 from lemniscate.maths.distributions import Bernoulli, Categorical, Distribution, Gaussian, MultiCategorical
 from lemniscate.maths.losses import clipped_surrogate, value_loss
 from lemniscate.maths.returns import gae
+from lemniscate.maths.schedules import adapt_to_kl, linear
 from lemniscate.maths.stats import (
     clip_fraction,
     explained_variance,
     kl_k1,
     kl_k3,
     merge_moments,
+    ratio_statistics,
     standardize,
 )
 
@@ -18,13 +20,16 @@ __all__ = [
     "Distribution",
     "Gaussian",
     "MultiCategorical",
+    "adapt_to_kl",
     "clip_fraction",
     "clipped_surrogate",
     "explained_variance",
     "gae",
     "kl_k1",
     "kl_k3",
+    "linear",
     "merge_moments",
+    "ratio_statistics",
     "standardize",
     "value_loss",
 ]

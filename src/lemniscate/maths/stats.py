@@ -38,6 +38,15 @@ def clip_fraction(log_ratio: Tensor, clip: float) -> Tensor:
     return ((log_ratio.exp() - 1).abs() > clip).float().mean()
 
 
+def ratio_statistics(log_ratio: Tensor, clip: float) -> dict[str, Tensor]:
+    """What to watch of how far a policy has moved: the two KL estimates and the clip fraction, by their usual names."""
+    return {
+        "approx_kl": kl_k3(log_ratio),
+        "old_approx_kl": kl_k1(log_ratio),
+        "clip_fraction": clip_fraction(log_ratio, clip),
+    }
+
+
 def merge_moments(
     mean_a: Tensor, var_a: Tensor, count_a: Tensor, mean_b: Tensor, var_b: Tensor, count_b: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:

@@ -40,6 +40,10 @@ class Policy(nn.Module):
         """What `Distribution.sample` needs for actions at observations [*shape, O]."""
         raise NotImplementedError
 
+    def watch(self) -> dict[str, Tensor]:
+        """What is worth a curve, by its usual name."""
+        return {}
+
     def observe(self, obs: Tensor) -> None:
         """Take [B, O] training observations into the normalizer's statistics, if there is one."""
         if isinstance(self.normalizer, RunningNorm):
@@ -60,6 +64,10 @@ class GaussianPolicy(Policy):
     def noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
         """Standard normal, [*shape, A]."""
         return torch.randn(*shape, *self.log_std.shape, generator=generator, device=generator.device)
+
+    def watch(self) -> dict[str, Tensor]:
+        """The mean of σ over coordinates."""
+        return {"policy_std": self.log_std.detach().exp().mean()}
 
 
 class CategoricalPolicy(Policy):
@@ -135,7 +143,6 @@ class ActorCritic(nn.Module):
         spec: Spec,
         hidden: Sequence[int] = (64, 64),
         activation: Activation = "tanh",
-        *,
         initial_log_std: float = 0.0,
         normalize_observations: bool = False,
     ) -> None:

@@ -9,13 +9,14 @@ import gymnasium as gym
 import numpy as np
 
 from lemniscate.envs.api import VecEnv
+from lemniscate.envs.gymnasium import make_one, spec_of
 from lemniscate.errors import UserError
 from lemniscate.nn.policies import Policy
 from lemniscate.report import curves, flight
 from lemniscate.run.evaluate import Evaluation, evaluate
 from lemniscate.types import Spec
 
-Act = Callable[[object], np.ndarray]
+Act = Callable[..., np.ndarray]
 
 
 def sentence(scores: Evaluation) -> str:
@@ -89,10 +90,10 @@ def show_flight(policy: Policy, env: VecEnv, seed: int) -> None:
 def film_episode(act: Act, spec: Spec, file: Path, seed: int) -> str:
     """Record one episode of a Gymnasium environment into `file`."""
     env = _rendered(spec.env_id, "rgb_array")
-    obs, _ = env.reset(seed=seed)
+    obs, info = env.reset(seed=seed)
     frames, over = [np.asarray(env.render())], False
     while not over:
-        obs, _, terminated, truncated, _ = env.step(act(obs))
+        obs, _, terminated, truncated, info = env.step(act(obs, action_mask=info.get("action_mask")))
         frames.append(np.asarray(env.render()))
         over = terminated or truncated
     fps = float(env.metadata.get("render_fps", 30))
@@ -104,17 +105,17 @@ def film_episode(act: Act, spec: Spec, file: Path, seed: int) -> str:
 def show_episode(act: Act, spec: Spec, seed: int) -> None:
     """Play one episode in a window, at its own speed."""
     env = _rendered(spec.env_id, "human")
-    obs, _ = env.reset(seed=seed)
+    obs, info = env.reset(seed=seed)
     over = False
     while not over:
-        obs, _, terminated, truncated, _ = env.step(act(obs))
+        obs, _, terminated, truncated, info = env.step(act(obs, action_mask=info.get("action_mask")))
         over = terminated or truncated
     env.close()
 
 
 def _rendered(env_id: str, mode: str) -> gym.Env:
     try:
-        env = gym.make(env_id, render_mode=mode)
+        env = make_one(spec_of(env_id), render_mode=mode)
         env.reset(seed=0)
         env.render()
         return env

@@ -1,0 +1,151 @@
+"""Is this environment fit to be learned in? Gymnasium's own checker, and what it does not look at."""
+
+import time
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from gymnasium.utils.env_checker import check_env
+
+from lemniscate.envs import api
+from lemniscate.envs.api import VecEnv
+from lemniscate.envs.gymnasium import make_one, spec_of
+from lemniscate.errors import NonFiniteError, UserError
+from lemniscate.types import Action, Box, Discrete, MultiDiscrete, Rollout
+
+COPIES, STEPS = 4, 500
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One sentence about an environment. `grade` is "good", "note" (works, but look at it) or "bad"."""
+
+    grade: str
+    sentence: str
+
+
+def check(env_id: str, backend: str | None = None) -> Iterator[Finding]:
+    """Everything found, one by one; the first that keeps it from being made is the last."""
+    served_by = backend or api.backend_for(env_id)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            env = api.make(env_id, COPIES, backend=backend)
+    except UserError as error:
+        yield Finding("bad", str(error))
+        return
+    try:
+        yield from _spaces(env, served_by)
+        if served_by.startswith("gymnasium") and spec_of(env_id).entry_point is not None:
+            yield from _gymnasium(env_id)
+        yield from _behaviour(env)
+    finally:
+        env.close()
+
+
+def _spaces(env: VecEnv, served_by: str) -> Iterator[Finding]:
+    spec = env.spec
+    parts = ", ".join(f"{part.name} {part.size}" for part in spec.layout)
+    seen = "an image" if spec.image else f"{spec.observation_size} numbers ({parts})"
+    yield Finding("good", f"Served by {served_by}; observes {seen}; acts by {_describe(spec.action)}.")
+    if spec.max_episode_steps is None:
+        yield Finding("note", "It has no time limit: a policy that never ends an episode is never evaluated.")
+    if isinstance(spec.action, Box) and not np.isfinite([*spec.action.low, *spec.action.high]).all():
+        yield Finding("note", "Some actions have no bound: those are not scaled, so a policy begins around zero, ±1.")
+
+
+def _describe(action: Action) -> str:
+    if isinstance(action, Box):
+        return f"{action.size} continuous numbers"
+    if isinstance(action, Discrete):
+        return f"one of {action.n} choices" + (", masked" if action.masked else "")
+    if isinstance(action, MultiDiscrete):
+        return f"{len(action.nvec)} choices, of {', '.join(map(str, action.nvec))}"
+    return f"{action.n} switches"
+
+
+def _gymnasium(env_id: str) -> Iterator[Finding]:
+    found: list[Finding] = []
+    env = make_one(spec_of(env_id))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            check_env(env.unwrapped, skip_render_check=True)
+        except Exception as error:  # the environment's own code: whatever it raises is the finding
+            found.append(Finding("bad", f"Gymnasium's checker: {_one_line(error)}"))
+        finally:
+            env.close()
+    told = sorted({_one_line(warning.message) for warning in caught if warning.category is UserWarning})
+    found += [Finding("note", f"Gymnasium's checker: {sentence}") for sentence in told]
+    yield from found or [Finding("good", "Gymnasium's checker finds nothing.")]
+
+
+def _behaviour(env: VecEnv) -> Iterator[Finding]:
+    try:
+        started = time.perf_counter()
+        first = _play(env, seed=0)
+        speed = COPIES * STEPS / (time.perf_counter() - started)
+        again, other = _play(env, seed=0), _play(env, seed=1)
+    except NonFiniteError as error:
+        yield Finding("bad", f"{error} Learning would stop there.")
+        return
+    yield Finding("good", f"{STEPS} random steps: every observation and reward is finite.")
+    same = all(torch.equal(getattr(first, name), getattr(again, name)) for name in ("obs", "reward", "terminated"))
+    if not same:
+        yield Finding("bad", "The same seed and actions give another episode: runs cannot be repeated, nor resumed.")
+    elif torch.equal(first.obs, other.obs):
+        yield Finding("note", "Another seed gives the same episodes: everything about it is deterministic.")
+    else:
+        yield Finding("good", "The same seed gives the same episodes, another one others.")
+    yield from _rows(first)
+    rewards = first.reward[first.valid]
+    if rewards.abs().max() > 100:
+        yield Finding("note", f"Rewards reach {rewards.abs().max():.3g}; train with --scale-rewards.")
+    yield Finding("good", f"{speed:,.0f} steps a second ({COPIES} copies, random actions).")
+
+
+def _rows(rollout: Rollout) -> Iterator[Finding]:
+    inside = (rollout.valid & ~rollout.done)[:-1]
+    if not torch.equal(rollout.next_obs[:-1][inside], rollout.obs[1:][inside]):
+        yield Finding("bad", "Within an episode, an observation is not the one that the step before ended in.")
+    ended, timed_out = int(rollout.terminated.sum()), int(rollout.truncated.sum())
+    ignored = int((~rollout.valid).sum())
+    resets = f", and {ignored} steps in which it ignored its action to reset itself, which are not learned from"
+    yield Finding(
+        "good", f"{ended} episodes ended by its rules and {timed_out} by the clock{resets if ignored else ''}."
+    )
+
+
+def _play(env: VecEnv, seed: int) -> Rollout:
+    """Random actions, always the same."""
+    rng = np.random.default_rng(7)
+    rows = []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # Gymnasium's, of which we have told already
+        env.restart(seed)
+        for _ in range(STEPS):
+            obs, action = env.obs, torch.from_numpy(_random(env, rng))
+            step = env.step(action)
+            rows.append(Rollout(obs, action, step.reward, step.next_obs, step.terminated, step.truncated, step.valid))
+    return Rollout.stack(rows)
+
+
+def _random(env: VecEnv, rng: np.random.Generator) -> np.ndarray:
+    action = env.spec.action
+    if isinstance(action, Box):
+        return rng.uniform(-1, 1, (env.num_envs, action.size)).astype(np.float32)
+    if isinstance(action, MultiDiscrete):
+        return rng.integers(action.nvec, size=(env.num_envs, len(action.nvec)))
+    if isinstance(action, Discrete) and action.masked:
+        masks = env.obs[:, -action.n :].numpy()
+        return np.array([rng.choice(np.flatnonzero(mask)) for mask in masks])
+    if isinstance(action, Discrete):
+        return rng.integers(action.n, size=env.num_envs)
+    return rng.integers(2, size=(env.num_envs, action.n))
+
+
+def _one_line(message: object) -> str:
+    text = str(message).replace("\x1b[33m", "").replace("\x1b[0m", "").removeprefix("WARN: ")
+    return " ".join(text.split())

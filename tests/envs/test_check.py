@@ -1,0 +1,98 @@
+"""`lemniscate check` finds what is wrong, and says it."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import worlds  # noqa: F401  (registers the copies)
+from lemniscate.envs.check import check
+
+
+class Fine(gym.Env):
+    """Nothing is wrong with it."""
+
+    observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        return self.look(), {}
+
+    def step(self, action):
+        self.t += 1
+        return self.look(), self.pay(), self.t == 20, False, {}
+
+    def look(self):
+        return self.np_random.uniform(-1, 1, 2).astype(np.float32)
+
+    def pay(self):
+        return 1.0
+
+
+class Unseeded(Fine):
+    def look(self):
+        return np.random.default_rng().uniform(-1, 1, 2).astype(np.float32)
+
+
+class Blind(Fine):
+    def look(self):
+        return np.zeros(2, dtype=np.float32)
+
+
+class Nan(Fine):
+    def pay(self):
+        return float("nan") if self.t > 7 else 1.0
+
+
+class WrongType(Fine):
+    def look(self):
+        return [5.0, 5.0]
+
+
+class Rich(Fine):
+    def pay(self):
+        return 1e4
+
+
+def found(name):
+    return [(finding.grade, finding.sentence) for finding in check(f"envs.test_check:{name}")]
+
+
+def test_a_good_environment():
+    findings = found("Fine")
+    assert not [sentence for grade, sentence in findings if grade == "bad"]
+    text = " ".join(sentence for _, sentence in findings)
+    assert "observes 2 numbers" in text
+    assert "one of 2 choices" in text
+    assert "has no time limit" in text
+    assert "100 episodes ended by its rules" in text
+
+
+@pytest.mark.parametrize(
+    ("name", "grade", "said"),
+    [
+        ("Unseeded", "bad", "cannot be repeated"),
+        ("Blind", "note", "Another seed gives the same"),
+        ("Nan", "bad", "The reward of environment 0 is nan"),
+        ("WrongType", "bad", "Gymnasium's checker: The first element returned by `env.reset()`"),
+        ("Rich", "note", "train with --scale-rewards"),
+    ],
+)
+def test_what_is_wrong_is_said(name, grade, said):
+    assert any(grade == g and said in sentence for g, sentence in found(name)), found(name)
+
+
+def test_masks_images_and_native_backends_are_played():
+    assert any("masked" in sentence for _, sentence in [(f.grade, f.sentence) for f in check("Copy-masked-v0")])
+    assert any("an image" in f.sentence for f in check("Copy-image-v0"))
+    assert "Served by envpool" in next(check("CartPole-v1")).sentence
+
+
+def test_a_module_that_is_not_there():
+    from lemniscate.errors import UserError
+
+    with pytest.raises(UserError, match="nowhere:Env cannot be made: No module named 'nowhere'"):
+        list(check("nowhere:Env"))
+    with pytest.raises(UserError, match="neither an environment class nor an id Nothing"):
+        list(check("envs.test_check:Nothing"))

@@ -1,0 +1,110 @@
+"""EnvPool's environments are Gymnasium's: the reason why it may serve them."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+from lemniscate.envs import api
+from lemniscate.envs.envpool import EnvpoolBackend
+
+CPU = torch.device("cpu")
+MUJOCO = {"Ant-v5": 2, "HalfCheetah-v5": 1, "Hopper-v5": 1, "Humanoid-v5": 2, "Walker2d-v5": 1}
+"""how many of the first positions the observation leaves out"""
+
+
+@pytest.mark.parametrize("env_id", api.ENVPOOL_IDS)
+def test_spaces_and_limits_are_the_same(env_id):
+    pool, own = (api.make(env_id, 2, backend=backend) for backend in ("envpool", "gymnasium"))
+    assert pool.spec == own.spec
+    own.close()
+
+
+@pytest.mark.parametrize("env_id", MUJOCO)
+def test_each_step_is_the_same(env_id):
+    """From EnvPool's positions and velocities, Gymnasium's physics steps to the same place, reward and end.
+
+    Exact but for contacts, whose solver starts from what it found before: so most steps must agree, not all. Where the
+    observation clips velocities (to ±10, for two of them), the state is not known and the step does not count.
+    """
+    own = gym.make(env_id).unwrapped
+    own.reset(seed=0)
+    hidden, nq, nv = MUJOCO[env_id], own.model.nq, own.model.nv
+    raw = EnvpoolBackend(env_id, 1, CPU)._build(env_id, 3)
+    obs, _ = raw.reset()
+    rng = np.random.default_rng(0)
+    differences, ends = [], 0
+    for _ in range(300):
+        own.set_state(np.r_[np.zeros(hidden), obs[0, : nq - hidden]], obs[0, nq - hidden : nq - hidden + nv])
+        known = np.abs(obs[0]).max() < 10 or env_id not in ("Hopper-v5", "Walker2d-v5")
+        action = rng.uniform(own.action_space.low, own.action_space.high)
+        expected, reward, terminated, _, _ = own.step(action)
+        obs, rewards, terminations, truncations, _ = raw.step(action[None])
+        if known:
+            differences.append((np.abs(obs[0] - expected)[: nq - hidden + nv].max(), abs(rewards[0] - reward)))
+            ends += terminations[0] != terminated
+        if terminations[0] or truncations[0]:
+            obs, _ = raw.reset()
+    of_obs, of_reward = np.median(differences, axis=0)
+    assert len(differences) > 50
+    assert of_obs < 1e-3
+    assert of_reward < 1e-3
+    assert ends <= 3
+
+
+def test_cart_pole_steps_the_same():
+    own = gym.make("CartPole-v1").unwrapped
+    own.reset(seed=0)
+    pool = EnvpoolBackend("CartPole-v1", 1, CPU)._build("CartPole-v1", 3)
+    obs, _ = pool.reset()
+    for t in range(200):
+        own.state, own.steps_beyond_terminated = tuple(obs[0].astype(np.float64)), None
+        action = t // 3 % 2
+        expected, reward, terminated, _, _ = own.step(action)
+        obs, rewards, terminations, _, _ = pool.step(np.array([action]))
+        np.testing.assert_allclose(obs[0], expected, atol=1e-5)
+        assert (rewards[0], terminations[0]) == (reward, terminated)
+        if terminated:
+            obs, _ = pool.reset()
+
+
+def test_lunar_lander_falls_the_same():
+    """Its terrain and push are random, so it is the statistics of many falls that must agree."""
+    lengths, returns = {}, {}
+    for backend in ("envpool", "gymnasium"):
+        env = api.make("LunarLander-v3", 16, backend=backend)
+        env.restart(0)
+        rng = np.random.default_rng(1)
+        episodes = []
+        while len(episodes) < 200:
+            env.step(torch.from_numpy(rng.integers(4, size=16)))
+            ended = env.take_episodes()
+            episodes += zip(ended.lengths, ended.returns, strict=True)
+        lengths[backend], returns[backend] = np.array(episodes[:200]).T
+        env.close()
+    for of in (lengths, returns):
+        error = np.sqrt(sum(values.var() / 200 for values in of.values()))
+        assert abs(of["envpool"].mean() - of["gymnasium"].mean()) < 4 * error
+
+
+def test_bits_do_not_depend_on_the_number_of_threads():
+    def play(threads):
+        env = EnvpoolBackend("Hopper-v5", 5, CPU, stagger=True, num_threads=threads)
+        obs, generator = [env.restart(4)], torch.Generator().manual_seed(0)
+        for _ in range(120):
+            obs.append(env.step(torch.rand(5, 3, generator=generator) * 2 - 1).obs)
+        return torch.stack(obs)
+
+    assert torch.equal(play(1), play(2))
+
+
+def test_bits_do_not_depend_on_workers():
+    def play(backend):
+        env = api.make("CartPole-v1", 3, backend=backend, stagger=True)
+        obs = [env.restart(4)]
+        for t in range(60):
+            obs.append(env.step(torch.full((3,), t % 2)).obs)
+        env.close()
+        return torch.stack(obs)
+
+    assert torch.equal(play("gymnasium"), play("gymnasium-async"))

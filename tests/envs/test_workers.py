@@ -1,0 +1,63 @@
+"""A worker that dies or hangs is named within a bounded time, and closing never hangs."""
+
+import os
+import signal
+import time
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+from lemniscate.envs import api
+from lemniscate.envs.workers import WatchedVectorEnv
+from lemniscate.errors import WorkerError
+
+
+class Stubborn(gym.Env):
+    """Sleeps for ever at the third step of the copy whose number is asked for, deaf to every signal but SIGKILL."""
+
+    observation_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.hangs, self.t = seed == 2, 0
+        return np.zeros(1, dtype=np.float32), {}
+
+    def step(self, action):
+        self.t += 1
+        if self.hangs and self.t == 3:
+            signal.signal(signal.SIGTERM, signal.SIG_IGN)
+            time.sleep(1000)
+        return np.zeros(1, dtype=np.float32), 0.0, False, False, {}
+
+
+def step(env, times):
+    for _ in range(times):
+        env.step(torch.zeros(3, dtype=torch.int64))
+
+
+def test_one_that_dies_is_named():
+    env = api.make("CartPole-v1", 3, backend="gymnasium-async")
+    try:
+        env.restart(0)
+        step(env, 1)
+        os.kill(env._backend._envs.processes[1].pid, signal.SIGKILL)
+        with pytest.raises(WorkerError, match=r"The process of environment 1 died \(exit code -9\)"):
+            step(env, 2)
+    finally:
+        env.close()
+
+
+def test_one_that_hangs_is_named_and_closing_kills_it(monkeypatch):
+    monkeypatch.setattr(WatchedVectorEnv, "patience", 2.0)
+    env = api.make("envs.test_workers:Stubborn", 3, backend="gymnasium-async")
+    try:
+        env.restart(0)  # its copies get the seeds 0, 1, 2
+        with pytest.raises(WorkerError, match=r"Environment 2 has not answered for 2 s\."):
+            step(env, 3)
+        processes = env._backend._envs.processes
+    finally:
+        env.close()
+    assert not any(process.is_alive() for process in processes)
