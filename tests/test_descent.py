@@ -68,10 +68,26 @@ def engines_agree(actions):
     assert compiled._engine._chosen is compiled._engine._compiled
 
 
-@pytest.mark.parametrize("actions", ACTIONS)
-def test_the_two_engines_agree(actions):
+def programs_are_not_mixed_up():
+    """Two runs of one process, of other sizes and other constants; without checks one program would serve both."""
+    for clip, size in ((0.2, 8), (1e-3, 8), (0.2, 4)):
+        (one, loss), (two, _) = fresh(clip=clip), fresh(clip=clip)
+        eager, compiled = Descent(one, loss), Descent(two, loss)
+        compiled.make_native()
+        two.policy.make_native()
+        parts = torch.arange(24).view(-1, size)
+        for _ in range(2):
+            a, b = eager(numbers(), parts, 0.01), compiled(numbers(), parts, 0.01)
+            torch.testing.assert_close(a, b)
+        obs = torch.randn(size, 5, dtype=torch.float64)
+        noise = torch.zeros(size, 2, dtype=torch.float64)
+        torch.testing.assert_close(two.policy.act(obs, noise), one.policy.act(obs, noise))
+
+
+@pytest.mark.parametrize("call", ["engines_agree('box')", "engines_agree('discrete')", "programs_are_not_mixed_up()"])
+def test_the_two_engines_agree(call):
     """In a process of its own: the shape checks of this one are not for the compiler."""
-    code = f"from test_descent import engines_agree; engines_agree({actions!r})"
+    code = f"from test_descent import *; {call}"
     done = subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parent, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 

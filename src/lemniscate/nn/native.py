@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Callable
+from types import FunctionType, MethodType
 from typing import Any, Generic, ParamSpec, TypeVar
 
 import torch
@@ -21,7 +22,7 @@ class Native(Generic[P, R]):
         options: dict[str, Any] = {"guard_filter_fn": torch.compiler.skip_all_guards_unsafe}
         if device.type == "cpu":
             options["cpp_wrapper"] = True
-        self._compiled = torch.compile(function, fullgraph=True, dynamic=False, options=options)
+        self._compiled = torch.compile(_own(function), fullgraph=True, dynamic=False, options=options)
         self._otherwise = otherwise
         self._chosen: Callable[P, R] | None = None
 
@@ -38,3 +39,11 @@ class Native(Generic[P, R]):
             print(f"Nothing can be compiled here ({reason}); going on without.", file=sys.stderr)
             self._chosen = self._otherwise
             return self._otherwise(*args, **kwargs)
+
+
+def _own(method: Callable[P, R]) -> Callable[P, R]:
+    """The same method with code of its own: programs are kept by code, and without checks the wrong one would serve."""
+    assert isinstance(method, MethodType)
+    function = method.__func__
+    copied = FunctionType(function.__code__.replace(), function.__globals__, function.__name__)
+    return MethodType(copied, method.__self__)
