@@ -32,13 +32,19 @@ MUTANTS = [
     ("k3 without its control variate", "maths/stats.py", "log_ratio.exp() - 1 - log_ratio", "-log_ratio", "maths"),
     ("moments forget the distance of means", "maths/stats.py", " + delta.square() *", " + 0 * delta *", "maths"),
     ("log-prob without the std", "maths/distributions.py", "(self.log_std.sum(-1) +", "(", "maths"),
-    ("actions scaled to half their range", "envs/spaces.py", "base + 0.5 *", "base + 0.25 *", "envs/test_spaces.py"),
+    (
+        "actions scaled to half their range",
+        "envs/spaces.py",
+        "base + half *",
+        "base + 0.5 * half *",
+        "envs/test_spaces.py",
+    ),
     ("reset rows are real", "envs/gymnasium.py", "~self._resetting, done", "valid, done", "envs/test_contract.py"),
     (
         "the reset observation is the final one",
         "envs/gymnasium.py",
-        "rows = np.flatnonzero(done)",
-        "rows = np.flatnonzero(done & False)",
+        "in np.flatnonzero(done):",
+        "in np.flatnonzero(done & False):",
         "envs/test_contract.py",
     ),
     (
@@ -80,13 +86,22 @@ MUTANTS = [
     (
         "Adam without its bias correction",
         "nn/descent.py",
-        "/ (1 - self._betas[0]",
-        "/ (1 - 0 * self._betas[0]",
+        "learning_rate / (1 - beta_1**step)",
+        "learning_rate",
         "test_descent.py",
     ),
     ("the gradient is not clipped", "nn/descent.py", ".clamp(max=1)", ".clamp(min=1, max=1)", "test_descent.py"),
     ("the gradient is added up", "nn/descent.py", "self._gradient.zero_()", "pass", "test_descent.py"),
     ("returns run on over the end", "nn/normalizer.py", "self.running * ~done", "self.running * 1", "test_nn.py"),
+    ("a masked action may be chosen", "nn/policies.py", "== 0, -1e9)", "== 0, 0.0)", "test_ppo.py"),
+    (
+        "noise 0 chooses what is impossible",
+        "maths/distributions.py",
+        "cumulative <= noise",
+        "cumulative < noise",
+        "maths",
+    ),
+    ("native programs are mixed up", "nn/native.py", "compile(_own(function)", "compile((function)", "test_descent.py"),
     ("the learning rate adapts the wrong way", "maths/schedules.py", "1 / 1.5 if kl > 2", "1 / 1.5 if kl < 2", "maths"),
 ]
 

@@ -4,7 +4,7 @@ from lemniscate.maths import adapt_to_kl, linear
 
 
 def test_the_learning_rate_falls_linearly_to_its_fraction():
-    assert [linear(1e-3, 0.2, progress) for progress in (0, 0.5, 1, 2)] == pytest.approx([1e-3, 6e-4, 2e-4, 2e-4])
+    assert [linear(1e-3, 0.2, progress) for progress in (0.0, 0.5, 1.0, 2.0)] == pytest.approx([1e-3, 6e-4, 2e-4, 2e-4])
 
 
 def test_the_learning_rate_adapts_to_the_kl():

@@ -1,0 +1,244 @@
+"""Steps per second, side by side in one run: ours, Stable-Baselines3, SBX, and the bare physics.
+
+    make bench-speed                                         installs the peers and measures everything
+    .venv/bin/python benchmarks/speed.py throughput parts    only these
+
+    throughput   PPO on 16 copies, 2048 rows × 10 epochs × minibatches of 64, 64 × 64 tanh; each peer at its best
+                 number of threads and kind of vector
+    parts        where the time of one update goes, eager and native
+    startup      from the command to the first update: eager, native with a cold cache, native with a warm one
+    lander       from process start to a policy of mean return 250 over 100 episodes of LunarLander-v3
+
+Every line of `benchmarks/results/speed.jsonl` carries commit, versions and machine. Rounds are interleaved, and what is
+reported is the median over rounds of the ratios within each.
+"""
+
+import argparse
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from statistics import median
+
+from common import append, provenance
+
+ENVS = ("HalfCheetah-v5", "Ant-v5", "Humanoid-v5", "Hopper-v5")
+SHARED = {"num_envs": 16, "num_steps": 128, "minibatch_size": 64, "epochs": 10, "learning_rate": 3e-4}
+PEERS = [(peer, threads, kind) for peer in ("sb3", "sbx") for threads in (1, 2) for kind in ("dummy", "subproc")]
+
+PEER = """
+import sys, time, torch
+peer, env, threads, kind, steps = sys.argv[1], sys.argv[2], int(sys.argv[3]), sys.argv[4], int(sys.argv[5])
+torch.set_num_threads(threads)
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+if peer == "sb3":
+    from stable_baselines3 import PPO
+else:
+    from sbx import PPO
+if __name__ == "__main__":
+    vector = make_vec_env(env, n_envs=16, vec_env_cls=SubprocVecEnv if kind == "subproc" else DummyVecEnv)
+    model = PPO("MlpPolicy", vector, n_steps=128, batch_size=64, n_epochs=10, learning_rate=3e-4)
+    model.learn(4096)
+    started = time.perf_counter()
+    model.learn(steps, reset_num_timesteps=False)
+    print((model.num_timesteps - 4096) / (time.perf_counter() - started))
+"""
+
+BARE = """
+import sys, time, warnings, numpy, envpool
+warnings.simplefilter("ignore")
+env = envpool.make(sys.argv[1], env_type="gymnasium", num_envs=16, num_threads=2, seed=1)
+space = env.action_space
+actions = numpy.random.default_rng(0).uniform(space.low, space.high, (64, 16, *space.shape))
+env.reset()
+for t in range(200): env.step(actions[t % 64])
+started = time.perf_counter()
+for t in range(int(sys.argv[2]) // 16): env.step(actions[t % 64])
+print(int(sys.argv[2]) / (time.perf_counter() - started))
+"""
+
+PEER_LANDER = """
+import sys, time, torch
+torch.set_num_threads(1)
+from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import EvalCallback, StopTrainingOnRewardThreshold
+from stable_baselines3.common.env_util import make_vec_env
+vector, judge = make_vec_env("LunarLander-v3", n_envs=16), make_vec_env("LunarLander-v3", n_envs=16)
+model = PPO("MlpPolicy", vector, n_steps=1024, batch_size=64, gae_lambda=0.98, gamma=0.999, n_epochs=4, ent_coef=0.01)
+stop = StopTrainingOnRewardThreshold(250)
+model.learn(3_000_000, EvalCallback(judge, stop, n_eval_episodes=100, eval_freq=3125, verbose=0, warn=False))
+print(model.num_timesteps)
+"""
+
+
+def say(*words):
+    print(*words, file=sys.stderr, flush=True)
+
+
+def python(code, *arguments):
+    """The last line that a program prints, as a number."""
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "program.py"
+        file.write_text(code)
+        done = subprocess.run([sys.executable, file, *map(str, arguments)], capture_output=True, text=True)
+    if done.returncode:
+        raise SystemExit(done.stderr[-2000:])
+    return float(done.stdout.split()[-1])
+
+
+def train(folder, env, *, environment=None, wait=True, **fields):
+    """`lemniscate train` in a process of its own."""
+    flags = [part for name, value in fields.items() for part in (f"--{name.replace('_', '-')}", str(value))]
+    command = [sys.executable, "-m", "lemniscate.cli", "train", "ppo", "--env", env, "--run", str(folder), *flags]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, env={**os.environ, **(environment or {})}, text=True)
+    if wait and process.wait():
+        raise SystemExit(process.stderr.read())
+    return process
+
+
+def lines(folder):
+    path = folder / "metrics.jsonl"
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def ours(env, steps):
+    """Steps per second, the median over updates; compiled, so without the first."""
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch) / "run"
+        train(folder, env, preset="default", total_steps=steps, checkpoint_every=steps, engine="compiled", **SHARED)
+        return median(line["time/steps_per_second"] for line in lines(folder)[3:])
+
+
+def throughput(rounds, stamp):
+    best = {}
+    for env in ENVS:
+        rows = []
+        for _ in range(rounds):
+            row = {"bare physics": python(BARE, env, 100_000 if env == "HalfCheetah-v5" else 40_000)}
+            row["lemniscate"] = ours(env, 100_000)
+            if env == "HalfCheetah-v5":
+                for peer in ("sb3", "sbx"):
+                    if peer not in best:  # the first round tries all, the others what was best
+                        tried = {way: python(PEER, peer, env, *way[1:], 16384) for way in PEERS if way[0] == peer}
+                        best[peer] = max(tried, key=tried.__getitem__)
+                        say(f"{peer} is fastest with {best[peer][1]} threads and {best[peer][2]} vectors")
+                    row[peer] = python(PEER, peer, env, *best[peer][1:], 30_000)
+            rows.append(row)
+            say(env, {name: round(speed) for name, speed in row.items()})
+            append("speed", {"what": "throughput", "env": env, **row, "peers": best} | stamp)
+        for name in rows[0]:
+            if name != "lemniscate":
+                ratio = median(row["lemniscate"] / row[name] for row in rows)
+                print(f"| {env} | {median(row['lemniscate'] for row in rows):,.0f} | {name} | {ratio:.2f} |")
+
+
+def parts(rounds, stamp):
+    """Milliseconds of each part of an update of 2048 rows, HalfCheetah's sizes, on one thread."""
+    import torch
+
+    from lemniscate.algos import ppo
+    from lemniscate.maths import gae
+    from lemniscate.types import Box, Part, Rollout, Spec
+
+    torch.set_num_threads(1)
+    spec = Spec("x", (Part((), (17,)),), Box((-1.0,) * 6, (1.0,) * 6))
+    config, device = ppo.Config(**SHARED), torch.device("cpu")
+    no, obs = torch.zeros(128, 16, dtype=torch.bool), torch.randn(129, 16, 17)
+    rollout = Rollout(obs[:-1], torch.randn(128, 16, 6), torch.randn(128, 16), obs[1:], no, no, ~no)
+
+    def clock(function, times):
+        function()
+        started = time.perf_counter()
+        for _ in range(times):
+            function()
+        return 1e3 * (time.perf_counter() - started) / times
+
+    for engine in ("eager", "native"):
+        state = ppo.init(config, spec, device)
+        if engine == "native":
+            state.policy.make_native()
+            state.optimizer.make_native()
+        noise, played = state.policy.noise((16,), state.noise), torch.arange(2048)
+        batch = ppo.advantages(config, state, rollout)
+        minibatches = ppo.minibatches(played, 2048, 64, state.shuffle)
+        with torch.no_grad():
+            act = clock(lambda: state.policy.act(obs[0], noise), 500)  # noqa: B023
+        row = {
+            "what": "parts",
+            "engine": engine,
+            "policy step, 16 rows": act,
+            "values, log-probs and GAE, 2048 rows": clock(lambda: ppo.advantages(config, state, rollout), 20),  # noqa: B023
+            "of which GAE": clock(lambda: gae(rollout.reward, rollout.reward, rollout.reward, no, no), 20),
+            "gradient step, 64 rows": clock(lambda: state.optimizer(batch, minibatches, 3e-4), 3 * rounds) / 32,  # noqa: B023
+        }
+        append("speed", row | stamp)
+        for name, milliseconds in list(row.items())[2:]:
+            print(f"| {name} | {engine} | {milliseconds:.3f} ms |")
+
+
+def startup(rounds, stamp):
+    """Seconds from the command to the first line of metrics."""
+    cache = tempfile.mkdtemp()
+    for name in ("eager", "native, cold", *["native, warm"] * rounds):
+        environment = {"TORCHINDUCTOR_CACHE_DIR": cache}
+        with tempfile.TemporaryDirectory() as scratch:
+            folder, started = Path(scratch) / "run", time.monotonic()
+            engine = "eager" if name == "eager" else "compiled"
+            process = train(
+                folder, ENVS[0], wait=False, environment=environment, preset="default", engine=engine, **SHARED
+            )
+            while not lines(folder):
+                time.sleep(0.02)
+            seconds = time.monotonic() - started
+            process.terminate()
+            process.wait()
+        append("speed", {"what": "startup", "engine": name, "seconds": seconds} | stamp)
+        print(f"| {name} | {seconds:.1f} s |")
+    shutil.rmtree(cache)
+
+
+def lander(rounds, stamp):
+    """Seconds to a mean return of 250, both judged every 50,000 steps by 100 episodes."""
+    ratios = []
+    for seed in range(1, rounds + 1):
+        with tempfile.TemporaryDirectory() as scratch:
+            folder, started = Path(scratch) / "run", time.monotonic()
+            judge = {"evaluate_every": 50_000, "evaluate_episodes": 100, "seed": seed}
+            process = train(folder, "LunarLander-v3", wait=False, **judge)
+            while (
+                process.poll() is None and max((x.get("evaluation/return", 0) for x in lines(folder)), default=0) < 250
+            ):
+                time.sleep(0.1)
+            mine, steps = time.monotonic() - started, lines(folder)[-1]["step"]
+            process.terminate()
+            process.wait()
+        started = time.monotonic()
+        their_steps = python(PEER_LANDER)
+        theirs = time.monotonic() - started
+        ratios.append(theirs / mine)
+        row = {"what": "lander", "lemniscate": mine, "steps": steps, "sb3": theirs, "sb3_steps": their_steps}
+        append("speed", row | stamp)
+        print(f"| seed {seed} | {mine:.0f} s, {steps:,} steps | {theirs:.0f} s, {their_steps:,.0f} steps |", flush=True)
+    print(f"median ratio {median(ratios):.1f}")
+
+
+MEASURES = {"throughput": throughput, "parts": parts, "startup": startup, "lander": lander}
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("measures", nargs="*", choices=[*MEASURES, []], default=list(MEASURES))
+    parser.add_argument("--rounds", type=int, default=3)
+    given = parser.parse_args()
+    stamp = provenance()
+    for name in given.measures:
+        MEASURES[name](given.rounds, stamp)
+
+
+if __name__ == "__main__":
+    main()
