@@ -20,11 +20,11 @@ from lemniscate.algos import ALGORITHMS
 from lemniscate.envs import api
 from lemniscate.envs.check import check as check_environment
 from lemniscate.errors import NonFiniteError, UserError, WorkerError, unknown
-from lemniscate.presets import BEST, PRESETS, choose
+from lemniscate.presets import best, choose, names
 from lemniscate.report import curves, pictures
 from lemniscate.report.flight import check_film
 from lemniscate.run.config import RunConfig
-from lemniscate.run.run import Stopped
+from lemniscate.run.run import Stopped, engine_of
 
 Command = Callable[[argparse.Namespace, list[str]], None]
 
@@ -53,8 +53,8 @@ def train(given: argparse.Namespace, rest: list[str]) -> None:
     """Train a policy; with --report also evaluate it and draw pictures."""
     config = _with_fields(front.config_for(given.algorithm, given.env, given.preset), rest)
     preset, _ = choose(given.algorithm, config.env, given.preset)
-    served_by = config.backend or api.backend_for(config.env)
-    _say(f"{given.algorithm} on {config.num_envs} × {config.env} by {served_by}: preset {preset}, seed {config.seed}")
+    what = f"{given.algorithm} on {config.num_envs} × {config.env} by {config.backend}"
+    _say(f"{what}: preset {preset}, seed {config.seed}, {engine_of(config)} engine")
     fields = {name: getattr(config, name) for name in config.names() if name != "env"}
     run = front.train(
         given.algorithm,
@@ -115,7 +115,7 @@ def envs(given: argparse.Namespace, rest: list[str]) -> None:
     _nothing_left(rest)
     for env_id in api.known_ids():
         if given.filter.lower() in env_id.lower():
-            fitting = [f"{algorithm}: {BEST.get((algorithm, env_id), 'default')}" for algorithm in ALGORITHMS]
+            fitting = [f"{algorithm}: {best(algorithm, env_id)}" for algorithm in ALGORITHMS]
             _say(f"{env_id:<40} {api.backend_for(env_id):<12} {', '.join(fitting)}")
 
 
@@ -204,7 +204,7 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("algorithm", help=", ".join(ALGORITHMS))
     sub.add_argument("--env", help="environment id, or module:Class of your own; a preset may have one")
     sub.add_argument("--run", type=Path, metavar="DIR", help="run directory; must not exist (default: runs/…)")
-    sub.add_argument("--preset", help="; ".join(f"{a}: {', '.join(PRESETS[a])}" for a in ALGORITHMS))
+    sub.add_argument("--preset", help="; ".join(f"{a}: {', '.join(names(a))}" for a in ALGORITHMS))
     sub.add_argument("--track", metavar="LOGGER", help="a logger beside the local ones: wandb")
     sub.add_argument("--report", action="store_true", help="evaluate the result and leave pictures")
 

@@ -102,8 +102,9 @@ def config_for(algorithm: str, env: str | None = None, preset: str | None = None
     name, config = presets.choose(algorithm, env, preset)
     if name == "default" and env is None:
         raise UserError("Which environment? Name one with env; `lemniscate envs` lists them.")
-    api.backend_for(config.env)
-    return config.replace(**fields)
+    served_by = api.backend_for(config.env)
+    config = config.replace(**fields)
+    return config if config.backend else config.replace(backend=served_by)
 
 
 def make_envs(config: RunConfig) -> tuple[VecEnv, VecEnv]:
@@ -113,7 +114,7 @@ def make_envs(config: RunConfig) -> tuple[VecEnv, VecEnv]:
     """
     device = str(_device(config.device))
     train_env = api.make(config.env, config.num_envs, device=device, stagger=True, backend=config.backend)
-    return train_env, _evaluation_env(config.env, config, config.evaluate_episodes, device)
+    return train_env, _evaluation_env(config.env, config, config.evaluate_episodes, device, config.backend)
 
 
 def train(
@@ -246,7 +247,7 @@ def evaluation_env(policy: TrainedPolicy, episodes: int) -> VecEnv:
 def _evaluation_env(env_id: str, config: RunConfig, episodes: int, device: str, backend: str | None = None) -> VecEnv:
     """As many copies as training has for a drone, whose compiled program they share; else a few."""
     copies = config.num_envs if env_id in api.CRAZYFLOW_IDS else min(episodes, 16)
-    return api.make(env_id, copies, device=device, backend=backend or config.backend)
+    return api.make(env_id, copies, device=device, backend=backend)
 
 
 def _loggers(track: str | None) -> tuple[str, ...]:

@@ -16,6 +16,7 @@ FIGURE_EIGHT = "DroneFigureEightTrajectory-v0"
 class Preset:
     """A Config that has been tried, with its provenance."""
 
+    name: str
     config: RunConfig
     source: str
     date: str
@@ -47,9 +48,10 @@ ANNEALED = ppo.Config(
 )
 """few copies, small minibatches, and a learning rate that falls; after Tianshou"""
 
-PPO = {
-    "default": Preset(ppo.Config(), "Schulman et al. 2017, table 3, on 8 copies with a running normalizer", "2026-11"),
-    "figure-eight": Preset(
+PPO = [
+    Preset("default", ppo.Config(), "Schulman et al. 2017, table 3, on 8 copies with a running normalizer", "2026-11"),
+    Preset(
+        "figure-eight",
         ppo.Config(
             env=FIGURE_EIGHT,
             num_envs=256,
@@ -71,7 +73,8 @@ PPO = {
         "random search, some 200 runs, none with the seeds 1 to 5 that it is evaluated on",
         "2026-11",
     ),
-    "course": Preset(
+    Preset(
+        "course",
         ppo.Config(
             env=FIGURE_EIGHT,
             num_envs=1024,
@@ -95,7 +98,8 @@ PPO = {
         "the drone course's notebook: its settings, on the corrected algorithm",
         "2026-11",
     ),
-    "cart-pole": Preset(
+    Preset(
+        "cart-pole",
         ppo.Config(
             env="CartPole-v1",
             total_steps=50_000,
@@ -110,7 +114,8 @@ PPO = {
         "the settings of rl-baselines3-zoo, in half the steps",
         "2026-11",
     ),
-    "lunar-lander": Preset(
+    Preset(
+        "lunar-lander",
         ppo.Config(
             env="LunarLander-v3",
             num_envs=16,
@@ -126,11 +131,37 @@ PPO = {
         "search by hand, on seed 101",
         "2026-11",
     ),
-    "half-cheetah": Preset(ADAPTIVE.replace(env="HalfCheetah-v5"), "search by hand, on seeds 101 and 102", "2026-11"),
-    "ant": Preset(ADAPTIVE.replace(env="Ant-v5"), "search by hand, on seeds 101 and 102", "2026-11"),
-    "humanoid": Preset(ADAPTIVE.replace(env="Humanoid-v5"), "search by hand, on seeds 101 and 102", "2026-11"),
-    "hopper": Preset(ANNEALED.replace(env="Hopper-v5"), "Tianshou's settings, on seeds 101 and 102", "2026-11"),
-    "walker2d": Preset(
+    Preset(
+        "course",
+        ppo.Config(
+            env="LunarLander-v3",
+            num_envs=16,
+            num_steps=10,
+            total_steps=320_000,
+            epochs=5,
+            minibatch_size=160,
+            learning_rate=1e-4,
+            final_learning_rate=1.0,
+            adam_eps=1e-8,
+            gamma=0.9,
+            gae_lambda=0.95,
+            value_coef=2.0,
+            normalize_advantage=False,
+            max_grad_norm=None,
+            recompute_advantages=True,
+            hidden=(128, 128),
+            activation="relu",
+            normalize_observations=False,
+        ),
+        "the reinforcement-learning course's exercise on LunarLander: its settings, on the corrected algorithm",
+        "2026-11",
+    ),
+    Preset("half-cheetah", ADAPTIVE.replace(env="HalfCheetah-v5"), "search by hand, on seeds 101 and 102", "2026-11"),
+    Preset("ant", ADAPTIVE.replace(env="Ant-v5"), "search by hand, on seeds 101 and 102", "2026-11"),
+    Preset("humanoid", ADAPTIVE.replace(env="Humanoid-v5"), "search by hand, on seeds 101 and 102", "2026-11"),
+    Preset("hopper", ANNEALED.replace(env="Hopper-v5"), "Tianshou's settings, on seeds 101 and 102", "2026-11"),
+    Preset(
+        "walker2d",
         ANNEALED.replace(
             env="Walker2d-v5",
             num_envs=16,
@@ -142,31 +173,31 @@ PPO = {
         "search by hand, on seeds 101 and 102",
         "2026-11",
     ),
-}
+]
 
-PRESETS: dict[str, dict[str, Preset]] = {"ppo": PPO}
+PRESETS: dict[str, list[Preset]] = {"ppo": PPO}
 
-BEST: dict[tuple[str, str], str] = {
-    ("ppo", FIGURE_EIGHT): "figure-eight",
-    ("ppo", "CartPole-v1"): "cart-pole",
-    ("ppo", "LunarLander-v3"): "lunar-lander",
-    ("ppo", "HalfCheetah-v5"): "half-cheetah",
-    ("ppo", "Hopper-v5"): "hopper",
-    ("ppo", "Walker2d-v5"): "walker2d",
-    ("ppo", "Ant-v5"): "ant",
-    ("ppo", "Humanoid-v5"): "humanoid",
-}
-"""the preset that an environment gets unasked"""
+
+def names(algorithm: str) -> list[str]:
+    """Every preset's name, each once."""
+    return list(dict.fromkeys(preset.name for preset in PRESETS[algorithm]))
+
+
+def best(algorithm: str, env_id: str | None) -> str:
+    """The preset that an environment gets unasked: the first that is its own, or the default."""
+    own = (preset.name for preset in PRESETS[algorithm][1:] if preset.config.env == env_id)
+    return next(own, "default")
 
 
 def choose(algorithm: str, env_id: str | None, name: str | None) -> tuple[str, RunConfig]:
     """The preset asked for, or the best known for the environment, or the default: (its name, its Config).
 
-    The Config's `env` is `env_id` if one is given. Raises `UserError` with the nearest names for an unknown preset.
+    Where several environments have a preset of one name, the environment decides. The Config's `env` is `env_id` if one
+    is given. Raises `UserError` with the nearest names for an unknown preset.
     """
-    table = PRESETS[algorithm]
-    name = name or BEST.get((algorithm, env_id or ""), "default")
-    if name not in table:
-        raise unknown("preset", name, table)
-    config = table[name].config
+    name = name or best(algorithm, env_id)
+    named = [preset.config for preset in PRESETS[algorithm] if preset.name == name]
+    if not named:
+        raise unknown("preset", name, names(algorithm))
+    config = next((config for config in named if config.env == env_id), named[0])
     return name, config.replace(env=env_id) if env_id else config

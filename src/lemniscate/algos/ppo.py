@@ -69,8 +69,8 @@ class Config(RunConfig):
     """c₂, the weight of the entropy bonus"""
     normalize_advantage: bool = True
     """standardize advantages within each minibatch"""
-    max_grad_norm: Positive = 0.5
-    """global gradient norm that is clipped to"""
+    max_grad_norm: Positive | None = 0.5
+    """global gradient norm that is clipped to; none leaves it free"""
     target_kl: Positive | None = None
     """stop the epochs of an update once the approximate KL has passed this"""
     recompute_advantages: bool = False
@@ -125,10 +125,10 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
     networks = ActorCritic(
         spec, config.hidden, config.activation, config.initial_log_std, config.normalize_observations
     ).to(device)
-    betas = (0.9, config.adam_beta2)
+    betas, limit = (0.9, config.adam_beta2), config.max_grad_norm or math.inf
     return State(
         networks,
-        Descent(networks, partial(loss, config), betas=betas, eps=config.adam_eps, max_grad_norm=config.max_grad_norm),
+        Descent(networks, partial(loss, config), betas=betas, eps=config.adam_eps, max_grad_norm=limit),
         RewardScale(config.num_envs, config.gamma).to(device),
         noise=generator(config.seed, device, 2),
         shuffle=generator(config.seed, device, 3),

@@ -153,9 +153,7 @@ class Run:
         self._lock.release()
 
     def _choose_engine(self, state: AnyState) -> None:
-        """Compile the gradient steps where that is asked for, or repaid."""
-        engine = self.config.engine
-        if engine == "compiled" or (engine == "auto" and self.config.gradient_steps >= WORTH_COMPILING):
+        if engine_of(self.config) == "compiled":
             if self._visible:
                 print("Compiling: about half a minute the first time, 4 s from then on.", file=sys.stderr)
             state.policy.make_native()
@@ -239,6 +237,13 @@ class Run:
         finally:
             for signum, handler in previous.items():
                 signal.signal(signum, handler)
+
+
+def engine_of(config: RunConfig) -> str:
+    """The engine asked for; of itself, "compiled" for a run that is long enough to repay it, else "eager"."""
+    if config.engine != "auto":
+        return config.engine
+    return "compiled" if config.gradient_steps >= WORTH_COMPILING else "eager"
 
 
 def create_directory(path: Path, algorithm: str, config: RunConfig) -> None:
