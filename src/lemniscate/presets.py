@@ -103,15 +103,12 @@ PPO = [
         ppo.Config(
             env="CartPole-v1",
             total_steps=50_000,
-            num_steps=32,
-            minibatch_size=256,
-            epochs=20,
+            num_steps=64,
+            minibatch_size=128,
             learning_rate=1e-3,
-            gamma=0.98,
-            gae_lambda=0.8,
             normalize_observations=False,
         ),
-        "the settings of rl-baselines3-zoo, in half the steps",
+        "search by hand, on seeds 101 to 111",
         "2026-11",
     ),
     Preset(
