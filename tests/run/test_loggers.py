@@ -4,6 +4,8 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 
+from lemniscate.envs.api import Episodes
+from lemniscate.report.curves import episode_returns
 from lemniscate.run.loggers import JsonLines, WeightsAndBiases, read_metrics
 
 
@@ -16,6 +18,23 @@ def test_a_resumed_log_drops_what_it_will_write_again(tmp_path):
     log.write(30, {"x": 0.5})
     log.close([])
     assert read_metrics(tmp_path) == [{"step": 10, "x": 10 / 3}, {"step": 20, "x": 20 / 3}, {"step": 30, "x": 0.5}]
+
+
+def test_each_episode_is_written(tmp_path):
+    log = JsonLines(tmp_path, {}, 0)
+    log.write(10, {"x": 1.0}, Episodes([1.23456789, 2.0], [7, 9]))
+    log.write(20, {"x": 1.0})
+    log.write(30, {"x": 1.0}, Episodes([3.0], [4]))
+    log.close([])
+    assert read_metrics(tmp_path)[0] == {
+        "step": 10,
+        "x": 1.0,
+        "episode/returns": [1.23457, 2.0],
+        "episode/lengths": [7, 9],
+    }
+    steps, returns = episode_returns(tmp_path)
+    assert steps.tolist() == [5.0, 10.0, 30.0]
+    assert returns.tolist() == [1.23457, 2.0, 3.0]
 
 
 def test_a_line_that_a_crash_cut_off_is_left_out(tmp_path):

@@ -13,15 +13,23 @@ from lemniscate.run.loggers import read_metrics
 from lemniscate.run.run import read_config
 
 DIAGNOSTICS = ("losses/value", "explained_variance", "approx_kl", "clip_fraction", "losses/entropy", "gradient_norm")
+POINTS = 3000
+"""episodes drawn of a run, evenly chosen"""
+
 COLORS = mpl.colormaps["tab10"].colors  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def learning_curve(runs: list[Path], file: Path) -> Path:
-    """Return of whole training episodes against steps, a curve for each run."""
+    """Return of each whole training episode against steps, and the mean of the last 20 (or 2 %, if they are many)."""
     figure = Figure(figsize=(7, 4), layout="constrained")
     axes = figure.subplots()
     for i, run in enumerate(runs):
-        _curve(axes, run, "episode/return", COLORS[i % 10], smooth=True)
+        steps, returns = episode_returns(run)
+        if len(steps):
+            some = np.linspace(0, len(steps) - 1, min(len(steps), POINTS)).astype(int)
+            axes.plot(steps[some], returns[some], ".", color=COLORS[i % 10], alpha=0.25, markersize=3)
+            average = _moving_average(returns, max(20, len(returns) // 50))
+            axes.plot(steps[some], average[some], color=COLORS[i % 10], linewidth=1.5, label=run.name)
     if not axes.has_data():
         axes.text(0.5, 0.5, "no whole training episode yet", transform=axes.transAxes, ha="center", color="grey")
     axes.set(xlabel="environment steps", ylabel="return of an episode")
@@ -36,10 +44,24 @@ def diagnostics(runs: list[Path], file: Path) -> Path:
     grid = figure.subplots(2, 3)
     for axes, name in zip(grid.flat, DIAGNOSTICS, strict=True):
         for i, run in enumerate(runs):
-            _curve(axes, run, name, COLORS[i % 10], smooth=False)
+            _curve(axes, run, name, COLORS[i % 10])
         axes.set_title(name, loc="left", fontsize=10)
         _finish(axes, len(runs) if axes is grid.flat[0] else 1)
     return _save(figure, file)
+
+
+def episode_returns(run: Path) -> tuple[np.ndarray, np.ndarray]:
+    """(steps, returns) of every whole training episode of a run, in the order in which they ended.
+
+    The steps are those of the update that an episode ended in, spread over it.
+    """
+    steps, returns, before = [], [], 0
+    for line in read_metrics(run):
+        ended = line.get("episode/returns", [])
+        steps += list(np.linspace(before, line["step"], len(ended) + 1)[1:])
+        returns += ended
+        before = line["step"]
+    return np.array(steps), np.array(returns)
 
 
 def plot_runs(runs: list[Path]) -> list[Path]:
@@ -52,14 +74,11 @@ def plot_runs(runs: list[Path]) -> list[Path]:
     return [learning_curve(runs, folder / "learning_curve.png"), diagnostics(runs, folder / "diagnostics.png")]
 
 
-def _curve(axes: Axes, run: Path, name: str, color: object, smooth: bool) -> None:
+def _curve(axes: Axes, run: Path, name: str, color: object) -> None:
     rows = [(line["step"], line[name]) for line in read_metrics(run) if name in line]
     if not rows:
         return
     steps, values = np.array(rows).T
-    if smooth:
-        axes.plot(steps, values, color=color, alpha=0.25, linewidth=1)
-        values = _moving_average(values, max(1, len(values) // 20))
     axes.plot(steps, values, color=color, linewidth=1.5, label=run.name)
 
 

@@ -8,14 +8,17 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
 
+from lemniscate.envs.api import Episodes
+
 Metrics = Mapping[str, float]
+NO_EPISODES = Episodes([], [])
 
 
 class Logger(Protocol):
     """One place for metrics."""
 
-    def write(self, step: int, metrics: Metrics) -> None:
-        """Take the metrics of one update."""
+    def write(self, step: int, metrics: Metrics, episodes: Episodes = NO_EPISODES) -> None:
+        """Take the metrics of one update, and the whole episodes that ended in it."""
         ...
 
     def close(self, pictures: list[Path]) -> None:
@@ -34,9 +37,13 @@ class JsonLines:
         temporary.replace(self._path)
         self._file = self._path.open("a")
 
-    def write(self, step: int, metrics: Metrics) -> None:
-        """Append a line."""
-        self._file.write(json.dumps({"step": step, **metrics}) + "\n")
+    def write(self, step: int, metrics: Metrics, episodes: Episodes = NO_EPISODES) -> None:
+        """Append a line; `episode/returns` and `episode/lengths` are lists, in the order in which episodes ended."""
+        line: dict[str, Any] = {"step": step, **metrics}
+        if episodes.returns:
+            line |= {"episode/returns": [float(f"{r:.6g}") for r in episodes.returns]}
+            line |= {"episode/lengths": episodes.lengths}
+        self._file.write(json.dumps(line) + "\n")
         self._file.flush()
 
     def close(self, pictures: list[Path]) -> None:
@@ -54,7 +61,7 @@ class TensorBoard:
         rows = "\n".join(f"|{name}|{value}|" for name, value in config.items())
         self._writer.add_text("config", f"|field|value|\n|-|-|\n{rows}")
 
-    def write(self, step: int, metrics: Metrics) -> None:
+    def write(self, step: int, metrics: Metrics, episodes: Episodes = NO_EPISODES) -> None:
         """Add a scalar for each metric."""
         for name, value in metrics.items():
             self._writer.add_scalar(name, value, step)
@@ -92,7 +99,7 @@ class WeightsAndBiases:
         if mode == "offline":
             print(f"W&B records offline; upload later with: wandb sync {path}/wandb/offline-run-*", file=sys.stderr)
 
-    def write(self, step: int, metrics: Metrics) -> None:
+    def write(self, step: int, metrics: Metrics, episodes: Episodes = NO_EPISODES) -> None:
         """Log one row."""
         self._run.log(dict(metrics), step=step)
 
@@ -112,7 +119,7 @@ LOGGERS: dict[str, Callable[[Path, Mapping[str, Any], int], Logger]] = {
 }
 
 
-def read_metrics(path: Path) -> list[dict[str, float]]:
+def read_metrics(path: Path) -> list[dict[str, Any]]:
     """The lines of a run's `metrics.jsonl`; a last line that was cut off by a crash is left out."""
     lines = []
     file = path / "metrics.jsonl"

@@ -31,7 +31,7 @@ from lemniscate.nn.policies import Policy
 from lemniscate.run import checkpoint
 from lemniscate.run.config import RunConfig
 from lemniscate.run.evaluate import evaluate
-from lemniscate.run.loggers import LOGGERS, Logger
+from lemniscate.run.loggers import LOGGERS, NO_EPISODES, Logger
 from lemniscate.run.progress import ProgressBar
 from lemniscate.run.seeding import derive, globals_undisturbed, seed_globals
 
@@ -141,7 +141,7 @@ class Run:
         now = time.monotonic()
         numbers["time/steps_per_second"] = (state.step - self._clock_step) / max(now - self._clock, 1e-9)
         self._clock, self._clock_step = now, state.step
-        self._write(state.step, numbers)
+        self._write(state.step, numbers, episodes)
         self._bar.update(state.step, sum(self._recent) / len(self._recent) if self._recent else None)
 
     def close(self, pictures: list[Path] | None = None) -> None:
@@ -195,9 +195,9 @@ class Run:
             metrics["evaluation/rmse_after_1s_mm"] = scores.rmse_after_1s_mm
         self._write(state.step, metrics)
 
-    def _write(self, step: int, numbers: dict[str, float]) -> None:
+    def _write(self, step: int, numbers: dict[str, float], episodes: Episodes = NO_EPISODES) -> None:
         for logger in self._loggers:
-            logger.write(step, numbers)
+            logger.write(step, numbers, episodes)
 
     def _save(self, state: AnyState, planned: bool) -> None:
         record = {
