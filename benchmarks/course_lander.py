@@ -1,0 +1,93 @@
+"""What the two defects of a course's LunarLander notebook cost: its settings, corrected and not, in one picture.
+
+    .venv/bin/python benchmarks/course_lander.py        seeds 1 to 3, some ten minutes
+
+The notebook resets an environment when an episode has ended by its rules, never when time is up; and it takes the old
+log-probabilities anew in each epoch, so that the ratio is always 1 and the clip never acts.
+"""
+
+import argparse
+import json
+import tempfile
+from pathlib import Path
+from unittest.mock import patch
+
+import numpy as np
+from common import RESULTS, append, provenance, rows
+from gymnasium.envs.box2d import LunarLander
+
+VARIANTS = ("corrected", "time-outs never reset", "ratio always 1")
+COLORS = ("#3465a4", "#cc0000", "#f57900")
+
+
+class WithoutEnd(LunarLander):
+    """The lander without its time limit: what the notebook's loop makes of it."""
+
+
+def one(variant, seed, steps):
+    """Train; fly 100 episodes of the real environment."""
+    import lemniscate as lem
+    from lemniscate.algos import ppo
+    from lemniscate.report.curves import episode_returns
+
+    env = "course_lander:WithoutEnd" if variant == VARIANTS[1] else "LunarLander-v3"
+    fields = {**lem.config_for("ppo", "LunarLander-v3", "course").to_json(), "backend": "gymnasium"}
+    fields |= {"env": env, "seed": seed, "total_steps": steps, "hidden": tuple(fields["hidden"])}
+    # The batch that was estimated anew, with its new log-probabilities, in the place of the old ones.
+    keep_new = patch.object(ppo, "replace", lambda batch, **_: batch)
+    with tempfile.TemporaryDirectory() as folder:
+        if variant == VARIANTS[2]:
+            keep_new.start()
+        try:
+            run = lem.train("ppo", run=Path(folder) / "run", progress=False, **fields)
+        finally:
+            patch.stopall()
+        at, returns = episode_returns(run.path)
+        flown = {
+            way: lem.evaluate(run.policy, "LunarLander-v3", deterministic=way == "mode") for way in ("mode", "sample")
+        }
+    average = np.convolve(returns, np.ones(20) / 20, mode="valid")
+    chosen = np.linspace(0, len(average) - 1, min(len(average), 200)).astype(int)
+    row = {
+        "variant": variant,
+        "seed": seed,
+        "mean_return": mode.mean_return,
+        "mean_return_sampled": sample.mean_return,
+        "mean_length": float(np.mean(sample.lengths)),
+        "episodes": len(returns),
+        "curve": [[round(x) for x in at[19:][chosen]], [round(x, 1) for x in average[chosen]]],
+    }
+    append("course_lander", row | provenance())
+    print(json.dumps({name: value for name, value in row.items() if name != "curve"}), flush=True)
+
+
+def draw(file):
+    """Mean of the last 20 training episodes, a line for each seed."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7, 4), layout="constrained")
+    axes = figure.subplots()
+    for variant, color in zip(VARIANTS, COLORS, strict=True):
+        for i, row in enumerate(row for row in rows("course_lander") if row["variant"] == variant):
+            axes.plot(*row["curve"], color=color, linewidth=1, alpha=0.8, label=None if i else variant)
+    axes.set(xlabel="environment steps", ylabel="return, mean of the last 20 episodes", ylim=(-500, 300))
+    axes.set_title("LunarLander-v3 with the course's settings", loc="left")
+    axes.legend(frameon=False)
+    axes.spines[["top", "right"]].set_visible(False)
+    figure.savefig(file, dpi=150)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3])
+    parser.add_argument("--steps", type=int, default=320_000)
+    parser.add_argument("--draw", action="store_true", help="run nothing")
+    given = parser.parse_args()
+    for seed in [] if given.draw else given.seeds:
+        for variant in VARIANTS:
+            one(variant, seed, given.steps)
+    draw(RESULTS / "course_lander.png")
+
+
+if __name__ == "__main__":
+    main()
