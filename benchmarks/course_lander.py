@@ -43,9 +43,7 @@ def one(variant, seed, steps):
         finally:
             patch.stopall()
         at, returns = episode_returns(run.path)
-        flown = {
-            way: lem.evaluate(run.policy, "LunarLander-v3", deterministic=way == "mode") for way in ("mode", "sample")
-        }
+        mode, sample = (lem.evaluate(run.policy, "LunarLander-v3", deterministic=which) for which in (True, False))
     average = np.convolve(returns, np.ones(20) / 20, mode="valid")
     chosen = np.linspace(0, len(average) - 1, min(len(average), 200)).astype(int)
     row = {
