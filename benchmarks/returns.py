@@ -92,6 +92,8 @@ def draw(algorithm):
     panels = figure.subplots(2, 4).flat
     for env, (marks, _) in RUNS[algorithm].items():
         of = measured(algorithm, env, marks[-1])
+        if not of:
+            continue
         axes = next(panels)
         axes.set_title(env, fontsize=10)
         for row in of:
