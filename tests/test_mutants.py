@@ -93,6 +93,14 @@ MUTANTS = [
     ("the gradient is not clipped", "nn/descent.py", ".clamp(max=1)", ".clamp(min=1, max=1)", "test_descent.py"),
     ("the gradient is added up", "nn/descent.py", "self._gradient.zero_()", "pass", "test_descent.py"),
     ("returns run on over the end", "nn/normalizer.py", "self.running * ~done", "self.running * 1", "test_nn.py"),
+    (
+        "an episode is counted with its last step missing",
+        "envs/books.py",
+        "after_end[:1]), after_end[:-1]]",
+        "after_end[:0]), after_end]",
+        "envs/test_books.py",
+    ),
+    ("fragments are counted", "envs/books.py", "done & whole]", "done & (whole | done)]", "envs/test_books.py"),
     ("a masked action may be chosen", "nn/policies.py", "== 0, -1e9)", "== 0, 0.0)", "test_ppo.py"),
     (
         "noise 0 chooses what is impossible",

@@ -6,13 +6,13 @@ A backend is one file with a class that has `spec`, `num_envs`, `device`, `resta
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Protocol
 
 import gymnasium as gym
 import torch
 from torch import Tensor
 
+from lemniscate.envs.books import Books, Episodes
 from lemniscate.errors import NonFiniteError, UserError, is_installed, missing_extra, unknown
 from lemniscate.types import Spec, Step
 
@@ -39,20 +39,8 @@ class Backend(Protocol):
         ...
 
 
-@dataclass(frozen=True)
-class Episodes:
-    """Whole episodes that ended, in the order of their ends."""
-
-    returns: list[float]
-    lengths: list[int]
-
-
 class VecEnv:
-    """A backend with its current observation and the books of its episodes.
-
-    Fragments (episodes that staggering began late or cut early) are learned from but not counted; ignored actions
-    (`valid` False) count nowhere.
-    """
+    """A backend with its current observation and the books of its episodes."""
 
     def __init__(self, backend: Backend) -> None:
         self._backend = backend
@@ -60,13 +48,11 @@ class VecEnv:
         self.num_envs = backend.num_envs
         self.device = backend.device
         self.obs = torch.empty(0)
-        self._ended: list[tuple[Tensor, Tensor]] = []
 
     def restart(self, seed: int, steps: int = 0) -> Tensor:
         """Begin anew from `seed`; also stored as `obs`, [N, O]. `steps` is what the run has taken so far."""
         self.steps = steps
-        zeros = torch.zeros(self.num_envs, device=self.device)
-        self._return, self._length, self._ended = zeros, zeros.clone(), []
+        self._books = Books(self.num_envs, self.device)
         self.obs = self._backend.restart(seed)
         self._require_finite(observation=self.obs)
         return self.obs
@@ -82,13 +68,7 @@ class VecEnv:
         self._require_finite(observation=step.next_obs, reward=step.reward)
         self.obs = step.obs
         self.steps += self.num_envs
-        self._return = self._return + step.reward * step.valid
-        self._length = self._length + step.valid
-        done = (step.terminated | step.truncated) & step.valid
-        if done.any():
-            counted = done & whole
-            self._ended.append((self._return[counted], self._length[counted]))
-            self._return, self._length = self._return * ~done, self._length * ~done
+        self._books.log(step, whole)
         return step
 
     def _require_finite(self, **quantities: Tensor) -> None:
@@ -102,11 +82,7 @@ class VecEnv:
 
     def take_episodes(self) -> Episodes:
         """The whole episodes that ended since the last call."""
-        ended, self._ended = self._ended, []
-        if not ended:
-            return Episodes([], [])
-        returns, lengths = (torch.cat(column) for column in zip(*ended, strict=True))
-        return Episodes(returns.tolist(), lengths.int().tolist())
+        return self._books.take()
 
     def close(self) -> None:
         """Give back processes and windows."""

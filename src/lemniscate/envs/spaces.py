@@ -94,7 +94,7 @@ def scale_action(action: np.ndarray, box: Box) -> np.ndarray:
     A coordinate with an infinite bound is not scaled, only clipped to its bounds.
     """
     floor, ceiling, base, half = _scale(box)
-    return base + half * np.clip(action, floor, ceiling)
+    return base + half * np.minimum(np.maximum(action, floor), ceiling)
 
 
 @lru_cache

@@ -8,7 +8,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
 
-from lemniscate.envs.api import Episodes
+from lemniscate.envs.books import Episodes
 
 Metrics = Mapping[str, float]
 NO_EPISODES = Episodes([], [])

@@ -24,7 +24,8 @@ from typing import Any, Protocol, TypeVar
 import torch
 from filelock import FileLock, Timeout
 
-from lemniscate.envs.api import Episodes, VecEnv
+from lemniscate.envs.api import VecEnv
+from lemniscate.envs.books import Episodes
 from lemniscate.errors import NonFiniteError, UserError
 from lemniscate.nn.descent import Descent
 from lemniscate.nn.policies import Policy
