@@ -22,7 +22,6 @@ from lemniscate.envs.check import check as check_environment
 from lemniscate.errors import NonFiniteError, UserError, WorkerError, unknown
 from lemniscate.presets import best, choose, names
 from lemniscate.report import curves, pictures
-from lemniscate.report.flight import check_film
 from lemniscate.run.config import RunConfig
 from lemniscate.run.run import Stopped, engine_of
 
@@ -88,19 +87,9 @@ def evaluate(given: argparse.Namespace, rest: list[str]) -> None:
 def watch(given: argparse.Namespace, rest: list[str]) -> None:
     """Show one episode in a window, or record it."""
     _nothing_left(rest)
-    if given.video is not None:
-        check_film(given.video)
-    policy = front.load(given.run)
-    if policy.spec.tracking:
-        env = front.evaluation_env(policy, policy.config.evaluate_episodes)
-        if given.video is None:
-            pictures.show_flight(policy.module, env, given.seed)
-        else:
-            _say(pictures.film_flight(policy.module, env, given.video, given.seed))
-    elif given.video is None:
-        pictures.show_episode(policy.act, policy.spec, given.seed)
-    else:
-        _say(pictures.film_episode(policy.act, policy.spec, given.video, given.seed))
+    said = front.watch(front.load(given.run), seed=given.seed, video=given.video)
+    if said:
+        _say(said)
 
 
 def plot(given: argparse.Namespace, rest: list[str]) -> None:

@@ -1,4 +1,4 @@
-"""The front door: train, resume, load, evaluate, make_envs."""
+"""The front door: train, resume, load, evaluate, watch, make_envs."""
 
 from dataclasses import dataclass
 from itertools import count
@@ -16,6 +16,7 @@ from lemniscate.envs.spaces import flatten_observation, physical_action
 from lemniscate.errors import UserError, is_installed, missing_extra, unknown
 from lemniscate.nn.policies import Policy
 from lemniscate.report import pictures as pictures_of
+from lemniscate.report import playback
 from lemniscate.run import checkpoint
 from lemniscate.run.config import RunConfig
 from lemniscate.run.evaluate import Evaluation
@@ -216,6 +217,33 @@ def evaluate(
         return evaluate_module(policy.module, vec, episodes, seed, deterministic)
     finally:
         vec.close()
+
+
+def watch(policy: TrainedPolicy, *, seed: int = 0, video: str | Path | None = None) -> str | None:
+    """Show one episode: below the cell in a notebook, in a window elsewhere, or recorded into a file.
+
+    Args:
+        policy: from `load` or `train`.
+        seed: of the start.
+        video: a .gif, .webp or .mp4 to record into.
+
+    Returns:
+        A sentence on what was recorded, if anything.
+
+    Raises:
+        UserError: nothing to show it on, or another kind of file.
+    """
+    if video is not None:
+        playback.check_film(Path(video))
+    drone = bool(policy.spec.tracking)
+    env = evaluation_env(policy, policy.config.evaluate_episodes) if drone else None
+    if env and video is not None:
+        return playback.film_flight(policy.module, env, Path(video), seed)
+    if env:
+        return playback.show_flight(policy.module, env, seed)
+    if video is not None:
+        return playback.film_episode(policy.act, policy.spec, Path(video), seed)
+    return playback.show_episode(policy.act, policy.spec, seed)
 
 
 def _train(

@@ -7,10 +7,9 @@ import numpy as np
 import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from PIL import Image
 
 from lemniscate.envs.api import VecEnv
-from lemniscate.errors import UserError, is_installed
+from lemniscate.errors import UserError
 from lemniscate.nn.policies import Policy
 from lemniscate.run.evaluate import fly
 
@@ -120,28 +119,6 @@ def animate(flight: Flight, every: int = 4) -> list[np.ndarray]:
             axes.draw_artist(artist)
         frames.append(np.asarray(canvas.buffer_rgba())[..., :3].copy())
     return frames
-
-
-def save_frames(frames: list[np.ndarray], file: Path, fps: float) -> Path:
-    """An animated picture (.gif, .webp) from frames, or a film (.mp4, extra `video`)."""
-    check_film(file)
-    file.parent.mkdir(parents=True, exist_ok=True)
-    if file.suffix == ".mp4":
-        from imageio import v3 as imageio
-
-        imageio.imwrite(file, np.stack(frames), fps=fps)
-    else:
-        images = [Image.fromarray(frame) for frame in frames]
-        images[0].save(file, save_all=True, append_images=images[1:], duration=1000 / fps, loop=0)
-    return file
-
-
-def check_film(file: Path) -> None:
-    """Raise `UserError` for a film that could not be written, before anything is flown for it."""
-    if file.suffix not in (".gif", ".webp", ".mp4"):
-        raise UserError(f"{file} must end in .gif, .webp or .mp4.")
-    if file.suffix == ".mp4" and not is_installed("imageio_ffmpeg"):
-        raise UserError(f"{file} needs ffmpeg (pip install 'lemniscate[video]'); a .gif or .webp does not.")
 
 
 def _rotate_x_axis(quaternion: np.ndarray) -> np.ndarray:

@@ -1,0 +1,164 @@
+"""Showing an episode: in a window, in a notebook, or into a file."""
+
+import io
+import os
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from PIL import Image
+
+from lemniscate.envs.api import VecEnv
+from lemniscate.envs.gymnasium import make_one, spec_of
+from lemniscate.errors import UserError, is_installed
+from lemniscate.nn.policies import Policy
+from lemniscate.report import flight
+from lemniscate.types import Spec
+
+Act = Callable[..., np.ndarray]
+
+NOTEBOOK_FPS = 25
+"""more frames a second than a browser is sent; the others are left out"""
+
+FLIGHT_STRIDE = 5
+"""a drone's flight is drawn at every so many-th step"""
+
+
+def film_episode(act: Act, spec: Spec, file: Path, seed: int) -> str:
+    """Record one episode of a Gymnasium environment into `file`; returns a sentence."""
+    with_pictures = _rendered(spec.env_id, "rgb_array")
+    frames = [np.asarray(env.render()) for env in _play(with_pictures, act, seed)]
+    save_frames(frames, file, _fps(with_pictures))
+    return f"{file}: {len(frames) - 1} steps."
+
+
+def show_episode(act: Act, spec: Spec, seed: int) -> None:
+    """Play one episode of a Gymnasium environment at its own speed: in the notebook that asks, or in a window."""
+    if in_notebook():
+        with_pictures = _rendered(spec.env_id, "rgb_array")
+        send_frames((np.asarray(env.render()) for env in _play(with_pictures, act, seed)), _fps(with_pictures))
+    else:
+        for _ in _play(_rendered(spec.env_id, "human"), act, seed):
+            pass  # Gymnasium draws at each step
+
+
+def film_flight(policy: Policy, env: VecEnv, file: Path, seed: int) -> str:
+    """Animate one flight into `file`; returns a sentence on how it was drawn."""
+    frames, fps, how = _draw_flight(flight.record(policy, env, env.num_envs, seed), env)
+    save_frames(list(frames), file, fps)
+    return f"{file}: {how}."
+
+
+def show_flight(policy: Policy, env: VecEnv, seed: int) -> None:
+    """Play one flight of a drone: in the notebook that asks, or in a window."""
+    if in_notebook():
+        frames, fps, _ = _draw_flight(flight.record(policy, env, env.num_envs, seed), env)
+        send_frames(frames, fps)
+        return
+    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise UserError("There is no display for a window; record the flight instead: --video flight.gif")
+    from lemniscate.report import scene
+
+    scene.show(flight.record(policy, env, env.num_envs, seed), _drone_model(env))
+
+
+def save_frames(frames: list[np.ndarray], file: Path, fps: float) -> Path:
+    """An animated picture (.gif, .webp) from frames, or a film (.mp4, extra `video`)."""
+    check_film(file)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    if file.suffix == ".mp4":
+        from imageio import v3 as imageio
+
+        imageio.imwrite(file, np.stack(frames), fps=fps)
+    else:
+        images = [Image.fromarray(frame) for frame in frames]
+        images[0].save(file, save_all=True, append_images=images[1:], duration=1000 / fps, loop=0)
+    return file
+
+
+def check_film(file: Path) -> None:
+    """Raise `UserError` for a film that could not be written, before anything is flown for it."""
+    if file.suffix not in (".gif", ".webp", ".mp4"):
+        raise UserError(f"{file} must end in .gif, .webp or .mp4.")
+    if file.suffix == ".mp4" and not is_installed("imageio_ffmpeg"):
+        raise UserError(f"{file} needs ffmpeg (pip install 'lemniscate[video]'); a .gif or .webp does not.")
+
+
+def in_notebook() -> bool:
+    """Whether this is a cell of a notebook, which can show pictures, and not a terminal."""
+    if "IPython" not in sys.modules:
+        return False
+    from IPython.core.getipython import get_ipython
+
+    return hasattr(get_ipython(), "kernel")
+
+
+def send_frames(frames: Iterable[np.ndarray], fps: float) -> None:
+    """Show frames [H, W, 3] uint8 one after the other below the cell, at their own speed."""
+    from IPython.display import Image as Shown
+    from IPython.display import display
+
+    stride = max(1, round(fps / NOTEBOOK_FPS))
+    place, started = None, time.monotonic()
+    for i, frame in enumerate(frames):
+        if i % stride:
+            continue
+        jpeg = io.BytesIO()
+        Image.fromarray(frame).save(jpeg, format="JPEG", quality=85)
+        shown = Shown(jpeg.getvalue(), format="jpeg")
+        if place is None:
+            place = display(shown, display_id=True)
+        else:
+            place.update(shown)
+        time.sleep(max(0.0, started + i / fps - time.monotonic()))
+
+
+def _play(env: gym.Env, act: Act, seed: int) -> Iterator[gym.Env]:
+    """The environment after its reset and after each step of one episode; then it is closed."""
+    obs, info = env.reset(seed=seed)
+    yield env
+    over = False
+    while not over:
+        obs, _, terminated, truncated, info = env.step(act(obs, action_mask=info.get("action_mask")))
+        yield env
+        over = terminated or truncated
+    env.close()
+
+
+def _fps(env: gym.Env) -> float:
+    return float(env.metadata.get("render_fps", 30))
+
+
+def _rendered(env_id: str, mode: str) -> gym.Env:
+    try:
+        env = make_one(spec_of(env_id), render_mode=mode)
+        env.reset(seed=0)
+        env.render()
+        return env
+    except Exception as error:  # pygame, GLFW and MuJoCo each have their own
+        raise UserError(f"{env_id} cannot be shown here: {error}") from error
+
+
+def _draw_flight(track: flight.Flight, env: VecEnv) -> tuple[Iterable[np.ndarray], float, str]:
+    """(frames, frames a second, how they were drawn)."""
+    from lemniscate.report import scene
+
+    fps = 1 / (FLIGHT_STRIDE * track.time_step)
+    rendered = scene.render(track, _drone_model(env), FLIGHT_STRIDE)
+    if rendered is not None:
+        return rendered, fps, "rendered by MuJoCo"
+    how = (
+        "drawn with matplotlib, since there is no off-screen OpenGL; for a MuJoCo rendering install EGL or OSMesa"
+        " (Debian: libegl1 and libgl1-mesa-dri, or libosmesa6)"
+    )
+    return flight.animate(track, FLIGHT_STRIDE), fps, how
+
+
+def _drone_model(env: VecEnv) -> Any:
+    from lemniscate.envs.crazyflow import simulator
+
+    return simulator(env.spec.env_id, env.num_envs, env.device.type).model
