@@ -1,6 +1,7 @@
 """What the documents say is in the code, and what they show runs."""
 
 import re
+import runpy
 from pathlib import Path
 
 import pytest
@@ -44,6 +45,28 @@ def test_the_python_of_the_readme_runs(tmp_path, monkeypatch):
     scope = {}
     exec(code.replace("total_steps=20_000", "total_steps=2_048, progress=False"), scope)
     assert scope["action"] in (0, 1)
+
+
+def test_the_python_of_the_lander_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "notes" / "lander.md").read_text(), re.DOTALL)
+    assert len(code.splitlines()) <= 10
+    scope = {}
+    exec(code.replace("seed=1)\npictures", "seed=1, total_steps=1600, progress=False)\npictures"), scope)
+    assert [picture.name for picture in scope["pictures"]] == ["learning_curve.png", "diagnostics.png"]
+    assert scope["run"].policy.step == 1600
+    assert (tmp_path / "lander.gif").stat().st_size > 10_000
+
+
+def test_lambda_is_drawn_and_the_formulas_lie_on_its_lines(tmp_path):
+    """At λ = 0 and 1 the lines of `gae` go through the dots that were added up by hand."""
+    figure = runpy.run_path(str(ROOT / "docs" / "figures" / "gae_lambda.py"))["draw"]()
+    lines = {line.get_label(): line.get_ydata() for line in figure.axes[0].lines}
+    assert lines["gae, λ = 0"] == pytest.approx(lines["r + V(s′) − V(s)"])
+    assert lines["gae, λ = 1"] == pytest.approx(lines["return to come − V(s)"])
+    bias, std = (figure.axes[1].lines[i].get_ydata() for i in (0, 1))
+    assert std[0] == pytest.approx(0, abs=1e-9)
+    assert bias[-1] < 0.1 * bias[0]
 
 
 def test_every_command_of_the_readme_is_understood():

@@ -1,7 +1,18 @@
 """Deep reinforcement learning that you can read in an evening, leave alone overnight, and fly in half a minute."""
 
 from lemniscate.errors import NonFiniteError, UserError
-from lemniscate.front import TrainedPolicy, TrainedRun, config_for, evaluate, load, make_envs, resume, train, watch
+from lemniscate.front import (
+    TrainedPolicy,
+    TrainedRun,
+    config_for,
+    evaluate,
+    load,
+    make_envs,
+    plot,
+    resume,
+    train,
+    watch,
+)
 from lemniscate.run.evaluate import Evaluation
 from lemniscate.run.run import Stopped
 from lemniscate.run.seeding import set_seeds
@@ -17,6 +28,7 @@ __all__ = [
     "evaluate",
     "load",
     "make_envs",
+    "plot",
     "resume",
     "set_seeds",
     "train",

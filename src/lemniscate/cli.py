@@ -21,7 +21,7 @@ from lemniscate.envs import api
 from lemniscate.envs.check import check as check_environment
 from lemniscate.errors import NonFiniteError, UserError, WorkerError, unknown
 from lemniscate.presets import best, choose, names
-from lemniscate.report import curves, pictures
+from lemniscate.report import pictures
 from lemniscate.run.config import RunConfig
 from lemniscate.run.run import Stopped, engine_of
 
@@ -95,8 +95,8 @@ def watch(given: argparse.Namespace, rest: list[str]) -> None:
 def plot(given: argparse.Namespace, rest: list[str]) -> None:
     """Draw the curves of one run, or of several side by side."""
     _nothing_left(rest)
-    trained = len(given.runs) == 1 and any((given.runs[0] / "checkpoints").glob("step-*"))
-    _draw(given.runs, front.load(given.runs[0]) if trained else None)
+    for file in front.plot(*given.runs):
+        _say(file)
 
 
 def envs(given: argparse.Namespace, rest: list[str]) -> None:
@@ -117,17 +117,6 @@ def check(given: argparse.Namespace, rest: list[str]) -> None:
         _say(f"{MARKS[finding.grade]} {finding.sentence}")
     if bad:
         raise UserError(f"{given.env} is not fit to be learned in: {bad} finding{'s' * (bad > 1)} above.")
-
-
-def _draw(runs: list[Path], policy: front.TrainedPolicy | None) -> None:
-    """Plot the curves, and the flights of `policy` if it has a reference to track."""
-    files = curves.plot_runs(runs)
-    if policy and policy.spec.tracking:
-        episodes = policy.config.evaluate_episodes
-        env = front.evaluation_env(policy, episodes)
-        files += pictures.draw_flight(policy.module, env, files[0].parent, episodes, seed=0)
-    for file in files:
-        _say(file)
 
 
 def _with_fields(config: RunConfig, arguments: list[str]) -> RunConfig:

@@ -1,4 +1,4 @@
-"""The front door: train, resume, load, evaluate, watch, make_envs."""
+"""The front door: train, resume, load, evaluate, watch, plot, make_envs."""
 
 from dataclasses import dataclass
 from itertools import count
@@ -15,8 +15,8 @@ from lemniscate.envs.api import VecEnv
 from lemniscate.envs.spaces import flatten_observation, physical_action
 from lemniscate.errors import UserError, is_installed, missing_extra, unknown
 from lemniscate.nn.policies import Policy
+from lemniscate.report import curves, playback
 from lemniscate.report import pictures as pictures_of
-from lemniscate.report import playback
 from lemniscate.run import checkpoint
 from lemniscate.run.config import RunConfig
 from lemniscate.run.evaluate import Evaluation
@@ -235,8 +235,7 @@ def watch(policy: TrainedPolicy, *, seed: int = 0, video: str | Path | None = No
     """
     if video is not None:
         playback.check_film(Path(video))
-    drone = bool(policy.spec.tracking)
-    env = evaluation_env(policy, policy.config.evaluate_episodes) if drone else None
+    env = _drones(policy) if policy.spec.tracking else None
     if env and video is not None:
         return playback.film_flight(policy.module, env, Path(video), seed)
     if env:
@@ -244,6 +243,21 @@ def watch(policy: TrainedPolicy, *, seed: int = 0, video: str | Path | None = No
     if video is not None:
         return playback.film_episode(policy.act, policy.spec, Path(video), seed)
     return playback.show_episode(policy.act, policy.spec, seed)
+
+
+def plot(*runs: str | Path) -> list[Path]:
+    """Draw the curves of a run into its `plots/`, or those of several into one picture; returns the pictures.
+
+    A drone's run also gets its flights.
+    """
+    paths = [Path(run) for run in runs]
+    pictures = curves.plot_runs(paths)
+    if len(paths) == 1 and any((paths[0] / "checkpoints").glob("step-*")):
+        policy = load(paths[0])
+        if policy.spec.tracking:
+            folder, flights = paths[0] / "plots", policy.config.evaluate_episodes
+            pictures += pictures_of.draw_flight(policy.module, _drones(policy), folder, flights, seed=0)
+    return pictures
 
 
 def _train(
@@ -267,9 +281,9 @@ def _train(
     return TrainedRun(path, TrainedPolicy(state.policy.cpu(), run.spec, config, state.step), run.seconds)
 
 
-def evaluation_env(policy: TrainedPolicy, episodes: int) -> VecEnv:
-    """The environments that `evaluate` would play `episodes` in."""
-    return _evaluation_env(policy.spec.env_id, policy.config, episodes, "cpu")
+def _drones(policy: TrainedPolicy) -> VecEnv:
+    """The fleet that a drone's policy is evaluated in."""
+    return _evaluation_env(policy.spec.env_id, policy.config, policy.config.evaluate_episodes, "cpu")
 
 
 def _evaluation_env(env_id: str, config: RunConfig, episodes: int, device: str, backend: str | None = None) -> VecEnv:
