@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
-.PHONY: setup fly test test-long check bench lock clean
+.PHONY: setup fly test test-long check bench bench-returns lock clean
 
 setup: .venv/.ready
 
@@ -29,8 +29,16 @@ check: setup  ## style, types, floors
 	$(BIN)/pyright
 	$(BIN)/lint-imports
 
-bench: setup  ## the README's numbers: five seeds of each drone preset
+bench: .venv/.peers  ## the README's speed tables, beside the peers: an hour on a quiet machine
 	$(BIN)/python benchmarks/figure_eight.py
+	$(BIN)/python benchmarks/speed.py
+
+bench-returns: setup  ## the README's returns, seed by seed: some hours
+	$(BIN)/python benchmarks/returns.py ppo
+
+.venv/.peers: .venv/.ready
+	$(BIN)/python -m pip install --quiet --constraint requirements.lock --no-build-isolation --editable '.[bench]'
+	touch $@
 
 lock: setup  ## renew requirements.lock from pyproject.toml
 	$(BIN)/pip-compile --quiet --strip-extras --extra box2d --extra classic-control --extra drone --extra envpool --extra mujoco --extra dev --no-emit-index-url --no-emit-find-links --no-emit-trusted-host --no-header --allow-unsafe --annotation-style=line --constraint constraints.txt --output-file requirements.lock pyproject.toml

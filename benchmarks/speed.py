@@ -1,7 +1,8 @@
 """Steps per second, side by side in one run: ours, Stable-Baselines3, SBX, and the bare physics.
 
-    make bench-speed                                         installs the peers and measures everything
+    make bench                                               installs the peers and measures everything
     .venv/bin/python benchmarks/speed.py throughput parts    only these
+    .venv/bin/python benchmarks/speed.py --table             the table of what has been measured, and its picture
 
     throughput   PPO on 16 copies, 2048 rows × 10 epochs × minibatches of 64, 64 × 64 tanh; each peer at its best
                  number of threads and kind of vector
@@ -22,12 +23,13 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-from statistics import median
+from statistics import harmonic_mean, median
 
-from common import append, provenance
+from common import RESULTS, append, provenance, rows
 
 ENVS = ("HalfCheetah-v5", "Ant-v5", "Humanoid-v5", "Hopper-v5")
 SHARED = {"num_envs": 16, "num_steps": 128, "minibatch_size": 64, "epochs": 10, "learning_rate": 3e-4}
+OURS, PHYSICS = "lemniscate", "EnvPool alone"
 PEERS = [(peer, threads, kind) for peer in ("sb3", "sbx") for threads in (1, 2) for kind in ("dummy", "subproc")]
 
 PEER = """
@@ -107,34 +109,72 @@ def lines(folder):
 
 
 def ours(env, steps):
-    """Steps per second, the median over updates; compiled, so without the first."""
+    """Steps per second after the third update: the first compiles."""
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch) / "run"
         train(folder, env, preset="default", total_steps=steps, checkpoint_every=steps, engine="compiled", **SHARED)
-        return median(line["time/steps_per_second"] for line in lines(folder)[3:])
+        return harmonic_mean(line["time/steps_per_second"] for line in lines(folder)[3:])
 
 
 def throughput(rounds, stamp):
     best = {}
     for env in ENVS:
-        rows = []
         for _ in range(rounds):
-            row = {"bare physics": python(BARE, env, 100_000 if env == "HalfCheetah-v5" else 40_000)}
-            row["lemniscate"] = ours(env, 100_000)
-            if env == "HalfCheetah-v5":
-                for peer in ("sb3", "sbx"):
-                    if peer not in best:  # the first round tries all, the others what was best
-                        tried = {way: python(PEER, peer, env, *way[1:], 16384) for way in PEERS if way[0] == peer}
-                        best[peer] = max(tried, key=tried.__getitem__)
-                        say(f"{peer} is fastest with {best[peer][1]} threads and {best[peer][2]} vectors")
-                    row[peer] = python(PEER, peer, env, *best[peer][1:], 30_000)
-            rows.append(row)
+            row = {PHYSICS: python(BARE, env, 100_000 if env == ENVS[0] else 40_000), OURS: ours(env, 100_000)}
+            for peer in ("sb3", "sbx") if env == ENVS[0] else ():
+                if peer not in best:  # the first round tries all, the others what was best
+                    tried = {way: python(PEER, peer, env, *way[1:], 16384) for way in PEERS if way[0] == peer}
+                    best[peer] = max(tried, key=tried.__getitem__)
+                    say(f"{peer} is fastest with {best[peer][1]} threads and {best[peer][2]} vectors")
+                row[peer] = python(PEER, peer, env, *best[peer][1:], 30_000)
             say(env, {name: round(speed) for name, speed in row.items()})
-            append("speed", {"what": "throughput", "env": env, **row, "peers": best} | stamp)
-        for name in rows[0]:
-            if name != "lemniscate":
-                ratio = median(row["lemniscate"] / row[name] for row in rows)
-                print(f"| {env} | {median(row['lemniscate'] for row in rows):,.0f} | {name} | {ratio:.2f} |")
+            append("speed", {"what": "throughput", "env": env, "steps_per_second": row, "peers": best} | stamp)
+
+
+def measured(env):
+    """The rounds of the newest commit that has any: a dictionary of speeds for each."""
+    of = [row for row in rows("speed") if row["what"] == "throughput" and row["env"] == env]
+    return [row["steps_per_second"] for row in of if row["commit"] == of[-1]["commit"]]
+
+
+def summary():
+    """The README's table: medians, and the medians of ratios within a round."""
+    print("| environment | lemniscate | beside it | | lemniscate is |")
+    print("|---|---|---|---|---|")
+    for env in ENVS:
+        speeds = measured(env)
+        mine = median(row[OURS] for row in speeds)
+        for name in [name for name in speeds[0] if name != OURS] if speeds else []:
+            ratio, other = median(row[OURS] / row[name] for row in speeds), median(row[name] for row in speeds)
+            times = f"{100 * ratio:.0f} %" if name == PHYSICS else f"{ratio:.1f} ×"
+            print(f"| {env} | {mine:,.0f} steps/s | {name} | {other:,.0f} steps/s | {times} |")
+
+
+def draw():
+    """HalfCheetah beside the peers; every environment as a share of its physics."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10, 3), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    speeds = measured(ENVS[0])
+    names = sorted(speeds[0], key=lambda name: median(row[name] for row in speeds))
+    medians = [median(row[name] for row in speeds) for name in names]
+    colors = ["#3465a4" if name == OURS else "#d3d7cf" for name in names]
+    left.barh(names, medians, color=colors)
+    for i, value in enumerate(medians):
+        left.text(value, i, f" {value:,.0f}", va="center", fontsize=9)
+    left.set_xlim(0, 1.15 * max(medians))
+    left.set_title(f"{ENVS[0]}, PPO, steps per second", loc="left", fontsize=10)
+    shares = [100 * median(row[OURS] / row[PHYSICS] for row in measured(env)) for env in ENVS]
+    right.barh(ENVS[::-1], shares[::-1], color="#3465a4")
+    for i, share in enumerate(shares[::-1]):
+        right.text(share, i, f" {share:.0f} %", va="center", fontsize=9)
+    right.set_xlim(0, 115)
+    right.set_title("share of what EnvPool steps without learning", loc="left", fontsize=10)
+    for axes in (left, right):
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.tick_params(labelsize=9)
+    figure.savefig(RESULTS / "speed.png", dpi=130)
 
 
 def parts(rounds, stamp):
@@ -233,11 +273,14 @@ MEASURES = {"throughput": throughput, "parts": parts, "startup": startup, "lande
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("measures", nargs="*", choices=[*MEASURES, []], default=list(MEASURES))
-    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--table", action="store_true", help="run nothing")
     given = parser.parse_args()
     stamp = provenance()
-    for name in given.measures:
+    for name in [] if given.table else given.measures:
         MEASURES[name](given.rounds, stamp)
+    summary()
+    draw()
 
 
 if __name__ == "__main__":

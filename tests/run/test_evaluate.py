@@ -1,9 +1,11 @@
 import pytest
 import torch
 
+import lemniscate as lem
 from lemniscate.envs import toy
 from lemniscate.envs.api import VecEnv
 from lemniscate.envs.gymnasium import GymnasiumBackend
+from lemniscate.errors import UserError
 from lemniscate.nn.policies import ActorCritic
 from lemniscate.run.evaluate import evaluate
 
@@ -43,3 +45,30 @@ def test_the_same_seed_gives_the_same_scores_and_another_does_not():
     assert first.returns != other.returns
     assert first.rmse_mm is None
     assert "rmse_mm" not in first.to_json()
+
+
+def endless(num_envs, mode="DISABLED"):
+    return VecEnv(GymnasiumBackend("Countdown-v0", num_envs, CPU, mode=mode, length=None, horizon=None))
+
+
+def test_an_episode_without_end_is_a_sentence_and_not_a_hang(monkeypatch):
+    monkeypatch.setattr("lemniscate.run.evaluate.PATIENCE", 30)
+    env = endless(2)
+    with pytest.raises(UserError, match=r"Countdown-v0 has not ended after 30 steps.*time limit"):
+        evaluate(ActorCritic(env.spec, (4,)).policy, env, 2, seed=0)
+    assert env.steps == 60
+
+
+def test_patience_is_for_one_episode_not_for_all(monkeypatch):
+    monkeypatch.setattr("lemniscate.run.evaluate.PATIENCE", 30)
+    env = VecEnv(GymnasiumBackend("Countdown-v0", 2, CPU, mode="DISABLED", length=20, horizon=None))
+    assert evaluate(ActorCritic(env.spec, (4,)).policy, env, 10, seed=0).lengths == [20] * 10
+
+
+def test_a_run_goes_on_when_its_evaluation_cannot(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr("lemniscate.run.evaluate.PATIENCE", 30)
+    monkeypatch.setattr("lemniscate.front._evaluation_env", lambda *_: endless(2))
+    fields = {"num_envs": 2, "num_steps": 32, "total_steps": 128, "evaluate_every": 64, "progress": False}
+    run = lem.train("ppo", "Countdown-v0", run=tmp_path / "run", backend="gymnasium", **fields)
+    assert run.policy.step == 128
+    assert "No evaluation at step 64" in capsys.readouterr().err

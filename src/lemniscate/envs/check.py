@@ -51,7 +51,7 @@ def _spaces(env: VecEnv, served_by: str) -> Iterator[Finding]:
     seen = "an image" if spec.image else f"{spec.observation_size} numbers ({parts})"
     yield Finding("good", f"Served by {served_by}; observes {seen}; acts by {_describe(spec.action)}.")
     if spec.max_episode_steps is None:
-        yield Finding("note", "It has no time limit: a policy that never ends an episode is never evaluated.")
+        yield Finding("note", "It has no time limit: an episode that a policy does not end cannot be evaluated.")
     if isinstance(spec.action, Box) and not np.isfinite([*spec.action.low, *spec.action.high]).all():
         yield Finding("note", "Some actions have no bound: those are not scaled, so a policy begins around zero, ±1.")
 

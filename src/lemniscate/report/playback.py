@@ -17,6 +17,7 @@ from lemniscate.envs.gymnasium import make_one, spec_of
 from lemniscate.errors import UserError, is_installed
 from lemniscate.nn.policies import Policy
 from lemniscate.report import flight
+from lemniscate.run.evaluate import PATIENCE
 from lemniscate.types import Spec
 
 Act = Callable[..., np.ndarray]
@@ -118,14 +119,14 @@ def send_frames(frames: Iterable[np.ndarray], fps: float) -> None:
 
 
 def _play(env: gym.Env, act: Act, seed: int) -> Iterator[gym.Env]:
-    """The environment after its reset and after each step of one episode; then it is closed."""
+    """The environment after its reset and after each step of one episode (of its first steps, if endless)."""
     obs, info = env.reset(seed=seed)
     yield env
-    over = False
-    while not over:
+    for _ in range(PATIENCE if env.spec is None or env.spec.max_episode_steps is None else sys.maxsize):
         obs, _, terminated, truncated, info = env.step(act(obs, action_mask=info.get("action_mask")))
         yield env
-        over = terminated or truncated
+        if terminated or truncated:
+            break
     env.close()
 
 

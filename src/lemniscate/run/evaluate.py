@@ -9,12 +9,16 @@ import torch
 from torch import Tensor
 
 from lemniscate.envs.api import VecEnv
+from lemniscate.errors import UserError
 from lemniscate.nn.policies import Policy
 from lemniscate.run.seeding import derive, generator
 from lemniscate.types import Step
 
 EVALUATION = 1
 """the stream of seeds that training never draws from"""
+
+PATIENCE = 20_000
+"""steps that an episode may take in an environment without a time limit"""
 
 
 @dataclass(frozen=True)
@@ -43,16 +47,24 @@ def fly(
     """Play `episodes` whole episodes; yields each step with the mask [N] of the copies that still count.
 
     Every copy has its own share of the episodes, fixed beforehand: taking the first that end would favour short ones.
+    Raises `UserError` when an episode of an environment without a time limit takes more than 20,000 steps.
     """
     noise = partial(policy.noise, (env.num_envs,), generator(seed, env.device, EVALUATION, 1))
     copies = torch.arange(env.num_envs, device=env.device)
     left = episodes // env.num_envs + (copies < episodes % env.num_envs).int()
     env.restart(derive(seed, EVALUATION, 0))
+    age = torch.zeros_like(left)
     while (left > 0).any():
+        if env.spec.max_episode_steps is None and age.max() >= PATIENCE:
+            raise UserError(
+                f"An episode of {env.spec.env_id} has not ended after {PATIENCE:,} steps, and there is no time limit;"
+                " give it one, with max_episode_steps where it is registered."
+            )
         distribution = policy(env.obs)
         step = env.step(distribution.mode() if deterministic else distribution.sample(noise()))
         yield step, (left > 0) & step.valid
-        left = left - ((step.terminated | step.truncated) & step.valid).int()
+        done = (step.terminated | step.truncated) & step.valid
+        left, age = left - done.int(), (age + 1) * (~done & (left > 0))
 
 
 def evaluate(policy: Policy, env: VecEnv, episodes: int, seed: int, deterministic: bool = True) -> Evaluation:

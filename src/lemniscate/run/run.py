@@ -189,8 +189,12 @@ class Run:
             raise Stopped(message, self._stop_signal)
 
     def _evaluate(self, state: AnyState) -> None:
-        with globals_undisturbed():
-            scores = evaluate(state.policy, self.eval_env, self.config.evaluate_episodes, self.config.seed)
+        try:
+            with globals_undisturbed():
+                scores = evaluate(state.policy, self.eval_env, self.config.evaluate_episodes, self.config.seed)
+        except UserError as error:  # an endless episode costs this evaluation, not the run
+            print(f"No evaluation at step {state.step:,}: {error}", file=sys.stderr)
+            return
         metrics = {"evaluation/return": scores.mean_return, "evaluation/length": sum(scores.lengths) / scores.episodes}
         if scores.rmse_after_1s_mm is not None:
             metrics["evaluation/rmse_after_1s_mm"] = scores.rmse_after_1s_mm
