@@ -1,6 +1,6 @@
-"""What the two defects of a course's LunarLander notebook cost: its settings, corrected and not, in one picture.
+"""What the two defects of a course's LunarLander notebook cost, at its settings and at bolder ones, in one picture.
 
-    .venv/bin/python benchmarks/course_lander.py        seeds 1 to 3, some ten minutes
+    .venv/bin/python benchmarks/course_lander.py        seeds 1 to 3, some twenty minutes
 
 The notebook resets an environment when an episode has ended by its rules, never when time is up; and it takes the old
 log-probabilities anew in each epoch, so that the ratio is always 1 and the clip never acts.
@@ -9,6 +9,7 @@ log-probabilities anew in each epoch, so that the ratio is always 1 and the clip
 import argparse
 import json
 import tempfile
+from itertools import product
 from pathlib import Path
 from unittest.mock import patch
 
@@ -16,6 +17,10 @@ import numpy as np
 from common import RESULTS, append, provenance, rows
 from gymnasium.envs.box2d import LunarLander
 
+SETTINGS = {
+    "the course's settings": {},
+    "γ = 0.99, ten times the learning rate": {"gamma": 0.99, "learning_rate": 1e-3},
+}
 VARIANTS = ("corrected", "time-outs never reset", "ratio always 1")
 COLORS = ("#3465a4", "#cc0000", "#f57900")
 
@@ -24,7 +29,7 @@ class WithoutEnd(LunarLander):
     """The lander without its time limit: what the notebook's loop makes of it."""
 
 
-def one(variant, seed, steps):
+def one(settings, variant, seed, steps):
     """Train; fly 100 episodes of the real environment."""
     import lemniscate as lem
     from lemniscate.algos import ppo
@@ -32,7 +37,7 @@ def one(variant, seed, steps):
 
     env = "course_lander:WithoutEnd" if variant == VARIANTS[1] else "LunarLander-v3"
     fields = {**lem.config_for("ppo", "LunarLander-v3", "course").to_json(), "backend": "gymnasium"}
-    fields |= {"env": env, "seed": seed, "total_steps": steps, "hidden": tuple(fields["hidden"])}
+    fields |= {"env": env, "seed": seed, "total_steps": steps, "hidden": tuple(fields["hidden"]), **SETTINGS[settings]}
     # The batch that was estimated anew, with its new log-probabilities, in the place of the old ones.
     keep_new = patch.object(ppo, "replace", lambda batch, **_: batch)
     with tempfile.TemporaryDirectory() as folder:
@@ -47,6 +52,7 @@ def one(variant, seed, steps):
     average = np.convolve(returns, np.ones(20) / 20, mode="valid")
     chosen = np.linspace(0, len(average) - 1, min(len(average), 200)).astype(int)
     row = {
+        "settings": settings,
         "variant": variant,
         "seed": seed,
         "mean_return": mode.mean_return,
@@ -60,30 +66,36 @@ def one(variant, seed, steps):
 
 
 def draw(file):
-    """Mean of the last 20 training episodes, a line for each seed."""
+    """Mean of the last 20 training episodes: a thin line for each seed, a thick one for their mean."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(7, 4), layout="constrained")
-    axes = figure.subplots()
-    for variant, color in zip(VARIANTS, COLORS, strict=True):
-        for i, row in enumerate(row for row in rows("course_lander") if row["variant"] == variant):
-            axes.plot(*row["curve"], color=color, linewidth=1, alpha=0.8, label=None if i else variant)
-    axes.set(xlabel="environment steps", ylabel="return, mean of the last 20 episodes", ylim=(-500, 300))
-    axes.set_title("LunarLander-v3 with the course's settings", loc="left")
-    axes.legend(frameon=False)
-    axes.spines[["top", "right"]].set_visible(False)
-    figure.savefig(file, dpi=150)
+    figure = Figure(figsize=(10, 4), layout="constrained")
+    panels = figure.subplots(1, 2, sharey=True)
+    for axes, settings in zip(panels, SETTINGS, strict=True):
+        for variant, color in zip(VARIANTS, COLORS, strict=True):
+            of = [row for row in rows("course_lander") if (row["settings"], row["variant"]) == (settings, variant)]
+            for row in of:
+                axes.plot(*row["curve"], color=color, linewidth=0.7, alpha=0.35)
+            grid = np.linspace(5_000, 315_000, 150)
+            mean = np.mean([np.interp(grid, *row["curve"]) for row in of], axis=0)
+            axes.plot(grid, mean, color=color, linewidth=2, label=variant)
+        axes.set(xlabel="environment steps", ylim=(-400, 300))
+        axes.set_title(settings, loc="left", fontsize=11)
+        axes.spines[["top", "right"]].set_visible(False)
+    panels[0].set_ylabel("return, mean of the last 20 episodes")
+    panels[0].legend(frameon=False)
+    figure.savefig(file, dpi=130)
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3])
+    parser.add_argument("--settings", nargs="+", choices=SETTINGS, default=list(SETTINGS))
     parser.add_argument("--steps", type=int, default=320_000)
     parser.add_argument("--draw", action="store_true", help="run nothing")
     given = parser.parse_args()
-    for seed in [] if given.draw else given.seeds:
-        for variant in VARIANTS:
-            one(variant, seed, given.steps)
+    for settings, seed, variant in [] if given.draw else product(given.settings, given.seeds, VARIANTS):
+        one(settings, variant, seed, given.steps)
     draw(RESULTS / "course_lander.png")
 
 

@@ -110,6 +110,22 @@ MUTANTS = [
         "maths",
     ),
     ("native programs are mixed up", "nn/native.py", "compile(_own(function)", "compile((function)", "test_descent.py"),
+    ("noise that grows", "maths/noise.py", "math.sqrt(1 - phi * phi) *", "", "maths/test_noise.py"),
+    (
+        "noise that forgets too fast",
+        "maths/noise.py",
+        "math.exp(-1 / time)",
+        "math.exp(-2 / time)",
+        "maths/test_noise.py",
+    ),
+    ("power where amplitude was meant", "maths/noise.py", "(-exponent / 2)", "(-exponent)", "maths/test_noise.py"),
+    (
+        "the highest frequency counts twice",
+        "maths/noise.py",
+        "ends[0] = ends[-1] = 1",
+        "ends[0] = 1",
+        "maths/test_noise.py",
+    ),
     ("the learning rate adapts the wrong way", "maths/schedules.py", "1 / 1.5 if kl > 2", "1 / 1.5 if kl < 2", "maths"),
 ]
 

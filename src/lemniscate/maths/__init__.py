@@ -2,6 +2,7 @@
 
 from lemniscate.maths.distributions import Bernoulli, Categorical, Distribution, Gaussian, MultiCategorical
 from lemniscate.maths.losses import clipped_surrogate, value_loss
+from lemniscate.maths.noise import coloured, ornstein_uhlenbeck
 from lemniscate.maths.returns import gae
 from lemniscate.maths.schedules import adapt_to_kl, linear
 from lemniscate.maths.stats import (
@@ -23,12 +24,14 @@ __all__ = [
     "adapt_to_kl",
     "clip_fraction",
     "clipped_surrogate",
+    "coloured",
     "explained_variance",
     "gae",
     "kl_k1",
     "kl_k3",
     "linear",
     "merge_moments",
+    "ornstein_uhlenbeck",
     "ratio_statistics",
     "standardize",
     "value_loss",

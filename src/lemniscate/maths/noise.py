@@ -1,0 +1,52 @@
+"""Noise correlated in time: pure functions from standard normal numbers to noise of variance 1 at every step."""
+
+import math
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+def ornstein_uhlenbeck(previous: Float[Tensor, "*S"], normal: Float[Tensor, "*S"], time: float) -> Float[Tensor, "*S"]:
+    """One step of an Ornstein–Uhlenbeck process, exact for any step: Uhlenbeck & Ornstein 1930; Gillespie 1996.
+
+        x_{t+1} = φ x_t + √(1 − φ²) ε_t,    φ = exp(−1 / time)
+
+    Begun from a standard normal number, every x_t is standard normal, and x_t and x_{t+k} correlate by φᵏ. In the form
+    that the DDPG paper (Lillicrap et al. 2016, arXiv:1509.02971, section 3) takes it from, dx = −θ x dt + σ dW, this is
+    time = 1 / (θ dt) and a stationary standard deviation of σ / √(2θ), divided out.
+
+    Args:
+        previous: x_t.
+        normal: ε_t, standard normal.
+        time: steps in which the correlation falls to 1/e, positive.
+    """
+    phi = math.exp(-1 / time)
+    return phi * previous + math.sqrt(1 - phi * phi) * normal
+
+
+def coloured(normal: Float[Tensor, "*S L"], exponent: float) -> Float[Tensor, "*S L"]:
+    """Sequences whose power falls as f^(−β): Timmer & König 1995, *On generating power law noise*.
+
+    Each frequency k / L gets an amplitude and a phase that are Gaussian, of standard deviation s_k = max(k, 1)^(−β/2)
+    before the whole is scaled; then back to time by an inverse Fourier transform. Exponent 0 is white noise, 1 is pink
+    (Eberhard et al. 2023, *Pink noise is all you need*), 2 red, the noise of a random walk that is held back.
+
+    Args:
+        normal: standard normal; L even.
+        exponent: β.
+
+    Returns:
+        Standard normal at every step, correlated along L.
+    """
+    length = normal.shape[-1]
+    half = length // 2
+    scale = torch.arange(half + 1, dtype=normal.dtype, device=normal.device).clamp(min=1) ** (-exponent / 2)
+    ends = torch.full_like(scale, 2)
+    ends[0] = ends[-1] = 1  # frequencies 0 and ½ have no phase, and so one number of normal instead of two
+    scale = scale * length / (2 * ends * scale.square()).sum().sqrt()
+    real, imaginary = normal[..., : half + 1].clone(), torch.zeros_like(normal[..., : half + 1])
+    imaginary[..., 1:half] = normal[..., half + 1 :]
+    real[..., 0] *= math.sqrt(2)
+    real[..., -1] *= math.sqrt(2)
+    return torch.fft.irfft(torch.complex(real, imaginary) * scale, n=length)

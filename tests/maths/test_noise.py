@@ -1,0 +1,73 @@
+import math
+
+import pytest
+import torch
+
+from lemniscate.maths import coloured, ornstein_uhlenbeck
+
+
+def within(values, expected, standard_errors=5.0):
+    """Each mean over dim 0 is within so many standard errors of what it should be."""
+    error = values.std(0) / math.sqrt(len(values))
+    return bool(((values.mean(0) - expected).abs() <= standard_errors * error).all())
+
+
+@pytest.mark.parametrize("time", [0.3, 5.0, 40.0])
+def test_the_process_has_variance_one_at_every_step_and_forgets_exponentially(rng, time):
+    x = [torch.randn(20_000, generator=rng, dtype=torch.float64)]
+    for _ in range(60):
+        x.append(ornstein_uhlenbeck(x[-1], torch.randn(20_000, generator=rng, dtype=torch.float64), time))
+    path = torch.stack(x, dim=1)
+    assert within(path, 0.0)
+    assert within(path.square(), 1.0)
+    for lag in (1, 7, 30):
+        assert within(path[:, :-lag] * path[:, lag:], math.exp(-lag / time))
+
+
+def test_two_steps_of_the_process_are_one_step_of_half_the_time():
+    """Exact in the step: the factor on x₀ is e^(−2/τ), and the variance that comes in is 1 − e^(−4/τ)."""
+    zero, one = torch.zeros(1, dtype=torch.float64), torch.ones(1, dtype=torch.float64)
+    decay = ornstein_uhlenbeck(ornstein_uhlenbeck(one, zero, 6.0), zero, 6.0)
+    assert decay.item() == pytest.approx(ornstein_uhlenbeck(one, zero, 3.0).item(), rel=1e-12)
+    first = ornstein_uhlenbeck(ornstein_uhlenbeck(zero, one, 6.0), zero, 6.0)
+    second = ornstein_uhlenbeck(zero, one, 6.0)
+    both = ornstein_uhlenbeck(zero, one, 3.0)
+    assert (first.square() + second.square()).item() == pytest.approx(both.square().item(), rel=1e-12)
+
+
+@pytest.mark.parametrize("exponent", [0.0, 0.5, 1.0, 2.0])
+@pytest.mark.parametrize("length", [2, 16, 250])
+def test_coloured_noise_has_variance_one_at_every_step(rng, exponent, length):
+    x = coloured(torch.randn(20_000, length, generator=rng, dtype=torch.float64), exponent)
+    assert within(x, 0.0)
+    assert within(x.square(), 1.0)
+
+
+@pytest.mark.parametrize("exponent", [0.0, 1.0, 2.0])
+def test_the_power_falls_as_its_exponent_says(rng, exponent):
+    length = 64
+    x = coloured(torch.randn(20_000, length, generator=rng, dtype=torch.float64), exponent)
+    power = torch.fft.rfft(x).abs().square()
+    frequency = torch.arange(1, length // 2 + 1, dtype=torch.float64)
+    flat = power[:, 1:] * frequency**exponent
+    assert within(flat / flat[:, :-1].mean(), 1.0)
+    assert within(power[:, 0] / flat[:, :-1].mean(), 1.0)  # frequency 0 has the power of the lowest above it
+
+
+def test_white_noise_is_white(rng):
+    x = coloured(torch.randn(20_000, 32, generator=rng, dtype=torch.float64), 0.0)
+    for lag in (1, 2, 9):
+        assert within(x[:, :-lag] * x[:, lag:], 0.0)
+
+
+def test_coloured_noise_is_the_sum_of_its_waves(rng):
+    """The transform, written out."""
+    normal = torch.randn(10, generator=rng, dtype=torch.float64)
+    t = torch.arange(10, dtype=torch.float64)
+    s = torch.tensor([1.0, 1.0, 2**-0.5, 3**-0.5, 4**-0.5, 5**-0.5], dtype=torch.float64)
+    s = s / math.sqrt(2 * (s[0] ** 2 + s[5] ** 2) + 4 * (s[1:5] ** 2).sum())
+    expected = math.sqrt(2) * (s[0] * normal[0] + s[5] * normal[5] * (-1) ** t)
+    for k in range(1, 5):
+        angle = 2 * math.pi * k * t / 10
+        expected = expected + 2 * s[k] * (normal[k] * angle.cos() - normal[5 + k] * angle.sin())
+    assert coloured(normal, 1.0) == pytest.approx(expected)
