@@ -3,7 +3,8 @@
     .venv/bin/python benchmarks/course_lander.py        seeds 1 to 3, some twenty minutes
 
 The notebook resets an environment when an episode has ended by its rules, never when time is up; and it takes the old
-log-probabilities anew in each epoch, so that the ratio is always 1 and the clip never acts.
+log-probabilities anew in each epoch, so that the ratio is always 1 and the clip never acts. (Without a time limit the
+first episodes are not staggered either.)
 """
 
 import argparse

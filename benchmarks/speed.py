@@ -15,7 +15,6 @@ reported is the median over rounds of the ratios within each.
 """
 
 import argparse
-import json
 import os
 import shutil
 import subprocess
@@ -71,7 +70,8 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import EvalCallback, StopTrainingOnRewardThreshold
 from stable_baselines3.common.env_util import make_vec_env
 vector, judge = make_vec_env("LunarLander-v3", n_envs=16), make_vec_env("LunarLander-v3", n_envs=16)
-model = PPO("MlpPolicy", vector, n_steps=1024, batch_size=64, gae_lambda=0.98, gamma=0.999, n_epochs=4, ent_coef=0.01)
+fields = dict(n_steps=1024, batch_size=64, gae_lambda=0.98, gamma=0.999, n_epochs=4, ent_coef=0.01)
+model = PPO("MlpPolicy", vector, seed=int(sys.argv[1]), **fields)
 stop = StopTrainingOnRewardThreshold(250)
 model.learn(3_000_000, EvalCallback(judge, stop, n_eval_episodes=100, eval_freq=3125, verbose=0, warn=False))
 print(model.num_timesteps)
@@ -104,15 +104,16 @@ def train(folder, env, *, environment=None, wait=True, **fields):
 
 
 def lines(folder):
-    path = folder / "metrics.jsonl"
-    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+    from lemniscate.run.loggers import read_metrics
+
+    return read_metrics(folder)
 
 
 def ours(env, steps):
     """Steps per second after the third update: the first compiles."""
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch) / "run"
-        train(folder, env, preset="default", total_steps=steps, checkpoint_every=steps, engine="compiled", **SHARED)
+        train(folder, env, preset="default", total_steps=steps, checkpoint_every=steps, engine="native", **SHARED)
         return harmonic_mean(line["time/steps_per_second"] for line in lines(folder)[3:])
 
 
@@ -143,8 +144,8 @@ def summary():
     print("|---|---|---|---|---|")
     for env in ENVS:
         speeds = measured(env)
-        mine = median(row[OURS] for row in speeds)
         for name in [name for name in speeds[0] if name != OURS] if speeds else []:
+            mine = median(row[OURS] for row in speeds)
             ratio, other = median(row[OURS] / row[name] for row in speeds), median(row[name] for row in speeds)
             times = f"{100 * ratio:.0f} %" if name == PHYSICS else f"{ratio:.1f} ×"
             print(f"| {env} | {mine:,.0f} steps/s | {name} | {other:,.0f} steps/s | {times} |")
@@ -228,11 +229,13 @@ def startup(rounds, stamp):
         environment = {"TORCHINDUCTOR_CACHE_DIR": cache}
         with tempfile.TemporaryDirectory() as scratch:
             folder, started = Path(scratch) / "run", time.monotonic()
-            engine = "eager" if name == "eager" else "compiled"
+            engine = "eager" if name == "eager" else "native"
             process = train(
                 folder, ENVS[0], wait=False, environment=environment, preset="default", engine=engine, **SHARED
             )
             while not lines(folder):
+                if process.poll() is not None:
+                    raise SystemExit(process.stderr.read())
                 time.sleep(0.02)
             seconds = time.monotonic() - started
             process.terminate()
@@ -258,10 +261,17 @@ def lander(rounds, stamp):
             process.terminate()
             process.wait()
         started = time.monotonic()
-        their_steps = python(PEER_LANDER)
+        their_steps = python(PEER_LANDER, seed)
         theirs = time.monotonic() - started
         ratios.append(theirs / mine)
-        row = {"what": "lander", "lemniscate": mine, "steps": steps, "sb3": theirs, "sb3_steps": their_steps}
+        row = {
+            "what": "lander",
+            "seed": seed,
+            "lemniscate": mine,
+            "steps": steps,
+            "sb3": theirs,
+            "sb3_steps": their_steps,
+        }
         append("speed", row | stamp)
         print(f"| seed {seed} | {mine:.0f} s, {steps:,} steps | {theirs:.0f} s, {their_steps:,.0f} steps |", flush=True)
     print(f"median ratio {median(ratios):.1f}")
@@ -272,15 +282,19 @@ MEASURES = {"throughput": throughput, "parts": parts, "startup": startup, "lande
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("measures", nargs="*", choices=[*MEASURES, []], default=list(MEASURES))
+    parser.add_argument("measures", nargs="*", metavar="MEASURE", help=", ".join(MEASURES))
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--table", action="store_true", help="run nothing")
     given = parser.parse_args()
     stamp = provenance()
-    for name in [] if given.table else given.measures:
+    wrong = set(given.measures) - set(MEASURES)
+    if wrong:
+        parser.error(f"there is no measure {', '.join(wrong)}; there is {', '.join(MEASURES)}")
+    for name in [] if given.table else given.measures or MEASURES:
         MEASURES[name](given.rounds, stamp)
-    summary()
-    draw()
+    if all(measured(env) for env in ENVS):
+        summary()
+        draw()
 
 
 if __name__ == "__main__":

@@ -84,6 +84,14 @@ def test_a_policy_acts_on_discrete_observations(tmp_path):
     assert run.policy.act(np.array([0, 5, 15])).shape == (3,)
 
 
+def test_a_batch_of_as_many_numbers_as_there_are_kinds_is_a_batch(tmp_path):
+    """Sixteen observations of a Discrete(16) are not one observation that is one-hot."""
+    policy = lem.train("ppo", "FrozenLake-v1", run=tmp_path / "run", progress=False, total_steps=2048).policy
+    assert policy.act(np.arange(16)).shape == (16,)
+    assert policy.act(np.eye(16, dtype=np.float32)).shape == (16,)
+    assert policy.act(np.eye(16, dtype=np.float32)[3]) == policy.act(3)
+
+
 def test_an_environment_whose_package_is_missing_is_said(monkeypatch):
     def missing(*_, **__):
         raise gym.error.DependencyNotInstalled("Box2D is not installed, run `pip install swig`")

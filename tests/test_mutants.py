@@ -50,8 +50,8 @@ MUTANTS = [
     (
         "reset rows reach the batch",
         "algos/ppo.py",
-        "torch.nonzero(rollout.valid.flatten())[:, 0]",
-        "torch.arange(rollout.num_steps)",
+        "rollout.valid.flatten().nonzero()[:, 0]",
+        "torch.arange(rollout.num_rows)",
         "test_ppo.py",
     ),
     ("the entropy bonus is a penalty", "algos/ppo.py", "- config.entropy_coef", "+ config.entropy_coef", "test_ppo.py"),
@@ -92,6 +92,14 @@ MUTANTS = [
     ),
     ("the gradient is not clipped", "nn/descent.py", ".clamp(max=1)", ".clamp(min=1, max=1)", "test_descent.py"),
     ("the gradient is added up", "nn/descent.py", "self._gradient.zero_()", "pass", "test_descent.py"),
+    ("ignored rewards are counted", "nn/normalizer.py", ".double() * rollout.valid", ".double()", "test_nn.py"),
+    (
+        "rewards are clipped unasked",
+        "algos/ppo.py",
+        "outcome = (rollout.reward,",
+        "outcome = (rollout.reward.clamp(-10, 10),",
+        "test_ppo.py",
+    ),
     ("returns run on over the end", "nn/normalizer.py", "self.running * ~done", "self.running * 1", "test_nn.py"),
     (
         "an episode is counted with its last step missing",

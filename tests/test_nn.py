@@ -74,11 +74,16 @@ def test_rewards_are_divided_by_the_std_of_the_discounted_return(rng):
         scale.update(Rollout(no, no, reward[part], no, done[part], no, ~ignored[part]))
         for t in range(40):
             for n in range(2):
-                running[n] = 0.9 * running[n] + reward[part, t, n].item()
-                if not ignored[part, t, n]:
+                if ignored[part, t, n]:
+                    running[n] *= 0.9
+                else:
+                    running[n] = 0.9 * running[n] + reward[part, t, n].item()
                     expected.append(running[n])
                 if done[part, t, n]:
                     running[n] = 0.0
     std = torch.tensor(expected, dtype=torch.float64).std(correction=0)
     torch.testing.assert_close(scale(reward[0]), reward[0] / std.float())
     assert scale(torch.tensor([1e6, -1e6])).tolist() == [10.0, -10.0]
+    assert scale.running.any()
+    scale.restart()
+    assert not scale.running.any()

@@ -34,13 +34,15 @@ MARKS = {"good": "✓", "note": "·", "bad": "✗"}
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
+    given = None
     try:
         given, rest = _parser().parse_known_args(arguments)
         given.run_command(given, rest)
     except UserError as error:
         return _say(error, 2)
     except (NonFiniteError, WorkerError) as error:
-        return _say(f"{error} Training stopped; the last checkpoint is as it was.", 1)
+        learning = given is not None and given.run_command in (train, resume)
+        return _say(f"{error} Training stopped; the last checkpoint is as it was." if learning else error, 1)
     except Stopped as stopped:
         return _say(stopped, 128 + stopped.signum)
     except KeyboardInterrupt:
@@ -51,6 +53,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def train(given: argparse.Namespace, rest: list[str]) -> None:
     """Train a policy; with --report also evaluate it and draw pictures."""
     config = _with_fields(front.config_for(given.algorithm, given.env, given.preset), rest)
+    if config.backend:
+        api.require_backend(config.backend)
     preset, _ = choose(given.algorithm, config.env, given.preset)
     what = f"{given.algorithm} on {config.num_envs} × {config.env} by {config.backend}"
     _say(f"{what}: preset {preset}, seed {config.seed}, {engine_of(config)} engine")
@@ -77,7 +81,8 @@ def resume(given: argparse.Namespace, rest: list[str]) -> None:
 def evaluate(given: argparse.Namespace, rest: list[str]) -> None:
     """Play whole episodes with the newest policy of a run."""
     _nothing_left(rest)
-    scores = front.evaluate(front.load(given.run), episodes=given.episodes, seed=given.seed)
+    policy = front.load(given.run)
+    scores = front.evaluate(policy, episodes=given.episodes, seed=given.seed, backend=given.backend)
     if given.json:
         print(json.dumps(scores.to_json()))
     else:
@@ -195,6 +200,7 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("run", type=Path, help="a run or a checkpoint")
     sub.add_argument("--episodes", type=int, default=100)
     sub.add_argument("--seed", type=int, default=0, help="of the starts")
+    sub.add_argument("--backend", help="who steps the environments; as in training unless named")
     sub.add_argument("--json", action="store_true", help="one JSON object on standard output")
 
     sub = command(watch)

@@ -22,7 +22,7 @@ from lemniscate.run.config import RunConfig
 from lemniscate.run.evaluate import Evaluation
 from lemniscate.run.evaluate import evaluate as evaluate_module
 from lemniscate.run.loggers import LOGGERS
-from lemniscate.run.run import Run, create_directory, newest, read_config
+from lemniscate.run.run import Run, create_directory, newest, read_config, require_absent
 from lemniscate.run.seeding import generator, set_seeds
 from lemniscate.types import Discrete, Spec
 
@@ -65,7 +65,8 @@ class TrainedPolicy:
         """([B, O], whether it was a batch)."""
         size, layout, env_id = self.spec.observation_size, self.spec.layout, self.spec.env_id
         shape = np.shape(obs) if not isinstance(obs, dict | tuple) else None
-        if shape is not None and shape != layout[0].shape and shape[-1:] == (size,) and len(shape) <= 2:
+        whole_numbers = bool(layout[0].nvec) and np.issubdtype(np.asarray(obs).dtype, np.integer) if shape else False
+        if shape and not whole_numbers and shape != layout[0].shape and shape[-1:] == (size,) and len(shape) <= 2:
             flat = np.asarray(obs, dtype=np.uint8 if self.spec.image else np.float32).reshape(-1, size)
             return flat, len(shape) == 2
         try:
@@ -115,7 +116,7 @@ def make_envs(config: RunConfig) -> tuple[VecEnv, VecEnv]:
     """
     device = str(_device(config.device))
     train_env = api.make(config.env, config.num_envs, device=device, stagger=True, backend=config.backend)
-    return train_env, _evaluation_env(config.env, config, config.evaluate_episodes, device, config.backend)
+    return train_env, _evaluation_env(config.env, config, config.evaluate_episodes, device, _simulator(config))
 
 
 def train(
@@ -147,6 +148,7 @@ def train(
     config = config_for(algorithm, env, preset, **fields)
     path = Path(run) if run is not None else _fresh_directory(algorithm, config)
     loggers = _loggers(track)
+    require_absent(path)
     set_seeds(config.seed)  # before JAX starts, which reads its flags then
     envs = make_envs(config)  # before the directory: an environment that cannot be made leaves nothing behind
     create_directory(path, algorithm, config)
@@ -204,14 +206,16 @@ def evaluate(
         episodes: how many.
         seed: of the starts.
         deterministic: act by the mode of the distribution.
-        backend: who steps the environments; chosen by the id unless named.
+        backend: who steps the environments; as in training unless named, or by the id if `env` is another.
     """
     if episodes < 1:
         raise UserError(f"episodes must be a whole number at least 1, not {episodes}.")
-    if seed < 0:
-        raise UserError(f"seed must be a whole number at least 0, not {seed}.")
+    _check_seed(seed)
+    if env is None:
+        backend = backend or _simulator(policy.config)
     vec = _evaluation_env(env or policy.spec.env_id, policy.config, episodes, "cpu", backend)
-    if vec.spec.layout != policy.spec.layout or vec.spec.action != policy.spec.action:
+    if not vec.spec.fits(policy.spec):
+        vec.close()
         raise UserError(f"A policy for {policy.spec.env_id} cannot act in {vec.spec.env_id}: its spaces are others.")
     try:
         return evaluate_module(policy.module, vec, episodes, seed, deterministic)
@@ -233,6 +237,7 @@ def watch(policy: TrainedPolicy, *, seed: int = 0, video: str | Path | None = No
     Raises:
         UserError: nothing to show it on, or another kind of file.
     """
+    _check_seed(seed)
     if video is not None:
         playback.check_film(Path(video))
     env = _drones(policy) if policy.spec.tracking else None
@@ -284,6 +289,18 @@ def _train(
 def _drones(policy: TrainedPolicy) -> VecEnv:
     """The fleet that a drone's policy is evaluated in."""
     return _evaluation_env(policy.spec.env_id, policy.config, policy.config.evaluate_episodes, "cpu")
+
+
+def _check_seed(seed: int) -> None:
+    if seed < 0:
+        raise UserError(f"seed must be a whole number at least 0, not {seed}.")
+
+
+def _simulator(config: RunConfig) -> str | None:
+    """Who steps evaluations: as in training, but in this process; None, the id's own, where that is not installed."""
+    if config.backend == "envpool" and not is_installed("envpool"):
+        return None
+    return "gymnasium" if config.backend == "gymnasium-async" else config.backend
 
 
 def _evaluation_env(env_id: str, config: RunConfig, episodes: int, device: str, backend: str | None = None) -> VecEnv:

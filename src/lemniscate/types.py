@@ -12,18 +12,26 @@ from torch import Tensor
 class Box:
     """Continuous actions. A policy acts in [-1, 1]^A; the environment floor maps that onto [low, high].
 
-    Where a bound is infinite there is nothing to scale to: that coordinate passes unchanged, clipped to the bounds.
-    `shape` is how the environment wants the A coordinates, if not in a row.
+    Where a bound is infinite the unit stays what it is: see `envs.spaces.scale_action`.
+    `shape` is how the environment wants the A coordinates, if not in a row, and `dtype` in which numbers.
     """
 
     low: tuple[float, ...]
     high: tuple[float, ...]
     shape: tuple[int, ...] | None = None
+    dtype: str = "float32"
 
     @property
     def size(self) -> int:
         """A, the number of coordinates."""
         return len(self.low)
+
+    def same_as(self, other: "Action") -> bool:
+        """Whether both mean the same, up to the rounding of their bounds."""
+        if not isinstance(other, Box) or (self.size, self.shape) != (other.size, other.shape):
+            return False
+        bounds = zip((*self.low, *self.high), (*other.low, *other.high), strict=True)
+        return all(math.isclose(mine, its, rel_tol=1e-6) for mine, its in bounds)
 
 
 @dataclass(frozen=True)
@@ -101,6 +109,12 @@ class Spec:
     tracking: tuple[int, int] | None = None
     image: bool = False
 
+    def fits(self, other: "Spec") -> bool:
+        """Whether a policy for one environment can act in the other."""
+        mine, its = self.action, other.action
+        same_action = mine.same_as(its) if isinstance(mine, Box) else mine == its
+        return same_action and (self.layout, self.image) == (other.layout, other.image)
+
     @property
     def observation_size(self) -> int:
         """O, the length of the flat observation, without the action mask."""
@@ -153,7 +167,7 @@ class Rollout(_Record):
     valid: Tensor
 
     @property
-    def num_steps(self) -> int:
+    def num_rows(self) -> int:
         """T · N."""
         return self.reward.numel()
 

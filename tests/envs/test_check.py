@@ -55,6 +55,23 @@ class Rich(Fine):
         return 1e4
 
 
+class Stillborn(Fine):
+    def __init__(self):
+        raise OSError("no such robot")
+
+
+class Breaks(Fine):
+    def pay(self):
+        return 1.0 if self.t < 15 else self.bolts
+
+
+class Stuck(Fine):
+    """Rules every action out."""
+
+    def reset(self, *, seed=None, options=None):
+        return super().reset(seed=seed)[0], {"action_mask": [0, 0]}
+
+
 def found(name):
     return [(finding.grade, finding.sentence) for finding in check(f"envs.test_check:{name}")]
 
@@ -67,6 +84,12 @@ def test_a_good_environment():
     assert "one of 2 choices" in text
     assert "has no time limit" in text
     assert "100 episodes ended by its rules" in text
+    assert "the final observation is kept" in text
+    assert "Its observations are float32" in text
+
+
+def test_the_mode_of_a_vector_environment_is_told():
+    assert any("the action of that step is ignored" in finding.sentence for finding in check("Countdown-v0"))
 
 
 @pytest.mark.parametrize(
@@ -77,6 +100,9 @@ def test_a_good_environment():
         ("Nan", "bad", "The reward of environment 0 is nan"),
         ("WrongType", "bad", "Gymnasium's checker: The first element returned by `env.reset()`"),
         ("Rich", "note", "train with --scale-rewards"),
+        ("Stillborn", "bad", "It cannot be made: OSError: no such robot."),
+        ("Breaks", "bad", "It cannot be played with random actions: AttributeError: 'Breaks' object has no attribute"),
+        ("Stuck", "bad", "rules out every action of copy 0: its action_mask is all zero."),
     ],
 )
 def test_what_is_wrong_is_said(name, grade, said):

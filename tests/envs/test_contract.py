@@ -151,6 +151,37 @@ def test_a_nan_is_named_with_environment_and_step(monkeypatch, quantity):
         play(env, 8)
 
 
+def test_a_nan_that_a_reset_returns_is_named(monkeypatch):
+    class BornBroken(toy.Countdown):
+        def reset(self, **kwargs):
+            obs, info = super().reset(**kwargs)
+            if kwargs.get("options"):
+                obs[2] = np.nan
+            return obs, info
+
+    monkeypatch.setattr(toy, "Countdown", BornBroken)
+    with pytest.raises(NonFiniteError, match="The observation of environment 2 is nan in the step after"):
+        play(countdown("DISABLED", length=3), 8)
+
+
+@pytest.mark.parametrize("mode", ["NEXT_STEP", "SAME_STEP"])
+def test_a_vector_environment_may_write_over_its_own_arrays(monkeypatch, mode):
+    class Reuses(toy.Countdown):
+        def step(self, actions):
+            obs, reward, terminated, truncated, info = super().step(actions)
+            if not hasattr(self, "mine"):
+                self.mine = [np.empty_like(part) for part in (obs, reward, terminated, truncated)]
+            for mine, part in zip(self.mine, (obs, reward, terminated, truncated), strict=True):
+                mine[:] = part
+            return (*self.mine, info)
+
+    plain = play(countdown(mode, length=4), 12)
+    monkeypatch.setattr(toy, "Countdown", Reuses)
+    reused = play(countdown(mode, length=4), 12)
+    for name in ("obs", "next_obs", "reward", "terminated", "valid"):
+        assert torch.equal(getattr(plain, name), getattr(reused, name)), name
+
+
 def test_staggering_spreads_the_first_episodes():
     env = api.make("Pendulum-v1", 16, stagger=True)
     rollout = play(env, 200)

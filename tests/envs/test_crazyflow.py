@@ -50,7 +50,7 @@ def test_every_step_is_crazyflows_own_step(env):
     import jax
 
     env.restart(5)
-    backend = env._backend
+    backend = env.backend
     with crazyflow._quietly():
         native = crazyflow.gym.make_vec(FIGURE_EIGHT, num_envs=N, freq=50, device="cpu").unwrapped
         native.reset(seed=0)
@@ -105,7 +105,7 @@ def test_staggered_drones_are_spread_over_the_curve_and_stay_beside_it(staggered
     goal = obs[:, 0:3] + offset
     assert goal[:, 0].min() < -0.9
     assert goal[:, 0].max() > 0.9
-    whole = env._backend.whole
+    whole = env.backend.whole
     assert 0.1 < whole.float().mean() < 0.4  # a quarter begins at the beginning
     assert ((goal[whole] - torch.tensor([0.0, 0.0, 1.0])).norm(dim=-1) < 1e-3).all()
 

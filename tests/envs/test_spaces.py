@@ -31,9 +31,24 @@ def test_the_unit_interval_maps_onto_the_bounds(low, span, action):
         assert at(action) == pytest.approx(low + (action + 1) / 2 * span, abs=1e-5)
 
 
-def test_an_infinite_bound_is_not_scaled_to():
-    box = Box((-math.inf, 0.0, -2.0), (math.inf, math.inf, 2.0))
-    assert scale_action(np.array([[5.0, -5.0, 0.5]]), box).tolist() == [[5.0, 0.0, 1.0]]
+def test_an_infinite_bound_leaves_the_unit_and_a_policy_that_begins_around_zero_reaches_both_sides():
+    box = Box((-math.inf, 10.0, -math.inf, -2.0), (math.inf, math.inf, -3.0, 2.0))
+    at = lambda a: scale_action(np.full((1, 4), a), box)[0].tolist()  # noqa: E731
+    assert at(0.0) == [0.0, 11.0, -4.0, 0.0]
+    assert at(0.5) == [0.5, 11.5, -3.5, 1.0]
+    assert at(5.0) == [5.0, 16.0, -3.0, 2.0]
+    assert at(-5.0) == [-5.0, 10.0, -9.0, -2.0]
+
+
+@given(
+    st.floats(-100, 100), st.floats(0.01, 100), st.sampled_from([np.float32, np.float64]), st.floats(-3, 3, width=32)
+)
+def test_the_environment_accepts_every_action_that_is_sent(low, span, dtype, action):
+    """Also at the ends, where rounding could lead outside."""
+    space = spaces.Box(np.array([low], dtype), np.array([low + span], dtype), dtype=dtype)
+    kind = action_kind(space, "x")
+    for chosen in (-1.0, 1.0, action):
+        assert space.contains(physical_action(np.array([[chosen]], dtype=np.float32), kind)[0])
 
 
 def test_physical_actions():
@@ -66,7 +81,9 @@ def test_what_a_policy_chooses_is_in_the_space(space):
         else:
             chosen = rng.integers(getattr(kind, "nvec", 2), size=(1, getattr(kind, "n", None) or len(kind.nvec)))
         physical = physical_action(chosen, kind)[0]
-        assert space.contains(physical if isinstance(space, spaces.Discrete) else physical.astype(space.dtype))
+        assert space.contains(
+            physical if isinstance(space, spaces.Box | spaces.Discrete) else physical.astype(space.dtype)
+        )
 
 
 EVERY_OBSERVATION = [
@@ -97,6 +114,13 @@ def test_observations_are_flattened_as_gymnasium_does(space):
     assert flat.shape == (5, sum(part.size for part in layout))
     np.testing.assert_allclose(flat, expected.astype(np.float32))
     np.testing.assert_allclose(np.concatenate([flatten_observation(layout, s) for s in samples]), flat)
+
+
+def test_a_number_outside_its_space_is_not_taken_for_another():
+    layout = observation_layout(spaces.Discrete(3, start=1), "x")
+    for wrong in (0, 4):
+        with pytest.raises(ValueError, match=f"obs is {wrong}, which is not in its space"):
+            flatten_observation(layout, wrong)
 
 
 def test_parts_are_named_by_their_path():

@@ -1,5 +1,6 @@
 """A worker that dies or hangs is named within a bounded time, and closing never hangs."""
 
+import multiprocessing
 import os
 import signal
 import time
@@ -33,6 +34,36 @@ class Stubborn(gym.Env):
         return np.zeros(1, dtype=np.float32), 0.0, False, False, {}
 
 
+class NeverThere(Stubborn):
+    """Its constructor returns in this process only."""
+
+    def __init__(self):
+        if multiprocessing.parent_process() is not None:
+            time.sleep(1000)
+
+
+class Gone(Stubborn):
+    """Its constructor takes any other process with it."""
+
+    def __init__(self):
+        if multiprocessing.parent_process() is not None:
+            os._exit(3)
+
+
+@pytest.mark.parametrize(
+    ("name", "patience", "sentence"),
+    [
+        ("NeverThere", 4.0, r"Environment 0, 1 has not answered for 4 s\."),
+        ("Gone", 60.0, r"The process of environment \d died \(exit code 3\)"),
+    ],
+)
+def test_one_that_never_comes_to_life_is_named(monkeypatch, name, patience, sentence):
+    monkeypatch.setattr(WatchedVectorEnv, "patience", patience)
+    with pytest.raises(WorkerError, match=sentence):
+        api.make(f"envs.test_workers:{name}", 2, backend="gymnasium-async")
+    assert not multiprocessing.active_children()
+
+
 def step(env, times):
     for _ in range(times):
         env.step(torch.zeros(3, dtype=torch.int64))
@@ -43,7 +74,7 @@ def test_one_that_dies_is_named():
     try:
         env.restart(0)
         step(env, 1)
-        os.kill(env._backend._envs.processes[1].pid, signal.SIGKILL)
+        os.kill(env.backend._envs.processes[1].pid, signal.SIGKILL)
         with pytest.raises(WorkerError, match=r"The process of environment 1 died \(exit code -9\)"):
             step(env, 2)
     finally:
@@ -57,7 +88,7 @@ def test_one_that_hangs_is_named_and_closing_kills_it(monkeypatch):
         env.restart(0)  # its copies get the seeds 0, 1, 2
         with pytest.raises(WorkerError, match=r"Environment 2 has not answered for 2 s\."):
             step(env, 3)
-        processes = env._backend._envs.processes
+        processes = env.backend._envs.processes
     finally:
         env.close()
     assert not any(process.is_alive() for process in processes)

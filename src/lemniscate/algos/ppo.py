@@ -142,8 +142,8 @@ def advantages(config: Config, state: State, rollout: Rollout) -> Batch:
     policy, value_of = state.networks.policy, state.networks.value
     value, next_value = value_of(rollout.obs), value_of(rollout.next_obs)
     log_prob = policy(rollout.obs).log_prob(rollout.action)
-    reward, ends = state.reward_scale(rollout.reward), (rollout.terminated, rollout.done)
-    advantage, target = gae(reward, value, next_value, *ends, gamma=config.gamma, lam=config.gae_lambda)
+    outcome = (rollout.reward, value, next_value, rollout.terminated, rollout.done)
+    advantage, target = gae(*outcome, gamma=config.gamma, lam=config.gae_lambda)
     return Batch(rollout.obs, rollout.action, log_prob, value, advantage, target).flatten()  # [T, N, …] -> [B, …]
 
 
@@ -167,17 +167,17 @@ def loss(config: Config, networks: ActorCritic, batch: Batch) -> tuple[Tensor, d
 def update(config: Config, state: State, rollout: Rollout) -> Mapping[str, Tensor | float]:
     """K epochs of minibatch steps on one rollout (algorithm 1); returns the means of what was watched."""
     if config.desired_kl is None:
-        progress = state.step / config.total_steps
-        state.learning_rate = linear(config.learning_rate, config.final_learning_rate, progress)
+        state.learning_rate = linear(config.learning_rate, config.final_learning_rate, state.step / config.total_steps)
     if config.scale_rewards:
         state.reward_scale.update(rollout)
+        rollout = replace(rollout, reward=state.reward_scale(rollout.reward))
     batch = collected = advantages(config, state, rollout)
-    played = torch.nonzero(rollout.valid.flatten())[:, 0]  # without the rows in which no action was taken
+    played = rollout.valid.flatten().nonzero()[:, 0]  # without the rows in which no action was taken
     watched: list[Mapping[str, Tensor]] = []
     for epoch in range(config.epochs):
         if config.recompute_advantages and epoch > 0:
             batch = replace(advantages(config, state, rollout), log_prob=collected.log_prob)
-        parts = minibatches(played, rollout.num_steps, config.minibatch_size, state.shuffle)
+        parts = minibatches(played, rollout.num_rows, config.minibatch_size, state.shuffle)
         watched.append(state.optimizer(batch, parts, state.learning_rate))
         kl = watched[-1]["approx_kl"].item()
         if config.desired_kl is not None:
@@ -185,7 +185,7 @@ def update(config: Config, state: State, rollout: Rollout) -> Mapping[str, Tenso
         if config.target_kl is not None and kl > config.target_kl:
             break
     state.policy.observe(rollout.obs[rollout.valid])  # afterwards: both probabilities are taken through one normalizer
-    state.step += rollout.num_steps
+    state.step += rollout.num_rows
     means = {name: torch.stack([row[name] for row in watched]).mean() for name in watched[0]}
     explained = explained_variance(collected.value[played], collected.target[played])
     return {**means, **state.policy.watch(), "explained_variance": explained, "learning_rate": state.learning_rate}

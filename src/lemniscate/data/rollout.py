@@ -6,6 +6,7 @@ import torch
 from torch import Generator, Tensor
 
 from lemniscate.envs.api import VecEnv
+from lemniscate.errors import UserError
 from lemniscate.nn.policies import Policy
 from lemniscate.types import Rollout
 
@@ -34,6 +35,10 @@ def minibatches(played: Tensor, collected: int, size: int, generator: Generator)
         size: b; a rollout with fewer rows is one minibatch.
         generator: draws the order.
     """
+    if not len(played):
+        raise UserError(
+            "In a whole rollout every action was ignored by an environment that reset itself; take more num_steps."
+        )
     size = min(size, collected)
     wanted = math.ceil(collected / size) * size
     order = played[torch.randperm(len(played), generator=generator, device=generator.device)]

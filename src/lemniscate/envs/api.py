@@ -43,7 +43,7 @@ class VecEnv:
     """A backend with its current observation and the books of its episodes."""
 
     def __init__(self, backend: Backend) -> None:
-        self._backend = backend
+        self.backend = backend
         self.spec = backend.spec
         self.num_envs = backend.num_envs
         self.device = backend.device
@@ -53,7 +53,7 @@ class VecEnv:
         """Begin anew from `seed`; also stored as `obs`, [N, O]. `steps` is what the run has taken so far."""
         self.steps = steps
         self._books = Books(self.num_envs, self.device)
-        self.obs = self._backend.restart(seed)
+        self.obs = self.backend.restart(seed)
         self._require_finite(observation=self.obs)
         return self.obs
 
@@ -63,9 +63,11 @@ class VecEnv:
         Raises:
             NonFiniteError: an observation or a reward is NaN or infinite; nothing has learned from it yet.
         """
-        whole = self._backend.whole
-        step = self._backend.step(action)
+        whole = self.backend.whole
+        step = self.backend.step(action)
         self._require_finite(observation=step.next_obs, reward=step.reward)
+        if step.obs is not step.next_obs:
+            self._require_finite(observation=step.obs)
         self.obs = step.obs
         self.steps += self.num_envs
         self._books.log(step, whole)
@@ -86,7 +88,7 @@ class VecEnv:
 
     def close(self) -> None:
         """Give back processes and windows."""
-        self._backend.close()
+        self.backend.close()
 
 
 def _gymnasium(env_id: str, num_envs: int, device: torch.device, stagger: bool) -> Backend:
@@ -165,6 +167,13 @@ def backend_for(env_id: str) -> str:
     return "envpool" if env_id in ENVPOOL_IDS and is_installed("envpool") else "gymnasium"
 
 
+def require_backend(backend: str) -> str:
+    """The name itself. Raises `UserError` with the nearest names for one that is not known."""
+    if backend not in BACKENDS:
+        raise unknown("backend", backend, BACKENDS)
+    return backend
+
+
 def make(
     env_id: str, num_envs: int, *, device: str = "cpu", stagger: bool = False, backend: str | None = None
 ) -> VecEnv:
@@ -174,8 +183,6 @@ def make(
         UserError: an unknown environment or backend, spaces nobody can act in, a missing extra.
     """
     served_by = backend_for(env_id)
-    if backend is not None and backend not in BACKENDS:
-        raise unknown("backend", backend, BACKENDS)
-    if backend is not None and (backend == "crazyflow") != (served_by == "crazyflow"):
+    if backend is not None and (require_backend(backend) == "crazyflow") != (served_by == "crazyflow"):
         raise UserError(f"{env_id} cannot be served by the {backend} backend; {served_by} serves it.")
     return VecEnv(BACKENDS[backend or served_by](env_id, num_envs, torch.device(device), stagger))

@@ -8,10 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode
 
 from lemniscate.envs import api
 from lemniscate.envs.api import VecEnv
 from lemniscate.envs.gymnasium import make_one, spec_of
+from lemniscate.envs.spaces import follow, is_image, observation_layout
 from lemniscate.errors import NonFiniteError, UserError
 from lemniscate.types import Action, Box, Discrete, MultiDiscrete, Rollout
 
@@ -28,13 +30,16 @@ class Finding:
 
 def check(env_id: str, backend: str | None = None) -> Iterator[Finding]:
     """Everything found, one by one; the first that keeps it from being made is the last."""
-    served_by = backend or api.backend_for(env_id)
+    served_by = api.backend_for(env_id) if backend is None else api.require_backend(backend)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             env = api.make(env_id, COPIES, backend=backend)
     except UserError as error:
         yield Finding("bad", str(error))
+        return
+    except Exception as error:  # the environment's own code, here and below: whatever it raises is the finding
+        yield Finding("bad", f"It cannot be made: {_told(error)}.")
         return
     try:
         yield from _spaces(env, served_by)
@@ -50,10 +55,26 @@ def _spaces(env: VecEnv, served_by: str) -> Iterator[Finding]:
     parts = ", ".join(f"{part.name} {part.size}" for part in spec.layout)
     seen = "an image" if spec.image else f"{spec.observation_size} numbers ({parts})"
     yield Finding("good", f"Served by {served_by}; observes {seen}; acts by {_describe(spec.action)}.")
+    yield from _autoreset(env)
     if spec.max_episode_steps is None:
         yield Finding("note", "It has no time limit: an episode that a policy does not end cannot be evaluated.")
     if isinstance(spec.action, Box) and not np.isfinite([*spec.action.low, *spec.action.high]).all():
-        yield Finding("note", "Some actions have no bound: those are not scaled, so a policy begins around zero, ±1.")
+        yield Finding(
+            "note",
+            "Some actions have no bound: a policy begins around zero, or around one unit from the only bound.",
+        )
+
+
+def _autoreset(env: VecEnv) -> Iterator[Finding]:
+    mode = getattr(env.backend, "mode", None)
+    if mode is AutoresetMode.SAME_STEP:
+        yield Finding("good", "Resets in the step that ends an episode, and gives the final observation in its info.")
+    elif mode is AutoresetMode.NEXT_STEP:
+        yield Finding(
+            "good", "Resets in the step after an end; the action of that step is ignored, and not learned from."
+        )
+    else:
+        yield Finding("good", "Is reset here, right after an episode's end; the final observation is kept.")
 
 
 def _describe(action: Action) -> str:
@@ -73,13 +94,27 @@ def _gymnasium(env_id: str) -> Iterator[Finding]:
         warnings.simplefilter("always")
         try:
             check_env(env.unwrapped, skip_render_check=True)
-        except Exception as error:  # the environment's own code: whatever it raises is the finding
+        except Exception as error:
             found.append(Finding("bad", f"Gymnasium's checker: {_one_line(error)}"))
         finally:
             env.close()
     told = sorted({_one_line(warning.message) for warning in caught if warning.category is UserWarning})
     found += [Finding("note", f"Gymnasium's checker: {sentence}") for sentence in told]
     yield from found or [Finding("good", "Gymnasium's checker finds nothing.")]
+    if not any(finding.grade == "bad" for finding in found):
+        yield from _dtypes(env_id)
+
+
+def _dtypes(env_id: str) -> Iterator[Finding]:
+    env = make_one(spec_of(env_id)).unwrapped
+    obs, _ = env.reset(seed=0)
+    kinds = {
+        np.asarray(follow(part.path, obs)).dtype.name for part in observation_layout(env.observation_space, env_id)
+    }
+    env.close()
+    kept = kinds == {"uint8"} and is_image(env.observation_space)
+    as_what = "stay bytes" if kept else "reach the policy as float32"
+    yield Finding("good", f"Its observations are {', '.join(sorted(kinds))}, and {as_what}.")
 
 
 def _behaviour(env: VecEnv) -> Iterator[Finding]:
@@ -90,6 +125,12 @@ def _behaviour(env: VecEnv) -> Iterator[Finding]:
         again, other = _play(env, seed=0), _play(env, seed=1)
     except NonFiniteError as error:
         yield Finding("bad", f"{error} Learning would stop there.")
+        return
+    except UserError as error:
+        yield Finding("bad", str(error))
+        return
+    except Exception as error:
+        yield Finding("bad", f"It cannot be played with random actions: {_told(error)}.")
         return
     yield Finding("good", f"{STEPS} random steps: every observation and reward is finite.")
     same = all(torch.equal(getattr(first, name), getattr(again, name)) for name in ("obs", "reward", "terminated"))
@@ -144,6 +185,10 @@ def _random(env: VecEnv, rng: np.random.Generator) -> np.ndarray:
     if isinstance(action, Discrete):
         return rng.integers(action.n, size=env.num_envs)
     return rng.integers(2, size=(env.num_envs, action.n))
+
+
+def _told(error: Exception) -> str:
+    return f"{type(error).__name__}: {_one_line(error).rstrip('.')}"
 
 
 def _one_line(message: object) -> str:

@@ -4,12 +4,11 @@ import os
 import warnings
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import torch
 from torch import Tensor
 
-from lemniscate.envs.spaces import action_kind, flatten_observation, observation_layout, physical_action
+from lemniscate.envs.spaces import action_kind, flatten_observation, is_image, observation_layout, physical_action
 from lemniscate.envs.stagger import Cuts
 from lemniscate.errors import UserError
 from lemniscate.types import Spec, Step
@@ -30,14 +29,15 @@ class EnvpoolBackend:
         self.num_envs, self.device = num_envs, device
         self._num_threads = min(num_envs, num_threads or len(os.sched_getaffinity(0)))
         self._valid = torch.ones(num_envs, dtype=torch.bool, device=device)
-        limit = gym.spec(env_id).max_episode_steps
-        self._stagger_up_to = limit if stagger else None
         self._pool = self._build(env_id, 0)
+        limit = int(self._pool.config["max_episode_steps"])
+        self._stagger_up_to = limit if stagger else None
         self.spec = Spec(
             env_id=env_id,
             layout=observation_layout(self._pool.observation_space, env_id),
             action=action_kind(self._pool.action_space, env_id),
             max_episode_steps=limit,
+            image=is_image(self._pool.observation_space),
         )
 
     def _build(self, env_id: str, seed: int) -> Any:
@@ -59,22 +59,23 @@ class EnvpoolBackend:
         self._cuts = Cuts(self.num_envs, self._stagger_up_to, seed)
         self.whole = self._tensor(self._cuts.whole)
         obs, _ = self._pool.reset()
-        return self._tensor(flatten_observation(self.spec.layout, obs))
+        return self._tensor(self._seen(obs))
 
     def step(self, action: Tensor) -> Step:
         """Step all copies, then reset those whose episode has ended."""
         raw, reward, terminated, truncated, _ = self._pool.step(physical_action(action.cpu().numpy(), self.spec.action))
-        obs = next_obs = flatten_observation(self.spec.layout, raw)
+        next_obs = self._seen(raw)
         truncated = self._cuts.apply(terminated, truncated & ~terminated)
         done = terminated | truncated
+        here = there = self._tensor(next_obs)
         if done.any():
             fresh, info = self._pool.reset(np.flatnonzero(done).astype(np.int32))
             obs = next_obs.copy()
-            obs[info["env_id"]] = flatten_observation(self.spec.layout, fresh)
-        self.whole = self._tensor(self._cuts.whole)
+            obs[info["env_id"]] = self._seen(fresh)
+            here, self.whole = self._tensor(obs), self._tensor(self._cuts.whole)
         return Step(
-            obs=self._tensor(obs),
-            next_obs=self._tensor(next_obs),
+            obs=here,
+            next_obs=there,
             reward=self._tensor(reward.astype(np.float32)),
             terminated=self._tensor(terminated),
             truncated=self._tensor(truncated),
@@ -84,6 +85,9 @@ class EnvpoolBackend:
     def close(self) -> None:
         """Let the pool's threads end."""
         self._pool.close()
+
+    def _seen(self, raw: Any) -> np.ndarray:
+        return flatten_observation(self.spec.layout, raw, image=self.spec.image)
 
     def _tensor(self, array: np.ndarray) -> Tensor:
         return torch.from_numpy(array).to(self.device)

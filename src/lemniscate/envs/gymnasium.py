@@ -1,6 +1,7 @@
 """Gymnasium vector environments, in all three autoreset modes."""
 
 import importlib
+import multiprocessing
 import signal
 import sys
 from dataclasses import replace
@@ -50,13 +51,14 @@ class GymnasiumBackend:
         self.num_envs, self.device = num_envs, device
         try:
             self._envs = self._build()
-        except (gym.error.Error, ModuleNotFoundError) as error:
+        except (gym.error.Error, ImportError) as error:
             raise UserError(f"{env_id} cannot be made: {error}") from error
         self.mode = self._envs.metadata.get("autoreset_mode")
         if not isinstance(self.mode, AutoresetMode):
             raise UserError(f"{env_id} does not say when it resets: its metadata needs an autoreset_mode.")
         space = self._envs.single_observation_space
         layout, action = observation_layout(space, env_id), action_kind(self._envs.single_action_space, env_id)
+        self._used = isinstance(action, Discrete)
         if isinstance(action, Discrete) and "action_mask" in self._envs.reset(seed=0)[1]:
             action = replace(action, masked=True)
         limit = self._gym_spec.max_episode_steps
@@ -74,13 +76,16 @@ class GymnasiumBackend:
             return gym.make_vec(self._gym_spec, self.num_envs, **self._kwargs)
         copies = [partial(make_one, self._gym_spec, **self._kwargs)] * self.num_envs
         if self._workers:
+            multiprocessing.get_context("forkserver").set_forkserver_preload([__name__])  # imported once, for all
             return WatchedVectorEnv(copies, context="forkserver", autoreset_mode=AutoresetMode.DISABLED)
         return SyncVectorEnv(copies, autoreset_mode=AutoresetMode.DISABLED)
 
     def restart(self, seed: int) -> Tensor:
         """Close the environments and build them again: some (Box2D) carry more over a reset than they tell."""
-        self._envs.close()
-        self._envs = self._build()
+        if self._used:
+            self._envs.close()
+            self._envs = self._build()
+        self._used = True
         self._resetting = np.zeros(self.num_envs, dtype=bool)
         self._cuts = Cuts(self.num_envs, self._stagger_up_to, seed)
         self.whole = self._tensor(self._cuts.whole)
@@ -92,6 +97,7 @@ class GymnasiumBackend:
         """Step, then find the true successor of each row and where to act next, as the mode demands."""
         physical = physical_action(action.cpu().numpy(), self.spec.action)
         raw, reward, terminated, truncated, info = self._envs.step(physical)
+        terminated, truncated = terminated.copy(), truncated.copy()  # a vector environment may write over its own
         obs = next_obs = self._seen(raw, info)
         valid = np.ones(self.num_envs, dtype=bool)
         done = terminated | truncated
@@ -105,9 +111,10 @@ class GymnasiumBackend:
             if done.any():
                 obs = self._seen(*self._envs.reset(options={"reset_mask": done.copy()}))
         self.whole = self._tensor(self._cuts.whole)
+        there = self._tensor(next_obs)
         return Step(
-            obs=self._tensor(obs),
-            next_obs=self._tensor(next_obs),
+            obs=there if obs is next_obs else self._tensor(obs),
+            next_obs=there,
             reward=self._tensor(reward.astype(np.float32)),
             terminated=self._tensor(terminated),
             truncated=self._tensor(truncated),
@@ -136,10 +143,16 @@ class GymnasiumBackend:
         """The flat observation; after it the action mask, where there is one."""
         flat = flatten_observation(self.spec.layout, raw, image=self.spec.image)
         if not (isinstance(self.spec.action, Discrete) and self.spec.action.masked):
-            return flat
+            return flat.copy() if self._gym_spec.entry_point is None else flat
         if "action_mask" in info:
-            told = info.get("_action_mask", np.ones(self.num_envs, dtype=bool))
-            self._mask = np.where(told[:, None], info["action_mask"], self._mask)
+            self._mask = self._mask.copy()
+            for row in np.flatnonzero(info.get("_action_mask", np.ones(self.num_envs, dtype=bool))):
+                self._mask[row] = info["action_mask"][row]
+            if not self._mask.any(axis=1).all():
+                copy = int(np.argmin(self._mask.any(axis=1)))
+                raise UserError(
+                    f"{self.spec.env_id} rules out every action of copy {copy}: its action_mask is all zero."
+                )
         return np.concatenate([flat, self._mask.astype(flat.dtype)], axis=-1)
 
     def _tensor(self, array: np.ndarray) -> Tensor:

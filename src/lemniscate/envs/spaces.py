@@ -47,11 +47,12 @@ def is_image(space: gym.Space) -> bool:
 
 def flatten_observation(layout: tuple[Part, ...], obs: Any, *, image: bool = False) -> np.ndarray:
     """A batch of raw observations as [N, O]: float32, or the bytes of an image."""
-    pieces = [_flatten(part, _follow(part.path, obs), image) for part in layout]
+    pieces = [_flatten(part, follow(part.path, obs), image) for part in layout]
     return pieces[0] if len(pieces) == 1 else np.concatenate(pieces, axis=-1)
 
 
-def _follow(path: tuple[str | int, ...], obs: Any) -> Any:
+def follow(path: tuple[str | int, ...], obs: Any) -> Any:
+    """The piece of an observation that a part's path leads to."""
     for step in path:
         obs = obs[step]
     return obs
@@ -60,8 +61,12 @@ def _follow(path: tuple[str | int, ...], obs: Any) -> Any:
 def _flatten(part: Part, obs: Any, image: bool) -> np.ndarray:
     if part.nvec:
         numbers = np.asarray(obs).reshape(-1, len(part.nvec)) - np.array(part.start)
-        hot = [np.eye(n, dtype=np.float32)[numbers[:, k]] for k, n in enumerate(part.nvec)]
-        return np.concatenate(hot, axis=-1)
+        if (numbers < 0).any() or (numbers >= np.array(part.nvec)).any():
+            raise ValueError(f"{part.name} is {obs}, which is not in its space")
+        hot = np.zeros((len(numbers), part.size), dtype=np.float32)
+        columns = numbers + np.cumsum((0, *part.nvec[:-1]))
+        hot[np.arange(len(numbers))[:, None], columns] = 1
+        return hot
     return np.asarray(obs, dtype=np.uint8 if image else np.float32).reshape(-1, part.size)
 
 
@@ -74,8 +79,8 @@ def action_kind(space: gym.Space, env_id: str) -> Action:
     if isinstance(space, spaces.MultiBinary):
         return MultiBinary(int(np.prod(space.shape)), tuple(map(int, space.shape)))
     if isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.floating):
-        low, high = (tuple(map(float, np.ravel(np.float32(bound)))) for bound in (space.low, space.high))
-        return Box(low, high, tuple(map(int, space.shape)))
+        low, high = (tuple(map(float, np.ravel(bound))) for bound in (space.low, space.high))
+        return Box(low, high, tuple(map(int, space.shape)), space.dtype.name)
     raise UserError(
         f"{env_id} takes {space} actions; what can be acted in is Discrete, MultiDiscrete, MultiBinary and a Box of"
         " floating-point numbers."
@@ -87,23 +92,26 @@ def _whole(numbers: np.ndarray) -> tuple[int, ...]:
 
 
 def scale_action(action: np.ndarray, box: Box) -> np.ndarray:
-    """Actions in [-1, 1]^A to physical units, [N, A]; what lies outside is clipped.
+    """Actions of a policy to physical units, [N, A], in the dtype of the space; what lies outside is clipped.
 
-        a_phys = low + ½ (clip(a, −1, 1) + 1) (high − low)
+        a_phys = clip(low + ½ (a + 1) (high − low), low, high)
 
-    A coordinate with an infinite bound is not scaled, only clipped to its bounds.
+    With one infinite bound, −1 is the finite one and the unit stays: low + 1 + a, or high − 1 + a. With two, a is not
+    changed.
     """
-    floor, ceiling, base, half = _scale(box)
-    return base + half * np.minimum(np.maximum(action, floor), ceiling)
+    low, high, middle, half = _scale(box)
+    return np.minimum(np.maximum(middle + half * action, low), high)
 
 
 @lru_cache
 def _scale(box: Box) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    low, high = np.array(box.low, dtype=np.float32), np.array(box.high, dtype=np.float32)
-    finite = np.isfinite(low) & np.isfinite(high)
-    low_or_0, high_or_0 = np.where(finite, low, 0), np.where(finite, high, 0)
-    half = np.where(finite, 0.5 * high_or_0 - 0.5 * low_or_0, 1)
-    return np.where(finite, -1, low), np.where(finite, 1, high), 0.5 * (low_or_0 + high_or_0), half
+    low, high = np.array(box.low, dtype=box.dtype), np.array(box.high, dtype=box.dtype)
+    below, above = np.isfinite(low), np.isfinite(high)
+    with np.errstate(invalid="ignore"):  # ∞ − ∞, of which nothing is taken
+        cases = [(below & above, 0.5 * low + 0.5 * high), (below & ~above, low + 1), (~below & above, high - 1)]
+        half = np.where(below & above, 0.5 * high - 0.5 * low, 1).astype(box.dtype)
+    middle = np.select(*zip(*cases, strict=True), default=0).astype(box.dtype)
+    return low, high, middle, half
 
 
 def physical_action(action: np.ndarray, kind: Action) -> np.ndarray:

@@ -27,6 +27,16 @@ class WatchedVectorEnv(AsyncVectorEnv):
         """As Gymnasium's. Raises `WorkerError` if a worker died or does not answer."""
         return self._watched(lambda: self.step_async(actions), self.step_wait)
 
+    def _check_spaces(self) -> None:
+        """As Gymnasium's, which waits without end; so first ask whether every worker is there."""
+        try:
+            self._watched(lambda: self.call_async("metadata"), self.call_wait)
+        except WorkerError:
+            self.close_extras(terminate=True)
+            self.closed = True
+            raise
+        super()._check_spaces()
+
     def _watched(self, ask: Callable[[], None], wait: Callable[..., Any]) -> Any:
         try:
             ask()

@@ -14,7 +14,7 @@ def explained_variance(prediction: Tensor, target: Tensor) -> Tensor:
 
     Not finite where the target is constant.
     """
-    return 1 - (target - prediction).var() / target.var()
+    return 1 - (target - prediction).var(correction=0) / target.var(correction=0)
 
 
 def kl_k1(log_ratio: Tensor) -> Tensor:

@@ -34,7 +34,7 @@ class RunningNorm(Observed):
     """(x − mean) / std of everything seen in training, clipped to ±`clip`.
 
     The statistics are buffers and change in `update` only; calling the module never changes them. Before the first
-    update it passes observations through.
+    update it only clips.
     """
 
     mean: Tensor
@@ -84,11 +84,16 @@ class RewardScale(nn.Module):
         """Any shape to the same shape."""
         return (reward / (self.var + 1e-8).sqrt().to(reward.dtype)).clamp(-self.clip, self.clip)
 
+    def restart(self) -> None:
+        """The environments begin anew: the episodes under way are over."""
+        self.running = torch.zeros_like(self.running)
+
     @torch.no_grad()
     def update(self, rollout: Rollout) -> None:
         """Follow the discounted return Σ γ^k r_{t−k} of each episode through a rollout [T, N]."""
         returns = []
-        for reward, done in zip(rollout.reward.double(), rollout.done, strict=True):
+        paid = rollout.reward.double() * rollout.valid
+        for reward, done in zip(paid, rollout.done, strict=True):
             self.running = self.gamma * self.running + reward
             returns.append(self.running)
             self.running = self.running * ~done

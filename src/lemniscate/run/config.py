@@ -52,7 +52,7 @@ class RunConfig:
     """where networks, and simulators that can, live; auto takes cuda if there is one"""
     threads: Count = 1
     """torch's threads on the CPU; results of one number differ in rounding from another's"""
-    engine: Literal["auto", "eager", "compiled"] = "auto"
+    engine: Literal["auto", "eager", "native"] = "auto"
     """how gradient steps are taken: one by one through autograd, or as one native call; auto compiles long runs"""
     checkpoint_every: Natural = 0
     """steps between checkpoints, at each of which the environments restart; 0 makes five of the run"""

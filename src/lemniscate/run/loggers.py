@@ -1,6 +1,7 @@
 """Where metrics go. A logger is one small class with `write` and `close`, and one line in `LOGGERS`."""
 
 import json
+import math
 import os
 import sys
 from collections.abc import Callable, Mapping
@@ -38,8 +39,11 @@ class JsonLines:
         self._file = self._path.open("a")
 
     def write(self, step: int, metrics: Metrics, episodes: Episodes = NO_EPISODES) -> None:
-        """Append a line; `episode/returns` and `episode/lengths` are lists, in the order in which episodes ended."""
-        line: dict[str, Any] = {"step": step, **metrics}
+        """Append a line; `episode/returns` and `episode/lengths` are lists, in the order in which episodes ended.
+
+        What is not a number is left out: JSON has no word for it.
+        """
+        line: dict[str, Any] = {"step": step} | {name: x for name, x in metrics.items() if math.isfinite(x)}
         if episodes.returns:
             line |= {"episode/returns": [float(f"{r:.6g}") for r in episodes.returns]}
             line |= {"episode/lengths": episodes.lengths}

@@ -37,7 +37,7 @@ from lemniscate.run.progress import ProgressBar
 from lemniscate.run.seeding import derive, globals_undisturbed, seed_globals
 
 WORTH_COMPILING = 15_000
-"""gradient steps of a run from which on a compiled one is sooner done"""
+"""gradient steps of a run from which on a native one is sooner done"""
 
 TRAINING = 0
 """the stream of seeds that training environments restart from"""
@@ -154,7 +154,7 @@ class Run:
         self._lock.release()
 
     def _choose_engine(self, state: AnyState) -> None:
-        if engine_of(self.config) == "compiled":
+        if engine_of(self.config) == "native":
             if self._visible:
                 print("Compiling: about half a minute the first time, 4 s from then on.", file=sys.stderr)
             state.policy.make_native()
@@ -166,6 +166,9 @@ class Run:
         seed = derive(self.config.seed, TRAINING, state.step)
         seed_globals(seed)  # nothing here draws from them, but somebody's environment may
         self.env.restart(seed, state.step)
+        for part in vars(state).values():
+            if hasattr(part, "restart"):  # what follows episodes has to know that they are cut
+                part.restart()
 
     def _between(self, state: AnyState, before: int, total_steps: int) -> None:
         every, interval = self.config.evaluate_every, self.config.checkpoint_interval
@@ -244,18 +247,26 @@ class Run:
                 signal.signal(signum, handler)
 
 
+UNFINISHED = "config.json.tmp"
+
+
 def engine_of(config: RunConfig) -> str:
-    """The engine asked for; of itself, "compiled" for a run that is long enough to repay it, else "eager"."""
+    """The engine asked for; of itself, "native" for a run that is long enough to repay it, else "eager"."""
     if config.engine != "auto":
         return config.engine
-    return "compiled" if config.gradient_steps >= WORTH_COMPILING else "eager"
+    return "native" if config.gradient_steps >= WORTH_COMPILING else "eager"
+
+
+def require_absent(path: Path) -> None:
+    """Raise `UserError` if a run directory exists already, but for the beginning of one that could not be written."""
+    if path.exists() and (not path.is_dir() or set(path.iterdir()) - {path / UNFINISHED}):
+        raise UserError(f"{path} exists already; go on with it (lemniscate resume {path}) or choose another --run.")
 
 
 def create_directory(path: Path, algorithm: str, config: RunConfig) -> None:
     """Make a run directory and write its `config.json`. Raises `UserError` if there is something already."""
-    temporary = path / "config.json.tmp"
-    if path.exists() and (not path.is_dir() or set(path.iterdir()) - {temporary}):
-        raise UserError(f"{path} exists already; go on with it (lemniscate resume {path}) or choose another --run.")
+    require_absent(path)
+    temporary = path / UNFINISHED
     try:
         path.mkdir(parents=True, exist_ok=True)
         temporary.write_text(json.dumps({"algorithm": algorithm, "config": config.to_json()}, indent=1) + "\n")
