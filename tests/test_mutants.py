@@ -35,8 +35,8 @@ MUTANTS = [
     (
         "actions scaled to half their range",
         "envs/spaces.py",
-        "base + half *",
-        "base + 0.5 * half *",
+        "middle + half *",
+        "middle + 0.5 * half *",
         "envs/test_spaces.py",
     ),
     ("reset rows are real", "envs/gymnasium.py", "~self._resetting, done", "valid, done", "envs/test_contract.py"),
