@@ -5,7 +5,8 @@
     .venv/bin/python benchmarks/returns.py ppo --table               the table of what has been run, and its picture
 
 Each row of `benchmarks/results/returns.jsonl` is one policy: 100 episodes from starts that training never saw. Where an
-environment has two numbers of steps, one run serves both: its checkpoint at the first, its last policy at the second.
+environment has two numbers of steps, one run serves both: nothing in those presets depends on how long the run is to
+be, so the policy at the first is the one that a shorter run would have ended with.
 """
 
 import argparse

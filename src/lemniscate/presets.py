@@ -109,7 +109,7 @@ PPO = [
             normalize_observations=False,
             checkpoint_every=50_000,  # restarts would cut the long episodes in which the cart drifts off the track
         ),
-        "search by hand, on seeds 101 to 111",
+        "search by hand, 27 runs, on seeds 101 to 111",
         "2026-11",
     ),
     Preset(
@@ -126,7 +126,7 @@ PPO = [
             scale_rewards=True,
             checkpoint_every=250_000,
         ),
-        "search by hand, on seed 101",
+        "search by hand, 3 runs, on seed 101",
         "2026-11",
     ),
     Preset(
@@ -154,10 +154,20 @@ PPO = [
         "the reinforcement-learning course's exercise on LunarLander: its settings, on the corrected algorithm",
         "2026-11",
     ),
-    Preset("half-cheetah", ADAPTIVE.replace(env="HalfCheetah-v5"), "search by hand, on seeds 101 and 102", "2026-11"),
-    Preset("ant", ADAPTIVE.replace(env="Ant-v5"), "search by hand, on seeds 101 and 102", "2026-11"),
-    Preset("humanoid", ADAPTIVE.replace(env="Humanoid-v5"), "search by hand, on seeds 101 and 102", "2026-11"),
-    Preset("hopper", ANNEALED.replace(env="Hopper-v5"), "Tianshou's settings, on seeds 101 and 102", "2026-11"),
+    Preset(
+        "half-cheetah",
+        ADAPTIVE.replace(env="HalfCheetah-v5"),
+        "search by hand, 6 runs, on seeds 101 and 102",
+        "2026-11",
+    ),
+    Preset("ant", ADAPTIVE.replace(env="Ant-v5"), "search by hand, 5 runs, on seeds 101 and 102", "2026-11"),
+    Preset("humanoid", ADAPTIVE.replace(env="Humanoid-v5"), "search by hand, 2 runs, on seeds 101 and 102", "2026-11"),
+    Preset(
+        "hopper",
+        ANNEALED.replace(env="Hopper-v5"),
+        "Tianshou's settings, best of 11 runs, on seeds 101 and 102",
+        "2026-11",
+    ),
     Preset(
         "walker2d",
         ANNEALED.replace(
@@ -168,7 +178,7 @@ PPO = [
             learning_rate=1e-3,
             normalize_advantage=True,
         ),
-        "search by hand, on seeds 101 and 102",
+        "search by hand, 7 runs, on seeds 101 and 102",
         "2026-11",
     ),
 ]
