@@ -85,6 +85,11 @@ def test_envs_lists_backend_and_preset(capsys):
         (["evaluate", "nowhere"], "nowhere is not a run directory"),
         (["evaluate", "nowhere", "--episods", "3"], "--episods is not understood here"),
         (["resume", "nowhere"], "nowhere is not a run directory"),
+        (["train", "--seed", "3", "ppo"], "The algorithm comes first, then its fields: lemniscate train ppo"),
+        (["train", "ppo", "--env", "CartPole-v1", "--backend", "envpol"], "There is no backend 'envpol'"),
+        (["train", "ppo", "--env", "test_cli:Nothing"], "has neither an environment class nor an id Nothing"),
+        (["check", "CartPole-v1", "--backend", "foo"], "There is no backend 'foo'"),
+        (["train", "ppo", "--env", "Ant-v2"], "Ant-v2 cannot be made: The mujoco v2"),
         (["watch"], "The following arguments are required"),
         (["evaluat"], "Invalid choice: 'evaluat'"),
     ],
@@ -101,6 +106,12 @@ def test_an_episode_is_filmed(run, capsys):
     film = run / "videos" / "episode.gif"
     assert main(["watch", str(run), "--video", str(film)]) == 0
     assert film.stat().st_size > 5000
+
+
+def test_a_seed_below_zero_is_a_sentence(run, capsys):
+    for command in ("watch", "evaluate"):
+        assert main([command, str(run), "--seed", "-1"]) == 2
+        assert "seed must be a whole number at least 0, not -1." in capsys.readouterr().err
 
 
 def test_a_film_that_cannot_be_written_is_a_sentence(run, capsys):

@@ -52,6 +52,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def train(given: argparse.Namespace, rest: list[str]) -> None:
     """Train a policy; with --report also evaluate it and draw pictures."""
+    misplaced = sorted(set(rest) & set(ALGORITHMS))
+    if misplaced and given.algorithm not in ALGORITHMS:
+        raise UserError(f"The algorithm comes first, then its fields: lemniscate train {misplaced[0]} …")
     config = _with_fields(front.config_for(given.algorithm, given.env, given.preset), rest)
     if config.backend:
         api.require_backend(config.backend)
