@@ -89,7 +89,6 @@ def test_envs_lists_backend_and_preset(capsys):
         (["train", "ppo", "--env", "CartPole-v1", "--backend", "envpol"], "There is no backend 'envpol'"),
         (["train", "ppo", "--env", "test_cli:Nothing"], "has neither an environment class nor an id Nothing"),
         (["check", "CartPole-v1", "--backend", "foo"], "There is no backend 'foo'"),
-        (["train", "ppo", "--env", "Ant-v2"], "Ant-v2 cannot be made: The mujoco v2"),
         (["watch"], "The following arguments are required"),
         (["evaluat"], "Invalid choice: 'evaluat'"),
     ],
