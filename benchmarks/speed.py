@@ -4,8 +4,8 @@
     .venv/bin/python benchmarks/speed.py throughput parts    only these
     .venv/bin/python benchmarks/speed.py --table             the table of what has been measured, and its picture
 
-    throughput   PPO on 16 copies, 2048 rows × 10 epochs × minibatches of 64, 64 × 64 tanh; each peer at its best
-                 number of threads and kind of vector
+    throughput   PPO, 2048 rows × 10 epochs × minibatches of 64, 64 × 64 tanh. HalfCheetah on 16 copies, each peer at
+                 its best number of threads and kind of vector; the others on 64 copies, beside EnvPool alone
     parts        where the time of one update goes, eager and native
     startup      from the command to the first update: eager, native with a cold cache, native with a warm one
     lander       from process start to a policy of mean return 250 over 100 episodes of LunarLander-v3
@@ -26,7 +26,8 @@ from statistics import harmonic_mean, median
 
 from common import RESULTS, append, provenance, rows
 
-ENVS = ("HalfCheetah-v5", "Ant-v5", "Humanoid-v5", "Hopper-v5")
+COPIES = {"HalfCheetah-v5": 16, "Ant-v5": 64, "Humanoid-v5": 64, "Hopper-v5": 64}
+ENVS = tuple(COPIES)
 SHARED = {"num_envs": 16, "num_steps": 128, "minibatch_size": 64, "epochs": 10, "learning_rate": 3e-4}
 OURS, PHYSICS = "lemniscate", "EnvPool alone"
 PEERS = [(peer, threads, kind) for peer in ("sb3", "sbx") for threads in (1, 2) for kind in ("dummy", "subproc")]
@@ -53,13 +54,14 @@ if __name__ == "__main__":
 BARE = """
 import sys, time, warnings, numpy, envpool
 warnings.simplefilter("ignore")
-env = envpool.make(sys.argv[1], env_type="gymnasium", num_envs=16, num_threads=2, seed=1)
+env = envpool.make(sys.argv[1], env_type="gymnasium", num_envs=int(sys.argv[3]), num_threads=2, seed=1)
 space = env.action_space
-actions = numpy.random.default_rng(0).uniform(space.low, space.high, (64, 16, *space.shape))
+copies = int(sys.argv[3])
+actions = numpy.random.default_rng(0).uniform(space.low, space.high, (64, copies, *space.shape))
 env.reset()
-for t in range(200): env.step(actions[t % 64])
+for t in range(3200 // copies): env.step(actions[t % 64])
 started = time.perf_counter()
-for t in range(int(sys.argv[2]) // 16): env.step(actions[t % 64])
+for t in range(int(sys.argv[2]) // copies): env.step(actions[t % 64])
 print(int(sys.argv[2]) / (time.perf_counter() - started))
 """
 
@@ -113,15 +115,17 @@ def ours(env, steps):
     """Steps per second after the third update: the first compiles."""
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch) / "run"
-        train(folder, env, preset="default", total_steps=steps, checkpoint_every=steps, engine="native", **SHARED)
+        size = {**SHARED, "num_envs": COPIES[env], "num_steps": 2048 // COPIES[env]}
+        train(folder, env, preset="default", total_steps=steps, checkpoint_every=steps, engine="native", **size)
         return harmonic_mean(line["time/steps_per_second"] for line in lines(folder)[3:])
 
 
-def throughput(rounds, stamp):
+def throughput(rounds, stamp, envs=ENVS):
     best = {}
-    for env in ENVS:
+    for env in envs:
         for _ in range(rounds):
-            row = {PHYSICS: python(BARE, env, 100_000 if env == ENVS[0] else 40_000), OURS: ours(env, 100_000)}
+            alone = python(BARE, env, 100_000 if env == ENVS[0] else 40_000, COPIES[env])
+            row = {PHYSICS: alone, OURS: ours(env, 100_000)}
             for peer in ("sb3", "sbx") if env == ENVS[0] else ():
                 if peer not in best:  # the first round tries all, the others what was best
                     tried = {way: python(PEER, peer, env, *way[1:], 16384) for way in PEERS if way[0] == peer}
@@ -129,7 +133,11 @@ def throughput(rounds, stamp):
                     say(f"{peer} is fastest with {best[peer][1]} threads and {best[peer][2]} vectors")
                 row[peer] = python(PEER, peer, env, *best[peer][1:], 30_000)
             say(env, {name: round(speed) for name, speed in row.items()})
-            append("speed", {"what": "throughput", "env": env, "steps_per_second": row, "peers": best} | stamp)
+            append(
+                "speed",
+                {"what": "throughput", "env": env, "copies": COPIES[env], "steps_per_second": row, "peers": best}
+                | stamp,
+            )
 
 
 def measured(env):
@@ -284,6 +292,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("measures", nargs="*", metavar="MEASURE", help=", ".join(MEASURES))
     parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--envs", nargs="+", choices=ENVS, default=ENVS, help="of throughput")
     parser.add_argument("--table", action="store_true", help="run nothing")
     given = parser.parse_args()
     stamp = provenance()
@@ -291,7 +300,7 @@ def main():
     if wrong:
         parser.error(f"there is no measure {', '.join(wrong)}; there is {', '.join(MEASURES)}")
     for name in [] if given.table else given.measures or MEASURES:
-        MEASURES[name](given.rounds, stamp)
+        MEASURES[name](given.rounds, stamp, *([given.envs] if name == "throughput" else []))
     if all(measured(env) for env in ENVS):
         summary()
         draw()
