@@ -73,9 +73,7 @@ def summary(algorithm):
     print("|---|---|---|---|---|---|---|")
     for env, (marks, _) in RUNS[algorithm].items():
         for mark in marks:
-            of = [
-                row for row in rows("returns") if (row["algorithm"], row["env"], row["steps"]) == (algorithm, env, mark)
-            ]
+            of = measured(algorithm, env, mark)
             if not of:
                 continue
             means = [row["mean_return"] for row in of]

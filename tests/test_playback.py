@@ -74,9 +74,11 @@ def test_a_window_is_opened_and_closed(policy, monkeypatch):
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     opened = []
     rendered = playback._rendered
-    monkeypatch.setattr(playback, "_rendered", lambda env_id, mode: opened.append(mode) or rendered(env_id, mode))
+    monkeypatch.setattr(playback, "_rendered", lambda *asked: opened.append(rendered(*asked)) or opened[-1])
     assert lem.watch(policy, seed=3) is None
-    assert opened == ["human"]
+    (env,) = opened
+    assert env.render_mode == "human"
+    assert not env.unwrapped.isopen
 
 
 def test_a_film_lasts_as_long_as_the_episode(policy, tmp_path):

@@ -63,18 +63,23 @@ class TrainedPolicy:
 
     def _flatten(self, obs: Any) -> tuple[np.ndarray, bool]:
         """([B, O], whether it was a batch)."""
-        size, layout, env_id = self.spec.observation_size, self.spec.layout, self.spec.env_id
-        shape = np.shape(obs) if not isinstance(obs, dict | tuple) else None
-        whole_numbers = bool(layout[0].nvec) and np.issubdtype(np.asarray(obs).dtype, np.integer) if shape else False
-        if shape and not whole_numbers and shape != layout[0].shape and shape[-1:] == (size,) and len(shape) <= 2:
-            flat = np.asarray(obs, dtype=np.uint8 if self.spec.image else np.float32).reshape(-1, size)
-            return flat, len(shape) == 2
+        layout, env_id = self.spec.layout, self.spec.env_id
+        if not isinstance(obs, dict | tuple) and self._is_flat(np.asarray(obs)):
+            flat = np.asarray(obs, dtype=np.uint8 if self.spec.image else np.float32)
+            return flat.reshape(-1, self.spec.observation_size), flat.ndim == 2
         try:
             flat = flatten_observation(layout, obs, image=self.spec.image)
         except (KeyError, IndexError, TypeError, ValueError) as error:
             parts = ", ".join(f"{part.name} {part.shape}" for part in layout)
             raise UserError(f"{env_id} observes {parts}; this observation cannot be read: {error!r}.") from None
         return flat, self._is_batch(obs)
+
+    def _is_flat(self, obs: np.ndarray) -> bool:
+        """Whether it is [O] or [B, O], laid out as policies see it, and not as the environment returns it."""
+        first = self.spec.layout[0]
+        counted = bool(first.nvec) and np.issubdtype(obs.dtype, np.integer)  # numbers that are yet to become one-hot
+        right_size = obs.ndim in (1, 2) and obs.shape[-1] == self.spec.observation_size
+        return right_size and obs.shape != first.shape and not counted
 
     def _is_batch(self, obs: Any) -> bool:
         """Whether the first part of an observation has one dimension more than the environment gives it."""

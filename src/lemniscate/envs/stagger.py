@@ -15,16 +15,14 @@ class Cuts:
             self._steps_left = np.random.default_rng(seed).integers(1, limit, num_envs, endpoint=True)
         self.whole = np.full(num_envs, limit is None)
         """[N] bool: the copy's present episode began at its beginning and is not to be cut"""
-        self._all_whole = limit is None
 
     def apply(self, terminated: np.ndarray, truncated: np.ndarray) -> np.ndarray:
         """After one more step in every copy: `truncated` [N], with the cuts that are due."""
-        if self._all_whole:
+        if self.whole.all():
             return truncated
         self._steps_left -= 1
         truncated = truncated | ((self._steps_left == 0) & ~terminated)
         done = terminated | truncated
         self._steps_left[done] = -1
         self.whole = self.whole | done
-        self._all_whole = bool(self.whole.all())
         return truncated

@@ -156,7 +156,9 @@ class Run:
     def _choose_engine(self, state: AnyState) -> None:
         if engine_of(self.config) == "native":
             if self._visible:
-                print("Compiling: about half a minute the first time, 4 s from then on.", file=sys.stderr)
+                print(
+                    "Compiling: half a minute or a whole one the first time, 5 to 10 s from then on.", file=sys.stderr
+                )
             state.policy.make_native()
             for part in vars(state).values():
                 if isinstance(part, Descent):
