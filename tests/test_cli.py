@@ -6,6 +6,7 @@ import pytest
 
 from conftest import tiny_fields
 from lemniscate.cli import main
+from lemniscate.errors import NonFiniteError
 
 TINY = [
     str(part)
@@ -105,6 +106,18 @@ def test_an_episode_is_filmed(run, capsys):
     film = run / "videos" / "episode.gif"
     assert main(["watch", str(run), "--video", str(film)]) == 0
     assert film.stat().st_size > 5000
+
+
+@pytest.mark.parametrize(
+    ("command", "ending"), [("train", " Training stopped; the last checkpoint is as it was."), ("evaluate", "")]
+)
+def test_a_nan_is_told_with_what_it_means_for_the_run(run, capsys, monkeypatch, command, ending):
+    def breaks(*_, **__):
+        raise NonFiniteError("The reward of environment 0 is nan.")
+
+    monkeypatch.setattr(f"lemniscate.cli.front.{command}", breaks)
+    assert main(["train", "ppo", "--env", "CartPole-v1"] if command == "train" else [command, str(run)]) == 1
+    assert capsys.readouterr().err.splitlines()[-1] == f"The reward of environment 0 is nan.{ending}"
 
 
 def test_a_seed_below_zero_is_a_sentence(run, capsys):

@@ -9,6 +9,7 @@ import torch
 
 import lemniscate as lem
 from conftest import tiny_fields
+from lemniscate.envs import api
 
 
 @pytest.fixture(scope="module")
@@ -90,6 +91,31 @@ def test_a_batch_of_as_many_numbers_as_there_are_kinds_is_a_batch(tmp_path):
     assert policy.act(np.arange(16)).shape == (16,)
     assert policy.act(np.eye(16, dtype=np.float32)).shape == (16,)
     assert policy.act(np.eye(16, dtype=np.float32)[3]) == policy.act(3)
+
+
+@pytest.mark.parametrize(
+    ("trained_by", "installed", "evaluated_by"),
+    [
+        ("gymnasium", True, "gymnasium"),
+        ("gymnasium-async", True, "gymnasium"),
+        ("envpool", True, "envpool"),
+        ("envpool", False, None),
+    ],
+)
+def test_a_policy_is_evaluated_by_the_simulator_that_trained_it(
+    cartpole, monkeypatch, trained_by, installed, evaluated_by
+):
+    """But without workers, and by what there is where EnvPool is not."""
+    asked = []
+    make = api.make
+    monkeypatch.setattr(api, "make", lambda *a, **k: asked.append(k["backend"]) or make(*a, **{**k, "backend": None}))
+    monkeypatch.setattr("lemniscate.front.is_installed", lambda _: installed)
+    policy = lem.load(cartpole.path)
+    policy.config = policy.config.replace(backend=trained_by)
+    lem.evaluate(policy, episodes=2)
+    lem.evaluate(policy, episodes=2, backend="gymnasium")
+    lem.evaluate(policy, "CartPole-v1", episodes=2)
+    assert asked == [evaluated_by, "gymnasium", None]
 
 
 def test_an_environment_whose_package_is_missing_is_said(monkeypatch):

@@ -17,6 +17,7 @@ import torch
 import lemniscate as lem
 from conftest import tiny_fields
 from lemniscate.envs import toy
+from lemniscate.nn.normalizer import RewardScale
 from lemniscate.run import checkpoint
 from lemniscate.run.evaluate import EVALUATION
 from lemniscate.run.loggers import read_metrics
@@ -39,6 +40,15 @@ def final_hashes(path: Path) -> dict[str, str]:
 def history(path: Path) -> list[dict]:
     """The metrics, without what the wall clock decides."""
     return [{k: v for k, v in line.items() if not k.startswith("time/")} for line in read_metrics(path)]
+
+
+def test_what_follows_episodes_begins_anew_with_the_environments(tmp_path, monkeypatch):
+    """At the start and at each planned checkpoint but the last, after which nothing is played."""
+    told = []
+    restart = RewardScale.restart
+    monkeypatch.setattr(RewardScale, "restart", lambda self: told.append(int(self.count)) or restart(self))
+    train(tmp_path / "run", "CartPole-v1", scale_rewards=True, total_steps=256, checkpoint_every=64)
+    assert told == [0, 64, 128, 192]
 
 
 @pytest.mark.parametrize("env", ["Countdown-v0", "Matching-v0", "CartPole-v1", "Pendulum-v1"])
