@@ -37,6 +37,13 @@ def test_each_episode_is_written(tmp_path):
     assert returns.tolist() == [1.23457, 2.0, 3.0]
 
 
+def test_what_is_not_a_number_is_left_out(tmp_path):
+    log = JsonLines(tmp_path, {}, 0)
+    log.write(10, {"x": float("nan"), "y": float("inf"), "z": 1.0})
+    log.close([])
+    assert (tmp_path / "metrics.jsonl").read_text() == '{"step": 10, "z": 1.0}\n'
+
+
 def test_a_line_that_a_crash_cut_off_is_left_out(tmp_path):
     (tmp_path / "metrics.jsonl").write_text(json.dumps({"step": 1}) + '\n{"step": 2, "x"')
     assert read_metrics(tmp_path) == [{"step": 1}]
