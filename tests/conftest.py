@@ -45,3 +45,19 @@ def tiny_fields(env="Countdown-v0", **fields):
     """The same as keyword arguments of `lem.train`."""
     config = tiny(env, **fields)
     return {name: getattr(config, name) for name in config.names() if name != "env"}
+
+
+def tiny_memory(**fields):
+    """Keyword arguments of `lem.train` for an algorithm that learns from memory, over in a moment."""
+    defaults = {
+        "num_envs": 2,
+        "num_steps": 8,
+        "total_steps": 256,
+        "learning_starts": 32,
+        "buffer_size": 100,  # less than the run: the ring goes round
+        "batch_size": 16,
+        "hidden": (16,),
+        "critic_hidden": (16,),
+        "evaluate_episodes": 2,
+    }
+    return {**defaults, **fields}

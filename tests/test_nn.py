@@ -1,7 +1,7 @@
 import torch
 
 from lemniscate.maths import Categorical, Gaussian
-from lemniscate.nn.networks import Tanh, mlp
+from lemniscate.nn.networks import Tanh, network
 from lemniscate.nn.normalizer import RewardScale, RunningNorm
 from lemniscate.nn.policies import ActorCritic
 from lemniscate.types import Box, Discrete, Part, Rollout, Spec
@@ -11,7 +11,7 @@ DISCRETE = Spec("x", (Part((), (5,)),), Discrete(3))
 
 
 def test_orthogonal_layers_with_their_gains():
-    first, _, last = mlp((6, 4, 2), "tanh", last_gain=0.01)
+    first, _, last = network("mlp", (6, 4, 2), "tanh", last_gain=0.01)
     torch.testing.assert_close(first.weight @ first.weight.T, 2 * torch.eye(4))
     torch.testing.assert_close(last.weight @ last.weight.T, 1e-4 * torch.eye(2))
     assert not first.bias.any()
@@ -71,7 +71,7 @@ def test_rewards_are_divided_by_the_std_of_the_discounted_return(rng):
     assert torch.equal(scale(reward[0]), reward[0])
     for part in range(3):
         no = torch.zeros(40, 2, dtype=torch.bool)
-        scale.update(Rollout(no, no, reward[part], no, done[part], no, ~ignored[part]))
+        scale.follow(Rollout(no, no, reward[part], no, done[part], no, ~ignored[part]))
         for t in range(40):
             for n in range(2):
                 if ignored[part, t, n]:

@@ -86,3 +86,17 @@ class Unreadable(gym.Env):
 
 
 gym.register("Unreadable-v0", entry_point="worlds:Unreadable")
+
+
+class Unbounded(gym.Env):
+    """Actions without an end."""
+
+    observation_space = spaces.Box(-1, 1, (1,))
+    action_space = spaces.Box(-np.inf, np.inf, (1,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(1, np.float32), {}
+
+
+gym.register("Unbounded-v0", entry_point="worlds:Unbounded", max_episode_steps=5)

@@ -22,7 +22,7 @@ from lemniscate.run.config import RunConfig
 from lemniscate.run.evaluate import Evaluation
 from lemniscate.run.evaluate import evaluate as evaluate_module
 from lemniscate.run.loggers import LOGGERS
-from lemniscate.run.run import Run, create_directory, newest, read_config, require_absent
+from lemniscate.run.run import Run, newest, read_config, require_absent
 from lemniscate.run.seeding import generator, set_seeds
 from lemniscate.types import Discrete, Spec
 
@@ -155,9 +155,7 @@ def train(
     loggers = _loggers(track)
     require_absent(path)
     set_seeds(config.seed)  # before JAX starts, which reads its flags then
-    envs = make_envs(config)  # before the directory: an environment that cannot be made leaves nothing behind
-    create_directory(path, algorithm, config)
-    return _train(path, algorithm, config, envs, loggers, report or track is not None, progress)
+    return _train(path, algorithm, config, make_envs(config), loggers, report or track is not None, progress)
 
 
 def resume(run: str | Path, *, track: str | None = None, report: bool = False, progress: bool = True) -> TrainedRun:
@@ -189,9 +187,9 @@ def load(path: str | Path) -> TrainedPolicy:
     record = found.record
     spec = checkpoint.spec_from_json(record["spec"])
     config = ALGORITHMS[record["algorithm"]].Config.from_json(record["config"])
-    state = ALGORITHMS[record["algorithm"]].init(config, spec, torch.device("cpu"))
-    state.networks.load_state_dict(found.part("networks"))
-    return TrainedPolicy(state.policy, spec, config, found.numbers["step"])
+    networks = ALGORITHMS[record["algorithm"]].networks(config, spec)
+    networks.load_state_dict(found.part("networks"))
+    return TrainedPolicy(networks.policy, spec, config, found.numbers["step"])
 
 
 def evaluate(

@@ -5,7 +5,7 @@
 
 from dataclasses import dataclass
 
-from lemniscate.algos import ppo
+from lemniscate.algos import ddpg, ppo
 from lemniscate.errors import unknown
 from lemniscate.run.config import RunConfig
 
@@ -181,7 +181,9 @@ PPO = [
     ),
 ]
 
-PRESETS: dict[str, list[Preset]] = {"ppo": PPO}
+DDPG = [Preset("default", ddpg.Config(), "the settings that most libraries share today", "2026-11")]
+
+PRESETS: dict[str, list[Preset]] = {"ddpg": DDPG, "ppo": PPO}
 
 
 def names(algorithm: str) -> list[str]:

@@ -122,7 +122,7 @@ class Spec:
 
 
 @dataclass(frozen=True)
-class _Record:
+class Record:
     """Tensors that share their leading dimensions."""
 
     def __getitem__(self, rows: Tensor | slice) -> Self:
@@ -139,7 +139,7 @@ class _Record:
 
 
 @dataclass(frozen=True)
-class Step(_Record):
+class Step(Record):
     """What the environments answered to one action, [N, …].
 
     `next_obs` is the true successor, before any reset; `obs` is where to act next, after it. They differ only where
@@ -155,7 +155,7 @@ class Step(_Record):
 
 
 @dataclass(frozen=True)
-class Rollout(_Record):
+class Rollout(Record):
     """T steps of N environments, [T, N, …]. Row t is everything action t caused; no flag speaks about the past."""
 
     obs: Tensor
@@ -178,7 +178,21 @@ class Rollout(_Record):
 
 
 @dataclass(frozen=True)
-class Batch(_Record):
+class Transition(Record):
+    """What an action caused, without its when and where, [B, …].
+
+    `next_obs` is the true successor; `terminated` tells an end by the rules alone, since a time-out ends no value.
+    """
+
+    obs: Tensor
+    action: Tensor
+    reward: Tensor
+    next_obs: Tensor
+    terminated: Tensor
+
+
+@dataclass(frozen=True)
+class Batch(Record):
     """What an on-policy loss looks at, [B, …]: a rollout with its advantages."""
 
     obs: Tensor

@@ -1,10 +1,12 @@
 """torch.distributions is the oracle."""
 
+import math
+
 import pytest
 import torch
 from torch import distributions
 
-from lemniscate.maths import Bernoulli, Categorical, Gaussian, MultiCategorical
+from lemniscate.maths import Bernoulli, Categorical, Gaussian, MultiCategorical, Point, SquashedGaussian
 
 
 def test_gaussian(rng):
@@ -72,3 +74,36 @@ def test_bernoulli(rng):
     assert torch.equal(ours.mode(), (logits > 0).long())
     many = Bernoulli(logits[0].expand(200_000, 3)).sample(torch.rand(200_000, 3, generator=rng)).double().mean(0)
     torch.testing.assert_close(many, logits[0].sigmoid(), atol=0.01, rtol=0)
+
+
+def test_squashed_gaussian(rng):
+    mean, log_std, noise = (torch.randn(7, 3, generator=rng, dtype=torch.float64) for _ in range(3))
+    ours = SquashedGaussian(mean, log_std)
+    normal = distributions.Normal(mean, log_std.exp())
+    oracle = distributions.TransformedDistribution(normal, distributions.TanhTransform())
+    action, log_prob = ours.sample_with_log_prob(noise)
+    torch.testing.assert_close(action, ours.sample(noise))
+    torch.testing.assert_close(log_prob, oracle.log_prob(action).sum(-1))
+    torch.testing.assert_close(ours.log_prob(action), log_prob)
+    torch.testing.assert_close(ours.mode(), torch.tanh(mean))
+
+
+def test_a_squashed_density_integrates_to_one():
+    a = torch.linspace(-1, 1, 200_001, dtype=torch.float64)[1:-1, None]
+    density = SquashedGaussian(torch.tensor([0.4]).double(), torch.tensor([-0.5]).double()).log_prob(a).exp()
+    assert torch.trapezoid(density, a[:, 0]).item() == pytest.approx(1, abs=1e-6)
+
+
+def test_a_squashed_log_prob_is_finite_and_has_a_gradient_where_tanh_is_one():
+    mean = torch.tensor([[30.0, -30.0]], requires_grad=True)
+    action, log_prob = SquashedGaussian(mean, torch.zeros(1, 2)).sample_with_log_prob(torch.zeros(1, 2))
+    assert action.abs().min() == 1
+    log_prob.sum().backward()
+    # log(1 − tanh² u) → 2 (log 2 − |u|)
+    assert log_prob.item() == pytest.approx(-math.log(2 * math.pi) + 2 * 2 * (30 - math.log(2)))
+    assert mean.grad.tolist() == [[2.0, -2.0]]
+
+
+def test_a_point_is_itself(rng):
+    action = torch.randn(4, 2, generator=rng)
+    assert Point(action).sample(torch.empty(4, 0)) is Point(action).mode() is action

@@ -3,7 +3,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lemniscate.maths import gae
+from lemniscate.maths import gae, polyak, td_target
 
 
 def brute_force(reward, value, next_value, terminated, done, gamma, lam):
@@ -97,3 +97,34 @@ def test_cutting_a_rollout_at_an_end_changes_nothing(rollout):
     head, _ = gae(*(c[:cut] for c in (reward, value, next_value, terminated, done)))
     tail, _ = gae(*(c[cut:] for c in (reward, value, next_value, terminated, done)))
     torch.testing.assert_close(whole, torch.cat([head, tail]))
+
+
+@given(st.integers(0, 2**31), st.sampled_from([(), (2,)]), st.floats(0, 1))
+def test_a_td_target_is_the_sum_row_by_row(seed, critics, gamma):
+    g = torch.Generator().manual_seed(seed)
+    reward, next_value = (torch.randn(shape, generator=g, dtype=torch.float64) for shape in ((6,), (*critics, 6)))
+    terminated = torch.rand(6, generator=g) < 0.5
+    target = td_target(reward, next_value, terminated, gamma=gamma)
+    for i in range(6):
+        follows = 0.0 if terminated[i] else gamma * next_value[..., i]
+        torch.testing.assert_close(target[..., i], reward[i] + torch.zeros_like(next_value[..., i]) + follows)
+
+
+@given(st.integers(0, 2**31), st.floats(0, 1), st.integers(1, 6))
+def test_polyak_moves_the_target_alone_and_by_a_power(seed, tau, times):
+    g = torch.Generator().manual_seed(seed)
+    target, online = ([torch.randn(3, 2, generator=g, dtype=torch.float64)] for _ in range(2))
+    start, kept = target[0].clone(), online[0].clone()
+    for _ in range(times):
+        polyak(target, online, tau)
+    left = (1 - tau) ** times
+    torch.testing.assert_close(target[0], left * start + (1 - left) * kept)
+    assert torch.equal(online[0], kept)
+
+
+def test_polyak_takes_no_gradient():
+    target, online = torch.zeros(2, requires_grad=True), torch.ones(2, requires_grad=True)
+    polyak([target], [online], 1.0)
+    assert torch.equal(target, online)
+    assert target.is_leaf
+    assert target.data_ptr() != online.data_ptr()

@@ -15,7 +15,7 @@ import pytest
 import torch
 
 import lemniscate as lem
-from conftest import tiny_fields
+from conftest import tiny_fields, tiny_memory
 from lemniscate.envs import toy
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.run import checkpoint
@@ -27,7 +27,17 @@ from lemniscate.run.seeding import derive
 LOUD = "import sys, lemniscate.cli; sys.exit(lemniscate.cli.main())"
 
 
+REMEMBERING = {
+    # name: algorithm and fields; in Pendulum-v1, whose episodes are longer than the distance of checkpoints
+    "ddpg": {"noise": "ou", "policy_delay": 2, "normalize_observations": True},
+    "ddpg-pink": {"noise": "coloured", "update_every": 2, "num_updates": 3, "architecture": "simba"},
+}
+
+
 def train(path, env="Countdown-v0", **fields):
+    if env in REMEMBERING:
+        fields = tiny_memory(**REMEMBERING[env], **fields)
+        return lem.train(env.split("-")[0], "Pendulum-v1", run=path, progress=False, **fields)
     return lem.train("ppo", env, run=path, progress=False, **tiny_fields(env, **fields))
 
 
@@ -51,7 +61,7 @@ def test_what_follows_episodes_begins_anew_with_the_environments(tmp_path, monke
     assert told == [0, 64, 128, 192]
 
 
-@pytest.mark.parametrize("env", ["Countdown-v0", "Matching-v0", "CartPole-v1", "Pendulum-v1"])
+@pytest.mark.parametrize("env", ["Countdown-v0", "Matching-v0", "CartPole-v1", "Pendulum-v1", *REMEMBERING])
 def test_the_same_seed_gives_the_same_bits_and_another_does_not(tmp_path, env):
     for name, seed in (("a", 1), ("b", 1), ("c", 2)):
         train(tmp_path / name, env, seed=seed)
@@ -60,14 +70,15 @@ def test_the_same_seed_gives_the_same_bits_and_another_does_not(tmp_path, env):
     assert final_hashes(tmp_path / "a")["tensors.safetensors"] != final_hashes(tmp_path / "c")["tensors.safetensors"]
 
 
-def test_evaluation_changes_no_bit_of_training(tmp_path):
-    train(tmp_path / "without", "CartPole-v1")
-    train(tmp_path / "with", "CartPole-v1", evaluate_every=32)
+@pytest.mark.parametrize("env", ["CartPole-v1", "ddpg"])
+def test_evaluation_changes_no_bit_of_training(tmp_path, env):
+    train(tmp_path / "without", env)
+    train(tmp_path / "with", env, evaluate_every=32)
     tensors = "tensors.safetensors"
     assert final_hashes(tmp_path / "without")[tensors] == final_hashes(tmp_path / "with")[tensors]
     assert sum("evaluation/return" in line for line in read_metrics(tmp_path / "with")) == 8
     losses = [
-        [line["losses/policy"] for line in read_metrics(tmp_path / n) if "losses/policy" in line]
+        [line["gradient_norm"] for line in read_metrics(tmp_path / n) if "gradient_norm" in line]
         for n in ("with", "without")
     ]
     assert losses[0] == losses[1]
@@ -90,12 +101,13 @@ def test_training_and_evaluation_are_separate_and_differently_seeded():
     assert torch.equal(train_env.obs, before)
 
 
-def test_a_run_resumed_from_any_checkpoint_ends_in_the_same_bits(tmp_path):
+@pytest.mark.parametrize("env", ["CartPole-v1", *REMEMBERING])
+def test_a_run_resumed_from_any_checkpoint_ends_in_the_same_bits(tmp_path, env):
     fields = {"checkpoint_every": 64, "keep_checkpoints": 10}
-    train(tmp_path / "whole", "CartPole-v1", **fields)
+    train(tmp_path / "whole", env, **fields)
     for back in (1, 2, 3):
         path = tmp_path / f"back{back}"
-        train(path, "CartPole-v1", **fields)
+        train(path, env, **fields)
         for step in checkpoint.list_steps(path / "checkpoints")[-back:]:
             (path / "checkpoints" / f"step-{step}" / "manifest.json").unlink()
         lem.resume(path, progress=False)
@@ -175,6 +187,12 @@ def command(*arguments, stderr=subprocess.DEVNULL, **options):
 
 def long_run(path, env, updates=150):
     """Arguments of a run of some seconds with a checkpoint every eighth update."""
+    if env in REMEMBERING:
+        fields = tiny_memory(**REMEMBERING[env], total_steps=16 * updates, checkpoint_every=128, engine="eager")
+        flags = [f"--{name.replace('_', '-')}" for name in fields]
+        values = [() if value is True else value if isinstance(value, tuple) else (value,) for value in fields.values()]
+        given = [part for flag, value in zip(flags, values, strict=True) for part in (flag, *value)]
+        return ["train", env, "--env", "Pendulum-v1", "--run", path, *given]
     fields = tiny_fields(env, hidden=(32, 32), total_steps=32 * updates, checkpoint_every=32 * 8, epochs=4)
     flags = ["--run", path]
     for name in ("num_envs", "num_steps", "total_steps", "epochs", "minibatch_size", "checkpoint_every"):
@@ -188,7 +206,7 @@ def wait_for(condition, process=None):
         time.sleep(0.005)
 
 
-@pytest.mark.parametrize("env", ["Countdown-v0", "CartPole-v1"])
+@pytest.mark.parametrize("env", ["Countdown-v0", "CartPole-v1", "ddpg"])
 def test_killed_at_random_and_resumed_it_ends_in_the_same_bits(tmp_path, env):
     """SIGKILL on real processes, several times in one run, at times drawn anew in each test run."""
     check_kills(tmp_path, long_run(tmp_path / "whole", env), long_run(tmp_path / "killed", env), kills=3)

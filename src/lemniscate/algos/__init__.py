@@ -2,6 +2,6 @@
 
 from types import ModuleType
 
-from lemniscate.algos import ppo
+from lemniscate.algos import ddpg, ppo
 
-ALGORITHMS: dict[str, ModuleType] = {"ppo": ppo}
+ALGORITHMS: dict[str, ModuleType] = {"ddpg": ddpg, "ppo": ppo}

@@ -21,6 +21,7 @@ from lemniscate.maths import (
     explained_variance,
     gae,
     linear,
+    means,
     ratio_statistics,
     standardize,
     value_loss,
@@ -108,9 +109,7 @@ class State:
     noise: Generator
     """what actions are drawn with"""
     shuffle: Generator
-    """what minibatches are drawn with"""
     learning_rate: float
-    """α, as it is by now"""
     step: int = 0
     """environment steps taken"""
 
@@ -120,15 +119,18 @@ class State:
         return self.networks.policy
 
 
+def networks(config: Config, spec: Spec) -> ActorCritic:
+    """π and V for the spaces in `spec`."""
+    return ActorCritic(spec, config.hidden, config.activation, config.initial_log_std, config.normalize_observations)
+
+
 def init(config: Config, spec: Spec, device: torch.device) -> State:
     """Fresh networks, a fresh optimizer, generators from the run's seed."""
-    networks = ActorCritic(
-        spec, config.hidden, config.activation, config.initial_log_std, config.normalize_observations
-    ).to(device)
+    fresh = networks(config, spec).to(device)
     betas, limit = (0.9, config.adam_beta2), config.max_grad_norm or math.inf
     return State(
-        networks,
-        Descent(networks, partial(loss, config), betas=betas, eps=config.adam_eps, max_grad_norm=limit),
+        fresh,
+        Descent(fresh, partial(loss, config), betas=betas, eps=config.adam_eps, max_grad_norm=limit),
         RewardScale(config.num_envs, config.gamma).to(device),
         noise=generator(config.seed, device, 2),
         shuffle=generator(config.seed, device, 3),
@@ -139,9 +141,8 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
 @torch.no_grad()
 def advantages(config: Config, state: State, rollout: Rollout) -> Batch:
     """Row t's log π_old(a|s), V(s), A (eq. 11) and value target."""
-    policy, value_of = state.networks.policy, state.networks.value
-    value, next_value = value_of(rollout.obs), value_of(rollout.next_obs)
-    log_prob = policy(rollout.obs).log_prob(rollout.action)
+    value, next_value = state.networks.value(rollout.obs), state.networks.value(rollout.next_obs)
+    log_prob = state.policy(rollout.obs).log_prob(rollout.action)
     outcome = (rollout.reward, value, next_value, rollout.terminated, rollout.done)
     advantage, target = gae(*outcome, gamma=config.gamma, lam=config.gae_lambda)
     return Batch(rollout.obs, rollout.action, log_prob, value, advantage, target).flatten()  # [T, N, …] -> [B, …]
@@ -169,8 +170,7 @@ def update(config: Config, state: State, rollout: Rollout) -> Mapping[str, Tenso
     if config.desired_kl is None:
         state.learning_rate = linear(config.learning_rate, config.final_learning_rate, state.step / config.total_steps)
     if config.scale_rewards:
-        state.reward_scale.update(rollout)
-        rollout = replace(rollout, reward=state.reward_scale(rollout.reward))
+        rollout = state.reward_scale.follow(rollout)
     batch = collected = advantages(config, state, rollout)
     played = rollout.valid.flatten().nonzero()[:, 0]  # without the rows in which no action was taken
     watched: list[Mapping[str, Tensor]] = []
@@ -186,9 +186,9 @@ def update(config: Config, state: State, rollout: Rollout) -> Mapping[str, Tenso
             break
     state.policy.observe(rollout.obs[rollout.valid])  # afterwards: both probabilities are taken through one normalizer
     state.step += rollout.num_rows
-    means = {name: torch.stack([row[name] for row in watched]).mean() for name in watched[0]}
     explained = explained_variance(collected.value[played], collected.target[played])
-    return {**means, **state.policy.watch(), "explained_variance": explained, "learning_rate": state.learning_rate}
+    seen = {**means(watched), **state.policy.watch()}
+    return {**seen, "explained_variance": explained, "learning_rate": state.learning_rate}
 
 
 def train(config: Config, run: Run) -> State:

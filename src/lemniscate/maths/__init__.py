@@ -1,15 +1,25 @@
 """What can be wrong, once: pure functions on tensors, each with its equation and its oracle in `tests/maths`."""
 
-from lemniscate.maths.distributions import Bernoulli, Categorical, Distribution, Gaussian, MultiCategorical
+from lemniscate.maths.distributions import (
+    Bernoulli,
+    Categorical,
+    Density,
+    Distribution,
+    Gaussian,
+    MultiCategorical,
+    Point,
+    SquashedGaussian,
+)
 from lemniscate.maths.losses import clipped_surrogate, value_loss
 from lemniscate.maths.noise import coloured, ornstein_uhlenbeck
-from lemniscate.maths.returns import gae
+from lemniscate.maths.returns import gae, polyak, td_target
 from lemniscate.maths.schedules import adapt_to_kl, linear
 from lemniscate.maths.stats import (
     clip_fraction,
     explained_variance,
     kl_k1,
     kl_k3,
+    means,
     merge_moments,
     ratio_statistics,
     standardize,
@@ -18,9 +28,12 @@ from lemniscate.maths.stats import (
 __all__ = [
     "Bernoulli",
     "Categorical",
+    "Density",
     "Distribution",
     "Gaussian",
     "MultiCategorical",
+    "Point",
+    "SquashedGaussian",
     "adapt_to_kl",
     "clip_fraction",
     "clipped_surrogate",
@@ -30,9 +43,12 @@ __all__ = [
     "kl_k1",
     "kl_k3",
     "linear",
+    "means",
     "merge_moments",
     "ornstein_uhlenbeck",
+    "polyak",
     "ratio_statistics",
     "standardize",
+    "td_target",
     "value_loss",
 ]

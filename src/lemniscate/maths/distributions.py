@@ -6,7 +6,7 @@ from typing import Protocol
 
 import torch
 from torch import Tensor
-from torch.nn.functional import binary_cross_entropy_with_logits, logsigmoid
+from torch.nn.functional import binary_cross_entropy_with_logits, logsigmoid, softplus
 
 LOG_2PI = math.log(2 * math.pi)
 
@@ -21,6 +21,10 @@ class Distribution(Protocol):
     def mode(self) -> Tensor:
         """The most probable action each."""
         ...
+
+
+class Density(Distribution, Protocol):
+    """One whose probabilities can be asked for."""
 
     def log_prob(self, action: Tensor) -> Tensor:
         """Log π(a|s), [B]."""
@@ -129,3 +133,57 @@ class Bernoulli:
         """[B]: −Σ_i [ σ_i log σ_i + (1 − σ_i) log (1 − σ_i) ]."""
         on, off = logsigmoid(self.logits), logsigmoid(-self.logits)
         return -(on.exp() * on + off.exp() * off).sum(-1)
+
+
+@dataclass(frozen=True)
+class Point:
+    """All probability on one action, `action` [B, A]."""
+
+    action: Tensor
+
+    def sample(self, noise: Tensor) -> Tensor:
+        """[B, A], whatever the noise."""
+        return self.action
+
+    def mode(self) -> Tensor:
+        """[B, A]."""
+        return self.action
+
+
+@dataclass(frozen=True)
+class SquashedGaussian:
+    """tanh(u) with u ~ N(mean, exp(log_std)²): mean and log_std [B, A]. Haarnoja et al. 2018, arXiv:1801.01290."""
+
+    mean: Tensor
+    log_std: Tensor
+
+    def sample(self, noise: Tensor) -> Tensor:
+        """[B, A] in [-1, 1], from standard normal noise [B, A]."""
+        return torch.tanh(self.mean + self.log_std.exp() * noise)
+
+    def mode(self) -> Tensor:
+        """[B, A]: tanh(mean), the median of each coordinate."""
+        return torch.tanh(self.mean)
+
+    def sample_with_log_prob(self, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """([B, A], [B]): an action and its log π, appendix C, eq. 21.
+
+            log π(a) = Σ_i [ log N(u_i; μ_i, σ_i) − log(1 − tanh² u_i) ]
+            log(1 − tanh² u) = 2 (log 2 − u − softplus(−2u))
+
+        From u itself, so that it is exact where tanh has long been 1.
+        """
+        u = self.mean + self.log_std.exp() * noise
+        normal = -0.5 * (noise.square() + LOG_2PI) - self.log_std
+        return torch.tanh(u), (normal - _log_slope(u)).sum(-1)
+
+    def log_prob(self, action: Tensor) -> Tensor:
+        """[B]; of an action strictly inside (-1, 1)."""
+        u = torch.atanh(action)
+        z = (u - self.mean) * (-self.log_std).exp()
+        return (-0.5 * (z.square() + LOG_2PI) - self.log_std - _log_slope(u)).sum(-1)
+
+
+def _log_slope(u: Tensor) -> Tensor:
+    """Log of the derivative of tanh."""
+    return 2 * (math.log(2) - u - softplus(-2 * u))

@@ -1,7 +1,16 @@
 """Statistics of batches and of streams."""
 
+from collections.abc import Mapping, Sequence
+
+import torch
 from jaxtyping import Float
 from torch import Tensor
+
+
+def means(rows: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
+    """The mean of each quantity over the rows in which it is."""
+    names = dict.fromkeys(name for row in rows for name in row)
+    return {name: torch.stack([row[name] for row in rows if name in row]).mean() for name in names}
 
 
 def standardize(x: Float[Tensor, " B"], eps: float = 1e-8) -> Float[Tensor, " B"]:

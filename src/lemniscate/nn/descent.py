@@ -8,17 +8,20 @@ compiler turns into one native call. Without the compiler the same loss goes thr
 import math
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import torch
 from torch import Tensor, nn
 from torch.func import functional_call, grad_and_value
 
+from lemniscate.maths import means
 from lemniscate.nn.native import Native
-from lemniscate.types import Batch
+from lemniscate.types import Record
 
 Networks = TypeVar("Networks", bound=nn.Module)
 Metrics = Mapping[str, Tensor]
+Loss = Callable[..., tuple[Tensor, Metrics]]
+"""loss(networks, batch [b, …], *noise) -> (a scalar to descend, what to watch of it)"""
 
 STEPS_PER_CALL = 4
 """compiled into one native call, where the minibatches can be so grouped; more are hardly faster, and compile longer"""
@@ -54,16 +57,16 @@ def adam(
 
 
 class Descent(Generic[Networks]):
-    """Adam down `loss(networks, batch)`, minibatch by minibatch.
+    """Adam down `loss(networks, batch, *noise)`, minibatch by minibatch.
 
-    From here on the parameters of `networks` are views of one vector; they stay ordinary parameters to everyone else.
-    Move the networks to their device before.
+    Other networks may take part in the loss; only the parameters of `networks` move. From here on these are views of
+    one vector; they stay ordinary parameters to everyone else. Move the networks to their device before.
     """
 
     def __init__(
         self,
         networks: Networks,
-        loss: Callable[[Networks, Batch], tuple[Tensor, Metrics]],
+        loss: Loss,
         *,
         betas: tuple[float, float] = (0.9, 0.999),
         eps: float = 1e-8,
@@ -75,6 +78,7 @@ class Descent(Generic[Networks]):
         self._names = [name for name, _ in named]
         self._shapes = [parameter.shape for _, parameter in named]
         self._sizes = [parameter.numel() for _, parameter in named]
+        self._parameters = [parameter for _, parameter in named]
         self._vector = torch.cat([parameter.detach().flatten() for _, parameter in named])
         self._gradient = torch.zeros_like(self._vector)
         self._mean, self._square = torch.zeros_like(self._vector), torch.zeros_like(self._vector)
@@ -86,13 +90,14 @@ class Descent(Generic[Networks]):
         self._engine: Callable[..., dict[str, Tensor]] = self._eager
         self._steps_per_call = 1
 
-    def __call__(self, batch: Batch, parts: Tensor, learning_rate: float) -> dict[str, Tensor]:
+    def __call__(self, batch: Record, parts: Tensor, learning_rate: float, *noise: Tensor) -> dict[str, Tensor]:
         """Descend one step on `batch[rows]` for each `rows` in `parts`.
 
         Args:
             batch: record of tensors [B, …].
             parts: K minibatches of b rows each, [K, b] int64. Once native, every call must have the same B, K and b.
             learning_rate: α.
+            *noise: random numbers that the loss needs, a part of them for each step, [K, …].
 
         Returns:
             Means over the K steps of what the loss watches, and of "gradient_norm" before the clip.
@@ -101,12 +106,10 @@ class Descent(Generic[Networks]):
         self.steps += len(parts)
         scales = torch.tensor([self._scales(step, learning_rate) for step in steps], dtype=self._vector.dtype)
         at_once = next(n for n in range(self._steps_per_call, 0, -1) if len(parts) % n == 0)
-        chunks = zip(scales.to(self._vector.device).split(at_once), parts.split(at_once), strict=True)
-        watched = [
-            self._engine(self._vector, self._mean, self._square, some_scales, batch, some_parts)
-            for some_scales, some_parts in chunks
-        ]
-        return _means(watched)
+        by_step = (scales.to(self._vector.device), parts, *noise)
+        chunks = zip(*(tensor.split(at_once) for tensor in by_step), strict=True)
+        watched = [self._engine(self._vector, self._mean, self._square, batch, *chunk) for chunk in chunks]
+        return means(watched)
 
     def _scales(self, step: int, learning_rate: float) -> tuple[float, float, float, float]:
         beta_1, beta_2 = self._betas
@@ -129,47 +132,44 @@ class Descent(Generic[Networks]):
         self.steps = int(state["steps"])
 
     def _eager(
-        self, vector: Tensor, mean: Tensor, square: Tensor, scales: Tensor, batch: Batch, parts: Tensor
+        self, vector: Tensor, mean: Tensor, square: Tensor, batch: Record, *by_step: Tensor
     ) -> dict[str, Tensor]:
         watched = []
-        for some_scales, rows in zip(scales, parts, strict=True):
+        for scales, rows, *noise in zip(*by_step, strict=True):
             self._gradient.zero_()
-            total, metrics = self._objective(batch[rows])
-            total.backward()
+            total, metrics = self._objective(batch[rows], *noise)
+            total.backward(inputs=self._parameters)
             with torch.no_grad():
-                norm = adam(vector, self._gradient, mean, square, some_scales, self._betas)
+                norm = adam(vector, self._gradient, mean, square, scales, self._betas)
             watched.append({**metrics, "gradient_norm": norm})
-        return _means(watched)
+        return means(watched)
 
     def _functional(
-        self, vector: Tensor, mean: Tensor, square: Tensor, scales: Tensor, batch: Batch, parts: Tensor
+        self, vector: Tensor, mean: Tensor, square: Tensor, batch: Record, *by_step: Tensor
     ) -> dict[str, Tensor]:
         watched = []
-        for some_scales, rows in zip(scales.unbind(), parts.unbind(), strict=True):
-            part = batch[rows]
-            differentiate = grad_and_value(partial(functional_call, self._objective, args=(part,)), has_aux=True)
-            gradients, (_, metrics) = differentiate(dict(zip(self._names, self._cut(vector), strict=True)))
-            gradient = torch.cat([gradients[name].flatten() for name in self._names])
-            norm = adam(vector, gradient, mean, square, some_scales, self._betas)
-            watched.append({**metrics, "gradient_norm": norm})
-        return _means(watched)
+        with torch.no_grad():  # of networks that only take part; `grad_and_value` differentiates all the same
+            for scales, rows, *noise in zip(*(tensor.unbind() for tensor in by_step), strict=True):
+                args = (batch[rows], *noise)
+                differentiate = grad_and_value(partial(functional_call, self._objective, args=args), has_aux=True)
+                gradients, (_, metrics) = differentiate(dict(zip(self._names, self._cut(vector), strict=True)))
+                gradient = torch.cat([gradients[name].flatten() for name in self._names])
+                norm = adam(vector, gradient, mean, square, scales, self._betas)
+                watched.append({**metrics, "gradient_norm": norm})
+        return means(watched)
 
     def _cut(self, vector: Tensor) -> list[Tensor]:
         parts = vector.split(self._sizes)
         return [part.view(shape) for part, shape in zip(parts, self._shapes, strict=True)]
 
 
-def _means(watched: list[dict[str, Tensor]]) -> dict[str, Tensor]:
-    return {name: torch.stack([row[name] for row in watched]).mean() for name in watched[0]}
-
-
 class _Objective(nn.Module, Generic[Networks]):
     """A loss as a module, so that `functional_call` can put other parameters under it."""
 
-    def __init__(self, networks: Networks, loss: Callable[[Networks, Batch], tuple[Tensor, Metrics]]) -> None:
+    def __init__(self, networks: Networks, loss: Loss) -> None:
         super().__init__()
         self.networks = networks
         self._loss = loss
 
-    def forward(self, batch: Batch) -> tuple[Tensor, Metrics]:
-        return self._loss(self.networks, batch)
+    def forward(self, batch: Any, *noise: Tensor) -> tuple[Tensor, Metrics]:
+        return self._loss(self.networks, batch, *noise)

@@ -1,12 +1,15 @@
-"""Multi-layer perceptrons, and a small convolutional network to look at images with."""
+"""Multi-layer perceptrons, residual ones, and a small convolutional network to look at images with."""
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
 Activation = Literal["tanh", "relu", "elu", "silu"]
+Architecture = Literal["mlp", "layer_norm", "simba"]
+"""layers with an activation between; the same with layer normalization before it; residual blocks of one width"""
 
 
 class Tanh(nn.Module):
@@ -20,18 +23,38 @@ class Tanh(nn.Module):
 ACTIVATIONS = {"tanh": Tanh, "relu": nn.ReLU, "elu": nn.ELU, "silu": nn.SiLU}
 
 
-def mlp(sizes: Sequence[int], activation: Activation, last_gain: float) -> nn.Sequential:
-    """Linear layers with an activation between them; orthogonal weights, zero biases.
+def network(kind: Architecture, sizes: Sequence[int], activation: Activation, last_gain: float) -> nn.Sequential:
+    """From `sizes[0]` numbers, through layers of the sizes between, to `sizes[-1]`; orthogonal weights, zero biases.
 
-    Hidden layers have gain √2, the last one `last_gain`: 0.01 for a policy, so that it starts near the centre of its
-    range whatever it sees (Andrychowicz et al. 2021, arXiv:2006.05990, section 3.2), 1 for a value.
+    The last layer has gain `last_gain`: 0.01 for a policy, so that it starts near the centre of its range whatever it
+    sees (Andrychowicz et al. 2021, arXiv:2006.05990, section 3.2), 1 for a value; the others have √2.
     """
+    inputs, *hidden, outputs = sizes
     layers: list[nn.Module] = []
-    for i in range(len(sizes) - 1):
-        last = i == len(sizes) - 2
-        linear = _orthogonal(nn.Linear(sizes[i], sizes[i + 1]), last_gain if last else 2**0.5)
-        layers += [linear] if last else [linear, ACTIVATIONS[activation]()]
-    return nn.Sequential(*layers)
+    if kind == "simba":
+        layers += [_orthogonal(nn.Linear(inputs, hidden[0]), 1.0), *(Residual(hidden[0]) for _ in hidden)]
+        layers += [nn.LayerNorm(hidden[0])]
+    else:
+        for before, after in pairwise((inputs, *hidden)):
+            layers += [_orthogonal(nn.Linear(before, after), 2**0.5)]
+            layers += [nn.LayerNorm(after)] if kind == "layer_norm" else []
+            layers += [ACTIVATIONS[activation]()]
+    return nn.Sequential(*layers, _orthogonal(nn.Linear(hidden[-1] if hidden else inputs, outputs), last_gain))
+
+
+class Residual(nn.Module):
+    """x + W₂ relu(W₁ LN(x)), four times as wide inside: a block of SimBa, Lee et al. 2025, arXiv:2410.09754, eq. 5."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        inner, outer = nn.Linear(width, 4 * width), nn.Linear(4 * width, width)
+        self.layers = nn.Sequential(
+            nn.LayerNorm(width), _orthogonal(inner, 2**0.5), nn.ReLU(), _orthogonal(outer, 2**0.5)
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[…, width] to the same shape."""
+        return x + self.layers(x)
 
 
 class ImageEncoder(nn.Module):

@@ -3,6 +3,8 @@
 The observation normalizer is part of the policy and so is evaluated with it; the reward's scale is for training only.
 """
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor, nn
 
@@ -89,8 +91,8 @@ class RewardScale(nn.Module):
         self.running = torch.zeros_like(self.running)
 
     @torch.no_grad()
-    def update(self, rollout: Rollout) -> None:
-        """Follow the discounted return Σ γ^k r_{t−k} of each episode through a rollout [T, N]."""
+    def follow(self, rollout: Rollout) -> Rollout:
+        """Follow the discounted return Σ γ^k r_{t−k} of each episode through a rollout [T, N]; scale its rewards."""
         returns = []
         paid = rollout.reward.double() * rollout.valid
         for reward, done in zip(paid, rollout.done, strict=True):
@@ -101,3 +103,4 @@ class RewardScale(nn.Module):
         count = torch.full_like(self.count, len(seen))
         moments = merge_moments(self.mean, self.var, self.count, seen.mean(), seen.var(correction=0), count)
         self.mean, self.var, self.count = moments
+        return replace(rollout, reward=self(rollout.reward))

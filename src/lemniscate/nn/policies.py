@@ -1,13 +1,17 @@
 """Policies and values. A policy returns a distribution and remembers nothing."""
 
+import copy
+import math
 from collections.abc import Callable, Sequence
+from typing import Self
 
 import torch
 from torch import Generator, Tensor, nn
 
-from lemniscate.maths import Bernoulli, Categorical, Distribution, Gaussian, MultiCategorical
+from lemniscate.errors import UserError
+from lemniscate.maths import Bernoulli, Categorical, Distribution, Gaussian, MultiCategorical, Point, SquashedGaussian
 from lemniscate.nn.native import Native
-from lemniscate.nn.networks import Activation, ImageEncoder, mlp
+from lemniscate.nn.networks import Activation, Architecture, ImageEncoder, network
 from lemniscate.nn.normalizer import Observed, Pixels, RunningNorm
 from lemniscate.types import Action, Box, Discrete, MultiDiscrete, Spec
 
@@ -122,6 +126,35 @@ class BernoulliPolicy(Policy):
         return torch.rand(*shape, self.n, generator=generator, device=generator.device)
 
 
+class DeterministicPolicy(Policy):
+    """One action at each observation, tanh of a network: in [-1, 1]^A, which the env floor maps onto its bounds."""
+
+    def forward(self, obs: Tensor) -> Point:
+        """[B, O] to [B, A]."""
+        return Point(torch.tanh(self.net(self.normalizer(obs))))
+
+    def noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
+        """Nothing is random: [*shape] of nothing."""
+        return torch.empty(*shape, 0, device=generator.device)
+
+
+class SquashedGaussianPolicy(Policy):
+    """tanh(u), u ~ N(μ(s), σ(s)²); log σ is kept in [-5, 2], softly, as tanh moves from one end to the other."""
+
+    def __init__(self, normalizer: Observed, net: nn.Module, size: int) -> None:
+        super().__init__(normalizer, net)
+        self.size = size
+
+    def forward(self, obs: Tensor) -> SquashedGaussian:
+        """[B, O] to μ and log σ, [B, A] each."""
+        mean, log_std = self.net(self.normalizer(obs)).chunk(2, dim=-1)
+        return SquashedGaussian(mean, -5 + 3.5 * (torch.tanh(log_std) + 1))
+
+    def noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
+        """Standard normal, [*shape, A]."""
+        return torch.randn(*shape, self.size, generator=generator, device=generator.device)
+
+
 class Value(nn.Module):
     """V(s). It looks through the policy's normalizer, and does not own it."""
 
@@ -133,6 +166,33 @@ class Value(nn.Module):
     def forward(self, obs: Tensor) -> Tensor:
         """[…, O] to […]."""
         return self.net(self.normalizer(obs)).squeeze(-1)
+
+
+class QValue(nn.Module):
+    """Q(s, a). It looks through the policy's normalizer, and does not own it."""
+
+    def __init__(self, normalizer: Observed, encoder: nn.Module, net: nn.Module) -> None:
+        super().__init__()
+        self.normalizer = normalizer
+        self.encoder = encoder
+        self.net = net
+
+    def forward(self, obs: Tensor, action: Tensor) -> Tensor:
+        """[…, O] and […, A] to […]."""
+        seen = self.encoder(self.normalizer(obs))
+        return self.net(torch.cat([seen, action], dim=-1)).squeeze(-1)
+
+
+class TwinQ(nn.Module):
+    """Two Q-values that never see each other: Fujimoto et al. 2018, arXiv:1802.09477, section 4.2."""
+
+    def __init__(self, one: QValue, two: QValue) -> None:
+        super().__init__()
+        self.one, self.two = one, two
+
+    def forward(self, obs: Tensor, action: Tensor) -> Tensor:
+        """[…, O] and […, A] to [2, …]."""
+        return torch.stack([self.one(obs, action), self.two(obs, action)])
 
 
 class ActorCritic(nn.Module):
@@ -147,17 +207,69 @@ class ActorCritic(nn.Module):
         normalize_observations: bool = False,
     ) -> None:
         super().__init__()
-        size = spec.observation_size
-        kind = Pixels if spec.image else RunningNorm if normalize_observations else Observed
-        self.policy = _policy(kind(size), spec, hidden, activation, initial_log_std)
-        self.value = Value(self.policy.normalizer, _network(spec, hidden, activation, 1, last_gain=1.0))
+        self.policy = _policy(_normalizer(spec, normalize_observations), spec, hidden, activation, initial_log_std)
+        self.value = Value(self.policy.normalizer, _from_obs(spec, hidden, activation, 1, last_gain=1.0))
+
+
+def bounded_box(spec: Spec) -> Box:
+    """The actions of `spec`. Raises `UserError` unless they are numbers between finite bounds."""
+    action = spec.action
+    if not isinstance(action, Box):
+        kind = type(action).__name__
+        raise UserError(f"{spec.env_id} has {kind} actions; ddpg, td3 and sac need continuous ones. ppo learns here.")
+    if not all(map(math.isfinite, (*action.low, *action.high))):
+        raise UserError(
+            f"{spec.env_id} has actions without bounds; ddpg, td3 and sac explore between bounds, such as those that"
+            " gymnasium.wrappers.RescaleAction or ClipAction's Box sets. ppo learns here."
+        )
+    return action
+
+
+class ActorQ(nn.Module):
+    """A policy over continuous actions and its Q-value, or two of them: separate networks behind one normalizer."""
+
+    def __init__(
+        self,
+        spec: Spec,
+        *,
+        stochastic: bool,
+        twin: bool,
+        hidden: Sequence[int],
+        critic_hidden: Sequence[int],
+        activation: Activation,
+        architecture: Architecture,
+        normalize_observations: bool,
+    ) -> None:
+        super().__init__()
+        size = bounded_box(spec).size
+        normalizer = _normalizer(spec, normalize_observations)
+        net = _from_obs(spec, hidden, activation, 2 * size if stochastic else size, 0.01, architecture)
+        policy = SquashedGaussianPolicy(normalizer, net, size) if stochastic else DeterministicPolicy(normalizer, net)
+        self.policy: Policy = policy
+
+        def value() -> QValue:
+            encoder, seen = _encoder(spec)
+            net = network(architecture, (seen + size, *critic_hidden, 1), activation, last_gain=1.0)
+            return QValue(normalizer, encoder, net)
+
+        self.critic: nn.Module = TwinQ(value(), value()) if twin else value()
+
+    def target(self) -> Self:
+        """A copy that only follows, behind the same normalizer."""
+        normalizer = self.policy.normalizer
+        return copy.deepcopy(self, {id(normalizer): normalizer}).requires_grad_(False)
+
+
+def _normalizer(spec: Spec, normalize_observations: bool) -> Observed:
+    kind = Pixels if spec.image else RunningNorm if normalize_observations else Observed
+    return kind(spec.observation_size)
 
 
 def _policy(
     normalizer: Observed, spec: Spec, hidden: Sequence[int], activation: Activation, initial_log_std: float
 ) -> Policy:
     action = spec.action
-    net = _network(spec, hidden, activation, _outputs(action), last_gain=0.01)
+    net = _from_obs(spec, hidden, activation, _outputs(action), last_gain=0.01)
     if isinstance(action, Box):
         return GaussianPolicy(normalizer, net, action, initial_log_std)
     if isinstance(action, Discrete):
@@ -174,11 +286,23 @@ def _outputs(action: Action) -> int:
     return sum(action.nvec) if isinstance(action, MultiDiscrete) else action.n
 
 
-def _network(
-    spec: Spec, hidden: Sequence[int], activation: Activation, outputs: int, last_gain: float
-) -> nn.Sequential:
+def _encoder(spec: Spec) -> tuple[nn.Module, int]:
+    """What an observation goes through first, and how many numbers come out."""
     if not spec.image:
-        return mlp((spec.observation_size, *hidden, outputs), activation, last_gain)
+        return nn.Identity(), spec.observation_size
     height, width, channels = spec.layout[0].shape
     encoder = ImageEncoder((height, width, channels))
-    return nn.Sequential(encoder, mlp((encoder.size, *hidden, outputs), activation, last_gain))
+    return encoder, encoder.size
+
+
+def _from_obs(
+    spec: Spec,
+    hidden: Sequence[int],
+    activation: Activation,
+    outputs: int,
+    last_gain: float,
+    kind: Architecture = "mlp",
+) -> nn.Sequential:
+    encoder, size = _encoder(spec)
+    layers = network(kind, (size, *hidden, outputs), activation, last_gain)
+    return nn.Sequential(encoder, layers) if spec.image else layers

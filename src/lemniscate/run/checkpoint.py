@@ -13,13 +13,13 @@ import hashlib
 import json
 import os
 import shutil
+from collections import Counter
 from pathlib import Path
 from typing import Any, get_args
 
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load as tensors_from_bytes
-from safetensors.torch import save as tensors_to_bytes
+from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from lemniscate.errors import UserError
@@ -74,24 +74,17 @@ def write(directory: Path, state: Any, step: int, record: dict[str, Any], keep: 
             tensors |= {f"{name}.{key}": t for key, t in value.state_dict().items()}
         else:
             numbers[name] = value
-    contents = {
-        # Clones, because modules may share a normalizer and safetensors refuses shared memory.
-        PARTS[0]: tensors_to_bytes({k: t.detach().cpu().clone().contiguous() for k, t in tensors.items()}),
-        PARTS[1]: _json({"numbers": numbers, "record": record}),
-    }
-    hashes = {name: hashlib.sha256(data).hexdigest() for name, data in contents.items()}
-    contents["manifest.json"] = _json({"format": FORMAT, "sha256": hashes})
-
     directory.mkdir(parents=True, exist_ok=True)
     for stale in directory.glob("*.tmp"):
         shutil.rmtree(stale)
     temporary = directory / f"step-{step}.tmp"
     temporary.mkdir()
-    for name, data in contents.items():
-        with (temporary / name).open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
+    save_file(_apart(tensors), temporary / PARTS[0])
+    (temporary / PARTS[1]).write_text(_json({"numbers": numbers, "record": record}))
+    hashes = {name: _sha256(temporary / name) for name in PARTS}
+    (temporary / "manifest.json").write_text(_json({"format": FORMAT, "sha256": hashes}))
+    for path in temporary.iterdir():
+        _sync(path)
     _sync(temporary)
     if final.exists():
         shutil.rmtree(final)
@@ -111,14 +104,12 @@ def read(path: Path) -> Checkpoint:
     manifest = _parse(path / "manifest.json")
     if manifest.get("format") != FORMAT:
         raise UserError(f"{path} has format {manifest.get('format')!r}; this version of lemniscate reads {FORMAT}.")
-    contents = {}
     for name in PARTS:
-        contents[name] = _bytes(path / name)
-        if hashlib.sha256(contents[name]).hexdigest() != manifest.get("sha256", {}).get(name):
+        if _sha256(path / name) != manifest.get("sha256", {}).get(name):
             raise DamagedCheckpointError(f"{path / name} is not what was written: its sha256 differs.")
     try:
-        tensors = tensors_from_bytes(contents[PARTS[0]])
-        state = json.loads(contents[PARTS[1]])
+        tensors = load_file(path / PARTS[0])
+        state = json.loads((path / PARTS[1]).read_bytes())
         return Checkpoint(path, tensors, state["numbers"], state["record"])
     except (SafetensorError, ValueError, KeyError, TypeError) as error:
         raise DamagedCheckpointError(f"{path} cannot be read: {error}.") from error
@@ -153,19 +144,29 @@ def _parts(state: Any) -> list[tuple[str, Any]]:
     return [(field.name, getattr(state, field.name)) for field in dataclasses.fields(state)]
 
 
-def _json(record: Any) -> bytes:
-    return json.dumps(record, indent=1).encode()
+def _apart(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The same on the CPU; those that share memory, as safetensors refuses it, become copies. A replay shares none."""
+    at = {name: t.untyped_storage().data_ptr() for name, t in tensors.items()}
+    times = Counter(at.values())
+    return {name: (t.clone() if times[at[name]] > 1 else t).detach().cpu().contiguous() for name, t in tensors.items()}
 
 
-def _bytes(path: Path) -> bytes:
+def _json(record: Any) -> str:
+    return json.dumps(record, indent=1)
+
+
+def _sha256(path: Path) -> str:
     if not path.is_file():
         raise DamagedCheckpointError(f"{path} is missing.")
-    return path.read_bytes()
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _parse(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        raise DamagedCheckpointError(f"{path} is missing.")
     try:
-        parsed = json.loads(_bytes(path))
+        parsed = json.loads(path.read_bytes())
         if isinstance(parsed, dict):
             return parsed
     except ValueError:
@@ -173,8 +174,8 @@ def _parse(path: Path) -> dict[str, Any]:
     raise DamagedCheckpointError(f"{path} is not JSON any more.")
 
 
-def _sync(directory: Path) -> None:
-    handle = os.open(directory, os.O_RDONLY)
+def _sync(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
     finally:

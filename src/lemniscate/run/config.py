@@ -120,3 +120,46 @@ class RunConfig:
     def from_json(cls, record: dict[str, Any]) -> Self:
         """The Config that `to_json` came from."""
         return cls().replace(**{k: tuple(v) if isinstance(v, list) else v for k, v in record.items()})
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReplayConfig(RunConfig):
+    """What algorithms that learn from memory share: the memory, and the rhythm of acting and learning."""
+
+    num_envs: Count = 1
+    """copies of the environment, N"""
+    buffer_size: Count = 1_000_000
+    """transitions that are remembered; the oldest make room"""
+    batch_size: Count = 256
+    """of each gradient step, M"""
+    learning_starts: Natural = 5_000
+    """environment steps with random actions before anything is learned"""
+    update_every: Count = 1
+    """steps of each copy between updates"""
+    num_updates: Count = 1
+    """gradient steps at each update; so num_updates / (N · update_every) for each environment step"""
+    num_steps: Count = 500
+    """steps of each copy between two lines of metrics"""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.learning_starts >= self.total_steps:
+            raise UserError(
+                f"learning_starts must be below total_steps, or nothing is ever learned: {self.learning_starts:,} is"
+                f" not below {self.total_steps:,}."
+            )
+        if self.capacity < self.batch_size:
+            raise UserError(
+                f"The replay must hold a batch: the smaller of buffer_size {self.buffer_size:,} and total_steps"
+                f" {self.total_steps:,} is below batch_size {self.batch_size:,}."
+            )
+
+    @property
+    def capacity(self) -> int:
+        """Rows of the replay: no more than the run can fill."""
+        return min(self.buffer_size, self.total_steps)
+
+    @property
+    def gradient_steps(self) -> int:
+        """Of the whole run."""
+        return (self.total_steps - self.learning_starts) * self.num_updates // (self.num_envs * self.update_every)

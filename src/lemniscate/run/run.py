@@ -24,6 +24,7 @@ from typing import Any, Protocol, TypeVar
 import torch
 from filelock import FileLock, Timeout
 
+from lemniscate.data.replay import Replay
 from lemniscate.envs.api import VecEnv
 from lemniscate.envs.books import Episodes
 from lemniscate.errors import NonFiniteError, UserError
@@ -86,19 +87,25 @@ class Run:
         self._stop_signal = 0
         self._recent: list[float] = []
         self._lock = FileLock(path / ".lock", timeout=0)
+
+    def restore(self, state: S) -> S:
+        """Fill `state` from the newest checkpoint to resume from, if there is one; then open the loggers.
+
+        A new run gets its directory here: what no state can be made for leaves nothing behind.
+        """
+        if not (self.path / "config.json").exists():
+            _create_directory(self.path, self.algorithm, self.config)
         try:
             self._lock.acquire()
         except Timeout:
-            raise UserError(f"{path} is being trained by another process.") from None
-
-    def restore(self, state: S) -> S:
-        """Fill `state` from the newest checkpoint to resume from, if there is one; then open the loggers."""
+            raise UserError(f"{self.path} is being trained by another process.") from None
         found = newest_resumable(self.path)
         if found:
             found.restore(state)
         elif checkpoint.list_steps(self.path / "checkpoints"):
             print(f"{self.path} has no planned checkpoint to go on from; it begins again at step 0.", file=sys.stderr)
         self._forget_after(state.step)
+        self._announce(state)
         self._choose_engine(state)
         config = {"algorithm": self.algorithm, **self.config.to_json()}
         for name in self._logger_names:
@@ -152,6 +159,12 @@ class Run:
         self.env.close()
         self.eval_env.close()
         self._lock.release()
+
+    def _announce(self, state: AnyState) -> None:
+        if self._visible:
+            for part in vars(state).values():
+                if isinstance(part, Replay):
+                    print(f"It remembers: a {part}, as much again in each checkpoint.", file=sys.stderr)
 
     def _choose_engine(self, state: AnyState) -> None:
         if engine_of(self.config) == "native":
@@ -265,7 +278,7 @@ def require_absent(path: Path) -> None:
         raise UserError(f"{path} exists already; go on with it (lemniscate resume {path}) or choose another --run.")
 
 
-def create_directory(path: Path, algorithm: str, config: RunConfig) -> None:
+def _create_directory(path: Path, algorithm: str, config: RunConfig) -> None:
     """Make a run directory and write its `config.json`. Raises `UserError` if there is something already."""
     require_absent(path)
     temporary = path / UNFINISHED

@@ -1,0 +1,101 @@
+"""Replay: every transition whole, in the ring it belongs to, and back in every bit."""
+
+from types import SimpleNamespace
+
+import psutil
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lemniscate.data.replay import Replay
+from lemniscate.errors import UserError
+from lemniscate.types import Box, Part, Spec, Transition
+
+CPU = torch.device("cpu")
+SPEC = Spec("x", (Part((), (3,)),), Box((-1.0, -1.0), (1.0, 1.0)))
+
+
+def numbered(first, count):
+    """Transitions whose every number says which one it belongs to."""
+    n = torch.arange(first, first + count, dtype=torch.float32)
+    return Transition(
+        n[:, None].expand(-1, 3), -n[:, None].expand(-1, 2), 2 * n, n[:, None] + torch.rand(3), n % 2 == 0
+    )
+
+
+def of(rows):
+    """Which ones these are; fails if a row is put together from several."""
+    n = rows.obs[:, 0]
+    assert torch.equal(rows.obs, n[:, None].expand(-1, 3))
+    assert torch.equal(rows.action, -n[:, None].expand(-1, 2))
+    assert torch.equal(rows.reward, 2 * n)
+    assert torch.equal(rows.next_obs.floor(), rows.obs)
+    assert torch.equal(rows.terminated, n % 2 == 0)
+    return n.int().tolist()
+
+
+@given(st.lists(st.integers(0, 7), max_size=30), st.integers(7, 20))
+def test_it_holds_the_last_ones_each_of_one_piece(counts, capacity):
+    replay, written = Replay(SPEC, capacity, CPU), 0
+    for count in counts:
+        replay.add(numbered(written, count))
+        written += count
+    assert len(replay) == min(written, capacity)
+    held = of(replay.transitions[: len(replay)])
+    assert sorted(held) == list(range(max(0, written - capacity), written))
+
+
+def test_every_row_is_drawn_and_none_that_is_not_filled(rng):
+    replay = Replay(SPEC, 50, CPU)
+    replay.add(numbered(0, 8))
+    rows = replay.draw(400, 20, rng)
+    assert rows.shape == (400, 20)
+    counts = torch.bincount(rows.flatten(), minlength=8)
+    assert len(counts) == 8
+    assert (counts / 1000 - 1).abs().max() < 0.15  # five standard deviations
+
+
+@pytest.mark.parametrize("written", [0, 5, 10, 13])
+def test_it_comes_back_in_every_bit_and_goes_on_alike(written):
+    replay, other = Replay(SPEC, 10, CPU), Replay(SPEC, 10, CPU)
+    other.add(numbered(100, 7))
+    if written:
+        replay.add(numbered(0, min(written, 7)))
+        replay.add(numbered(7, written - min(written, 7)))
+    other.load_state_dict({name: t.clone() for name, t in replay.state_dict().items()})
+    for ring in (replay, other):
+        ring.add(numbered(50, 4))
+    assert len(replay) == len(other)
+    for name in vars(replay.transitions):
+        mine, its = (getattr(ring.transitions, name)[: len(ring)] for ring in (replay, other))
+        if name != "next_obs":  # which has something random in it, here
+            assert torch.equal(mine, its)
+
+
+def test_what_is_saved_is_not_copied():
+    replay = Replay(SPEC, 10, CPU)
+    replay.add(numbered(0, 4))
+    saved = replay.state_dict()
+    assert saved["obs"].data_ptr() == replay.transitions.obs.data_ptr()
+    assert len(saved["obs"]) == 4
+
+
+def test_a_million_of_hopper_fit_into_130_megabytes():
+    hopper = Spec("Hopper-v5", (Part((), (11,)),), Box((-1.0,) * 3, (1.0,) * 3))
+    replay = Replay(hopper, 1_000_000, CPU)
+    assert replay.num_bytes <= 130e6
+    assert replay.num_bytes == sum(t.nbytes for t in vars(replay.transitions).values())
+    assert str(replay) == "replay of 1,000,000 transitions, 105 MB"
+
+
+def test_an_image_stays_bytes():
+    image = Spec("x", (Part((), (4, 4, 3)),), Box((-1.0,), (1.0,)), image=True)
+    assert Replay(image, 5, CPU).transitions.next_obs.dtype == torch.uint8
+
+
+def test_what_does_not_fit_is_refused_with_what_would(monkeypatch):
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=3700))
+    with pytest.raises(UserError, match="choose buffer_size at most 100"):
+        Replay(SPEC, 101, CPU)
+    Replay(SPEC, 100, CPU)
