@@ -8,6 +8,7 @@
                  its best number of threads and kind of vector; the others on 64 copies, beside EnvPool alone
     parts        where the time of one update goes, eager and native
     startup      from the command to the first update: eager, native with a cold cache, native with a warm one
+    replay       DDPG on Hopper-v5: one copy, batches of 256, 256 × 256, one gradient step for each step
     lander       from process start to a policy of mean return 250 over 100 episodes of LunarLander-v3
 
 Every line of `benchmarks/results/speed.jsonl` carries commit, versions and machine. Rounds are interleaved, and what is
@@ -65,6 +66,25 @@ for t in range(int(sys.argv[2]) // copies): env.step(actions[t % 64])
 print(int(sys.argv[2]) / (time.perf_counter() - started))
 """
 
+PEER_REPLAY = """
+import sys, time, numpy, torch
+peer, threads, steps = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
+torch.set_num_threads(threads)
+from stable_baselines3.common.noise import NormalActionNoise
+if peer == "sb3":
+    from stable_baselines3 import DDPG
+else:
+    from sbx import DDPG
+noise = NormalActionNoise(numpy.zeros(3), 0.1 * numpy.ones(3))
+fields = dict(batch_size=256, learning_rate=3e-4, learning_starts=500, action_noise=noise, buffer_size=100_000)
+model = DDPG("MlpPolicy", "Hopper-v5", policy_kwargs={"net_arch": [256, 256]}, **fields)
+model.learn(1500)
+started = time.perf_counter()
+model.learn(steps, reset_num_timesteps=False)
+print(steps / (time.perf_counter() - started))
+"""
+REPLAY = {"batch_size": 256, "learning_starts": 500, "buffer_size": 100_000, "num_steps": 500, "engine": "native"}
+
 PEER_LANDER = """
 import sys, time, torch
 torch.set_num_threads(1)
@@ -95,10 +115,10 @@ def python(code, *arguments):
     return float(done.stdout.split()[-1])
 
 
-def train(folder, env, *, environment=None, wait=True, **fields):
+def train(folder, env, *, algorithm="ppo", environment=None, wait=True, **fields):
     """`lemniscate train` in a process of its own."""
     flags = [part for name, value in fields.items() for part in (f"--{name.replace('_', '-')}", str(value))]
-    command = [sys.executable, "-m", "lemniscate.cli", "train", "ppo", "--env", env, "--run", str(folder), *flags]
+    command = [sys.executable, "-m", "lemniscate.cli", "train", algorithm, "--env", env, "--run", str(folder), *flags]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, env={**os.environ, **(environment or {})}, text=True)
     if wait and process.wait():
         raise SystemExit(process.stderr.read())
@@ -253,6 +273,29 @@ def startup(rounds, stamp):
     shutil.rmtree(cache)
 
 
+def replay(rounds, stamp):
+    """Steps per second of DDPG, each at its best number of threads, which the first round finds."""
+    threads = {}
+
+    def ours(count):
+        with tempfile.TemporaryDirectory() as scratch:
+            folder = Path(scratch) / "run"
+            train(folder, "Hopper-v5", algorithm="ddpg", preset="default", total_steps=6000, threads=count, **REPLAY)
+            return harmonic_mean(line["time/steps_per_second"] for line in lines(folder)[3:])
+
+    clocks = {OURS: ours} | {
+        peer: lambda count, peer=peer: python(PEER_REPLAY, peer, count, 4000) for peer in ("sb3", "sbx")
+    }
+    for _ in range(rounds):
+        row = {}
+        for name, clock in clocks.items():
+            tried = {count: clock(count) for count in ([threads[name]] if name in threads else (1, 2))}
+            threads[name] = max(tried, key=tried.__getitem__)
+            row[name] = tried[threads[name]]
+        say("DDPG, Hopper-v5", {name: round(speed) for name, speed in row.items()}, threads)
+        append("speed", {"what": "replay", "steps_per_second": row, "threads": dict(threads)} | stamp)
+
+
 def lander(rounds, stamp):
     """Seconds to a mean return of 250, both judged every 50,000 steps by 100 episodes."""
     ratios = []
@@ -285,7 +328,7 @@ def lander(rounds, stamp):
     print(f"median ratio {median(ratios):.1f}")
 
 
-MEASURES = {"throughput": throughput, "parts": parts, "startup": startup, "lander": lander}
+MEASURES = {"throughput": throughput, "parts": parts, "startup": startup, "replay": replay, "lander": lander}
 
 
 def main():

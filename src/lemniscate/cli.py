@@ -112,8 +112,9 @@ def envs(given: argparse.Namespace, rest: list[str]) -> None:
     _nothing_left(rest)
     for env_id in api.known_ids():
         if given.filter.lower() in env_id.lower():
-            fitting = [f"{algorithm}: {best(algorithm, env_id)}" for algorithm in ALGORITHMS]
-            _say(f"{env_id:<40} {api.backend_for(env_id):<12} {', '.join(fitting)}")
+            presets = ((algorithm, best(algorithm, env_id)) for algorithm in ALGORITHMS)
+            fitting = ", ".join(f"{algorithm}: {preset}" for algorithm, preset in presets if preset != "default")
+            _say(f"{env_id:<40} {api.backend_for(env_id):<12} {fitting or 'default'}")
 
 
 def check(given: argparse.Namespace, rest: list[str]) -> None:

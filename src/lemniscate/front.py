@@ -19,10 +19,11 @@ from lemniscate.report import curves, playback
 from lemniscate.report import pictures as pictures_of
 from lemniscate.run import checkpoint
 from lemniscate.run.config import RunConfig
+from lemniscate.run.critique import critic_of
 from lemniscate.run.evaluate import Evaluation
 from lemniscate.run.evaluate import evaluate as evaluate_module
 from lemniscate.run.loggers import LOGGERS
-from lemniscate.run.run import Run, newest, read_config, require_absent
+from lemniscate.run.run import AnyState, Run, newest, read_config, require_absent
 from lemniscate.run.seeding import generator, set_seeds
 from lemniscate.types import Discrete, Spec
 
@@ -30,8 +31,9 @@ from lemniscate.types import Discrete, Spec
 class TrainedPolicy:
     """A policy from a run or a checkpoint: NumPy in, NumPy out."""
 
-    def __init__(self, module: Policy, spec: Spec, config: RunConfig, step: int) -> None:
-        self.module = module.eval()
+    def __init__(self, networks: Any, spec: Spec, config: RunConfig, step: int) -> None:
+        self.networks = networks.eval()
+        self.module: Policy = networks.policy
         self.spec, self.config, self.step = spec, config, step
         self._noise = generator(config.seed, torch.device("cpu"), 4)
 
@@ -189,7 +191,7 @@ def load(path: str | Path) -> TrainedPolicy:
     config = ALGORITHMS[record["algorithm"]].Config.from_json(record["config"])
     networks = ALGORITHMS[record["algorithm"]].networks(config, spec)
     networks.load_state_dict(found.part("networks"))
-    return TrainedPolicy(networks.policy, spec, config, found.numbers["step"])
+    return TrainedPolicy(networks, spec, config, found.numbers["step"])
 
 
 def evaluate(
@@ -221,7 +223,8 @@ def evaluate(
         vec.close()
         raise UserError(f"A policy for {policy.spec.env_id} cannot act in {vec.spec.env_id}: its spaces are others.")
     try:
-        return evaluate_module(policy.module, vec, episodes, seed, deterministic)
+        critic = critic_of(policy.networks, policy.config)
+        return evaluate_module(policy.module, vec, episodes, seed, deterministic, critic)
     finally:
         vec.close()
 
@@ -256,14 +259,17 @@ def watch(policy: TrainedPolicy, *, seed: int = 0, video: str | Path | None = No
 def plot(*runs: str | Path) -> list[Path]:
     """Draw the curves of a run into its `plots/`, or those of several into one picture; returns the pictures.
 
-    A drone's run also gets its flights.
+    A drone's run also gets its flights, and one with a Q what that says beside what followed.
     """
     paths = [Path(run) for run in runs]
     pictures = curves.plot_runs(paths)
     if len(paths) == 1 and any((paths[0] / "checkpoints").glob("step-*")):
-        policy = load(paths[0])
+        policy, folder = load(paths[0]), paths[0] / "plots"
+        if critic_of(policy.networks, policy.config):
+            honesty = evaluate(policy, episodes=policy.config.evaluate_episodes).honesty
+            pictures += [curves.draw_honesty(honesty, folder / "q.png")] if honesty else []
         if policy.spec.tracking:
-            folder, flights = paths[0] / "plots", policy.config.evaluate_episodes
+            flights = policy.config.evaluate_episodes
             pictures += pictures_of.draw_flight(policy.module, _drones(policy), folder, flights, seed=0)
     return pictures
 
@@ -278,15 +284,24 @@ def _train(
     progress: bool,
 ) -> TrainedRun:
     torch.set_num_threads(config.threads)
-    run = Run(path, algorithm, config, envs, loggers=loggers, progress=progress)
+
+    def film(state: AnyState) -> None:
+        networks = ALGORITHMS[algorithm].networks(config, run.spec)
+        networks.load_state_dict(state.networks.state_dict())
+        policy = TrainedPolicy(networks, run.spec, config, state.step)
+        kind = "mp4" if is_installed("imageio_ffmpeg") else "gif"
+        watch(policy, video=path / "videos" / f"step-{state.step}.{kind}")
+
+    run = Run(path, algorithm, config, envs, loggers=loggers, progress=progress, film=film)
     pictures: list[Path] = []
     try:
         state = ALGORITHMS[algorithm].train(config, run)
         if draw:
-            pictures = pictures_of.report(state.policy, run.eval_env, path, config.evaluate_episodes)
+            critic = critic_of(state.networks, config)
+            pictures = pictures_of.report(state.policy, run.eval_env, path, config.evaluate_episodes, critic)
     finally:
         run.close(pictures)
-    return TrainedRun(path, TrainedPolicy(state.policy.cpu(), run.spec, config, state.step), run.seconds)
+    return TrainedRun(path, TrainedPolicy(state.networks.cpu(), run.spec, config, state.step), run.seconds)
 
 
 def _drones(policy: TrainedPolicy) -> VecEnv:

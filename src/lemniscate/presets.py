@@ -5,7 +5,7 @@
 
 from dataclasses import dataclass
 
-from lemniscate.algos import ddpg, ppo
+from lemniscate.algos import ddpg, ppo, sac, td3
 from lemniscate.errors import unknown
 from lemniscate.run.config import RunConfig
 
@@ -181,9 +181,12 @@ PPO = [
     ),
 ]
 
-DDPG = [Preset("default", ddpg.Config(), "the settings that most libraries share today", "2026-11")]
+SHARED = "the settings that most libraries share today"
+DDPG = [Preset("default", ddpg.Config(), SHARED, "2026-11")]
+TD3 = [Preset("default", td3.Config(), SHARED, "2026-11")]
+SAC = [Preset("default", sac.Config(), SHARED, "2026-11")]
 
-PRESETS: dict[str, list[Preset]] = {"ddpg": DDPG, "ppo": PPO}
+PRESETS: dict[str, list[Preset]] = {"ddpg": DDPG, "ppo": PPO, "sac": SAC, "td3": TD3}
 
 
 def names(algorithm: str) -> list[str]:

@@ -39,7 +39,7 @@ def of(rows):
 def test_it_holds_the_last_ones_each_of_one_piece(counts, capacity):
     replay, written = Replay(SPEC, capacity, CPU), 0
     for count in counts:
-        replay.add(numbered(written, count))
+        replay.extend(numbered(written, count))
         written += count
     assert len(replay) == min(written, capacity)
     held = of(replay.transitions[: len(replay)])
@@ -48,7 +48,7 @@ def test_it_holds_the_last_ones_each_of_one_piece(counts, capacity):
 
 def test_every_row_is_drawn_and_none_that_is_not_filled(rng):
     replay = Replay(SPEC, 50, CPU)
-    replay.add(numbered(0, 8))
+    replay.extend(numbered(0, 8))
     rows = replay.draw(400, 20, rng)
     assert rows.shape == (400, 20)
     counts = torch.bincount(rows.flatten(), minlength=8)
@@ -59,13 +59,13 @@ def test_every_row_is_drawn_and_none_that_is_not_filled(rng):
 @pytest.mark.parametrize("written", [0, 5, 10, 13])
 def test_it_comes_back_in_every_bit_and_goes_on_alike(written):
     replay, other = Replay(SPEC, 10, CPU), Replay(SPEC, 10, CPU)
-    other.add(numbered(100, 7))
+    other.extend(numbered(100, 7))
     if written:
-        replay.add(numbered(0, min(written, 7)))
-        replay.add(numbered(7, written - min(written, 7)))
+        replay.extend(numbered(0, min(written, 7)))
+        replay.extend(numbered(7, written - min(written, 7)))
     other.load_state_dict({name: t.clone() for name, t in replay.state_dict().items()})
     for ring in (replay, other):
-        ring.add(numbered(50, 4))
+        ring.extend(numbered(50, 4))
     assert len(replay) == len(other)
     for name in vars(replay.transitions):
         mine, its = (getattr(ring.transitions, name)[: len(ring)] for ring in (replay, other))
@@ -75,7 +75,7 @@ def test_it_comes_back_in_every_bit_and_goes_on_alike(written):
 
 def test_what_is_saved_is_not_copied():
     replay = Replay(SPEC, 10, CPU)
-    replay.add(numbered(0, 4))
+    replay.extend(numbered(0, 4))
     saved = replay.state_dict()
     assert saved["obs"].data_ptr() == replay.transitions.obs.data_ptr()
     assert len(saved["obs"]) == 4

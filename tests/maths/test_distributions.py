@@ -104,6 +104,8 @@ def test_a_squashed_log_prob_is_finite_and_has_a_gradient_where_tanh_is_one():
     assert mean.grad.tolist() == [[2.0, -2.0]]
 
 
-def test_a_point_is_itself(rng):
-    action = torch.randn(4, 2, generator=rng)
-    assert Point(action).sample(torch.empty(4, 0)) is Point(action).mode() is action
+def test_a_point_is_itself_and_what_is_added_stays_in_bounds():
+    point = Point(torch.tensor([[0.5, -0.9]]))
+    assert point.mode() is point.action
+    assert torch.equal(point.sample(torch.zeros(1, 2)), point.action)
+    assert torch.equal(point.sample(torch.tensor([[0.25, -0.25]])), torch.tensor([[0.75, -1.0]]))

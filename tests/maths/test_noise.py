@@ -3,7 +3,7 @@ import math
 import pytest
 import torch
 
-from lemniscate.maths import coloured, ornstein_uhlenbeck
+from lemniscate.maths import coloured, ornstein_uhlenbeck, uniform
 
 
 def within(values, expected, standard_errors=5.0):
@@ -71,3 +71,12 @@ def test_coloured_noise_is_the_sum_of_its_waves(rng):
         angle = 2 * math.pi * k * t / 10
         expected = expected + 2 * s[k] * (normal[k] * angle.cos() - normal[5 + k] * angle.sin())
     assert coloured(normal, 1.0) == pytest.approx(expected)
+
+
+def test_uniform_numbers_are_uniform_and_go_together_as_before(rng):
+    x = torch.randn(100_000, generator=rng, dtype=torch.float64)
+    u = uniform(x)
+    quantiles = torch.linspace(0.01, 0.99, 99, dtype=torch.float64)
+    torch.testing.assert_close(u.quantile(quantiles), 2 * quantiles - 1, atol=0.015, rtol=0)
+    assert torch.equal(u.argsort(), x.argsort())
+    torch.testing.assert_close(uniform(-x), -u)

@@ -2,6 +2,6 @@
 
 from types import ModuleType
 
-from lemniscate.algos import ddpg, ppo
+from lemniscate.algos import ddpg, ppo, sac, td3
 
-ALGORITHMS: dict[str, ModuleType] = {"ddpg": ddpg, "ppo": ppo}
+ALGORITHMS: dict[str, ModuleType] = {"ddpg": ddpg, "ppo": ppo, "sac": sac, "td3": td3}

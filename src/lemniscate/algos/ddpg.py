@@ -14,7 +14,7 @@ from torch import Generator, Tensor, nn
 from lemniscate.data.exploration import Exploration, Noise
 from lemniscate.data.replay import Replay
 from lemniscate.envs.api import VecEnv
-from lemniscate.maths import means, polyak, td_target, value_loss
+from lemniscate.maths import means, polyak, td_target, uniform, value_loss
 from lemniscate.nn.descent import Descent
 from lemniscate.nn.networks import Activation, Architecture
 from lemniscate.nn.policies import ActorQ, Policy, bounded_box
@@ -32,8 +32,6 @@ class Config(ReplayConfig):
     """Adam's step size for the policy"""
     critic_learning_rate: Positive = 3e-4
     """Adam's step size for Q"""
-    gamma: Fraction = 0.99
-    """discount γ"""
     tau: Fraction = 0.005
     """how far the target networks move at each of their updates"""
     policy_delay: Count = 1
@@ -86,36 +84,22 @@ class State:
 
 def networks(config: Config, spec: Spec) -> ActorQ:
     """μ and Q for the spaces in `spec`."""
-    return ActorQ(
-        spec,
-        stochastic=False,
-        twin=False,
-        hidden=config.hidden,
-        critic_hidden=config.critic_hidden,
-        activation=config.activation,
-        architecture=config.architecture,
-        normalize_observations=config.normalize_observations,
-    )
+    shape = (config.hidden, config.critic_hidden, config.activation, config.architecture)
+    return ActorQ(spec, *shape, config.normalize_observations, twin=False)
 
 
 def init(config: Config, spec: Spec, device: torch.device) -> State:
     """Fresh networks, an empty memory, generators from the run's seed."""
     online = networks(config, spec).to(device)
     targets = online.target()
+    copies, length = (config.num_envs, bounded_box(spec).size), spec.max_episode_steps or 1000
     return State(
         online,
         targets,
-        Descent(online.policy, partial(actor_loss, online.critic)),
-        Descent(online.critic, partial(critic_loss, config, targets)),
+        Descent(online.policy, partial(actor_loss, online.critic), watch_as="gradient_norm/actor"),
+        Descent(online.critic, partial(critic_loss, config, targets), watch_as="gradient_norm/critic"),
         Replay(spec, config.capacity, device),
-        Exploration(
-            config.noise,
-            (config.num_envs, bounded_box(spec).size),
-            spec.max_episode_steps or 1000,
-            device,
-            time=config.noise_time,
-            exponent=config.noise_exponent,
-        ),
+        Exploration(config.noise, copies, length, device, time=config.noise_time, exponent=config.noise_exponent),
         noise=generator(config.seed, device, 2),
         draws=generator(config.seed, device, 3),
     )
@@ -123,15 +107,12 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
 
 @torch.no_grad()
 def play(config: Config, state: State, env: VecEnv) -> None:
-    """One step of every copy: a = μ(s) + noise, or anything at all while warming up (algorithm 1)."""
-    obs, noise = env.obs, config.noise_std * state.exploration(state.noise)
-    if state.step < config.learning_starts:
-        action = 2 * torch.rand(noise.shape, generator=state.noise, device=noise.device) - 1
-    else:
-        action = (state.policy(obs).mode() + noise).clamp(-1, 1)
+    """One step of every copy: a = μ(s) + noise (section 3, eq. 7), or anything at all while warming up."""
+    obs, noise = env.obs, state.exploration(state.noise)
+    warm = state.step >= config.learning_starts
+    action = state.policy.act(obs, config.noise_std * noise) if warm else uniform(noise)
     step = env.step(action)
-    rows = Transition(obs, action, step.reward, step.next_obs, step.terminated)
-    state.replay.add(rows if step.valid.all() else rows[step.valid])
+    state.replay.add(obs, action, step)
     state.exploration.cut(step.terminated | step.truncated)
     state.policy.observe(obs[step.valid])
     state.step += env.num_envs
@@ -140,7 +121,7 @@ def play(config: Config, state: State, env: VecEnv) -> None:
 def critic_loss(
     config: Config, targets: ActorQ, critic: nn.Module, batch: Transition
 ) -> tuple[Tensor, dict[str, Tensor]]:
-    """½ (Q(s, a) − y)², y = r + γ Q'(s', μ'(s')) (section 3, eq. 4 and 5)."""
+    """½ (Q(s, a) − y)², y = r + γ Q'(s', μ'(s')) (section 2, eq. 4 and 5)."""
     next_action = targets.policy(batch.next_obs).mode()
     target = td_target(batch.reward, targets.critic(batch.next_obs, next_action), batch.terminated, gamma=config.gamma)
     value = critic(batch.obs, batch.action)

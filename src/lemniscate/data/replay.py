@@ -7,7 +7,7 @@ import torch
 from torch import Generator, Tensor
 
 from lemniscate.errors import UserError
-from lemniscate.types import Spec, Transition
+from lemniscate.types import Spec, Step, Transition
 
 
 class Replay:
@@ -48,7 +48,12 @@ class Replay:
     def __str__(self) -> str:
         return f"replay of {self.capacity:,} transitions, {_megabytes(self.num_bytes)}"
 
-    def add(self, rows: Transition) -> None:
+    def add(self, obs: Tensor, action: Tensor, step: Step) -> None:
+        """Remember what `action` at `obs` brought, copy by copy; rows in which it was ignored are left out."""
+        rows = Transition(obs, action, step.reward, step.next_obs, step.terminated)
+        self.extend(rows if step.valid.all() else rows[step.valid])
+
+    def extend(self, rows: Transition) -> None:
         """Keep `rows` [B, …], in the place of the oldest."""
         start, count = self._written % self.capacity, len(rows.reward)
         room = min(count, self.capacity - start)

@@ -11,7 +11,7 @@ from lemniscate.maths.distributions import (
     SquashedGaussian,
 )
 from lemniscate.maths.losses import clipped_surrogate, value_loss
-from lemniscate.maths.noise import coloured, ornstein_uhlenbeck
+from lemniscate.maths.noise import coloured, ornstein_uhlenbeck, uniform
 from lemniscate.maths.returns import gae, polyak, td_target
 from lemniscate.maths.schedules import adapt_to_kl, linear
 from lemniscate.maths.stats import (
@@ -50,5 +50,6 @@ __all__ = [
     "ratio_statistics",
     "standardize",
     "td_target",
+    "uniform",
     "value_loss",
 ]

@@ -137,13 +137,13 @@ class Bernoulli:
 
 @dataclass(frozen=True)
 class Point:
-    """All probability on one action, `action` [B, A]."""
+    """All probability on one action in [-1, 1]^A, `action` [B, A]; what noise there is comes from outside."""
 
     action: Tensor
 
     def sample(self, noise: Tensor) -> Tensor:
-        """[B, A], whatever the noise."""
-        return self.action
+        """[B, A] in [-1, 1]: action + noise, noise [B, A] of any kind."""
+        return (self.action + noise).clamp(-1, 1)
 
     def mode(self) -> Tensor:
         """[B, A]."""

@@ -1,4 +1,4 @@
-"""Noise correlated in time: pure functions from standard normal numbers to noise of variance 1 at every step."""
+"""Noise correlated in time: pure functions of standard normal numbers."""
 
 import math
 
@@ -50,3 +50,8 @@ def coloured(normal: Float[Tensor, "*S L"], exponent: float) -> Float[Tensor, "*
     real[..., 0] *= math.sqrt(2)
     real[..., -1] *= math.sqrt(2)
     return torch.fft.irfft(torch.complex(real, imaginary) * scale, n=length)
+
+
+def uniform(normal: Float[Tensor, "*S"]) -> Float[Tensor, "*S"]:
+    """2 Φ(x) − 1: standard normal numbers become uniform ones in [-1, 1], and those that went together still do."""
+    return torch.erf(normal / math.sqrt(2))

@@ -71,9 +71,11 @@ class Descent(Generic[Networks]):
         betas: tuple[float, float] = (0.9, 0.999),
         eps: float = 1e-8,
         max_grad_norm: float = math.inf,
+        watch_as: str = "gradient_norm",
     ) -> None:
         self._objective = _Objective(networks, loss)
         self._betas, self._eps, self._max_grad_norm = betas, eps, max_grad_norm
+        self._watch_as = watch_as
         named = list(self._objective.named_parameters())
         self._names = [name for name, _ in named]
         self._shapes = [parameter.shape for _, parameter in named]
@@ -100,7 +102,7 @@ class Descent(Generic[Networks]):
             *noise: random numbers that the loss needs, a part of them for each step, [K, …].
 
         Returns:
-            Means over the K steps of what the loss watches, and of "gradient_norm" before the clip.
+            Means over the K steps of what the loss watches, and of the gradient's norm before the clip.
         """
         steps = range(self.steps + 1, self.steps + 1 + len(parts))
         self.steps += len(parts)
@@ -141,7 +143,7 @@ class Descent(Generic[Networks]):
             total.backward(inputs=self._parameters)
             with torch.no_grad():
                 norm = adam(vector, self._gradient, mean, square, scales, self._betas)
-            watched.append({**metrics, "gradient_norm": norm})
+            watched.append({**metrics, self._watch_as: norm})
         return means(watched)
 
     def _functional(
@@ -155,7 +157,7 @@ class Descent(Generic[Networks]):
                 gradients, (_, metrics) = differentiate(dict(zip(self._names, self._cut(vector), strict=True)))
                 gradient = torch.cat([gradients[name].flatten() for name in self._names])
                 norm = adam(vector, gradient, mean, square, scales, self._betas)
-                watched.append({**metrics, "gradient_norm": norm})
+                watched.append({**metrics, self._watch_as: norm})
         return means(watched)
 
     def _cut(self, vector: Tensor) -> list[Tensor]:

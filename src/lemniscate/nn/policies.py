@@ -3,7 +3,7 @@
 import copy
 import math
 from collections.abc import Callable, Sequence
-from typing import Self
+from typing import Any, Self
 
 import torch
 from torch import Generator, Tensor, nn
@@ -129,13 +129,17 @@ class BernoulliPolicy(Policy):
 class DeterministicPolicy(Policy):
     """One action at each observation, tanh of a network: in [-1, 1]^A, which the env floor maps onto its bounds."""
 
+    def __init__(self, normalizer: Observed, net: nn.Module, size: int) -> None:
+        super().__init__(normalizer, net)
+        self.size = size
+
     def forward(self, obs: Tensor) -> Point:
         """[B, O] to [B, A]."""
         return Point(torch.tanh(self.net(self.normalizer(obs))))
 
     def noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
-        """Nothing is random: [*shape] of nothing."""
-        return torch.empty(*shape, 0, device=generator.device)
+        """It has none of its own: zeros, [*shape, A]."""
+        return torch.zeros(*shape, self.size, device=generator.device)
 
 
 class SquashedGaussianPolicy(Policy):
@@ -211,6 +215,18 @@ class ActorCritic(nn.Module):
         self.value = Value(self.policy.normalizer, _from_obs(spec, hidden, activation, 1, last_gain=1.0))
 
 
+class Temperature(nn.Module):
+    """SAC's α, the price of entropy; log α is what is learned."""
+
+    def __init__(self, initial: float) -> None:
+        super().__init__()
+        self.log = nn.Parameter(torch.tensor(math.log(initial)))
+
+    def forward(self) -> Tensor:
+        """α, a scalar."""
+        return self.log.exp()
+
+
 def bounded_box(spec: Spec) -> Box:
     """The actions of `spec`. Raises `UserError` unless they are numbers between finite bounds."""
     action = spec.action
@@ -226,33 +242,55 @@ def bounded_box(spec: Spec) -> Box:
 
 
 class ActorQ(nn.Module):
-    """A policy over continuous actions and its Q-value, or two of them: separate networks behind one normalizer."""
+    """A policy over continuous actions and its Q-value, or two of them: separate networks behind one normalizer.
+
+    With a `temperature` the policy is random, and α, its price of entropy, is learned from there on.
+    """
 
     def __init__(
         self,
         spec: Spec,
-        *,
-        stochastic: bool,
-        twin: bool,
         hidden: Sequence[int],
         critic_hidden: Sequence[int],
         activation: Activation,
         architecture: Architecture,
         normalize_observations: bool,
+        *,
+        twin: bool,
+        temperature: float | None = None,
     ) -> None:
         super().__init__()
+        stochastic = temperature is not None
         size = bounded_box(spec).size
         normalizer = _normalizer(spec, normalize_observations)
         net = _from_obs(spec, hidden, activation, 2 * size if stochastic else size, 0.01, architecture)
-        policy = SquashedGaussianPolicy(normalizer, net, size) if stochastic else DeterministicPolicy(normalizer, net)
-        self.policy: Policy = policy
+        kind = SquashedGaussianPolicy if stochastic else DeterministicPolicy
+        self.policy: Policy = kind(normalizer, net, size)
 
         def value() -> QValue:
             encoder, seen = _encoder(spec)
             net = network(architecture, (seen + size, *critic_hidden, 1), activation, last_gain=1.0)
             return QValue(normalizer, encoder, net)
 
-        self.critic: nn.Module = TwinQ(value(), value()) if twin else value()
+        self.critic: Any = TwinQ(value(), value()) if twin else value()
+        self.temperature = Temperature(temperature) if temperature is not None else None
+
+    @property
+    def actor(self) -> nn.ModuleList:
+        """What learns to act: the policy, and α where there is one."""
+        return nn.ModuleList(part for part in (self.policy, self.temperature) if part is not None)
+
+    def q(self, obs: Tensor, action: Tensor) -> Tensor:
+        """What is believed of [B, O] and [B, A], [B]: the lower of two."""
+        value = self.critic(obs, action)
+        return value.amin(0) if isinstance(self.critic, TwinQ) else value
+
+    def entropy_bonus(self, obs: Tensor, generator: Generator) -> Tensor:
+        """−α log π of an action drawn at each observation [B, O], [B]; 0 where the policy is not paid for entropy."""
+        if self.temperature is None:
+            return torch.zeros(len(obs), device=obs.device)
+        _, log_prob = self.policy(obs).sample_with_log_prob(self.policy.noise((len(obs),), generator))
+        return -self.temperature() * log_prob
 
     def target(self) -> Self:
         """A copy that only follows, behind the same normalizer."""

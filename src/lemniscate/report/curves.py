@@ -1,5 +1,7 @@
 """Learning curves, of one run or of several side by side."""
 
+import math
+from itertools import zip_longest
 from pathlib import Path
 
 import matplotlib as mpl
@@ -9,10 +11,26 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
 from lemniscate.errors import UserError
+from lemniscate.run.critique import Honesty
 from lemniscate.run.loggers import read_metrics
 from lemniscate.run.run import read_config
 
-DIAGNOSTICS = ("losses/value", "explained_variance", "approx_kl", "clip_fraction", "losses/entropy", "gradient_norm")
+DIAGNOSTICS = (
+    "losses/value",
+    "explained_variance",
+    "approx_kl",
+    "clip_fraction",
+    "losses/critic",
+    "losses/actor",
+    "q",
+    "losses/entropy",
+    "temperature",
+    "gradient_norm",
+    "gradient_norm/critic",
+    "gradient_norm/actor",
+)
+"""what is drawn of an update, where an algorithm has it"""
+
 POINTS = 3000
 """episodes drawn of a run, evenly chosen"""
 
@@ -39,14 +57,33 @@ def learning_curve(runs: list[Path], file: Path) -> Path:
 
 
 def diagnostics(runs: list[Path], file: Path) -> Path:
-    """What was watched in the updates: value loss, explained variance, KL, clip fraction, entropy, gradient norm."""
-    figure = Figure(figsize=(10, 5.5), layout="constrained")
-    grid = figure.subplots(2, 3)
-    for axes, name in zip(grid.flat, DIAGNOSTICS, strict=True):
+    """What was watched in the updates: losses, KL, entropy, Q, gradient norms; three panels in a row."""
+    watched = {name for run in runs for line in read_metrics(run) for name in line}
+    names = [name for name in DIAGNOSTICS if name in watched]
+    lines = max(1, math.ceil(len(names) / 3))
+    figure = Figure(figsize=(10, 2.75 * lines), layout="constrained")
+    panels = figure.subplots(lines, 3, squeeze=False).flat
+    for axes, name in zip_longest(panels, names):
+        if name is None:
+            axes.set_visible(False)
+            continue
         for i, run in enumerate(runs):
             _curve(axes, run, name, COLORS[i % 10])
         axes.set_title(name, loc="left", fontsize=10)
-        _finish(axes, len(runs) if axes is grid.flat[0] else 1)
+        _finish(axes, len(runs) if name == names[0] else 1)
+    return _save(figure, file)
+
+
+def draw_honesty(honesty: Honesty, file: Path) -> Path:
+    """What Q said of the beginning of each episode, against what followed: on the line it is honest."""
+    figure = Figure(figsize=(4.6, 4.6), layout="constrained")
+    axes = figure.subplots()
+    ends = [min(honesty.predicted + honesty.realised), max(honesty.predicted + honesty.realised)]
+    axes.plot(ends, ends, color="grey", linewidth=1, label="honest")
+    axes.plot(honesty.realised, honesty.predicted, ".", color=COLORS[0], alpha=0.6, label="episodes")
+    axes.set(xlabel="discounted return that followed", ylabel="Q(s₀, a₀)")
+    axes.set_title(str(honesty).partition(": ")[2], loc="left", fontsize=10)
+    _finish(axes, 2)
     return _save(figure, file)
 
 

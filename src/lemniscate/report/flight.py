@@ -46,7 +46,7 @@ def record(policy: Policy, env: VecEnv, flights: int, seed: int) -> Flight:
         raise UserError(f"{spec.env_id} has no reference to track, so no flight can be drawn against one.")
     flights = min(flights, env.num_envs)
     rows = []
-    for step, counts in fly(policy, env, flights, seed):
+    for _, _, step, counts in fly(policy, env, flights, seed):
         row = torch.where(counts[:, None], step.next_obs, torch.nan)[:flights]
         rows.append(row.cpu().numpy())
     track = np.stack(rows)

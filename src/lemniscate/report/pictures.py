@@ -4,7 +4,7 @@ import sys
 from pathlib import Path
 
 from lemniscate.envs.api import VecEnv
-from lemniscate.nn.policies import Policy
+from lemniscate.nn.policies import ActorQ, Policy
 from lemniscate.report import curves, flight
 from lemniscate.report.playback import film_flight
 from lemniscate.run.evaluate import Evaluation, evaluate
@@ -20,13 +20,18 @@ def sentence(scores: Evaluation) -> str:
             f", {scores.terminated} crashes; tracking error {scores.rmse_mm:.1f} mm over the whole flight,"
             f" {scores.rmse_after_1s_mm:.2f} mm after the first second"
         )
-    return said + "."
+    return f"{said}.\n{scores.honesty}." if scores.honesty else f"{said}."
 
 
-def report(policy: Policy, env: VecEnv, path: Path, episodes: int) -> list[Path]:
+def report(
+    policy: Policy, env: VecEnv, path: Path, episodes: int, critic: tuple[ActorQ, float] | None = None
+) -> list[Path]:
     """Evaluate from unseen starts, draw everything there is to draw; says what it did, returns the pictures."""
-    say(sentence(evaluate(policy, env, episodes, seed=0)))
+    scores = evaluate(policy, env, episodes, seed=0, critic=critic)
+    say(sentence(scores))
     pictures = curves.plot_runs([path])
+    if scores.honesty:
+        pictures.append(curves.draw_honesty(scores.honesty, path / "plots" / "q.png"))
     if env.spec.tracking:
         pictures += draw_flight(policy, env, path / "plots", episodes, seed=0)
     for picture in pictures:

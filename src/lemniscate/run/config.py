@@ -62,6 +62,8 @@ class RunConfig:
     """steps between evaluations during training; 0 leaves it to the end"""
     evaluate_episodes: Count = 20
     """episodes of each evaluation"""
+    video_every: Natural = 0
+    """steps between recordings of an episode into videos/step-N; 0 records none"""
 
     def __post_init__(self) -> None:
         hints = get_type_hints(type(self), include_extras=True)
@@ -128,6 +130,8 @@ class ReplayConfig(RunConfig):
 
     num_envs: Count = 1
     """copies of the environment, N"""
+    gamma: Fraction = 0.99
+    """discount γ"""
     buffer_size: Count = 1_000_000
     """transitions that are remembered; the oldest make room"""
     batch_size: Count = 256

@@ -2,7 +2,8 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
 from functools import partial
 
 import torch
@@ -10,7 +11,8 @@ from torch import Tensor
 
 from lemniscate.envs.api import VecEnv
 from lemniscate.errors import UserError
-from lemniscate.nn.policies import Policy
+from lemniscate.nn.policies import ActorQ, Policy
+from lemniscate.run.critique import Critique, Honesty
 from lemniscate.run.seeding import derive, generator
 from lemniscate.types import Step
 
@@ -34,17 +36,32 @@ class Evaluation:
     terminated: int
     rmse_mm: float | None = None
     rmse_after_1s_mm: float | None = None
+    honesty: Honesty | None = None
+    date: str = ""
 
     def to_json(self) -> dict[str, object]:
         """Without what the environment does not have."""
-        return {name: value for name, value in asdict(self).items() if value is not None}
+        scores: dict[str, object] = {
+            name: value for name, value in asdict(self).items() if value is not None and name != "date"
+        }
+        return scores | ({"q_bias": self.honesty.bias} if self.honesty else {})
+
+    def to_course(self) -> dict[str, object]:
+        """The dictionary that a course on DDPG hands in with a policy; the time is ISO 8601."""
+        return {
+            "env_id": self.env_id,
+            "mean_reward": self.mean_return,
+            "std_reward": self.std_return,
+            "n_evaluation_episodes": self.episodes,
+            "eval_datetime": self.date,
+        }
 
 
 @torch.no_grad()
 def fly(
     policy: Policy, env: VecEnv, episodes: int, seed: int, deterministic: bool = True
-) -> Iterator[tuple[Step, Tensor]]:
-    """Play `episodes` whole episodes; yields each step with the mask [N] of the copies that still count.
+) -> Iterator[tuple[Tensor, Tensor, Step, Tensor]]:
+    """Play `episodes` whole episodes; yields (obs, action, step, the mask [N] of the copies that still count).
 
     Every copy has its own share of the episodes, fixed beforehand: taking the first that end would favour short ones.
     Raises `UserError` when an episode of an environment without a time limit takes more than 20,000 steps.
@@ -60,20 +77,34 @@ def fly(
                 f"An episode of {env.spec.env_id} has not ended after {PATIENCE:,} steps, and there is no time limit;"
                 " give it one, with max_episode_steps where it is registered."
             )
-        distribution = policy(env.obs)
-        step = env.step(distribution.mode() if deterministic else distribution.sample(noise()))
-        yield step, (left > 0) & step.valid
+        obs, distribution = env.obs, policy(env.obs)
+        action = distribution.mode() if deterministic else distribution.sample(noise())
+        step = env.step(action)
+        yield obs, action, step, (left > 0) & step.valid
         done = (step.terminated | step.truncated) & step.valid
         left, age = left - done.int(), (age + 1) * (~done & (left > 0))
 
 
-def evaluate(policy: Policy, env: VecEnv, episodes: int, seed: int, deterministic: bool = True) -> Evaluation:
-    """Mean return over `episodes` whole episodes from starts drawn with `seed`; for drones the tracking error too."""
+def evaluate(
+    policy: Policy,
+    env: VecEnv,
+    episodes: int,
+    seed: int,
+    deterministic: bool = True,
+    critic: tuple[ActorQ, float] | None = None,
+) -> Evaluation:
+    """Mean return over `episodes` whole episodes from starts drawn with `seed`; for drones the tracking error too.
+
+    With a `critic`, networks and γ, also what Q says of each beginning, beside what followed.
+    """
     running = torch.zeros(2, env.num_envs, device=env.device)
     ended: list[Tensor] = []
     errors: list[Tensor] = []
     terminated = 0
-    for step, counts in fly(policy, env, episodes, seed, deterministic):
+    critique = Critique(*critic, generator(seed, env.device, EVALUATION, 2)) if critic else None
+    for obs, action, step, counts in fly(policy, env, episodes, seed, deterministic):
+        if critique:
+            critique.follow(obs, action, step, counts)
         if env.spec.tracking:
             error = step.next_obs[:, slice(*env.spec.tracking)].square().sum(-1)
             errors.append(torch.stack([error, running[1]], dim=-1)[counts])
@@ -86,18 +117,23 @@ def evaluate(policy: Policy, env: VecEnv, episodes: int, seed: int, deterministi
     table = torch.cat(ended, dim=1)
     returns, lengths = table[:2, table[2].argsort(stable=True)]  # by copy, then by time
     mean, std = returns.mean().item(), returns.std(correction=0).item()
-    scores = Evaluation(env.spec.env_id, episodes, mean, std, returns.tolist(), lengths.int().tolist(), terminated)
+    scores = Evaluation(
+        env.spec.env_id,
+        episodes,
+        mean,
+        std,
+        returns.tolist(),
+        lengths.int().tolist(),
+        terminated,
+        honesty=critique.honesty() if critique else None,
+        date=datetime.now(UTC).isoformat(timespec="seconds"),
+    )
     if not errors or env.spec.time_step is None:
         return scores
     squared, step_index = torch.cat(errors).unbind(-1)
     late = squared[step_index >= 1 / env.spec.time_step]
-    return Evaluation(
-        **{
-            **asdict(scores),
-            "rmse_mm": _root_mean_mm(squared),
-            "rmse_after_1s_mm": _root_mean_mm(late) if len(late) else math.nan,
-        }
-    )
+    after_1s = _root_mean_mm(late) if len(late) else math.nan
+    return replace(scores, rmse_mm=_root_mean_mm(squared), rmse_after_1s_mm=after_1s)
 
 
 def _root_mean_mm(squared_m: Tensor) -> float:

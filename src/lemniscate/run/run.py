@@ -15,7 +15,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -32,6 +32,7 @@ from lemniscate.nn.descent import Descent
 from lemniscate.nn.policies import Policy
 from lemniscate.run import checkpoint
 from lemniscate.run.config import RunConfig
+from lemniscate.run.critique import critic_of
 from lemniscate.run.evaluate import evaluate
 from lemniscate.run.loggers import LOGGERS, NO_EPISODES, Logger
 from lemniscate.run.progress import ProgressBar
@@ -48,6 +49,7 @@ class AnyState(Protocol):
     """What a run needs to know of an algorithm's State: how far it is, and whom to evaluate."""
 
     step: int
+    networks: Any
 
     @property
     def policy(self) -> Policy:
@@ -78,11 +80,12 @@ class Run:
         *,
         loggers: tuple[str, ...] = ("jsonl", "tensorboard"),
         progress: bool = True,
+        film: Callable[[AnyState], None] | None = None,
     ) -> None:
         self.path, self.algorithm, self.config = path, algorithm, config
         self.env, self.eval_env = envs
         self.spec = self.env.spec
-        self._logger_names, self._visible = loggers, progress
+        self._logger_names, self._visible, self._film = loggers, progress, film
         self._loggers: list[Logger] = []
         self._stop_signal = 0
         self._recent: list[float] = []
@@ -123,6 +126,8 @@ class Run:
         self._clock, self._clock_step = started, state.step
         try:
             with self._catching_signals():
+                if state.step == 0:
+                    self._record(state)  # where nothing can be recorded, better told now than hours later
                 self._restart(state)
                 while state.step < total_steps:
                     before = state.step
@@ -189,6 +194,9 @@ class Run:
         every, interval = self.config.evaluate_every, self.config.checkpoint_interval
         if every and state.step // every > before // every:
             self._evaluate(state)
+        every = self.config.video_every
+        if every and state.step // every > before // every:
+            self._record(state)
         finished = state.step >= total_steps
         planned = finished or state.step // interval > before // interval
         if planned:
@@ -206,16 +214,27 @@ class Run:
             )
             raise Stopped(message, self._stop_signal)
 
+    def _record(self, state: AnyState) -> None:
+        if self.config.video_every and self._film:
+            with globals_undisturbed():
+                self._film(state)
+
     def _evaluate(self, state: AnyState) -> None:
         try:
             with globals_undisturbed():
-                scores = evaluate(state.policy, self.eval_env, self.config.evaluate_episodes, self.config.seed)
+                critic = critic_of(state.networks, self.config)
+                episodes, seed = self.config.evaluate_episodes, self.config.seed
+                scores = evaluate(state.policy, self.eval_env, episodes, seed, critic=critic)
         except UserError as error:  # an endless episode costs this evaluation, not the run
             print(f"No evaluation at step {state.step:,}: {error}", file=sys.stderr)
             return
         metrics = {"evaluation/return": scores.mean_return, "evaluation/length": sum(scores.lengths) / scores.episodes}
         if scores.rmse_after_1s_mm is not None:
             metrics["evaluation/rmse_after_1s_mm"] = scores.rmse_after_1s_mm
+        if scores.honesty:
+            predicted, realised = scores.honesty.means
+            metrics |= {"evaluation/q": predicted, "evaluation/q_realised": realised}
+            metrics |= {"evaluation/q_bias": scores.honesty.bias}
         self._write(state.step, metrics)
 
     def _write(self, step: int, numbers: dict[str, float], episodes: Episodes = NO_EPISODES) -> None:

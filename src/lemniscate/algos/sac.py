@@ -1,0 +1,167 @@
+"""Soft Actor-Critic with a temperature that is learned: Haarnoja et al. 2018, arXiv:1812.05905.
+
+Twin critics as in TD3; but the policy is random by itself, is paid for being so, and needs no noise from outside.
+Departures from the paper, and why: docs/notes/ddpg.md.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+
+import torch
+from torch import Generator, Tensor, nn
+
+from lemniscate.data.replay import Replay
+from lemniscate.envs.api import VecEnv
+from lemniscate.maths import means, polyak, td_target, uniform, value_loss
+from lemniscate.nn.descent import Descent
+from lemniscate.nn.networks import Activation, Architecture
+from lemniscate.nn.policies import ActorQ, Policy, TwinQ
+from lemniscate.run.config import Count, Fraction, Positive, ReplayConfig
+from lemniscate.run.run import Run
+from lemniscate.run.seeding import generator
+from lemniscate.types import Spec, Transition
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config(ReplayConfig):
+    """Every knob of SAC. The defaults are the paper's (table 1), but for the warm-up."""
+
+    actor_learning_rate: Positive = 3e-4
+    """Adam's step size for the policy and the temperature"""
+    critic_learning_rate: Positive = 3e-4
+    """Adam's step size for Q"""
+    tau: Fraction = 0.005
+    """how far the target networks move at each of their updates"""
+    policy_delay: Count = 1
+    """gradient steps of Q for each of the policy, the temperature and the targets, d"""
+    initial_temperature: Positive = 1.0
+    """α at the start"""
+    target_entropy: float | None = None
+    """H̄ in nats, which the temperature steers to, over actions in [-1, 1]^A; none is −A"""
+    hidden: tuple[Count, ...] = (256, 256)
+    """widths of the policy's hidden layers"""
+    critic_hidden: tuple[Count, ...] = (256, 256)
+    """widths of Q's"""
+    activation: Activation = "relu"
+    """between the layers"""
+    architecture: Architecture = "mlp"
+    """plain layers; with layer normalization; or SimBa's residual blocks"""
+    normalize_observations: bool = False
+    """a running normalizer inside the policy"""
+
+
+@dataclass
+class State:
+    """Everything a crash may not take from us."""
+
+    networks: ActorQ
+    targets: TwinQ
+    """Q'₁ and Q'₂: copies that follow slowly"""
+    actor_descent: Descent[nn.ModuleList]
+    critic_descent: Descent[TwinQ]
+    replay: Replay
+    noise: Generator
+    """what actions are drawn with"""
+    draws: Generator
+    """what minibatches are drawn with"""
+    updates: int = 0
+    """gradient steps of Q taken"""
+    step: int = 0
+    """environment steps taken"""
+
+    @property
+    def policy(self) -> Policy:
+        """π, whom to evaluate."""
+        return self.networks.policy
+
+
+def networks(config: Config, spec: Spec) -> ActorQ:
+    """π, Q₁ and Q₂ for the spaces in `spec`."""
+    shape = (config.hidden, config.critic_hidden, config.activation, config.architecture)
+    return ActorQ(spec, *shape, config.normalize_observations, twin=True, temperature=config.initial_temperature)
+
+
+def init(config: Config, spec: Spec, device: torch.device) -> State:
+    """Fresh networks, an empty memory, generators from the run's seed."""
+    online = networks(config, spec).to(device)
+    targets, actor = online.target().critic, online.actor
+    return State(
+        online,
+        targets,
+        Descent(actor, partial(actor_loss, config, online.critic), watch_as="gradient_norm/actor"),
+        Descent(online.critic, partial(critic_loss, config, targets, actor), watch_as="gradient_norm/critic"),
+        Replay(spec, config.capacity, device),
+        noise=generator(config.seed, device, 2),
+        draws=generator(config.seed, device, 3),
+    )
+
+
+@torch.no_grad()
+def play(config: Config, state: State, env: VecEnv) -> None:
+    """One step of every copy: a ~ π(·|s), or anything at all while warming up."""
+    obs, noise = env.obs, state.policy.noise((env.num_envs,), state.noise)
+    warm = state.step >= config.learning_starts
+    action = state.policy.act(obs, noise) if warm else uniform(noise)
+    step = env.step(action)
+    state.replay.add(obs, action, step)
+    state.policy.observe(obs[step.valid])
+    state.step += env.num_envs
+
+
+def critic_loss(
+    config: Config, targets: TwinQ, actor: nn.ModuleList, critic: TwinQ, batch: Transition, noise: Tensor
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Σ_i ½ (Q_i(s, a) − y)², y = r + γ (min_i Q'_i(s', a') − α log π(a'|s')), a' ~ π(·|s') (eq. 5 and 3)."""
+    policy, temperature = actor
+    next_action, log_prob = policy(batch.next_obs).sample_with_log_prob(noise)
+    next_value = targets(batch.next_obs, next_action).amin(0) - temperature() * log_prob
+    target = td_target(batch.reward, next_value, batch.terminated, gamma=config.gamma).detach()
+    one, two = critic(batch.obs, batch.action)
+    loss = value_loss(one, target) + value_loss(two, target)
+    return loss, {"losses/critic": loss.detach(), "q": one.detach().mean()}
+
+
+def actor_loss(
+    config: Config, critic: TwinQ, actor: nn.ModuleList, batch: Transition, noise: Tensor
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """α log π(a|s) − min_i Q_i(s, a), a ~ π(·|s) (eq. 7), and −α (log π(a|s) + H̄) (eq. 18)."""
+    policy, temperature = actor
+    action, log_prob = policy(batch.obs).sample_with_log_prob(noise)
+    alpha, value = temperature(), critic(batch.obs, action).amin(0)
+    policy_loss = (alpha.detach() * log_prob - value).mean()
+    wanted = -action.shape[-1] if config.target_entropy is None else config.target_entropy
+    temperature_loss = -(alpha * (log_prob.detach() + wanted)).mean()
+    return policy_loss + temperature_loss, {
+        "losses/actor": policy_loss.detach(),
+        "losses/entropy": -log_prob.detach().mean(),
+        "temperature": alpha.detach(),
+    }
+
+
+def update(config: Config, state: State) -> Mapping[str, Tensor]:
+    """Gradient steps on what is remembered (algorithm 1); returns the means of what was watched."""
+    watched: list[Mapping[str, Tensor]] = []
+    memory = state.replay.transitions
+    for rows in state.replay.draw(config.num_updates, config.batch_size, state.draws).split(1):
+        state.updates += 1
+        noise = state.policy.noise(rows.shape, state.noise)
+        watched.append(state.critic_descent(memory, rows, config.critic_learning_rate, noise))
+        if state.updates % config.policy_delay == 0:
+            noise = state.policy.noise(rows.shape, state.noise)
+            watched.append(state.actor_descent(memory, rows, config.actor_learning_rate, noise))
+            polyak(state.targets.parameters(), state.networks.critic.parameters(), config.tau)
+    return means(watched)
+
+
+def train(config: Config, run: Run) -> State:
+    """Algorithm 1: act, remember, learn, repeat."""
+    state = run.restore(init(config, run.spec, run.env.device))
+    for env in run.until(config.total_steps, state):
+        watched: list[Mapping[str, Tensor]] = []
+        for t in range(1, config.num_steps + 1):
+            play(config, state, env)
+            if state.step > config.learning_starts and t % config.update_every == 0:
+                watched.append(update(config, state))
+        run.log(state, means(watched), env.take_episodes())
+    return state

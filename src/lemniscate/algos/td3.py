@@ -1,0 +1,168 @@
+"""Twin Delayed DDPG: Fujimoto et al. 2018, arXiv:1802.09477.
+
+DDPG with two critics, of which the lower is believed, noise on the target's action, and a policy that moves less often.
+Departures from the paper, and why: docs/notes/ddpg.md.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+
+import torch
+from torch import Generator, Tensor
+
+from lemniscate.data.exploration import Exploration, Noise
+from lemniscate.data.replay import Replay
+from lemniscate.envs.api import VecEnv
+from lemniscate.maths import means, polyak, td_target, uniform, value_loss
+from lemniscate.nn.descent import Descent
+from lemniscate.nn.networks import Activation, Architecture
+from lemniscate.nn.policies import ActorQ, Policy, TwinQ, bounded_box
+from lemniscate.run.config import Count, Fraction, NonNegative, Positive, ReplayConfig
+from lemniscate.run.run import Run
+from lemniscate.run.seeding import generator
+from lemniscate.types import Spec, Transition
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config(ReplayConfig):
+    """Every knob of TD3. The defaults are those in use today, near the paper's."""
+
+    actor_learning_rate: Positive = 3e-4
+    """Adam's step size for the policy"""
+    critic_learning_rate: Positive = 3e-4
+    """Adam's step size for Q"""
+    tau: Fraction = 0.005
+    """how far the target networks move at each of their updates"""
+    policy_delay: Count = 2
+    """gradient steps of Q for each of the policy and of the targets, d"""
+    target_noise: NonNegative = 0.2
+    """standard deviation σ̃ of the noise on the target's action, in units of half the action range"""
+    target_noise_clip: NonNegative = 0.5
+    """c, where that noise is clipped"""
+    noise: Noise = "white"
+    """what is added to actions in training: white; Ornstein–Uhlenbeck; coloured"""
+    noise_std: NonNegative = 0.1
+    """its standard deviation, in units of half the action range"""
+    noise_time: Positive = 6.7
+    """steps in which Ornstein–Uhlenbeck noise forgets itself; the paper's θ = 0.15 is 1 / 0.15"""
+    noise_exponent: NonNegative = 1.0
+    """β of coloured noise, whose power falls as f^(−β); 1 is pink"""
+    hidden: tuple[Count, ...] = (256, 256)
+    """widths of the policy's hidden layers"""
+    critic_hidden: tuple[Count, ...] = (256, 256)
+    """widths of Q's"""
+    activation: Activation = "relu"
+    """between the layers"""
+    architecture: Architecture = "mlp"
+    """plain layers; with layer normalization; or SimBa's residual blocks"""
+    normalize_observations: bool = False
+    """a running normalizer inside the policy"""
+
+
+@dataclass
+class State:
+    """Everything a crash may not take from us."""
+
+    networks: ActorQ
+    targets: ActorQ
+    """μ', Q'₁ and Q'₂: copies that follow slowly"""
+    actor_descent: Descent[Policy]
+    critic_descent: Descent[TwinQ]
+    replay: Replay
+    exploration: Exploration
+    noise: Generator
+    """what actions are drawn with"""
+    draws: Generator
+    """what minibatches are drawn with"""
+    updates: int = 0
+    """gradient steps of Q taken"""
+    step: int = 0
+    """environment steps taken"""
+
+    @property
+    def policy(self) -> Policy:
+        """μ, whom to evaluate."""
+        return self.networks.policy
+
+
+def networks(config: Config, spec: Spec) -> ActorQ:
+    """μ, Q₁ and Q₂ for the spaces in `spec`."""
+    shape = (config.hidden, config.critic_hidden, config.activation, config.architecture)
+    return ActorQ(spec, *shape, config.normalize_observations, twin=True)
+
+
+def init(config: Config, spec: Spec, device: torch.device) -> State:
+    """Fresh networks, an empty memory, generators from the run's seed."""
+    online = networks(config, spec).to(device)
+    targets = online.target()
+    copies, length = (config.num_envs, bounded_box(spec).size), spec.max_episode_steps or 1000
+    return State(
+        online,
+        targets,
+        Descent(online.policy, partial(actor_loss, online.critic), watch_as="gradient_norm/actor"),
+        Descent(online.critic, partial(critic_loss, config, targets), watch_as="gradient_norm/critic"),
+        Replay(spec, config.capacity, device),
+        Exploration(config.noise, copies, length, device, time=config.noise_time, exponent=config.noise_exponent),
+        noise=generator(config.seed, device, 2),
+        draws=generator(config.seed, device, 3),
+    )
+
+
+@torch.no_grad()
+def play(config: Config, state: State, env: VecEnv) -> None:
+    """One step of every copy: a = μ(s) + noise (section 3, eq. 7), or anything at all while warming up."""
+    obs, noise = env.obs, state.exploration(state.noise)
+    warm = state.step >= config.learning_starts
+    action = state.policy.act(obs, config.noise_std * noise) if warm else uniform(noise)
+    step = env.step(action)
+    state.replay.add(obs, action, step)
+    state.exploration.cut(step.terminated | step.truncated)
+    state.policy.observe(obs[step.valid])
+    state.step += env.num_envs
+
+
+def critic_loss(
+    config: Config, targets: ActorQ, critic: TwinQ, batch: Transition, noise: Tensor
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Σ_i ½ (Q_i(s, a) − y)², y = r + γ min_i Q'_i(s', μ'(s') + ε), ε ~ clip(N(0, σ̃²), −c, c) (algorithm 1)."""
+    limit = config.target_noise_clip
+    next_action = targets.policy(batch.next_obs).sample((config.target_noise * noise).clamp(-limit, limit))
+    next_value = targets.critic(batch.next_obs, next_action).amin(0)
+    target = td_target(batch.reward, next_value, batch.terminated, gamma=config.gamma)
+    one, two = critic(batch.obs, batch.action)
+    loss = value_loss(one, target) + value_loss(two, target)
+    return loss, {"losses/critic": loss.detach(), "q": one.detach().mean()}
+
+
+def actor_loss(critic: TwinQ, policy: Policy, batch: Transition) -> tuple[Tensor, dict[str, Tensor]]:
+    """−Q₁(s, μ(s)), whose gradient is the deterministic policy gradient (algorithm 1)."""
+    loss = -critic.one(batch.obs, policy(batch.obs).mode()).mean()
+    return loss, {"losses/actor": loss.detach()}
+
+
+def update(config: Config, state: State) -> Mapping[str, Tensor]:
+    """Gradient steps on what is remembered (algorithm 1); returns the means of what was watched."""
+    watched: list[Mapping[str, Tensor]] = []
+    memory = state.replay.transitions
+    for rows in state.replay.draw(config.num_updates, config.batch_size, state.draws).split(1):
+        state.updates += 1
+        noise = torch.randn(*rows.shape, memory.action.shape[-1], generator=state.noise, device=rows.device)
+        watched.append(state.critic_descent(memory, rows, config.critic_learning_rate, noise))
+        if state.updates % config.policy_delay == 0:
+            watched.append(state.actor_descent(memory, rows, config.actor_learning_rate))
+            polyak(state.targets.parameters(), state.networks.parameters(), config.tau)
+    return means(watched)
+
+
+def train(config: Config, run: Run) -> State:
+    """Algorithm 1: act, remember, learn, repeat."""
+    state = run.restore(init(config, run.spec, run.env.device))
+    for env in run.until(config.total_steps, state):
+        watched: list[Mapping[str, Tensor]] = []
+        for t in range(1, config.num_steps + 1):
+            play(config, state, env)
+            if state.step > config.learning_starts and t % config.update_every == 0:
+                watched.append(update(config, state))
+        run.log(state, means(watched), env.take_episodes())
+    return state

@@ -1,0 +1,84 @@
+"""Is Q honest? What it says of the first action of an episode, beside the discounted return that followed."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Generator, Tensor, nn
+
+from lemniscate.nn.policies import ActorQ
+from lemniscate.run.config import ReplayConfig, RunConfig
+from lemniscate.types import Step
+
+
+@dataclass(frozen=True)
+class Honesty:
+    """Episode by episode, in the order of their ends.
+
+    `realised` is Σ γ^t r_t; where the clock ended the episode, what Q expects from there on is added, since Q speaks of
+    what follows too. Under SAC it holds the entropy that was paid for as well, which Q counts.
+    """
+
+    predicted: list[float]
+    realised: list[float]
+
+    @property
+    def means(self) -> tuple[float, float]:
+        """Of what was predicted, and of what came."""
+        return sum(self.predicted) / len(self.predicted), sum(self.realised) / len(self.realised)
+
+    @property
+    def bias(self) -> float:
+        """How much more was predicted than came, as a share of what came; not finite if nothing did."""
+        predicted, realised = self.means
+        return (predicted - realised) / abs(realised) if realised else float("inf")
+
+    def __str__(self) -> str:
+        predicted, realised = self.means
+        said = f"Q(s₀, a₀) says {predicted:.4g}, and {realised:.4g} followed, discounted: "
+        if abs(self.bias) < 0.01:
+            return said + "it is right to a hundredth"
+        size = f"{100 * abs(self.bias):.0f} %" if abs(self.bias) < 10 else f"{abs(predicted - realised):.4g}"
+        return said + f"it {'over' if self.bias > 0 else 'under'}-estimates by {size}"
+
+
+class Critique:
+    """Follows an evaluation step by step.
+
+    Args:
+        networks: whose Q is asked.
+        gamma: γ of its training.
+        generator: samples the entropy of a random policy.
+    """
+
+    def __init__(self, networks: ActorQ, gamma: float, generator: Generator) -> None:
+        self._networks, self._gamma, self._generator = networks, gamma, generator
+        self._running = torch.empty(0)
+        self._ended: list[Tensor] = []
+
+    @torch.no_grad()
+    def follow(self, obs: Tensor, action: Tensor, step: Step, counts: Tensor) -> None:
+        """One step of every copy; only the copies in `counts` [N] count."""
+        networks = self._networks
+        if not len(self._running):
+            self._running = torch.zeros(3, len(obs), device=obs.device)
+        predicted, realised, age = self._running
+        begins = age == 0
+        if begins.any():
+            predicted = torch.where(begins, networks.q(obs, action), predicted)
+        paid = step.reward + torch.where(begins, 0, networks.entropy_bonus(obs, self._generator))
+        realised, age = realised + self._gamma**age * paid * counts, age + counts
+        done = (step.terminated | step.truncated) & counts
+        if done.any():
+            follows = networks.q(step.next_obs, networks.policy(step.next_obs).mode()) * ~step.terminated
+            self._ended.append(torch.stack([predicted, realised + self._gamma**age * follows])[:, done])
+        self._running = torch.stack([predicted, realised, age]) * ~done
+
+    def honesty(self) -> Honesty:
+        """Of all episodes that ended."""
+        predicted, realised = torch.cat(self._ended, dim=1).tolist()
+        return Honesty(predicted, realised)
+
+
+def critic_of(networks: nn.Module, config: RunConfig) -> tuple[ActorQ, float] | None:
+    """The networks and γ, where there is a Q to ask."""
+    return (networks, config.gamma) if isinstance(networks, ActorQ) and isinstance(config, ReplayConfig) else None

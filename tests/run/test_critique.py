@@ -1,0 +1,113 @@
+"""Is Q honest: the prediction of the first action, and what followed it, by hand."""
+
+import json
+import math
+
+import pytest
+import torch
+
+import lemniscate as lem
+from conftest import tiny_memory
+from lemniscate.envs import toy
+from lemniscate.envs.api import VecEnv
+from lemniscate.envs.gymnasium import GymnasiumBackend
+from lemniscate.nn.policies import ActorQ
+from lemniscate.report.pictures import sentence
+from lemniscate.run.critique import Honesty
+from lemniscate.run.evaluate import evaluate
+from test_memory import Levers
+
+CPU = torch.device("cpu")
+
+
+def networks(spec, **fields):
+    torch.manual_seed(0)
+    return ActorQ(spec, (4,), (8,), "relu", "mlp", False, **{"twin": True, **fields})
+
+
+@pytest.mark.parametrize("mode", ["NEXT_STEP", "SAME_STEP", "DISABLED"])
+@pytest.mark.parametrize(
+    ("length", "horizon", "gamma"), [(5, None, 0.9), (None, 4, 0.9), (5, None, 1.0), (None, 4, 0.0)]
+)
+def test_what_followed_is_the_discounted_return_and_after_a_time_out_what_q_expects(
+    monkeypatch, mode, length, horizon, gamma
+):
+    monkeypatch.setattr(toy, "Countdown", Levers)
+    env = VecEnv(GymnasiumBackend("Countdown-v0", 3, CPU, mode=mode, length=length, horizon=horizon))
+    nets = networks(env.spec)
+    honesty = evaluate(nets.policy, env, 8, seed=0, critic=(nets, gamma)).honesty
+    predicted, realised = [], []
+    for copy in range(3):
+        for episode in range(3 if copy < 2 else 2):
+            first, last = (torch.tensor([[copy, episode, t]]).float() for t in (0, length or horizon))
+            predicted.append(nets.q(first, nets.policy(first).mode()).item())
+            earned = sum(gamma**t for t in range(length or horizon))
+            if horizon:
+                earned += gamma**horizon * nets.q(last, nets.policy(last).mode()).item()
+            realised.append(earned)
+    assert sorted(honesty.predicted) == pytest.approx(sorted(predicted), abs=1e-5)
+    assert sorted(honesty.realised) == pytest.approx(sorted(realised), abs=1e-5)
+    pairs = {(round(p, 3), round(r, 3)) for p, r in zip(honesty.predicted, honesty.realised, strict=True)}
+    assert pairs == {(round(p, 3), round(r, 3)) for p, r in zip(predicted, realised, strict=True)}
+
+
+def test_entropy_counts_from_the_second_step_on(monkeypatch, rng):
+    """Two steps of reward 1, γ = ½, at a temperature of 2."""
+    monkeypatch.setattr(toy, "Countdown", Levers)
+    env = VecEnv(GymnasiumBackend("Countdown-v0", 1, CPU, length=2))
+    nets = networks(env.spec, temperature=2.0)
+    seen = []
+    monkeypatch.setattr(ActorQ, "entropy_bonus", lambda *_: seen.append(1) or torch.tensor([10.0]))
+    honesty = evaluate(nets.policy, env, 1, seed=0, critic=(nets, 0.5)).honesty
+    assert honesty.realised == pytest.approx([1 + 0.5 * (1 + 10)])
+    monkeypatch.undo()
+    obs = torch.randn(20_000, 3, generator=rng)
+    policy = nets.policy(obs)
+    noise = nets.policy.noise((20_000,), torch.Generator().manual_seed(5))
+    mine = -2 * policy.sample_with_log_prob(noise)[1].mean()
+    assert nets.entropy_bonus(obs, torch.Generator().manual_seed(5)).mean().item() == pytest.approx(
+        mine.item(), abs=1e-4
+    )
+    assert networks(env.spec).entropy_bonus(obs, rng).abs().max() == 0
+
+
+@pytest.mark.parametrize(
+    ("predicted", "said"),
+    [
+        ([69.0, 69.0], "Q(s₀, a₀) says 69, and 50 followed, discounted: it over-estimates by 38 %"),
+        ([40.0, 20.0], "it under-estimates by 40 %"),
+        ([50.1, 50.1], "it is right to a hundredth"),
+        ([5000.0, 5000.0], "it over-estimates by 4950"),
+    ],
+)
+def test_the_sentence(predicted, said):
+    assert said in str(Honesty(predicted, [40.0, 60.0]))
+
+
+def test_nothing_followed():
+    assert math.isinf(Honesty([1.0], [0.0]).bias)
+    assert "over-estimates by 1" in str(Honesty([1.0], [0.0]))
+
+
+def test_it_is_said_written_and_drawn(tmp_path, capsys):
+    run = lem.train("td3", "Pendulum-v1", run=tmp_path / "r", progress=False, **tiny_memory(evaluate_every=128))
+    scores = lem.evaluate(run.policy, episodes=3)
+    assert len(scores.honesty.predicted) == 3
+    assert sentence(scores).count("\n") == 1
+    assert json.loads(json.dumps(scores.to_json()))["q_bias"] == scores.honesty.bias
+    lines = [json.loads(line) for line in (tmp_path / "r" / "metrics.jsonl").read_text().splitlines()]
+    assert sum("evaluation/q_bias" in line for line in lines) == 2
+    assert tmp_path / "r" / "plots" / "q.png" in lem.plot(tmp_path / "r")
+
+
+def test_the_dictionary_of_the_course(tmp_path):
+    run = lem.train("ddpg", "Pendulum-v1", run=tmp_path / "r", progress=False, **tiny_memory())
+    scores = lem.evaluate(run.policy, episodes=3)
+    handed_in = scores.to_course()
+    assert handed_in.pop("eval_datetime")[:2] == "20"
+    assert handed_in == {
+        "env_id": "Pendulum-v1",
+        "mean_reward": scores.mean_return,
+        "std_reward": scores.std_return,
+        "n_evaluation_episodes": 3,
+    }
