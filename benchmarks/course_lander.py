@@ -69,6 +69,7 @@ def one(settings, variant, seed, steps):
 def draw(file):
     """Mean of the last 20 training episodes: a thin line for each seed, a thick one for their mean."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import EngFormatter
 
     figure = Figure(figsize=(10, 4), layout="constrained")
     panels = figure.subplots(1, 2, sharey=True)
@@ -80,11 +81,12 @@ def draw(file):
             grid = np.linspace(5_000, 315_000, 150)
             mean = np.mean([np.interp(grid, *row["curve"]) for row in of], axis=0)
             axes.plot(grid, mean, color=color, linewidth=2, label=variant)
-        axes.set(xlabel="environment steps", ylim=(-400, 300))
+        axes.set(xlabel="environment steps", ylim=(-650, 200))
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         axes.set_title(settings, loc="left", fontsize=11)
         axes.spines[["top", "right"]].set_visible(False)
     panels[0].set_ylabel("return, mean of the last 20 episodes")
-    panels[0].legend(frameon=False)
+    panels[0].legend(frameon=False, loc="lower right")
     figure.savefig(file, dpi=130)
 
 

@@ -95,7 +95,7 @@ vector, judge = make_vec_env("LunarLander-v3", n_envs=16), make_vec_env("LunarLa
 fields = dict(n_steps=1024, batch_size=64, gae_lambda=0.98, gamma=0.999, n_epochs=4, ent_coef=0.01)
 model = PPO("MlpPolicy", vector, seed=int(sys.argv[1]), **fields)
 stop = StopTrainingOnRewardThreshold(250)
-model.learn(3_000_000, EvalCallback(judge, stop, n_eval_episodes=100, eval_freq=3125, verbose=0, warn=False))
+model.learn(1_000_000, EvalCallback(judge, stop, n_eval_episodes=100, eval_freq=3125, verbose=0, warn=False))
 print(model.num_timesteps)
 """
 
@@ -297,8 +297,7 @@ def replay(rounds, stamp):
 
 
 def lander(rounds, stamp):
-    """Seconds to a mean return of 250, both judged every 50,000 steps by 100 episodes."""
-    ratios = []
+    """Seconds to a mean return of 250, both judged every 50,000 steps by 100 episodes, for 1,000,000 steps at most."""
     for seed in range(1, rounds + 1):
         with tempfile.TemporaryDirectory() as scratch:
             folder, started = Path(scratch) / "run", time.monotonic()
@@ -314,7 +313,6 @@ def lander(rounds, stamp):
         started = time.monotonic()
         their_steps = python(PEER_LANDER, seed)
         theirs = time.monotonic() - started
-        ratios.append(theirs / mine)
         row = {
             "what": "lander",
             "seed": seed,
@@ -324,8 +322,11 @@ def lander(rounds, stamp):
             "sb3_steps": their_steps,
         }
         append("speed", row | stamp)
-        print(f"| seed {seed} | {mine:.0f} s, {steps:,} steps | {theirs:.0f} s, {their_steps:,.0f} steps |", flush=True)
-    print(f"median ratio {median(ratios):.1f}")
+        late = "not in " if their_steps >= 1_000_000 else ""
+        print(
+            f"| seed {seed} | {mine:.0f} s, {steps:,} steps | {late}{theirs:.0f} s, {their_steps:,.0f} steps |",
+            flush=True,
+        )
 
 
 MEASURES = {"throughput": throughput, "parts": parts, "startup": startup, "replay": replay, "lander": lander}

@@ -282,12 +282,13 @@ def test_actions_are_random_while_it_warms_up_and_the_policys_afterwards(monkeyp
     assert warm.min() < -0.9
     assert warm.max() > 0.9
     assert warm.std().item() == pytest.approx(1 / 3**0.5, abs=0.05)
-    obs, generator = env.obs, state.noise.get_state()
+    drawn, exploration = [], state.exploration
+    state.exploration = lambda generator: drawn.append(exploration(generator)) or drawn[-1]
+    state.exploration.cut, obs = exploration.cut, env.obs
     algo.play(config, state, env)
     action = state.replay.transitions.action[160:164]
     if algo is sac:
-        state.noise.set_state(generator)
-        assert torch.equal(action, state.policy.act(obs, state.policy.noise((4,), state.noise)))
+        assert torch.equal(action, state.policy.act(obs, drawn[0]))
     else:
         assert 0 < (action - state.policy(obs).mode()).abs().max() < 0.25
 

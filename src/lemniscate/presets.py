@@ -182,7 +182,15 @@ PPO = [
 ]
 
 SHARED = "the settings that most libraries share today"
-DDPG = [Preset("default", ddpg.Config(), SHARED, "2026-11")]
+DDPG = [
+    Preset("default", ddpg.Config(), SHARED, "2026-11"),
+    Preset(
+        "course",
+        ddpg.Config(env="Hopper-v5", learning_starts=25_000, policy_delay=2),
+        "the reinforcement-learning course's notebook on DDPG: its settings, on the corrected algorithm",
+        "2026-11",
+    ),
+]
 TD3 = [Preset("default", td3.Config(), SHARED, "2026-11")]
 SAC = [Preset("default", sac.Config(), SHARED, "2026-11")]
 

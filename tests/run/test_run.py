@@ -31,6 +31,8 @@ REMEMBERING = {
     # name: algorithm and fields; in Pendulum-v1, whose episodes are longer than the distance of checkpoints
     "ddpg": {"noise": "ou", "policy_delay": 2, "normalize_observations": True},
     "ddpg-pink": {"noise": "coloured", "update_every": 2, "num_updates": 3, "architecture": "simba"},
+    "td3": {"architecture": "layer_norm"},
+    "sac": {"noise": "coloured"},
 }
 
 

@@ -1,6 +1,6 @@
 """Soft Actor-Critic with a temperature that is learned: Haarnoja et al. 2018, arXiv:1812.05905.
 
-Twin critics as in TD3; but the policy is random by itself, is paid for being so, and needs no noise from outside.
+Twin critics as in TD3; but the policy is random by itself, and is paid for being so.
 Departures from the paper, and why: docs/notes/ddpg.md.
 """
 
@@ -11,13 +11,14 @@ from functools import partial
 import torch
 from torch import Generator, Tensor, nn
 
+from lemniscate.data.exploration import Exploration, Noise
 from lemniscate.data.replay import Replay
 from lemniscate.envs.api import VecEnv
 from lemniscate.maths import means, polyak, td_target, uniform, value_loss
 from lemniscate.nn.descent import Descent
 from lemniscate.nn.networks import Activation, Architecture
-from lemniscate.nn.policies import ActorQ, Policy, TwinQ
-from lemniscate.run.config import Count, Fraction, Positive, ReplayConfig
+from lemniscate.nn.policies import ActorQ, Policy, TwinQ, bounded_box
+from lemniscate.run.config import Count, Fraction, NonNegative, Positive, ReplayConfig
 from lemniscate.run.run import Run
 from lemniscate.run.seeding import generator
 from lemniscate.types import Spec, Transition
@@ -39,6 +40,12 @@ class Config(ReplayConfig):
     """α at the start"""
     target_entropy: float | None = None
     """H̄ in nats, which the temperature steers to, over actions in [-1, 1]^A; none is −A"""
+    noise: Noise = "white"
+    """what actions are drawn with in training: white; Ornstein–Uhlenbeck; coloured"""
+    noise_time: Positive = 6.7
+    """steps in which Ornstein–Uhlenbeck noise forgets itself"""
+    noise_exponent: NonNegative = 1.0
+    """β of coloured noise, whose power falls as f^(−β); 1 is pink"""
     hidden: tuple[Count, ...] = (256, 256)
     """widths of the policy's hidden layers"""
     critic_hidden: tuple[Count, ...] = (256, 256)
@@ -61,6 +68,7 @@ class State:
     actor_descent: Descent[nn.ModuleList]
     critic_descent: Descent[TwinQ]
     replay: Replay
+    exploration: Exploration
     noise: Generator
     """what actions are drawn with"""
     draws: Generator
@@ -86,12 +94,14 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
     """Fresh networks, an empty memory, generators from the run's seed."""
     online = networks(config, spec).to(device)
     targets, actor = online.target().critic, online.actor
+    copies, length = (config.num_envs, bounded_box(spec).size), spec.max_episode_steps or 1000
     return State(
         online,
         targets,
         Descent(actor, partial(actor_loss, config, online.critic), watch_as="gradient_norm/actor"),
         Descent(online.critic, partial(critic_loss, config, targets, actor), watch_as="gradient_norm/critic"),
         Replay(spec, config.capacity, device),
+        Exploration(config.noise, copies, length, device, time=config.noise_time, exponent=config.noise_exponent),
         noise=generator(config.seed, device, 2),
         draws=generator(config.seed, device, 3),
     )
@@ -100,11 +110,12 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
 @torch.no_grad()
 def play(config: Config, state: State, env: VecEnv) -> None:
     """One step of every copy: a ~ π(·|s), or anything at all while warming up."""
-    obs, noise = env.obs, state.policy.noise((env.num_envs,), state.noise)
+    obs, noise = env.obs, state.exploration(state.noise)
     warm = state.step >= config.learning_starts
     action = state.policy.act(obs, noise) if warm else uniform(noise)
     step = env.step(action)
     state.replay.add(obs, action, step)
+    state.exploration.cut(step.terminated | step.truncated)
     state.policy.observe(obs[step.valid])
     state.step += env.num_envs
 
