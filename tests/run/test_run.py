@@ -3,6 +3,7 @@
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -84,6 +85,29 @@ def test_evaluation_changes_no_bit_of_training(tmp_path, env):
         for n in ("with", "without")
     ]
     assert losses[0] == losses[1]
+
+
+@pytest.mark.parametrize("env", ["CartPole-v1", "sac"])
+def test_recordings_change_no_bit_of_training_and_survive_a_resume(tmp_path, env, monkeypatch):
+    monkeypatch.setattr(lem.front, "is_installed", lambda name: name != "imageio_ffmpeg")
+    train(tmp_path / "without", env, checkpoint_every=64)
+    path = tmp_path / "with"
+    train(path, env, checkpoint_every=64, video_every=96)
+    assert final_hashes(path)["tensors.safetensors"] == final_hashes(tmp_path / "without")["tensors.safetensors"]
+    videos = {video.name: video.read_bytes() for video in (path / "videos").iterdir()}
+    assert set(videos) == {"step-0.gif", "step-96.gif", "step-192.gif"}
+    assert len(set(videos.values())) >= 2  # a policy that has not moved yet may do the same
+    for step in checkpoint.list_steps(path / "checkpoints")[-2:]:  # back to step 128
+        shutil.rmtree(path / "checkpoints" / f"step-{step}")
+    (path / "videos" / "step-192.gif").unlink()
+    lem.resume(path, progress=False)
+    assert {video.name: video.read_bytes() for video in (path / "videos").iterdir()} == videos
+
+
+def test_what_cannot_be_recorded_is_told_before_training(tmp_path):
+    with pytest.raises(lem.UserError, match="Countdown-v0"):
+        train(tmp_path / "r", video_every=64)
+    assert not read_metrics(tmp_path / "r")
 
 
 def test_two_seeds_of_neighbouring_runs_share_no_start():
