@@ -136,7 +136,7 @@ def ours(env, steps):
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch) / "run"
         size = {**SHARED, "num_envs": COPIES[env], "num_steps": 2048 // COPIES[env]}
-        train(folder, env, preset="default", total_steps=steps, checkpoint_every=steps, engine="native", **size)
+        train(folder, env, preset="paper", total_steps=steps, checkpoint_every=steps, engine="native", **size)
         return harmonic_mean(line["time/steps_per_second"] for line in lines(folder)[3:])
 
 
@@ -259,7 +259,7 @@ def startup(rounds, stamp):
             folder, started = Path(scratch) / "run", time.monotonic()
             engine = "eager" if name == "eager" else "native"
             process = train(
-                folder, ENVS[0], wait=False, environment=environment, preset="default", engine=engine, **SHARED
+                folder, ENVS[0], wait=False, environment=environment, preset="paper", engine=engine, **SHARED
             )
             while not lines(folder):
                 if process.poll() is not None:

@@ -49,7 +49,12 @@ ANNEALED = ppo.Config(
 """few copies, small minibatches, and a learning rate that falls; after Tianshou"""
 
 PPO = [
-    Preset("default", ppo.Config(), "Schulman et al. 2017, table 3, on 8 copies with a running normalizer", "2026-11"),
+    Preset(
+        "default",
+        ADAPTIVE.replace(num_envs=16, num_steps=128, minibatch_size=256, checkpoint_every=0),
+        "the best of five candidates on Pendulum, Acrobot and InvertedDoublePendulum, seeds 101 and 102",
+        "2026-11",
+    ),
     Preset(
         "figure-eight",
         ppo.Config(
@@ -179,6 +184,7 @@ PPO = [
         "search by hand, 7 runs, on seeds 101 and 102",
         "2026-11",
     ),
+    Preset("paper", ppo.Config(), "Schulman et al. 2017, table 3, on 8 copies with a running normalizer", "2026-11"),
 ]
 
 SHARED = "the settings that most libraries share today"

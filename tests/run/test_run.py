@@ -223,7 +223,7 @@ def long_run(path, env, updates=150):
     flags = ["--run", path]
     for name in ("num_envs", "num_steps", "total_steps", "epochs", "minibatch_size", "checkpoint_every"):
         flags += [f"--{name.replace('_', '-')}", fields[name]]
-    return ["train", "ppo", "--env", env, "--preset", "default", "--hidden", "32", "32", *flags]
+    return ["train", "ppo", "--env", env, "--preset", "paper", "--hidden", "32", "32", *flags]
 
 
 def wait_for(condition, process=None):
