@@ -27,7 +27,24 @@ RUNS = {
         "Walker2d-v5": ((MILLION,), 5),
         "Ant-v5": ((MILLION, 3 * MILLION), 5),
         "Humanoid-v5": ((MILLION, 3 * MILLION), 3),
-    }
+    },
+    "ddpg": {
+        "MountainCarContinuous-v0": ((30_000, 100_000), 10),
+        "Pendulum-v1": ((20_000,), 5),
+        "LunarLanderContinuous-v3": ((300_000,), 3),
+        "HalfCheetah-v5": ((MILLION,), 2),
+        "Hopper-v5": ((MILLION,), 3),
+    },
+    "td3": {
+        "Pendulum-v1": ((20_000,), 5),
+        "LunarLanderContinuous-v3": ((300_000,), 3),
+        "HalfCheetah-v5": ((300_000,), 2),
+    },
+    "sac": {
+        "Pendulum-v1": ((20_000,), 5),
+        "LunarLanderContinuous-v3": ((300_000,), 3),
+        "HalfCheetah-v5": ((300_000,), 2),
+    },
 }
 
 

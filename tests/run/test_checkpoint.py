@@ -148,3 +148,12 @@ def test_a_full_disk_leaves_the_checkpoint_before(tmp_path, monkeypatch):
     checkpoint.read(tmp_path / "step-1")
     write(tmp_path, state, 3)
     assert not list(tmp_path.glob("*.tmp"))
+
+
+def test_only_what_shares_memory_is_copied():
+    """A million transitions are not: a part of a ring that is not full yet goes to the disk from where it lies."""
+    vector, ring = torch.arange(10.0), torch.arange(6.0)
+    apart = checkpoint._apart({"a": vector[:5], "b": vector[5:], "c": ring[:4]})
+    assert apart["c"].data_ptr() == ring.data_ptr()
+    assert apart["a"].untyped_storage().data_ptr() != apart["b"].untyped_storage().data_ptr()
+    assert [len(t) for t in apart.values()] == [5, 5, 4]
