@@ -308,6 +308,7 @@ def lander(rounds, stamp):
             ):
                 time.sleep(0.1)
             mine, steps = time.monotonic() - started, lines(folder)[-1]["step"]
+            say(f"lemniscate, seed {seed}: {mine:.0f} s, {steps:,} steps")
             process.terminate()
             process.wait()
         started = time.monotonic()

@@ -1,9 +1,9 @@
 import torch
 
 from lemniscate.maths import Categorical, Gaussian
+from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.networks import Tanh, network
 from lemniscate.nn.normalizer import RewardScale, RunningNorm
-from lemniscate.nn.policies import ActorCritic
 from lemniscate.types import Box, Discrete, Part, Rollout, Spec
 
 BOX = Spec("x", (Part((), (5,)),), Box((-1.0, -1.0), (1.0, 1.0)))

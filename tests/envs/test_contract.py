@@ -11,7 +11,7 @@ from lemniscate.envs import api, toy
 from lemniscate.envs.api import VecEnv
 from lemniscate.envs.gymnasium import GymnasiumBackend
 from lemniscate.errors import NonFiniteError, UserError
-from lemniscate.nn.policies import ActorCritic
+from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.types import Box
 
 CPU = torch.device("cpu")

@@ -11,7 +11,7 @@ from conftest import tiny_memory
 from lemniscate.envs import toy
 from lemniscate.envs.api import VecEnv
 from lemniscate.envs.gymnasium import GymnasiumBackend
-from lemniscate.nn.policies import ActorQ
+from lemniscate.nn.actor_critic import ActorQ
 from lemniscate.report.pictures import sentence
 from lemniscate.run.critique import Honesty
 from lemniscate.run.evaluate import evaluate

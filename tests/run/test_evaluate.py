@@ -6,7 +6,7 @@ from lemniscate.envs import toy
 from lemniscate.envs.api import VecEnv
 from lemniscate.envs.gymnasium import GymnasiumBackend
 from lemniscate.errors import UserError
-from lemniscate.nn.policies import ActorCritic
+from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.run.evaluate import evaluate
 
 CPU = torch.device("cpu")

@@ -4,7 +4,6 @@ Collect a rollout, estimate advantages, take a few epochs of clipped minibatch s
 Departures from the paper, and why: docs/notes/ppo.md.
 """
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -26,10 +25,11 @@ from lemniscate.maths import (
     standardize,
     value_loss,
 )
+from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.descent import Descent
 from lemniscate.nn.networks import Activation
 from lemniscate.nn.normalizer import RewardScale
-from lemniscate.nn.policies import ActorCritic, Policy
+from lemniscate.nn.policies import Policy
 from lemniscate.run.config import Count, Fraction, NonNegative, Positive, Range, RunConfig
 from lemniscate.run.run import Run
 from lemniscate.run.seeding import generator
@@ -96,7 +96,7 @@ class Config(RunConfig):
     def gradient_steps(self) -> int:
         """Of the whole run."""
         rows = self.num_envs * self.num_steps
-        return math.ceil(self.total_steps / rows) * self.epochs * math.ceil(rows / self.minibatch_size)
+        return -(-self.total_steps // rows) * self.epochs * -(-rows // self.minibatch_size)
 
 
 @dataclass
@@ -127,7 +127,7 @@ def networks(config: Config, spec: Spec) -> ActorCritic:
 def init(config: Config, spec: Spec, device: torch.device) -> State:
     """Fresh networks, a fresh optimizer, generators from the run's seed."""
     fresh = networks(config, spec).to(device)
-    betas, limit = (0.9, config.adam_beta2), config.max_grad_norm or math.inf
+    betas, limit = (0.9, config.adam_beta2), config.max_grad_norm
     return State(
         fresh,
         Descent(fresh, partial(loss, config), betas=betas, eps=config.adam_eps, max_grad_norm=limit),

@@ -15,9 +15,11 @@ from lemniscate.data.exploration import Exploration, Noise
 from lemniscate.data.replay import Replay
 from lemniscate.envs.api import VecEnv
 from lemniscate.maths import means, polyak, td_target, uniform, value_loss
+from lemniscate.nn.actor_critic import ActorQ, bounded_box
+from lemniscate.nn.critics import TwinQ
 from lemniscate.nn.descent import Descent
 from lemniscate.nn.networks import Activation, Architecture
-from lemniscate.nn.policies import ActorQ, Policy, TwinQ, bounded_box
+from lemniscate.nn.policies import Policy
 from lemniscate.run.config import Count, Fraction, NonNegative, Positive, ReplayConfig
 from lemniscate.run.run import Run
 from lemniscate.run.seeding import generator

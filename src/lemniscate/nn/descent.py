@@ -70,11 +70,11 @@ class Descent(Generic[Networks]):
         *,
         betas: tuple[float, float] = (0.9, 0.999),
         eps: float = 1e-8,
-        max_grad_norm: float = math.inf,
+        max_grad_norm: float | None = None,
         watch_as: str = "gradient_norm",
     ) -> None:
         self._objective = _Objective(networks, loss)
-        self._betas, self._eps, self._max_grad_norm = betas, eps, max_grad_norm
+        self._betas, self._eps, self._max_grad_norm = betas, eps, max_grad_norm or math.inf
         self._watch_as = watch_as
         named = list(self._objective.named_parameters())
         self._names = [name for name, _ in named]

@@ -4,7 +4,8 @@ import sys
 from pathlib import Path
 
 from lemniscate.envs.api import VecEnv
-from lemniscate.nn.policies import ActorQ, Policy
+from lemniscate.nn.actor_critic import ActorQ
+from lemniscate.nn.policies import Policy
 from lemniscate.report import curves, flight
 from lemniscate.report.playback import film_flight
 from lemniscate.run.evaluate import Evaluation, evaluate

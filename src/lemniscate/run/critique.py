@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import torch
 from torch import Generator, Tensor, nn
 
-from lemniscate.nn.policies import ActorQ
+from lemniscate.nn.actor_critic import ActorQ
 from lemniscate.run.config import ReplayConfig, RunConfig
 from lemniscate.types import Step
 

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from lemniscate.envs.api import VecEnv
 from lemniscate.errors import UserError
-from lemniscate.nn.policies import ActorQ, Policy
+from lemniscate.nn.actor_critic import ActorQ
+from lemniscate.nn.policies import Policy
 from lemniscate.run.critique import Critique, Honesty
 from lemniscate.run.seeding import derive, generator
 from lemniscate.types import Step

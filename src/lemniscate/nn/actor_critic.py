@@ -1,0 +1,171 @@
+"""A policy and its critics for the spaces of an environment: separate networks behind one normalizer."""
+
+import copy
+import math
+from collections.abc import Sequence
+from typing import Any, Self
+
+import torch
+from torch import Generator, Tensor, nn
+
+from lemniscate.errors import UserError
+from lemniscate.nn.critics import QValue, TwinQ, Value
+from lemniscate.nn.networks import Activation, Architecture, ImageEncoder, network
+from lemniscate.nn.normalizer import Observed, Pixels, RunningNorm
+from lemniscate.nn.policies import (
+    BernoulliPolicy,
+    CategoricalPolicy,
+    DeterministicPolicy,
+    GaussianPolicy,
+    MultiCategoricalPolicy,
+    Policy,
+    SquashedGaussianPolicy,
+)
+from lemniscate.types import Action, Box, Discrete, MultiDiscrete, Spec
+
+
+class ActorCritic(nn.Module):
+    """A policy and a value for the spaces in `spec`: two separate networks behind one normalizer."""
+
+    def __init__(
+        self,
+        spec: Spec,
+        hidden: Sequence[int] = (64, 64),
+        activation: Activation = "tanh",
+        initial_log_std: float = 0.0,
+        normalize_observations: bool = False,
+    ) -> None:
+        super().__init__()
+        self.policy = _policy(_normalizer(spec, normalize_observations), spec, hidden, activation, initial_log_std)
+        self.value = Value(self.policy.normalizer, _from_obs(spec, hidden, activation, 1, last_gain=1.0))
+
+
+class Temperature(nn.Module):
+    """SAC's α, the price of entropy; log α is what is learned."""
+
+    def __init__(self, initial: float) -> None:
+        super().__init__()
+        self.log = nn.Parameter(torch.tensor(math.log(initial)))
+
+    def forward(self) -> Tensor:
+        """α, a scalar."""
+        return self.log.exp()
+
+
+def bounded_box(spec: Spec) -> Box:
+    """The actions of `spec`. Raises `UserError` unless they are numbers between finite bounds."""
+    action = spec.action
+    if not isinstance(action, Box):
+        kind = type(action).__name__
+        raise UserError(f"{spec.env_id} has {kind} actions; ddpg, td3 and sac need continuous ones. ppo learns here.")
+    if not all(map(math.isfinite, (*action.low, *action.high))):
+        raise UserError(
+            f"{spec.env_id} has actions without bounds; ddpg, td3 and sac explore between bounds, such as those that"
+            " gymnasium.wrappers.RescaleAction or ClipAction's Box sets. ppo learns here."
+        )
+    return action
+
+
+class ActorQ(nn.Module):
+    """A policy over continuous actions and its Q-value, or two of them: separate networks behind one normalizer.
+
+    With a `temperature` the policy is random, and α, its price of entropy, is learned from there on.
+    """
+
+    def __init__(
+        self,
+        spec: Spec,
+        hidden: Sequence[int],
+        critic_hidden: Sequence[int],
+        activation: Activation,
+        architecture: Architecture,
+        normalize_observations: bool,
+        *,
+        twin: bool,
+        temperature: float | None = None,
+    ) -> None:
+        super().__init__()
+        stochastic = temperature is not None
+        size = bounded_box(spec).size
+        normalizer = _normalizer(spec, normalize_observations)
+        net = _from_obs(spec, hidden, activation, 2 * size if stochastic else size, 0.01, architecture)
+        kind = SquashedGaussianPolicy if stochastic else DeterministicPolicy
+        self.policy: Policy = kind(normalizer, net, size)
+
+        def value() -> QValue:
+            encoder, seen = _encoder(spec)
+            net = network(architecture, (seen + size, *critic_hidden, 1), activation, last_gain=1.0)
+            return QValue(normalizer, encoder, net)
+
+        self.critic: Any = TwinQ(value(), value()) if twin else value()
+        self.temperature = Temperature(temperature) if temperature is not None else None
+
+    @property
+    def actor(self) -> nn.ModuleList:
+        """What learns to act: the policy, and α where there is one."""
+        return nn.ModuleList(part for part in (self.policy, self.temperature) if part is not None)
+
+    def q(self, obs: Tensor, action: Tensor) -> Tensor:
+        """What is believed of [B, O] and [B, A], [B]: the lower of two."""
+        value = self.critic(obs, action)
+        return value.amin(0) if isinstance(self.critic, TwinQ) else value
+
+    def entropy_bonus(self, obs: Tensor, generator: Generator) -> Tensor:
+        """−α log π of an action drawn at each observation [B, O], [B]; 0 where the policy is not paid for entropy."""
+        if self.temperature is None:
+            return torch.zeros(len(obs), device=obs.device)
+        _, log_prob = self.policy(obs).sample_with_log_prob(self.policy.noise((len(obs),), generator))
+        return -self.temperature() * log_prob
+
+    def target(self) -> Self:
+        """A copy that only follows, behind the same normalizer."""
+        normalizer = self.policy.normalizer
+        return copy.deepcopy(self, {id(normalizer): normalizer}).requires_grad_(False)
+
+
+def _normalizer(spec: Spec, normalize_observations: bool) -> Observed:
+    kind = Pixels if spec.image else RunningNorm if normalize_observations else Observed
+    return kind(spec.observation_size)
+
+
+def _policy(
+    normalizer: Observed, spec: Spec, hidden: Sequence[int], activation: Activation, initial_log_std: float
+) -> Policy:
+    action = spec.action
+    net = _from_obs(spec, hidden, activation, _outputs(action), last_gain=0.01)
+    if isinstance(action, Box):
+        return GaussianPolicy(normalizer, net, action, initial_log_std)
+    if isinstance(action, Discrete):
+        return CategoricalPolicy(normalizer, net, action)
+    if isinstance(action, MultiDiscrete):
+        return MultiCategoricalPolicy(normalizer, net, action)
+    return BernoulliPolicy(normalizer, net, action.n)
+
+
+def _outputs(action: Action) -> int:
+    """How many numbers a network has to give for the distribution over actions."""
+    if isinstance(action, Box):
+        return action.size
+    return sum(action.nvec) if isinstance(action, MultiDiscrete) else action.n
+
+
+def _encoder(spec: Spec) -> tuple[nn.Module, int]:
+    """What an observation goes through first, and how many numbers come out."""
+    if not spec.image:
+        return nn.Identity(), spec.observation_size
+    height, width, channels = spec.layout[0].shape
+    encoder = ImageEncoder((height, width, channels))
+    return encoder, encoder.size
+
+
+def _from_obs(
+    spec: Spec,
+    hidden: Sequence[int],
+    activation: Activation,
+    outputs: int,
+    last_gain: float,
+    kind: Architecture = "mlp",
+) -> nn.Sequential:
+    encoder, size = _encoder(spec)
+    layers = network(kind, (size, *hidden, outputs), activation, last_gain)
+    return nn.Sequential(encoder, layers) if spec.image else layers
