@@ -26,6 +26,7 @@ from pathlib import Path
 from statistics import harmonic_mean, median
 
 from common import RESULTS, append, provenance, rows
+from peers import BARE, PEER, PEER_LANDER, PEER_REPLAY
 
 COPIES = {"HalfCheetah-v5": 16, "Ant-v5": 64, "Humanoid-v5": 64, "Hopper-v5": 64}
 ENVS = tuple(COPIES)
@@ -33,71 +34,7 @@ SHARED = {"num_envs": 16, "num_steps": 128, "minibatch_size": 64, "epochs": 10, 
 OURS, PHYSICS = "lemniscate", "EnvPool alone"
 PEERS = [(peer, threads, kind) for peer in ("sb3", "sbx") for threads in (1, 2) for kind in ("dummy", "subproc")]
 
-PEER = """
-import sys, time, torch
-peer, env, threads, kind, steps = sys.argv[1], sys.argv[2], int(sys.argv[3]), sys.argv[4], int(sys.argv[5])
-torch.set_num_threads(threads)
-from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
-if peer == "sb3":
-    from stable_baselines3 import PPO
-else:
-    from sbx import PPO
-if __name__ == "__main__":
-    vector = make_vec_env(env, n_envs=16, vec_env_cls=SubprocVecEnv if kind == "subproc" else DummyVecEnv)
-    model = PPO("MlpPolicy", vector, n_steps=128, batch_size=64, n_epochs=10, learning_rate=3e-4)
-    model.learn(4096)
-    started = time.perf_counter()
-    model.learn(steps, reset_num_timesteps=False)
-    print((model.num_timesteps - 4096) / (time.perf_counter() - started))
-"""
-
-BARE = """
-import sys, time, warnings, numpy, envpool
-warnings.simplefilter("ignore")
-env = envpool.make(sys.argv[1], env_type="gymnasium", num_envs=int(sys.argv[3]), num_threads=2, seed=1)
-space = env.action_space
-copies = int(sys.argv[3])
-actions = numpy.random.default_rng(0).uniform(space.low, space.high, (64, copies, *space.shape))
-env.reset()
-for t in range(3200 // copies): env.step(actions[t % 64])
-started = time.perf_counter()
-for t in range(int(sys.argv[2]) // copies): env.step(actions[t % 64])
-print(int(sys.argv[2]) / (time.perf_counter() - started))
-"""
-
-PEER_REPLAY = """
-import sys, time, numpy, torch
-peer, threads, steps = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
-torch.set_num_threads(threads)
-from stable_baselines3.common.noise import NormalActionNoise
-if peer == "sb3":
-    from stable_baselines3 import DDPG
-else:
-    from sbx import DDPG
-noise = NormalActionNoise(numpy.zeros(3), 0.1 * numpy.ones(3))
-fields = dict(batch_size=256, learning_rate=3e-4, learning_starts=500, action_noise=noise, buffer_size=100_000)
-model = DDPG("MlpPolicy", "Hopper-v5", policy_kwargs={"net_arch": [256, 256]}, **fields)
-model.learn(1500)
-started = time.perf_counter()
-model.learn(steps, reset_num_timesteps=False)
-print(steps / (time.perf_counter() - started))
-"""
 REPLAY = {"batch_size": 256, "learning_starts": 500, "buffer_size": 100_000, "num_steps": 500, "engine": "native"}
-
-PEER_LANDER = """
-import sys, time, torch
-torch.set_num_threads(1)
-from stable_baselines3 import PPO
-from stable_baselines3.common.callbacks import EvalCallback, StopTrainingOnRewardThreshold
-from stable_baselines3.common.env_util import make_vec_env
-vector, judge = make_vec_env("LunarLander-v3", n_envs=16), make_vec_env("LunarLander-v3", n_envs=16)
-fields = dict(n_steps=1024, batch_size=64, gae_lambda=0.98, gamma=0.999, n_epochs=4, ent_coef=0.01)
-model = PPO("MlpPolicy", vector, seed=int(sys.argv[1]), **fields)
-stop = StopTrainingOnRewardThreshold(250)
-model.learn(1_000_000, EvalCallback(judge, stop, n_eval_episodes=100, eval_freq=3125, verbose=0, warn=False))
-print(model.num_timesteps)
-"""
 
 
 def say(*words):

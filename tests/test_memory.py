@@ -1,5 +1,9 @@
 """DDPG, TD3 and SAC on environments whose answers are known."""
 
+import subprocess
+import sys
+from pathlib import Path
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -7,12 +11,14 @@ import torch
 
 import lemniscate as lem
 import worlds  # noqa: F401  (registers Copy-box-v0)
+from conftest import tiny_memory
 from lemniscate.algos import ddpg, sac, td3
 from lemniscate.envs import toy
 from lemniscate.envs.api import VecEnv
 from lemniscate.envs.gymnasium import GymnasiumBackend
 from lemniscate.errors import UserError
-from lemniscate.types import Transition
+from lemniscate.run import checkpoint
+from lemniscate.types import Box, Part, Spec, Transition
 
 CPU = torch.device("cpu")
 MODES = ["NEXT_STEP", "SAME_STEP", "DISABLED"]
@@ -275,6 +281,66 @@ def test_the_actors_gradient_is_that_of_q_through_the_action(monkeypatch):
 
 
 @EACH
+def test_an_end_cuts_the_noise_of_its_copy(monkeypatch, algo):
+    config, told = small(algo, noise="ou"), []
+    state, env = ready(monkeypatch, algo, config, length=3)
+    monkeypatch.setattr(state.exploration, "cut", told.append)
+    ended = [bool(env.step(torch.zeros(4, 1)).terminated.all()) for _ in range(3)]
+    assert sum(ended) == 1
+    for _ in range(3):
+        algo.play(config, state, env)
+    assert [row.all().item() for row in told] == ended
+    assert [row.any().item() for row in told] == ended
+
+
+@EACH
+@pytest.mark.parametrize(
+    "rhythm", [{}, {"num_envs": 4}, {"update_every": 4}, {"num_envs": 4, "num_updates": 3, "update_every": 2}]
+)
+def test_as_many_gradient_steps_are_taken_as_announced(tmp_path, algo, rhythm):
+    fields = tiny_memory(**{"num_envs": 1, "evaluate_episodes": 1, **rhythm})
+    name = algo.__name__.rpartition(".")[2]
+    config = lem.config_for(name, "Pendulum-v1", **fields)
+    run = lem.train(name, "Pendulum-v1", run=tmp_path / "r", progress=False, **fields)
+    taken = checkpoint.read(run.path / "checkpoints" / "step-256").numbers["updates"]
+    assert taken == config.gradient_steps
+
+
+def engines_agree(algo):
+    """Two updates of three steps each, native and eager, from the same memory and the same random numbers."""
+    config, states = small(algo, critic_hidden=(8,), num_updates=3, policy_delay=2, tau=0.3), []
+    spec = Spec("x", (Part((), (3,)),), Box((-1.0,), (1.0,)))
+    for native in (False, True):
+        torch.manual_seed(0)
+        state = algo.init(config, spec, CPU)
+        state.replay.extend(
+            Transition(*(torch.randn(50, n) for n in (3, 1)), torch.randn(50), torch.randn(50, 3), torch.rand(50) < 0.3)
+        )
+        if native:
+            state.actor_descent.make_native()
+            state.critic_descent.make_native()
+        states.append(state)
+    for _ in range(2):
+        a, b = (algo.update(config, state) for state in states)
+        assert a.keys() == b.keys()
+        for key in a:
+            torch.testing.assert_close(a[key], b[key], rtol=1e-3, atol=1e-4)
+    for name in ("networks", "targets"):
+        for p, q in zip(*(getattr(state, name).parameters() for state in states), strict=True):
+            torch.testing.assert_close(p, q, rtol=1e-3, atol=1e-4)
+    for descent in (states[1].actor_descent, states[1].critic_descent):
+        assert descent._engine._chosen is descent._engine._compiled
+
+
+@pytest.mark.parametrize("algo", ["ddpg", "td3", "sac"])
+def test_the_two_engines_agree(algo):
+    """In a process of its own: the shape checks of this one are not for the compiler."""
+    code = f"from test_memory import *; engines_agree({algo})"
+    done = subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parent, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+@EACH
 def test_actions_are_random_while_it_warms_up_and_the_policys_afterwards(monkeypatch, algo):
     config = small(algo, learning_starts=160, **({} if algo is sac else {"noise_std": 0.05}))
     state, env = ready(monkeypatch, algo, config)
@@ -300,6 +366,8 @@ def test_actions_are_random_while_it_warms_up_and_the_policys_afterwards(monkeyp
         ({"env": "CartPole-v1"}, "has Discrete actions; ddpg, td3 and sac need continuous ones"),
         ({"env": "Unbounded-v0"}, "has actions without bounds"),
         ({"learning_starts": 10_000, "total_steps": 10_000}, "learning_starts must be below total_steps"),
+        ({"architecture": "simba", "hidden": (64, 32)}, "SimBa's blocks have one width"),
+        ({"architecture": "simba", "critic_hidden": ()}, "SimBa's blocks have one width"),
         ({"buffer_size": 200}, "buffer_size 200 .* below batch_size 256"),
         ({"buffer_size": 10**12, "total_steps": 10**12}, "choose buffer_size at most"),
     ],

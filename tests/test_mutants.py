@@ -185,6 +185,22 @@ MUTANTS = [
     ("entropy costs", "algos/sac.py", "amin(0) - temperature()", "amin(0) + temperature()", "test_memory.py"),
     ("the temperature runs away", "algos/sac.py", "temperature_loss = -(", "temperature_loss = (", "test_memory.py"),
     ("the policy hates entropy", "algos/sac.py", "(alpha.detach() *", "(-alpha.detach() *", "test_memory.py"),
+    (
+        "noise is not told of ends",
+        "algos/sac.py",
+        "state.exploration.cut(step.terminated | step.truncated)",
+        "",
+        "test_memory.py",
+    ),
+    ("an update at every step", "algos/td3.py", " and t % config.update_every == 0", "", "test_memory.py"),
+    ("Q is the higher one", "nn/actor_critic.py", "value.amin(0)", "value.amax(0)", "run/test_critique.py"),
+    (
+        "a time-out is worth nothing",
+        "run/critique.py",
+        "realised + self._gamma**age * follows",
+        "realised",
+        "run/test_critique.py",
+    ),
     ("the delay is forgotten", "algos/td3.py", "state.updates % config.policy_delay == 0", "True", "test_memory.py"),
     (
         "the ring tears rows apart",

@@ -87,3 +87,22 @@ def test_rewards_are_divided_by_the_std_of_the_discounted_return(rng):
     assert scale.running.any()
     scale.restart()
     assert not scale.running.any()
+
+
+def test_layer_norm_stands_between_a_layer_and_its_activation():
+    kinds = [type(layer).__name__ for layer in network("layer_norm", (6, 4, 5, 2), "relu", last_gain=1.0)]
+    assert kinds == ["Linear", "LayerNorm", "ReLU", "Linear", "LayerNorm", "ReLU", "Linear"]
+
+
+def test_simba_is_residual_blocks_between_two_layers_and_a_norm(rng):
+    first, one, two, norm, last = network("simba", (6, 4, 4, 2), "relu", last_gain=0.01)
+    x = torch.randn(7, 6, generator=rng)
+    hidden = first(x)
+    for block in (one, two):
+        before, inner, _, outer = block.layers
+        assert (inner.weight.shape, outer.weight.shape) == ((16, 4), (4, 16))
+        hidden = hidden + torch.relu(before(hidden) @ inner.weight.T + inner.bias) @ outer.weight.T + outer.bias
+    network_of_all = network("simba", (6, 4, 4, 2), "relu", last_gain=0.01)
+    network_of_all.load_state_dict(torch.nn.Sequential(first, one, two, norm, last).state_dict())
+    torch.testing.assert_close(network_of_all(x), last(norm(hidden)))
+    assert isinstance(norm, torch.nn.LayerNorm)

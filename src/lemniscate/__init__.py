@@ -2,7 +2,6 @@
 
 from lemniscate.errors import NonFiniteError, UserError
 from lemniscate.front import (
-    TrainedPolicy,
     TrainedRun,
     config_for,
     evaluate,
@@ -16,6 +15,7 @@ from lemniscate.front import (
 from lemniscate.run.evaluate import Evaluation
 from lemniscate.run.run import Stopped
 from lemniscate.run.seeding import set_seeds
+from lemniscate.trained import TrainedPolicy
 
 __all__ = [
     "Evaluation",

@@ -15,6 +15,7 @@ from lemniscate.nn.actor_critic import ActorQ
 from lemniscate.report.pictures import sentence
 from lemniscate.run.critique import Honesty
 from lemniscate.run.evaluate import evaluate
+from lemniscate.types import Box, Part, Spec
 from test_memory import Levers
 
 CPU = torch.device("cpu")
@@ -87,6 +88,15 @@ def test_the_sentence(predicted, said):
 def test_nothing_followed():
     assert math.isinf(Honesty([1.0], [0.0]).bias)
     assert "over-estimates by 1" in str(Honesty([1.0], [0.0]))
+    assert Honesty([1.0], [0.0]).to_json() == {"predicted": [1.0], "realised": [0.0]}  # JSON has no infinity
+
+
+def test_of_two_critics_the_lower_is_asked(rng):
+    nets = networks(Spec("x", (Part((), (3,)),), Box((-1.0,), (1.0,))))
+    obs, action = torch.randn(50, 3, generator=rng), torch.randn(50, 1, generator=rng)
+    one, two = nets.critic(obs, action)
+    assert 0 < (one < two).sum() < 50
+    assert torch.equal(nets.q(obs, action), torch.min(one, two))
 
 
 def test_it_is_said_written_and_drawn(tmp_path, capsys):
@@ -94,7 +104,7 @@ def test_it_is_said_written_and_drawn(tmp_path, capsys):
     scores = lem.evaluate(run.policy, episodes=3)
     assert len(scores.honesty.predicted) == 3
     assert sentence(scores).count("\n") == 1
-    assert json.loads(json.dumps(scores.to_json()))["q_bias"] == scores.honesty.bias
+    assert json.loads(json.dumps(scores.to_json()))["honesty"]["bias"] == scores.honesty.bias
     lines = [json.loads(line) for line in (tmp_path / "r" / "metrics.jsonl").read_text().splitlines()]
     assert sum("evaluation/q_bias" in line for line in lines) == 2
     assert tmp_path / "r" / "plots" / "q.png" in lem.plot(tmp_path / "r")

@@ -11,15 +11,14 @@ from functools import partial
 import torch
 from torch import Generator, Tensor, nn
 
-from lemniscate.data.exploration import Exploration, Noise
+from lemniscate.data.exploration import Exploration
 from lemniscate.data.replay import Replay
 from lemniscate.envs.api import VecEnv
 from lemniscate.maths import means, polyak, td_target, uniform, value_loss
 from lemniscate.nn.actor_critic import ActorQ, bounded_box
 from lemniscate.nn.descent import Descent
-from lemniscate.nn.networks import Activation, Architecture
 from lemniscate.nn.policies import Policy
-from lemniscate.run.config import Count, Fraction, NonNegative, Positive, ReplayConfig
+from lemniscate.run.config import Count, NonNegative, ReplayConfig
 from lemniscate.run.run import Run
 from lemniscate.run.seeding import generator
 from lemniscate.types import Spec, Transition
@@ -27,34 +26,12 @@ from lemniscate.types import Spec, Transition
 
 @dataclass(frozen=True, kw_only=True)
 class Config(ReplayConfig):
-    """Every knob of DDPG. The defaults are those in use today, rather than the paper's."""
+    """What DDPG adds to the knobs of all that learn from memory."""
 
-    actor_learning_rate: Positive = 3e-4
-    """Adam's step size for the policy"""
-    critic_learning_rate: Positive = 3e-4
-    """Adam's step size for Q"""
-    tau: Fraction = 0.005
-    """how far the target networks move at each of their updates"""
     policy_delay: Count = 1
     """gradient steps of Q for each of the policy and of the targets"""
-    noise: Noise = "white"
-    """what is added to actions in training: white; Ornstein–Uhlenbeck; coloured"""
     noise_std: NonNegative = 0.1
-    """its standard deviation, in units of half the action range"""
-    noise_time: Positive = 6.7
-    """steps in which Ornstein–Uhlenbeck noise forgets itself; the paper's θ = 0.15 is 1 / 0.15"""
-    noise_exponent: NonNegative = 1.0
-    """β of coloured noise, whose power falls as f^(−β); 1 is pink"""
-    hidden: tuple[Count, ...] = (256, 256)
-    """widths of the policy's hidden layers"""
-    critic_hidden: tuple[Count, ...] = (256, 256)
-    """widths of Q's"""
-    activation: Activation = "relu"
-    """between the layers"""
-    architecture: Architecture = "mlp"
-    """plain layers; with layer normalization; or SimBa's residual blocks"""
-    normalize_observations: bool = False
-    """a running normalizer inside the policy"""
+    """standard deviation of the noise on actions, in units of half the action range"""
 
 
 @dataclass

@@ -7,20 +7,20 @@ Departures from the paper, and why: docs/notes/ddpg.md.
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
+from typing import Annotated
 
 import torch
 from torch import Generator, Tensor, nn
 
-from lemniscate.data.exploration import Exploration, Noise
+from lemniscate.data.exploration import Exploration
 from lemniscate.data.replay import Replay
 from lemniscate.envs.api import VecEnv
 from lemniscate.maths import means, polyak, td_target, uniform, value_loss
 from lemniscate.nn.actor_critic import ActorQ, bounded_box
 from lemniscate.nn.critics import TwinQ
 from lemniscate.nn.descent import Descent
-from lemniscate.nn.networks import Activation, Architecture
 from lemniscate.nn.policies import Policy
-from lemniscate.run.config import Count, Fraction, NonNegative, Positive, ReplayConfig
+from lemniscate.run.config import Count, Positive, Range, ReplayConfig
 from lemniscate.run.run import Run
 from lemniscate.run.seeding import generator
 from lemniscate.types import Spec, Transition
@@ -28,36 +28,14 @@ from lemniscate.types import Spec, Transition
 
 @dataclass(frozen=True, kw_only=True)
 class Config(ReplayConfig):
-    """Every knob of SAC. The defaults are the paper's (table 1), but for the warm-up."""
+    """What SAC adds to the knobs of all that learn from memory."""
 
-    actor_learning_rate: Positive = 3e-4
-    """Adam's step size for the policy and the temperature"""
-    critic_learning_rate: Positive = 3e-4
-    """Adam's step size for Q"""
-    tau: Fraction = 0.005
-    """how far the target networks move at each of their updates"""
     policy_delay: Count = 1
-    """gradient steps of Q for each of the policy, the temperature and the targets, d"""
+    """gradient steps of Q for each of the policy, the temperature and the targets"""
     initial_temperature: Positive = 1.0
-    """α at the start"""
-    target_entropy: float | None = None
+    """α at the start; it learns with the policy's step size"""
+    target_entropy: Annotated[float, Range()] | None = None
     """H̄ in nats, which the temperature steers to, over actions in [-1, 1]^A; none is −A"""
-    noise: Noise = "white"
-    """what actions are drawn with in training: white; Ornstein–Uhlenbeck; coloured"""
-    noise_time: Positive = 6.7
-    """steps in which Ornstein–Uhlenbeck noise forgets itself"""
-    noise_exponent: NonNegative = 1.0
-    """β of coloured noise, whose power falls as f^(−β); 1 is pink"""
-    hidden: tuple[Count, ...] = (256, 256)
-    """widths of the policy's hidden layers"""
-    critic_hidden: tuple[Count, ...] = (256, 256)
-    """widths of Q's"""
-    activation: Activation = "relu"
-    """between the layers"""
-    architecture: Architecture = "mlp"
-    """plain layers; with layer normalization; or SimBa's residual blocks"""
-    normalize_observations: bool = False
-    """a running normalizer inside the policy"""
 
 
 @dataclass

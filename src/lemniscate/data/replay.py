@@ -7,6 +7,7 @@ import torch
 from torch import Generator, Tensor
 
 from lemniscate.errors import UserError
+from lemniscate.nn.actor_critic import bounded_box
 from lemniscate.types import Spec, Step, Transition
 
 
@@ -17,7 +18,7 @@ class Replay:
     """
 
     def __init__(self, spec: Spec, capacity: int, device: torch.device) -> None:
-        observation, action = spec.observation_size, getattr(spec.action, "size", 1)
+        observation, action = spec.observation_size, bounded_box(spec).size
         pixel = torch.uint8 if spec.image else torch.float32
         shapes = {
             "obs": ((observation,), pixel),

@@ -3,7 +3,6 @@
 from lemniscate.maths.distributions import (
     Bernoulli,
     Categorical,
-    Density,
     Distribution,
     Gaussian,
     MultiCategorical,
@@ -28,7 +27,6 @@ from lemniscate.maths.stats import (
 __all__ = [
     "Bernoulli",
     "Categorical",
-    "Density",
     "Distribution",
     "Gaussian",
     "MultiCategorical",

@@ -23,18 +23,6 @@ class Distribution(Protocol):
         ...
 
 
-class Density(Distribution, Protocol):
-    """One whose probabilities can be asked for."""
-
-    def log_prob(self, action: Tensor) -> Tensor:
-        """Log π(a|s), [B]."""
-        ...
-
-    def entropy(self) -> Tensor:
-        """H[π(·|s)] in nats, [B] or broadcastable to it."""
-        ...
-
-
 @dataclass(frozen=True)
 class Gaussian:
     """Independent normals, N(mean, exp(log_std)²): mean [B, A], log_std [A]."""
@@ -176,12 +164,6 @@ class SquashedGaussian:
         u = self.mean + self.log_std.exp() * noise
         normal = -0.5 * (noise.square() + LOG_2PI) - self.log_std
         return torch.tanh(u), (normal - _log_slope(u)).sum(-1)
-
-    def log_prob(self, action: Tensor) -> Tensor:
-        """[B]; of an action strictly inside (-1, 1)."""
-        u = torch.atanh(action)
-        z = (u - self.mean) * (-self.log_std).exp()
-        return (-0.5 * (z.square() + LOG_2PI) - self.log_std - _log_slope(u)).sum(-1)
 
 
 def _log_slope(u: Tensor) -> Tensor:

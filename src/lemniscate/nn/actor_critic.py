@@ -60,8 +60,8 @@ def bounded_box(spec: Spec) -> Box:
         raise UserError(f"{spec.env_id} has {kind} actions; ddpg, td3 and sac need continuous ones. ppo learns here.")
     if not all(map(math.isfinite, (*action.low, *action.high))):
         raise UserError(
-            f"{spec.env_id} has actions without bounds; ddpg, td3 and sac explore between bounds, such as those that"
-            " gymnasium.wrappers.RescaleAction or ClipAction's Box sets. ppo learns here."
+            f"{spec.env_id} has actions without bounds, and ddpg, td3 and sac explore between bounds: give its Box a"
+            " finite low and high. ppo learns here."
         )
     return action
 

@@ -6,7 +6,9 @@ import math
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Self, get_args, get_origin, get_type_hints
 
+from lemniscate.data.exploration import Noise
 from lemniscate.errors import UserError, unknown
+from lemniscate.nn.networks import Activation, Architecture
 
 
 @dataclass(frozen=True)
@@ -126,7 +128,10 @@ class RunConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayConfig(RunConfig):
-    """What algorithms that learn from memory share: the memory, and the rhythm of acting and learning."""
+    """What algorithms that learn from memory share: the memory, the rhythm of acting and learning, noise, networks.
+
+    The defaults are those in use today, rather than any paper's.
+    """
 
     num_envs: Count = 1
     """copies of the environment, N"""
@@ -144,6 +149,28 @@ class ReplayConfig(RunConfig):
     """gradient steps at each update; so num_updates / (N · update_every) for each environment step"""
     num_steps: Count = 500
     """steps of each copy between two lines of metrics"""
+    actor_learning_rate: Positive = 3e-4
+    """Adam's step size for the policy"""
+    critic_learning_rate: Positive = 3e-4
+    """Adam's step size for Q"""
+    tau: Fraction = 0.005
+    """how far the target networks move at each of their updates"""
+    noise: Noise = "white"
+    """what actions are drawn with in training: white; Ornstein–Uhlenbeck; coloured"""
+    noise_time: Positive = 6.7
+    """steps in which Ornstein–Uhlenbeck noise forgets itself; DDPG's paper has θ = 0.15, which is 1 / 0.15"""
+    noise_exponent: NonNegative = 1.0
+    """β of coloured noise, whose power falls as f^(−β); 1 is pink"""
+    hidden: tuple[Count, ...] = (256, 256)
+    """widths of the policy's hidden layers"""
+    critic_hidden: tuple[Count, ...] = (256, 256)
+    """widths of Q's"""
+    activation: Activation = "relu"
+    """between the layers; SimBa's is relu in any case"""
+    architecture: Architecture = "mlp"
+    """plain layers; with layer normalization; or SimBa's residual blocks, all of one width"""
+    normalize_observations: bool = False
+    """a running normalizer inside the policy"""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -151,6 +178,10 @@ class ReplayConfig(RunConfig):
             raise UserError(
                 f"learning_starts must be below total_steps, or nothing is ever learned: {self.learning_starts:,} is"
                 f" not below {self.total_steps:,}."
+            )
+        if self.architecture == "simba" and any(len(set(widths)) != 1 for widths in (self.hidden, self.critic_hidden)):
+            raise UserError(
+                f"SimBa's blocks have one width, such as (256, 256): not {self.hidden} and {self.critic_hidden}."
             )
         if self.capacity < self.batch_size:
             raise UserError(

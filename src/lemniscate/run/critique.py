@@ -1,5 +1,6 @@
 """Is Q honest? What it says of the first action of an episode, beside the discounted return that followed."""
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -30,7 +31,11 @@ class Honesty:
     def bias(self) -> float:
         """How much more was predicted than came, as a share of what came; not finite if nothing did."""
         predicted, realised = self.means
-        return (predicted - realised) / abs(realised) if realised else float("inf")
+        return (predicted - realised) / abs(realised) if realised else math.inf
+
+    def to_json(self) -> dict[str, object]:
+        """With the bias, where it is a number."""
+        return {**vars(self), **({"bias": self.bias} if math.isfinite(self.bias) else {})}
 
     def __str__(self) -> str:
         predicted, realised = self.means
@@ -47,20 +52,20 @@ class Critique:
     Args:
         networks: whose Q is asked.
         gamma: γ of its training.
+        num_envs: copies that are followed.
         generator: samples the entropy of a random policy.
     """
 
-    def __init__(self, networks: ActorQ, gamma: float, generator: Generator) -> None:
+    def __init__(self, networks: ActorQ, gamma: float, num_envs: int, generator: Generator) -> None:
         self._networks, self._gamma, self._generator = networks, gamma, generator
-        self._running = torch.empty(0)
+        self._running = torch.zeros(3, num_envs, device=generator.device)
+        """[predicted, realised, steps] of the episode under way in each copy"""
         self._ended: list[Tensor] = []
 
     @torch.no_grad()
     def follow(self, obs: Tensor, action: Tensor, step: Step, counts: Tensor) -> None:
         """One step of every copy; only the copies in `counts` [N] count."""
         networks = self._networks
-        if not len(self._running):
-            self._running = torch.zeros(3, len(obs), device=obs.device)
         predicted, realised, age = self._running
         begins = age == 0
         if begins.any():

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
 
@@ -43,9 +43,9 @@ class Evaluation:
     def to_json(self) -> dict[str, object]:
         """Without what the environment does not have."""
         scores: dict[str, object] = {
-            name: value for name, value in asdict(self).items() if value is not None and name != "date"
+            name: value for name, value in vars(self).items() if value is not None and name != "date"
         }
-        return scores | ({"q_bias": self.honesty.bias} if self.honesty else {})
+        return scores | ({"honesty": self.honesty.to_json()} if self.honesty else {})
 
     def to_course(self) -> dict[str, object]:
         """The dictionary that a course on DDPG hands in with a policy; the time is ISO 8601."""
@@ -102,7 +102,7 @@ def evaluate(
     ended: list[Tensor] = []
     errors: list[Tensor] = []
     terminated = 0
-    critique = Critique(*critic, generator(seed, env.device, EVALUATION, 2)) if critic else None
+    critique = Critique(*critic, env.num_envs, generator(seed, env.device, EVALUATION, 2)) if critic else None
     for obs, action, step, counts in fly(policy, env, episodes, seed, deterministic):
         if critique:
             critique.follow(obs, action, step, counts)
