@@ -306,9 +306,11 @@ def test_as_many_gradient_steps_are_taken_as_announced(tmp_path, algo, rhythm):
     assert taken == config.gradient_steps
 
 
-def engines_agree(algo):
+def engines_agree(algo, matmul="float32"):
     """Two updates of three steps each, native and eager, from the same memory and the same random numbers."""
-    config, states = small(algo, critic_hidden=(8,), num_updates=3, policy_delay=2, tau=0.3), []
+    layers = {"hidden": (16, 16), "critic_hidden": (8, 8), "matmul": matmul}
+    close = {"rtol": 1e-3, "atol": 1e-4} if matmul == "float32" else {"rtol": 2**-6, "atol": 2**-6}
+    config, states = small(algo, num_updates=3, policy_delay=2, tau=0.3, critic_learning_rate=1e-3, **layers), []
     spec = Spec("x", (Part((), (3,)),), Box((-1.0,), (1.0,)))
     for native in (False, True):
         torch.manual_seed(0)
@@ -324,15 +326,15 @@ def engines_agree(algo):
         a, b = (algo.update(config, state) for state in states)
         assert a.keys() == b.keys()
         for key in a:
-            torch.testing.assert_close(a[key], b[key], rtol=1e-3, atol=1e-4)
+            torch.testing.assert_close(a[key], b[key], **close)
     for name in ("networks", "targets"):
         for p, q in zip(*(getattr(state, name).parameters() for state in states), strict=True):
-            torch.testing.assert_close(p, q, rtol=1e-3, atol=1e-4)
+            torch.testing.assert_close(p, q, **close)
     for descent in (states[1].actor_descent, states[1].critic_descent):
         assert descent._engine._chosen is descent._engine._compiled
 
 
-@pytest.mark.parametrize("algo", ["ddpg", "td3", "sac"])
+@pytest.mark.parametrize("algo", ["ddpg", "td3", "sac", "ddpg, 'bfloat16'"])
 def test_the_two_engines_agree(algo):
     """In a process of its own: the shape checks of this one are not for the compiler."""
     code = f"from test_memory import *; engines_agree({algo})"

@@ -2,7 +2,7 @@ import torch
 
 from lemniscate.maths import Categorical, Gaussian
 from lemniscate.nn.actor_critic import ActorCritic
-from lemniscate.nn.networks import Tanh, network
+from lemniscate.nn.networks import Bfloat16Linear, Layers, Tanh
 from lemniscate.nn.normalizer import RewardScale, RunningNorm
 from lemniscate.types import Box, Discrete, Part, Rollout, Spec
 
@@ -11,7 +11,7 @@ DISCRETE = Spec("x", (Part((), (5,)),), Discrete(3))
 
 
 def test_orthogonal_layers_with_their_gains():
-    first, _, last = network("mlp", (6, 4, 2), "tanh", last_gain=0.01)
+    first, _, last = Layers((4,)).network(6, 2, last_gain=0.01)
     torch.testing.assert_close(first.weight @ first.weight.T, 2 * torch.eye(4))
     torch.testing.assert_close(last.weight @ last.weight.T, 1e-4 * torch.eye(2))
     assert not first.bias.any()
@@ -26,7 +26,7 @@ def test_the_fast_tanh_is_tanh():
 
 
 def test_a_policy_starts_near_the_centre_and_a_value_has_one_number():
-    networks = ActorCritic(BOX, initial_log_std=-0.5)
+    networks = ActorCritic(BOX, Layers(), initial_log_std=-0.5)
     policy, value = networks.policy, networks.value
     obs = torch.randn(20, 5)
     distribution = policy(obs)
@@ -35,7 +35,7 @@ def test_a_policy_starts_near_the_centre_and_a_value_has_one_number():
     torch.testing.assert_close(distribution.log_std, torch.full((2,), -0.5))
     assert value(obs).shape == (20,)
     assert value(obs.view(4, 5, 5)).shape == (4, 5)
-    assert isinstance(ActorCritic(DISCRETE).policy(obs), Categorical)
+    assert isinstance(ActorCritic(DISCRETE, Layers()).policy(obs), Categorical)
 
 
 def test_the_normalizer_standardizes_what_it_has_seen_and_clips():
@@ -60,7 +60,7 @@ def test_looking_through_the_normalizer_never_moves_it():
 
 
 def test_policy_and_value_see_through_one_normalizer():
-    networks = ActorCritic(BOX, normalize_observations=True)
+    networks = ActorCritic(BOX, Layers(), normalize_observations=True)
     assert networks.policy.normalizer is networks.value.normalizer
 
 
@@ -89,20 +89,45 @@ def test_rewards_are_divided_by_the_std_of_the_discounted_return(rng):
     assert not scale.running.any()
 
 
+def test_a_bfloat16_layer_rounds_both_factors_there_and_back_and_nothing_else(rng):
+    layer, x = Bfloat16Linear(40, 30), torch.randn(20, 40, generator=rng, requires_grad=True)
+    out, back = layer(x), torch.randn(20, 30, generator=rng)
+    out.backward(back)
+    short = {name: tensor.detach().bfloat16().double() for name, tensor in (("x", x), ("w", layer.weight), ("g", back))}
+    exact = {
+        "out": short["x"] @ short["w"].T + layer.bias.detach().double(),
+        "x": short["g"] @ short["w"],
+        "w": short["g"].T @ short["x"],
+        "b": back.double().sum(0),
+    }
+    for ours, name in ((out, "out"), (x.grad, "x"), (layer.weight.grad, "w"), (layer.bias.grad, "b")):
+        assert ours.dtype == torch.float32
+        torch.testing.assert_close(ours.double(), exact[name], rtol=2**-8, atol=2**-8)
+    assert not torch.equal(out, torch.nn.functional.linear(x, layer.weight, layer.bias))
+
+
+def test_only_products_between_hidden_layers_are_short():
+    for architecture, count in (("mlp", 2), ("layer_norm", 2), ("simba", 6)):
+        layers = Layers((8, 8, 8), "relu", architecture, "bfloat16").network(6, 2, last_gain=1.0)
+        linear = [module for module in layers.modules() if isinstance(module, torch.nn.Linear)]
+        short = [isinstance(module, Bfloat16Linear) for module in linear]
+        assert short == [False, *[True] * count, False]
+
+
 def test_layer_norm_stands_between_a_layer_and_its_activation():
-    kinds = [type(layer).__name__ for layer in network("layer_norm", (6, 4, 5, 2), "relu", last_gain=1.0)]
+    kinds = [type(layer).__name__ for layer in Layers((4, 5), "relu", "layer_norm").network(6, 2, last_gain=1.0)]
     assert kinds == ["Linear", "LayerNorm", "ReLU", "Linear", "LayerNorm", "ReLU", "Linear"]
 
 
 def test_simba_is_residual_blocks_between_two_layers_and_a_norm(rng):
-    first, one, two, norm, last = network("simba", (6, 4, 4, 2), "relu", last_gain=0.01)
+    first, one, two, norm, last = Layers((4, 4), "relu", "simba").network(6, 2, last_gain=0.01)
     x = torch.randn(7, 6, generator=rng)
     hidden = first(x)
     for block in (one, two):
         before, inner, _, outer = block.layers
         assert (inner.weight.shape, outer.weight.shape) == ((16, 4), (4, 16))
         hidden = hidden + torch.relu(before(hidden) @ inner.weight.T + inner.bias) @ outer.weight.T + outer.bias
-    network_of_all = network("simba", (6, 4, 4, 2), "relu", last_gain=0.01)
+    network_of_all = Layers((4, 4), "relu", "simba").network(6, 2, last_gain=0.01)
     network_of_all.load_state_dict(torch.nn.Sequential(first, one, two, norm, last).state_dict())
     torch.testing.assert_close(network_of_all(x), last(norm(hidden)))
     assert isinstance(norm, torch.nn.LayerNorm)

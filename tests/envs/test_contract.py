@@ -12,6 +12,7 @@ from lemniscate.envs.api import VecEnv
 from lemniscate.envs.gymnasium import GymnasiumBackend
 from lemniscate.errors import NonFiniteError, UserError
 from lemniscate.nn.actor_critic import ActorCritic
+from lemniscate.nn.networks import Layers
 from lemniscate.types import Box
 
 CPU = torch.device("cpu")
@@ -41,7 +42,7 @@ def countdown(mode, num_envs=3, **kwargs):
 
 def play(env, num_steps, seed=0):
     """A rollout of a fresh policy, from a restart."""
-    policy = ActorCritic(env.spec, (8,)).policy
+    policy = ActorCritic(env.spec, Layers((8,))).policy
     env.restart(seed)
     return collect(env, policy, num_steps, torch.Generator().manual_seed(seed))
 

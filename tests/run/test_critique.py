@@ -12,6 +12,7 @@ from lemniscate.envs import toy
 from lemniscate.envs.api import VecEnv
 from lemniscate.envs.gymnasium import GymnasiumBackend
 from lemniscate.nn.actor_critic import ActorQ
+from lemniscate.nn.networks import Layers
 from lemniscate.report.pictures import sentence
 from lemniscate.run.critique import Honesty
 from lemniscate.run.evaluate import evaluate
@@ -23,7 +24,7 @@ CPU = torch.device("cpu")
 
 def networks(spec, **fields):
     torch.manual_seed(0)
-    return ActorQ(spec, (4,), (8,), "relu", "mlp", False, **{"twin": True, **fields})
+    return ActorQ(spec, Layers((4,)), Layers((8,)), False, **{"twin": True, **fields})
 
 
 @pytest.mark.parametrize("mode", ["NEXT_STEP", "SAME_STEP", "DISABLED"])

@@ -7,6 +7,7 @@ from lemniscate.envs.api import VecEnv
 from lemniscate.envs.gymnasium import GymnasiumBackend
 from lemniscate.errors import UserError
 from lemniscate.nn.actor_critic import ActorCritic
+from lemniscate.nn.networks import Layers
 from lemniscate.run.evaluate import evaluate
 
 CPU = torch.device("cpu")
@@ -26,7 +27,7 @@ def test_every_copy_plays_its_own_share(monkeypatch, mode, episodes):
     """Taking the first that end would fill the list with the short ones."""
     monkeypatch.setattr(toy, "Countdown", Uneven)
     env = VecEnv(GymnasiumBackend("Countdown-v0", 4, CPU, mode=mode))
-    policy = ActorCritic(env.spec, (4,)).policy
+    policy = ActorCritic(env.spec, Layers((4,))).policy
     scores = evaluate(policy, env, episodes, seed=0)
     shares = [episodes // 4 + (copy < episodes % 4) for copy in range(4)]
     expected = [copy + 1 for copy in range(4) for _ in range(shares[copy])]
@@ -39,7 +40,7 @@ def test_every_copy_plays_its_own_share(monkeypatch, mode, episodes):
 def test_the_same_seed_gives_the_same_scores_and_another_does_not():
     env = VecEnv(GymnasiumBackend("CartPole-v1", 4, CPU))
     torch.manual_seed(0)
-    policy = ActorCritic(env.spec, (4,)).policy
+    policy = ActorCritic(env.spec, Layers((4,))).policy
     first, again, other = (evaluate(policy, env, 6, seed, deterministic=False) for seed in (1, 1, 2))
     assert first == again
     assert first.returns != other.returns
@@ -55,14 +56,14 @@ def test_an_episode_without_end_is_a_sentence_and_not_a_hang(monkeypatch):
     monkeypatch.setattr("lemniscate.run.evaluate.PATIENCE", 30)
     env = endless(2)
     with pytest.raises(UserError, match=r"Countdown-v0 has not ended after 30 steps.*time limit"):
-        evaluate(ActorCritic(env.spec, (4,)).policy, env, 2, seed=0)
+        evaluate(ActorCritic(env.spec, Layers((4,))).policy, env, 2, seed=0)
     assert env.steps == 60
 
 
 def test_patience_is_for_one_episode_not_for_all(monkeypatch):
     monkeypatch.setattr("lemniscate.run.evaluate.PATIENCE", 30)
     env = VecEnv(GymnasiumBackend("Countdown-v0", 2, CPU, mode="DISABLED", length=20, horizon=None))
-    assert evaluate(ActorCritic(env.spec, (4,)).policy, env, 10, seed=0).lengths == [20] * 10
+    assert evaluate(ActorCritic(env.spec, Layers((4,))).policy, env, 10, seed=0).lengths == [20] * 10
 
 
 def test_a_run_goes_on_when_its_evaluation_cannot(monkeypatch, tmp_path, capsys):

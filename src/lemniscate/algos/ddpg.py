@@ -62,8 +62,8 @@ class State:
 
 def networks(config: Config, spec: Spec) -> ActorQ:
     """μ and Q for the spaces in `spec`."""
-    shape = (config.hidden, config.critic_hidden, config.activation, config.architecture)
-    return ActorQ(spec, *shape, config.normalize_observations, twin=False)
+    layers = config.actor_layers, config.critic_layers
+    return ActorQ(spec, *layers, config.normalize_observations, twin=False)
 
 
 def init(config: Config, spec: Spec, device: torch.device) -> State:

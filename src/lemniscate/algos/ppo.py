@@ -27,7 +27,7 @@ from lemniscate.maths import (
 )
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.descent import Descent
-from lemniscate.nn.networks import Activation
+from lemniscate.nn.networks import Activation, Layers
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.nn.policies import Policy
 from lemniscate.run.config import Count, Fraction, NonNegative, Positive, Range, RunConfig
@@ -121,7 +121,8 @@ class State:
 
 def networks(config: Config, spec: Spec) -> ActorCritic:
     """π and V for the spaces in `spec`."""
-    return ActorCritic(spec, config.hidden, config.activation, config.initial_log_std, config.normalize_observations)
+    layers = Layers(config.hidden, config.activation)
+    return ActorCritic(spec, layers, config.initial_log_std, config.normalize_observations)
 
 
 def init(config: Config, spec: Spec, device: torch.device) -> State:
@@ -186,9 +187,8 @@ def update(config: Config, state: State, rollout: Rollout) -> Mapping[str, Tenso
             break
     state.policy.observe(rollout.obs[rollout.valid])  # afterwards: both probabilities are taken through one normalizer
     state.step += rollout.num_rows
-    explained = explained_variance(collected.value[played], collected.target[played])
-    seen = {**means(watched), **state.policy.watch()}
-    return {**seen, "explained_variance": explained, "learning_rate": state.learning_rate}
+    seen = means(watched) | state.policy.watch() | {"learning_rate": state.learning_rate}
+    return seen | {"explained_variance": explained_variance(collected.value[played], collected.target[played])}
 
 
 def train(config: Config, run: Run) -> State:

@@ -66,8 +66,8 @@ class State:
 
 def networks(config: Config, spec: Spec) -> ActorQ:
     """π, Q₁ and Q₂ for the spaces in `spec`."""
-    shape = (config.hidden, config.critic_hidden, config.activation, config.architecture)
-    return ActorQ(spec, *shape, config.normalize_observations, twin=True, temperature=config.initial_temperature)
+    layers = config.actor_layers, config.critic_layers
+    return ActorQ(spec, *layers, config.normalize_observations, twin=True, temperature=config.initial_temperature)
 
 
 def init(config: Config, spec: Spec, device: torch.device) -> State:

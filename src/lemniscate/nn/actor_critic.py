@@ -2,7 +2,6 @@
 
 import copy
 import math
-from collections.abc import Sequence
 from typing import Any, Self
 
 import torch
@@ -10,7 +9,7 @@ from torch import Generator, Tensor, nn
 
 from lemniscate.errors import UserError
 from lemniscate.nn.critics import QValue, TwinQ, Value
-from lemniscate.nn.networks import Activation, Architecture, ImageEncoder, network
+from lemniscate.nn.networks import ImageEncoder, Layers
 from lemniscate.nn.normalizer import Observed, Pixels, RunningNorm
 from lemniscate.nn.policies import (
     BernoulliPolicy,
@@ -30,14 +29,13 @@ class ActorCritic(nn.Module):
     def __init__(
         self,
         spec: Spec,
-        hidden: Sequence[int] = (64, 64),
-        activation: Activation = "tanh",
+        layers: Layers,
         initial_log_std: float = 0.0,
         normalize_observations: bool = False,
     ) -> None:
         super().__init__()
-        self.policy = _policy(_normalizer(spec, normalize_observations), spec, hidden, activation, initial_log_std)
-        self.value = Value(self.policy.normalizer, _from_obs(spec, hidden, activation, 1, last_gain=1.0))
+        self.policy = _policy(_normalizer(spec, normalize_observations), spec, layers, initial_log_std)
+        self.value = Value(self.policy.normalizer, _from_obs(spec, layers, 1, last_gain=1.0))
 
 
 class Temperature(nn.Module):
@@ -75,10 +73,8 @@ class ActorQ(nn.Module):
     def __init__(
         self,
         spec: Spec,
-        hidden: Sequence[int],
-        critic_hidden: Sequence[int],
-        activation: Activation,
-        architecture: Architecture,
+        actor_layers: Layers,
+        critic_layers: Layers,
         normalize_observations: bool,
         *,
         twin: bool,
@@ -88,14 +84,13 @@ class ActorQ(nn.Module):
         stochastic = temperature is not None
         size = bounded_box(spec).size
         normalizer = _normalizer(spec, normalize_observations)
-        net = _from_obs(spec, hidden, activation, 2 * size if stochastic else size, 0.01, architecture)
+        net = _from_obs(spec, actor_layers, 2 * size if stochastic else size, last_gain=0.01)
         kind = SquashedGaussianPolicy if stochastic else DeterministicPolicy
         self.policy: Policy = kind(normalizer, net, size)
 
         def value() -> QValue:
             encoder, seen = _encoder(spec)
-            net = network(architecture, (seen + size, *critic_hidden, 1), activation, last_gain=1.0)
-            return QValue(normalizer, encoder, net)
+            return QValue(normalizer, encoder, critic_layers.network(seen + size, 1, last_gain=1.0))
 
         self.critic: Any = TwinQ(value(), value()) if twin else value()
         self.temperature = Temperature(temperature) if temperature is not None else None
@@ -128,11 +123,9 @@ def _normalizer(spec: Spec, normalize_observations: bool) -> Observed:
     return kind(spec.observation_size)
 
 
-def _policy(
-    normalizer: Observed, spec: Spec, hidden: Sequence[int], activation: Activation, initial_log_std: float
-) -> Policy:
+def _policy(normalizer: Observed, spec: Spec, layers: Layers, initial_log_std: float) -> Policy:
     action = spec.action
-    net = _from_obs(spec, hidden, activation, _outputs(action), last_gain=0.01)
+    net = _from_obs(spec, layers, _outputs(action), last_gain=0.01)
     if isinstance(action, Box):
         return GaussianPolicy(normalizer, net, action, initial_log_std)
     if isinstance(action, Discrete):
@@ -158,14 +151,7 @@ def _encoder(spec: Spec) -> tuple[nn.Module, int]:
     return encoder, encoder.size
 
 
-def _from_obs(
-    spec: Spec,
-    hidden: Sequence[int],
-    activation: Activation,
-    outputs: int,
-    last_gain: float,
-    kind: Architecture = "mlp",
-) -> nn.Sequential:
+def _from_obs(spec: Spec, layers: Layers, outputs: int, last_gain: float) -> nn.Sequential:
     encoder, size = _encoder(spec)
-    layers = network(kind, (size, *hidden, outputs), activation, last_gain)
-    return nn.Sequential(encoder, layers) if spec.image else layers
+    net = layers.network(size, outputs, last_gain)
+    return nn.Sequential(encoder, net) if spec.image else net

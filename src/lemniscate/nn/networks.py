@@ -1,6 +1,6 @@
 """Multi-layer perceptrons, residual ones, and a small convolutional network to look at images with."""
 
-from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal
 
@@ -10,6 +10,8 @@ from torch import Tensor, nn
 Activation = Literal["tanh", "relu", "elu", "silu"]
 Architecture = Literal["mlp", "layer_norm", "simba"]
 """layers with an activation between; the same with layer normalization before it; residual blocks of one width"""
+Matmul = Literal["float32", "bfloat16"]
+"""of products between hidden layers; the first and the last are always in float32"""
 
 
 class Tanh(nn.Module):
@@ -23,31 +25,52 @@ class Tanh(nn.Module):
 ACTIVATIONS = {"tanh": Tanh, "relu": nn.ReLU, "elu": nn.ELU, "silu": nn.SiLU}
 
 
-def network(kind: Architecture, sizes: Sequence[int], activation: Activation, last_gain: float) -> nn.Sequential:
-    """From `sizes[0]` numbers, through layers of the sizes between, to `sizes[-1]`; orthogonal weights, zero biases.
+class Bfloat16Linear(nn.Linear):
+    """x Wᵀ + b with both factors rounded to bfloat16, 8 bits each, on the way there and back.
 
-    The last layer has gain `last_gain`: 0.01 for a policy, so that it starts near the centre of its range whatever it
-    sees (Andrychowicz et al. 2021, arXiv:2006.05990, section 3.2), 1 for a value; the others have √2.
+    Parameters, gradients and what comes out keep their type. Half the time where the processor multiplies such numbers.
     """
-    inputs, *hidden, outputs = sizes
-    layers: list[nn.Module] = []
-    if kind == "simba":
-        layers += [_orthogonal(nn.Linear(inputs, hidden[0]), 1.0), *(Residual(hidden[0]) for _ in hidden)]
-        layers += [nn.LayerNorm(hidden[0])]
-    else:
-        for before, after in pairwise((inputs, *hidden)):
-            layers += [_orthogonal(nn.Linear(before, after), 2**0.5)]
-            layers += [nn.LayerNorm(after)] if kind == "layer_norm" else []
-            layers += [ACTIVATIONS[activation]()]
-    return nn.Sequential(*layers, _orthogonal(nn.Linear(hidden[-1] if hidden else inputs, outputs), last_gain))
+
+    def forward(self, input: Tensor) -> Tensor:
+        """[…, inputs] to […, outputs]."""
+        return nn.functional.linear(input.bfloat16(), self.weight.bfloat16()).to(input.dtype) + self.bias
+
+
+@dataclass(frozen=True)
+class Layers:
+    """What stands between a network's inputs and its outputs."""
+
+    hidden: tuple[int, ...] = (64, 64)
+    activation: Activation = "tanh"
+    architecture: Architecture = "mlp"
+    matmul: Matmul = "float32"
+
+    def network(self, inputs: int, outputs: int, last_gain: float) -> nn.Sequential:
+        """[…, inputs] to […, outputs]; orthogonal weights, zero biases.
+
+        The last layer has gain `last_gain`: 0.01 for a policy, so that it starts near the centre of its range whatever
+        it sees (Andrychowicz et al. 2021, arXiv:2006.05990, section 3.2), 1 for a value; the others have √2.
+        """
+        kind = nn.Linear if self.matmul == "float32" else Bfloat16Linear
+        last = self.hidden[-1] if self.hidden else inputs
+        layers: list[nn.Module] = []
+        if self.architecture == "simba":
+            layers += [_orthogonal(nn.Linear(inputs, last), 1.0)]
+            layers += [*(Residual(last, kind) for _ in self.hidden), nn.LayerNorm(last)]
+        else:
+            for i, (before, after) in enumerate(pairwise((inputs, *self.hidden))):
+                layers += [_orthogonal((kind if i else nn.Linear)(before, after), 2**0.5)]
+                layers += [nn.LayerNorm(after)] if self.architecture == "layer_norm" else []
+                layers += [ACTIVATIONS[self.activation]()]
+        return nn.Sequential(*layers, _orthogonal(nn.Linear(last, outputs), last_gain))
 
 
 class Residual(nn.Module):
     """x + W₂ relu(W₁ LN(x)), four times as wide inside: a block of SimBa, Lee et al. 2025, arXiv:2410.09754, eq. 5."""
 
-    def __init__(self, width: int) -> None:
+    def __init__(self, width: int, kind: type[nn.Linear] = nn.Linear) -> None:
         super().__init__()
-        inner, outer = nn.Linear(width, 4 * width), nn.Linear(4 * width, width)
+        inner, outer = kind(width, 4 * width), kind(4 * width, width)
         self.layers = nn.Sequential(
             nn.LayerNorm(width), _orthogonal(inner, 2**0.5), nn.ReLU(), _orthogonal(outer, 2**0.5)
         )
