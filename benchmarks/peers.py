@@ -35,7 +35,7 @@ print(int(sys.argv[2]) / (time.perf_counter() - started))
 
 PEER_REPLAY = """
 import sys, time, numpy, torch
-peer, threads, steps = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
+steps, peer, threads = int(sys.argv[1]), sys.argv[2], int(sys.argv[3])
 torch.set_num_threads(threads)
 from stable_baselines3.common.noise import NormalActionNoise
 if peer == "sb3":

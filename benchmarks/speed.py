@@ -22,6 +22,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from functools import partial
 from pathlib import Path
 from statistics import harmonic_mean, median
 
@@ -35,6 +36,11 @@ OURS, PHYSICS = "lemniscate", "EnvPool alone"
 PEERS = [(peer, threads, kind) for peer in ("sb3", "sbx") for threads in (1, 2) for kind in ("dummy", "subproc")]
 
 REPLAY = {"batch_size": 256, "learning_starts": 500, "buffer_size": 100_000, "num_steps": 500, "engine": "native"}
+WAYS = {
+    OURS: {},
+    "lemniscate, bfloat16 products": {"matmul": "bfloat16"},
+    "lemniscate, 4 copies, 4 updates for each of their steps": {"num_envs": 4, "num_updates": 4, "num_steps": 125},
+}
 
 
 def say(*words):
@@ -97,9 +103,9 @@ def throughput(rounds, stamp, envs=ENVS):
             )
 
 
-def measured(env):
+def measured(what, env=None):
     """The rounds of the newest commit that has any: a dictionary of speeds for each."""
-    of = [row for row in rows("speed") if row["what"] == "throughput" and row["env"] == env]
+    of = [row for row in rows("speed") if row["what"] == what and row.get("env") == env]
     return [row["steps_per_second"] for row in of if row["commit"] == of[-1]["commit"]]
 
 
@@ -108,7 +114,7 @@ def summary():
     print("| environment | lemniscate | beside it | | lemniscate is |")
     print("|---|---|---|---|---|")
     for env in ENVS:
-        speeds = measured(env)
+        speeds = measured("throughput", env)
         for name in [name for name in speeds[0] if name != OURS] if speeds else []:
             mine = median(row[OURS] for row in speeds)
             ratio, other = median(row[OURS] / row[name] for row in speeds), median(row[name] for row in speeds)
@@ -122,7 +128,7 @@ def draw():
 
     figure = Figure(figsize=(10, 3), layout="constrained")
     left, right = figure.subplots(1, 2)
-    speeds = measured(ENVS[0])
+    speeds = measured("throughput", ENVS[0])
     names = sorted(speeds[0], key=lambda name: median(row[name] for row in speeds))
     medians = [median(row[name] for row in speeds) for name in names]
     colors = ["#3465a4" if name == OURS else "#d3d7cf" for name in names]
@@ -131,7 +137,7 @@ def draw():
         left.text(value, i, f" {value:,.0f}", va="center", fontsize=9)
     left.set_xlim(0, 1.15 * max(medians))
     left.set_title(f"{ENVS[0]}, PPO, steps per second", loc="left", fontsize=10)
-    shares = [100 * median(row[OURS] / row[PHYSICS] for row in measured(env)) for env in ENVS]
+    shares = [100 * median(row[OURS] / row[PHYSICS] for row in measured("throughput", env)) for env in ENVS]
     right.barh(ENVS[::-1], shares[::-1], color="#3465a4")
     for i, share in enumerate(shares[::-1]):
         right.text(share, i, f" {share:.0f} %", va="center", fontsize=9)
@@ -212,17 +218,16 @@ def startup(rounds, stamp):
 
 def replay(rounds, stamp):
     """Steps per second of DDPG, each at its best number of threads, which the first round finds."""
-    threads = {}
 
-    def ours(count):
+    def ours(fields, count):
         with tempfile.TemporaryDirectory() as scratch:
-            folder = Path(scratch) / "run"
-            train(folder, "Hopper-v5", algorithm="ddpg", preset="default", total_steps=6000, threads=count, **REPLAY)
+            folder, size = Path(scratch) / "run", REPLAY | fields
+            train(folder, "Hopper-v5", algorithm="ddpg", preset="default", total_steps=6000, threads=count, **size)
             return harmonic_mean(line["time/steps_per_second"] for line in lines(folder)[3:])
 
-    clocks = {OURS: ours} | {
-        peer: lambda count, peer=peer: python(PEER_REPLAY, peer, count, 4000) for peer in ("sb3", "sbx")
-    }
+    clocks = {name: partial(ours, fields) for name, fields in WAYS.items()}
+    clocks |= {name: partial(python, PEER_REPLAY, 4000, name) for name in ("sb3", "sbx")}
+    threads = {}
     for _ in range(rounds):
         row = {}
         for name, clock in clocks.items():
@@ -231,6 +236,17 @@ def replay(rounds, stamp):
             row[name] = tried[threads[name]]
         say("DDPG, Hopper-v5", {name: round(speed) for name, speed in row.items()}, threads)
         append("speed", {"what": "replay", "steps_per_second": row, "threads": dict(threads)} | stamp)
+    replay_summary()
+
+
+def replay_summary():
+    """The README's table of it: medians, and the medians of ratios within a round."""
+    speeds = measured("replay")
+    print("| DDPG, Hopper-v5 | steps/s | lemniscate is |")
+    print("|---|---|---|")
+    for name in speeds[0]:
+        ratio = median(row[OURS] / row[name] for row in speeds)
+        print(f"| {name} | {median(row[name] for row in speeds):,.0f} | {ratio:.2f} × |")
 
 
 def lander(rounds, stamp):
@@ -283,7 +299,7 @@ def main():
         parser.error(f"there is no measure {', '.join(wrong)}; there is {', '.join(MEASURES)}")
     for name in [] if given.table else given.measures or MEASURES:
         MEASURES[name](given.rounds, stamp, *([given.envs] if name == "throughput" else []))
-    if all(measured(env) for env in ENVS):
+    if all(measured("throughput", env) for env in ENVS):
         summary()
         draw()
 

@@ -306,6 +306,27 @@ def test_as_many_gradient_steps_are_taken_as_announced(tmp_path, algo, rhythm):
     assert taken == config.gradient_steps
 
 
+@EACH
+def test_learning_rates_fall_linearly_over_the_run(monkeypatch, algo):
+    rates = {"actor_learning_rate": 0.02, "critic_learning_rate": 0.1}
+    config = small(algo, total_steps=1000, final_learning_rate=0.2, policy_delay=1, **rates)
+    state, _ = ready(monkeypatch, algo, config)
+    used = []
+    for descent in (state.actor_descent, state.critic_descent):
+        engine = descent._engine
+        monkeypatch.setattr(
+            descent, "_engine", lambda *args, e=engine, d=descent: used.append((d, args[4])) or e(*args)
+        )
+    for step in (160, 500, 1000):
+        state.step = step
+        algo.update(config, state)
+        (_, q), (_, pi) = used[-2:]
+        fell = 1 - 0.8 * step / 1000
+        scale = 1 / (1 - 0.9**state.critic_descent.steps)
+        assert q[0, 0].item() == pytest.approx(0.1 * fell * scale, rel=1e-5)
+        assert pi[0, 0].item() == pytest.approx(0.02 * fell * scale, rel=1e-5)
+
+
 def engines_agree(algo, matmul="float32"):
     """Two updates of three steps each, native and eager, from the same memory and the same random numbers."""
     layers = {"hidden": (16, 16), "critic_hidden": (8, 8), "matmul": matmul}

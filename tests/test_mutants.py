@@ -192,6 +192,7 @@ MUTANTS = [
         "",
         "test_memory.py",
     ),
+    ("Q learns as fast at the end", "algos/sac.py", "fall * config.critic", "config.critic", "test_memory.py"),
     ("an update at every step", "algos/td3.py", " and t % config.update_every == 0", "", "test_memory.py"),
     ("Q is the higher one", "nn/actor_critic.py", "value.amin(0)", "value.amax(0)", "run/test_critique.py"),
     (

@@ -15,7 +15,7 @@ from torch import Generator, Tensor, nn
 from lemniscate.data.exploration import Exploration
 from lemniscate.data.replay import Replay
 from lemniscate.envs.api import VecEnv
-from lemniscate.maths import means, polyak, td_target, uniform, value_loss
+from lemniscate.maths import linear, means, polyak, td_target, uniform, value_loss
 from lemniscate.nn.actor_critic import ActorQ, bounded_box
 from lemniscate.nn.critics import TwinQ
 from lemniscate.nn.descent import Descent
@@ -134,13 +134,14 @@ def update(config: Config, state: State) -> Mapping[str, Tensor]:
     """Gradient steps on what is remembered (algorithm 1); returns the means of what was watched."""
     watched: list[Mapping[str, Tensor]] = []
     memory = state.replay.transitions
+    fall = linear(1.0, config.final_learning_rate, state.step / config.total_steps)
     for rows in state.replay.draw(config.num_updates, config.batch_size, state.draws).split(1):
         state.updates += 1
         noise = state.policy.noise(rows.shape, state.noise)
-        watched.append(state.critic_descent(memory, rows, config.critic_learning_rate, noise))
+        watched.append(state.critic_descent(memory, rows, fall * config.critic_learning_rate, noise))
         if state.updates % config.policy_delay == 0:
             noise = state.policy.noise(rows.shape, state.noise)
-            watched.append(state.actor_descent(memory, rows, config.actor_learning_rate, noise))
+            watched.append(state.actor_descent(memory, rows, fall * config.actor_learning_rate, noise))
             polyak(state.targets.parameters(), state.networks.critic.parameters(), config.tau)
     return means(watched)
 

@@ -153,6 +153,8 @@ class ReplayConfig(RunConfig):
     """Adam's step size for the policy"""
     critic_learning_rate: Positive = 3e-4
     """Adam's step size for Q"""
+    final_learning_rate: Fraction = 1.0
+    """fraction of both that they fall to, linearly over the run; 1 keeps them as they are"""
     tau: Fraction = 0.005
     """how far the target networks move at each of their updates"""
     noise: Noise = "white"
