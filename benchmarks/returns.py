@@ -2,6 +2,7 @@
 
     .venv/bin/python benchmarks/returns.py ppo                       every environment of the README, every seed
     .venv/bin/python benchmarks/returns.py ppo --envs Hopper-v5 --seeds 1 2
+    .venv/bin/python benchmarks/returns.py ddpg --runs DIR           keep the runs there, and go on with unfinished ones
     .venv/bin/python benchmarks/returns.py ppo --table               the table of what has been run, and its picture
 
 Each row of `benchmarks/results/returns.jsonl` is one policy: 100 episodes from starts that training never saw. Where an
@@ -12,6 +13,9 @@ be, so the policy at the first is the one that a shorter run would have ended wi
 import argparse
 import json
 import tempfile
+from contextlib import nullcontext
+from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 from common import RESULTS, append, provenance, rows
@@ -29,7 +33,7 @@ RUNS = {
         "Humanoid-v5": ((MILLION, 3 * MILLION), 3),
     },
     "ddpg": {
-        "MountainCarContinuous-v0": ((30_000, 100_000), 10),
+        "MountainCarContinuous-v0": ((30_000,), 10),
         "Pendulum-v1": ((20_000,), 5),
         "LunarLanderContinuous-v3": ((300_000,), 3),
         "HalfCheetah-v5": ((MILLION,), 2),
@@ -48,16 +52,20 @@ RUNS = {
 }
 
 
-def one(algorithm, env, seed, marks):
-    """Train once; evaluate at each mark."""
+def one(algorithm, env, seed, marks, runs):
+    """Train once, or to the end; evaluate at each mark."""
     import lemniscate as lem
 
-    with tempfile.TemporaryDirectory() as folder:
-        run = lem.train(
-            algorithm, env, seed=seed, total_steps=marks[-1], keep_checkpoints=50, run=f"{folder}/run", progress=False
-        )
+    with tempfile.TemporaryDirectory() if runs is None else nullcontext(runs) as folder:
+        path, fields = Path(folder) / f"{algorithm}-{env}-{seed}", {"total_steps": marks[-1], "keep_checkpoints": 50}
+        if path.exists():
+            run = lem.resume(path, progress=False)
+        else:
+            run = lem.train(algorithm, env, seed=seed, run=path, progress=False, **fields)
         lines = [json.loads(line) for line in (run.path / "metrics.jsonl").read_text().splitlines()]
+        paces = [(line["step"], line["time/steps_per_second"]) for line in lines if "time/steps_per_second" in line]
         curve = [(line["step"], round(line["episode/return"], 1)) for line in lines if "episode/return" in line]
+        spent = sum((b - a) / pace for (a, _), (b, pace) in pairwise([(0, 0), *paces]))
         points = curve[:: max(1, len(curve) // 60)]
         checkpoints = sorted((run.path / "checkpoints").glob("step-*"), key=lambda path: int(path.name[5:]))
         for mark in marks:
@@ -71,7 +79,7 @@ def one(algorithm, env, seed, marks):
                 "mean_return": scores.mean_return,
                 "std_return": scores.std_return,
                 "mean_length": sum(scores.lengths) / scores.episodes,
-                "training_s": run.seconds * policy.step / curve[-1][0],
+                "training_s": spent * policy.step / paces[-1][0],
                 "curve": [point for point in points if point[0] <= mark],
             }
             append("returns", row | provenance())
@@ -128,13 +136,14 @@ def main():
     parser.add_argument("algorithm", choices=RUNS)
     parser.add_argument("--envs", nargs="+")
     parser.add_argument("--seeds", nargs="+", type=int)
+    parser.add_argument("--runs", type=Path)
     parser.add_argument("--table", action="store_true", help="run nothing")
     given = parser.parse_args()
     if not given.table:
         for env in given.envs or RUNS[given.algorithm]:
             marks, seeds = RUNS[given.algorithm][env]
             for seed in given.seeds or range(1, seeds + 1):
-                one(given.algorithm, env, seed, marks)
+                one(given.algorithm, env, seed, marks, given.runs)
     summary(given.algorithm)
     draw(given.algorithm)
 

@@ -5,7 +5,7 @@
 
 from dataclasses import dataclass
 
-from lemniscate.algos import ddpg, ppo, sac, td3
+from lemniscate.algos import a2c, ddpg, ppo, reinforce, sac, td3, trpo
 from lemniscate.errors import unknown
 from lemniscate.run.config import RunConfig
 
@@ -187,7 +187,19 @@ PPO = [
     Preset("paper", ppo.Config(), "Schulman et al. 2017, table 3, on 8 copies with a running normalizer", "2026-11"),
 ]
 
+REINFORCE = [Preset("default", reinforce.Config(), "first values", "2026-11")]
+A2C = [Preset("default", a2c.Config(num_envs=16), "first values", "2026-11")]
+TRPO = [Preset("default", trpo.Config(num_envs=16, num_steps=128), "first values", "2026-11")]
+
 SHARED = "the settings that most libraries share today"
+BOLD = {
+    "learning_starts": 10_000,
+    "actor_learning_rate": 1e-3,
+    "critic_learning_rate": 1e-3,
+    "architecture": "layer_norm",
+}
+"""layer normalization bears the larger steps"""
+
 DDPG = [
     Preset("default", ddpg.Config(), SHARED, "2026-11"),
     Preset(
@@ -196,11 +208,47 @@ DDPG = [
         "the reinforcement-learning course's notebook on DDPG: its settings, on the corrected algorithm",
         "2026-11",
     ),
+    Preset(
+        "half-cheetah",
+        ddpg.Config(env="HalfCheetah-v5", **BOLD),
+        "a run of 300,000 steps on seed 101",
+        "2026-11",
+    ),
+    Preset(
+        "mountain-car",
+        ddpg.Config(
+            env="MountainCarContinuous-v0",
+            total_steps=30_000,
+            noise="ou",
+            noise_std=0.6,
+            gamma=0.998,
+            batch_size=128,
+            learning_starts=2000,
+            actor_learning_rate=3e-4,
+            critic_learning_rate=1e-3,
+            final_learning_rate=0.0,
+            policy_delay=2,
+            hidden=(64, 64),
+            critic_hidden=(64, 64),
+            architecture="layer_norm",
+            normalize_observations=True,
+        ),
+        "search by hand, 24 settings, on seeds 101 and 102; the best two also on 103 and 104",
+        "2026-11",
+    ),
 ]
 TD3 = [Preset("default", td3.Config(), SHARED, "2026-11")]
 SAC = [Preset("default", sac.Config(), SHARED, "2026-11")]
 
-PRESETS: dict[str, list[Preset]] = {"ddpg": DDPG, "ppo": PPO, "sac": SAC, "td3": TD3}
+PRESETS: dict[str, list[Preset]] = {
+    "reinforce": REINFORCE,
+    "a2c": A2C,
+    "trpo": TRPO,
+    "ppo": PPO,
+    "ddpg": DDPG,
+    "td3": TD3,
+    "sac": SAC,
+}
 
 
 def names(algorithm: str) -> list[str]:

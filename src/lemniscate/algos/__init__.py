@@ -2,6 +2,14 @@
 
 from types import ModuleType
 
-from lemniscate.algos import ddpg, ppo, sac, td3
+from lemniscate.algos import a2c, ddpg, ppo, reinforce, sac, td3, trpo
 
-ALGORITHMS: dict[str, ModuleType] = {"ddpg": ddpg, "ppo": ppo, "sac": sac, "td3": td3}
+ALGORITHMS: dict[str, ModuleType] = {
+    "reinforce": reinforce,
+    "a2c": a2c,
+    "trpo": trpo,
+    "ppo": ppo,
+    "ddpg": ddpg,
+    "td3": td3,
+    "sac": sac,
+}

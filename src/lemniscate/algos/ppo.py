@@ -7,7 +7,6 @@ Departures from the paper, and why: docs/notes/ppo.md.
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Annotated
 
 import torch
 from torch import Generator, Tensor
@@ -27,21 +26,18 @@ from lemniscate.maths import (
 )
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.descent import Descent
-from lemniscate.nn.networks import Activation, Layers
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.nn.policies import Policy
-from lemniscate.run.config import Count, Fraction, NonNegative, Positive, Range, RunConfig
+from lemniscate.run.config import Count, Fraction, NonNegative, Positive, RolloutConfig
 from lemniscate.run.run import Run
 from lemniscate.run.seeding import generator
 from lemniscate.types import Batch, Rollout, Spec
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(RunConfig):
-    """Every knob of PPO. The defaults are those of the paper's MuJoCo experiments (table 3), for 8 environments."""
+class Config(RolloutConfig):
+    """What PPO adds to the knobs of all that learn from rollouts; by default the paper's for MuJoCo (table 3)."""
 
-    num_steps: Count = 256
-    """steps of each copy between updates, T"""
     epochs: Count = 10
     """passes over a rollout, K"""
     minibatch_size: Count = 64
@@ -56,8 +52,6 @@ class Config(RunConfig):
     """Adam's ε"""
     adam_beta2: Fraction = 0.999
     """Adam's memory of squared gradients; shorter follows a fast run better"""
-    gamma: Fraction = 0.99
-    """discount γ"""
     gae_lambda: Fraction = 0.95
     """trace decay λ of the advantage estimate; 0 is one-step TD, 1 Monte Carlo"""
     clip: Positive = 0.2
@@ -76,27 +70,16 @@ class Config(RunConfig):
     """stop the epochs of an update once the approximate KL has passed this"""
     recompute_advantages: bool = False
     """estimate advantages anew before each epoch, with the value network as it is by then"""
-    hidden: tuple[Count, ...] = (64, 64)
-    """widths of the hidden layers, the same for policy and value"""
-    activation: Activation = "tanh"
-    """between the layers"""
-    initial_log_std: Annotated[float, Range(-10, 5)] = 0.0
-    """log σ at the start, in units of half the action range"""
-    normalize_observations: bool = True
-    """a running normalizer inside the policy"""
-    scale_rewards: bool = False
-    """divide rewards by the running standard deviation of the discounted return"""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if min(self.minibatch_size, self.num_envs * self.num_steps) == 1 and self.normalize_advantage:
+        if min(self.minibatch_size, self.num_rows) == 1 and self.normalize_advantage:
             raise UserError("normalize_advantage needs minibatches of 2 rows or more; these have 1.")
 
     @property
     def gradient_steps(self) -> int:
         """Of the whole run."""
-        rows = self.num_envs * self.num_steps
-        return -(-self.total_steps // rows) * self.epochs * -(-rows // self.minibatch_size)
+        return self.num_rollouts * self.epochs * -(-self.num_rows // self.minibatch_size)
 
 
 @dataclass
@@ -121,8 +104,7 @@ class State:
 
 def networks(config: Config, spec: Spec) -> ActorCritic:
     """π and V for the spaces in `spec`."""
-    layers = Layers(config.hidden, config.activation)
-    return ActorCritic(spec, layers, config.initial_log_std, config.normalize_observations)
+    return ActorCritic(spec, config.layers, config.initial_log_std, config.normalize_observations)
 
 
 def init(config: Config, spec: Spec, device: torch.device) -> State:

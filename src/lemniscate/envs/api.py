@@ -39,6 +39,10 @@ class Backend(Protocol):
         ...
 
 
+PATIENCE = 20_000
+"""steps that an episode may take in an environment without a time limit, where whole ones are wanted"""
+
+
 class VecEnv:
     """A backend with its current observation and the books of its episodes."""
 
@@ -81,6 +85,14 @@ class VecEnv:
             if len(bad):
                 value, copy = values[tuple(bad[0])].item(), int(bad[0, 0])
                 raise NonFiniteError(f"The {name} of environment {copy} is {value} in the step after {self.steps:,}.")
+
+    def require_end(self, age: int) -> None:
+        """Raise `UserError` where an episode of `age` steps has had its chance to end, and there is no time limit."""
+        if self.spec.max_episode_steps is None and age >= PATIENCE:
+            raise UserError(
+                f"An episode of {self.spec.env_id} has not ended after {PATIENCE:,} steps, and there is no time limit;"
+                " give it one, with max_episode_steps where it is registered."
+            )
 
     def take_episodes(self) -> Episodes:
         """The whole episodes that ended since the last call."""

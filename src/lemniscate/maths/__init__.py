@@ -9,9 +9,9 @@ from lemniscate.maths.distributions import (
     Point,
     SquashedGaussian,
 )
-from lemniscate.maths.losses import clipped_surrogate, value_loss
+from lemniscate.maths.losses import clipped_surrogate, policy_gradient, surrogate, value_loss
 from lemniscate.maths.noise import coloured, ornstein_uhlenbeck, uniform
-from lemniscate.maths.returns import gae, polyak, td_target
+from lemniscate.maths.returns import gae, polyak, reward_to_go, td_target, whole_return
 from lemniscate.maths.schedules import adapt_to_kl, linear
 from lemniscate.maths.stats import (
     clip_fraction,
@@ -23,6 +23,7 @@ from lemniscate.maths.stats import (
     ratio_statistics,
     standardize,
 )
+from lemniscate.maths.trust_region import backtrack, conjugate_gradient, hessian, natural_step
 
 __all__ = [
     "Bernoulli",
@@ -33,21 +34,29 @@ __all__ = [
     "Point",
     "SquashedGaussian",
     "adapt_to_kl",
+    "backtrack",
     "clip_fraction",
     "clipped_surrogate",
     "coloured",
+    "conjugate_gradient",
     "explained_variance",
     "gae",
+    "hessian",
     "kl_k1",
     "kl_k3",
     "linear",
     "means",
     "merge_moments",
+    "natural_step",
     "ornstein_uhlenbeck",
+    "policy_gradient",
     "polyak",
     "ratio_statistics",
+    "reward_to_go",
     "standardize",
+    "surrogate",
     "td_target",
     "uniform",
     "value_loss",
+    "whole_return",
 ]

@@ -47,6 +47,12 @@ class Gaussian:
         """[]: Σ_i [ log σ_i + ½ log 2πe ], the same for every observation."""
         return (self.log_std + 0.5 * (1 + LOG_2PI)).sum(-1)
 
+    def kl(self, other: "Gaussian") -> Tensor:
+        """[B]: KL(self ‖ other) = Σ_i [ log σ'_i − log σ_i + (σ_i² + (μ_i − μ'_i)²) / 2σ'_i² − ½ ]."""
+        widened = other.log_std - self.log_std
+        apart = (self.mean - other.mean) * (-other.log_std).exp()
+        return (widened + 0.5 * ((-2 * widened).exp() + apart.square() - 1)).sum(-1)
+
 
 @dataclass(frozen=True)
 class Categorical:
@@ -72,6 +78,11 @@ class Categorical:
         log_p = self.logits.log_softmax(-1)
         return -(log_p.exp() * log_p).sum(-1)
 
+    def kl(self, other: "Categorical") -> Tensor:
+        """[B]: KL(self ‖ other) = Σ_a π_a (log π_a − log π'_a)."""
+        log_p = self.logits.log_softmax(-1)
+        return (log_p.exp() * (log_p - other.logits.log_softmax(-1))).sum(-1)
+
 
 @dataclass(frozen=True)
 class MultiCategorical:
@@ -94,6 +105,10 @@ class MultiCategorical:
     def entropy(self) -> Tensor:
         """[B]: Σ_k H[π_k]."""
         return torch.stack([part.entropy() for part in self.parts]).sum(0)
+
+    def kl(self, other: "MultiCategorical") -> Tensor:
+        """[B]: Σ_k KL(π_k ‖ π'_k)."""
+        return torch.stack([mine.kl(its) for mine, its in zip(self.parts, other.parts, strict=True)]).sum(0)
 
     def _with(self, columns: Tensor) -> list[tuple[Categorical, Tensor]]:
         return list(zip(self.parts, columns.unbind(-1), strict=True))
@@ -121,6 +136,12 @@ class Bernoulli:
         """[B]: −Σ_i [ σ_i log σ_i + (1 − σ_i) log (1 − σ_i) ]."""
         on, off = logsigmoid(self.logits), logsigmoid(-self.logits)
         return -(on.exp() * on + off.exp() * off).sum(-1)
+
+    def kl(self, other: "Bernoulli") -> Tensor:
+        """[B]: Σ_i [ σ_i (log σ_i − log σ'_i) + (1 − σ_i) (log (1 − σ_i) − log (1 − σ'_i)) ]."""
+        on, off = logsigmoid(self.logits), logsigmoid(-self.logits)
+        its_on, its_off = logsigmoid(other.logits), logsigmoid(-other.logits)
+        return (on.exp() * (on - its_on) + off.exp() * (off - its_off)).sum(-1)
 
 
 @dataclass(frozen=True)

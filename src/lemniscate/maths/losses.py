@@ -5,6 +5,40 @@ from jaxtyping import Float
 from torch import Tensor
 
 
+def policy_gradient(log_prob: Float[Tensor, " B"], weight: Float[Tensor, " B"]) -> Float[Tensor, ""]:
+    """A scalar whose gradient is the policy gradient, negated: Williams 1992, theorem 1; arXiv:1602.01783, section 4.
+
+        −E[ log π(a|s) Ψ ]      ∇J = E[ ∇log π(a|s) Ψ ]
+
+    Its value means nothing; only its gradient does, and that only where the actions are of π itself.
+
+    Args:
+        log_prob: log π(a|s).
+        weight: Ψ, no gradient: a return, a reward-to-go, an advantage (arXiv:1506.02438, eq. 1).
+
+    Returns:
+        A scalar.
+    """
+    return -(log_prob * weight).mean()
+
+
+def surrogate(log_ratio: Float[Tensor, " B"], advantage: Float[Tensor, " B"]) -> Float[Tensor, ""]:
+    """TRPO's surrogate, negated: Schulman et al. 2015, arXiv:1502.05477, eq. 14 with advantages for Q.
+
+        L = E[ r A ],   r = exp(log_ratio) = π(a|s) / π_old(a|s)
+
+    At r = 1 its gradient is the policy gradient.
+
+    Args:
+        log_ratio: log π(a|s) − log π_old(a|s).
+        advantage: A, no gradient.
+
+    Returns:
+        −L, a scalar.
+    """
+    return -(log_ratio.exp() * advantage).mean()
+
+
 def clipped_surrogate(
     log_ratio: Float[Tensor, " B"], advantage: Float[Tensor, " B"], clip: float = 0.2
 ) -> Float[Tensor, ""]:

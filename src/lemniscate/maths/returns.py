@@ -48,6 +48,59 @@ def gae(
     return advantage, advantage + value
 
 
+def reward_to_go(
+    reward: Float[Tensor, "T N"],
+    next_value: Float[Tensor, "T N"],
+    terminated: Bool[Tensor, "T N"],
+    done: Bool[Tensor, "T N"],
+    *,
+    gamma: float = 0.99,
+) -> Float[Tensor, "T N"]:
+    """What follows each action: Sutton & Barto 2018, section 13.3.
+
+        G_t = r_t + γ G_{t+1}       up to the end of the episode
+
+    Where rows run out before the episode does, and where a time-out cut it, `next_value` stands for the rest; zeros
+    leave it out.
+
+    Args:
+        reward: r_t.
+        next_value: V(s_{t+1}) of the true successor.
+        terminated: the episode ended by its own rules at row t.
+        done: the episode ended at row t for any reason.
+        gamma: discount γ in [0, 1].
+    """
+    delta = reward + gamma * next_value * (done & ~terminated)
+    delta[-1] = reward[-1] + gamma * next_value[-1] * ~terminated[-1]
+    go = torch.empty_like(delta)
+    follows = torch.zeros_like(delta[0])
+    for t in reversed(range(len(delta))):
+        follows = delta[t] + gamma * follows * ~done[t]
+        go[t] = follows
+    return go
+
+
+def whole_return(
+    to_go: Float[Tensor, "T N"], reward: Float[Tensor, "T N"], done: Bool[Tensor, "T N"], *, gamma: float = 0.99
+) -> Float[Tensor, "T N"]:
+    """The return of the whole episode at each of its rows: Williams 1992, section 5, where every action gets it.
+
+        G_0 = Σ_{k<t} γ^k r_k + γ^t G_t
+
+    Args:
+        to_go: G_t of `reward_to_go`.
+        reward: r_t.
+        done: the episode ended at row t. Row 0 begins an episode, and so does every row after an end.
+        gamma: discount γ in [0, 1].
+    """
+    whole, weight, paid = torch.empty_like(to_go), torch.ones_like(to_go[0]), torch.zeros_like(to_go[0])
+    for t in range(len(to_go)):
+        whole[t] = paid + weight * to_go[t]
+        paid = torch.where(done[t], 0.0, paid + weight * reward[t])
+        weight = torch.where(done[t], 1.0, gamma * weight)
+    return whole
+
+
 def td_target(
     reward: Float[Tensor, " B"],
     next_value: Float[Tensor, "*C B"],

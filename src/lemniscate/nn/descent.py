@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from torch.func import functional_call, grad_and_value
 
 from lemniscate.maths import means
+from lemniscate.nn.flat import Flat
 from lemniscate.nn.native import Native
 from lemniscate.types import Record
 
@@ -59,8 +60,8 @@ def adam(
 class Descent(Generic[Networks]):
     """Adam down `loss(networks, batch, *noise)`, minibatch by minibatch.
 
-    Other networks may take part in the loss; only the parameters of `networks` move. From here on these are views of
-    one vector; they stay ordinary parameters to everyone else. Move the networks to their device before.
+    Other networks may take part in the loss; only the parameters of `networks` move, from here on views of one vector
+    (`Flat`). Move the networks to their device before.
     """
 
     def __init__(
@@ -76,19 +77,14 @@ class Descent(Generic[Networks]):
         self._objective = _Objective(networks, loss)
         self._betas, self._eps, self._max_grad_norm = betas, eps, max_grad_norm or math.inf
         self._watch_as = watch_as
-        named = list(self._objective.named_parameters())
-        self._names = [name for name, _ in named]
-        self._shapes = [parameter.shape for _, parameter in named]
-        self._sizes = [parameter.numel() for _, parameter in named]
-        self._parameters = [parameter for _, parameter in named]
-        self._vector = torch.cat([parameter.detach().flatten() for _, parameter in named])
+        self._flat = Flat(self._objective)
+        self._vector = self._flat.vector
         self._gradient = torch.zeros_like(self._vector)
         self._mean, self._square = torch.zeros_like(self._vector), torch.zeros_like(self._vector)
+        self._parameters = list(self._objective.parameters())
+        for parameter, gradient in zip(self._parameters, self._flat.parts(self._gradient).values(), strict=True):
+            parameter.grad = gradient
         self.steps = 0
-        for (_, parameter), mine, gradient in zip(
-            named, self._cut(self._vector), self._cut(self._gradient), strict=True
-        ):
-            parameter.data, parameter.grad = mine, gradient
         self._engine: Callable[..., dict[str, Tensor]] = self._eager
         self._steps_per_call = 1
 
@@ -154,15 +150,10 @@ class Descent(Generic[Networks]):
             for scales, rows, *noise in zip(*(tensor.unbind() for tensor in by_step), strict=True):
                 args = (batch[rows], *noise)
                 differentiate = grad_and_value(partial(functional_call, self._objective, args=args), has_aux=True)
-                gradients, (_, metrics) = differentiate(dict(zip(self._names, self._cut(vector), strict=True)))
-                gradient = torch.cat([gradients[name].flatten() for name in self._names])
-                norm = adam(vector, gradient, mean, square, scales, self._betas)
+                gradients, (_, metrics) = differentiate(self._flat.parts(vector))
+                norm = adam(vector, self._flat.join(gradients), mean, square, scales, self._betas)
                 watched.append({**metrics, self._watch_as: norm})
         return means(watched)
-
-    def _cut(self, vector: Tensor) -> list[Tensor]:
-        parts = vector.split(self._sizes)
-        return [part.view(shape) for part, shape in zip(parts, self._shapes, strict=True)]
 
 
 class _Objective(nn.Module, Generic[Networks]):

@@ -12,12 +12,11 @@ import gymnasium as gym
 import numpy as np
 from PIL import Image
 
-from lemniscate.envs.api import VecEnv
+from lemniscate.envs.api import PATIENCE, VecEnv
 from lemniscate.envs.gymnasium import make_one, spec_of
 from lemniscate.errors import UserError, is_installed
 from lemniscate.nn.policies import Policy
 from lemniscate.report import flight
-from lemniscate.run.evaluate import PATIENCE
 from lemniscate.types import Spec
 
 Act = Callable[..., np.ndarray]

@@ -127,6 +127,41 @@ class RunConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
+class RolloutConfig(RunConfig):
+    """What algorithms that learn from their own newest rollout share."""
+
+    num_steps: Count = 256
+    """steps of each copy between updates, T"""
+    gamma: Fraction = 0.99
+    """discount γ"""
+    hidden: tuple[Count, ...] = (64, 64)
+    """widths of the hidden layers, the same for policy and value"""
+    activation: Activation = "tanh"
+    """between the layers"""
+    initial_log_std: Annotated[float, Range(-10, 5)] = 0.0
+    """log σ at the start, in units of half the action range"""
+    normalize_observations: bool = True
+    """a running normalizer inside the policy"""
+    scale_rewards: bool = False
+    """divide rewards by the running standard deviation of the discounted return"""
+
+    @property
+    def layers(self) -> Layers:
+        """Of the policy, and of the value."""
+        return Layers(self.hidden, self.activation)
+
+    @property
+    def num_rows(self) -> int:
+        """Of a rollout, T · N."""
+        return self.num_steps * self.num_envs
+
+    @property
+    def num_rollouts(self) -> int:
+        """Of the whole run."""
+        return -(-self.total_steps // self.num_rows)
+
+
+@dataclass(frozen=True, kw_only=True)
 class ReplayConfig(RunConfig):
     """What algorithms that learn from memory share: the memory, the rhythm of acting and learning, noise, networks.
 

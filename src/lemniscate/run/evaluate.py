@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from lemniscate.envs.api import VecEnv
-from lemniscate.errors import UserError
 from lemniscate.nn.actor_critic import ActorQ
 from lemniscate.nn.policies import Policy
 from lemniscate.run.critique import Critique, Honesty
@@ -19,9 +18,6 @@ from lemniscate.types import Step
 
 EVALUATION = 1
 """the stream of seeds that training never draws from"""
-
-PATIENCE = 20_000
-"""steps that an episode may take in an environment without a time limit"""
 
 
 @dataclass(frozen=True)
@@ -73,11 +69,7 @@ def fly(
     env.restart(derive(seed, EVALUATION, 0))
     age = torch.zeros_like(left)
     while (left > 0).any():
-        if env.spec.max_episode_steps is None and age.max() >= PATIENCE:
-            raise UserError(
-                f"An episode of {env.spec.env_id} has not ended after {PATIENCE:,} steps, and there is no time limit;"
-                " give it one, with max_episode_steps where it is registered."
-            )
+        env.require_end(int(age.max()))
         obs, distribution = env.obs, policy(env.obs)
         action = distribution.mode() if deterministic else distribution.sample(noise())
         step = env.step(action)

@@ -1,0 +1,117 @@
+"""The natural gradient and the trust region, from products with the curvature alone."""
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.func import grad, vjp
+
+Product = Callable[[Tensor], Tensor]
+"""v [P] to A v [P], for a symmetric matrix A that nobody writes down"""
+
+
+def hessian(function: Callable[[Tensor], Tensor], point: Float[Tensor, " P"]) -> Product:
+    """Products with the Hessian of a scalar function at a point: ∇(∇f · v), Pearlmutter 1994, eq. 2.
+
+    Where f is the mean KL from the policy at `point`, this is the Fisher matrix there (arXiv:1502.05477, appendix C.1):
+    the gradient of that KL is zero, so its curvature is all there is to second order.
+
+    Args:
+        function: f, from [P] to a scalar.
+        point: θ.
+
+    Returns:
+        v to H v. The graph of the gradient is built once, and serves every product.
+    """
+    product: Callable[[Tensor], tuple[Tensor]] = vjp(grad(function), point)[1]
+    return lambda vector: product(vector)[0]
+
+
+def conjugate_gradient(
+    product: Product, b: Float[Tensor, " P"], *, iterations: int = 10, tolerance: float = 1e-10
+) -> Float[Tensor, " P"]:
+    """X ≈ A⁻¹ b for a symmetric positive definite A: Hestenes & Stiefel 1952; arXiv:1502.05477, appendix C.
+
+        α = rᵀr / pᵀAp      x ← x + α p      r' = r − α A p      p ← r' + (r'ᵀr' / rᵀr) p
+
+    Exact after P iterations, up to rounding; good long before where few eigenvalues differ.
+
+    Args:
+        product: v to A v.
+        b: the right-hand side.
+        iterations: at most so many.
+        tolerance: stop once ‖r‖² is below this fraction of ‖b‖².
+
+    Returns:
+        x; zeros where b is zero.
+    """
+    x, residual, direction = torch.zeros_like(b), b, b
+    rr = residual @ residual
+    enough = tolerance * rr
+    for _ in range(iterations):
+        if rr <= enough:
+            break
+        towards = product(direction)
+        alpha = rr / (direction @ towards)
+        x = x + alpha * direction
+        residual = residual - alpha * towards
+        before, rr = rr, residual @ residual
+        direction = residual + (rr / before) * direction
+    return x
+
+
+def natural_step(
+    product: Product, gradient: Float[Tensor, " P"], max_kl: float, *, iterations: int = 10
+) -> Float[Tensor, " P"]:
+    """The step that lowers a loss most among those of one length in KL: arXiv:1502.05477, appendix C.
+
+        minimize gᵀs  subject to  ½ sᵀHs = δ        s = −√(2δ / gᵀH⁻¹g) H⁻¹g
+
+    Args:
+        product: v to H v, the curvature of the KL (with any damping in it).
+        gradient: g, of the loss.
+        max_kl: δ.
+        iterations: of the conjugate gradient.
+
+    Returns:
+        s; zeros where g is zero.
+    """
+    direction = conjugate_gradient(product, -gradient, iterations=iterations)
+    length = (direction @ product(direction)).clamp(min=torch.finfo(gradient.dtype).tiny)
+    return (2 * max_kl / length).sqrt() * direction
+
+
+def backtrack(
+    judge: Callable[[Tensor], tuple[Tensor, Tensor]],
+    start: Float[Tensor, " P"],
+    step: Float[Tensor, " P"],
+    *,
+    max_kl: float,
+    shrink: float = 0.8,
+    attempts: int = 10,
+) -> tuple[Float[Tensor, " P"], float]:
+    """Where to stand after a step: the farthest of start + shrinkʲ · step that keeps both promises.
+
+    Promised are a loss below that at the start, and a KL within δ (arXiv:1502.05477, appendix C). Nothing is moved and
+    nothing has to be put back: the caller goes where this says.
+
+    Args:
+        judge: a point to (its loss, its KL from the start), scalars.
+        start: θ_old, also what is returned when no point will do.
+        step: the whole step, j = 0.
+        max_kl: δ.
+        shrink: in (0, 1).
+        attempts: how many points are tried.
+
+    Returns:
+        (the point to stand on, the fraction of the step taken: 0 where it is the start).
+    """
+    before, _ = judge(start)
+    for j in range(attempts):
+        fraction = shrink**j
+        point = start + fraction * step
+        loss, kl = judge(point)
+        if loss < before and kl <= max_kl:
+            return point, fraction
+    return start, 0.0
