@@ -109,3 +109,44 @@ def test_a_point_is_itself_and_what_is_added_stays_in_bounds():
     assert point.mode() is point.action
     assert torch.equal(point.sample(torch.zeros(1, 2)), point.action)
     assert torch.equal(point.sample(torch.tensor([[0.25, -0.25]])), torch.tensor([[0.75, -1.0]]))
+
+
+def pairs(rng):
+    """Two of each kind that are neither equal nor far apart: (ours, the same in torch.distributions)."""
+
+    def logits(*shape):
+        return [torch.randn(*shape, generator=rng, dtype=torch.float64) for _ in range(2)]
+
+    mean, log_std = logits(7, 3), logits(3)
+    yield (
+        [Gaussian(*x) for x in zip(mean, log_std, strict=True)],
+        [distributions.Independent(distributions.Normal(m, s.exp()), 1) for m, s in zip(mean, log_std, strict=True)],
+    )
+    of = logits(7, 4)
+    yield [Categorical(x) for x in of], [distributions.Categorical(logits=x) for x in of]
+    of = logits(7, 3)
+    yield (
+        [Bernoulli(x) for x in of],
+        [distributions.Independent(distributions.Bernoulli(logits=x), 1) for x in of],
+    )
+
+
+def test_kl_is_that_of_torch_never_negative_and_not_symmetric(rng):
+    for (ours, other), (oracle, its_other) in pairs(rng):
+        expected = distributions.kl_divergence(oracle, its_other)
+        torch.testing.assert_close(ours.kl(other), expected, rtol=1e-9, atol=1e-12)
+        assert (expected > 0).all()
+        assert not torch.allclose(ours.kl(other), other.kl(ours))
+        torch.testing.assert_close(ours.kl(ours), torch.zeros(7, dtype=torch.float64), rtol=0, atol=1e-12)
+
+
+def test_the_kl_of_several_choices_is_the_sum_of_theirs(rng):
+    parts = [[Categorical(torch.randn(7, n, generator=rng, dtype=torch.float64)) for n in (2, 5)] for _ in range(2)]
+    one, two = (MultiCategorical(tuple(of)) for of in parts)
+    torch.testing.assert_close(one.kl(two), sum(a.kl(b) for a, b in zip(*parts, strict=True)))
+
+
+def test_the_kl_of_what_is_masked_in_both_is_finite():
+    one, two = (Categorical(torch.tensor([[0.0, x, -1e9]], dtype=torch.float64)) for x in (1.0, -2.0))
+    short = [Categorical(x.logits[:, :2]) for x in (one, two)]
+    torch.testing.assert_close(one.kl(two), short[0].kl(short[1]))

@@ -1,9 +1,11 @@
+import math
+
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lemniscate.maths import clipped_surrogate, value_loss
+from lemniscate.maths import Categorical, clipped_surrogate, policy_gradient, surrogate, value_loss
 
 
 def f64(*x):
@@ -69,3 +71,57 @@ def test_a_wide_value_clip_is_no_clip(values):
 def test_a_clip_without_old_values_is_refused():
     with pytest.raises(ValueError, match="old_value"):
         value_loss(f64(1.0), f64(1.0), clip=0.2)
+
+
+@given(floats)
+def test_the_surrogate_is_the_mean_of_ratio_times_advantage_and_at_ratio_one_the_policy_gradient(values):
+    advantage = torch.tensor(values, dtype=torch.float64)
+    far = torch.linspace(-1, 1, len(values), dtype=torch.float64)
+    assert surrogate(far, advantage).item() == pytest.approx(
+        -sum(math.exp(x) * a for x, a in zip(far.tolist(), values, strict=True)) / len(values)
+    )
+    log_ratio, log_prob = (torch.zeros_like(advantage, requires_grad=True) for _ in range(2))
+    surrogate(log_ratio, advantage).backward()
+    policy_gradient(log_prob, advantage).backward()
+    torch.testing.assert_close(log_ratio.grad, log_prob.grad)
+    torch.testing.assert_close(log_prob.grad, -advantage / len(values))
+
+
+BANDIT = torch.tensor([0.3, -0.5, 1.1], dtype=torch.float64)
+PAYS = torch.tensor([10.0, 11.0, 12.5], dtype=torch.float64)
+
+
+def gradients(baseline, samples=4000, batch=10):
+    """Many policy gradients of a bandit with three arms, each from `batch` pulls, [samples, 3]."""
+    noise = torch.rand(samples, batch, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    action = Categorical(BANDIT.expand(samples, batch, 3)).sample(noise)
+
+    def gradient(action):
+        return torch.func.grad(
+            lambda logits: policy_gradient(
+                Categorical(logits.expand(batch, 3)).log_prob(action), (PAYS - baseline)[action]
+            )
+        )(BANDIT)
+
+    return torch.func.vmap(gradient)(action)
+
+
+def test_the_policy_gradient_is_the_gradient_of_what_is_expected():
+    exact = torch.func.grad(lambda logits: -(logits.softmax(0) * PAYS).sum())(BANDIT)
+    estimates = gradients(0.0)
+    error = estimates.std(0) / len(estimates) ** 0.5
+    assert ((estimates.mean(0) - exact).abs() < 4 * error).all()
+
+
+def test_a_baseline_changes_only_the_variance():
+    exact = torch.func.grad(lambda logits: -(logits.softmax(0) * PAYS).sum())(BANDIT)
+    plain, less = gradients(0.0), gradients((BANDIT.softmax(0) * PAYS).sum())
+    error = less.std(0) / len(less) ** 0.5
+    assert ((less.mean(0) - exact).abs() < 4 * error).all()
+    assert less.var(0).sum() < plain.var(0).sum() / 50
+
+
+def test_the_score_is_zero_in_the_mean():
+    """E[∇log π] = 0, which is why."""
+    scores = gradients(PAYS - 1)  # every pull weighs one
+    assert (scores.mean(0).abs() < 4 * scores.std(0) / len(scores) ** 0.5).all()

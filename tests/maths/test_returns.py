@@ -1,9 +1,10 @@
+import numpy as np
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lemniscate.maths import gae, polyak, td_target
+from lemniscate.maths import gae, polyak, reward_to_go, td_target, whole_return
 
 
 def brute_force(reward, value, next_value, terminated, done, gamma, lam):
@@ -128,3 +129,43 @@ def test_polyak_takes_no_gradient():
     assert torch.equal(target, online)
     assert target.is_leaf
     assert target.data_ptr() != online.data_ptr()
+
+
+@given(rollouts(), st.floats(0, 1))
+def test_reward_to_go_is_the_sum_of_what_follows(rollout, gamma):
+    reward, _, next_value, terminated, done = rollout
+    expected = torch.zeros_like(reward)
+    for t, n in np.ndindex(*reward.shape):
+        k, weight = t, 1.0
+        while True:
+            expected[t, n] += weight * reward[k, n]
+            weight *= gamma
+            if done[k, n] or k == len(reward) - 1:
+                break
+            k += 1
+        expected[t, n] += 0 if terminated[k, n] else weight * next_value[k, n]
+    actual = reward_to_go(reward, next_value, terminated, done, gamma=gamma)
+    torch.testing.assert_close(actual, expected, rtol=1e-10, atol=1e-10)
+
+
+@given(rollouts(), st.floats(0, 1))
+def test_gae_with_lambda_one_is_reward_to_go_minus_the_value(rollout, gamma):
+    """Where the value of a successor is that of the next row, the sum of TD errors telescopes."""
+    reward, value, next_value, terminated, done = rollout
+    shifted = torch.cat([value[1:], next_value[-1:]])
+    next_value = torch.where(done, next_value, shifted)
+    advantage, _ = gae(reward, value, next_value, terminated, done, gamma=gamma, lam=1.0)
+    to_go = reward_to_go(reward, next_value, terminated, done, gamma=gamma)
+    torch.testing.assert_close(advantage, to_go - value, rtol=1e-9, atol=1e-9)
+
+
+@given(rollouts(), st.floats(0, 1))
+def test_the_whole_return_is_that_of_the_first_row_of_the_episode(rollout, gamma):
+    reward, _, next_value, terminated, done = rollout
+    to_go = reward_to_go(reward, next_value, terminated, done, gamma=gamma)
+    expected = to_go.clone()
+    for n in range(reward.shape[1]):
+        for t in range(1, len(reward)):
+            expected[t, n] = to_go[t, n] if done[t - 1, n] else expected[t - 1, n]
+    actual = whole_return(to_go, reward, done, gamma=gamma)
+    torch.testing.assert_close(actual, expected, rtol=1e-9, atol=1e-9)
