@@ -37,7 +37,19 @@ REMEMBERING = {
 }
 
 
+ROAD = {
+    # name: algorithm and fields; in CartPole-v1
+    "reinforce": {"scale_rewards": True},
+    "reinforce-episodes": {"episodes": 1, "baseline": "mean", "returns": "whole"},
+    "a2c": {"gae_lambda": 0.9},
+    "trpo": {"final_critic_learning_rate": 0.1},
+}
+
+
 def train(path, env="Countdown-v0", **fields):
+    if env in ROAD:
+        small = {"num_envs": 4, "num_steps": 8, "total_steps": 256, "hidden": (16,), "evaluate_episodes": 4}
+        return lem.train(env.split("-")[0], "CartPole-v1", run=path, progress=False, **{**small, **ROAD[env], **fields})
     if env in REMEMBERING:
         fields = tiny_memory(**REMEMBERING[env], **fields)
         return lem.train(env.split("-")[0], "Pendulum-v1", run=path, progress=False, **fields)
@@ -64,7 +76,7 @@ def test_what_follows_episodes_begins_anew_with_the_environments(tmp_path, monke
     assert told == [0, 64, 128, 192]
 
 
-@pytest.mark.parametrize("env", ["Countdown-v0", "Matching-v0", "CartPole-v1", "Pendulum-v1", *REMEMBERING])
+@pytest.mark.parametrize("env", ["Countdown-v0", "Matching-v0", "CartPole-v1", "Pendulum-v1", *REMEMBERING, *ROAD])
 def test_the_same_seed_gives_the_same_bits_and_another_does_not(tmp_path, env):
     for name, seed in (("a", 1), ("b", 1), ("c", 2)):
         train(tmp_path / name, env, seed=seed)
@@ -73,7 +85,7 @@ def test_the_same_seed_gives_the_same_bits_and_another_does_not(tmp_path, env):
     assert final_hashes(tmp_path / "a")["tensors.safetensors"] != final_hashes(tmp_path / "c")["tensors.safetensors"]
 
 
-@pytest.mark.parametrize("env", ["CartPole-v1", "ddpg"])
+@pytest.mark.parametrize("env", ["CartPole-v1", "ddpg", "trpo"])
 def test_evaluation_changes_no_bit_of_training(tmp_path, env):
     train(tmp_path / "without", env)
     train(tmp_path / "with", env, evaluate_every=32)
@@ -127,7 +139,7 @@ def test_training_and_evaluation_are_separate_and_differently_seeded():
     assert torch.equal(train_env.obs, before)
 
 
-@pytest.mark.parametrize("env", ["CartPole-v1", *REMEMBERING])
+@pytest.mark.parametrize("env", ["CartPole-v1", *REMEMBERING, *ROAD])
 def test_a_run_resumed_from_any_checkpoint_ends_in_the_same_bits(tmp_path, env):
     fields = {"checkpoint_every": 64, "keep_checkpoints": 10}
     train(tmp_path / "whole", env, **fields)
