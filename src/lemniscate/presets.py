@@ -200,6 +200,19 @@ BOLD = {
 }
 """layer normalization bears the larger steps"""
 
+QUICK = {
+    "actor_learning_rate": 1e-3,
+    "critic_learning_rate": 1e-3,
+    "final_learning_rate": 0.0,
+    "batch_size": 128,
+    "hidden": (64, 64),
+    "critic_hidden": (64, 64),
+    "architecture": "layer_norm",
+}
+"""small networks, and learning rates that fall"""
+PENDULUM = {"env": "Pendulum-v1", "total_steps": 20_000, "learning_starts": 1000, **QUICK}
+SWUNG = "search by hand, three settings of each algorithm, on seed 101"
+
 DDPG = [
     Preset("default", ddpg.Config(), SHARED, "2026-11"),
     Preset(
@@ -208,6 +221,7 @@ DDPG = [
         "the reinforcement-learning course's notebook on DDPG: its settings, on the corrected algorithm",
         "2026-11",
     ),
+    Preset("pendulum", ddpg.Config(**PENDULUM), SWUNG, "2026-11"),
     Preset(
         "half-cheetah",
         ddpg.Config(env="HalfCheetah-v5", **BOLD),
@@ -237,8 +251,14 @@ DDPG = [
         "2026-11",
     ),
 ]
-TD3 = [Preset("default", td3.Config(), SHARED, "2026-11")]
-SAC = [Preset("default", sac.Config(), SHARED, "2026-11")]
+TD3 = [
+    Preset("default", td3.Config(), SHARED, "2026-11"),
+    Preset("pendulum", td3.Config(**PENDULUM), SWUNG, "2026-11"),
+]
+SAC = [
+    Preset("default", sac.Config(), SHARED, "2026-11"),
+    Preset("pendulum", sac.Config(**PENDULUM), SWUNG, "2026-11"),
+]
 
 PRESETS: dict[str, list[Preset]] = {
     "reinforce": REINFORCE,
