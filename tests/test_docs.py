@@ -69,6 +69,32 @@ def test_lambda_is_drawn_and_the_formulas_lie_on_its_lines(tmp_path):
     assert bias[-1] < 0.1 * bias[0]
 
 
+def drawing(name):
+    return runpy.run_path(str(ROOT / "docs" / "figures" / f"{name}.py"))
+
+
+def test_the_clip_is_drawn_and_its_gradient_stops_where_the_note_says():
+    objectives = drawing("clip")["objectives"]
+    for advantage, stops in ((1.0, lambda ratio: ratio > 1.2), (-1.0, lambda ratio: ratio < 0.8)):
+        ratio, plain, clipped, slope = objectives(advantage)
+        assert ((slope == 0) == stops(ratio)).double().mean() > 0.98  # but for rounding at the edge
+        assert (clipped <= plain + 1e-12).all()
+    assert len(drawing("clip")["draw"]().axes) == 2
+
+
+def test_baselines_lower_the_variance_of_the_gradient_in_the_picture():
+    figure = drawing("variance")["draw"](batches=12, updates=4, num_envs=2)
+    whole, to_go, _, value = (bar.get_width() for bar in figure.axes[0].patches[::-1])
+    assert whole == 1
+    assert value < to_go < whole
+
+
+@pytest.mark.parametrize(("name", "fields"), [("collapse", {"seeds": (1,)}), ("traces", {})])
+def test_the_pictures_of_training_are_drawn(name, fields):
+    figure = drawing(name)["draw"](steps=4096, **fields)
+    assert all(axes.lines for axes in figure.axes)
+
+
 def test_every_command_of_the_readme_is_understood():
     from lemniscate.cli import _parser
 
