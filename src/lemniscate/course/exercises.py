@@ -1,0 +1,214 @@
+"""Functions worth writing oneself, each with cases that are easily got wrong and the mistakes that get them wrong."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lemniscate import maths
+
+Function = Callable[..., Any]
+
+
+@dataclass(frozen=True)
+class Case:
+    """Arguments, and in a word what is special about them."""
+
+    about: str
+    args: tuple[Any, ...]
+    options: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Exercise:
+    """A function to write: what it is compared with, on what, and how it usually goes wrong."""
+
+    right: Function
+    outputs: tuple[str, ...]
+    """what it returns, by name"""
+    cases: Sequence[Case]
+    mistakes: Mapping[str, Function]
+    """in words: the function that makes it"""
+    is_loss: bool = False
+    """the gradient in the first argument counts too"""
+
+
+def _column(*numbers: float) -> Tensor:
+    return torch.tensor(numbers)[:, None]
+
+
+def _flags(*rows: int, length: int = 4) -> Tensor:
+    flags = torch.zeros(length, 1, dtype=torch.bool)
+    flags[list(rows)] = True
+    return flags
+
+
+def _drawn(*shape: int) -> Tensor:
+    return torch.randn(shape, generator=torch.Generator().manual_seed(sum(shape)))
+
+
+VALUES = (_column(1.0, -0.5, 2.0, 0.5), _column(0.3, 1.2, -0.4, 0.8), _column(0.9, -0.7, 0.6, 1.5))
+"""r, V(s) and V(s') of four steps of one environment"""
+DISCOUNTS = {"gamma": 0.9, "lam": 0.8}
+NEVER, LAST = _flags(), _flags(3)
+TWO = (_drawn(5, 2), _drawn(2, 5).T.contiguous(), _drawn(2, 5).T.contiguous() + 1)
+TWO_ENDS = (torch.tensor([[0, 0], [1, 0], [0, 0], [0, 1], [0, 0]]).bool(),)
+TWO_DONE = (torch.tensor([[0, 1], [1, 0], [0, 0], [0, 1], [1, 0]]).bool(),)
+
+
+def _late(flags: Tensor) -> Tensor:
+    return torch.cat([flags[1:], flags[-1:]])
+
+
+def _without(flags: Tensor) -> Tensor:
+    return torch.zeros_like(flags)
+
+
+def _chain_by(decay: Callable[[float, float], float]) -> Function:
+    """GAE whose chain decays by another factor."""
+
+    def gae(r: Tensor, v: Tensor, n: Tensor, term: Tensor, done: Tensor, *, gamma: float, lam: float) -> Any:
+        delta = r + gamma * n * ~term - v
+        zero = torch.zeros_like(delta)
+        advantage, _ = maths.gae(delta, zero, zero, term, done, gamma=1.0, lam=decay(gamma, lam))
+        return advantage, advantage + v
+
+    return gae
+
+
+def _clipped_value_alone(v: Tensor, target: Tensor, old: Tensor | None = None, clip: float = 0.0) -> Tensor:
+    return maths.value_loss(v if old is None else old + (v - old).clamp(-clip, clip), target)
+
+
+EXERCISES: dict[str, Exercise] = {
+    "gae": Exercise(
+        maths.gae,
+        ("advantage", "target"),
+        [
+            Case("no end", (*VALUES, NEVER, NEVER), DISCOUNTS),
+            Case("a death at the last row", (*VALUES, LAST, LAST), DISCOUNTS),
+            Case("a death at row 1", (*VALUES, _flags(1), _flags(1)), DISCOUNTS),
+            Case("a time-out at row 1", (*VALUES, NEVER, _flags(1)), DISCOUNTS),
+            Case("two environments, ends of both kinds", (*TWO, *TWO_ENDS, *TWO_DONE), DISCOUNTS),
+        ],
+        {
+            "the chain is not cut at time-outs": lambda r, v, n, te, d, **o: maths.gae(r, v, n, te, te, **o),
+            "the chain is cut nowhere": lambda r, v, n, te, d, **o: maths.gae(r, v, n, te, _without(d), **o),
+            "a time-out is taken for a death": lambda r, v, n, te, d, **o: maths.gae(r, v, n, d, d, **o),
+            "a value follows a death": lambda r, v, n, te, d, **o: maths.gae(r, v, n, _without(te), d, **o),
+            "the flags are read one row too late": lambda r, v, n, te, d, **o: maths.gae(
+                r, v, n, _late(te), _late(d), **o
+            ),
+            "V(s') is taken from the next row, which after an end is another episode's": lambda r, v, n, te, d, **o: (
+                maths.gae(r, v, torch.cat([v[1:], n[-1:]]), te, d, **o)
+            ),
+            "λ is left out": _chain_by(lambda gamma, lam: gamma),
+            "γ is left out of the chain": _chain_by(lambda gamma, lam: lam),
+            "there is no chain": _chain_by(lambda gamma, lam: 0.0),
+            "V is not added to the target": lambda *a, **o: (maths.gae(*a, **o)[0],) * 2,
+            "the two are returned in the other order": lambda *a, **o: maths.gae(*a, **o)[::-1],
+        },
+    ),
+    "reward_to_go": Exercise(
+        maths.reward_to_go,
+        ("return",),
+        [
+            Case("no end", (VALUES[0], VALUES[2], NEVER, NEVER), {"gamma": 0.9}),
+            Case("a death at row 1", (VALUES[0], VALUES[2], _flags(1), _flags(1)), {"gamma": 0.9}),
+            Case("a time-out at row 1", (VALUES[0], VALUES[2], NEVER, _flags(1)), {"gamma": 0.9}),
+        ],
+        {
+            "nothing stands for what the last row cuts off": lambda r, n, te, d, **o: maths.reward_to_go(
+                r, torch.where(d, n, 0.0), te, d, **o
+            ),
+            "a time-out is taken for a death": lambda r, n, te, d, **o: maths.reward_to_go(r, n, d, d, **o),
+            "a value follows a death": lambda r, n, te, d, **o: maths.reward_to_go(r, n, _without(te), d, **o),
+            "the sum runs on over the end": lambda r, n, te, d, **o: maths.reward_to_go(
+                r, n, _without(te), _without(d), **o
+            ),
+            "γ is left out": lambda r, n, te, d, **o: maths.reward_to_go(r, n, te, d, gamma=1.0),
+            "every row gets what came before it": lambda r, n, te, d, **o: maths.reward_to_go(
+                r.flip(0), n, te, d, **o
+            ).flip(0),
+        },
+    ),
+    "td_target": Exercise(
+        maths.td_target,
+        ("target",),
+        [
+            Case("nothing ends", (_drawn(6), _drawn(6) + 1, torch.zeros(6).bool()), {"gamma": 0.9}),
+            Case("some end", (_drawn(6), _drawn(6) + 1, torch.tensor([0, 1, 0, 0, 1, 1]).bool()), {"gamma": 0.9}),
+        ],
+        {
+            "a value follows a death": lambda r, n, te, **o: maths.td_target(r, n, _without(te), **o),
+            "only what ended bootstraps": lambda r, n, te, **o: maths.td_target(r, n, ~te, **o),
+            "γ is left out": lambda r, n, te, **o: maths.td_target(r, n, te, gamma=1.0),
+            "the reward is left out": lambda r, n, te, **o: maths.td_target(torch.zeros_like(r), n, te, **o),
+            "the reward of a death is left out": lambda r, n, te, gamma: (r + gamma * n) * ~te,
+        },
+    ),
+    "policy_gradient": Exercise(
+        maths.policy_gradient,
+        ("loss",),
+        [Case("eight actions", (_drawn(8), _drawn(8) + 0.5))],
+        {
+            "the sign: optimizers descend": lambda log_prob, weight: -maths.policy_gradient(log_prob, weight),
+            "the sum in place of the mean": lambda log_prob, weight: -(log_prob * weight).sum(),
+            "π in place of log π": lambda log_prob, weight: maths.policy_gradient(log_prob.exp(), weight),
+        },
+        is_loss=True,
+    ),
+    "clipped_surrogate": Exercise(
+        maths.clipped_surrogate,
+        ("loss",),
+        [
+            Case("ratios of one", (torch.zeros(4), torch.tensor([1.0, 2.0, -1.0, 0.5])), {"clip": 0.2}),
+            Case("good actions", (torch.tensor([-0.5, -0.1, 0.1, 0.5]), torch.ones(4)), {"clip": 0.2}),
+            Case("bad actions", (torch.tensor([-0.5, -0.1, 0.1, 0.5]), -torch.ones(4)), {"clip": 0.2}),
+            Case("of all kinds", (_drawn(12) / 3, _drawn(12).flip(0)), {"clip": 0.1}),
+        ],
+        {
+            "the sign: optimizers descend": lambda x, a, clip: -maths.clipped_surrogate(x, a, clip),
+            "the larger of the two is taken": lambda x, a, clip: maths.clipped_surrogate(x, -a, clip).neg(),
+            "only the clipped ratio counts, so what went the wrong way has no gradient": lambda x, a, clip: (
+                -(x.exp().clamp(1 - clip, 1 + clip) * a).mean()
+            ),
+            "nothing is clipped": lambda x, a, clip: maths.surrogate(x, a),
+            "the sum in place of the mean": lambda x, a, clip: maths.clipped_surrogate(x, a, clip) * len(x),
+            "the ratio is exp of the difference of log-probabilities": lambda x, a, clip: (
+                -torch.min(x * a, x.clamp(1 - clip, 1 + clip) * a).mean()
+            ),
+        },
+        is_loss=True,
+    ),
+    "value_loss": Exercise(
+        maths.value_loss,
+        ("loss",),
+        [
+            Case("without a clip", (_drawn(6), _drawn(6) + 1)),
+            Case("with a clip", (_drawn(8), _drawn(8).flip(0), _drawn(8) + 0.3, 0.2)),
+        ],
+        {
+            "the conventional half is missing": lambda *a: 2 * maths.value_loss(*a),
+            "the sum in place of the mean": lambda v, *a: maths.value_loss(v, *a) * len(v),
+            "the error is not squared": lambda v, target, *_: 0.5 * (v - target).abs().mean(),
+            "the clip is left out": lambda v, target, *_: maths.value_loss(v, target),
+            "only the clipped value counts": _clipped_value_alone,
+        },
+        is_loss=True,
+    ),
+    "polyak": Exercise(
+        maths.polyak,
+        ("target[0]", "target[1]", "online[0]", "online[1]"),
+        [Case("two tensors", ([_drawn(3), _drawn(2, 2)], [_drawn(3) + 1, _drawn(2, 2) - 1], 0.1))],
+        {
+            "the target is to be changed in place": lambda target, online, tau: None,
+            "τ and 1 − τ are exchanged": lambda target, online, tau: maths.polyak(target, online, 1 - tau),
+            "the online network is moved, not the target": lambda target, online, tau: maths.polyak(
+                online, target, tau
+            ),
+        },
+    ),
+}
