@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
-.PHONY: setup fly test test-long check bench bench-returns lock clean
+.PHONY: setup fly test test-long check bench bench-returns tutorials lock clean
 
 setup: .venv/.ready
 
@@ -39,6 +39,9 @@ bench-returns: setup  ## the README's returns, seed by seed: some hours
 .venv/.peers: .venv/.ready
 	$(BIN)/python -m pip install --quiet --constraint requirements.lock --no-build-isolation --editable '.[bench]'
 	touch $@
+
+tutorials: setup  ## the notebooks, from docs/tutorial/*.py
+	$(BIN)/jupytext --quiet --to notebook docs/tutorial/*.py
 
 lock: setup  ## renew requirements.lock from pyproject.toml
 	$(BIN)/pip-compile --quiet --strip-extras --extra box2d --extra classic-control --extra drone --extra envpool --extra mujoco --extra dev --no-emit-index-url --no-emit-find-links --no-emit-trusted-host --no-header --allow-unsafe --annotation-style=line --constraint constraints.txt --output-file requirements.lock pyproject.toml

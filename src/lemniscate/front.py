@@ -192,6 +192,8 @@ def watch(policy: TrainedPolicy, *, seed: int = 0, video: str | Path | None = No
 def plot(*runs: str | Path) -> list[Path]:
     """Draw the curves of a run into its `plots/`, or those of several into one picture; returns the pictures.
 
+    In a notebook they are also shown below the cell.
+
     A drone's run also gets its flights, and one with a Q what that says beside what followed.
     """
     paths = [Path(run) for run in runs]
@@ -204,6 +206,8 @@ def plot(*runs: str | Path) -> list[Path]:
         if policy.spec.tracking:
             flights = policy.config.evaluate_episodes
             pictures += pictures_of.draw_flight(policy.module, _drones(policy), folder, flights, seed=0)
+    if playback.in_notebook():
+        playback.show_pictures(pictures)
     return pictures
 
 

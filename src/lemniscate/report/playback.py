@@ -97,6 +97,15 @@ def in_notebook() -> bool:
     return hasattr(get_ipython(), "kernel")
 
 
+def show_pictures(files: Iterable[Path]) -> None:
+    """Show pictures below the cell."""
+    from IPython.display import Image as Shown
+    from IPython.display import display
+
+    for file in files:
+        display(Shown(filename=str(file)))
+
+
 def send_frames(frames: Iterable[np.ndarray], fps: float) -> None:
     """Show frames [H, W, 3] uint8 one after the other below the cell, at their own speed."""
     from IPython.display import Image as Shown
