@@ -104,8 +104,12 @@ def summary(algorithm):
             means = [row["mean_return"] for row in of]
             low, high = bootstrap_interval(means)
             seconds = np.median([row["training_s"] for row in of])
-            spread = f"{np.mean(means):,.0f} ± {np.std(means):,.0f} | {iqm(means):,.0f} [{low:,.0f}, {high:,.0f}]"
-            print(f"| {env} | {mark:,} | {spread} | {min(means):,.0f} | {len(means)} | {seconds / 60:.1f} min |")
+            digits = 1 if abs(np.mean(means)) < 200 else 0
+            mean, std, middle, low, high, worst = (
+                f"{x:,.{digits}f}" for x in (np.mean(means), np.std(means), iqm(means), low, high, min(means))
+            )
+            spread = f"{mean} ± {std} | {middle} [{low}, {high}]"
+            print(f"| {env} | {mark:,} | {spread} | {worst} | {len(means)} | {seconds / 60:.1f} min |")
 
 
 def draw(algorithm):
