@@ -50,6 +50,7 @@ started = time.perf_counter()
 model.learn(steps, reset_num_timesteps=False)
 print(steps / (time.perf_counter() - started))
 """
+
 PEER_LANDER = """
 import sys, time, torch
 torch.set_num_threads(1)
@@ -62,4 +63,21 @@ model = PPO("MlpPolicy", vector, seed=int(sys.argv[1]), **fields)
 stop = StopTrainingOnRewardThreshold(250)
 model.learn(1_000_000, EvalCallback(judge, stop, n_eval_episodes=100, eval_freq=3125, verbose=0, warn=False))
 print(model.num_timesteps)
+"""
+
+PEER_TRPO = """
+import sys, time, torch
+steps, kind, threads = int(sys.argv[1]), sys.argv[2], int(sys.argv[3])
+torch.set_num_threads(threads)
+from sb3_contrib import TRPO
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+if __name__ == "__main__":
+    vector = make_vec_env("HalfCheetah-v5", n_envs=16, vec_env_cls=SubprocVecEnv if kind == "subproc" else DummyVecEnv)
+    fields = dict(n_steps=128, batch_size=128, learning_rate=1e-3, cg_max_steps=15, cg_damping=0.1, n_critic_updates=10)
+    model = TRPO("MlpPolicy", vector, target_kl=0.01, **fields)
+    model.learn(4096)
+    started = time.perf_counter()
+    model.learn(steps, reset_num_timesteps=False)
+    print((model.num_timesteps - 4096) / (time.perf_counter() - started))
 """

@@ -8,6 +8,7 @@
                  its best number of threads and kind of vector; the others on 64 copies, beside EnvPool alone
     parts        where the time of one update goes, eager and native
     startup      from the command to the first update: eager, native with a cold cache, native with a warm one
+    trust        TRPO on 16 copies of HalfCheetah-v5, 2048 rows, beside sb3-contrib with the same settings
     replay       DDPG on Hopper-v5: one copy, batches of 256, 256 × 256, one gradient step for each step
     lander       from process start to a policy of mean return 250 over 100 episodes of LunarLander-v3
 
@@ -27,7 +28,7 @@ from pathlib import Path
 from statistics import harmonic_mean, median
 
 from common import RESULTS, append, provenance, rows
-from peers import BARE, PEER, PEER_LANDER, PEER_REPLAY
+from peers import BARE, PEER, PEER_LANDER, PEER_REPLAY, PEER_TRPO
 
 COPIES = {"HalfCheetah-v5": 16, "Ant-v5": 64, "Humanoid-v5": 64, "Hopper-v5": 64}
 ENVS = tuple(COPIES)
@@ -216,6 +217,25 @@ def startup(rounds, stamp):
     shutil.rmtree(cache)
 
 
+def trust(rounds, stamp):
+    """Steps per second of TRPO; the peer at its best threads and vectors, which the first round finds."""
+    size = {"num_envs": 16, "num_steps": 128, "cg_iterations": 15, "critic_epochs": 10, "critic_minibatch_size": 128}
+    best = None
+    for _ in range(rounds):
+        with tempfile.TemporaryDirectory() as scratch:
+            folder = Path(scratch) / "run"
+            train(folder, ENVS[0], algorithm="trpo", preset="default", total_steps=60_000, engine="native", **size)
+            mine = harmonic_mean(line["time/steps_per_second"] for line in lines(folder)[3:])
+        ways = [best] if best else [(kind, threads) for kind in ("dummy", "subproc") for threads in (1, 2)]
+        tried = {way: python(PEER_TRPO, 20_000, *way) for way in ways}
+        best = max(tried, key=tried.__getitem__)
+        say(f"TRPO, {ENVS[0]}: {mine:,.0f} beside {tried[best]:,.0f} steps/s of sb3-contrib ({best})")
+        row = {OURS: mine, "sb3-contrib": tried[best]}
+        append("speed", {"what": "trust", "steps_per_second": row, "peer": best} | stamp)
+    ratio = median(row[OURS] / row["sb3-contrib"] for row in measured("trust"))
+    print(f"| HalfCheetah-v5, TRPO | lemniscate is {ratio:.1f} × sb3-contrib |")
+
+
 def replay(rounds, stamp):
     """Steps per second of DDPG, each at its best number of threads, which the first round finds."""
 
@@ -283,7 +303,14 @@ def lander(rounds, stamp):
         )
 
 
-MEASURES = {"throughput": throughput, "parts": parts, "startup": startup, "replay": replay, "lander": lander}
+MEASURES = {
+    "throughput": throughput,
+    "parts": parts,
+    "startup": startup,
+    "trust": trust,
+    "replay": replay,
+    "lander": lander,
+}
 
 
 def main():
