@@ -1,6 +1,7 @@
 """Against dense linear algebra, finite differences and policies whose natural gradient is known in closed form."""
 
 import math
+from functools import partial
 
 import pytest
 import torch
@@ -8,7 +9,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.func import functional_call, grad
 
-from lemniscate.maths import Categorical, Gaussian, backtrack, conjugate_gradient, hessian, natural_step
+from lemniscate.maths import (
+    Bernoulli,
+    Categorical,
+    Gaussian,
+    MultiCategorical,
+    backtrack,
+    conjugate_gradient,
+    fisher_product,
+    natural_step,
+)
 
 F64 = torch.float64
 
@@ -78,47 +88,66 @@ def small_policy():
     return policy, point
 
 
-def test_products_with_the_hessian_are_finite_differences_of_the_gradient():
-    policy, point = small_policy()
-    old = policy(point + 0.1)  # away from the minimum, where the Hessian is more than the Fisher matrix
-    kl = lambda theta: old.kl(policy(theta)).mean()  # noqa: E731
-    product = hessian(kl, point)
-    for seed in range(3):
-        v = torch.randn(len(point), generator=torch.Generator().manual_seed(seed), dtype=F64)
-        numeric = (grad(kl)(point + 1e-5 * v) - grad(kl)(point - 1e-5 * v)) / 2e-5
-        torch.testing.assert_close(product(v), numeric, rtol=1e-6, atol=1e-8)
+def dense(policy, theta):
+    """The whole Fisher matrix, a product with each unit vector."""
+    return torch.stack([fisher_product(policy, theta, row) for row in torch.eye(len(theta), dtype=F64)])
 
 
-def test_the_curvature_of_the_kl_is_the_fisher_matrix():
-    """E[∇log π ∇log πᵀ], by quadrature over each of the two independent actions."""
+def test_products_are_finite_differences_of_the_gradient_of_the_kl():
     policy, point = small_policy()
     old = policy(point)
-    product = hessian(lambda theta: old.kl(policy(theta)).mean(), point)
+    gradient = grad(lambda theta: old.kl(policy(theta)).mean())
+    torch.testing.assert_close(gradient(point), torch.zeros_like(point), rtol=0, atol=1e-12)
+    for seed in range(3):
+        v = torch.randn(len(point), generator=torch.Generator().manual_seed(seed), dtype=F64)
+        numeric = (gradient(point + 1e-5 * v) - gradient(point - 1e-5 * v)) / 2e-5
+        torch.testing.assert_close(fisher_product(policy, point, v), numeric, rtol=1e-6, atol=1e-8)
+
+
+def test_it_is_the_fisher_matrix():
+    """Of a Gaussian with a σ of its own it is E[ ∂μᵀ/∂θ σ⁻² ∂μ/∂θ ]; symmetric, and no direction has less than none."""
+    policy, point = small_policy()
     jacobian = torch.func.jacrev(lambda theta: policy(theta).mean)(point)  # [6, 2, P]
-    fisher = torch.einsum("bap,baq,a->pq", jacobian, jacobian, (-2 * old.log_std).exp()) / 6
-    dense = torch.stack([product(row) for row in torch.eye(len(point), dtype=F64)])
-    torch.testing.assert_close(dense, fisher, rtol=1e-9, atol=1e-12)
-    torch.testing.assert_close(dense, dense.T, rtol=1e-9, atol=1e-12)
+    expected = torch.einsum("bap,baq,a->pq", jacobian, jacobian, (-2 * policy(point).log_std).exp()) / 6
+    fisher = dense(policy, point)
+    torch.testing.assert_close(fisher, expected, rtol=1e-9, atol=1e-12)
+    torch.testing.assert_close(fisher, fisher.T, rtol=1e-9, atol=1e-12)
+    assert torch.linalg.eigvalsh(fisher).min() > -1e-12
+
+
+def test_it_is_the_covariance_of_the_score():
+    """E[∇log π ∇log πᵀ], summed over the actions of two choices and of switches."""
+    theta = torch.tensor([0.2, -1.0, 0.7, 0.0, 0.4], dtype=F64)
+    two = lambda theta: MultiCategorical((Categorical(theta[None, :2]), Categorical(theta[None, 2:])))  # noqa: E731
+    switches = lambda theta: Bernoulli(theta[None])  # noqa: E731
+    for policy, actions in (
+        (two, torch.cartesian_prod(torch.arange(2), torch.arange(3))),
+        (switches, torch.cartesian_prod(*[torch.arange(2)] * 5)),
+    ):
+        expected = torch.zeros(5, 5, dtype=F64)
+        for action in actions:
+            log_prob = lambda theta: policy(theta).log_prob(action[None])[0]  # noqa: B023, E731
+            score = grad(log_prob)(theta)
+            expected += log_prob(theta).exp() * torch.outer(score, score)
+        torch.testing.assert_close(dense(policy, theta), expected, rtol=1e-9, atol=1e-12)
 
 
 def test_the_natural_gradient_of_a_gaussian_is_known():
     """Fisher information of μ is 1/σ², of log σ it is 2: so the natural gradient is σ² g and g / 2."""
-    old = Gaussian(torch.tensor([[0.3, -1.0]], dtype=F64), torch.tensor([0.5, -0.7], dtype=F64))
-    theta = torch.cat([old.mean[0], old.log_std])
-    kl = lambda theta: old.kl(Gaussian(theta[None, :2], theta[2:])).mean()  # noqa: E731
+    theta = torch.tensor([0.3, -1.0, 0.5, -0.7], dtype=F64)
+    policy = lambda theta: Gaussian(theta[None, :2], theta[2:])  # noqa: E731
     g = torch.tensor([1.0, -2.0, 0.5, 3.0], dtype=F64)
-    natural = conjugate_gradient(hessian(kl, theta), g, iterations=20, tolerance=1e-24)
-    expected = torch.cat([(2 * old.log_std).exp() * g[:2], g[2:] / 2])
+    natural = conjugate_gradient(partial(fisher_product, policy, theta), g, iterations=20, tolerance=1e-24)
+    expected = torch.cat([(2 * theta[2:]).exp() * g[:2], g[2:] / 2])
     torch.testing.assert_close(natural, expected, rtol=1e-9, atol=1e-12)
 
 
 def test_the_curvature_of_a_softmax_is_known():
     """diag(p) − p pᵀ."""
     logits = torch.tensor([0.2, -1.0, 0.7, 0.0], dtype=F64)
-    old, p = Categorical(logits[None]), logits.softmax(0)
-    product = hessian(lambda theta: old.kl(Categorical(theta[None])).mean(), logits)
-    dense = torch.stack([product(row) for row in torch.eye(4, dtype=F64)])
-    torch.testing.assert_close(dense, p.diag() - torch.outer(p, p), rtol=1e-9, atol=1e-12)
+    p = logits.softmax(0)
+    expected = p.diag() - torch.outer(p, p)
+    torch.testing.assert_close(dense(lambda theta: Categorical(theta[None]), logits), expected, rtol=1e-9, atol=1e-12)
 
 
 def judge(point):

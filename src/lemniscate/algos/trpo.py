@@ -6,18 +6,16 @@ Departures from the paper, and why: docs/notes/trpo.md.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Generator, Tensor
-from torch.func import functional_call, grad
+from torch.func import grad
 
-from lemniscate.data.rollout import collect, minibatches
+from lemniscate.data.rollout import collect, minibatches, whole_batch
 from lemniscate.maths import (
     backtrack,
     explained_variance,
     gae,
-    hessian,
     linear,
     natural_step,
     standardize,
@@ -27,7 +25,7 @@ from lemniscate.maths import (
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.critics import Value
 from lemniscate.nn.descent import Descent
-from lemniscate.nn.flat import Flat
+from lemniscate.nn.flat import FlatPolicy
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.nn.policies import Policy
 from lemniscate.run.config import Count, Fraction, NonNegative, Positive, RolloutConfig
@@ -76,7 +74,7 @@ class State:
     """Everything a crash may not take from us."""
 
     networks: ActorCritic
-    parameters: Flat
+    parameters: FlatPolicy
     """θ, the policy's"""
     critic: Descent[Value]
     reward_scale: RewardScale
@@ -102,7 +100,7 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
     fresh = networks(config, spec).to(device)
     return State(
         fresh,
-        Flat(fresh.policy),
+        FlatPolicy(fresh.policy),
         Descent(fresh.value, critic_loss),
         RewardScale(config.num_envs, config.gamma).to(device),
         noise=generator(config.seed, device, 2),
@@ -128,32 +126,28 @@ def critic_loss(value: Value, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
 
 def improve(config: Config, state: State, batch: Batch) -> dict[str, Tensor | float]:
     """Maximize L(θ) subject to KL(θ_old ‖ θ) ≤ δ, to first and to second order (eq. 14, appendix C)."""
-    here = state.parameters.vector.clone()
+    here, pi = state.parameters.vector.clone(), state.parameters.at
     advantage = standardize(batch.advantage) if config.normalize_advantage else batch.advantage
 
-    def policy(theta: Tensor) -> Any:
-        return functional_call(state.policy, state.parameters.parts(theta), (batch.obs,))
-
     def loss(theta: Tensor) -> Tensor:
-        return surrogate(policy(theta).log_prob(batch.action) - batch.log_prob, advantage)
+        return surrogate(pi(theta, batch.obs).log_prob(batch.action) - batch.log_prob, advantage)
 
     def kl(theta: Tensor) -> Tensor:
-        return old.kl(policy(theta)).mean()
+        return pi(here, batch.obs).kl(pi(theta, batch.obs)).mean()
 
     def fisher(vector: Tensor) -> Tensor:
-        return curvature(vector) + config.damping * vector
+        return state.parameters.fisher(vector, batch.obs) + config.damping * vector
 
+    gradient = grad(loss)(here)
     with torch.no_grad():
-        old = policy(here)
-    gradient, curvature = grad(loss)(here), hessian(kl, here)
-    step = natural_step(fisher, gradient, config.max_kl, iterations=config.cg_iterations)
-    with torch.no_grad():
+        step = natural_step(fisher, gradient, config.max_kl, iterations=config.cg_iterations)
         limits = {"max_kl": config.max_kl, "shrink": config.shrink, "attempts": config.attempts}
         there, fraction = here + step, 1.0
         if config.line_search:
             there, fraction = backtrack(lambda theta: (loss(theta), kl(theta)), here, step, **limits)
+        entropy = pi(here, batch.obs).entropy().mean()
+        watched = {"losses/policy": loss(there), "losses/entropy": entropy, "kl": kl(there)}
         state.parameters.vector.copy_(there)
-        watched = {"losses/policy": loss(there), "losses/entropy": old.entropy().mean(), "kl": kl(there)}
     return {**watched, "gradient_norm": gradient.norm(), "step_fraction": fraction}
 
 
@@ -164,7 +158,7 @@ def update(config: Config, state: State, rollout: Rollout) -> Mapping[str, Tenso
         rollout = state.reward_scale.follow(rollout)
     batch = advantages(config, state, rollout)
     played = rollout.valid.flatten().nonzero()[:, 0]  # without the rows in which no action was taken
-    watched = improve(config, state, batch[played])
+    watched = improve(config, state, batch[whole_batch(played, rollout.num_rows)[0]])
     for _ in range(config.critic_epochs):
         parts = minibatches(played, rollout.num_rows, config.critic_minibatch_size, state.shuffle)
         watched["losses/value"] = state.critic(batch, parts, rate)["losses/value"]

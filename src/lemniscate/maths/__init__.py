@@ -23,7 +23,7 @@ from lemniscate.maths.stats import (
     ratio_statistics,
     standardize,
 )
-from lemniscate.maths.trust_region import backtrack, conjugate_gradient, hessian, natural_step
+from lemniscate.maths.trust_region import backtrack, conjugate_gradient, fisher_product, natural_step
 
 __all__ = [
     "Bernoulli",
@@ -40,8 +40,8 @@ __all__ = [
     "coloured",
     "conjugate_gradient",
     "explained_variance",
+    "fisher_product",
     "gae",
-    "hessian",
     "kl_k1",
     "kl_k3",
     "linear",

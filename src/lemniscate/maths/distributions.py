@@ -190,3 +190,7 @@ class SquashedGaussian:
 def _log_slope(u: Tensor) -> Tensor:
     """Log of the derivative of tanh."""
     return 2 * (math.log(2) - u - softplus(-2 * u))
+
+
+for kind in (Gaussian, Categorical, MultiCategorical, Bernoulli):
+    torch.export.register_dataclass(kind)  # so that derivatives can be taken in what a distribution is made of

@@ -1,31 +1,36 @@
 """The natural gradient and the trust region, from products with the curvature alone."""
 
 from collections.abc import Callable
+from typing import Any, cast
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.func import grad, vjp
+from torch.func import grad, jvp, vjp
 
 Product = Callable[[Tensor], Tensor]
 """v [P] to A v [P], for a symmetric matrix A that nobody writes down"""
 
 
-def hessian(function: Callable[[Tensor], Tensor], point: Float[Tensor, " P"]) -> Product:
-    """Products with the Hessian of a scalar function at a point: ∇(∇f · v), Pearlmutter 1994, eq. 2.
+def fisher_product(
+    policy: Callable[[Tensor], Any], theta: Float[Tensor, " P"], vector: Float[Tensor, " P"]
+) -> Float[Tensor, " P"]:
+    """F v, the curvature of the mean KL from a policy to its neighbours: arXiv:1502.05477, appendix C.1.
 
-    Where f is the mean KL from the policy at `point`, this is the Fisher matrix there (arXiv:1502.05477, appendix C.1):
-    the gradient of that KL is zero, so its curvature is all there is to second order.
+        F = Jᵀ M J      J = ∂φ/∂θ,  M = ∂²/∂φ² E[KL(π_θ ‖ π_φ)] at φ = φ(θ)
+
+    φ are the numbers that a distribution is made of (mean and log σ, or logits). At θ itself the KL is zero and so is
+    its gradient; therefore this is its Hessian, and the Fisher matrix E[∇log π ∇log πᵀ], exactly.
 
     Args:
-        function: f, from [P] to a scalar.
-        point: θ.
-
-    Returns:
-        v to H v. The graph of the gradient is built once, and serves every product.
+        policy: θ to its distributions at B observations.
+        theta: θ.
+        vector: v.
     """
-    product: Callable[[Tensor], tuple[Tensor]] = vjp(grad(function), point)[1]
-    return lambda vector: product(vector)[0]
+    here, tangent = cast(tuple[Any, Any], jvp(policy, (theta,), (vector,)))  # J v
+    curved = jvp(grad(lambda there: here.kl(there).mean()), (here,), (tangent,))[1]  # M J v
+    pull_back: Callable[[Any], tuple[Tensor]] = vjp(policy, theta)[1]
+    return pull_back(curved)[0]  # Jᵀ M J v
 
 
 def conjugate_gradient(

@@ -1,9 +1,15 @@
 """All parameters of some networks as one vector."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.func import functional_call
+
+from lemniscate.maths import fisher_product
+from lemniscate.nn.native import Native
+from lemniscate.nn.policies import Policy
 
 
 class Flat:
@@ -30,8 +36,32 @@ class Flat:
         """What `parts` cut, in one vector [P] again."""
         return torch.cat([parts[name].flatten() for name in self._names])
 
+
+class FlatPolicy(Flat):
+    """A policy as a function of one vector θ, and how its distributions curve there."""
+
+    def __init__(self, policy: Policy) -> None:
+        super().__init__(policy)
+        self._policy = policy
+        self._product: Callable[[Tensor, Tensor, Tensor], Tensor] = self._fisher
+
+    def at(self, theta: Tensor, obs: Tensor) -> Any:
+        """π_θ(·|s) at observations [B, O]."""
+        return functional_call(self._policy, self.parts(theta), (obs,))
+
+    def fisher(self, vector: Tensor, obs: Tensor) -> Tensor:
+        """F v [P], F the Fisher matrix at θ over observations [B, O]; once native, B is always the same."""
+        return self._product(self.vector, vector, obs)
+
+    def make_native(self) -> None:
+        """From the next product on, each is one native call."""
+        self._product = Native(self._fisher, self._fisher, self.vector.device)
+
+    def _fisher(self, theta: Tensor, vector: Tensor, obs: Tensor) -> Tensor:
+        return fisher_product(lambda point: self.at(point, obs), theta, vector)
+
     def state_dict(self) -> dict[str, Tensor]:
-        """Nothing of its own: the parameters belong to the networks."""
+        """Nothing of its own: the parameters belong to the policy."""
         return {}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:

@@ -29,6 +29,7 @@ from lemniscate.envs.api import VecEnv
 from lemniscate.envs.books import Episodes
 from lemniscate.errors import NonFiniteError, UserError
 from lemniscate.nn.descent import Descent
+from lemniscate.nn.flat import FlatPolicy
 from lemniscate.nn.policies import Policy
 from lemniscate.run import checkpoint
 from lemniscate.run.config import RunConfig
@@ -179,7 +180,7 @@ class Run:
                 )
             state.policy.make_native()
             for part in vars(state).values():
-                if isinstance(part, Descent):
+                if isinstance(part, (Descent, FlatPolicy)):
                     part.make_native()
 
     def _restart(self, state: AnyState) -> None:
