@@ -247,6 +247,14 @@ MUTANTS = [
         "self._position.fill_(self._length)",
         "data/test_exploration.py",
     ),
+    (
+        "a tie is lost",
+        "report/seeds.py",
+        "(1 + np.sign(difference)",
+        "(1 + np.sign(difference - 1e-9)",
+        "test_seeds.py",
+    ),
+    ("one seed is ranked", "report/compare.py", "len(one.finals(scores)) > 1", "one.finals(scores)", "test_compare.py"),
     ("the learning rate adapts the wrong way", "maths/schedules.py", "1 / 1.5 if kl > 2", "1 / 1.5 if kl < 2", "maths"),
 ]
 

@@ -1,4 +1,8 @@
-"""Environments in which the right action is a copy of what is seen, in spaces of every kind."""
+"""Environments in which the right action is a copy of what is seen, in spaces of every kind, and some that fail."""
+
+import os
+import signal
+import sys
 
 import gymnasium as gym
 import numpy as np
@@ -100,3 +104,22 @@ class Unbounded(gym.Env):
 
 
 gym.register("Unbounded-v0", entry_point="worlds:Unbounded", max_episode_steps=5)
+
+
+class Fragile(gym.Env):
+    """In a run named ppo-2 a reward is NaN, in one named ppo-3 the process is killed; else nothing happens."""
+
+    observation_space = spaces.Box(-1, 1, (1,))
+    action_space = spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.t += 1
+        name = next((argument.rpartition("/")[2] for argument in sys.argv if "/ppo-" in argument), "")
+        if name == "ppo-3":
+            os.kill(os.getpid(), signal.SIGKILL)
+        return np.zeros(1, np.float32), np.nan if name == "ppo-2" else 1.0, self.t == 8, False, {}

@@ -1,6 +1,6 @@
 """Deep reinforcement learning that you can read in an evening, leave alone overnight, and fly in half a minute."""
 
-from lemniscate.errors import NonFiniteError, UserError
+from lemniscate.errors import NonFiniteError, SetError, UserError
 from lemniscate.front import (
     TrainedRun,
     config_for,
@@ -15,14 +15,17 @@ from lemniscate.front import (
 from lemniscate.run.evaluate import Evaluation
 from lemniscate.run.run import Stopped
 from lemniscate.run.seeding import set_seeds
+from lemniscate.sets import TrainedSet, resume_set, train_set
 from lemniscate.trained import TrainedPolicy
 
 __all__ = [
     "Evaluation",
     "NonFiniteError",
+    "SetError",
     "Stopped",
     "TrainedPolicy",
     "TrainedRun",
+    "TrainedSet",
     "UserError",
     "config_for",
     "evaluate",
@@ -30,7 +33,9 @@ __all__ = [
     "make_envs",
     "plot",
     "resume",
+    "resume_set",
     "set_seeds",
     "train",
+    "train_set",
     "watch",
 ]

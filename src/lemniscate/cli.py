@@ -11,19 +11,20 @@ import re
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import tyro
 
-from lemniscate import front
+from lemniscate import front, sets
 from lemniscate.algos import ALGORITHMS
 from lemniscate.envs import api
 from lemniscate.envs.check import check as check_environment
-from lemniscate.errors import NonFiniteError, UserError, WorkerError, unknown
+from lemniscate.errors import NonFiniteError, SetError, UserError, WorkerError, said_of, unknown
 from lemniscate.presets import best, choose, names
 from lemniscate.report import pictures
 from lemniscate.run.config import RunConfig
 from lemniscate.run.run import Stopped, engine_of
+from lemniscate.run.set_file import is_set
 
 Command = Callable[[argparse.Namespace, list[str]], None]
 
@@ -43,6 +44,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (NonFiniteError, WorkerError) as error:
         learning = given is not None and given.run_command in (train, resume)
         return _say(f"{error} Training stopped; the last checkpoint is as it was." if learning else error, 1)
+    except SetError as error:
+        return _say(error, 1)
     except Stopped as stopped:
         return _say(stopped, 128 + stopped.signum)
     except KeyboardInterrupt:
@@ -51,10 +54,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def train(given: argparse.Namespace, rest: list[str]) -> None:
-    """Train a policy; with --report also evaluate it and draw pictures."""
+    """Train a policy, or with --seeds one for each of several algorithms and seeds, to compare them."""
     misplaced = sorted(set(rest) & set(ALGORITHMS))
     if misplaced and given.algorithm not in ALGORITHMS:
         raise UserError(f"The algorithm comes first, then its fields: lemniscate train {misplaced[0]} …")
+    if given.seeds or "," in given.algorithm:
+        return _train_set(given, rest)
     config = _with_fields(front.config_for(given.algorithm, given.env, given.preset), rest)
     if config.backend:
         api.require_backend(config.backend)
@@ -71,13 +76,43 @@ def train(given: argparse.Namespace, rest: list[str]) -> None:
         report=given.report,
         **fields,
     )
+    if given.score:
+        front.final_return(run.path)
     _say(f"Trained in {run.seconds:.1f} s. Everything is in {run.path}")
 
 
+def _train_set(given: argparse.Namespace, rest: list[str]) -> None:
+    if any(argument.partition("=")[0] == "--seed" for argument in rest):
+        raise UserError("Several runs have several seeds: --seeds 1-5, not --seed.")
+    if not given.seeds:
+        raise UserError("Algorithms are compared over several seeds: add --seeds 1-5.")
+    fields: dict[str, Any] = {}
+    for algorithm in sets.algorithms_of(given.algorithm):
+        with said_of(algorithm):
+            preset = front.config_for(algorithm, given.env, given.preset)
+            config = _with_fields(preset, rest)
+        values = {name: getattr(config, name) for name in config.names()}
+        fields |= {name: value for name, value in values.items() if value != getattr(preset, name)}
+    trained = sets.train_set(
+        given.algorithm,
+        given.env,
+        given.seeds,
+        run=given.run,
+        preset=given.preset,
+        track=given.track,
+        report=given.report,
+        **fields,
+    )
+    _say(f"Everything is in {trained.path}")
+
+
 def resume(given: argparse.Namespace, rest: list[str]) -> None:
-    """Go on with an interrupted run."""
+    """Go on with an interrupted run, or with a set of them."""
     _nothing_left(rest)
-    run = front.resume(given.run, track=given.track, report=given.report)
+    go_on = sets.resume_set if is_set(given.run) else front.resume
+    run = go_on(given.run, track=given.track, report=given.report)
+    if given.score and not is_set(given.run):
+        front.final_return(run.path)
     _say(f"Done. Everything is in {run.path}")
 
 
@@ -101,7 +136,7 @@ def watch(given: argparse.Namespace, rest: list[str]) -> None:
 
 
 def plot(given: argparse.Namespace, rest: list[str]) -> None:
-    """Draw the curves of one run, or of several side by side."""
+    """Draw the curves of one run, or compare several, grouped by all but the seed."""
     _nothing_left(rest)
     for file in front.plot(*given.runs):
         _say(file)
@@ -188,17 +223,16 @@ def _parser() -> argparse.ArgumentParser:
         return sub
 
     sub = command(train, _TrainParser)
-    sub.add_argument("algorithm", help=", ".join(ALGORITHMS))
+    sub.add_argument("algorithm", help=f"{', '.join(ALGORITHMS)}; or several, such as {','.join([*ALGORITHMS][:2])}")
     sub.add_argument("--env", help="environment id, or module:Class of your own; a preset may have one")
     sub.add_argument("--run", type=Path, metavar="DIR", help="run directory; must not exist (default: runs/…)")
+    sub.add_argument("--seeds", help="a run for each, such as 1-5 or 1,3,7, as many at once as cores serve")
     sub.add_argument("--preset", help="; ".join(f"{a}: {', '.join(names(a))}" for a in ALGORITHMS))
-    sub.add_argument("--track", metavar="LOGGER", help="a logger beside the local ones: wandb")
-    sub.add_argument("--report", action="store_true", help="evaluate the result and leave pictures")
+    _add_endings(sub)
 
     sub = command(resume)
-    sub.add_argument("run", type=Path)
-    sub.add_argument("--track", metavar="LOGGER", help="a logger beside the local ones")
-    sub.add_argument("--report", action="store_true", help="evaluate the result and leave pictures")
+    sub.add_argument("run", type=Path, help="a run or a set of runs")
+    _add_endings(sub)
 
     sub = command(evaluate)
     sub.add_argument("run", type=Path, help="a run or a checkpoint")
@@ -213,7 +247,7 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--seed", type=int, default=0)
 
     sub = command(plot)
-    sub.add_argument("runs", type=Path, nargs="+")
+    sub.add_argument("runs", type=Path, nargs="+", help="runs or sets of runs")
 
     sub = command(check)
     sub.add_argument("env", help="an id, or module:Class of your own")
@@ -222,6 +256,12 @@ def _parser() -> argparse.ArgumentParser:
     sub = command(envs)
     sub.add_argument("filter", nargs="?", default="", help="a part of the id")
     return parser
+
+
+def _add_endings(sub: argparse.ArgumentParser) -> None:
+    sub.add_argument("--track", metavar="LOGGER", help="a logger beside the local ones: wandb")
+    sub.add_argument("--report", action="store_true", help="evaluate the result and leave pictures")
+    sub.add_argument("--score", action="store_true", help="evaluate the result as `plot` will to compare it")
 
 
 if __name__ == "__main__":

@@ -4,7 +4,8 @@ The command line prints a `UserError` as it is and exits with 2; anything else i
 traceback.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from difflib import get_close_matches
 from importlib.util import find_spec
 
@@ -19,6 +20,19 @@ class NonFiniteError(ArithmeticError):
 
 class WorkerError(RuntimeError):
     """The process of an environment died, or does not answer: names which."""
+
+
+class SetError(RuntimeError):
+    """Some runs of a set could not go on: names each, with its sentence."""
+
+
+@contextmanager
+def said_of(name: str) -> Iterator[None]:
+    """A `UserError` from inside also says of what it is."""
+    try:
+        yield
+    except UserError as error:
+        raise UserError(f"{name}: {error}") from None
 
 
 def unknown(kind: str, name: str, known: Iterable[str]) -> UserError:

@@ -1,8 +1,10 @@
 """The front door: train, resume, load, evaluate, watch, plot, make_envs."""
 
+import json
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -11,17 +13,21 @@ from lemniscate.algos import ALGORITHMS
 from lemniscate.envs import api
 from lemniscate.envs.api import VecEnv
 from lemniscate.errors import UserError, is_installed, missing_extra, unknown
-from lemniscate.report import curves, playback
+from lemniscate.report import compare, curves, playback
 from lemniscate.report import pictures as pictures_of
 from lemniscate.run import checkpoint
 from lemniscate.run.config import RunConfig
 from lemniscate.run.critique import critic_of
 from lemniscate.run.evaluate import Evaluation
 from lemniscate.run.evaluate import evaluate as evaluate_module
-from lemniscate.run.loggers import LOGGERS
-from lemniscate.run.run import AnyState, Run, newest, read_config, require_absent
+from lemniscate.run.loggers import LOGGERS, read_metrics
+from lemniscate.run.run import AnyState, Run, is_finished, newest, read_config, require_absent
 from lemniscate.run.seeding import set_seeds
+from lemniscate.run.set_file import is_set, read_set
 from lemniscate.trained import TrainedPolicy
+
+FINAL_EPISODES = 100
+"""that a run's final policy is judged by where runs are compared"""
 
 
 @dataclass(frozen=True)
@@ -54,7 +60,7 @@ def make_envs(config: RunConfig) -> tuple[VecEnv, VecEnv]:
 
     They are restarted with seeds of different streams, so no start of one is ever a start of the other.
     """
-    device = str(_device(config.device))
+    device = str(device_for(config.device))
     train_env = api.make(config.env, config.num_envs, device=device, stagger=True, backend=config.backend)
     return train_env, _evaluation_env(config.env, config, config.evaluate_episodes, device, _simulator(config))
 
@@ -86,8 +92,8 @@ def train(
         UserError: see `config_for`; a run directory that exists.
     """
     config = config_for(algorithm, env, preset, **fields)
-    path = Path(run) if run is not None else _fresh_directory(algorithm, config)
-    loggers = _loggers(track)
+    path = Path(run) if run is not None else fresh_directory(config.env, f"{algorithm}-{config.seed}")
+    loggers = loggers_with(track)
     require_absent(path)
     set_seeds(config.seed)  # before JAX starts, which reads its flags then
     return _train(path, algorithm, config, make_envs(config), loggers, report or track is not None, progress)
@@ -100,7 +106,7 @@ def resume(run: str | Path, *, track: str | None = None, report: bool = False, p
     if algorithm not in ALGORITHMS:
         raise unknown("algorithm", algorithm, ALGORITHMS)
     config = ALGORITHMS[algorithm].Config.from_json(fields)
-    loggers = _loggers(track)
+    loggers = loggers_with(track)
     set_seeds(config.seed)
     return _train(path, algorithm, config, make_envs(config), loggers, report or track is not None, progress)
 
@@ -190,16 +196,23 @@ def watch(policy: TrainedPolicy, *, seed: int = 0, video: str | Path | None = No
 
 
 def plot(*runs: str | Path) -> list[Path]:
-    """Draw the curves of a run into its `plots/`, or those of several into one picture; returns the pictures.
+    """Draw the curves of a run into its `plots/`, or compare several, grouped by all but the seed.
 
     In a notebook they are also shown below the cell.
 
     A drone's run also gets its flights, and one with a Q what that says beside what followed.
+
+    A set is its runs, and has a `plots/` of its own; what else is compared is drawn into `plots/` here, with a table on
+    standard error. Compared are the final policies of finished runs, over 100 episodes each. Returns the pictures.
     """
     paths = [Path(run) for run in runs]
-    pictures = curves.plot_runs(paths)
-    if len(paths) == 1 and any((paths[0] / "checkpoints").glob("step-*")):
-        policy, folder = load(paths[0]), paths[0] / "plots"
+    found = [run for path in paths for run in _members(path)]
+    folder = paths[0] / "plots" if len(paths) == 1 else Path("plots")
+    if found != paths[:1]:
+        return compare.report(compare.group(found), _final_returns(found), folder)
+    pictures = curves.plot_runs(found, folder)
+    if any((paths[0] / "checkpoints").glob("step-*")):
+        policy = load(paths[0])
         if critic_of(policy.networks, policy.config):
             honesty = evaluate(policy, episodes=policy.config.evaluate_episodes).honesty
             pictures += [curves.draw_honesty(honesty, folder / "q.png")] if honesty else []
@@ -209,6 +222,43 @@ def plot(*runs: str | Path) -> list[Path]:
     if playback.in_notebook():
         playback.show_pictures(pictures)
     return pictures
+
+
+def final_return(run: str | Path) -> float:
+    """Mean return of a run's newest policy over 100 episodes; kept in its `final.json` while there is no newer."""
+    path = Path(run)
+    file = path / "final.json"
+    known: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {}
+    if known.get("step") not in checkpoint.list_steps(path / "checkpoints")[-1:]:
+        policy = load(path)
+        pictures_of.say(f"Evaluating {path}: {FINAL_EPISODES} episodes.")
+        scores = evaluate(policy, episodes=FINAL_EPISODES, seed=0)
+        known = {"step": policy.step, "seed": 0, **scores.to_json()}
+        temporary = file.with_suffix(".tmp")
+        temporary.write_text(json.dumps(known) + "\n")
+        temporary.replace(file)
+    return known["mean_return"]
+
+
+def _final_returns(runs: list[Path]) -> dict[Path, float]:
+    """Of the finished ones; what cannot be evaluated here is told, and left out."""
+    returns: dict[Path, float] = {}
+    for run in filter(is_finished, runs):
+        try:
+            returns[run] = final_return(run)
+        except UserError as error:
+            pictures_of.say(f"{run} has no final return: {error}")
+    return returns
+
+
+def _members(path: Path) -> list[Path]:
+    """A run itself, or those of a set that have something to show."""
+    if not is_set(path):
+        read_config(path)
+    runs = [run for run in (read_set(path).runs if is_set(path) else [path]) if read_metrics(run)]
+    if not runs:
+        raise UserError(f"{path} has no metrics to plot yet.")
+    return runs
 
 
 def _train(
@@ -264,7 +314,8 @@ def _evaluation_env(env_id: str, config: RunConfig, episodes: int, device: str, 
     return api.make(env_id, copies, device=device, backend=backend)
 
 
-def _loggers(track: str | None) -> tuple[str, ...]:
+def loggers_with(track: str | None) -> tuple[str, ...]:
+    """The local loggers, and the one asked for. Raises `UserError` if there is no such, or it is not installed."""
     always = ("jsonl", "tensorboard")
     trackers = [name for name in LOGGERS if name not in always]
     if track is None:
@@ -276,7 +327,8 @@ def _loggers(track: str | None) -> tuple[str, ...]:
     return (*always, track)
 
 
-def _device(name: str) -> torch.device:
+def device_for(name: str) -> torch.device:
+    """cpu, cuda, or with auto the better one that is there. Raises `UserError` for cuda without a GPU."""
     if name == "cuda" and not torch.cuda.is_available():
         raise UserError("device is cuda, but torch sees no GPU; use cpu or auto.")
     if name == "auto":
@@ -284,7 +336,8 @@ def _device(name: str) -> torch.device:
     return torch.device(name)
 
 
-def _fresh_directory(algorithm: str, config: RunConfig) -> Path:
-    stem = f"{config.env.replace('/', '_').replace(':', '_')}-{algorithm}-{config.seed}"
+def fresh_directory(env_id: str, name: str) -> Path:
+    """A directory under `runs/` that is not there yet."""
+    stem = f"{api.file_name(env_id)}-{name}"
     names = (Path("runs") / (stem if n == 1 else f"{stem}-{n}") for n in count(1))
     return next(path for path in names if not path.exists())

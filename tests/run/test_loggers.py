@@ -49,6 +49,16 @@ def test_a_line_that_a_crash_cut_off_is_left_out(tmp_path):
     assert read_metrics(tmp_path) == [{"step": 1}]
 
 
+def test_of_the_end_of_a_file_only_whole_lines_are_read(tmp_path):
+    lines = [json.dumps({"step": step}) + "\n" for step in range(8)]
+    (tmp_path / "metrics.jsonl").write_text("".join(lines))
+    for count in range(1, 9):
+        size = count * len(lines[0])
+        assert [line["step"] for line in read_metrics(tmp_path, size)] == list(range(8 - count, 8))
+        assert [line["step"] for line in read_metrics(tmp_path, size + 1)] == list(range(8 - count, 8))
+        assert [line["step"] for line in read_metrics(tmp_path, size - 1)] == list(range(9 - count, 8))
+
+
 class FakeWandb(ModuleType):
     """Enough of W&B to see what it is told."""
 

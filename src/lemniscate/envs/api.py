@@ -179,6 +179,11 @@ def backend_for(env_id: str) -> str:
     return "envpool" if env_id in ENVPOOL_IDS and is_installed("envpool") else "gymnasium"
 
 
+def file_name(env_id: str) -> str:
+    """An id as a part of a file's name."""
+    return env_id.replace("/", "_").replace(":", "_")
+
+
 def require_backend(backend: str) -> str:
     """The name itself. Raises `UserError` with the nearest names for one that is not known."""
     if backend not in BACKENDS:

@@ -1,8 +1,11 @@
 """Learning curves, of one run or of several side by side."""
 
 import math
+import textwrap
+from collections.abc import Iterator, Sequence
 from itertools import zip_longest
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -10,7 +13,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from lemniscate.errors import UserError
 from lemniscate.run.critique import Honesty
 from lemniscate.run.loggers import read_metrics
 from lemniscate.run.run import read_config
@@ -37,41 +39,45 @@ POINTS = 3000
 COLORS = mpl.colormaps["tab10"].colors  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def learning_curve(runs: list[Path], file: Path) -> Path:
+def learning_curve(runs: list[Path], file: Path, labels: Sequence[str] | None = None) -> Path:
     """Return of each whole training episode against steps, and the mean of the last 20 (or 2 %, if they are many)."""
     figure = Figure(figsize=(7, 4), layout="constrained")
     axes = figure.subplots()
-    for i, run in enumerate(runs):
+    for run, color, label in _styles(runs, labels):
         steps, returns = episode_returns(run)
         if len(steps):
             some = np.linspace(0, len(steps) - 1, min(len(steps), POINTS)).astype(int)
-            axes.plot(steps[some], returns[some], ".", color=COLORS[i % 10], alpha=0.25, markersize=3)
-            average = _moving_average(returns, max(20, len(returns) // 50))
-            axes.plot(steps[some], average[some], color=COLORS[i % 10], linewidth=1.5, label=run.name)
+            axes.plot(steps[some], returns[some], ".", color=color, alpha=0.25, markersize=3)
+            axes.plot(steps[some], smooth(returns)[some], color=color, linewidth=1.5, label=label)
     if not axes.has_data():
         axes.text(0.5, 0.5, "no whole training episode yet", transform=axes.transAxes, ha="center", color="grey")
     axes.set(xlabel="environment steps", ylabel="return of an episode")
     axes.set_title(_title(runs), loc="left")
-    _finish(axes, len(runs))
-    return _save(figure, file)
+    finish(axes)
+    if len(runs) > 1:
+        legend_above(figure)
+    return save(figure, file)
 
 
-def diagnostics(runs: list[Path], file: Path) -> Path:
+def diagnostics(runs: list[Path], file: Path, labels: Sequence[str] | None = None) -> Path:
     """What was watched in the updates: losses, KL, entropy, Q, gradient norms; three panels in a row."""
-    watched = {name for run in runs for line in read_metrics(run) for name in line}
+    logs = {run: read_metrics(run) for run in runs}
+    watched = {name for lines in logs.values() for line in lines for name in line}
     names = [name for name in DIAGNOSTICS if name in watched]
-    lines = max(1, math.ceil(len(names) / 3))
-    figure = Figure(figsize=(10, 2.75 * lines), layout="constrained")
-    panels = figure.subplots(lines, 3, squeeze=False).flat
+    height = max(1, math.ceil(len(names) / 3))
+    figure = Figure(figsize=(10, 2.75 * height), layout="constrained")
+    panels = figure.subplots(height, 3, squeeze=False).flat
     for axes, name in zip_longest(panels, names):
         if name is None:
             axes.set_visible(False)
             continue
-        for i, run in enumerate(runs):
-            _curve(axes, run, name, COLORS[i % 10])
+        for run, color, label in _styles(runs, labels):
+            _curve(axes, logs[run], name, color, label, width=1.5 if len(runs) <= 5 else 0.7)
         axes.set_title(name, loc="left", fontsize=10)
-        _finish(axes, len(runs) if name == names[0] else 1)
-    return _save(figure, file)
+        finish(axes)
+    if len(runs) > 1:
+        legend_above(figure)
+    return save(figure, file)
 
 
 def draw_honesty(honesty: Honesty, file: Path) -> Path:
@@ -83,8 +89,9 @@ def draw_honesty(honesty: Honesty, file: Path) -> Path:
     axes.plot(honesty.realised, honesty.predicted, ".", color=COLORS[0], alpha=0.6, label="episodes")
     axes.set(xlabel="discounted return that followed", ylabel="Q(s₀, a₀)")
     axes.set_title(str(honesty).partition(": ")[2], loc="left", fontsize=10)
-    _finish(axes, 2)
-    return _save(figure, file)
+    finish(axes)
+    axes.legend(frameon=False)
+    return save(figure, file)
 
 
 def episode_returns(run: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -101,22 +108,47 @@ def episode_returns(run: Path) -> tuple[np.ndarray, np.ndarray]:
     return np.array(steps), np.array(returns)
 
 
-def plot_runs(runs: list[Path]) -> list[Path]:
-    """Draw the pictures of one run into its `plots/`, or of several into `plots/` here. Returns the files."""
-    for run in runs:
-        read_config(run)
-        if not read_metrics(run):
-            raise UserError(f"{run} has no metrics to plot yet.")
-    folder = runs[0] / "plots" if len(runs) == 1 else Path("plots")
-    return [learning_curve(runs, folder / "learning_curve.png"), diagnostics(runs, folder / "diagnostics.png")]
+def training_minutes(run: Path) -> tuple[np.ndarray, np.ndarray]:
+    """(steps, minutes) of a run's training loop, at its start and at each line of its metrics.
+
+    Evaluations, checkpoints and recordings are in them; the start of the process is not, nor the time between a stop
+    and a resume.
+    """
+    steps, seconds = [0], [0.0]
+    for line in read_metrics(run):
+        if "time/steps_per_second" in line:
+            seconds.append(seconds[-1] + (line["step"] - steps[-1]) / line["time/steps_per_second"])
+            steps.append(line["step"])
+    return np.array(steps), np.array(seconds) / 60
 
 
-def _curve(axes: Axes, run: Path, name: str, color: object) -> None:
-    rows = [(line["step"], line[name]) for line in read_metrics(run) if name in line]
+def plot_runs(runs: list[Path], folder: Path, labels: Sequence[str] | None = None, ending: str = ".png") -> list[Path]:
+    """Draw the curves of runs into a folder; those of one label, their names unless given, have one colour."""
+    return [
+        learning_curve(runs, folder / f"learning_curve{ending}", labels),
+        diagnostics(runs, folder / f"diagnostics{ending}", labels),
+    ]
+
+
+def smooth(returns: np.ndarray) -> np.ndarray:
+    """The mean of the last 20 episodes at each of them, or of the last 2 % of all if that is more."""
+    return _moving_average(returns, max(20, len(returns) // 50))
+
+
+def _styles(runs: list[Path], labels: Sequence[str] | None) -> Iterator[tuple[Path, object, str]]:
+    """(run, colour, label) of each; one colour for one label."""
+    names = list(labels or (run.name for run in runs))
+    different = list(dict.fromkeys(names))
+    for run, name in zip(runs, names, strict=True):
+        yield run, COLORS[different.index(name) % 10], name
+
+
+def _curve(axes: Axes, log: list[dict[str, Any]], name: str, color: object, label: str, width: float) -> None:
+    rows = [(line["step"], line[name]) for line in log if name in line]
     if not rows:
         return
     steps, values = np.array(rows).T
-    axes.plot(steps, values, color=color, linewidth=1.5, label=run.name)
+    axes.plot(steps, values, color=color, linewidth=width, label=label)
 
 
 def _moving_average(values: np.ndarray, window: int) -> np.ndarray:
@@ -128,18 +160,30 @@ def _moving_average(values: np.ndarray, window: int) -> np.ndarray:
 
 def _title(runs: list[Path]) -> str:
     algorithm, config = read_config(runs[0])
-    return f"{algorithm.upper()} on {config['env']}" if len(runs) == 1 else f"{len(runs)} runs"
+    return f"{algorithm.upper() if len(runs) == 1 else f'{len(runs)} runs'} on {config['env']}"
 
 
-def _finish(axes: Axes, runs: int) -> None:
+def finish(axes: Axes) -> None:
+    """Spines, grid, 100k for a hundred thousand steps."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(alpha=0.3)
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-    if runs > 1 and axes.has_data():
-        axes.legend(frameon=False)
 
 
-def _save(figure: Figure, file: Path) -> Path:
+def legend_above(figure: Figure) -> None:
+    """One legend for all panels, each label once, in as many columns as fit."""
+    letters = int(13 * figure.get_figwidth())
+    once: dict[str, Any] = {}
+    for axes in figure.axes:
+        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
+            once.setdefault(textwrap.fill(label, letters), handle)
+    columns = max(1, letters // (8 + max(map(len, once), default=0)))
+    if once:
+        figure.legend(once.values(), once.keys(), loc="outside upper left", frameon=False, fontsize=9, ncols=columns)
+
+
+def save(figure: Figure, file: Path) -> Path:
+    """Write a picture."""
     file.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(file, dpi=150)
     return file

@@ -30,7 +30,7 @@ def report(
     """Evaluate from unseen starts, draw everything there is to draw; says what it did, returns the pictures."""
     scores = evaluate(policy, env, episodes, seed=0, critic=critic)
     say(sentence(scores))
-    pictures = curves.plot_runs([path])
+    pictures = curves.plot_runs([path], path / "plots")
     if scores.honesty:
         pictures.append(curves.draw_honesty(scores.honesty, path / "plots" / "q.png"))
     if env.spec.tracking:

@@ -1,8 +1,14 @@
-"""What several seeds say together: Agarwal et al. 2021, arXiv:2108.13264."""
+"""What several seeds say together: Agarwal et al. 2021, arXiv:2108.13264.
+
+Intervals are percentile bootstraps (section 4.1): seeds are drawn again with replacement, of each group on its own.
+They are always the same for the same scores.
+"""
 
 from collections.abc import Sequence
 
 import numpy as np
+
+RESAMPLES = 10_000
 
 
 def iqm(scores: Sequence[float] | np.ndarray, axis: int = -1) -> np.ndarray:
@@ -15,10 +21,45 @@ def iqm(scores: Sequence[float] | np.ndarray, axis: int = -1) -> np.ndarray:
 
 
 def bootstrap_interval(
-    scores: Sequence[float], confidence: float = 0.95, resamples: int = 10_000
+    scores: Sequence[float], confidence: float = 0.95, resamples: int = RESAMPLES
 ) -> tuple[float, float]:
-    """Percentile interval of the IQM over resampled seeds; always the same for the same scores."""
-    rng = np.random.default_rng(0)
-    drawn = rng.choice(np.asarray(scores, dtype=np.float64), (resamples, len(scores)))
-    low, high = np.quantile(iqm(drawn), [(1 - confidence) / 2, (1 + confidence) / 2])
+    """Interval of the IQM over resampled seeds."""
+    drawn = _drawn_again(np.asarray(scores, dtype=np.float64), np.random.default_rng(0), resamples)
+    low, high = _percentiles(iqm(drawn), confidence)
     return float(low), float(high)
+
+
+def mean_interval(curves: np.ndarray, confidence: float = 0.95, resamples: int = 2_000) -> np.ndarray:
+    """Interval of the mean over resampled seeds at each point of `curves` [seeds, points]: (low, high), [2, points]."""
+    means = _drawn_again(curves, np.random.default_rng(0), resamples).mean(axis=1)
+    return _percentiles(means, confidence)
+
+
+def probability_of_improvement(x: Sequence[float] | np.ndarray, y: Sequence[float] | np.ndarray) -> np.ndarray:
+    """P(X > Y): the share of pairs of a run of x [..., n] and one of y [..., m] that the first wins; a tie is half.
+
+    1/(nm) Σᵢ Σⱼ S(xᵢ, yⱼ) with S = 1, ½, 0 for more, equal, less: the paper's probability of improvement on one task,
+    which is the U statistic of Mann and Whitney 1947 over nm.
+    """
+    difference = np.asarray(x, dtype=np.float64)[..., :, None] - np.asarray(y, dtype=np.float64)[..., None, :]
+    return (1 + np.sign(difference).mean(axis=(-2, -1))) / 2
+
+
+def improvement_interval(
+    x: Sequence[float], y: Sequence[float], confidence: float = 0.95, resamples: int = RESAMPLES
+) -> tuple[float, float]:
+    """Interval of P(X > Y) over resampled seeds of both."""
+    rng = np.random.default_rng(0)
+    drawn = [_drawn_again(np.asarray(scores, dtype=np.float64), rng, resamples) for scores in (x, y)]
+    low, high = _percentiles(probability_of_improvement(*drawn), confidence)
+    return float(low), float(high)
+
+
+def _drawn_again(scores: np.ndarray, rng: np.random.Generator, resamples: int) -> np.ndarray:
+    """[resamples, seeds, …]: as many seeds as there are, each drawn from all of them."""
+    return rng.choice(scores, (resamples, len(scores)))
+
+
+def _percentiles(resampled: np.ndarray, confidence: float) -> np.ndarray:
+    """The middle `confidence` of what resampling gave, along its first dimension."""
+    return np.quantile(resampled, [(1 - confidence) / 2, (1 + confidence) / 2], axis=0)

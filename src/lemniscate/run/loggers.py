@@ -123,15 +123,22 @@ LOGGERS: dict[str, Callable[[Path, Mapping[str, Any], int], Logger]] = {
 }
 
 
-def read_metrics(path: Path) -> list[dict[str, Any]]:
-    """The lines of a run's `metrics.jsonl`; a last line that was cut off by a crash is left out."""
-    lines = []
+def read_metrics(path: Path, last_bytes: int | None = None) -> list[dict[str, Any]]:
+    """The lines of a run's `metrics.jsonl`, or those within its end; a last one that a crash cut off is left out."""
     file = path / "metrics.jsonl"
-    for text in file.read_text().splitlines() if file.exists() else []:
-        try:
-            lines.append(json.loads(text))
-        except ValueError:
-            break
+    if not file.exists():
+        return []
+    lines = []
+    with file.open("rb") as text:
+        start = file.stat().st_size - last_bytes if last_bytes else 0
+        if start > 0:
+            text.seek(start - 1)
+            text.readline()
+        for line in text:
+            try:
+                lines.append(json.loads(line))
+            except ValueError:
+                break
     return lines
 
 

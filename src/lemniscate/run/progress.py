@@ -2,9 +2,11 @@
 
 import sys
 import time
+from collections.abc import Mapping
+from datetime import timedelta
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 
 class ProgressBar:
@@ -43,3 +45,71 @@ class ProgressBar:
         """Leave the terminal as it was."""
         if self._live:
             self._bar.stop()
+
+
+class SetProgress:
+    """A bar for a set of runs and one for each that is going on; without a terminal, lines at each tenth of the set.
+
+    What has ended is told in a line that stays.
+    """
+
+    def __init__(self, totals: Mapping[str, int], steps: Mapping[str, int], visible: bool = True) -> None:
+        self._console = Console(stderr=True)
+        live = visible and (self._console.is_terminal or self._console.is_jupyter)
+        self._visible, self._lines = visible, visible and not live
+        self._totals = totals
+        self._steps = {name: min(step, totals[name]) for name, step in steps.items()}
+        self._going: dict[str, str] = {}
+        """what is to be said of each run that is going on"""
+        self._tasks: dict[str, TaskID] = {}
+        self._over = sum(self._steps[name] >= total for name, total in totals.items())
+        self._tenth = 10 * sum(self._steps.values()) // sum(totals.values())
+        self._bars = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=20),
+            TextColumn("{task.percentage:>3.0f}%  {task.fields[said]}"),
+            console=self._console,
+            transient=True,
+            disable=not live,
+        )
+        self._whole = self._bars.add_task("all", total=sum(totals.values()), said="")
+        self._bars.start()
+
+    def update(self, name: str, step: int, episode_return: float | None, rate: float | None) -> None:
+        """A run that is going on has come to `step`, lately at `rate` steps per second."""
+        total = self._totals[name]
+        self._steps[name] = min(step, total)
+        ret = "–" if episode_return is None else f"{episode_return:.1f}"
+        left = f"{timedelta(seconds=round((total - step) / rate))} left" if rate and step < total else "being evaluated"
+        self._going[name] = f"{step:,} steps  {rate:,.0f}/s  return {ret}  {left}" if rate else "starting"
+        if name not in self._tasks:
+            self._tasks[name] = self._bars.add_task(name, total=total, said="")
+        self._bars.update(self._tasks[name], completed=step, said=self._going[name])
+        self._count()
+
+    def end(self, name: str, sentence: str) -> None:
+        """A run is over, or could not go on."""
+        if name in self._tasks:
+            self._bars.remove_task(self._tasks.pop(name))
+        self._going.pop(name, None)
+        self._over += 1
+        self.say(f"{name}: {sentence}")
+        self._count()
+
+    def say(self, text: str) -> None:
+        """A line that stays."""
+        if self._visible:
+            self._console.print(text, highlight=False, markup=False, soft_wrap=True)
+
+    def close(self) -> None:
+        """Leave the terminal as it was."""
+        self._bars.stop()
+
+    def _count(self) -> None:
+        taken, total = sum(self._steps.values()), sum(self._totals.values())
+        said = f"{self._over} of {len(self._totals)} runs over, {taken:,} of {total:,} steps"
+        self._bars.update(self._whole, completed=taken, said=said)
+        if self._lines and 10 * taken // total > self._tenth:
+            self._tenth = 10 * taken // total
+            going = "".join(f"\n  {name}: {said}" for name, said in self._going.items())
+            print(f"{10 * self._tenth} % of all steps{going}", file=sys.stderr, flush=True)

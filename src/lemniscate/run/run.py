@@ -98,7 +98,7 @@ class Run:
         A new run gets its directory here: what no state can be made for leaves nothing behind.
         """
         if not (self.path / "config.json").exists():
-            _create_directory(self.path, self.algorithm, self.config)
+            create_directory(self.path, "config.json", {"algorithm": self.algorithm, "config": self.config.to_json()})
         try:
             self._lock.acquire()
         except Timeout:
@@ -283,6 +283,8 @@ class Run:
 
 
 UNFINISHED = "config.json.tmp"
+SET = "set.json"
+"""what a set of runs has in the place of a `config.json`"""
 
 
 def engine_of(config: RunConfig) -> str:
@@ -298,25 +300,34 @@ def require_absent(path: Path) -> None:
         raise UserError(f"{path} exists already; go on with it (lemniscate resume {path}) or choose another --run.")
 
 
-def _create_directory(path: Path, algorithm: str, config: RunConfig) -> None:
-    """Make a run directory and write its `config.json`. Raises `UserError` if there is something already."""
+def create_directory(path: Path, name: str, record: dict[str, Any]) -> None:
+    """Make a directory with the one file that says what it is. Raises `UserError` if there is something already."""
     require_absent(path)
     temporary = path / UNFINISHED
     try:
         path.mkdir(parents=True, exist_ok=True)
-        temporary.write_text(json.dumps({"algorithm": algorithm, "config": config.to_json()}, indent=1) + "\n")
-        temporary.replace(path / "config.json")
+        temporary.write_text(json.dumps(record, indent=1) + "\n")
+        temporary.replace(path / name)
     except OSError as error:
         raise UserError(f"{path} cannot be made: {error.strerror}.") from error
 
 
 def read_config(path: Path) -> tuple[str, dict[str, Any]]:
     """The algorithm's name and its config, from a run directory. Raises `UserError` if it is none."""
+    if (path / SET).exists():
+        runs = sorted(file.parent for file in path.glob("*/config.json"))
+        raise UserError(f"{path} is a set of runs: name one of them, such as {runs[0] if runs else path / '…'}.")
     try:
         record = json.loads((path / "config.json").read_text())
         return record["algorithm"], record["config"]
     except (OSError, ValueError, KeyError, TypeError):
         raise UserError(f"{path} is not a run directory: it holds no config.json that can be read.") from None
+
+
+def is_finished(path: Path) -> bool:
+    """Whether a run has taken all its steps, and the checkpoint of its end is there."""
+    _, config = read_config(path)
+    return checkpoint.list_steps(path / "checkpoints")[-1:] >= [config["total_steps"]]
 
 
 def newest_resumable(path: Path) -> checkpoint.Checkpoint | None:

@@ -1,0 +1,57 @@
+"""What a set of runs consists of: several algorithms times several seeds, a run directory for each.
+
+    set.json          the seeds, and the Config of each algorithm
+    ppo-1/, sac-1/…   the runs
+
+A run that has not begun is a directory with nothing but its `config.json`: it is resumed, from step 0, like any other.
+"""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from lemniscate.errors import UserError
+from lemniscate.run.run import SET, create_directory
+
+
+@dataclass(frozen=True)
+class RunSet:
+    """A set's directory and what its `set.json` says: the seeds, and the Config of each algorithm but for the seed."""
+
+    path: Path
+    seeds: list[int]
+    configs: dict[str, dict[str, Any]]
+
+    @property
+    def runs(self) -> dict[Path, dict[str, Any]]:
+        """The run directories, and what their `config.json` says: every algorithm with the first seed, and so on."""
+        return {
+            self.path / f"{algorithm}-{seed}": {"algorithm": algorithm, "config": {**config, "seed": seed}}
+            for seed in self.seeds
+            for algorithm, config in self.configs.items()
+        }
+
+    def create(self) -> None:
+        """Write `set.json` into a new directory. Raises `UserError` if there is something already."""
+        create_directory(self.path, SET, {"seeds": self.seeds, "configs": self.configs})
+
+    def create_runs(self) -> None:
+        """Make the run directories that are not there yet."""
+        for path, record in self.runs.items():
+            if not (path / "config.json").exists():
+                create_directory(path, "config.json", record)
+
+
+def is_set(path: Path) -> bool:
+    """Whether a directory holds a set of runs."""
+    return (path / SET).exists()
+
+
+def read_set(path: Path) -> RunSet:
+    """The set in a directory. Raises `UserError` if there is none."""
+    try:
+        record = json.loads((path / SET).read_text())
+        return RunSet(path, record["seeds"], record["configs"])
+    except (OSError, ValueError, KeyError, TypeError):
+        raise UserError(f"{path} is not a set of runs: it holds no {SET} that can be read.") from None

@@ -1,0 +1,189 @@
+"""Runs side by side: grouping, the table, the refusal to rank on one seed, the pictures."""
+
+import json
+
+import numpy as np
+import pytest
+
+import lemniscate as lem
+from lemniscate.report import compare
+from lemniscate.report.curves import training_minutes
+
+
+def write_run(path, algorithm="ppo", env="CartPole-v1", seed=1, score=100.0, *, taken=None, rate=100.0, **fields):
+    """A run directory as training leaves it, of 1,000 steps in ten lines, without the weights."""
+    config = lem.config_for(algorithm, env, seed=seed, total_steps=10_000, **fields).to_json()
+    path.mkdir(parents=True)
+    (path / "config.json").write_text(json.dumps({"algorithm": algorithm, "config": config}))
+    last = 10_000 if taken is None else taken
+    with (path / "metrics.jsonl").open("w") as file:
+        for step in range(1_000, last + 1, 1_000):
+            returns = [score * step / 10_000] * 3
+            file.write(json.dumps({"step": step, "time/steps_per_second": rate, "episode/returns": returns}) + "\n")
+    (path / "checkpoints" / f"step-{last}").mkdir(parents=True)
+    (path / "final.json").write_text(json.dumps({"step": last, "mean_return": score}))
+    return path
+
+
+def write_runs(folder, seeds=(1, 2, 3), **fields):
+    return [write_run(folder / f"{seed}", seed=seed, score=100.0 + seed, **fields) for seed in seeds]
+
+
+@pytest.fixture(autouse=True)
+def _here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def labels(runs):
+    return [one.label for one in compare.group(runs)]
+
+
+def test_runs_that_differ_in_their_seed_alone_are_one_group(tmp_path):
+    ppo, sac = write_runs(tmp_path / "a"), write_runs(tmp_path / "b", algorithm="sac", env="Pendulum-v1")
+    groups = compare.group([ppo[0], sac[0], *ppo[1:], *sac[1:]])
+    assert [one.runs for one in groups] == [ppo, sac]
+    assert [one.label for one in groups] == ["PPO", "SAC"]
+    assert [one.env for one in groups] == ["CartPole-v1", "Pendulum-v1"]
+
+
+def test_groups_of_one_algorithm_are_told_apart_by_the_fields_that_differ(tmp_path):
+    a = write_runs(tmp_path / "a", gamma=0.9)
+    b = write_runs(tmp_path / "b", gamma=0.98, hidden=(32, 32))
+    other = write_runs(tmp_path / "c", env="Acrobot-v1", gamma=0.5)
+    assert labels([*a, *b, *other]) == ["PPO, gamma 0.9, hidden 64×64", "PPO, gamma 0.98, hidden 32×32", "PPO"]
+
+
+def test_of_many_fields_a_label_names_the_first_if_they_tell_the_groups_apart(tmp_path):
+    many = {"num_envs": 4, "num_steps": 48, "epochs": 3, "gamma": 0.5, "clip": 0.3}
+    runs = [write_run(tmp_path / "a"), write_run(tmp_path / "b", **many)]
+    assert labels(runs)[1] == "PPO, num_envs 4, num_steps 48, epochs 3, and 2 more"
+    runs.append(write_run(tmp_path / "c", **(many | {"clip": 0.4})))
+    assert labels(runs)[1:] == [
+        f"PPO, num_envs 4, num_steps 48, epochs 3, gamma 0.5, clip {clip}" for clip in (0.3, 0.4)
+    ]
+
+
+def test_runs_alike_even_in_their_seed_are_told_apart_by_where_they_are(tmp_path):
+    """As when the code has changed in between."""
+    config = json.loads((write_run(tmp_path / "old" / "ppo-1") / "config.json").read_text())["config"]
+    runs = [tmp_path / "old" / "ppo-1", write_run(tmp_path / "old" / "ppo-2", seed=2), write_run(tmp_path / "ppo")]
+    (tmp_path / "old" / "set.json").write_text(json.dumps({"seeds": [1, 2], "configs": {"ppo": config}}))
+    groups = compare.group(runs)
+    assert [one.label for one in groups] == [f"PPO, directory {tmp_path / name}" for name in ("old", "ppo")]
+    assert [len(one.runs) for one in groups] == [2, 1]
+
+
+def test_the_time_of_training_is_added_up_from_its_speed(tmp_path):
+    run = write_run(tmp_path / "r")
+    lines = [
+        {"step": 100, "time/steps_per_second": 10.0},
+        {"step": 100, "evaluation/return": 1.0},
+        {"step": 400, "time/steps_per_second": 5.0},
+    ]
+    (run / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    steps, minutes = training_minutes(run)
+    assert steps.tolist() == [0, 100, 400]
+    assert (60 * minutes).tolist() == pytest.approx([0, 10, 70])
+
+
+def test_the_table_says_what_the_seeds_say_together(tmp_path):
+    a = write_runs(tmp_path / "a", seeds=(1, 2, 3, 4), rate=100.0)
+    b = [write_run(tmp_path / "b", algorithm="sac", env="Pendulum-v1")]
+    groups = compare.group([*a, *b])
+    head, ppo, sac = compare.table(groups, {**{run: 1000.0 * (i + 1) for i, run in enumerate(a)}, b[0]: -7.0})
+    assert head.split() == ["seeds", "final", "return", "IQM", "[95", "%]", "worst", "seed", "minutes"]
+    assert ppo.split() == ["PPO", "4", "2,500", "±", "1,118", "2,500", "[1,000,", "4,000]", "1,000", "1.7"]
+    assert sac.split() == ["SAC", "1", "-7", "–", "-7", "1.7"]
+    assert len({len(line) for line in (head, ppo, sac)}) == 1
+
+
+def drawn(monkeypatch, *runs):
+    """The figure of the comparison that `lem.plot` draws."""
+    figures = {}
+    save = compare.save
+    monkeypatch.setattr(compare, "save", lambda figure, file: figures.update({file.name: figure}) or save(figure, file))
+    lem.plot(*runs)
+    return figures
+
+
+def test_one_seed_ranks_nothing_and_that_is_said(tmp_path, monkeypatch, capsys):
+    runs = [*write_runs(tmp_path / "a"), write_run(tmp_path / "b", gamma=0.5)]
+    (figure,) = drawn(monkeypatch, *runs).values()
+    *curves, below = figure.axes
+    assert [text.get_text() for text in below.texts] == [compare.ONE_SEED]
+    assert [axes.get_xlabel() for axes in curves] == ["environment steps", "minutes of training"]
+    said = capsys.readouterr().err
+    assert compare.ONE_SEED in said
+    assert "train more with --seeds 1-5." in said
+
+
+def test_seeds_enough_are_ranked(tmp_path, monkeypatch, capsys):
+    runs = [*write_runs(tmp_path / "a", gamma=0.9), *write_runs(tmp_path / "b", gamma=0.8, seeds=(4, 5))]
+    (figure,) = drawn(monkeypatch, *runs).values()
+    titles = [axes.get_title("left") for axes in figure.axes]
+    assert titles[2:] == [
+        "final return: each seed; IQM and its 95 %",
+        "probability that the left one is better than the right one",
+    ]
+    (better,) = figure.axes[3].lines[-1].get_xdata()
+    assert better == 0  # 101 to 103 against 104 and 105
+    assert compare.ONE_SEED not in capsys.readouterr().err
+
+
+def test_one_group_is_ranked_against_nobody(tmp_path, monkeypatch):
+    (figure,) = drawn(monkeypatch, *write_runs(tmp_path / "a")).values()
+    assert len(figure.axes) == 3
+
+
+def test_the_curve_of_a_group_is_the_mean_of_its_seeds_as_far_as_all_go(tmp_path, monkeypatch):
+    runs = [
+        write_run(tmp_path / "a", score=100.0, rate=100.0),
+        write_run(tmp_path / "b", seed=2, score=300.0, rate=50.0),
+    ]
+    (figure,) = drawn(monkeypatch, *runs).values()
+    by_step, by_minute = ([line for line in axes.lines if len(line.get_xdata()) > 2] for axes in figure.axes[:2])
+    (mean,), (timed,) = by_step, by_minute
+    assert mean.get_xdata()[-1] == 10_000
+    assert mean.get_ydata()[-1] == pytest.approx((figure_end(100) + figure_end(300)) / 2)
+    assert timed.get_xdata()[-1] == pytest.approx(100 / 60)  # there the faster one has ended
+
+
+def figure_end(score):
+    """The mean of the last 20 episodes of a run of thirty, three at each tenth."""
+    return np.mean(np.repeat(score * np.arange(1, 11) / 10, 3)[-20:])
+
+
+def test_what_is_not_finished_is_in_the_curves_alone(tmp_path, monkeypatch, capsys):
+    runs = [*write_runs(tmp_path / "a"), write_run(tmp_path / "b", seed=9, score=1.0, taken=4_000)]
+    (figure,) = drawn(monkeypatch, *runs).values()
+    ends = sorted(line.get_xdata()[-1] for line in figure.axes[0].lines if len(line.get_xdata()) > 2)
+    assert ends == [4_000, 10_000]
+    said = capsys.readouterr().err
+    assert f"Not finished, so in the curves alone: {runs[-1]}." in said
+    assert "3 of 4" in said
+    assert "101.0" in said
+
+
+def test_before_anything_is_finished_there_are_curves(tmp_path, monkeypatch, capsys):
+    runs = [write_run(tmp_path / f"{seed}", seed=seed, taken=3_000) for seed in (1, 2)]
+    (figure,) = drawn(monkeypatch, *runs).values()
+    assert "PPO (2 seeds)" in [text.get_text() for text in figure.legends[0].texts]
+    assert compare.ONE_SEED in capsys.readouterr().err
+
+
+def test_each_environment_has_its_own_picture_and_table(tmp_path, monkeypatch, capsys):
+    runs = [*write_runs(tmp_path / "a"), *write_runs(tmp_path / "b", env="Acrobot-v1")]
+    assert set(drawn(monkeypatch, *runs)) == {"comparison-CartPole-v1.png", "comparison-Acrobot-v1.png"}
+    assert (tmp_path / "plots" / "learning_curve-Acrobot-v1.png").exists()
+    said = capsys.readouterr().err
+    assert "CartPole-v1:\n" in said
+    assert "Acrobot-v1:\n" in said
+
+
+def test_long_labels_stand_in_the_legend_and_numbers_beside_the_rows(tmp_path, monkeypatch):
+    runs = [
+        run for gamma in (0.9, 0.8) for run in write_runs(tmp_path / f"{gamma}", gamma=gamma, learning_rate=gamma / 90)
+    ]
+    (figure,) = drawn(monkeypatch, *runs).values()
+    assert [label.get_text() for label in figure.axes[2].get_yticklabels()] == ["1", "2"]
+    assert figure.legends[0].texts[0].get_text() == "1: PPO, learning_rate 0.01, gamma 0.9 (3 seeds)"

@@ -1,0 +1,252 @@
+"""Sets of runs: real processes, as many bits as alone, whatever happens to some of them."""
+
+import contextlib
+import io
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+from filelock import FileLock
+
+import lemniscate as lem
+from lemniscate import sets
+from lemniscate.cli import main
+from lemniscate.run import checkpoint
+from lemniscate.run.loggers import read_metrics
+from lemniscate.run.progress import SetProgress
+
+SEEDS = ["--seeds", "1-2"]
+ENV = "worlds:Copy-box-v0"
+SHARED = {"num_envs": 4, "num_steps": 64, "total_steps": 5_200, "hidden": (16,)}
+FLAGS = ["--num-envs", "4", "--num-steps", "64", "--total-steps", "5_200", "--hidden", "16"]
+SMALL = [
+    "--num-envs",
+    "4",
+    "--num-steps",
+    "8",
+    "--epochs",
+    "4",
+    "--hidden",
+    "16",
+    "--minibatch-size",
+    "16",
+    "--engine",
+    "eager",
+]
+
+
+def final_hash(run):
+    last = run / "checkpoints" / f"step-{checkpoint.list_steps(run / 'checkpoints')[-1]}"
+    return json.loads((last / "manifest.json").read_text())["sha256"]
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A set of PPO and DDPG, and what was said."""
+    path = tmp_path_factory.mktemp("sets") / "both"
+    with contextlib.redirect_stderr(io.StringIO()) as said:
+        code = main(["train", "ppo,ddpg", "--env", ENV, "--seeds", "1-2", "--run", str(path), *FLAGS])
+    assert code == 0, said.getvalue()
+    return path, said.getvalue()
+
+
+def test_a_set_is_a_run_for_each_algorithm_and_seed(trained):
+    path, _ = trained
+    record = json.loads((path / "set.json").read_text())
+    assert record["seeds"] == [1, 2]
+    assert list(record["configs"]) == ["ppo", "ddpg"]
+    assert record["configs"]["ddpg"]["total_steps"] == 5_200
+    runs = {file.parent.name: json.loads(file.read_text()) for file in path.glob("*/config.json")}
+    assert set(runs) == {"ppo-1", "ppo-2", "ddpg-1", "ddpg-2"}
+    assert runs["ddpg-2"]["algorithm"] == "ddpg"
+    assert runs["ddpg-2"]["config"]["seed"] == 2
+
+
+@pytest.mark.parametrize(("algorithm", "seed"), [("ppo", 2), ("ddpg", 1)])
+def test_each_run_of_a_set_ends_in_the_bits_of_a_run_alone(trained, tmp_path, algorithm, seed):
+    path, _ = trained
+    alone = lem.train(algorithm, ENV, seed=seed, run=tmp_path / "alone", progress=False, **SHARED)
+    assert final_hash(alone.path) == final_hash(path / f"{algorithm}-{seed}")
+
+
+def test_at_the_end_there_is_one_table_and_one_picture(trained):
+    path, said = trained
+    assert "4 of 4 runs to train" in said
+    assert "ppo-1: done, final return " in said
+    table = said[said.index(f"{ENV}:") :].splitlines()
+    assert [line.split()[0] for line in table[1:4]] == ["seeds", "PPO", "DDPG"]
+    assert f"{path}/plots/comparison.png" in table
+    assert (path / "plots" / "comparison.png").stat().st_size > 20_000
+
+
+def test_the_set_is_plotted_again_without_playing(trained, monkeypatch):
+    path, _ = trained
+    monkeypatch.setattr(lem.front, "evaluate", None)
+    assert {picture.parent for picture in lem.plot(path)} == {path / "plots"}
+
+
+def test_what_needs_one_run_says_so_of_a_set(trained, capsys):
+    path, _ = trained
+    for command in ("evaluate", "watch"):
+        assert main([command, str(path)]) == 2
+        said = f"{path} is a set of runs: name one of them, such as {path / 'ddpg-1'}.\n"
+        assert capsys.readouterr().err == said
+    with pytest.raises(lem.UserError, match="is a set of runs"):
+        lem.resume(path)
+
+
+def test_resuming_a_set_goes_on_begins_and_leaves_alone(trained, tmp_path, capsys):
+    path, _ = trained
+    copy = shutil.copytree(path, tmp_path / "copy")
+    shutil.rmtree(copy / "ddpg-2")
+    for step in checkpoint.list_steps(copy / "ppo-2" / "checkpoints")[-2:]:
+        shutil.rmtree(copy / "ppo-2" / "checkpoints" / f"step-{step}")
+    untouched = {file: file.stat().st_mtime_ns for name in ("ppo-1", "ddpg-1") for file in (copy / name).rglob("*")}
+    assert main(["resume", str(copy)]) == 0
+    assert "2 of 4 runs to train" in capsys.readouterr().err
+    for name in ("ppo-2", "ddpg-2"):
+        assert final_hash(copy / name) == final_hash(path / name)
+    assert {file: file.stat().st_mtime_ns for file in untouched} == untouched
+
+
+def test_a_finished_set_is_resumed_in_no_time(trained, capsys, monkeypatch):
+    path, _ = trained
+    monkeypatch.setattr(subprocess, "Popen", None)
+    assert main(["resume", str(path)]) == 0
+    assert "0 of 4 runs to train" in capsys.readouterr().err
+
+
+def test_two_processes_do_not_train_one_set(trained):
+    path, _ = trained
+    with FileLock(path / ".lock"), pytest.raises(lem.UserError, match="being trained by another process"):
+        lem.resume_set(path)
+
+
+def test_the_policy_is_played_anew_when_there_is_a_newer_checkpoint(trained, tmp_path, capsys):
+    run = shutil.copytree(trained[0] / "ppo-1", tmp_path / "run")
+    known = json.loads((run / "final.json").read_text())
+    assert lem.front.final_return(run) == known["mean_return"]
+    assert capsys.readouterr().err == ""
+    newest = run / "checkpoints" / f"step-{known['step']}"
+    newest.rename(newest.with_name(f"step-{known['step'] + 1}"))
+    (run / "final.json").write_text(json.dumps(known | {"mean_return": 7.0}))
+    assert lem.front.final_return(run) == known["mean_return"]
+    assert "Evaluating" in capsys.readouterr().err
+
+
+def command(*arguments):
+    """The command line in a process that has one core, so that runs train one after the other."""
+    one_core = "import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})"
+    loud = f"{one_core}; import sys, lemniscate.cli; sys.exit(lemniscate.cli.main())"
+    arguments = [sys.executable, "-c", loud, *map(str, arguments)]
+    return subprocess.Popen(arguments, stderr=subprocess.PIPE, text=True, start_new_session=True)
+
+
+def test_ctrl_c_stops_every_run_and_the_set_goes_on_to_the_same_bits(tmp_path):
+    path = tmp_path / "stopped"
+    fields = [*SMALL, "--total-steps", "3_200", "--checkpoint-every", "512"]
+    process = command("train", "ppo", "--env", "Countdown-v0", "--seeds", "1,2", "--run", path, *fields)
+    while len(read_metrics(path / "ppo-1")) < 20:
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.005)
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does, to all who belong to it
+    said = process.communicate()[1]
+    assert process.returncode == 130
+    assert f"Stopped; what had begun is saved. Go on with: lemniscate resume {path}" in said
+    assert "ppo-1: stopped at step" in said
+    assert "Traceback" not in said
+    with FileLock(path / "ppo-1" / ".lock", timeout=0):  # nobody trains any more
+        assert lem.load(path / "ppo-1").step == read_metrics(path / "ppo-1")[-1]["step"] < 3_200
+    assert not (path / "ppo-2" / "metrics.jsonl").exists()
+    process = command("resume", path)
+    assert "1 at a time" in process.communicate()[1]
+    assert process.returncode == 0
+    config = json.loads((path / "ppo-2" / "config.json").read_text())["config"]
+    for seed in (1, 2):
+        fields = {name: tuple(x) if isinstance(x, list) else x for name, x in config.items()} | {"seed": seed}
+        alone = lem.train("ppo", run=tmp_path / f"{seed}", progress=False, **fields)
+        assert final_hash(path / f"ppo-{seed}") == final_hash(alone.path)
+
+
+def test_runs_that_fail_are_named_and_the_others_are_not_touched(tmp_path, capsys):
+    with pytest.raises(lem.SetError) as told:
+        lem.train_set(["ppo"], "worlds:Fragile", range(1, 4), run=tmp_path / "s", num_envs=2, total_steps=2_000)
+    first, nan, killed = str(told.value).splitlines()
+    assert first == "2 of 3 runs could not go on; log.txt in each says more."
+    assert nan.startswith("ppo-2: The reward of environment 0 is nan in the step after 0. Training stopped;")
+    assert killed == "ppo-3: Killed."
+    assert lem.load(tmp_path / "s" / "ppo-1").step >= 2_000
+    said = capsys.readouterr().err
+    assert "PPO      1" in said
+    assert "One seed says nothing" in said
+
+
+def test_the_command_ends_in_1_if_a_run_has_failed(monkeypatch, capsys):
+    def fails(*_, **__):
+        raise lem.SetError("1 of 2 runs could not go on.\nppo-2: why.")
+
+    monkeypatch.setattr(sets, "train_set", fails)
+    assert main(["train", "ppo", "--env", "CartPole-v1", "--seeds", "1-2"]) == 1
+    assert capsys.readouterr().err == "1 of 2 runs could not go on.\nppo-2: why.\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["ppo,ddpg", "--env", "Pendulum-v1", "--clip", "0.1", *SEEDS], "ddpg: There is no field '--clip'"),
+        (
+            ["ppo,ddpg", "--env", "Pendulum-v1", "--gamma", "2", *SEEDS],
+            "ppo: gamma must be a number from 0 to 1, not 2.0.",
+        ),
+        (["ppo,ddpg", "--env", "Pendulum-v1", "--total-steps", "4000", *SEEDS], "ddpg: learning_starts must be below"),
+        (["ppo,ddpg", "--env", "CartPole-v1", *SEEDS], "ddpg: CartPole-v1 has Discrete actions"),
+        (["ppo,sacc", "--env", "Pendulum-v1", *SEEDS], "There is no algorithm 'sacc': did you mean sac?"),
+        (["ppo,ddpg", "--preset", "course", *SEEDS], "These presets are for different environments"),
+        (["ppo,ddpg", "--env", "Pendulum-v1"], "over several seeds: add --seeds 1-5."),
+        (["ppo", "--seeds", "1-2"], "ppo: Which environment?"),
+        (["ppo", "--env", "CartPole-v1", "--seeds", "5-1"], "seeds must be numbers such as 1-5 or 1,3,7, not '5-1'."),
+        (["ppo", "--env", "CartPole-v1", "--seeds", "1,x"], "seeds must be numbers such as 1-5 or 1,3,7, not '1,x'."),
+        (["ppo", "--env", "CartPole-v1", "--seeds", "1-2", "--seed", "3"], "--seeds 1-5, not --seed."),
+        (["ppo", "--env", "CartPole-v1", "--seeds", "1-2", "--track", "x"], "There is no tracker 'x'"),
+    ],
+)
+def test_a_mistake_is_one_sentence_before_anything_starts(tmp_path, capsys, arguments, said):
+    assert main(["train", *arguments, "--run", str(tmp_path / "set")]) == 2
+    err = capsys.readouterr().err
+    assert said in err
+    assert len(err.strip().splitlines()) == 1
+    assert not (tmp_path / "set").exists()
+
+
+def test_seeds_are_given_as_ranges_and_lists():
+    assert sets._seeds_of("1-3") == [1, 2, 3]
+    assert sets._seeds_of("7,1-2, 7") == [7, 1, 2]
+    assert sets._seeds_of(range(2)) == [0, 1]
+
+
+@pytest.mark.parametrize(("cores", "threads", "runs"), [(8, 1, 8), (8, 3, 2), (2, 4, 1)])
+def test_as_many_runs_at_once_as_cores_serve(monkeypatch, cores, threads, runs):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)))
+    assert sets.at_once(threads) == runs
+
+
+def test_without_a_terminal_progress_is_a_line_now_and_then(capsys):
+    bars = SetProgress({"a": 1_000, "b": 1_000}, {"a": 0, "b": 500})
+    bars.update("a", 0, None, None)
+    bars.update("a", 100, 7.0, 50.0)
+    bars.update("a", 150, 7.0, 50.0)
+    bars.update("a", 1_030, 9.0, 50.0)
+    bars.end("a", "done")
+    bars.close()
+    assert capsys.readouterr().err.splitlines() == [
+        "30 % of all steps",
+        "  a: 100 steps  50/s  return 7.0  0:00:18 left",
+        "70 % of all steps",
+        "  a: 1,030 steps  50/s  return 9.0  being evaluated",
+        "a: done",
+    ]
