@@ -56,7 +56,7 @@ def test_groups_of_one_algorithm_are_told_apart_by_the_fields_that_differ(tmp_pa
 def test_of_many_fields_a_label_names_the_first_if_they_tell_the_groups_apart(tmp_path):
     many = {"num_envs": 4, "num_steps": 48, "epochs": 3, "gamma": 0.5, "clip": 0.3}
     runs = [write_run(tmp_path / "a"), write_run(tmp_path / "b", **many)]
-    assert labels(runs)[1] == "PPO, num_envs 4, num_steps 48, epochs 3, and 2 more"
+    assert labels(runs)[1] == "PPO, num_envs 4, num_steps 48, gamma 0.5, and 2 more"
     runs.append(write_run(tmp_path / "c", **(many | {"clip": 0.4})))
     assert labels(runs)[1:] == [
         f"PPO, num_envs 4, num_steps 48, epochs 3, gamma 0.5, clip {clip}" for clip in (0.3, 0.4)
@@ -186,4 +186,4 @@ def test_long_labels_stand_in_the_legend_and_numbers_beside_the_rows(tmp_path, m
     ]
     (figure,) = drawn(monkeypatch, *runs).values()
     assert [label.get_text() for label in figure.axes[2].get_yticklabels()] == ["1", "2"]
-    assert figure.legends[0].texts[0].get_text() == "1: PPO, learning_rate 0.01, gamma 0.9 (3 seeds)"
+    assert figure.legends[0].texts[0].get_text() == "1: PPO, gamma 0.9, learning_rate 0.01 (3 seeds)"

@@ -391,7 +391,7 @@ def test_actions_are_random_while_it_warms_up_and_the_policys_afterwards(monkeyp
         ({"learning_starts": 10_000, "total_steps": 10_000}, "learning_starts must be below total_steps"),
         ({"architecture": "simba", "hidden": (64, 32)}, "SimBa's blocks have one width"),
         ({"architecture": "simba", "critic_hidden": ()}, "SimBa's blocks have one width"),
-        ({"buffer_size": 200}, "buffer_size 200 .* below batch_size 256"),
+        ({"buffer_size": 100}, "buffer_size 100 .* below batch_size 128"),
         ({"buffer_size": 10**12, "total_steps": 10**12}, "choose buffer_size at most"),
     ],
 )
