@@ -59,7 +59,7 @@ def test_of_many_fields_a_label_names_the_first_if_they_tell_the_groups_apart(tm
     assert labels(runs)[1] == "PPO, num_envs 4, num_steps 48, gamma 0.5, and 2 more"
     runs.append(write_run(tmp_path / "c", **(many | {"clip": 0.4})))
     assert labels(runs)[1:] == [
-        f"PPO, num_envs 4, num_steps 48, epochs 3, gamma 0.5, clip {clip}" for clip in (0.3, 0.4)
+        f"PPO, num_envs 4, num_steps 48, gamma 0.5, epochs 3, clip {clip}" for clip in (0.3, 0.4)
     ]
 
 
