@@ -5,7 +5,8 @@
     .venv/bin/python benchmarks/returns.py ddpg --runs DIR           keep the runs there, and go on with unfinished ones
     .venv/bin/python benchmarks/returns.py ppo --table               the table of what has been run, and its picture
 
-Each row of `benchmarks/results/returns.jsonl` is one policy: 100 episodes from starts that training never saw. Where an
+Each row of `benchmarks/results/returns.jsonl` is one policy: 100 episodes from starts that training never saw; the
+drone's in crazyflow. Where an
 environment has two numbers of steps, one run serves both: nothing in those presets depends on how long the run is to
 be, so the policy at the first is the one that a shorter run would have ended with.
 """
@@ -20,7 +21,7 @@ from pathlib import Path
 import numpy as np
 from common import RESULTS, append, provenance, rows
 
-MILLION = 1_000_000
+MILLION, DRONE = 1_000_000, "DroneFigureEightTrajectory-v0"
 RUNS = {
     # algorithm: environment: (numbers of steps, seeds)
     "ppo": {
@@ -31,6 +32,15 @@ RUNS = {
         "Walker2d-v5": ((MILLION,), 5),
         "Ant-v5": ((MILLION, 3 * MILLION), 5),
         "Humanoid-v5": ((MILLION, 3 * MILLION), 3),
+    },
+    "reinforce": {"CartPole-v1": ((200_000,), 5), "InvertedPendulum-v5": ((500_000,), 5)},
+    "a2c": {"HalfCheetah-v5": ((MILLION,), 5), DRONE: ((MILLION,), 5)},
+    "trpo": {
+        "HalfCheetah-v5": ((MILLION,), 5),
+        "Hopper-v5": ((MILLION,), 5),
+        "Walker2d-v5": ((MILLION,), 5),
+        "Swimmer-v5": ((MILLION,), 5),
+        DRONE: ((MILLION,), 5),
     },
     "ddpg": {
         "MountainCarContinuous-v0": ((30_000,), 10),
@@ -70,7 +80,7 @@ def one(algorithm, env, seed, marks, runs):
         checkpoints = sorted((run.path / "checkpoints").glob("step-*"), key=lambda path: int(path.name[5:]))
         for mark in marks:
             policy = lem.load(next(path for path in checkpoints if int(path.name[5:]) >= mark))
-            scores = lem.evaluate(policy, episodes=100, seed=0, backend="gymnasium")
+            scores = lem.evaluate(policy, episodes=100, seed=0, backend=None if env == DRONE else "gymnasium")
             row = {
                 "algorithm": algorithm,
                 "env": env,

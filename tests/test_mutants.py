@@ -1,14 +1,16 @@
 """Wrong versions of the maths that the suite must kill: each is written into a copy of the package and tested."""
 
+import multiprocessing
 import os
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parents[1]
+
+MEMORY, PPO, ROAD = (f"test_{name}.py::test_" for name in ("memory", "ppo", "road"))
 
 MUTANTS = [
     # what goes wrong, file, the right line, the wrong line, the tests that must notice
@@ -49,18 +51,24 @@ MUTANTS = [
     ),
     (
         "reset rows reach the batch",
-        "algos/ppo.py",
-        "rollout.valid.flatten().nonzero()[:, 0]",
-        "torch.arange(rollout.num_rows)",
-        "test_ppo.py",
+        "types.py",
+        "self.valid.flatten().nonzero()[:, 0]",
+        "torch.arange(self.num_rows)",
+        PPO + "time_outs_bootstrap_and_reset_rows_teach_nothing",
     ),
-    ("the entropy bonus is a penalty", "algos/ppo.py", "- config.entropy_coef", "+ config.entropy_coef", "test_ppo.py"),
+    (
+        "the entropy bonus is a penalty",
+        "algos/ppo.py",
+        "- config.entropy_coef",
+        "+ config.entropy_coef",
+        PPO + "the_loss_is_equation_9",
+    ),
     (
         "the normalizer moves before the update",
         "algos/ppo.py",
         "    played = ",
         "    state.policy.observe(rollout.obs[rollout.valid])\n    played = ",
-        "test_ppo.py",
+        PPO + "the_first_ratio_is_one",
     ),
     (
         "evaluation takes the first that end",
@@ -98,7 +106,7 @@ MUTANTS = [
         "algos/ppo.py",
         "outcome = (rollout.reward,",
         "outcome = (rollout.reward.clamp(-10, 10),",
-        "test_ppo.py",
+        PPO + "rewards_of_any_size_are_learned_from_as_they_are_unless_scaling_is_asked_for",
     ),
     ("returns run on over the end", "nn/normalizer.py", "self.running * ~done", "self.running * 1", "test_nn.py"),
     (
@@ -109,7 +117,13 @@ MUTANTS = [
         "envs/test_books.py",
     ),
     ("fragments are counted", "envs/books.py", "done & whole]", "done & (whole | done)]", "envs/test_books.py"),
-    ("a masked action may be chosen", "nn/policies.py", "== 0, -1e9)", "== 0, 0.0)", "test_ppo.py"),
+    (
+        "a masked action may be chosen",
+        "nn/policies.py",
+        "== 0, -1e9)",
+        "== 0, 0.0)",
+        PPO + "it_learns_in_spaces_of_every_kind",
+    ),
     (
         "noise 0 chooses what is impossible",
         "maths/distributions.py",
@@ -150,16 +164,22 @@ MUTANTS = [
         "return (math.log(2)",
         "maths",
     ),
-    ("the KL turned round", "algos/trpo.py", "pi(here, batch.obs).kl(", "-pi(here, batch.obs).kl(", "test_road.py"),
+    (
+        "the KL turned round",
+        "algos/trpo.py",
+        "pi(here, batch.obs).kl(",
+        "-pi(here, batch.obs).kl(",
+        ROAD + "trpo_keeps_its_promises_after_every_step",
+    ),
     ("curvature turned round", "maths/trust_region.py", "here.kl(there)", "-here.kl(there)", "maths"),
     (
         "the values in the Fisher matrix",
         "algos/trpo.py",
         "FlatPolicy(fresh.policy)",
         "FlatPolicy(fresh)",
-        "test_road.py",
+        ROAD + "trpos_policy_step_leaves_the_critic_alone_and_the_critics_the_policy",
     ),
-    ("damping forgotten", "algos/trpo.py", " + config.damping * vector", "", "test_road.py"),
+    ("damping forgotten", "algos/trpo.py", " + config.damping * vector", "", ROAD + "damping_shortens_the_step"),
     ("a step that is not taken back", "maths/trust_region.py", "return start, 0.0", "return point, 0.0", "maths"),
     ("any KL will do", "maths/trust_region.py", " and kl <= max_kl", "", "maths"),
     ("any loss will do", "maths/trust_region.py", "loss < before and ", "", "maths"),
@@ -169,54 +189,174 @@ MUTANTS = [
     ("KL the wrong way round", "maths/distributions.py", "other.log_std - self", "self.log_std - other", "maths"),
     ("down the policy gradient", "maths/losses.py", "-(log_prob * weight)", "(log_prob * weight)", "maths"),
     ("what went before is forgotten", "maths/returns.py", "paid + weight * to_go[t]", "weight * to_go[t]", "maths"),
-    ("a reset row is an action", "algos/reinforce.py", "done | ~rollout.valid", "done", "test_road.py"),
-    ("the baseline is added", "algos/reinforce.py", "paid - baseline", "paid + baseline", "test_road.py"),
-    ("fragments among whole episodes", "data/rollout.py", "(ended >= 1) & ", "", "test_road.py"),
-    ("quick copies play more episodes", "data/rollout.py", " & (ended <= episodes)", "", "test_road.py"),
-    ("the target critic is the critic", "algos/ddpg.py", "targets.critic(batch", "critic(batch", "test_memory.py"),
-    ("the policy climbs down", "algos/ddpg.py", "loss = -critic(", "loss = critic(", "test_memory.py"),
+    (
+        "a reset row is an action",
+        "algos/reinforce.py",
+        "done | ~rollout.valid",
+        "done",
+        ROAD + "an_action_is_paid_with_what_followed_it_or_with_the_whole_episode",
+    ),
+    (
+        "the baseline is added",
+        "algos/reinforce.py",
+        "paid - baseline",
+        "paid + baseline",
+        ROAD + "an_action_is_paid_with_what_followed_it_or_with_the_whole_episode",
+    ),
+    (
+        "fragments among whole episodes",
+        "data/rollout.py",
+        "(ended >= 1) & ",
+        "",
+        ROAD + "whole_episodes_are_whole_and_as_many_from_each_copy",
+    ),
+    (
+        "quick copies play more episodes",
+        "data/rollout.py",
+        " & (ended <= episodes)",
+        "",
+        ROAD + "whole_episodes_are_whole_and_as_many_from_each_copy",
+    ),
+    (
+        "the bound on the KL stays",
+        "algos/trpo.py",
+        "(config.max_kl, config.final_max_kl",
+        "(config.max_kl, 1.0",
+        ROAD + "the_bound_on_the_kl_falls",
+    ),
+    (
+        "every attempt is a tenth",
+        "algos/trpo.py",
+        '"attempts": config.attempts',
+        '"attempts": 10',
+        ROAD + "trpo_shortens_a_step_that_is_too_long",
+    ),
+    (
+        "the entropy of a policy costs",
+        "algos/reinforce.py",
+        "loss - config.entropy_coef",
+        "loss + config.entropy_coef",
+        ROAD + "the_entropy_bonus_pays_for_entropy",
+    ),
+    (
+        "weights are never standardized",
+        "algos/reinforce.py",
+        "standardize(batch.advantage) if config.standardize else",
+        "",
+        ROAD + "weights_are_standardized_only_where_that_is_asked_for",
+    ),
+    (
+        "rewards are never scaled",
+        "algos/a2c.py",
+        "rollout = state.reward_scale.follow(rollout)",
+        "state.reward_scale.follow(rollout)",
+        ROAD + "rewards_of_any_size_are_learned_from_as_they_are_unless_scaling_is_asked_for",
+    ),
+    (
+        "the critic learns as fast at the end",
+        "algos/trpo.py",
+        "state.critic(batch, parts, rate)",
+        "state.critic(batch, parts, config.critic_learning_rate)",
+        ROAD + "steps_shrink_to_nothing_where_they_are_told_to",
+    ),
+    (
+        "the target critic is the critic",
+        "algos/ddpg.py",
+        "targets.critic(batch",
+        "critic(batch",
+        MEMORY + "ddpgs_target_is_of_the_target_networks_alone",
+    ),
+    (
+        "the policy climbs down",
+        "algos/ddpg.py",
+        "loss = -critic(",
+        "loss = critic(",
+        MEMORY + "the_actors_gradient_is_that_of_q_through_the_action",
+    ),
     (
         "a time-out is remembered as a death",
         "data/replay.py",
         "step.next_obs, step.terminated)",
         "step.next_obs, step.terminated | step.truncated)",
-        "test_memory.py",
+        MEMORY + "time_outs_bootstrap_and_reset_rows_teach_nothing",
     ),
     (
         "reset rows are remembered",
         "data/replay.py",
         "rows if step.valid.all() else rows[step.valid]",
         "rows",
-        "test_memory.py",
+        MEMORY + "time_outs_bootstrap_and_reset_rows_teach_nothing",
     ),
     (
         "the next observation is that after the reset",
         "data/replay.py",
         "step.reward, step.next_obs,",
         "step.reward, step.obs,",
-        "test_memory.py",
+        MEMORY + "what_is_remembered_is_what_happened",
     ),
-    ("the higher of two is believed", "algos/td3.py", "next_action).amin(0)", "next_action).amax(0)", "test_memory.py"),
+    (
+        "the higher of two is believed",
+        "algos/td3.py",
+        "next_action).amin(0)",
+        "next_action).amax(0)",
+        MEMORY + "td3s_target_is_the_lower_of_two_at_a_noisy_action",
+    ),
     (
         "a target without noise",
         "algos/td3.py",
         ".sample((config.target_noise * noise).clamp(-limit, limit))",
         ".mode()",
-        "test_memory.py",
+        MEMORY + "td3s_target_is_the_lower_of_two_at_a_noisy_action",
     ),
-    ("noise on the target that is not clipped", "algos/td3.py", ".clamp(-limit, limit)", "", "test_memory.py"),
-    ("entropy costs", "algos/sac.py", "amin(0) - temperature()", "amin(0) + temperature()", "test_memory.py"),
-    ("the temperature runs away", "algos/sac.py", "temperature_loss = -(", "temperature_loss = (", "test_memory.py"),
-    ("the policy hates entropy", "algos/sac.py", "(alpha.detach() *", "(-alpha.detach() *", "test_memory.py"),
+    (
+        "noise on the target that is not clipped",
+        "algos/td3.py",
+        ".clamp(-limit, limit)",
+        "",
+        MEMORY + "td3s_target_is_the_lower_of_two_at_a_noisy_action",
+    ),
+    (
+        "entropy costs",
+        "algos/sac.py",
+        "amin(0) - temperature()",
+        "amin(0) + temperature()",
+        MEMORY + "sacs_target_is_the_lower_of_two_less_the_price_of_the_action",
+    ),
+    (
+        "the temperature runs away",
+        "algos/sac.py",
+        "temperature_loss = -(",
+        "temperature_loss = (",
+        MEMORY + "sacs_policy_is_paid_for_entropy_and_its_temperature_steers_it",
+    ),
+    (
+        "the policy hates entropy",
+        "algos/sac.py",
+        "(alpha.detach() *",
+        "(-alpha.detach() *",
+        MEMORY + "sacs_policy_is_paid_for_entropy_and_its_temperature_steers_it",
+    ),
     (
         "noise is not told of ends",
         "algos/sac.py",
         "state.exploration.cut(step.terminated | step.truncated)",
         "",
-        "test_memory.py",
+        MEMORY + "an_end_cuts_the_noise_of_its_copy",
     ),
-    ("Q learns as fast at the end", "algos/sac.py", "fall * config.critic", "config.critic", "test_memory.py"),
-    ("an update at every step", "algos/td3.py", " and t % config.update_every == 0", "", "test_memory.py"),
+    (
+        "Q learns as fast at the end",
+        "algos/sac.py",
+        "fall * config.critic",
+        "config.critic",
+        MEMORY + "learning_rates_fall_linearly_over_the_run",
+    ),
+    (
+        "an update at every step",
+        "algos/td3.py",
+        " and t % config.update_every == 0",
+        "",
+        MEMORY + "as_many_gradient_steps_are_taken_as_announced",
+    ),
     ("Q is the higher one", "nn/actor_critic.py", "value.amin(0)", "value.amax(0)", "run/test_critique.py"),
     (
         "a time-out is worth nothing",
@@ -225,7 +365,13 @@ MUTANTS = [
         "realised",
         "run/test_critique.py",
     ),
-    ("the delay is forgotten", "algos/td3.py", "state.updates % config.policy_delay == 0", "True", "test_memory.py"),
+    (
+        "the delay is forgotten",
+        "algos/td3.py",
+        "state.updates % config.policy_delay == 0",
+        "True",
+        MEMORY + "each_step_moves_what_it_should",
+    ),
     (
         "the ring tears rows apart",
         "data/replay.py",
@@ -259,6 +405,23 @@ MUTANTS = [
 ]
 
 
+FORKS = multiprocessing.get_context("forkserver")
+FORKS.set_forkserver_preload(["torch", "torch.func", "gymnasium", "matplotlib.figure", "pytest"])
+"""a mutant's tests run in a process in which all that is slow to import is there already, and no lemniscate"""
+
+
+def run_tests(package, tests, output):
+    """Exit with pytest's code, having run `tests` on the package in a directory."""
+    with Path(output).open("w") as file:
+        os.dup2(file.fileno(), 1)
+        os.dup2(file.fileno(), 2)
+    os.environ |= {"PYTHONPATH": str(package), "PYTHONDONTWRITEBYTECODE": "1"}
+    sys.path.insert(0, str(package))
+    sys.dont_write_bytecode = True
+    os.chdir(ROOT)
+    sys.exit(pytest.main(["-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", "-m", "not long", str(tests)]))
+
+
 @pytest.mark.parametrize("mutant", MUTANTS, ids=[mutant[0].replace(" ", "-") for mutant in MUTANTS])
 def test_the_suite_kills(tmp_path, mutant):
     _, name, right, wrong, tests = mutant
@@ -267,10 +430,9 @@ def test_the_suite_kills(tmp_path, mutant):
     text = file.read_text()
     assert text.count(right) == 1, f"{name} no longer has this line once: {right}"
     file.write_text(text.replace(right, wrong))
-    environment = {**os.environ, "PYTHONPATH": str(tmp_path), "PYTHONDONTWRITEBYTECODE": "1"}
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", "-m", "not long"]
-    done = subprocess.run(
-        [*command, str(ROOT / "tests" / tests)], env=environment, cwd=ROOT, capture_output=True, text=True
-    )
-    assert done.returncode == 1, done.stdout[-2000:]
-    assert "1 failed" in done.stdout
+    process = FORKS.Process(target=run_tests, args=(tmp_path, ROOT / "tests" / tests, tmp_path / "output"))
+    process.start()
+    process.join()
+    said = (tmp_path / "output").read_text()
+    assert process.exitcode == 1, said[-2000:]
+    assert "1 failed" in said

@@ -263,6 +263,26 @@ def test_without_the_line_search_it_is_the_natural_policy_gradient():
     torch.testing.assert_close(there, _stepped(config, state, batch, before), rtol=1e-2, atol=1e-4)
 
 
+def test_damping_shortens_the_step():
+    """With very much of it the step is √(2δ / c) along the gradient, whatever the Fisher matrix says."""
+    config, state, rollout = one_rollout(trpo, num_steps=64, line_search=False, damping=1e4, max_kl=1e-2)
+    batch, start = trpo.advantages(config, state, rollout), state.parameters.vector.clone()
+    step = _stepped(config, state, batch, start) - start
+    assert step.norm().item() == pytest.approx((2 * 1e-2 / 1e4) ** 0.5, rel=1e-2)
+
+
+def test_the_bound_on_the_kl_falls():
+    """Half way from δ to 0.2 δ a whole step's KL is 0.6 δ, to second order."""
+    tight = {"damping": 1e-3, "cg_iterations": 30, "max_kl": 1e-4, "hidden": (4,)}
+    config, state, rollout = one_rollout(trpo, num_steps=64, line_search=False, final_max_kl=0.2, **tight)
+    batch, start, seen = trpo.advantages(config, state, rollout), state.parameters.vector.clone(), []
+    for progress in (0, 0.5, 1):
+        state.parameters.vector.copy_(start)
+        state.step = int(progress * config.total_steps)
+        seen.append(trpo.improve(config, state, batch)["kl"].item())
+    assert seen[1:] == pytest.approx([0.6 * seen[0], 0.2 * seen[0]], rel=0.05)
+
+
 def _stepped(config, state, batch, start):
     state.parameters.vector.copy_(start)
     trpo.improve(config, state, batch)
@@ -292,10 +312,86 @@ def test_the_normalizer_moves_after_the_update_and_sees_only_real_rows(algo):
 
 
 @EACH
-def test_rewards_are_scaled_only_where_that_is_asked_for(algo):
-    for scaled in (False, True):
-        config = small(algo, gamma=0.5, scale_rewards=scaled)
-        state, env = begin(algo, config)
-        rollout = collect(env, state.policy, 8, state.noise)
-        algo.update(config, state, rollout)
-        assert (state.reward_scale.count > 0) == scaled
+@pytest.mark.parametrize("scaled", [False, True])
+def test_rewards_of_any_size_are_learned_from_as_they_are_unless_scaling_is_asked_for(algo, rng, scaled):
+    """γ = 0: the value target is the reward."""
+    config, state, rollout = one_rollout(algo, gamma=0.0, scale_rewards=scaled)
+    seen = []
+    spy = lambda batch, parts, rate: seen.append(batch) or {"losses/value": torch.zeros(())}  # noqa: E731
+    setattr(state, "optimizer" if algo is a2c else "critic", spy)
+    rollout = dataclasses.replace(rollout, reward=100 * torch.randn(8, 4, generator=rng) + 300)
+    algo.update(config, state, rollout)
+    expected = rollout.reward / rollout.reward.std(correction=0) if scaled else rollout.reward
+    torch.testing.assert_close(seen[0].target, expected.flatten())
+
+
+@EACH
+def test_steps_shrink_to_nothing_where_they_are_told_to(algo):
+    """The networks that a falling learning rate moves stay where they are at the end of the run, and only there."""
+    field = "final_critic_learning_rate" if algo is trpo else "final_learning_rate"
+    config, state, rollout = one_rollout(algo, **{field: 0.0})
+    first = config.critic_learning_rate if algo is trpo else config.learning_rate
+    part = {a2c: state.networks, reinforce: state.networks.policy, trpo: state.networks.value}[algo]
+    for step, moves in ((0, True), (config.total_steps // 2, True), (config.total_steps, False)):
+        state.step, before = step, [p.clone() for p in part.parameters()]
+        rate = algo.update(config, state, rollout)["learning_rate"]
+        assert rate == pytest.approx((1 - step / config.total_steps) * first)
+        assert moves != all(torch.equal(a, b) for a, b in zip(before, part.parameters(), strict=True))
+
+
+def slope(loss, module):
+    """The gradient of a loss, as one vector."""
+    gradients = torch.autograd.grad(loss, list(module.parameters()), materialize_grads=True)
+    return torch.cat([gradient.flatten() for gradient in gradients])
+
+
+@pytest.mark.parametrize("standardized", [False, True])
+def test_weights_are_standardized_only_where_that_is_asked_for(standardized):
+    """Then scale and shift of what weighs log π change nothing."""
+    config, state, rollout = one_rollout(a2c, normalize_advantage=standardized, value_coef=0.0)
+    batch = a2c.advantages(config, state, rollout)
+    other = dataclasses.replace(batch, advantage=3 * batch.advantage + 5)
+    a, b = (slope(a2c.loss(config, state.networks, x)[0], state.policy) for x in (batch, other))
+    assert torch.allclose(a, b, rtol=1e-3, atol=1e-6) == standardized
+    config, state, rollout = one_rollout(reinforce, standardize=standardized)
+    a, b = (slope(reinforce.policy_loss(config, state.policy, x)[0], state.policy) for x in (batch, other))
+    assert torch.allclose(a, b, rtol=1e-3, atol=1e-6) == standardized
+    config, state, rollout = one_rollout(trpo, normalize_advantage=standardized)
+    start = state.parameters.vector.clone()
+    a, b = (_stepped(config, state, x, start) - start for x in (batch, other))
+    assert torch.allclose(a, b, rtol=1e-3, atol=1e-5) == standardized
+
+
+def test_the_entropy_bonus_pays_for_entropy():
+    config, state, rollout = one_rollout(reinforce)
+    batch = reinforce.outcomes(config, state, rollout)
+    plain = slope(reinforce.policy_loss(config, state.policy, batch)[0], state.policy)
+    paid = dataclasses.replace(config, entropy_coef=0.3)
+    with_bonus = slope(reinforce.policy_loss(paid, state.policy, batch)[0], state.policy)
+    entropy = slope(state.policy(batch.obs).entropy().mean(), state.policy)
+    torch.testing.assert_close(with_bonus, plain - 0.3 * entropy)
+    assert entropy.norm() > 0
+
+
+def test_a2cs_gradient_is_clipped():
+    """Adam forgets the length of a gradient, but for its ε: far below that, nothing moves."""
+    config, state, rollout = one_rollout(a2c, max_grad_norm=1e-12)
+    before = [p.clone() for p in state.networks.parameters()]
+    a2c.update(config, state, rollout)
+    for old, new in zip(before, state.networks.parameters(), strict=True):
+        torch.testing.assert_close(old, new, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize(("attempts", "taken"), [(2, 0), (20, 0.5**3)])
+def test_trpo_shortens_a_step_that_is_too_long(monkeypatch, attempts, taken):
+    """Six times too long, by halves: an eighth of it is the first within the bound."""
+    config, state, rollout = one_rollout(trpo, num_steps=64, shrink=0.5, attempts=attempts, damping=1e-3, max_kl=1e-4)
+    natural_step = trpo.natural_step
+    monkeypatch.setattr(trpo, "natural_step", lambda *a, **k: 6 * natural_step(*a, **k))
+    assert trpo.improve(config, state, trpo.advantages(config, state, rollout))["step_fraction"] == taken
+
+
+@EACH
+def test_a_single_row_has_no_standard_deviation(algo):
+    with pytest.raises(UserError, match=r"(standardize|normalize_advantage) needs batches of 2 rows"):
+        small(algo, num_envs=1, num_steps=1, **({} if algo is reinforce else {"normalize_advantage": True}))

@@ -18,10 +18,11 @@ from lemniscate.report import pictures as pictures_of
 from lemniscate.run import checkpoint
 from lemniscate.run.config import RunConfig
 from lemniscate.run.critique import critic_of
+from lemniscate.run.directory import is_finished, newest, read_config, require_absent
 from lemniscate.run.evaluate import Evaluation
 from lemniscate.run.evaluate import evaluate as evaluate_module
 from lemniscate.run.loggers import LOGGERS, read_metrics
-from lemniscate.run.run import AnyState, Run, is_finished, newest, read_config, require_absent
+from lemniscate.run.run import AnyState, Run
 from lemniscate.run.seeding import set_seeds
 from lemniscate.run.set_file import is_set, read_set
 from lemniscate.trained import TrainedPolicy

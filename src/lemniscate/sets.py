@@ -25,9 +25,10 @@ from lemniscate.envs import api
 from lemniscate.errors import SetError, UserError, said_of, unknown
 from lemniscate.report.pictures import say
 from lemniscate.run.config import RunConfig
+from lemniscate.run.directory import is_finished
 from lemniscate.run.loggers import read_metrics
 from lemniscate.run.progress import SetProgress
-from lemniscate.run.run import Stopped, is_finished
+from lemniscate.run.run import Stopped
 from lemniscate.run.set_file import RunSet, read_set
 
 LOG = "log.txt"

@@ -176,6 +176,11 @@ class Rollout(Record):
         """[T, N]: the episode ended here, by its own rules or by the clock."""
         return self.terminated | self.truncated
 
+    @property
+    def played(self) -> Tensor:
+        """The numbers, in the flattened rollout, of the rows in which an action was taken."""
+        return self.valid.flatten().nonzero()[:, 0]
+
 
 @dataclass(frozen=True)
 class Transition(Record):

@@ -46,6 +46,10 @@ class Config(RolloutConfig):
     max_grad_norm: Positive | None = 0.5
     """global gradient norm that is clipped to; none leaves it free"""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._require_rows("normalize_advantage", self.num_rows)
+
     @property
     def gradient_steps(self) -> int:
         """Of the whole run."""
@@ -117,7 +121,7 @@ def update(config: Config, state: State, rollout: Rollout) -> Mapping[str, Tenso
     if config.scale_rewards:
         rollout = state.reward_scale.follow(rollout)
     batch = advantages(config, state, rollout)
-    played = rollout.valid.flatten().nonzero()[:, 0]  # without the rows in which no action was taken
+    played = rollout.played
     seen = state.optimizer(batch, whole_batch(played, rollout.num_rows), rate)
     state.policy.observe(rollout.obs[rollout.valid])  # afterwards: the actions were drawn through the normalizer before
     state.step += rollout.num_rows

@@ -12,7 +12,6 @@ import torch
 from torch import Generator, Tensor
 
 from lemniscate.data.rollout import collect, minibatches
-from lemniscate.errors import UserError
 from lemniscate.maths import (
     adapt_to_kl,
     clipped_surrogate,
@@ -73,8 +72,7 @@ class Config(RolloutConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if min(self.minibatch_size, self.num_rows) == 1 and self.normalize_advantage:
-            raise UserError("normalize_advantage needs minibatches of 2 rows or more; these have 1.")
+        self._require_rows("normalize_advantage", min(self.minibatch_size, self.num_rows))
 
     @property
     def gradient_steps(self) -> int:
@@ -155,7 +153,7 @@ def update(config: Config, state: State, rollout: Rollout) -> Mapping[str, Tenso
     if config.scale_rewards:
         rollout = state.reward_scale.follow(rollout)
     batch = collected = advantages(config, state, rollout)
-    played = rollout.valid.flatten().nonzero()[:, 0]  # without the rows in which no action was taken
+    played = rollout.played
     watched: list[Mapping[str, Tensor]] = []
     for epoch in range(config.epochs):
         if config.recompute_advantages and epoch > 0:

@@ -69,6 +69,8 @@ class Config(RolloutConfig):
             )
         if self.episodes and self.engine == "native":
             raise UserError("Batches of whole episodes differ in size, which the native engine cannot take: use eager.")
+        if not self.episodes:
+            self._require_rows("standardize", self.num_rows)
 
     @property
     def gradient_steps(self) -> int:
@@ -152,7 +154,7 @@ def update(config: Config, state: State, rollout: Rollout) -> Mapping[str, Tenso
     if config.scale_rewards:
         rollout = state.reward_scale.follow(rollout)
     batch = outcomes(config, state, rollout)
-    played = rollout.valid.flatten().nonzero()[:, 0]  # of whole episodes, or without the rows of resets
+    played = rollout.played
     size = len(played) if config.episodes else rollout.num_rows
     watched = state.optimizer(batch, whole_batch(played, size), rate)
     with torch.no_grad():

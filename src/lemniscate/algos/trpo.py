@@ -39,7 +39,9 @@ class Config(RolloutConfig):
     """What TRPO adds to the knobs of all that learn from rollouts."""
 
     max_kl: Positive = 0.01
-    """δ: the mean KL from the old policy to the new that an update may reach"""
+    """δ: the mean KL from the old policy to the new that an update may reach, at the start"""
+    final_max_kl: Fraction = 1.0
+    """fraction of it that it falls to, linearly over the run; 1 keeps it constant"""
     line_search: bool = True
     """shorten the step until it keeps its promises; without it this is the natural policy gradient"""
     shrink: Fraction = 0.8
@@ -62,6 +64,10 @@ class Config(RolloutConfig):
     """Adam's step size for the critic at the start"""
     final_critic_learning_rate: Fraction = 1.0
     """fraction of it that it falls to, linearly over the run"""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._require_rows("normalize_advantage", self.num_rows)
 
     @property
     def gradient_steps(self) -> int:
@@ -126,6 +132,7 @@ def critic_loss(value: Value, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
 
 def improve(config: Config, state: State, batch: Batch) -> dict[str, Tensor | float]:
     """Maximize L(θ) subject to KL(θ_old ‖ θ) ≤ δ, to first and to second order (eq. 14, appendix C)."""
+    max_kl = linear(config.max_kl, config.final_max_kl, state.step / config.total_steps)
     here, pi = state.parameters.vector.clone(), state.parameters.at
     advantage = standardize(batch.advantage) if config.normalize_advantage else batch.advantage
 
@@ -140,8 +147,8 @@ def improve(config: Config, state: State, batch: Batch) -> dict[str, Tensor | fl
 
     gradient = grad(loss)(here)
     with torch.no_grad():
-        step = natural_step(fisher, gradient, config.max_kl, iterations=config.cg_iterations)
-        limits = {"max_kl": config.max_kl, "shrink": config.shrink, "attempts": config.attempts}
+        step = natural_step(fisher, gradient, max_kl, iterations=config.cg_iterations)
+        limits = {"max_kl": max_kl, "shrink": config.shrink, "attempts": config.attempts}
         there, fraction = here + step, 1.0
         if config.line_search:
             there, fraction = backtrack(lambda theta: (loss(theta), kl(theta)), here, step, **limits)
@@ -157,7 +164,7 @@ def update(config: Config, state: State, rollout: Rollout) -> Mapping[str, Tenso
     if config.scale_rewards:
         rollout = state.reward_scale.follow(rollout)
     batch = advantages(config, state, rollout)
-    played = rollout.valid.flatten().nonzero()[:, 0]  # without the rows in which no action was taken
+    played = rollout.played
     watched = improve(config, state, batch[whole_batch(played, rollout.num_rows)[0]])
     for _ in range(config.critic_epochs):
         parts = minibatches(played, rollout.num_rows, config.critic_minibatch_size, state.shuffle)

@@ -28,7 +28,7 @@ ACTIVATIONS = {"tanh": Tanh, "relu": nn.ReLU, "elu": nn.ELU, "silu": nn.SiLU}
 class Bfloat16Linear(nn.Linear):
     """x Wᵀ + b with both factors rounded to bfloat16, 8 bits each, on the way there and back.
 
-    Parameters, gradients and what comes out keep their type. Half the time where the processor multiplies such numbers.
+    Parameters, gradients and what comes out keep their type.
     """
 
     def forward(self, input: Tensor) -> Tensor:

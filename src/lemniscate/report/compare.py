@@ -36,7 +36,7 @@ from lemniscate.report.seeds import (
     mean_interval,
     probability_of_improvement,
 )
-from lemniscate.run.run import is_finished, read_config
+from lemniscate.run.directory import is_finished, read_config
 from lemniscate.run.set_file import is_set
 
 POINTS = 200

@@ -14,8 +14,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
 from lemniscate.run.critique import Honesty
+from lemniscate.run.directory import read_config
 from lemniscate.run.loggers import read_metrics
-from lemniscate.run.run import read_config
 
 DIAGNOSTICS = (
     "losses/value",

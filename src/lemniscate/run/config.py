@@ -160,6 +160,11 @@ class RolloutConfig(RunConfig):
         """Of the whole run."""
         return -(-self.total_steps // self.num_rows)
 
+    def _require_rows(self, field: str, rows: int) -> None:
+        """Raise `UserError` if `field`, which standardizes, would have a single row to do it with."""
+        if rows == 1 and getattr(self, field):
+            raise UserError(f"{field} needs batches of 2 rows or more; these have 1.")
+
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayConfig(RunConfig):
@@ -207,7 +212,7 @@ class ReplayConfig(RunConfig):
     architecture: Architecture = "mlp"
     """plain layers; with layer normalization; or SimBa's residual blocks, all of one width"""
     matmul: Matmul = "float32"
-    """of products between hidden layers; bfloat16 takes half the time where the processor has it"""
+    """of products between hidden layers; bfloat16 is quicker where the processor has it"""
     normalize_observations: bool = False
     """a running normalizer inside the policy"""
 

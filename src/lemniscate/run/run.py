@@ -1,4 +1,4 @@
-"""What surrounds a training loop: the run directory, and the generator that the loop is written over.
+"""What surrounds a training loop: the generator that the loop is written over.
 
     for env in run.until(config.total_steps, state):
         ...one update...
@@ -9,7 +9,6 @@ A checkpoint is a place where the run starts anew: there the environments restar
 step), in a run that goes on as in one that is resumed. So both end in the same bits, whatever the simulator.
 """
 
-import json
 import shutil
 import signal
 import sys
@@ -28,12 +27,11 @@ from lemniscate.data.replay import Replay
 from lemniscate.envs.api import VecEnv
 from lemniscate.envs.books import Episodes
 from lemniscate.errors import NonFiniteError, UserError
-from lemniscate.nn.descent import Descent
-from lemniscate.nn.flat import FlatPolicy
 from lemniscate.nn.policies import Policy
 from lemniscate.run import checkpoint
 from lemniscate.run.config import RunConfig
 from lemniscate.run.critique import critic_of
+from lemniscate.run.directory import create_directory, newest_resumable
 from lemniscate.run.evaluate import evaluate
 from lemniscate.run.loggers import LOGGERS, NO_EPISODES, Logger
 from lemniscate.run.progress import ProgressBar
@@ -178,9 +176,8 @@ class Run:
                 print(
                     "Compiling: half a minute or a whole one the first time, 5 to 10 s from then on.", file=sys.stderr
                 )
-            state.policy.make_native()
-            for part in vars(state).values():
-                if isinstance(part, (Descent, FlatPolicy)):
+            for part in (state.policy, *vars(state).values()):
+                if hasattr(part, "make_native"):
                     part.make_native()
 
     def _restart(self, state: AnyState) -> None:
@@ -282,71 +279,8 @@ class Run:
                 signal.signal(signum, handler)
 
 
-UNFINISHED = "config.json.tmp"
-SET = "set.json"
-"""what a set of runs has in the place of a `config.json`"""
-
-
 def engine_of(config: RunConfig) -> str:
     """The engine asked for; of itself, "native" for a run that is long enough to repay it, else "eager"."""
     if config.engine != "auto":
         return config.engine
     return "native" if config.gradient_steps >= WORTH_COMPILING else "eager"
-
-
-def require_absent(path: Path) -> None:
-    """Raise `UserError` if a run directory exists already, but for the beginning of one that could not be written."""
-    if path.exists() and (not path.is_dir() or set(path.iterdir()) - {path / UNFINISHED}):
-        raise UserError(f"{path} exists already; go on with it (lemniscate resume {path}) or choose another --run.")
-
-
-def create_directory(path: Path, name: str, record: dict[str, Any]) -> None:
-    """Make a directory with the one file that says what it is. Raises `UserError` if there is something already."""
-    require_absent(path)
-    temporary = path / UNFINISHED
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-        temporary.write_text(json.dumps(record, indent=1) + "\n")
-        temporary.replace(path / name)
-    except OSError as error:
-        raise UserError(f"{path} cannot be made: {error.strerror}.") from error
-
-
-def read_config(path: Path) -> tuple[str, dict[str, Any]]:
-    """The algorithm's name and its config, from a run directory. Raises `UserError` if it is none."""
-    if (path / SET).exists():
-        runs = sorted(file.parent for file in path.glob("*/config.json"))
-        raise UserError(f"{path} is a set of runs: name one of them, such as {runs[0] if runs else path / '…'}.")
-    try:
-        record = json.loads((path / "config.json").read_text())
-        return record["algorithm"], record["config"]
-    except (OSError, ValueError, KeyError, TypeError):
-        raise UserError(f"{path} is not a run directory: it holds no config.json that can be read.") from None
-
-
-def is_finished(path: Path) -> bool:
-    """Whether a run has taken all its steps, and the checkpoint of its end is there."""
-    _, config = read_config(path)
-    return checkpoint.list_steps(path / "checkpoints")[-1:] >= [config["total_steps"]]
-
-
-def newest_resumable(path: Path) -> checkpoint.Checkpoint | None:
-    """The newest planned checkpoint of a run that is whole; damaged ones are named on standard error."""
-    return _newest(path, planned_only=True)
-
-
-def newest(path: Path) -> checkpoint.Checkpoint | None:
-    """The newest whole checkpoint of a run, a stopped run's last one included."""
-    return _newest(path, planned_only=False)
-
-
-def _newest(path: Path, planned_only: bool) -> checkpoint.Checkpoint | None:
-    for step in reversed(checkpoint.list_steps(path / "checkpoints")):
-        try:
-            found = checkpoint.read(path / "checkpoints" / f"step-{step}")
-        except checkpoint.DamagedCheckpointError as error:
-            print(f"{error} Taking the one before.", file=sys.stderr)
-            continue
-        if found.record["planned"] or not planned_only:
-            return found
-    return None

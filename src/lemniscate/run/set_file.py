@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from lemniscate.errors import UserError
-from lemniscate.run.run import SET, create_directory
+from lemniscate.run.directory import SET, create_directory
 
 
 @dataclass(frozen=True)
