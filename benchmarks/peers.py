@@ -67,15 +67,16 @@ print(model.num_timesteps)
 
 PEER_TRPO = """
 import sys, time, torch
-steps, kind, threads = int(sys.argv[1]), sys.argv[2], int(sys.argv[3])
-torch.set_num_threads(threads)
+steps, kind, threads, cg_iterations, critic_epochs, max_kl = int(sys.argv[1]), sys.argv[2], *map(float, sys.argv[3:])
+torch.set_num_threads(int(threads))
 from sb3_contrib import TRPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 if __name__ == "__main__":
     vector = make_vec_env("HalfCheetah-v5", n_envs=16, vec_env_cls=SubprocVecEnv if kind == "subproc" else DummyVecEnv)
-    fields = dict(n_steps=128, batch_size=128, learning_rate=1e-3, cg_max_steps=15, cg_damping=0.1, n_critic_updates=10)
-    model = TRPO("MlpPolicy", vector, target_kl=0.01, **fields)
+    fields = dict(n_steps=128, batch_size=128, learning_rate=1e-3, cg_damping=0.1, target_kl=max_kl)
+    fields |= dict(cg_max_steps=int(cg_iterations), n_critic_updates=int(critic_epochs))
+    model = TRPO("MlpPolicy", vector, **fields)
     model.learn(4096)
     started = time.perf_counter()
     model.learn(steps, reset_num_timesteps=False)

@@ -3,12 +3,11 @@
     .venv/bin/python benchmarks/returns.py ppo                       every environment of the README, every seed
     .venv/bin/python benchmarks/returns.py ppo --envs Hopper-v5 --seeds 1 2
     .venv/bin/python benchmarks/returns.py ddpg --runs DIR           keep the runs there, and go on with unfinished ones
-    .venv/bin/python benchmarks/returns.py ppo --table               the table of what has been run, and its picture
+    .venv/bin/python benchmarks/returns.py ppo trpo --table          the table of what has been run, and the pictures
 
 Each row of `benchmarks/results/returns.jsonl` is one policy: 100 episodes from starts that training never saw; the
-drone's in crazyflow. Where an
-environment has two numbers of steps, one run serves both: nothing in those presets depends on how long the run is to
-be, so the policy at the first is the one that a shorter run would have ended with.
+drone's in crazyflow. Where an environment has two numbers of steps, one run serves both: nothing in those presets
+depends on how long the run is to be, so the policy at the first is the one that a shorter run would have ended with.
 """
 
 import argparse
@@ -101,11 +100,9 @@ def measured(algorithm, env, steps):
 
 
 def summary(algorithm):
-    """The README's table of what has been run."""
+    """The README's rows of what has been run."""
     from lemniscate.report.seeds import bootstrap_interval, iqm
 
-    print("| environment | steps | return, mean ± std over seeds | IQM [95 %] | worst seed | seeds | training |")
-    print("|---|---|---|---|---|---|---|")
     for env, (marks, _) in RUNS[algorithm].items():
         for mark in marks:
             of = measured(algorithm, env, mark)
@@ -115,51 +112,56 @@ def summary(algorithm):
             low, high = bootstrap_interval(means)
             seconds = np.median([row["training_s"] for row in of])
             digits = 1 if abs(np.mean(means)) < 200 else 0
-            mean, std, middle, low, high, worst = (
-                f"{x:,.{digits}f}" for x in (np.mean(means), np.std(means), iqm(means), low, high, min(means))
-            )
-            spread = f"{mean} ± {std} | {middle} [{low}, {high}]"
-            print(f"| {env} | {mark:,} | {spread} | {worst} | {len(means)} | {seconds / 60:.1f} min |")
+            numbers = (np.mean(means), np.std(means), iqm(means), low, high, min(means))
+            mean, std, middle, low, high, worst = (f"{x:,.{digits}f}" for x in numbers)
+            name = f"{algorithm.upper()} | {env} | {mark:,}"
+            spread = f"{mean} ± {std} | {middle} [{low}, {high}] | {worst}"
+            print(f"| {name} | {spread} | {len(means)} | {seconds / 60:.1f} min |")
 
 
 def draw(algorithm):
     """Training returns of every seed, one panel for each environment."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(11, 5.5), layout="constrained")
-    panels = figure.subplots(2, 4).flat
-    for env, (marks, _) in RUNS[algorithm].items():
-        of = measured(algorithm, env, marks[-1])
-        if not of:
-            continue
-        axes = next(panels)
+    lines = {env: measured(algorithm, env, marks[-1]) for env, (marks, _) in RUNS[algorithm].items()}
+    shown = [env for env in lines if lines[env]]
+    if not shown:
+        return
+    columns, height = min(4, len(shown)), -(-len(shown) // 4)
+    figure = Figure(figsize=(2.75 * columns, 2.75 * height), layout="constrained")
+    panels = figure.subplots(height, columns, squeeze=False).flatten()
+    for env, axes in zip(shown, panels, strict=False):
         axes.set_title(env, fontsize=10)
-        for row in of:
+        unit, word = (1e6, "million") if RUNS[algorithm][env][0][-1] >= MILLION else (1e3, "thousand")
+        for row in lines[env]:
             steps, values = zip(*row["curve"], strict=True)
-            axes.plot(np.array(steps) / 1e6, values, color="#3465a4", alpha=0.5, linewidth=1)
-        axes.set_xlabel("million steps", fontsize=8)
+            axes.plot(np.array(steps) / unit, values, color="#3465a4", alpha=0.5, linewidth=1)
+        axes.set_xlabel(f"{word} steps", fontsize=8)
         axes.tick_params(labelsize=8)
         axes.spines[["top", "right"]].set_visible(False)
-    for axes in panels:
+    for axes in panels[len(shown) :]:
         axes.set_visible(False)
     figure.savefig(RESULTS / f"returns-{algorithm}.png", dpi=120)
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("algorithm", choices=RUNS)
+    parser.add_argument("algorithms", nargs="+", choices=RUNS)
     parser.add_argument("--envs", nargs="+")
     parser.add_argument("--seeds", nargs="+", type=int)
     parser.add_argument("--runs", type=Path)
     parser.add_argument("--table", action="store_true", help="run nothing")
     given = parser.parse_args()
-    if not given.table:
-        for env in given.envs or RUNS[given.algorithm]:
-            marks, seeds = RUNS[given.algorithm][env]
+    for algorithm in () if given.table else given.algorithms:
+        for env in given.envs or RUNS[algorithm]:
+            marks, seeds = RUNS[algorithm][env]
             for seed in given.seeds or range(1, seeds + 1):
-                one(given.algorithm, env, seed, marks, given.runs)
-    summary(given.algorithm)
-    draw(given.algorithm)
+                one(algorithm, env, seed, marks, given.runs)
+    print("| algorithm | environment | steps | mean ± std over seeds | IQM [95 %] | worst seed | seeds | training |")
+    print("|---|---|---|---|---|---|---|---|")
+    for algorithm in given.algorithms:
+        summary(algorithm)
+        draw(algorithm)
 
 
 if __name__ == "__main__":

@@ -187,9 +187,59 @@ PPO = [
     Preset("paper", ppo.Config(), "Schulman et al. 2017, table 3, on 8 copies with a running normalizer", "2026-11"),
 ]
 
-REINFORCE = [Preset("default", reinforce.Config(), "first values", "2026-11")]
+REINFORCE = [
+    Preset("default", reinforce.Config(), "first values, tried on CartPole and InvertedPendulum, seed 101", "2026-11")
+]
 A2C = [Preset("default", a2c.Config(num_envs=16), "first values", "2026-11")]
-TRPO = [Preset("default", trpo.Config(num_envs=16, num_steps=128), "first values", "2026-11")]
+
+BOUNDED = trpo.Config(num_envs=16, num_steps=64, critic_epochs=20, initial_log_std=-0.5, scale_rewards=True)
+"""small rollouts, and a critic that is fitted well"""
+
+TRPO = [
+    Preset("default", BOUNDED, "what serves HalfCheetah and Walker2d", "2026-11"),
+    Preset(
+        "half-cheetah",
+        BOUNDED.replace(env="HalfCheetah-v5"),
+        "search by hand, 3 runs, on seed 101",
+        "2026-11",
+    ),
+    Preset("walker2d", BOUNDED.replace(env="Walker2d-v5"), "a run on seed 101", "2026-11"),
+    Preset(
+        "hopper",
+        BOUNDED.replace(env="Hopper-v5", num_envs=8, num_steps=256),
+        "search by hand, 2 runs, on seed 101",
+        "2026-11",
+    ),
+    Preset(
+        "swimmer",
+        trpo.Config(
+            env="Swimmer-v5",
+            num_envs=4,
+            num_steps=512,
+            max_kl=0.04,
+            final_max_kl=0.0,
+            gamma=0.9999,
+            gae_lambda=0.98,
+            critic_epochs=20,
+        ),
+        "search by hand, 3 runs, on seed 101",
+        "2026-11",
+    ),
+    Preset(
+        "figure-eight",
+        trpo.Config(
+            env=FIGURE_EIGHT,
+            num_envs=64,
+            num_steps=32,
+            max_kl=0.03,
+            gamma=0.97,
+            initial_log_std=-0.8,
+            evaluate_episodes=64,
+        ),
+        "a run on seed 101",
+        "2026-11",
+    ),
+]
 
 SHARED = "the settings that most libraries share today"
 BOLD = {
