@@ -190,7 +190,38 @@ PPO = [
 REINFORCE = [
     Preset("default", reinforce.Config(), "first values, tried on CartPole and InvertedPendulum, seed 101", "2026-11")
 ]
-A2C = [Preset("default", a2c.Config(num_envs=16), "first values", "2026-11")]
+
+SURE = a2c.Config(
+    num_envs=16,
+    num_steps=16,
+    learning_rate=1e-3,
+    gae_lambda=0.95,
+    normalize_advantage=True,
+    scale_rewards=True,
+    initial_log_std=-1.0,
+)
+"""little noise: with a step for each rollout, most of what is tried has to be good"""
+
+A2C = [
+    Preset("default", SURE, "what serves HalfCheetah", "2026-11"),
+    Preset("half-cheetah", SURE.replace(env="HalfCheetah-v5"), "search by hand, 12 runs, on seed 101", "2026-11"),
+    Preset(
+        "figure-eight",
+        a2c.Config(
+            env=FIGURE_EIGHT,
+            num_envs=32,
+            num_steps=8,
+            learning_rate=3e-3,
+            gamma=0.97,
+            gae_lambda=0.95,
+            normalize_advantage=True,
+            initial_log_std=-0.8,
+            evaluate_episodes=64,
+        ),
+        "search by hand, 6 runs, on seed 101",
+        "2026-11",
+    ),
+]
 
 BOUNDED = trpo.Config(num_envs=16, num_steps=64, critic_epochs=20, initial_log_std=-0.5, scale_rewards=True)
 """small rollouts, and a critic that is fitted well"""
