@@ -33,8 +33,8 @@ bench: .venv/.peers  ## the README's speed tables, beside the peers: an hour on 
 	$(BIN)/python benchmarks/figure_eight.py
 	$(BIN)/python benchmarks/speed.py
 
-bench-returns: setup  ## the README's returns, seed by seed: some hours
-	$(BIN)/python benchmarks/returns.py ppo
+bench-returns: setup  ## the README's returns, seed by seed: a day; returns.py takes some of them too
+	$(BIN)/python benchmarks/returns.py reinforce a2c trpo ppo ddpg td3 sac
 
 .venv/.peers: .venv/.ready
 	$(BIN)/python -m pip install --quiet --constraint requirements.lock --no-build-isolation --editable '.[bench]'
