@@ -1,5 +1,6 @@
 """Runs side by side: grouping, the table, the refusal to rank on one seed, the pictures."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -8,11 +9,20 @@ import pytest
 import lemniscate as lem
 from lemniscate.report import compare
 from lemniscate.report.curves import training_minutes
+from lemniscate.report.seeds import bootstrap_interval, improvement_interval, iqm
+from lemniscate.run import checkpoint
+
+
+@dataclasses.dataclass
+class Weightless:
+    """A State of which nothing is asked."""
+
+    step: int = 0
 
 
 def write_run(path, algorithm="ppo", env="CartPole-v1", seed=1, score=100.0, *, taken=None, rate=100.0, **fields):
     """A run directory as training leaves it, of 1,000 steps in ten lines, without the weights."""
-    config = lem.config_for(algorithm, env, seed=seed, total_steps=10_000, **fields).to_json()
+    config = lem.config_for(algorithm, env, seed=seed, **{"total_steps": 10_000, **fields}).to_json()
     path.mkdir(parents=True)
     (path / "config.json").write_text(json.dumps({"algorithm": algorithm, "config": config}))
     last = 10_000 if taken is None else taken
@@ -20,7 +30,7 @@ def write_run(path, algorithm="ppo", env="CartPole-v1", seed=1, score=100.0, *, 
         for step in range(1_000, last + 1, 1_000):
             returns = [score * step / 10_000] * 3
             file.write(json.dumps({"step": step, "time/steps_per_second": rate, "episode/returns": returns}) + "\n")
-    (path / "checkpoints" / f"step-{last}").mkdir(parents=True)
+    checkpoint.write(path / "checkpoints", Weightless(), last, {"planned": True}, keep=1)
     (path / "final.json").write_text(json.dumps({"step": last, "mean_return": score}))
     return path
 
@@ -127,6 +137,13 @@ def test_seeds_enough_are_ranked(tmp_path, monkeypatch, capsys):
     ]
     (better,) = figure.axes[3].lines[-1].get_xdata()
     assert better == 0  # 101 to 103 against 104 and 105
+    finals = [np.array([101.0, 102.0, 103.0]), np.array([104.0, 105.0])]
+    for i, (seeds, interval, middle) in enumerate(zip(*[iter(figure.axes[2].lines)] * 3, strict=True)):
+        assert list(seeds.get_xdata()) == pytest.approx(list(finals[i]))
+        assert list(interval.get_xdata()) == pytest.approx(bootstrap_interval(finals[i]))
+        assert list(middle.get_xdata()) == pytest.approx([iqm(finals[i])])
+    assert list(figure.axes[3].lines[1].get_xdata()) == pytest.approx(improvement_interval(*finals))
+    assert [len(axes.collections) for axes in figure.axes[:2]] == [2, 2]  # a band for each group
     assert compare.ONE_SEED not in capsys.readouterr().err
 
 
@@ -168,7 +185,15 @@ def test_before_anything_is_finished_there_are_curves(tmp_path, monkeypatch, cap
     runs = [write_run(tmp_path / f"{seed}", seed=seed, taken=3_000) for seed in (1, 2)]
     (figure,) = drawn(monkeypatch, *runs).values()
     assert "PPO (2 seeds)" in [text.get_text() for text in figure.legends[0].texts]
-    assert compare.ONE_SEED in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "Nothing is ranked before two seeds of each are finished" in said
+    assert compare.ONE_SEED not in said
+
+
+def test_runs_of_unequal_length_are_named(tmp_path, monkeypatch, capsys):
+    runs = [*write_runs(tmp_path / "a"), *write_runs(tmp_path / "b", total_steps=20_000, taken=20_000)]
+    drawn(monkeypatch, *runs)
+    assert "They have not taken the same number of steps: PPO" in capsys.readouterr().err
 
 
 def test_each_environment_has_its_own_picture_and_table(tmp_path, monkeypatch, capsys):

@@ -74,6 +74,43 @@ def test_a_loss_needs_its_gradient():
     assert "the value is right, but its gradient is not" in half.sentence
 
 
+@pytest.mark.parametrize(
+    ("move", "said"),
+    [
+        (
+            lambda mine, theirs, tau: mine.lerp_(theirs, tau),
+            "it raised RuntimeError: a leaf Variable that requires grad",
+        ),
+        (lambda mine, theirs, tau: mine.lerp(theirs, tau), "Likely: the target is to be changed in place."),
+    ],
+)
+def test_a_target_is_moved_in_place_and_without_a_gradient(move, said):
+    def polyak(target, online, tau):
+        for mine, theirs in zip(target, online, strict=True):
+            move(mine, theirs, tau)
+
+    assert said in course.check(polyak).sentence
+
+
+def test_what_a_function_that_works_in_place_returns_does_not_matter():
+    def polyak(target, online, tau):
+        target = list(target)
+        maths.polyak(target, online, tau)
+        return target
+
+    assert course.check(polyak)
+
+
+def test_what_a_gradient_raises_is_said():
+    def clipped_surrogate(log_ratio, advantage, clip):
+        ratio = log_ratio.exp()
+        loss = -torch.min(ratio * advantage, ratio.clamp(1 - clip, 1 + clip) * advantage).mean()
+        ratio.data, _ = ratio.data, ratio.mul_(1.0)
+        return loss
+
+    assert "it raised RuntimeError: " in course.check(clipped_surrogate).sentence
+
+
 def test_an_unknown_exercise_is_a_sentence():
     with pytest.raises(UserError, match="gae"):
         course.check(gae, "gea")

@@ -17,6 +17,7 @@ import lemniscate as lem
 from lemniscate import sets
 from lemniscate.cli import main
 from lemniscate.run import checkpoint
+from lemniscate.run.directory import is_finished
 from lemniscate.run.loggers import read_metrics
 from lemniscate.run.progress import SetProgress
 
@@ -24,6 +25,7 @@ SEEDS = ["--seeds", "1-2"]
 ENV = "worlds:Copy-box-v0"
 SHARED = {"num_envs": 4, "num_steps": 64, "total_steps": 5_200, "hidden": (16,)}
 FLAGS = ["--num-envs", "4", "--num-steps", "64", "--total-steps", "5_200", "--hidden", "16"]
+FEW = {"num_envs": 4, "num_steps": 8, "total_steps": 256, "hidden": (16,), "minibatch_size": 16}
 SMALL = [
     "--num-envs",
     "4",
@@ -119,6 +121,23 @@ def test_a_finished_set_is_resumed_in_no_time(trained, capsys, monkeypatch):
     monkeypatch.setattr(subprocess, "Popen", None)
     assert main(["resume", str(path)]) == 0
     assert "0 of 4 runs to train" in capsys.readouterr().err
+
+
+def test_a_run_whose_last_checkpoint_is_damaged_is_not_finished(trained, tmp_path):
+    run = shutil.copytree(trained[0] / "ppo-1", tmp_path / "run")
+    assert is_finished(run)
+    state = run / "checkpoints" / f"step-{checkpoint.list_steps(run / 'checkpoints')[-1]}" / "state.json"
+    state.write_bytes(state.read_bytes()[:-1])
+    assert not is_finished(run)
+
+
+def test_runs_are_trained_side_by_side_where_there_are_cores(tmp_path, monkeypatch):
+    monkeypatch.setattr(sets, "at_once", lambda threads: 2)
+    most = []
+    look = sets._Crew._look
+    monkeypatch.setattr(sets._Crew, "_look", lambda crew: most.append(len(crew._going)) or look(crew))
+    lem.train_set("ppo", "Countdown-v0", "1-3", run=tmp_path / "set", progress=False, **FEW)
+    assert max(most) == 2
 
 
 def test_two_processes_do_not_train_one_set(trained):
@@ -227,6 +246,7 @@ def test_seeds_are_given_as_ranges_and_lists():
     assert sets._seeds_of("1-3") == [1, 2, 3]
     assert sets._seeds_of("7,1-2, 7") == [7, 1, 2]
     assert sets._seeds_of(range(2)) == [0, 1]
+    assert sets._seeds_of(5) == [5]
 
 
 @pytest.mark.parametrize(("cores", "threads", "runs"), [(8, 1, 8), (8, 3, 2), (2, 4, 1)])

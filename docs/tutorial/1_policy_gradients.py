@@ -114,7 +114,7 @@ lem.plot(*[run.path for run in runs])
 
 # %% [markdown]
 # One seed ranks nothing: which curve is higher here is luck as much as merit. `lemniscate train reinforce,a2c,trpo,ppo
-# --env CartPole-v1 --seeds 1-5` says more.
+# --env CartPole-v1 --seeds 1-5 --total-steps 100_000` says more.
 #
 # **Try.** REINFORCE with `learning_rate=0.1, final_learning_rate=1.0` and several seeds: how does it look, and what does
 # `approx_kl` say of it? What becomes of PPO with `clip=10.0`? With a `gae` whose chain is not cut?

@@ -1,8 +1,8 @@
 # %% [markdown]
 # # 2 · LunarLander
 #
-# A lander, four engines commands, eight numbers to see, and −100 for a crash. PPO on sixteen copies at once. You write
-# the two functions in which a lander that hovers is told from one that crashed, and read a run's pictures.
+# A lander, four commands, eight numbers to see, and −100 for a crash. PPO on sixteen copies at once. You write the
+# function in which a lander that hovers is told from one that crashed, and the critic's loss, and read a run's pictures.
 
 # %%
 import torch

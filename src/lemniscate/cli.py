@@ -58,7 +58,7 @@ def train(given: argparse.Namespace, rest: list[str]) -> None:
     misplaced = sorted(set(rest) & set(ALGORITHMS))
     if misplaced and given.algorithm not in ALGORITHMS:
         raise UserError(f"The algorithm comes first, then its fields: lemniscate train {misplaced[0]} …")
-    if given.seeds or "," in given.algorithm:
+    if given.seeds is not None or "," in given.algorithm:
         return _train_set(given, rest)
     config = _with_fields(front.config_for(given.algorithm, given.env, given.preset), rest)
     if config.backend:
@@ -84,7 +84,7 @@ def train(given: argparse.Namespace, rest: list[str]) -> None:
 def _train_set(given: argparse.Namespace, rest: list[str]) -> None:
     if any(argument.partition("=")[0] == "--seed" for argument in rest):
         raise UserError("Several runs have several seeds: --seeds 1-5, not --seed.")
-    if not given.seeds:
+    if given.seeds is None:
         raise UserError("Algorithms are compared over several seeds: add --seeds 1-5.")
     fields: dict[str, Any] = {}
     for algorithm in sets.algorithms_of(given.algorithm):

@@ -235,6 +235,8 @@ def _why(run: Path, code: int) -> str:
 def algorithms_of(names: str | Iterable[str]) -> list[str]:
     """Each name once, of "ppo,sac" or of a list. Raises `UserError` for one that is unknown."""
     split = [name.strip() for name in (names.split(",") if isinstance(names, str) else names)]
+    if not split:
+        raise UserError(f"Name at least one algorithm: {', '.join(ALGORITHMS)}.")
     for name in split:
         if name not in ALGORITHMS:
             raise unknown("algorithm", name, ALGORITHMS)
@@ -244,7 +246,7 @@ def algorithms_of(names: str | Iterable[str]) -> list[str]:
 def _seeds_of(seeds: str | Iterable[int]) -> list[int]:
     """Each seed once, of "1-5,8" or of a list."""
     if not isinstance(seeds, str):
-        return list(dict.fromkeys(int(seed) for seed in seeds))
+        seeds = ",".join(map(str, seeds if isinstance(seeds, Iterable) else [seeds]))
     numbers: list[int] = []
     for part in seeds.split(","):
         ends = re.fullmatch(r"(\d+)(?:-(\d+))?", part.strip())

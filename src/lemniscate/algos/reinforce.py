@@ -46,7 +46,7 @@ class Config(RolloutConfig):
     baseline: Literal["none", "mean", "value"] = "value"
     """what is taken off: nothing, the mean of the batch, or a learned V(s)"""
     standardize: bool = True
-    """scale what is left to mean 0 and standard deviation 1 within each batch"""
+    """scale what is left to mean 0 and standard deviation 1 within each batch: a mean is a baseline, too"""
     learning_rate: Positive = 3e-3
     """Adam's step size for the policy at the start"""
     final_learning_rate: Fraction = 0.0

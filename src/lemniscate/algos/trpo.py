@@ -6,6 +6,7 @@ Departures from the paper, and why: docs/notes/trpo.md.
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from torch import Generator, Tensor
@@ -28,7 +29,7 @@ from lemniscate.nn.descent import Descent
 from lemniscate.nn.flat import FlatPolicy
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.nn.policies import Policy
-from lemniscate.run.config import Count, Fraction, NonNegative, Positive, RolloutConfig
+from lemniscate.run.config import Count, Fraction, NonNegative, Positive, Range, RolloutConfig
 from lemniscate.run.run import Run
 from lemniscate.run.seeding import generator
 from lemniscate.types import Batch, Rollout, Spec
@@ -44,7 +45,7 @@ class Config(RolloutConfig):
     """fraction of it that it falls to, linearly over the run; 1 keeps it constant"""
     line_search: bool = True
     """shorten the step until it keeps its promises; without it this is the natural policy gradient"""
-    shrink: Fraction = 0.8
+    shrink: Annotated[float, Range(0.01, 0.99)] = 0.8
     """what a step that does not is multiplied by"""
     attempts: Count = 10
     """how many lengths are tried before the policy stays where it is"""
@@ -130,8 +131,11 @@ def critic_loss(value: Value, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
     return loss, {"losses/value": loss.detach()}
 
 
-def improve(config: Config, state: State, batch: Batch) -> dict[str, Tensor | float]:
-    """Maximize L(θ) subject to KL(θ_old ‖ θ) ≤ δ, to first and to second order (eq. 14, appendix C)."""
+def improve(config: Config, state: State, batch: Batch, obs: Tensor) -> dict[str, Tensor | float]:
+    """Maximize L(θ) subject to KL(θ_old ‖ θ) ≤ δ, to first and to second order (eq. 14, appendix C).
+
+    L and the KL are means over `batch`; the Fisher matrix is that at `obs`, as many in every update.
+    """
     max_kl = linear(config.max_kl, config.final_max_kl, state.step / config.total_steps)
     here, pi = state.parameters.vector.clone(), state.parameters.at
     advantage = standardize(batch.advantage) if config.normalize_advantage else batch.advantage
@@ -143,7 +147,7 @@ def improve(config: Config, state: State, batch: Batch) -> dict[str, Tensor | fl
         return pi(here, batch.obs).kl(pi(theta, batch.obs)).mean()
 
     def fisher(vector: Tensor) -> Tensor:
-        return state.parameters.fisher(vector, batch.obs) + config.damping * vector
+        return state.parameters.fisher(vector, obs) + config.damping * vector
 
     gradient = grad(loss)(here)
     with torch.no_grad():
@@ -165,7 +169,8 @@ def update(config: Config, state: State, rollout: Rollout) -> Mapping[str, Tenso
         rollout = state.reward_scale.follow(rollout)
     batch = advantages(config, state, rollout)
     played = rollout.played
-    watched = improve(config, state, batch[whole_batch(played, rollout.num_rows)[0]])
+    obs = batch.obs[whole_batch(played, rollout.num_rows)[0]]
+    watched = improve(config, state, batch[played], obs)
     for _ in range(config.critic_epochs):
         parts = minibatches(played, rollout.num_rows, config.critic_minibatch_size, state.shuffle)
         watched["losses/value"] = state.critic(batch, parts, rate)["losses/value"]

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from lemniscate.course.exercises import EXERCISES, Case, Exercise, Function
 from lemniscate.errors import unknown
@@ -65,9 +65,13 @@ def _find(name: str, exercise: Exercise, function: Function) -> Finding:
 def _complaint(exercise: Exercise, function: Function, case: Case) -> str | None:
     """One sentence on the first thing that is off, and another on the likely cause."""
     try:
-        answer, want = _ask(exercise, function, case), _ask(exercise, exercise.right, case)
+        return _off(exercise, function, case)
     except Exception as error:  # whatever a learner's function raises is an answer too
         return f"it raised {type(error).__name__}: {error}"
+
+
+def _off(exercise: Exercise, function: Function, case: Case) -> str | None:
+    answer, want = _ask(exercise, function, case), _ask(exercise, exercise.right, case)
     if len(answer) != len(want) or not all(isinstance(output, Tensor) for output in answer):
         kinds = ", ".join(type(output).__name__ for output in answer)
         return f"it should return {' and '.join(exercise.outputs)}, each a tensor; it returned {kinds}."
@@ -86,13 +90,15 @@ def _complaint(exercise: Exercise, function: Function, case: Case) -> str | None
 
 
 def _ask(exercise: Exercise, function: Function, case: Case) -> tuple[Any, ...]:
-    """What a function answers, as a tuple; of one that returns nothing, what it made of its lists of tensors."""
+    """What a function answers, as a tuple; of one that works in place, what it made of its networks' parameters."""
     args = copy.deepcopy(case.args)
+    if exercise.in_place:
+        parameters = [[nn.Parameter(tensor) for tensor in arg] for arg in args if isinstance(arg, list)]
+        function(*map(iter, parameters), *args[len(parameters) :], **case.options)  # as `module.parameters()` comes
+        return tuple(parameter for network in parameters for parameter in network)
     if exercise.is_loss:
         args[0].requires_grad_()
     answer = function(*args, **case.options)
-    if answer is None:
-        return tuple(tensor for arg in args if isinstance(arg, list) for tensor in arg) or (None,)
     return answer if isinstance(answer, tuple) else (answer,)
 
 

@@ -33,6 +33,8 @@ class Exercise:
     """in words: the function that makes it"""
     is_loss: bool = False
     """the gradient in the first argument counts too"""
+    in_place: bool = False
+    """it changes the parameters of two networks, and returns nothing"""
 
 
 def _column(*numbers: float) -> Tensor:
@@ -210,5 +212,6 @@ EXERCISES: dict[str, Exercise] = {
                 online, target, tau
             ),
         },
+        in_place=True,
     ),
 }

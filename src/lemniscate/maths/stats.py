@@ -14,8 +14,8 @@ def means(rows: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
 
 
 def standardize(x: Float[Tensor, " B"], eps: float = 1e-8) -> Float[Tensor, " B"]:
-    """(x − mean) / (std + eps), with the unbiased std; a constant batch becomes zeros."""
-    return (x - x.mean()) / (x.std() + eps)
+    """(x − mean) / (std + eps), with the unbiased std; a constant batch becomes zeros, and so does a single row."""
+    return (x - x.mean()) / (x.std(correction=min(1, len(x) - 1)) + eps)
 
 
 def explained_variance(prediction: Tensor, target: Tensor) -> Tensor:

@@ -49,6 +49,7 @@ SHORT = 10
 """letters of a label up to which it stands beside a row of its own"""
 
 ONE_SEED = "One seed says nothing about which is better: train more with --seeds 1-5."
+UNFINISHED = "Nothing is ranked before two seeds of each are finished: go on with lemniscate resume."
 
 Scores = Mapping[Path, float]
 """final return of each run that is finished"""
@@ -156,10 +157,20 @@ def _cells(one: Group, scores: Scores, digits: int) -> list[str]:
 
 
 def remarks(groups: list[Group], scores: Scores) -> list[str]:
-    """What has to be said of a comparison: which runs are not finished, and that one seed ranks nothing."""
+    """What has to be said of a comparison: runs of unequal length, runs that are not finished, and of one seed."""
+    said: list[str] = []
+    lengths = {one.label: read_config(one.runs[0])[1]["total_steps"] for one in groups}
+    if len(set(lengths.values())) > 1:
+        each = "; ".join(f"{label}: {steps:,}" for label, steps in lengths.items())
+        said.append(f"They have not taken the same number of steps: {each}.")
     unfinished = [run for one in groups for run in one.runs if not is_finished(run)]
-    said = [f"Not finished, so in the curves alone: {', '.join(map(str, unfinished))}."] if unfinished else []
-    return said if is_ranked(groups, scores) else [*said, ONE_SEED]
+    if unfinished:
+        said.append(f"Not finished, so in the curves alone: {', '.join(map(str, unfinished))}.")
+    return said if is_ranked(groups, scores) else [*said, _why_unranked(groups)]
+
+
+def _why_unranked(groups: list[Group]) -> str:
+    return ONE_SEED if any(len(one.runs) == 1 for one in groups) else UNFINISHED
 
 
 def is_ranked(groups: list[Group], scores: Scores) -> bool:
@@ -178,7 +189,7 @@ def draw(groups: list[Group], scores: Scores, file: Path) -> Path:
     _draw_training(figure, by_step, figure.add_subplot(grid[0, 1], sharey=by_step), groups)
     if not ranked:
         axes = figure.add_subplot(grid[1, :])
-        axes.text(0.5, 0.5, ONE_SEED, ha="center", va="center")
+        axes.text(0.5, 0.5, _why_unranked(groups), ha="center", va="center")
         axes.axis("off")
     else:
         _draw_finals(figure.add_subplot(grid[1, 0] if pairs else grid[1, :]), groups, scores)

@@ -21,6 +21,8 @@ DIAGNOSTICS = (
     "losses/value",
     "explained_variance",
     "approx_kl",
+    "kl",
+    "step_fraction",
     "clip_fraction",
     "losses/critic",
     "losses/actor",

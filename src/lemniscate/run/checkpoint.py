@@ -101,18 +101,22 @@ def read(path: Path) -> Checkpoint:
     Raises:
         DamagedCheckpointError: naming the file and what is wrong with it.
     """
-    manifest = _parse(path / "manifest.json")
-    if manifest.get("format") != FORMAT:
-        raise UserError(f"{path} has format {manifest.get('format')!r}; this version of lemniscate reads {FORMAT}.")
-    for name in PARTS:
-        if _sha256(path / name) != manifest.get("sha256", {}).get(name):
-            raise DamagedCheckpointError(f"{path / name} is not what was written: its sha256 differs.")
+    _verify(path)
     try:
         tensors = load_file(path / PARTS[0])
         state = json.loads((path / PARTS[1]).read_bytes())
         return Checkpoint(path, tensors, state["numbers"], state["record"])
     except (SafetensorError, ValueError, KeyError, TypeError) as error:
         raise DamagedCheckpointError(f"{path} cannot be read: {error}.") from error
+
+
+def is_whole(path: Path) -> bool:
+    """Whether a checkpoint directory is what was written, every byte of it."""
+    try:
+        _verify(path)
+    except DamagedCheckpointError:
+        return False
+    return True
 
 
 def list_steps(directory: Path) -> list[int]:
@@ -149,6 +153,15 @@ def _apart(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     at = {name: t.untyped_storage().data_ptr() for name, t in tensors.items()}
     times = Counter(at.values())
     return {name: (t.clone() if times[at[name]] > 1 else t).detach().cpu().contiguous() for name, t in tensors.items()}
+
+
+def _verify(path: Path) -> None:
+    manifest = _parse(path / "manifest.json")
+    if manifest.get("format") != FORMAT:
+        raise UserError(f"{path} has format {manifest.get('format')!r}; this version of lemniscate reads {FORMAT}.")
+    for name in PARTS:
+        if _sha256(path / name) != manifest.get("sha256", {}).get(name):
+            raise DamagedCheckpointError(f"{path / name} is not what was written: its sha256 differs.")
 
 
 def _json(record: Any) -> str:

@@ -44,9 +44,10 @@ def read_config(path: Path) -> tuple[str, dict[str, Any]]:
 
 
 def is_finished(path: Path) -> bool:
-    """Whether a run has taken all its steps, and the checkpoint of its end is there."""
+    """Whether a run has taken all its steps, and the checkpoint of its end is there and whole."""
     _, config = read_config(path)
-    return checkpoint.list_steps(path / "checkpoints")[-1:] >= [config["total_steps"]]
+    steps = checkpoint.list_steps(path / "checkpoints")
+    return steps[-1:] >= [config["total_steps"]] and checkpoint.is_whole(path / "checkpoints" / f"step-{steps[-1]}")
 
 
 def newest_resumable(path: Path) -> checkpoint.Checkpoint | None:
