@@ -2,6 +2,7 @@
 
 import multiprocessing
 import os
+import re
 import shutil
 import sys
 from pathlib import Path
@@ -436,3 +437,4 @@ def test_the_suite_kills(tmp_path, mutant):
     said = (tmp_path / "output").read_text()
     assert process.exitcode == 1, said[-2000:]
     assert "1 failed" in said
+    assert re.search(r"^E +(assert|AssertionError|Failed: DID NOT RAISE)", said, re.MULTILINE), said[-2000:]

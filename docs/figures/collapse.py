@@ -2,7 +2,8 @@
 
     .venv/bin/python docs/figures/collapse.py [FILE]
 
-Returns of training episodes, and how far each update moved the policy: KL from the old to the new.
+Returns of training episodes, and how far each update moved the policy: KL from the old to the new, of PPO as the
+minibatches of its epochs saw it on the way.
 """
 
 import sys
@@ -20,7 +21,7 @@ CONSTANT = {"final_learning_rate": 1.0}
 WAYS = {
     "REINFORCE, α = 0.003": ("reinforce", {"learning_rate": 0.003, **CONSTANT}),
     "REINFORCE, α = 0.1": ("reinforce", {"learning_rate": 0.1, **CONSTANT}),
-    "TRPO, δ = 0.01": ("trpo", {}),
+    "TRPO, δ = 0.01": ("trpo", {"max_kl": 0.01, "critic_epochs": 10, "scale_rewards": False}),
     "PPO, α = 0.01, target KL 0.02": (
         "ppo",
         {"learning_rate": 0.01, "desired_kl": None, "target_kl": 0.02, **CONSTANT},
