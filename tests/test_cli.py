@@ -80,7 +80,7 @@ def test_envs_lists_backend_and_preset(capsys):
         (["train", "ppo", "--env", "CartPole-v1", "--gamma", "3"], "gamma must be a number from 0 to 1, not 3.0."),
         (
             ["train", "ppo", "--env", "CartPole-v1", "--minibatch-size", "1"],
-            "normalize_advantage needs minibatches of 2",
+            "normalize_advantage needs batches of 2",
         ),
         (["train", "ppo", "--env", "CartPole-v1", "--activation", "x"], "Expected one of"),
         (["evaluate", "nowhere"], "nowhere is not a run directory"),

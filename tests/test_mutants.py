@@ -1,9 +1,10 @@
 """Wrong versions of the maths that the suite must kill: each is written into a copy of the package and tested."""
 
-import multiprocessing
+import json
 import os
 import re
 import shutil
+import subprocess
 import sys
 from pathlib import Path
 
@@ -15,26 +16,68 @@ MEMORY, PPO, ROAD = (f"test_{name}.py::test_" for name in ("memory", "ppo", "roa
 
 MUTANTS = [
     # what goes wrong, file, the right line, the wrong line, the tests that must notice
-    ("a time-out ends the value", "maths/returns.py", "next_value * ~terminated -", "next_value * ~done -", "maths"),
-    ("a death does not", "maths/returns.py", "next_value * ~terminated -", "next_value -", "maths"),
-    ("the chain runs on", "maths/returns.py", "(~done).to(delta.dtype)", "(~terminated).to(delta.dtype)", "maths"),
-    ("the chain is off by one", "maths/returns.py", "decay[t] * trace", "decay[max(t - 1, 0)] * trace", "maths"),
-    ("lambda is forgotten", "maths/returns.py", "gamma * lam * (", "gamma * (", "maths"),
+    (
+        "a time-out ends the value",
+        "maths/returns.py",
+        "next_value * ~terminated -",
+        "next_value * ~done -",
+        "maths/test_returns.py",
+    ),
+    ("a death does not", "maths/returns.py", "next_value * ~terminated -", "next_value -", "maths/test_returns.py"),
+    (
+        "the chain runs on",
+        "maths/returns.py",
+        "(~done).to(delta.dtype)",
+        "(~terminated).to(delta.dtype)",
+        "maths/test_returns.py",
+    ),
+    (
+        "the chain is off by one",
+        "maths/returns.py",
+        "decay[t] * trace",
+        "decay[max(t - 1, 0)] * trace",
+        "maths/test_returns.py",
+    ),
+    ("lambda is forgotten", "maths/returns.py", "gamma * lam * (", "gamma * (", "maths/test_returns.py"),
     (
         "the target is the advantage",
         "maths/returns.py",
         "return advantage, advantage + value",
         "return advantage, advantage",
-        "maths",
+        "maths/test_returns.py",
     ),
-    ("the sign of the surrogate", "maths/losses.py", "return -torch.min(", "return torch.min(", "maths"),
-    ("an optimistic bound", "maths/losses.py", "-torch.min(ratio", "-torch.max(ratio", "maths"),
-    ("the clip is one-sided", "maths/losses.py", "clamp(1 - clip, 1 + clip)", "clamp(max=1 + clip)", "maths"),
-    ("the smaller value error", "maths/losses.py", "error = torch.max(", "error = torch.min(", "maths"),
-    ("no half in the value loss", "maths/losses.py", "0.5 * error.mean()", "error.mean()", "maths"),
-    ("k3 without its control variate", "maths/stats.py", "log_ratio.exp() - 1 - log_ratio", "-log_ratio", "maths"),
-    ("moments forget the distance of means", "maths/stats.py", " + delta.square() *", " + 0 * delta *", "maths"),
-    ("log-prob without the std", "maths/distributions.py", "(self.log_std.sum(-1) +", "(", "maths"),
+    ("the sign of the surrogate", "maths/losses.py", "return -torch.min(", "return torch.min(", "maths/test_losses.py"),
+    ("an optimistic bound", "maths/losses.py", "-torch.min(ratio", "-torch.max(ratio", "maths/test_losses.py"),
+    (
+        "the clip is one-sided",
+        "maths/losses.py",
+        "clamp(1 - clip, 1 + clip)",
+        "clamp(max=1 + clip)",
+        "maths/test_losses.py",
+    ),
+    ("the smaller value error", "maths/losses.py", "error = torch.max(", "error = torch.min(", "maths/test_losses.py"),
+    ("no half in the value loss", "maths/losses.py", "0.5 * error.mean()", "error.mean()", "maths/test_losses.py"),
+    (
+        "k3 without its control variate",
+        "maths/stats.py",
+        "log_ratio.exp() - 1 - log_ratio",
+        "-log_ratio",
+        "maths/test_stats.py",
+    ),
+    (
+        "moments forget the distance of means",
+        "maths/stats.py",
+        " + delta.square() *",
+        " + 0 * delta *",
+        "maths/test_stats.py",
+    ),
+    (
+        "log-prob without the std",
+        "maths/distributions.py",
+        "(self.log_std.sum(-1) +",
+        "(",
+        "maths/test_distributions.py",
+    ),
     (
         "actions scaled to half their range",
         "envs/spaces.py",
@@ -69,7 +112,7 @@ MUTANTS = [
         "algos/ppo.py",
         "    played = ",
         "    state.policy.observe(rollout.obs[rollout.valid])\n    played = ",
-        PPO + "the_first_ratio_is_one",
+        PPO + "the_first_gradient_step_sees_ratios_of_one_whatever_the_normalizer_learns_from_the_rollout",
     ),
     (
         "evaluation takes the first that end",
@@ -130,9 +173,15 @@ MUTANTS = [
         "maths/distributions.py",
         "cumulative <= noise",
         "cumulative < noise",
-        "maths",
+        "maths/test_distributions.py",
     ),
-    ("native programs are mixed up", "nn/native.py", "compile(_own(function)", "compile((function)", "test_descent.py"),
+    (
+        "native programs are mixed up",
+        "nn/native.py",
+        "compile(_own(function)",
+        "compile((function)",
+        "test_descent.py::test_the_two_engines_agree[programs_are_not_mixed_up()]",
+    ),
     ("noise that grows", "maths/noise.py", "math.sqrt(1 - phi * phi) *", "", "maths/test_noise.py"),
     (
         "noise that forgets too fast",
@@ -149,21 +198,33 @@ MUTANTS = [
         "ends[0] = 1",
         "maths/test_noise.py",
     ),
-    ("a death bootstraps", "maths/returns.py", "gamma * next_value * ~terminated\n", "gamma * next_value\n", "maths"),
+    (
+        "a death bootstraps",
+        "maths/returns.py",
+        "gamma * next_value * ~terminated\n",
+        "gamma * next_value\n",
+        "maths/test_returns.py",
+    ),
     (
         "the target runs away",
         "maths/returns.py",
         "mine.data.lerp_(theirs.data, tau)",
         "theirs.data.lerp_(mine.data, tau)",
-        "maths",
+        "maths/test_returns.py",
     ),
-    ("no correction for the squashing", "maths/distributions.py", "(normal - _log_slope(u))", "(normal)", "maths"),
+    (
+        "no correction for the squashing",
+        "maths/distributions.py",
+        "(normal - _log_slope(u))",
+        "(normal)",
+        "maths/test_distributions.py",
+    ),
     (
         "a slope that is half as steep",
         "maths/distributions.py",
         "return 2 * (math.log(2)",
         "return (math.log(2)",
-        "maths",
+        "maths/test_distributions.py",
     ),
     (
         "the KL turned round",
@@ -172,7 +233,13 @@ MUTANTS = [
         "-pi(here, batch.obs).kl(",
         ROAD + "trpo_keeps_its_promises_after_every_step",
     ),
-    ("curvature turned round", "maths/trust_region.py", "here.kl(there)", "-here.kl(there)", "maths"),
+    (
+        "curvature turned round",
+        "maths/trust_region.py",
+        "here.kl(there)",
+        "-here.kl(there)",
+        "maths/test_trust_region.py",
+    ),
     (
         "the values in the Fisher matrix",
         "algos/trpo.py",
@@ -181,15 +248,57 @@ MUTANTS = [
         ROAD + "trpos_policy_step_leaves_the_critic_alone_and_the_critics_the_policy",
     ),
     ("damping forgotten", "algos/trpo.py", " + config.damping * vector", "", ROAD + "damping_shortens_the_step"),
-    ("a step that is not taken back", "maths/trust_region.py", "return start, 0.0", "return point, 0.0", "maths"),
-    ("any KL will do", "maths/trust_region.py", " and kl <= max_kl", "", "maths"),
-    ("any loss will do", "maths/trust_region.py", "loss < before and ", "", "maths"),
-    ("directions that are not conjugate", "maths/trust_region.py", "(rr / before) * direction", "0", "maths"),
-    ("a step up the gradient", "maths/trust_region.py", "product, -gradient", "product, gradient", "maths"),
-    ("a step √2 too short", "maths/trust_region.py", "(2 * max_kl / length)", "(max_kl / length)", "maths"),
-    ("KL the wrong way round", "maths/distributions.py", "other.log_std - self", "self.log_std - other", "maths"),
-    ("down the policy gradient", "maths/losses.py", "-(log_prob * weight)", "(log_prob * weight)", "maths"),
-    ("what went before is forgotten", "maths/returns.py", "paid + weight * to_go[t]", "weight * to_go[t]", "maths"),
+    (
+        "a step that is not taken back",
+        "maths/trust_region.py",
+        "return start, 0.0",
+        "return point, 0.0",
+        "maths/test_trust_region.py",
+    ),
+    ("any KL will do", "maths/trust_region.py", " and kl <= max_kl", "", "maths/test_trust_region.py"),
+    ("any loss will do", "maths/trust_region.py", "loss < before and ", "", "maths/test_trust_region.py"),
+    (
+        "directions that are not conjugate",
+        "maths/trust_region.py",
+        "(rr / before) * direction",
+        "0",
+        "maths/test_trust_region.py",
+    ),
+    (
+        "a step up the gradient",
+        "maths/trust_region.py",
+        "product, -gradient",
+        "product, gradient",
+        "maths/test_trust_region.py",
+    ),
+    (
+        "a step √2 too short",
+        "maths/trust_region.py",
+        "(2 * max_kl / length)",
+        "(max_kl / length)",
+        "maths/test_trust_region.py",
+    ),
+    (
+        "KL the wrong way round",
+        "maths/distributions.py",
+        "other.log_std - self",
+        "self.log_std - other",
+        "maths/test_distributions.py",
+    ),
+    (
+        "down the policy gradient",
+        "maths/losses.py",
+        "-(log_prob * weight)",
+        "(log_prob * weight)",
+        "maths/test_losses.py",
+    ),
+    (
+        "what went before is forgotten",
+        "maths/returns.py",
+        "paid + weight * to_go[t]",
+        "weight * to_go[t]",
+        "maths/test_returns.py",
+    ),
     (
         "a reset row is an action",
         "algos/reinforce.py",
@@ -402,39 +511,58 @@ MUTANTS = [
         "test_seeds.py",
     ),
     ("one seed is ranked", "report/compare.py", "len(one.finals(scores)) > 1", "one.finals(scores)", "test_compare.py"),
-    ("the learning rate adapts the wrong way", "maths/schedules.py", "1 / 1.5 if kl > 2", "1 / 1.5 if kl < 2", "maths"),
+    (
+        "the learning rate adapts the wrong way",
+        "maths/schedules.py",
+        "1 / 1.5 if kl > 2",
+        "1 / 1.5 if kl < 2",
+        "maths/test_schedules.py",
+    ),
 ]
 
 
-FORKS = multiprocessing.get_context("forkserver")
-FORKS.set_forkserver_preload(["torch", "torch.func", "gymnasium", "matplotlib.figure", "pytest"])
-"""a mutant's tests run in a process in which all that is slow to import is there already, and no lemniscate"""
+SERVER = """
+import json, os, sys
+import torch, torch.func, gymnasium, matplotlib.figure, pytest
+
+for line in sys.stdin:
+    package, tests, output = json.loads(line)
+    child = os.fork()
+    if not child:
+        file = os.open(output, os.O_WRONLY | os.O_CREAT)
+        os.dup2(file, 1), os.dup2(file, 2)
+        sys.path.insert(0, package)
+        os.environ["PYTHONPATH"] = package
+        code = pytest.main(["-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", "-m", "not long", tests])
+        sys.stdout.flush(), sys.stderr.flush()
+        os._exit(code)
+    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
+"""
+"""runs each mutant's tests in a fork of itself, in which all that is slow to import is there, and no lemniscate yet"""
 
 
-def run_tests(package, tests, output):
-    """Exit with pytest's code, having run `tests` on the package in a directory."""
-    with Path(output).open("w") as file:
-        os.dup2(file.fileno(), 1)
-        os.dup2(file.fileno(), 2)
-    os.environ |= {"PYTHONPATH": str(package), "PYTHONDONTWRITEBYTECODE": "1"}
-    sys.path.insert(0, str(package))
-    sys.dont_write_bytecode = True
-    os.chdir(ROOT)
-    sys.exit(pytest.main(["-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", "-m", "not long", str(tests)]))
+@pytest.fixture(scope="module")
+def server():
+    environment = {**os.environ, "PYTHONDONTWRITEBYTECODE": "1"}
+    command = [sys.executable, "-c", SERVER]
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=ROOT, env=environment, text=True
+    ) as process:
+        yield process
+        process.stdin.close()
 
 
 @pytest.mark.parametrize("mutant", MUTANTS, ids=[mutant[0].replace(" ", "-") for mutant in MUTANTS])
-def test_the_suite_kills(tmp_path, mutant):
+def test_the_suite_kills(server, tmp_path, mutant):
     _, name, right, wrong, tests = mutant
     shutil.copytree(ROOT / "src" / "lemniscate", tmp_path / "lemniscate")
     file = tmp_path / "lemniscate" / name
     text = file.read_text()
     assert text.count(right) == 1, f"{name} no longer has this line once: {right}"
     file.write_text(text.replace(right, wrong))
-    process = FORKS.Process(target=run_tests, args=(tmp_path, ROOT / "tests" / tests, tmp_path / "output"))
-    process.start()
-    process.join()
-    said = (tmp_path / "output").read_text()
-    assert process.exitcode == 1, said[-2000:]
+    server.stdin.write(json.dumps([str(tmp_path), str(ROOT / "tests" / tests), str(tmp_path / "output")]) + "\n")
+    server.stdin.flush()
+    code, said = int(server.stdout.readline()), (tmp_path / "output").read_text()
+    assert code == 1, said[-2000:]
     assert "1 failed" in said
     assert re.search(r"^E +(assert|AssertionError|Failed: DID NOT RAISE)", said, re.MULTILINE), said[-2000:]

@@ -127,6 +127,16 @@ def test_the_first_ratio_is_one():
     assert watched["clip_fraction"] == 0
 
 
+def test_the_first_gradient_step_sees_ratios_of_one_whatever_the_normalizer_learns_from_the_rollout():
+    env = VecEnv(GymnasiumBackend("Pendulum-v1", 4, CPU))
+    env.restart(0)
+    config = tiny("Pendulum-v1", epochs=1, minibatch_size=32)
+    state = ppo.init(config, env.spec, CPU)
+    for _ in range(2):
+        seen = ppo.update(config, state, collect(env, state.policy, 8, state.noise))
+        assert seen["approx_kl"].item() == pytest.approx(0, abs=1e-9)
+
+
 def test_the_loss_is_equation_9():
     config, state, rollout = one_update(entropy_coef=0.1, value_coef=0.7, normalize_advantage=False)
     batch = ppo.advantages(config, state, rollout)
