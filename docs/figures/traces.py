@@ -16,7 +16,7 @@ from lemniscate.run.loggers import read_metrics
 
 SHARED = {"num_envs": 8, "preset": "default", "engine": "eager", "progress": False, "seed": 1}
 WAYS = {
-    "A2C": ("a2c", {"num_steps": 8, "learning_rate": 7e-4, "gae_lambda": 1.0, "scale_rewards": False}),
+    "A2C": ("a2c", {"num_steps": 8}),
     "TRPO": ("trpo", {"num_steps": 256, "critic_epochs": 10, "scale_rewards": False}),
     "PPO": ("ppo", {"num_steps": 256, "desired_kl": None, "final_learning_rate": 0.0}),
 }
