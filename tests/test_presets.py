@@ -4,6 +4,7 @@ import pytest
 
 from lemniscate import presets
 from lemniscate.errors import UserError
+from lemniscate.presets.on_policy import FIGURE_EIGHT
 
 
 @pytest.mark.parametrize("algorithm", presets.PRESETS)
@@ -20,8 +21,8 @@ def test_each_environment_gets_its_own_unasked(algorithm):
 
 def test_one_name_may_serve_several_environments():
     assert presets.choose("ppo", "LunarLander-v3", "course")[1].hidden == (128, 128)
-    assert presets.choose("ppo", presets.FIGURE_EIGHT, "course")[1].num_envs == 1024
-    assert presets.choose("ppo", None, "course")[1].env == presets.FIGURE_EIGHT
+    assert presets.choose("ppo", FIGURE_EIGHT, "course")[1].num_envs == 1024
+    assert presets.choose("ppo", None, "course")[1].env == FIGURE_EIGHT
     assert presets.choose("ppo", "LunarLander-v3", None)[0] == "lunar-lander"
 
 

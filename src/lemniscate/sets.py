@@ -52,7 +52,7 @@ class TrainedSet:
 def train_set(
     algorithms: str | Iterable[str],
     env: str | None,
-    seeds: str | Iterable[int],
+    seeds: str | int | Iterable[int],
     *,
     run: str | Path | None = None,
     preset: str | None = None,
@@ -66,7 +66,7 @@ def train_set(
     Args:
         algorithms: "ppo,sac", or names in a list.
         env: the environment's id, one for all; None if the preset has one of its own.
-        seeds: "1-5", "1,3,7", or numbers in a list.
+        seeds: "1-5", "1,3,7", a number, or numbers in a list.
         run: the set's directory; by default a new one under `runs/`.
         preset: by name, for every algorithm; the best known for the environment unless given.
         track: as in `train`, for every run.
@@ -243,8 +243,8 @@ def algorithms_of(names: str | Iterable[str]) -> list[str]:
     return list(dict.fromkeys(split))
 
 
-def _seeds_of(seeds: str | Iterable[int]) -> list[int]:
-    """Each seed once, of "1-5,8" or of a list."""
+def _seeds_of(seeds: str | int | Iterable[int]) -> list[int]:
+    """Each seed once, of "1-5,8", a number or a list."""
     if not isinstance(seeds, str):
         seeds = ",".join(map(str, seeds if isinstance(seeds, Iterable) else [seeds]))
     numbers: list[int] = []

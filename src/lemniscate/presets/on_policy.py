@@ -1,26 +1,9 @@
-"""Tuned Configs, as Python values: where each came from, and when.
+"""Presets of those that learn from rollouts: REINFORCE, A2C, TRPO, PPO."""
 
-`default` is what an environment without a preset of its own gets.
-"""
-
-from dataclasses import dataclass
-
-from lemniscate.algos import a2c, ddpg, ppo, reinforce, sac, td3, trpo
-from lemniscate.errors import unknown
-from lemniscate.run.config import RunConfig
+from lemniscate.algos import a2c, ppo, reinforce, trpo
+from lemniscate.presets.preset import Preset
 
 FIGURE_EIGHT = "DroneFigureEightTrajectory-v0"
-
-
-@dataclass(frozen=True)
-class Preset:
-    """A Config that has been tried, with its provenance."""
-
-    name: str
-    config: RunConfig
-    source: str
-    date: str
-
 
 ADAPTIVE = ppo.Config(
     num_envs=64,
@@ -271,107 +254,3 @@ TRPO = [
         "2026-11",
     ),
 ]
-
-SHARED = "the settings that most libraries share today"
-BOLD = {
-    "learning_starts": 10_000,
-    "actor_learning_rate": 1e-3,
-    "critic_learning_rate": 1e-3,
-    "architecture": "layer_norm",
-}
-"""layer normalization bears the larger steps"""
-
-QUICK = {
-    "actor_learning_rate": 1e-3,
-    "critic_learning_rate": 1e-3,
-    "final_learning_rate": 0.0,
-    "batch_size": 128,
-    "hidden": (64, 64),
-    "critic_hidden": (64, 64),
-    "architecture": "layer_norm",
-}
-"""small networks, and learning rates that fall"""
-PENDULUM = {"env": "Pendulum-v1", "total_steps": 20_000, "learning_starts": 1000, **QUICK}
-SWUNG = "search by hand, three settings of each algorithm, on seed 101"
-
-DDPG = [
-    Preset("default", ddpg.Config(), SHARED, "2026-11"),
-    Preset(
-        "course",
-        ddpg.Config(env="Hopper-v5", learning_starts=25_000, policy_delay=2),
-        "the reinforcement-learning course's notebook on DDPG: its settings, on the corrected algorithm",
-        "2026-11",
-    ),
-    Preset("pendulum", ddpg.Config(**PENDULUM), SWUNG, "2026-11"),
-    Preset(
-        "half-cheetah",
-        ddpg.Config(env="HalfCheetah-v5", **BOLD),
-        "a run of 300,000 steps on seed 101",
-        "2026-11",
-    ),
-    Preset(
-        "mountain-car",
-        ddpg.Config(
-            env="MountainCarContinuous-v0",
-            total_steps=30_000,
-            noise="ou",
-            noise_std=0.6,
-            gamma=0.998,
-            batch_size=128,
-            learning_starts=2000,
-            actor_learning_rate=3e-4,
-            critic_learning_rate=1e-3,
-            final_learning_rate=0.0,
-            policy_delay=2,
-            hidden=(64, 64),
-            critic_hidden=(64, 64),
-            architecture="layer_norm",
-            normalize_observations=True,
-        ),
-        "search by hand, 24 settings, on seeds 101 and 102; the best two also on 103 and 104",
-        "2026-11",
-    ),
-]
-TD3 = [
-    Preset("default", td3.Config(), SHARED, "2026-11"),
-    Preset("pendulum", td3.Config(**PENDULUM), SWUNG, "2026-11"),
-]
-SAC = [
-    Preset("default", sac.Config(), SHARED, "2026-11"),
-    Preset("pendulum", sac.Config(**PENDULUM), SWUNG, "2026-11"),
-]
-
-PRESETS: dict[str, list[Preset]] = {
-    "reinforce": REINFORCE,
-    "a2c": A2C,
-    "trpo": TRPO,
-    "ppo": PPO,
-    "ddpg": DDPG,
-    "td3": TD3,
-    "sac": SAC,
-}
-
-
-def names(algorithm: str) -> list[str]:
-    """Every preset's name, each once."""
-    return list(dict.fromkeys(preset.name for preset in PRESETS[algorithm]))
-
-
-def best(algorithm: str, env_id: str | None) -> str:
-    """The preset that an environment gets unasked: the first that is its own, or the default."""
-    own = (preset.name for preset in PRESETS[algorithm][1:] if preset.config.env == env_id)
-    return next(own, "default")
-
-
-def choose(algorithm: str, env_id: str | None, name: str | None) -> tuple[str, RunConfig]:
-    """The preset asked for, or the best known for the environment, or the default: (its name, its Config).
-
-    Where several environments have a preset of one name, the environment decides. The Config's `env` is `env_id` if one
-    is given. Raises `UserError` with the nearest names for an unknown preset.
-    """
-    name = name or best(algorithm, env_id)
-    named = [preset.config for preset in PRESETS[algorithm] if preset.name == name]
-    if not named:
-        raise unknown("preset", name, names(algorithm))
-    config = next((config for config in named if config.env == env_id), named[0])
-    return name, config.replace(env=env_id) if env_id else config

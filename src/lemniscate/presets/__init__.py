@@ -1,0 +1,45 @@
+"""Tuned Configs, as Python values: where each came from, and when.
+
+`default` is what an environment without a preset of its own gets.
+"""
+
+from lemniscate.errors import unknown
+from lemniscate.presets.off_policy import DDPG, SAC, TD3
+from lemniscate.presets.on_policy import A2C, PPO, REINFORCE, TRPO
+from lemniscate.presets.preset import Preset
+from lemniscate.run.config import RunConfig
+
+PRESETS: dict[str, list[Preset]] = {
+    "reinforce": REINFORCE,
+    "a2c": A2C,
+    "trpo": TRPO,
+    "ppo": PPO,
+    "ddpg": DDPG,
+    "td3": TD3,
+    "sac": SAC,
+}
+
+
+def names(algorithm: str) -> list[str]:
+    """Every preset's name, each once."""
+    return list(dict.fromkeys(preset.name for preset in PRESETS[algorithm]))
+
+
+def best(algorithm: str, env_id: str | None) -> str:
+    """The preset that an environment gets unasked: the first that is its own, or the default."""
+    own = (preset.name for preset in PRESETS[algorithm][1:] if preset.config.env == env_id)
+    return next(own, "default")
+
+
+def choose(algorithm: str, env_id: str | None, name: str | None) -> tuple[str, RunConfig]:
+    """The preset asked for, or the best known for the environment, or the default: (its name, its Config).
+
+    Where several environments have a preset of one name, the environment decides. The Config's `env` is `env_id` if one
+    is given. Raises `UserError` with the nearest names for an unknown preset.
+    """
+    name = name or best(algorithm, env_id)
+    named = [preset.config for preset in PRESETS[algorithm] if preset.name == name]
+    if not named:
+        raise unknown("preset", name, names(algorithm))
+    config = next((config for config in named if config.env == env_id), named[0])
+    return name, config.replace(env=env_id) if env_id else config

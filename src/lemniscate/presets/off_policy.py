@@ -1,0 +1,73 @@
+"""Presets of those that learn from memory: DDPG, TD3, SAC."""
+
+from lemniscate.algos import ddpg, sac, td3
+from lemniscate.presets.preset import Preset
+
+SHARED = "the settings that most libraries share today"
+BOLD = {
+    "learning_starts": 10_000,
+    "actor_learning_rate": 1e-3,
+    "critic_learning_rate": 1e-3,
+    "architecture": "layer_norm",
+}
+"""layer normalization bears the larger steps"""
+
+QUICK = {
+    "actor_learning_rate": 1e-3,
+    "critic_learning_rate": 1e-3,
+    "final_learning_rate": 0.0,
+    "batch_size": 128,
+    "hidden": (64, 64),
+    "critic_hidden": (64, 64),
+    "architecture": "layer_norm",
+}
+"""small networks, and learning rates that fall"""
+PENDULUM = {"env": "Pendulum-v1", "total_steps": 20_000, "learning_starts": 1000, **QUICK}
+SWUNG = "search by hand, three settings of each algorithm, on seed 101"
+
+DDPG = [
+    Preset("default", ddpg.Config(), SHARED, "2026-11"),
+    Preset(
+        "course",
+        ddpg.Config(env="Hopper-v5", learning_starts=25_000, policy_delay=2),
+        "the reinforcement-learning course's notebook on DDPG: its settings, on the corrected algorithm",
+        "2026-11",
+    ),
+    Preset("pendulum", ddpg.Config(**PENDULUM), SWUNG, "2026-11"),
+    Preset(
+        "half-cheetah",
+        ddpg.Config(env="HalfCheetah-v5", **BOLD),
+        "a run of 300,000 steps on seed 101",
+        "2026-11",
+    ),
+    Preset(
+        "mountain-car",
+        ddpg.Config(
+            env="MountainCarContinuous-v0",
+            total_steps=30_000,
+            noise="ou",
+            noise_std=0.6,
+            gamma=0.998,
+            batch_size=128,
+            learning_starts=2000,
+            actor_learning_rate=3e-4,
+            critic_learning_rate=1e-3,
+            final_learning_rate=0.0,
+            policy_delay=2,
+            hidden=(64, 64),
+            critic_hidden=(64, 64),
+            architecture="layer_norm",
+            normalize_observations=True,
+        ),
+        "search by hand, 24 settings, on seeds 101 and 102; the best two also on 103 and 104",
+        "2026-11",
+    ),
+]
+TD3 = [
+    Preset("default", td3.Config(), SHARED, "2026-11"),
+    Preset("pendulum", td3.Config(**PENDULUM), SWUNG, "2026-11"),
+]
+SAC = [
+    Preset("default", sac.Config(), SHARED, "2026-11"),
+    Preset("pendulum", sac.Config(**PENDULUM), SWUNG, "2026-11"),
+]
