@@ -67,6 +67,15 @@ def history(path: Path) -> list[dict]:
     return [{k: v for k, v in line.items() if not k.startswith("time/")} for line in read_metrics(path)]
 
 
+@pytest.mark.parametrize(
+    ("env", "total", "planned"), [("Countdown-v0", 256, 5), ("Pendulum-v1", 256, 1), ("Pendulum-v1", 7_200, 3)]
+)
+def test_unasked_there_are_five_checkpoints_or_as_many_as_leave_episodes_whole(tmp_path, env, total, planned):
+    """Four copies of Pendulum, 200 steps an episode: one each 2,400 steps at most."""
+    train(tmp_path / "r", env, total_steps=total, num_steps=64 if total > 256 else 8, keep_checkpoints=10)
+    assert len(checkpoint.list_steps(tmp_path / "r" / "checkpoints")) == planned
+
+
 def test_what_follows_episodes_begins_anew_with_the_environments(tmp_path, monkeypatch):
     """At the start and at each planned checkpoint but the last, after which nothing is played."""
     told = []

@@ -57,7 +57,7 @@ class RunConfig:
     engine: Literal["auto", "eager", "native"] = "auto"
     """how gradient steps are taken: one by one through autograd, or as one native call; auto compiles long runs"""
     checkpoint_every: Natural = 0
-    """steps between checkpoints, at each of which the environments restart; 0 makes five of the run"""
+    """steps between checkpoints, at each of which the environments restart; 0 makes five, fewer of a short run"""
     keep_checkpoints: Count = 3
     """older ones are deleted"""
     evaluate_every: Natural = 0
@@ -93,11 +93,6 @@ class RunConfig:
                 if not (number and value in limits):
                     what = "a whole number" if kind is int else "a number"
                     raise UserError(f"{name} must be {what} {limits}, not {value!r}.")
-
-    @property
-    def checkpoint_interval(self) -> int:
-        """Steps between checkpoints."""
-        return self.checkpoint_every or -(-self.total_steps // 5)
 
     @property
     def gradient_steps(self) -> int:

@@ -188,8 +188,14 @@ class Run:
             if hasattr(part, "restart"):  # what follows episodes has to know that they are cut
                 part.restart()
 
+    def _checkpoint_interval(self) -> int:
+        """As asked for; else a fifth of the run, but room for three whole episodes of each copy between restarts."""
+        longest = self.spec.max_episode_steps or 0
+        fifth = -(-self.config.total_steps // 5)
+        return self.config.checkpoint_every or max(fifth, 3 * longest * self.config.num_envs)
+
     def _between(self, state: AnyState, before: int, total_steps: int) -> None:
-        every, interval = self.config.evaluate_every, self.config.checkpoint_interval
+        every, interval = self.config.evaluate_every, self._checkpoint_interval()
         if every and state.step // every > before // every:
             self._evaluate(state)
         every = self.config.video_every
