@@ -523,7 +523,7 @@ MUTANTS = [
 
 SERVER = """
 import json, os, sys
-import torch, torch.func, gymnasium, matplotlib.figure, pytest
+import gymnasium, hypothesis.strategies, matplotlib.figure, pytest, torch._dynamo, torch.distributed.tensor, torch.func
 
 for line in sys.stdin:
     package, tests, output = json.loads(line)
@@ -533,12 +533,14 @@ for line in sys.stdin:
         os.dup2(file, 1), os.dup2(file, 2)
         sys.path.insert(0, package)
         os.environ["PYTHONPATH"] = package
-        code = pytest.main(["-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", "-m", "not long", tests])
+        os.environ["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"
+        code = pytest.main(["-x", "-q", "-p", "no:cacheprovider", "-m", "not long", "-o", "addopts=", tests])
         sys.stdout.flush(), sys.stderr.flush()
         os._exit(code)
     print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
 """
-"""runs each mutant's tests in a fork of itself, in which all that is slow to import is there, and no lemniscate yet"""
+"""Runs each mutant's tests in a fork of itself: what is slow to import is there, and no lemniscate yet. Without the
+checks of shapes, which take longer to build than the tests to run."""
 
 
 @pytest.fixture(scope="module")
