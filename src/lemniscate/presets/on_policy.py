@@ -237,7 +237,7 @@ TRPO = [
             critic_epochs=20,
             scale_rewards=True,
         ),
-        "search by hand, 6 settings, three of them on seeds 101 to 104",
+        "search by hand, 3 settings on seed 101, 3 on seeds 102 to 104",
         "2026-11",
     ),
     Preset(
