@@ -233,11 +233,10 @@ TRPO = [
             max_kl=0.04,
             final_max_kl=0.0,
             gamma=0.9999,
-            gae_lambda=0.995,
+            gae_lambda=0.98,
             critic_epochs=20,
-            scale_rewards=True,
         ),
-        "search by hand, 3 settings on seed 101, 3 on seeds 102 to 104",
+        "search by hand, 3 runs, on seed 101",
         "2026-11",
     ),
     Preset(
