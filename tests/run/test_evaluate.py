@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -42,7 +44,7 @@ def test_the_same_seed_gives_the_same_scores_and_another_does_not():
     torch.manual_seed(0)
     policy = ActorCritic(env.spec, Layers((4,))).policy
     first, again, other = (evaluate(policy, env, 6, seed, deterministic=False) for seed in (1, 1, 2))
-    assert first == again
+    assert first == replace(again, date=first.date)
     assert first.returns != other.returns
     assert first.rmse_mm is None
     assert "rmse_mm" not in first.to_json()
