@@ -328,13 +328,6 @@ MUTANTS = [
         ROAD + "whole_episodes_are_whole_and_as_many_from_each_copy",
     ),
     (
-        "the bound on the KL stays",
-        "algos/trpo.py",
-        "(config.max_kl, config.final_max_kl",
-        "(config.max_kl, 1.0",
-        ROAD + "the_bound_on_the_kl_falls",
-    ),
-    (
         "every attempt is a tenth",
         "algos/trpo.py",
         '"attempts": config.attempts',

@@ -40,9 +40,7 @@ class Config(RolloutConfig):
     """What TRPO adds to the knobs of all that learn from rollouts."""
 
     max_kl: Positive = 0.01
-    """δ: the mean KL from the old policy to the new that an update may reach, at the start"""
-    final_max_kl: Fraction = 1.0
-    """fraction of it that it falls to, linearly over the run; 1 keeps it constant"""
+    """δ: the mean KL from the old policy to the new that an update may reach"""
     line_search: bool = True
     """shorten the step until it keeps its promises; without it this is the natural policy gradient"""
     shrink: Annotated[float, Range(0.01, 0.99)] = 0.8
@@ -136,7 +134,6 @@ def improve(config: Config, state: State, batch: Batch, obs: Tensor) -> dict[str
 
     L and the KL are means over `batch`; the Fisher matrix is that at `obs`, as many in every update.
     """
-    max_kl = linear(config.max_kl, config.final_max_kl, state.step / config.total_steps)
     here, pi = state.parameters.vector.clone(), state.parameters.at
     advantage = standardize(batch.advantage) if config.normalize_advantage else batch.advantage
 
@@ -151,8 +148,8 @@ def improve(config: Config, state: State, batch: Batch, obs: Tensor) -> dict[str
 
     gradient = grad(loss)(here)
     with torch.no_grad():
-        step = natural_step(fisher, gradient, max_kl, iterations=config.cg_iterations)
-        limits = {"max_kl": max_kl, "shrink": config.shrink, "attempts": config.attempts}
+        step = natural_step(fisher, gradient, config.max_kl, iterations=config.cg_iterations)
+        limits = {"max_kl": config.max_kl, "shrink": config.shrink, "attempts": config.attempts}
         there, fraction = here + step, 1.0
         if config.line_search:
             there, fraction = backtrack(lambda theta: (loss(theta), kl(theta)), here, step, **limits)
