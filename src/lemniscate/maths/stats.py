@@ -10,7 +10,8 @@ from torch import Tensor
 def means(rows: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
     """The mean of each quantity over the rows in which it is."""
     names = dict.fromkeys(name for row in rows for name in row)
-    return {name: torch.stack([row[name] for row in rows if name in row]).mean() for name in names}
+    columns = {name: [row[name] for row in rows if name in row] for name in names}
+    return {name: torch.stack(column).mean() if len(column) > 1 else column[0] for name, column in columns.items()}
 
 
 def standardize(x: Float[Tensor, " B"], eps: float = 1e-8) -> Float[Tensor, " B"]:
