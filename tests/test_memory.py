@@ -312,38 +312,31 @@ def test_learning_rates_fall_linearly_over_the_run(monkeypatch, algo):
     config = small(algo, total_steps=1000, final_learning_rate=0.2, policy_delay=1, **rates)
     state, _ = ready(monkeypatch, algo, config)
     used = []
-    for descent in (state.actor_descent, state.critic_descent):
-        engine = descent._engine
-        monkeypatch.setattr(
-            descent, "_engine", lambda *args, e=engine, d=descent: used.append((d, args[4])) or e(*args)
-        )
+    for name in ("critic_descent", "actor_descent"):
+        step = getattr(state, name).step
+        seen = lambda batch, scales, *noise, step=step: used.append(scales) or step(batch, scales, *noise)  # noqa: E731
+        monkeypatch.setattr(getattr(state, name), "step", seen)
     for step in (160, 500, 1000):
         state.step = step
         algo.update(config, state)
-        (_, q), (_, pi) = used[-2:]
+        q, pi = used[-2:]
         fell = 1 - 0.8 * step / 1000
         scale = 1 / (1 - 0.9**state.critic_descent.steps)
-        assert q[0, 0].item() == pytest.approx(0.1 * fell * scale, rel=1e-5)
-        assert pi[0, 0].item() == pytest.approx(0.02 * fell * scale, rel=1e-5)
+        assert q[0].item() == pytest.approx(0.1 * fell * scale, rel=1e-5)
+        assert pi[0].item() == pytest.approx(0.02 * fell * scale, rel=1e-5)
 
 
-def engines_agree(algo, matmul="float32"):
-    """Two updates of three steps each, native and eager, from the same memory and the same random numbers."""
-    layers = {"hidden": (16, 16), "critic_hidden": (8, 8), "matmul": matmul}
-    close = {"rtol": 1e-3, "atol": 1e-4} if matmul == "float32" else {"rtol": 2**-6, "atol": 2**-6}
-    config, states = small(algo, num_updates=3, policy_delay=2, tau=0.3, critic_learning_rate=1e-3, **layers), []
-    spec = Spec("x", (Part((), (3,)),), Box((-1.0,), (1.0,)))
-    for native in (False, True):
-        torch.manual_seed(0)
-        state = algo.init(config, spec, CPU)
-        state.replay.extend(
-            Transition(*(torch.randn(50, n) for n in (3, 1)), torch.randn(50), torch.randn(50, 3), torch.rand(50) < 0.3)
-        )
-        if native:
-            state.actor_descent.make_native()
-            state.critic_descent.make_native()
-        states.append(state)
-    for _ in range(2):
+def remembering(algo, config):
+    """A state for three numbers in and one out, with a memory of noise; always the same."""
+    torch.manual_seed(0)
+    state = algo.init(config, Spec("x", (Part((), (3,)),), Box((-1.0,), (1.0,))), CPU)
+    rows = (torch.randn(50, 3), torch.randn(50, 1), torch.randn(50), torch.randn(50, 3), torch.rand(50) < 0.3)
+    state.replay.extend(Transition(*rows))
+    return state
+
+
+def same_after(updates, algo, config, states, **close):
+    for _ in range(updates):
         a, b = (algo.update(config, state) for state in states)
         assert a.keys() == b.keys()
         for key in a:
@@ -351,16 +344,38 @@ def engines_agree(algo, matmul="float32"):
     for name in ("networks", "targets"):
         for p, q in zip(*(getattr(state, name).parameters() for state in states), strict=True):
             torch.testing.assert_close(p, q, **close)
-    for descent in (states[1].actor_descent, states[1].critic_descent):
-        assert descent._engine._chosen is descent._engine._compiled
 
 
-@pytest.mark.parametrize("algo", ["ddpg", "td3", "sac", "ddpg, 'bfloat16'"])
-def test_the_two_engines_agree(algo):
+def engines_agree(algo, delay=1, matmul="float32"):
+    """Native and eager, from the same memory and the same random numbers."""
+    layers = {"hidden": (16, 16), "critic_hidden": (8, 8), "matmul": matmul}
+    close = {"rtol": 1e-3, "atol": 1e-4} if matmul == "float32" else {"rtol": 2**-6, "atol": 2**-6}
+    config = small(algo, policy_delay=delay, tau=0.3, critic_learning_rate=1e-3, **layers)
+    states = [remembering(algo, config), remembering(algo, config)]
+    states[1].joint.make_native()
+    same_after(2 * delay, algo, config, states, **close)
+    programs = states[1].joint._programs
+    assert len(programs) == delay
+    assert all(program._chosen is program._compiled for program in programs.values())
+
+
+@pytest.mark.parametrize("case", ["ddpg, delay=2", "td3", "sac", "ddpg, matmul='bfloat16'"])
+def test_the_two_engines_agree(case):
     """In a process of its own: the shape checks of this one are not for the compiler."""
-    code = f"from test_memory import *; engines_agree({algo})"
+    code = f"from test_memory import *; engines_agree({case})"
     done = subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parent, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+@EACH
+def test_many_steps_are_several_calls_of_the_same_size(monkeypatch, algo):
+    """Six steps, the policy's turn at every fourth of all: two calls of three, of turns that differ."""
+    monkeypatch.setattr("lemniscate.nn.joint.Native", lambda function, otherwise, device: otherwise)
+    config = small(algo, num_updates=6, policy_delay=4, tau=0.3)
+    states = [remembering(algo, config), remembering(algo, config)]
+    states[1].joint.make_native()
+    same_after(2, algo, config, states)
+    assert set(states[1].joint._programs) == {(i == 0, i == 1, i == 2) for i in range(4)}
 
 
 @EACH

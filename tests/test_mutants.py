@@ -138,12 +138,12 @@ MUTANTS = [
     (
         "Adam without its bias correction",
         "nn/descent.py",
-        "learning_rate / (1 - beta_1**step)",
+        "learning_rate / beta_1",
         "learning_rate",
         "test_descent.py",
     ),
     ("the gradient is not clipped", "nn/descent.py", ".clamp(max=1)", ".clamp(min=1, max=1)", "test_descent.py"),
-    ("the gradient is added up", "nn/descent.py", "self._gradient.zero_()", "pass", "test_descent.py"),
+    ("the gradient is added up", "nn/descent.py", "self._gradient.zero_()", "self._gradient", "test_descent.py"),
     ("ignored rewards are counted", "nn/normalizer.py", ".double() * rollout.valid", ".double()", "test_nn.py"),
     (
         "rewards are clipped unasked",
@@ -208,7 +208,7 @@ MUTANTS = [
     (
         "the target runs away",
         "maths/returns.py",
-        "mine.data.lerp_(theirs.data, tau)",
+        "mine.lerp_(theirs, tau)",
         "theirs.data.lerp_(mine.data, tau)",
         "maths/test_returns.py",
     ),
@@ -469,9 +469,23 @@ MUTANTS = [
         "run/test_critique.py",
     ),
     (
+        "the first turns are everyone's",
+        "nn/joint.py",
+        "turns[done : done + len(chunk[0])]",
+        "turns[: len(chunk[0])]",
+        MEMORY + "many_steps_are_several_calls",
+    ),
+    (
+        "steps that are not taken count",
+        "nn/descent.py",
+        "accumulate(taken, initial=self.steps)",
+        "accumulate([True] * len(taken), initial=self.steps)",
+        MEMORY + "learning_rates_fall_linearly_over_the_run",
+    ),
+    (
         "the delay is forgotten",
         "algos/td3.py",
-        "state.updates % config.policy_delay == 0",
+        "(state.updates + k) % config.policy_delay == 0",
         "True",
         MEMORY + "each_step_moves_what_it_should",
     ),

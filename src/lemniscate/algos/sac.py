@@ -4,7 +4,7 @@ Twin critics as in TD3; but the policy is random by itself, and is paid for bein
 Departures from the paper, and why: docs/notes/ddpg.md.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Annotated
@@ -19,6 +19,7 @@ from lemniscate.maths import linear, means, polyak, td_target, uniform, value_lo
 from lemniscate.nn.actor_critic import ActorQ, bounded_box
 from lemniscate.nn.critics import TwinQ
 from lemniscate.nn.descent import Descent
+from lemniscate.nn.joint import Joint
 from lemniscate.nn.policies import Policy
 from lemniscate.run.config import Count, Positive, Range, ReplayConfig
 from lemniscate.run.run import Run
@@ -47,6 +48,8 @@ class State:
     """Q'₁ and Q'₂: copies that follow slowly"""
     actor_descent: Descent[nn.ModuleList]
     critic_descent: Descent[TwinQ]
+    joint: Joint
+    """both descents by turns"""
     replay: Replay
     exploration: Exploration
     noise: Generator
@@ -75,11 +78,16 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
     online = networks(config, spec).to(device)
     targets, actor = online.target().critic, online.actor
     copies, length = (config.num_envs, bounded_box(spec).size), spec.max_episode_steps or 1000
+    actor_descent = Descent(actor, partial(actor_loss, config, online.critic), watch_as="gradient_norm/actor")
+    critic_descent = Descent(
+        online.critic, partial(critic_loss, config, targets, actor), watch_as="gradient_norm/critic"
+    )
     return State(
         online,
         targets,
-        Descent(actor, partial(actor_loss, config, online.critic), watch_as="gradient_norm/actor"),
-        Descent(online.critic, partial(critic_loss, config, targets, actor), watch_as="gradient_norm/critic"),
+        actor_descent,
+        critic_descent,
+        Joint(learn, actor_descent, critic_descent),
         Replay(spec, config.capacity, device),
         Exploration(config.noise, copies, length, device, time=config.noise_time, exponent=config.noise_exponent),
         noise=generator(config.seed, device, 2),
@@ -130,20 +138,38 @@ def actor_loss(
     }
 
 
-def update(config: Config, state: State) -> Mapping[str, Tensor]:
-    """Gradient steps on what is remembered (algorithm 1); returns the means of what was watched."""
-    watched: list[Mapping[str, Tensor]] = []
-    memory = state.replay.transitions
-    fall = linear(1.0, config.final_learning_rate, state.step / config.total_steps)
-    for rows in state.replay.draw(config.num_updates, config.batch_size, state.draws).split(1):
-        state.updates += 1
-        noise = state.policy.noise(rows.shape, state.noise)
-        watched.append(state.critic_descent(memory, rows, fall * config.critic_learning_rate, noise))
-        if state.updates % config.policy_delay == 0:
-            noise = state.policy.noise(rows.shape, state.noise)
-            watched.append(state.actor_descent(memory, rows, fall * config.actor_learning_rate, noise))
+def learn(
+    config: Config,
+    state: State,
+    turns: Sequence[bool],
+    memory: Transition,
+    parts: Tensor,
+    critic_scales: Tensor,
+    actor_scales: Tensor,
+    next_noise: Tensor,
+    noise: Tensor,
+) -> list[dict[str, Tensor]]:
+    """Gradient steps on the minibatches `parts` [K, M] of `memory` (algorithm 1); at its turns the policy moves too."""
+    watched = []
+    for k, rows in enumerate(parts):
+        batch = memory[rows]
+        watched.append(state.critic_descent.step(batch, critic_scales[k], next_noise[k]))
+        if turns[k]:
+            watched.append(state.actor_descent.step(batch, actor_scales[k], noise[k]))
             polyak(state.targets.parameters(), state.networks.critic.parameters(), config.tau)
-    return means(watched)
+    return watched
+
+
+def update(config: Config, state: State) -> Mapping[str, Tensor]:
+    """Draw what `learn` needs, and learn; returns the means of what was watched."""
+    turns = [(state.updates + k) % config.policy_delay == 0 for k in range(1, config.num_updates + 1)]
+    state.updates += config.num_updates
+    fall = linear(1.0, config.final_learning_rate, state.step / config.total_steps)
+    critic_scales = state.critic_descent.scales(fall * config.critic_learning_rate, [True] * len(turns))
+    actor_scales = state.actor_descent.scales(fall * config.actor_learning_rate, turns)
+    memory, parts = state.replay.transitions, state.replay.draw(len(turns), config.batch_size, state.draws)
+    next_noise, noise = state.policy.noise((2, *parts.shape), state.noise)
+    return state.joint(config, state, turns, memory, parts, critic_scales, actor_scales, next_noise, noise)
 
 
 def train(config: Config, run: Run) -> State:

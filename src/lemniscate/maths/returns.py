@@ -121,6 +121,7 @@ def td_target(
     return reward + gamma * next_value * ~terminated
 
 
+@torch.no_grad()
 def polyak(target: Iterable[Tensor], online: Iterable[Tensor], tau: float) -> None:
     """Move a target network towards the online one, in place: arXiv:1509.02971, section 3.
 
@@ -135,4 +136,4 @@ def polyak(target: Iterable[Tensor], online: Iterable[Tensor], tau: float) -> No
         tau: τ in [0, 1]; 1 copies.
     """
     for mine, theirs in zip(target, online, strict=True):
-        mine.data.lerp_(theirs.data, tau)
+        mine.lerp_(theirs, tau)

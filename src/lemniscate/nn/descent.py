@@ -1,13 +1,14 @@
 """One step of Adam down a loss: the same loss on two engines.
 
 Small networks on a CPU are bound by the overhead of single operations, not by arithmetic. So all parameters live in
-one vector, and the whole step (gather the rows, forward, backward, clip, Adam) is one pure function of it, which the
-compiler turns into one native call. Without the compiler the same loss goes through autograd. Both agree to rounding.
+one vector, and the whole step (gather the rows, forward, backward, clip, Adam) is a function of it, which the compiler
+turns into one native call. Without the compiler the same loss goes through autograd. Both agree to rounding.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
+from itertools import accumulate
 from typing import Any, Generic, TypeVar
 
 import torch
@@ -74,18 +75,19 @@ class Descent(Generic[Networks]):
         max_grad_norm: float | None = None,
         watch_as: str = "gradient_norm",
     ) -> None:
-        self._objective = _Objective(networks, loss)
+        self.objective = _Objective(networks, loss)
         self._betas, self._eps, self._max_grad_norm = betas, eps, max_grad_norm or math.inf
         self._watch_as = watch_as
-        self._flat = Flat(self._objective)
+        self._flat = Flat(self.objective)
         self._vector = self._flat.vector
+        self.device = self._vector.device
         self._gradient = torch.zeros_like(self._vector)
         self._mean, self._square = torch.zeros_like(self._vector), torch.zeros_like(self._vector)
-        self._parameters = list(self._objective.parameters())
+        self._parameters = list(self.objective.parameters())
         for parameter, gradient in zip(self._parameters, self._flat.parts(self._gradient).values(), strict=True):
             parameter.grad = gradient
         self.steps = 0
-        self._engine: Callable[..., dict[str, Tensor]] = self._eager
+        self._engine: Callable[..., dict[str, Tensor]] = self._steps
         self._steps_per_call = 1
 
     def __call__(self, batch: Record, parts: Tensor, learning_rate: float, *noise: Tensor) -> dict[str, Tensor]:
@@ -100,23 +102,43 @@ class Descent(Generic[Networks]):
         Returns:
             Means over the K steps of what the loss watches, and of the gradient's norm before the clip.
         """
-        steps = range(self.steps + 1, self.steps + 1 + len(parts))
-        self.steps += len(parts)
-        scales = torch.tensor([self._scales(step, learning_rate) for step in steps], dtype=self._vector.dtype)
-        at_once = next(n for n in range(self._steps_per_call, 0, -1) if len(parts) % n == 0)
-        by_step = (scales.to(self._vector.device), parts, *noise)
-        chunks = zip(*(tensor.split(at_once) for tensor in by_step), strict=True)
-        watched = [self._engine(self._vector, self._mean, self._square, batch, *chunk) for chunk in chunks]
-        return means(watched)
+        scales = self.scales(learning_rate, [True] * len(parts))
+        return means([self._engine(batch, *chunk) for chunk in in_calls(self._steps_per_call, parts, scales, *noise)])
 
-    def _scales(self, step: int, learning_rate: float) -> tuple[float, float, float, float]:
-        beta_1, beta_2 = self._betas
-        rate, correction = learning_rate / (1 - beta_1**step), 1 / math.sqrt(1 - beta_2**step)
-        return rate, correction, self._eps, self._max_grad_norm
+    def scales(self, learning_rate: float, taken: Sequence[bool]) -> Tensor:
+        """The numbers of Adam's next K steps, [K, 4] for `adam`; rows that are not `taken` are to be left unused."""
+        counts = list(accumulate(taken, initial=self.steps))[1:]
+        self.steps = counts[-1]
+        rows = []
+        for count in counts:
+            beta_1, beta_2 = (1 - beta ** max(count, 1) for beta in self._betas)
+            rows.append((learning_rate / beta_1, 1 / math.sqrt(beta_2), self._eps, self._max_grad_norm))
+        return torch.tensor(rows, dtype=self._vector.dtype, device=self._vector.device)
+
+    def step(self, batch: Record, scales: Tensor, *noise: Tensor) -> dict[str, Tensor]:
+        """One step down the loss of `batch`: what the loss watches, and the gradient's norm before the clip.
+
+        In a native call the networks are a function of the vector; elsewhere the vector's parts are their parameters.
+        """
+        if torch.compiler.is_compiling():
+            differentiate = grad_and_value(partial(functional_call, self.objective, args=(batch, *noise)), has_aux=True)
+            gradients, (_, metrics) = differentiate(self.parameters())
+            gradient = self._flat.join(gradients)
+        else:
+            gradient = self._gradient.zero_()
+            total, metrics = self.objective(batch, *noise)
+            total.backward(inputs=self._parameters)
+        with torch.no_grad():
+            norm = adam(self._vector, gradient, self._mean, self._square, scales, self._betas)
+        return {**metrics, self._watch_as: norm}
+
+    def parameters(self) -> dict[str, Tensor]:
+        """Those of `objective` by name, views of the vector as it is now."""
+        return self._flat.parts(self._vector)
 
     def make_native(self) -> None:
         """From the next step on, up to four steps are one native call."""
-        self._engine = Native(self._functional, self._eager, self._vector.device)
+        self._engine = Native(self._native, self._steps, self.device)
         self._steps_per_call = STEPS_PER_CALL
 
     def state_dict(self) -> dict[str, Tensor]:
@@ -129,31 +151,19 @@ class Descent(Generic[Networks]):
         self._square.copy_(state["square"])
         self.steps = int(state["steps"])
 
-    def _eager(
-        self, vector: Tensor, mean: Tensor, square: Tensor, batch: Record, *by_step: Tensor
-    ) -> dict[str, Tensor]:
-        watched = []
-        for scales, rows, *noise in zip(*by_step, strict=True):
-            self._gradient.zero_()
-            total, metrics = self._objective(batch[rows], *noise)
-            total.backward(inputs=self._parameters)
-            with torch.no_grad():
-                norm = adam(vector, self._gradient, mean, square, scales, self._betas)
-            watched.append({**metrics, self._watch_as: norm})
-        return means(watched)
+    def _steps(self, batch: Record, parts: Tensor, *by_step: Tensor) -> dict[str, Tensor]:
+        steps = zip(*(tensor.unbind() for tensor in (parts, *by_step)), strict=True)
+        return means([self.step(batch[rows], *rest) for rows, *rest in steps])
 
-    def _functional(
-        self, vector: Tensor, mean: Tensor, square: Tensor, batch: Record, *by_step: Tensor
-    ) -> dict[str, Tensor]:
-        watched = []
+    def _native(self, batch: Record, *by_step: Tensor) -> dict[str, Tensor]:
         with torch.no_grad():  # of networks that only take part; `grad_and_value` differentiates all the same
-            for scales, rows, *noise in zip(*(tensor.unbind() for tensor in by_step), strict=True):
-                args = (batch[rows], *noise)
-                differentiate = grad_and_value(partial(functional_call, self._objective, args=args), has_aux=True)
-                gradients, (_, metrics) = differentiate(self._flat.parts(vector))
-                norm = adam(vector, self._flat.join(gradients), mean, square, scales, self._betas)
-                watched.append({**metrics, self._watch_as: norm})
-        return means(watched)
+            return self._steps(batch, *by_step)
+
+
+def in_calls(most: int, *by_step: Tensor) -> Iterator[tuple[Tensor, ...]]:
+    """Tensors [K, …] in parts of one size, as large as divides K and is at most `most`."""
+    size = next(n for n in range(most, 0, -1) if len(by_step[0]) % n == 0)
+    return zip(*(tensor.split(size) for tensor in by_step), strict=True)
 
 
 class _Objective(nn.Module, Generic[Networks]):
