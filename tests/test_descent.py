@@ -56,6 +56,14 @@ def test_it_is_torchs_adam(limit):
         torch.testing.assert_close(mine, theirs)
 
 
+def test_steps_that_are_not_taken_do_not_count():
+    one, two = (Descent(*fresh()) for _ in range(2))
+    for rate in (0.1, 0.2):
+        some, all_taken = one.scales(rate, [False, True, True, False]), two.scales(rate, [True, True])
+        torch.testing.assert_close(some[1:3], all_taken)
+    assert one.steps == two.steps == 4
+
+
 def engines_agree(actions):
     (one, loss), (two, _) = fresh(actions), fresh(actions)
     eager, compiled = (Descent(nets, loss, max_grad_norm=0.1) for nets in (one, two))

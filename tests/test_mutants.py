@@ -473,14 +473,14 @@ MUTANTS = [
         "nn/joint.py",
         "turns[done : done + len(chunk[0])]",
         "turns[: len(chunk[0])]",
-        MEMORY + "many_steps_are_several_calls",
+        MEMORY + "many_steps_are_several_calls_of_the_same_size",
     ),
     (
         "steps that are not taken count",
         "nn/descent.py",
         "accumulate(taken, initial=self.steps)",
         "accumulate([True] * len(taken), initial=self.steps)",
-        MEMORY + "learning_rates_fall_linearly_over_the_run",
+        "test_descent.py::test_steps_that_are_not_taken_do_not_count",
     ),
     (
         "the delay is forgotten",
