@@ -44,13 +44,11 @@ RUNS = {
     "ddpg": {
         "MountainCarContinuous-v0": ((30_000,), 10),
         "Pendulum-v1": ((20_000,), 5),
-        "LunarLanderContinuous-v3": ((300_000,), 3),
         "HalfCheetah-v5": ((MILLION,), 2),
         "Hopper-v5": ((MILLION,), 3),
     },
     "td3": {
         "Pendulum-v1": ((20_000,), 5),
-        "LunarLanderContinuous-v3": ((300_000,), 3),
         "HalfCheetah-v5": ((300_000,), 2),
     },
     "sac": {

@@ -4,7 +4,13 @@ from lemniscate.algos import ddpg, sac, td3
 from lemniscate.presets.preset import Preset
 
 SHARED = "the settings that most libraries share today"
-BOLD = {"learning_starts": 10_000, "actor_learning_rate": 1e-3, "critic_learning_rate": 1e-3, "batch_size": 128}
+CHEETAH = {
+    "env": "HalfCheetah-v5",
+    "learning_starts": 10_000,
+    "actor_learning_rate": 1e-3,
+    "critic_learning_rate": 1e-3,
+    "batch_size": 128,
+}
 """large steps on small batches"""
 
 QUICK = {
@@ -31,7 +37,7 @@ DDPG = [
     Preset("pendulum", ddpg.Config(**PENDULUM), SWUNG, "2026-11"),
     Preset(
         "half-cheetah",
-        ddpg.Config(env="HalfCheetah-v5", **BOLD),
+        ddpg.Config(**CHEETAH),
         "search by hand: five settings, a run of 300,000 steps of each on seed 101 or 102; this one is common practice",
         "2026-11",
     ),
@@ -61,8 +67,27 @@ DDPG = [
 TD3 = [
     Preset("default", td3.Config(), SHARED, "2026-11"),
     Preset("pendulum", td3.Config(**PENDULUM), SWUNG, "2026-11"),
+    Preset("half-cheetah", td3.Config(total_steps=300_000, **CHEETAH), "not searched: DDPG's", "2026-11"),
 ]
 SAC = [
     Preset("default", sac.Config(), SHARED, "2026-11"),
     Preset("pendulum", sac.Config(**PENDULUM), SWUNG, "2026-11"),
+    Preset("half-cheetah", sac.Config(total_steps=300_000, **CHEETAH), "not searched: DDPG's", "2026-11"),
+    Preset(
+        "lunar-lander-continuous",
+        sac.Config(
+            env="LunarLanderContinuous-v3",
+            total_steps=300_000,
+            learning_starts=10_000,
+            actor_learning_rate=1e-3,
+            critic_learning_rate=1e-3,
+            final_learning_rate=0.0,
+            tau=0.01,
+            hidden=(128, 128),
+            critic_hidden=(128, 128),
+            architecture="layer_norm",
+        ),
+        "search by hand: SAC in two sizes and TD3 in one, on seed 101",
+        "2026-11",
+    ),
 ]
