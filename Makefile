@@ -41,7 +41,7 @@ bench-returns: setup  ## the README's returns, seed by seed: a day; returns.py t
 	touch $@
 
 tutorials: setup  ## the notebooks, from docs/tutorial/*.py
-	$(BIN)/jupytext --quiet --to notebook docs/tutorial/*.py
+	$(BIN)/jupytext --quiet --update --to notebook docs/tutorial/*.py
 
 lock: setup  ## renew requirements.lock from pyproject.toml
 	$(BIN)/pip-compile --quiet --strip-extras --extra box2d --extra classic-control --extra drone --extra envpool --extra mujoco --extra dev --no-emit-index-url --no-emit-find-links --no-emit-trusted-host --no-header --allow-unsafe --annotation-style=line --constraint constraints.txt --output-file requirements.lock pyproject.toml
