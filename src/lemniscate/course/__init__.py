@@ -59,7 +59,8 @@ def _find(name: str, exercise: Exercise, function: Function) -> Finding:
     for i, case in enumerate(exercise.cases, start=1):
         if complaint := _complaint(exercise, function, case):
             return Finding(name, False, f"case {i} of {len(exercise.cases)}, {case.about}: {complaint}")
-    return Finding(name, True, f"right in all {len(exercise.cases)} cases.")
+    cases = len(exercise.cases)
+    return Finding(name, True, f"right in all {cases} cases." if cases > 1 else "right.")
 
 
 def _complaint(exercise: Exercise, function: Function, case: Case) -> str | None:
