@@ -38,7 +38,7 @@ DDPG = [
     Preset(
         "half-cheetah",
         ddpg.Config(**CHEETAH),
-        "search by hand: five settings, a run of 300,000 steps of each on seed 101 or 102; this one is common practice",
+        "three settings for 300,000 steps, on seed 101 or 102; the networks of one with the batches of another",
         "2026-11",
     ),
     Preset(
