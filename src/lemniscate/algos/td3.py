@@ -49,8 +49,6 @@ class State:
     """μ', Q'₁ and Q'₂: copies that follow slowly"""
     actor_descent: Descent[Policy]
     critic_descent: Descent[TwinQ]
-    joint: Joint
-    """both descents by turns"""
     replay: Replay
     exploration: Exploration
     noise: Generator
@@ -61,6 +59,9 @@ class State:
     """gradient steps of Q taken"""
     step: int = 0
     """environment steps taken"""
+
+    def __post_init__(self) -> None:
+        self.joint = Joint(learn, self.actor_descent, self.critic_descent)
 
     @property
     def policy(self) -> Policy:
@@ -79,14 +80,11 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
     online = networks(config, spec).to(device)
     targets = online.target()
     copies, length = (config.num_envs, bounded_box(spec).size), spec.max_episode_steps or 1000
-    actor_descent = Descent(online.policy, partial(actor_loss, online.critic), watch_as="gradient_norm/actor")
-    critic_descent = Descent(online.critic, partial(critic_loss, config, targets), watch_as="gradient_norm/critic")
     return State(
         online,
         targets,
-        actor_descent,
-        critic_descent,
-        Joint(learn, actor_descent, critic_descent),
+        Descent(online.policy, partial(actor_loss, online.critic), watch_as="gradient_norm/actor"),
+        Descent(online.critic, partial(critic_loss, config, targets), watch_as="gradient_norm/critic"),
         Replay(spec, config.capacity, device),
         Exploration(config.noise, copies, length, device, time=config.noise_time, exponent=config.noise_exponent),
         noise=generator(config.seed, device, 2),

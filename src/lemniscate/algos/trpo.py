@@ -79,8 +79,6 @@ class State:
     """Everything a crash may not take from us."""
 
     networks: ActorCritic
-    parameters: FlatPolicy
-    """θ, the policy's"""
     critic: Descent[Value]
     reward_scale: RewardScale
     noise: Generator
@@ -88,6 +86,9 @@ class State:
     shuffle: Generator
     step: int = 0
     """environment steps taken"""
+
+    def __post_init__(self) -> None:
+        self.parameters = FlatPolicy(self.policy)  # θ
 
     @property
     def policy(self) -> Policy:
@@ -105,7 +106,6 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
     fresh = networks(config, spec).to(device)
     return State(
         fresh,
-        FlatPolicy(fresh.policy),
         Descent(fresh.value, critic_loss),
         RewardScale(config.num_envs, config.gamma).to(device),
         noise=generator(config.seed, device, 2),

@@ -1,6 +1,6 @@
 """All parameters of some networks as one vector."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -59,10 +59,3 @@ class FlatPolicy(Flat):
 
     def _fisher(self, theta: Tensor, vector: Tensor, obs: Tensor) -> Tensor:
         return fisher_product(lambda point: self.at(point, obs), theta, vector)
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """Nothing of its own: the parameters belong to the policy."""
-        return {}
-
-    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Nothing to do."""

@@ -66,13 +66,6 @@ class Joint:
         with torch.no_grad():
             return functional_call(self._networks, views, args)
 
-    def state_dict(self) -> dict[str, Tensor]:
-        """Nothing of its own."""
-        return {}
-
-    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Nothing to do."""
-
 
 class _Networks(nn.Module):
     """`learn` as a module, so that `functional_call` can put other parameters under it."""
