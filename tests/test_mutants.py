@@ -243,8 +243,8 @@ MUTANTS = [
     (
         "the values in the Fisher matrix",
         "algos/trpo.py",
-        "FlatPolicy(fresh.policy)",
-        "FlatPolicy(fresh)",
+        "FlatPolicy(self.policy)",
+        "FlatPolicy(self.networks)",
         ROAD + "trpos_policy_step_leaves_the_critic_alone_and_the_critics_the_policy",
     ),
     ("damping forgotten", "algos/trpo.py", " + config.damping * vector", "", ROAD + "damping_shortens_the_step"),
