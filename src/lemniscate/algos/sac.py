@@ -140,8 +140,6 @@ def learn(
     turns: Sequence[bool],
     memory: Transition,
     parts: Tensor,
-    critic_scales: Tensor,
-    actor_scales: Tensor,
     next_noise: Tensor,
     noise: Tensor,
 ) -> list[dict[str, Tensor]]:
@@ -149,9 +147,9 @@ def learn(
     watched = []
     for k, rows in enumerate(parts):
         batch = memory[rows]
-        watched.append(state.critic_descent.step(batch, critic_scales[k], next_noise[k]))
+        watched.append(state.critic_descent.step(batch, next_noise[k]))
         if turns[k]:
-            watched.append(state.actor_descent.step(batch, actor_scales[k], noise[k]))
+            watched.append(state.actor_descent.step(batch, noise[k]))
             polyak(state.targets.parameters(), state.networks.critic.parameters(), config.tau)
     return watched
 
@@ -161,11 +159,11 @@ def update(config: Config, state: State) -> Mapping[str, Tensor]:
     turns = [(state.updates + k) % config.policy_delay == 0 for k in range(1, config.num_updates + 1)]
     state.updates += config.num_updates
     fall = linear(1.0, config.final_learning_rate, state.step / config.total_steps)
-    critic_scales = state.critic_descent.scales(fall * config.critic_learning_rate, [True] * len(turns))
-    actor_scales = state.actor_descent.scales(fall * config.actor_learning_rate, turns)
+    state.critic_descent.set_learning_rate(fall * config.critic_learning_rate)
+    state.actor_descent.set_learning_rate(fall * config.actor_learning_rate)
     memory, parts = state.replay.transitions, state.replay.draw(len(turns), config.batch_size, state.draws)
     next_noise, noise = state.policy.noise((2, *parts.shape), state.noise)
-    return state.joint(config, state, turns, memory, parts, critic_scales, actor_scales, next_noise, noise)
+    return state.joint(config, state, turns, memory, parts, next_noise, noise)
 
 
 def train(config: Config, run: Run) -> State:

@@ -125,22 +125,15 @@ def actor_loss(critic: TwinQ, policy: Policy, batch: Transition) -> tuple[Tensor
 
 
 def learn(
-    config: Config,
-    state: State,
-    turns: Sequence[bool],
-    memory: Transition,
-    parts: Tensor,
-    critic_scales: Tensor,
-    actor_scales: Tensor,
-    noise: Tensor,
+    config: Config, state: State, turns: Sequence[bool], memory: Transition, parts: Tensor, noise: Tensor
 ) -> list[dict[str, Tensor]]:
     """Gradient steps on the minibatches `parts` [K, M] of `memory` (algorithm 1); at its turns the policy moves too."""
     watched = []
     for k, rows in enumerate(parts):
         batch = memory[rows]
-        watched.append(state.critic_descent.step(batch, critic_scales[k], noise[k]))
+        watched.append(state.critic_descent.step(batch, noise[k]))
         if turns[k]:
-            watched.append(state.actor_descent.step(batch, actor_scales[k]))
+            watched.append(state.actor_descent.step(batch))
             polyak(state.targets.parameters(), state.networks.parameters(), config.tau)
     return watched
 
@@ -150,11 +143,11 @@ def update(config: Config, state: State) -> Mapping[str, Tensor]:
     turns = [(state.updates + k) % config.policy_delay == 0 for k in range(1, config.num_updates + 1)]
     state.updates += config.num_updates
     fall = linear(1.0, config.final_learning_rate, state.step / config.total_steps)
-    critic_scales = state.critic_descent.scales(fall * config.critic_learning_rate, [True] * len(turns))
-    actor_scales = state.actor_descent.scales(fall * config.actor_learning_rate, turns)
+    state.critic_descent.set_learning_rate(fall * config.critic_learning_rate)
+    state.actor_descent.set_learning_rate(fall * config.actor_learning_rate)
     memory, parts = state.replay.transitions, state.replay.draw(len(turns), config.batch_size, state.draws)
     noise = torch.randn(*parts.shape, memory.action.shape[-1], generator=state.noise, device=parts.device)
-    return state.joint(config, state, turns, memory, parts, critic_scales, actor_scales, noise)
+    return state.joint(config, state, turns, memory, parts, noise)
 
 
 def train(config: Config, run: Run) -> State:

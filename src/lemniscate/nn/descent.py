@@ -6,9 +6,8 @@ turns into one native call. Without the compiler the same loss goes through auto
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
-from itertools import accumulate
 from typing import Any, Generic, TypeVar
 
 import torch
@@ -30,7 +29,15 @@ STEPS_PER_CALL = 4
 
 
 def adam(
-    parameters: Tensor, gradient: Tensor, mean: Tensor, square: Tensor, scales: Tensor, betas: tuple[float, float]
+    parameters: Tensor,
+    gradient: Tensor,
+    mean: Tensor,
+    square: Tensor,
+    scales: Tensor,
+    *,
+    betas: tuple[float, float],
+    eps: float,
+    max_grad_norm: float,
 ) -> Tensor:
     """Clip the gradient's norm, then one step of Adam in place: Kingma & Ba 2015, arXiv:1412.6980, algorithm 1.
 
@@ -43,18 +50,19 @@ def adam(
         gradient: g [P].
         mean: m [P], changed.
         square: v [P], changed.
-        scales: the numbers that differ from step to step, [4]: α / (1 − β₁ᵗ), 1 / √(1 − β₂ᵗ), ε, c.
+        scales: what differs from step to step, α / (1 − β₁ᵗ) and 1 / √(1 − β₂ᵗ), [2].
         betas: β₁ and β₂.
+        eps: ε.
+        max_grad_norm: c, which may be infinite.
 
     Returns:
         ‖g‖ before the clip, a scalar.
     """
-    rate, correction, eps, limit = scales.unbind()
     norm = gradient.square().sum().sqrt()
-    gradient = gradient * (limit / (norm + 1e-6)).clamp(max=1)
+    gradient = gradient * (max_grad_norm / (norm + 1e-6)).clamp(max=1)
     mean.lerp_(gradient, 1 - betas[0])
     square.lerp_(gradient.square(), 1 - betas[1])
-    parameters.sub_(rate * mean / (square.sqrt() * correction + eps))
+    parameters.sub_(scales[0] * mean / (square.sqrt() * scales[1] + eps))
     return norm
 
 
@@ -76,17 +84,19 @@ class Descent(Generic[Networks]):
         watch_as: str = "gradient_norm",
     ) -> None:
         self.objective = _Objective(networks, loss)
-        self._betas, self._eps, self._max_grad_norm = betas, eps, max_grad_norm or math.inf
         self._watch_as = watch_as
         self._flat = Flat(self.objective)
         self._vector = self._flat.vector
         self.device = self._vector.device
         self._gradient = torch.zeros_like(self._vector)
         self._mean, self._square = torch.zeros_like(self._vector), torch.zeros_like(self._vector)
+        self._adam = partial(adam, betas=betas, eps=eps, max_grad_norm=max_grad_norm or math.inf)
+        self._betas = torch.tensor(betas, dtype=torch.float64, device=self.device)
+        self._count, self._learning_rate = self._betas.new_zeros(1), self._betas.new_zeros(1)
+        self._scales = self._vector.new_zeros(2)
         self._parameters = list(self.objective.parameters())
         for parameter, gradient in zip(self._parameters, self._flat.parts(self._gradient).values(), strict=True):
             parameter.grad = gradient
-        self.steps = 0
         self._engine: Callable[..., dict[str, Tensor]] = self._steps
         self._steps_per_call = 1
 
@@ -102,20 +112,19 @@ class Descent(Generic[Networks]):
         Returns:
             Means over the K steps of what the loss watches, and of the gradient's norm before the clip.
         """
-        scales = self.scales(learning_rate, [True] * len(parts))
-        return means([self._engine(batch, *chunk) for chunk in in_calls(self._steps_per_call, parts, scales, *noise)])
+        self.set_learning_rate(learning_rate)
+        return means([self._engine(batch, *chunk) for chunk in in_calls(self._steps_per_call, parts, *noise)])
 
-    def scales(self, learning_rate: float, taken: Sequence[bool]) -> Tensor:
-        """The numbers of Adam's next K steps, [K, 4] for `adam`; rows that are not `taken` are to be left unused."""
-        counts = list(accumulate(taken, initial=self.steps))[1:]
-        self.steps = counts[-1]
-        rows = []
-        for count in counts:
-            beta_1, beta_2 = (1 - beta ** max(count, 1) for beta in self._betas)
-            rows.append((learning_rate / beta_1, 1 / math.sqrt(beta_2), self._eps, self._max_grad_norm))
-        return torch.tensor(rows, dtype=self._vector.dtype, device=self._vector.device)
+    def set_learning_rate(self, learning_rate: float) -> None:
+        """α of every step from here on."""
+        self._learning_rate.fill_(learning_rate)
 
-    def step(self, batch: Record, scales: Tensor, *noise: Tensor) -> dict[str, Tensor]:
+    @property
+    def steps(self) -> int:
+        """Taken so far, t."""
+        return int(self._count)
+
+    def step(self, batch: Record, *noise: Tensor) -> dict[str, Tensor]:
         """One step down the loss of `batch`: what the loss watches, and the gradient's norm before the clip.
 
         In a native call the networks are a function of the vector; elsewhere the vector's parts are their parameters.
@@ -129,7 +138,11 @@ class Descent(Generic[Networks]):
             total, metrics = self.objective(batch, *noise)
             total.backward(inputs=self._parameters)
         with torch.no_grad():
-            norm = adam(self._vector, gradient, self._mean, self._square, scales, self._betas)
+            self._count.add_(1)
+            bias = 1 - self._betas**self._count
+            self._scales[:1].copy_(self._learning_rate / bias[:1])  # kept, or native code divides for each parameter
+            self._scales[1:].copy_(bias[1:].rsqrt())
+            norm = self._adam(self._vector, gradient, self._mean, self._square, self._scales)
         return {**metrics, self._watch_as: norm}
 
     def parameters(self) -> dict[str, Tensor]:
@@ -143,13 +156,13 @@ class Descent(Generic[Networks]):
 
     def state_dict(self) -> dict[str, Tensor]:
         """Adam's two moments and its count; the parameters belong to the networks."""
-        return {"mean": self._mean, "square": self._square, "steps": torch.tensor(self.steps)}
+        return {"mean": self._mean, "square": self._square, "steps": self._count}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
         """Take up where `state_dict` was."""
         self._mean.copy_(state["mean"])
         self._square.copy_(state["square"])
-        self.steps = int(state["steps"])
+        self._count.copy_(state["steps"])
 
     def _steps(self, batch: Record, parts: Tensor, *by_step: Tensor) -> dict[str, Tensor]:
         steps = zip(*(tensor.unbind() for tensor in (parts, *by_step)), strict=True)
