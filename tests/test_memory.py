@@ -282,21 +282,42 @@ def test_the_actors_gradient_is_that_of_q_through_the_action(monkeypatch):
 
 
 @EACH
-def test_an_end_cuts_the_noise_of_its_copy(monkeypatch, algo):
-    config, told = small(algo, noise="ou"), []
-    state, env = ready(monkeypatch, algo, config, length=3)
-    monkeypatch.setattr(state.exploration, "cut", told.append)
-    ended = [bool(env.step(torch.zeros(4, 1)).terminated.all()) for _ in range(3)]
-    assert sum(ended) == 1
-    for _ in range(3):
-        algo.play(config, state, env)
-    assert [row.all().item() for row in told] == ended
-    assert [row.any().item() for row in told] == ended
+@pytest.mark.parametrize("mode", MODES)
+def test_an_episode_hears_a_sequence_from_its_beginning(monkeypatch, algo, mode):
+    state, env = ready(monkeypatch, algo, small(algo, noise="ou"), mode=mode, length=3)
+    exploration, heard = state.exploration, []
+    state.exploration = lambda rng: (exploration(rng), heard.append(exploration._position - 1))[0]
+    state.exploration.cut = exploration.cut
+    counted = 0
+    for _ in range(12):
+        age, held = env.obs[:, 2], state.replay._written
+        algo.play(small(algo), state, env)
+        if state.replay._written > held:  # else the action was ignored
+            assert torch.equal(heard[-1], age.long())
+            counted += 1
+    assert counted == (9 if mode == "NEXT_STEP" else 12)
+
+
+@EACH
+@pytest.mark.parametrize("mode", MODES)
+def test_the_normalizer_learns_from_what_is_remembered_and_nothing_else(monkeypatch, algo, mode):
+    state, _ = ready(monkeypatch, algo, small(algo, normalize_observations=True), mode=mode, length=3)
+    seen, normalizer = state.replay.transitions.obs[: len(state.replay)].double(), state.policy.normalizer
+    assert normalizer.count == len(seen)
+    torch.testing.assert_close(normalizer.mean, seen.mean(0))
+    torch.testing.assert_close(normalizer.var, seen.var(0, correction=0))
 
 
 @EACH
 @pytest.mark.parametrize(
-    "rhythm", [{}, {"num_envs": 4}, {"update_every": 4}, {"num_envs": 4, "num_updates": 3, "update_every": 2}]
+    "rhythm",
+    [
+        {},
+        {"num_envs": 4, "learning_starts": 33},
+        {"update_every": 3},  # no divisor of the steps between two lines of metrics
+        {"update_every": 20},  # more than those
+        {"num_envs": 4, "num_updates": 3, "update_every": 2},
+    ],
 )
 def test_as_many_gradient_steps_are_taken_as_announced(tmp_path, algo, rhythm):
     fields = tiny_memory(**{"num_envs": 1, "evaluate_episodes": 1, **rhythm})
@@ -342,20 +363,20 @@ def same_after(updates, algo, config, states, **close):
             torch.testing.assert_close(p, q, **close)
 
 
-def engines_agree(algo, delay=1, matmul="float32"):
+def engines_agree(algo, delay=1, updates=1, matmul="float32"):
     """Native and eager, from the same memory and the same random numbers."""
     layers = {"hidden": (16, 16), "critic_hidden": (8, 8), "matmul": matmul}
     close = {"rtol": 1e-3, "atol": 1e-4} if matmul == "float32" else {"rtol": 2**-6, "atol": 2**-6}
-    config = small(algo, policy_delay=delay, tau=0.3, critic_learning_rate=1e-3, **layers)
+    config = small(algo, policy_delay=delay, num_updates=updates, tau=0.3, critic_learning_rate=1e-3, **layers)
     states = [remembering(algo, config), remembering(algo, config)]
     states[1].joint.make_native()
     same_after(2 * delay, algo, config, states, **close)
     programs = states[1].joint._programs
-    assert len(programs) == delay
+    assert len(programs) == delay // updates
     assert all(program._chosen is program._compiled for program in programs.values())
 
 
-@pytest.mark.parametrize("case", ["ddpg, delay=2", "td3", "sac", "ddpg, matmul='bfloat16'"])
+@pytest.mark.parametrize("case", ["ddpg, delay=2, updates=2", "td3, delay=2", "sac", "ddpg, matmul='bfloat16'"])
 def test_the_two_engines_agree(case):
     """In a process of its own: the shape checks of this one are not for the compiler."""
     code = f"from test_memory import *; engines_agree({case})"
@@ -397,12 +418,13 @@ def test_actions_are_random_while_it_warms_up_and_the_policys_afterwards(monkeyp
 @pytest.mark.parametrize(
     ("fields", "sentence"),
     [
-        ({"env": "CartPole-v1"}, "has Discrete actions; ddpg, td3 and sac need continuous ones"),
+        ({"env": "CartPole-v1"}, "has Discrete actions; this algorithm needs continuous ones"),
         ({"env": "Unbounded-v0"}, "has actions without bounds"),
         ({"learning_starts": 10_000, "total_steps": 10_000}, "learning_starts must be below total_steps"),
         ({"architecture": "simba", "hidden": (64, 32)}, "SimBa's blocks have one width"),
         ({"architecture": "simba", "critic_hidden": ()}, "SimBa's blocks have one width"),
         ({"buffer_size": 100}, "buffer_size 100 .* below batch_size 128"),
+        ({"buffer_size": 200, "num_envs": 201}, "buffer_size 200 .* below num_envs 201"),
         ({"buffer_size": 10**12, "total_steps": 10**12}, "choose buffer_size at most"),
     ],
 )

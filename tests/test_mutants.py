@@ -182,7 +182,7 @@ MUTANTS = [
         "compile((function)",
         "test_descent.py::test_the_two_engines_agree[programs_are_not_mixed_up()]",
     ),
-    ("noise that grows", "maths/noise.py", "math.sqrt(1 - phi * phi) *", "", "maths/test_noise.py"),
+    ("noise that grows", "maths/noise.py", " * math.sqrt(1 - phi * phi)", "", "maths/test_noise.py"),
     (
         "noise that forgets too fast",
         "maths/noise.py",
@@ -442,9 +442,30 @@ MUTANTS = [
     (
         "noise is not told of ends",
         "algos/sac.py",
-        "state.exploration.cut(step.terminated | step.truncated)",
+        "state.exploration.cut(step.terminated | step.truncated | ~step.valid)",
         "",
-        MEMORY + "an_end_cuts_the_noise_of_its_copy",
+        MEMORY + "an_episode_hears_a_sequence_from_its_beginning",
+    ),
+    (
+        "noise for rows that were ignored",
+        "algos/td3.py",
+        " | ~step.valid",
+        "",
+        MEMORY + "an_episode_hears_a_sequence_from_its_beginning",
+    ),
+    (
+        "the mean of no observations",
+        "nn/normalizer.py",
+        "if not len(obs):",
+        "if len(obs) < 0:",
+        MEMORY + "the_normalizer_learns_from_what_is_remembered_and_nothing_else",
+    ),
+    (
+        "a time-out ends the entropy",
+        "run/critique.py",
+        " + networks.entropy_bonus(last, self._generator)",
+        "",
+        "run/test_critique.py",
     ),
     (
         "Q learns as fast at the end",
@@ -456,7 +477,7 @@ MUTANTS = [
     (
         "an update at every step",
         "algos/td3.py",
-        " and t % config.update_every == 0",
+        " and state.step // env.num_envs % config.update_every == 0",
         "",
         MEMORY + "as_many_gradient_steps_are_taken_as_announced",
     ),
@@ -464,7 +485,7 @@ MUTANTS = [
     (
         "a time-out is worth nothing",
         "run/critique.py",
-        "realised + self._gamma**age * follows",
+        "realised + self._gamma**age * value * ~step.terminated",
         "realised",
         "run/test_critique.py",
     ),

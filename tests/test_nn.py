@@ -89,7 +89,7 @@ def test_rewards_are_divided_by_the_std_of_the_discounted_return(rng):
     assert not scale.running.any()
 
 
-def test_a_bfloat16_layer_rounds_both_factors_there_and_back_and_nothing_else(rng):
+def test_a_bfloat16_layer_rounds_both_factors_and_the_product_there_and_back(rng):
     layer, x = Bfloat16Linear(40, 30), torch.randn(20, 40, generator=rng, requires_grad=True)
     out, back = layer(x), torch.randn(20, 30, generator=rng)
     out.backward(back)
@@ -100,6 +100,8 @@ def test_a_bfloat16_layer_rounds_both_factors_there_and_back_and_nothing_else(rn
         "w": short["g"].T @ short["x"],
         "b": back.double().sum(0),
     }
+    product = layer(x) - layer.bias
+    torch.testing.assert_close(product, product.bfloat16().float(), rtol=1e-6, atol=1e-7)
     for ours, name in ((out, "out"), (x.grad, "x"), (layer.weight.grad, "w"), (layer.bias.grad, "b")):
         assert ours.dtype == torch.float32
         torch.testing.assert_close(ours.double(), exact[name], rtol=2**-8, atol=2**-8)

@@ -216,7 +216,7 @@ def plot(*runs: str | Path) -> list[Path]:
         policy = load(paths[0])
         if critic_of(policy.networks, policy.config):
             honesty = evaluate(policy, episodes=policy.config.evaluate_episodes).honesty
-            pictures += [curves.draw_honesty(honesty, folder / "q.png")] if honesty else []
+            pictures += [curves.draw_honesty(honesty, paths[0], folder / "q.png")] if honesty else []
         if policy.spec.tracking:
             flights = policy.config.evaluate_episodes
             pictures += pictures_of.draw_flight(policy.module, _drones(policy), folder, flights, seed=0)
@@ -283,6 +283,7 @@ def _train(
     run = Run(path, algorithm, config, envs, loggers=loggers, progress=progress, film=film)
     pictures: list[Path] = []
     try:
+        run.announce()
         state = ALGORITHMS[algorithm].train(config, run)
         if draw:
             critic = critic_of(state.networks, config)

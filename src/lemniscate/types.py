@@ -7,6 +7,8 @@ from typing import Self
 import torch
 from torch import Tensor
 
+from lemniscate.errors import UserError
+
 
 @dataclass(frozen=True)
 class Box:
@@ -114,6 +116,18 @@ class Spec:
         mine, its = self.action, other.action
         same_action = mine.same_as(its) if isinstance(mine, Box) else mine == its
         return same_action and (self.layout, self.image) == (other.layout, other.image)
+
+    def bounded_box(self) -> Box:
+        """The actions. Raises `UserError` unless they are numbers between finite bounds."""
+        if not isinstance(self.action, Box):
+            kind = type(self.action).__name__
+            raise UserError(f"{self.env_id} has {kind} actions; this algorithm needs continuous ones. ppo learns here.")
+        if not all(map(math.isfinite, (*self.action.low, *self.action.high))):
+            raise UserError(
+                f"{self.env_id} has actions without bounds, and this algorithm explores between bounds: give its Box a"
+                " finite low and high. ppo learns here."
+            )
+        return self.action
 
     @property
     def observation_size(self) -> int:

@@ -14,25 +14,22 @@ def within(values, expected, standard_errors=5.0):
 
 @pytest.mark.parametrize("time", [0.3, 5.0, 40.0])
 def test_the_process_has_variance_one_at_every_step_and_forgets_exponentially(rng, time):
-    x = [torch.randn(20_000, generator=rng, dtype=torch.float64)]
-    for _ in range(60):
-        x.append(ornstein_uhlenbeck(x[-1], torch.randn(20_000, generator=rng, dtype=torch.float64), time))
-    path = torch.stack(x, dim=1)
+    path = ornstein_uhlenbeck(torch.randn(20_000, 61, generator=rng, dtype=torch.float64), time)
     assert within(path, 0.0)
     assert within(path.square(), 1.0)
     for lag in (1, 7, 30):
         assert within(path[:, :-lag] * path[:, lag:], math.exp(-lag / time))
 
 
-def test_two_steps_of_the_process_are_one_step_of_half_the_time():
-    """Exact in the step: the factor on x₀ is e^(−2/τ), and the variance that comes in is 1 − e^(−4/τ)."""
-    zero, one = torch.zeros(1, dtype=torch.float64), torch.ones(1, dtype=torch.float64)
-    decay = ornstein_uhlenbeck(ornstein_uhlenbeck(one, zero, 6.0), zero, 6.0)
-    assert decay.item() == pytest.approx(ornstein_uhlenbeck(one, zero, 3.0).item(), rel=1e-12)
-    first = ornstein_uhlenbeck(ornstein_uhlenbeck(zero, one, 6.0), zero, 6.0)
-    second = ornstein_uhlenbeck(zero, one, 6.0)
-    both = ornstein_uhlenbeck(zero, one, 3.0)
-    assert (first.square() + second.square()).item() == pytest.approx(both.square().item(), rel=1e-12)
+@pytest.mark.parametrize("length", [1, 2, 3, 16, 61])
+@pytest.mark.parametrize("time", [0.01, 6.7, 1000.0])
+def test_the_process_is_the_recursion_that_defines_it(rng, length, time):
+    normal = torch.randn(4, 3, length, generator=rng, dtype=torch.float64)
+    phi = math.exp(-1 / time)
+    x = [normal[..., 0]]
+    for t in range(1, length):
+        x.append(phi * x[-1] + math.sqrt(1 - phi * phi) * normal[..., t])
+    torch.testing.assert_close(ornstein_uhlenbeck(normal, time), torch.stack(x, dim=-1), rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("exponent", [0.0, 0.5, 1.0, 2.0])

@@ -16,7 +16,7 @@ from lemniscate.data.exploration import Exploration
 from lemniscate.data.replay import Replay
 from lemniscate.envs.api import VecEnv
 from lemniscate.maths import linear, means, polyak, td_target, uniform, value_loss
-from lemniscate.nn.actor_critic import ActorQ, bounded_box
+from lemniscate.nn.actor_critic import ActorQ
 from lemniscate.nn.critics import TwinQ
 from lemniscate.nn.descent import Descent
 from lemniscate.nn.joint import Joint
@@ -78,7 +78,7 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
     """Fresh networks, an empty memory, generators from the run's seed."""
     online = networks(config, spec).to(device)
     targets, actor = online.target().critic, online.actor
-    copies, length = (config.num_envs, bounded_box(spec).size), spec.max_episode_steps or 1000
+    copies, length = (config.num_envs, spec.bounded_box().size), spec.max_episode_steps or 1000
     return State(
         online,
         targets,
@@ -95,11 +95,11 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
 def play(config: Config, state: State, env: VecEnv) -> None:
     """One step of every copy: a ~ π(·|s), or anything at all while warming up."""
     obs, noise = env.obs, state.exploration(state.noise)
-    warm = state.step >= config.learning_starts
-    action = state.policy.act(obs, noise) if warm else uniform(noise)
+    warming_up = state.step < config.learning_starts
+    action = uniform(noise) if warming_up else state.policy.act(obs, noise)
     step = env.step(action)
     state.replay.add(obs, action, step)
-    state.exploration.cut(step.terminated | step.truncated)
+    state.exploration.cut(step.terminated | step.truncated | ~step.valid)
     state.policy.observe(obs[step.valid])
     state.step += env.num_envs
 
@@ -171,9 +171,9 @@ def train(config: Config, run: Run) -> State:
     state = run.restore(init(config, run.spec, run.env.device))
     for env in run.until(config.total_steps, state):
         watched: list[Mapping[str, Tensor]] = []
-        for t in range(1, config.num_steps + 1):
+        for _ in range(config.num_steps):
             play(config, state, env)
-            if state.step > config.learning_starts and t % config.update_every == 0:
+            if state.step > config.learning_starts and state.step // env.num_envs % config.update_every == 0:
                 watched.append(update(config, state))
         run.log(state, means(watched), env.take_episodes())
     return state

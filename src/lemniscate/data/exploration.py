@@ -45,7 +45,7 @@ class Exploration:
         return noise
 
     def cut(self, done: Tensor) -> None:
-        """Episodes ended in the copies `done` [N]: what follows there is independent of what was."""
+        """Episodes ended in the copies `done` [N]: what follows there is a sequence from its beginning."""
         self._position[done.cpu()] = self._length
 
     def restart(self) -> None:
@@ -67,9 +67,6 @@ class Exploration:
         normal = torch.randn(shape, generator=generator, device=generator.device)
         if self._kind == "white":
             return normal
-        if self._kind == "coloured":
-            return coloured(normal, self._exponent)
-        x = [normal[..., 0]]
-        for fresh in normal.unbind(-1)[1:]:
-            x.append(ornstein_uhlenbeck(x[-1], fresh, self._time))
-        return torch.stack(x, dim=-1)
+        if self._kind == "ou":
+            return ornstein_uhlenbeck(normal, self._time)
+        return coloured(normal, self._exponent)

@@ -7,7 +7,6 @@ import torch
 from torch import Generator, Tensor
 
 from lemniscate.errors import UserError
-from lemniscate.nn.actor_critic import bounded_box
 from lemniscate.types import Spec, Step, Transition
 
 
@@ -18,36 +17,22 @@ class Replay:
     """
 
     def __init__(self, spec: Spec, capacity: int, device: torch.device) -> None:
-        observation, action = spec.observation_size, bounded_box(spec).size
-        pixel = torch.uint8 if spec.image else torch.float32
-        shapes = {
-            "obs": ((observation,), pixel),
-            "action": ((action,), torch.float32),
-            "reward": ((), torch.float32),
-            "next_obs": ((observation,), pixel),
-            "terminated": ((), torch.bool),
-        }
-        self.num_bytes = capacity * sum(math.prod(shape) * dtype.itemsize for shape, dtype in shapes.values())
+        num_bytes = capacity * bytes_of_one(spec)
         free = torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else psutil.virtual_memory().available
-        if self.num_bytes > free:
+        if num_bytes > free:
             raise UserError(
-                f"A replay of {capacity:,} transitions of {spec.env_id} takes {_megabytes(self.num_bytes)}, and"
-                f" {_megabytes(free)} are free: choose buffer_size at most {capacity * free // self.num_bytes:,}."
+                f"A replay of {capacity:,} transitions of {spec.env_id} takes {num_bytes / 1e6:,.0f} MB, and"
+                f" {free / 1e6:,.0f} MB are free: choose buffer_size at most {capacity * free // num_bytes:,}."
             )
-        self.transitions = Transition(
-            **{
-                name: torch.zeros(capacity, *shape, dtype=dtype, device=device)
-                for name, (shape, dtype) in shapes.items()
-            }
-        )
+        columns = {
+            name: torch.zeros(capacity, *shape, dtype=kind, device=device) for name, shape, kind in _columns(spec)
+        }
+        self.transitions = Transition(**columns)
         self.capacity = capacity
         self._written = 0
 
     def __len__(self) -> int:
         return min(self._written, self.capacity)
-
-    def __str__(self) -> str:
-        return f"replay of {self.capacity:,} transitions, {_megabytes(self.num_bytes)}"
 
     def add(self, obs: Tensor, action: Tensor, step: Step) -> None:
         """Remember what `action` at `obs` brought, copy by copy; rows in which it was ignored are left out."""
@@ -81,5 +66,17 @@ class Replay:
             ring[: len(self)] = state[name]
 
 
-def _megabytes(num_bytes: int) -> str:
-    return f"{num_bytes / 1e6:,.0f} MB"
+def bytes_of_one(spec: Spec) -> int:
+    """What a transition takes."""
+    return sum(math.prod(shape) * kind.itemsize for _, shape, kind in _columns(spec))
+
+
+def _columns(spec: Spec) -> list[tuple[str, tuple[int, ...], torch.dtype]]:
+    seen = ((spec.observation_size,), torch.uint8 if spec.image else torch.float32)
+    return [
+        ("obs", *seen),
+        ("action", (spec.bounded_box().size,), torch.float32),
+        ("reward", (), torch.float32),
+        ("next_obs", *seen),
+        ("terminated", (), torch.bool),
+    ]

@@ -7,22 +7,27 @@ from jaxtyping import Float
 from torch import Tensor
 
 
-def ornstein_uhlenbeck(previous: Float[Tensor, "*S"], normal: Float[Tensor, "*S"], time: float) -> Float[Tensor, "*S"]:
-    """One step of an Ornstein–Uhlenbeck process, exact for any step: Uhlenbeck & Ornstein 1930; Gillespie 1996.
+def ornstein_uhlenbeck(normal: Float[Tensor, "*S L"], time: float) -> Float[Tensor, "*S L"]:
+    """Sequences of an Ornstein–Uhlenbeck process, exact for any step: Uhlenbeck & Ornstein 1930; Gillespie 1996.
 
-        x_{t+1} = φ x_t + √(1 − φ²) ε_t,    φ = exp(−1 / time)
+        x_0 = ε_0,    x_{t+1} = φ x_t + √(1 − φ²) ε_{t+1},    φ = exp(−1 / time)
 
-    Begun from a standard normal number, every x_t is standard normal, and x_t and x_{t+k} correlate by φᵏ. In the form
-    that the DDPG paper (Lillicrap et al. 2016, arXiv:1509.02971, section 3) takes it from, dx = −θ x dt + σ dW, this is
-    time = 1 / (θ dt) and a stationary standard deviation of σ / √(2θ), divided out.
+    Every x_t is standard normal, and x_t and x_{t+k} correlate by φᵏ. In the form that the DDPG paper (Lillicrap et al.
+    2016, arXiv:1509.02971, section 3) takes it from, dx = −θ x dt + σ dW, this is time = 1 / (θ dt) and a stationary
+    standard deviation of σ / √(2θ), divided out.
 
     Args:
-        previous: x_t.
-        normal: ε_t, standard normal.
+        normal: ε, standard normal.
         time: steps in which the correlation falls to 1/e, positive.
     """
     phi = math.exp(-1 / time)
-    return phi * previous + math.sqrt(1 - phi * phi) * normal
+    x = normal * math.sqrt(1 - phi * phi)
+    x[..., 0] = normal[..., 0]
+    reach = 1  # x_t = Σ_{k < reach} φᵏ x_{t−k} of what it was; so twice as far at each turn
+    while reach < x.shape[-1]:
+        x = torch.cat([x[..., :reach], x[..., reach:] + phi**reach * x[..., :-reach]], dim=-1)
+        reach *= 2
+    return x
 
 
 def coloured(normal: Float[Tensor, "*S L"], exponent: float) -> Float[Tensor, "*S L"]:

@@ -7,7 +7,6 @@ from typing import Any, Self
 import torch
 from torch import Generator, Tensor, nn
 
-from lemniscate.errors import UserError
 from lemniscate.nn.critics import QValue, TwinQ, Value
 from lemniscate.nn.networks import ImageEncoder, Layers
 from lemniscate.nn.normalizer import Observed, Pixels, RunningNorm
@@ -50,20 +49,6 @@ class Temperature(nn.Module):
         return self.log.exp()
 
 
-def bounded_box(spec: Spec) -> Box:
-    """The actions of `spec`. Raises `UserError` unless they are numbers between finite bounds."""
-    action = spec.action
-    if not isinstance(action, Box):
-        kind = type(action).__name__
-        raise UserError(f"{spec.env_id} has {kind} actions; ddpg, td3 and sac need continuous ones. ppo learns here.")
-    if not all(map(math.isfinite, (*action.low, *action.high))):
-        raise UserError(
-            f"{spec.env_id} has actions without bounds, and ddpg, td3 and sac explore between bounds: give its Box a"
-            " finite low and high. ppo learns here."
-        )
-    return action
-
-
 class ActorQ(nn.Module):
     """A policy over continuous actions and its Q-value, or two of them: separate networks behind one normalizer.
 
@@ -82,7 +67,7 @@ class ActorQ(nn.Module):
     ) -> None:
         super().__init__()
         stochastic = temperature is not None
-        size = bounded_box(spec).size
+        size = spec.bounded_box().size
         normalizer = _normalizer(spec, normalize_observations)
         net = _from_obs(spec, actor_layers, 2 * size if stochastic else size, last_gain=0.01)
         kind = SquashedGaussianPolicy if stochastic else DeterministicPolicy

@@ -26,14 +26,21 @@ ACTIVATIONS = {"tanh": Tanh, "relu": nn.ReLU, "elu": nn.ELU, "silu": nn.SiLU}
 
 
 class Bfloat16Linear(nn.Linear):
-    """x Wᵀ + b with both factors rounded to bfloat16, 8 bits each, on the way there and back.
+    """x Wᵀ + b with both factors and their product rounded to bfloat16, 8 bits each, on the way there and back.
 
-    Parameters, gradients and what comes out keep their type.
+    The sums inside the product are of float32. Parameters and b keep their type, and so does what comes out.
     """
 
     def forward(self, input: Tensor) -> Tensor:
         """[…, inputs] to […, outputs]."""
         return nn.functional.linear(input.bfloat16(), self.weight.bfloat16()).to(input.dtype) + self.bias
+
+
+def has_bfloat16(device: torch.device) -> bool:
+    """Whether the processor multiplies in bfloat16 by itself; elsewhere it is emulated, and slow."""
+    if device.type == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    return any(able for name, able in torch.cpu.get_capabilities().items() if "bf16" in name)
 
 
 @dataclass(frozen=True)

@@ -57,7 +57,9 @@ class RunningNorm(Observed):
 
     @torch.no_grad()
     def update(self, obs: Tensor) -> None:
-        """Take [B, O or more] observations into the statistics; all of them finite."""
+        """Take [B, O or more] observations into the statistics; all of them finite, and there may be none."""
+        if not len(obs):
+            return
         obs = super().forward(obs).double()
         count = torch.full_like(self.count, len(obs))
         moments = merge_moments(self.mean, self.var, self.count, obs.mean(0), obs.var(0, correction=0), count)

@@ -82,17 +82,27 @@ def diagnostics(runs: list[Path], file: Path, labels: Sequence[str] | None = Non
     return save(figure, file)
 
 
-def draw_honesty(honesty: Honesty, file: Path) -> Path:
-    """What Q said of the beginning of each episode, against what followed: on the line it is honest."""
-    figure = Figure(figsize=(4.6, 4.6), layout="constrained")
-    axes = figure.subplots()
+def draw_honesty(honesty: Honesty, run: Path, file: Path) -> Path:
+    """What Q said of the beginning of each episode, against what followed: on the line it is honest.
+
+    Beside it the means of both at every evaluation of the run, if it had any.
+    """
+    log = [line for line in read_metrics(run) if "evaluation/q" in line]
+    figure = Figure(figsize=(9.2 if log else 4.6, 4.6), layout="constrained")
+    axes, *beside = figure.subplots(1, 2 if log else 1, squeeze=False)[0]
     ends = [min(honesty.predicted + honesty.realised), max(honesty.predicted + honesty.realised)]
     axes.plot(ends, ends, color="grey", linewidth=1, label="honest")
     axes.plot(honesty.realised, honesty.predicted, ".", color=COLORS[0], alpha=0.6, label="episodes")
     axes.set(xlabel="discounted return that followed", ylabel="Q(s₀, a₀)")
     axes.set_title(str(honesty).partition(": ")[2], loc="left", fontsize=10)
-    finish(axes)
-    axes.legend(frameon=False)
+    for axes in beside:
+        _curve(axes, log, "evaluation/q", COLORS[0], "Q(s₀, a₀)", width=1.5)
+        _curve(axes, log, "evaluation/q_realised", "grey", "what followed", width=1.5)
+        axes.set_xlabel("environment steps")
+        axes.set_title("at the evaluations of the run", loc="left", fontsize=10)
+    for axes in figure.axes:
+        finish(axes)
+        axes.legend(frameon=False)
     return save(figure, file)
 
 

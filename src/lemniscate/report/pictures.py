@@ -32,7 +32,7 @@ def report(
     say(sentence(scores))
     pictures = curves.plot_runs([path], path / "plots")
     if scores.honesty:
-        pictures.append(curves.draw_honesty(scores.honesty, path / "plots" / "q.png"))
+        pictures.append(curves.draw_honesty(scores.honesty, path, path / "plots" / "q.png"))
     if env.spec.tracking:
         pictures += draw_flight(policy, env, path / "plots", episodes, seed=0)
     for picture in pictures:

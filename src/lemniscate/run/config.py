@@ -222,11 +222,13 @@ class ReplayConfig(RunConfig):
             raise UserError(
                 f"SimBa's blocks have one width, such as (256, 256): not {self.hidden} and {self.critic_hidden}."
             )
-        if self.capacity < self.batch_size:
-            raise UserError(
-                f"The replay must hold a batch: the smaller of buffer_size {self.buffer_size:,} and total_steps"
-                f" {self.total_steps:,} is below batch_size {self.batch_size:,}."
-            )
+        for name in ("batch_size", "num_envs"):
+            if self.capacity < (rows := getattr(self, name)):
+                raise UserError(
+                    f"The replay must hold a batch, and a step of every copy: the smaller of buffer_size"
+                    f" {self.buffer_size:,} and the {self.num_envs * self.steps_of_each_copy:,} steps of the run is"
+                    f" below {name} {rows:,}."
+                )
 
     @property
     def actor_layers(self) -> Layers:
@@ -241,9 +243,15 @@ class ReplayConfig(RunConfig):
     @property
     def capacity(self) -> int:
         """Rows of the replay: no more than the run can fill."""
-        return min(self.buffer_size, self.total_steps)
+        return min(self.buffer_size, self.num_envs * self.steps_of_each_copy)
+
+    @property
+    def steps_of_each_copy(self) -> int:
+        """In the whole run: the first multiple of num_steps with which all copies reach total_steps."""
+        return -(-self.total_steps // (self.num_envs * self.num_steps)) * self.num_steps
 
     @property
     def gradient_steps(self) -> int:
         """Of the whole run."""
-        return (self.total_steps - self.learning_starts) * self.num_updates // (self.num_envs * self.update_every)
+        updates = self.steps_of_each_copy // self.update_every
+        return self.num_updates * (updates - self.learning_starts // self.num_envs // self.update_every)

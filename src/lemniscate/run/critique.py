@@ -13,10 +13,11 @@ from lemniscate.types import Step
 
 @dataclass(frozen=True)
 class Honesty:
-    """Episode by episode, in the order of their ends.
+    """Episode by episode, in the order of an evaluation's returns: copy by copy, then as they ended.
 
     `realised` is Σ γ^t r_t; where the clock ended the episode, what Q expects from there on is added, since Q speaks of
-    what follows too. Under SAC it holds the entropy that was paid for as well, which Q counts.
+    what follows too. Under SAC both hold the price of the policy's entropy in every state but the first; yet Q speaks
+    of the random policy, so that what the deterministic one does better (or worse) is part of the difference.
     """
 
     predicted: list[float]
@@ -60,6 +61,7 @@ class Critique:
         self._networks, self._gamma, self._generator = networks, gamma, generator
         self._running = torch.zeros(3, num_envs, device=generator.device)
         """[predicted, realised, steps] of the episode under way in each copy"""
+        self._copies = torch.arange(num_envs, device=generator.device)
         self._ended: list[Tensor] = []
 
     @torch.no_grad()
@@ -74,13 +76,16 @@ class Critique:
         realised, age = realised + self._gamma**age * paid * counts, age + counts
         done = (step.terminated | step.truncated) & counts
         if done.any():
-            follows = networks.q(step.next_obs, networks.policy(step.next_obs).mode()) * ~step.terminated
-            self._ended.append(torch.stack([predicted, realised + self._gamma**age * follows])[:, done])
+            last = step.next_obs
+            value = networks.q(last, networks.policy(last).mode()) + networks.entropy_bonus(last, self._generator)
+            followed = realised + self._gamma**age * value * ~step.terminated
+            self._ended.append(torch.stack([predicted, followed, self._copies])[:, done])
         self._running = torch.stack([predicted, realised, age]) * ~done
 
     def honesty(self) -> Honesty:
         """Of all episodes that ended."""
-        predicted, realised = torch.cat(self._ended, dim=1).tolist()
+        table = torch.cat(self._ended, dim=1)
+        predicted, realised = table[:2, table[2].argsort(stable=True)].tolist()
         return Honesty(predicted, realised)
 
 

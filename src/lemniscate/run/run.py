@@ -23,13 +23,14 @@ from typing import Any, Protocol, TypeVar
 import torch
 from filelock import FileLock, Timeout
 
-from lemniscate.data.replay import Replay
+from lemniscate.data.replay import bytes_of_one
 from lemniscate.envs.api import VecEnv
 from lemniscate.envs.books import Episodes
 from lemniscate.errors import NonFiniteError, UserError
+from lemniscate.nn.networks import has_bfloat16
 from lemniscate.nn.policies import Policy
 from lemniscate.run import checkpoint
-from lemniscate.run.config import RunConfig
+from lemniscate.run.config import ReplayConfig, RunConfig
 from lemniscate.run.critique import critic_of
 from lemniscate.run.directory import create_directory, newest_resumable
 from lemniscate.run.evaluate import evaluate
@@ -90,6 +91,18 @@ class Run:
         self._recent: list[float] = []
         self._lock = FileLock(path / ".lock", timeout=0)
 
+    def announce(self) -> None:
+        """Say what the run is about to take; to be called before there is a state."""
+        config = self.config
+        if self._visible and isinstance(config, ReplayConfig):
+            size = config.capacity * bytes_of_one(self.spec) / 1e6
+            print(
+                f"It will remember {config.capacity:,} transitions: {size:,.0f} MB, and as much in each checkpoint.",
+                file=sys.stderr,
+            )
+            if config.matmul == "bfloat16" and not has_bfloat16(self.env.device):
+                print("No bfloat16 in this processor: --matmul float32 is as good, and faster.", file=sys.stderr)
+
     def restore(self, state: S) -> S:
         """Fill `state` from the newest checkpoint to resume from, if there is one; then open the loggers.
 
@@ -107,7 +120,6 @@ class Run:
         elif checkpoint.list_steps(self.path / "checkpoints"):
             print(f"{self.path} has no planned checkpoint to go on from; it begins again at step 0.", file=sys.stderr)
         self._forget_after(state.step)
-        self._announce(state)
         self._choose_engine(state)
         config = {"algorithm": self.algorithm, **self.config.to_json()}
         for name in self._logger_names:
@@ -163,12 +175,6 @@ class Run:
         self.env.close()
         self.eval_env.close()
         self._lock.release()
-
-    def _announce(self, state: AnyState) -> None:
-        if self._visible:
-            for part in vars(state).values():
-                if isinstance(part, Replay):
-                    print(f"It remembers: a {part}, as much again in each checkpoint.", file=sys.stderr)
 
     def _choose_engine(self, state: AnyState) -> None:
         if engine_of(self.config) == "native":
