@@ -454,10 +454,10 @@ MUTANTS = [
         MEMORY + "an_episode_hears_a_sequence_from_its_beginning",
     ),
     (
-        "the mean of no observations",
-        "nn/normalizer.py",
-        "if not len(obs):",
-        "if len(obs) < 0:",
+        "statistics of rows that were ignored",
+        "algos/ddpg.py",
+        "state.policy.observe(obs[step.valid])",
+        "state.policy.observe(obs)",
         MEMORY + "the_normalizer_learns_from_what_is_remembered_and_nothing_else",
     ),
     (

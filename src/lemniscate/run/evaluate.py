@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
 
@@ -34,7 +34,7 @@ class Evaluation:
     rmse_mm: float | None = None
     rmse_after_1s_mm: float | None = None
     honesty: Honesty | None = None
-    date: str = ""
+    date: str = field(default="", compare=False)
 
     def to_json(self) -> dict[str, object]:
         """Without what the environment does not have."""

@@ -97,7 +97,7 @@ class Run:
         if self._visible and isinstance(config, ReplayConfig):
             size = config.capacity * bytes_of_one(self.spec) / 1e6
             print(
-                f"It will remember {config.capacity:,} transitions: {size:,.0f} MB, and as much in each checkpoint.",
+                f"It will remember {config.capacity:,} transitions: {size:,.1f} MB, and as much in each checkpoint.",
                 file=sys.stderr,
             )
             if config.matmul == "bfloat16" and not has_bfloat16(self.env.device):
