@@ -24,6 +24,7 @@ def test_one_name_may_serve_several_environments():
     assert presets.choose("ppo", FIGURE_EIGHT, "course")[1].num_envs == 1024
     assert presets.choose("ppo", None, "course")[1].env == FIGURE_EIGHT
     assert presets.choose("ppo", "LunarLander-v3", None)[0] == "lunar-lander"
+    assert presets.choose("ddpg", "Hopper-v5", None)[0] == "hopper"
 
 
 def test_the_course_has_the_settings_of_its_notebook():

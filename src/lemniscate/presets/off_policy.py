@@ -29,6 +29,20 @@ SWUNG = "search by hand, three settings of each algorithm, on seed 101"
 DDPG = [
     Preset("default", ddpg.Config(), SHARED, "2026-11"),
     Preset(
+        "hopper",
+        ddpg.Config(
+            env="Hopper-v5",
+            learning_starts=10_000,
+            buffer_size=100_000,
+            batch_size=128,
+            noise_std=0.2,
+            policy_delay=2,
+            final_learning_rate=0.0,
+        ),
+        "nine settings for 300,000 steps, on seed 101; the best of them for a million on 102",
+        "2026-11",
+    ),
+    Preset(
         "course",
         ddpg.Config(env="Hopper-v5", learning_starts=25_000, policy_delay=2),
         "the reinforcement-learning course's notebook on DDPG: its settings, on the corrected algorithm",
