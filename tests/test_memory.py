@@ -285,15 +285,12 @@ def test_the_actors_gradient_is_that_of_q_through_the_action(monkeypatch):
 @pytest.mark.parametrize("mode", MODES)
 def test_an_episode_hears_a_sequence_from_its_beginning(monkeypatch, algo, mode):
     state, env = ready(monkeypatch, algo, small(algo, noise="ou"), mode=mode, length=3)
-    exploration, heard = state.exploration, []
-    state.exploration = lambda rng: (exploration(rng), heard.append(exploration._position - 1))[0]
-    state.exploration.cut = exploration.cut
-    counted = 0
+    exploration, counted = state.exploration, 0
     for _ in range(12):
-        age, held = env.obs[:, 2], state.replay._written
+        age, held, before = env.obs[:, 2].long(), len(state.replay), exploration._position.clone()
         algo.play(small(algo), state, env)
-        if state.replay._written > held:  # else the action was ignored
-            assert torch.equal(heard[-1], age.long())
+        if len(state.replay) > held:  # else the action was ignored
+            assert torch.equal(before % exploration._length, age)  # at its end the next one begins
             counted += 1
     assert counted == (9 if mode == "NEXT_STEP" else 12)
 
@@ -414,6 +411,21 @@ def test_actions_are_random_while_it_warms_up_and_the_policys_afterwards(monkeyp
         assert 0 < (action - state.policy(obs).mode()).abs().max() < 0.25
 
 
+@EACH
+def test_what_it_will_take_is_said_before_it_is_taken(tmp_path, monkeypatch, capsys, algo):
+    def refuse(*_):
+        raise MemoryError
+
+    monkeypatch.setattr(algo, "Replay", refuse)
+    monkeypatch.setattr("lemniscate.run.run.has_bfloat16", lambda _: False)
+    fields = tiny_memory(matmul="bfloat16", buffer_size=200)
+    with pytest.raises(MemoryError):
+        lem.train(algo.__name__.rpartition(".")[2], "Pendulum-v1", run=tmp_path / "r", progress=True, **fields)
+    said = capsys.readouterr().err
+    assert "It will remember 200 transitions: 0.0 MB" in said  # 33 bytes each
+    assert "no products in bfloat16" in said
+
+
 @pytest.mark.parametrize("algorithm", ["ddpg", "td3", "sac"])
 @pytest.mark.parametrize(
     ("fields", "sentence"),
@@ -421,6 +433,7 @@ def test_actions_are_random_while_it_warms_up_and_the_policys_afterwards(monkeyp
         ({"env": "CartPole-v1"}, "has Discrete actions; this algorithm needs continuous ones"),
         ({"env": "Unbounded-v0"}, "has actions without bounds"),
         ({"learning_starts": 10_000, "total_steps": 10_000}, "learning_starts must be below total_steps"),
+        ({"update_every": 2000, "total_steps": 1500}, "update_every 2,000 is so large that nothing is ever learned"),
         ({"architecture": "simba", "hidden": (64, 32)}, "SimBa's blocks have one width"),
         ({"architecture": "simba", "critic_hidden": ()}, "SimBa's blocks have one width"),
         ({"buffer_size": 100}, "buffer_size 100 .* below batch_size 128"),

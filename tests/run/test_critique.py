@@ -13,9 +13,11 @@ from lemniscate.envs.api import VecEnv
 from lemniscate.envs.gymnasium import GymnasiumBackend
 from lemniscate.nn.actor_critic import ActorQ
 from lemniscate.nn.networks import Layers
+from lemniscate.report import curves
 from lemniscate.report.pictures import sentence
 from lemniscate.run.critique import Honesty
 from lemniscate.run.evaluate import evaluate
+from lemniscate.run.loggers import read_metrics
 from lemniscate.types import Box, Part, Spec
 from test_memory import Levers
 
@@ -111,6 +113,23 @@ def test_it_is_said_written_and_drawn(tmp_path, capsys):
     lines = [json.loads(line) for line in (tmp_path / "r" / "metrics.jsonl").read_text().splitlines()]
     assert sum("evaluation/q_bias" in line for line in lines) == 2
     assert tmp_path / "r" / "plots" / "q.png" in lem.plot(tmp_path / "r")
+
+
+@pytest.mark.parametrize("every", [None, 128])
+def test_the_picture_has_what_the_evaluations_said_beside_what_is(tmp_path, monkeypatch, every):
+    fields = tiny_memory(evaluate_every=every) if every else tiny_memory()
+    run = lem.train("td3", "Pendulum-v1", run=tmp_path / "r", progress=False, **fields)
+    drawn = []
+    monkeypatch.setattr(curves, "save", lambda figure, file: drawn.append(figure) or file)
+    curves.draw_honesty(Honesty([1.0, 2.0], [3.0, 4.0]), run.path, tmp_path / "q.png")
+    now, *history = drawn[0].axes
+    assert now.lines[1].get_xydata().tolist() == [[3, 1], [4, 2]]
+    logged = [line for line in read_metrics(run.path) if "evaluation/q" in line]
+    assert len(history) == bool(every)
+    for axes in history:
+        promised, realised = axes.lines
+        assert promised.get_xydata().tolist() == [[line["step"], line["evaluation/q"]] for line in logged]
+        assert realised.get_ydata().tolist() == [line["evaluation/q_realised"] for line in logged]
 
 
 def test_the_dictionary_of_the_course(tmp_path):

@@ -39,7 +39,7 @@ DDPG = [
             policy_delay=2,
             final_learning_rate=0.0,
         ),
-        "nine settings for 300,000 steps, on seed 101; the best of them for a million on 102",
+        "eight settings for up to 300,000 steps, on seed 101; the best of them for a million on 102",
         "2026-11",
     ),
     Preset(

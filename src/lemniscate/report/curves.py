@@ -95,14 +95,14 @@ def draw_honesty(honesty: Honesty, run: Path, file: Path) -> Path:
     axes.plot(honesty.realised, honesty.predicted, ".", color=COLORS[0], alpha=0.6, label="episodes")
     axes.set(xlabel="discounted return that followed", ylabel="Q(s₀, a₀)")
     axes.set_title(str(honesty).partition(": ")[2], loc="left", fontsize=10)
-    for axes in beside:
-        _curve(axes, log, "evaluation/q", COLORS[0], "Q(s₀, a₀)", width=1.5)
-        _curve(axes, log, "evaluation/q_realised", "grey", "what followed", width=1.5)
-        axes.set_xlabel("environment steps")
-        axes.set_title("at the evaluations of the run", loc="left", fontsize=10)
-    for axes in figure.axes:
-        finish(axes)
-        axes.legend(frameon=False)
+    for history in beside:
+        _curve(history, log, "evaluation/q", COLORS[0], "Q(s₀, a₀)", width=1.5)
+        _curve(history, log, "evaluation/q_realised", "grey", "what followed", width=1.5)
+        history.set_xlabel("environment steps")
+        history.set_title("at the evaluations of the run", loc="left", fontsize=10)
+    for panel in (axes, *beside):
+        finish(panel)
+        panel.legend(frameon=False)
     return save(figure, file)
 
 

@@ -218,6 +218,11 @@ class ReplayConfig(RunConfig):
                 f"learning_starts must be below total_steps, or nothing is ever learned: {self.learning_starts:,} is"
                 f" not below {self.total_steps:,}."
             )
+        if not self.gradient_steps:
+            raise UserError(
+                f"update_every {self.update_every:,} is so large that nothing is ever learned: after learning_starts"
+                f" each copy takes {self.steps_of_each_copy - self.learning_starts // self.num_envs:,} steps."
+            )
         if self.architecture == "simba" and any(len(set(widths)) != 1 for widths in (self.hidden, self.critic_hidden)):
             raise UserError(
                 f"SimBa's blocks have one width, such as (256, 256): not {self.hidden} and {self.critic_hidden}."

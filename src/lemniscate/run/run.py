@@ -101,7 +101,7 @@ class Run:
                 file=sys.stderr,
             )
             if config.matmul == "bfloat16" and not has_bfloat16(self.env.device):
-                print("No bfloat16 in this processor: --matmul float32 is as good, and faster.", file=sys.stderr)
+                print("This processor has no products in bfloat16; --matmul float32 is faster.", file=sys.stderr)
 
     def restore(self, state: S) -> S:
         """Fill `state` from the newest checkpoint to resume from, if there is one; then open the loggers.
