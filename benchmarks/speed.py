@@ -277,11 +277,11 @@ def replay(rounds, stamp):
 def replay_summary():
     """The README's table of it: medians, and the medians of ratios within a round."""
     speeds = measured("replay")
-    print("| DDPG, Hopper-v5 | steps/s | lemniscate is |")
-    print("|---|---|---|")
+    print("| DDPG, Hopper-v5 | steps/s | × sb3 | × sbx |")
+    print("|---|---|---|---|")
     for name in speeds[0]:
-        ratio = median(row[OURS] / row[name] for row in speeds)
-        print(f"| {name} | {median(row[name] for row in speeds):,.0f} | {ratio:.2f} × |")
+        times = [f"{median(row[name] / row[peer] for row in speeds):.2f}" for peer in ("sb3", "sbx")]
+        print(f"| {name} | {median(row[name] for row in speeds):,.0f} | {' | '.join(times)} |")
 
 
 def lander(rounds, stamp):
