@@ -113,7 +113,7 @@ def summary(algorithm):
             numbers = (np.mean(means), np.std(means), iqm(means), low, high, min(means))
             mean, std, middle, low, high, worst = (f"{x:,.{digits}f}" for x in numbers)
             name = f"{algorithm.upper()} | {env} | {mark:,}"
-            spread = f"{mean} ± {std} | {middle} [{low}, {high}] | {worst}"
+            spread = f"{mean} ± {std} | {middle} [{low}, {high}] | {worst}" if len(means) > 1 else f"{mean} | | {worst}"
             print(f"| {name} | {spread} | {len(means)} | {seconds / 60:.1f} min |")
 
 
