@@ -1,4 +1,8 @@
-"""Programs for processes of their own: what stands beside ours. The last thing each prints is its number."""
+"""Programs for processes of their own: what stands beside ours. The last thing each prints is its number.
+
+Two take turns: REPLAY, which is ours, and PEER_REPLAY. For each line that they read they take 500 steps, and write one;
+where nothing more can be read, they end.
+"""
 
 PEER = """
 import sys, time, torch
@@ -33,22 +37,46 @@ for t in range(int(sys.argv[2]) // copies): env.step(actions[t % 64])
 print(int(sys.argv[2]) / (time.perf_counter() - started))
 """
 
+REPLAY = """
+import json, sys, tempfile
+import lemniscate as lem
+from lemniscate.run.loggers import LOGGERS
+
+class Turns:
+    def __init__(self, *_): pass
+    def write(self, *_):  # after each update
+        print(flush=True)
+        sys.stdin.readline() or sys.exit()
+    def close(self, *_): pass
+
+LOGGERS["jsonl"] = Turns
+sys.stdin.readline()
+with tempfile.TemporaryDirectory() as scratch:
+    lem.train("ddpg", "Hopper-v5", preset="default", run=scratch + "/run", progress=False, **json.loads(sys.argv[1]))
+"""
+
 PEER_REPLAY = """
-import sys, time, numpy, torch
-steps, peer, threads = int(sys.argv[1]), sys.argv[2], int(sys.argv[3])
+import sys, numpy, torch
+peer, threads = sys.argv[1], int(sys.argv[2])
 torch.set_num_threads(threads)
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import NormalActionNoise
 if peer == "sb3":
     from stable_baselines3 import DDPG
 else:
     from sbx import DDPG
+
+class Turns(BaseCallback):
+    def _on_step(self):
+        if self.n_calls % 500 == 0:
+            print(flush=True)
+            sys.stdin.readline() or sys.exit()
+        return True
+
+sys.stdin.readline()
 noise = NormalActionNoise(numpy.zeros(3), 0.1 * numpy.ones(3))
 fields = dict(batch_size=256, learning_rate=3e-4, learning_starts=500, action_noise=noise, buffer_size=100_000)
-model = DDPG("MlpPolicy", "Hopper-v5", policy_kwargs={"net_arch": [256, 256]}, **fields)
-model.learn(1500)
-started = time.perf_counter()
-model.learn(steps, reset_num_timesteps=False)
-print(steps / (time.perf_counter() - started))
+DDPG("MlpPolicy", "Hopper-v5", policy_kwargs={"net_arch": [256, 256]}, **fields).learn(1_000_000, Turns())
 """
 
 PEER_LANDER = """

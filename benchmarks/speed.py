@@ -17,19 +17,21 @@ reported is the median over rounds of the ratios within each.
 """
 
 import argparse
+import json
 import os
 import shutil
 import subprocess
 import sys
 import tempfile
 import time
+from contextlib import ExitStack
 from functools import partial
 from itertools import product
 from pathlib import Path
 from statistics import harmonic_mean, median
 
 from common import RESULTS, append, provenance, rows
-from peers import BARE, PEER, PEER_LANDER, PEER_REPLAY, PEER_TRPO
+from peers import BARE, PEER, PEER_LANDER, PEER_REPLAY, PEER_TRPO, REPLAY
 
 COPIES = {"HalfCheetah-v5": 16, "Ant-v5": 64, "Humanoid-v5": 64, "Hopper-v5": 64}
 ENVS = tuple(COPIES)
@@ -41,7 +43,7 @@ TRUST = {
     "sb3-contrib's defaults": {"cg_iterations": 15, "critic_epochs": 10, "max_kl": 0.01},
     "its zoo, for this environment": {"cg_iterations": 25, "critic_epochs": 20, "max_kl": 0.04},
 }
-REPLAY = {"batch_size": 256, "learning_starts": 500, "buffer_size": 100_000, "num_steps": 500, "engine": "native"}
+MEMORY = {"batch_size": 256, "learning_starts": 500, "buffer_size": 100_000, "num_steps": 500, "engine": "native"}
 WAYS = {
     OURS: {},
     "lemniscate, bfloat16 products": {"matmul": "bfloat16"},
@@ -252,26 +254,41 @@ def trust(rounds, stamp):
 
 
 def replay(rounds, stamp):
-    """Steps per second of DDPG, each at its best number of threads, which the first round finds."""
-
-    def ours(fields, count):
-        with tempfile.TemporaryDirectory() as scratch:
-            folder, size = Path(scratch) / "run", REPLAY | fields
-            train(folder, "Hopper-v5", algorithm="ddpg", preset="default", total_steps=6000, threads=count, **size)
-            return harmonic_mean(line["time/steps_per_second"] for line in lines(folder)[3:])
-
-    clocks = {name: partial(ours, fields) for name, fields in WAYS.items()}
-    clocks |= {name: partial(python, PEER_REPLAY, 4000, name) for name in ("sb3", "sbx")}
-    threads = {}
-    for _ in range(rounds):
-        row = {}
-        for name, clock in clocks.items():
-            tried = {count: clock(count) for count in ([threads[name]] if name in threads else (1, 2))}
-            threads[name] = max(tried, key=tried.__getitem__)
-            row[name] = tried[threads[name]]
-        say("DDPG, Hopper-v5", {name: round(speed) for name, speed in row.items()}, threads)
-        append("speed", {"what": "replay", "steps_per_second": row, "threads": dict(threads)} | stamp)
+    """Steps per second of DDPG, in turns of 500 steps, each at the number of threads that was the quicker at first."""
+    size = MEMORY | {"total_steps": 1_000_000, "checkpoint_every": 1_000_000}
+    programs = {
+        (name, threads): (REPLAY, json.dumps(size | fields | {"threads": threads}))
+        for (name, fields), threads in product(WAYS.items(), (1, 2))
+    }
+    programs |= {way: (PEER_REPLAY, *map(str, way)) for way in product(("sb3", "sbx"), (1, 2))}
+    with ExitStack() as stack:
+        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "bufsize": 1, "text": True}
+        processes = {
+            way: stack.enter_context(subprocess.Popen([sys.executable, "-c", *program], **pipes))
+            for way, program in programs.items()
+        }
+        take_turns(processes, 3)  # they import, compile, and fill a first batch
+        tried = take_turns(processes, 4)
+        best = [min((way for way in tried if way[0] == name), key=tried.get) for name in (*WAYS, "sb3", "sbx")]
+        for _ in range(rounds):
+            spent = take_turns({way: processes[way] for way in best}, 10)
+            row = {name: 10 * 500 / spent[name, threads] for name, threads in best}
+            say("DDPG, Hopper-v5", {name: round(speed) for name, speed in row.items()}, dict(best))
+            append("speed", {"what": "replay", "steps_per_second": row, "threads": dict(best)} | stamp)
     replay_summary()
+
+
+def take_turns(processes, turns):
+    """Seconds that each took in so many turns; one has its turn while all the others wait."""
+    spent = dict.fromkeys(processes, 0.0)
+    for _ in range(turns):
+        for name, process in processes.items():
+            started = time.perf_counter()
+            process.stdin.write("\n")
+            if not process.stdout.readline():
+                raise SystemExit(f"{name} ended before its turn was over.")
+            spent[name] += time.perf_counter() - started
+    return spent
 
 
 def replay_summary():

@@ -91,9 +91,9 @@ class Descent(Generic[Networks]):
         self._gradient = torch.zeros_like(self._vector)
         self._mean, self._square = torch.zeros_like(self._vector), torch.zeros_like(self._vector)
         self._adam = partial(adam, betas=betas, eps=eps, max_grad_norm=max_grad_norm or math.inf)
-        self._betas = torch.tensor(betas, dtype=torch.float64, device=self.device)
-        self._count, self._learning_rate = self._betas.new_zeros(1), self._betas.new_zeros(1)
-        self._scales = self._vector.new_zeros(2)
+        self._log_betas = torch.tensor(betas, dtype=torch.float64, device=self.device).log()
+        self._rates, self._powers = self._log_betas.new_ones(2), self._log_betas.new_tensor([-1, -0.5])
+        self._count = self._log_betas.new_zeros(1)
         self._parameters = list(self.objective.parameters())
         for parameter, gradient in zip(self._parameters, self._flat.parts(self._gradient).values(), strict=True):
             parameter.grad = gradient
@@ -117,7 +117,7 @@ class Descent(Generic[Networks]):
 
     def set_learning_rate(self, learning_rate: float) -> None:
         """α of every step from here on."""
-        self._learning_rate.fill_(learning_rate)
+        self._rates[0] = learning_rate
 
     @property
     def steps(self) -> int:
@@ -139,10 +139,9 @@ class Descent(Generic[Networks]):
             total.backward(inputs=self._parameters)
         with torch.no_grad():
             self._count.add_(1)
-            bias = 1 - self._betas**self._count
-            self._scales[:1].copy_(self._learning_rate / bias[:1])  # kept, or native code divides for each parameter
-            self._scales[1:].copy_(bias[1:].rsqrt())
-            norm = self._adam(self._vector, gradient, self._mean, self._square, self._scales)
+            bias = 1 - (self._log_betas * self._count).exp()  # βᵗ as a power, native code computes for each parameter
+            scales = (self._rates * bias**self._powers).to(self._vector)
+            norm = self._adam(self._vector, gradient, self._mean, self._square, scales)
         return {**metrics, self._watch_as: norm}
 
     def parameters(self) -> dict[str, Tensor]:
