@@ -138,8 +138,8 @@ MUTANTS = [
     (
         "Adam without its bias correction",
         "nn/descent.py",
-        "learning_rate / bias[:1]",
-        "learning_rate",
+        "self._rates * bias**self._powers",
+        "self._rates",
         "test_descent.py",
     ),
     ("the gradient is not clipped", "nn/descent.py", ".clamp(max=1)", ".clamp(min=1, max=1)", "test_descent.py"),
