@@ -44,7 +44,7 @@ from lemniscate.run.loggers import LOGGERS
 
 class Turns:
     def __init__(self, *_): pass
-    def write(self, *_):  # after each update
+    def write(self, *_):  # every 500 steps
         print(flush=True)
         sys.stdin.readline() or sys.exit()
     def close(self, *_): pass
@@ -56,8 +56,11 @@ with tempfile.TemporaryDirectory() as scratch:
 """
 
 PEER_REPLAY = """
-import sys, numpy, torch
+import os, sys
 peer, threads = sys.argv[1], int(sys.argv[2])
+if peer == "sbx":  # XLA has a thread for each processor that it may use
+    os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:threads])
+import numpy, torch
 torch.set_num_threads(threads)
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import NormalActionNoise

@@ -280,6 +280,8 @@ def _train(
         kind = "mp4" if is_installed("imageio_ffmpeg") else "gif"
         watch(policy, video=path / "videos" / f"step-{state.step}.{kind}")
 
+    if config.video_every:
+        playback.require_pictures(envs[0].spec)  # better told now than hours later
     run = Run(path, algorithm, config, envs, loggers=loggers, progress=progress, film=film)
     pictures: list[Path] = []
     try:

@@ -83,7 +83,7 @@ def test_entropy_counts_from_the_second_step_on(monkeypatch, rng, timed_out):
         ([69.0, 69.0], "Q(s₀, a₀) says 69, and 50 followed, discounted: it over-estimates by 38 %"),
         ([40.0, 20.0], "it under-estimates by 40 %"),
         ([50.1, 50.1], "it is right to a hundredth"),
-        ([5000.0, 5000.0], "it over-estimates by 4950"),
+        ([5000.0, 5000.0], "it over-estimates by 4,950"),
     ],
 )
 def test_the_sentence(predicted, said):
@@ -93,6 +93,8 @@ def test_the_sentence(predicted, said):
 def test_nothing_followed():
     assert math.isinf(Honesty([1.0], [0.0]).bias)
     assert "over-estimates by 1" in str(Honesty([1.0], [0.0]))
+    assert "under-estimates by 1" in str(Honesty([-1.0], [0.0]))
+    assert "right to a hundredth" in str(Honesty([0.0], [0.0]))
     assert Honesty([1.0], [0.0]).to_json() == {"predicted": [1.0], "realised": [0.0]}  # JSON has no infinity
 
 

@@ -128,7 +128,17 @@ def test_recordings_change_no_bit_of_training_and_survive_a_resume(tmp_path, env
 def test_what_cannot_be_recorded_is_told_before_training(tmp_path):
     with pytest.raises(lem.UserError, match="Countdown-v0"):
         train(tmp_path / "r", video_every=64)
-    assert not read_metrics(tmp_path / "r")
+    assert not (tmp_path / "r").exists()
+
+
+def test_what_can_no_longer_be_recorded_costs_no_step(tmp_path, monkeypatch, capsys):
+    def full(*_args, **_):
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(lem.report.playback, "save_frames", full)
+    train(tmp_path / "r", "CartPole-v1", video_every=96)
+    assert "No recording at step 96: No space left on device" in capsys.readouterr().err
+    assert (tmp_path / "r" / "checkpoints" / "step-256").exists()
 
 
 def test_two_seeds_of_neighbouring_runs_share_no_start():
@@ -232,10 +242,10 @@ def command(*arguments, stderr=subprocess.DEVNULL, **options):
     )
 
 
-def long_run(path, env, updates=150):
+def long_run(path, env, updates=150, engine="eager"):
     """Arguments of a run of some seconds with a checkpoint every eighth update."""
     if env in REMEMBERING:
-        fields = tiny_memory(**REMEMBERING[env], total_steps=16 * updates, checkpoint_every=128, engine="eager")
+        fields = tiny_memory(**REMEMBERING[env], total_steps=16 * updates, checkpoint_every=128, engine=engine)
         flags = [f"--{name.replace('_', '-')}" for name in fields]
         values = [() if value is True else value if isinstance(value, tuple) else (value,) for value in fields.values()]
         given = [part for flag, value in zip(flags, values, strict=True) for part in (flag, *value)]
@@ -257,6 +267,22 @@ def wait_for(condition, process=None):
 def test_killed_at_random_and_resumed_it_ends_in_the_same_bits(tmp_path, env):
     """SIGKILL on real processes, several times in one run, at times drawn anew in each test run."""
     check_kills(tmp_path, long_run(tmp_path / "whole", env), long_run(tmp_path / "killed", env), kills=3)
+
+
+def test_a_native_run_goes_on_to_the_same_bits(tmp_path):
+    """From a checkpoint on in a new process: what was compiled there is compiled again here."""
+    whole, half = tmp_path / "whole", tmp_path / "half"
+    assert command(*long_run(whole, "ddpg", updates=40, engine="native")).wait() == 0
+    shutil.copytree(whole, half)
+    for step in checkpoint.list_steps(half / "checkpoints")[1:]:
+        shutil.rmtree(half / "checkpoints" / f"step-{step}")
+    resumed = command("resume", half, stderr=subprocess.PIPE)
+    said = resumed.communicate()[1]
+    assert resumed.returncode == 0
+    assert "Compiling" in said
+    assert "Nothing can be compiled" not in said
+    assert final_hashes(half) == final_hashes(whole)
+    assert history(half) == history(whole)
 
 
 def check_kills(tmp_path, whole, killed, kills):

@@ -14,7 +14,7 @@ class Exploration:
     """Noise of variance 1 for N copies and A coordinates, each a sequence of its own.
 
     A sequence is as long as an episode may be, and a copy begins a new one with each episode. (Where episodes have no
-    limit, or a copy begins late in one, a sequence may end first; then the next one follows.)
+    limit, a sequence may end first; then the next one follows.)
 
     Args:
         kind: white; Ornstein–Uhlenbeck; or coloured, of power f^(−β).

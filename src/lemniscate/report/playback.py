@@ -31,9 +31,16 @@ FLIGHT_STRIDE = 5
 def film_episode(act: Act, spec: Spec, file: Path, seed: int) -> str:
     """Record one episode of a Gymnasium environment into `file`; returns a sentence."""
     with_pictures = _rendered(spec.env_id, "rgb_array")
-    frames = [np.asarray(env.render()) for env in _play(with_pictures, act, seed)]
-    save_frames(frames, file, _fps(with_pictures))
-    return f"{file}: {len(frames) - 1} steps."
+    steps = -1
+
+    def frames() -> Iterator[np.ndarray]:
+        nonlocal steps
+        for env in _play(with_pictures, act, seed):
+            steps += 1
+            yield np.asarray(env.render())
+
+    save_frames(frames(), file, _fps(with_pictures))
+    return f"{file}: {steps} steps."
 
 
 def show_episode(act: Act, spec: Spec, seed: int) -> None:
@@ -49,7 +56,7 @@ def show_episode(act: Act, spec: Spec, seed: int) -> None:
 def film_flight(policy: Policy, env: VecEnv, file: Path, seed: int) -> str:
     """Animate one flight into `file`; returns a sentence on how it was drawn."""
     frames, fps, how = _draw_flight(flight.record(policy, env, env.num_envs, seed), env)
-    save_frames(list(frames), file, fps)
+    save_frames(frames, file, fps)
     return f"{file}: {how}."
 
 
@@ -66,18 +73,25 @@ def show_flight(policy: Policy, env: VecEnv, seed: int) -> None:
     scene.show(flight.record(policy, env, env.num_envs, seed), _drone_model(env))
 
 
-def save_frames(frames: list[np.ndarray], file: Path, fps: float) -> Path:
-    """An animated picture (.gif, .webp) from frames, or a film (.mp4, extra `video`)."""
+def require_pictures(spec: Spec) -> None:
+    """Raise `UserError` where an environment cannot be recorded; a drone always can."""
+    if not spec.tracking:
+        _rendered(spec.env_id, "rgb_array").close()
+
+
+def save_frames(frames: Iterable[np.ndarray], file: Path, fps: float) -> None:
+    """An animated picture (.gif, .webp) from frames, or a film (.mp4, extra `video`); no two of them raw in memory."""
     check_film(file)
     file.parent.mkdir(parents=True, exist_ok=True)
     if file.suffix == ".mp4":
-        from imageio import v3 as imageio
+        from imageio import v2 as imageio
 
-        imageio.imwrite(file, np.stack(frames), fps=fps)
+        with imageio.get_writer(file, fps=fps) as film:
+            for frame in frames:
+                film.append_data(frame)
     else:
-        images = [Image.fromarray(frame) for frame in frames]
-        images[0].save(file, save_all=True, append_images=images[1:], duration=1000 / fps, loop=0)
-    return file
+        images = (Image.fromarray(frame) for frame in frames)
+        next(images).save(file, save_all=True, append_images=images, duration=1000 / fps, loop=0)
 
 
 def check_film(file: Path) -> None:

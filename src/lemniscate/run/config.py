@@ -49,7 +49,7 @@ class RunConfig:
     seed: Seed = 1
     """the one seed; every other is derived from it"""
     total_steps: Count = 1_000_000
-    """environment steps of the whole run, summed over the copies"""
+    """environment steps of the whole run, summed over the copies; it ends with the update that reaches them"""
     device: Literal["auto", "cpu", "cuda"] = "cpu"
     """where networks, and simulators that can, live; auto takes cuda if there is one"""
     threads: Count = 1
@@ -183,7 +183,7 @@ class ReplayConfig(RunConfig):
     num_updates: Count = 1
     """gradient steps at each update; so num_updates / (N · update_every) for each environment step"""
     num_steps: Count = 500
-    """steps of each copy between two lines of metrics"""
+    """steps of each copy between two lines of metrics; evaluations, checkpoints and the end wait for the next one"""
     actor_learning_rate: Positive = 3e-4
     """Adam's step size for the policy"""
     critic_learning_rate: Positive = 3e-4

@@ -40,11 +40,15 @@ class Honesty:
 
     def __str__(self) -> str:
         predicted, realised = self.means
-        said = f"Q(s₀, a₀) says {predicted:.4g}, and {realised:.4g} followed, discounted: "
-        if abs(self.bias) < 0.01:
+        said = f"Q(s₀, a₀) says {_short(predicted)}, and {_short(realised)} followed, discounted: "
+        if abs(predicted - realised) <= 0.01 * abs(realised):
             return said + "it is right to a hundredth"
-        size = f"{100 * abs(self.bias):.0f} %" if abs(self.bias) < 10 else f"{abs(predicted - realised):.4g}"
-        return said + f"it {'over' if self.bias > 0 else 'under'}-estimates by {size}"
+        size = f"{100 * abs(self.bias):.0f} %" if abs(self.bias) < 10 else _short(abs(predicted - realised))
+        return said + f"it {'over' if predicted > realised else 'under'}-estimates by {size}"
+
+
+def _short(value: float) -> str:
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
 
 
 class Critique:

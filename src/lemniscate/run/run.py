@@ -138,7 +138,7 @@ class Run:
         try:
             with self._catching_signals():
                 if state.step == 0:
-                    self._record(state)  # where nothing can be recorded, better told now than hours later
+                    self._record(state)
                 self._restart(state)
                 while state.step < total_steps:
                     before = state.step
@@ -225,9 +225,13 @@ class Run:
             raise Stopped(message, self._stop_signal)
 
     def _record(self, state: AnyState) -> None:
-        if self.config.video_every and self._film:
+        if not (self.config.video_every and self._film):
+            return
+        try:
             with globals_undisturbed():
                 self._film(state)
+        except (UserError, OSError) as error:  # no display any more, a full disk: it costs this recording, not the run
+            print(f"No recording at step {state.step:,}: {error}", file=sys.stderr)
 
     def _evaluate(self, state: AnyState) -> None:
         try:
