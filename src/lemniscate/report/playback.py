@@ -86,7 +86,8 @@ def save_frames(frames: Iterable[np.ndarray], file: Path, fps: float) -> None:
     if file.suffix == ".mp4":
         from imageio import v2 as imageio
 
-        with imageio.get_writer(file, fps=fps) as film:
+        film: Any = imageio.get_writer(file, fps=fps)
+        with film:
             for frame in frames:
                 film.append_data(frame)
     else:
