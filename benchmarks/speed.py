@@ -45,6 +45,7 @@ TRUST = {
     "its zoo, for this environment": {"cg_iterations": 25, "critic_epochs": 20, "max_kl": 0.04},
 }
 MEMORY = {"batch_size": 256, "learning_starts": 500, "buffer_size": 100_000, "num_steps": 500, "engine": "native"}
+MEMORY |= {"total_steps": 1_000_000, "checkpoint_every": 1_000_000}
 WAYS = {
     OURS: {},
     "lemniscate, bfloat16 products": {"matmul": "bfloat16"},
@@ -256,9 +257,8 @@ def trust(rounds, stamp):
 
 def replay(rounds, stamp):
     """Steps per second of DDPG, in turns of 500 steps, each at the number of threads that was the quicker at first."""
-    size = MEMORY | {"total_steps": 1_000_000, "checkpoint_every": 1_000_000}
     programs = {
-        (name, threads): (REPLAY, json.dumps(size | fields | {"threads": threads}))
+        (name, threads): (REPLAY, json.dumps(MEMORY | fields | {"threads": threads}))
         for (name, fields), threads in product(WAYS.items(), (1, 2))
     }
     programs |= {way: (PEER_REPLAY, *map(str, way)) for way in product(("sb3", "sbx"), (1, 2))}
@@ -270,12 +270,12 @@ def replay(rounds, stamp):
         }
         take_turns(processes, 3)  # they import, compile, and fill a first batch
         tried = take_turns(processes, 4)
-        best = [min((way for way in tried if way[0] == name), key=tried.get) for name in (*WAYS, "sb3", "sbx")]
+        best = dict(min((way for way in tried if way[0] == name), key=tried.get) for name in (*WAYS, "sb3", "sbx"))
         for _ in range(rounds):
-            spent = take_turns({way: processes[way] for way in best}, 10)
-            row = {name: 10 * 500 / spent[name, threads] for name, threads in best}
-            say("DDPG, Hopper-v5", {name: round(speed) for name, speed in row.items()}, dict(best))
-            append("speed", {"what": "replay", "steps_per_second": row, "threads": dict(best)} | stamp)
+            spent = take_turns({way: processes[way] for way in best.items()}, 10)
+            row = {name: 10 * 500 / seconds for (name, _), seconds in spent.items()}
+            say("DDPG, Hopper-v5", {name: round(speed) for name, speed in row.items()}, best)
+            append("speed", {"what": "replay", "steps_per_second": row, "threads": best} | stamp)
     replay_summary()
 
 

@@ -138,8 +138,15 @@ MUTANTS = [
     (
         "Adam without its bias correction",
         "nn/descent.py",
-        "self._rates * bias**self._powers",
-        "self._rates",
+        "new_tensor([-1, -0.5])",
+        "new_tensor([0, -0.5])",
+        "test_descent.py",
+    ),
+    (
+        "Adam without that of the squares",
+        "nn/descent.py",
+        "new_tensor([-1, -0.5])",
+        "new_tensor([-1, 0])",
         "test_descent.py",
     ),
     ("the gradient is not clipped", "nn/descent.py", ".clamp(max=1)", ".clamp(min=1, max=1)", "test_descent.py"),

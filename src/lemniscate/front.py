@@ -97,7 +97,10 @@ def train(
     loggers = loggers_with(track)
     require_absent(path)
     set_seeds(config.seed)  # before JAX starts, which reads its flags then
-    return _train(path, algorithm, config, make_envs(config), loggers, report or track is not None, progress)
+    envs = make_envs(config)
+    if config.video_every:
+        playback.require_pictures(envs[0].spec)
+    return _train(path, algorithm, config, envs, loggers, report or track is not None, progress)
 
 
 def resume(run: str | Path, *, track: str | None = None, report: bool = False, progress: bool = True) -> TrainedRun:
@@ -280,8 +283,6 @@ def _train(
         kind = "mp4" if is_installed("imageio_ffmpeg") else "gif"
         watch(policy, video=path / "videos" / f"step-{state.step}.{kind}")
 
-    if config.video_every:
-        playback.require_pictures(envs[0].spec)  # better told now than hours later
     run = Run(path, algorithm, config, envs, loggers=loggers, progress=progress, film=film)
     pictures: list[Path] = []
     try:

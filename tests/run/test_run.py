@@ -136,9 +136,20 @@ def test_what_can_no_longer_be_recorded_costs_no_step(tmp_path, monkeypatch, cap
         raise OSError("No space left on device")
 
     monkeypatch.setattr(lem.report.playback, "save_frames", full)
-    train(tmp_path / "r", "CartPole-v1", video_every=96)
+    path = tmp_path / "r"
+    train(path, "CartPole-v1", checkpoint_every=64, video_every=96)
     assert "No recording at step 96: No space left on device" in capsys.readouterr().err
-    assert (tmp_path / "r" / "checkpoints" / "step-256").exists()
+    done = final_hashes(path)
+    for step in checkpoint.list_steps(path / "checkpoints")[-2:]:  # back to step 128
+        shutil.rmtree(path / "checkpoints" / f"step-{step}")
+
+    def blind(*_args):
+        raise lem.UserError("there is no display")
+
+    monkeypatch.setattr(lem.report.playback, "_rendered", blind)
+    lem.resume(path, progress=False)  # where nobody can see, a run goes on all the same
+    assert "No recording at step 192: there is no display" in capsys.readouterr().err
+    assert final_hashes(path) == done
 
 
 def test_two_seeds_of_neighbouring_runs_share_no_start():

@@ -139,7 +139,7 @@ class Descent(Generic[Networks]):
             total.backward(inputs=self._parameters)
         with torch.no_grad():
             self._count.add_(1)
-            bias = 1 - (self._log_betas * self._count).exp()  # βᵗ as a power, native code computes for each parameter
+            bias = 1 - (self._log_betas * self._count).exp()  # as a power, βᵗ would be computed for each parameter
             scales = (self._rates * bias**self._powers).to(self._vector)
             norm = self._adam(self._vector, gradient, self._mean, self._square, scales)
         return {**metrics, self._watch_as: norm}

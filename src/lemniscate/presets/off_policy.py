@@ -40,7 +40,7 @@ DDPG = [
             critic_learning_rate=1e-3,
             final_learning_rate=0.0,
         ),
-        "search by hand, sixteen settings for 300,000 or a million steps, on seed 101; the best three also on 102",
+        "search by hand, sixteen settings for 300,000 or a million steps, on seed 101; three of them also on 102",
         "2026-11",
     ),
     Preset(

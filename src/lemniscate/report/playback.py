@@ -80,7 +80,7 @@ def require_pictures(spec: Spec) -> None:
 
 
 def save_frames(frames: Iterable[np.ndarray], file: Path, fps: float) -> None:
-    """An animated picture (.gif, .webp) from frames, or a film (.mp4, extra `video`); no two of them raw in memory."""
+    """An animated picture (.gif, .webp) from frames, or a film (.mp4, extra `video`); only .webp keeps all."""
     check_film(file)
     file.parent.mkdir(parents=True, exist_ok=True)
     if file.suffix == ".mp4":
