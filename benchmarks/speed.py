@@ -257,6 +257,7 @@ def trust(rounds, stamp):
 
 def replay(rounds, stamp):
     """Steps per second of DDPG, in turns of 500 steps, each at the number of threads that was the quicker at first."""
+    turns = 10
     programs = {
         (name, threads): (REPLAY, json.dumps(MEMORY | fields | {"threads": threads}))
         for (name, fields), threads in product(WAYS.items(), (1, 2))
@@ -272,8 +273,8 @@ def replay(rounds, stamp):
         tried = take_turns(processes, 4)
         best = dict(min((way for way in tried if way[0] == name), key=tried.get) for name in (*WAYS, "sb3", "sbx"))
         for _ in range(rounds):
-            spent = take_turns({way: processes[way] for way in best.items()}, 10)
-            row = {name: 10 * 500 / seconds for (name, _), seconds in spent.items()}
+            spent = take_turns({way: processes[way] for way in best.items()}, turns)
+            row = {name: 500 * turns / seconds for (name, _), seconds in spent.items()}
             say("DDPG, Hopper-v5", {name: round(speed) for name, speed in row.items()}, best)
             append("speed", {"what": "replay", "steps_per_second": row, "threads": best} | stamp)
     replay_summary()
