@@ -165,10 +165,11 @@ def parts(rounds, stamp):
 
     from lemniscate.algos import ppo
     from lemniscate.maths import gae
-    from lemniscate.types import Box, Part, Rollout, Spec
+    from lemniscate.spec import Box, ObservationPart, Spec
+    from lemniscate.types import Rollout
 
     torch.set_num_threads(1)
-    spec = Spec("x", (Part((), (17,)),), Box((-1.0,) * 6, (1.0,) * 6))
+    spec = Spec("x", (ObservationPart((), (17,)),), Box((-1.0,) * 6, (1.0,) * 6))
     config, device = ppo.Config(**SHARED), torch.device("cpu")
     no, obs = torch.zeros(128, 16, dtype=torch.bool), torch.randn(129, 16, 17)
     rollout = Rollout(obs[:-1], torch.randn(128, 16, 6), torch.randn(128, 16), obs[1:], no, no, ~no)

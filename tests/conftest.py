@@ -47,7 +47,7 @@ def tiny_fields(env="Countdown-v0", **fields):
     return {name: getattr(config, name) for name in config.names() if name != "env"}
 
 
-def tiny_memory(**fields):
+def tiny_off_policy(**fields):
     """Keyword arguments of `lem.train` for an algorithm that learns from memory, over in a moment."""
     defaults = {
         "num_envs": 2,

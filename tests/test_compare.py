@@ -77,7 +77,7 @@ def test_runs_alike_even_in_their_seed_are_told_apart_by_where_they_are(tmp_path
     """As when the code has changed in between."""
     config = json.loads((write_run(tmp_path / "old" / "ppo-1") / "config.json").read_text())["config"]
     runs = [tmp_path / "old" / "ppo-1", write_run(tmp_path / "old" / "ppo-2", seed=2), write_run(tmp_path / "ppo")]
-    (tmp_path / "old" / "set.json").write_text(json.dumps({"seeds": [1, 2], "configs": {"ppo": config}}))
+    (tmp_path / "old" / "sweep.json").write_text(json.dumps({"seeds": [1, 2], "configs": {"ppo": config}}))
     groups = compare.group(runs)
     assert [one.label for one in groups] == [f"PPO, directory {tmp_path / name}" for name in ("old", "ppo")]
     assert [len(one.runs) for one in groups] == [2, 1]

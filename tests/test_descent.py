@@ -12,7 +12,8 @@ from torch import nn
 from lemniscate.algos import ppo
 from lemniscate.nn.descent import Descent
 from lemniscate.nn.networks import Layers
-from lemniscate.types import Batch, Box, Discrete, Part, Spec
+from lemniscate.spec import Box, Discrete, ObservationPart, Spec
+from lemniscate.types import Batch
 
 ACTIONS = {"box": Box((-1.0, -1.0), (1.0, 1.0)), "discrete": Discrete(3)}
 
@@ -29,7 +30,7 @@ def fresh(actions="box", dtype=torch.float64, **fields):
     torch.manual_seed(0)
     config = ppo.Config(num_envs=4, num_steps=6, minibatch_size=8, clip_value=0.3, entropy_coef=0.01, **fields)
     networks = ppo.ActorCritic(
-        Spec("x", (Part((), (5,)),), ACTIONS[actions]), Layers((8,)), normalize_observations=True
+        Spec("x", (ObservationPart((), (5,)),), ACTIONS[actions]), Layers((8,)), normalize_observations=True
     )
     networks.policy.observe(torch.randn(50, 5))
     networks.to(dtype)

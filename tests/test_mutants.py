@@ -165,9 +165,9 @@ MUTANTS = [
         "envs/books.py",
         "after_end[:1]), after_end[:-1]]",
         "after_end[:0]), after_end]",
-        "envs/test_books.py",
+        "envs/test_episodes.py",
     ),
-    ("fragments are counted", "envs/books.py", "done & whole]", "done & (whole | done)]", "envs/test_books.py"),
+    ("fragments are counted", "envs/books.py", "done & whole]", "done & (whole | done)]", "envs/test_episodes.py"),
     (
         "a masked action may be chosen",
         "nn/policies.py",
@@ -449,7 +449,7 @@ MUTANTS = [
     (
         "noise is not told of ends",
         "algos/sac.py",
-        "state.exploration.cut(step.terminated | step.truncated | ~step.valid)",
+        "state.action_noise.cut(step.terminated | step.truncated | ~step.valid)",
         "",
         MEMORY + "an_episode_hears_a_sequence_from_its_beginning",
     ),
@@ -469,10 +469,10 @@ MUTANTS = [
     ),
     (
         "a time-out ends the entropy",
-        "run/critique.py",
+        "run/q_bias_meter.py",
         " + networks.entropy_bonus(last, self._generator)",
         "",
-        "run/test_critique.py",
+        "run/test_q_bias.py",
     ),
     (
         "Q learns as fast at the end",
@@ -488,13 +488,13 @@ MUTANTS = [
         "",
         MEMORY + "as_many_gradient_steps_are_taken_as_announced",
     ),
-    ("Q is the higher one", "nn/actor_critic.py", "value.amin(0)", "value.amax(0)", "run/test_critique.py"),
+    ("Q is the higher one", "nn/actor_critic.py", "value.amin(0)", "value.amax(0)", "run/test_q_bias.py"),
     (
         "a time-out is worth nothing",
-        "run/critique.py",
+        "run/q_bias_meter.py",
         "realised + self._gamma**age * value * ~step.terminated",
         "realised",
-        "run/test_critique.py",
+        "run/test_q_bias.py",
     ),
     (
         "the first turns are everyone's",
@@ -526,17 +526,17 @@ MUTANTS = [
     ),
     (
         "noise runs on over an end",
-        "data/exploration.py",
+        "data/action_noise.py",
         "self._position[done.cpu()] = self._length",
         "pass",
-        "data/test_exploration.py",
+        "data/test_action_noise.py",
     ),
     (
         "every copy's noise is cut",
-        "data/exploration.py",
+        "data/action_noise.py",
         "self._position[done.cpu()] = self._length",
         "self._position.fill_(self._length)",
-        "data/test_exploration.py",
+        "data/test_action_noise.py",
     ),
     (
         "a tie is lost",

@@ -4,10 +4,11 @@ from lemniscate.maths import Categorical, Gaussian
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.networks import Bfloat16Linear, Layers, Tanh
 from lemniscate.nn.normalizer import RewardScale, RunningNorm
-from lemniscate.types import Box, Discrete, Part, Rollout, Spec
+from lemniscate.spec import Box, Discrete, ObservationPart, Spec
+from lemniscate.types import Rollout
 
-BOX = Spec("x", (Part((), (5,)),), Box((-1.0, -1.0), (1.0, 1.0)))
-DISCRETE = Spec("x", (Part((), (5,)),), Discrete(3))
+BOX = Spec("x", (ObservationPart((), (5,)),), Box((-1.0, -1.0), (1.0, 1.0)))
+DISCRETE = Spec("x", (ObservationPart((), (5,)),), Discrete(3))
 
 
 def test_orthogonal_layers_with_their_gains():

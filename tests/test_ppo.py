@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-import worlds
+import environments
 from conftest import tiny
 from lemniscate.algos import ppo
 from lemniscate.data.rollout import collect, minibatches
 from lemniscate.envs import toy
-from lemniscate.envs.api import VecEnv
 from lemniscate.envs.gymnasium import GymnasiumBackend
+from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError
 
 CPU = torch.device("cpu")
@@ -89,7 +89,7 @@ def test_it_learns_to_match(mode):
     assert np.mean(returns[-16:]) > 19
 
 
-@pytest.mark.parametrize("kind", worlds.KINDS)
+@pytest.mark.parametrize("kind", environments.KINDS)
 def test_it_learns_in_spaces_of_every_kind(kind):
     knobs = {"minibatch_size": 64, "epochs": 6, "learning_rate": 0.01, "initial_log_std": -1.0}
     config = tiny(

@@ -1,6 +1,6 @@
-"""Where a car with no idea gets, by the colour of its noise: docs/images/exploration.png.
+"""Where a car with no idea gets, by the colour of its noise: docs/images/action_noise.png.
 
-    .venv/bin/python docs/figures/exploration.py
+    .venv/bin/python docs/figures/action_noise.py
 
 MountainCarContinuous-v0 under noise alone, of the same standard deviation at every step; nothing is learned.
 """
@@ -11,10 +11,10 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-from lemniscate.data.exploration import Exploration
-from lemniscate.envs import api
+from lemniscate.data.action_noise import ActionNoise
+from lemniscate.envs import registry
 
-IMAGE = Path(__file__).parents[1] / "images" / "exploration.png"
+IMAGE = Path(__file__).parents[1] / "images" / "action_noise.png"
 NOISES = {
     "white": ("white", {}),
     "Ornstein–Uhlenbeck": ("ou", {"time": 1 / 0.15}),
@@ -25,9 +25,9 @@ CARS, STEPS, STD = 64, 999, 0.6
 
 def drive(kind, time=1.0, exponent=0.0):
     """([T, N, 2] positions and velocities, which of N cars reached the flag) in one episode each."""
-    env = api.make("MountainCarContinuous-v0", CARS)
+    env = registry.make("MountainCarContinuous-v0", CARS)
     env.restart(0)
-    noise = Exploration(kind, (CARS, 1), STEPS, torch.device("cpu"), time=time, exponent=exponent)
+    noise = ActionNoise(kind, (CARS, 1), STEPS, torch.device("cpu"), time=time, exponent=exponent)
     generator = torch.Generator().manual_seed(0)
     seen, arrived = [], torch.zeros(CARS, dtype=torch.bool)
     for _ in range(STEPS):

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 from lemniscate.algos import reinforce
 from lemniscate.data.rollout import collect, collect_episodes
-from lemniscate.envs.api import make
+from lemniscate.envs.registry import make
 from lemniscate.maths import policy_gradient
 
 WAYS = {

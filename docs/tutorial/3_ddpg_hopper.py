@@ -74,10 +74,10 @@ lem.plot(run.path)
 
 # %%
 scores = lem.evaluate(run.policy, episodes=10, seed=0)
-print(scores.mean_return, "·", scores.honesty)
+print(scores.mean_return, "·", scores.q_bias)
 print(scores.to_course())
 
 # %% [markdown]
 # **Try.** `architecture="layer_norm"` with `actor_learning_rate=1e-3, critic_learning_rate=1e-3`. `policy_delay=1`. A
 # `td_target` that forgets `~terminated`: what does Q promise then? And the riddle of the mountain car, in
-# [`docs/notes/exploration.md`](../notes/exploration.md).
+# [`docs/notes/action_noise.md`](../notes/action_noise.md).

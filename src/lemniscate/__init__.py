@@ -1,7 +1,6 @@
 """Deep reinforcement learning that you can read in an evening, leave alone overnight, and fly in half a minute."""
 
-from lemniscate.errors import NonFiniteError, SetError, UserError
-from lemniscate.front import (
+from lemniscate.api import (
     TrainedRun,
     config_for,
     evaluate,
@@ -12,20 +11,21 @@ from lemniscate.front import (
     train,
     watch,
 )
+from lemniscate.errors import NonFiniteError, SweepError, UserError
+from lemniscate.policy import TrainedPolicy
 from lemniscate.run.evaluate import Evaluation
 from lemniscate.run.run import Stopped
 from lemniscate.run.seeding import set_seeds
-from lemniscate.sets import TrainedSet, resume_set, train_set
-from lemniscate.trained import TrainedPolicy
+from lemniscate.sweep import TrainedSweep, resume_sweep, train_sweep
 
 __all__ = [
     "Evaluation",
     "NonFiniteError",
-    "SetError",
     "Stopped",
+    "SweepError",
     "TrainedPolicy",
     "TrainedRun",
-    "TrainedSet",
+    "TrainedSweep",
     "UserError",
     "config_for",
     "evaluate",
@@ -33,9 +33,9 @@ __all__ = [
     "make_envs",
     "plot",
     "resume",
-    "resume_set",
+    "resume_sweep",
     "set_seeds",
     "train",
-    "train_set",
+    "train_sweep",
     "watch",
 ]

@@ -15,16 +15,16 @@ from typing import Any, NoReturn
 
 import tyro
 
-from lemniscate import front, sets
+from lemniscate import api, sweep
 from lemniscate.algos import ALGORITHMS
-from lemniscate.envs import api
+from lemniscate.envs import registry
 from lemniscate.envs.check import check as check_environment
-from lemniscate.errors import NonFiniteError, SetError, UserError, WorkerError, said_of, unknown
+from lemniscate.errors import NonFiniteError, SweepError, UserError, WorkerError, prefix_errors, unknown_name
 from lemniscate.presets import best, choose, names
 from lemniscate.report import pictures
 from lemniscate.run.config import RunConfig
 from lemniscate.run.run import Stopped, engine_of
-from lemniscate.run.set_file import is_set
+from lemniscate.run.sweep_file import is_sweep
 
 Command = Callable[[argparse.Namespace, list[str]], None]
 
@@ -44,7 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (NonFiniteError, WorkerError) as error:
         learning = given is not None and given.run_command in (train, resume)
         return _say(f"{error} Training stopped; the last checkpoint is as it was." if learning else error, 1)
-    except SetError as error:
+    except SweepError as error:
         return _say(error, 1)
     except Stopped as stopped:
         return _say(stopped, 128 + stopped.signum)
@@ -59,15 +59,15 @@ def train(given: argparse.Namespace, rest: list[str]) -> None:
     if misplaced and given.algorithm not in ALGORITHMS:
         raise UserError(f"The algorithm comes first, then its fields: lemniscate train {misplaced[0]} …")
     if given.seeds is not None or "," in given.algorithm:
-        return _train_set(given, rest)
-    config = _with_fields(front.config_for(given.algorithm, given.env, given.preset), rest)
+        return _train_sweep(given, rest)
+    config = _with_fields(api.config_for(given.algorithm, given.env, given.preset), rest)
     if config.backend:
-        api.require_backend(config.backend)
+        registry.require_backend(config.backend)
     preset, _ = choose(given.algorithm, config.env, given.preset)
     what = f"{given.algorithm} on {config.num_envs} × {config.env} by {config.backend}"
     _say(f"{what}: preset {preset}, seed {config.seed}, {engine_of(config)} engine")
     fields = {name: getattr(config, name) for name in config.names() if name != "env"}
-    run = front.train(
+    run = api.train(
         given.algorithm,
         config.env,
         run=given.run,
@@ -77,23 +77,23 @@ def train(given: argparse.Namespace, rest: list[str]) -> None:
         **fields,
     )
     if given.score:
-        front.final_return(run.path)
+        api.final_return(run.path)
     _say(f"Trained in {run.seconds:.1f} s. Everything is in {run.path}")
 
 
-def _train_set(given: argparse.Namespace, rest: list[str]) -> None:
+def _train_sweep(given: argparse.Namespace, rest: list[str]) -> None:
     if any(argument.partition("=")[0] == "--seed" for argument in rest):
         raise UserError("Several runs have several seeds: --seeds 1-5, not --seed.")
     if given.seeds is None:
         raise UserError("Algorithms are compared over several seeds: add --seeds 1-5.")
     fields: dict[str, Any] = {}
-    for algorithm in sets.algorithms_of(given.algorithm):
-        with said_of(algorithm):
-            preset = front.config_for(algorithm, given.env, given.preset)
+    for algorithm in sweep.algorithms_of(given.algorithm):
+        with prefix_errors(algorithm):
+            preset = api.config_for(algorithm, given.env, given.preset)
             config = _with_fields(preset, rest)
         values = {name: getattr(config, name) for name in config.names()}
         fields |= {name: value for name, value in values.items() if value != getattr(preset, name)}
-    trained = sets.train_set(
+    trained = sweep.train_sweep(
         given.algorithm,
         given.env,
         given.seeds,
@@ -109,18 +109,18 @@ def _train_set(given: argparse.Namespace, rest: list[str]) -> None:
 def resume(given: argparse.Namespace, rest: list[str]) -> None:
     """Go on with an interrupted run, or with a set of them."""
     _nothing_left(rest)
-    go_on = sets.resume_set if is_set(given.run) else front.resume
+    go_on = sweep.resume_sweep if is_sweep(given.run) else api.resume
     run = go_on(given.run, track=given.track, report=given.report)
-    if given.score and not is_set(given.run):
-        front.final_return(run.path)
+    if given.score and not is_sweep(given.run):
+        api.final_return(run.path)
     _say(f"Done. Everything is in {run.path}")
 
 
 def evaluate(given: argparse.Namespace, rest: list[str]) -> None:
     """Play whole episodes with the newest policy of a run."""
     _nothing_left(rest)
-    policy = front.load(given.run)
-    scores = front.evaluate(policy, episodes=given.episodes, seed=given.seed, backend=given.backend)
+    policy = api.load(given.run)
+    scores = api.evaluate(policy, episodes=given.episodes, seed=given.seed, backend=given.backend)
     if given.json:
         print(json.dumps(scores.to_json()))
     else:
@@ -130,7 +130,7 @@ def evaluate(given: argparse.Namespace, rest: list[str]) -> None:
 def watch(given: argparse.Namespace, rest: list[str]) -> None:
     """Show one episode in a window, or record it."""
     _nothing_left(rest)
-    said = front.watch(front.load(given.run), seed=given.seed, video=given.video)
+    said = api.watch(api.load(given.run), seed=given.seed, video=given.video)
     if said:
         _say(said)
 
@@ -138,18 +138,18 @@ def watch(given: argparse.Namespace, rest: list[str]) -> None:
 def plot(given: argparse.Namespace, rest: list[str]) -> None:
     """Draw the curves of one run, or compare several, grouped by all but the seed."""
     _nothing_left(rest)
-    for file in front.plot(*given.runs):
+    for file in api.plot(*given.runs):
         _say(file)
 
 
 def envs(given: argparse.Namespace, rest: list[str]) -> None:
     """List the environments, who serves each, and the preset that fits."""
     _nothing_left(rest)
-    for env_id in api.known_ids():
+    for env_id in registry.known_ids():
         if given.filter.lower() in env_id.lower():
             presets = ((algorithm, best(algorithm, env_id)) for algorithm in ALGORITHMS)
             fitting = ", ".join(f"{algorithm}: {preset}" for algorithm, preset in presets if preset != "default")
-            _say(f"{env_id:<40} {api.backend_for(env_id):<12} {fitting or 'default'}")
+            _say(f"{env_id:<40} {registry.backend_for(env_id):<12} {fitting or 'default'}")
 
 
 def check(given: argparse.Namespace, rest: list[str]) -> None:
@@ -169,7 +169,7 @@ def _with_fields(config: RunConfig, arguments: list[str]) -> RunConfig:
     for argument in arguments:
         flag = argument.partition("=")[0].replace("_", "-")
         if flag.startswith("--") and flag not in known and flag.replace("--no-", "--", 1) not in known:
-            raise unknown("field", flag, known)
+            raise unknown_name("field", flag, known)
     complaint = io.StringIO()
     try:
         with contextlib.redirect_stdout(complaint), contextlib.redirect_stderr(complaint):

@@ -22,12 +22,12 @@ class WorkerError(RuntimeError):
     """The process of an environment died, or does not answer: names which."""
 
 
-class SetError(RuntimeError):
+class SweepError(RuntimeError):
     """Some runs of a set could not go on: names each, with its sentence."""
 
 
 @contextmanager
-def said_of(name: str) -> Iterator[None]:
+def prefix_errors(name: str) -> Iterator[None]:
     """A `UserError` from inside also says of what it is."""
     try:
         yield
@@ -35,7 +35,7 @@ def said_of(name: str) -> Iterator[None]:
         raise UserError(f"{name}: {error}") from None
 
 
-def unknown(kind: str, name: str, known: Iterable[str]) -> UserError:
+def unknown_name(kind: str, name: str, known: Iterable[str]) -> UserError:
     """The sentence for a name that is not in a table: the nearest names, or all of them when few."""
     names = sorted(known)
     near = get_close_matches(name, names, n=3, cutoff=0.5)

@@ -1,4 +1,4 @@
-"""Replay: every transition whole, in the ring it belongs to, and back in every bit."""
+"""ReplayBuffer: every transition whole, in the ring it belongs to, and back in every bit."""
 
 from types import SimpleNamespace
 
@@ -8,12 +8,13 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lemniscate.data.replay import Replay, bytes_of_one
+from lemniscate.data.replay import ReplayBuffer, bytes_per_transition
 from lemniscate.errors import UserError
-from lemniscate.types import Box, Part, Spec, Transition
+from lemniscate.spec import Box, ObservationPart, Spec
+from lemniscate.types import Transition
 
 CPU = torch.device("cpu")
-SPEC = Spec("x", (Part((), (3,)),), Box((-1.0, -1.0), (1.0, 1.0)))
+SPEC = Spec("x", (ObservationPart((), (3,)),), Box((-1.0, -1.0), (1.0, 1.0)))
 
 
 def numbered(first, count):
@@ -37,7 +38,7 @@ def of(rows):
 
 @given(st.lists(st.integers(0, 7), max_size=30), st.integers(7, 20))
 def test_it_holds_the_last_ones_each_of_one_piece(counts, capacity):
-    replay, written = Replay(SPEC, capacity, CPU), 0
+    replay, written = ReplayBuffer(SPEC, capacity, CPU), 0
     for count in counts:
         replay.extend(numbered(written, count))
         written += count
@@ -47,7 +48,7 @@ def test_it_holds_the_last_ones_each_of_one_piece(counts, capacity):
 
 
 def test_every_row_is_drawn_and_none_that_is_not_filled(rng):
-    replay = Replay(SPEC, 50, CPU)
+    replay = ReplayBuffer(SPEC, 50, CPU)
     replay.extend(numbered(0, 8))
     rows = replay.draw(400, 20, rng)
     assert rows.shape == (400, 20)
@@ -58,7 +59,7 @@ def test_every_row_is_drawn_and_none_that_is_not_filled(rng):
 
 @pytest.mark.parametrize("written", [0, 5, 10, 13])
 def test_it_comes_back_in_every_bit_and_goes_on_alike(written):
-    replay, other = Replay(SPEC, 10, CPU), Replay(SPEC, 10, CPU)
+    replay, other = ReplayBuffer(SPEC, 10, CPU), ReplayBuffer(SPEC, 10, CPU)
     other.extend(numbered(100, 7))
     if written:
         replay.extend(numbered(0, min(written, 7)))
@@ -73,7 +74,7 @@ def test_it_comes_back_in_every_bit_and_goes_on_alike(written):
 
 
 def test_what_is_saved_is_not_copied():
-    replay = Replay(SPEC, 10, CPU)
+    replay = ReplayBuffer(SPEC, 10, CPU)
     replay.extend(numbered(0, 4))
     saved = replay.state_dict()
     assert saved["obs"].data_ptr() == replay.transitions.obs.data_ptr()
@@ -81,18 +82,18 @@ def test_what_is_saved_is_not_copied():
 
 
 def test_a_million_of_hopper_fit_into_130_megabytes():
-    hopper = Spec("Hopper-v5", (Part((), (11,)),), Box((-1.0,) * 3, (1.0,) * 3))
-    replay = Replay(hopper, 1_000_000, CPU)
-    assert 1_000_000 * bytes_of_one(hopper) == sum(t.nbytes for t in vars(replay.transitions).values()) <= 130e6
+    hopper = Spec("Hopper-v5", (ObservationPart((), (11,)),), Box((-1.0,) * 3, (1.0,) * 3))
+    replay = ReplayBuffer(hopper, 1_000_000, CPU)
+    assert 1_000_000 * bytes_per_transition(hopper) == sum(t.nbytes for t in vars(replay.transitions).values()) <= 130e6
 
 
 def test_an_image_stays_bytes():
-    image = Spec("x", (Part((), (4, 4, 3)),), Box((-1.0,), (1.0,)), image=True)
-    assert Replay(image, 5, CPU).transitions.next_obs.dtype == torch.uint8
+    image = Spec("x", (ObservationPart((), (4, 4, 3)),), Box((-1.0,), (1.0,)), image=True)
+    assert ReplayBuffer(image, 5, CPU).transitions.next_obs.dtype == torch.uint8
 
 
 def test_what_does_not_fit_is_refused_with_what_would(monkeypatch):
     monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=3700))
     with pytest.raises(UserError, match="choose buffer_size at most 100"):
-        Replay(SPEC, 101, CPU)
-    Replay(SPEC, 100, CPU)
+        ReplayBuffer(SPEC, 101, CPU)
+    ReplayBuffer(SPEC, 100, CPU)

@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-import worlds  # noqa: F401  (registers the copies)
+import environments  # noqa: F401  (registers the copies)
 from lemniscate.envs.check import check
 
 

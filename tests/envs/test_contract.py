@@ -5,15 +5,15 @@ import pytest
 import torch
 from gymnasium.vector import AutoresetMode
 
-import worlds
+import environments
 from lemniscate.data.rollout import collect
-from lemniscate.envs import api, toy
-from lemniscate.envs.api import VecEnv
+from lemniscate.envs import registry, toy
 from lemniscate.envs.gymnasium import GymnasiumBackend
+from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import NonFiniteError, UserError
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.networks import Layers
-from lemniscate.types import Box
+from lemniscate.spec import Box
 
 CPU = torch.device("cpu")
 MODES = [mode.name for mode in AutoresetMode]
@@ -26,7 +26,7 @@ EVERY = [
     ("CartPole-v1", "envpool"),
     ("Hopper-v5", "envpool"),
     ("LunarLander-v3", "envpool"),
-    *[(f"Copy-{kind}-v0", "gymnasium") for kind in worlds.KINDS],
+    *[(f"Copy-{kind}-v0", "gymnasium") for kind in environments.KINDS],
     ("Copy-tuple-v0", "gymnasium-async"),
     ("Copy-masked-v0", "gymnasium-async"),
     ("DroneFigureEightTrajectory-v0", "crazyflow"),
@@ -49,7 +49,7 @@ def play(env, num_steps, seed=0):
 
 @pytest.mark.parametrize(("env_id", "backend"), EVERY)
 def test_every_backend(env_id, backend):
-    env = api.make(env_id, 4, backend=backend, stagger=True)
+    env = registry.make(env_id, 4, backend=backend, stagger=True)
     try:
         torch.manual_seed(0)
         first = play(env, 70)
@@ -184,7 +184,7 @@ def test_a_vector_environment_may_write_over_its_own_arrays(monkeypatch, mode):
 
 
 def test_staggering_spreads_the_first_episodes():
-    env = api.make("Pendulum-v1", 16, stagger=True)
+    env = registry.make("Pendulum-v1", 16, stagger=True)
     rollout = play(env, 200)
     first_end = rollout.truncated.int().argmax(0)
     assert len(set(first_end.tolist())) > 8
@@ -193,7 +193,7 @@ def test_staggering_spreads_the_first_episodes():
 
 
 def test_two_copies_differ_and_two_seeds_differ():
-    env = api.make("CartPole-v1", 2)
+    env = registry.make("CartPole-v1", 2)
     a, b = env.restart(0), env.restart(1)
     assert not torch.equal(a[0], a[1])
     assert not torch.equal(a, b)
@@ -210,9 +210,9 @@ def test_two_copies_differ_and_two_seeds_differ():
 )
 def test_what_cannot_be_made_is_said(arguments, said):
     with pytest.raises(UserError, match=said):
-        api.make(*arguments)
+        registry.make(*arguments)
 
 
 def test_a_backend_that_does_not_serve_an_environment_is_refused():
     with pytest.raises(UserError, match="cannot be served by the crazyflow backend"):
-        api.make("CartPole-v1", 2, backend="crazyflow")
+        registry.make("CartPole-v1", 2, backend="crazyflow")

@@ -10,7 +10,7 @@ import torch
 
 crazyflow = pytest.importorskip("lemniscate.envs.crazyflow")
 
-from lemniscate.envs import api
+from lemniscate.envs import registry
 from lemniscate.envs.spaces import scale_action
 
 FIGURE_EIGHT = "DroneFigureEightTrajectory-v0"
@@ -19,12 +19,12 @@ N = 8
 
 @pytest.fixture(scope="module")
 def env():
-    return api.make(FIGURE_EIGHT, N)
+    return registry.make(FIGURE_EIGHT, N)
 
 
 @pytest.fixture(scope="module")
 def staggered():
-    return api.make(FIGURE_EIGHT, N, stagger=True)
+    return registry.make(FIGURE_EIGHT, N, stagger=True)
 
 
 def test_the_layout_is_the_documented_one(env):
@@ -97,7 +97,7 @@ def test_a_time_out_is_a_truncation_after_500_steps(env):
 
 
 def test_staggered_drones_are_spread_over_the_curve_and_stay_beside_it(staggered):
-    env = api.make(FIGURE_EIGHT, 256, stagger=True)
+    env = registry.make(FIGURE_EIGHT, 256, stagger=True)
     obs = env.restart(0)
     offset = obs[:, 13:16]
     assert (offset[:, :2].abs() <= 0.1 + 1e-4).all()
@@ -105,7 +105,7 @@ def test_staggered_drones_are_spread_over_the_curve_and_stay_beside_it(staggered
     goal = obs[:, 0:3] + offset
     assert goal[:, 0].min() < -0.9
     assert goal[:, 0].max() > 0.9
-    whole = env.backend.whole
+    whole = env.backend.counts
     assert 0.1 < whole.float().mean() < 0.4  # a quarter begins at the beginning
     assert ((goal[whole] - torch.tensor([0.0, 0.0, 1.0])).norm(dim=-1) < 1e-3).all()
 
@@ -132,7 +132,7 @@ def test_no_copy_is_made_on_the_way_to_torch(env, monkeypatch):
 
 @pytest.mark.parametrize("env_id", ["DroneReachPos-v0", "DroneReachVel-v0"])
 def test_goals_come_from_the_seed_too(env_id):
-    env = api.make(env_id, 4)
+    env = registry.make(env_id, 4)
     first, second, again = env.restart(1), env.restart(2), env.restart(1)
     assert not torch.equal(first, second)
     assert torch.equal(first, again)
@@ -141,7 +141,7 @@ def test_goals_come_from_the_seed_too(env_id):
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 def test_on_a_gpu_nothing_leaves_it():
-    env = api.make(FIGURE_EIGHT, N, device="cuda")
+    env = registry.make(FIGURE_EIGHT, N, device="cuda")
     env.restart(0)
     step = env.step(torch.zeros(N, 4, device="cuda"))
     assert step.obs.is_cuda

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from lemniscate.envs import api
+from lemniscate.envs import registry
 from lemniscate.envs.envpool import EnvpoolBackend
 
 CPU = torch.device("cpu")
@@ -13,9 +13,9 @@ MUJOCO = {"Ant-v5": 2, "HalfCheetah-v5": 1, "Hopper-v5": 1, "Humanoid-v5": 2, "W
 """how many of the first positions the observation leaves out"""
 
 
-@pytest.mark.parametrize("env_id", api.ENVPOOL_IDS)
+@pytest.mark.parametrize("env_id", registry.ENVPOOL_IDS)
 def test_spaces_and_limits_are_the_same(env_id):
-    pool, own = (api.make(env_id, 2, backend=backend) for backend in ("envpool", "gymnasium"))
+    pool, own = (registry.make(env_id, 2, backend=backend) for backend in ("envpool", "gymnasium"))
     assert pool.spec.fits(own.spec)
     assert pool.spec.max_episode_steps == own.spec.max_episode_steps  # each side's own
     theirs, ours = pool.backend._pool, own.backend._envs
@@ -76,7 +76,7 @@ def test_lunar_lander_falls_the_same():
     """Its terrain and push are random, so it is the statistics of many falls that must agree."""
     lengths, returns = {}, {}
     for backend in ("envpool", "gymnasium"):
-        env = api.make("LunarLander-v3", 16, backend=backend)
+        env = registry.make("LunarLander-v3", 16, backend=backend)
         env.restart(0)
         rng = np.random.default_rng(1)
         episodes = []
@@ -104,7 +104,7 @@ def test_bits_do_not_depend_on_the_number_of_threads():
 
 def test_bits_do_not_depend_on_workers():
     def play(backend):
-        env = api.make("CartPole-v1", 3, backend=backend, stagger=True)
+        env = registry.make("CartPole-v1", 3, backend=backend, stagger=True)
         obs = [env.restart(4)]
         for t in range(60):
             obs.append(env.step(torch.full((3,), t % 2)).obs)

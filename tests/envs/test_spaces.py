@@ -16,7 +16,7 @@ from lemniscate.envs.spaces import (
     scale_action,
 )
 from lemniscate.errors import UserError
-from lemniscate.types import Box, Discrete
+from lemniscate.spec import Box, Discrete
 
 
 @given(st.floats(-10, 10, width=32), st.floats(0.125, 10, width=32), st.floats(-3, 3, width=32))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from lemniscate.envs import api
+from lemniscate.envs import registry
 from lemniscate.envs.workers import WatchedVectorEnv
 from lemniscate.errors import WorkerError
 
@@ -60,7 +60,7 @@ class Gone(Stubborn):
 def test_one_that_never_comes_to_life_is_named(monkeypatch, name, patience, sentence):
     monkeypatch.setattr(WatchedVectorEnv, "patience", patience)
     with pytest.raises(WorkerError, match=sentence):
-        api.make(f"envs.test_workers:{name}", 2, backend="gymnasium-async")
+        registry.make(f"envs.test_workers:{name}", 2, backend="gymnasium-async")
     assert not multiprocessing.active_children()
 
 
@@ -70,7 +70,7 @@ def step(env, times):
 
 
 def test_one_that_dies_is_named():
-    env = api.make("CartPole-v1", 3, backend="gymnasium-async")
+    env = registry.make("CartPole-v1", 3, backend="gymnasium-async")
     try:
         env.restart(0)
         step(env, 1)
@@ -83,7 +83,7 @@ def test_one_that_dies_is_named():
 
 def test_one_that_hangs_is_named_and_closing_kills_it(monkeypatch):
     monkeypatch.setattr(WatchedVectorEnv, "patience", 2.0)
-    env = api.make("envs.test_workers:Stubborn", 3, backend="gymnasium-async")
+    env = registry.make("envs.test_workers:Stubborn", 3, backend="gymnasium-async")
     try:
         env.restart(0)  # its copies get the seeds 0, 1, 2
         with pytest.raises(WorkerError, match=r"Environment 2 has not answered for 2 s\."):

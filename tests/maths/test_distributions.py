@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import distributions
 
-from lemniscate.maths import Bernoulli, Categorical, Gaussian, MultiCategorical, Point, SquashedGaussian
+from lemniscate.maths import Bernoulli, Categorical, Deterministic, Gaussian, MultiCategorical, SquashedGaussian
 
 
 def test_gaussian(rng):
@@ -105,7 +105,7 @@ def test_a_squashed_log_prob_is_finite_and_has_a_gradient_where_tanh_is_one():
 
 
 def test_a_point_is_itself_and_what_is_added_stays_in_bounds():
-    point = Point(torch.tensor([[0.5, -0.9]]))
+    point = Deterministic(torch.tensor([[0.5, -0.9]]))
     assert point.mode() is point.action
     assert torch.equal(point.sample(torch.zeros(1, 2)), point.action)
     assert torch.equal(point.sample(torch.tensor([[0.25, -0.25]])), torch.tensor([[0.75, -1.0]]))

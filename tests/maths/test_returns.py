@@ -4,7 +4,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lemniscate.maths import gae, polyak, reward_to_go, td_target, whole_return
+from lemniscate.maths import episode_return, gae, polyak, reward_to_go, td_target
 
 
 def brute_force(reward, value, next_value, terminated, done, gamma, lam):
@@ -167,5 +167,5 @@ def test_the_whole_return_is_that_of_the_first_row_of_the_episode(rollout, gamma
     for n in range(reward.shape[1]):
         for t in range(1, len(reward)):
             expected[t, n] = to_go[t, n] if done[t - 1, n] else expected[t - 1, n]
-    actual = whole_return(to_go, reward, done, gamma=gamma)
+    actual = episode_return(to_go, reward, done, gamma=gamma)
     torch.testing.assert_close(actual, expected, rtol=1e-9, atol=1e-9)

@@ -13,9 +13,10 @@ from conftest import tiny
 from lemniscate.algos import ppo
 from lemniscate.run import checkpoint
 from lemniscate.run.checkpoint import DamagedCheckpointError
-from lemniscate.types import Batch, Box, Discrete, MultiBinary, MultiDiscrete, Part, Spec
+from lemniscate.spec import Box, Discrete, MultiBinary, MultiDiscrete, ObservationPart, Spec
+from lemniscate.types import Batch
 
-SPEC = Spec("x", (Part((), (3,)),), Box((-1.0,), (1.0,)), 500, 0.02, (0, 3))
+SPEC = Spec("x", (ObservationPart((), (3,)),), Box((-1.0,), (1.0,)), 500, 0.02, (0, 3))
 CPU = torch.device("cpu")
 
 
@@ -75,7 +76,7 @@ def test_the_policy_and_the_value_still_share_their_normalizer(tmp_path):
     "spec",
     [
         SPEC,
-        Spec("y", (Part(("a",), (), (4,), (1,)), Part(("b", 0), (2,))), Discrete(4, 1)),
+        Spec("y", (ObservationPart(("a",), (), (4,), (1,)), ObservationPart(("b", 0), (2,))), Discrete(4, 1)),
         Spec("z", (), MultiDiscrete((2, 3), (0, 1), (2,)), image=True),
         Spec("w", (), MultiBinary(3)),
     ],

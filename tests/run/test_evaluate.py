@@ -5,8 +5,8 @@ import torch
 
 import lemniscate as lem
 from lemniscate.envs import toy
-from lemniscate.envs.api import VecEnv
 from lemniscate.envs.gymnasium import GymnasiumBackend
+from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.networks import Layers
@@ -55,7 +55,7 @@ def endless(num_envs, mode="DISABLED"):
 
 
 def test_an_episode_without_end_is_a_sentence_and_not_a_hang(monkeypatch):
-    monkeypatch.setattr("lemniscate.envs.api.PATIENCE", 30)
+    monkeypatch.setattr("lemniscate.envs.vec_env.PATIENCE", 30)
     env = endless(2)
     with pytest.raises(UserError, match=r"Countdown-v0 has not ended after 30 steps.*time limit"):
         evaluate(ActorCritic(env.spec, Layers((4,))).policy, env, 2, seed=0)
@@ -63,14 +63,14 @@ def test_an_episode_without_end_is_a_sentence_and_not_a_hang(monkeypatch):
 
 
 def test_patience_is_for_one_episode_not_for_all(monkeypatch):
-    monkeypatch.setattr("lemniscate.envs.api.PATIENCE", 30)
+    monkeypatch.setattr("lemniscate.envs.vec_env.PATIENCE", 30)
     env = VecEnv(GymnasiumBackend("Countdown-v0", 2, CPU, mode="DISABLED", length=20, horizon=None))
     assert evaluate(ActorCritic(env.spec, Layers((4,))).policy, env, 10, seed=0).lengths == [20] * 10
 
 
 def test_a_run_goes_on_when_its_evaluation_cannot(monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr("lemniscate.envs.api.PATIENCE", 30)
-    monkeypatch.setattr("lemniscate.front._evaluation_env", lambda *_: endless(2))
+    monkeypatch.setattr("lemniscate.envs.vec_env.PATIENCE", 30)
+    monkeypatch.setattr("lemniscate.api._evaluation_env", lambda *_: endless(2))
     fields = {"num_envs": 2, "num_steps": 32, "total_steps": 128, "evaluate_every": 64, "progress": False}
     run = lem.train("ppo", "Countdown-v0", run=tmp_path / "run", backend="gymnasium", **fields)
     assert run.policy.step == 128

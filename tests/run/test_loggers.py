@@ -4,7 +4,7 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 
-from lemniscate.envs.books import Episodes
+from lemniscate.envs.episodes import Episodes
 from lemniscate.report.curves import episode_returns
 from lemniscate.run.loggers import JsonLines, WeightsAndBiases, read_metrics
 

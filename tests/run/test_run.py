@@ -16,7 +16,7 @@ import pytest
 import torch
 
 import lemniscate as lem
-from conftest import tiny_fields, tiny_memory
+from conftest import tiny_fields, tiny_off_policy
 from lemniscate.envs import toy
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.run import checkpoint
@@ -51,7 +51,7 @@ def train(path, env="Countdown-v0", **fields):
         small = {"num_envs": 4, "num_steps": 8, "total_steps": 256, "hidden": (16,), "evaluate_episodes": 4}
         return lem.train(env.split("-")[0], "CartPole-v1", run=path, progress=False, **{**small, **ROAD[env], **fields})
     if env in REMEMBERING:
-        fields = tiny_memory(**REMEMBERING[env], **fields)
+        fields = tiny_off_policy(**REMEMBERING[env], **fields)
         return lem.train(env.split("-")[0], "Pendulum-v1", run=path, progress=False, **fields)
     return lem.train("ppo", env, run=path, progress=False, **tiny_fields(env, **fields))
 
@@ -256,7 +256,7 @@ def command(*arguments, stderr=subprocess.DEVNULL, **options):
 def long_run(path, env, updates=150, engine="eager"):
     """Arguments of a run of some seconds with a checkpoint every eighth update."""
     if env in REMEMBERING:
-        fields = tiny_memory(**REMEMBERING[env], total_steps=16 * updates, checkpoint_every=128, engine=engine)
+        fields = tiny_off_policy(**REMEMBERING[env], total_steps=16 * updates, checkpoint_every=128, engine=engine)
         flags = [f"--{name.replace('_', '-')}" for name in fields]
         values = [() if value is True else value if isinstance(value, tuple) else (value,) for value in fields.values()]
         given = [part for flag, value in zip(flags, values, strict=True) for part in (flag, *value)]

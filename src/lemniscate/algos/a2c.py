@@ -16,15 +16,16 @@ from lemniscate.maths import explained_variance, gae, linear, policy_gradient, s
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.descent import Descent
 from lemniscate.nn.normalizer import RewardScale
-from lemniscate.nn.policies import Policy
-from lemniscate.run.config import Count, Fraction, NonNegative, Positive, RolloutConfig
+from lemniscate.run.config import Count, Fraction, NonNegative, OnPolicyConfig, Positive
 from lemniscate.run.run import Run
 from lemniscate.run.seeding import generator
-from lemniscate.types import Batch, Rollout, Spec
+from lemniscate.run.state import TrainState
+from lemniscate.spec import Spec
+from lemniscate.types import Batch, Rollout
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(RolloutConfig):
+class Config(OnPolicyConfig):
     """What A2C adds to the knobs of all that learn from rollouts."""
 
     num_steps: Count = 8
@@ -57,7 +58,7 @@ class Config(RolloutConfig):
 
 
 @dataclass
-class State:
+class State(TrainState):
     """Everything a crash may not take from us."""
 
     networks: ActorCritic
@@ -67,11 +68,6 @@ class State:
     """what actions are drawn with"""
     step: int = 0
     """environment steps taken"""
-
-    @property
-    def policy(self) -> Policy:
-        """π, the part of it that acts."""
-        return self.networks.policy
 
 
 def networks(config: Config, spec: Spec) -> ActorCritic:

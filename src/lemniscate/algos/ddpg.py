@@ -11,22 +11,24 @@ from functools import partial
 import torch
 from torch import Generator, Tensor, nn
 
-from lemniscate.data.exploration import Exploration
-from lemniscate.data.replay import Replay
-from lemniscate.envs.api import VecEnv
+from lemniscate.data.action_noise import ActionNoise
+from lemniscate.data.replay import ReplayBuffer
+from lemniscate.envs.vec_env import VecEnv
 from lemniscate.maths import linear, means, polyak, td_target, uniform, value_loss
 from lemniscate.nn.actor_critic import ActorQ
 from lemniscate.nn.descent import Descent
 from lemniscate.nn.joint import Joint
 from lemniscate.nn.policies import Policy
-from lemniscate.run.config import Count, NonNegative, ReplayConfig
+from lemniscate.run.config import Count, NonNegative, OffPolicyConfig
 from lemniscate.run.run import Run
 from lemniscate.run.seeding import generator
-from lemniscate.types import Spec, Transition
+from lemniscate.run.state import TrainState
+from lemniscate.spec import Spec
+from lemniscate.types import Transition
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(ReplayConfig):
+class Config(OffPolicyConfig):
     """What DDPG adds to the knobs of all that learn from memory."""
 
     policy_delay: Count = 1
@@ -36,7 +38,7 @@ class Config(ReplayConfig):
 
 
 @dataclass
-class State:
+class State(TrainState):
     """Everything a crash may not take from us."""
 
     networks: ActorQ
@@ -44,8 +46,8 @@ class State:
     """μ' and Q': copies that follow slowly"""
     actor_descent: Descent[Policy]
     critic_descent: Descent[nn.Module]
-    replay: Replay
-    exploration: Exploration
+    replay: ReplayBuffer
+    action_noise: ActionNoise
     noise: Generator
     """what actions are drawn with"""
     draws: Generator
@@ -57,11 +59,6 @@ class State:
 
     def __post_init__(self) -> None:
         self.joint = Joint(learn, self.actor_descent, self.critic_descent)
-
-    @property
-    def policy(self) -> Policy:
-        """μ, whom to evaluate."""
-        return self.networks.policy
 
 
 def networks(config: Config, spec: Spec) -> ActorQ:
@@ -80,8 +77,8 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
         targets,
         Descent(online.policy, partial(actor_loss, online.critic), watch_as="gradient_norm/actor"),
         Descent(online.critic, partial(critic_loss, config, targets), watch_as="gradient_norm/critic"),
-        Replay(spec, config.capacity, device),
-        Exploration(config.noise, copies, length, device, time=config.noise_time, exponent=config.noise_exponent),
+        ReplayBuffer(spec, config.capacity, device),
+        ActionNoise(config.noise, copies, length, device, time=config.noise_time, exponent=config.noise_exponent),
         noise=generator(config.seed, device, 2),
         draws=generator(config.seed, device, 3),
     )
@@ -90,12 +87,12 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
 @torch.no_grad()
 def play(config: Config, state: State, env: VecEnv) -> None:
     """One step of every copy: a = μ(s) + noise (section 3, eq. 7), or anything at all while warming up."""
-    obs, noise = env.obs, state.exploration(state.noise)
+    obs, noise = env.obs, state.action_noise(state.noise)
     warming_up = state.step < config.learning_starts
     action = uniform(noise) if warming_up else state.policy.act(obs, config.noise_std * noise)
     step = env.step(action)
     state.replay.add(obs, action, step)
-    state.exploration.cut(step.terminated | step.truncated | ~step.valid)
+    state.action_noise.cut(step.terminated | step.truncated | ~step.valid)
     state.policy.observe(obs[step.valid])
     state.step += env.num_envs
 

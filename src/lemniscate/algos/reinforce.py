@@ -15,6 +15,7 @@ from torch import Generator, Tensor
 from lemniscate.data.rollout import collect, collect_episodes, minibatches, whole_batch
 from lemniscate.errors import UserError
 from lemniscate.maths import (
+    episode_return,
     explained_variance,
     kl_k3,
     linear,
@@ -22,21 +23,22 @@ from lemniscate.maths import (
     reward_to_go,
     standardize,
     value_loss,
-    whole_return,
 )
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.critics import Value
 from lemniscate.nn.descent import Descent
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.nn.policies import Policy
-from lemniscate.run.config import Count, Fraction, Natural, NonNegative, Positive, RolloutConfig
+from lemniscate.run.config import Count, Fraction, Natural, NonNegative, OnPolicyConfig, Positive
 from lemniscate.run.run import Run
 from lemniscate.run.seeding import generator
-from lemniscate.types import Batch, Rollout, Spec
+from lemniscate.run.state import TrainState
+from lemniscate.spec import Spec
+from lemniscate.types import Batch, Rollout
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(RolloutConfig):
+class Config(OnPolicyConfig):
     """What REINFORCE adds to the knobs of all that learn from rollouts."""
 
     episodes: Natural = 0
@@ -81,7 +83,7 @@ class Config(RolloutConfig):
 
 
 @dataclass
-class State:
+class State(TrainState):
     """Everything a crash may not take from us."""
 
     networks: ActorCritic
@@ -93,11 +95,6 @@ class State:
     shuffle: Generator
     step: int = 0
     """environment steps taken"""
-
-    @property
-    def policy(self) -> Policy:
-        """π, the part of it that acts."""
-        return self.networks.policy
 
 
 def networks(config: Config, spec: Spec) -> ActorCritic:
@@ -127,7 +124,7 @@ def outcomes(config: Config, state: State, rollout: Rollout) -> Batch:
     to_go = reward_to_go(rollout.reward, next_value, rollout.terminated, rollout.done, gamma=config.gamma)
     paid = to_go
     if config.returns == "whole":
-        paid = whole_return(to_go, rollout.reward, rollout.done | ~rollout.valid, gamma=config.gamma)
+        paid = episode_return(to_go, rollout.reward, rollout.done | ~rollout.valid, gamma=config.gamma)
     baseline = paid[rollout.valid].mean() if config.baseline == "mean" else value
     log_prob = state.policy(rollout.obs).log_prob(rollout.action)
     return Batch(rollout.obs, rollout.action, log_prob, value, paid - baseline, to_go).flatten()

@@ -12,23 +12,24 @@ from typing import Annotated
 import torch
 from torch import Generator, Tensor, nn
 
-from lemniscate.data.exploration import Exploration
-from lemniscate.data.replay import Replay
-from lemniscate.envs.api import VecEnv
+from lemniscate.data.action_noise import ActionNoise
+from lemniscate.data.replay import ReplayBuffer
+from lemniscate.envs.vec_env import VecEnv
 from lemniscate.maths import linear, means, polyak, td_target, uniform, value_loss
 from lemniscate.nn.actor_critic import ActorQ
 from lemniscate.nn.critics import TwinQ
 from lemniscate.nn.descent import Descent
 from lemniscate.nn.joint import Joint
-from lemniscate.nn.policies import Policy
-from lemniscate.run.config import Count, Positive, Range, ReplayConfig
+from lemniscate.run.config import Count, OffPolicyConfig, Positive, Range
 from lemniscate.run.run import Run
 from lemniscate.run.seeding import generator
-from lemniscate.types import Spec, Transition
+from lemniscate.run.state import TrainState
+from lemniscate.spec import Spec
+from lemniscate.types import Transition
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(ReplayConfig):
+class Config(OffPolicyConfig):
     """What SAC adds to the knobs of all that learn from memory."""
 
     policy_delay: Count = 1
@@ -40,7 +41,7 @@ class Config(ReplayConfig):
 
 
 @dataclass
-class State:
+class State(TrainState):
     """Everything a crash may not take from us."""
 
     networks: ActorQ
@@ -48,8 +49,8 @@ class State:
     """Q'₁ and Q'₂: copies that follow slowly"""
     actor_descent: Descent[nn.ModuleList]
     critic_descent: Descent[TwinQ]
-    replay: Replay
-    exploration: Exploration
+    replay: ReplayBuffer
+    action_noise: ActionNoise
     noise: Generator
     """what actions are drawn with"""
     draws: Generator
@@ -61,11 +62,6 @@ class State:
 
     def __post_init__(self) -> None:
         self.joint = Joint(learn, self.actor_descent, self.critic_descent)
-
-    @property
-    def policy(self) -> Policy:
-        """π, whom to evaluate."""
-        return self.networks.policy
 
 
 def networks(config: Config, spec: Spec) -> ActorQ:
@@ -84,8 +80,8 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
         targets,
         Descent(actor, partial(actor_loss, config, online.critic), watch_as="gradient_norm/actor"),
         Descent(online.critic, partial(critic_loss, config, targets, actor), watch_as="gradient_norm/critic"),
-        Replay(spec, config.capacity, device),
-        Exploration(config.noise, copies, length, device, time=config.noise_time, exponent=config.noise_exponent),
+        ReplayBuffer(spec, config.capacity, device),
+        ActionNoise(config.noise, copies, length, device, time=config.noise_time, exponent=config.noise_exponent),
         noise=generator(config.seed, device, 2),
         draws=generator(config.seed, device, 3),
     )
@@ -94,12 +90,12 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
 @torch.no_grad()
 def play(config: Config, state: State, env: VecEnv) -> None:
     """One step of every copy: a ~ π(·|s), or anything at all while warming up."""
-    obs, noise = env.obs, state.exploration(state.noise)
+    obs, noise = env.obs, state.action_noise(state.noise)
     warming_up = state.step < config.learning_starts
     action = uniform(noise) if warming_up else state.policy.act(obs, noise)
     step = env.step(action)
     state.replay.add(obs, action, step)
-    state.exploration.cut(step.terminated | step.truncated | ~step.valid)
+    state.action_noise.cut(step.terminated | step.truncated | ~step.valid)
     state.policy.observe(obs[step.valid])
     state.step += env.num_envs
 

@@ -28,15 +28,16 @@ from lemniscate.nn.critics import Value
 from lemniscate.nn.descent import Descent
 from lemniscate.nn.flat import FlatPolicy
 from lemniscate.nn.normalizer import RewardScale
-from lemniscate.nn.policies import Policy
-from lemniscate.run.config import Count, Fraction, NonNegative, Positive, Range, RolloutConfig
+from lemniscate.run.config import Count, Fraction, NonNegative, OnPolicyConfig, Positive, Range
 from lemniscate.run.run import Run
 from lemniscate.run.seeding import generator
-from lemniscate.types import Batch, Rollout, Spec
+from lemniscate.run.state import TrainState
+from lemniscate.spec import Spec
+from lemniscate.types import Batch, Rollout
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(RolloutConfig):
+class Config(OnPolicyConfig):
     """What TRPO adds to the knobs of all that learn from rollouts."""
 
     max_kl: Positive = 0.01
@@ -75,7 +76,7 @@ class Config(RolloutConfig):
 
 
 @dataclass
-class State:
+class State(TrainState):
     """Everything a crash may not take from us."""
 
     networks: ActorCritic
@@ -89,11 +90,6 @@ class State:
 
     def __post_init__(self) -> None:
         self.parameters = FlatPolicy(self.policy)  # θ
-
-    @property
-    def policy(self) -> Policy:
-        """π, the part of it that acts."""
-        return self.networks.policy
 
 
 def networks(config: Config, spec: Spec) -> ActorCritic:

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from lemniscate.course.exercises import EXERCISES, Case, Exercise, Function
-from lemniscate.errors import unknown
+from lemniscate.errors import unknown_name
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ def check(function: Function, name: str | None = None) -> Finding:
     """
     name = name or function.__name__
     if name not in EXERCISES:
-        raise unknown("exercise", name, EXERCISES)
+        raise unknown_name("exercise", name, EXERCISES)
     finding = _find(name, EXERCISES[name], function)
     print(finding, file=sys.stderr)
     return finding

@@ -1,4 +1,4 @@
-"""Replay: a ring of transitions that a learner draws from again and again (Lin 1992; Mnih et al. 2015)."""
+"""ReplayBuffer: a ring of transitions that a learner draws from again and again (Lin 1992; Mnih et al. 2015)."""
 
 import math
 
@@ -7,17 +7,18 @@ import torch
 from torch import Generator, Tensor
 
 from lemniscate.errors import UserError
-from lemniscate.types import Spec, Step, Transition
+from lemniscate.spec import Spec
+from lemniscate.types import Step, Transition
 
 
-class Replay:
+class ReplayBuffer:
     """The last `capacity` transitions, whichever copy they came from; preallocated on `device`.
 
     Raises `UserError` where they would not fit into the memory that is free.
     """
 
     def __init__(self, spec: Spec, capacity: int, device: torch.device) -> None:
-        num_bytes = capacity * bytes_of_one(spec)
+        num_bytes = capacity * bytes_per_transition(spec)
         free = torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else psutil.virtual_memory().available
         if num_bytes > free:
             raise UserError(
@@ -66,7 +67,7 @@ class Replay:
             ring[: len(self)] = state[name]
 
 
-def bytes_of_one(spec: Spec) -> int:
+def bytes_per_transition(spec: Spec) -> int:
     """What a transition takes."""
     return sum(math.prod(shape) * kind.itemsize for _, shape, kind in _columns(spec))
 

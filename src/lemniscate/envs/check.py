@@ -10,12 +10,13 @@ import torch
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
-from lemniscate.envs import api
-from lemniscate.envs.api import VecEnv
+from lemniscate.envs import registry
 from lemniscate.envs.gymnasium import make_one, spec_of
 from lemniscate.envs.spaces import follow, is_image, observation_layout
+from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import NonFiniteError, UserError
-from lemniscate.types import Action, Box, Discrete, MultiDiscrete, Rollout
+from lemniscate.spec import Action, Box, Discrete, MultiDiscrete
+from lemniscate.types import Rollout
 
 COPIES, STEPS = 4, 500
 
@@ -30,11 +31,11 @@ class Finding:
 
 def check(env_id: str, backend: str | None = None) -> Iterator[Finding]:
     """Everything found, one by one; the first that keeps it from being made is the last."""
-    served_by = api.backend_for(env_id) if backend is None else api.require_backend(backend)
+    served_by = registry.backend_for(env_id) if backend is None else registry.require_backend(backend)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            env = api.make(env_id, COPIES, backend=backend)
+            env = registry.make(env_id, COPIES, backend=backend)
     except UserError as error:
         yield Finding("bad", str(error))
         return

@@ -23,7 +23,8 @@ from torch import Tensor
 
 from lemniscate.envs.spaces import action_kind
 from lemniscate.errors import UserError, missing_extra
-from lemniscate.types import Box, Part, Spec, Step
+from lemniscate.spec import Box, ObservationPart, Spec
+from lemniscate.types import Step
 
 os.environ.setdefault("SCIPY_ARRAY_API", "1")  # crazyflow insists, and before SciPy is first imported
 try:
@@ -89,7 +90,7 @@ class Simulator:
         """The observation in its documented order: the drone's state first, then the task's own parts."""
         parts = self.env.obs()
         names = (*STATE_PARTS, *(name for name in parts if name not in STATE_PARTS))
-        self.layout = tuple(Part((name,), (parts[name].shape[-1],)) for name in names)
+        self.layout = tuple(ObservationPart((name,), (parts[name].shape[-1],)) for name in names)
         return jnp.concatenate([parts[name] for name in names], axis=-1)
 
     def _restart(self, seed: jax.Array, stagger: jax.Array) -> tuple[State, jax.Array, jax.Array]:
@@ -188,7 +189,7 @@ class CrazyflowBackend:
         # Committed to the device like everything that follows, or the step would be compiled a second time.
         seed_here = jax.device_put(np.uint32(seed), self._simulator.env.device)
         self._state, obs, ahead = self._simulator.restart(seed_here, self._stagger)
-        self.whole = ~torch.from_dlpack(ahead)
+        self.counts = ~torch.from_dlpack(ahead)
         return torch.from_dlpack(obs)
 
     def step(self, action: Tensor) -> Step:
@@ -196,7 +197,7 @@ class CrazyflowBackend:
         command = jax.dlpack.from_dlpack(action.contiguous())
         self._state, out = self._simulator.step(self._state, command, self._stagger)
         obs, next_obs, reward, terminated, truncated, ahead = map(torch.from_dlpack, out)
-        self.whole = (self.whole | terminated | truncated) & ~ahead
+        self.counts = (self.counts | terminated | truncated) & ~ahead
         return Step(obs, next_obs, reward, terminated, truncated, self._valid)
 
     def close(self) -> None:

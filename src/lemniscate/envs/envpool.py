@@ -8,17 +8,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lemniscate.envs.episodes import Stagger
 from lemniscate.envs.spaces import action_kind, flatten_observation, is_image, observation_layout, physical_action
-from lemniscate.envs.stagger import Cuts
 from lemniscate.errors import UserError
-from lemniscate.types import Spec, Step
+from lemniscate.spec import Spec
+from lemniscate.types import Step
 
 
 class EnvpoolBackend:
     """N copies of one of the ids that EnvPool serves.
 
     EnvPool by itself resets in the step after an end and ignores the action of that step. Here an ended copy is reset
-    at once, so that every row is real. With `stagger`, first episodes are cut: see `Cuts`.
+    at once, so that every row is real. With `stagger`, first episodes are cut: see `Stagger`.
 
     Nothing depends on `num_threads` but the speed; by default there is one for each processor that we may use.
     """
@@ -56,8 +57,8 @@ class EnvpoolBackend:
         """Build the pool again: nothing of the past remains."""
         self._pool.close()
         self._pool = self._build(self.spec.env_id, seed % 2**31)
-        self._cuts = Cuts(self.num_envs, self._stagger_up_to, seed)
-        self.whole = self._tensor(self._cuts.whole)
+        self._stagger = Stagger(self.num_envs, self._stagger_up_to, seed)
+        self.counts = self._tensor(self._stagger.counts)
         obs, _ = self._pool.reset()
         return self._tensor(self._seen(obs))
 
@@ -65,14 +66,14 @@ class EnvpoolBackend:
         """Step all copies, then reset those whose episode has ended."""
         raw, reward, terminated, truncated, _ = self._pool.step(physical_action(action.cpu().numpy(), self.spec.action))
         next_obs = self._seen(raw)
-        truncated = self._cuts.apply(terminated, truncated & ~terminated)
+        truncated = self._stagger.apply(terminated, truncated & ~terminated)
         done = terminated | truncated
         here = there = self._tensor(next_obs)
         if done.any():
             fresh, info = self._pool.reset(np.flatnonzero(done).astype(np.int32))
             obs = next_obs.copy()
             obs[info["env_id"]] = self._seen(fresh)
-            here, self.whole = self._tensor(obs), self._tensor(self._cuts.whole)
+            here, self.counts = self._tensor(obs), self._tensor(self._stagger.counts)
         return Step(
             obs=here,
             next_obs=there,

@@ -17,11 +17,12 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from torch import Tensor
 
+from lemniscate.envs.episodes import Stagger
 from lemniscate.envs.spaces import action_kind, flatten_observation, is_image, observation_layout, physical_action
-from lemniscate.envs.stagger import Cuts
 from lemniscate.envs.workers import WatchedVectorEnv
 from lemniscate.errors import UserError
-from lemniscate.types import Discrete, Spec, Step
+from lemniscate.spec import Discrete, Spec
+from lemniscate.types import Step
 
 
 class GymnasiumBackend:
@@ -34,7 +35,7 @@ class GymnasiumBackend:
     - SAME_STEP: the returned observation is of the next episode; the true final one is in `info["final_obs"]`.
     - NEXT_STEP: the returned observation is the true final one; the next action is ignored (`valid` False).
 
-    With `stagger`, first episodes are cut (see `Cuts`) where the environment can be reset at will (DISABLED).
+    With `stagger`, first episodes are cut (see `Stagger`) where the environment can be reset at will (DISABLED).
     """
 
     def __init__(
@@ -87,8 +88,8 @@ class GymnasiumBackend:
             self._envs = self._build()
         self._used = True
         self._resetting = np.zeros(self.num_envs, dtype=bool)
-        self._cuts = Cuts(self.num_envs, self._stagger_up_to, seed)
-        self.whole = self._tensor(self._cuts.whole)
+        self._stagger = Stagger(self.num_envs, self._stagger_up_to, seed)
+        self.counts = self._tensor(self._stagger.counts)
         if isinstance(self.spec.action, Discrete):
             self._mask = np.ones((self.num_envs, self.spec.action.n), dtype=bool)
         return self._tensor(self._seen(*self._envs.reset(seed=seed)))
@@ -106,11 +107,11 @@ class GymnasiumBackend:
         elif self.mode is AutoresetMode.SAME_STEP:
             next_obs = self._with_final(obs, info, done)
         else:
-            truncated = self._cuts.apply(terminated, truncated)
+            truncated = self._stagger.apply(terminated, truncated)
             done = terminated | truncated
             if done.any():
                 obs = self._seen(*self._envs.reset(options={"reset_mask": done.copy()}))
-        self.whole = self._tensor(self._cuts.whole)
+        self.counts = self._tensor(self._stagger.counts)
         there = self._tensor(next_obs)
         return Step(
             obs=there if obs is next_obs else self._tensor(obs),

@@ -8,13 +8,13 @@ import numpy as np
 from gymnasium import spaces
 
 from lemniscate.errors import UserError
-from lemniscate.types import Action, Box, Discrete, MultiBinary, MultiDiscrete, Part
+from lemniscate.spec import Action, Box, Discrete, MultiBinary, MultiDiscrete, ObservationPart
 
 IMAGE_CHANNELS = 16
 """a uint8 array of three dimensions with at most so many channels in its last one is an image"""
 
 
-def observation_layout(space: gym.Space, env_id: str, path: tuple[str | int, ...] = ()) -> tuple[Part, ...]:
+def observation_layout(space: gym.Space, env_id: str, path: tuple[str | int, ...] = ()) -> tuple[ObservationPart, ...]:
     """The parts of the flat observation, in order.
 
     A Box of any shape and dtype is flattened in C order, as float32; so is a MultiBinary. Each number of a Discrete or
@@ -22,11 +22,11 @@ def observation_layout(space: gym.Space, env_id: str, path: tuple[str | int, ...
     its order. Raises `UserError` for anything else.
     """
     if isinstance(space, spaces.Box | spaces.MultiBinary):
-        return (Part(path, tuple(map(int, space.shape))),)
+        return (ObservationPart(path, tuple(map(int, space.shape))),)
     if isinstance(space, spaces.Discrete):
-        return (Part(path, (), (int(space.n),), (int(space.start),)),)
+        return (ObservationPart(path, (), (int(space.n),), (int(space.start),)),)
     if isinstance(space, spaces.MultiDiscrete):
-        return (Part(path, tuple(space.shape), _whole(space.nvec), _whole(space.start)),)
+        return (ObservationPart(path, tuple(space.shape), _whole(space.nvec), _whole(space.start)),)
     if isinstance(space, spaces.Dict):
         inside = [observation_layout(part, env_id, (*path, name)) for name, part in space.spaces.items()]
         return tuple(part for parts in inside for part in parts)
@@ -45,7 +45,7 @@ def is_image(space: gym.Space) -> bool:
     return isinstance(space, spaces.Box) and space.dtype == np.uint8 and len(shape) == 3 and shape[2] <= IMAGE_CHANNELS
 
 
-def flatten_observation(layout: tuple[Part, ...], obs: Any, *, image: bool = False) -> np.ndarray:
+def flatten_observation(layout: tuple[ObservationPart, ...], obs: Any, *, image: bool = False) -> np.ndarray:
     """A batch of raw observations as [N, O]: float32, or the bytes of an image."""
     pieces = [_flatten(part, follow(part.path, obs), image) for part in layout]
     return pieces[0] if len(pieces) == 1 else np.concatenate(pieces, axis=-1)
@@ -58,7 +58,7 @@ def follow(path: tuple[str | int, ...], obs: Any) -> Any:
     return obs
 
 
-def _flatten(part: Part, obs: Any, image: bool) -> np.ndarray:
+def _flatten(part: ObservationPart, obs: Any, image: bool) -> np.ndarray:
     if part.nvec:
         numbers = np.asarray(obs).reshape(-1, len(part.nvec)) - np.array(part.start)
         if (numbers < 0).any() or (numbers >= np.array(part.nvec)).any():

@@ -3,15 +3,15 @@
 from lemniscate.maths.distributions import (
     Bernoulli,
     Categorical,
+    Deterministic,
     Distribution,
     Gaussian,
     MultiCategorical,
-    Point,
     SquashedGaussian,
 )
 from lemniscate.maths.losses import clipped_surrogate, policy_gradient, surrogate, value_loss
 from lemniscate.maths.noise import coloured, ornstein_uhlenbeck, uniform
-from lemniscate.maths.returns import gae, polyak, reward_to_go, td_target, whole_return
+from lemniscate.maths.returns import episode_return, gae, polyak, reward_to_go, td_target
 from lemniscate.maths.schedules import adapt_to_kl, linear
 from lemniscate.maths.stats import (
     clip_fraction,
@@ -28,10 +28,10 @@ from lemniscate.maths.trust_region import backtrack, conjugate_gradient, fisher_
 __all__ = [
     "Bernoulli",
     "Categorical",
+    "Deterministic",
     "Distribution",
     "Gaussian",
     "MultiCategorical",
-    "Point",
     "SquashedGaussian",
     "adapt_to_kl",
     "backtrack",
@@ -39,6 +39,7 @@ __all__ = [
     "clipped_surrogate",
     "coloured",
     "conjugate_gradient",
+    "episode_return",
     "explained_variance",
     "fisher_product",
     "gae",
@@ -58,5 +59,4 @@ __all__ = [
     "td_target",
     "uniform",
     "value_loss",
-    "whole_return",
 ]

@@ -145,7 +145,7 @@ class Bernoulli:
 
 
 @dataclass(frozen=True)
-class Point:
+class Deterministic:
     """All probability on one action in [-1, 1]^A, `action` [B, A]; what noise there is comes from outside."""
 
     action: Tensor

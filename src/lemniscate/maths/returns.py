@@ -80,7 +80,7 @@ def reward_to_go(
     return go
 
 
-def whole_return(
+def episode_return(
     to_go: Float[Tensor, "T N"], reward: Float[Tensor, "T N"], done: Bool[Tensor, "T N"], *, gamma: float = 0.99
 ) -> Float[Tensor, "T N"]:
     """The return of the whole episode at each of its rows: Williams 1992, section 5, where every action gets it.

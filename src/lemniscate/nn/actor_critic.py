@@ -9,7 +9,7 @@ from torch import Generator, Tensor, nn
 
 from lemniscate.nn.critics import QValue, TwinQ, Value
 from lemniscate.nn.networks import ImageEncoder, Layers
-from lemniscate.nn.normalizer import Observed, Pixels, RunningNorm
+from lemniscate.nn.normalizer import NoNorm, RunningNorm, ScaleBytes
 from lemniscate.nn.policies import (
     BernoulliPolicy,
     CategoricalPolicy,
@@ -19,7 +19,7 @@ from lemniscate.nn.policies import (
     Policy,
     SquashedGaussianPolicy,
 )
-from lemniscate.types import Action, Box, Discrete, MultiDiscrete, Spec
+from lemniscate.spec import Action, Box, Discrete, MultiDiscrete, Spec
 
 
 class ActorCritic(nn.Module):
@@ -103,12 +103,12 @@ class ActorQ(nn.Module):
         return copy.deepcopy(self, {id(normalizer): normalizer}).requires_grad_(False)
 
 
-def _normalizer(spec: Spec, normalize_observations: bool) -> Observed:
-    kind = Pixels if spec.image else RunningNorm if normalize_observations else Observed
+def _normalizer(spec: Spec, normalize_observations: bool) -> NoNorm:
+    kind = ScaleBytes if spec.image else RunningNorm if normalize_observations else NoNorm
     return kind(spec.observation_size)
 
 
-def _policy(normalizer: Observed, spec: Spec, layers: Layers, initial_log_std: float) -> Policy:
+def _policy(normalizer: NoNorm, spec: Spec, layers: Layers, initial_log_std: float) -> Policy:
     action = spec.action
     net = _from_obs(spec, layers, _outputs(action), last_gain=0.01)
     if isinstance(action, Box):

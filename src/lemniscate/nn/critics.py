@@ -3,13 +3,13 @@
 import torch
 from torch import Tensor, nn
 
-from lemniscate.nn.normalizer import Observed
+from lemniscate.nn.normalizer import NoNorm
 
 
 class Value(nn.Module):
     """V(s). It looks through the policy's normalizer, and does not own it."""
 
-    def __init__(self, normalizer: Observed, net: nn.Module) -> None:
+    def __init__(self, normalizer: NoNorm, net: nn.Module) -> None:
         super().__init__()
         self.normalizer = normalizer
         self.net = net
@@ -22,7 +22,7 @@ class Value(nn.Module):
 class QValue(nn.Module):
     """Q(s, a). It looks through the policy's normalizer, and does not own it."""
 
-    def __init__(self, normalizer: Observed, encoder: nn.Module, net: nn.Module) -> None:
+    def __init__(self, normalizer: NoNorm, encoder: nn.Module, net: nn.Module) -> None:
         super().__init__()
         self.normalizer = normalizer
         self.encoder = encoder

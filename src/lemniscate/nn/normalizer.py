@@ -12,7 +12,7 @@ from lemniscate.maths import merge_moments
 from lemniscate.types import Rollout
 
 
-class Observed(nn.Module):
+class NoNorm(nn.Module):
     """Observations as they are: the first `size` numbers, without an action mask that may follow them."""
 
     def __init__(self, size: int) -> None:
@@ -24,7 +24,7 @@ class Observed(nn.Module):
         return obs[..., : self.size]
 
 
-class Pixels(Observed):
+class ScaleBytes(NoNorm):
     """Bytes to numbers from 0 to 1."""
 
     def forward(self, obs: Tensor) -> Tensor:
@@ -32,7 +32,7 @@ class Pixels(Observed):
         return super().forward(obs).float() / 255
 
 
-class RunningNorm(Observed):
+class RunningNorm(NoNorm):
     """(x − mean) / std of everything seen in training, clipped to ±`clip`.
 
     The statistics are buffers and change in `update` only; calling the module never changes them. Before the first

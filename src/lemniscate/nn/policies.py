@@ -5,16 +5,24 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Generator, Tensor, nn
 
-from lemniscate.maths import Bernoulli, Categorical, Distribution, Gaussian, MultiCategorical, Point, SquashedGaussian
+from lemniscate.maths import (
+    Bernoulli,
+    Categorical,
+    Deterministic,
+    Distribution,
+    Gaussian,
+    MultiCategorical,
+    SquashedGaussian,
+)
 from lemniscate.nn.native import Native
-from lemniscate.nn.normalizer import Observed, RunningNorm
-from lemniscate.types import Box, Discrete, MultiDiscrete
+from lemniscate.nn.normalizer import NoNorm, RunningNorm
+from lemniscate.spec import Box, Discrete, MultiDiscrete
 
 
 class Policy(nn.Module):
     """Base of all policies: `normalizer`, `net`, then `forward(obs [B, O]) -> Distribution`."""
 
-    def __init__(self, normalizer: Observed, net: nn.Module) -> None:
+    def __init__(self, normalizer: NoNorm, net: nn.Module) -> None:
         super().__init__()
         self.normalizer = normalizer
         self.net = net
@@ -52,7 +60,7 @@ class Policy(nn.Module):
 class GaussianPolicy(Policy):
     """N(μ(s), σ²) in normalized action units, σ one learned number per coordinate, the same in every state."""
 
-    def __init__(self, normalizer: Observed, net: nn.Module, action: Box, initial_log_std: float) -> None:
+    def __init__(self, normalizer: NoNorm, net: nn.Module, action: Box, initial_log_std: float) -> None:
         super().__init__(normalizer, net)
         self.log_std = nn.Parameter(torch.full((action.size,), initial_log_std))
 
@@ -72,7 +80,7 @@ class GaussianPolicy(Policy):
 class CategoricalPolicy(Policy):
     """A softmax over n actions; those that the observation's mask rules out get probability zero."""
 
-    def __init__(self, normalizer: Observed, net: nn.Module, action: Discrete) -> None:
+    def __init__(self, normalizer: NoNorm, net: nn.Module, action: Discrete) -> None:
         super().__init__(normalizer, net)
         self.action = action
 
@@ -91,7 +99,7 @@ class CategoricalPolicy(Policy):
 class MultiCategoricalPolicy(Policy):
     """K independent softmaxes over n_k actions each."""
 
-    def __init__(self, normalizer: Observed, net: nn.Module, action: MultiDiscrete) -> None:
+    def __init__(self, normalizer: NoNorm, net: nn.Module, action: MultiDiscrete) -> None:
         super().__init__(normalizer, net)
         self.action = action
 
@@ -108,7 +116,7 @@ class MultiCategoricalPolicy(Policy):
 class BernoulliPolicy(Policy):
     """n independent switches."""
 
-    def __init__(self, normalizer: Observed, net: nn.Module, n: int) -> None:
+    def __init__(self, normalizer: NoNorm, net: nn.Module, n: int) -> None:
         super().__init__(normalizer, net)
         self.n = n
 
@@ -124,13 +132,13 @@ class BernoulliPolicy(Policy):
 class DeterministicPolicy(Policy):
     """One action at each observation, tanh of a network: in [-1, 1]^A, which the env floor maps onto its bounds."""
 
-    def __init__(self, normalizer: Observed, net: nn.Module, size: int) -> None:
+    def __init__(self, normalizer: NoNorm, net: nn.Module, size: int) -> None:
         super().__init__(normalizer, net)
         self.size = size
 
-    def forward(self, obs: Tensor) -> Point:
+    def forward(self, obs: Tensor) -> Deterministic:
         """[B, O] to [B, A]."""
-        return Point(torch.tanh(self.net(self.normalizer(obs))))
+        return Deterministic(torch.tanh(self.net(self.normalizer(obs))))
 
     def noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
         """It has none of its own: zeros, [*shape, A]."""
@@ -140,7 +148,7 @@ class DeterministicPolicy(Policy):
 class SquashedGaussianPolicy(Policy):
     """tanh(u), u ~ N(μ(s), σ(s)²); log σ is kept in [-5, 2], softly, as tanh moves from one end to the other."""
 
-    def __init__(self, normalizer: Observed, net: nn.Module, size: int) -> None:
+    def __init__(self, normalizer: NoNorm, net: nn.Module, size: int) -> None:
         super().__init__(normalizer, net)
         self.size = size
 

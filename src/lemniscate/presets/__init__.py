@@ -3,7 +3,7 @@
 `default` is what an environment without a preset of its own gets.
 """
 
-from lemniscate.errors import unknown
+from lemniscate.errors import unknown_name
 from lemniscate.presets.off_policy import DDPG, SAC, TD3
 from lemniscate.presets.on_policy import A2C, PPO, REINFORCE, TRPO
 from lemniscate.presets.preset import Preset
@@ -40,6 +40,6 @@ def choose(algorithm: str, env_id: str | None, name: str | None) -> tuple[str, R
     name = name or best(algorithm, env_id)
     named = [preset.config for preset in PRESETS[algorithm] if preset.name == name]
     if not named:
-        raise unknown("preset", name, names(algorithm))
+        raise unknown_name("preset", name, names(algorithm))
     config = next((config for config in named if config.env == env_id), named[0])
     return name, config.replace(env=env_id) if env_id else config

@@ -17,7 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.axis import YAxis
 from matplotlib.figure import Figure
 
-from lemniscate.envs.api import file_name
+from lemniscate.envs.registry import file_name
 from lemniscate.report.curves import (
     COLORS,
     episode_returns,
@@ -37,7 +37,7 @@ from lemniscate.report.seeds import (
     probability_of_improvement,
 )
 from lemniscate.run.directory import is_finished, read_config
-from lemniscate.run.set_file import is_set
+from lemniscate.run.sweep_file import is_sweep
 
 POINTS = 200
 """of the grid that curves of several seeds are brought to"""
@@ -95,7 +95,7 @@ def group(runs: Iterable[Path]) -> list[Group]:
     twins = {_key(kind, but="seed") for kind in found.values() if times[_key(kind)] > 1}
     for run, kind in found.items():
         if _key(kind, but="seed") in twins:
-            kind["directory"] = str(run.parent if is_set(run.parent) else run)
+            kind["directory"] = str(run.parent if is_sweep(run.parent) else run)
     groups: dict[str, list[Path]] = {}
     for run, kind in found.items():
         groups.setdefault(_key(kind, but="seed"), []).append(run)

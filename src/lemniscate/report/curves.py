@@ -13,9 +13,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from lemniscate.run.critique import Honesty
 from lemniscate.run.directory import read_config
 from lemniscate.run.loggers import read_metrics
+from lemniscate.run.q_bias import QBias
 
 DIAGNOSTICS = (
     "losses/value",
@@ -82,7 +82,7 @@ def diagnostics(runs: list[Path], file: Path, labels: Sequence[str] | None = Non
     return save(figure, file)
 
 
-def draw_honesty(honesty: Honesty, run: Path, file: Path) -> Path:
+def draw_q_bias(q_bias: QBias, run: Path, file: Path) -> Path:
     """What Q said of the beginning of each episode, against what followed: on the line it is honest.
 
     Beside it the means of both at every evaluation of the run, if it had any.
@@ -90,11 +90,11 @@ def draw_honesty(honesty: Honesty, run: Path, file: Path) -> Path:
     log = [line for line in read_metrics(run) if "evaluation/q" in line]
     figure = Figure(figsize=(9.2 if log else 4.6, 4.6), layout="constrained")
     axes, *beside = figure.subplots(1, 2 if log else 1, squeeze=False)[0]
-    ends = [min(honesty.predicted + honesty.realised), max(honesty.predicted + honesty.realised)]
+    ends = [min(q_bias.predicted + q_bias.realised), max(q_bias.predicted + q_bias.realised)]
     axes.plot(ends, ends, color="grey", linewidth=1, label="honest")
-    axes.plot(honesty.realised, honesty.predicted, ".", color=COLORS[0], alpha=0.6, label="episodes")
+    axes.plot(q_bias.realised, q_bias.predicted, ".", color=COLORS[0], alpha=0.6, label="episodes")
     axes.set(xlabel="discounted return that followed", ylabel="Q(s₀, a₀)")
-    axes.set_title(str(honesty).partition(": ")[2], loc="left", fontsize=10)
+    axes.set_title(str(q_bias).partition(": ")[2], loc="left", fontsize=10)
     for history in beside:
         _curve(history, log, "evaluation/q", COLORS[0], "Q(s₀, a₀)", width=1.5)
         _curve(history, log, "evaluation/q_realised", "grey", "what followed", width=1.5)

@@ -3,7 +3,7 @@
 import sys
 from pathlib import Path
 
-from lemniscate.envs.api import VecEnv
+from lemniscate.envs.vec_env import VecEnv
 from lemniscate.nn.actor_critic import ActorQ
 from lemniscate.nn.policies import Policy
 from lemniscate.report import curves, flight
@@ -21,7 +21,7 @@ def sentence(scores: Evaluation) -> str:
             f", {scores.terminated} crashes; tracking error {scores.rmse_mm:.1f} mm over the whole flight,"
             f" {scores.rmse_after_1s_mm:.2f} mm after the first second"
         )
-    return f"{said}.\n{scores.honesty}." if scores.honesty else f"{said}."
+    return f"{said}.\n{scores.q_bias}." if scores.q_bias else f"{said}."
 
 
 def report(
@@ -31,8 +31,8 @@ def report(
     scores = evaluate(policy, env, episodes, seed=0, critic=critic)
     say(sentence(scores))
     pictures = curves.plot_runs([path], path / "plots")
-    if scores.honesty:
-        pictures.append(curves.draw_honesty(scores.honesty, path, path / "plots" / "q.png"))
+    if scores.q_bias:
+        pictures.append(curves.draw_q_bias(scores.q_bias, path, path / "plots" / "q.png"))
     if env.spec.tracking:
         pictures += draw_flight(policy, env, path / "plots", episodes, seed=0)
     for picture in pictures:

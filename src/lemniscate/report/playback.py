@@ -12,12 +12,12 @@ import gymnasium as gym
 import numpy as np
 from PIL import Image
 
-from lemniscate.envs.api import PATIENCE, VecEnv
 from lemniscate.envs.gymnasium import make_one, spec_of
+from lemniscate.envs.vec_env import PATIENCE, VecEnv
 from lemniscate.errors import UserError, is_installed
 from lemniscate.nn.policies import Policy
 from lemniscate.report import flight
-from lemniscate.types import Spec
+from lemniscate.spec import Spec
 
 Act = Callable[..., np.ndarray]
 

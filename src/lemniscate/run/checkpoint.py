@@ -23,7 +23,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from lemniscate.errors import UserError
-from lemniscate.types import Action, Part, Spec
+from lemniscate.spec import Action, ObservationPart, Spec
 
 FORMAT = 1
 PARTS = ("tensors.safetensors", "state.json")
@@ -136,7 +136,7 @@ def spec_from_json(record: dict[str, Any]) -> Spec:
     """The Spec that `spec_to_json` came from."""
     action = _tuples(record["action"])
     kind = {k.__name__: k for k in get_args(Action)}[action.pop("kind")]
-    layout = tuple(Part(**_tuples(part)) for part in record["layout"])
+    layout = tuple(ObservationPart(**_tuples(part)) for part in record["layout"])
     return Spec(**{**_tuples(record), "action": kind(**action), "layout": layout})
 
 

@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Self, get_args, get_origin, get_type_hints
 
-from lemniscate.data.exploration import Noise
-from lemniscate.errors import UserError, unknown
+from lemniscate.data.action_noise import Noise
+from lemniscate.errors import UserError, unknown_name
 from lemniscate.nn.networks import Activation, Architecture, Layers, Matmul
 
 
@@ -103,7 +103,7 @@ class RunConfig:
         """A copy with some fields changed. Raises `UserError` for an unknown field or a value out of range."""
         for name in changes:
             if name not in self.names():
-                raise unknown("field", name, self.names())
+                raise unknown_name("field", name, self.names())
         return dataclasses.replace(self, **changes)
 
     @classmethod
@@ -122,7 +122,7 @@ class RunConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RolloutConfig(RunConfig):
+class OnPolicyConfig(RunConfig):
     """What algorithms that learn from their own newest rollout share."""
 
     num_steps: Count = 256
@@ -162,7 +162,7 @@ class RolloutConfig(RunConfig):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReplayConfig(RunConfig):
+class OffPolicyConfig(RunConfig):
     """What algorithms that learn from memory share: the memory, the rhythm of acting and learning, noise, networks.
 
     The defaults are those in use today, rather than any paper's.

@@ -9,7 +9,7 @@ from lemniscate.errors import UserError
 from lemniscate.run import checkpoint
 
 UNFINISHED = "config.json.tmp"
-SET = "set.json"
+SET = "sweep.json"
 """what a set of runs has in the place of a `config.json`"""
 
 

@@ -9,10 +9,10 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from lemniscate.envs.api import VecEnv
+from lemniscate.envs.vec_env import VecEnv
 from lemniscate.nn.actor_critic import ActorQ
 from lemniscate.nn.policies import Policy
-from lemniscate.run.critique import Critique, Honesty
+from lemniscate.run.q_bias import QBias, QBiasMeter
 from lemniscate.run.seeding import derive, generator
 from lemniscate.types import Step
 
@@ -33,7 +33,7 @@ class Evaluation:
     terminated: int
     rmse_mm: float | None = None
     rmse_after_1s_mm: float | None = None
-    honesty: Honesty | None = None
+    q_bias: QBias | None = None
     date: str = field(default="", compare=False)
 
     def to_json(self) -> dict[str, object]:
@@ -41,7 +41,7 @@ class Evaluation:
         scores: dict[str, object] = {
             name: value for name, value in vars(self).items() if value is not None and name != "date"
         }
-        return scores | ({"honesty": self.honesty.to_json()} if self.honesty else {})
+        return scores | ({"q_bias": self.q_bias.to_json()} if self.q_bias else {})
 
     def to_course(self) -> dict[str, object]:
         """The dictionary that a course on DDPG hands in with a policy; the time is ISO 8601."""
@@ -94,10 +94,10 @@ def evaluate(
     ended: list[Tensor] = []
     errors: list[Tensor] = []
     terminated = 0
-    critique = Critique(*critic, env.num_envs, generator(seed, env.device, EVALUATION, 2)) if critic else None
+    q_bias_meter = QBiasMeter(*critic, env.num_envs, generator(seed, env.device, EVALUATION, 2)) if critic else None
     for obs, action, step, counts in fly(policy, env, episodes, seed, deterministic):
-        if critique:
-            critique.follow(obs, action, step, counts)
+        if q_bias_meter:
+            q_bias_meter.follow(obs, action, step, counts)
         if env.spec.tracking:
             error = step.next_obs[:, slice(*env.spec.tracking)].square().sum(-1)
             errors.append(torch.stack([error, running[1]], dim=-1)[counts])
@@ -118,7 +118,7 @@ def evaluate(
         returns.tolist(),
         lengths.int().tolist(),
         terminated,
-        honesty=critique.honesty() if critique else None,
+        q_bias=q_bias_meter.q_bias() if q_bias_meter else None,
         date=datetime.now(UTC).isoformat(timespec="seconds"),
     )
     if not errors or env.spec.time_step is None:

@@ -9,7 +9,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
 
-from lemniscate.envs.books import Episodes
+from lemniscate.envs.episodes import Episodes
 
 Metrics = Mapping[str, float]
 NO_EPISODES = Episodes([], [])

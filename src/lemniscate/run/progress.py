@@ -47,7 +47,7 @@ class ProgressBar:
             self._bar.stop()
 
 
-class SetProgress:
+class SweepProgress:
     """A bar for a set of runs and one for each that is going on; without a terminal, lines at each tenth of the set.
 
     What has ended is told in a line that stays.

@@ -18,25 +18,25 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import Any, Protocol, TypeVar
+from typing import TypeVar
 
 import torch
 from filelock import FileLock, Timeout
 
-from lemniscate.data.replay import bytes_of_one
-from lemniscate.envs.api import VecEnv
-from lemniscate.envs.books import Episodes
+from lemniscate.data.replay import bytes_per_transition
+from lemniscate.envs.episodes import Episodes
+from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import NonFiniteError, UserError
 from lemniscate.nn.networks import has_bfloat16
-from lemniscate.nn.policies import Policy
 from lemniscate.run import checkpoint
-from lemniscate.run.config import ReplayConfig, RunConfig
-from lemniscate.run.critique import critic_of
+from lemniscate.run.config import OffPolicyConfig, RunConfig
 from lemniscate.run.directory import create_directory, newest_resumable
 from lemniscate.run.evaluate import evaluate
 from lemniscate.run.loggers import LOGGERS, NO_EPISODES, Logger
 from lemniscate.run.progress import ProgressBar
+from lemniscate.run.q_bias import critic_of
 from lemniscate.run.seeding import derive, globals_undisturbed, seed_globals
+from lemniscate.run.state import TrainState
 
 WORTH_COMPILING = 15_000
 """gradient steps of a run from which on a native one is sooner done"""
@@ -45,19 +45,7 @@ TRAINING = 0
 """the stream of seeds that training environments restart from"""
 
 
-class AnyState(Protocol):
-    """What a run needs to know of an algorithm's State: how far it is, and whom to evaluate."""
-
-    step: int
-    networks: Any
-
-    @property
-    def policy(self) -> Policy:
-        """Whom to evaluate."""
-        ...
-
-
-S = TypeVar("S", bound=AnyState)
+S = TypeVar("S", bound=TrainState)
 
 
 class Stopped(KeyboardInterrupt):
@@ -80,7 +68,7 @@ class Run:
         *,
         loggers: tuple[str, ...] = ("jsonl", "tensorboard"),
         progress: bool = True,
-        film: Callable[[AnyState], None] | None = None,
+        film: Callable[[TrainState], None] | None = None,
     ) -> None:
         self.path, self.algorithm, self.config = path, algorithm, config
         self.env, self.eval_env = envs
@@ -94,8 +82,8 @@ class Run:
     def announce(self) -> None:
         """Say what the run is about to take; to be called before there is a state."""
         config = self.config
-        if self._visible and isinstance(config, ReplayConfig):
-            size = config.capacity * bytes_of_one(self.spec) / 1e6
+        if self._visible and isinstance(config, OffPolicyConfig):
+            size = config.capacity * bytes_per_transition(self.spec) / 1e6
             print(
                 f"It will remember {config.capacity:,} transitions: {size:,.1f} MB, and as much in each checkpoint.",
                 file=sys.stderr,
@@ -126,7 +114,7 @@ class Run:
             self._loggers.append(LOGGERS[name](self.path, config, state.step))
         return state
 
-    def until(self, total_steps: int, state: AnyState) -> Iterator[VecEnv]:
+    def until(self, total_steps: int, state: TrainState) -> Iterator[VecEnv]:
         """The environments, once for each update, until `total_steps` are taken.
 
         Raises:
@@ -148,7 +136,7 @@ class Run:
             self.seconds = time.monotonic() - started
             self._bar.close()
 
-    def log(self, state: AnyState, metrics: Mapping[str, torch.Tensor | float], episodes: Episodes) -> None:
+    def log(self, state: TrainState, metrics: Mapping[str, torch.Tensor | float], episodes: Episodes) -> None:
         """Write one line of metrics.
 
         Raises:
@@ -176,23 +164,19 @@ class Run:
         self.eval_env.close()
         self._lock.release()
 
-    def _choose_engine(self, state: AnyState) -> None:
+    def _choose_engine(self, state: TrainState) -> None:
         if engine_of(self.config) == "native":
             if self._visible:
                 print(
                     "Compiling: half a minute or a whole one the first time, 5 to 10 s from then on.", file=sys.stderr
                 )
-            for part in (state.policy, *vars(state).values()):
-                if hasattr(part, "make_native"):
-                    part.make_native()
+            state.compile()
 
-    def _restart(self, state: AnyState) -> None:
+    def _restart(self, state: TrainState) -> None:
         seed = derive(self.config.seed, TRAINING, state.step)
         seed_globals(seed)  # nothing here draws from them, but somebody's environment may
         self.env.restart(seed, state.step)
-        for part in vars(state).values():
-            if hasattr(part, "restart"):  # what follows episodes has to know that they are cut
-                part.restart()
+        state.on_restart()
 
     def _checkpoint_interval(self) -> int:
         """As asked for; else a fifth of the run, but room for three whole episodes of each copy between restarts."""
@@ -200,7 +184,7 @@ class Run:
         fifth = -(-self.config.total_steps // 5)
         return self.config.checkpoint_every or max(fifth, 3 * longest * self.config.num_envs)
 
-    def _between(self, state: AnyState, before: int, total_steps: int) -> None:
+    def _between(self, state: TrainState, before: int, total_steps: int) -> None:
         every, interval = self.config.evaluate_every, self._checkpoint_interval()
         if every and state.step // every > before // every:
             self._evaluate(state)
@@ -224,7 +208,7 @@ class Run:
             )
             raise Stopped(message, self._stop_signal)
 
-    def _record(self, state: AnyState) -> None:
+    def _record(self, state: TrainState) -> None:
         if not (self.config.video_every and self._film):
             return
         try:
@@ -233,7 +217,7 @@ class Run:
         except (UserError, OSError) as error:  # no display any more, a full disk: it costs this recording, not the run
             print(f"No recording at step {state.step:,}: {error}", file=sys.stderr)
 
-    def _evaluate(self, state: AnyState) -> None:
+    def _evaluate(self, state: TrainState) -> None:
         try:
             with globals_undisturbed():
                 critic = critic_of(state.networks, self.config)
@@ -245,17 +229,17 @@ class Run:
         metrics = {"evaluation/return": scores.mean_return, "evaluation/length": sum(scores.lengths) / scores.episodes}
         if scores.rmse_after_1s_mm is not None:
             metrics["evaluation/rmse_after_1s_mm"] = scores.rmse_after_1s_mm
-        if scores.honesty:
-            predicted, realised = scores.honesty.means
+        if scores.q_bias:
+            predicted, realised = scores.q_bias.means
             metrics |= {"evaluation/q": predicted, "evaluation/q_realised": realised}
-            metrics |= {"evaluation/q_bias": scores.honesty.bias}
+            metrics |= {"evaluation/q_bias": scores.q_bias.bias}
         self._write(state.step, metrics)
 
     def _write(self, step: int, numbers: dict[str, float], episodes: Episodes = NO_EPISODES) -> None:
         for logger in self._loggers:
             logger.write(step, numbers, episodes)
 
-    def _save(self, state: AnyState, planned: bool) -> None:
+    def _save(self, state: TrainState, planned: bool) -> None:
         record = {
             "algorithm": self.algorithm,
             "planned": planned,

@@ -1,20 +1,20 @@
-"""Exploration noise: what each kind is, copy by copy, and where it is cut."""
+"""ActionNoise noise: what each kind is, copy by copy, and where it is cut."""
 
 import pytest
 import torch
 
-from lemniscate.data.exploration import Exploration
+from lemniscate.data.action_noise import ActionNoise
 
 CPU = torch.device("cpu")
 KINDS = ["white", "ou", "coloured"]
 
 
 def noise(kind, shape=(3, 2), length=8):
-    return Exploration(kind, shape, length, CPU, time=5.0, exponent=1.0)
+    return ActionNoise(kind, shape, length, CPU, time=5.0, exponent=1.0)
 
 
-def played(exploration, steps, rng):
-    return torch.stack([exploration(rng) for _ in range(steps)])  # [T, N, A]
+def played(action_noise, steps, rng):
+    return torch.stack([action_noise(rng) for _ in range(steps)])  # [T, N, A]
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -40,12 +40,12 @@ def test_copies_and_coordinates_are_independent(kind, rng):
 @pytest.mark.parametrize("kind", ["ou", "coloured"])
 def test_an_episode_that_ends_cuts_its_own_sequence_and_no_other(kind, rng):
     """Ends after every second step in the odd copies: there, what follows an end owes nothing to what was."""
-    exploration, x = noise(kind, (2000, 1), 100), []
+    action_noise, x = noise(kind, (2000, 1), 100), []
     odd = torch.arange(2000) % 2 == 1
     for t in range(12):
-        x.append(exploration(rng)[:, 0])
+        x.append(action_noise(rng)[:, 0])
         if t % 2 == 1:
-            exploration.cut(odd)
+            action_noise.cut(odd)
     x = torch.stack(x)
     across = [(x[t] * x[t + 1]) for t in range(1, 11, 2)]
     within = [(x[t] * x[t + 1]) for t in range(0, 12, 2)]
@@ -67,7 +67,7 @@ def test_it_goes_on_from_a_checkpoint_in_the_same_bits(kind):
 
 
 def test_after_a_restart_all_begin_anew(rng):
-    exploration = noise("ou", (4000, 1), 100)
-    before = exploration(rng)
-    exploration.restart()
-    assert (before * exploration(rng)).mean().abs() < 0.05
+    action_noise = noise("ou", (4000, 1), 100)
+    before = action_noise(rng)
+    action_noise.restart()
+    assert (before * action_noise(rng)).mean().abs() < 0.05

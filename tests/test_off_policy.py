@@ -9,16 +9,17 @@ import numpy as np
 import pytest
 import torch
 
+import environments  # noqa: F401  (registers Copy-box-v0)
 import lemniscate as lem
-import worlds  # noqa: F401  (registers Copy-box-v0)
-from conftest import tiny_memory
+from conftest import tiny_off_policy
 from lemniscate.algos import ddpg, sac, td3
 from lemniscate.envs import toy
-from lemniscate.envs.api import VecEnv
 from lemniscate.envs.gymnasium import GymnasiumBackend
+from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError
 from lemniscate.run import checkpoint
-from lemniscate.types import Box, Part, Spec, Transition
+from lemniscate.spec import Box, ObservationPart, Spec
+from lemniscate.types import Transition
 
 CPU = torch.device("cpu")
 MODES = ["NEXT_STEP", "SAME_STEP", "DISABLED"]
@@ -285,12 +286,12 @@ def test_the_actors_gradient_is_that_of_q_through_the_action(monkeypatch):
 @pytest.mark.parametrize("mode", MODES)
 def test_an_episode_hears_a_sequence_from_its_beginning(monkeypatch, algo, mode):
     state, env = ready(monkeypatch, algo, small(algo, noise="ou"), mode=mode, length=3)
-    exploration, counted = state.exploration, 0
+    action_noise, counted = state.action_noise, 0
     for _ in range(12):
-        age, held, before = env.obs[:, 2].long(), len(state.replay), exploration._position.clone()
+        age, held, before = env.obs[:, 2].long(), len(state.replay), action_noise._position.clone()
         algo.play(small(algo), state, env)
         if len(state.replay) > held:  # else the action was ignored
-            assert torch.equal(before % exploration._length, age)  # at its end the next one begins
+            assert torch.equal(before % action_noise._length, age)  # at its end the next one begins
             counted += 1
     assert counted == (9 if mode == "NEXT_STEP" else 12)
 
@@ -317,7 +318,7 @@ def test_the_normalizer_learns_from_what_is_remembered_and_nothing_else(monkeypa
     ],
 )
 def test_as_many_gradient_steps_are_taken_as_announced(tmp_path, algo, rhythm):
-    fields = tiny_memory(**{"num_envs": 1, "evaluate_episodes": 1, **rhythm})
+    fields = tiny_off_policy(**{"num_envs": 1, "evaluate_episodes": 1, **rhythm})
     name = algo.__name__.rpartition(".")[2]
     config = lem.config_for(name, "Pendulum-v1", **fields)
     run = lem.train(name, "Pendulum-v1", run=tmp_path / "r", progress=False, **fields)
@@ -343,7 +344,7 @@ def test_learning_rates_fall_linearly_over_the_run(monkeypatch, algo):
 def remembering(algo, config):
     """A state for three numbers in and one out, with a memory of noise; always the same."""
     torch.manual_seed(0)
-    state = algo.init(config, Spec("x", (Part((), (3,)),), Box((-1.0,), (1.0,))), CPU)
+    state = algo.init(config, Spec("x", (ObservationPart((), (3,)),), Box((-1.0,), (1.0,))), CPU)
     rows = (torch.randn(50, 3), torch.randn(50, 1), torch.randn(50), torch.randn(50, 3), torch.rand(50) < 0.3)
     state.replay.extend(Transition(*rows))
     return state
@@ -376,7 +377,7 @@ def engines_agree(algo, delay=1, updates=1, matmul="float32"):
 @pytest.mark.parametrize("case", ["ddpg, delay=2, updates=2", "td3, delay=2", "sac", "ddpg, matmul='bfloat16'"])
 def test_the_two_engines_agree(case):
     """In a process of its own: the shape checks of this one are not for the compiler."""
-    code = f"from test_memory import *; engines_agree({case})"
+    code = f"from test_off_policy import *; engines_agree({case})"
     done = subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parent, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 
@@ -400,9 +401,9 @@ def test_actions_are_random_while_it_warms_up_and_the_policys_afterwards(monkeyp
     assert warm.min() < -0.9
     assert warm.max() > 0.9
     assert warm.std().item() == pytest.approx(1 / 3**0.5, abs=0.05)
-    drawn, exploration = [], state.exploration
-    state.exploration = lambda generator: drawn.append(exploration(generator)) or drawn[-1]
-    state.exploration.cut, obs = exploration.cut, env.obs
+    drawn, action_noise = [], state.action_noise
+    state.action_noise = lambda generator: drawn.append(action_noise(generator)) or drawn[-1]
+    state.action_noise.cut, obs = action_noise.cut, env.obs
     algo.play(config, state, env)
     action = state.replay.transitions.action[160:164]
     if algo is sac:
@@ -416,9 +417,9 @@ def test_what_it_will_take_is_said_before_it_is_taken(tmp_path, monkeypatch, cap
     def refuse(*_):
         raise MemoryError
 
-    monkeypatch.setattr(algo, "Replay", refuse)
+    monkeypatch.setattr(algo, "ReplayBuffer", refuse)
     monkeypatch.setattr("lemniscate.run.run.has_bfloat16", lambda _: False)
-    fields = tiny_memory(matmul="bfloat16", buffer_size=200)
+    fields = tiny_off_policy(matmul="bfloat16", buffer_size=200)
     with pytest.raises(MemoryError):
         lem.train(algo.__name__.rpartition(".")[2], "Pendulum-v1", run=tmp_path / "r", progress=True, **fields)
     said = capsys.readouterr().err

@@ -19,17 +19,17 @@ from types import FrameType
 
 from filelock import FileLock, Timeout
 
-from lemniscate import front
+from lemniscate import api
 from lemniscate.algos import ALGORITHMS
-from lemniscate.envs import api
-from lemniscate.errors import SetError, UserError, said_of, unknown
+from lemniscate.envs import registry
+from lemniscate.errors import SweepError, UserError, prefix_errors, unknown_name
 from lemniscate.report.pictures import say
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import is_finished
 from lemniscate.run.loggers import read_metrics
-from lemniscate.run.progress import SetProgress
+from lemniscate.run.progress import SweepProgress
 from lemniscate.run.run import Stopped
-from lemniscate.run.set_file import RunSet, read_set
+from lemniscate.run.sweep_file import Sweep, read_sweep
 
 LOG = "log.txt"
 """what a run of a set says, in its directory"""
@@ -42,14 +42,14 @@ PAUSE = 0.3
 
 
 @dataclass(frozen=True)
-class TrainedSet:
-    """What `train_set` leaves: the set's directory, and the run directories in it."""
+class TrainedSweep:
+    """What `train_sweep` leaves: the set's directory, and the run directories in it."""
 
     path: Path
     runs: list[Path]
 
 
-def train_set(
+def train_sweep(
     algorithms: str | Iterable[str],
     env: str | None,
     seeds: str | int | Iterable[int],
@@ -60,7 +60,7 @@ def train_set(
     report: bool = False,
     progress: bool = True,
     **fields: object,
-) -> TrainedSet:
+) -> TrainedSweep:
     """Train every algorithm with every seed, and compare them: a table on standard error, pictures in `plots/`.
 
     Args:
@@ -76,32 +76,32 @@ def train_set(
 
     Raises:
         UserError: before anything starts, what an algorithm cannot be trained with.
-        Stopped: Ctrl-C or SIGTERM, when every run has saved itself; go on with `resume_set`.
-        SetError: some runs failed; the others are trained and compared.
+        Stopped: Ctrl-C or SIGTERM, when every run has saved itself; go on with `resume_sweep`.
+        SweepError: some runs failed; the others are trained and compared.
     """
     names, numbers = algorithms_of(algorithms), _seeds_of(seeds)
     configs: dict[str, RunConfig] = {}
     for name in names:
-        with said_of(name):
-            configs[name] = front.config_for(name, env, preset, **fields)
+        with prefix_errors(name):
+            configs[name] = api.config_for(name, env, preset, **fields)
     if len({config.env for config in configs.values()}) > 1:
         raise UserError("These presets are for different environments; name the one of the whole set with env.")
     _require_trainable(configs, numbers, track)
     stem = f"{'-'.join(names)}-{len(numbers)}-seeds"
-    path = Path(run) if run is not None else front.fresh_directory(next(iter(configs.values())).env, stem)
+    path = Path(run) if run is not None else api.fresh_directory(next(iter(configs.values())).env, stem)
     records = {name: config.to_json() for name, config in configs.items()}
     but_seed = {name: {k: v for k, v in record.items() if k != "seed"} for name, record in records.items()}
-    runs = RunSet(path, numbers, but_seed)
+    runs = Sweep(path, numbers, but_seed)
     runs.create()
     return _train(runs, track, report, progress)
 
 
-def resume_set(
+def resume_sweep(
     path: str | Path, *, track: str | None = None, report: bool = False, progress: bool = True
-) -> TrainedSet:
+) -> TrainedSweep:
     """Go on with an interrupted set: with the runs that are not finished, and those that never began."""
-    front.loggers_with(track)
-    return _train(read_set(Path(path)), track, report, progress)
+    api.loggers_with(track)
+    return _train(read_sweep(Path(path)), track, report, progress)
 
 
 def at_once(threads: int) -> int:
@@ -110,7 +110,7 @@ def at_once(threads: int) -> int:
     return max(1, cores // threads)
 
 
-def _train(runs: RunSet, track: str | None, report: bool, progress: bool) -> TrainedSet:
+def _train(runs: Sweep, track: str | None, report: bool, progress: bool) -> TrainedSweep:
     options = [*(["--track", track] if track else []), *(["--report"] if report else [])]
     try:
         with FileLock(runs.path / ".lock", timeout=0):
@@ -119,18 +119,18 @@ def _train(runs: RunSet, track: str | None, report: bool, progress: bool) -> Tra
     except Timeout:
         raise UserError(f"{runs.path} is being trained by another process.") from None
     if any(map(is_finished, runs.runs)):
-        for picture in front.plot(runs.path):
+        for picture in api.plot(runs.path):
             say(picture)
     if failed:
         sentences = "".join(f"\n{name}: {sentence}" for name, sentence in failed.items())
-        raise SetError(f"{len(failed)} of {len(runs.runs)} runs could not go on; {LOG} in each says more.{sentences}")
-    return TrainedSet(runs.path, list(runs.runs))
+        raise SweepError(f"{len(failed)} of {len(runs.runs)} runs could not go on; {LOG} in each says more.{sentences}")
+    return TrainedSweep(runs.path, list(runs.runs))
 
 
 class _Crew:
     """The processes that train a set, and what became of those that failed."""
 
-    def __init__(self, runs: RunSet, options: list[str], progress: bool) -> None:
+    def __init__(self, runs: Sweep, options: list[str], progress: bool) -> None:
         self._runs, self._options = runs, options
         self._waiting = [run for run in runs.runs if not is_finished(run)]
         self._going: dict[Path, subprocess.Popen] = {}
@@ -138,7 +138,7 @@ class _Crew:
         self._stop_signal = 0
         totals = {run.name: record["config"]["total_steps"] for run, record in runs.runs.items()}
         steps = {run.name: _so_far(run)[0] for run in runs.runs}
-        self._bars = SetProgress(totals, steps, progress)
+        self._bars = SweepProgress(totals, steps, progress)
 
     def train(self) -> dict[str, str]:
         """Every run to its end; returns the sentence of each that failed. Raises `Stopped` after a signal."""
@@ -186,7 +186,7 @@ class _Crew:
                 continue
             del self._going[run]
             if code == 0:
-                sentence = f"done, final return {front.final_return(run):.1f}"
+                sentence = f"done, final return {api.final_return(run):.1f}"
             elif self._stop_signal:
                 sentence = f"stopped at step {step:,}"
             else:
@@ -239,7 +239,7 @@ def algorithms_of(names: str | Iterable[str]) -> list[str]:
         raise UserError(f"Name at least one algorithm: {', '.join(ALGORITHMS)}.")
     for name in split:
         if name not in ALGORITHMS:
-            raise unknown("algorithm", name, ALGORITHMS)
+            raise unknown_name("algorithm", name, ALGORITHMS)
     return list(dict.fromkeys(split))
 
 
@@ -259,13 +259,13 @@ def _seeds_of(seeds: str | int | Iterable[int]) -> list[int]:
 
 def _require_trainable(configs: dict[str, RunConfig], seeds: list[int], track: str | None) -> None:
     """Raise `UserError` where a run could not begin: better one sentence now than one from each of them."""
-    front.loggers_with(track)
+    api.loggers_with(track)
     some = next(iter(configs.values()))
-    env = api.make(some.env, 1, backend=some.backend)
+    env = registry.make(some.env, 1, backend=some.backend)
     env.close()
     for name, config in configs.items():
-        front.device_for(config.device)
+        api.device_for(config.device)
         for seed in seeds:
             config.replace(seed=seed)
-        with said_of(name):
+        with prefix_errors(name):
             ALGORITHMS[name].networks(config, env.spec)

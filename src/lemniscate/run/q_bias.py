@@ -7,12 +7,12 @@ import torch
 from torch import Generator, Tensor, nn
 
 from lemniscate.nn.actor_critic import ActorQ
-from lemniscate.run.config import ReplayConfig, RunConfig
+from lemniscate.run.config import OffPolicyConfig, RunConfig
 from lemniscate.types import Step
 
 
 @dataclass(frozen=True)
-class Honesty:
+class QBias:
     """Episode by episode, in the order of an evaluation's returns: copy by copy, then as they ended.
 
     `realised` is Σ γ^t r_t; where the clock ended the episode, what Q expects from there on is added, since Q speaks of
@@ -51,7 +51,7 @@ def _short(value: float) -> str:
     return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
 
 
-class Critique:
+class QBiasMeter:
     """Follows an evaluation step by step.
 
     Args:
@@ -86,13 +86,13 @@ class Critique:
             self._ended.append(torch.stack([predicted, followed, self._copies])[:, done])
         self._running = torch.stack([predicted, realised, age]) * ~done
 
-    def honesty(self) -> Honesty:
+    def q_bias(self) -> QBias:
         """Of all episodes that ended."""
         table = torch.cat(self._ended, dim=1)
         predicted, realised = table[:2, table[2].argsort(stable=True)].tolist()
-        return Honesty(predicted, realised)
+        return QBias(predicted, realised)
 
 
 def critic_of(networks: nn.Module, config: RunConfig) -> tuple[ActorQ, float] | None:
     """The networks and γ, where there is a Q to ask."""
-    return (networks, config.gamma) if isinstance(networks, ActorQ) and isinstance(config, ReplayConfig) else None
+    return (networks, config.gamma) if isinstance(networks, ActorQ) and isinstance(config, OffPolicyConfig) else None

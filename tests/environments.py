@@ -79,7 +79,7 @@ class Copy(gym.Env):
 
 
 for kind in KINDS:
-    gym.register(f"Copy-{kind}-v0", entry_point="worlds:Copy", max_episode_steps=100, kwargs={"kind": kind})
+    gym.register(f"Copy-{kind}-v0", entry_point="environments:Copy", max_episode_steps=100, kwargs={"kind": kind})
 
 
 class Unreadable(gym.Env):
@@ -89,7 +89,7 @@ class Unreadable(gym.Env):
     action_space = spaces.Discrete(2)
 
 
-gym.register("Unreadable-v0", entry_point="worlds:Unreadable")
+gym.register("Unreadable-v0", entry_point="environments:Unreadable")
 
 
 class Unbounded(gym.Env):
@@ -103,7 +103,7 @@ class Unbounded(gym.Env):
         return np.zeros(1, np.float32), {}
 
 
-gym.register("Unbounded-v0", entry_point="worlds:Unbounded", max_episode_steps=5)
+gym.register("Unbounded-v0", entry_point="environments:Unbounded", max_episode_steps=5)
 
 
 class Fragile(gym.Env):

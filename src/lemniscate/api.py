@@ -10,22 +10,23 @@ import torch
 
 from lemniscate import presets
 from lemniscate.algos import ALGORITHMS
-from lemniscate.envs import api
-from lemniscate.envs.api import VecEnv
-from lemniscate.errors import UserError, is_installed, missing_extra, unknown
+from lemniscate.envs import registry
+from lemniscate.envs.vec_env import VecEnv
+from lemniscate.errors import UserError, is_installed, missing_extra, unknown_name
+from lemniscate.policy import TrainedPolicy
 from lemniscate.report import compare, curves, playback
 from lemniscate.report import pictures as pictures_of
 from lemniscate.run import checkpoint
 from lemniscate.run.config import RunConfig
-from lemniscate.run.critique import critic_of
 from lemniscate.run.directory import is_finished, newest, read_config, require_absent
 from lemniscate.run.evaluate import Evaluation
 from lemniscate.run.evaluate import evaluate as evaluate_module
 from lemniscate.run.loggers import LOGGERS, read_metrics
-from lemniscate.run.run import AnyState, Run
+from lemniscate.run.q_bias import critic_of
+from lemniscate.run.run import Run
 from lemniscate.run.seeding import set_seeds
-from lemniscate.run.set_file import is_set, read_set
-from lemniscate.trained import TrainedPolicy
+from lemniscate.run.state import TrainState
+from lemniscate.run.sweep_file import is_sweep, read_sweep
 
 FINAL_EPISODES = 100
 """that a run's final policy is judged by where runs are compared"""
@@ -47,11 +48,11 @@ def config_for(algorithm: str, env: str | None = None, preset: str | None = None
         UserError: an unknown algorithm, environment, preset or field, or a value out of range.
     """
     if algorithm not in ALGORITHMS:
-        raise unknown("algorithm", algorithm, ALGORITHMS)
+        raise unknown_name("algorithm", algorithm, ALGORITHMS)
     name, config = presets.choose(algorithm, env, preset)
     if name == "default" and env is None:
         raise UserError("Which environment? Name one with env; `lemniscate envs` lists them.")
-    served_by = api.backend_for(config.env)
+    served_by = registry.backend_for(config.env)
     config = config.replace(**fields)
     return config if config.backend else config.replace(backend=served_by)
 
@@ -62,7 +63,7 @@ def make_envs(config: RunConfig) -> tuple[VecEnv, VecEnv]:
     They are restarted with seeds of different streams, so no start of one is ever a start of the other.
     """
     device = str(device_for(config.device))
-    train_env = api.make(config.env, config.num_envs, device=device, stagger=True, backend=config.backend)
+    train_env = registry.make(config.env, config.num_envs, device=device, stagger=True, backend=config.backend)
     return train_env, _evaluation_env(config.env, config, config.evaluate_episodes, device, _simulator(config))
 
 
@@ -108,7 +109,7 @@ def resume(run: str | Path, *, track: str | None = None, report: bool = False, p
     path = Path(run)
     algorithm, fields = read_config(path)
     if algorithm not in ALGORITHMS:
-        raise unknown("algorithm", algorithm, ALGORITHMS)
+        raise unknown_name("algorithm", algorithm, ALGORITHMS)
     config = ALGORITHMS[algorithm].Config.from_json(fields)
     loggers = loggers_with(track)
     set_seeds(config.seed)
@@ -218,8 +219,8 @@ def plot(*runs: str | Path) -> list[Path]:
     if any((paths[0] / "checkpoints").glob("step-*")):
         policy = load(paths[0])
         if critic_of(policy.networks, policy.config):
-            honesty = evaluate(policy, episodes=policy.config.evaluate_episodes).honesty
-            pictures += [curves.draw_honesty(honesty, paths[0], folder / "q.png")] if honesty else []
+            q_bias = evaluate(policy, episodes=policy.config.evaluate_episodes).q_bias
+            pictures += [curves.draw_q_bias(q_bias, paths[0], folder / "q.png")] if q_bias else []
         if policy.spec.tracking:
             flights = policy.config.evaluate_episodes
             pictures += pictures_of.draw_flight(policy.module, _drones(policy), folder, flights, seed=0)
@@ -257,9 +258,9 @@ def _final_returns(runs: list[Path]) -> dict[Path, float]:
 
 def _members(path: Path) -> list[Path]:
     """A run itself, or those of a set that have something to show."""
-    if not is_set(path):
+    if not is_sweep(path):
         read_config(path)
-    runs = [run for run in (read_set(path).runs if is_set(path) else [path]) if read_metrics(run)]
+    runs = [run for run in (read_sweep(path).runs if is_sweep(path) else [path]) if read_metrics(run)]
     if not runs:
         raise UserError(f"{path} has no metrics to plot yet.")
     return runs
@@ -276,7 +277,7 @@ def _train(
 ) -> TrainedRun:
     torch.set_num_threads(config.threads)
 
-    def film(state: AnyState) -> None:
+    def film(state: TrainState) -> None:
         networks = ALGORITHMS[algorithm].networks(config, run.spec)
         networks.load_state_dict(state.networks.state_dict())
         policy = TrainedPolicy(networks, run.spec, config, state.step)
@@ -315,8 +316,8 @@ def _simulator(config: RunConfig) -> str | None:
 
 def _evaluation_env(env_id: str, config: RunConfig, episodes: int, device: str, backend: str | None = None) -> VecEnv:
     """As many copies as training has for a drone, whose compiled program they share; else a few."""
-    copies = config.num_envs if env_id in api.CRAZYFLOW_IDS else min(episodes, 16)
-    return api.make(env_id, copies, device=device, backend=backend)
+    copies = config.num_envs if env_id in registry.CRAZYFLOW_IDS else min(episodes, 16)
+    return registry.make(env_id, copies, device=device, backend=backend)
 
 
 def loggers_with(track: str | None) -> tuple[str, ...]:
@@ -326,7 +327,7 @@ def loggers_with(track: str | None) -> tuple[str, ...]:
     if track is None:
         return always
     if track not in trackers:
-        raise unknown("tracker", track, trackers)
+        raise unknown_name("tracker", track, trackers)
     if not is_installed(track):
         raise missing_extra(track, track)
     return (*always, track)
@@ -343,6 +344,6 @@ def device_for(name: str) -> torch.device:
 
 def fresh_directory(env_id: str, name: str) -> Path:
     """A directory under `runs/` that is not there yet."""
-    stem = f"{api.file_name(env_id)}-{name}"
+    stem = f"{registry.file_name(env_id)}-{name}"
     names = (Path("runs") / (stem if n == 1 else f"{stem}-{n}") for n in count(1))
     return next(path for path in names if not path.exists())

@@ -7,19 +7,19 @@ import pytest
 import torch
 
 import lemniscate as lem
-from conftest import tiny_memory
+from conftest import tiny_off_policy
 from lemniscate.envs import toy
-from lemniscate.envs.api import VecEnv
 from lemniscate.envs.gymnasium import GymnasiumBackend
+from lemniscate.envs.vec_env import VecEnv
 from lemniscate.nn.actor_critic import ActorQ
 from lemniscate.nn.networks import Layers
 from lemniscate.report import curves
 from lemniscate.report.pictures import sentence
-from lemniscate.run.critique import Honesty
 from lemniscate.run.evaluate import evaluate
 from lemniscate.run.loggers import read_metrics
-from lemniscate.types import Box, Part, Spec
-from test_memory import Levers
+from lemniscate.run.q_bias import QBias
+from lemniscate.spec import Box, ObservationPart, Spec
+from test_off_policy import Levers
 
 CPU = torch.device("cpu")
 
@@ -39,7 +39,7 @@ def test_what_followed_is_the_discounted_return_and_after_a_time_out_what_q_expe
     monkeypatch.setattr(toy, "Countdown", Levers)
     env = VecEnv(GymnasiumBackend("Countdown-v0", 3, CPU, mode=mode, length=length, horizon=horizon))
     nets = networks(env.spec)
-    honesty = evaluate(nets.policy, env, 8, seed=0, critic=(nets, gamma)).honesty
+    q_bias = evaluate(nets.policy, env, 8, seed=0, critic=(nets, gamma)).q_bias
     predicted, realised = [], []
     for copy in range(3):
         for episode in range(3 if copy < 2 else 2):
@@ -49,8 +49,8 @@ def test_what_followed_is_the_discounted_return_and_after_a_time_out_what_q_expe
             if horizon:
                 earned += gamma**horizon * nets.q(last, nets.policy(last).mode()).item()
             realised.append(earned)
-    assert honesty.predicted == pytest.approx(predicted, abs=1e-5)  # in the order of the returns
-    assert honesty.realised == pytest.approx(realised, abs=1e-5)
+    assert q_bias.predicted == pytest.approx(predicted, abs=1e-5)  # in the order of the returns
+    assert q_bias.realised == pytest.approx(realised, abs=1e-5)
 
 
 @pytest.mark.parametrize("timed_out", [False, True])
@@ -62,10 +62,10 @@ def test_entropy_counts_from_the_second_step_on(monkeypatch, rng, timed_out):
     nets = networks(env.spec, temperature=2.0)
     seen = []
     monkeypatch.setattr(ActorQ, "entropy_bonus", lambda *_: seen.append(1) or torch.tensor([10.0]))
-    honesty = evaluate(nets.policy, env, 1, seed=0, critic=(nets, 0.5)).honesty
+    q_bias = evaluate(nets.policy, env, 1, seed=0, critic=(nets, 0.5)).q_bias
     last = torch.tensor([[0.0, 0.0, 2.0]])
     follows = nets.q(last, nets.policy(last).mode()).item() + 10 if timed_out else 0
-    assert honesty.realised == pytest.approx([1 + 0.5 * (1 + 10) + 0.25 * follows])
+    assert q_bias.realised == pytest.approx([1 + 0.5 * (1 + 10) + 0.25 * follows])
     monkeypatch.undo()
     obs = torch.randn(20_000, 3, generator=rng)
     policy = nets.policy(obs)
@@ -87,19 +87,19 @@ def test_entropy_counts_from_the_second_step_on(monkeypatch, rng, timed_out):
     ],
 )
 def test_the_sentence(predicted, said):
-    assert said in str(Honesty(predicted, [40.0, 60.0]))
+    assert said in str(QBias(predicted, [40.0, 60.0]))
 
 
 def test_nothing_followed():
-    assert math.isinf(Honesty([1.0], [0.0]).bias)
-    assert "over-estimates by 1" in str(Honesty([1.0], [0.0]))
-    assert "under-estimates by 1" in str(Honesty([-1.0], [0.0]))
-    assert "right to a hundredth" in str(Honesty([0.0], [0.0]))
-    assert Honesty([1.0], [0.0]).to_json() == {"predicted": [1.0], "realised": [0.0]}  # JSON has no infinity
+    assert math.isinf(QBias([1.0], [0.0]).bias)
+    assert "over-estimates by 1" in str(QBias([1.0], [0.0]))
+    assert "under-estimates by 1" in str(QBias([-1.0], [0.0]))
+    assert "right to a hundredth" in str(QBias([0.0], [0.0]))
+    assert QBias([1.0], [0.0]).to_json() == {"predicted": [1.0], "realised": [0.0]}  # JSON has no infinity
 
 
 def test_of_two_critics_the_lower_is_asked(rng):
-    nets = networks(Spec("x", (Part((), (3,)),), Box((-1.0,), (1.0,))))
+    nets = networks(Spec("x", (ObservationPart((), (3,)),), Box((-1.0,), (1.0,))))
     obs, action = torch.randn(50, 3, generator=rng), torch.randn(50, 1, generator=rng)
     one, two = nets.critic(obs, action)
     assert 0 < (one < two).sum() < 50
@@ -107,11 +107,11 @@ def test_of_two_critics_the_lower_is_asked(rng):
 
 
 def test_it_is_said_written_and_drawn(tmp_path, capsys):
-    run = lem.train("td3", "Pendulum-v1", run=tmp_path / "r", progress=False, **tiny_memory(evaluate_every=128))
+    run = lem.train("td3", "Pendulum-v1", run=tmp_path / "r", progress=False, **tiny_off_policy(evaluate_every=128))
     scores = lem.evaluate(run.policy, episodes=3)
-    assert len(scores.honesty.predicted) == 3
+    assert len(scores.q_bias.predicted) == 3
     assert sentence(scores).count("\n") == 1
-    assert json.loads(json.dumps(scores.to_json()))["honesty"]["bias"] == scores.honesty.bias
+    assert json.loads(json.dumps(scores.to_json()))["q_bias"]["bias"] == scores.q_bias.bias
     lines = [json.loads(line) for line in (tmp_path / "r" / "metrics.jsonl").read_text().splitlines()]
     assert sum("evaluation/q_bias" in line for line in lines) == 2
     assert tmp_path / "r" / "plots" / "q.png" in lem.plot(tmp_path / "r")
@@ -119,11 +119,11 @@ def test_it_is_said_written_and_drawn(tmp_path, capsys):
 
 @pytest.mark.parametrize("every", [None, 128])
 def test_the_picture_has_what_the_evaluations_said_beside_what_is(tmp_path, monkeypatch, every):
-    fields = tiny_memory(evaluate_every=every) if every else tiny_memory()
+    fields = tiny_off_policy(evaluate_every=every) if every else tiny_off_policy()
     run = lem.train("td3", "Pendulum-v1", run=tmp_path / "r", progress=False, **fields)
     drawn = []
     monkeypatch.setattr(curves, "save", lambda figure, file: drawn.append(figure) or file)
-    curves.draw_honesty(Honesty([1.0, 2.0], [3.0, 4.0]), run.path, tmp_path / "q.png")
+    curves.draw_q_bias(QBias([1.0, 2.0], [3.0, 4.0]), run.path, tmp_path / "q.png")
     now, *history = drawn[0].axes
     assert now.lines[1].get_xydata().tolist() == [[3, 1], [4, 2]]
     logged = [line for line in read_metrics(run.path) if "evaluation/q" in line]
@@ -135,7 +135,7 @@ def test_the_picture_has_what_the_evaluations_said_beside_what_is(tmp_path, monk
 
 
 def test_the_dictionary_of_the_course(tmp_path):
-    run = lem.train("ddpg", "Pendulum-v1", run=tmp_path / "r", progress=False, **tiny_memory())
+    run = lem.train("ddpg", "Pendulum-v1", run=tmp_path / "r", progress=False, **tiny_off_policy())
     scores = lem.evaluate(run.policy, episodes=3)
     handed_in = scores.to_course()
     assert handed_in.pop("eval_datetime")[:2] == "20"

@@ -10,7 +10,7 @@ from lemniscate.maths import coloured, ornstein_uhlenbeck
 Noise = Literal["white", "ou", "coloured"]
 
 
-class Exploration:
+class ActionNoise:
     """Noise of variance 1 for N copies and A coordinates, each a sequence of its own.
 
     A sequence is as long as an episode may be, and a copy begins a new one with each episode. (Where episodes have no

@@ -9,7 +9,7 @@ import torch
 
 import lemniscate as lem
 from conftest import tiny_fields
-from lemniscate.envs import api
+from lemniscate.envs import registry
 
 
 @pytest.fixture(scope="module")
@@ -107,9 +107,11 @@ def test_a_policy_is_evaluated_by_the_simulator_that_trained_it(
 ):
     """But without workers, and by what there is where EnvPool is not."""
     asked = []
-    make = api.make
-    monkeypatch.setattr(api, "make", lambda *a, **k: asked.append(k["backend"]) or make(*a, **{**k, "backend": None}))
-    monkeypatch.setattr("lemniscate.front.is_installed", lambda _: installed)
+    make = registry.make
+    monkeypatch.setattr(
+        registry, "make", lambda *a, **k: asked.append(k["backend"]) or make(*a, **{**k, "backend": None})
+    )
+    monkeypatch.setattr("lemniscate.api.is_installed", lambda _: installed)
     policy = lem.load(cartpole.path)
     policy.config = policy.config.replace(backend=trained_by)
     lem.evaluate(policy, episodes=2)

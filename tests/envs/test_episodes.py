@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from lemniscate.envs.books import LOG_ROWS, Books, episode_sums
+from lemniscate.envs.episodes import LOG_ROWS, EpisodeStatistics, episode_sums
 from lemniscate.types import Step
 
 
@@ -26,7 +26,7 @@ def test_the_books_agree_with_adding_up_one_by_one(rng, every):
     steps, copies = LOG_ROWS + 300, 3
     reward = torch.randn(steps, copies, generator=rng)
     terminated, truncated, ignored, fragment = torch.rand(4, steps, copies, generator=rng) < 0.05
-    books, returns, lengths = Books(copies, torch.device("cpu")), [], []
+    books, returns, lengths = EpisodeStatistics(copies, torch.device("cpu")), [], []
     for t in range(steps):
         nothing = torch.zeros(copies, 1)
         books.log(Step(nothing, nothing, reward[t], terminated[t], truncated[t], ~ignored[t]), ~fragment[t])

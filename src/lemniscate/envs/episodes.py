@@ -1,7 +1,8 @@
-"""The books of a vector of environments: what each episode brought, and how long it took."""
+"""The episodes of N parallel environments: their returns and lengths, and their staggering."""
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -19,7 +20,7 @@ class Episodes:
     lengths: list[int]
 
 
-class Books:
+class EpisodeStatistics:
     """Steps are logged one by one and booked many at once, since [T, N] costs hardly more than [N].
 
     Fragments (episodes that staggering began late or cut early) and ignored actions (`valid` False) are not counted.
@@ -30,9 +31,9 @@ class Books:
         self._running = torch.zeros(2, num_envs, dtype=torch.float64, device=device)
         self._ended: list[Tensor] = []
 
-    def log(self, step: Step, whole: Tensor) -> None:
-        """One step of every copy; `whole` [N] says whose episode had begun at its beginning."""
-        self._log.append((step.reward, step.terminated, step.truncated, step.valid, whole))
+    def log(self, step: Step, counts: Tensor) -> None:
+        """One step of every copy; `counts` [N] is False where the episode is a fragment."""
+        self._log.append((step.reward, step.terminated, step.truncated, step.valid, counts))
         if len(self._log) == LOG_ROWS:
             self._book()
 
@@ -45,10 +46,10 @@ class Books:
         return Episodes(returns.tolist(), lengths.int().tolist())
 
     def _book(self) -> None:
-        reward, terminated, truncated, valid, whole = (torch.stack(column) for column in zip(*self._log, strict=True))
+        reward, terminated, truncated, valid, counts = (torch.stack(column) for column in zip(*self._log, strict=True))
         done = (terminated | truncated) & valid
         running = episode_sums(torch.stack([reward * valid, valid]).double(), done, self._running)
-        self._ended.append(running[:, done & whole])  # by time, then by copy
+        self._ended.append(running[:, done & counts])  # by time, then by copy
         self._running = running[:, -1] * ~done[-1]
         self._log = []
 
@@ -69,3 +70,28 @@ def episode_sums(rows: Tensor, done: Tensor, carried: Tensor) -> Tensor:
     after_end = torch.where(done, next_row, 0).cummax(0).values
     first_row = torch.cat([torch.zeros_like(after_end[:1]), after_end[:-1]])  # of the episode at hand, or 0
     return sums[:, 1:] - sums.gather(1, first_row.expand(len(rows), -1, -1))
+
+
+class Stagger:
+    """The first episode of each copy is cut after a random number of steps, uniform up to the time limit.
+
+    A cut counts as a truncation. Without a limit there are no cuts, and every episode is whole.
+    """
+
+    def __init__(self, num_envs: int, limit: int | None, seed: int) -> None:
+        self._steps_left = np.full(num_envs, -1)
+        if limit is not None:
+            self._steps_left = np.random.default_rng(seed).integers(1, limit, num_envs, endpoint=True)
+        self.counts = np.full(num_envs, limit is None)
+        """[N] bool: the copy's present episode began at its beginning and is not to be cut"""
+
+    def apply(self, terminated: np.ndarray, truncated: np.ndarray) -> np.ndarray:
+        """After one more step in every copy: `truncated` [N], with the cuts that are due."""
+        if self.counts.all():
+            return truncated
+        self._steps_left -= 1
+        truncated = truncated | ((self._steps_left == 0) & ~terminated)
+        done = terminated | truncated
+        self._steps_left[done] = -1
+        self.counts = self.counts | done
+        return truncated

@@ -14,15 +14,15 @@ import pytest
 from filelock import FileLock
 
 import lemniscate as lem
-from lemniscate import sets
+from lemniscate import sweep
 from lemniscate.cli import main
 from lemniscate.run import checkpoint
 from lemniscate.run.directory import is_finished
 from lemniscate.run.loggers import read_metrics
-from lemniscate.run.progress import SetProgress
+from lemniscate.run.progress import SweepProgress
 
 SEEDS = ["--seeds", "1-2"]
-ENV = "worlds:Copy-box-v0"
+ENV = "environments:Copy-box-v0"
 SHARED = {"num_envs": 4, "num_steps": 64, "total_steps": 5_200, "hidden": (16,)}
 FLAGS = ["--num-envs", "4", "--num-steps", "64", "--total-steps", "5_200", "--hidden", "16"]
 FEW = {"num_envs": 4, "num_steps": 8, "total_steps": 256, "hidden": (16,), "minibatch_size": 16}
@@ -59,7 +59,7 @@ def trained(tmp_path_factory):
 
 def test_a_set_is_a_run_for_each_algorithm_and_seed(trained):
     path, _ = trained
-    record = json.loads((path / "set.json").read_text())
+    record = json.loads((path / "sweep.json").read_text())
     assert record["seeds"] == [1, 2]
     assert list(record["configs"]) == ["ppo", "ddpg"]
     assert record["configs"]["ddpg"]["total_steps"] == 5_200
@@ -132,29 +132,29 @@ def test_a_run_whose_last_checkpoint_is_damaged_is_not_finished(trained, tmp_pat
 
 
 def test_runs_are_trained_side_by_side_where_there_are_cores(tmp_path, monkeypatch):
-    monkeypatch.setattr(sets, "at_once", lambda threads: 2)
+    monkeypatch.setattr(sweep, "at_once", lambda threads: 2)
     most = []
-    look = sets._Crew._look
-    monkeypatch.setattr(sets._Crew, "_look", lambda crew: most.append(len(crew._going)) or look(crew))
-    lem.train_set("ppo", "Countdown-v0", "1-3", run=tmp_path / "set", progress=False, **FEW)
+    look = sweep._Crew._look
+    monkeypatch.setattr(sweep._Crew, "_look", lambda crew: most.append(len(crew._going)) or look(crew))
+    lem.train_sweep("ppo", "Countdown-v0", "1-3", run=tmp_path / "set", progress=False, **FEW)
     assert max(most) == 2
 
 
 def test_two_processes_do_not_train_one_set(trained):
     path, _ = trained
     with FileLock(path / ".lock"), pytest.raises(lem.UserError, match="being trained by another process"):
-        lem.resume_set(path)
+        lem.resume_sweep(path)
 
 
 def test_the_policy_is_played_anew_when_there_is_a_newer_checkpoint(trained, tmp_path, capsys):
     run = shutil.copytree(trained[0] / "ppo-1", tmp_path / "run")
     known = json.loads((run / "final.json").read_text())
-    assert lem.front.final_return(run) == known["mean_return"]
+    assert lem.api.final_return(run) == known["mean_return"]
     assert capsys.readouterr().err == ""
     newest = run / "checkpoints" / f"step-{known['step']}"
     newest.rename(newest.with_name(f"step-{known['step'] + 1}"))
     (run / "final.json").write_text(json.dumps(known | {"mean_return": 7.0}))
-    assert lem.front.final_return(run) == known["mean_return"]
+    assert lem.api.final_return(run) == known["mean_return"]
     assert "Evaluating" in capsys.readouterr().err
 
 
@@ -193,8 +193,8 @@ def test_ctrl_c_stops_every_run_and_the_set_goes_on_to_the_same_bits(tmp_path):
 
 
 def test_runs_that_fail_are_named_and_the_others_are_not_touched(tmp_path, capsys):
-    with pytest.raises(lem.SetError) as told:
-        lem.train_set(["ppo"], "worlds:Fragile", range(1, 4), run=tmp_path / "s", num_envs=2, total_steps=2_000)
+    with pytest.raises(lem.SweepError) as told:
+        lem.train_sweep(["ppo"], "environments:Fragile", range(1, 4), run=tmp_path / "s", num_envs=2, total_steps=2_000)
     first, nan, killed = str(told.value).splitlines()
     assert first == "2 of 3 runs could not go on; log.txt in each says more."
     assert nan.startswith("ppo-2: The reward of environment 0 is nan in the step after 0. Training stopped;")
@@ -207,9 +207,9 @@ def test_runs_that_fail_are_named_and_the_others_are_not_touched(tmp_path, capsy
 
 def test_the_command_ends_in_1_if_a_run_has_failed(monkeypatch, capsys):
     def fails(*_, **__):
-        raise lem.SetError("1 of 2 runs could not go on.\nppo-2: why.")
+        raise lem.SweepError("1 of 2 runs could not go on.\nppo-2: why.")
 
-    monkeypatch.setattr(sets, "train_set", fails)
+    monkeypatch.setattr(sweep, "train_sweep", fails)
     assert main(["train", "ppo", "--env", "CartPole-v1", "--seeds", "1-2"]) == 1
     assert capsys.readouterr().err == "1 of 2 runs could not go on.\nppo-2: why.\n"
 
@@ -243,20 +243,20 @@ def test_a_mistake_is_one_sentence_before_anything_starts(tmp_path, capsys, argu
 
 
 def test_seeds_are_given_as_ranges_and_lists():
-    assert sets._seeds_of("1-3") == [1, 2, 3]
-    assert sets._seeds_of("7,1-2, 7") == [7, 1, 2]
-    assert sets._seeds_of(range(2)) == [0, 1]
-    assert sets._seeds_of(5) == [5]
+    assert sweep._seeds_of("1-3") == [1, 2, 3]
+    assert sweep._seeds_of("7,1-2, 7") == [7, 1, 2]
+    assert sweep._seeds_of(range(2)) == [0, 1]
+    assert sweep._seeds_of(5) == [5]
 
 
 @pytest.mark.parametrize(("cores", "threads", "runs"), [(8, 1, 8), (8, 3, 2), (2, 4, 1)])
 def test_as_many_runs_at_once_as_cores_serve(monkeypatch, cores, threads, runs):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)))
-    assert sets.at_once(threads) == runs
+    assert sweep.at_once(threads) == runs
 
 
 def test_without_a_terminal_progress_is_a_line_now_and_then(capsys):
-    bars = SetProgress({"a": 1_000, "b": 1_000}, {"a": 0, "b": 500})
+    bars = SweepProgress({"a": 1_000, "b": 1_000}, {"a": 0, "b": 500})
     bars.update("a", 0, None, None)
     bars.update("a", 100, 7.0, 50.0)
     bars.update("a", 150, 7.0, 50.0)

@@ -1,6 +1,6 @@
 """What a set of runs consists of: several algorithms times several seeds, a run directory for each.
 
-    set.json          the seeds, and the Config of each algorithm
+    sweep.json          the seeds, and the Config of each algorithm
     ppo-1/, sac-1/…   the runs
 
 A run that has not begun is a directory with nothing but its `config.json`: it is resumed, from step 0, like any other.
@@ -16,8 +16,8 @@ from lemniscate.run.directory import SET, create_directory
 
 
 @dataclass(frozen=True)
-class RunSet:
-    """A set's directory and what its `set.json` says: the seeds, and the Config of each algorithm but for the seed."""
+class Sweep:
+    """The directory of a sweep and its `sweep.json`: the seeds, and the Config of each algorithm without its seed."""
 
     path: Path
     seeds: list[int]
@@ -33,7 +33,7 @@ class RunSet:
         }
 
     def create(self) -> None:
-        """Write `set.json` into a new directory. Raises `UserError` if there is something already."""
+        """Write `sweep.json` into a new directory. Raises `UserError` if there is something already."""
         create_directory(self.path, SET, {"seeds": self.seeds, "configs": self.configs})
 
     def create_runs(self) -> None:
@@ -43,15 +43,15 @@ class RunSet:
                 create_directory(path, "config.json", record)
 
 
-def is_set(path: Path) -> bool:
+def is_sweep(path: Path) -> bool:
     """Whether a directory holds a set of runs."""
     return (path / SET).exists()
 
 
-def read_set(path: Path) -> RunSet:
+def read_sweep(path: Path) -> Sweep:
     """The set in a directory. Raises `UserError` if there is none."""
     try:
         record = json.loads((path / SET).read_text())
-        return RunSet(path, record["seeds"], record["configs"])
+        return Sweep(path, record["seeds"], record["configs"])
     except (OSError, ValueError, KeyError, TypeError):
         raise UserError(f"{path} is not a set of runs: it holds no {SET} that can be read.") from None

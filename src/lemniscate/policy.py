@@ -10,7 +10,7 @@ from lemniscate.errors import UserError
 from lemniscate.nn.policies import Policy
 from lemniscate.run.config import RunConfig
 from lemniscate.run.seeding import generator
-from lemniscate.types import Discrete, Spec
+from lemniscate.spec import Discrete, Spec
 
 
 class TrainedPolicy:

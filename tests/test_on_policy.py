@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import torch
 
-import worlds
+import environments
 from lemniscate.algos import a2c, ppo, reinforce, trpo
 from lemniscate.data.rollout import collect, collect_episodes, minibatches
 from lemniscate.envs import toy
-from lemniscate.envs.api import VecEnv
 from lemniscate.envs.gymnasium import GymnasiumBackend
+from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError
 
 CPU = torch.device("cpu")
@@ -87,7 +87,7 @@ def test_with_reset_rows_the_value_is_wrong(monkeypatch, algo):
 
 
 @EACH
-@pytest.mark.parametrize("kind", worlds.KINDS)
+@pytest.mark.parametrize("kind", environments.KINDS)
 def test_it_learns_in_spaces_of_every_kind(algo, kind):
     size = {"num_envs": 16, "num_steps": 16, "initial_log_std": -1.0, "normalize_observations": False}
     config = small(algo, f"Copy-{kind}-v0", **size, **FAST[algo])
@@ -190,7 +190,7 @@ def test_it_learns_from_whole_episodes(mode, baseline):
 
 
 def test_an_episode_that_never_ends_is_a_sentence(monkeypatch):
-    monkeypatch.setattr("lemniscate.envs.api.PATIENCE", 30)
+    monkeypatch.setattr("lemniscate.envs.vec_env.PATIENCE", 30)
     config = small(reinforce, episodes=1)
     state, env = begin(reinforce, config, length=None)
     with pytest.raises(UserError, match=r"Countdown-v0 has not ended after 30 steps"):
@@ -325,7 +325,7 @@ def engines_agree(algo, env):
 )
 def test_the_two_engines_agree(call):
     """In a process of its own: the shape checks of this one are not for the compiler."""
-    code = f"from test_road import *; engines_agree({call})"
+    code = f"from test_on_policy import *; engines_agree({call})"
     done = subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parent, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 

@@ -1,0 +1,131 @@
+"""The description of an environment that a policy needs: its observations, its actions, its time limit."""
+
+import math
+from dataclasses import dataclass
+
+from lemniscate.errors import UserError
+
+
+@dataclass(frozen=True)
+class Box:
+    """Continuous actions. A policy acts in [-1, 1]^A; the environment floor maps that onto [low, high].
+
+    Where a bound is infinite the unit stays what it is: see `envs.spaces.scale_action`.
+    `shape` is how the environment wants the A coordinates, if not in a row, and `dtype` in which numbers.
+    """
+
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    shape: tuple[int, ...] | None = None
+    dtype: str = "float32"
+
+    @property
+    def size(self) -> int:
+        """A, the number of coordinates."""
+        return len(self.low)
+
+    def same_as(self, other: "Action") -> bool:
+        """Whether both mean the same, up to the rounding of their bounds."""
+        if not isinstance(other, Box) or (self.size, self.shape) != (other.size, other.shape):
+            return False
+        bounds = zip((*self.low, *self.high), (*other.low, *other.high), strict=True)
+        return all(math.isclose(mine, its, rel_tol=1e-6) for mine, its in bounds)
+
+
+@dataclass(frozen=True)
+class Discrete:
+    """One of n actions. A policy chooses 0 … n-1; the environment floor adds `start`.
+
+    With `masked`, the environment says at each step which of them are valid, and the observation ends in that mask:
+    n numbers, 1 or 0.
+    """
+
+    n: int
+    start: int = 0
+    masked: bool = False
+
+
+@dataclass(frozen=True)
+class MultiDiscrete:
+    """One of n_k actions for each of K levers; the environment floor adds `start`."""
+
+    nvec: tuple[int, ...]
+    start: tuple[int, ...]
+    shape: tuple[int, ...] | None = None
+
+
+@dataclass(frozen=True)
+class MultiBinary:
+    """n switches, each on or off."""
+
+    n: int
+    shape: tuple[int, ...] | None = None
+
+
+Action = Box | Discrete | MultiDiscrete | MultiBinary
+
+
+@dataclass(frozen=True)
+class ObservationPart:
+    """A piece of the flat observation: where it is in the environment's own, and its shape there.
+
+    `path` leads through Dict keys and Tuple indices; it is empty where the observation is the piece itself. With
+    `nvec`, each number of the piece becomes a one-hot vector, counted from `start`.
+    """
+
+    path: tuple[str | int, ...]
+    shape: tuple[int, ...]
+    nvec: tuple[int, ...] = ()
+    start: tuple[int, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """The path as one word."""
+        return "/".join(map(str, self.path)) or "obs"
+
+    @property
+    def size(self) -> int:
+        """How many numbers it is in the flat observation."""
+        return sum(self.nvec) if self.nvec else math.prod(self.shape)
+
+
+@dataclass(frozen=True)
+class Spec:
+    """What a policy has to know of an environment; saved with every checkpoint.
+
+    `layout` names the parts of the flat observation in their order; their sizes sum to O. With `image`, the only part
+    is an image of bytes, height × width × channels, and stays bytes.
+    `time_step` is the control period in seconds, where the environment has one.
+    `tracking` is where the tracking error (x, y, z in metres) stands in the observation, as (start, stop).
+    """
+
+    env_id: str
+    layout: tuple[ObservationPart, ...]
+    action: Action
+    max_episode_steps: int | None = None
+    time_step: float | None = None
+    tracking: tuple[int, int] | None = None
+    image: bool = False
+
+    def fits(self, other: "Spec") -> bool:
+        """Whether a policy for one environment can act in the other."""
+        mine, its = self.action, other.action
+        same_action = mine.same_as(its) if isinstance(mine, Box) else mine == its
+        return same_action and (self.layout, self.image) == (other.layout, other.image)
+
+    def bounded_box(self) -> Box:
+        """The actions. Raises `UserError` unless they are numbers between finite bounds."""
+        if not isinstance(self.action, Box):
+            kind = type(self.action).__name__
+            raise UserError(f"{self.env_id} has {kind} actions; this algorithm needs continuous ones. ppo learns here.")
+        if not all(map(math.isfinite, (*self.action.low, *self.action.high))):
+            raise UserError(
+                f"{self.env_id} has actions without bounds, and this algorithm explores between bounds: give its Box a"
+                " finite low and high. ppo learns here."
+            )
+        return self.action
+
+    @property
+    def observation_size(self) -> int:
+        """O, the length of the flat observation, without the action mask."""
+        return sum(part.size for part in self.layout)
