@@ -110,7 +110,7 @@ def test_evaluation_changes_no_bit_of_training(tmp_path, env):
 
 @pytest.mark.parametrize("env", ["CartPole-v1", "sac"])
 def test_recordings_change_no_bit_of_training_and_survive_a_resume(tmp_path, env, monkeypatch):
-    monkeypatch.setattr(lem.front, "is_installed", lambda name: name != "imageio_ffmpeg")
+    monkeypatch.setattr(lem.api, "is_installed", lambda name: name != "imageio_ffmpeg")
     train(tmp_path / "without", env, checkpoint_every=64)
     path = tmp_path / "with"
     train(path, env, checkpoint_every=64, video_every=96)
