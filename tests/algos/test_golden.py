@@ -116,7 +116,9 @@ def five_updates(case):
     off_policy = hasattr(state, "replay")
     if off_policy:
         for name, column in vars(state.replay.transitions).items():
-            object.__setattr__(state.replay.transitions, name, column.double() if column.is_floating_point() else column)
+            object.__setattr__(
+                state.replay.transitions, name, column.double() if column.is_floating_point() else column
+            )
         state.replay.extend(transitions(data))
         state.networks.policy.observe(state.replay.transitions.obs)
     rows = []

@@ -11,10 +11,10 @@ import torch
 from torch import Tensor
 
 from lemniscate.data.rollout import collect, one_minibatch
-from lemniscate.maths import explained_variance, gae, linear, means, policy_gradient, standardize, value_loss
+from lemniscate.maths import explained_variance, gae, means, policy_gradient, standardize, value_loss
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.normalizer import RewardScale
-from lemniscate.optim.adam import Adam
+from lemniscate.optim.adam import Adam, linear
 from lemniscate.run.config import Count, Fraction, LogStd, NonNegative, OnPolicyConfig, Positive
 from lemniscate.run.run import Run
 from lemniscate.run.state import Generators, OnPolicyState

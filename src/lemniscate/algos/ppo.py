@@ -12,11 +12,9 @@ from torch import Tensor
 
 from lemniscate.data.rollout import collect, epoch_minibatches
 from lemniscate.maths import (
-    adapt_to_kl,
     clipped_surrogate,
     explained_variance,
     gae,
-    linear,
     means,
     ratio_statistics,
     standardize,
@@ -24,7 +22,7 @@ from lemniscate.maths import (
 )
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.normalizer import RewardScale
-from lemniscate.optim.adam import Adam
+from lemniscate.optim.adam import Adam, adapt_to_kl, linear
 from lemniscate.run.config import Count, Fraction, NonNegative, OnPolicyConfig, Positive
 from lemniscate.run.run import Run
 from lemniscate.run.state import Generators, OnPolicyState

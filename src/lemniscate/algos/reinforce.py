@@ -17,7 +17,6 @@ from lemniscate.maths import (
     episode_return,
     explained_variance,
     kl_k3,
-    linear,
     means,
     policy_gradient,
     reward_to_go,
@@ -28,7 +27,7 @@ from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.critics import Value
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.nn.policies import Policy
-from lemniscate.optim.adam import Adam
+from lemniscate.optim.adam import Adam, linear
 from lemniscate.run.config import Count, Fraction, LogStd, Natural, NonNegative, OnPolicyConfig, Positive
 from lemniscate.run.run import Run
 from lemniscate.run.state import Generators, OnPolicyState
@@ -73,7 +72,9 @@ class Config(OnPolicyConfig):
         super().__post_init__()
         if not self.episodes and (self.returns, self.baseline) != ("to_go", "value"):
             cut = f"returns {self.returns}, baseline {self.baseline} need whole episodes"
-            raise UserError(f"{cut}, which num_steps cuts: use episodes 1 or more, or returns to_go and baseline value.")
+            raise UserError(
+                f"{cut}, which num_steps cuts: use episodes 1 or more, or returns to_go and baseline value."
+            )
         if self.episodes and self.compile == "on":
             raise UserError("Batches of whole episodes differ in size and cannot be compiled: use --compile off.")
         if not self.episodes:
@@ -157,9 +158,8 @@ def update(config: Config, state: State, rollout: Rollout) -> dict[str, Tensor |
     size = len(valid_rows) if config.episodes else rollout.num_rows
     metrics: dict[str, Tensor | float] = {"learning_rate": rate}
     metrics |= means(state.learn(config, state, batch, one_minibatch(valid_rows, size), update_policy=True))
-    with torch.no_grad():
-        new_log_prob = policy(batch.obs[valid_rows]).log_prob(batch.action[valid_rows])
-        metrics["approx_kl"] = kl_k3(new_log_prob - batch.log_prob[valid_rows])
+    new_log_prob = policy(batch.obs[valid_rows]).log_prob(batch.action[valid_rows]).detach()
+    metrics["approx_kl"] = kl_k3(new_log_prob - batch.log_prob[valid_rows])
     if config.baseline == "value":
         for _ in range(config.critic_epochs):
             minibatches = epoch_minibatches(valid_rows, size, config.critic_minibatch_size, state.rng.minibatch)

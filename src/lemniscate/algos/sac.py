@@ -15,7 +15,7 @@ from lemniscate.maths import means, polyak, td_target, value_loss
 from lemniscate.nn.actor_critic import SoftActorQ
 from lemniscate.nn.critics import Critics, Temperature
 from lemniscate.nn.policies import Policy
-from lemniscate.optim.adam import Adam
+from lemniscate.optim.adam import Adam, linear
 from lemniscate.run.config import Finite, OffPolicyConfig, Positive
 from lemniscate.run.run import Run
 from lemniscate.run.state import Generators, OffPolicyState
@@ -93,10 +93,9 @@ def learn(
     metrics = []
     for k, rows in enumerate(minibatches):
         batch = replay[rows]
-        next_noise, now_noise = noise[k]
-        metrics.append(state.critic_optimizer.step(partial(critic_loss, config, state), batch, next_noise))
+        metrics.append(state.critic_optimizer.step(partial(critic_loss, config, state), batch, noise[k, 0]))
         if update_actor[k]:
-            actor = state.actor_optimizer.step(partial(actor_loss, state), batch, now_noise)
+            actor = state.actor_optimizer.step(partial(actor_loss, state), batch, noise[k, 1])
             entropy, size = actor["losses/entropy"], batch.action.shape[-1]
             metrics += [actor, state.temperature_optimizer.step(partial(temperature_loss, config), entropy, size)]
             polyak(state.targets.parameters(), state.networks.critics.parameters(), config.tau)
@@ -105,12 +104,13 @@ def learn(
 
 def update(config: Config, state: State) -> Metrics:
     """The gradient steps after a step of the environments; returns the means of the metrics."""
-    state.critic_optimizer.learning_rate = config.annealed(config.critic_learning_rate, state.step)
-    state.actor_optimizer.learning_rate = config.annealed(config.actor_learning_rate, state.step)
-    state.temperature_optimizer.learning_rate = config.annealed(config.actor_learning_rate, state.step)
+    progress = state.step / config.total_steps
+    state.critic_optimizer.learning_rate = linear(config.critic_learning_rate, config.final_learning_rate, progress)
+    state.actor_optimizer.learning_rate = linear(config.actor_learning_rate, config.final_learning_rate, progress)
+    state.temperature_optimizer.learning_rate = linear(config.actor_learning_rate, config.final_learning_rate, progress)
     minibatches = state.replay.sample_indices(config.num_updates, config.batch_size, state.rng.minibatch)
     noise = state.networks.policy.draw_noise((2, *minibatches.shape), state.rng.action).transpose(0, 1)  # [K, 2, M, A]
-    update_actor = config.actor_turns(state.updates)
+    update_actor = tuple((state.updates + k) % config.policy_delay == 0 for k in range(1, config.num_updates + 1))
     state.updates += config.num_updates
     return means(state.learn(config, state, state.replay.transitions, minibatches, noise, update_actor=update_actor))
 

@@ -15,7 +15,7 @@ from lemniscate.maths import means, polyak, td_target, value_loss
 from lemniscate.nn.actor_critic import ActorQ
 from lemniscate.nn.critics import Critics
 from lemniscate.nn.policies import Policy
-from lemniscate.optim.adam import Adam
+from lemniscate.optim.adam import Adam, linear
 from lemniscate.run.config import Count, NonNegative, OffPolicyConfig
 from lemniscate.run.run import Run
 from lemniscate.run.state import Generators, OffPolicyState
@@ -97,14 +97,15 @@ def learn(
 
 def update(config: Config, state: State) -> Metrics:
     """The gradient steps after a step of the environments; returns the means of the metrics."""
-    state.critic_optimizer.learning_rate = config.annealed(config.critic_learning_rate, state.step)
-    state.actor_optimizer.learning_rate = config.annealed(config.actor_learning_rate, state.step)
+    progress = state.step / config.total_steps
+    state.critic_optimizer.learning_rate = linear(config.critic_learning_rate, config.final_learning_rate, progress)
+    state.actor_optimizer.learning_rate = linear(config.actor_learning_rate, config.final_learning_rate, progress)
     minibatches = state.replay.sample_indices(config.num_updates, config.batch_size, state.rng.minibatch)
     replay = state.replay.transitions
     noise = torch.randn(
         *minibatches.shape, replay.action.shape[-1], generator=state.rng.action, device=minibatches.device
     )
-    update_actor = config.actor_turns(state.updates)
+    update_actor = tuple((state.updates + k) % config.policy_delay == 0 for k in range(1, config.num_updates + 1))
     state.updates += config.num_updates
     return means(state.learn(config, state, replay, minibatches, noise, update_actor=update_actor))
 

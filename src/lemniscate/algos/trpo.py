@@ -16,7 +16,6 @@ from lemniscate.maths import (
     backtrack,
     explained_variance,
     gae,
-    linear,
     means,
     natural_step,
     standardize,
@@ -26,7 +25,7 @@ from lemniscate.maths import (
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.critics import Value
 from lemniscate.nn.normalizer import RewardScale
-from lemniscate.optim.adam import Adam
+from lemniscate.optim.adam import Adam, linear
 from lemniscate.optim.vector import PolicyVector
 from lemniscate.run.config import Count, Fraction, NonNegative, OnPolicyConfig, Positive, Range
 from lemniscate.run.run import Run
@@ -142,13 +141,8 @@ def improve(config: Config, state: State, batch: Batch, fisher_obs: Tensor) -> d
         there, fraction = here + step, 1.0
         if config.line_search:
             there, fraction = backtrack(lambda theta: (loss(theta), kl(theta)), here, step, **limits)
-        metrics: dict[str, Tensor | float] = {
-            "losses/policy": loss(there),
-            "losses/entropy": pi(here, batch.obs).entropy().mean(),
-            "kl": kl(there),
-            "step_fraction": fraction,
-            "gradient_norm": gradient.norm(),
-        }
+        metrics: dict[str, Tensor | float] = {"losses/policy": loss(there), "kl": kl(there), "step_fraction": fraction}
+        metrics |= {"losses/entropy": pi(here, batch.obs).entropy().mean(), "gradient_norm": gradient.norm()}
         state.parameters.vector.copy_(there)
     return metrics
 

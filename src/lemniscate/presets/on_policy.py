@@ -1,6 +1,6 @@
 """Presets of the on-policy algorithms: REINFORCE, A2C, TRPO, PPO."""
 
-from lemniscate.algos import a2c, ppo, reinforce, trpo
+from lemniscate.algos import a2c, ppo, trpo
 from lemniscate.presets.preset import Preset
 
 FIGURE_EIGHT = "DroneFigureEightTrajectory-v0"
@@ -195,9 +195,7 @@ TRPO = [
     ),
     Preset(
         "swimmer",
-        trpo.Config(
-            env="Swimmer-v5", num_envs=4, num_steps=512, gamma=0.9999, gae_lambda=0.995, initial_log_std=0.0
-        ),
+        trpo.Config(env="Swimmer-v5", num_envs=4, num_steps=512, gamma=0.9999, gae_lambda=0.995, initial_log_std=0.0),
         "search by hand, 8 settings, on seeds 101 to 110; this one on 105 to 110",
         "2026-11",
     ),

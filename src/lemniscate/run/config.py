@@ -10,9 +10,9 @@ import torch
 
 from lemniscate.data.action_noise import ActionNoise, Kind
 from lemniscate.errors import UserError, unknown_name
-from lemniscate.maths import linear
+from lemniscate.nn.activations import Activation
 from lemniscate.nn.actor_critic import ActorCritic
-from lemniscate.nn.networks import Activation, Layers, Matmul
+from lemniscate.nn.networks import Layers, Matmul
 from lemniscate.spec import Spec
 
 
@@ -280,14 +280,6 @@ class OffPolicyConfig(RunConfig):
         """Action noise for the environments of a run; a sequence is as long as an episode may be."""
         shape, length = (self.num_envs, spec.bounded_box().size), spec.max_episode_steps or 1000
         return ActionNoise(self.action_noise, shape, length, device, time=self.noise_time, exponent=self.noise_exponent)
-
-    def annealed(self, learning_rate: float, step: int) -> float:
-        """A learning rate at environment step `step`."""
-        return linear(learning_rate, self.final_learning_rate, step / self.total_steps)
-
-    def actor_turns(self, updates: int) -> tuple[bool, ...]:
-        """For each of the next `num_updates` gradient steps after `updates`, whether the policy is updated too."""
-        return tuple((updates + k) % self.policy_delay == 0 for k in range(1, self.num_updates + 1))
 
     def updates_at(self, step: int) -> bool:
         """Whether an update follows environment step `step`."""
