@@ -15,9 +15,12 @@ from lemniscate.run import checkpoint
 
 @dataclasses.dataclass
 class Weightless:
-    """A State of which nothing is asked."""
+    """A training state without networks."""
 
     step: int = 0
+
+    def saved(self):
+        return {"step": self.step}
 
 
 def write_run(path, algorithm="ppo", env="CartPole-v1", seed=1, score=100.0, *, taken=None, rate=100.0, **fields):
