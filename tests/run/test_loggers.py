@@ -6,7 +6,8 @@ import pytest
 
 from lemniscate.envs.episodes import Episodes
 from lemniscate.report.curves import episode_returns
-from lemniscate.run.loggers import JsonLines, WeightsAndBiases, read_metrics
+from lemniscate.run.loggers import JsonLines, read_metrics
+from lemniscate.run.wandb_logger import WeightsAndBiases
 
 
 def test_a_resumed_log_drops_what_it_will_write_again(tmp_path):

@@ -16,12 +16,13 @@ from lemniscate.types import Rollout
 def collect(env: VecEnv, policy: Policy, num_steps: int, generator: Generator) -> Rollout:
     """Act `num_steps` times in every environment, from where it stands. Returns a rollout [T, N, …]."""
     rows = []
-    for noise in policy.noise((num_steps, env.num_envs), generator):
-        obs = env.obs
-        action = policy.act(obs, noise)
-        step = env.step(action)
-        rows.append(Rollout(obs, action, step.reward, step.next_obs, step.terminated, step.truncated, step.valid))
-    return Rollout.stack(rows)
+    with env.collecting:
+        for noise in policy.noise((num_steps, env.num_envs), generator):
+            obs = env.obs
+            action = policy.act(obs, noise)
+            step = env.step(action)
+            rows.append(Rollout(obs, action, step.reward, step.next_obs, step.terminated, step.truncated, step.valid))
+        return Rollout.stack(rows)
 
 
 @torch.no_grad()

@@ -6,9 +6,13 @@ import math
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Self, get_args, get_origin, get_type_hints
 
+import torch
+
 from lemniscate.data.action_noise import Noise
+from lemniscate.data.replay import bytes_per_transition
 from lemniscate.errors import UserError, unknown_name
-from lemniscate.nn.networks import Activation, Architecture, Layers, Matmul
+from lemniscate.nn.networks import Activation, Architecture, Layers, Matmul, has_bfloat16
+from lemniscate.spec import Spec
 
 
 @dataclass(frozen=True)
@@ -66,6 +70,8 @@ class RunConfig:
     """episodes of each evaluation"""
     video_every: Natural = 0
     """steps between recordings of an episode into videos/step-N; 0 records none"""
+    warm_start: str | None = None
+    """run or checkpoint whose networks are the beginning of this run's"""
 
     def __post_init__(self) -> None:
         hints = get_type_hints(type(self), include_extras=True)
@@ -98,6 +104,10 @@ class RunConfig:
     def gradient_steps(self) -> int:
         """Of the whole run."""
         raise NotImplementedError
+
+    def notices(self, spec: Spec, device: torch.device) -> list[str]:
+        """Sentences that a person should read before a run of this Config starts."""
+        return []
 
     def replace(self, **changes: object) -> Self:
         """A copy with some fields changed. Raises `UserError` for an unknown field or a value out of range."""
@@ -234,6 +244,14 @@ class OffPolicyConfig(RunConfig):
                     f" {self.buffer_size:,} and the {self.num_envs * self.steps_of_each_copy:,} steps of the run is"
                     f" below {name} {rows:,}."
                 )
+
+    def notices(self, spec: Spec, device: torch.device) -> list[str]:
+        """The size of the replay buffer; and products in bfloat16 where the processor has none."""
+        size = self.capacity * bytes_per_transition(spec) / 1e6
+        notices = [f"Replay buffer: {self.capacity:,} transitions, {size:,.1f} MB (also in each checkpoint)."]
+        if self.matmul == "bfloat16" and not has_bfloat16(device):
+            notices.append("This processor has no products in bfloat16; --matmul float32 is faster.")
+        return notices
 
     @property
     def actor_layers(self) -> Layers:

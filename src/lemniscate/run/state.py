@@ -22,6 +22,9 @@ class TrainState:
             if hasattr(part, "restart"):
                 part.restart()
 
+    def on_warm_start(self) -> None:
+        """Called when networks of another run have been loaded into `networks`: target networks become copies again."""
+
     def compile(self) -> None:
         """Compile what is called at every step, from the next call on."""
         for part in (self.policy, *vars(self).values()):
