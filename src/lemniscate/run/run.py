@@ -200,8 +200,8 @@ class Run:
     def _tell_stop(self, step: int) -> None:
         message = (
             f"Stopped at step {step:,}; the policy is saved. Go on with: lemniscate resume {self.path}\n"
-            f"It resumes at step {self._saver.last_planned:,}, the last planned checkpoint, and ends in the same bits as"
-            " a run that was never stopped."
+            f"It resumes at step {self._saver.last_planned:,}, the last planned checkpoint, and ends in the same bits"
+            " as a run that was never stopped."
         )
         if self._stop_signal:
             raise Stopped(message, self._stop_signal)

@@ -10,8 +10,11 @@ from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import find_checkpoint
 from lemniscate.spec import Spec
 
-FORWARD = ("network", "architecture", "activation")
+FUNCTION = ("network", "architecture", "activation")
 """fields of a Config that change what networks of the same shapes compute"""
+
+SHAPE = ("hidden", "normalize_observations")
+"""fields of a Config that a policy of other shapes may come from"""
 
 
 def load_networks(networks: nn.Module, config: RunConfig, spec: Spec) -> str:
@@ -33,11 +36,12 @@ def load_networks(networks: nn.Module, config: RunConfig, spec: Spec) -> str:
             f"warm_start: {name} was trained on {their_spec.env_id}, whose observation or action spaces differ from"
             f" those of {spec.env_id}."
         )
-    theirs = source.record["config"]
-    for field in FORWARD:
-        mine = getattr(config, field, None)
-        if theirs.get(field, mine) != mine:
-            raise UserError(f"warm_start: {field} is {theirs[field]!r} in {name}, and {mine!r} here.")
+    theirs, mine = source.record["config"], config.to_json()
+    shared = [field for field in (*FUNCTION, *SHAPE) if field in theirs and field in mine]
+    differing = [field for field in shared if theirs[field] != mine[field]]
+    settings = [f"{field} is {theirs[field]!r} there and {mine[field]!r} here" for field in differing]
+    if set(differing) & set(FUNCTION):
+        raise UserError(f"warm_start: {name} does not fit: {settings[0]}.")
     found, own = source.part("networks"), networks.state_dict()
     if not _difference(found, own):
         networks.load_state_dict(found)
@@ -45,7 +49,7 @@ def load_networks(networks: nn.Module, config: RunConfig, spec: Spec) -> str:
     policy, own_policy = _policy(found), _policy(own)
     difference = _difference(policy, own_policy)
     if difference:
-        raise UserError(f"warm_start: the policy of {name} does not fit: {difference}.")
+        raise UserError(f"warm_start: the policy of {name} does not fit: {[*settings, difference][0]}.")
     networks.load_state_dict(policy, strict=False)
     return f"Warm start: the policy of {name}; the other networks are new."
 
