@@ -12,6 +12,7 @@ from test_run import final_hashes, history
 
 import lemniscate as lem
 from conftest import tiny_fields, tiny_off_policy
+from lemniscate.envs import toy
 from lemniscate.report import live
 from lemniscate.run import checkpoint
 from lemniscate.run.loggers import read_metrics
@@ -44,6 +45,17 @@ def test_callbacks_that_draw_and_scribble_change_no_bit(tmp_path, algorithm):
     tensors = "tensors.safetensors"
     assert final_hashes(tmp_path / "with")[tensors] == final_hashes(tmp_path / "without")[tensors]
     assert history(tmp_path / "with") == history(tmp_path / "without")
+
+
+def test_global_generators_that_an_environment_draws_from_are_not_moved(tmp_path, monkeypatch):
+    class Careless(toy.Matching):
+        def _draw(self, mask):
+            self.secret = np.where(mask, np.random.randint(0, 2, self.num_envs), self.secret)  # noqa: NPY002
+
+    monkeypatch.setattr(toy, "Matching", Careless)
+    for name, callbacks in (("without", []), ("with", [lambda *_: np.random.seed(3)])):  # noqa: NPY002
+        lem.train("ppo", "Matching-v0", run=tmp_path / name, progress=False, callbacks=callbacks, **tiny_fields())
+    assert final_hashes(tmp_path / "with") == final_hashes(tmp_path / "without")
 
 
 def test_every_logged_line_is_shown_once_in_order(tmp_path):
