@@ -16,14 +16,14 @@ from typing import Any, NoReturn
 import tyro
 
 from lemniscate import api, sweep
-from lemniscate.algos import ALGORITHMS
+from lemniscate.algos import ALGORITHMS, find
 from lemniscate.envs import registry
 from lemniscate.envs.check import check as check_environment
 from lemniscate.errors import NonFiniteError, SweepError, UserError, WorkerError, prefix_errors, unknown_name
 from lemniscate.presets import best, choose, names
 from lemniscate.report import pictures
 from lemniscate.run.config import RunConfig
-from lemniscate.run.run import Stopped, engine_of
+from lemniscate.run.run import Stopped, is_compiled
 from lemniscate.run.sweep_file import is_sweep
 
 Command = Callable[[argparse.Namespace, list[str]], None]
@@ -65,7 +65,7 @@ def train(given: argparse.Namespace, rest: list[str]) -> None:
         registry.require_backend(config.backend)
     preset, _ = choose(given.algorithm, config.env, given.preset)
     what = f"{given.algorithm} on {config.num_envs} × {config.env} by {config.backend}"
-    _say(f"{what}: preset {preset}, seed {config.seed}, {engine_of(config)} engine")
+    _say(f"{what}: preset {preset}, seed {config.seed}, {'compiled' if is_compiled(config) else 'not compiled'}")
     fields = {name: getattr(config, name) for name in config.names() if name != "env"}
     run = api.train(
         given.algorithm,
@@ -206,7 +206,11 @@ class _TrainParser(_Parser):
     """Its help goes on with the fields of each algorithm's Config, which are options too."""
 
     def format_help(self) -> str:
-        fields = [tyro.extras.get_parser(module.Config, prog=name).format_help() for name, module in ALGORITHMS.items()]
+        fields = [
+            tyro.extras.get_parser(module.Config, prog=name).format_help()
+            for name in ALGORITHMS
+            for module in [find(name)]
+        ]
         return "\n".join([super().format_help(), "And every field of the algorithm's Config:\n", *fields])
 
 
