@@ -173,7 +173,7 @@ def test_another_kind_of_policy_does_not_fit(tmp_path):
     """A Gaussian policy has parameters that a deterministic one lacks, and one output for each action as well."""
     train(tmp_path / "ppo", "ppo", "Pendulum-v1", activation="relu", normalize_observations=False)
     with pytest.raises(lem.UserError, match=r"does not fit: policy.log_std is \[1\] there and missing here"):
-        train(tmp_path / "r", "ddpg", "Pendulum-v1", warm_start=str(tmp_path / "ppo"))
+        train(tmp_path / "r", "ddpg", "Pendulum-v1", architecture="mlp", warm_start=str(tmp_path / "ppo"))
 
 
 def test_a_sweep_says_so_before_it_starts(source, tmp_path):
