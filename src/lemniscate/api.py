@@ -143,7 +143,7 @@ def load(path: str | Path) -> TrainedPolicy:
     algorithm, spec = _module_of(found.record["algorithm"]), checkpoint.spec_from_json(found.record["spec"])
     config = algorithm.Config.from_json(found.record["config"])
     networks = algorithm.networks(config, spec)
-    networks.load_state_dict(found.part("networks"))
+    networks.load_state_dict(found.tensors_of("networks"))
     return TrainedPolicy(networks, spec, config, found.numbers["step"])
 
 
