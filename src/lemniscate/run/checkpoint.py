@@ -43,7 +43,7 @@ class Checkpoint:
     record: dict[str, Any]
 
     def restore(self, state: Any) -> None:
-        """Restore every field of a State made from the same Config: generators, objects with a `state_dict`, numbers."""
+        """Restore every field of a State of the same Config: generators, objects with a `state_dict`, numbers."""
         for name, value in _fields_of(state):
             mine = self.tensors_of(name)
             if isinstance(value, torch.Generator):
