@@ -145,7 +145,7 @@ def load(path: str | Path) -> TrainedPolicy:
     algorithm, spec = algos.find(found.record["algorithm"]), checkpoint.spec_from_json(found.record["spec"])
     config = algorithm.Config.from_json(found.record["config"])
     networks = config.networks(spec)
-    networks.load_state_dict(found.part("networks"))
+    networks.load_state_dict(found.tensors_of("networks"))
     return TrainedPolicy(networks, spec, config, found.numbers["step"])
 
 
