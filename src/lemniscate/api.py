@@ -133,7 +133,7 @@ def load(path: str | Path) -> TrainedPolicy:
     record = found.record
     spec = checkpoint.spec_from_json(record["spec"])
     config = ALGORITHMS[record["algorithm"]].Config.from_json(record["config"])
-    networks = ALGORITHMS[record["algorithm"]].networks(config, spec)
+    networks = config.networks(spec)
     networks.load_state_dict(found.part("networks"))
     return TrainedPolicy(networks, spec, config, found.numbers["step"])
 
@@ -278,7 +278,7 @@ def _train(
     torch.set_num_threads(config.threads)
 
     def film(state: TrainState) -> None:
-        networks = ALGORITHMS[algorithm].networks(config, run.spec)
+        networks = config.networks(run.spec)
         networks.load_state_dict(state.networks.state_dict())
         policy = TrainedPolicy(networks, run.spec, config, state.step)
         kind = "mp4" if is_installed("imageio_ffmpeg") else "gif"

@@ -268,4 +268,4 @@ def _require_trainable(configs: dict[str, RunConfig], seeds: list[int], track: s
         for seed in seeds:
             config.replace(seed=seed)
         with prefix_errors(name):
-            ALGORITHMS[name].networks(config, env.spec)
+            config.networks(env.spec)

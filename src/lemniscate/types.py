@@ -6,6 +6,13 @@ from typing import Self
 import torch
 from torch import Tensor
 
+Metrics = dict[str, Tensor]
+"""scalars by name"""
+Loss = tuple[Tensor, Metrics]
+"""a scalar to minimize, and its metrics"""
+Flags = tuple[bool, ...]
+"""a constant for each gradient step, [K]"""
+
 
 @dataclass(frozen=True)
 class Record:
@@ -26,7 +33,7 @@ class Record:
 
 @dataclass(frozen=True)
 class Step(Record):
-    """What the environments answered to one action, [N, …].
+    """The result of one action in each of N environments, [N, …].
 
     `next_obs` is the true successor, before any reset; `obs` is where to act next, after it. They differ only where
     an episode ended. `valid` is False where the environment ignored the action (the reset row of NEXT_STEP).
@@ -42,7 +49,7 @@ class Step(Record):
 
 @dataclass(frozen=True)
 class Rollout(Record):
-    """T steps of N environments, [T, N, …]. Row t is everything action t caused; no flag speaks about the past."""
+    """T steps of N environments, [T, N, …]. Row t is everything action t caused; no flag is about the past."""
 
     obs: Tensor
     action: Tensor
@@ -59,20 +66,21 @@ class Rollout(Record):
 
     @property
     def done(self) -> Tensor:
-        """[T, N]: the episode ended here, by its own rules or by the clock."""
+        """[T, N]: the episode ended here, by its own rules or by a time limit."""
         return self.terminated | self.truncated
 
     @property
-    def played(self) -> Tensor:
-        """The numbers, in the flattened rollout, of the rows in which an action was taken."""
+    def valid_rows(self) -> Tensor:
+        """The indices [B], in the flattened rollout, of the rows whose action was not ignored."""
         return self.valid.flatten().nonzero()[:, 0]
 
 
 @dataclass(frozen=True)
 class Transition(Record):
-    """What an action caused, without its when and where, [B, …].
+    """Steps without their order, [B, …]: the rows of a replay buffer.
 
-    `next_obs` is the true successor; `terminated` tells an end by the rules alone, since a time-out ends no value.
+    `next_obs` is the true successor; `terminated` is an end by the environment's rules alone, since a time-out does not
+    end the value.
     """
 
     obs: Tensor
@@ -84,7 +92,7 @@ class Transition(Record):
 
 @dataclass(frozen=True)
 class Batch(Record):
-    """What an on-policy loss looks at, [B, …]: a rollout with its advantages."""
+    """The rows of a rollout with their advantages, [B, …]: the input of on-policy losses."""
 
     obs: Tensor
     action: Tensor

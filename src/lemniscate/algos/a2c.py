@@ -1,51 +1,51 @@
-"""Advantage actor-critic: Mnih et al. 2016, arXiv:1602.01783, its copies in step with each other.
+"""Advantage actor-critic: Mnih et al. 2016, arXiv:1602.01783, synchronous.
 
-Collect a short rollout, take one gradient step on it, throw it away.
+Collect a short rollout, take one gradient step on it, discard it.
 Departures from the paper, and why: docs/notes/a2c.md.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 
 import torch
-from torch import Generator, Tensor
+from torch import Tensor
 
-from lemniscate.data.rollout import collect, whole_batch
-from lemniscate.maths import explained_variance, gae, linear, policy_gradient, standardize, value_loss
+from lemniscate.data.rollout import collect, one_minibatch
+from lemniscate.maths import explained_variance, gae, means, policy_gradient, standardize, value_loss
 from lemniscate.nn.actor_critic import ActorCritic
-from lemniscate.nn.descent import Descent
 from lemniscate.nn.normalizer import RewardScale
-from lemniscate.run.config import Count, Fraction, NonNegative, OnPolicyConfig, Positive
+from lemniscate.optim.adam import Adam, linear
+from lemniscate.run.config import Count, Fraction, LogStd, NonNegative, OnPolicyConfig, Positive
 from lemniscate.run.run import Run
-from lemniscate.run.seeding import generator
-from lemniscate.run.state import TrainState
+from lemniscate.run.state import Generators, OnPolicyState
 from lemniscate.spec import Spec
-from lemniscate.types import Batch, Rollout
+from lemniscate.types import Batch, Loss, Metrics, Rollout
 
 
 @dataclass(frozen=True, kw_only=True)
 class Config(OnPolicyConfig):
-    """What A2C adds to the knobs of all that learn from rollouts."""
+    """The settings of A2C."""
 
-    num_steps: Count = 8
-    """steps of each copy between updates, T"""
-    learning_rate: Positive = 7e-4
-    """Adam's step size at the start"""
+    num_steps: Count = 16
+    """steps of each environment between updates, T; usually 5 to 32"""
+    initial_log_std: LogStd = -1.0
+    """initial log σ of a Gaussian policy, in units of half the action range; usually -1 to 0"""
+    learning_rate: Positive = 1e-3
+    """Adam's initial step size; usually 3e-4 to 3e-3"""
     final_learning_rate: Fraction = 0.0
-    """fraction of learning_rate that it falls to, linearly over the run; 1 keeps it constant"""
+    """final learning rate as a fraction of the initial one, annealed linearly; 1: constant"""
     adam_eps: Positive = 1e-5
-    """Adam's ε"""
-    gae_lambda: Fraction = 1.0
+    """Adam's ε; usually 1e-8 to 1e-5"""
+    gae_lambda: Fraction = 0.95
     """trace decay λ of the advantage estimate; 1 is the paper's n-step return, 0 the one-step TD error"""
-    normalize_advantage: bool = False
+    normalize_advantage: bool = True
     """standardize advantages within each batch"""
     value_coef: NonNegative = 0.5
-    """weight of the value loss"""
+    """weight of the value loss; usually 0.25 to 1"""
     entropy_coef: NonNegative = 0.0
-    """β, the weight of the entropy bonus"""
+    """weight β of the entropy bonus; usually 0 to 0.01"""
     max_grad_norm: Positive | None = 0.5
-    """global gradient norm that is clipped to; none leaves it free"""
+    """gradient clipping by global norm, usually 0.5 to 1; none: no clipping"""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -53,51 +53,41 @@ class Config(OnPolicyConfig):
 
     @property
     def gradient_steps(self) -> int:
-        """Of the whole run."""
+        """The number of gradient steps of the whole run."""
         return self.num_rollouts
 
 
-@dataclass
-class State(TrainState):
-    """Everything a crash may not take from us."""
+@dataclass(kw_only=True)
+class State(OnPolicyState):
+    """The training state of A2C."""
 
-    networks: ActorCritic
-    optimizer: Descent[ActorCritic]
-    reward_scale: RewardScale
-    noise: Generator
-    """what actions are drawn with"""
-    step: int = 0
-    """environment steps taken"""
-
-
-def networks(config: Config, spec: Spec) -> ActorCritic:
-    """π and V for the spaces in `spec`."""
-    return ActorCritic(spec, config.layers, config.initial_log_std, config.normalize_observations)
+    optimizer: Adam
 
 
 def init(config: Config, spec: Spec, device: torch.device) -> State:
-    """Fresh networks, a fresh optimizer, a generator from the run's seed."""
-    fresh = networks(config, spec).to(device)
+    """A new state, seeded by the run's seed."""
+    networks = config.networks(spec).to(device)
     return State(
-        fresh,
-        Descent(fresh, partial(loss, config), eps=config.adam_eps, max_grad_norm=config.max_grad_norm),
-        RewardScale(config.num_envs, config.gamma).to(device),
-        noise=generator(config.seed, device, 2),
+        networks=networks,
+        optimizer=Adam(networks, eps=config.adam_eps, max_grad_norm=config.max_grad_norm),
+        reward_scale=RewardScale(config.num_envs, config.gamma).to(device),
+        rng=Generators(config.seed, device),
+        learn=learn,
     )
 
 
 @torch.no_grad()
-def advantages(config: Config, state: State, rollout: Rollout) -> Batch:
-    """Row t's log π(a|s), V(s), A and value target (section 4, with λ: arXiv:1506.02438, eq. 16)."""
-    value, next_value = state.networks.value(rollout.obs), state.networks.value(rollout.next_obs)
-    log_prob = state.policy(rollout.obs).log_prob(rollout.action)
-    outcome = (rollout.reward, value, next_value, rollout.terminated, rollout.done)
-    advantage, target = gae(*outcome, gamma=config.gamma, lam=config.gae_lambda)
+def advantages(config: Config, networks: ActorCritic, rollout: Rollout) -> Batch:
+    """The rows of a rollout with V(s), advantage and value target (section 4; with λ: arXiv:1506.02438, eq. 16)."""
+    value, next_value = networks.value(rollout.obs), networks.value(rollout.next_obs)
+    gamma, lam = config.gamma, config.gae_lambda
+    advantage, target = gae(rollout.reward, value, next_value, rollout.terminated, rollout.done, gamma=gamma, lam=lam)
+    log_prob = networks.policy(rollout.obs).log_prob(rollout.action)
     return Batch(rollout.obs, rollout.action, log_prob, value, advantage, target).flatten()  # [T, N, …] -> [B, …]
 
 
-def loss(config: Config, networks: ActorCritic, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
-    """−log π(a|s) A − β H + c ½ (V − target)² (section 4), and what to watch of it."""
+def loss(config: Config, networks: ActorCritic, batch: Batch) -> Loss:
+    """−log π(a|s) A − β H + c ½ (V − target)² (section 4), and its metrics."""
     distribution = networks.policy(batch.obs)
     advantage = standardize(batch.advantage) if config.normalize_advantage else batch.advantage
     policy_loss = policy_gradient(distribution.log_prob(batch.action), advantage)
@@ -111,24 +101,31 @@ def loss(config: Config, networks: ActorCritic, batch: Batch) -> tuple[Tensor, d
     }
 
 
-def update(config: Config, state: State, rollout: Rollout) -> Mapping[str, Tensor | float]:
-    """One gradient step on one rollout (algorithm S3, without the threads); returns what was watched."""
+def learn(config: Config, state: State, batch: Batch, minibatches: Tensor) -> list[Metrics]:
+    """A clipped gradient step on each minibatch, rows [K, M] of the batch; in A2C there is one, the whole batch."""
+    return [state.optimizer.step(partial(loss, config), batch[rows]) for rows in minibatches]
+
+
+def update(config: Config, state: State, rollout: Rollout) -> dict[str, Tensor | float]:
+    """One gradient step on one rollout (algorithm S3, without the threads); returns the metrics."""
+    networks = state.networks
     rate = linear(config.learning_rate, config.final_learning_rate, state.step / config.total_steps)
+    state.optimizer.learning_rate = rate
     if config.scale_rewards:
-        rollout = state.reward_scale.follow(rollout)
-    batch = advantages(config, state, rollout)
-    played = rollout.played
-    seen = state.optimizer(batch, whole_batch(played, rollout.num_rows), rate)
-    state.policy.observe(rollout.obs[rollout.valid])  # afterwards: the actions were drawn through the normalizer before
+        rollout = state.reward_scale.scale(rollout)
+    batch = advantages(config, networks, rollout)
+    valid_rows = rollout.valid_rows
+    metrics = means(state.learn(config, state, batch, one_minibatch(valid_rows, rollout.num_rows)))
+    networks.policy.observe(rollout.obs[rollout.valid])  # last: the actions were drawn through the normalizer before
     state.step += rollout.num_rows
-    explained = explained_variance(batch.value[played], batch.target[played])
-    return {**seen, **state.policy.watch(), "explained_variance": explained, "learning_rate": rate}
+    explained = explained_variance(batch.value[valid_rows], batch.target[valid_rows])
+    return {**metrics, **networks.policy.metrics(), "explained_variance": explained, "learning_rate": rate}
 
 
 def train(config: Config, run: Run) -> State:
     """Algorithm S3: collect, update, repeat."""
     state = run.restore(init(config, run.spec, run.env.device))
     for env in run.until(config.total_steps, state):
-        rollout = collect(env, state.policy, config.num_steps, state.noise)
+        rollout = collect(env, state.networks.policy, config.num_steps, state.rng.action)
         run.log(state, update(config, state, rollout), env.take_episodes())
     return state

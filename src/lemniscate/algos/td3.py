@@ -1,160 +1,126 @@
 """Twin Delayed DDPG: Fujimoto et al. 2018, arXiv:1802.09477.
 
-DDPG with two critics, of which the lower is believed, noise on the target's action, and a policy that moves less often.
+DDPG with two critics, the smaller of which makes the target; noise on the target's action; and a delayed policy.
 Departures from the paper, and why: docs/notes/ddpg.md.
 """
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
 import torch
-from torch import Generator, Tensor
+from torch import Tensor
 
-from lemniscate.data.action_noise import ActionNoise
-from lemniscate.data.replay import ReplayBuffer
-from lemniscate.envs.vec_env import VecEnv
-from lemniscate.maths import linear, means, polyak, td_target, uniform, value_loss
+from lemniscate.data.replay import ReplayBuffer, interact
+from lemniscate.maths import means, polyak, td_target, value_loss
 from lemniscate.nn.actor_critic import ActorQ
-from lemniscate.nn.critics import TwinQ
-from lemniscate.nn.descent import Descent
-from lemniscate.nn.joint import Joint
+from lemniscate.nn.critics import Critics
 from lemniscate.nn.policies import Policy
+from lemniscate.optim.adam import Adam, linear
 from lemniscate.run.config import Count, NonNegative, OffPolicyConfig
 from lemniscate.run.run import Run
-from lemniscate.run.seeding import generator
-from lemniscate.run.state import TrainState
+from lemniscate.run.state import Generators, OffPolicyState
 from lemniscate.spec import Spec
-from lemniscate.types import Transition
+from lemniscate.types import Flags, Loss, Metrics, Transition
 
 
 @dataclass(frozen=True, kw_only=True)
 class Config(OffPolicyConfig):
-    """What TD3 adds to the knobs of all that learn from memory."""
+    """The settings of TD3."""
 
     policy_delay: Count = 2
-    """gradient steps of Q for each of the policy and of the targets, d"""
+    """gradient steps of the critics for each of the policy and the targets, d; usually 2"""
     noise_std: NonNegative = 0.1
-    """standard deviation of the noise on actions, in units of half the action range"""
+    """standard deviation of the action noise, in units of half the action range; usually 0.1 to 0.3"""
     target_noise: NonNegative = 0.2
-    """standard deviation σ̃ of the noise on the target's action, in the same units"""
+    """standard deviation σ̃ of the noise on the target's action, in the same units; usually 0.2"""
     target_noise_clip: NonNegative = 0.5
-    """c, where that noise is clipped"""
+    """c, the largest noise on the target's action; usually 0.5"""
+
+    def networks(self, spec: Spec) -> ActorQ:
+        """New networks for the spaces in `spec`: μ, Q₁ and Q₂."""
+        return ActorQ(spec, *self.network_settings, critics=2)
 
 
-@dataclass
-class State(TrainState):
-    """Everything a crash may not take from us."""
+@dataclass(kw_only=True)
+class State(OffPolicyState[ActorQ]):
+    """The training state of TD3; `targets` are μ', Q'₁ and Q'₂."""
 
-    networks: ActorQ
-    targets: ActorQ
-    """μ', Q'₁ and Q'₂: copies that follow slowly"""
-    actor_descent: Descent[Policy]
-    critic_descent: Descent[TwinQ]
-    replay: ReplayBuffer
-    action_noise: ActionNoise
-    noise: Generator
-    """what actions are drawn with"""
-    draws: Generator
-    """what minibatches are drawn with"""
-    updates: int = 0
-    """gradient steps of Q taken"""
-    step: int = 0
-    """environment steps taken"""
-
-    def __post_init__(self) -> None:
-        self.joint = Joint(learn, self.actor_descent, self.critic_descent)
-
-
-def networks(config: Config, spec: Spec) -> ActorQ:
-    """μ, Q₁ and Q₂ for the spaces in `spec`."""
-    layers = config.actor_layers, config.critic_layers
-    return ActorQ(spec, *layers, config.normalize_observations, twin=True)
+    actor_optimizer: Adam
+    critic_optimizer: Adam
 
 
 def init(config: Config, spec: Spec, device: torch.device) -> State:
-    """Fresh networks, an empty memory, generators from the run's seed."""
-    online = networks(config, spec).to(device)
-    targets = online.target()
-    copies, length = (config.num_envs, spec.bounded_box().size), spec.max_episode_steps or 1000
+    """A new state with an empty replay buffer, seeded by the run's seed."""
+    networks = config.networks(spec).to(device)
     return State(
-        online,
-        targets,
-        Descent(online.policy, partial(actor_loss, online.critic), watch_as="gradient_norm/actor"),
-        Descent(online.critic, partial(critic_loss, config, targets), watch_as="gradient_norm/critic"),
-        ReplayBuffer(spec, config.capacity, device),
-        ActionNoise(config.noise, copies, length, device, time=config.noise_time, exponent=config.noise_exponent),
-        noise=generator(config.seed, device, 2),
-        draws=generator(config.seed, device, 3),
+        networks=networks,
+        targets=networks.target(),
+        actor_optimizer=Adam(networks.policy, name="actor"),
+        critic_optimizer=Adam(networks.critics, name="critic"),
+        replay=ReplayBuffer(spec, config.capacity, device),
+        action_noise=config.make_action_noise(spec, device),
+        rng=Generators(config.seed, device),
+        learn=learn,
     )
 
 
-@torch.no_grad()
-def play(config: Config, state: State, env: VecEnv) -> None:
-    """One step of every copy: a = μ(s) + noise (algorithm 1), or anything at all while warming up."""
-    obs, noise = env.obs, state.action_noise(state.noise)
-    warming_up = state.step < config.learning_starts
-    action = uniform(noise) if warming_up else state.policy.act(obs, config.noise_std * noise)
-    step = env.step(action)
-    state.replay.add(obs, action, step)
-    state.action_noise.cut(step.terminated | step.truncated | ~step.valid)
-    state.policy.observe(obs[step.valid])
-    state.step += env.num_envs
-
-
-def critic_loss(
-    config: Config, targets: ActorQ, critic: TwinQ, batch: Transition, noise: Tensor
-) -> tuple[Tensor, dict[str, Tensor]]:
+def critic_loss(config: Config, state: State, critics: Critics, batch: Transition, noise: Tensor) -> Loss:
     """Σ_i ½ (Q_i(s, a) − y)², y = r + γ min_i Q'_i(s', μ'(s') + ε), ε ~ clip(N(0, σ̃²), −c, c) (algorithm 1)."""
     limit = config.target_noise_clip
-    next_action = targets.policy(batch.next_obs).sample((config.target_noise * noise).clamp(-limit, limit))
-    next_value = targets.critic(batch.next_obs, next_action).amin(0)
+    next_action = state.targets.policy(batch.next_obs).sample((config.target_noise * noise).clamp(-limit, limit))
+    next_value = state.targets.critics(batch.next_obs, next_action).amin(0)
     target = td_target(batch.reward, next_value, batch.terminated, gamma=config.gamma)
-    one, two = critic(batch.obs, batch.action)
-    loss = value_loss(one, target) + value_loss(two, target)
-    return loss, {"losses/critic": loss.detach(), "q": one.detach().mean()}
+    q = critics(batch.obs, batch.action)  # [2, M]
+    loss = value_loss(q[0], target) + value_loss(q[1], target)
+    return loss, {"losses/critic": loss.detach(), "q": q[0].detach().mean()}
 
 
-def actor_loss(critic: TwinQ, policy: Policy, batch: Transition) -> tuple[Tensor, dict[str, Tensor]]:
-    """−Q₁(s, μ(s)), whose gradient is the deterministic policy gradient (algorithm 1)."""
-    loss = -critic.one(batch.obs, policy(batch.obs).mode()).mean()
+def actor_loss(state: State, policy: Policy, batch: Transition) -> Loss:
+    """−Q₁(s, μ(s)), whose gradient is the deterministic policy gradient (algorithm 1), and its metrics."""
+    loss = -state.networks.critics.first(batch.obs, policy(batch.obs).mode()).mean()
     return loss, {"losses/actor": loss.detach()}
 
 
 def learn(
-    config: Config, state: State, turns: Sequence[bool], memory: Transition, parts: Tensor, noise: Tensor
-) -> list[dict[str, Tensor]]:
-    """Gradient steps on the minibatches `parts` [K, M] of `memory` (algorithm 1); at its turns the policy moves too."""
-    watched = []
-    for k, rows in enumerate(parts):
-        batch = memory[rows]
-        watched.append(state.critic_descent.step(batch, noise[k]))
-        if turns[k]:
-            watched.append(state.actor_descent.step(batch))
+    config: Config, state: State, replay: Transition, minibatches: Tensor, noise: Tensor, *, update_actor: Flags
+) -> list[Metrics]:
+    """A gradient step of both Q on each minibatch, rows [K, M] of `replay`, and where `update_actor`, of the policy."""
+    metrics = []
+    for k, rows in enumerate(minibatches):
+        batch = replay[rows]
+        metrics.append(state.critic_optimizer.step(partial(critic_loss, config, state), batch, noise[k]))
+        if update_actor[k]:
+            metrics.append(state.actor_optimizer.step(partial(actor_loss, state), batch))
             polyak(state.targets.parameters(), state.networks.parameters(), config.tau)
-    return watched
+    return metrics
 
 
-def update(config: Config, state: State) -> Mapping[str, Tensor]:
-    """Draw what `learn` needs, and learn; returns the means of what was watched."""
-    turns = [(state.updates + k) % config.policy_delay == 0 for k in range(1, config.num_updates + 1)]
+def update(config: Config, state: State) -> Metrics:
+    """The gradient steps after a step of the environments; returns the means of the metrics."""
+    progress = state.step / config.total_steps
+    state.critic_optimizer.learning_rate = linear(config.critic_learning_rate, config.final_learning_rate, progress)
+    state.actor_optimizer.learning_rate = linear(config.actor_learning_rate, config.final_learning_rate, progress)
+    minibatches = state.replay.sample_indices(config.num_updates, config.batch_size, state.rng.minibatch)
+    replay = state.replay.transitions
+    noise = torch.randn(
+        *minibatches.shape, replay.action.shape[-1], generator=state.rng.action, device=minibatches.device
+    )
+    update_actor = tuple((state.updates + k) % config.policy_delay == 0 for k in range(1, config.num_updates + 1))
     state.updates += config.num_updates
-    fall = linear(1.0, config.final_learning_rate, state.step / config.total_steps)
-    state.critic_descent.set_learning_rate(fall * config.critic_learning_rate)
-    state.actor_descent.set_learning_rate(fall * config.actor_learning_rate)
-    memory, parts = state.replay.transitions, state.replay.draw(len(turns), config.batch_size, state.draws)
-    noise = torch.randn(*parts.shape, memory.action.shape[-1], generator=state.noise, device=parts.device)
-    return state.joint(config, state, turns, memory, parts, noise)
+    return means(state.learn(config, state, replay, minibatches, noise, update_actor=update_actor))
 
 
 def train(config: Config, run: Run) -> State:
-    """Algorithm 1: act, remember, learn, repeat."""
+    """Algorithm 1: act, store, learn, repeat."""
     state = run.restore(init(config, run.spec, run.env.device))
     for env in run.until(config.total_steps, state):
-        watched: list[Mapping[str, Tensor]] = []
-        for _ in range(config.num_steps):
-            play(config, state, env)
-            if state.step > config.learning_starts and state.step // env.num_envs % config.update_every == 0:
-                watched.append(update(config, state))
-        run.log(state, means(watched), env.take_episodes())
+        metrics: list[Metrics] = []
+        for _ in range(config.log_every):
+            policy, rng = state.networks.policy, state.rng.action
+            random = state.step < config.learning_starts
+            interact(env, policy, state.replay, state.action_noise, rng, noise_std=config.noise_std, random=random)
+            state.step += env.num_envs
+            if config.updates_at(state.step):
+                metrics.append(update(config, state))
+        run.log(state, means(metrics), env.take_episodes())
     return state

@@ -1,23 +1,22 @@
 """Trust region policy optimization: Schulman et al. 2015, arXiv:1502.05477.
 
-Collect a rollout, move the policy along the natural gradient as far as a bound on the KL allows, fit the critic.
+Collect a rollout, move the policy along the natural gradient as far as a bound on the KL allows, fit the value.
 Departures from the paper, and why: docs/notes/trpo.md.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated
 
 import torch
-from torch import Generator, Tensor
+from torch import Tensor
 from torch.func import grad
 
-from lemniscate.data.rollout import collect, minibatches, whole_batch
+from lemniscate.data.rollout import collect, epoch_minibatches, one_minibatch
 from lemniscate.maths import (
     backtrack,
     explained_variance,
     gae,
-    linear,
+    means,
     natural_step,
     standardize,
     surrogate,
@@ -25,45 +24,46 @@ from lemniscate.maths import (
 )
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.critics import Value
-from lemniscate.nn.descent import Descent
-from lemniscate.nn.flat import FlatPolicy
 from lemniscate.nn.normalizer import RewardScale
+from lemniscate.optim.adam import Adam, linear
+from lemniscate.optim.vector import PolicyVector
 from lemniscate.run.config import Count, Fraction, NonNegative, OnPolicyConfig, Positive, Range
 from lemniscate.run.run import Run
-from lemniscate.run.seeding import generator
-from lemniscate.run.state import TrainState
+from lemniscate.run.state import Generators, OnPolicyState
 from lemniscate.spec import Spec
-from lemniscate.types import Batch, Rollout
+from lemniscate.types import Batch, Loss, Metrics, Rollout
 
 
 @dataclass(frozen=True, kw_only=True)
 class Config(OnPolicyConfig):
-    """What TRPO adds to the knobs of all that learn from rollouts."""
+    """The settings of TRPO."""
 
+    num_steps: Count = 64
+    """steps of each environment between updates, T; usually 64 to 1024"""
     max_kl: Positive = 0.01
-    """δ: the mean KL from the old policy to the new that an update may reach"""
+    """δ, the largest mean KL from the old policy to the new one in an update; usually 0.005 to 0.03"""
     line_search: bool = True
-    """shorten the step until it keeps its promises; without it this is the natural policy gradient"""
+    """backtracking line search; without it this is the natural policy gradient"""
     shrink: Annotated[float, Range(0.01, 0.99)] = 0.8
-    """what a step that does not is multiplied by"""
+    """backtracking factor of the step length; usually 0.5 to 0.8"""
     attempts: Count = 10
-    """how many lengths are tried before the policy stays where it is"""
+    """step lengths tried before the policy stays as it is; usually 10"""
     cg_iterations: Count = 10
-    """of the conjugate gradient"""
+    """iterations of the conjugate gradient; usually 10 to 25"""
     damping: NonNegative = 0.1
-    """added to the diagonal of the Fisher matrix"""
+    """added to the diagonal of the Fisher matrix; usually 0.01 to 0.1"""
     gae_lambda: Fraction = 0.95
-    """trace decay λ of the advantage estimate"""
+    """trace decay λ of the advantage estimate; usually 0.9 to 1"""
     normalize_advantage: bool = True
     """standardize advantages within each rollout"""
-    critic_epochs: Count = 10
-    """passes of the critic over a rollout"""
+    critic_epochs: Count = 20
+    """passes of the value over each rollout; usually 5 to 80"""
     critic_minibatch_size: Count = 128
-    """rows of each of its gradient steps"""
+    """rows of each gradient step of the value; usually 64 to 512"""
     critic_learning_rate: Positive = 1e-3
-    """Adam's step size for the critic at the start"""
+    """initial step size of the value's Adam; usually 3e-4 to 3e-3"""
     final_critic_learning_rate: Fraction = 1.0
-    """fraction of it that it falls to, linearly over the run"""
+    """final value of it as a fraction of the initial one, annealed linearly; 1: constant"""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -71,64 +71,56 @@ class Config(OnPolicyConfig):
 
     @property
     def gradient_steps(self) -> int:
-        """Of the critic in the whole run."""
+        """The number of gradient steps of the value in the whole run."""
         return self.num_rollouts * self.critic_epochs * -(-self.num_rows // self.critic_minibatch_size)
 
 
-@dataclass
-class State(TrainState):
-    """Everything a crash may not take from us."""
+@dataclass(kw_only=True)
+class State(OnPolicyState):
+    """The training state of TRPO."""
 
-    networks: ActorCritic
-    critic: Descent[Value]
-    reward_scale: RewardScale
-    noise: Generator
-    """what actions are drawn with"""
-    shuffle: Generator
-    step: int = 0
-    """environment steps taken"""
+    critic_optimizer: Adam
 
     def __post_init__(self) -> None:
-        self.parameters = FlatPolicy(self.policy)  # θ
+        self.parameters = PolicyVector(self.policy)  # θ
 
-
-def networks(config: Config, spec: Spec) -> ActorCritic:
-    """π and V for the spaces in `spec`."""
-    return ActorCritic(spec, config.layers, config.initial_log_std, config.normalize_observations)
+    def per_step_methods(self) -> list[tuple[object, str]]:
+        """Those of every state, and the Fisher product."""
+        return [*super().per_step_methods(), (self.parameters, "fisher")]
 
 
 def init(config: Config, spec: Spec, device: torch.device) -> State:
-    """Fresh networks, a fresh optimizer for the critic, generators from the run's seed."""
-    fresh = networks(config, spec).to(device)
+    """A new state, seeded by the run's seed."""
+    networks = config.networks(spec).to(device)
     return State(
-        fresh,
-        Descent(fresh.value, critic_loss),
-        RewardScale(config.num_envs, config.gamma).to(device),
-        noise=generator(config.seed, device, 2),
-        shuffle=generator(config.seed, device, 3),
+        networks=networks,
+        critic_optimizer=Adam(networks.value, name="value"),
+        reward_scale=RewardScale(config.num_envs, config.gamma).to(device),
+        rng=Generators(config.seed, device),
+        learn=learn,
     )
 
 
 @torch.no_grad()
-def advantages(config: Config, state: State, rollout: Rollout) -> Batch:
-    """Row t's log π_old(a|s), V(s), A and value target (arXiv:1506.02438, eq. 16)."""
-    value, next_value = state.networks.value(rollout.obs), state.networks.value(rollout.next_obs)
-    log_prob = state.policy(rollout.obs).log_prob(rollout.action)
-    outcome = (rollout.reward, value, next_value, rollout.terminated, rollout.done)
-    advantage, target = gae(*outcome, gamma=config.gamma, lam=config.gae_lambda)
+def advantages(config: Config, networks: ActorCritic, rollout: Rollout) -> Batch:
+    """The rows of a rollout with log π_old(a|s), V(s), advantage and value target (arXiv:1506.02438, eq. 16)."""
+    value, next_value = networks.value(rollout.obs), networks.value(rollout.next_obs)
+    gamma, lam = config.gamma, config.gae_lambda
+    advantage, target = gae(rollout.reward, value, next_value, rollout.terminated, rollout.done, gamma=gamma, lam=lam)
+    log_prob = networks.policy(rollout.obs).log_prob(rollout.action)
     return Batch(rollout.obs, rollout.action, log_prob, value, advantage, target).flatten()  # [T, N, …] -> [B, …]
 
 
-def critic_loss(value: Value, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
-    """½ (V(s) − target)²."""
+def critic_loss(value: Value, batch: Batch) -> Loss:
+    """½ (V(s) − target)², and its metrics."""
     loss = value_loss(value(batch.obs), batch.target)
     return loss, {"losses/value": loss.detach()}
 
 
-def improve(config: Config, state: State, batch: Batch, obs: Tensor) -> dict[str, Tensor | float]:
+def improve(config: Config, state: State, batch: Batch, fisher_obs: Tensor) -> dict[str, Tensor | float]:
     """Maximize L(θ) subject to KL(θ_old ‖ θ) ≤ δ, to first and to second order (eq. 14, appendix C).
 
-    L and the KL are means over `batch`; the Fisher matrix is that at `obs`, as many in every update.
+    L and the KL are means over the rows of `batch`, the Fisher matrix over `fisher_obs`.
     """
     here, pi = state.parameters.vector.clone(), state.parameters.at
     advantage = standardize(batch.advantage) if config.normalize_advantage else batch.advantage
@@ -140,7 +132,7 @@ def improve(config: Config, state: State, batch: Batch, obs: Tensor) -> dict[str
         return pi(here, batch.obs).kl(pi(theta, batch.obs)).mean()
 
     def fisher(vector: Tensor) -> Tensor:
-        return state.parameters.fisher(vector, obs) + config.damping * vector
+        return state.parameters.fisher(vector, fisher_obs) + config.damping * vector
 
     gradient = grad(loss)(here)
     with torch.no_grad():
@@ -149,34 +141,40 @@ def improve(config: Config, state: State, batch: Batch, obs: Tensor) -> dict[str
         there, fraction = here + step, 1.0
         if config.line_search:
             there, fraction = backtrack(lambda theta: (loss(theta), kl(theta)), here, step, **limits)
-        entropy = pi(here, batch.obs).entropy().mean()
-        watched = {"losses/policy": loss(there), "losses/entropy": entropy, "kl": kl(there)}
+        metrics: dict[str, Tensor | float] = {"losses/policy": loss(there), "kl": kl(there), "step_fraction": fraction}
+        metrics |= {"losses/entropy": pi(here, batch.obs).entropy().mean(), "gradient_norm": gradient.norm()}
         state.parameters.vector.copy_(there)
-    return {**watched, "gradient_norm": gradient.norm(), "step_fraction": fraction}
+    return metrics
 
 
-def update(config: Config, state: State, rollout: Rollout) -> Mapping[str, Tensor | float]:
-    """One step of the policy, some epochs of the critic; returns what was watched."""
+def learn(config: Config, state: State, batch: Batch, minibatches: Tensor) -> list[Metrics]:
+    """A gradient step of the value on each minibatch, rows [K, M] of the batch."""
+    return [state.critic_optimizer.step(critic_loss, batch[rows]) for rows in minibatches]
+
+
+def update(config: Config, state: State, rollout: Rollout) -> dict[str, Tensor | float]:
+    """One step of the policy on one rollout, some epochs of the value; returns the metrics."""
     rate = linear(config.critic_learning_rate, config.final_critic_learning_rate, state.step / config.total_steps)
+    state.critic_optimizer.learning_rate = rate
     if config.scale_rewards:
-        rollout = state.reward_scale.follow(rollout)
-    batch = advantages(config, state, rollout)
-    played = rollout.played
-    obs = batch.obs[whole_batch(played, rollout.num_rows)[0]]
-    watched = improve(config, state, batch[played], obs)
+        rollout = state.reward_scale.scale(rollout)
+    batch = advantages(config, state.networks, rollout)
+    valid_rows = rollout.valid_rows
+    fisher_obs = batch.obs[one_minibatch(valid_rows, rollout.num_rows)[0]]  # of one size in every update
+    metrics = improve(config, state, batch[valid_rows], fisher_obs)
     for _ in range(config.critic_epochs):
-        parts = minibatches(played, rollout.num_rows, config.critic_minibatch_size, state.shuffle)
-        watched["losses/value"] = state.critic(batch, parts, rate)["losses/value"]
-    state.policy.observe(rollout.obs[rollout.valid])  # afterwards: both probabilities are taken through one normalizer
+        minibatches = epoch_minibatches(valid_rows, rollout.num_rows, config.critic_minibatch_size, state.rng.minibatch)
+        metrics |= means(state.learn(config, state, batch, minibatches))
+    state.networks.policy.observe(rollout.obs[rollout.valid])  # last: old and new probabilities share a normalizer
     state.step += rollout.num_rows
-    explained = explained_variance(batch.value[played], batch.target[played])
-    return {**watched, **state.policy.watch(), "explained_variance": explained, "learning_rate": rate}
+    explained = explained_variance(batch.value[valid_rows], batch.target[valid_rows])
+    return {**metrics, **state.networks.policy.metrics(), "explained_variance": explained, "learning_rate": rate}
 
 
 def train(config: Config, run: Run) -> State:
     """Algorithm 1: collect with π_old, update, repeat."""
     state = run.restore(init(config, run.spec, run.env.device))
     for env in run.until(config.total_steps, state):
-        rollout = collect(env, state.policy, config.num_steps, state.noise)
+        rollout = collect(env, state.networks.policy, config.num_steps, state.rng.action)
         run.log(state, update(config, state, rollout), env.take_episodes())
     return state

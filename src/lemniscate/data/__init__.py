@@ -1,1 +1,1 @@
-"""From steps to rollouts to minibatches."""
+"""From steps to rollouts, replay and minibatches."""

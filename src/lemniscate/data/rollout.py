@@ -16,7 +16,7 @@ from lemniscate.types import Rollout
 def collect(env: VecEnv, policy: Policy, num_steps: int, generator: Generator) -> Rollout:
     """Act `num_steps` times in every environment, from where it stands. Returns a rollout [T, N, …]."""
     rows = []
-    for noise in policy.noise((num_steps, env.num_envs), generator):
+    for noise in policy.draw_noise((num_steps, env.num_envs), generator):
         obs = env.obs
         action = policy.act(obs, noise)
         step = env.step(action)
@@ -26,16 +26,16 @@ def collect(env: VecEnv, policy: Policy, num_steps: int, generator: Generator) -
 
 @torch.no_grad()
 def collect_episodes(env: VecEnv, policy: Policy, episodes: int, generator: Generator) -> Rollout:
-    """Act until every environment has played `episodes` whole episodes, from wherever it stands.
+    """Act until every environment has completed `episodes` whole episodes, from where it stands.
 
     Returns:
-        A rollout [T, N, …]; T is what it takes. The rows before an environment's first end and after its last are not
-        `valid`: the same number of episodes from each, since taking those that end first would favour short ones.
+        A rollout [T, N, …], T as large as it takes. The rows before an environment's first end and after its last are
+        not `valid`: each gives the same number of episodes, since those that end first are short ones.
 
     Raises:
         UserError: an episode of an environment without a time limit takes more than 20,000 steps.
     """
-    rows, noise = [], partial(policy.noise, (env.num_envs,), generator)
+    rows, noise = [], partial(policy.draw_noise, (env.num_envs,), generator)
     ended = torch.zeros(env.num_envs, dtype=torch.int64, device=env.device)
     age = torch.zeros_like(ended)
     while (ended <= episodes).any():
@@ -50,30 +50,32 @@ def collect_episodes(env: VecEnv, policy: Policy, episodes: int, generator: Gene
     return Rollout.stack(rows)
 
 
-def whole_batch(played: Tensor, collected: int) -> Tensor:
-    """All rows that were played, [B], as one minibatch [1, `collected`], in their order, filled up as below."""
-    return minibatches(played, collected, collected, None)
+def one_minibatch(valid_rows: Tensor, num_rows: int) -> Tensor:
+    """All valid rows as one minibatch, in their order: indices [1, num_rows]; see `epoch_minibatches`."""
+    return _cut(valid_rows, num_rows, num_rows)
 
 
-def minibatches(played: Tensor, collected: int, size: int, generator: Generator | None) -> Tensor:
-    """The rows of an epoch in a new random order, cut into minibatches: indices [K, b].
+def epoch_minibatches(valid_rows: Tensor, num_rows: int, size: int, generator: Generator) -> Tensor:
+    """The valid rows in a new random order, cut into the minibatches of one epoch: indices [K, M].
 
-    Every epoch of a run has the same K and b, whatever was played, so that one compiled program serves all. Where rows
-    are missing, the first ones of the order are taken again.
+    K and M are the same in every epoch of a run, whatever the number of valid rows. Where rows are missing, the first
+    ones of the order are repeated.
 
     Args:
-        played: the rows to learn from, [B] int64, at most `collected`.
-        collected: how many rows a rollout has.
-        size: b; a rollout with fewer rows is one minibatch.
-        generator: draws the order; without one it stays as it is.
+        valid_rows: indices of the rows to learn from, [B] int64.
+        num_rows: the number of rows of a rollout, at least B.
+        size: M; a rollout with fewer rows is one minibatch.
+        generator: of the order.
+
+    Raises:
+        UserError: there is no valid row.
     """
-    if not len(played):
-        raise UserError(
-            "In a whole rollout every action was ignored by an environment that reset itself; take more num_steps."
-        )
-    size = min(size, collected)
-    wanted = math.ceil(collected / size) * size
-    order = played
-    if generator:
-        order = played[torch.randperm(len(played), generator=generator, device=generator.device)]
-    return order.repeat(math.ceil(wanted / len(order)))[:wanted].view(-1, size)
+    order = torch.randperm(len(valid_rows), generator=generator, device=generator.device)
+    return _cut(valid_rows[order], num_rows, min(size, num_rows))
+
+
+def _cut(rows: Tensor, num_rows: int, size: int) -> Tensor:
+    if not len(rows):
+        raise UserError("No valid transition in the whole rollout; increase num_steps.")
+    total = math.ceil(num_rows / size) * size
+    return rows.repeat(math.ceil(total / len(rows)))[:total].view(-1, size)

@@ -1,4 +1,4 @@
-"""What can be wrong, once: pure functions on tensors, each with its equation and its oracle in `tests/maths`."""
+"""The mathematics: pure functions on tensors, each with its equation and a test against brute force."""
 
 from lemniscate.maths.distributions import (
     Bernoulli,
@@ -12,7 +12,6 @@ from lemniscate.maths.distributions import (
 from lemniscate.maths.losses import clipped_surrogate, policy_gradient, surrogate, value_loss
 from lemniscate.maths.noise import coloured, ornstein_uhlenbeck, uniform
 from lemniscate.maths.returns import episode_return, gae, polyak, reward_to_go, td_target
-from lemniscate.maths.schedules import adapt_to_kl, linear
 from lemniscate.maths.stats import (
     clip_fraction,
     explained_variance,
@@ -33,7 +32,6 @@ __all__ = [
     "Gaussian",
     "MultiCategorical",
     "SquashedGaussian",
-    "adapt_to_kl",
     "backtrack",
     "clip_fraction",
     "clipped_surrogate",
@@ -45,7 +43,6 @@ __all__ = [
     "gae",
     "kl_k1",
     "kl_k3",
-    "linear",
     "means",
     "merge_moments",
     "natural_step",

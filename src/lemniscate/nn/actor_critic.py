@@ -1,13 +1,12 @@
 """A policy and its critics for the spaces of an environment: separate networks behind one normalizer."""
 
 import copy
-import math
-from typing import Any, Self
+from typing import TypeVar
 
 import torch
 from torch import Generator, Tensor, nn
 
-from lemniscate.nn.critics import QValue, TwinQ, Value
+from lemniscate.nn.critics import Critics, QValue, Temperature, Value
 from lemniscate.nn.networks import ImageEncoder, Layers
 from lemniscate.nn.normalizer import NoNorm, RunningNorm, ScaleBytes
 from lemniscate.nn.policies import (
@@ -21,39 +20,70 @@ from lemniscate.nn.policies import (
 )
 from lemniscate.spec import Action, Box, Discrete, MultiDiscrete, Spec
 
+Module = TypeVar("Module", bound=nn.Module)
+
 
 class ActorCritic(nn.Module):
-    """A policy and a value for the spaces in `spec`: two separate networks behind one normalizer."""
+    """A policy for any actions, and V(s)."""
 
     def __init__(
-        self,
-        spec: Spec,
-        layers: Layers,
-        initial_log_std: float = 0.0,
-        normalize_observations: bool = False,
+        self, spec: Spec, layers: Layers, initial_log_std: float = 0.0, normalize_observations: bool = False
     ) -> None:
         super().__init__()
         self.policy = _policy(_normalizer(spec, normalize_observations), spec, layers, initial_log_std)
-        self.value = Value(self.policy.normalizer, _from_obs(spec, layers, 1, last_gain=1.0))
-
-
-class Temperature(nn.Module):
-    """SAC's α, the price of entropy; log α is what is learned."""
-
-    def __init__(self, initial: float) -> None:
-        super().__init__()
-        self.log = nn.Parameter(torch.tensor(math.log(initial)))
-
-    def forward(self) -> Tensor:
-        """α, a scalar."""
-        return self.log.exp()
+        self.value = Value(self.policy.normalizer, _network(spec, layers, 1, last_gain=1.0))
 
 
 class ActorQ(nn.Module):
-    """A policy over continuous actions and its Q-value, or two of them: separate networks behind one normalizer.
+    """A policy for bounded continuous actions, deterministic in this class, and C critics Q(s, a).
 
-    With a `temperature` the policy is random, and α, its price of entropy, is learned from there on.
+    Args:
+        spec: of the environment.
+        actor_layers: of the policy.
+        critic_layers: of each critic.
+        normalize_observations: put a running normalizer in front of all of them.
+        critics: C.
+
+    Raises:
+        UserError: actions that are not continuous, or without bounds.
     """
+
+    def __init__(
+        self, spec: Spec, actor_layers: Layers, critic_layers: Layers, normalize_observations: bool, *, critics: int
+    ) -> None:
+        super().__init__()
+        size = spec.bounded_box().size
+        normalizer = _normalizer(spec, normalize_observations)
+        self.policy: Policy = self._policy(spec, normalizer, actor_layers, size)
+
+        def critic() -> QValue:
+            encoder, features = _encoder(spec)
+            return QValue(normalizer, encoder, critic_layers.network(features + size, 1, last_gain=1.0))
+
+        self.critics = Critics(critic() for _ in range(critics))
+
+    def _policy(self, spec: Spec, normalizer: NoNorm, layers: Layers, size: int) -> Policy:
+        return DeterministicPolicy(normalizer, _network(spec, layers, size, last_gain=0.01), size)
+
+    def q(self, obs: Tensor, action: Tensor) -> Tensor:
+        """The smallest of the C values of [B, O] and [B, A], [B]."""
+        return self.critics(obs, action).amin(0)
+
+    def entropy_bonus(self, obs: Tensor, generator: Generator) -> Tensor:
+        """The value of the policy's entropy at each observation [B, O]: 0 [B] for a deterministic policy."""
+        return torch.zeros(len(obs), device=obs.device)
+
+    def target(self) -> nn.Module:
+        """A copy for the target networks: it shares the normalizer, and its parameters need no gradient."""
+        return self._follower(self)
+
+    def _follower(self, networks: Module) -> Module:
+        normalizer = self.policy.normalizer
+        return copy.deepcopy(networks, {id(normalizer): normalizer}).requires_grad_(False)  # the memo keeps it shared
+
+
+class SoftActorQ(ActorQ):
+    """A stochastic policy for bounded continuous actions, C critics, and the temperature α of its entropy."""
 
     def __init__(
         self,
@@ -62,45 +92,23 @@ class ActorQ(nn.Module):
         critic_layers: Layers,
         normalize_observations: bool,
         *,
-        twin: bool,
-        temperature: float | None = None,
+        critics: int,
+        initial_temperature: float,
     ) -> None:
-        super().__init__()
-        stochastic = temperature is not None
-        size = spec.bounded_box().size
-        normalizer = _normalizer(spec, normalize_observations)
-        net = _from_obs(spec, actor_layers, 2 * size if stochastic else size, last_gain=0.01)
-        kind = SquashedGaussianPolicy if stochastic else DeterministicPolicy
-        self.policy: Policy = kind(normalizer, net, size)
+        super().__init__(spec, actor_layers, critic_layers, normalize_observations, critics=critics)
+        self.temperature = Temperature(initial_temperature)
 
-        def value() -> QValue:
-            encoder, seen = _encoder(spec)
-            return QValue(normalizer, encoder, critic_layers.network(seen + size, 1, last_gain=1.0))
+    def _policy(self, spec: Spec, normalizer: NoNorm, layers: Layers, size: int) -> Policy:
+        return SquashedGaussianPolicy(normalizer, _network(spec, layers, 2 * size, last_gain=0.01), size)
 
-        self.critic: Any = TwinQ(value(), value()) if twin else value()
-        self.temperature = Temperature(temperature) if temperature is not None else None
-
-    @property
-    def actor(self) -> nn.ModuleList:
-        """What learns to act: the policy, and α where there is one."""
-        return nn.ModuleList(part for part in (self.policy, self.temperature) if part is not None)
-
-    def q(self, obs: Tensor, action: Tensor) -> Tensor:
-        """What is believed of [B, O] and [B, A], [B]: the lower of two."""
-        value = self.critic(obs, action)
-        return value.amin(0) if isinstance(self.critic, TwinQ) else value
+    def target(self) -> nn.Module:
+        """A copy of the critics, which are all that has target networks."""
+        return self._follower(self.critics)
 
     def entropy_bonus(self, obs: Tensor, generator: Generator) -> Tensor:
-        """−α log π of an action drawn at each observation [B, O], [B]; 0 where the policy is not paid for entropy."""
-        if self.temperature is None:
-            return torch.zeros(len(obs), device=obs.device)
-        _, log_prob = self.policy(obs).sample_with_log_prob(self.policy.noise((len(obs),), generator))
+        """−α log π(a|s) of an action drawn at each observation [B, O], [B]."""
+        _, log_prob = self.policy(obs).sample_with_log_prob(self.policy.draw_noise((len(obs),), generator))
         return -self.temperature() * log_prob
-
-    def target(self) -> Self:
-        """A copy that only follows, behind the same normalizer."""
-        normalizer = self.policy.normalizer
-        return copy.deepcopy(self, {id(normalizer): normalizer}).requires_grad_(False)
 
 
 def _normalizer(spec: Spec, normalize_observations: bool) -> NoNorm:
@@ -110,7 +118,7 @@ def _normalizer(spec: Spec, normalize_observations: bool) -> NoNorm:
 
 def _policy(normalizer: NoNorm, spec: Spec, layers: Layers, initial_log_std: float) -> Policy:
     action = spec.action
-    net = _from_obs(spec, layers, _outputs(action), last_gain=0.01)
+    net = _network(spec, layers, _outputs(action), last_gain=0.01)
     if isinstance(action, Box):
         return GaussianPolicy(normalizer, net, action, initial_log_std)
     if isinstance(action, Discrete):
@@ -121,14 +129,14 @@ def _policy(normalizer: NoNorm, spec: Spec, layers: Layers, initial_log_std: flo
 
 
 def _outputs(action: Action) -> int:
-    """How many numbers a network has to give for the distribution over actions."""
+    """The number of parameters of a distribution over the actions."""
     if isinstance(action, Box):
         return action.size
     return sum(action.nvec) if isinstance(action, MultiDiscrete) else action.n
 
 
 def _encoder(spec: Spec) -> tuple[nn.Module, int]:
-    """What an observation goes through first, and how many numbers come out."""
+    """The module that turns a normalized observation into features, and their number."""
     if not spec.image:
         return nn.Identity(), spec.observation_size
     height, width, channels = spec.layout[0].shape
@@ -136,7 +144,7 @@ def _encoder(spec: Spec) -> tuple[nn.Module, int]:
     return encoder, encoder.size
 
 
-def _from_obs(spec: Spec, layers: Layers, outputs: int, last_gain: float) -> nn.Sequential:
-    encoder, size = _encoder(spec)
-    net = layers.network(size, outputs, last_gain)
+def _network(spec: Spec, layers: Layers, outputs: int, last_gain: float) -> nn.Module:
+    encoder, features = _encoder(spec)
+    net = layers.network(features, outputs, last_gain)
     return nn.Sequential(encoder, net) if spec.image else net

@@ -1,4 +1,7 @@
-"""What states and actions are worth. Critics look through the policy's normalizer, and do not own it."""
+"""Value functions. Every critic shares the policy's observation normalizer."""
+
+import math
+from collections.abc import Iterable
 
 import torch
 from torch import Tensor, nn
@@ -7,7 +10,7 @@ from lemniscate.nn.normalizer import NoNorm
 
 
 class Value(nn.Module):
-    """V(s). It looks through the policy's normalizer, and does not own it."""
+    """V(s), behind the policy's observation normalizer."""
 
     def __init__(self, normalizer: NoNorm, net: nn.Module) -> None:
         super().__init__()
@@ -20,7 +23,7 @@ class Value(nn.Module):
 
 
 class QValue(nn.Module):
-    """Q(s, a). It looks through the policy's normalizer, and does not own it."""
+    """Q(s, a), behind the policy's observation normalizer."""
 
     def __init__(self, normalizer: NoNorm, encoder: nn.Module, net: nn.Module) -> None:
         super().__init__()
@@ -30,17 +33,33 @@ class QValue(nn.Module):
 
     def forward(self, obs: Tensor, action: Tensor) -> Tensor:
         """[…, O] and […, A] to […]."""
-        seen = self.encoder(self.normalizer(obs))
-        return self.net(torch.cat([seen, action], dim=-1)).squeeze(-1)
+        features = self.encoder(self.normalizer(obs))
+        return self.net(torch.cat([features, action], dim=-1)).squeeze(-1)
 
 
-class TwinQ(nn.Module):
-    """Two Q-values that never see each other: Fujimoto et al. 2018, arXiv:1802.09477, section 4.2."""
+class Critics(nn.Module):
+    """C independent Q-values: one in DDPG; two in TD3 and SAC (Fujimoto et al. 2018, arXiv:1802.09477, section 4.2)."""
 
-    def __init__(self, one: QValue, two: QValue) -> None:
+    def __init__(self, members: Iterable[QValue]) -> None:
         super().__init__()
-        self.one, self.two = one, two
+        self.members = nn.ModuleList(members)
 
     def forward(self, obs: Tensor, action: Tensor) -> Tensor:
-        """[…, O] and […, A] to [2, …]."""
-        return torch.stack([self.one(obs, action), self.two(obs, action)])
+        """[…, O] and […, A] to [C, …]."""
+        return torch.stack([q(obs, action) for q in self.members])
+
+    def first(self, obs: Tensor, action: Tensor) -> Tensor:
+        """Q₁(s, a) alone: […, O] and […, A] to […]."""
+        return self.members[0](obs, action)
+
+
+class Temperature(nn.Module):
+    """α > 0, the weight of the entropy in SAC; log α is the parameter."""
+
+    def __init__(self, initial: float) -> None:
+        super().__init__()
+        self.log_alpha = nn.Parameter(torch.tensor(math.log(initial)))
+
+    def forward(self) -> Tensor:
+        """α, a scalar."""
+        return self.log_alpha.exp()

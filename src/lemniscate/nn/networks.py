@@ -1,5 +1,6 @@
-"""Multi-layer perceptrons, residual ones, and a small convolutional network to look at images with."""
+"""Hidden layers: perceptrons, residual blocks, a convolutional encoder of images, and modules of one's own."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal
@@ -7,22 +8,12 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-Activation = Literal["tanh", "relu", "elu", "silu"]
-Architecture = Literal["mlp", "layer_norm", "simba"]
-"""layers with an activation between; the same with layer normalization before it; residual blocks of one width"""
+from lemniscate.errors import UserError, unknown_name
+from lemniscate.nn.activations import ACTIVATIONS, Activation
+from lemniscate.objects import find_object
+
 Matmul = Literal["float32", "bfloat16"]
 """of products between hidden layers; the first and the last are always in float32"""
-
-
-class Tanh(nn.Module):
-    """tanh(x) = 2σ(2x) − 1, three times faster than `torch.tanh` on a CPU; the two differ by at most 2e-7."""
-
-    def forward(self, x: Tensor) -> Tensor:
-        """Any shape to the same shape."""
-        return torch.sigmoid(x * 2) * 2 - 1
-
-
-ACTIVATIONS = {"tanh": Tanh, "relu": nn.ReLU, "elu": nn.ELU, "silu": nn.SiLU}
 
 
 class Bfloat16Linear(nn.Linear):
@@ -37,7 +28,7 @@ class Bfloat16Linear(nn.Linear):
 
 
 def has_bfloat16(device: torch.device) -> bool:
-    """Whether the processor multiplies in bfloat16 by itself; elsewhere it is emulated, and slow."""
+    """Whether the processor has products in bfloat16; elsewhere they are emulated, and slow."""
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
     return any(able for name, able in torch.cpu.get_capabilities().items() if "bf16" in name)
@@ -45,31 +36,81 @@ def has_bfloat16(device: torch.device) -> bool:
 
 @dataclass(frozen=True)
 class Layers:
-    """What stands between a network's inputs and its outputs."""
+    """The settings of a network between its inputs and its outputs.
+
+    Args:
+        hidden: widths of the hidden layers.
+        activation: between the layers.
+        kind: a name in `NETWORKS`, or `module:Class` of one's own: `Class(inputs, outputs)` makes a module that takes
+            [B, inputs] to [B, outputs].
+        matmul: precision of the products between hidden layers.
+    """
 
     hidden: tuple[int, ...] = (64, 64)
     activation: Activation = "tanh"
-    architecture: Architecture = "mlp"
+    kind: str = "mlp"
     matmul: Matmul = "float32"
 
-    def network(self, inputs: int, outputs: int, last_gain: float) -> nn.Sequential:
-        """[…, inputs] to […, outputs]; orthogonal weights, zero biases.
+    def check(self) -> None:
+        """Raise `UserError` if no network can have these layers."""
+        if self.kind not in NETWORKS and ":" not in self.kind:
+            raise unknown_name("network", self.kind, [*NETWORKS, "module:Class"])
+        if self.kind == "simba" and len(set(self.hidden)) != 1:
+            raise UserError(f"SimBa's blocks have one width, such as (256, 256), not {self.hidden}.")
+
+    def network(self, inputs: int, outputs: int, last_gain: float) -> nn.Module:
+        """A new network, […, inputs] to […, outputs]; orthogonal weights, zero biases.
 
         The last layer has gain `last_gain`: 0.01 for a policy, so that it starts near the centre of its range whatever
-        it sees (Andrychowicz et al. 2021, arXiv:2006.05990, section 3.2), 1 for a value; the others have √2.
+        it observes (Andrychowicz et al. 2021, arXiv:2006.05990, section 3.2), 1 for a value; the others have √2.
         """
-        kind = nn.Linear if self.matmul == "float32" else Bfloat16Linear
-        last = self.hidden[-1] if self.hidden else inputs
-        layers: list[nn.Module] = []
-        if self.architecture == "simba":
-            layers += [_orthogonal(nn.Linear(inputs, last), 1.0)]
-            layers += [*(Residual(last, kind) for _ in self.hidden), nn.LayerNorm(last)]
-        else:
-            for i, (before, after) in enumerate(pairwise((inputs, *self.hidden))):
-                layers += [_orthogonal((kind if i else nn.Linear)(before, after), 2**0.5)]
-                layers += [nn.LayerNorm(after)] if self.architecture == "layer_norm" else []
-                layers += [ACTIVATIONS[self.activation]()]
-        return nn.Sequential(*layers, _orthogonal(nn.Linear(last, outputs), last_gain))
+        if self.kind not in NETWORKS:
+            return _own_network(self.kind, inputs, outputs)
+        layers, width = NETWORKS[self.kind](self, inputs)
+        return nn.Sequential(*layers, _orthogonal(nn.Linear(width, outputs), last_gain))
+
+    @property
+    def linear(self) -> type[nn.Linear]:
+        """The class of the products between hidden layers."""
+        return nn.Linear if self.matmul == "float32" else Bfloat16Linear
+
+
+def _mlp(layers: Layers, inputs: int, normalized: bool = False) -> tuple[list[nn.Module], int]:
+    modules: list[nn.Module] = []
+    for i, (before, after) in enumerate(pairwise((inputs, *layers.hidden))):
+        modules += [_orthogonal((layers.linear if i else nn.Linear)(before, after), 2**0.5)]
+        modules += [nn.LayerNorm(after)] if normalized else []
+        modules += [ACTIVATIONS[layers.activation]()]
+    return modules, layers.hidden[-1] if layers.hidden else inputs
+
+
+def _layer_norm(layers: Layers, inputs: int) -> tuple[list[nn.Module], int]:
+    return _mlp(layers, inputs, normalized=True)
+
+
+def _simba(layers: Layers, inputs: int) -> tuple[list[nn.Module], int]:
+    width = layers.hidden[-1]
+    blocks = (Residual(width, layers.linear) for _ in layers.hidden)
+    return [_orthogonal(nn.Linear(inputs, width), 1.0), *blocks, nn.LayerNorm(width)], width
+
+
+NETWORKS: dict[str, Callable[[Layers, int], tuple[list[nn.Module], int]]] = {
+    "mlp": _mlp,
+    "layer_norm": _layer_norm,
+    "simba": _simba,
+}
+"""The layers before the last one, and the number of their outputs."""
+
+
+def _own_network(name: str, inputs: int, outputs: int) -> nn.Module:
+    try:
+        network = find_object(name, "network")(inputs, outputs)
+        shape = network(torch.zeros(2, inputs)).shape
+    except (TypeError, RuntimeError, AttributeError) as error:
+        raise UserError(f"{name}({inputs}, {outputs}) must make a module for [2, {inputs}]: {error}") from None
+    if shape != (2, outputs):
+        raise UserError(f"{name} must take [2, {inputs}] to [2, {outputs}]; it returns {list(shape)}.")
+    return network
 
 
 class Residual(nn.Module):

@@ -1,6 +1,6 @@
-"""Running statistics: modules, so that they are saved and moved with the rest.
+"""Normalizers of observations and rewards: modules, so that they are saved and moved with the networks.
 
-The observation normalizer is part of the policy and so is evaluated with it; the reward's scale is for training only.
+The observation normalizer is part of the policy, and evaluated with it; the reward scale is for training only.
 """
 
 from dataclasses import replace
@@ -23,6 +23,9 @@ class NoNorm(nn.Module):
         """[…, O or more] to […, O]."""
         return obs[..., : self.size]
 
+    def update(self, obs: Tensor) -> None:
+        """Nothing: there are no statistics."""
+
 
 class ScaleBytes(NoNorm):
     """Bytes to numbers from 0 to 1."""
@@ -33,7 +36,7 @@ class ScaleBytes(NoNorm):
 
 
 class RunningNorm(NoNorm):
-    """(x − mean) / std of everything seen in training, clipped to ±`clip`.
+    """(x − mean) / std, with the moments of all training observations, clipped to ±`clip`.
 
     The statistics are buffers and change in `update` only; calling the module never changes them. Before the first
     update it only clips.
@@ -57,7 +60,7 @@ class RunningNorm(NoNorm):
 
     @torch.no_grad()
     def update(self, obs: Tensor) -> None:
-        """Take [B, O or more] observations into the statistics; all of them finite, and there may be none."""
+        """Merge finite observations [B, O or more] into the statistics; B may be 0."""
         if not len(obs):
             return
         obs = super().forward(obs).double()
@@ -70,7 +73,7 @@ class RunningNorm(NoNorm):
 class RewardScale(nn.Module):
     """r / std of the discounted return so far, clipped to ±`clip`; the returns are those of N running episodes.
 
-    The mean is left in: taking it out would pay for living or dying. Before the first update rewards pass unscaled.
+    The mean is not subtracted, which would reward surviving or dying. Before the first update rewards are unscaled.
     """
 
     running: Tensor
@@ -88,21 +91,21 @@ class RewardScale(nn.Module):
         """Any shape to the same shape."""
         return (reward / (self.var + 1e-8).sqrt().to(reward.dtype)).clamp(-self.clip, self.clip)
 
-    def restart(self) -> None:
-        """The environments begin anew: the episodes under way are over."""
+    def on_restart(self) -> None:
+        """Forget the running episodes: the environments have been restarted."""
         self.running = torch.zeros_like(self.running)
 
     @torch.no_grad()
-    def follow(self, rollout: Rollout) -> Rollout:
-        """Follow the discounted return Σ γ^k r_{t−k} of each episode through a rollout [T, N]; scale its rewards."""
+    def scale(self, rollout: Rollout) -> Rollout:
+        """The rollout [T, N] with scaled rewards, after its returns Σ γ^k r_{t−k} have joined the statistics."""
         returns = []
-        paid = rollout.reward.double() * rollout.valid
-        for reward, done in zip(paid, rollout.done, strict=True):
+        counted = rollout.reward.double() * rollout.valid
+        for reward, done in zip(counted, rollout.done, strict=True):
             self.running = self.gamma * self.running + reward
             returns.append(self.running)
             self.running = self.running * ~done
-        seen = torch.stack(returns)[rollout.valid]
-        count = torch.full_like(self.count, len(seen))
-        moments = merge_moments(self.mean, self.var, self.count, seen.mean(), seen.var(correction=0), count)
+        observed = torch.stack(returns)[rollout.valid]
+        count = torch.full_like(self.count, len(observed))
+        moments = merge_moments(self.mean, self.var, self.count, observed.mean(), observed.var(correction=0), count)
         self.mean, self.var, self.count = moments
         return replace(rollout, reward=self(rollout.reward))

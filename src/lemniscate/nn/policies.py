@@ -1,6 +1,6 @@
-"""Policies. A policy returns a distribution and remembers nothing."""
+"""Policies. A policy is stateless and returns a distribution over actions."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Generator, Tensor, nn
@@ -14,8 +14,7 @@ from lemniscate.maths import (
     MultiCategorical,
     SquashedGaussian,
 )
-from lemniscate.nn.native import Native
-from lemniscate.nn.normalizer import NoNorm, RunningNorm
+from lemniscate.nn.normalizer import NoNorm
 from lemniscate.spec import Box, Discrete, MultiDiscrete
 
 
@@ -26,35 +25,26 @@ class Policy(nn.Module):
         super().__init__()
         self.normalizer = normalizer
         self.net = net
-        self._act: Callable[[Tensor, Tensor], Tensor] = self._sample
 
     def act(self, obs: Tensor, noise: Tensor) -> Tensor:
-        """An action at each observation [B, O], drawn with `noise`; once native, B is always the same."""
-        return self._act(obs, noise)
-
-    def make_native(self) -> None:
-        """From the next action on, `act` is one native call."""
-        self._act = Native(self._sample, self._sample, next(self.parameters()).device)
-
-    def _sample(self, obs: Tensor, noise: Tensor) -> Tensor:
+        """An action at each observation [B, O], drawn with the random numbers `noise` of `draw_noise`."""
         return self(obs).sample(noise)
 
     def forward(self, obs: Tensor) -> Distribution:
         """The distribution over actions at each observation, [B, O]."""
         raise NotImplementedError
 
-    def noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
-        """What `Distribution.sample` needs for actions at observations [*shape, O]."""
+    def draw_noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
+        """The random numbers that `Distribution.sample` needs for actions at observations [*shape, O]."""
         raise NotImplementedError
 
-    def watch(self) -> dict[str, Tensor]:
-        """What is worth a curve, by its usual name."""
+    def metrics(self) -> dict[str, Tensor]:
+        """Extra metrics of the policy, each a scalar."""
         return {}
 
     def observe(self, obs: Tensor) -> None:
-        """Take [B, O] training observations into the normalizer's statistics, if there is one."""
-        if isinstance(self.normalizer, RunningNorm):
-            self.normalizer.update(obs)
+        """Update the statistics of the normalizer, if it has any, with training observations [B, O]."""
+        self.normalizer.update(obs)
 
 
 class GaussianPolicy(Policy):
@@ -68,11 +58,11 @@ class GaussianPolicy(Policy):
         """[B, O] to N(μ [B, A], σ [A])."""
         return Gaussian(self.net(self.normalizer(obs)), self.log_std)
 
-    def noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
+    def draw_noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
         """Standard normal, [*shape, A]."""
         return torch.randn(*shape, *self.log_std.shape, generator=generator, device=generator.device)
 
-    def watch(self) -> dict[str, Tensor]:
+    def metrics(self) -> dict[str, Tensor]:
         """The mean of σ over coordinates."""
         return {"policy_std": self.log_std.detach().exp().mean()}
 
@@ -91,7 +81,7 @@ class CategoricalPolicy(Policy):
             logits = logits.masked_fill(obs[..., -self.action.n :] == 0, -1e9)
         return Categorical(logits)
 
-    def noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
+    def draw_noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
         """Uniform in [0, 1), [*shape]."""
         return torch.rand(*shape, generator=generator, device=generator.device)
 
@@ -108,7 +98,7 @@ class MultiCategoricalPolicy(Policy):
         logits = self.net(self.normalizer(obs)).split(self.action.nvec, dim=-1)
         return MultiCategorical(tuple(Categorical(part) for part in logits))
 
-    def noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
+    def draw_noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
         """Uniform in [0, 1), [*shape, K]."""
         return torch.rand(*shape, len(self.action.nvec), generator=generator, device=generator.device)
 
@@ -124,7 +114,7 @@ class BernoulliPolicy(Policy):
         """[B, O] to logits [B, n]."""
         return Bernoulli(self.net(self.normalizer(obs)))
 
-    def noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
+    def draw_noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
         """Uniform in [0, 1), [*shape, n]."""
         return torch.rand(*shape, self.n, generator=generator, device=generator.device)
 
@@ -140,8 +130,8 @@ class DeterministicPolicy(Policy):
         """[B, O] to [B, A]."""
         return Deterministic(torch.tanh(self.net(self.normalizer(obs))))
 
-    def noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
-        """It has none of its own: zeros, [*shape, A]."""
+    def draw_noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
+        """Zeros, [*shape, A]: the policy has no randomness of its own."""
         return torch.zeros(*shape, self.size, device=generator.device)
 
 
@@ -157,6 +147,6 @@ class SquashedGaussianPolicy(Policy):
         mean, log_std = self.net(self.normalizer(obs)).chunk(2, dim=-1)
         return SquashedGaussian(mean, -5 + 3.5 * (torch.tanh(log_std) + 1))
 
-    def noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
+    def draw_noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
         """Standard normal, [*shape, A]."""
         return torch.randn(*shape, self.size, generator=generator, device=generator.device)

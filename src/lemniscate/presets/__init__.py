@@ -1,8 +1,9 @@
-"""Tuned Configs, as Python values: where each came from, and when.
+"""Tuned Configs, as Python values, each with its source and date.
 
-`default` is what an environment without a preset of its own gets.
+`default` is the Config of an algorithm as it stands: an environment without a preset of its own gets it.
 """
 
+from lemniscate.algos import ALGORITHMS
 from lemniscate.errors import unknown_name
 from lemniscate.presets.off_policy import DDPG, SAC, TD3
 from lemniscate.presets.on_policy import A2C, PPO, REINFORCE, TRPO
@@ -21,13 +22,13 @@ PRESETS: dict[str, list[Preset]] = {
 
 
 def names(algorithm: str) -> list[str]:
-    """Every preset's name, each once."""
-    return list(dict.fromkeys(preset.name for preset in PRESETS[algorithm]))
+    """The names of the presets, each once."""
+    return ["default", *dict.fromkeys(preset.name for preset in PRESETS.get(algorithm, ()))]
 
 
 def best(algorithm: str, env_id: str | None) -> str:
-    """The preset that an environment gets unasked: the first that is its own, or the default."""
-    own = (preset.name for preset in PRESETS[algorithm][1:] if preset.config.env == env_id)
+    """The preset that an environment gets unless another is named: the first of its own, or the default."""
+    own = (preset.name for preset in PRESETS.get(algorithm, ()) if preset.config.env == env_id)
     return next(own, "default")
 
 
@@ -38,7 +39,9 @@ def choose(algorithm: str, env_id: str | None, name: str | None) -> tuple[str, R
     is given. Raises `UserError` with the nearest names for an unknown preset.
     """
     name = name or best(algorithm, env_id)
-    named = [preset.config for preset in PRESETS[algorithm] if preset.name == name]
+    named = [preset.config for preset in PRESETS.get(algorithm, ()) if preset.name == name]
+    if name == "default":
+        named = [ALGORITHMS[algorithm].Config()]
     if not named:
         raise unknown_name("preset", name, names(algorithm))
     config = next((config for config in named if config.env == env_id), named[0])

@@ -1,9 +1,8 @@
-"""Presets of those that learn from memory: DDPG, TD3, SAC."""
+"""Presets of the off-policy algorithms: DDPG, TD3, SAC."""
 
 from lemniscate.algos import ddpg, sac, td3
 from lemniscate.presets.preset import Preset
 
-SHARED = "the settings that most libraries share today"
 CHEETAH = {
     "env": "HalfCheetah-v5",
     "learning_starts": 10_000,
@@ -20,14 +19,13 @@ QUICK = {
     "batch_size": 128,
     "hidden": (64, 64),
     "critic_hidden": (64, 64),
-    "architecture": "layer_norm",
+    "network": "layer_norm",
 }
-"""small networks, and learning rates that fall"""
+"""small networks, and annealed learning rates"""
 PENDULUM = {"env": "Pendulum-v1", "total_steps": 20_000, "learning_starts": 1000, **QUICK}
 SWUNG = "search by hand, three settings of each algorithm, on seed 101"
 
 DDPG = [
-    Preset("default", ddpg.Config(), SHARED, "2026-11"),
     Preset(
         "hopper",
         ddpg.Config(
@@ -61,7 +59,7 @@ DDPG = [
         ddpg.Config(
             env="MountainCarContinuous-v0",
             total_steps=30_000,
-            noise="ou",
+            action_noise="ou",
             noise_std=0.6,
             gamma=0.998,
             batch_size=128,
@@ -72,7 +70,7 @@ DDPG = [
             policy_delay=2,
             hidden=(64, 64),
             critic_hidden=(64, 64),
-            architecture="layer_norm",
+            network="layer_norm",
             normalize_observations=True,
         ),
         "search by hand, 24 settings, on seeds 101 and 102; the best two also on 103 and 104",
@@ -80,12 +78,10 @@ DDPG = [
     ),
 ]
 TD3 = [
-    Preset("default", td3.Config(), SHARED, "2026-11"),
     Preset("pendulum", td3.Config(**PENDULUM), SWUNG, "2026-11"),
     Preset("half-cheetah", td3.Config(total_steps=300_000, **CHEETAH), "not searched: DDPG's", "2026-11"),
 ]
 SAC = [
-    Preset("default", sac.Config(), SHARED, "2026-11"),
     Preset("pendulum", sac.Config(**PENDULUM), SWUNG, "2026-11"),
     Preset("half-cheetah", sac.Config(total_steps=300_000, **CHEETAH), "not searched: DDPG's", "2026-11"),
     Preset(
@@ -100,7 +96,7 @@ SAC = [
             tau=0.01,
             hidden=(128, 128),
             critic_hidden=(128, 128),
-            architecture="layer_norm",
+            network="layer_norm",
         ),
         "search by hand: SAC in two sizes and TD3 in one, on seed 101",
         "2026-11",

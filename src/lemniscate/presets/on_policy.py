@@ -1,27 +1,27 @@
-"""Presets of those that learn from rollouts: REINFORCE, A2C, TRPO, PPO."""
+"""Presets of the on-policy algorithms: REINFORCE, A2C, TRPO, PPO."""
 
-from lemniscate.algos import a2c, ppo, reinforce, trpo
+from lemniscate.algos import a2c, ppo, trpo
 from lemniscate.presets.preset import Preset
 
 FIGURE_EIGHT = "DroneFigureEightTrajectory-v0"
 
-ADAPTIVE = ppo.Config(
-    num_envs=64,
-    num_steps=64,
-    minibatch_size=512,
-    desired_kl=0.01,
-    max_grad_norm=1.0,
-    value_coef=1.0,
-    scale_rewards=True,
-    recompute_advantages=True,
-    initial_log_std=-0.5,
-    checkpoint_every=250_000,
-)
-"""many copies, and a learning rate that follows the KL; after rl_games and rsl_rl"""
-
-ANNEALED = ppo.Config(
+PAPER = ppo.Config(
+    num_envs=8,
     num_steps=256,
     minibatch_size=64,
+    desired_kl=None,
+    value_coef=0.5,
+    max_grad_norm=0.5,
+    scale_rewards=False,
+    recompute_advantages=False,
+    initial_log_std=0.0,
+)
+"""table 3 of the paper, for MuJoCo, on 8 parallel environments with a running normalizer"""
+
+ADAPTIVE = ppo.Config(num_envs=64, num_steps=64, minibatch_size=512, checkpoint_every=250_000)
+"""many parallel environments, and a learning rate that follows the KL; after rl_games and rsl_rl"""
+
+ANNEALED = PAPER.replace(
     value_coef=0.25,
     scale_rewards=True,
     recompute_advantages=True,
@@ -29,18 +29,12 @@ ANNEALED = ppo.Config(
     initial_log_std=-0.5,
     checkpoint_every=250_000,
 )
-"""few copies, small minibatches, and a learning rate that falls; after Tianshou"""
+"""few parallel environments, small minibatches, and an annealed learning rate; after Tianshou"""
 
 PPO = [
     Preset(
-        "default",
-        ADAPTIVE.replace(num_envs=16, num_steps=128, minibatch_size=256, checkpoint_every=0),
-        "the best of five candidates on Pendulum, Acrobot and InvertedDoublePendulum, seeds 101 and 102",
-        "2026-11",
-    ),
-    Preset(
         "figure-eight",
-        ppo.Config(
+        PAPER.replace(
             env=FIGURE_EIGHT,
             num_envs=256,
             num_steps=32,
@@ -62,7 +56,7 @@ PPO = [
     ),
     Preset(
         "course",
-        ppo.Config(
+        PAPER.replace(
             env=FIGURE_EIGHT,
             num_envs=1024,
             num_steps=16,
@@ -86,7 +80,7 @@ PPO = [
     ),
     Preset(
         "cart-pole",
-        ppo.Config(
+        PAPER.replace(
             env="CartPole-v1",
             total_steps=50_000,
             num_steps=64,
@@ -100,7 +94,7 @@ PPO = [
     ),
     Preset(
         "lunar-lander",
-        ppo.Config(
+        PAPER.replace(
             env="LunarLander-v3",
             num_envs=16,
             minibatch_size=512,
@@ -117,7 +111,7 @@ PPO = [
     ),
     Preset(
         "course",
-        ppo.Config(
+        PAPER.replace(
             env="LunarLander-v3",
             num_envs=16,
             num_steps=10,
@@ -167,37 +161,21 @@ PPO = [
         "search by hand, 7 runs, on seeds 101 and 102",
         "2026-11",
     ),
-    Preset("paper", ppo.Config(), "Schulman et al. 2017, table 3, on 8 copies with a running normalizer", "2026-11"),
+    Preset("paper", PAPER, "Schulman et al. 2017, table 3, on 8 copies with a running normalizer", "2026-11"),
 ]
 
-REINFORCE = [
-    Preset("default", reinforce.Config(), "first values, tried on CartPole and InvertedPendulum, seed 101", "2026-11")
-]
-
-SURE = a2c.Config(
-    num_envs=16,
-    num_steps=16,
-    learning_rate=1e-3,
-    gae_lambda=0.95,
-    normalize_advantage=True,
-    scale_rewards=True,
-    initial_log_std=-1.0,
-)
-"""little noise: with a step for each rollout, most of what is tried has to be good"""
+REINFORCE: list[Preset] = []
 
 A2C = [
-    Preset("default", SURE, "what serves HalfCheetah", "2026-11"),
-    Preset("half-cheetah", SURE.replace(env="HalfCheetah-v5"), "search by hand, 12 runs, on seed 101", "2026-11"),
+    Preset("half-cheetah", a2c.Config(env="HalfCheetah-v5"), "search by hand, 12 runs, on seed 101", "2026-11"),
     Preset(
         "figure-eight",
         a2c.Config(
             env=FIGURE_EIGHT,
             num_envs=32,
-            num_steps=16,
             learning_rate=3e-3,
             gamma=0.92,
-            gae_lambda=0.95,
-            normalize_advantage=True,
+            scale_rewards=False,
             initial_log_std=-0.8,
             evaluate_episodes=64,
         ),
@@ -206,35 +184,18 @@ A2C = [
     ),
 ]
 
-BOUNDED = trpo.Config(num_envs=16, num_steps=64, critic_epochs=20, initial_log_std=-0.5, scale_rewards=True)
-"""small rollouts, and a critic that is fitted well"""
-
 TRPO = [
-    Preset("default", BOUNDED, "what serves HalfCheetah and Walker2d", "2026-11"),
-    Preset(
-        "half-cheetah",
-        BOUNDED.replace(env="HalfCheetah-v5"),
-        "search by hand, 3 runs, on seed 101",
-        "2026-11",
-    ),
-    Preset("walker2d", BOUNDED.replace(env="Walker2d-v5"), "a run on seed 101", "2026-11"),
+    Preset("half-cheetah", trpo.Config(env="HalfCheetah-v5"), "search by hand, 3 runs, on seed 101", "2026-11"),
+    Preset("walker2d", trpo.Config(env="Walker2d-v5"), "a run on seed 101", "2026-11"),
     Preset(
         "hopper",
-        BOUNDED.replace(env="Hopper-v5", num_envs=8, num_steps=256),
+        trpo.Config(env="Hopper-v5", num_envs=8, num_steps=256),
         "search by hand, 2 runs, on seed 101",
         "2026-11",
     ),
     Preset(
         "swimmer",
-        trpo.Config(
-            env="Swimmer-v5",
-            num_envs=4,
-            num_steps=512,
-            gamma=0.9999,
-            gae_lambda=0.995,
-            critic_epochs=20,
-            scale_rewards=True,
-        ),
+        trpo.Config(env="Swimmer-v5", num_envs=4, num_steps=512, gamma=0.9999, gae_lambda=0.995, initial_log_std=0.0),
         "search by hand, 8 settings, on seeds 101 to 110; this one on 105 to 110",
         "2026-11",
     ),
@@ -246,6 +207,8 @@ TRPO = [
             num_steps=32,
             max_kl=0.03,
             gamma=0.97,
+            critic_epochs=10,
+            scale_rewards=False,
             initial_log_std=-0.8,
             evaluate_episodes=64,
         ),

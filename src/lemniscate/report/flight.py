@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError
 from lemniscate.nn.policies import Policy
-from lemniscate.run.evaluate import fly
+from lemniscate.run.evaluate import play_episodes
 
 BLUE, ORANGE, GREY = "#1f5fa8", "#e07b1a", "#9aa0a6"
 
@@ -46,7 +46,7 @@ def record(policy: Policy, env: VecEnv, flights: int, seed: int) -> Flight:
         raise UserError(f"{spec.env_id} has no reference to track, so no flight can be drawn against one.")
     flights = min(flights, env.num_envs)
     rows = []
-    for _, _, step, counts in fly(policy, env, flights, seed):
+    for _, _, step, counts in play_episodes(policy, env, flights, seed):
         row = torch.where(counts[:, None], step.next_obs, torch.nan)[:flights]
         rows.append(row.cpu().numpy())
     track = np.stack(rows)

@@ -145,7 +145,7 @@ def _tuples(record: dict[str, Any]) -> dict[str, Any]:
 
 
 def _parts(state: Any) -> list[tuple[str, Any]]:
-    return [(field.name, getattr(state, field.name)) for field in dataclasses.fields(state)]
+    return list(state.saved().items())
 
 
 def _apart(tensors: dict[str, Tensor]) -> dict[str, Tensor]:

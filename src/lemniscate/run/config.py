@@ -1,4 +1,4 @@
-"""What every algorithm's Config shares, and the ranges that all of them are held to."""
+"""The settings that algorithms share, and the ranges of all settings."""
 
 import dataclasses
 import json
@@ -8,10 +8,15 @@ from dataclasses import dataclass
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Self, Union, get_args, get_origin, get_type_hints
 
-from lemniscate.data.action_noise import Noise
+import torch
+
+from lemniscate.data.action_noise import ActionNoise, Kind
 from lemniscate.errors import UserError
 from lemniscate.glossary import unknown_field
-from lemniscate.nn.networks import Activation, Architecture, Layers, Matmul
+from lemniscate.nn.activations import Activation
+from lemniscate.nn.actor_critic import ActorCritic
+from lemniscate.nn.networks import Layers, Matmul
+from lemniscate.spec import Spec
 
 
 @dataclass(frozen=True)
@@ -37,6 +42,8 @@ Seed = Annotated[int, Range(0, 2**32 - 1)]
 Fraction = Annotated[float, Range(0, 1)]
 Positive = Annotated[float, Range(0, above=True)]
 NonNegative = Annotated[float, Range(0)]
+Finite = Annotated[float, Range()]
+LogStd = Annotated[float, Range(-10, 5)]
 
 
 def options_of(hint: Any) -> tuple[Any, ...]:
@@ -104,29 +111,30 @@ class RunConfig:
     env: str = "CartPole-v1"
     """environment id; `lemniscate envs` lists them"""
     backend: str | None = None
-    """who steps the environments; chosen by the id unless named"""
-    num_envs: Count = 8
-    """copies of the environment, N"""
+    """simulation backend (default: chosen from the id)"""
+    num_envs: Count = 16
+    """number of parallel environments, N; usually 8 to 64"""
     seed: Seed = 1
-    """the one seed; every other is derived from it"""
+    """seed of the run, from which all others are derived"""
     total_steps: Count = 1_000_000
-    """environment steps of the whole run, summed over the copies; it ends with the update that reaches them"""
+    """environment steps of the whole run, summed over the parallel environments; it ends with the update that reaches
+    them"""
     device: Literal["auto", "cpu", "cuda"] = "cpu"
-    """where networks, and simulators that can, live; auto takes cuda if there is one"""
+    """device of the networks, and of simulators that can use it; auto takes cuda if there is one"""
     threads: Count = 1
-    """torch's threads on the CPU; results of one number differ in rounding from another's"""
-    engine: Literal["auto", "eager", "native"] = "auto"
-    """how gradient steps are taken: one by one through autograd, or as one native call; auto compiles long runs"""
+    """CPU threads for torch; results differ in rounding between thread counts"""
+    compile: Literal["auto", "on", "off"] = "auto"
+    """compile the gradient steps and the policy; auto compiles long runs, where it saves time"""
     checkpoint_every: Natural = 0
-    """steps between checkpoints, at each of which the environments restart; 0 makes five, fewer of a short run"""
+    """steps between checkpoints, at each of which the environments restart; 0: about five per run"""
     keep_checkpoints: Count = 3
-    """older ones are deleted"""
+    """number of newest checkpoints kept"""
     evaluate_every: Natural = 0
-    """steps between evaluations during training; 0 leaves it to the end"""
+    """steps between evaluations during training; 0: only at the end"""
     evaluate_episodes: Count = 20
     """episodes of each evaluation"""
     video_every: Natural = 0
-    """steps between recordings of an episode into videos/step-N; 0 records none"""
+    """steps between recordings of an episode into videos/step-N; 0: none"""
 
     def __post_init__(self) -> None:
         hints = get_type_hints(type(self), include_extras=True)
@@ -135,7 +143,11 @@ class RunConfig:
 
     @property
     def gradient_steps(self) -> int:
-        """Of the whole run."""
+        """The number of gradient steps of the whole run."""
+        raise NotImplementedError
+
+    def networks(self, spec: Spec) -> Any:
+        """New networks for the spaces in `spec`, a module with a `policy`. Raises `UserError` if they do not fit."""
         raise NotImplementedError
 
     def replace(self, **changes: object) -> Self:
@@ -165,36 +177,46 @@ class RunConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class OnPolicyConfig(RunConfig):
-    """What algorithms that learn from their own newest rollout share."""
+    """The settings of algorithms that learn from their newest rollout."""
 
-    num_steps: Count = 256
-    """steps of each copy between updates, T"""
+    num_steps: Count = 128
+    """steps of each environment between updates, T; usually 16 to 2048, so that N · T is about 2048"""
     gamma: Fraction = 0.99
-    """discount γ"""
+    """discount factor γ; usually 0.9 to 0.999"""
     hidden: tuple[Count, ...] = (64, 64)
-    """widths of the hidden layers, the same for policy and value"""
+    """widths of the hidden layers of the policy, and of the value"""
     activation: Activation = "tanh"
-    """between the layers"""
-    initial_log_std: Annotated[float, Range(-10, 5)] = 0.0
-    """log σ at the start, in units of half the action range"""
+    """activation function between the layers"""
+    network: str = "mlp"
+    """mlp, layer_norm (the same with layer normalization), simba (residual blocks of one width), or module:Class"""
+    initial_log_std: LogStd = -0.5
+    """initial log σ of a Gaussian policy, in units of half the action range; usually -1 to 0"""
     normalize_observations: bool = True
-    """a running normalizer inside the policy"""
-    scale_rewards: bool = False
+    """normalize observations by their running mean and standard deviation, inside the policy"""
+    scale_rewards: bool = True
     """divide rewards by the running standard deviation of the discounted return"""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.layers.check()
+
+    def networks(self, spec: Spec) -> ActorCritic:
+        """New networks for the spaces in `spec`: the policy and V(s)."""
+        return ActorCritic(spec, self.layers, self.initial_log_std, self.normalize_observations)
 
     @property
     def layers(self) -> Layers:
-        """Of the policy, and of the value."""
-        return Layers(self.hidden, self.activation)
+        """The hidden layers of the policy, and of the value."""
+        return Layers(self.hidden, self.activation, self.network)
 
     @property
     def num_rows(self) -> int:
-        """Of a rollout, T · N."""
+        """The number of rows of a rollout, T · N."""
         return self.num_steps * self.num_envs
 
     @property
     def num_rollouts(self) -> int:
-        """Of the whole run."""
+        """The number of rollouts of the whole run."""
         return -(-self.total_steps // self.num_rows)
 
     def _require_rows(self, field: str, rows: int) -> None:
@@ -205,56 +227,57 @@ class OnPolicyConfig(RunConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class OffPolicyConfig(RunConfig):
-    """What algorithms that learn from memory share: the memory, the rhythm of acting and learning, noise, networks.
-
-    The defaults are those in use today, rather than any paper's.
-    """
+    """The settings of algorithms that learn from a replay buffer."""
 
     num_envs: Count = 1
-    """copies of the environment, N"""
+    """number of parallel environments, N; usually 1 to 8"""
     gamma: Fraction = 0.99
-    """discount γ"""
+    """discount factor γ; usually 0.95 to 0.999"""
     buffer_size: Count = 1_000_000
-    """transitions that are remembered; the oldest make room"""
+    """transitions in the replay buffer; the oldest are replaced"""
     batch_size: Count = 256
-    """of each gradient step, M"""
+    """rows of each gradient step, M; usually 64 to 512"""
     learning_starts: Natural = 5_000
-    """environment steps with random actions before anything is learned"""
+    """environment steps with random actions before the first update; usually 1,000 to 25,000"""
     update_every: Count = 1
-    """steps of each copy between updates"""
+    """steps of each environment between updates"""
     num_updates: Count = 1
-    """gradient steps at each update; so num_updates / (N · update_every) for each environment step"""
-    num_steps: Count = 500
-    """steps of each copy between two lines of metrics; evaluations, checkpoints and the end wait for the next one"""
+    """gradient steps of the critics at each update; so num_updates / (N · update_every) for each environment step"""
+    log_every: Count = 500
+    """steps of each environment between lines of metrics; evaluations and checkpoints wait for the next one"""
     actor_learning_rate: Positive = 3e-4
-    """Adam's step size for the policy"""
+    """step size of the policy's Adam; usually 1e-4 to 1e-3"""
     critic_learning_rate: Positive = 3e-4
-    """Adam's step size for Q"""
+    """step size of the critics' Adam; usually 1e-4 to 1e-3"""
     final_learning_rate: Fraction = 1.0
-    """fraction of both that they fall to, linearly over the run; 1 keeps them as they are"""
+    """final value of both as a fraction of the initial one, annealed linearly; 1: constant"""
     tau: Fraction = 0.005
-    """how far the target networks move at each of their updates"""
-    noise: Noise = "white"
-    """what actions are drawn with in training: white; Ornstein–Uhlenbeck; coloured"""
+    """τ, the share by which the target networks move at each update; usually 0.001 to 0.02"""
+    policy_delay: Count = 1
+    """gradient steps of the critics for each of the policy and the target networks; usually 1 or 2"""
+    action_noise: Kind = "white"
+    """noise of actions in training: white, ou (Ornstein–Uhlenbeck) or coloured"""
     noise_time: Positive = 6.7
-    """steps in which Ornstein–Uhlenbeck noise forgets itself; DDPG's paper has θ = 0.15, which is 1 / 0.15"""
+    """correlation time of Ornstein–Uhlenbeck noise in steps; θ = 0.15 of DDPG's paper is 1 / 0.15"""
     noise_exponent: NonNegative = 1.0
     """β of coloured noise, whose power falls as f^(−β); 1 is pink"""
     hidden: tuple[Count, ...] = (256, 256)
     """widths of the policy's hidden layers"""
     critic_hidden: tuple[Count, ...] = (256, 256)
-    """widths of Q's"""
+    """widths of each critic's hidden layers"""
     activation: Activation = "relu"
-    """between the layers; SimBa's is relu in any case"""
-    architecture: Architecture = "mlp"
-    """plain layers; with layer normalization; or SimBa's residual blocks, all of one width"""
+    """activation function between the layers; simba has its own"""
+    network: str = "mlp"
+    """mlp, layer_norm (the same with layer normalization), simba (residual blocks of one width), or module:Class"""
     matmul: Matmul = "float32"
-    """of products between hidden layers; bfloat16 is quicker where the processor has it"""
+    """precision of the products between hidden layers; bfloat16 is faster where the processor has it"""
     normalize_observations: bool = False
-    """a running normalizer inside the policy"""
+    """normalize observations by their running mean and standard deviation, inside the policy"""
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        for layers in self.network_settings[:2]:
+            layers.check()
         if self.learning_starts >= self.total_steps:
             raise UserError(
                 f"learning_starts must be below total_steps, or nothing is ever learned: {self.learning_starts:,} is"
@@ -263,42 +286,43 @@ class OffPolicyConfig(RunConfig):
         if not self.gradient_steps:
             raise UserError(
                 f"update_every {self.update_every:,} is so large that nothing is ever learned: after learning_starts"
-                f" each copy takes {self.steps_of_each_copy - self.learning_starts // self.num_envs:,} steps."
-            )
-        if self.architecture == "simba" and any(len(set(widths)) != 1 for widths in (self.hidden, self.critic_hidden)):
-            raise UserError(
-                f"SimBa's blocks have one width, such as (256, 256): not {self.hidden} and {self.critic_hidden}."
+                f" each environment takes {self.steps_per_env - self.learning_starts // self.num_envs:,} steps."
             )
         for name in ("batch_size", "num_envs"):
             if self.capacity < (rows := getattr(self, name)):
                 raise UserError(
-                    f"The replay must hold a batch, and a step of every copy: the smaller of buffer_size"
-                    f" {self.buffer_size:,} and the {self.num_envs * self.steps_of_each_copy:,} steps of the run is"
+                    f"The replay buffer must hold a batch, and a step of every environment: the smaller of buffer_size"
+                    f" {self.buffer_size:,} and the {self.num_envs * self.steps_per_env:,} steps of the run is"
                     f" below {name} {rows:,}."
                 )
 
     @property
-    def actor_layers(self) -> Layers:
-        """Of the policy."""
-        return Layers(self.hidden, self.activation, self.architecture, self.matmul)
-
-    @property
-    def critic_layers(self) -> Layers:
-        """Of Q."""
-        return Layers(self.critic_hidden, self.activation, self.architecture, self.matmul)
+    def network_settings(self) -> tuple[Layers, Layers, bool]:
+        """The hidden layers of the policy and of each critic, and whether observations are normalized."""
+        shared = self.activation, self.network, self.matmul
+        return Layers(self.hidden, *shared), Layers(self.critic_hidden, *shared), self.normalize_observations
 
     @property
     def capacity(self) -> int:
-        """Rows of the replay: no more than the run can fill."""
-        return min(self.buffer_size, self.num_envs * self.steps_of_each_copy)
+        """The rows of the replay buffer: no more than the run can fill."""
+        return min(self.buffer_size, self.num_envs * self.steps_per_env)
 
     @property
-    def steps_of_each_copy(self) -> int:
-        """In the whole run: the first multiple of num_steps with which all copies reach total_steps."""
-        return -(-self.total_steps // (self.num_envs * self.num_steps)) * self.num_steps
+    def steps_per_env(self) -> int:
+        """Steps of each environment in the whole run: the first multiple of log_every that reaches total_steps."""
+        return -(-self.total_steps // (self.num_envs * self.log_every)) * self.log_every
 
     @property
     def gradient_steps(self) -> int:
-        """Of the whole run."""
-        updates = self.steps_of_each_copy // self.update_every
+        """The number of gradient steps of the critics in the whole run."""
+        updates = self.steps_per_env // self.update_every
         return self.num_updates * (updates - self.learning_starts // self.num_envs // self.update_every)
+
+    def make_action_noise(self, spec: Spec, device: torch.device) -> ActionNoise:
+        """Action noise for the environments of a run; a sequence is as long as an episode may be."""
+        shape, length = (self.num_envs, spec.bounded_box().size), spec.max_episode_steps or 1000
+        return ActionNoise(self.action_noise, shape, length, device, time=self.noise_time, exponent=self.noise_exponent)
+
+    def updates_at(self, step: int) -> bool:
+        """Whether an update follows environment step `step`."""
+        return step > self.learning_starts and step // self.num_envs % self.update_every == 0

@@ -55,7 +55,7 @@ class Evaluation:
 
 
 @torch.no_grad()
-def fly(
+def play_episodes(
     policy: Policy, env: VecEnv, episodes: int, seed: int, deterministic: bool = True
 ) -> Iterator[tuple[Tensor, Tensor, Step, Tensor]]:
     """Play `episodes` whole episodes; yields (obs, action, step, the mask [N] of the copies that still count).
@@ -63,7 +63,7 @@ def fly(
     Every copy has its own share of the episodes, fixed beforehand: taking the first that end would favour short ones.
     Raises `UserError` when an episode of an environment without a time limit takes more than 20,000 steps.
     """
-    noise = partial(policy.noise, (env.num_envs,), generator(seed, env.device, EVALUATION, 1))
+    noise = partial(policy.draw_noise, (env.num_envs,), generator(seed, env.device, EVALUATION, 1))
     copies = torch.arange(env.num_envs, device=env.device)
     left = episodes // env.num_envs + (copies < episodes % env.num_envs).int()
     env.restart(derive(seed, EVALUATION, 0))
@@ -95,7 +95,7 @@ def evaluate(
     errors: list[Tensor] = []
     terminated = 0
     q_bias_meter = QBiasMeter(*critic, env.num_envs, generator(seed, env.device, EVALUATION, 2)) if critic else None
-    for obs, action, step, counts in fly(policy, env, episodes, seed, deterministic):
+    for obs, action, step, counts in play_episodes(policy, env, episodes, seed, deterministic):
         if q_bias_meter:
             q_bias_meter.follow(obs, action, step, counts)
         if env.spec.tracking:

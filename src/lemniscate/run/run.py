@@ -165,7 +165,7 @@ class Run:
         self._lock.release()
 
     def _choose_engine(self, state: TrainState) -> None:
-        if engine_of(self.config) == "native":
+        if engine_of(self.config) == "on":
             if self._visible:
                 print(
                     "Compiling: half a minute or a whole one the first time, 5 to 10 s from then on.", file=sys.stderr
@@ -280,7 +280,7 @@ class Run:
 
 
 def engine_of(config: RunConfig) -> str:
-    """The engine asked for; of itself, "native" for a run that is long enough to repay it, else "eager"."""
-    if config.engine != "auto":
-        return config.engine
-    return "native" if config.gradient_steps >= WORTH_COMPILING else "eager"
+    """The engine asked for; of itself, "native" for a run that is long enough to repay it, else "off"."""
+    if config.compile != "auto":
+        return config.compile
+    return "on" if config.gradient_steps >= WORTH_COMPILING else "off"

@@ -1,29 +1,116 @@
-"""The training state that every algorithm shares."""
+"""Training states: what a checkpoint holds, and what a run asks of it."""
 
-from typing import Any
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any, Generic, TypeVar
 
+import torch
+from torch import Generator, Tensor
+
+from lemniscate.data.action_noise import ActionNoise
+from lemniscate.data.replay import ReplayBuffer
+from lemniscate.nn.actor_critic import ActorCritic
+from lemniscate.nn.normalizer import RewardScale
 from lemniscate.nn.policies import Policy
+from lemniscate.optim.adam import Adam
+from lemniscate.optim.compiled import Compiled
+from lemniscate.optim.learner import Learner
+from lemniscate.run.seeding import generator
+
+Networks = TypeVar("Networks", bound=Any)
 
 
-class TrainState:
-    """Training state; saved whole in every checkpoint. An algorithm adds its networks, optimizers and counters."""
+class Generators:
+    """The random generators of a run, each with its own stream of the run's seed."""
 
-    networks: Any
-    step: int
+    def __init__(self, seed: int, device: torch.device) -> None:
+        self.action: Generator = generator(seed, device, 2)
+        """of the policy's actions, and of the noise in losses"""
+        self.minibatch: Generator = generator(seed, device, 3)
+        """of the rows of minibatches"""
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """The state of each generator."""
+        return {name: stream.get_state() for name, stream in vars(self).items()}
+
+    def load_state_dict(self, states: Mapping[str, Tensor]) -> None:
+        """Restore what `state_dict` returned."""
+        for name, stream in vars(self).items():
+            stream.set_state(states[name])
+
+
+@dataclass(kw_only=True)
+class TrainState(Generic[Networks]):
+    """Training state; saved whole in every checkpoint. An algorithm adds its optimizers and counters.
+
+    A field is a number, or has `state_dict` and `load_state_dict`; `learn` is the only one that is not saved.
+    """
+
+    networks: Networks
+    """with a `policy`; what is loaded to evaluate it"""
+    rng: Generators
+    learn: Callable[..., Any] = field(metadata={"saved": False})
+    """the algorithm's gradient steps; in a compiled run, their compiled form"""
+    step: int = 0
+    """environment steps taken"""
 
     @property
     def policy(self) -> Policy:
         """The policy that acts and is evaluated."""
         return self.networks.policy
 
+    def saved(self) -> dict[str, Any]:
+        """The fields that a checkpoint holds, by name."""
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.metadata.get("saved", True)}
+
+    def optimizers(self) -> list[Adam]:
+        """All optimizers of the state."""
+        return [value for value in vars(self).values() if isinstance(value, Adam)]
+
     def on_restart(self) -> None:
-        """What follows episodes forgets them: the environments have been restarted."""
-        for part in vars(self).values():
-            if hasattr(part, "restart"):
-                part.restart()
+        """Forget the running episodes: the environments have been restarted."""
+
+    def on_warm_start(self) -> None:
+        """Follow `networks`, whose parameters have been loaded from another run."""
+
+    def per_step_methods(self) -> list[tuple[object, str]]:
+        """(owner, name) of the methods that are called all the time, always with the same shapes."""
+        return [(self.policy, "act")]
 
     def compile(self) -> None:
-        """Compile what is called at every step, from the next call on."""
-        for part in (self.policy, *vars(self).values()):
-            if hasattr(part, "make_native"):
-                part.make_native()
+        """Compile the gradient steps and `per_step_methods`, from the next call on."""
+        self.learn = Learner(self.learn, self.optimizers())
+        device = next(self.networks.parameters()).device
+        for owner, name in self.per_step_methods():
+            vars(owner)[name] = Compiled(getattr(owner, name), device)  # over the method of the class
+
+
+@dataclass(kw_only=True)
+class OnPolicyState(TrainState[ActorCritic]):
+    """The training state of the algorithms that learn from their newest rollout."""
+
+    reward_scale: RewardScale
+
+    def on_restart(self) -> None:
+        """Forget the running returns."""
+        self.reward_scale.on_restart()
+
+
+@dataclass(kw_only=True)
+class OffPolicyState(TrainState[Networks]):
+    """The training state of the algorithms that learn from a replay buffer."""
+
+    targets: Any
+    """target networks: copies that follow slowly"""
+    replay: ReplayBuffer
+    action_noise: ActionNoise
+    updates: int = 0
+    """gradient steps of the critics taken"""
+
+    def on_restart(self) -> None:
+        """Begin new sequences of action noise."""
+        self.action_noise.on_restart()
+
+    def on_warm_start(self) -> None:
+        """Copy the loaded networks into the targets."""
+        self.targets.load_state_dict(self.networks.target().state_dict())

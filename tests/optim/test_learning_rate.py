@@ -1,6 +1,6 @@
 import pytest
 
-from lemniscate.maths import adapt_to_kl, linear
+from lemniscate.optim.adam import adapt_to_kl, linear
 
 
 def test_the_learning_rate_falls_linearly_to_its_fraction():

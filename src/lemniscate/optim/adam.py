@@ -1,0 +1,166 @@
+"""Adam on one vector of parameters, and its learning rate over a run: Kingma & Ba 2015, arXiv:1412.6980.
+
+Small networks on a CPU are bound by the overhead of single operations, not by arithmetic. So all parameters lie in one
+vector: clipping and Adam are a few operations on one tensor. Inside a compiled call (`optim.learner`) the gradient is
+that of a pure function of the vector; elsewhere it comes from autograd. Both agree to rounding.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.func import functional_call, grad_and_value
+
+from lemniscate.optim.vector import ParameterVector
+from lemniscate.types import Loss, Metrics
+
+LossFunction = Callable[..., Loss]
+"""loss(networks, *args)"""
+
+
+def adam(
+    parameters: Tensor,
+    gradient: Tensor,
+    mean: Tensor,
+    square: Tensor,
+    scales: Tensor,
+    *,
+    betas: tuple[float, float],
+    eps: float,
+    max_grad_norm: float,
+) -> Tensor:
+    """Clipping of the gradient's norm, then one step of Adam, in place: Kingma & Ba 2015, algorithm 1.
+
+        g ← g · min(1, c / ‖g‖)
+        m ← β₁ m + (1 − β₁) g        v ← β₂ v + (1 − β₂) g²
+        θ ← θ − α m̂ / (√v̂ + ε),      m̂ = m / (1 − β₁ᵗ),  v̂ = v / (1 − β₂ᵗ)
+
+    Args:
+        parameters: θ [P], changed.
+        gradient: g [P].
+        mean: m [P], changed.
+        square: v [P], changed.
+        scales: α / (1 − β₁ᵗ) and 1 / √(1 − β₂ᵗ), which differ from step to step, [2].
+        betas: β₁ and β₂.
+        eps: ε.
+        max_grad_norm: c, which may be infinite.
+
+    Returns:
+        ‖g‖ before the clip, a scalar.
+    """
+    norm = gradient.square().sum().sqrt()
+    gradient = gradient * (max_grad_norm / (norm + 1e-6)).clamp(max=1)
+    mean.lerp_(gradient, 1 - betas[0])
+    square.lerp_(gradient.square(), 1 - betas[1])
+    parameters.sub_(scales[0] * mean / (square.sqrt() * scales[1] + eps))
+    return norm
+
+
+class Adam:
+    """Adam for the parameters of `networks`, which become views of one vector (`ParameterVector`).
+
+    Args:
+        networks: the module whose parameters move, already on its device. Other networks may take part in a loss.
+        betas: β₁ and β₂, usually 0.9 and 0.99 to 0.999.
+        eps: ε, usually 1e-8 to 1e-5.
+        max_grad_norm: the global gradient norm above which a gradient is scaled down; None leaves it free.
+        name: the ending of the metric `gradient_norm/name`, where an algorithm has several optimizers.
+    """
+
+    def __init__(
+        self,
+        networks: nn.Module,
+        *,
+        betas: tuple[float, float] = (0.9, 0.999),
+        eps: float = 1e-8,
+        max_grad_norm: float | None = None,
+        name: str | None = None,
+    ) -> None:
+        self.module = _Networks(networks)
+        self._parameters = ParameterVector(self.module)
+        self.vector = self._parameters.vector
+        self._gradient = torch.zeros_like(self.vector)
+        self._mean, self._square = torch.zeros_like(self.vector), torch.zeros_like(self.vector)
+        self._adam = partial(adam, betas=betas, eps=eps, max_grad_norm=max_grad_norm or math.inf)
+        self._log_betas = torch.tensor(betas, dtype=torch.float64, device=self.vector.device).log()
+        self._rates, self._powers = self._log_betas.new_ones(2), self._log_betas.new_tensor([-1, -0.5])
+        self._count = self._log_betas.new_zeros(1)
+        self._norm_name = f"gradient_norm/{name}" if name else "gradient_norm"
+        self._inputs = list(self.module.parameters())
+        for parameter, gradient in zip(self._inputs, self._parameters.views(self._gradient).values(), strict=True):
+            parameter.grad = gradient
+
+    @property
+    def learning_rate(self) -> float:
+        """α, the step size of every step from here on."""
+        return self._rates[0].item()
+
+    @learning_rate.setter
+    def learning_rate(self, learning_rate: float) -> None:
+        self._rates[0] = learning_rate
+
+    @property
+    def steps(self) -> int:
+        """The number of steps taken, t."""
+        return int(self._count)
+
+    def step(self, loss: LossFunction, *args: Any) -> Metrics:
+        """One step down `loss(networks, *args)`; returns the metrics of the loss, and the gradient's norm."""
+        if torch.compiler.is_compiling():
+            differentiate = grad_and_value(partial(functional_call, self.module, args=(loss, *args)), has_aux=True)
+            gradients, (_, metrics) = differentiate(self.views())
+            gradient = self._parameters.join(gradients)
+        else:
+            gradient = self._gradient.zero_()
+            total, metrics = self.module(loss, *args)
+            total.backward(inputs=self._inputs)
+        with torch.no_grad():
+            self._count.add_(1)
+            bias = 1 - (self._log_betas * self._count).exp()  # as a power, βᵗ would be computed for each parameter
+            norm = self._adam(
+                self.vector, gradient, self._mean, self._square, (self._rates * bias**self._powers).to(gradient)
+            )
+        return {**metrics, self._norm_name: norm}
+
+    def views(self) -> dict[str, Tensor]:
+        """The parameters of `module` by name, views of the vector as it is now."""
+        return self._parameters.views(self.vector)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """Adam's two moments and its count; the parameters belong to the networks."""
+        return {"mean": self._mean, "square": self._square, "steps": self._count}
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Restore what `state_dict` returned."""
+        self._mean.copy_(state["mean"])
+        self._square.copy_(state["square"])
+        self._count.copy_(state["steps"])
+
+
+def linear(start: float, final_fraction: float, progress: float) -> float:
+    """From `start` at progress 0 to `final_fraction` of it at progress 1, and no further."""
+    return start * (1 - (1 - final_fraction) * min(1.0, progress))
+
+
+def adapt_to_kl(learning_rate: float, kl: float, desired_kl: float) -> float:
+    """A smaller rate after an epoch that went twice too far, a larger one after one that went half as far.
+
+    The rule that Schulman et al. 2017, arXiv:1707.06347, section 4, have for the penalty β, applied to the step size;
+    by a factor of 1.5, within [1e-6, 1e-2].
+    """
+    factor = 1 / 1.5 if kl > 2 * desired_kl else 1.5 if kl < desired_kl / 2 else 1.0
+    return min(max(learning_rate * factor, 1e-6), 1e-2)
+
+
+class _Networks(nn.Module):
+    """A loss as a method of a module, so that `functional_call` can replace the parameters of its networks."""
+
+    def __init__(self, networks: nn.Module) -> None:
+        super().__init__()
+        self.networks = networks
+
+    def forward(self, loss: LossFunction, *args: Any) -> Loss:
+        return loss(self.networks, *args)
