@@ -1,6 +1,7 @@
 """The commands, as a person types them."""
 
 import json
+import re
 import subprocess
 import sys
 
@@ -10,6 +11,7 @@ import pytest
 
 import lemniscate as lem
 from conftest import tiny_fields
+from lemniscate.algos import find
 from lemniscate.cli import algorithms, main, parse
 from lemniscate.cli.fields import read
 
@@ -20,7 +22,7 @@ TINY = [
     for part in (f"--{name.replace('_', '-')}", value)
 ]
 
-ALGORITHMS = ("a2c", "ddpg", "ppo", "reinforce", "sac", "td3", "trpo")
+ALGORITHMS = ("reinforce", "a2c", "trpo", "ppo", "ddpg", "td3", "sac")
 
 
 class Broken(gym.Env):
@@ -158,24 +160,24 @@ def test_help_of_an_algorithm_is_its_own_fields_on_two_pages(algorithm, columns,
     assert main(["train", algorithm, "--help"]) == 0
     out = capsys.readouterr().out
     assert len(out.splitlines()) <= 120
-    assert ("--clip NUMBER" in out) == (algorithm == "ppo")
-    assert ("--tau NUMBER" in out) == (algorithm in ("ddpg", "td3", "sac"))
+    assert ("--clip FLOAT" in out) == (algorithm == "ppo")
+    assert ("--tau FLOAT" in out) == (algorithm in ("ddpg", "td3", "sac"))
     titles = [line for line in out.splitlines() if line.endswith(":") and not line.startswith(" ")]
     assert titles == ["options:", "run:", "environment:", "algorithm:", "networks:", "logging and checkpoints:"]
-    names = [field for field in lem.config_for(algorithm, "CartPole-v1").names() if field not in ("env", "env_kwargs")]
-    flags = [f"--{name.replace('_', '-')} " for name in names]
-    assert [f for f in flags if f not in out.replace("[no-]", "")] == []
+    flags = set(re.findall(r"--[a-z-]+", out.replace("[no-]", "")))
+    fields = {name for name in find(algorithm).Config.names() if name not in ("env", "env_kwargs")}
+    assert {f"--{name.replace('_', '-')}" for name in fields} <= flags
 
 
 def test_help_of_a_field_is_its_type_docstring_choices_and_default(capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "120")
     assert main(["train", "ppo", "--help"]) == 0
     out = " ".join(capsys.readouterr().out.split())
-    assert "--epochs INT passes over a rollout" in out
-    assert "--hidden INT [INT ...] widths" in out
-    assert "default 64 64)" in out
-    assert "(tanh, relu, elu, silu; default tanh)" in out
-    assert "--target-kl NUMBER|none" in out
+    assert "--epochs INT " in out
+    assert "--hidden INT … widths" in out
+    assert " [64 64] " in out
+    assert "{tanh, relu, elu, silu} [tanh]" in out
+    assert "--target-kl FLOAT|none" in out
 
 
 @pytest.mark.parametrize(
@@ -222,6 +224,10 @@ class Config(PPO):
 
     courage: float = 0.25
     """how bold the policy is"""
+
+
+def train(config, run):
+    """Nothing is learned here."""
 '''
 
 
@@ -231,8 +237,8 @@ def test_an_algorithm_of_ones_own_has_its_fields_in_its_help(tmp_path, monkeypat
     monkeypatch.syspath_prepend(tmp_path)
     assert main(["train", "bold", "--help"]) == 0
     out = capsys.readouterr().out
-    assert "--courage NUMBER               how bold the policy is (default 0.25)" in out
-    assert "--clip NUMBER" in out
+    assert "--courage FLOAT              how bold the policy is [0.25]" in out
+    assert "--clip FLOAT" in out
     assert parse(["train", "bold", "--courage", "1"]).fields == {"courage": 1}
 
 
@@ -242,15 +248,14 @@ def test_an_algorithm_of_ones_own_has_its_fields_in_its_help(tmp_path, monkeypat
         (["trian"], "There is no command 'trian': did you mean train?"),
         (["evaluat"], "There is no command 'evaluat': did you mean evaluate?"),
         (["--verion"], "The following arguments are required: COMMAND"),
-        (["train"], "Which algorithm? lemniscate train ALGORITHM …, with one of a2c, ddpg, ppo"),
+        (["train"], "Which algorithm? lemniscate train ALGORITHM …, with one of reinforce, a2c, trpo, ppo"),
         (["train", "pp", "--env", "CartPole-v1"], "There is no algorithm 'pp': did you mean ppo?"),
         (["train", "PPO", "--env", "CartPole-v1"], "There is no algorithm 'PPO': did you mean ppo?"),
         (["train", "ppo,sacc", "--seeds", "1-2"], "There is no algorithm 'sacc': did you mean sac"),
         (["train", "--seed", "3", "ppo"], "The algorithm comes first, then its fields: lemniscate train ppo"),
         (["train", "CartPole-v1", "ppo"], "The algorithm comes first, then its fields: lemniscate train ppo"),
-        (["train", "nowhere.to:Be"], "There is no module 'nowhere.to' that can be imported from here."),
-        (["train", "json"], "json is no algorithm: it has no Config"),
-        (["train", "json:Nothing"], "json has no Nothing."),
+        (["train", "nowhere.to"], "There is no algorithm 'nowhere.to'"),
+        (["train", "json"], "json is not an algorithm: it has no Config and no train."),
         (["train", "ppo"], "Which environment?"),
         (["train", "ppo", "--env", "CartPol-v1"], "There is no environment 'CartPol-v1': did you mean CartPole-v1"),
         (["train", "ppo", "--env"], "Argument --env: expected one argument"),

@@ -45,6 +45,7 @@ FIELDS = """
 `matmul` | – | – | – | – | `precision`, `amp`
 `run` | `tensorboard_log` | `exp_name` | `exp_name`, `output_dir` | `log_dir` | `logdir`, `save_path`, `run_name`
 `track` | – | `track` (yes or no) | – | `logger` | `wandb`, `use_wandb`
+`callbacks` | `callback` | – | – | – | `hooks`
 `seed` | `seed` | `seed` | `seed` | `seed` | `random_seed`
 `backend` | `vec_env_cls` | – | – | (environment's own) | `simulator`
 `device` | `device` | `cuda` | – | `device` | `gpu`
@@ -63,6 +64,7 @@ FIELDS = """
 `num_updates` | `gradient_steps` | 1, fixed | `update_every` | – | `utd`, `updates_per_step`
 `actor_learning_rate` | `learning_rate`, of both | `learning_rate`, `policy_lr` | `pi_lr` | – | `lr`, `actor_lr`
 `critic_learning_rate` | `learning_rate`, of both | `learning_rate`, `q_lr` | `q_lr`, `vf_lr` | – | `lr`, `critic_lr`
+`final_critic_learning_rate` | – | – | – | – | –
 `tau` | `tau` | `tau` | `polyak` (1 − tau) | – | `target_update_rate`
 `policy_delay` (policy and targets) | `policy_delay` | `policy_frequency` | `policy_delay` | – | `actor_update_interval`
 `action_noise` | `action_noise` | Gaussian, fixed | Gaussian, fixed | – | `noise`, `exploration`

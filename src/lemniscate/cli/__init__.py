@@ -14,6 +14,7 @@ from pathlib import Path
 from shutil import get_terminal_size
 from typing import Any, NoReturn
 
+from lemniscate.algos import ALGORITHMS
 from lemniscate.errors import NonFiniteError, SweepError, UserError, WorkerError, is_installed, unknown_name
 
 COMMANDS = {
@@ -68,10 +69,9 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
 
 def algorithms() -> dict[str, str]:
     """The algorithms, and the first line of each file, read from there: to import them is to import torch."""
-    texts = {file.stem: file.read_text() for file in sorted((Path(__file__).parents[1] / "algos").glob("*.py"))}
-    return {
-        name: text.removeprefix('"""').partition("\n")[0] for name, text in texts.items() if "\nclass Config(" in text
-    }
+    folder = Path(__file__).parents[1] / "algos"
+    lines = {name: (folder / f"{name}.py").read_text().partition("\n")[0] for name in ALGORITHMS}
+    return {name: line.removeprefix('"""') for name, line in lines.items()}
 
 
 def say(text: object, code: int = 0) -> int:
@@ -82,11 +82,9 @@ def say(text: object, code: int = 0) -> int:
 
 def add_train_options(parser: argparse.ArgumentParser) -> None:
     """What `lemniscate train` takes besides the fields of a Config."""
-    parser.add_argument(
-        "--env", metavar="ID", help="environment id, or module:Class of your own; a preset may have one"
-    )
-    parser.add_argument("--run", type=Path, metavar="DIR", help="run directory; must not exist (default: runs/…)")
-    parser.add_argument("--preset", metavar="NAME", help="tuned settings (default: those of the environment)")
+    parser.add_argument("--env", metavar="ID", help="environment id, or module:Class of your own")
+    parser.add_argument("--run", type=Path, metavar="DIR", help="run directory; must not exist [runs/…]")
+    parser.add_argument("--preset", metavar="NAME", help="tuned settings [those of the environment]")
     parser.add_argument("--seeds", metavar="LIST", help="train one run per seed, such as 1-5 or 1,3,7, in parallel")
     _add_endings(parser)
 
@@ -103,16 +101,16 @@ class Parser(argparse.ArgumentParser):
 
 
 class _Help(argparse.RawDescriptionHelpFormatter):
-    """A wide first column; --[no-]flag where there are both; description and epilog as they are."""
+    """A wide first column; --[no-]flag where there are both; `INT …` for several; the epilog as it is."""
 
     def __init__(self, prog: str) -> None:
-        super().__init__(prog, max_help_position=34, width=min(get_terminal_size((112, 24)).columns, 120) - 2)
+        super().__init__(prog, max_help_position=31, width=min(get_terminal_size((112, 24)).columns, 120) - 2)
 
     def _format_action_invocation(self, action: argparse.Action) -> str:
         if isinstance(action, argparse.BooleanOptionalAction):
             return action.option_strings[0].replace("--", "--[no-]", 1)
         if action.option_strings and action.nargs != 0:
-            return f"{action.option_strings[0]} {self._format_args(action, str(action.metavar))}"
+            return f"{action.option_strings[0]} {action.metavar}{' …' if action.nargs == '+' else ''}"
         return super()._format_action_invocation(action)
 
 
@@ -129,28 +127,31 @@ def _parsers() -> tuple[Parser, dict[str, Parser]]:
 
     sub = subs["evaluate"]
     sub.add_argument("run", type=Path, metavar="RUN", help="a run or a checkpoint")
-    sub.add_argument("--episodes", type=int, default=100, metavar="INT", help="how many (default: 100)")
-    sub.add_argument("--seed", type=int, default=0, metavar="INT", help="seed of the starts (default: 0)")
-    sub.add_argument("--env-args", metavar="JSON", help="arguments of the environment (default: as in training)")
-    sub.add_argument("--backend", metavar="NAME", help="simulation backend (default: as in training)")
+    sub.add_argument("--episodes", type=int, default=100, metavar="INT", help="how many [100]")
+    sub.add_argument("--seed", type=int, default=0, metavar="INT", help="seed of the starts [0]")
+    sub.add_argument("--env-args", metavar="JSON", help="arguments of the environment [as in training]")
+    sub.add_argument("--backend", metavar="NAME", help="simulation backend [as in training]")
     sub.add_argument("--json", action="store_true", help="print one JSON object on standard output")
 
     sub = subs["watch"]
     sub.add_argument("run", type=Path, metavar="RUN", help="a run or a checkpoint")
     sub.add_argument("--video", type=Path, metavar="FILE", help=".gif, .webp or .mp4 instead of a window")
-    sub.add_argument("--seed", type=int, default=0, metavar="INT", help="seed of the start (default: 0)")
+    sub.add_argument("--seed", type=int, default=0, metavar="INT", help="seed of the start [0]")
 
     subs["plot"].add_argument("runs", type=Path, nargs="+", metavar="RUN", help="runs or sweeps")
 
     subs["envs"].add_argument("filter", nargs="?", default="", metavar="FILTER", help="a part of the id")
 
     subs["check"].add_argument("env", metavar="ENV", help="an id, or module:Class of your own")
-    subs["check"].add_argument("--backend", metavar="NAME", help="simulation backend (default: chosen from the id)")
+    subs["check"].add_argument("--backend", metavar="NAME", help="simulation backend [chosen from the id]")
     return parser, subs
 
 
 def _add_endings(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--track", metavar="LOGGER", help="additional logger, such as wandb")
+    parser.add_argument("--track", metavar="LOGGER", help="additional logger: wandb, or module:Class of your own")
+    parser.add_argument(
+        "--callbacks", nargs="+", metavar="FUNCTION", help="module:function that sees each update and may stop the run"
+    )
     parser.add_argument("--report", action="store_true", help="evaluate the final policy, and draw plots and videos")
     parser.add_argument(
         "--score", action="store_true", help="evaluate the final policy over 100 episodes and store the result"

@@ -22,6 +22,8 @@ def train(given: argparse.Namespace) -> None:
     """Train one policy, or with --seeds one for each algorithm and seed."""
     shared = {"run": given.run, "preset": given.preset, "track": given.track, "report": given.report, **given.fields}
     if given.seeds is not None or "," in given.algorithm:
+        if given.callbacks:
+            raise UserError("--callbacks sees one run: it does not go with --seeds.")
         if "seed" in given.fields:
             raise UserError("Several runs have several seeds: --seeds 1-5, not --seed.")
         if given.seeds is None:
@@ -34,7 +36,7 @@ def train(given: argparse.Namespace) -> None:
     preset, _ = choose(given.algorithm, config.env, given.preset)
     what = f"{given.algorithm} on {config.num_envs} × {config.env}"
     say(f"{what}: backend {config.backend}, preset {preset}, seed {config.seed}")
-    run = api.train(given.algorithm, config.env, **shared)
+    run = api.train(given.algorithm, config.env, **shared, **_callbacks(given))
     if given.score:
         api.final_return(run.path)
     say(f"Trained in {run.seconds:.1f} s. Everything is in {run.path}")
@@ -42,10 +44,14 @@ def train(given: argparse.Namespace) -> None:
 
 def resume(given: argparse.Namespace) -> None:
     """Continue an interrupted run or sweep."""
-    go_on = sweep.resume_sweep if is_sweep(given.run) else api.resume
-    run = go_on(given.run, track=given.track, report=given.report)
-    if given.score and not is_sweep(given.run):
-        api.final_return(run.path)
+    if is_sweep(given.run):
+        if given.callbacks:
+            raise UserError(f"--callbacks sees one run: {given.run} is a sweep.")
+        run = sweep.resume_sweep(given.run, track=given.track, report=given.report)
+    else:
+        run = api.resume(given.run, track=given.track, report=given.report, **_callbacks(given))
+        if given.score:
+            api.final_return(run.path)
     say(f"Done. Everything is in {run.path}")
 
 
@@ -90,3 +96,8 @@ def check(given: argparse.Namespace) -> None:
         say(f"{MARKS[finding.grade]} {finding.sentence}")
     if bad:
         raise UserError(f"{given.env} is not suitable for training: {bad} finding{'s' * (bad > 1)} above.")
+
+
+def _callbacks(given: argparse.Namespace) -> dict[str, Any]:
+    names = [name for word in given.callbacks or () for name in word.split(",")]
+    return {"callbacks": names} if names else {}

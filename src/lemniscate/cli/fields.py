@@ -4,16 +4,14 @@ import argparse
 import ast
 import inspect
 import json
-import re
 from contextlib import nullcontext
-from importlib import import_module
 from itertools import pairwise
 from textwrap import dedent, fill
 from types import NoneType
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 from lemniscate import glossary
-from lemniscate.algos import ALGORITHMS
+from lemniscate.algos import find
 from lemniscate.cli import Parser, add_train_options, unknown_argument
 from lemniscate.errors import UserError, prefix_errors
 from lemniscate.presets import PRESETS, names
@@ -60,15 +58,6 @@ def parse_fields(algorithms: list[str], words: list[str]) -> argparse.Namespace:
             fields |= own
     given.command, given.algorithm, given.fields = "train", ",".join(algorithms), fields
     return given
-
-
-def config_class(algorithm: str) -> type[RunConfig]:
-    """The Config of an algorithm in the table, or of somebody's own `module` or `module:Name`."""
-    module = ALGORITHMS[algorithm] if algorithm in ALGORITHMS else _own(algorithm)
-    config = getattr(module, "Config", None)
-    if not (isinstance(config, type) and issubclass(config, RunConfig)):
-        raise UserError(f"{algorithm} is no algorithm: it has no Config that is a RunConfig.")
-    return config
 
 
 def flag(name: str) -> str:
@@ -126,11 +115,11 @@ def field_help(config: type[RunConfig]) -> dict[str, str]:
 
 
 def _parse(algorithm: str, words: list[str]) -> tuple[argparse.Namespace, dict[str, Any]]:
-    config = config_class(algorithm)
+    config = find(algorithm).Config
     hints = get_type_hints(config, include_extras=True)
     given, rest = _parser(algorithm, config, hints).parse_known_args(words)
     if rest:
-        known = {*config.names(), "run", "preset", "seeds", "track", "report", "score"}
+        known = [*config.names(), "run", "preset", "seeds", "track", "report", "score", "callbacks"]
         raise unknown_argument(rest, lambda word: glossary.unknown_field(word[2:].replace("-", "_"), known, flag))
     values = {name: value for name, value in vars(given).items() if name in hints and name != "env"}
     return given, {name: read(name, hints[name], value) for name, value in values.items()}
@@ -155,18 +144,19 @@ def _parser(algorithm: str, config: type[RunConfig], hints: dict[str, Any]) -> P
 
 
 def _presets(algorithm: str) -> str:
-    """What the presets of an algorithm are, and whose the defaults above are."""
+    """The presets of an algorithm, and what the brackets of its help mean."""
     listed = fill(f"presets: {', '.join(names(algorithm) if algorithm in PRESETS else ['default'])}", 110)
-    return f"{listed}\nThe defaults above are those of an environment that has no preset of its own."
+    return f"{listed}\n[…] is the default, where neither --preset nor the environment's own preset says otherwise."
 
 
 def _add(group: argparse._ArgumentGroup, name: str, hint: Any, text: str, default: Any) -> None:
     flags = list(dict.fromkeys([flag(name), f"--{name.replace('_', '-')}"]))
     options = options_of(hint)
     choices = [str(choice) for option in options if get_origin(option) is Literal for choice in get_args(option)]
-    facts = [", ".join(choices)] if choices else []
-    facts += [f"default {_shown(default)}"] if default not in ((), {}) else []
-    text = f"{text} ({'; '.join(facts)})" if facts else text
+    if choices:
+        text += f" {{{', '.join(choices)}}}"
+    if default not in ((), {}) and "(default" not in text:
+        text += f" [{_shown(default)}]"
     shared: dict[str, Any] = {"dest": name, "default": argparse.SUPPRESS, "help": text.replace("%", "%%")}
     if bool in options:
         group.add_argument(*flags, action=argparse.BooleanOptionalAction, **shared)
@@ -177,14 +167,14 @@ def _add(group: argparse._ArgumentGroup, name: str, hint: Any, text: str, defaul
 
 
 def _metavar(options: tuple[Any, ...]) -> str:
-    """INT, NUMBER, NAME or JSON; `|none` where nothing is a value too."""
+    """INT, FLOAT, NAME or JSON; `|none` where nothing is a value too."""
     kinds: list[str] = []
     for option in options:
         if get_origin(option) is tuple:
             kinds.append(_metavar(options_of(get_args(option)[0])))
         elif option is not NoneType:
             number = _number(option)
-            kinds.append("INT" if number is int else "NUMBER" if number else "JSON" if _is_dict(option) else "NAME")
+            kinds.append("INT" if number is int else "FLOAT" if number else "JSON" if _is_dict(option) else "NAME")
     return "|".join([*dict.fromkeys(kinds), *(["none"] if NoneType in options else [])])
 
 
@@ -219,17 +209,3 @@ def _split(word: str) -> list[str]:
         else:
             parts[-1] += character
     return [part.strip() for part in parts if part.strip()]
-
-
-def _own(algorithm: str) -> Any:
-    """Somebody's own algorithm: `module`, or `Name` in a module."""
-    module, _, name = algorithm.partition(":")
-    try:
-        found = import_module(module)
-    except ModuleNotFoundError as error:
-        if error.name is None or not re.match(rf"{re.escape(error.name)}(\.|$)", module):
-            raise
-        raise UserError(f"There is no module {module!r} that can be imported from here.") from None
-    if name and not hasattr(found, name):
-        raise UserError(f"{module} has no {name}.")
-    return getattr(found, name) if name else found

@@ -32,7 +32,8 @@ class Range:
 
     def __str__(self) -> str:
         if self.high < math.inf:
-            return f"{'above' if self.above else 'from'} {self.low:g} to {self.high:g}"
+            high = f"{self.high:,.0f}" if self.high >= 1e6 else f"{self.high:g}"
+            return f"{'above' if self.above else 'from'} {self.low:g} to {high}"
         return f"{'above' if self.above else 'at least'} {self.low:g}" if self.low > -math.inf else ""
 
 
@@ -79,7 +80,8 @@ def _convert(value: Any, option: Any) -> Any:
     """`value` as an `option` that is no union. Raises `ValueError` with what would be right."""
     kind = get_origin(option) or option
     if kind is Annotated or kind in (int, float):
-        return _number(value, *get_args(option)) if kind is Annotated else _number(value, kind)
+        number, *limits = get_args(option) if kind is Annotated else (kind,)
+        return _number(value, number, *(limit for limit in limits if isinstance(limit, Range)))
     if kind is NoneType:
         raise ValueError("None")
     if kind is Literal and value not in get_args(option):
@@ -90,6 +92,11 @@ def _convert(value: Any, option: Any) -> Any:
     for basic, wanted in ((bool, "True or False"), (str, "a text"), (dict, "a dictionary, such as {'gravity': -5}")):
         if kind is basic and not isinstance(value, basic):
             raise ValueError(wanted)
+    if kind is dict:
+        try:
+            json.dumps(value)
+        except TypeError:  # it could not be saved with the run
+            raise ValueError("a dictionary of what JSON can hold") from None
     return value
 
 
