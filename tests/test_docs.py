@@ -2,6 +2,7 @@
 
 import re
 import runpy
+import shlex
 from pathlib import Path
 
 import pytest
@@ -107,12 +108,12 @@ def test_the_pictures_of_training_are_drawn(name, fields):
 
 
 def test_every_command_of_the_readme_is_understood():
-    from lemniscate.cli import _parser
+    from lemniscate.cli import parse
 
     lines = re.findall(r"^lemniscate ([^#\n]+)", (ROOT / "README.md").read_text(), re.MULTILINE)
     assert len(lines) >= 6
     for line in lines:
-        _parser().parse_known_args(line.split())
+        parse(shlex.split(line))
 
 
 def test_every_field_has_its_docstring():

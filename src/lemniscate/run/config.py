@@ -3,14 +3,17 @@
 import dataclasses
 import json
 import math
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, Self, get_args, get_origin, get_type_hints
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Self, Union, get_args, get_origin, get_type_hints
 
 import torch
 
 from lemniscate.data.action_noise import ActionNoise, Kind
 from lemniscate.data.replay import bytes_per_transition
-from lemniscate.errors import UserError, unknown_name
+from lemniscate.errors import UserError
+from lemniscate.glossary import unknown_field
 from lemniscate.nn.activations import Activation
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.networks import Layers, Matmul, has_bfloat16
@@ -30,8 +33,9 @@ class Range:
 
     def __str__(self) -> str:
         if self.high < math.inf:
-            return f"{'above' if self.above else 'from'} {self.low:g} to {self.high:g}"
-        return f"{'above' if self.above else 'at least'} {self.low:g}"
+            high = f"{self.high:,.0f}" if self.high >= 1e6 else f"{self.high:g}"
+            return f"{'above' if self.above else 'from'} {self.low:g} to {high}"
+        return f"{'above' if self.above else 'at least'} {self.low:g}" if self.low > -math.inf else ""
 
 
 Count = Annotated[int, Range(1)]
@@ -42,6 +46,70 @@ Positive = Annotated[float, Range(0, above=True)]
 NonNegative = Annotated[float, Range(0)]
 Finite = Annotated[float, Range()]
 LogStd = Annotated[float, Range(-10, 5)]
+
+
+def options_of(hint: Any) -> tuple[Any, ...]:
+    """The types that a field may have: those of a union, or the one."""
+    return get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+
+
+def checked(name: str, value: Any, hint: Any) -> Any:
+    """`value` as the field `name` holds it.
+
+    NumPy's scalars and arrays become Python's, 1e6 a whole number where one is wanted, lists tuples.
+
+    Raises:
+        UserError: a value that no option of `hint` has room for.
+    """
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    options = options_of(hint)
+    if value is None and NoneType in options:
+        return None
+    wanted: list[str] = []
+    for option in options:
+        if get_origin(option) is tuple and isinstance(value, Iterable) and not isinstance(value, str | Mapping):
+            return tuple(checked(name, item, get_args(option)[0]) for item in value)
+        try:
+            return _convert(value, option)
+        except ValueError as error:
+            wanted.append(str(error))
+    raise UserError(f"{name} must be {' or '.join(wanted)}, not {value!r}.")
+
+
+def _convert(value: Any, option: Any) -> Any:
+    """`value` as an `option` that is no union. Raises `ValueError` with what would be right."""
+    kind = get_origin(option) or option
+    if kind is Annotated or kind in (int, float):
+        number, *limits = get_args(option) if kind is Annotated else (kind,)
+        return _number(value, number, *(limit for limit in limits if isinstance(limit, Range)))
+    if kind is NoneType:
+        raise ValueError("None")
+    if kind is Literal and value not in get_args(option):
+        raise ValueError(f"one of {', '.join(map(str, get_args(option)))}")
+    if kind is tuple:
+        several = "names, such as ('module:name',)" if get_args(option)[0] is str else "numbers, such as (64, 64)"
+        raise ValueError(f"several {several}")
+    for basic, wanted in ((bool, "True or False"), (str, "a text"), (dict, "a dictionary, such as {'gravity': -5}")):
+        if kind is basic and not isinstance(value, basic):
+            raise ValueError(wanted)
+    if kind is dict:
+        try:
+            json.dumps(value)
+        except TypeError:  # it could not be saved with the run
+            raise ValueError("a dictionary of what JSON can hold") from None
+    return value
+
+
+def _number(value: Any, kind: type, limits: Range = Range()) -> int | float:
+    """A finite number within `limits`; 1e6 is whole."""
+    if isinstance(value, int | float) and not isinstance(value, bool) and value in limits:
+        number = float(value)
+        if kind is float:
+            return number
+        if isinstance(value, int) or number.is_integer():
+            return int(value)
+    raise ValueError(f"{'a whole number' if kind is int else 'a number'} {limits}".strip())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,29 +149,7 @@ class RunConfig:
     def __post_init__(self) -> None:
         hints = get_type_hints(type(self), include_extras=True)
         for name in self.names():
-            value, hint = getattr(self, name), hints[name]
-            if get_origin(hint) is not tuple:
-                self._check(name, value, hint)
-            elif isinstance(value, (tuple, list)):
-                for item in value:
-                    self._check(name, item, get_args(hint)[0])
-            else:
-                raise UserError(f"{name} must be several numbers, such as (64, 64), not {value!r}.")
-
-    @staticmethod
-    def _check(name: str, value: Any, hint: Any) -> None:
-        options = [hint] if get_origin(hint) in (Annotated, Literal) else get_args(hint)
-        if value is None and type(None) in options:
-            return
-        for option in options:
-            if get_origin(option) is Literal and value not in get_args(option):
-                raise UserError(f"{name} must be one of {', '.join(get_args(option))}, not {value!r}.")
-            if get_origin(option) is Annotated:
-                kind, limits = get_args(option)
-                number = isinstance(value, int if kind is int else (int, float)) and not isinstance(value, bool)
-                if not (number and value in limits):
-                    what = "a whole number" if kind is int else "a number"
-                    raise UserError(f"{name} must be {what} {limits}, not {value!r}.")
+            object.__setattr__(self, name, checked(name, getattr(self, name), hints[name]))
 
     @property
     def gradient_steps(self) -> int:
@@ -122,7 +168,7 @@ class RunConfig:
         """A copy with some fields changed. Raises `UserError` for an unknown field or a value out of range."""
         for name in changes:
             if name not in self.names():
-                raise unknown_name("field", name, self.names())
+                raise unknown_field(name, self.names())
         return dataclasses.replace(self, **changes)
 
     @classmethod
@@ -136,8 +182,11 @@ class RunConfig:
 
     @classmethod
     def from_json(cls, record: dict[str, Any]) -> Self:
-        """The Config that `to_json` came from."""
-        return cls().replace(**{k: tuple(v) if isinstance(v, list) else v for k, v in record.items()})
+        """The Config that `to_json` came from. Raises `UserError` for one that another version wrote."""
+        strangers = [name for name in record if name not in cls.names()]
+        if strangers:
+            raise UserError(f"This was written by another version of lemniscate: there is no field {strangers[0]} now.")
+        return cls().replace(**record)
 
 
 @dataclass(frozen=True, kw_only=True)
