@@ -16,7 +16,7 @@ from lemniscate.console import say
 from lemniscate.envs import registry
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError, is_installed, missing_extra, unknown_name
-from lemniscate.objects import find_object
+from lemniscate.objects import find_object, name_of
 from lemniscate.policy import TrainedPolicy
 from lemniscate.report import compare, curves, playback
 from lemniscate.report import pictures as pictures_of
@@ -53,12 +53,12 @@ def config_for(
     Raises:
         UserError: an unknown algorithm, environment, preset or field, or a value out of range.
     """
-    algorithm = algos.name_of(algos.find(algorithm))
+    algorithm = algos.name_of(algorithm)
     name, config = presets.choose(algorithm, env, preset)
     if name == "default" and env is None:
         raise UserError("Which environment? Name one with env; `lemniscate envs` lists them.")
     served_by = registry.backend_for(config.env)
-    config = config.replace(**fields)
+    config = config.replace(**{name: name_of(x) if callable(x) else x for name, x in fields.items()})
     return config if config.backend else config.replace(backend=served_by)
 
 
@@ -103,7 +103,7 @@ def train(
     Raises:
         UserError: see `config_for`; a run directory that exists.
     """
-    algorithm = algos.name_of(algos.find(algorithm))
+    algorithm = algos.name_of(algorithm)
     config = config_for(algorithm, env, preset, **fields)
     path = Path(run) if run is not None else fresh_directory(config.env, f"{algorithm}-{config.seed}")
     loggers = loggers_with(track)
