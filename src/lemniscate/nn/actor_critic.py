@@ -131,7 +131,7 @@ def _encoder(spec: Spec) -> tuple[nn.Module, int]:
     """What an observation goes through first, and how many numbers come out."""
     if not spec.image:
         return nn.Identity(), spec.observation_size
-    height, width, channels = spec.layout[0].shape
+    height, width, channels = spec.observation_parts[0].shape
     encoder = ImageEncoder((height, width, channels))
     return encoder, encoder.size
 

@@ -3,7 +3,7 @@
 import dataclasses
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal, Self, get_args, get_origin, get_type_hints
 
 from lemniscate.data.action_noise import Noise
@@ -66,6 +66,10 @@ class RunConfig:
     """episodes of each evaluation"""
     video_every: Natural = 0
     """steps between recordings of an episode into videos/step-N; 0 records none"""
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    """arguments of the environment, as JSON: '{"dynamics": "first_principles"}'"""
+    wrappers: tuple[str, ...] = ()
+    """wrappers of each environment, the first innermost: module:name or module:name(key=value)"""
 
     def __post_init__(self) -> None:
         hints = get_type_hints(type(self), include_extras=True)
