@@ -6,8 +6,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from lemniscate import named
 from lemniscate.errors import UserError, unknown_name
-from lemniscate.objects import find_object
 
 ALGORITHMS = ("reinforce", "a2c", "trpo", "ppo", "ddpg", "td3", "sac")
 
@@ -41,7 +41,7 @@ def name_of(algorithm: str | ModuleType) -> str:
 
 def _import(name: str) -> Any:
     if ":" in name:
-        return find_object(name, "algorithm")
+        return named.find(name)
     if str(Path.cwd()) not in sys.path:
         sys.path.insert(0, str(Path.cwd()))
     try:

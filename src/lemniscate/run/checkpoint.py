@@ -136,8 +136,8 @@ def spec_from_json(record: dict[str, Any]) -> Spec:
     """The Spec that `spec_to_json` came from."""
     action = _tuples(record["action"])
     kind = {k.__name__: k for k in get_args(Action)}[action.pop("kind")]
-    layout = tuple(ObservationPart(**_tuples(part)) for part in record["layout"])
-    return Spec(**{**_tuples(record), "action": kind(**action), "layout": layout})
+    parts = tuple(ObservationPart(**_tuples(part)) for part in record["observation_parts"])
+    return Spec(**{**_tuples(record), "action": kind(**action), "observation_parts": parts})
 
 
 def _tuples(record: dict[str, Any]) -> dict[str, Any]:
