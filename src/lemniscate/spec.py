@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 from lemniscate.errors import UserError
 
@@ -87,7 +88,7 @@ class ObservationPart:
         """The path as one word."""
         return "/".join(map(str, self.path)) or "obs"
 
-    @property
+    @cached_property
     def size(self) -> int:
         """How many numbers it is in the flat observation."""
         return sum(self.nvec) if self.nvec else math.prod(self.shape)
