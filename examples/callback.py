@@ -1,6 +1,6 @@
 """A callback: it sees the step, the metrics and the policy after every update, and may stop the run.
 
-    python examples/callback.py
+python examples/callback.py
 """
 
 from collections.abc import Mapping

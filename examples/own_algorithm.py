@@ -23,9 +23,9 @@ from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.optim.adam import Adam
 from lemniscate.presets.preset import Preset
-from lemniscate.run.config import Count, Fraction, NonNegative, OnPolicyConfig, Positive
+from lemniscate.run.config import Count, Fraction, NonNegative, Positive
+from lemniscate.run.on_policy import OnPolicyConfig, OnPolicyState
 from lemniscate.run.run import Run
-from lemniscate.run.state import Generators, OnPolicyState
 from lemniscate.spec import Spec
 from lemniscate.types import Batch, Loss, Metrics, Rollout
 
@@ -70,7 +70,7 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
         networks=networks,
         optimizer=optimizer,
         reward_scale=RewardScale(config.num_envs, config.gamma).to(device),
-        rng=Generators(config.seed, device),
+        rng=config.generators(device),
         learn=learn,
     )
 

@@ -1,10 +1,10 @@
-"""An environment of one's own with arguments, and a wrapper around it.
+r"""An environment of one's own with arguments, and a wrapper around it.
 
-    cd examples
-    lemniscate check own_environment:Balance
-    lemniscate train sac --env own_environment:Balance --env-args '{"wind": 0.5}' \\
+cd examples
+lemniscate check own_environment:Balance
+lemniscate train sac --env own_environment:Balance --env-args '{"wind": 0.5}' \
         --wrappers 'own_environment:scaled(factor=0.1)' --total-steps 10_000
-    python own_environment.py
+python own_environment.py
 """
 
 import gymnasium as gym

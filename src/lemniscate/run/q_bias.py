@@ -7,7 +7,8 @@ import torch
 from torch import Generator, Tensor, nn
 
 from lemniscate.nn.actor_critic import ActorQ
-from lemniscate.run.config import OffPolicyConfig, RunConfig
+from lemniscate.run.config import RunConfig
+from lemniscate.run.off_policy import OffPolicyConfig
 from lemniscate.types import Step
 
 

@@ -2,7 +2,7 @@
 
 import os
 import random
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 
 import numpy as np
@@ -65,3 +65,22 @@ def derive(seed: int, *path: int) -> int:
 def generator(seed: int, device: torch.device, *path: int) -> torch.Generator:
     """A random generator of a run's own, seeded with `derive(seed, *path)`; as a field of `State` it is saved."""
     return torch.Generator(device).manual_seed(derive(seed, *path))
+
+
+class Generators:
+    """The random generators of a run, each with its own stream of the run's seed."""
+
+    def __init__(self, seed: int, device: torch.device) -> None:
+        self.action = generator(seed, device, 2)
+        """of the policy's actions, and of the noise in losses"""
+        self.minibatch = generator(seed, device, 3)
+        """of the rows of minibatches"""
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        """The state of each generator."""
+        return {name: stream.get_state() for name, stream in vars(self).items()}
+
+    def load_state_dict(self, states: Mapping[str, torch.Tensor]) -> None:
+        """Restore what `state_dict` returned."""
+        for name, stream in vars(self).items():
+            stream.set_state(states[name])
