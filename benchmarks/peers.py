@@ -40,19 +40,16 @@ print(int(sys.argv[2]) / (time.perf_counter() - started))
 REPLAY = """
 import json, sys, tempfile
 import lemniscate as lem
-from lemniscate.run.loggers import LOGGERS
 
-class Turns:
-    def __init__(self, *_): pass
-    def write(self, *_):  # every 500 steps
-        print(flush=True)
-        sys.stdin.readline() or sys.exit()
-    def close(self, *_): pass
+def wait_for_turn(*_):  # every 500 steps
+    print(flush=True)
+    sys.stdin.readline() or sys.exit()
 
-LOGGERS["jsonl"] = Turns
+fields = json.loads(sys.argv[1])
 sys.stdin.readline()
 with tempfile.TemporaryDirectory() as scratch:
-    lem.train("ddpg", "Hopper-v5", preset="default", run=scratch + "/run", progress=False, **json.loads(sys.argv[1]))
+    path = scratch + "/run"
+    lem.train("ddpg", "Hopper-v5", preset="default", run=path, progress=False, callbacks=[wait_for_turn], **fields)
 """
 
 PEER_REPLAY = """

@@ -1,27 +1,31 @@
 """The front door: train, resume, load, evaluate, watch, plot, make_envs."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import torch
 
-from lemniscate import presets
-from lemniscate.algos import ALGORITHMS
+from lemniscate import algos, presets
+from lemniscate.callbacks import Callback, watch_with
+from lemniscate.console import say
 from lemniscate.envs import registry
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError, is_installed, missing_extra, unknown_name
+from lemniscate.objects import find_object
 from lemniscate.policy import TrainedPolicy
 from lemniscate.report import compare, curves, playback
 from lemniscate.report import pictures as pictures_of
 from lemniscate.run import checkpoint
 from lemniscate.run.config import RunConfig
-from lemniscate.run.directory import is_finished, newest, read_config, require_absent
+from lemniscate.run.directory import find_checkpoint, is_finished, read_config, require_absent
 from lemniscate.run.evaluate import Evaluation
 from lemniscate.run.evaluate import evaluate as evaluate_module
-from lemniscate.run.loggers import LOGGERS, read_metrics
+from lemniscate.run.loggers import TRACKERS, JsonLines, LoggerClass, TensorBoard, read_metrics
 from lemniscate.run.q_bias import critic_of
 from lemniscate.run.run import Run
 from lemniscate.run.seeding import set_seeds
@@ -34,21 +38,22 @@ FINAL_EPISODES = 100
 
 @dataclass(frozen=True)
 class TrainedRun:
-    """What `train` leaves: the run directory, the final policy, and how long the training loop took."""
+    """The result of `train` and `resume`: the run directory, the final policy, the seconds of the training loop."""
 
     path: Path
     policy: TrainedPolicy
     seconds: float
 
 
-def config_for(algorithm: str, env: str | None = None, preset: str | None = None, **fields: object) -> RunConfig:
+def config_for(
+    algorithm: str | ModuleType, env: str | None = None, preset: str | None = None, **fields: object
+) -> RunConfig:
     """The Config of a preset, with some fields changed.
 
     Raises:
         UserError: an unknown algorithm, environment, preset or field, or a value out of range.
     """
-    if algorithm not in ALGORITHMS:
-        raise unknown_name("algorithm", algorithm, ALGORITHMS)
+    algorithm = algos.name_of(algos.find(algorithm))
     name, config = presets.choose(algorithm, env, preset)
     if name == "default" and env is None:
         raise UserError("Which environment? Name one with env; `lemniscate envs` lists them.")
@@ -68,31 +73,37 @@ def make_envs(config: RunConfig) -> tuple[VecEnv, VecEnv]:
 
 
 def train(
-    algorithm: str,
+    algorithm: str | ModuleType,
     env: str | None = None,
     *,
     run: str | Path | None = None,
     preset: str | None = None,
-    track: str | None = None,
+    track: str | LoggerClass | None = None,
+    callbacks: Sequence[Callback | str] = (),
     report: bool = False,
     progress: bool = True,
     **fields: object,
 ) -> TrainedRun:
-    """Train a policy from nothing.
+    """Train a policy.
 
     Args:
-        algorithm: a name in `lemniscate.algos.ALGORITHMS`.
+        algorithm: a name in `lemniscate.algos.ALGORITHMS`; a module of your own, or its name.
         env: the environment's id; a preset may have one of its own.
         run: where to keep everything; by default a new directory under `runs/`.
         preset: by name; the best known for the environment unless given.
-        track: a logger beside the local ones: "wandb"; it gets the final pictures too.
-        report: evaluate the result, and draw it into `plots/` and `videos/`.
+        track: a logger beside the local ones: "wandb", the `module:Class` of your own, or the class itself; it gets
+            the final pictures too.
+        callbacks: functions of (step, metrics, policy), or their names as `module:function`. They are called after
+            each logged line with a read-only view of its metrics and a copy of the policy, and can change nothing in
+            the run; one that returns True stops it, saved. An exception that one raises also leaves it saved.
+        report: evaluate the final policy, and draw it into `plots/` and `videos/`.
         progress: the live line on standard error.
-        **fields: any field of the algorithm's Config, such as seed or total_steps.
+        **fields: any field of the algorithm's Config, such as seed, total_steps or warm_start.
 
     Raises:
         UserError: see `config_for`; a run directory that exists.
     """
+    algorithm = algos.name_of(algos.find(algorithm))
     config = config_for(algorithm, env, preset, **fields)
     path = Path(run) if run is not None else fresh_directory(config.env, f"{algorithm}-{config.seed}")
     loggers = loggers_with(track)
@@ -101,19 +112,27 @@ def train(
     envs = make_envs(config)
     if config.video_every:
         playback.require_pictures(envs[0].spec)
-    return _train(path, algorithm, config, envs, loggers, report or track is not None, progress)
+    return _train(path, algorithm, config, envs, loggers, callbacks, report or track is not None, progress)
 
 
-def resume(run: str | Path, *, track: str | None = None, report: bool = False, progress: bool = True) -> TrainedRun:
-    """Go on with an interrupted run, from its newest planned checkpoint that is whole, to its end."""
+def resume(
+    run: str | Path,
+    *,
+    track: str | LoggerClass | None = None,
+    callbacks: Sequence[Callback | str] = (),
+    report: bool = False,
+    progress: bool = True,
+) -> TrainedRun:
+    """Resume an interrupted run from its newest whole planned checkpoint, and train it to its end.
+
+    The arguments are those of `train`, and are not saved with the run.
+    """
     path = Path(run)
     algorithm, fields = read_config(path)
-    if algorithm not in ALGORITHMS:
-        raise unknown_name("algorithm", algorithm, ALGORITHMS)
-    config = ALGORITHMS[algorithm].Config.from_json(fields)
+    config = algos.find(algorithm).Config.from_json(fields)
     loggers = loggers_with(track)
     set_seeds(config.seed)
-    return _train(path, algorithm, config, make_envs(config), loggers, report or track is not None, progress)
+    return _train(path, algorithm, config, make_envs(config), loggers, callbacks, report or track is not None, progress)
 
 
 def load(path: str | Path) -> TrainedPolicy:
@@ -122,17 +141,9 @@ def load(path: str | Path) -> TrainedPolicy:
     Raises:
         UserError: neither a run nor a checkpoint, or a run without a whole checkpoint; a damaged checkpoint.
     """
-    path = Path(path)
-    if (path / "manifest.json").exists():
-        found = checkpoint.read(path)
-    else:
-        read_config(path)
-        found = newest(path)
-        if found is None:
-            raise UserError(f"{path} has no checkpoint that can be read yet.")
-    record = found.record
-    spec = checkpoint.spec_from_json(record["spec"])
-    config = ALGORITHMS[record["algorithm"]].Config.from_json(record["config"])
+    found = find_checkpoint(Path(path))
+    algorithm, spec = algos.find(found.record["algorithm"]), checkpoint.spec_from_json(found.record["spec"])
+    config = algorithm.Config.from_json(found.record["config"])
     networks = config.networks(spec)
     networks.load_state_dict(found.part("networks"))
     return TrainedPolicy(networks, spec, config, found.numbers["step"])
@@ -230,13 +241,13 @@ def plot(*runs: str | Path) -> list[Path]:
 
 
 def final_return(run: str | Path) -> float:
-    """Mean return of a run's newest policy over 100 episodes; kept in its `final.json` while there is no newer."""
+    """Mean return of a run's newest policy over 100 episodes; kept in `final.json` until there is a newer policy."""
     path = Path(run)
     file = path / "final.json"
     known: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {}
     if known.get("step") not in checkpoint.list_steps(path / "checkpoints")[-1:]:
         policy = load(path)
-        pictures_of.say(f"Evaluating {path}: {FINAL_EPISODES} episodes.")
+        say(f"Evaluating {path}: {FINAL_EPISODES} episodes.")
         scores = evaluate(policy, episodes=FINAL_EPISODES, seed=0)
         known = {"step": policy.step, "seed": 0, **scores.to_json()}
         temporary = file.with_suffix(".tmp")
@@ -246,13 +257,13 @@ def final_return(run: str | Path) -> float:
 
 
 def _final_returns(runs: list[Path]) -> dict[Path, float]:
-    """Of the finished ones; what cannot be evaluated here is told, and left out."""
+    """The final returns of the finished runs; a line names each run that cannot be evaluated here."""
     returns: dict[Path, float] = {}
     for run in filter(is_finished, runs):
         try:
             returns[run] = final_return(run)
         except UserError as error:
-            pictures_of.say(f"{run} has no final return: {error}")
+            say(f"{run} has no final return: {error}")
     return returns
 
 
@@ -271,30 +282,37 @@ def _train(
     algorithm: str,
     config: RunConfig,
     envs: tuple[VecEnv, VecEnv],
-    loggers: tuple[str, ...],
+    loggers: tuple[LoggerClass, ...],
+    callbacks: Sequence[Callback | str],
     draw: bool,
     progress: bool,
 ) -> TrainedRun:
+    module, spec = algos.find(algorithm), envs[0].spec
     torch.set_num_threads(config.threads)
 
-    def film(state: TrainState) -> None:
-        networks = config.networks(run.spec)
+    def copy_networks(state: TrainState) -> Any:
+        networks = config.networks(spec)
         networks.load_state_dict(state.networks.state_dict())
-        policy = TrainedPolicy(networks, run.spec, config, state.step)
+        return networks
+
+    def film(state: TrainState) -> None:
         kind = "mp4" if is_installed("imageio_ffmpeg") else "gif"
+        policy = TrainedPolicy(copy_networks(state), spec, config, state.step)
         watch(policy, video=path / "videos" / f"step-{state.step}.{kind}")
 
-    run = Run(path, algorithm, config, envs, loggers=loggers, progress=progress, film=film)
+    watcher = watch_with(callbacks, copy_networks, spec, config) if callbacks else None
+    run = Run(path, algorithm, config, envs, loggers=loggers, progress=progress, film=film, watch=watcher)
     pictures: list[Path] = []
     try:
-        run.announce()
-        state = ALGORITHMS[algorithm].train(config, run)
+        for notice in config.notices(spec, envs[0].device) if progress else ():
+            say(notice)
+        state = module.train(config, run)
         if draw:
             critic = critic_of(state.networks, config)
             pictures = pictures_of.report(state.policy, run.eval_env, path, config.evaluate_episodes, critic)
     finally:
         run.close(pictures)
-    return TrainedRun(path, TrainedPolicy(state.networks.cpu(), run.spec, config, state.step), run.seconds)
+    return TrainedRun(path, TrainedPolicy(state.networks.cpu(), spec, config, state.step), run.seconds)
 
 
 def _drones(policy: TrainedPolicy) -> VecEnv:
@@ -320,17 +338,17 @@ def _evaluation_env(env_id: str, config: RunConfig, episodes: int, device: str, 
     return registry.make(env_id, copies, device=device, backend=backend)
 
 
-def loggers_with(track: str | None) -> tuple[str, ...]:
-    """The local loggers, and the one asked for. Raises `UserError` if there is no such, or it is not installed."""
-    always = ("jsonl", "tensorboard")
-    trackers = [name for name in LOGGERS if name not in always]
+def loggers_with(track: str | LoggerClass | None) -> tuple[LoggerClass, ...]:
+    """The local loggers, and the tracker asked for. Raises `UserError` if it does not exist or is not installed."""
     if track is None:
-        return always
-    if track not in trackers:
-        raise unknown_name("tracker", track, trackers)
-    if not is_installed(track):
-        raise missing_extra(track, track)
-    return (*always, track)
+        return JsonLines, TensorBoard
+    if isinstance(track, str) and ":" not in track:
+        if track not in TRACKERS:
+            raise unknown_name("tracker", track, TRACKERS)
+        extra, track = TRACKERS[track]
+        if not is_installed(extra):
+            raise missing_extra(extra, extra)
+    return JsonLines, TensorBoard, find_object(track, "tracker") if isinstance(track, str) else track
 
 
 def device_for(name: str) -> torch.device:

@@ -33,7 +33,8 @@ def check_names(algorithm: str | ModuleType, folder: Path, **settings: Any) -> N
     module = algos.find(algorithm)
     for name, base in (("Config", RunConfig), ("State", TrainState)):
         kind = getattr(module, name, None)
-        assert inspect.isclass(kind) and issubclass(kind, base), f"{name} must be a subclass of {base.__name__}."
+        assert inspect.isclass(kind), f"There is no class {name}."
+        assert issubclass(kind, base), f"{name} must be a subclass of {base.__name__}."
         assert dataclasses.is_dataclass(kind), f"{name} must be a dataclass."
     for name, expected in SIGNATURES.items():
         function = getattr(module, name, None)
@@ -84,7 +85,9 @@ def check_compilation(algorithm: str | ModuleType, folder: Path, **settings: Any
         rows.append({name: x for name, x in read_metrics(path)[0].items() if name.startswith("losses/")})
     off, on = rows
     for name, value in off.items():
-        assert math.isclose(value, on[name], rel_tol=1e-3, abs_tol=1e-5), f"Compiled, {name} is {on[name]}, not {value}."
+        assert math.isclose(value, on[name], rel_tol=1e-3, abs_tol=1e-5), (
+            f"Compiled, {name} is {on[name]}, not {value}."
+        )
 
 
 ALGORITHM_CONTRACT = (check_names, check_training, check_seeds, check_resume)

@@ -1,6 +1,7 @@
 """The contract of the environment floor: what a backend provides, and `VecEnv`, which is what the floors above see."""
 
 import math
+import time
 from typing import Protocol
 
 import torch
@@ -38,6 +39,24 @@ PATIENCE = 20_000
 """steps that an episode may take in an environment without a time limit, where whole ones are wanted"""
 
 
+class Stopwatch:
+    """Seconds spent inside its `with` blocks."""
+
+    def __init__(self) -> None:
+        self._began, self._seconds = 0.0, 0.0
+
+    def __enter__(self) -> None:
+        self._began = time.perf_counter()
+
+    def __exit__(self, *_: object) -> None:
+        self._seconds += time.perf_counter() - self._began
+
+    def take(self) -> float:
+        """The seconds since the last call."""
+        seconds, self._seconds = self._seconds, 0.0
+        return seconds
+
+
 class VecEnv:
     """A backend with its current observation and the books of its episodes."""
 
@@ -47,6 +66,8 @@ class VecEnv:
         self.num_envs = backend.num_envs
         self.device = backend.device
         self.obs = torch.empty(0)
+        self.collecting = Stopwatch()
+        """seconds that the functions of `data` spend acting and stepping"""
 
     def restart(self, seed: int, steps: int = 0) -> Tensor:
         """Begin anew from `seed`; also stored as `obs`, [N, O]. `steps` is what the run has taken so far."""

@@ -17,6 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.axis import YAxis
 from matplotlib.figure import Figure
 
+from lemniscate.console import say
 from lemniscate.envs.registry import file_name
 from lemniscate.report.curves import (
     COLORS,
@@ -28,7 +29,6 @@ from lemniscate.report.curves import (
     smooth,
     training_minutes,
 )
-from lemniscate.report.pictures import say
 from lemniscate.report.seeds import (
     bootstrap_interval,
     improvement_interval,

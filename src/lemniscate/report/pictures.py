@@ -1,8 +1,8 @@
 """Everything a finished run is shown with: numbers in a sentence, plots, an animation."""
 
-import sys
 from pathlib import Path
 
+from lemniscate.console import say
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.nn.actor_critic import ActorQ
 from lemniscate.nn.policies import Policy
@@ -40,11 +40,6 @@ def report(
     if env.spec.tracking:
         say(film_flight(policy, env, path / "videos" / "flight.gif", seed=0))
     return pictures
-
-
-def say(text: object) -> None:
-    """Tell a person."""
-    print(text, file=sys.stderr, flush=True)
 
 
 def draw_flight(policy: Policy, env: VecEnv, folder: Path, flights: int, seed: int) -> list[Path]:

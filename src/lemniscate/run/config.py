@@ -11,11 +11,12 @@ from typing import Annotated, Any, Literal, Self, Union, get_args, get_origin, g
 import torch
 
 from lemniscate.data.action_noise import ActionNoise, Kind
+from lemniscate.data.replay import bytes_per_transition
 from lemniscate.errors import UserError
 from lemniscate.glossary import unknown_field
 from lemniscate.nn.activations import Activation
 from lemniscate.nn.actor_critic import ActorCritic
-from lemniscate.nn.networks import Layers, Matmul
+from lemniscate.nn.networks import Layers, Matmul, has_bfloat16
 from lemniscate.spec import Spec
 
 
@@ -142,6 +143,8 @@ class RunConfig:
     """episodes of each evaluation"""
     video_every: Natural = 0
     """steps between recordings of an episode into videos/step-N; 0: none"""
+    warm_start: str | None = None
+    """run or checkpoint whose networks this run begins with"""
 
     def __post_init__(self) -> None:
         hints = get_type_hints(type(self), include_extras=True)
@@ -156,6 +159,10 @@ class RunConfig:
     def networks(self, spec: Spec) -> Any:
         """New networks for the spaces in `spec`, a module with a `policy`. Raises `UserError` if they do not fit."""
         raise NotImplementedError
+
+    def notices(self, spec: Spec, device: torch.device) -> list[str]:
+        """Sentences that a person should read before a run of this Config starts."""
+        return []
 
     def replace(self, **changes: object) -> Self:
         """A copy with some fields changed. Raises `UserError` for an unknown field or a value out of range."""
@@ -302,6 +309,14 @@ class OffPolicyConfig(RunConfig):
                     f" {self.buffer_size:,} and the {self.num_envs * self.steps_per_env:,} steps of the run is"
                     f" below {name} {rows:,}."
                 )
+
+    def notices(self, spec: Spec, device: torch.device) -> list[str]:
+        """The size of the replay buffer; and products in bfloat16 where the processor has none."""
+        size = self.capacity * bytes_per_transition(spec) / 1e6
+        notices = [f"Replay buffer: {self.capacity:,} transitions, {size:,.1f} MB (also in each checkpoint)."]
+        if self.matmul == "bfloat16" and not has_bfloat16(device):
+            notices.append("This processor has no products in bfloat16; --matmul float32 is faster.")
+        return notices
 
     @property
     def network_settings(self) -> tuple[Layers, Layers, bool]:

@@ -1,4 +1,4 @@
-"""Randomness with names. One run seed; everything else is derived from it."""
+"""Random generators and their seeds, which are all derived from the one seed of the run."""
 
 import os
 import random
@@ -35,30 +35,33 @@ def set_seeds(seed: int, deterministic: bool = True) -> None:
 
 
 def seed_globals(seed: int) -> None:
-    """The generators that belong to nobody: Python's, NumPy's old one, torch's on every device."""
+    """Seed the global generators: Python's, NumPy's legacy one, torch's on every device."""
     random.seed(seed)
-    np.random.seed(seed)  # noqa: NPY002  (other people's environments use it)
+    np.random.seed(seed)  # noqa: NPY002  (users' environments may draw from it)
     torch.manual_seed(seed)
     torch.cuda.manual_seed_all(seed)
 
 
 @contextmanager
 def globals_undisturbed() -> Iterator[None]:
-    """Whatever happens inside, Python's, NumPy's and torch's CPU generators go on afterwards as if it had not."""
+    """Restore the global generators afterwards: Python's, NumPy's legacy one, torch's on the CPU and on every GPU."""
     states = random.getstate(), np.random.get_state(), torch.get_rng_state()  # noqa: NPY002
+    gpus = torch.cuda.get_rng_state_all() if torch.cuda.is_initialized() else []
     try:
         yield
     finally:
         random.setstate(states[0])
         np.random.set_state(states[1])  # noqa: NPY002
         torch.set_rng_state(states[2])
+        if gpus:
+            torch.cuda.set_rng_state_all(gpus)
 
 
 def derive(seed: int, *path: int) -> int:
-    """A seed in 0 … 2³¹ − 1 for one use, unrelated to that of any other (seed, path): NumPy's SeedSequence."""
+    """A seed in 0 … 2³¹ − 1, unrelated to that of any other (seed, path); by NumPy's SeedSequence."""
     return int(np.random.SeedSequence(seed, spawn_key=path).generate_state(1)[0] >> 1)
 
 
 def generator(seed: int, device: torch.device, *path: int) -> torch.Generator:
-    """A named random generator: part of `State`, hence of every checkpoint."""
+    """A random generator of a run's own, seeded with `derive(seed, *path)`; as a field of `State` it is saved."""
     return torch.Generator(device).manual_seed(derive(seed, *path))
