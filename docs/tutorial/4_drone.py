@@ -57,7 +57,9 @@ course.check(gae_one_row_late, "gae")
 ppo.gae = gae
 run = lem.train("ppo", env="DroneFigureEightTrajectory-v0", seed=1, total_steps=STEPS)
 scores = lem.evaluate(run.policy, seed=0)
-print(f"{scores.mean_return:.1f} of 500, {scores.rmse_after_1s_mm:.2f} mm from the curve after the first second")
+print(
+    f"{scores.mean_return:.1f} of 500, {scores.measures['rmse_after_1s_mm']:.2f} mm from the curve after the first second"
+)
 
 # %%
 lem.plot(run.path)

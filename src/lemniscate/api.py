@@ -1,7 +1,7 @@
 """The front door: train, resume, load, evaluate, watch, plot, make_envs."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
@@ -10,13 +10,12 @@ from typing import Any
 
 import torch
 
-from lemniscate import algos, presets
+from lemniscate import algos, named, presets
 from lemniscate.callbacks import Callback, watch_with
 from lemniscate.console import say
 from lemniscate.envs import registry
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError, is_installed, missing_extra, unknown_name
-from lemniscate.objects import find_object
 from lemniscate.policy import TrainedPolicy
 from lemniscate.report import compare, curves, playback
 from lemniscate.report import pictures as pictures_of
@@ -46,20 +45,29 @@ class TrainedRun:
 
 
 def config_for(
-    algorithm: str | ModuleType, env: str | None = None, preset: str | None = None, **fields: object
+    algorithm: str | ModuleType,
+    env: str | Callable[..., Any] | None = None,
+    preset: str | None = None,
+    **fields: object,
 ) -> RunConfig:
     """The Config of a preset, with some fields changed.
 
     Raises:
         UserError: an unknown algorithm, environment, preset or field, or a value out of range.
     """
-    algorithm = algos.name_of(algos.find(algorithm))
-    name, config = presets.choose(algorithm, env, preset)
+    env = None if env is None else registry.name_of(env)
+    name, config = presets.choose(algos.name_of(algorithm), env, preset)
     if name == "default" and env is None:
         raise UserError("Which environment? Name one with env; `lemniscate envs` lists them.")
-    served_by = registry.backend_for(config.env)
-    config = config.replace(**fields)
-    return config if config.backend else config.replace(backend=served_by)
+    config = config.replace(**{name: _named(value) for name, value in fields.items()})
+    return config if config.backend else config.replace(backend=registry.backend_for(config.env, config.wrappers))
+
+
+def _named(value: object) -> object:
+    """A value of a Config: functions and classes, and those in a sequence, by their names."""
+    if isinstance(value, list | tuple):
+        return tuple(map(_named, value))
+    return named.name_of(value) if callable(value) else value
 
 
 def make_envs(config: RunConfig) -> tuple[VecEnv, VecEnv]:
@@ -68,13 +76,14 @@ def make_envs(config: RunConfig) -> tuple[VecEnv, VecEnv]:
     They are restarted with seeds of different streams, so no start of one is ever a start of the other.
     """
     device = str(device_for(config.device))
-    train_env = registry.make(config.env, config.num_envs, device=device, stagger=True, backend=config.backend)
-    return train_env, _evaluation_env(config.env, config, config.evaluate_episodes, device, _simulator(config))
+    world = {"kwargs": config.env_kwargs, "wrappers": config.wrappers, "backend": config.backend}
+    train_env = registry.make(config.env, config.num_envs, device=device, stagger=True, **world)
+    return train_env, _evaluation_env(config, config.evaluate_episodes, device=device)
 
 
 def train(
     algorithm: str | ModuleType,
-    env: str | None = None,
+    env: str | Callable[..., Any] | None = None,
     *,
     run: str | Path | None = None,
     preset: str | None = None,
@@ -88,7 +97,7 @@ def train(
 
     Args:
         algorithm: a name in `lemniscate.algos.ALGORITHMS`; a module of your own, or its name.
-        env: the environment's id; a preset may have one of its own.
+        env: an id, `module:Class`, a class, or a function that makes an environment; a preset may have its own.
         run: where to keep everything; by default a new directory under `runs/`.
         preset: by name; the best known for the environment unless given.
         track: a logger beside the local ones: "wandb", the `module:Class` of your own, or the class itself; it gets
@@ -103,7 +112,7 @@ def train(
     Raises:
         UserError: see `config_for`; a run directory that exists.
     """
-    algorithm = algos.name_of(algos.find(algorithm))
+    algorithm = algos.name_of(algorithm)
     config = config_for(algorithm, env, preset, **fields)
     path = Path(run) if run is not None else fresh_directory(config.env, f"{algorithm}-{config.seed}")
     loggers = loggers_with(track)
@@ -111,7 +120,7 @@ def train(
     set_seeds(config.seed)  # before JAX starts, which reads its flags then
     envs = make_envs(config)
     if config.video_every:
-        playback.require_pictures(envs[0].spec)
+        playback.require_pictures(config, envs[0])
     return _train(path, algorithm, config, envs, loggers, callbacks, report or track is not None, progress)
 
 
@@ -145,38 +154,43 @@ def load(path: str | Path) -> TrainedPolicy:
     algorithm, spec = algos.find(found.record["algorithm"]), checkpoint.spec_from_json(found.record["spec"])
     config = algorithm.Config.from_json(found.record["config"])
     networks = config.networks(spec)
-    networks.load_state_dict(found.part("networks"))
+    networks.load_state_dict(found.tensors_of("networks"))
     return TrainedPolicy(networks, spec, config, found.numbers["step"])
 
 
 def evaluate(
     policy: TrainedPolicy,
-    env: str | None = None,
+    env: str | Callable[..., Any] | None = None,
     episodes: int = 100,
     seed: int = 0,
     *,
     deterministic: bool = True,
     backend: str | None = None,
+    env_kwargs: Mapping[str, Any] | None = None,
 ) -> Evaluation:
     """Play whole episodes from starts drawn with `seed`, none of which training ever saw.
 
     Args:
         policy: from `load` or `train`.
-        env: by default the environment it was trained on.
+        env: an id, `module:Class`, a class, or a function that makes an environment; by default the one of training.
         episodes: how many.
         seed: of the starts.
         deterministic: act by the mode of the distribution.
-        backend: who steps the environments; as in training unless named, or by the id if `env` is another.
+        backend: simulation backend; that of training unless named, or by the id if `env` is another.
+        env_kwargs: arguments of the environment that are to be other than in training.
+
+    Raises:
+        UserError: numbers out of range; an environment that cannot be made, or whose spaces differ.
     """
     if episodes < 1:
         raise UserError(f"episodes must be a whole number at least 1, not {episodes}.")
     _check_seed(seed)
-    if env is None:
-        backend = backend or _simulator(policy.config)
-    vec = _evaluation_env(env or policy.spec.env_id, policy.config, episodes, "cpu", backend)
+    vec = _evaluation_env(policy.config, episodes, env=env, env_kwargs=env_kwargs, backend=backend)
     if not vec.spec.fits(policy.spec):
         vec.close()
-        raise UserError(f"A policy for {policy.spec.env_id} cannot act in {vec.spec.env_id}: its spaces are others.")
+        raise UserError(
+            f"A policy for {policy.spec.env_id} cannot act in {vec.spec.env_id}: observation or action spaces differ."
+        )
     try:
         critic = critic_of(policy.networks, policy.config)
         return evaluate_module(policy.module, vec, episodes, seed, deterministic, critic)
@@ -201,14 +215,14 @@ def watch(policy: TrainedPolicy, *, seed: int = 0, video: str | Path | None = No
     _check_seed(seed)
     if video is not None:
         playback.check_film(Path(video))
-    env = _drones(policy) if policy.spec.tracking else None
+    env = _scene_env(policy)
     if env and video is not None:
         return playback.film_flight(policy.module, env, Path(video), seed)
     if env:
         return playback.show_flight(policy.module, env, seed)
     if video is not None:
-        return playback.film_episode(policy.act, policy.spec, Path(video), seed)
-    return playback.show_episode(policy.act, policy.spec, seed)
+        return playback.film_episode(policy.act, policy.config, Path(video), seed)
+    return playback.show_episode(policy.act, policy.config, seed)
 
 
 def plot(*runs: str | Path) -> list[Path]:
@@ -216,7 +230,7 @@ def plot(*runs: str | Path) -> list[Path]:
 
     In a notebook they are also shown below the cell.
 
-    A drone's run also gets its flights, and one with a Q what that says beside what followed.
+    Where the environment has a scene, flights are drawn too; where there is a Q, its predictions beside the returns.
 
     A set is its runs, and has a `plots/` of its own; what else is compared is drawn into `plots/` here, with a table on
     standard error. Compared are the final policies of finished runs, over 100 episodes each. Returns the pictures.
@@ -232,9 +246,9 @@ def plot(*runs: str | Path) -> list[Path]:
         if critic_of(policy.networks, policy.config):
             q_bias = evaluate(policy, episodes=policy.config.evaluate_episodes).q_bias
             pictures += [curves.draw_q_bias(q_bias, paths[0], folder / "q.png")] if q_bias else []
-        if policy.spec.tracking:
+        if env := _scene_env(policy):
             flights = policy.config.evaluate_episodes
-            pictures += pictures_of.draw_flight(policy.module, _drones(policy), folder, flights, seed=0)
+            pictures += pictures_of.draw_flight(policy.module, env, folder, flights, seed=0)
     if playback.in_notebook():
         playback.show_pictures(pictures)
     return pictures
@@ -315,9 +329,13 @@ def _train(
     return TrainedRun(path, TrainedPolicy(state.networks.cpu(), spec, config, state.step), run.seconds)
 
 
-def _drones(policy: TrainedPolicy) -> VecEnv:
-    """The fleet that a drone's policy is evaluated in."""
-    return _evaluation_env(policy.spec.env_id, policy.config, policy.config.evaluate_episodes, "cpu")
+def _scene_env(policy: TrainedPolicy) -> VecEnv | None:
+    """Environments to draw flights in, where the backend has a scene for them."""
+    config = policy.config
+    if not hasattr(registry.backend_class(config.backend or registry.backend_for(config.env)), "scene"):
+        return None
+    env = _evaluation_env(config, config.evaluate_episodes)
+    return env if env.scene else None
 
 
 def _check_seed(seed: int) -> None:
@@ -325,17 +343,26 @@ def _check_seed(seed: int) -> None:
         raise UserError(f"seed must be a whole number at least 0, not {seed}.")
 
 
-def _simulator(config: RunConfig) -> str | None:
-    """Who steps evaluations: as in training, but in this process; None, the id's own, where that is not installed."""
-    if config.backend == "envpool" and not is_installed("envpool"):
-        return None
-    return "gymnasium" if config.backend == "gymnasium-async" else config.backend
+def _evaluation_env(
+    config: RunConfig,
+    episodes: int,
+    *,
+    env: str | Callable[..., Any] | None = None,
+    env_kwargs: Mapping[str, Any] | None = None,
+    backend: str | None = None,
+    device: str = "cpu",
+) -> VecEnv:
+    """A few environments of a run, or of another `env`; as many as in training where a program is compiled for these.
 
-
-def _evaluation_env(env_id: str, config: RunConfig, episodes: int, device: str, backend: str | None = None) -> VecEnv:
-    """As many copies as training has for a drone, whose compiled program they share; else a few."""
-    copies = config.num_envs if env_id in registry.CRAZYFLOW_IDS else min(episodes, 16)
-    return registry.make(env_id, copies, device=device, backend=backend)
+    `env_kwargs` change those of the run; in another environment they are the only ones.
+    """
+    name = config.env if env is None else registry.name_of(env)
+    kwargs = {**(config.env_kwargs if name == config.env else {}), **(env_kwargs or {})}
+    if env is None and backend is None:
+        backend = registry.for_evaluation(config.backend)
+    served_by = backend or registry.backend_for(name, config.wrappers)
+    num_envs = config.num_envs if registry.is_compiled(served_by) else min(episodes, 16)
+    return registry.make(name, num_envs, kwargs=kwargs, wrappers=config.wrappers, device=device, backend=backend)
 
 
 def loggers_with(track: str | LoggerClass | None) -> tuple[LoggerClass, ...]:
@@ -348,7 +375,7 @@ def loggers_with(track: str | LoggerClass | None) -> tuple[LoggerClass, ...]:
         extra, track = TRACKERS[track]
         if not is_installed(extra):
             raise missing_extra(extra, extra)
-    return JsonLines, TensorBoard, find_object(track, "tracker") if isinstance(track, str) else track
+    return JsonLines, TensorBoard, named.find(track) if isinstance(track, str) else track
 
 
 def device_for(name: str) -> torch.device:

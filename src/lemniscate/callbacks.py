@@ -6,8 +6,8 @@ from typing import Any
 
 import torch
 
+from lemniscate import named
 from lemniscate.errors import UserError
-from lemniscate.objects import find_object
 from lemniscate.policy import TrainedPolicy
 from lemniscate.run.config import RunConfig
 from lemniscate.run.run import Watch
@@ -58,7 +58,7 @@ def watch_with(
     Raises:
         UserError: a callback that cannot be loaded or called.
     """
-    functions = [find_object(one, "callback") if isinstance(one, str) else one for one in callbacks]
+    functions = [named.find(one) if isinstance(one, str) else one for one in callbacks]
     for function in functions:
         if not callable(function):
             raise UserError(f"A callback must be a function of (step, metrics, policy), not {function!r}.")

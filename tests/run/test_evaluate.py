@@ -4,15 +4,11 @@ import pytest
 import torch
 
 import lemniscate as lem
-from lemniscate.envs import toy
-from lemniscate.envs.gymnasium import GymnasiumBackend
-from lemniscate.envs.vec_env import VecEnv
+from lemniscate.envs import registry, toy
 from lemniscate.errors import UserError
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.networks import Layers
 from lemniscate.run.evaluate import evaluate
-
-CPU = torch.device("cpu")
 
 
 class Uneven(toy.Countdown):
@@ -25,10 +21,9 @@ class Uneven(toy.Countdown):
 
 @pytest.mark.parametrize("mode", ["NEXT_STEP", "SAME_STEP", "DISABLED"])
 @pytest.mark.parametrize("episodes", [3, 4, 10])
-def test_every_copy_plays_its_own_share(monkeypatch, mode, episodes):
+def test_every_copy_plays_its_own_share(mode, episodes):
     """Taking the first that end would fill the list with the short ones."""
-    monkeypatch.setattr(toy, "Countdown", Uneven)
-    env = VecEnv(GymnasiumBackend("Countdown-v0", 4, CPU, mode=mode))
+    env = registry.make(Uneven, 4, kwargs={"mode": mode})
     policy = ActorCritic(env.spec, Layers((4,))).policy
     scores = evaluate(policy, env, episodes, seed=0)
     shares = [episodes // 4 + (copy < episodes % 4) for copy in range(4)]
@@ -40,18 +35,17 @@ def test_every_copy_plays_its_own_share(monkeypatch, mode, episodes):
 
 
 def test_the_same_seed_gives_the_same_scores_and_another_does_not():
-    env = VecEnv(GymnasiumBackend("CartPole-v1", 4, CPU))
+    env = registry.make("CartPole-v1", 4, backend="gymnasium")
     torch.manual_seed(0)
     policy = ActorCritic(env.spec, Layers((4,))).policy
     first, again, other = (evaluate(policy, env, 6, seed, deterministic=False) for seed in (1, 1, 2))
     assert first == replace(again, date=first.date)
     assert first.returns != other.returns
-    assert first.rmse_mm is None
-    assert "rmse_mm" not in first.to_json()
+    assert first.measures == {}
 
 
 def endless(num_envs, mode="DISABLED"):
-    return VecEnv(GymnasiumBackend("Countdown-v0", num_envs, CPU, mode=mode, length=None, horizon=None))
+    return registry.make("Countdown-v0", num_envs, kwargs={"mode": mode, "length": None})
 
 
 def test_an_episode_without_end_is_a_sentence_and_not_a_hang(monkeypatch):
@@ -64,14 +58,20 @@ def test_an_episode_without_end_is_a_sentence_and_not_a_hang(monkeypatch):
 
 def test_patience_is_for_one_episode_not_for_all(monkeypatch):
     monkeypatch.setattr("lemniscate.envs.vec_env.PATIENCE", 30)
-    env = VecEnv(GymnasiumBackend("Countdown-v0", 2, CPU, mode="DISABLED", length=20, horizon=None))
+    env = registry.make("Countdown-v0", 2, kwargs={"mode": "DISABLED", "length": 20})
     assert evaluate(ActorCritic(env.spec, Layers((4,))).policy, env, 10, seed=0).lengths == [20] * 10
 
 
 def test_a_run_goes_on_when_its_evaluation_cannot(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr("lemniscate.envs.vec_env.PATIENCE", 30)
-    monkeypatch.setattr("lemniscate.api._evaluation_env", lambda *_: endless(2))
-    fields = {"num_envs": 2, "num_steps": 32, "total_steps": 128, "evaluate_every": 64, "progress": False}
+    fields = {
+        "env_kwargs": {"length": None},
+        "num_envs": 2,
+        "num_steps": 32,
+        "total_steps": 128,
+        "evaluate_every": 64,
+        "progress": False,
+    }
     run = lem.train("ppo", "Countdown-v0", run=tmp_path / "run", backend="gymnasium", **fields)
     assert run.policy.step == 128
     assert "No evaluation at step 64" in capsys.readouterr().err

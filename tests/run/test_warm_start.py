@@ -23,7 +23,7 @@ def train(path, algorithm="ppo", env="CartPole-v1", **fields):
 def networks_at(path, step=None):
     steps = checkpoint.list_steps(path / "checkpoints")
     found = checkpoint.read(path / "checkpoints" / f"step-{steps[-1] if step is None else step}")
-    return found.part("networks")
+    return found.tensors_of("networks")
 
 
 def first_networks(path, **fields):
@@ -81,13 +81,13 @@ def test_optimizers_counters_and_generators_are_fresh(source, tmp_path):
     begun = checkpoint.read(tmp_path / "warm" / "checkpoints" / "step-0")
     assert begun.numbers["step"] == 0
     fresh = lem.algos.ppo.init(lem.load(tmp_path / "cold").config, lem.load(source).spec, torch.device("cpu"))
-    for name, value in checkpoint._parts(fresh):
+    for name, value in checkpoint._fields_of(fresh):
         if name == "networks":
             continue
         if isinstance(value, torch.Generator):
-            assert torch.equal(begun.part(name)["state"], value.get_state())
+            assert torch.equal(begun.tensors_of(name)["state"], value.get_state())
         elif hasattr(value, "state_dict"):
-            assert same(begun.part(name), dict(value.state_dict()))
+            assert same(begun.tensors_of(name), dict(value.state_dict()))
 
 
 def test_the_run_no_longer_depends_on_its_source_once_it_has_begun(source, tmp_path):
@@ -134,7 +134,7 @@ def test_target_networks_begin_as_copies_of_the_loaded_ones(tmp_path, algorithm)
     train(tmp_path / "source", algorithm, "Pendulum-v1")
     path = tmp_path / "warm"
     begun = first_networks(path, algorithm=algorithm, env="Pendulum-v1", warm_start=str(tmp_path / "source"))
-    targets = checkpoint.read(path / "checkpoints" / "step-0").part("targets")
+    targets = checkpoint.read(path / "checkpoints" / "step-0").tensors_of("targets")
     assert targets
     for name, tensor in targets.items():
         own = begun.get(name, begun.get(f"critic.{name}", begun.get(f"critics.{name}")))
@@ -173,7 +173,7 @@ def test_another_kind_of_policy_does_not_fit(tmp_path):
     """A Gaussian policy has parameters that a deterministic one lacks, and one output for each action as well."""
     train(tmp_path / "ppo", "ppo", "Pendulum-v1", activation="relu", normalize_observations=False)
     with pytest.raises(lem.UserError, match=r"does not fit: policy.log_std is \[1\] there and missing here"):
-        train(tmp_path / "r", "ddpg", "Pendulum-v1", warm_start=str(tmp_path / "ppo"))
+        train(tmp_path / "r", "ddpg", "Pendulum-v1", architecture="mlp", warm_start=str(tmp_path / "ppo"))
 
 
 def test_a_sweep_says_so_before_it_starts(source, tmp_path):

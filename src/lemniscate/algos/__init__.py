@@ -4,7 +4,9 @@ import sys
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
+from lemniscate import named
 from lemniscate.errors import UserError, unknown_name
 
 ALGORITHMS = ("reinforce", "a2c", "trpo", "ppo", "ddpg", "td3", "sac")
@@ -13,32 +15,33 @@ REQUIRED = ("Config", "train")
 """names that a module needs to be an algorithm; `lemniscate.testing` checks the rest"""
 
 
-def find(algorithm: str | ModuleType) -> ModuleType:
-    """The module of an algorithm: one in `ALGORITHMS`, a module of one's own by its name, or the module itself.
+def find(algorithm: str | ModuleType) -> Any:
+    """The module of an algorithm: one in `ALGORITHMS`, one's own by its name `module` or `module:name`, or itself.
 
     A module of one's own is looked for in the working directory too.
 
     Raises:
         UserError: there is no such module, it cannot be imported, or it lacks `Config` or `train`.
     """
-    if isinstance(algorithm, ModuleType):
-        module = algorithm
-    elif algorithm in ALGORITHMS:
+    if algorithm in ALGORITHMS:
         return import_module(f"{__name__}.{algorithm}")
-    else:
-        module = _import(algorithm)
-    missing = [name for name in REQUIRED if not hasattr(module, name)]
+    own = _import(algorithm) if isinstance(algorithm, str) else algorithm
+    missing = [name for name in REQUIRED if not hasattr(own, name)]
     if missing:
-        raise UserError(f"{module.__name__} is not an algorithm: it has no {' and no '.join(missing)}.")
-    return module
+        name = algorithm if isinstance(algorithm, str) else getattr(own, "__name__", repr(own))
+        raise UserError(f"{name} is not an algorithm: it has no {' and no '.join(missing)}.")
+    return own
 
 
-def name_of(module: ModuleType) -> str:
-    """The name under which `find` returns a module."""
-    return module.__name__.removeprefix(f"{__name__}.")
+def name_of(algorithm: str | ModuleType) -> str:
+    """The name under which `find` returns an algorithm. Raises `UserError` as `find` does."""
+    found = find(algorithm)
+    return algorithm if isinstance(algorithm, str) else found.__name__.removeprefix(f"{__name__}.")
 
 
-def _import(name: str) -> ModuleType:
+def _import(name: str) -> Any:
+    if ":" in name:
+        return named.find(name)
     if str(Path.cwd()) not in sys.path:
         sys.path.insert(0, str(Path.cwd()))
     try:

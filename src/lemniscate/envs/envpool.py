@@ -2,6 +2,7 @@
 
 import os
 import warnings
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -9,45 +10,93 @@ import torch
 from torch import Tensor
 
 from lemniscate.envs.episodes import Stagger
-from lemniscate.envs.spaces import action_kind, flatten_observation, is_image, observation_layout, physical_action
-from lemniscate.errors import UserError
+from lemniscate.envs.measures import STANDARD, SUMMARIES, measured
+from lemniscate.envs.spaces import action_kind, flatten_observation, is_image, observation_parts, physical_action
+from lemniscate.errors import UserError, is_installed, missing_extra, unknown_name
 from lemniscate.spec import Spec
 from lemniscate.types import Step
 
+PREFIX = "EnvPool/"
+"""what an id of EnvPool's own begins with here, so that it is not mistaken for Gymnasium's of that name"""
+
+GYMNASIUM_IDS = (
+    "Ant-v5",
+    "CartPole-v1",
+    "HalfCheetah-v5",
+    "Hopper-v5",
+    "Humanoid-v5",
+    "LunarLander-v3",
+    "Walker2d-v5",
+)
+"""those that behave in EnvPool as in Gymnasium: tests/envs/test_envpool.py compares them"""
+
+REFUSED: dict[str, str] = {}
+"""families that do not fulfil the contract, and why: see docs/decisions/0008-envpool-families.md"""
+
+RESERVED = ("num_envs", "batch_size", "num_threads", "seed", "env_seed", "base_path", "max_num_players")
+"""options of EnvPool that are not the environment's"""
+
 
 class EnvpoolBackend:
-    """N copies of one of the ids that EnvPool serves.
+    """N parallel environments of one of the ids that EnvPool serves.
 
-    EnvPool by itself resets in the step after an end and ignores the action of that step. Here an ended copy is reset
-    at once, so that every row is real. With `stagger`, first episodes are cut: see `Stagger`.
+    EnvPool by itself resets in the step after an end and ignores the action of that step. Here an environment that has
+    ended is reset at once, so that every row is real. With `stagger`, first episodes are cut: see `Stagger`.
 
     Nothing depends on `num_threads` but the speed; by default there is one for each processor that we may use.
     """
 
-    def __init__(
-        self, env_id: str, num_envs: int, device: torch.device, *, stagger: bool = False, num_threads: int | None = None
-    ) -> None:
-        self.num_envs, self.device = num_envs, device
-        self._num_threads = min(num_envs, num_threads or len(os.sched_getaffinity(0)))
-        self._valid = torch.ones(num_envs, dtype=torch.bool, device=device)
-        self._pool = self._build(env_id, 0)
-        limit = int(self._pool.config["max_episode_steps"])
-        self._stagger_up_to = limit if stagger else None
-        self.spec = Spec(
-            env_id=env_id,
-            layout=observation_layout(self._pool.observation_space, env_id),
-            action=action_kind(self._pool.action_space, env_id),
-            max_episode_steps=limit,
-            image=is_image(self._pool.observation_space),
-        )
+    summaries = SUMMARIES
+    package = "envpool"
 
-    def _build(self, env_id: str, seed: int) -> Any:
+    @classmethod
+    def ids(cls) -> Collection[str]:
+        """The ids that are the same in Gymnasium; and all of EnvPool's, with `EnvPool/` before them."""
+        if not is_installed("envpool"):
+            return ()
         import envpool
 
-        if env_id not in envpool.list_all_envs():
-            raise UserError(f"EnvPool does not serve {env_id}; leave out the backend, or take gymnasium.")
-        copies = {"num_envs": self.num_envs, "num_threads": self._num_threads}
-        pool = envpool.make(env_id, env_type="gymnasium", seed=seed, **copies)
+        return (*GYMNASIUM_IDS, *(PREFIX + task for task in envpool.list_all_envs() if not refusal(task)))
+
+    @classmethod
+    def serves(cls, env: str) -> bool:
+        """Whether it is one of them, by the name."""
+        return env.startswith(PREFIX) or (env in GYMNASIUM_IDS and is_installed("envpool"))
+
+    def __init__(
+        self,
+        env: str,
+        num_envs: int,
+        device: torch.device,
+        *,
+        stagger: bool = False,
+        kwargs: Mapping[str, Any] | None = None,
+        wrappers: Sequence[str] = (),
+        num_threads: int | None = None,
+    ) -> None:
+        assert not wrappers, "EnvPool's environments cannot be wrapped"
+        self.num_envs, self.device = num_envs, device
+        self._valid = torch.ones(num_envs, dtype=torch.bool, device=device)
+        self._task = env.removeprefix(PREFIX)
+        self._options = _checked(self._task, dict(kwargs or {}))
+        self._options |= {
+            "num_envs": num_envs,
+            "num_threads": min(num_envs, num_threads or len(os.sched_getaffinity(0))),
+        }
+        self._pool = self._build(0)
+        self._limit = int(self._pool.config["max_episode_steps"])
+        self._stagger_up_to = self._limit if stagger else None
+        space = self._pool.observation_space
+        parts, action = observation_parts(space, env), action_kind(self._pool.action_space, env)
+        self.spec = Spec(env, parts, action, max_episode_steps=self._limit, image=is_image(space))
+
+    def _build(self, seed: int) -> Any:
+        import envpool
+
+        try:
+            pool = envpool.make(self._task, env_type="gymnasium", seed=seed, **self._options)
+        except (TypeError, ValueError, RuntimeError, AssertionError) as error:
+            raise UserError(f"EnvPool cannot make {self._task}: {error}") from error
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # Gymnasium's, on bounds that are float64 here and float32 there
             _ = pool.observation_space, pool.action_space  # made and kept when first looked at
@@ -56,23 +105,25 @@ class EnvpoolBackend:
     def restart(self, seed: int) -> Tensor:
         """Build the pool again: nothing of the past remains."""
         self._pool.close()
-        self._pool = self._build(self.spec.env_id, seed % 2**31)
+        self._pool = self._build(seed % 2**31)
         self._stagger = Stagger(self.num_envs, self._stagger_up_to, seed)
         self.counts = self._tensor(self._stagger.counts)
         obs, _ = self._pool.reset()
-        return self._tensor(self._seen(obs))
+        return self._tensor(self._flatten(obs))
 
     def step(self, action: Tensor) -> Step:
-        """Step all copies, then reset those whose episode has ended."""
-        raw, reward, terminated, truncated, _ = self._pool.step(physical_action(action.cpu().numpy(), self.spec.action))
-        next_obs = self._seen(raw)
+        """Step all environments, then reset those whose episode has ended."""
+        physical = physical_action(action.cpu().numpy(), self.spec.action)
+        raw, reward, terminated, truncated, info = self._pool.step(physical)
+        next_obs = self._flatten(raw)
+        truncated |= info["elapsed_step"] >= self._limit  # not every family ends there by itself
         truncated = self._stagger.apply(terminated, truncated & ~terminated)
         done = terminated | truncated
         here = there = self._tensor(next_obs)
         if done.any():
-            fresh, info = self._pool.reset(np.flatnonzero(done).astype(np.int32))
+            fresh, reset_info = self._pool.reset(np.flatnonzero(done).astype(np.int32))
             obs = next_obs.copy()
-            obs[info["env_id"]] = self._seen(fresh)
+            obs[reset_info["env_id"]] = self._flatten(fresh)
             here, self.counts = self._tensor(obs), self._tensor(self._stagger.counts)
         return Step(
             obs=here,
@@ -81,14 +132,45 @@ class EnvpoolBackend:
             terminated=self._tensor(terminated),
             truncated=self._tensor(truncated),
             valid=self._valid,
+            measures=measured(info, STANDARD, self.num_envs, self.device),
         )
 
     def close(self) -> None:
         """Let the pool's threads end."""
         self._pool.close()
 
-    def _seen(self, raw: Any) -> np.ndarray:
-        return flatten_observation(self.spec.layout, raw, image=self.spec.image)
+    def _flatten(self, raw: Any) -> np.ndarray:
+        return flatten_observation(self.spec.observation_parts, raw, image=self.spec.image)
 
     def _tensor(self, array: np.ndarray) -> Tensor:
         return torch.from_numpy(array).to(self.device)
+
+
+def family(task: str) -> str:
+    """The part of EnvPool that an id belongs to, such as atari or mujoco.playground."""
+    from envpool.registration import registry
+
+    return registry.specs[task][0].removeprefix("envpool.")
+
+
+def refusal(task: str) -> str | None:
+    """Why an id of EnvPool's is not served; None for one that is."""
+    return REFUSED.get(task) or REFUSED.get(family(task))
+
+
+def _checked(task: str, options: dict[str, Any]) -> dict[str, Any]:
+    """The options, each of which exists. Raises `UserError` for others, and for a task that is not served."""
+    if not is_installed("envpool"):
+        raise missing_extra("envpool", "envpool")
+    import envpool
+
+    if task not in envpool.list_all_envs():
+        raise unknown_name("environment of EnvPool", task, envpool.list_all_envs())
+    if reason := refusal(task):
+        raise UserError(f"{PREFIX}{task} is not served: {reason}")
+    known = {name for name in envpool.make_spec(task).config._fields} if options else set()
+    for name in options:
+        if name not in known or name in RESERVED:
+            there = unknown_name("option", name, known - set(RESERVED))
+            raise UserError(f"EnvPool's {task}: {there} The gymnasium backend takes Gymnasium's arguments.")
+    return options

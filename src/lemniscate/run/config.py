@@ -4,7 +4,7 @@ import dataclasses
 import json
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Self, Union, get_args, get_origin, get_type_hints
 
@@ -145,6 +145,10 @@ class RunConfig:
     """steps between recordings of an episode into videos/step-N; 0: none"""
     warm_start: str | None = None
     """run or checkpoint whose networks this run begins with"""
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    """arguments of the environment, as JSON: '{"dynamics": "first_principles"}'"""
+    wrappers: tuple[str, ...] = ()
+    """wrappers of each environment, the first innermost: module:name or module:name(key=value)"""
 
     def __post_init__(self) -> None:
         hints = get_type_hints(type(self), include_extras=True)

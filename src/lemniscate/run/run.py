@@ -244,8 +244,7 @@ class Run:
             say(f"No evaluation at step {state.step:,}: {error}")
             return
         metrics = {"evaluation/return": scores.mean_return, "evaluation/length": sum(scores.lengths) / scores.episodes}
-        if scores.rmse_after_1s_mm is not None:
-            metrics["evaluation/rmse_after_1s_mm"] = scores.rmse_after_1s_mm
+        metrics |= {f"evaluation/{name}": value for name, value in scores.measures.items()}
         if scores.q_bias:
             predicted, realised = scores.q_bias.means
             metrics |= {"evaluation/q": predicted, "evaluation/q_realised": realised}

@@ -42,7 +42,7 @@ def load_networks(networks: nn.Module, config: RunConfig, spec: Spec) -> str:
     settings = [f"{field} is {theirs[field]!r} there and {mine[field]!r} here" for field in differing]
     if set(differing) & set(FUNCTION):
         raise UserError(f"warm_start: {name} does not fit: {settings[0]}.")
-    found, own = source.part("networks"), networks.state_dict()
+    found, own = source.tensors_of("networks"), networks.state_dict()
     if not _difference(found, own):
         networks.load_state_dict(found)
         return f"Warm start: all networks of {name}."
