@@ -195,7 +195,7 @@ def test_wandb_missing_is_said_with_its_install_line(tmp_path, monkeypatch):
     import sys
 
     monkeypatch.setitem(sys.modules, "wandb", None)
-    with pytest.raises(lem.UserError, match=r"pip install 'lemniscate\[wandb\]'"):
+    with pytest.raises(lem.UserError, match=r"pip install '\.\[wandb\]'"):
         lem.train("ppo", "Countdown-v0", run=tmp_path / "r", track="wandb", progress=False, **tiny_fields())
 
 

@@ -164,7 +164,7 @@ def test_help_of_an_algorithm_is_its_own_fields_on_two_pages(algorithm, columns,
     assert ("--tau FLOAT" in out) == (algorithm in ("ddpg", "td3", "sac"))
     titles = [line for line in out.splitlines() if line.endswith(":") and not line.startswith(" ")]
     assert titles == ["options:", "run:", "environment:", "algorithm:", "networks:", "logging and checkpoints:"]
-    flags = set(re.findall(r"--[a-z-]+", out.replace("[no-]", "")))
+    flags = set(re.findall(r"--[a-z0-9-]+", out.replace("[no-]", "")))
     fields = {name for name in find(algorithm).Config.names() if name not in ("env", "env_kwargs")}
     assert {f"--{name.replace('_', '-')}" for name in fields} <= flags
 
@@ -270,10 +270,10 @@ def test_an_algorithm_of_ones_own_has_its_fields_in_its_help(tmp_path, monkeypat
         (["train", "ppo", "--total_timesteps", "1"], "There is no --total-timesteps: here it is --total-steps."),
         (["train", "ppo", "--logdir", "x"], "There is no --logdir: here it is --run."),
         (["train", "ppo", "--env", "CartPole-v1", "--gamma", "x"], "gamma must be a number from 0 to 1, not 'x'."),
-        (["train", "ppo", "--env", "CartPole-v1", "--gamma", "3"], "gamma must be a number from 0 to 1, not 3."),
+        (["train", "ppo", "--env", "CartPole-v1", "--gamma", "3"], "gamma must be a number from 0 to 1, not 3.0."),
         (["train", "ppo", "--env", "CartPole-v1", "--epochs", "1.5"], "epochs must be a whole number at least 1, not 1.5."),
         (["train", "ppo", "--env", "CartPole-v1", "--hidden", "8,x"], "hidden must be a whole number at least 1, not 'x'."),
-        (["train", "ppo", "--env", "CartPole-v1", "--clip-value", "0"], "clip_value must be a number above 0 or None, not 0."),
+        (["train", "ppo", "--env", "CartPole-v1", "--clip-value", "0"], "clip_value must be a number above 0 or None, not 0.0."),
         (["train", "ppo", "--env", "CartPole-v1", "--minibatch-size", "1"], "normalize_advantage needs batches of 2"),
         (["train", "ppo", "--env", "CartPole-v1", "--activation", "x"], "activation must be one of tanh, relu, elu, silu, not 'x'"),
         (["train", "ppo", "--env", "CartPole-v1", "--backend", "envpol"], "There is no backend 'envpol'"),

@@ -15,6 +15,7 @@ from shutil import get_terminal_size
 from typing import Any, NoReturn
 
 from lemniscate.algos import ALGORITHMS
+from lemniscate.console import say
 from lemniscate.errors import NonFiniteError, SweepError, UserError, WorkerError, is_installed, unknown_name
 
 COMMANDS = {
@@ -35,14 +36,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         given = parse(sys.argv[1:] if arguments is None else arguments)
         getattr(import_module("lemniscate.cli.commands"), given.command)(given)
     except UserError as error:
-        return say(error, 2)
+        say(error)
+        return 2
     except (NonFiniteError, WorkerError) as error:
         learning = given.command in ("train", "resume")
-        return say(f"{error} Training stopped; the last checkpoint is as it was." if learning else error, 1)
+        say(f"{error} Training stopped; the last checkpoint is as it was." if learning else error)
+        return 1
     except SweepError as error:
-        return say(error, 1)
+        say(error)
+        return 1
     except KeyboardInterrupt as stopped:  # a run that was asked to stop has a sentence and a signal of its own
-        return say(str(stopped) or "Interrupted.", 128 + getattr(stopped, "signum", 2))
+        say(str(stopped) or "Interrupted.")
+        return 128 + getattr(stopped, "signum", 2)
     except SystemExit as done:  # argparse has printed help, or the version
         return int(done.code or 0)
     return 0
@@ -72,12 +77,6 @@ def algorithms() -> dict[str, str]:
     folder = Path(__file__).parents[1] / "algos"
     lines = {name: (folder / f"{name}.py").read_text().partition("\n")[0] for name in ALGORITHMS}
     return {name: line.removeprefix('"""') for name, line in lines.items()}
-
-
-def say(text: object, code: int = 0) -> int:
-    """Print to standard error, where a person reads; returns the exit code."""
-    print(text, file=sys.stderr, flush=True)
-    return code
 
 
 def add_train_options(parser: argparse.ArgumentParser) -> None:
@@ -175,7 +174,7 @@ def _parse_train(parser: Parser, words: list[str]) -> argparse.Namespace:
         add_train_options(parser)
         listed = "\n".join(f"  {name:<12}{title}" for name, title in titles.items())
         parser.epilog = (
-            f"algorithms (several, such as ppo,sac, with --seeds; or module, module:Name of your own):\n{listed}\n\n"
+            f"algorithms (several, such as ppo,sac, with --seeds; or a module of your own):\n{listed}\n\n"
             "lemniscate train ALGORITHM --help lists the fields of that algorithm."
         )
         parser.print_help()
@@ -195,9 +194,9 @@ def _parse_train(parser: Parser, words: list[str]) -> argparse.Namespace:
 
 
 def _is_own(name: str) -> bool:
-    """Whether `name` is of somebody's own algorithm: module:Name, package.module, or a module that is there."""
+    """Whether `name` is of somebody's own algorithm: a module that is there, or one in a package."""
     if not name.isidentifier():
-        return ":" in name or "." in name
+        return "." in name
     return Path(f"{name}.py").exists() or Path(name).is_dir() or is_installed(name)
 
 

@@ -6,13 +6,14 @@ from typing import Any
 
 from lemniscate import api, sweep
 from lemniscate.algos import ALGORITHMS
-from lemniscate.cli import say
 from lemniscate.cli.fields import read_json
+from lemniscate.console import say
 from lemniscate.envs import registry
 from lemniscate.envs.check import check as check_environment
 from lemniscate.errors import UserError
 from lemniscate.presets import best, choose
 from lemniscate.report import pictures
+from lemniscate.run.run import is_compiled
 from lemniscate.run.sweep_file import is_sweep
 
 MARKS = {"good": "✓", "note": "·", "bad": "✗"}
@@ -34,8 +35,8 @@ def train(given: argparse.Namespace) -> None:
     if config.backend:
         registry.require_backend(config.backend)
     preset, _ = choose(given.algorithm, config.env, given.preset)
-    what = f"{given.algorithm} on {config.num_envs} × {config.env}"
-    say(f"{what}: backend {config.backend}, preset {preset}, seed {config.seed}")
+    what = f"{given.algorithm} on {config.num_envs} × {config.env}, backend {config.backend}"
+    say(f"{what}: preset {preset}, seed {config.seed}, {'compiled' if is_compiled(config) else 'not compiled'}")
     run = api.train(given.algorithm, config.env, **shared, **_callbacks(given))
     if given.score:
         api.final_return(run.path)

@@ -4,7 +4,7 @@ import argparse
 import ast
 import inspect
 import json
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from itertools import pairwise
 from textwrap import dedent, fill
 from types import NoneType
@@ -79,12 +79,10 @@ def read(name: str, hint: Any, text: Any) -> Any:
         return None
     if any(_is_dict(option) for option in options):
         return read_json(flag(name), text)
-    if any(_number(option) for option in options):
-        for kind in (int, float):
-            try:
-                return kind(text)
-            except ValueError:
-                pass
+    kinds = [_number(option) for option in options]
+    for kind in (int, float) if int in kinds else (float,) if float in kinds else ():
+        with suppress(ValueError):
+            return kind(text)
     return text
 
 
