@@ -4,8 +4,8 @@
 
 A policy and a value function are trained for a while and then frozen. Many batches of whole episodes are collected,
 and from each the gradient is estimated four times: with the return of the whole episode, with the reward-to-go, with
-that minus the mean of the batch, and with that minus V(s). γ is 1, so that all of them estimate the same vector, but for
-the small bias of a mean that contains the return from which it is subtracted.
+that minus the mean of the batch, and with that minus V(s). γ is 1, so that all of them estimate the same vector, except
+for the small bias of a mean that contains the return from which it is subtracted.
 """
 
 import sys
