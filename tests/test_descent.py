@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from lemniscate.nn.descent import Descent
 from torch import nn
 
 from lemniscate.algos import ppo
+from lemniscate.nn.descent import Descent
 from lemniscate.nn.networks import Layers
 from lemniscate.spec import Box, Discrete, ObservationPart, Spec
 from lemniscate.types import Batch
