@@ -28,12 +28,12 @@ import sys, time, warnings, numpy, envpool
 warnings.simplefilter("ignore")
 env = envpool.make(sys.argv[1], env_type="gymnasium", num_envs=int(sys.argv[3]), num_threads=2, seed=1)
 space = env.action_space
-copies = int(sys.argv[3])
-actions = numpy.random.default_rng(0).uniform(space.low, space.high, (64, copies, *space.shape))
+num_envs = int(sys.argv[3])
+actions = numpy.random.default_rng(0).uniform(space.low, space.high, (64, num_envs, *space.shape))
 env.reset()
-for t in range(3200 // copies): env.step(actions[t % 64])
+for t in range(3200 // num_envs): env.step(actions[t % 64])
 started = time.perf_counter()
-for t in range(int(sys.argv[2]) // copies): env.step(actions[t % 64])
+for t in range(int(sys.argv[2]) // num_envs): env.step(actions[t % 64])
 print(int(sys.argv[2]) / (time.perf_counter() - started))
 """
 
@@ -41,15 +41,14 @@ REPLAY = """
 import json, sys, tempfile
 import lemniscate as lem
 
-def wait_for_turn(*_):  # every 500 steps
+def take_turns(step, metrics, policy):  # every 500 steps
     print(flush=True)
     sys.stdin.readline() or sys.exit()
 
-fields = json.loads(sys.argv[1])
 sys.stdin.readline()
 with tempfile.TemporaryDirectory() as scratch:
-    path = scratch + "/run"
-    lem.train("ddpg", "Hopper-v5", preset="default", run=path, progress=False, callbacks=[wait_for_turn], **fields)
+    fields = {"preset": "default", "run": scratch + "/run", "progress": False, "callbacks": [take_turns]}
+    lem.train("ddpg", "Hopper-v5", **fields, **json.loads(sys.argv[1]))
 """
 
 PEER_REPLAY = """

@@ -31,17 +31,6 @@ def test_every_line_that_the_notes_quote_is_there(file, code):
     assert code in (SOURCE / file).read_text()
 
 
-def test_a_record_is_followed_through_eight_files_at_most():
-    """Each row of the tables is a file to open; what all rollouts have in common counts for each."""
-    shared, *sections = (ROOT / "docs" / "notes" / "record.md").read_text().split("\n## ")
-    files = lambda text: set(re.findall(r"`(\w+/\w+\.py)`", text)) - {"tests/test_docs.py"}  # noqa: E731
-    names = [section.partition("\n")[0] for section in sections]
-    assert names == ["REINFORCE", "A2C", "PPO", "TRPO", "DDPG, TD3, SAC"]
-    for name, section in zip(names, sections, strict=True):
-        followed = files(section) | (files(shared) if "DDPG" not in name else set())
-        assert 6 <= len(followed) <= 8, (name, followed)
-
-
 @pytest.mark.parametrize(
     "page", ["README.md", "CONTRIBUTING.md", *(str(p.relative_to(ROOT)) for p in ROOT.glob("docs/**/*.md"))]
 )
@@ -133,8 +122,8 @@ def test_algorithm_files_have_the_same_names_in_the_same_order():
         text = (SOURCE / "algos" / f"{name}.py").read_text()
         order = [
             text.index(f"\n{mark}")
-            for mark in ("class Config", "class State", "def networks", "def init", "def update", "def train")
+            for mark in ("class Config", "class State", "def init", "def learn", "def update", "def train")
         ]
         assert order == sorted(order)
-        assert 60 <= len(text.splitlines()) <= 200
+        assert 60 <= len(text.splitlines()) <= 180
         assert module.__doc__
