@@ -88,7 +88,7 @@ def test_envs_lists_backend_and_preset(capsys):
         (["resume", "nowhere"], "nowhere is not a run directory"),
         (["train", "--seed", "3", "ppo"], "The algorithm comes first, then its fields: lemniscate train ppo"),
         (["train", "ppo", "--env", "CartPole-v1", "--backend", "envpol"], "There is no backend 'envpol'"),
-        (["train", "ppo", "--env", "test_cli:Nothing"], "has neither an environment class nor an id Nothing"),
+        (["train", "ppo", "--env", "test_cli:Nothing"], "test_cli has no Nothing"),
         (["check", "CartPole-v1", "--backend", "foo"], "There is no backend 'foo'"),
         (["watch"], "The following arguments are required"),
         (["evaluat"], "Invalid choice: 'evaluat'"),

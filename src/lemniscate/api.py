@@ -74,7 +74,7 @@ def make_envs(config: RunConfig) -> tuple[VecEnv, VecEnv]:
 
 def train(
     algorithm: str,
-    env: str | None = None,
+    env: str | Callable[..., Any] | None = None,
     *,
     run: str | Path | None = None,
     preset: str | None = None,
