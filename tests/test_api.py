@@ -111,7 +111,7 @@ def test_a_policy_is_evaluated_by_the_simulator_that_trained_it(
     monkeypatch.setattr(
         registry, "make", lambda *a, **k: asked.append(k["backend"]) or make(*a, **{**k, "backend": None})
     )
-    monkeypatch.setattr("lemniscate.api.is_installed", lambda _: installed)
+    monkeypatch.setattr("lemniscate.envs.registry.is_installed", lambda _: installed)
     policy = lem.load(cartpole.path)
     policy.config = policy.config.replace(backend=trained_by)
     lem.evaluate(policy, episodes=2)

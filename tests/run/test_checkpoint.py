@@ -16,7 +16,7 @@ from lemniscate.run.checkpoint import DamagedCheckpointError
 from lemniscate.spec import Box, Discrete, MultiBinary, MultiDiscrete, ObservationPart, Spec
 from lemniscate.types import Batch
 
-SPEC = Spec("x", (ObservationPart((), (3,)),), Box((-1.0,), (1.0,)), 500, 0.02, (0, 3))
+SPEC = Spec("x", (ObservationPart((), (3,)),), Box((-1.0,), (1.0,)), 500)
 CPU = torch.device("cpu")
 
 

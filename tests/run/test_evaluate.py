@@ -1,10 +1,14 @@
 from dataclasses import replace
 
+import gymnasium as gym
+import numpy as np
 import pytest
 import torch
 
 import lemniscate as lem
+from lemniscate import named
 from lemniscate.envs import registry, toy
+from lemniscate.envs.backend import Summary
 from lemniscate.errors import UserError
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.networks import Layers
@@ -75,3 +79,61 @@ def test_a_run_goes_on_when_its_evaluation_cannot(monkeypatch, tmp_path, capsys)
     run = lem.train("ppo", "Countdown-v0", run=tmp_path / "run", backend="gymnasium", **fields)
     assert run.policy.step == 128
     assert "No evaluation at step 64" in capsys.readouterr().err
+
+
+class Climbs(gym.Env):
+    """Measures a height, the number of the step; success is reached in the last of `length` steps."""
+
+    observation_space = gym.spaces.Box(-1, 1, (1,))
+    action_space = gym.spaces.Discrete(2)
+    metadata = {"render_modes": [], "measures": ["height"]}  # noqa: RUF012
+
+    def __init__(self, length=4):
+        self.length = length
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.t += 1
+        info = {"height": float(self.t), "is_success": self.t == self.length}
+        return np.zeros(1, np.float32), 1.0, self.t == self.length, False, info
+
+
+def test_what_is_measured_is_averaged_over_the_rows_that_count():
+    """Ten episodes in four environments: two of them stop counting after two episodes, and go on playing."""
+    env = registry.make(Climbs, 4)
+    scores = evaluate(ActorCritic(env.spec, Layers((4,))).policy, env, 10, seed=0)
+    assert scores.measures == {"height": 2.5, "is_success": 0.25, "is_success_at_end": 1.0}
+    assert scores.to_json() | scores.measures == scores.to_json()
+
+
+def test_summaries_leave_out_the_first_steps():
+    env = registry.make(Climbs, 2)
+    env.summaries = (Summary("rms", "height", "rms", scale=10), Summary("late", "height", "rms", skip=2))
+    measures = evaluate(ActorCritic(env.spec, Layers((4,))).policy, env, 4, seed=0).measures
+    assert measures["rms"] == pytest.approx(10 * np.sqrt(np.mean(np.square([1, 2, 3, 4]))))
+    assert measures["late"] == pytest.approx(np.sqrt(np.mean(np.square([3, 4]))))
+
+
+def test_a_policy_is_evaluated_in_another_world(tmp_path):
+    fields = {"num_envs": 2, "num_steps": 8, "total_steps": 64, "minibatch_size": 16, "progress": False}
+    made = lem.train("ppo", Climbs, run=tmp_path / "run", env_kwargs={"length": 3}, **fields)
+    policy = lem.load(made.path)
+    assert policy.config.env == "test_evaluate:Climbs"
+    assert lem.evaluate(policy, episodes=2).lengths == [3, 3]
+    assert lem.evaluate(policy, episodes=2, env_kwargs={"length": 5}).lengths == [5, 5]
+    assert lem.evaluate(policy, env=lambda: Climbs(length=6), episodes=2).lengths == [6, 6]
+
+
+def test_an_environment_that_no_file_can_keep_is_asked_for_again(tmp_path):
+    fields = {"num_envs": 2, "num_steps": 8, "total_steps": 64, "minibatch_size": 16, "progress": False}
+    made = lem.train("ppo", lambda: Climbs(length=3), run=tmp_path / "run", **fields)
+    policy = lem.load(made.path)
+    assert lem.evaluate(policy, episodes=2).lengths == [3, 3]
+    named._PASSED.clear()  # as another process would have it
+    with pytest.raises(UserError, match="pass the object again"):
+        lem.evaluate(policy, episodes=2)
+    assert lem.evaluate(policy, env=lambda: Climbs(length=3), episodes=2).lengths == [3, 3]

@@ -16,7 +16,14 @@ from lemniscate.envs.episodes import Stagger
 from lemniscate.envs.factory import make_one, make_vector, maker_of, makes_vector
 from lemniscate.envs.masks import ActionMasks
 from lemniscate.envs.measures import SUMMARIES, measured, measures_of
-from lemniscate.envs.spaces import action_kind, flatten_observation, is_image, observation_parts, physical_action
+from lemniscate.envs.spaces import (
+    action_kind,
+    flatten_observation,
+    is_image,
+    observation_parts,
+    physical_action,
+    row_of,
+)
 from lemniscate.errors import UserError
 from lemniscate.named import find_callable
 from lemniscate.spec import Discrete, Spec
@@ -146,7 +153,7 @@ class GymnasiumBackend:
             )
         next_obs, size = obs.copy(), self.spec.observation_size
         for row in np.flatnonzero(done):
-            final = _row(info["final_obs"], int(row))
+            final = row_of(info["final_obs"], int(row))
             next_obs[row, :size] = flatten_observation(self.spec.observation_parts, final, image=self.spec.image)
         return next_obs
 
@@ -177,8 +184,3 @@ class AsyncGymnasiumBackend(GymnasiumBackend):
 def _with(kwargs: Mapping[str, Any], wrappers: Sequence[str]) -> str:
     given = [f"{name}={value!r}" for name, value in kwargs.items()] + list(wrappers)
     return f" with {', '.join(given)}" if given else ""
-
-
-def _row(batch: Any, row: int) -> Any:
-    """One observation out of a batch of them, which may be a dictionary or an array of objects."""
-    return {name: _row(part, row) for name, part in batch.items()} if isinstance(batch, dict) else batch[row]

@@ -77,6 +77,13 @@ def follow(path: tuple[str | int, ...], obs: Any) -> Any:
     return obs
 
 
+def row_of(batch: Any, row: int) -> Any:
+    """One observation out of a batch of them, which may be a dictionary, a tuple or an array."""
+    if isinstance(batch, dict):
+        return {name: row_of(part, row) for name, part in batch.items()}
+    return tuple(row_of(part, row) for part in batch) if isinstance(batch, tuple) else batch[row]
+
+
 def _flatten(part: ObservationPart, obs: Any, image: bool) -> np.ndarray:
     if part.nvec:
         numbers = np.asarray(obs).reshape(-1, len(part.nvec)) - np.array(part.start)
