@@ -71,6 +71,21 @@ def test_fields_reach_the_config(run):
     assert config["total_steps"] == 256
 
 
+def test_environment_arguments_and_wrappers_reach_training_and_evaluation(tmp_path, capsys):
+    path, wrapper = tmp_path / "run", "gymnasium.wrappers:TimeLimit(max_episode_steps=7)"
+    world = ["--env", "CartPole-v1", "--env-args", '{"sutton_barto_reward": true}', "--wrappers", wrapper]
+    assert main(["train", "ppo", *world, "--run", str(path), *TINY]) == 0
+    config = json.loads((path / "config.json").read_text())["config"]
+    assert config["env_kwargs"] == {"sutton_barto_reward": True}
+    assert config["wrappers"] == [wrapper]
+    returns = []
+    for kwargs in ([], ["--env-args", '{"sutton_barto_reward": false}']):
+        capsys.readouterr()
+        assert main(["evaluate", str(path), "--episodes", "3", "--json", *kwargs]) == 0
+        returns.append(json.loads(capsys.readouterr().out)["returns"])
+    assert returns == [[0, 0, 0], [7, 7, 7]]
+
+
 def test_train_with_a_report_leaves_pictures(tmp_path, capsys):
     path = tmp_path / "r"
     assert main(["train", "ppo", "--env", "CartPole-v1", "--run", str(path), "--report", *TINY]) == 0
@@ -277,7 +292,7 @@ def test_an_algorithm_of_ones_own_has_its_fields_in_its_help(tmp_path, monkeypat
         (["train", "ppo", "--env", "CartPole-v1", "--minibatch-size", "1"], "normalize_advantage needs batches of 2"),
         (["train", "ppo", "--env", "CartPole-v1", "--activation", "x"], "activation must be one of tanh, relu, elu, silu, not 'x'"),
         (["train", "ppo", "--env", "CartPole-v1", "--backend", "envpol"], "There is no backend 'envpol'"),
-        (["train", "ppo", "--env", "test_cli:Nothing"], "has neither an environment class nor an id Nothing"),
+        (["train", "ppo", "--env", "test_cli:Nothing"], "test_cli:Nothing cannot be found: test_cli has no Nothing."),
         (["train", "ppo,sac", "--env", "CartPole-v1"], "Algorithms are compared over several seeds: add --seeds 1-5."),
         (["train", "ppo", "--seeds", "1-2", "--seed", "3"], "Several runs have several seeds: --seeds 1-5, not --seed."),
         (["evaluate", "nowhere"], "nowhere is not a run directory"),
