@@ -37,8 +37,8 @@ def one(settings, variant, seed, steps):
     from lemniscate.report.curves import episode_returns
 
     env = "course_lander:WithoutEnd" if variant == VARIANTS[1] else "LunarLander-v3"
-    fields = {**lem.config_for("ppo", "LunarLander-v3", "course").to_json(), "backend": "gymnasium"}
-    fields |= {"env": env, "seed": seed, "total_steps": steps, "hidden": tuple(fields["hidden"]), **SETTINGS[settings]}
+    fields = {**vars(lem.config_for("ppo", "LunarLander-v3", "course")), "backend": "gymnasium"}
+    fields |= {"env": env, "seed": seed, "total_steps": steps, **SETTINGS[settings]}
     # The batch that was estimated again, with its new log-probabilities, in the place of the old ones.
     keep_new = patch.object(ppo, "replace", lambda batch, **_: batch)
     with tempfile.TemporaryDirectory() as folder:

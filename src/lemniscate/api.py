@@ -19,6 +19,7 @@ from lemniscate.errors import UserError, is_installed, missing_extra, unknown_na
 from lemniscate.policy import TrainedPolicy
 from lemniscate.report import compare, curves, playback
 from lemniscate.report import pictures as pictures_of
+from lemniscate.report.groups import group
 from lemniscate.run import checkpoint
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import find_checkpoint, is_finished, read_config, require_absent
@@ -239,7 +240,7 @@ def plot(*runs: str | Path) -> list[Path]:
     found = [run for path in paths for run in _members(path)]
     folder = paths[0] / "plots" if len(paths) == 1 else Path("plots")
     if found != paths[:1]:
-        return compare.report(compare.group(found), _final_returns(found), folder)
+        return compare.report(group(found), _final_returns(found), folder)
     pictures = curves.plot_runs(found, folder)
     if any((paths[0] / "checkpoints").glob("step-*")):
         policy = load(paths[0])
