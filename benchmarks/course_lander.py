@@ -2,8 +2,8 @@
 
     .venv/bin/python benchmarks/course_lander.py        seeds 1 to 3, some twenty minutes
 
-The notebook resets an environment when an episode has ended by its rules, never when time is up; and it takes the old
-log-probabilities anew in each epoch, so that the ratio is always 1 and the clip never acts. (Without a time limit the
+The notebook resets an environment when an episode has ended by its rules, never at the time limit; and it takes the old
+log-probabilities again in each epoch, so that the ratio is always 1 and the clip never acts. (Without a time limit the
 first episodes are not staggered either.)
 """
 
@@ -37,9 +37,9 @@ def one(settings, variant, seed, steps):
     from lemniscate.report.curves import episode_returns
 
     env = "course_lander:WithoutEnd" if variant == VARIANTS[1] else "LunarLander-v3"
-    fields = {**lem.config_for("ppo", "LunarLander-v3", "course").to_json(), "backend": "gymnasium"}
-    fields |= {"env": env, "seed": seed, "total_steps": steps, "hidden": tuple(fields["hidden"]), **SETTINGS[settings]}
-    # The batch that was estimated anew, with its new log-probabilities, in the place of the old ones.
+    fields = {**vars(lem.config_for("ppo", "LunarLander-v3", "course")), "backend": "gymnasium"}
+    fields |= {"env": env, "seed": seed, "total_steps": steps, **SETTINGS[settings]}
+    # The batch that was estimated again, with its new log-probabilities, in the place of the old ones.
     keep_new = patch.object(ppo, "replace", lambda batch, **_: batch)
     with tempfile.TemporaryDirectory() as folder:
         if variant == VARIANTS[2]:

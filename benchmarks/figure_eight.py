@@ -35,8 +35,8 @@ def one_run(preset, seed, device):
                 "mean_return": scores.mean_return,
                 "min_return": min(scores.returns),
                 "crashes": scores.terminated,
-                "rmse_mm": scores.rmse_mm,
-                "rmse_after_1s_mm": scores.rmse_after_1s_mm,
+                "rmse_mm": scores.measures["rmse_mm"],
+                "rmse_after_1s_mm": scores.measures["rmse_after_1s_mm"],
                 "training_s": run.seconds,
             }
         )

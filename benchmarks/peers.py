@@ -28,31 +28,27 @@ import sys, time, warnings, numpy, envpool
 warnings.simplefilter("ignore")
 env = envpool.make(sys.argv[1], env_type="gymnasium", num_envs=int(sys.argv[3]), num_threads=2, seed=1)
 space = env.action_space
-copies = int(sys.argv[3])
-actions = numpy.random.default_rng(0).uniform(space.low, space.high, (64, copies, *space.shape))
+num_envs = int(sys.argv[3])
+actions = numpy.random.default_rng(0).uniform(space.low, space.high, (64, num_envs, *space.shape))
 env.reset()
-for t in range(3200 // copies): env.step(actions[t % 64])
+for t in range(3200 // num_envs): env.step(actions[t % 64])
 started = time.perf_counter()
-for t in range(int(sys.argv[2]) // copies): env.step(actions[t % 64])
+for t in range(int(sys.argv[2]) // num_envs): env.step(actions[t % 64])
 print(int(sys.argv[2]) / (time.perf_counter() - started))
 """
 
 REPLAY = """
 import json, sys, tempfile
 import lemniscate as lem
-from lemniscate.run.loggers import LOGGERS
 
-class Turns:
-    def __init__(self, *_): pass
-    def write(self, *_):  # every 500 steps
-        print(flush=True)
-        sys.stdin.readline() or sys.exit()
-    def close(self, *_): pass
+def take_turns(step, metrics, policy):  # every 500 steps
+    print(flush=True)
+    sys.stdin.readline() or sys.exit()
 
-LOGGERS["jsonl"] = Turns
 sys.stdin.readline()
 with tempfile.TemporaryDirectory() as scratch:
-    lem.train("ddpg", "Hopper-v5", preset="default", run=scratch + "/run", progress=False, **json.loads(sys.argv[1]))
+    fields = {"preset": "default", "run": scratch + "/run", "progress": False, "callbacks": [take_turns]}
+    lem.train("ddpg", "Hopper-v5", **fields, **json.loads(sys.argv[1]))
 """
 
 PEER_REPLAY = """

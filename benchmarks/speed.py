@@ -4,11 +4,11 @@
     .venv/bin/python benchmarks/speed.py throughput parts    only these
     .venv/bin/python benchmarks/speed.py --table             the table of what has been measured, and its picture
 
-    throughput   PPO, 2048 rows × 10 epochs × minibatches of 64, 64 × 64 tanh. HalfCheetah on 16 copies, each peer at
-                 its best number of threads and kind of vector; the others on 64 copies, beside EnvPool alone
-    parts        where the time of one update goes, eager and native
-    startup      from the command to the first update: eager, native with a cold cache, native with a warm one
-    trust        TRPO on 16 copies of HalfCheetah-v5, 2048 rows, beside sb3-contrib with the same settings
+    throughput   PPO, 2048 rows × 10 epochs × minibatches of 64, 64 × 64 tanh. 16 × HalfCheetah, each peer at its best
+                 number of threads and kind of vector; 64 × each of the others, beside EnvPool alone
+    parts        the parts of one update, eager and compiled
+    startup      from the command to the first update: eager, compiled with a cold cache and with a warm one
+    trust        TRPO on 16 × HalfCheetah-v5, 2048 rows, beside sb3-contrib with the same settings
     replay       DDPG on Hopper-v5: batches of 256, 256 × 256, one gradient step for each step, in turns of 500
     lander       from process start to a policy of mean return 250 over 100 episodes of LunarLander-v3
 
@@ -33,8 +33,8 @@ from statistics import harmonic_mean, median
 from common import RESULTS, append, provenance, rows
 from peers import BARE, PEER, PEER_LANDER, PEER_REPLAY, PEER_TRPO, REPLAY
 
-COPIES = {"HalfCheetah-v5": 16, "Ant-v5": 64, "Humanoid-v5": 64, "Hopper-v5": 64}
-ENVS = tuple(COPIES)
+NUM_ENVS = {"HalfCheetah-v5": 16, "Ant-v5": 64, "Humanoid-v5": 64, "Hopper-v5": 64}
+ENVS = tuple(NUM_ENVS)
 SHARED = {"num_envs": 16, "num_steps": 128, "minibatch_size": 64, "epochs": 10, "learning_rate": 3e-4}
 OURS, PHYSICS = "lemniscate", "EnvPool alone"
 PEERS = [("sb3", threads, kind) for threads in (1, 2) for kind in ("dummy", "subproc")]
@@ -44,12 +44,16 @@ TRUST = {
     "sb3-contrib's defaults": {"cg_iterations": 15, "critic_epochs": 10, "max_kl": 0.01},
     "its zoo, for this environment": {"cg_iterations": 25, "critic_epochs": 20, "max_kl": 0.04},
 }
-MEMORY = {"batch_size": 256, "learning_starts": 500, "buffer_size": 100_000, "num_steps": 500, "engine": "native"}
-MEMORY |= {"total_steps": 1_000_000, "checkpoint_every": 1_000_000}
+DDPG = {"batch_size": 256, "learning_starts": 500, "buffer_size": 100_000, "log_every": 500, "compile": "on"}
+DDPG |= {"total_steps": 1_000_000, "checkpoint_every": 1_000_000}
 WAYS = {
     OURS: {},
     "lemniscate, bfloat16 products": {"matmul": "bfloat16"},
-    "lemniscate, 4 copies, 4 updates for each of their steps": {"num_envs": 4, "num_updates": 4, "num_steps": 125},
+    "lemniscate, 4 environments, 4 updates a step": {
+        "num_envs": 4,
+        "num_updates": 4,
+        "log_every": 125,
+    },
 }
 
 
@@ -88,8 +92,8 @@ def ours(env, steps):
     """Steps per second after the third update: the first compiles."""
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch) / "run"
-        size = {**SHARED, "num_envs": COPIES[env], "num_steps": 2048 // COPIES[env]}
-        train(folder, env, preset="paper", total_steps=steps, checkpoint_every=steps, engine="native", **size)
+        size = {**SHARED, "num_envs": NUM_ENVS[env], "num_steps": 2048 // NUM_ENVS[env]}
+        train(folder, env, preset="paper", total_steps=steps, checkpoint_every=steps, compile="on", **size)
         return harmonic_mean(line["time/steps_per_second"] for line in lines(folder)[3:])
 
 
@@ -97,7 +101,7 @@ def throughput(rounds, stamp, envs=ENVS):
     best = {}
     for env in envs:
         for _ in range(rounds):
-            alone = python(BARE, env, 100_000 if env == ENVS[0] else 40_000, COPIES[env])
+            alone = python(BARE, env, 100_000 if env == ENVS[0] else 40_000, NUM_ENVS[env])
             row = {PHYSICS: alone, OURS: ours(env, 100_000)}
             for peer in ("sb3", "sbx") if env == ENVS[0] else ():
                 if peer not in best:  # the first round tries all, the others what was best
@@ -108,7 +112,7 @@ def throughput(rounds, stamp, envs=ENVS):
             say(env, {name: round(speed) for name, speed in row.items()})
             append(
                 "speed",
-                {"what": "throughput", "env": env, "copies": COPIES[env], "steps_per_second": row, "peers": best}
+                {"what": "throughput", "env": env, "num_envs": NUM_ENVS[env], "steps_per_second": row, "peers": best}
                 | stamp,
             )
 
@@ -164,7 +168,8 @@ def parts(rounds, stamp):
     import torch
 
     from lemniscate.algos import ppo
-    from lemniscate.maths import gae
+    from lemniscate.data.rollout import epoch_minibatches
+    from lemniscate.maths import gae, means
     from lemniscate.spec import Box, ObservationPart, Spec
     from lemniscate.types import Rollout
 
@@ -174,47 +179,49 @@ def parts(rounds, stamp):
     no, obs = torch.zeros(128, 16, dtype=torch.bool), torch.randn(129, 16, 17)
     rollout = Rollout(obs[:-1], torch.randn(128, 16, 6), torch.randn(128, 16), obs[1:], no, no, ~no)
 
-    def clock(function, times):
+    def milliseconds(function, times):
         function()
         started = time.perf_counter()
         for _ in range(times):
             function()
         return 1e3 * (time.perf_counter() - started) / times
 
-    for engine in ("eager", "native"):
+    for how in ("eager", "compiled"):
         state = ppo.init(config, spec, device)
-        if engine == "native":
-            state.policy.make_native()
-            state.optimizer.make_native()
-        noise, played = state.policy.noise((16,), state.noise), torch.arange(2048)
-        batch = ppo.advantages(config, state, rollout)
-        minibatches = ppo.minibatches(played, 2048, 64, state.shuffle)
+        if how == "compiled":
+            state.compile()
+        state.optimizer.learning_rate = 3e-4
+        networks, noise = state.networks, state.policy.draw_noise((16,), state.rng.action)
+        batch = ppo.advantages(config, networks, rollout)
+        minibatches = epoch_minibatches(torch.arange(2048), 2048, 64, state.rng.minibatch)
         with torch.no_grad():
-            act = clock(lambda: state.policy.act(obs[0], noise), 500)  # noqa: B023
+            act = milliseconds(lambda: networks.policy.act(obs[0], noise), 500)  # noqa: B023
+        epoch = milliseconds(lambda: means(state.learn(config, state, batch, minibatches)), 3 * rounds)  # noqa: B023
         row = {
             "what": "parts",
-            "engine": engine,
+            "how": how,
             "policy step, 16 rows": act,
-            "values, log-probs and GAE, 2048 rows": clock(lambda: ppo.advantages(config, state, rollout), 20),  # noqa: B023
-            "of which GAE": clock(lambda: gae(rollout.reward, rollout.reward, rollout.reward, no, no), 20),
-            "gradient step, 64 rows": clock(lambda: state.optimizer(batch, minibatches, 3e-4), 3 * rounds) / 32,  # noqa: B023
+            "values, log-probs and GAE, 2048 rows": milliseconds(
+                lambda: ppo.advantages(config, networks, rollout),  # noqa: B023
+                20,
+            ),
+            "of which GAE": milliseconds(lambda: gae(rollout.reward, rollout.reward, rollout.reward, no, no), 20),
+            "gradient step, 64 rows": epoch / 32,
         }
         append("speed", row | stamp)
-        for name, milliseconds in list(row.items())[2:]:
-            print(f"| {name} | {engine} | {milliseconds:.3f} ms |")
+        for name, value in list(row.items())[2:]:
+            print(f"| {name} | {how} | {value:.3f} ms |")
 
 
 def startup(rounds, stamp):
     """Seconds from the command to the first line of metrics."""
     cache = tempfile.mkdtemp()
-    for name in ("eager", "native, cold", *["native, warm"] * rounds):
+    for name in ("eager", "compiled, cold", *["compiled, warm"] * rounds):
         environment = {"TORCHINDUCTOR_CACHE_DIR": cache}
         with tempfile.TemporaryDirectory() as scratch:
             folder, started = Path(scratch) / "run", time.monotonic()
-            engine = "eager" if name == "eager" else "native"
-            process = train(
-                folder, ENVS[0], wait=False, environment=environment, preset="paper", engine=engine, **SHARED
-            )
+            fields = {"preset": "paper", "compile": "off" if name == "eager" else "on", **SHARED}
+            process = train(folder, ENVS[0], wait=False, environment=environment, **fields)
             while not lines(folder):
                 if process.poll() is not None:
                     raise SystemExit(process.stderr.read())
@@ -222,7 +229,7 @@ def startup(rounds, stamp):
             seconds = time.monotonic() - started
             process.terminate()
             process.wait()
-        append("speed", {"what": "startup", "engine": name, "seconds": seconds} | stamp)
+        append("speed", {"what": "startup", "how": name, "seconds": seconds} | stamp)
         print(f"| {name} | {seconds:.1f} s |")
     shutil.rmtree(cache)
 
@@ -232,17 +239,17 @@ def trust(rounds, stamp):
 
     def ours(size, count):
         with tempfile.TemporaryDirectory() as scratch:
-            folder, fields = Path(scratch) / "run", {"num_envs": 16, "num_steps": 128, "engine": "native", **size}
+            folder, fields = Path(scratch) / "run", {"num_envs": 16, "num_steps": 128, "compile": "on", **size}
             train(folder, ENVS[0], algorithm="trpo", preset="default", total_steps=60_000, threads=count, **fields)
             return harmonic_mean(line["time/steps_per_second"] for line in lines(folder)[3:])
 
     best = {}
     for _ in range(rounds):
         for name, size in TRUST.items():
-            clocks = {(OURS, n): partial(ours, size, n) for n in (1, 2)}
+            programs = {(OURS, n): partial(ours, size, n) for n in (1, 2)}
             for kind, n in product(("dummy", "subproc"), (1, 2)):
-                clocks["sb3-contrib", kind, n] = partial(python, PEER_TRPO, 20_000, kind, n, *size.values())
-            tried = {way: clock() for way, clock in clocks.items() if way in best.get(name, clocks)}
+                programs["sb3-contrib", kind, n] = partial(python, PEER_TRPO, 20_000, kind, n, *size.values())
+            tried = {way: program() for way, program in programs.items() if way in best.get(name, programs)}
             best[name] = [max((way for way in tried if way[0] == who), key=tried.get) for who in (OURS, "sb3-contrib")]
             row = {way[0]: tried[way] for way in best[name]}
             say(f"TRPO, {ENVS[0]}, settings of {name}:", {who: round(speed) for who, speed in row.items()}, best[name])
@@ -260,7 +267,7 @@ def replay(rounds, stamp):
     """Steps per second of DDPG, in turns of 500 steps, each at the number of threads that was the quicker at first."""
     turns = 10
     programs = {
-        (name, threads): (REPLAY, json.dumps(MEMORY | fields | {"threads": threads}))
+        (name, threads): (REPLAY, json.dumps(DDPG | fields | {"threads": threads}))
         for (name, fields), threads in product(WAYS.items(), (1, 2))
     }
     programs |= {way: (PEER_REPLAY, *map(str, way)) for way in product(("sb3", "sbx"), (1, 2))}

@@ -123,3 +123,24 @@ class Fragile(gym.Env):
         if name == "ppo-3":
             os.kill(os.getpid(), signal.SIGKILL)
         return np.zeros(1, np.float32), np.nan if name == "ppo-2" else 1.0, self.t == 8, False, {}
+
+
+class Pictures(gym.Env):
+    """Random images of bytes of any shape; an episode is 8 steps."""
+
+    action_space = spaces.Discrete(2)
+
+    def __init__(self, shape):
+        self.observation_space = spaces.Box(0, 255, shape, np.uint8)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        return self._look(), {}
+
+    def step(self, action):
+        self.t += 1
+        return self._look(), 0.0, self.t == 8, False, {}
+
+    def _look(self):
+        return self.np_random.integers(0, 256, self.observation_space.shape, np.uint8)

@@ -111,7 +111,7 @@ def test_a_policy_is_evaluated_by_the_simulator_that_trained_it(
     monkeypatch.setattr(
         registry, "make", lambda *a, **k: asked.append(k["backend"]) or make(*a, **{**k, "backend": None})
     )
-    monkeypatch.setattr("lemniscate.api.is_installed", lambda _: installed)
+    monkeypatch.setattr("lemniscate.envs.registry.is_installed", lambda _: installed)
     policy = lem.load(cartpole.path)
     policy.config = policy.config.replace(backend=trained_by)
     lem.evaluate(policy, episodes=2)
@@ -195,7 +195,7 @@ def test_wandb_missing_is_said_with_its_install_line(tmp_path, monkeypatch):
     import sys
 
     monkeypatch.setitem(sys.modules, "wandb", None)
-    with pytest.raises(lem.UserError, match=r"pip install 'lemniscate\[wandb\]'"):
+    with pytest.raises(lem.UserError, match=r"pip install '\.\[wandb\]'"):
         lem.train("ppo", "Countdown-v0", run=tmp_path / "r", track="wandb", progress=False, **tiny_fields())
 
 

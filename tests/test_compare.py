@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 import lemniscate as lem
-from lemniscate.report import compare
+from lemniscate.report import compare, comparison_plot
 from lemniscate.report.curves import training_minutes
+from lemniscate.report.groups import group
 from lemniscate.report.seeds import bootstrap_interval, improvement_interval, iqm
 from lemniscate.run import checkpoint
 
@@ -48,12 +49,12 @@ def _here(tmp_path, monkeypatch):
 
 
 def labels(runs):
-    return [one.label for one in compare.group(runs)]
+    return [one.label for one in group(runs)]
 
 
 def test_runs_that_differ_in_their_seed_alone_are_one_group(tmp_path):
     ppo, sac = write_runs(tmp_path / "a"), write_runs(tmp_path / "b", algorithm="sac", env="Pendulum-v1")
-    groups = compare.group([ppo[0], sac[0], *ppo[1:], *sac[1:]])
+    groups = group([ppo[0], sac[0], *ppo[1:], *sac[1:]])
     assert [one.runs for one in groups] == [ppo, sac]
     assert [one.label for one in groups] == ["PPO", "SAC"]
     assert [one.env for one in groups] == ["CartPole-v1", "Pendulum-v1"]
@@ -81,7 +82,7 @@ def test_runs_alike_even_in_their_seed_are_told_apart_by_where_they_are(tmp_path
     config = json.loads((write_run(tmp_path / "old" / "ppo-1") / "config.json").read_text())["config"]
     runs = [tmp_path / "old" / "ppo-1", write_run(tmp_path / "old" / "ppo-2", seed=2), write_run(tmp_path / "ppo")]
     (tmp_path / "old" / "sweep.json").write_text(json.dumps({"seeds": [1, 2], "configs": {"ppo": config}}))
-    groups = compare.group(runs)
+    groups = group(runs)
     assert [one.label for one in groups] == [f"PPO, directory {tmp_path / name}" for name in ("old", "ppo")]
     assert [len(one.runs) for one in groups] == [2, 1]
 
@@ -102,7 +103,7 @@ def test_the_time_of_training_is_added_up_from_its_speed(tmp_path):
 def test_the_table_says_what_the_seeds_say_together(tmp_path):
     a = write_runs(tmp_path / "a", seeds=(1, 2, 3, 4), rate=100.0)
     b = [write_run(tmp_path / "b", algorithm="sac", env="Pendulum-v1")]
-    groups = compare.group([*a, *b])
+    groups = group([*a, *b])
     head, ppo, sac = compare.table(groups, {**{run: 1000.0 * (i + 1) for i, run in enumerate(a)}, b[0]: -7.0})
     assert head.split() == ["seeds", "final", "return", "IQM", "[95", "%]", "worst", "seed", "minutes"]
     assert ppo.split() == ["PPO", "4", "2,500", "±", "1,118", "2,500", "[1,000,", "4,000]", "1,000", "1.7"]
@@ -113,8 +114,10 @@ def test_the_table_says_what_the_seeds_say_together(tmp_path):
 def drawn(monkeypatch, *runs):
     """The figure of the comparison that `lem.plot` draws."""
     figures = {}
-    save = compare.save
-    monkeypatch.setattr(compare, "save", lambda figure, file: figures.update({file.name: figure}) or save(figure, file))
+    save = comparison_plot.save
+    monkeypatch.setattr(
+        comparison_plot, "save", lambda figure, file: figures.update({file.name: figure}) or save(figure, file)
+    )
     lem.plot(*runs)
     return figures
 

@@ -2,6 +2,8 @@
 
 import re
 import runpy
+import shlex
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -28,17 +30,6 @@ def test_the_table_has_its_equations():
 @pytest.mark.parametrize(("file", "code"), equation_rows())
 def test_every_line_that_the_notes_quote_is_there(file, code):
     assert code in (SOURCE / file).read_text()
-
-
-def test_a_record_is_followed_through_eight_files_at_most():
-    """Each row of the tables is a file to open; what all rollouts have in common counts for each."""
-    shared, *sections = (ROOT / "docs" / "notes" / "record.md").read_text().split("\n## ")
-    files = lambda text: set(re.findall(r"`(\w+/\w+\.py)`", text)) - {"tests/test_docs.py"}  # noqa: E731
-    names = [section.partition("\n")[0] for section in sections]
-    assert names == ["REINFORCE", "A2C", "PPO", "TRPO", "DDPG, TD3, SAC"]
-    for name, section in zip(names, sections, strict=True):
-        followed = files(section) | (files(shared) if "DDPG" not in name else set())
-        assert 6 <= len(followed) <= 8, (name, followed)
 
 
 @pytest.mark.parametrize(
@@ -107,33 +98,34 @@ def test_the_pictures_of_training_are_drawn(name, fields):
 
 
 def test_every_command_of_the_readme_is_understood():
-    from lemniscate.cli import _parser
+    from lemniscate.cli import parse
 
     lines = re.findall(r"^lemniscate ([^#\n]+)", (ROOT / "README.md").read_text(), re.MULTILINE)
     assert len(lines) >= 6
     for line in lines:
-        _parser().parse_known_args(line.split())
+        parse(shlex.split(line))
 
 
 def test_every_field_has_its_docstring():
     from lemniscate.algos import ALGORITHMS
 
-    for module in ALGORITHMS.values():
+    for name in ALGORITHMS:
+        module = import_module(f"lemniscate.algos.{name}")
         for config in module.Config.__mro__[:-1]:
             source = (SOURCE / (config.__module__.replace("lemniscate.", "").replace(".", "/") + ".py")).read_text()
-            for name in config.__annotations__:
-                assert re.search(rf'^    {name}: [^\n]+\n    """', source, re.MULTILINE), name
+            for field in config.__annotations__:
+                assert re.search(rf'^    {field}: [^\n]+\n    """', source, re.MULTILINE), field
 
 
 def test_algorithm_files_have_the_same_names_in_the_same_order():
     from lemniscate.algos import ALGORITHMS
 
-    for name, module in ALGORITHMS.items():
+    for name in ALGORITHMS:
         text = (SOURCE / "algos" / f"{name}.py").read_text()
         order = [
             text.index(f"\n{mark}")
-            for mark in ("class Config", "class State", "def networks", "def init", "def update", "def train")
+            for mark in ("class Config", "class State", "def init", "def learn", "def update", "def train")
         ]
         assert order == sorted(order)
-        assert 60 <= len(text.splitlines()) <= 200
-        assert module.__doc__
+        assert 60 <= len(text.splitlines()) <= 180
+        assert text.startswith('"""')

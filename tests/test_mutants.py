@@ -469,7 +469,7 @@ MUTANTS = [
     ),
     (
         "a time-out ends the entropy",
-        "run/q_bias_meter.py",
+        "run/q_bias.py",
         " + networks.entropy_bonus(last, self._generator)",
         "",
         "run/test_q_bias.py",
@@ -491,7 +491,7 @@ MUTANTS = [
     ("Q is the higher one", "nn/actor_critic.py", "value.amin(0)", "value.amax(0)", "run/test_q_bias.py"),
     (
         "a time-out is worth nothing",
-        "run/q_bias_meter.py",
+        "run/q_bias.py",
         "realised + self._gamma**age * value * ~step.terminated",
         "realised",
         "run/test_q_bias.py",

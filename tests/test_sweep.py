@@ -1,4 +1,4 @@
-"""Sets of runs: real processes, as many bits as alone, whatever happens to some of them."""
+"""Sweeps: real processes, each run ends in the same bits as alone, whatever happens to the others."""
 
 import contextlib
 import io
@@ -19,7 +19,7 @@ from lemniscate.cli import main
 from lemniscate.run import checkpoint
 from lemniscate.run.directory import is_finished
 from lemniscate.run.loggers import read_metrics
-from lemniscate.run.progress import SweepProgress
+from lemniscate.run.sweep_progress import SweepProgress
 
 SEEDS = ["--seeds", "1-2"]
 ENV = "environments:Copy-box-v0"
@@ -49,15 +49,15 @@ def final_hash(run):
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    """A set of PPO and DDPG, and what was said."""
-    path = tmp_path_factory.mktemp("sets") / "both"
+    """A sweep of PPO and DDPG, and its lines on standard error."""
+    path = tmp_path_factory.mktemp("sweeps") / "both"
     with contextlib.redirect_stderr(io.StringIO()) as said:
         code = main(["train", "ppo,ddpg", "--env", ENV, "--seeds", "1-2", "--run", str(path), *FLAGS])
     assert code == 0, said.getvalue()
     return path, said.getvalue()
 
 
-def test_a_set_is_a_run_for_each_algorithm_and_seed(trained):
+def test_a_sweep_is_a_run_for_each_algorithm_and_seed(trained):
     path, _ = trained
     record = json.loads((path / "sweep.json").read_text())
     assert record["seeds"] == [1, 2]
@@ -70,7 +70,7 @@ def test_a_set_is_a_run_for_each_algorithm_and_seed(trained):
 
 
 @pytest.mark.parametrize(("algorithm", "seed"), [("ppo", 2), ("ddpg", 1)])
-def test_each_run_of_a_set_ends_in_the_bits_of_a_run_alone(trained, tmp_path, algorithm, seed):
+def test_each_run_of_a_sweep_ends_in_the_bits_of_a_run_alone(trained, tmp_path, algorithm, seed):
     path, _ = trained
     alone = lem.train(algorithm, ENV, seed=seed, run=tmp_path / "alone", progress=False, **SHARED)
     assert final_hash(alone.path) == final_hash(path / f"{algorithm}-{seed}")
@@ -86,23 +86,23 @@ def test_at_the_end_there_is_one_table_and_one_picture(trained):
     assert (path / "plots" / "comparison.png").stat().st_size > 20_000
 
 
-def test_the_set_is_plotted_again_without_playing(trained, monkeypatch):
+def test_the_sweep_is_plotted_again_without_playing(trained, monkeypatch):
     path, _ = trained
     monkeypatch.setattr(lem.api, "evaluate", None)
     assert {picture.parent for picture in lem.plot(path)} == {path / "plots"}
 
 
-def test_what_needs_one_run_says_so_of_a_set(trained, capsys):
+def test_what_needs_one_run_says_so_of_a_sweep(trained, capsys):
     path, _ = trained
     for command in ("evaluate", "watch"):
         assert main([command, str(path)]) == 2
-        said = f"{path} is a set of runs: name one of them, such as {path / 'ddpg-1'}.\n"
+        said = f"{path} is a sweep: name one of its runs, such as {path / 'ddpg-1'}.\n"
         assert capsys.readouterr().err == said
-    with pytest.raises(lem.UserError, match="is a set of runs"):
+    with pytest.raises(lem.UserError, match="is a sweep"):
         lem.resume(path)
 
 
-def test_resuming_a_set_goes_on_begins_and_leaves_alone(trained, tmp_path, capsys):
+def test_resuming_a_sweep_goes_on_begins_and_leaves_alone(trained, tmp_path, capsys):
     path, _ = trained
     copy = shutil.copytree(path, tmp_path / "copy")
     shutil.rmtree(copy / "ddpg-2")
@@ -116,7 +116,7 @@ def test_resuming_a_set_goes_on_begins_and_leaves_alone(trained, tmp_path, capsy
     assert {file: file.stat().st_mtime_ns for file in untouched} == untouched
 
 
-def test_a_finished_set_is_resumed_in_no_time(trained, capsys, monkeypatch):
+def test_a_finished_sweep_is_resumed_in_no_time(trained, capsys, monkeypatch):
     path, _ = trained
     monkeypatch.setattr(subprocess, "Popen", None)
     assert main(["resume", str(path)]) == 0
@@ -134,13 +134,15 @@ def test_a_run_whose_last_checkpoint_is_damaged_is_not_finished(trained, tmp_pat
 def test_runs_are_trained_side_by_side_where_there_are_cores(tmp_path, monkeypatch):
     monkeypatch.setattr(sweep, "at_once", lambda threads: 2)
     most = []
-    look = sweep._Crew._look
-    monkeypatch.setattr(sweep._Crew, "_look", lambda crew: most.append(len(crew._going)) or look(crew))
+    poll = sweep._Processes._poll
+    monkeypatch.setattr(
+        sweep._Processes, "_poll", lambda processes: most.append(len(processes._running)) or poll(processes)
+    )
     lem.train_sweep("ppo", "Countdown-v0", "1-3", run=tmp_path / "set", progress=False, **FEW)
     assert max(most) == 2
 
 
-def test_two_processes_do_not_train_one_set(trained):
+def test_two_processes_do_not_train_one_sweep(trained):
     path, _ = trained
     with FileLock(path / ".lock"), pytest.raises(lem.UserError, match="being trained by another process"):
         lem.resume_sweep(path)
@@ -166,7 +168,7 @@ def command(*arguments):
     return subprocess.Popen(arguments, stderr=subprocess.PIPE, text=True, start_new_session=True)
 
 
-def test_ctrl_c_stops_every_run_and_the_set_goes_on_to_the_same_bits(tmp_path):
+def test_ctrl_c_stops_every_run_and_the_sweep_goes_on_to_the_same_bits(tmp_path):
     path = tmp_path / "stopped"
     fields = [*SMALL, "--total-steps", "3_200", "--checkpoint-every", "512"]
     process = command("train", "ppo", "--env", "Countdown-v0", "--seeds", "1,2", "--run", path, *fields)
@@ -176,7 +178,7 @@ def test_ctrl_c_stops_every_run_and_the_set_goes_on_to_the_same_bits(tmp_path):
     os.killpg(process.pid, signal.SIGINT)  # as a terminal does, to all who belong to it
     said = process.communicate()[1]
     assert process.returncode == 130
-    assert f"Stopped; what had begun is saved. Go on with: lemniscate resume {path}" in said
+    assert f"Stopped; the runs that had begun are saved. Go on with: lemniscate resume {path}" in said
     assert "ppo-1: stopped at step" in said
     assert "Traceback" not in said
     with FileLock(path / "ppo-1" / ".lock", timeout=0):  # nobody trains any more

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 import lemniscate as lem
 from lemniscate.run.loggers import read_metrics
 
-SHARED = {"num_envs": 8, "num_steps": 256, "preset": "default", "engine": "eager", "progress": False}
+SHARED = {"num_envs": 8, "num_steps": 256, "preset": "default", "compile": "off", "progress": False}
 CONSTANT = {"final_learning_rate": 1.0}
 WAYS = {
     "REINFORCE, α = 0.003": ("reinforce", {"learning_rate": 0.003, **CONSTANT}),

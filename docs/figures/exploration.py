@@ -1,6 +1,6 @@
-"""Where a car with no idea gets, by the colour of its noise: docs/images/action_noise.png.
+"""States that a car visits under action noise alone, by the colour of the noise: docs/images/exploration.png.
 
-    .venv/bin/python docs/figures/action_noise.py
+    .venv/bin/python docs/figures/exploration.py
 
 MountainCarContinuous-v0 under noise alone, of the same standard deviation at every step; nothing is learned.
 """
@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from lemniscate.data.action_noise import ActionNoise
 from lemniscate.envs import registry
 
-IMAGE = Path(__file__).parents[1] / "images" / "action_noise.png"
+IMAGE = Path(__file__).parents[1] / "images" / "exploration.png"
 NOISES = {
     "white": ("white", {}),
     "Ornstein–Uhlenbeck": ("ou", {"time": 1 / 0.15}),
@@ -29,20 +29,20 @@ def drive(kind, time=1.0, exponent=0.0):
     env.restart(0)
     noise = ActionNoise(kind, (CARS, 1), STEPS, torch.device("cpu"), time=time, exponent=exponent)
     generator = torch.Generator().manual_seed(0)
-    seen, arrived = [], torch.zeros(CARS, dtype=torch.bool)
+    visited, arrived = [], torch.zeros(CARS, dtype=torch.bool)
     for _ in range(STEPS):
         step = env.step((STD * noise(generator)).clamp(-1, 1))
-        seen.append(torch.where(arrived[:, None], torch.nan, step.next_obs))
+        visited.append(torch.where(arrived[:, None], torch.nan, step.next_obs))
         arrived |= step.terminated
     env.close()
-    return torch.stack(seen).numpy(), arrived
+    return torch.stack(visited).numpy(), arrived
 
 
 def draw():
     """One panel for each noise: all states that were visited, and how many cars arrived."""
     figure = Figure(figsize=(10, 3.3), layout="constrained")
-    for axes, (name, (kind, knobs)) in zip(figure.subplots(1, 3, sharey=True), NOISES.items(), strict=True):
-        states, arrived = drive(kind, **knobs)
+    for axes, (name, (kind, settings)) in zip(figure.subplots(1, 3, sharey=True), NOISES.items(), strict=True):
+        states, arrived = drive(kind, **settings)
         position, velocity = states.reshape(-1, 2).T
         known = ~np.isnan(position)
         axes.hexbin(

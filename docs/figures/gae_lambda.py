@@ -2,8 +2,8 @@
 
     .venv/bin/python docs/figures/gae_lambda.py [FILE]
 
-The walk starts in the middle of 0 … 10, goes left or right with equal chance, and is paid 1 where it leaves at 10 and
-nothing where it leaves at 0: V(s) = s / 10 at γ = 1. The critic has learned half of that.
+The walk starts in the middle of 0 … 10, goes left or right with equal chance, with reward 1 where it leaves at 10 and
+0 where it leaves at 0: V(s) = s / 10 at γ = 1. The critic has learned half of that.
 """
 
 import sys
@@ -35,11 +35,11 @@ def critic(position):
     return 0.25 + 0.5 * position.double() / END
 
 
-def errors(lam, rollout, played, pair, q):
+def errors(lam, rollout, valid, pair, q):
     """Root mean squares over pairs of state and action: (bias, standard deviation) of the estimate A + V of Q."""
     reward, value, next_value, ended = rollout
     advantage, _ = gae(reward, value, next_value, ended, ended, gamma=1.0, lam=lam)
-    error = (advantage + value - q)[played]
+    error = (advantage + value - q)[valid]
     count = torch.bincount(pair)
     mean = torch.bincount(pair, error) / count.clamp(min=1)
     variance = torch.bincount(pair, (error - mean[pair]).square()) / count.clamp(min=1)
@@ -49,12 +49,12 @@ def errors(lam, rollout, played, pair, q):
 
 def draw():
     """One walk at three λ; the error over many walks at every λ."""
-    before, after, reward, ended, played = walk()
+    before, after, reward, ended, valid = walk()
     rollout = (reward, critic(before), critic(after), ended)
     figure = Figure(figsize=(10, 4), layout="constrained")
     one, many = figure.subplots(1, 2)
 
-    lengths = played.sum(0)
+    lengths = valid.sum(0)
     chosen = int(torch.nonzero((lengths == 31) & reward.any(0))[0, 0])
     rows = slice(0, 31)
     for lam, color in COLORS.items():
@@ -70,11 +70,11 @@ def draw():
     one.set_title("One walk that ends at 10", loc="left")
     one.legend(frameon=False, fontsize=8)
 
-    pair = (2 * before + (after > before))[played]
+    pair = (2 * before + (after > before))[valid]
     q = after.double() / END  # Q(s, a) = V(s ± 1), and 1 or 0 at the ends: which are after / END too
-    bias, std = torch.tensor([errors(float(lam), rollout, played, pair, q) for lam in LAMBDAS]).T
-    many.plot(LAMBDAS, bias, color="#3465a4", label="bias: how far the critic misleads")
-    many.plot(LAMBDAS, std, color="#cc0000", label="standard deviation: how far luck does")
+    bias, std = torch.tensor([errors(float(lam), rollout, valid, pair, q) for lam in LAMBDAS]).T
+    many.plot(LAMBDAS, bias, color="#3465a4", label="bias, from the critic")
+    many.plot(LAMBDAS, std, color="#cc0000", label="standard deviation, from chance")
     total = (bias.square() + std.square()).sqrt()
     many.plot(LAMBDAS, total, color="black", label="both")
     best = int(total.argmin())

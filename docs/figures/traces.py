@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 import lemniscate as lem
 from lemniscate.run.loggers import read_metrics
 
-SHARED = {"num_envs": 8, "preset": "default", "engine": "eager", "progress": False, "seed": 1}
+SHARED = {"num_envs": 8, "preset": "default", "compile": "off", "progress": False, "seed": 1}
 WAYS = {
     "A2C": ("a2c", {"num_steps": 8}),
     "TRPO": ("trpo", {"num_steps": 256, "critic_epochs": 10, "scale_rewards": False}),

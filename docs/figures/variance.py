@@ -1,11 +1,11 @@
-"""How much a policy gradient varies, by what weighs log π: in CartPole-v1, for one policy that stands still.
+"""The variance of the policy gradient by the weight of log π: in CartPole-v1, for one frozen policy.
 
     .venv/bin/python docs/figures/variance.py [FILE]
 
-A policy and a value function are trained for a while and then frozen. Many batches of whole episodes are played, and
-from each the gradient is estimated four times: with the return of the whole episode, with what followed each action,
-with that minus the mean of the batch, and with that minus V(s). γ is 1, so that all of them estimate the same vector,
-but for the small bias of a mean that contains what it is taken off.
+A policy and a value function are trained for a while and then frozen. Many batches of whole episodes are collected,
+and from each the gradient is estimated four times: with the return of the whole episode, with the reward-to-go, with
+that minus the mean of the batch, and with that minus V(s). γ is 1, so that all of them estimate the same vector, except
+for the small bias of a mean that contains the return from which it is subtracted.
 """
 
 import sys
@@ -20,10 +20,10 @@ from lemniscate.envs.registry import make
 from lemniscate.maths import policy_gradient
 
 WAYS = {
-    "return of the whole episode": ("whole", "none"),
-    "what followed": ("to_go", "none"),
-    "what followed − its mean": ("to_go", "mean"),
-    "what followed − V(s)": ("to_go", "value"),
+    "return of the whole episode": ("episode", "none"),
+    "reward-to-go": ("to_go", "none"),
+    "reward-to-go − its mean": ("to_go", "mean"),
+    "reward-to-go − V(s)": ("to_go", "value"),
 }
 
 
@@ -36,14 +36,14 @@ def gradients(batches=60, updates=10, num_envs=4):
     torch.manual_seed(1)
     state = reinforce.init(config.replace(standardize=True), env.spec, torch.device("cpu"))
     for _ in range(updates):
-        rollout = collect(env, state.policy, config.num_steps, state.noise)
+        rollout = collect(env, state.policy, config.num_steps, state.rng.action)
         reinforce.update(config.replace(standardize=True), state, rollout)
     of = {way: [] for way in WAYS}
     for _ in range(batches):
-        rollout = collect_episodes(env, state.policy, 1, state.noise)
+        rollout = collect_episodes(env, state.policy, 1, state.rng.action)
         for way, (returns, baseline) in WAYS.items():
-            batch = reinforce.outcomes(config.replace(episodes=1, returns=returns, baseline=baseline), state, rollout)
-            batch = batch[rollout.valid.flatten()]
+            weighting = config.replace(episodes=1, returns=returns, baseline=baseline)
+            batch = reinforce.weights(weighting, state.networks, rollout)[rollout.valid_rows]
             loss = policy_gradient(state.policy(batch.obs).log_prob(batch.action), batch.advantage)
             gradient = torch.autograd.grad(loss, list(state.policy.parameters()))
             of[way].append(torch.cat([part.flatten() for part in gradient]))
@@ -62,7 +62,7 @@ def draw(**sizes):
         axes.text(share, i, f" {100 * share:.3g} %", va="center", fontsize=9)
     axes.set_xlim(0, 1.1)
     axes.xaxis.set_major_formatter("{x:.0%}")
-    axes.set_title("variance of the policy gradient, by what weighs log π", loc="left", fontsize=10)
+    axes.set_title("variance of the policy gradient, by the weight of log π", loc="left", fontsize=10)
     axes.spines[["top", "right"]].set_visible(False)
     axes.tick_params(labelsize=9)
     return figure

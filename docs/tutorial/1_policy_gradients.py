@@ -37,9 +37,9 @@ print(f"exact              {exact.numpy().round(2)}")
 # %% [markdown]
 # The mean is the same, the variance is not. That is all a baseline does, and it is a great deal.
 #
-# ## What followed
+# ## The reward-to-go
 #
-# An action can be blamed only for what came after it. Write the reward to go, for rows `[T, N]` of N environments:
+# An action can be blamed only for what came after it. Write the reward-to-go, for rows `[T, N]` of N environments:
 # $G_t = r_t + \gamma G_{t+1}$ up to the end of the episode. Where rows run out, and where a time-out cut the episode,
 # `next_value` stands for the rest; a death (`terminated`) has no rest.
 
@@ -59,8 +59,8 @@ def reward_to_go(reward, next_value, terminated, done, *, gamma):
 course.check(reward_to_go)
 
 # %% [markdown]
-# Now break it: drop `~terminated[t]`, or the line with `torch.where`, and look what `course.check` says. When it is right,
-# put it where REINFORCE looks for it, and train.
+# Now break it: drop `~terminated[t]`, or the line with `torch.where`, and see what `course.check` says. When it is right,
+# put it in the place of REINFORCE's own, and train.
 
 # %%
 reinforce.reward_to_go = reward_to_go
@@ -71,7 +71,7 @@ print(lem.evaluate(first.policy, episodes=20, seed=0).mean_return)
 # %% [markdown]
 # ## Looking one step ahead, or many
 #
-# A critic can answer for the rest after one step, or after two, or never. Generalized advantage estimation mixes them:
+# A critic can stand for the rest after one step, or after two, or never. Generalized advantage estimation mixes them:
 # $A_t = \delta_t + \gamma\lambda A_{t+1}$ with $\delta_t = r_t + \gamma V(s_{t+1}) - V(s_t)$. There are two flags, because
 # there are two ends: a death ends the *value*, any end cuts the *chain*.
 
@@ -94,7 +94,7 @@ course.check(gae)
 # %% [markdown]
 # ## A step that is not too large
 #
-# PPO takes many steps on one rollout, and stops paying where the ratio $r = \pi/\pi_{old}$ has left $[1-\epsilon,
+# PPO takes many steps on one rollout; its objective is flat where the ratio $r = \pi/\pi_{old}$ has left $[1-\epsilon,
 # 1+\epsilon]$: $L = E[\min(rA, \mathrm{clip}(r, 1-\epsilon, 1+\epsilon)A)]$. It is a loss, so its sign is turned.
 
 
@@ -113,8 +113,8 @@ runs = [first] + [lem.train(name, env="CartPole-v1", seed=1, total_steps=STEPS) 
 lem.plot(*[run.path for run in runs])
 
 # %% [markdown]
-# One seed ranks nothing: which curve is higher here is luck as much as merit. `lemniscate train reinforce,a2c,trpo,ppo
+# One seed ranks nothing: which curve is higher here is chance as much as merit. `lemniscate train reinforce,a2c,trpo,ppo
 # --env CartPole-v1 --seeds 1-5 --total-steps 100_000` says more.
 #
-# **Try.** REINFORCE with `learning_rate=0.1, final_learning_rate=1.0` and several seeds: how does it look, and what does
-# `approx_kl` say of it? What becomes of PPO with `clip=10.0`? With a `gae` whose chain is not cut?
+# **Try.** REINFORCE with `learning_rate=0.1, final_learning_rate=1.0` and several seeds: how does it look, and how large is
+# `approx_kl`? What becomes of PPO with `clip=10.0`? With a `gae` whose chain is not cut?

@@ -1,7 +1,7 @@
 # %% [markdown]
 # # 2 · LunarLander
 #
-# A lander, four commands, eight numbers to see, and −100 for a crash. PPO on sixteen copies at once. You write the
+# A lander, four commands, eight numbers to see, and −100 for a crash. PPO on sixteen parallel environments. You write the
 # function in which a lander that hovers is told from one that crashed, and the critic's loss, and read a run's pictures.
 
 # %%
@@ -16,8 +16,8 @@ STEPS = 300_000
 # %% [markdown]
 # ## A time-out is not a death
 #
-# After 1,000 steps the clock stops an episode, whatever the lander is doing. Nothing has ended but the patience of the
-# environment: the value of the state it stood in goes on. So the row of a time-out bootstraps, and the row of a crash
+# After 1,000 steps the time limit cuts an episode, whatever the lander is doing. The task has not ended there: the value
+# of the state it was in goes on. So the row of a time-out bootstraps, and the row of a crash
 # does not. Which flag belongs where?
 
 
@@ -56,7 +56,7 @@ course.check(value_loss)
 # %% [markdown]
 # ## Train, and read what happened
 #
-# The preset `lunar-lander` is chosen by the id. Sixteen copies, 8 epochs, γ = 0.999: a landing pays long after the
+# The preset `lunar-lander` is chosen by the id. Sixteen environments, 8 epochs, γ = 0.999: a landing pays long after the
 # decision that made it possible.
 
 # %%
@@ -67,8 +67,8 @@ print(f"{scores.mean_return:.0f} ± {scores.std_return:.0f}")
 lem.plot(run.path)
 
 # %% [markdown]
-# `losses/value` falls and `explained_variance` climbs towards 1: the critic knows what is coming. `approx_kl` and
-# `clip_fraction` say how far each update moved the policy. Entropy falls as it makes up its mind.
+# `losses/value` falls and `explained_variance` climbs towards 1: the critic predicts the returns well. `approx_kl` and
+# `clip_fraction` say how far each update moved the policy. Entropy falls as the policy becomes more certain.
 
 # %%
 lem.watch(run.policy, video="lander.gif")

@@ -1,8 +1,8 @@
 # %% [markdown]
 # # 3 · DDPG on Hopper
 #
-# A leg that hops, three torques, and an algorithm that learns from everything it ever did. You write the target of Q and
-# the way in which the target networks follow, train, and ask whether Q is honest.
+# A leg that hops, three torques, and an off-policy algorithm: it learns from every step it ever took. You write the target
+# of Q and the way in which the target networks follow, train, and measure the overestimation bias of Q.
 
 # %%
 import torch
@@ -16,9 +16,9 @@ STEPS = 30_000
 # %% [markdown]
 # ## The target
 #
-# Q(s, a) should be the reward plus the discounted value of what follows, as the *target* networks see it:
-# $y = r + \gamma Q'(s', \mu'(s'))$. A fall ends the value. The clock does not, which is why the memory knows `terminated`
-# alone.
+# Q(s, a) should be the reward plus the discounted value of what follows, as the *target* networks estimate it:
+# $y = r + \gamma Q'(s', \mu'(s'))$. A fall ends the value. A time limit does not, which is why the replay buffer holds
+# `terminated` alone.
 
 
 # %%
@@ -31,7 +31,7 @@ course.check(td_target)
 
 
 # %% [markdown]
-# Q is trained towards a target made of Q. So that it does not chase its own tail, the target is computed with copies that
+# Q is trained towards a target made of Q, which is unstable. So the target is computed with *target networks*, copies that
 # follow slowly: $\theta' \leftarrow (1 - \tau)\,\theta' + \tau\,\theta$, in place.
 
 
@@ -49,7 +49,7 @@ course.check(polyak)
 # ## Train
 #
 # `preset="course"` is the configuration of a university course: a million steps, an hour or two. Here are fewer, with
-# smaller networks, to see that it moves.
+# smaller networks, to see the first progress.
 
 # %%
 ddpg.td_target, ddpg.polyak = td_target, polyak
@@ -67,10 +67,10 @@ run = lem.train(
 lem.plot(run.path)
 
 # %% [markdown]
-# ## Is Q honest?
+# ## The overestimation bias of Q
 #
-# The curve `q` in the metrics is a mean over actions taken long ago: it cannot be compared with anything. What can be: what
-# Q says of the first step of an episode, and the discounted return of that very episode.
+# The curve `q` in the metrics is a mean over actions taken long ago: it cannot be compared with anything. Q at the first step
+# of an episode can: with the discounted return of that episode.
 
 # %%
 scores = lem.evaluate(run.policy, episodes=10, seed=0)
@@ -78,6 +78,6 @@ print(scores.mean_return, "·", scores.q_bias)
 print(scores.to_course())
 
 # %% [markdown]
-# **Try.** `architecture="layer_norm"` with `actor_learning_rate=1e-3, critic_learning_rate=1e-3`. `policy_delay=1`. A
-# `td_target` that forgets `~terminated`: what does Q promise then? And the riddle of the mountain car, in
-# [`docs/notes/action_noise.md`](../notes/action_noise.md).
+# **Try.** `network="layer_norm"` with `actor_learning_rate=1e-3, critic_learning_rate=1e-3`. `policy_delay=1`. A
+# `td_target` that forgets `~terminated`: what does Q predict then? And exploration on the mountain
+# car: [`docs/notes/exploration.md`](../notes/exploration.md).

@@ -1,8 +1,8 @@
 # %% [markdown]
 # # 4 · The drone and the figure eight
 #
-# 256 simulated Crazyflies, half a minute of training, and a curve that is flown to a millimetre. You write the estimate
-# that decides what a drone is praised for, train, and look at the flight.
+# 256 simulated Crazyflies, half a minute of training, and a curve that is flown to a millimetre. You write the
+# estimate of the advantage, train, and look at the flight.
 
 # %%
 import torch
@@ -14,14 +14,14 @@ from lemniscate.algos import ppo
 STEPS = 1_000_000
 
 # %% [markdown]
-# ## What is a drone praised for?
+# ## The advantage of an action
 #
 # The reward of a step is $\exp(-2\,\|p - p_{ref}\|)$: nearly 1 on the curve, and −1 for a crash, which ends the flight. A
 # thrust shows in the position only some steps later, so one step's reward says little. Generalized advantage estimation
-# looks ahead, and trusts the critic for the rest.
+# looks ahead, and takes the critic's value for the rest.
 #
-# Many write the flags down one row too late here, so that the crash is cut off from the step before it, the very one that
-# caused it. `course.check` knows that mistake too.
+# A frequent mistake is to read the flags one row too late, so that the crash is cut off from the step before it, which
+# caused it. `course.check` recognizes that mistake too.
 
 
 # %%
@@ -41,7 +41,7 @@ course.check(gae)
 
 # %%
 def gae_one_row_late(reward, value, next_value, terminated, done, **discounts):
-    """As it should not be."""
+    """The frequent mistake."""
     late = [torch.cat([flags[1:], flags[-1:]]) for flags in (terminated, done)]
     return gae(reward, value, next_value, *late, **discounts)
 
@@ -57,7 +57,9 @@ course.check(gae_one_row_late, "gae")
 ppo.gae = gae
 run = lem.train("ppo", env="DroneFigureEightTrajectory-v0", seed=1, total_steps=STEPS)
 scores = lem.evaluate(run.policy, seed=0)
-print(f"{scores.mean_return:.1f} of 500, {scores.rmse_after_1s_mm:.2f} mm from the curve after the first second")
+print(
+    f"{scores.mean_return:.1f} of 500, {scores.measures['rmse_after_1s_mm']:.2f} mm from the curve after the first second"
+)
 
 # %%
 lem.plot(run.path)

@@ -1,22 +1,19 @@
-"""Deep reinforcement learning that you can read in an evening, leave alone overnight, and fly in half a minute."""
+"""Deep reinforcement learning that you can read in an evening, leave alone overnight, and fly in half a minute.
 
-from lemniscate.api import (
-    TrainedRun,
-    config_for,
-    evaluate,
-    load,
-    make_envs,
-    plot,
-    resume,
-    train,
-    watch,
-)
-from lemniscate.errors import NonFiniteError, SweepError, UserError
-from lemniscate.policy import TrainedPolicy
-from lemniscate.run.evaluate import Evaluation
-from lemniscate.run.run import Stopped
-from lemniscate.run.seeding import set_seeds
-from lemniscate.sweep import TrainedSweep, resume_sweep, train_sweep
+Names are imported at their first use, so that `import lemniscate` and `lemniscate --help` do not wait for torch.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from lemniscate.api import TrainedRun, config_for, evaluate, load, make_envs, plot, resume, train, watch
+    from lemniscate.errors import NonFiniteError, SweepError, UserError
+    from lemniscate.policy import TrainedPolicy
+    from lemniscate.run.evaluate import Evaluation
+    from lemniscate.run.run import Stopped
+    from lemniscate.run.seeding import set_seeds
+    from lemniscate.sweep import TrainedSweep, resume_sweep, train_sweep
 
 __all__ = [
     "Evaluation",
@@ -39,3 +36,42 @@ __all__ = [
     "train_sweep",
     "watch",
 ]
+
+MODULES = {
+    "Evaluation": "run.evaluate",
+    "NonFiniteError": "errors",
+    "Stopped": "run.run",
+    "SweepError": "errors",
+    "TrainedPolicy": "policy",
+    "TrainedRun": "api",
+    "TrainedSweep": "sweep",
+    "UserError": "errors",
+    "config_for": "api",
+    "evaluate": "api",
+    "load": "api",
+    "make_envs": "api",
+    "plot": "api",
+    "resume": "api",
+    "resume_sweep": "sweep",
+    "set_seeds": "run.seeding",
+    "train": "api",
+    "train_sweep": "sweep",
+    "watch": "api",
+}
+"""where each public name is defined"""
+
+SUBMODULES = ("algos", "api", "course", "data", "envs", "errors", "maths", "nn", "policy", "presets", "sweep", "types")
+"""what `lemniscate.NAME` imports by itself"""
+
+
+def __getattr__(name: str) -> object:
+    if name in SUBMODULES:
+        return import_module(f"lemniscate.{name}")
+    if name not in MODULES:
+        raise AttributeError(f"module 'lemniscate' has no attribute {name!r}")
+    value = globals()[name] = getattr(import_module(f"lemniscate.{MODULES[name]}"), name)
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__, *SUBMODULES})

@@ -1,27 +1,31 @@
 """The front door: train, resume, load, evaluate, watch, plot, make_envs."""
 
 import json
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import torch
 
-from lemniscate import presets
-from lemniscate.algos import ALGORITHMS
+from lemniscate import algos, named, presets
+from lemniscate.callbacks import Callback, watch_with
+from lemniscate.console import say
 from lemniscate.envs import registry
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError, is_installed, missing_extra, unknown_name
 from lemniscate.policy import TrainedPolicy
 from lemniscate.report import compare, curves, playback
 from lemniscate.report import pictures as pictures_of
+from lemniscate.report.groups import group
 from lemniscate.run import checkpoint
 from lemniscate.run.config import RunConfig
-from lemniscate.run.directory import is_finished, newest, read_config, require_absent
+from lemniscate.run.directory import find_checkpoint, is_finished, read_config, require_absent
 from lemniscate.run.evaluate import Evaluation
 from lemniscate.run.evaluate import evaluate as evaluate_module
-from lemniscate.run.loggers import LOGGERS, read_metrics
+from lemniscate.run.loggers import TRACKERS, JsonLines, LoggerClass, TensorBoard, read_metrics
 from lemniscate.run.q_bias import critic_of
 from lemniscate.run.run import Run
 from lemniscate.run.seeding import set_seeds
@@ -34,27 +38,37 @@ FINAL_EPISODES = 100
 
 @dataclass(frozen=True)
 class TrainedRun:
-    """What `train` leaves: the run directory, the final policy, and how long the training loop took."""
+    """The result of `train` and `resume`: the run directory, the final policy, the seconds of the training loop."""
 
     path: Path
     policy: TrainedPolicy
     seconds: float
 
 
-def config_for(algorithm: str, env: str | None = None, preset: str | None = None, **fields: object) -> RunConfig:
+def config_for(
+    algorithm: str | ModuleType,
+    env: str | Callable[..., Any] | None = None,
+    preset: str | None = None,
+    **fields: object,
+) -> RunConfig:
     """The Config of a preset, with some fields changed.
 
     Raises:
         UserError: an unknown algorithm, environment, preset or field, or a value out of range.
     """
-    if algorithm not in ALGORITHMS:
-        raise unknown_name("algorithm", algorithm, ALGORITHMS)
-    name, config = presets.choose(algorithm, env, preset)
+    env = None if env is None else registry.name_of(env)
+    name, config = presets.choose(algos.name_of(algorithm), env, preset)
     if name == "default" and env is None:
         raise UserError("Which environment? Name one with env; `lemniscate envs` lists them.")
-    served_by = registry.backend_for(config.env)
-    config = config.replace(**fields)
-    return config if config.backend else config.replace(backend=served_by)
+    config = config.replace(**{name: _named(value) for name, value in fields.items()})
+    return config if config.backend else config.replace(backend=registry.backend_for(config.env, config.wrappers))
+
+
+def _named(value: object) -> object:
+    """A value of a Config: functions and classes, and those in a sequence, by their names."""
+    if isinstance(value, list | tuple):
+        return tuple(map(_named, value))
+    return named.name_of(value) if callable(value) else value
 
 
 def make_envs(config: RunConfig) -> tuple[VecEnv, VecEnv]:
@@ -63,36 +77,43 @@ def make_envs(config: RunConfig) -> tuple[VecEnv, VecEnv]:
     They are restarted with seeds of different streams, so no start of one is ever a start of the other.
     """
     device = str(device_for(config.device))
-    train_env = registry.make(config.env, config.num_envs, device=device, stagger=True, backend=config.backend)
-    return train_env, _evaluation_env(config.env, config, config.evaluate_episodes, device, _simulator(config))
+    world = {"kwargs": config.env_kwargs, "wrappers": config.wrappers, "backend": config.backend}
+    train_env = registry.make(config.env, config.num_envs, device=device, stagger=True, **world)
+    return train_env, _evaluation_env(config, config.evaluate_episodes, device=device)
 
 
 def train(
-    algorithm: str,
-    env: str | None = None,
+    algorithm: str | ModuleType,
+    env: str | Callable[..., Any] | None = None,
     *,
     run: str | Path | None = None,
     preset: str | None = None,
-    track: str | None = None,
+    track: str | LoggerClass | None = None,
+    callbacks: Sequence[Callback | str] = (),
     report: bool = False,
     progress: bool = True,
     **fields: object,
 ) -> TrainedRun:
-    """Train a policy from nothing.
+    """Train a policy.
 
     Args:
-        algorithm: a name in `lemniscate.algos.ALGORITHMS`.
-        env: the environment's id; a preset may have one of its own.
+        algorithm: a name in `lemniscate.algos.ALGORITHMS`; a module of your own, or its name.
+        env: an id, `module:Class`, a class, or a function that makes an environment; a preset may have its own.
         run: where to keep everything; by default a new directory under `runs/`.
         preset: by name; the best known for the environment unless given.
-        track: a logger beside the local ones: "wandb"; it gets the final pictures too.
-        report: evaluate the result, and draw it into `plots/` and `videos/`.
+        track: a logger beside the local ones: "wandb", the `module:Class` of your own, or the class itself; it gets
+            the final pictures too.
+        callbacks: functions of (step, metrics, policy), or their names as `module:function`. They are called after
+            each logged line with a read-only view of its metrics and a copy of the policy, and can change nothing in
+            the run; one that returns True stops it, saved. An exception that one raises also leaves it saved.
+        report: evaluate the final policy, and draw it into `plots/` and `videos/`.
         progress: the live line on standard error.
-        **fields: any field of the algorithm's Config, such as seed or total_steps.
+        **fields: any field of the algorithm's Config, such as seed, total_steps or warm_start.
 
     Raises:
         UserError: see `config_for`; a run directory that exists.
     """
+    algorithm = algos.name_of(algorithm)
     config = config_for(algorithm, env, preset, **fields)
     path = Path(run) if run is not None else fresh_directory(config.env, f"{algorithm}-{config.seed}")
     loggers = loggers_with(track)
@@ -100,20 +121,28 @@ def train(
     set_seeds(config.seed)  # before JAX starts, which reads its flags then
     envs = make_envs(config)
     if config.video_every:
-        playback.require_pictures(envs[0].spec)
-    return _train(path, algorithm, config, envs, loggers, report or track is not None, progress)
+        playback.require_pictures(config, envs[0])
+    return _train(path, algorithm, config, envs, loggers, callbacks, report or track is not None, progress)
 
 
-def resume(run: str | Path, *, track: str | None = None, report: bool = False, progress: bool = True) -> TrainedRun:
-    """Go on with an interrupted run, from its newest planned checkpoint that is whole, to its end."""
+def resume(
+    run: str | Path,
+    *,
+    track: str | LoggerClass | None = None,
+    callbacks: Sequence[Callback | str] = (),
+    report: bool = False,
+    progress: bool = True,
+) -> TrainedRun:
+    """Resume an interrupted run from its newest whole planned checkpoint, and train it to its end.
+
+    The arguments are those of `train`, and are not saved with the run.
+    """
     path = Path(run)
     algorithm, fields = read_config(path)
-    if algorithm not in ALGORITHMS:
-        raise unknown_name("algorithm", algorithm, ALGORITHMS)
-    config = ALGORITHMS[algorithm].Config.from_json(fields)
+    config = algos.find(algorithm).Config.from_json(fields)
     loggers = loggers_with(track)
     set_seeds(config.seed)
-    return _train(path, algorithm, config, make_envs(config), loggers, report or track is not None, progress)
+    return _train(path, algorithm, config, make_envs(config), loggers, callbacks, report or track is not None, progress)
 
 
 def load(path: str | Path) -> TrainedPolicy:
@@ -122,50 +151,47 @@ def load(path: str | Path) -> TrainedPolicy:
     Raises:
         UserError: neither a run nor a checkpoint, or a run without a whole checkpoint; a damaged checkpoint.
     """
-    path = Path(path)
-    if (path / "manifest.json").exists():
-        found = checkpoint.read(path)
-    else:
-        read_config(path)
-        found = newest(path)
-        if found is None:
-            raise UserError(f"{path} has no checkpoint that can be read yet.")
-    record = found.record
-    spec = checkpoint.spec_from_json(record["spec"])
-    config = ALGORITHMS[record["algorithm"]].Config.from_json(record["config"])
+    found = find_checkpoint(Path(path))
+    algorithm, spec = algos.find(found.record["algorithm"]), checkpoint.spec_from_json(found.record["spec"])
+    config = algorithm.Config.from_json(found.record["config"])
     networks = config.networks(spec)
-    networks.load_state_dict(found.part("networks"))
+    networks.load_state_dict(found.tensors_of("networks"))
     return TrainedPolicy(networks, spec, config, found.numbers["step"])
 
 
 def evaluate(
     policy: TrainedPolicy,
-    env: str | None = None,
+    env: str | Callable[..., Any] | None = None,
     episodes: int = 100,
     seed: int = 0,
     *,
     deterministic: bool = True,
     backend: str | None = None,
+    env_kwargs: Mapping[str, Any] | None = None,
 ) -> Evaluation:
     """Play whole episodes from starts drawn with `seed`, none of which training ever saw.
 
     Args:
         policy: from `load` or `train`.
-        env: by default the environment it was trained on.
+        env: an id, `module:Class`, a class, or a function that makes an environment; by default the one of training.
         episodes: how many.
         seed: of the starts.
         deterministic: act by the mode of the distribution.
-        backend: who steps the environments; as in training unless named, or by the id if `env` is another.
+        backend: simulation backend; that of training unless named, or by the id if `env` is another.
+        env_kwargs: arguments of the environment that are to be other than in training.
+
+    Raises:
+        UserError: numbers out of range; an environment that cannot be made, or whose spaces differ.
     """
     if episodes < 1:
         raise UserError(f"episodes must be a whole number at least 1, not {episodes}.")
     _check_seed(seed)
-    if env is None:
-        backend = backend or _simulator(policy.config)
-    vec = _evaluation_env(env or policy.spec.env_id, policy.config, episodes, "cpu", backend)
+    vec = _evaluation_env(policy.config, episodes, env=env, env_kwargs=env_kwargs, backend=backend)
     if not vec.spec.fits(policy.spec):
         vec.close()
-        raise UserError(f"A policy for {policy.spec.env_id} cannot act in {vec.spec.env_id}: its spaces are others.")
+        raise UserError(
+            f"A policy for {policy.spec.env_id} cannot act in {vec.spec.env_id}: observation or action spaces differ."
+        )
     try:
         critic = critic_of(policy.networks, policy.config)
         return evaluate_module(policy.module, vec, episodes, seed, deterministic, critic)
@@ -190,14 +216,14 @@ def watch(policy: TrainedPolicy, *, seed: int = 0, video: str | Path | None = No
     _check_seed(seed)
     if video is not None:
         playback.check_film(Path(video))
-    env = _drones(policy) if policy.spec.tracking else None
+    env = _scene_env(policy)
     if env and video is not None:
         return playback.film_flight(policy.module, env, Path(video), seed)
     if env:
         return playback.show_flight(policy.module, env, seed)
     if video is not None:
-        return playback.film_episode(policy.act, policy.spec, Path(video), seed)
-    return playback.show_episode(policy.act, policy.spec, seed)
+        return playback.film_episode(policy.act, policy.config, Path(video), seed)
+    return playback.show_episode(policy.act, policy.config, seed)
 
 
 def plot(*runs: str | Path) -> list[Path]:
@@ -205,7 +231,7 @@ def plot(*runs: str | Path) -> list[Path]:
 
     In a notebook they are also shown below the cell.
 
-    A drone's run also gets its flights, and one with a Q what that says beside what followed.
+    Where the environment has a scene, flights are drawn too; where there is a Q, its predictions beside the returns.
 
     A set is its runs, and has a `plots/` of its own; what else is compared is drawn into `plots/` here, with a table on
     standard error. Compared are the final policies of finished runs, over 100 episodes each. Returns the pictures.
@@ -214,29 +240,29 @@ def plot(*runs: str | Path) -> list[Path]:
     found = [run for path in paths for run in _members(path)]
     folder = paths[0] / "plots" if len(paths) == 1 else Path("plots")
     if found != paths[:1]:
-        return compare.report(compare.group(found), _final_returns(found), folder)
+        return compare.report(group(found), _final_returns(found), folder)
     pictures = curves.plot_runs(found, folder)
     if any((paths[0] / "checkpoints").glob("step-*")):
         policy = load(paths[0])
         if critic_of(policy.networks, policy.config):
             q_bias = evaluate(policy, episodes=policy.config.evaluate_episodes).q_bias
             pictures += [curves.draw_q_bias(q_bias, paths[0], folder / "q.png")] if q_bias else []
-        if policy.spec.tracking:
+        if env := _scene_env(policy):
             flights = policy.config.evaluate_episodes
-            pictures += pictures_of.draw_flight(policy.module, _drones(policy), folder, flights, seed=0)
+            pictures += pictures_of.draw_flight(policy.module, env, folder, flights, seed=0)
     if playback.in_notebook():
         playback.show_pictures(pictures)
     return pictures
 
 
 def final_return(run: str | Path) -> float:
-    """Mean return of a run's newest policy over 100 episodes; kept in its `final.json` while there is no newer."""
+    """Mean return of a run's newest policy over 100 episodes; kept in `final.json` until there is a newer policy."""
     path = Path(run)
     file = path / "final.json"
     known: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {}
     if known.get("step") not in checkpoint.list_steps(path / "checkpoints")[-1:]:
         policy = load(path)
-        pictures_of.say(f"Evaluating {path}: {FINAL_EPISODES} episodes.")
+        say(f"Evaluating {path}: {FINAL_EPISODES} episodes.")
         scores = evaluate(policy, episodes=FINAL_EPISODES, seed=0)
         known = {"step": policy.step, "seed": 0, **scores.to_json()}
         temporary = file.with_suffix(".tmp")
@@ -246,13 +272,13 @@ def final_return(run: str | Path) -> float:
 
 
 def _final_returns(runs: list[Path]) -> dict[Path, float]:
-    """Of the finished ones; what cannot be evaluated here is told, and left out."""
+    """The final returns of the finished runs; a line names each run that cannot be evaluated here."""
     returns: dict[Path, float] = {}
     for run in filter(is_finished, runs):
         try:
             returns[run] = final_return(run)
         except UserError as error:
-            pictures_of.say(f"{run} has no final return: {error}")
+            say(f"{run} has no final return: {error}")
     return returns
 
 
@@ -271,35 +297,46 @@ def _train(
     algorithm: str,
     config: RunConfig,
     envs: tuple[VecEnv, VecEnv],
-    loggers: tuple[str, ...],
+    loggers: tuple[LoggerClass, ...],
+    callbacks: Sequence[Callback | str],
     draw: bool,
     progress: bool,
 ) -> TrainedRun:
+    module, spec = algos.find(algorithm), envs[0].spec
     torch.set_num_threads(config.threads)
 
-    def film(state: TrainState) -> None:
-        networks = config.networks(run.spec)
+    def copy_networks(state: TrainState) -> Any:
+        networks = config.networks(spec)
         networks.load_state_dict(state.networks.state_dict())
-        policy = TrainedPolicy(networks, run.spec, config, state.step)
+        return networks
+
+    def film(state: TrainState) -> None:
         kind = "mp4" if is_installed("imageio_ffmpeg") else "gif"
+        policy = TrainedPolicy(copy_networks(state), spec, config, state.step)
         watch(policy, video=path / "videos" / f"step-{state.step}.{kind}")
 
-    run = Run(path, algorithm, config, envs, loggers=loggers, progress=progress, film=film)
+    watcher = watch_with(callbacks, copy_networks, spec, config) if callbacks else None
+    run = Run(path, algorithm, config, envs, loggers=loggers, progress=progress, film=film, watch=watcher)
     pictures: list[Path] = []
     try:
-        run.announce()
-        state = ALGORITHMS[algorithm].train(config, run)
+        for notice in config.notices(spec, envs[0].device) if progress else ():
+            say(notice)
+        state = module.train(config, run)
         if draw:
             critic = critic_of(state.networks, config)
             pictures = pictures_of.report(state.policy, run.eval_env, path, config.evaluate_episodes, critic)
     finally:
         run.close(pictures)
-    return TrainedRun(path, TrainedPolicy(state.networks.cpu(), run.spec, config, state.step), run.seconds)
+    return TrainedRun(path, TrainedPolicy(state.networks.cpu(), spec, config, state.step), run.seconds)
 
 
-def _drones(policy: TrainedPolicy) -> VecEnv:
-    """The fleet that a drone's policy is evaluated in."""
-    return _evaluation_env(policy.spec.env_id, policy.config, policy.config.evaluate_episodes, "cpu")
+def _scene_env(policy: TrainedPolicy) -> VecEnv | None:
+    """Environments to draw flights in, where the backend has a scene for them."""
+    config = policy.config
+    if not hasattr(registry.backend_class(config.backend or registry.backend_for(config.env)), "scene"):
+        return None
+    env = _evaluation_env(config, config.evaluate_episodes)
+    return env if env.scene else None
 
 
 def _check_seed(seed: int) -> None:
@@ -307,30 +344,39 @@ def _check_seed(seed: int) -> None:
         raise UserError(f"seed must be a whole number at least 0, not {seed}.")
 
 
-def _simulator(config: RunConfig) -> str | None:
-    """Who steps evaluations: as in training, but in this process; None, the id's own, where that is not installed."""
-    if config.backend == "envpool" and not is_installed("envpool"):
-        return None
-    return "gymnasium" if config.backend == "gymnasium-async" else config.backend
+def _evaluation_env(
+    config: RunConfig,
+    episodes: int,
+    *,
+    env: str | Callable[..., Any] | None = None,
+    env_kwargs: Mapping[str, Any] | None = None,
+    backend: str | None = None,
+    device: str = "cpu",
+) -> VecEnv:
+    """A few environments of a run, or of another `env`; as many as in training where a program is compiled for these.
+
+    `env_kwargs` change those of the run; in another environment they are the only ones.
+    """
+    name = config.env if env is None else registry.name_of(env)
+    kwargs = {**(config.env_kwargs if name == config.env else {}), **(env_kwargs or {})}
+    if env is None and backend is None:
+        backend = registry.for_evaluation(config.backend)
+    served_by = backend or registry.backend_for(name, config.wrappers)
+    num_envs = config.num_envs if registry.is_compiled(served_by) else min(episodes, 16)
+    return registry.make(name, num_envs, kwargs=kwargs, wrappers=config.wrappers, device=device, backend=backend)
 
 
-def _evaluation_env(env_id: str, config: RunConfig, episodes: int, device: str, backend: str | None = None) -> VecEnv:
-    """As many copies as training has for a drone, whose compiled program they share; else a few."""
-    copies = config.num_envs if env_id in registry.CRAZYFLOW_IDS else min(episodes, 16)
-    return registry.make(env_id, copies, device=device, backend=backend)
-
-
-def loggers_with(track: str | None) -> tuple[str, ...]:
-    """The local loggers, and the one asked for. Raises `UserError` if there is no such, or it is not installed."""
-    always = ("jsonl", "tensorboard")
-    trackers = [name for name in LOGGERS if name not in always]
+def loggers_with(track: str | LoggerClass | None) -> tuple[LoggerClass, ...]:
+    """The local loggers, and the tracker asked for. Raises `UserError` if it does not exist or is not installed."""
     if track is None:
-        return always
-    if track not in trackers:
-        raise unknown_name("tracker", track, trackers)
-    if not is_installed(track):
-        raise missing_extra(track, track)
-    return (*always, track)
+        return JsonLines, TensorBoard
+    if isinstance(track, str) and ":" not in track:
+        if track not in TRACKERS:
+            raise unknown_name("tracker", track, TRACKERS)
+        extra, track = TRACKERS[track]
+        if not is_installed(extra):
+            raise missing_extra(extra, extra)
+    return JsonLines, TensorBoard, named.find(track) if isinstance(track, str) else track
 
 
 def device_for(name: str) -> torch.device:

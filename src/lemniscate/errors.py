@@ -1,4 +1,4 @@
-"""Mistakes a user can make, each told in one sentence.
+"""A user's mistakes, each in one sentence.
 
 The command line prints a `UserError` as it is and exits with 2; anything else is our own mistake and keeps its
 traceback.
@@ -11,7 +11,7 @@ from importlib.util import find_spec
 
 
 class UserError(ValueError):
-    """A mistake of the user's: the message names what was wrong and what would be right."""
+    """A user's mistake: the message names what was wrong and what would be right."""
 
 
 class NonFiniteError(ArithmeticError):
@@ -23,12 +23,12 @@ class WorkerError(RuntimeError):
 
 
 class SweepError(RuntimeError):
-    """Some runs of a set could not go on: names each, with its sentence."""
+    """Some runs of a sweep failed: names each, with its sentence."""
 
 
 @contextmanager
 def prefix_errors(name: str) -> Iterator[None]:
-    """A `UserError` from inside also says of what it is."""
+    """Prefixes the message of a `UserError` with `name`."""
     try:
         yield
     except UserError as error:
@@ -38,7 +38,10 @@ def prefix_errors(name: str) -> Iterator[None]:
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> UserError:
     """The sentence for a name that is not in a table: the nearest names, or all of them when few."""
     names = sorted(known)
-    near = get_close_matches(name, names, n=3, cutoff=0.5)
+    plain = {choice.lower().lstrip("-"): choice for choice in names}
+    typed = name.lower().lstrip("-")
+    close = [typed] if typed in plain else get_close_matches(typed, plain, n=3, cutoff=0.5)
+    near = [plain[match] for match in close]
     if near:
         hint = f"did you mean {' or '.join(near)}?"
     elif len(names) <= 12:
@@ -58,4 +61,4 @@ def is_installed(package: str) -> bool:
 
 def missing_extra(package: str, extra: str) -> UserError:
     """The sentence for an optional package that is not installed."""
-    return UserError(f"{package} is not installed; it comes with: pip install 'lemniscate[{extra}]'")
+    return UserError(f"{package} is not installed; in the project's folder: pip install '.[{extra}]'")

@@ -54,27 +54,27 @@ class TrainedPolicy:
 
     def _flatten(self, obs: Any) -> tuple[np.ndarray, bool]:
         """([B, O], whether it was a batch)."""
-        layout, env_id = self.spec.layout, self.spec.env_id
+        parts, env_id = self.spec.observation_parts, self.spec.env_id
         if not isinstance(obs, dict | tuple) and self._is_flat(np.asarray(obs)):
             flat = np.asarray(obs, dtype=np.uint8 if self.spec.image else np.float32)
             return flat.reshape(-1, self.spec.observation_size), flat.ndim == 2
         try:
-            flat = flatten_observation(layout, obs, image=self.spec.image)
+            flat = flatten_observation(parts, obs, image=self.spec.image)
         except (KeyError, IndexError, TypeError, ValueError) as error:
-            parts = ", ".join(f"{part.name} {part.shape}" for part in layout)
-            raise UserError(f"{env_id} observes {parts}; this observation cannot be read: {error!r}.") from None
+            shapes = ", ".join(f"{part.name} {part.own_shape or part.shape}" for part in parts)
+            raise UserError(f"{env_id} observes {shapes}; this observation cannot be read: {error!r}.") from None
         return flat, self._is_batch(obs)
 
     def _is_flat(self, obs: np.ndarray) -> bool:
         """Whether it is [O] or [B, O], laid out as policies see it, and not as the environment returns it."""
-        first = self.spec.layout[0]
+        first = self.spec.observation_parts[0]
         counted = bool(first.nvec) and np.issubdtype(obs.dtype, np.integer)  # numbers that are yet to become one-hot
         right_size = obs.ndim in (1, 2) and obs.shape[-1] == self.spec.observation_size
         return right_size and obs.shape != first.shape and not counted
 
     def _is_batch(self, obs: Any) -> bool:
         """Whether the first part of an observation has one dimension more than the environment gives it."""
-        part = self.spec.layout[0]
+        part = self.spec.observation_parts[0]
         for step in part.path:
             obs = obs[step]
-        return np.ndim(obs) > len(part.shape)
+        return np.ndim(obs) > len(part.own_shape or part.shape)

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 from lemniscate.errors import UserError
 
@@ -70,20 +71,24 @@ class ObservationPart:
     """A piece of the flat observation: where it is in the environment's own, and its shape there.
 
     `path` leads through Dict keys and Tuple indices; it is empty where the observation is the piece itself. With
-    `nvec`, each number of the piece becomes a one-hot vector, counted from `start`.
+    `nvec`, each number of the piece becomes a one-hot vector, counted from `start`. With `axes`, the environment's own
+    array has the shape `own_shape`, and its axes are put in that order to get `shape`: an image with its channels
+    first, or a stack of images.
     """
 
     path: tuple[str | int, ...]
     shape: tuple[int, ...]
     nvec: tuple[int, ...] = ()
     start: tuple[int, ...] = ()
+    own_shape: tuple[int, ...] = ()
+    axes: tuple[int, ...] = ()
 
     @property
     def name(self) -> str:
         """The path as one word."""
         return "/".join(map(str, self.path)) or "obs"
 
-    @property
+    @cached_property
     def size(self) -> int:
         """How many numbers it is in the flat observation."""
         return sum(self.nvec) if self.nvec else math.prod(self.shape)
@@ -93,25 +98,21 @@ class ObservationPart:
 class Spec:
     """What a policy has to know of an environment; saved with every checkpoint.
 
-    `layout` names the parts of the flat observation in their order; their sizes sum to O. With `image`, the only part
-    is an image of bytes, height × width × channels, and stays bytes.
-    `time_step` is the control period in seconds, where the environment has one.
-    `tracking` is where the tracking error (x, y, z in metres) stands in the observation, as (start, stop).
+    `observation_parts` are the parts of the flat observation in their order; their sizes sum to O. With `image`, the
+    only part is an image of bytes, height × width × channels, and stays bytes. `max_episode_steps` is the time limit.
     """
 
     env_id: str
-    layout: tuple[ObservationPart, ...]
+    observation_parts: tuple[ObservationPart, ...]
     action: Action
     max_episode_steps: int | None = None
-    time_step: float | None = None
-    tracking: tuple[int, int] | None = None
     image: bool = False
 
     def fits(self, other: "Spec") -> bool:
         """Whether a policy for one environment can act in the other."""
         mine, its = self.action, other.action
         same_action = mine.same_as(its) if isinstance(mine, Box) else mine == its
-        return same_action and (self.layout, self.image) == (other.layout, other.image)
+        return same_action and (self.observation_parts, self.image) == (other.observation_parts, other.image)
 
     def bounded_box(self) -> Box:
         """The actions. Raises `UserError` unless they are numbers between finite bounds."""
@@ -128,4 +129,4 @@ class Spec:
     @property
     def observation_size(self) -> int:
         """O, the length of the flat observation, without the action mask."""
-        return sum(part.size for part in self.layout)
+        return sum(part.size for part in self.observation_parts)

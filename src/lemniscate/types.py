@@ -1,6 +1,6 @@
 """Data records of tensors. Shapes: T time, N environments, B batch, O observation, A action."""
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from typing import Self
 
 import torch
@@ -32,11 +32,20 @@ class Record:
 
 
 @dataclass(frozen=True)
-class Step(Record):
-    """The result of one action in each of N environments, [N, …].
+class Step:
+    """The answer of N parallel environments to one action.
 
-    `next_obs` is the true successor, before any reset; `obs` is where to act next, after it. They differ only where
-    an episode ended. `valid` is False where the environment ignored the action (the reset row of NEXT_STEP).
+    Attributes:
+        obs: [N, O], where to act next. It differs from `next_obs` only where an episode ended: there it is the first
+            observation of the next episode.
+        next_obs: [N, O], the true successor, before any reset.
+        reward: [N] float32.
+        terminated: [N] bool, the episode ended by its own rules.
+        truncated: [N] bool, the episode was cut by a time limit; never together with `terminated`.
+        valid: [N] bool, False where the environment ignored the action in order to reset itself. Such a row reaches no
+            loss, no replay buffer and no statistic.
+        measures: what the environment measures besides the reward, such as `tracking_error` or `is_success`: [N] each,
+            by name; NaN in a row that has none. Evaluation averages them; nothing learns from them.
     """
 
     obs: Tensor
@@ -45,6 +54,7 @@ class Step(Record):
     terminated: Tensor
     truncated: Tensor
     valid: Tensor
+    measures: dict[str, Tensor] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

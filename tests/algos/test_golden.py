@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from lemniscate.algos import ALGORITHMS
+from lemniscate.algos import find
 from lemniscate.spec import Box, Discrete, ObservationPart, Spec
 from lemniscate.types import Rollout, Transition
 
@@ -108,7 +108,7 @@ def transitions(generator, size=64):
 def five_updates(case):
     """The metrics of each update, and the sum and the sum of squares of each parameter at the end."""
     algorithm, _, actions = case.partition("-")
-    module, spec = ALGORITHMS[algorithm], Spec("Golden-v0", (ObservationPart((), (3,)),), ACTIONS[actions], 50)
+    module, spec = find(algorithm), Spec("Golden-v0", (ObservationPart((), (3,)),), ACTIONS[actions], 50)
     data = torch.Generator().manual_seed(7)
     torch.manual_seed(0)
     config = module.Config(**FIELDS[algorithm])

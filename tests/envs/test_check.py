@@ -102,7 +102,7 @@ def test_the_mode_of_a_vector_environment_is_told():
         ("Rich", "note", "train with --scale-rewards"),
         ("Stillborn", "bad", "It cannot be made: OSError: no such robot."),
         ("Breaks", "bad", "It cannot be played with random actions: AttributeError: 'Breaks' object has no attribute"),
-        ("Stuck", "bad", "rules out every action of copy 0: its action_mask is all zero."),
+        ("Stuck", "bad", "rules out every action of environment 0: its action_mask is all zero."),
     ],
 )
 def test_what_is_wrong_is_said(name, grade, said):
@@ -118,7 +118,7 @@ def test_masks_images_and_native_backends_are_played():
 def test_a_module_that_is_not_there():
     from lemniscate.errors import UserError
 
-    with pytest.raises(UserError, match="nowhere:Env cannot be made: No module named 'nowhere'"):
+    with pytest.raises(UserError, match="nowhere:Env cannot be found: No module named 'nowhere'"):
         list(check("nowhere:Env"))
-    with pytest.raises(UserError, match="neither an environment class nor an id Nothing"):
+    with pytest.raises(UserError, match=r"envs\.test_check has no Nothing"):
         list(check("envs.test_check:Nothing"))

@@ -8,14 +8,11 @@ from gymnasium.vector import AutoresetMode
 import environments
 from lemniscate.data.rollout import collect
 from lemniscate.envs import registry, toy
-from lemniscate.envs.gymnasium import GymnasiumBackend
-from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import NonFiniteError, UserError
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.networks import Layers
 from lemniscate.spec import Box
 
-CPU = torch.device("cpu")
 MODES = [mode.name for mode in AutoresetMode]
 EVERY = [
     ("CartPole-v1", "gymnasium"),
@@ -36,8 +33,8 @@ EVERY = [
 ]
 
 
-def countdown(mode, num_envs=3, **kwargs):
-    return VecEnv(GymnasiumBackend("Countdown-v0", num_envs, CPU, mode=mode, **kwargs))
+def countdown(mode, num_envs=3, kind=toy.Countdown, **kwargs):
+    return registry.make(kind, num_envs, kwargs={"mode": mode, **kwargs})
 
 
 def play(env, num_steps, seed=0):
@@ -118,10 +115,9 @@ class HidesFinalObs(toy.Countdown):
         return (*rest, {})
 
 
-def test_an_environment_that_hides_the_final_observation_is_refused(monkeypatch):
-    monkeypatch.setattr(toy, "Countdown", HidesFinalObs)
+def test_an_environment_that_hides_the_final_observation_is_refused():
     with pytest.raises(UserError, match="hides the final observation"):
-        play(countdown("SAME_STEP", length=3), 10)
+        play(countdown("SAME_STEP", kind=HidesFinalObs, length=3), 10)
 
 
 class SaysNothing(toy.Countdown):
@@ -131,14 +127,13 @@ class SaysNothing(toy.Countdown):
 
 
 @pytest.mark.filterwarnings("ignore:.*missing AutoresetMode")
-def test_an_environment_that_does_not_say_when_it_resets_is_refused(monkeypatch):
-    monkeypatch.setattr(toy, "Countdown", SaysNothing)
+def test_an_environment_that_does_not_say_when_it_resets_is_refused():
     with pytest.raises(UserError, match="autoreset_mode"):
-        countdown("NEXT_STEP")
+        countdown("NEXT_STEP", kind=SaysNothing)
 
 
 @pytest.mark.parametrize("quantity", ["observation", "reward"])
-def test_a_nan_is_named_with_environment_and_step(monkeypatch, quantity):
+def test_a_nan_is_named_with_environment_and_step(quantity):
     class Breaks(toy.Countdown):
         def step(self, actions):
             obs, reward, *rest = super().step(actions)
@@ -146,13 +141,12 @@ def test_a_nan_is_named_with_environment_and_step(monkeypatch, quantity):
                 (obs if quantity == "observation" else reward)[1] = np.nan
             return obs, reward, *rest
 
-    monkeypatch.setattr(toy, "Countdown", Breaks)
-    env = countdown("DISABLED", length=10)
+    env = countdown("DISABLED", kind=Breaks, length=10)
     with pytest.raises(NonFiniteError, match=rf"The {quantity} of environment 1 is nan in the step after \d+"):
         play(env, 8)
 
 
-def test_a_nan_that_a_reset_returns_is_named(monkeypatch):
+def test_a_nan_that_a_reset_returns_is_named():
     class BornBroken(toy.Countdown):
         def reset(self, **kwargs):
             obs, info = super().reset(**kwargs)
@@ -160,13 +154,12 @@ def test_a_nan_that_a_reset_returns_is_named(monkeypatch):
                 obs[2] = np.nan
             return obs, info
 
-    monkeypatch.setattr(toy, "Countdown", BornBroken)
     with pytest.raises(NonFiniteError, match="The observation of environment 2 is nan in the step after"):
-        play(countdown("DISABLED", length=3), 8)
+        play(countdown("DISABLED", kind=BornBroken, length=3), 8)
 
 
 @pytest.mark.parametrize("mode", ["NEXT_STEP", "SAME_STEP"])
-def test_a_vector_environment_may_write_over_its_own_arrays(monkeypatch, mode):
+def test_a_vector_environment_may_write_over_its_own_arrays(mode):
     class Reuses(toy.Countdown):
         def step(self, actions):
             obs, reward, terminated, truncated, info = super().step(actions)
@@ -177,8 +170,7 @@ def test_a_vector_environment_may_write_over_its_own_arrays(monkeypatch, mode):
             return (*self.mine, info)
 
     plain = play(countdown(mode, length=4), 12)
-    monkeypatch.setattr(toy, "Countdown", Reuses)
-    reused = play(countdown(mode, length=4), 12)
+    reused = play(countdown(mode, kind=Reuses, length=4), 12)
     for name in ("obs", "next_obs", "reward", "terminated", "valid"):
         assert torch.equal(getattr(plain, name), getattr(reused, name)), name
 

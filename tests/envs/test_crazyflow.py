@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-crazyflow = pytest.importorskip("lemniscate.envs.crazyflow")
+pytest.importorskip("crazyflow")
 
-from lemniscate.envs import registry
+import gymnasium as gym
+
+from lemniscate.envs import crazyflow, registry
 from lemniscate.envs.spaces import scale_action
 
 FIGURE_EIGHT = "DroneFigureEightTrajectory-v0"
@@ -28,11 +30,11 @@ def staggered():
 
 
 def test_the_layout_is_the_documented_one(env):
-    layout = [(part.name, part.size) for part in env.spec.layout]
+    layout = [(part.name, part.size) for part in env.spec.observation_parts]
     assert layout == [("pos", 3), ("quat", 4), ("vel", 3), ("ang_vel", 3), ("local_samples", 30)]
     assert env.spec.observation_size == 43
-    assert env.spec.tracking == (13, 16)
-    assert env.spec.time_step == 0.02
+    assert env.scene.error == slice(13, 16)
+    assert env.scene.time_step == 0.02
     assert env.spec.max_episode_steps == 500
 
 
@@ -52,7 +54,7 @@ def test_every_step_is_crazyflows_own_step(env):
     env.restart(5)
     backend = env.backend
     with crazyflow._quietly():
-        native = crazyflow.gym.make_vec(FIGURE_EIGHT, num_envs=N, freq=50, device="cpu").unwrapped
+        native = gym.make_vec(FIGURE_EIGHT, num_envs=N, freq=50, device="cpu").unwrapped
         native.reset(seed=0)
     native.sim.data = jax.tree.map(lambda x: x, backend._state[0])
     g = torch.Generator().manual_seed(0)
@@ -61,7 +63,7 @@ def test_every_step_is_crazyflows_own_step(env):
         step = env.step(action)
         obs, reward, terminated, truncated, _ = native.step(scale_action(action.numpy(), env.spec.action))
         assert not (terminated | truncated).any()
-        flat = np.concatenate([np.asarray(obs[part.name]) for part in env.spec.layout], axis=-1)
+        flat = np.concatenate([np.asarray(obs[part.name]) for part in env.spec.observation_parts], axis=-1)
         np.testing.assert_allclose(step.next_obs.numpy(), flat, rtol=1e-4, atol=1e-5)
         np.testing.assert_allclose(step.reward.numpy(), np.asarray(reward), rtol=1e-4, atol=1e-5)
 

@@ -11,7 +11,7 @@ from lemniscate.envs.spaces import (
     action_kind,
     flatten_observation,
     is_image,
-    observation_layout,
+    observation_parts,
     physical_action,
     scale_action,
 )
@@ -102,30 +102,30 @@ EVERY_OBSERVATION = [
 def test_observations_are_flattened_as_gymnasium_does(space):
     """But by the batch, and as float32."""
     space.seed(0)
-    layout = observation_layout(space, "x")
+    parts = observation_parts(space, "x")
     samples = [space.sample() for _ in range(5)]
     from gymnasium.vector.utils import batch_space, concatenate, create_empty_array
 
     batch = concatenate(space, samples, create_empty_array(space, 5))
     assert batch_space(space, 5).contains(batch)
-    flat = flatten_observation(layout, batch)
+    flat = flatten_observation(parts, batch)
     expected = np.stack([spaces.flatten(space, sample) for sample in samples])
     assert flat.dtype == np.float32
-    assert flat.shape == (5, sum(part.size for part in layout))
+    assert flat.shape == (5, sum(part.size for part in parts))
     np.testing.assert_allclose(flat, expected.astype(np.float32))
-    np.testing.assert_allclose(np.concatenate([flatten_observation(layout, s) for s in samples]), flat)
+    np.testing.assert_allclose(np.concatenate([flatten_observation(parts, s) for s in samples]), flat)
 
 
 def test_a_number_outside_its_space_is_not_taken_for_another():
-    layout = observation_layout(spaces.Discrete(3, start=1), "x")
+    parts = observation_parts(spaces.Discrete(3, start=1), "x")
     for wrong in (0, 4):
         with pytest.raises(ValueError, match=f"obs is {wrong}, which is not in its space"):
-            flatten_observation(layout, wrong)
+            flatten_observation(parts, wrong)
 
 
 def test_parts_are_named_by_their_path():
-    layout = observation_layout(EVERY_OBSERVATION[-1], "x")
-    assert [(part.name, part.size) for part in layout] == [("0", 2), ("1/y/0", 3), ("1/z", 2)]
+    parts = observation_parts(EVERY_OBSERVATION[-1], "x")
+    assert [(part.name, part.size) for part in parts] == [("0", 2), ("1/y/0", 3), ("1/z", 2)]
 
 
 def test_images_stay_bytes():
@@ -133,14 +133,14 @@ def test_images_stay_bytes():
     assert is_image(image)
     assert not is_image(spaces.Box(0, 255, (60,), np.uint8))
     assert not is_image(spaces.Box(0, 1, (4, 5, 3), np.float32))
-    flat = flatten_observation(observation_layout(image, "x"), image.sample()[None], image=True)
+    flat = flatten_observation(observation_parts(image, "x"), image.sample()[None], image=True)
     assert flat.dtype == np.uint8
     assert flat.shape == (1, 60)
 
 
 def test_other_spaces_get_a_sentence():
     with pytest.raises(UserError, match="myenv observes a Sequence, whose size is not fixed"):
-        observation_layout(spaces.Sequence(spaces.Discrete(2)), "myenv")
+        observation_parts(spaces.Sequence(spaces.Discrete(2)), "myenv")
     with pytest.raises(UserError, match="what can be acted in is"):
         action_kind(spaces.Dict({"a": spaces.Discrete(2)}), "myenv")
     with pytest.raises(UserError, match="a Box of floating-point numbers"):

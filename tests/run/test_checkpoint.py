@@ -16,7 +16,7 @@ from lemniscate.run.checkpoint import DamagedCheckpointError
 from lemniscate.spec import Box, Discrete, MultiBinary, MultiDiscrete, ObservationPart, Spec
 from lemniscate.types import Batch
 
-SPEC = Spec("x", (ObservationPart((), (3,)),), Box((-1.0,), (1.0,)), 500, 0.02, (0, 3))
+SPEC = Spec("x", (ObservationPart((), (3,)),), Box((-1.0,), (1.0,)), 500)
 CPU = torch.device("cpu")
 
 
@@ -44,7 +44,7 @@ def write(folder, state, step=123, keep=3):
 
 def same(a, b):
     """Equal in every bit that a checkpoint holds."""
-    for name, value in checkpoint._parts(a):
+    for name, value in checkpoint._fields_of(a):
         other = getattr(b, name)
         if isinstance(value, torch.Generator):
             assert torch.equal(value.get_state(), other.get_state())
@@ -98,7 +98,7 @@ def test_every_flipped_bit_is_seen(tmp_path):
     for trial in range(150):
         bad = tmp_path / f"bad{trial}"
         shutil.copytree(path, bad)
-        victim = bad / rng.choice([*checkpoint.PARTS])
+        victim = bad / rng.choice([*checkpoint.FILES])
         data = bytearray(victim.read_bytes())
         data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
         victim.write_bytes(data)
@@ -106,7 +106,7 @@ def test_every_flipped_bit_is_seen(tmp_path):
             checkpoint.read(bad)
 
 
-@pytest.mark.parametrize("name", [*checkpoint.PARTS, "manifest.json"])
+@pytest.mark.parametrize("name", [*checkpoint.FILES, "manifest.json"])
 def test_missing_truncated_and_foreign_files_are_named(tmp_path, name):
     path = write(tmp_path / "c", state_with_history())
     for damage in (lambda f: f.unlink(), lambda f: f.write_bytes(f.read_bytes()[:10]) if f.exists() else f.touch()):
@@ -124,7 +124,7 @@ def test_a_pickle_is_never_executed(tmp_path):
 
     path = write(tmp_path / "c", state_with_history())
     evil = pickle.dumps(Evil())
-    for name in (*checkpoint.PARTS, "manifest.json"):
+    for name in (*checkpoint.FILES, "manifest.json"):
         kept = (path / name).read_bytes()
         (path / name).write_bytes(evil)
         with pytest.raises(DamagedCheckpointError):
@@ -154,7 +154,7 @@ def test_a_full_disk_leaves_the_checkpoint_before(tmp_path, monkeypatch):
 def test_only_what_shares_memory_is_copied():
     """A million transitions are not: a part of a ring that is not full yet goes to the disk from where it lies."""
     vector, ring = torch.arange(10.0), torch.arange(6.0)
-    apart = checkpoint._apart({"a": vector[:5], "b": vector[5:], "c": ring[:4]})
+    apart = checkpoint._to_save({"a": vector[:5], "b": vector[5:], "c": ring[:4]})
     assert apart["c"].data_ptr() == ring.data_ptr()
     assert apart["a"].untyped_storage().data_ptr() != apart["b"].untyped_storage().data_ptr()
     assert [len(t) for t in apart.values()] == [5, 5, 4]

@@ -1,18 +1,18 @@
 from dataclasses import replace
 
+import gymnasium as gym
+import numpy as np
 import pytest
 import torch
 
 import lemniscate as lem
-from lemniscate.envs import toy
-from lemniscate.envs.gymnasium import GymnasiumBackend
-from lemniscate.envs.vec_env import VecEnv
+from lemniscate import named
+from lemniscate.envs import registry, toy
+from lemniscate.envs.backend import Summary
 from lemniscate.errors import UserError
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.networks import Layers
 from lemniscate.run.evaluate import evaluate
-
-CPU = torch.device("cpu")
 
 
 class Uneven(toy.Countdown):
@@ -25,10 +25,9 @@ class Uneven(toy.Countdown):
 
 @pytest.mark.parametrize("mode", ["NEXT_STEP", "SAME_STEP", "DISABLED"])
 @pytest.mark.parametrize("episodes", [3, 4, 10])
-def test_every_copy_plays_its_own_share(monkeypatch, mode, episodes):
+def test_every_copy_plays_its_own_share(mode, episodes):
     """Taking the first that end would fill the list with the short ones."""
-    monkeypatch.setattr(toy, "Countdown", Uneven)
-    env = VecEnv(GymnasiumBackend("Countdown-v0", 4, CPU, mode=mode))
+    env = registry.make(Uneven, 4, kwargs={"mode": mode})
     policy = ActorCritic(env.spec, Layers((4,))).policy
     scores = evaluate(policy, env, episodes, seed=0)
     shares = [episodes // 4 + (copy < episodes % 4) for copy in range(4)]
@@ -40,18 +39,17 @@ def test_every_copy_plays_its_own_share(monkeypatch, mode, episodes):
 
 
 def test_the_same_seed_gives_the_same_scores_and_another_does_not():
-    env = VecEnv(GymnasiumBackend("CartPole-v1", 4, CPU))
+    env = registry.make("CartPole-v1", 4, backend="gymnasium")
     torch.manual_seed(0)
     policy = ActorCritic(env.spec, Layers((4,))).policy
     first, again, other = (evaluate(policy, env, 6, seed, deterministic=False) for seed in (1, 1, 2))
     assert first == replace(again, date=first.date)
     assert first.returns != other.returns
-    assert first.rmse_mm is None
-    assert "rmse_mm" not in first.to_json()
+    assert first.measures == {}
 
 
 def endless(num_envs, mode="DISABLED"):
-    return VecEnv(GymnasiumBackend("Countdown-v0", num_envs, CPU, mode=mode, length=None, horizon=None))
+    return registry.make("Countdown-v0", num_envs, kwargs={"mode": mode, "length": None})
 
 
 def test_an_episode_without_end_is_a_sentence_and_not_a_hang(monkeypatch):
@@ -64,14 +62,78 @@ def test_an_episode_without_end_is_a_sentence_and_not_a_hang(monkeypatch):
 
 def test_patience_is_for_one_episode_not_for_all(monkeypatch):
     monkeypatch.setattr("lemniscate.envs.vec_env.PATIENCE", 30)
-    env = VecEnv(GymnasiumBackend("Countdown-v0", 2, CPU, mode="DISABLED", length=20, horizon=None))
+    env = registry.make("Countdown-v0", 2, kwargs={"mode": "DISABLED", "length": 20})
     assert evaluate(ActorCritic(env.spec, Layers((4,))).policy, env, 10, seed=0).lengths == [20] * 10
 
 
 def test_a_run_goes_on_when_its_evaluation_cannot(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr("lemniscate.envs.vec_env.PATIENCE", 30)
-    monkeypatch.setattr("lemniscate.api._evaluation_env", lambda *_: endless(2))
-    fields = {"num_envs": 2, "num_steps": 32, "total_steps": 128, "evaluate_every": 64, "progress": False}
+    fields = {
+        "env_kwargs": {"length": None},
+        "num_envs": 2,
+        "num_steps": 32,
+        "total_steps": 128,
+        "evaluate_every": 64,
+        "progress": False,
+    }
     run = lem.train("ppo", "Countdown-v0", run=tmp_path / "run", backend="gymnasium", **fields)
     assert run.policy.step == 128
     assert "No evaluation at step 64" in capsys.readouterr().err
+
+
+class Climbs(gym.Env):
+    """Measures a height, the number of the step; success is reached in the last of `length` steps."""
+
+    observation_space = gym.spaces.Box(-1, 1, (1,))
+    action_space = gym.spaces.Discrete(2)
+    metadata = {"render_modes": [], "measures": ["height"]}  # noqa: RUF012
+
+    def __init__(self, length=4):
+        self.length = length
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.t += 1
+        info = {"height": float(self.t), "is_success": self.t == self.length}
+        return np.zeros(1, np.float32), 1.0, self.t == self.length, False, info
+
+
+def test_what_is_measured_is_averaged_over_the_rows_that_count():
+    """Ten episodes in four environments: two of them stop counting after two episodes, and go on playing."""
+    env = registry.make(Climbs, 4)
+    scores = evaluate(ActorCritic(env.spec, Layers((4,))).policy, env, 10, seed=0)
+    assert scores.measures == {"height": 2.5, "is_success": 0.25, "is_success_at_end": 1.0}
+    assert scores.to_json() | scores.measures == scores.to_json()
+
+
+def test_summaries_leave_out_the_first_steps():
+    env = registry.make(Climbs, 2)
+    env.summaries = (Summary("rms", "height", "rms", scale=10), Summary("late", "height", "rms", skip=2))
+    measures = evaluate(ActorCritic(env.spec, Layers((4,))).policy, env, 4, seed=0).measures
+    assert measures["rms"] == pytest.approx(10 * np.sqrt(np.mean(np.square([1, 2, 3, 4]))))
+    assert measures["late"] == pytest.approx(np.sqrt(np.mean(np.square([3, 4]))))
+
+
+def test_a_policy_is_evaluated_in_another_world(tmp_path):
+    fields = {"num_envs": 2, "num_steps": 8, "total_steps": 64, "minibatch_size": 16, "progress": False}
+    made = lem.train("ppo", Climbs, run=tmp_path / "run", env_kwargs={"length": 3}, **fields)
+    policy = lem.load(made.path)
+    assert policy.config.env == "test_evaluate:Climbs"
+    assert lem.evaluate(policy, episodes=2).lengths == [3, 3]
+    assert lem.evaluate(policy, episodes=2, env_kwargs={"length": 5}).lengths == [5, 5]
+    assert lem.evaluate(policy, env=lambda: Climbs(length=6), episodes=2).lengths == [6, 6]
+
+
+def test_an_environment_that_no_file_can_keep_is_asked_for_again(tmp_path):
+    fields = {"num_envs": 2, "num_steps": 8, "total_steps": 64, "minibatch_size": 16, "progress": False}
+    made = lem.train("ppo", lambda: Climbs(length=3), run=tmp_path / "run", **fields)
+    policy = lem.load(made.path)
+    assert lem.evaluate(policy, episodes=2).lengths == [3, 3]
+    named._PASSED.clear()  # as another process would have it
+    with pytest.raises(UserError, match="pass the object again"):
+        lem.evaluate(policy, episodes=2)
+    assert lem.evaluate(policy, env=lambda: Climbs(length=3), episodes=2).lengths == [3, 3]

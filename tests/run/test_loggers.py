@@ -1,12 +1,14 @@
 import json
 import sys
+import time
 from types import ModuleType, SimpleNamespace
 
 import pytest
 
 from lemniscate.envs.episodes import Episodes
 from lemniscate.report.curves import episode_returns
-from lemniscate.run.loggers import JsonLines, WeightsAndBiases, read_metrics
+from lemniscate.run.loggers import JsonLines, read_metrics
+from lemniscate.run.wandb_logger import WeightsAndBiases
 
 
 def test_a_resumed_log_drops_what_it_will_write_again(tmp_path):
@@ -115,3 +117,52 @@ def test_no_secret_of_the_environment_is_written(tmp_path, monkeypatch):
     files = [file for file in run.path.rglob("*") if file.is_file()]
     assert len(files) > 5
     assert not any(secret.encode() in file.read_bytes() for file in files)
+
+
+LOGGER = """
+class Lines:
+    def __init__(self, path, config, step):
+        self.file = (path / "lines.txt").open("a")
+        print(config["algorithm"], config["env"], step, file=self.file)
+
+    def write(self, step, metrics, episodes=None):
+        print(step, sorted(metrics)[0], file=self.file)
+
+    def close(self, pictures):
+        print("pictures", len(pictures), file=self.file)
+        self.file.close()
+"""
+
+
+def test_a_logger_of_ones_own_is_named_as_module_and_class(tmp_path, monkeypatch):
+    import lemniscate as lem
+    from conftest import tiny_fields
+
+    (tmp_path / "my_logger.py").write_text(LOGGER)
+    monkeypatch.chdir(tmp_path)
+    fields = {"total_steps": 64, "progress": False, "track": "my_logger:Lines"}
+    run = lem.train("ppo", "Countdown-v0", run=tmp_path / "r", **{**tiny_fields(), **fields})
+    first, *lines, last = (run.path / "lines.txt").read_text().splitlines()
+    assert first == "ppo Countdown-v0 0"
+    assert [line.split()[0] for line in lines] == ["32", "64"]
+    assert last == "pictures 2"
+
+
+def test_seconds_spent_collecting_and_learning_are_logged(tmp_path, monkeypatch):
+    """An environment that takes its time makes collecting slow; the rest of an update is learning."""
+    import lemniscate as lem
+    from conftest import tiny_fields
+    from lemniscate.envs import toy
+
+    class Slow(toy.Countdown):
+        def step(self, actions):
+            time.sleep(0.01)
+            return super().step(actions)
+
+    monkeypatch.setattr(toy, "Countdown", Slow)
+    run = lem.train("ppo", "Countdown-v0", run=tmp_path / "r", progress=False, **tiny_fields(total_steps=64))
+    for line in read_metrics(run.path):
+        assert 0.08 <= line["time/collect"] < 0.2  # 8 steps of all environments
+        assert 0 < line["time/learn"] < 0.2
+        seconds = 32 / line["time/steps_per_second"]
+        assert line["time/collect"] + line["time/learn"] <= seconds

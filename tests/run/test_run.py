@@ -28,7 +28,7 @@ from lemniscate.run.seeding import derive
 LOUD = "import sys, lemniscate.cli; sys.exit(lemniscate.cli.main())"
 
 
-REMEMBERING = {
+OFF_POLICY = {
     # name: algorithm and fields; in Pendulum-v1, whose episodes are longer than the distance of checkpoints
     "ddpg": {"noise": "ou", "policy_delay": 2, "normalize_observations": True},
     "ddpg-pink": {"noise": "coloured", "update_every": 2, "num_updates": 3, "architecture": "simba"},
@@ -37,7 +37,7 @@ REMEMBERING = {
 }
 
 
-ROAD = {
+ON_POLICY = {
     # name: algorithm and fields; in CartPole-v1
     "reinforce": {"scale_rewards": True},
     "reinforce-episodes": {"episodes": 1, "baseline": "mean", "returns": "whole"},
@@ -47,11 +47,13 @@ ROAD = {
 
 
 def train(path, env="Countdown-v0", **fields):
-    if env in ROAD:
+    if env in ON_POLICY:
         small = {"num_envs": 4, "num_steps": 8, "total_steps": 256, "hidden": (16,), "evaluate_episodes": 4}
-        return lem.train(env.split("-")[0], "CartPole-v1", run=path, progress=False, **{**small, **ROAD[env], **fields})
-    if env in REMEMBERING:
-        fields = tiny_off_policy(**REMEMBERING[env], **fields)
+        return lem.train(
+            env.split("-")[0], "CartPole-v1", run=path, progress=False, **{**small, **ON_POLICY[env], **fields}
+        )
+    if env in OFF_POLICY:
+        fields = tiny_off_policy(**OFF_POLICY[env], **fields)
         return lem.train(env.split("-")[0], "Pendulum-v1", run=path, progress=False, **fields)
     return lem.train("ppo", env, run=path, progress=False, **tiny_fields(env, **fields))
 
@@ -76,7 +78,7 @@ def test_unasked_there_are_five_checkpoints_or_as_many_as_leave_episodes_whole(t
     assert len(checkpoint.list_steps(tmp_path / "r" / "checkpoints")) == planned
 
 
-def test_what_follows_episodes_begins_anew_with_the_environments(tmp_path, monkeypatch):
+def test_what_follows_episodes_is_restarted_with_the_environments(tmp_path, monkeypatch):
     """At the start and at each planned checkpoint but the last, after which nothing is played."""
     told = []
     restart = RewardScale.restart
@@ -85,8 +87,8 @@ def test_what_follows_episodes_begins_anew_with_the_environments(tmp_path, monke
     assert told == [0, 64, 128, 192]
 
 
-@pytest.mark.parametrize("env", ["Countdown-v0", "Matching-v0", "CartPole-v1", "Pendulum-v1", *REMEMBERING, *ROAD])
-def test_the_same_seed_gives_the_same_bits_and_another_does_not(tmp_path, env):
+@pytest.mark.parametrize("env", ["Countdown-v0", "Matching-v0", "CartPole-v1", "Pendulum-v1", *OFF_POLICY, *ON_POLICY])
+def test_the_same_seed_gives_the_same_bits_and_another_seed_does_not(tmp_path, env):
     for name, seed in (("a", 1), ("b", 1), ("c", 2)):
         train(tmp_path / name, env, seed=seed)
     assert final_hashes(tmp_path / "a")["tensors.safetensors"] == final_hashes(tmp_path / "b")["tensors.safetensors"]
@@ -169,7 +171,7 @@ def test_training_and_evaluation_are_separate_and_differently_seeded():
     assert torch.equal(train_env.obs, before)
 
 
-@pytest.mark.parametrize("env", ["CartPole-v1", *REMEMBERING, *ROAD])
+@pytest.mark.parametrize("env", ["CartPole-v1", *OFF_POLICY, *ON_POLICY])
 def test_a_run_resumed_from_any_checkpoint_ends_in_the_same_bits(tmp_path, env):
     fields = {"checkpoint_every": 64, "keep_checkpoints": 10}
     train(tmp_path / "whole", env, **fields)
@@ -192,7 +194,7 @@ def test_a_damaged_checkpoint_is_named_and_the_one_before_is_taken(tmp_path, cap
     data[len(data) // 2] ^= 1
     newest.write_bytes(data)
     assert lem.load(tmp_path / "r").step == 192
-    assert "step-256/tensors.safetensors is not what was written" in capsys.readouterr().err
+    assert "step-256/tensors.safetensors is damaged: its sha256 differs" in capsys.readouterr().err
     lem.resume(tmp_path / "r", progress=False)
     assert final_hashes(tmp_path / "r") == expected
 
@@ -255,8 +257,8 @@ def command(*arguments, stderr=subprocess.DEVNULL, **options):
 
 def long_run(path, env, updates=150, engine="eager"):
     """Arguments of a run of some seconds with a checkpoint every eighth update."""
-    if env in REMEMBERING:
-        fields = tiny_off_policy(**REMEMBERING[env], total_steps=16 * updates, checkpoint_every=128, engine=engine)
+    if env in OFF_POLICY:
+        fields = tiny_off_policy(**OFF_POLICY[env], total_steps=16 * updates, checkpoint_every=128, engine=engine)
         flags = [f"--{name.replace('_', '-')}" for name in fields]
         values = [() if value is True else value if isinstance(value, tuple) else (value,) for value in fields.values()]
         given = [part for flag, value in zip(flags, values, strict=True) for part in (flag, *value)]
@@ -276,7 +278,7 @@ def wait_for(condition, process=None):
 
 @pytest.mark.parametrize("env", ["Countdown-v0", "CartPole-v1", "ddpg"])
 def test_killed_at_random_and_resumed_it_ends_in_the_same_bits(tmp_path, env):
-    """SIGKILL on real processes, several times in one run, at times drawn anew in each test run."""
+    """SIGKILL on real processes, several times in one run, at times drawn again in each test run."""
     check_kills(tmp_path, long_run(tmp_path / "whole", env), long_run(tmp_path / "killed", env), kills=3)
 
 

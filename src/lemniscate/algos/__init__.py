@@ -1,15 +1,54 @@
-"""The algorithms. One file each, with the same names in the same order; one line each in this table."""
+"""The algorithms. One file each, with the same names in the same order; one name each in this table."""
 
+import sys
+from importlib import import_module
+from pathlib import Path
 from types import ModuleType
+from typing import Any
 
-from lemniscate.algos import a2c, ddpg, ppo, reinforce, sac, td3, trpo
+from lemniscate import named
+from lemniscate.errors import UserError, unknown_name
 
-ALGORITHMS: dict[str, ModuleType] = {
-    "reinforce": reinforce,
-    "a2c": a2c,
-    "trpo": trpo,
-    "ppo": ppo,
-    "ddpg": ddpg,
-    "td3": td3,
-    "sac": sac,
-}
+ALGORITHMS = ("reinforce", "a2c", "trpo", "ppo", "ddpg", "td3", "sac")
+
+REQUIRED = ("Config", "train")
+"""names that a module needs to be an algorithm; `lemniscate.testing` checks the rest"""
+
+
+def find(algorithm: str | ModuleType) -> Any:
+    """The module of an algorithm: one in `ALGORITHMS`, one's own by its name `module` or `module:name`, or itself.
+
+    A module of one's own is looked for in the working directory too.
+
+    Raises:
+        UserError: there is no such module, it cannot be imported, or it lacks `Config` or `train`.
+    """
+    if algorithm in ALGORITHMS:
+        return import_module(f"{__name__}.{algorithm}")
+    own = _import(algorithm) if isinstance(algorithm, str) else algorithm
+    missing = [name for name in REQUIRED if not hasattr(own, name)]
+    if missing:
+        name = algorithm if isinstance(algorithm, str) else getattr(own, "__name__", repr(own))
+        raise UserError(f"{name} is not an algorithm: it has no {' and no '.join(missing)}.")
+    return own
+
+
+def name_of(algorithm: str | ModuleType) -> str:
+    """The name under which `find` returns an algorithm. Raises `UserError` as `find` does."""
+    found = find(algorithm)
+    return algorithm if isinstance(algorithm, str) else found.__name__.removeprefix(f"{__name__}.")
+
+
+def _import(name: str) -> Any:
+    if ":" in name:
+        return named.find(name)
+    if str(Path.cwd()) not in sys.path:
+        sys.path.insert(0, str(Path.cwd()))
+    try:
+        return import_module(name)
+    except ModuleNotFoundError as error:
+        if error.name in (name, name.partition(".")[0]):
+            raise unknown_name("algorithm", name, ALGORITHMS) from None
+        raise UserError(f"The algorithm {name} cannot be imported: {error}.") from error
+    except (ImportError, SyntaxError, ValueError, TypeError) as error:
+        raise UserError(f"The algorithm {name} cannot be imported: {error}.") from error

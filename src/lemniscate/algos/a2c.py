@@ -15,9 +15,9 @@ from lemniscate.maths import explained_variance, gae, means, policy_gradient, st
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.optim.adam import Adam, linear
-from lemniscate.run.config import Count, Fraction, LogStd, NonNegative, OnPolicyConfig, Positive
+from lemniscate.run.config import Count, Fraction, LogStd, NonNegative, Positive
+from lemniscate.run.on_policy import OnPolicyConfig, OnPolicyState
 from lemniscate.run.run import Run
-from lemniscate.run.state import Generators, OnPolicyState
 from lemniscate.spec import Spec
 from lemniscate.types import Batch, Loss, Metrics, Rollout
 
@@ -71,7 +71,7 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
         networks=networks,
         optimizer=Adam(networks, eps=config.adam_eps, max_grad_norm=config.max_grad_norm),
         reward_scale=RewardScale(config.num_envs, config.gamma).to(device),
-        rng=Generators(config.seed, device),
+        rng=config.generators(device),
         learn=learn,
     )
 

@@ -16,9 +16,9 @@ from lemniscate.nn.actor_critic import ActorQ
 from lemniscate.nn.critics import Critics
 from lemniscate.nn.policies import Policy
 from lemniscate.optim.adam import Adam, linear
-from lemniscate.run.config import NonNegative, OffPolicyConfig
+from lemniscate.run.config import NonNegative
+from lemniscate.run.off_policy import OffPolicyConfig, OffPolicyState
 from lemniscate.run.run import Run
-from lemniscate.run.state import Generators, OffPolicyState
 from lemniscate.spec import Spec
 from lemniscate.types import Flags, Loss, Metrics, Transition
 
@@ -53,7 +53,7 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
         critic_optimizer=Adam(networks.critics, name="critic"),
         replay=ReplayBuffer(spec, config.capacity, device),
         action_noise=config.make_action_noise(spec, device),
-        rng=Generators(config.seed, device),
+        rng=config.generators(device),
         learn=learn,
     )
 

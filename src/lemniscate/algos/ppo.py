@@ -23,9 +23,9 @@ from lemniscate.maths import (
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.optim.adam import Adam, adapt_to_kl, linear
-from lemniscate.run.config import Count, Fraction, NonNegative, OnPolicyConfig, Positive
+from lemniscate.run.config import Count, Fraction, NonNegative, Positive
+from lemniscate.run.on_policy import OnPolicyConfig, OnPolicyState
 from lemniscate.run.run import Run
-from lemniscate.run.state import Generators, OnPolicyState
 from lemniscate.spec import Spec
 from lemniscate.types import Batch, Loss, Metrics, Rollout
 
@@ -94,7 +94,7 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
         optimizer=Adam(networks, betas=betas, eps=config.adam_eps, max_grad_norm=config.max_grad_norm),
         learning_rate=config.learning_rate,
         reward_scale=RewardScale(config.num_envs, config.gamma).to(device),
-        rng=Generators(config.seed, device),
+        rng=config.generators(device),
         learn=learn,
     )
 

@@ -28,9 +28,9 @@ from lemniscate.nn.critics import Value
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.nn.policies import Policy
 from lemniscate.optim.adam import Adam, linear
-from lemniscate.run.config import Count, Fraction, LogStd, Natural, NonNegative, OnPolicyConfig, Positive
+from lemniscate.run.config import Count, Fraction, LogStd, Natural, NonNegative, Positive
+from lemniscate.run.on_policy import OnPolicyConfig, OnPolicyState
 from lemniscate.run.run import Run
-from lemniscate.run.state import Generators, OnPolicyState
 from lemniscate.spec import Spec
 from lemniscate.types import Batch, Loss, Metrics, Rollout
 
@@ -104,7 +104,7 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
         optimizer=Adam(networks.policy),
         critic_optimizer=Adam(networks.value, name="value"),
         reward_scale=RewardScale(config.num_envs, config.gamma).to(device),
-        rng=Generators(config.seed, device),
+        rng=config.generators(device),
         learn=learn,
     )
 

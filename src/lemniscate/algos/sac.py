@@ -16,9 +16,9 @@ from lemniscate.nn.actor_critic import SoftActorQ
 from lemniscate.nn.critics import Critics, Temperature
 from lemniscate.nn.policies import Policy
 from lemniscate.optim.adam import Adam, linear
-from lemniscate.run.config import Finite, OffPolicyConfig, Positive
+from lemniscate.run.config import Finite, Positive
+from lemniscate.run.off_policy import OffPolicyConfig, OffPolicyState
 from lemniscate.run.run import Run
-from lemniscate.run.state import Generators, OffPolicyState
 from lemniscate.spec import Spec
 from lemniscate.types import Flags, Loss, Metrics, Transition
 
@@ -57,7 +57,7 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
         temperature_optimizer=Adam(networks.temperature, name="temperature"),
         replay=ReplayBuffer(spec, config.capacity, device),
         action_noise=config.make_action_noise(spec, device),
-        rng=Generators(config.seed, device),
+        rng=config.generators(device),
         learn=learn,
     )
 

@@ -1,4 +1,4 @@
-"""For those who write it themselves: is my function right, and if not, what is it likely to be?
+"""Checks of functions that a reader writes: correct, or wrong in a well-known way.
 
     from lemniscate import course
 
@@ -6,8 +6,8 @@
 
     course.check(gae)
 
-A function is compared with the library's of the same name on small cases, each with something that is easily got wrong.
-Where a value is off, the answer is held against those of well-known mistakes, and the one that agrees is named.
+A function is compared with the library's of the same name on small cases, each with one difficulty. Where a value
+differs, the result is compared with those of well-known mistakes, and the mistake that agrees is named.
 """
 
 import copy
@@ -24,7 +24,7 @@ from lemniscate.errors import unknown_name
 
 @dataclass(frozen=True)
 class Finding:
-    """What was found of one function; true if it is right."""
+    """The result of a check; true if the function is right."""
 
     name: str
     right: bool
@@ -38,11 +38,11 @@ class Finding:
 
 
 def check(function: Function, name: str | None = None) -> Finding:
-    """Compare a function with the library's; prints what was found, and returns it.
+    """Compare a function with the library's; prints the finding, and returns it.
 
     Args:
         function: takes what `lemniscate.maths` documents under its name, and returns the same.
-        name: whose work it does; by default its own name.
+        name: the name of the library's function; by default its own name.
 
     Raises:
         UserError: a name that is no exercise.
@@ -64,10 +64,10 @@ def _find(name: str, exercise: Exercise, function: Function) -> Finding:
 
 
 def _complaint(exercise: Exercise, function: Function, case: Case) -> str | None:
-    """One sentence on the first thing that is off, and another on the likely cause."""
+    """A sentence on the first difference, and one on its likely cause; None if there is none."""
     try:
         return _off(exercise, function, case)
-    except Exception as error:  # whatever a learner's function raises is an answer too
+    except Exception as error:  # whatever the function raises is a finding too
         return f"it raised {type(error).__name__}: {error}"
 
 
@@ -91,7 +91,7 @@ def _off(exercise: Exercise, function: Function, case: Case) -> str | None:
 
 
 def _ask(exercise: Exercise, function: Function, case: Case) -> tuple[Any, ...]:
-    """What a function answers, as a tuple; of one that works in place, what it made of its networks' parameters."""
+    """The outputs of a function as a tuple; of one that works in place, the parameters after the call."""
     args = copy.deepcopy(case.args)
     if exercise.in_place:
         parameters = [[nn.Parameter(tensor) for tensor in arg] for arg in args if isinstance(arg, list)]
@@ -115,7 +115,7 @@ def _close(mine: Tensor, right: Tensor) -> bool:
 
 
 def _apart(what: str, mine: Tensor, right: Tensor) -> str:
-    """Where a value is off first."""
+    """A sentence on the first element that differs."""
     if not mine.dim():
         return f"{what} is {mine:.4g}; it should be {right:.4g}."
     place = tuple(torch.nonzero(~torch.isclose(mine, right, rtol=1e-4, atol=1e-5))[0].tolist())
@@ -136,6 +136,6 @@ def _same(exercise: Exercise, one: Function, other: Function) -> bool:
                 return False
             if exercise.is_loss and not _close(_slope(exercise, one, case), _slope(exercise, other, case)):
                 return False
-        except Exception:  # it breaks in a later case: no mistake of ours
+        except Exception:  # it fails in a later case, so it is none of the known mistakes
             return False
     return True

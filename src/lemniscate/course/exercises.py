@@ -1,4 +1,4 @@
-"""Functions worth writing oneself, each with cases that are easily got wrong and the mistakes that get them wrong."""
+"""Functions to write as an exercise, each with test cases and its well-known mistakes."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,7 +14,7 @@ Function = Callable[..., Any]
 
 @dataclass(frozen=True)
 class Case:
-    """Arguments, and in a word what is special about them."""
+    """Arguments of a function, and what is special about them."""
 
     about: str
     args: tuple[Any, ...]
@@ -23,18 +23,18 @@ class Case:
 
 @dataclass(frozen=True)
 class Exercise:
-    """A function to write: what it is compared with, on what, and how it usually goes wrong."""
+    """A function to write: its reference, the cases it is compared on, and its usual mistakes."""
 
     right: Function
     outputs: tuple[str, ...]
-    """what it returns, by name"""
+    """names of what it returns"""
     cases: Sequence[Case]
     mistakes: Mapping[str, Function]
-    """in words: the function that makes it"""
+    """by description: a function that makes the mistake"""
     is_loss: bool = False
     """the gradient in the first argument counts too"""
     in_place: bool = False
-    """it changes the parameters of two networks, and returns nothing"""
+    """it changes the parameters of two networks in place, and returns nothing"""
 
 
 def _column(*numbers: float) -> Tensor:

@@ -94,12 +94,13 @@ def interact(
             stochastic policy, which takes standard normal numbers.
         random: act uniformly in [-1, 1]^A instead.
     """
-    obs, noise = env.obs, action_noise(generator)
-    action = uniform(noise) if random else policy.act(obs, noise_std * noise)
-    step = env.step(action)
-    replay.add(obs, action, step)
-    action_noise.on_episode_end(step.terminated | step.truncated | ~step.valid)
-    policy.observe(obs[step.valid])
+    with env.collecting:
+        obs, noise = env.obs, action_noise(generator)
+        action = uniform(noise) if random else policy.act(obs, noise_std * noise)
+        step = env.step(action)
+        replay.add(obs, action, step)
+        action_noise.on_episode_end(step.terminated | step.truncated | ~step.valid)
+        policy.observe(obs[step.valid])
 
 
 def bytes_per_transition(spec: Spec) -> int:

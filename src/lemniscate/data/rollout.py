@@ -16,12 +16,13 @@ from lemniscate.types import Rollout
 def collect(env: VecEnv, policy: Policy, num_steps: int, generator: Generator) -> Rollout:
     """Act `num_steps` times in every environment, from where it stands. Returns a rollout [T, N, …]."""
     rows = []
-    for noise in policy.draw_noise((num_steps, env.num_envs), generator):
-        obs = env.obs
-        action = policy.act(obs, noise)
-        step = env.step(action)
-        rows.append(Rollout(obs, action, step.reward, step.next_obs, step.terminated, step.truncated, step.valid))
-    return Rollout.stack(rows)
+    with env.collecting:
+        for noise in policy.draw_noise((num_steps, env.num_envs), generator):
+            obs = env.obs
+            action = policy.act(obs, noise)
+            step = env.step(action)
+            rows.append(Rollout(obs, action, step.reward, step.next_obs, step.terminated, step.truncated, step.valid))
+        return Rollout.stack(rows)
 
 
 @torch.no_grad()
@@ -38,16 +39,17 @@ def collect_episodes(env: VecEnv, policy: Policy, episodes: int, generator: Gene
     rows, noise = [], partial(policy.draw_noise, (env.num_envs,), generator)
     ended = torch.zeros(env.num_envs, dtype=torch.int64, device=env.device)
     age = torch.zeros_like(ended)
-    while (ended <= episodes).any():
-        env.require_end(int(age.max()))
-        obs = env.obs
-        action = policy.act(obs, noise())
-        step = env.step(action)
-        whole = step.valid & (ended >= 1) & (ended <= episodes)
-        rows.append(Rollout(obs, action, step.reward, step.next_obs, step.terminated, step.truncated, whole))
-        done = (step.terminated | step.truncated) & step.valid
-        ended, age = ended + done.int(), (age + 1) * ~done
-    return Rollout.stack(rows)
+    with env.collecting:
+        while (ended <= episodes).any():
+            env.require_end(int(age.max()))
+            obs = env.obs
+            action = policy.act(obs, noise())
+            step = env.step(action)
+            whole = step.valid & (ended >= 1) & (ended <= episodes)
+            rows.append(Rollout(obs, action, step.reward, step.next_obs, step.terminated, step.truncated, whole))
+            done = (step.terminated | step.truncated) & step.valid
+            ended, age = ended + done.int(), (age + 1) * ~done
+        return Rollout.stack(rows)
 
 
 def one_minibatch(valid_rows: Tensor, num_rows: int) -> Tensor:

@@ -11,14 +11,14 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 from lemniscate.envs import registry
-from lemniscate.envs.gymnasium import make_one, spec_of
-from lemniscate.envs.spaces import follow, is_image, observation_layout
+from lemniscate.envs.factory import make_one, maker_of, makes_vector
+from lemniscate.envs.spaces import follow, is_image, observation_parts
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import NonFiniteError, UserError
 from lemniscate.spec import Action, Box, Discrete, MultiDiscrete
 from lemniscate.types import Rollout
 
-COPIES, STEPS = 4, 500
+NUM_ENVS, STEPS = 4, 500
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ def check(env_id: str, backend: str | None = None) -> Iterator[Finding]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            env = registry.make(env_id, COPIES, backend=backend)
+            env = registry.make(env_id, NUM_ENVS, backend=backend)
     except UserError as error:
         yield Finding("bad", str(error))
         return
@@ -44,7 +44,7 @@ def check(env_id: str, backend: str | None = None) -> Iterator[Finding]:
         return
     try:
         yield from _spaces(env, served_by)
-        if served_by.startswith("gymnasium") and spec_of(env_id).entry_point is not None:
+        if registry.can_wrap(served_by) and not makes_vector(maker_of(env_id)):
             yield from _gymnasium(env_id)
         yield from _behaviour(env)
     finally:
@@ -53,7 +53,7 @@ def check(env_id: str, backend: str | None = None) -> Iterator[Finding]:
 
 def _spaces(env: VecEnv, served_by: str) -> Iterator[Finding]:
     spec = env.spec
-    parts = ", ".join(f"{part.name} {part.size}" for part in spec.layout)
+    parts = ", ".join(f"{part.name} {part.size}" for part in spec.observation_parts)
     seen = "an image" if spec.image else f"{spec.observation_size} numbers ({parts})"
     yield Finding("good", f"Served by {served_by}; observes {seen}; acts by {_describe(spec.action)}.")
     yield from _autoreset(env)
@@ -90,7 +90,7 @@ def _describe(action: Action) -> str:
 
 def _gymnasium(env_id: str) -> Iterator[Finding]:
     found: list[Finding] = []
-    env = make_one(spec_of(env_id))
+    env = make_one(maker_of(env_id))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
@@ -107,11 +107,9 @@ def _gymnasium(env_id: str) -> Iterator[Finding]:
 
 
 def _dtypes(env_id: str) -> Iterator[Finding]:
-    env = make_one(spec_of(env_id)).unwrapped
+    env = make_one(maker_of(env_id)).unwrapped
     obs, _ = env.reset(seed=0)
-    kinds = {
-        np.asarray(follow(part.path, obs)).dtype.name for part in observation_layout(env.observation_space, env_id)
-    }
+    kinds = {np.asarray(follow(part.path, obs)).dtype.name for part in observation_parts(env.observation_space, env_id)}
     env.close()
     kept = kinds == {"uint8"} and is_image(env.observation_space)
     as_what = "stay bytes" if kept else "reach the policy as float32"
@@ -122,7 +120,7 @@ def _behaviour(env: VecEnv) -> Iterator[Finding]:
     try:
         started = time.perf_counter()
         first = _play(env, seed=0)
-        speed = COPIES * STEPS / (time.perf_counter() - started)
+        speed = NUM_ENVS * STEPS / (time.perf_counter() - started)
         again, other = _play(env, seed=0), _play(env, seed=1)
     except NonFiniteError as error:
         yield Finding("bad", f"{error} Learning would stop there.")
@@ -145,7 +143,7 @@ def _behaviour(env: VecEnv) -> Iterator[Finding]:
     rewards = first.reward[first.valid]
     if rewards.abs().max() > 100:
         yield Finding("note", f"Rewards reach {rewards.abs().max():.3g}; train with --scale-rewards.")
-    yield Finding("good", f"{speed:,.0f} steps a second ({COPIES} copies, random actions).")
+    yield Finding("good", f"{speed:,.0f} steps a second ({NUM_ENVS} parallel environments, random actions).")
 
 
 def _rows(rollout: Rollout) -> Iterator[Finding]:
@@ -156,7 +154,7 @@ def _rows(rollout: Rollout) -> Iterator[Finding]:
     ignored = int((~rollout.valid).sum())
     resets = f", and {ignored} steps in which it ignored its action to reset itself, which are not learned from"
     yield Finding(
-        "good", f"{ended} episodes ended by its rules and {timed_out} by the clock{resets if ignored else ''}."
+        "good", f"{ended} episodes ended by its rules and {timed_out} by the time limit{resets if ignored else ''}."
     )
 
 

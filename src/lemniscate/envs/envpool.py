@@ -2,77 +2,137 @@
 
 import os
 import warnings
+from collections.abc import Collection, Mapping, Sequence
+from functools import partial
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import torch
 from torch import Tensor
 
 from lemniscate.envs.episodes import Stagger
-from lemniscate.envs.spaces import action_kind, flatten_observation, is_image, observation_layout, physical_action
-from lemniscate.errors import UserError
+from lemniscate.envs.measures import STANDARD, SUMMARIES, measured
+from lemniscate.envs.spaces import (
+    action_kind,
+    flatten_observation,
+    is_image,
+    observation_parts,
+    physical_action,
+    row_of,
+)
+from lemniscate.errors import UserError, is_installed, missing_extra, unknown_name
 from lemniscate.spec import Spec
 from lemniscate.types import Step
 
+PREFIX = "EnvPool/"
+"""what an id of EnvPool's own begins with here, so that it is not mistaken for Gymnasium's of that name"""
+
+GYMNASIUM_IDS = (
+    "Ant-v5",
+    "CartPole-v1",
+    "HalfCheetah-v5",
+    "Hopper-v5",
+    "Humanoid-v5",
+    "LunarLander-v3",
+    "Walker2d-v5",
+)
+"""those that behave in EnvPool as in Gymnasium: tests/envs/test_envpool.py compares them"""
+
+REFUSED = {
+    "procgen": "its games begin the next level in the step that ends one, which hides the final observation.",
+    "vizdoom": "its buttons are numbers without bounds, in which no policy can explore.",
+}
+"""families that do not fulfil the contract, and why: see docs/decisions/0008-envpool-families.md"""
+
+NO_LIMIT = 2**31 - 1
+"""the time limit of an environment that has none"""
+
+RESERVED = ("num_envs", "batch_size", "num_threads", "seed", "env_seed", "base_path", "max_num_players")
+"""options of EnvPool that are not the environment's"""
+
 
 class EnvpoolBackend:
-    """N copies of one of the ids that EnvPool serves.
+    """N parallel environments of one of the ids that EnvPool serves.
 
-    EnvPool by itself resets in the step after an end and ignores the action of that step. Here an ended copy is reset
-    at once, so that every row is real. With `stagger`, first episodes are cut: see `Stagger`.
+    EnvPool by itself resets in the step after an end and ignores the action of that step. Here an environment that has
+    ended is reset at once, so that every row is real. With `stagger`, first episodes are cut: see `Stagger`.
 
     Nothing depends on `num_threads` but the speed; by default there is one for each processor that we may use.
     """
 
-    def __init__(
-        self, env_id: str, num_envs: int, device: torch.device, *, stagger: bool = False, num_threads: int | None = None
-    ) -> None:
-        self.num_envs, self.device = num_envs, device
-        self._num_threads = min(num_envs, num_threads or len(os.sched_getaffinity(0)))
-        self._valid = torch.ones(num_envs, dtype=torch.bool, device=device)
-        self._pool = self._build(env_id, 0)
-        limit = int(self._pool.config["max_episode_steps"])
-        self._stagger_up_to = limit if stagger else None
-        self.spec = Spec(
-            env_id=env_id,
-            layout=observation_layout(self._pool.observation_space, env_id),
-            action=action_kind(self._pool.action_space, env_id),
-            max_episode_steps=limit,
-            image=is_image(self._pool.observation_space),
-        )
+    summaries = SUMMARIES
+    package = "envpool"
 
-    def _build(self, env_id: str, seed: int) -> Any:
+    @classmethod
+    def ids(cls) -> Collection[str]:
+        """The ids that are the same in Gymnasium; and all of EnvPool's, with `EnvPool/` before them."""
+        if not is_installed("envpool"):
+            return ()
         import envpool
 
-        if env_id not in envpool.list_all_envs():
-            raise UserError(f"EnvPool does not serve {env_id}; leave out the backend, or take gymnasium.")
-        copies = {"num_envs": self.num_envs, "num_threads": self._num_threads}
-        pool = envpool.make(env_id, env_type="gymnasium", seed=seed, **copies)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # Gymnasium's, on bounds that are float64 here and float32 there
-            _ = pool.observation_space, pool.action_space  # made and kept when first looked at
-        return pool
+        return (*GYMNASIUM_IDS, *(PREFIX + task for task in envpool.list_all_envs() if not refusal(task)))
+
+    @classmethod
+    def serves(cls, env: str) -> bool:
+        """Whether it is one of them, by the name."""
+        return env.startswith(PREFIX) or (env in GYMNASIUM_IDS and is_installed("envpool"))
+
+    @classmethod
+    def make_rendered(cls, env: str, mode: str, kwargs: Mapping[str, Any], wrappers: Sequence[str]) -> gym.Env:
+        """One environment that renders itself in `mode`: Gymnasium's where it is the same, else EnvPool's."""
+        if env in GYMNASIUM_IDS and not kwargs:
+            return gym.make(env, render_mode=mode)
+        return SingleEnv(env.removeprefix(PREFIX), mode, kwargs)
+
+    def __init__(
+        self,
+        env: str,
+        num_envs: int,
+        device: torch.device,
+        *,
+        stagger: bool = False,
+        kwargs: Mapping[str, Any] | None = None,
+        wrappers: Sequence[str] = (),
+        num_threads: int | None = None,
+    ) -> None:
+        assert not wrappers, "EnvPool's environments cannot be wrapped"
+        self.num_envs, self.device = num_envs, device
+        self._valid = torch.ones(num_envs, dtype=torch.bool, device=device)
+        task, threads = env.removeprefix(PREFIX), min(num_envs, num_threads or len(os.sched_getaffinity(0)))
+        options = _checked(task, dict(kwargs or {})) | {"num_envs": num_envs, "num_threads": threads}
+        self._build = partial(make_pool, task, options)
+        self._pool = self._build(0)
+        limit = int(self._pool.config["max_episode_steps"])
+        self._limit = limit if limit < NO_LIMIT else None
+        self._stagger_up_to = self._limit if stagger else None
+        space = self._pool.observation_space
+        parts, action = observation_parts(space, env), action_kind(self._pool.action_space, env)
+        self.spec = Spec(env, parts, action, max_episode_steps=self._limit, image=is_image(space))
 
     def restart(self, seed: int) -> Tensor:
         """Build the pool again: nothing of the past remains."""
         self._pool.close()
-        self._pool = self._build(self.spec.env_id, seed % 2**31)
+        self._pool = self._build(seed)
         self._stagger = Stagger(self.num_envs, self._stagger_up_to, seed)
         self.counts = self._tensor(self._stagger.counts)
         obs, _ = self._pool.reset()
-        return self._tensor(self._seen(obs))
+        return self._tensor(self._flatten(obs))
 
     def step(self, action: Tensor) -> Step:
-        """Step all copies, then reset those whose episode has ended."""
-        raw, reward, terminated, truncated, _ = self._pool.step(physical_action(action.cpu().numpy(), self.spec.action))
-        next_obs = self._seen(raw)
+        """Step all environments, then reset those whose episode has ended."""
+        physical = physical_action(action.cpu().numpy(), self.spec.action)
+        raw, reward, terminated, truncated, info = self._pool.step(physical)
+        next_obs = self._flatten(raw)
+        if self._limit:
+            truncated |= info["elapsed_step"] >= self._limit  # not every family ends there by itself
         truncated = self._stagger.apply(terminated, truncated & ~terminated)
         done = terminated | truncated
         here = there = self._tensor(next_obs)
         if done.any():
-            fresh, info = self._pool.reset(np.flatnonzero(done).astype(np.int32))
+            fresh, reset_info = self._pool.reset(np.flatnonzero(done).astype(np.int32))
             obs = next_obs.copy()
-            obs[info["env_id"]] = self._seen(fresh)
+            obs[reset_info["env_id"]] = self._flatten(fresh)
             here, self.counts = self._tensor(obs), self._tensor(self._stagger.counts)
         return Step(
             obs=here,
@@ -81,14 +141,101 @@ class EnvpoolBackend:
             terminated=self._tensor(terminated),
             truncated=self._tensor(truncated),
             valid=self._valid,
+            measures=measured(info, STANDARD, self.num_envs, self.device),
         )
 
     def close(self) -> None:
         """Let the pool's threads end."""
         self._pool.close()
 
-    def _seen(self, raw: Any) -> np.ndarray:
-        return flatten_observation(self.spec.layout, raw, image=self.spec.image)
+    def _flatten(self, raw: Any) -> np.ndarray:
+        return flatten_observation(self.spec.observation_parts, raw, image=self.spec.image)
 
     def _tensor(self, array: np.ndarray) -> Tensor:
         return torch.from_numpy(array).to(self.device)
+
+
+class SingleEnv(gym.Env):
+    """One environment of EnvPool's with Gymnasium's interface, for rendering."""
+
+    def __init__(self, task: str, mode: str, kwargs: Mapping[str, Any]) -> None:
+        self._make = partial(make_pool, task, {**_checked(task, dict(kwargs)), "num_envs": 1, "render_mode": mode})
+        self._pool = self._make(0)
+        self.render_mode = mode
+        self.observation_space, self.action_space = self._pool.observation_space, self._pool.action_space
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Build it again from `seed`: EnvPool seeds at no other time."""
+        self._pool.close()
+        self._pool = self._make(seed or 0)
+        return row_of(self._pool.reset()[0], 0), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """One step."""
+        obs, reward, terminated, truncated, _ = self._pool.step(np.asarray(action)[None])
+        return row_of(obs, 0), float(reward[0]), bool(terminated[0]), bool(truncated[0]), {}
+
+    def render(self) -> Any:
+        """The picture [H, W, 3] uint8, or None in a window."""
+        frames = self._pool.render()
+        return None if frames is None else frames[0]
+
+    def close(self) -> None:
+        """Let the pool's threads end."""
+        self._pool.close()
+
+
+def make_pool(task: str, options: Mapping[str, Any], seed: int) -> Any:
+    """A pool of EnvPool's. Raises `UserError` where it cannot be made."""
+    import envpool
+
+    try:
+        pool = envpool.make(task, env_type="gymnasium", seed=seed % 2**31, **options)
+    except (ImportError, TypeError, ValueError, RuntimeError, AssertionError) as error:
+        first_line = str(error).partition("\n")[0]
+        raise UserError(f"EnvPool cannot make {task}: {first_line}") from error
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # Gymnasium's, on bounds that are float64 here and float32 there
+        _ = pool.observation_space, pool.action_space  # made and kept when first looked at
+    return pool
+
+
+def family(task: str) -> str:
+    """The part of EnvPool that an id belongs to, such as atari or mujoco.playground."""
+    from envpool.registration import registry
+
+    return registry.specs[task][0].removeprefix("envpool.")
+
+
+def refusal(task: str) -> str | None:
+    """Why an id of EnvPool's is not served; None for one that is."""
+    part = family(task)
+    if (part == "pgx" and task != "Play2048-v1") or "multiagent" in task.lower().replace("-", ""):
+        return "it has several players."
+    return REFUSED.get(part)
+
+
+def _checked(task: str, options: dict[str, Any]) -> dict[str, Any]:
+    """The options, each of which exists. Raises `UserError` for others, and for a task that is not served."""
+    if not is_installed("envpool"):
+        raise missing_extra("envpool", "envpool")
+    import envpool
+
+    if task not in envpool.list_all_envs():
+        raise unknown_name("environment of EnvPool", task, envpool.list_all_envs())
+    if reason := refusal(task):
+        raise UserError(f"{PREFIX}{task} is not served: {reason}")
+    if not options:
+        return options
+    defaults = envpool.make_spec(task).config._asdict()
+    known = {name: value for name, value in defaults.items() if name not in RESERVED}
+    for name, value in options.items():
+        if name not in known:
+            other = " Gymnasium's arguments are those of the gymnasium backend." if task in GYMNASIUM_IDS else ""
+            raise UserError(f"{unknown_name(f'option of EnvPool’s {task}', name, known)}{other}")
+        if not isinstance(value, (int, float) if isinstance(known[name], float) else type(known[name])):
+            kind = type(known[name]).__name__
+            raise UserError(
+                f"{name} of EnvPool's {task} must be of type {kind}, such as {known[name]!r}, not {value!r}."
+            )
+    return options

@@ -1,105 +1,121 @@
-"""Gymnasium vector environments, in all three autoreset modes."""
+"""Gymnasium environments, in all three autoreset modes."""
 
-import importlib
-import multiprocessing
-import signal
-import sys
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from multiprocessing import parent_process
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import torch
-from gymnasium.envs.registration import EnvSpec
-from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
+from lemniscate.envs.backend import Summary
 from lemniscate.envs.episodes import Stagger
-from lemniscate.envs.spaces import action_kind, flatten_observation, is_image, observation_layout, physical_action
-from lemniscate.envs.workers import WatchedVectorEnv
+from lemniscate.envs.factory import make_one, make_vector, maker_of, makes_vector
+from lemniscate.envs.masks import ActionMasks
+from lemniscate.envs.measures import SUMMARIES, measured, measures_of
+from lemniscate.envs.spaces import (
+    action_kind,
+    flatten_observation,
+    is_image,
+    observation_parts,
+    physical_action,
+    row_of,
+)
 from lemniscate.errors import UserError
+from lemniscate.named import find_callable
 from lemniscate.spec import Discrete, Spec
 from lemniscate.types import Step
 
 
 class GymnasiumBackend:
-    """Any registered id, stepped one after the other (`workers=False`) or in a process each.
+    """Any environment of Gymnasium's interface, stepped one after the other in this process.
 
-    Ids with an `entry_point` are vectorized here, with autoreset DISABLED: this class resets what has ended, so every
-    row is real. An id that is a vector environment by itself is taken as it is, in whichever mode it declares:
+    Single environments are vectorized here, with autoreset DISABLED: this class resets what has ended, so every row is
+    real. What is a vector environment by itself is taken as it is, in whichever mode it declares:
 
     - DISABLED: reset by mask after the step.
     - SAME_STEP: the returned observation is of the next episode; the true final one is in `info["final_obs"]`.
     - NEXT_STEP: the returned observation is the true final one; the next action is ignored (`valid` False).
 
     With `stagger`, first episodes are cut (see `Stagger`) where the environment can be reset at will (DISABLED).
+    Measures are the entries of `info` that the environment's metadata names in `measures`, and `is_success`.
     """
+
+    workers, wraps = False, True
+    summaries: tuple[Summary, ...] = SUMMARIES
+
+    @classmethod
+    def ids(cls) -> Collection[str]:
+        """What Gymnasium's registry holds."""
+        return gym.registry
+
+    @classmethod
+    def serves(cls, env: str) -> bool:
+        """Registered ids, and classes and functions of one's own. Raises `UserError` if these are not there."""
+        return bool(maker_of(env)) if ":" in env else env in gym.registry
+
+    @classmethod
+    def make_rendered(cls, env: str, mode: str, kwargs: Mapping[str, Any], wrappers: Sequence[str]) -> gym.Env:
+        """One environment that renders itself in `mode`."""
+        return make_one(maker_of(env), tuple(map(find_callable, wrappers)), render_mode=mode, **kwargs)
 
     def __init__(
         self,
-        env_id: str,
+        env: str,
         num_envs: int,
         device: torch.device,
         *,
         stagger: bool = False,
-        workers: bool = False,
-        **kwargs: Any,
+        kwargs: Mapping[str, Any] | None = None,
+        wrappers: Sequence[str] = (),
     ) -> None:
-        self._gym_spec, self._workers, self._kwargs = spec_of(env_id), workers, kwargs
         self.num_envs, self.device = num_envs, device
+        maker = maker_of(env)
+        if makes_vector(maker) and (wrappers or self.workers):
+            raise UserError(f"{env} is {num_envs} environments at once: it takes no wrappers, and no process each.")
+        wraps = tuple(map(find_callable, wrappers))
+        self._build = partial(make_vector, maker, num_envs, dict(kwargs or {}), wraps, self.workers)
         try:
-            self._envs = self._build()
-        except (gym.error.Error, ImportError) as error:
-            raise UserError(f"{env_id} cannot be made: {error}") from error
+            self._envs, limit = self._build()
+        except (gym.error.Error, ImportError, TypeError, ValueError, AssertionError) as error:
+            raise UserError(f"{env} cannot be made{_with(kwargs or {}, wrappers)}: {error}") from error
         self.mode = self._envs.metadata.get("autoreset_mode")
         if not isinstance(self.mode, AutoresetMode):
-            raise UserError(f"{env_id} does not say when it resets: its metadata needs an autoreset_mode.")
-        space = self._envs.single_observation_space
-        layout, action = observation_layout(space, env_id), action_kind(self._envs.single_action_space, env_id)
+            raise UserError(f"{env} does not say when it resets: its metadata needs an autoreset_mode.")
+        space, action = self._envs.single_observation_space, action_kind(self._envs.single_action_space, env)
+        parts = observation_parts(space, env)
+        self._reuses = makes_vector(maker)  # it may write over its own observations
         self._used = isinstance(action, Discrete)
         if isinstance(action, Discrete) and "action_mask" in self._envs.reset(seed=0)[1]:
             action = replace(action, masked=True)
-        limit = self._gym_spec.max_episode_steps
         self._stagger_up_to = limit if stagger and self.mode is AutoresetMode.DISABLED else None
-        self.spec = Spec(
-            env_id=env_id,
-            layout=layout,
-            action=action,
-            max_episode_steps=limit,
-            image=is_image(space),
-        )
-
-    def _build(self) -> VectorEnv:
-        if self._gym_spec.entry_point is None:
-            return gym.make_vec(self._gym_spec, self.num_envs, **self._kwargs)
-        copies = [partial(make_one, self._gym_spec, **self._kwargs)] * self.num_envs
-        if self._workers:
-            multiprocessing.get_context("forkserver").set_forkserver_preload([__name__])  # imported once, for all
-            return WatchedVectorEnv(copies, context="forkserver", autoreset_mode=AutoresetMode.DISABLED)
-        return SyncVectorEnv(copies, autoreset_mode=AutoresetMode.DISABLED)
+        self._measures = measures_of(self._envs.metadata)
+        self.spec = Spec(env, parts, action, max_episode_steps=limit, image=is_image(space))
 
     def restart(self, seed: int) -> Tensor:
         """Close the environments and build them again: some (Box2D) carry more over a reset than they tell."""
         if self._used:
             self._envs.close()
-            self._envs = self._build()
+            self._envs, _ = self._build()
         self._used = True
         self._resetting = np.zeros(self.num_envs, dtype=bool)
         self._stagger = Stagger(self.num_envs, self._stagger_up_to, seed)
         self.counts = self._tensor(self._stagger.counts)
-        if isinstance(self.spec.action, Discrete):
-            self._mask = np.ones((self.num_envs, self.spec.action.n), dtype=bool)
-        return self._tensor(self._seen(*self._envs.reset(seed=seed)))
+        kind = self.spec.action
+        self._masks = None
+        if isinstance(kind, Discrete) and kind.masked:
+            self._masks = ActionMasks(self.spec.env_id, self.num_envs, kind.n)
+        return self._tensor(self._observe(*self._envs.reset(seed=seed)))
 
     def step(self, action: Tensor) -> Step:
         """Step, then find the true successor of each row and where to act next, as the mode demands."""
         physical = physical_action(action.cpu().numpy(), self.spec.action)
         raw, reward, terminated, truncated, info = self._envs.step(physical)
         terminated, truncated = terminated.copy(), truncated.copy()  # a vector environment may write over its own
-        obs = next_obs = self._seen(raw, info)
+        obs = next_obs = self._observe(raw, info)
         valid = np.ones(self.num_envs, dtype=bool)
         done = terminated | truncated
         if self.mode is AutoresetMode.NEXT_STEP:
@@ -110,7 +126,7 @@ class GymnasiumBackend:
             truncated = self._stagger.apply(terminated, truncated)
             done = terminated | truncated
             if done.any():
-                obs = self._seen(*self._envs.reset(options={"reset_mask": done.copy()}))
+                obs = self._observe(*self._envs.reset(options={"reset_mask": done.copy()}))
         self.counts = self._tensor(self._stagger.counts)
         there = self._tensor(next_obs)
         return Step(
@@ -120,6 +136,7 @@ class GymnasiumBackend:
             terminated=self._tensor(terminated),
             truncated=self._tensor(truncated),
             valid=self._tensor(valid),
+            measures=measured(info, self._measures, self.num_envs, self.device) if info else {},
         )
 
     def close(self) -> None:
@@ -136,61 +153,34 @@ class GymnasiumBackend:
             )
         next_obs, size = obs.copy(), self.spec.observation_size
         for row in np.flatnonzero(done):
-            final = _row(info["final_obs"], int(row))
-            next_obs[row, :size] = flatten_observation(self.spec.layout, final, image=self.spec.image)
+            final = row_of(info["final_obs"], int(row))
+            next_obs[row, :size] = flatten_observation(self.spec.observation_parts, final, image=self.spec.image)
         return next_obs
 
-    def _seen(self, raw: Any, info: dict) -> np.ndarray:
+    def _observe(self, raw: Any, info: dict) -> np.ndarray:
         """The flat observation; after it the action mask, where there is one."""
-        flat = flatten_observation(self.spec.layout, raw, image=self.spec.image)
-        if not (isinstance(self.spec.action, Discrete) and self.spec.action.masked):
-            return flat.copy() if self._gym_spec.entry_point is None else flat
-        if "action_mask" in info:
-            self._mask = self._mask.copy()
-            for row in np.flatnonzero(info.get("_action_mask", np.ones(self.num_envs, dtype=bool))):
-                self._mask[row] = info["action_mask"][row]
-            if not self._mask.any(axis=1).all():
-                copy = int(np.argmin(self._mask.any(axis=1)))
-                raise UserError(
-                    f"{self.spec.env_id} rules out every action of copy {copy}: its action_mask is all zero."
-                )
-        return np.concatenate([flat, self._mask.astype(flat.dtype)], axis=-1)
+        flat = flatten_observation(self.spec.observation_parts, raw, image=self.spec.image)
+        if self._masks:
+            return self._masks.append_to(flat, info)
+        return flat.copy() if self._reuses else flat
 
     def _tensor(self, array: np.ndarray) -> Tensor:
         return torch.from_numpy(array).to(self.device)
 
 
-def _row(batch: Any, row: int) -> Any:
-    """One observation out of a batch of them, which may be a dictionary or an array of objects."""
-    return {name: _row(part, row) for name, part in batch.items()} if isinstance(batch, dict) else batch[row]
+class AsyncGymnasiumBackend(GymnasiumBackend):
+    """The same, with a process for each environment. No id is served so unless it is asked for."""
+
+    workers = True
+    in_process = "gymnasium"
+    """the backend that evaluates what this one trained"""
+
+    @classmethod
+    def ids(cls) -> Collection[str]:
+        """None."""
+        return ()
 
 
-def spec_of(env_id: str) -> EnvSpec:
-    """How Gymnasium makes an environment: a registered id, `module:id`, or `module:Class` of somebody's own.
-
-    A module is looked for in the working directory too. Raises `UserError` if it or the class is not there.
-    """
-    module_name, _, name = env_id.rpartition(":")
-    if not module_name:
-        return gym.spec(env_id)
-    if str(Path.cwd()) not in sys.path:
-        sys.path.insert(0, str(Path.cwd()))
-    try:
-        module = importlib.import_module(module_name)
-    except ImportError as error:
-        raise UserError(f"{env_id} cannot be made: {error}.") from error
-    if name in gym.registry:
-        return gym.spec(name)
-    if not (isinstance(getattr(module, name, None), type) and issubclass(getattr(module, name), gym.Env)):
-        raise UserError(f"{env_id} cannot be made: {module_name} has neither an environment class nor an id {name}.")
-    return EnvSpec(name, entry_point=f"{module_name}:{name}")
-
-
-def make_one(spec: EnvSpec, **kwargs: Any) -> gym.Env:
-    """One environment, from its spec: a worker process may not know the id.
-
-    There, Ctrl-C is left to the parent, which stops the run in order.
-    """
-    if parent_process() is not None:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-    return gym.make(spec, **kwargs)
+def _with(kwargs: Mapping[str, Any], wrappers: Sequence[str]) -> str:
+    given = [f"{name}={value!r}" for name, value in kwargs.items()] + list(wrappers)
+    return f" with {', '.join(given)}" if given else ""

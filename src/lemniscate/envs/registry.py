@@ -1,111 +1,156 @@
 """The table of backends, and which of them runs an environment."""
 
-from collections.abc import Callable
+import importlib
+import re
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
-import gymnasium as gym
-import torch
+from lemniscate import named
+from lemniscate.errors import UserError, is_installed, unknown_name
 
-from lemniscate.envs.vec_env import Backend, VecEnv
-from lemniscate.errors import UserError, is_installed, missing_extra, unknown_name
+if TYPE_CHECKING:
+    import gymnasium as gym
 
+    from lemniscate.envs.backend import Backend
+    from lemniscate.envs.vec_env import VecEnv
 
-def _gymnasium(env_id: str, num_envs: int, device: torch.device, stagger: bool) -> Backend:
-    from lemniscate.envs.gymnasium import GymnasiumBackend
-
-    return GymnasiumBackend(env_id, num_envs, device, stagger=stagger)
-
-
-def _gymnasium_async(env_id: str, num_envs: int, device: torch.device, stagger: bool) -> Backend:
-    from lemniscate.envs.gymnasium import GymnasiumBackend
-
-    return GymnasiumBackend(env_id, num_envs, device, stagger=stagger, workers=True)
-
-
-def _envpool(env_id: str, num_envs: int, device: torch.device, stagger: bool) -> Backend:
-    if not is_installed("envpool"):
-        raise missing_extra("envpool", "envpool")
-    from lemniscate.envs.envpool import EnvpoolBackend
-
-    return EnvpoolBackend(env_id, num_envs, device, stagger=stagger)
-
-
-def _crazyflow(env_id: str, num_envs: int, device: torch.device, stagger: bool) -> Backend:
-    from lemniscate.envs.crazyflow import CrazyflowBackend
-
-    return CrazyflowBackend(env_id, num_envs, device, stagger=stagger)
-
-
-BACKENDS: dict[str, Callable[[str, int, torch.device, bool], Backend]] = {
-    "gymnasium": _gymnasium,
-    "gymnasium-async": _gymnasium_async,
-    "envpool": _envpool,
-    "crazyflow": _crazyflow,
+BACKENDS = {
+    "crazyflow": "lemniscate.envs.crazyflow:CrazyflowBackend",
+    "envpool": "lemniscate.envs.envpool:EnvpoolBackend",
+    "gymnasium": "lemniscate.envs.gymnasium:GymnasiumBackend",
+    "gymnasium-async": "lemniscate.envs.gymnasium:AsyncGymnasiumBackend",
 }
-
-CRAZYFLOW_IDS = (
-    "DroneFigureEightTrajectory-v0",
-    "DroneLanding-v0",
-    "DroneReachPos-v0",
-    "DroneReachVel-v0",
-)
-
-ENVPOOL_IDS = (
-    "Ant-v5",
-    "CartPole-v1",
-    "HalfCheetah-v5",
-    "Hopper-v5",
-    "Humanoid-v5",
-    "LunarLander-v3",
-    "Walker2d-v5",
-)
-"""those that behave in EnvPool as in Gymnasium: tests/envs/test_envpool.py compares them"""
+"""each is imported when it is used; the first that serves an id runs it"""
 
 
 def known_ids() -> list[str]:
     """Every environment id that can be asked for, sorted."""
-    import lemniscate.envs.toy  # noqa: F401  (registers the toys)
-
-    return sorted({*gym.registry, *CRAZYFLOW_IDS})
+    return sorted({env_id for backend in BACKENDS for env_id in backend_class(backend).ids()})
 
 
-def backend_for(env_id: str) -> str:
-    """The backend that serves `env_id`, an id or somebody's own `module:Class`.
+def backend_for(env: str, wrappers: Sequence[str] = ()) -> str:
+    """The name of the backend that runs `env`: an id, or the name of a class or function of one's own.
 
     Raises `UserError` with the nearest names if there is none.
     """
-    if ":" in env_id:
-        from lemniscate.envs.gymnasium import spec_of
-
-        spec_of(env_id)
-        return "gymnasium"
-    if env_id not in known_ids():
-        raise unknown_name("environment", env_id, known_ids())
-    if env_id in CRAZYFLOW_IDS:
-        return "crazyflow"
-    return "envpool" if env_id in ENVPOOL_IDS and is_installed("envpool") else "gymnasium"
+    serving = [name for name in BACKENDS if backend_class(name).serves(env)]
+    if not serving:
+        raise unknown_name("environment", env, known_ids())
+    return next((name for name in serving if not wrappers or can_wrap(name)), serving[0])
 
 
-def file_name(env_id: str) -> str:
-    """An id as a part of a file's name."""
-    return env_id.replace("/", "_").replace(":", "_")
+def backend_class(backend: str) -> type["Backend"]:
+    """The class of a backend by its name in the table, or by `module:Class`.
+
+    Raises `UserError` with the nearest names for one that is not known.
+    """
+    if backend in BACKENDS:
+        module, _, name = BACKENDS[backend].partition(":")
+        return getattr(importlib.import_module(module), name)
+    if ":" not in backend:
+        raise unknown_name("backend", backend, BACKENDS)
+    return named.find(backend)
 
 
 def require_backend(backend: str) -> str:
     """The name itself. Raises `UserError` with the nearest names for one that is not known."""
-    if backend not in BACKENDS:
-        raise unknown_name("backend", backend, BACKENDS)
+    backend_class(backend)
     return backend
 
 
-def make(
-    env_id: str, num_envs: int, *, device: str = "cpu", stagger: bool = False, backend: str | None = None
-) -> VecEnv:
-    """N copies of an environment on `device`; `restart` it before the first step.
+def can_wrap(backend: str) -> bool:
+    """Whether a backend steps single environments of Gymnasium's interface, which wrappers can be put around."""
+    return getattr(backend_class(backend), "wraps", False)
+
+
+def is_compiled(backend: str) -> bool:
+    """Whether a backend's step is a program for one number of environments, which others of that number share."""
+    return getattr(backend_class(backend), "compiled", False)
+
+
+def for_evaluation(backend: str | None) -> str | None:
+    """The backend that evaluates what `backend` trained: itself, but in this process. None if it is not installed."""
+    if backend is None:
+        return None
+    found = backend_class(backend)
+    if not is_installed(getattr(found, "package", "lemniscate")):
+        return None
+    return getattr(found, "in_process", backend)
+
+
+def make_rendered(
+    env: str, mode: str, kwargs: Mapping[str, Any], wrappers: Sequence[str], backend: str | None
+) -> "gym.Env":
+    """One environment of Gymnasium's interface that renders itself in `mode`, "rgb_array" or "human".
+
+    Raises `UserError` if its backend has none.
+    """
+    chosen = backend or backend_for(env, wrappers)
+    make_one = getattr(backend_class(chosen), "make_rendered", None)
+    if make_one is None:
+        raise UserError(f"the {chosen} backend renders no single environment.")
+    return make_one(env, mode, kwargs, wrappers)
+
+
+def name_of(env: object) -> str:
+    """The name of an environment for a Config: an id or `module:Class` as it is, or that of a class or a callable.
+
+    What can be imported by that name can be used again from a file; a lambda or a local class in this process only.
 
     Raises:
-        UserError: an unknown environment or backend, spaces nobody can act in, a missing extra.
+        UserError: an environment that is made already, or something else that cannot be called.
     """
-    served_by = backend_for(env_id)
-    if backend is not None and (require_backend(backend) == "crazyflow") != (served_by == "crazyflow"):
-        raise UserError(f"{env_id} cannot be served by the {backend} backend; {served_by} serves it.")
-    return VecEnv(BACKENDS[backend or served_by](env_id, num_envs, torch.device(device), stagger))
+    if isinstance(env, str):
+        return env
+    if not callable(env):
+        what = "an environment that is made already" if hasattr(env, "step") else f"{env!r}"
+        raise UserError(f"env is {what}; give its class, its id, or a function that makes it: several are needed.")
+    return named.name_of(env)
+
+
+def file_name(env: str) -> str:
+    """An environment's name as a part of a file's name."""
+    return re.sub(r"[^\w.-]+", "_", env)
+
+
+def make(
+    env: "str | Callable[..., Any]",
+    num_envs: int,
+    *,
+    kwargs: Mapping[str, Any] | None = None,
+    wrappers: "Sequence[str | Callable[..., Any]]" = (),
+    device: str = "cpu",
+    stagger: bool = False,
+    backend: str | None = None,
+) -> "VecEnv":
+    """N parallel environments on `device`; `restart` them before the first step.
+
+    Args:
+        env: an id, `module:Class`, a class, or a function that makes one environment (or, if it takes `num_envs`, a
+            vector environment).
+        num_envs: N.
+        kwargs: arguments of the environment.
+        wrappers: around each single environment, the first innermost: Gymnasium's or one's own, as a callable, or by
+            name as `module:Class` or `module:Class(key=value, …)`.
+        device: of the tensors: cpu, cuda, …
+        stagger: spread the first episodes over time.
+        backend: a name of `BACKENDS`, or `module:Class`; by default the first that serves `env`.
+
+    Raises:
+        UserError: an unknown environment or backend, arguments that it does not take, spaces nobody can act in, a
+            missing extra.
+    """
+    import torch
+
+    from lemniscate.envs.vec_env import VecEnv
+
+    name, wraps = name_of(env), tuple(map(named.name_of, wrappers))
+    if kwargs is not None and not isinstance(kwargs, Mapping):
+        raise UserError(f"The arguments of an environment are a dictionary, such as {{'x': 1}}, not {kwargs!r}.")
+    chosen = backend or backend_for(name, wraps)
+    if not backend_class(chosen).serves(name):
+        raise UserError(f"{name} cannot be served by the {chosen} backend; {backend_for(name, wraps)} serves it.")
+    if wraps and not can_wrap(chosen):
+        raise UserError(f"The {chosen} backend cannot wrap {name}; the gymnasium backend wraps what Gymnasium makes.")
+    made = backend_class(chosen)(name, num_envs, torch.device(device), stagger=stagger, kwargs=kwargs, wrappers=wraps)
+    return VecEnv(made)

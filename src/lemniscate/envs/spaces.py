@@ -1,5 +1,6 @@
 """Gymnasium spaces, read once into records; observations flattened, actions scaled."""
 
+import math
 from functools import lru_cache
 from typing import Any
 
@@ -11,16 +12,18 @@ from lemniscate.errors import UserError
 from lemniscate.spec import Action, Box, Discrete, MultiBinary, MultiDiscrete, ObservationPart
 
 IMAGE_CHANNELS = 16
-"""a uint8 array of three dimensions with at most so many channels in its last one is an image"""
+"""an image has at most so many channels, and a stack of images at most so many images"""
 
 
-def observation_layout(space: gym.Space, env_id: str, path: tuple[str | int, ...] = ()) -> tuple[ObservationPart, ...]:
+def observation_parts(space: gym.Space, env_id: str, path: tuple[str | int, ...] = ()) -> tuple[ObservationPart, ...]:
     """The parts of the flat observation, in order.
 
-    A Box of any shape and dtype is flattened in C order, as float32; so is a MultiBinary. Each number of a Discrete or
-    MultiDiscrete becomes one-hot. A Dict is laid out in the order of its own keys (Gymnasium sorts them), a Tuple in
-    its order. Raises `UserError` for anything else.
+    A Box of any shape and dtype is flattened in C order, as float32; so is a MultiBinary. An image of bytes is brought
+    to height × width × channels. Each number of a Discrete or MultiDiscrete becomes one-hot. A Dict is laid out in the
+    order of its own keys (Gymnasium sorts them), a Tuple in its order. Raises `UserError` for anything else.
     """
+    if not path and is_image(space):
+        return (_image_part(tuple(map(int, space.shape or ()))),)
     if isinstance(space, spaces.Box | spaces.MultiBinary):
         return (ObservationPart(path, tuple(map(int, space.shape))),)
     if isinstance(space, spaces.Discrete):
@@ -28,10 +31,10 @@ def observation_layout(space: gym.Space, env_id: str, path: tuple[str | int, ...
     if isinstance(space, spaces.MultiDiscrete):
         return (ObservationPart(path, tuple(space.shape), _whole(space.nvec), _whole(space.start)),)
     if isinstance(space, spaces.Dict):
-        inside = [observation_layout(part, env_id, (*path, name)) for name, part in space.spaces.items()]
+        inside = [observation_parts(part, env_id, (*path, name)) for name, part in space.spaces.items()]
         return tuple(part for parts in inside for part in parts)
     if isinstance(space, spaces.Tuple):
-        inside = [observation_layout(part, env_id, (*path, i)) for i, part in enumerate(space.spaces)]
+        inside = [observation_parts(part, env_id, (*path, i)) for i, part in enumerate(space.spaces)]
         return tuple(part for parts in inside for part in parts)
     raise UserError(
         f"{env_id} observes a {type(space).__name__}, whose size is not fixed; what a network can look at is Box,"
@@ -40,14 +43,30 @@ def observation_layout(space: gym.Space, env_id: str, path: tuple[str | int, ...
 
 
 def is_image(space: gym.Space) -> bool:
-    """Whether observations are bytes, height × width × channels: those stay bytes, for a convolutional network."""
-    shape = space.shape or ()
-    return isinstance(space, spaces.Box) and space.dtype == np.uint8 and len(shape) == 3 and shape[2] <= IMAGE_CHANNELS
+    """Whether observations are images of bytes, or stacks of images: they stay bytes, for a convolutional network."""
+    return isinstance(space, spaces.Box) and space.dtype == np.uint8 and bool(_image_axes(space.shape))
 
 
-def flatten_observation(layout: tuple[ObservationPart, ...], obs: Any, *, image: bool = False) -> np.ndarray:
+def _image_axes(shape: tuple[int, ...]) -> tuple[int, ...]:
+    """The order of an image's axes that puts height and width first, then the stack if there is one, then channels."""
+    if len(shape) == 4 and shape[0] <= IMAGE_CHANNELS:
+        inner = tuple(axis + 1 for axis in _image_axes(shape[1:]))
+        return (*inner[:2], 0, *inner[2:]) if inner else ()
+    if len(shape) != 3 or min(shape[0], shape[2]) > IMAGE_CHANNELS:
+        return ()
+    return (0, 1, 2) if shape[2] <= shape[0] else (1, 2, 0)
+
+
+def _image_part(own: tuple[int, ...]) -> ObservationPart:
+    axes = _image_axes(own)
+    height, width, *channels = (own[axis] for axis in axes)
+    shape = (height, width, math.prod(channels))
+    return ObservationPart((), shape) if own == shape else ObservationPart((), shape, own_shape=own, axes=axes)
+
+
+def flatten_observation(parts: tuple[ObservationPart, ...], obs: Any, *, image: bool = False) -> np.ndarray:
     """A batch of raw observations as [N, O]: float32, or the bytes of an image."""
-    pieces = [_flatten(part, follow(part.path, obs), image) for part in layout]
+    pieces = [_flatten(part, follow(part.path, obs), image) for part in parts]
     return pieces[0] if len(pieces) == 1 else np.concatenate(pieces, axis=-1)
 
 
@@ -56,6 +75,13 @@ def follow(path: tuple[str | int, ...], obs: Any) -> Any:
     for step in path:
         obs = obs[step]
     return obs
+
+
+def row_of(batch: Any, row: int) -> Any:
+    """One observation out of a batch of them, which may be a dictionary, a tuple or an array."""
+    if isinstance(batch, dict):
+        return {name: row_of(part, row) for name, part in batch.items()}
+    return tuple(row_of(part, row) for part in batch) if isinstance(batch, tuple) else batch[row]
 
 
 def _flatten(part: ObservationPart, obs: Any, image: bool) -> np.ndarray:
@@ -67,7 +93,10 @@ def _flatten(part: ObservationPart, obs: Any, image: bool) -> np.ndarray:
         columns = numbers + np.cumsum((0, *part.nvec[:-1]))
         hot[np.arange(len(numbers))[:, None], columns] = 1
         return hot
-    return np.asarray(obs, dtype=np.uint8 if image else np.float32).reshape(-1, part.size)
+    numbers = np.asarray(obs, dtype=np.uint8 if image else np.float32)
+    if part.axes:
+        numbers = numbers.reshape(-1, *part.own_shape).transpose(0, *(axis + 1 for axis in part.axes))
+    return numbers.reshape(-1, part.size)
 
 
 def action_kind(space: gym.Space, env_id: str) -> Action:

@@ -1,55 +1,58 @@
-"""The contract of the environment floor: what a backend provides, and `VecEnv`, which is what the floors above see."""
+"""Parallel environments, as the floors above see them."""
 
 import math
-from typing import Protocol
+import time
 
 import torch
 from torch import Tensor
 
+from lemniscate.envs.backend import Backend, Scene, Summary
 from lemniscate.envs.episodes import Episodes, EpisodeStatistics
 from lemniscate.errors import NonFiniteError, UserError
-from lemniscate.spec import Spec
+from lemniscate.spec import Box, Discrete, MultiBinary, Spec
 from lemniscate.types import Step
-
-
-class Backend(Protocol):
-    """N copies of an environment, stepped together."""
-
-    spec: Spec
-    num_envs: int
-    device: torch.device
-    counts: Tensor
-    """[N] bool: the environment's present episode counts in the statistics; False for the fragments of staggering"""
-
-    def restart(self, seed: int) -> Tensor:
-        """Begin anew, as if just built from `seed`: nothing of the past remains. Returns obs [N, O]."""
-        ...
-
-    def step(self, action: Tensor) -> Step:
-        """Act in every copy: Box actions float [N, A] in [-1, 1], Discrete ones int64 [N]."""
-        ...
-
-    def close(self) -> None:
-        """Give back processes and windows."""
-        ...
-
 
 PATIENCE = 20_000
 """steps that an episode may take in an environment without a time limit, where whole ones are wanted"""
 
 
+class Stopwatch:
+    """Seconds spent inside its `with` blocks."""
+
+    def __init__(self) -> None:
+        self._began, self._seconds = 0.0, 0.0
+
+    def __enter__(self) -> None:
+        self._began = time.perf_counter()
+
+    def __exit__(self, *_: object) -> None:
+        self._seconds += time.perf_counter() - self._began
+
+    def take(self) -> float:
+        """The seconds since the last call."""
+        seconds, self._seconds = self._seconds, 0.0
+        return seconds
+
+
 class VecEnv:
-    """A backend with its current observation and the books of its episodes."""
+    """A backend with its current observation and the statistics of its episodes."""
 
     def __init__(self, backend: Backend) -> None:
         self.backend = backend
         self.spec = backend.spec
         self.num_envs = backend.num_envs
         self.device = backend.device
+        self.summaries: tuple[Summary, ...] = getattr(backend, "summaries", ())
+        self.scene: Scene | None = getattr(backend, "scene", None)
         self.obs = torch.empty(0)
+        self.collecting = Stopwatch()
+        """seconds that the functions of `data` spend acting and stepping"""
+        self.steps = 0
+        self._statistics = EpisodeStatistics(self.num_envs, self.device)
+        self._action_shape = _action_shape(self.spec, self.num_envs)
 
     def restart(self, seed: int, steps: int = 0) -> Tensor:
-        """Begin anew from `seed`; also stored as `obs`, [N, O]. `steps` is what the run has taken so far."""
+        """Begin again from `seed`; also stored as `obs`, [N, O]. `steps` is what the run has taken so far."""
         self.steps = steps
         self._statistics = EpisodeStatistics(self.num_envs, self.device)
         self.obs = self.backend.restart(seed)
@@ -57,11 +60,17 @@ class VecEnv:
         return self.obs
 
     def step(self, action: Tensor) -> Step:
-        """Act in every copy and move `obs` on.
+        """Act in every environment and move `obs` on; actions as in `Backend.step`.
 
         Raises:
             NonFiniteError: an observation or a reward is NaN or infinite; nothing has learned from it yet.
+            UserError: actions of another shape.
         """
+        if action.shape != self._action_shape:
+            raise UserError(
+                f"Actions have the shape {tuple(self._action_shape)} in {self.num_envs} × {self.spec.env_id}, not"
+                f" {tuple(action.shape)}."
+            )
         counts = self.backend.counts
         step = self.backend.step(action)
         self._require_finite(observation=step.next_obs, reward=step.reward)
@@ -74,12 +83,14 @@ class VecEnv:
 
     def _require_finite(self, **quantities: Tensor) -> None:
         for name, values in quantities.items():
-            if math.isfinite(values.sum().item()):  # one NaN or infinity shows in the sum of all, and the sum is cheap
+            if values.dtype is torch.uint8 or math.isfinite(
+                values.sum().item()
+            ):  # a NaN shows in the sum, which is cheap
                 continue
             bad = torch.nonzero(~torch.isfinite(values))
             if len(bad):
-                value, copy = values[tuple(bad[0])].item(), int(bad[0, 0])
-                raise NonFiniteError(f"The {name} of environment {copy} is {value} in the step after {self.steps:,}.")
+                value, number = values[tuple(bad[0])].item(), int(bad[0, 0])
+                raise NonFiniteError(f"The {name} of environment {number} is {value} in the step after {self.steps:,}.")
 
     def require_end(self, age: int) -> None:
         """Raise `UserError` where an episode of `age` steps has had its chance to end, and there is no time limit."""
@@ -96,3 +107,12 @@ class VecEnv:
     def close(self) -> None:
         """Give back processes and windows."""
         self.backend.close()
+
+
+def _action_shape(spec: Spec, num_envs: int) -> torch.Size:
+    action = spec.action
+    if isinstance(action, Discrete):
+        return torch.Size((num_envs,))
+    if isinstance(action, Box):
+        return torch.Size((num_envs, action.size))
+    return torch.Size((num_envs, action.n if isinstance(action, MultiBinary) else len(action.nvec)))

@@ -139,7 +139,7 @@ def _encoder(spec: Spec) -> tuple[nn.Module, int]:
     """The module that turns a normalized observation into features, and their number."""
     if not spec.image:
         return nn.Identity(), spec.observation_size
-    height, width, channels = spec.layout[0].shape
+    height, width, channels = spec.observation_parts[0].shape
     encoder = ImageEncoder((height, width, channels))
     return encoder, encoder.size
 

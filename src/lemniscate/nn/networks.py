@@ -9,8 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from lemniscate.errors import UserError, unknown_name
+from lemniscate.named import find
 from lemniscate.nn.activations import ACTIVATIONS, Activation
-from lemniscate.objects import find_object
 
 Matmul = Literal["float32", "bfloat16"]
 """of products between hidden layers; the first and the last are always in float32"""
@@ -104,7 +104,7 @@ NETWORKS: dict[str, Callable[[Layers, int], tuple[list[nn.Module], int]]] = {
 
 def _own_network(name: str, inputs: int, outputs: int) -> nn.Module:
     try:
-        network = find_object(name, "network")(inputs, outputs)
+        network = find(name)(inputs, outputs)
         shape = network(torch.zeros(2, inputs)).shape
     except (TypeError, RuntimeError, AttributeError) as error:
         raise UserError(f"{name}({inputs}, {outputs}) must make a module for [2, {inputs}]: {error}") from None

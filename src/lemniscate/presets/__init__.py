@@ -3,7 +3,7 @@
 `default` is the Config of an algorithm as it stands: an environment without a preset of its own gets it.
 """
 
-from lemniscate.algos import ALGORITHMS
+from lemniscate.algos import find
 from lemniscate.errors import unknown_name
 from lemniscate.presets.off_policy import DDPG, SAC, TD3
 from lemniscate.presets.on_policy import A2C, PPO, REINFORCE, TRPO
@@ -21,14 +21,19 @@ PRESETS: dict[str, list[Preset]] = {
 }
 
 
+def of(algorithm: str) -> list[Preset]:
+    """The presets of an algorithm; those of a module of one's own are its `PRESETS`, if it has any."""
+    return PRESETS[algorithm] if algorithm in PRESETS else getattr(find(algorithm), "PRESETS", [])
+
+
 def names(algorithm: str) -> list[str]:
     """The names of the presets, each once."""
-    return ["default", *dict.fromkeys(preset.name for preset in PRESETS.get(algorithm, ()))]
+    return ["default", *dict.fromkeys(preset.name for preset in of(algorithm))]
 
 
 def best(algorithm: str, env_id: str | None) -> str:
     """The preset that an environment gets unless another is named: the first of its own, or the default."""
-    own = (preset.name for preset in PRESETS.get(algorithm, ()) if preset.config.env == env_id)
+    own = (preset.name for preset in of(algorithm) if preset.config.env == env_id)
     return next(own, "default")
 
 
@@ -39,9 +44,9 @@ def choose(algorithm: str, env_id: str | None, name: str | None) -> tuple[str, R
     is given. Raises `UserError` with the nearest names for an unknown preset.
     """
     name = name or best(algorithm, env_id)
-    named = [preset.config for preset in PRESETS.get(algorithm, ()) if preset.name == name]
+    named = [preset.config for preset in of(algorithm) if preset.name == name]
     if name == "default":
-        named = [ALGORITHMS[algorithm].Config()]
+        named = [find(algorithm).Config()]
     if not named:
         raise unknown_name("preset", name, names(algorithm))
     config = next((config for config in named if config.env == env_id), named[0])

@@ -33,16 +33,16 @@ DIAGNOSTICS = (
     "gradient_norm/critic",
     "gradient_norm/actor",
 )
-"""what is drawn of an update, where an algorithm has it"""
+"""the metrics of an update that are drawn, where an algorithm has them"""
 
 POINTS = 3000
-"""episodes drawn of a run, evenly chosen"""
+"""the most episodes of a run that are drawn, evenly chosen"""
 
 COLORS = mpl.colormaps["tab10"].colors  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def learning_curve(runs: list[Path], file: Path, labels: Sequence[str] | None = None) -> Path:
-    """Return of each whole training episode against steps, and the mean of the last 20 (or 2 %, if they are many)."""
+    """Return of each whole training episode against steps, and the mean of the last 20, or of 2 % if that is more."""
     figure = Figure(figsize=(7, 4), layout="constrained")
     axes = figure.subplots()
     for run, color, label in _styles(runs, labels):
@@ -62,10 +62,10 @@ def learning_curve(runs: list[Path], file: Path, labels: Sequence[str] | None = 
 
 
 def diagnostics(runs: list[Path], file: Path, labels: Sequence[str] | None = None) -> Path:
-    """What was watched in the updates: losses, KL, entropy, Q, gradient norms; three panels in a row."""
+    """Metrics of the updates: losses, KL, entropy, Q, gradient norms; three panels in a row."""
     logs = {run: read_metrics(run) for run in runs}
-    watched = {name for lines in logs.values() for line in lines for name in line}
-    names = [name for name in DIAGNOSTICS if name in watched]
+    logged = {name for lines in logs.values() for line in lines for name in line}
+    names = [name for name in DIAGNOSTICS if name in logged]
     height = max(1, math.ceil(len(names) / 3))
     figure = Figure(figsize=(10, 2.75 * height), layout="constrained")
     panels = figure.subplots(height, 3, squeeze=False).flat
@@ -83,7 +83,7 @@ def diagnostics(runs: list[Path], file: Path, labels: Sequence[str] | None = Non
 
 
 def draw_q_bias(q_bias: QBias, run: Path, file: Path) -> Path:
-    """What Q said of the beginning of each episode, against what followed: on the line it is honest.
+    """Q(s₀, a₀) of each episode against the discounted return that followed; on the line there is no bias.
 
     Beside it the means of both at every evaluation of the run, if it had any.
     """
@@ -91,13 +91,13 @@ def draw_q_bias(q_bias: QBias, run: Path, file: Path) -> Path:
     figure = Figure(figsize=(9.2 if log else 4.6, 4.6), layout="constrained")
     axes, *beside = figure.subplots(1, 2 if log else 1, squeeze=False)[0]
     ends = [min(q_bias.predicted + q_bias.realised), max(q_bias.predicted + q_bias.realised)]
-    axes.plot(ends, ends, color="grey", linewidth=1, label="honest")
+    axes.plot(ends, ends, color="grey", linewidth=1, label="no bias")
     axes.plot(q_bias.realised, q_bias.predicted, ".", color=COLORS[0], alpha=0.6, label="episodes")
     axes.set(xlabel="discounted return that followed", ylabel="Q(s₀, a₀)")
     axes.set_title(str(q_bias).partition(": ")[2], loc="left", fontsize=10)
     for history in beside:
         _curve(history, log, "evaluation/q", COLORS[0], "Q(s₀, a₀)", width=1.5)
-        _curve(history, log, "evaluation/q_realised", "grey", "what followed", width=1.5)
+        _curve(history, log, "evaluation/q_realised", "grey", "discounted return", width=1.5)
         history.set_xlabel("environment steps")
         history.set_title("at the evaluations of the run", loc="left", fontsize=10)
     for panel in (axes, *beside):
@@ -109,7 +109,7 @@ def draw_q_bias(q_bias: QBias, run: Path, file: Path) -> Path:
 def episode_returns(run: Path) -> tuple[np.ndarray, np.ndarray]:
     """(steps, returns) of every whole training episode of a run, in the order in which they ended.
 
-    The steps are those of the update that an episode ended in, spread over it.
+    The episodes that ended in one update are spread evenly over its steps.
     """
     steps, returns, before = [], [], 0
     for line in read_metrics(run):
@@ -123,8 +123,8 @@ def episode_returns(run: Path) -> tuple[np.ndarray, np.ndarray]:
 def training_minutes(run: Path) -> tuple[np.ndarray, np.ndarray]:
     """(steps, minutes) of a run's training loop, at its start and at each line of its metrics.
 
-    Evaluations, checkpoints and recordings are in them; the start of the process is not, nor the time between a stop
-    and a resume.
+    They include evaluations, checkpoints and recordings, but not the start of the process, nor the time between a
+    stop and a resume.
     """
     steps, seconds = [0], [0.0]
     for line in read_metrics(run):
@@ -135,7 +135,7 @@ def training_minutes(run: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def plot_runs(runs: list[Path], folder: Path, labels: Sequence[str] | None = None, ending: str = ".png") -> list[Path]:
-    """Draw the curves of runs into a folder; those of one label, their names unless given, have one colour."""
+    """Draw the curves of runs into a folder; runs of one label (by default their name) have one colour."""
     return [
         learning_curve(runs, folder / f"learning_curve{ending}", labels),
         diagnostics(runs, folder / f"diagnostics{ending}", labels),
@@ -176,7 +176,7 @@ def _title(runs: list[Path]) -> str:
 
 
 def finish(axes: Axes) -> None:
-    """Spines, grid, 100k for a hundred thousand steps."""
+    """Remove two spines, draw a grid, and write 100k for a hundred thousand steps."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(alpha=0.3)
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))

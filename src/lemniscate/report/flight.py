@@ -1,4 +1,4 @@
-"""A drone's flight along its reference: the path, the error, an animation."""
+"""The flight of a body along its reference: the path, the error, an animation."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,18 +40,18 @@ class Flight:
 
 
 def record(policy: Policy, env: VecEnv, flights: int, seed: int) -> Flight:
-    """Fly from the starts that `evaluate` flies from, and keep the tracks."""
-    spec = env.spec
-    if spec.tracking is None or spec.time_step is None:
-        raise UserError(f"{spec.env_id} has no reference to track, so no flight can be drawn against one.")
+    """Play from the starts that `evaluate` plays from, and keep the tracks."""
+    scene = env.scene
+    if scene is None:
+        raise UserError(f"{env.spec.env_id} has no reference to track, so no flight can be drawn against one.")
     flights = min(flights, env.num_envs)
     rows = []
     for _, _, step, counts in play_episodes(policy, env, flights, seed):
         row = torch.where(counts[:, None], step.next_obs, torch.nan)[:flights]
         rows.append(row.cpu().numpy())
     track = np.stack(rows)
-    position, attitude, error = track[..., 0:3], track[..., 3:7], track[..., slice(*spec.tracking)]
-    return Flight(position, position + error, attitude, spec.time_step)
+    position = track[..., scene.position]
+    return Flight(position, position + track[..., scene.error], track[..., scene.attitude], scene.time_step)
 
 
 def draw_path(flight: Flight, file: Path) -> Path:

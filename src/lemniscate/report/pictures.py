@@ -1,8 +1,8 @@
 """Everything a finished run is shown with: numbers in a sentence, plots, an animation."""
 
-import sys
 from pathlib import Path
 
+from lemniscate.console import say
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.nn.actor_critic import ActorQ
 from lemniscate.nn.policies import Policy
@@ -16,11 +16,9 @@ def sentence(scores: Evaluation) -> str:
     said = (
         f"{scores.mean_return:.1f} ± {scores.std_return:.1f} return over {scores.episodes} episodes of {scores.env_id}"
     )
-    if scores.rmse_mm is not None and scores.rmse_after_1s_mm is not None:
-        said += (
-            f", {scores.terminated} crashes; tracking error {scores.rmse_mm:.1f} mm over the whole flight,"
-            f" {scores.rmse_after_1s_mm:.2f} mm after the first second"
-        )
+    if scores.measures:
+        measures = ", ".join(f"{name} {value:.4g}" for name, value in scores.measures.items())
+        said += f", {scores.terminated} of them terminated; {measures}"
     return f"{said}.\n{scores.q_bias}." if scores.q_bias else f"{said}."
 
 
@@ -33,18 +31,13 @@ def report(
     pictures = curves.plot_runs([path], path / "plots")
     if scores.q_bias:
         pictures.append(curves.draw_q_bias(scores.q_bias, path, path / "plots" / "q.png"))
-    if env.spec.tracking:
+    if env.scene:
         pictures += draw_flight(policy, env, path / "plots", episodes, seed=0)
     for picture in pictures:
         say(picture)
-    if env.spec.tracking:
+    if env.scene:
         say(film_flight(policy, env, path / "videos" / "flight.gif", seed=0))
     return pictures
-
-
-def say(text: object) -> None:
-    """Tell a person."""
-    print(text, file=sys.stderr, flush=True)
 
 
 def draw_flight(policy: Policy, env: VecEnv, folder: Path, flights: int, seed: int) -> list[Path]:

@@ -12,12 +12,12 @@ import gymnasium as gym
 import numpy as np
 from PIL import Image
 
-from lemniscate.envs.gymnasium import make_one, spec_of
+from lemniscate.envs import registry
 from lemniscate.envs.vec_env import PATIENCE, VecEnv
 from lemniscate.errors import UserError, is_installed
 from lemniscate.nn.policies import Policy
 from lemniscate.report import flight
-from lemniscate.spec import Spec
+from lemniscate.run.config import RunConfig
 
 Act = Callable[..., np.ndarray]
 
@@ -25,12 +25,12 @@ NOTEBOOK_FPS = 25
 """more frames a second than a browser is sent; the others are left out"""
 
 FLIGHT_STRIDE = 5
-"""a drone's flight is drawn at every so many-th step"""
+"""a flight is drawn at every so many-th step"""
 
 
-def film_episode(act: Act, spec: Spec, file: Path, seed: int) -> str:
-    """Record one episode of a Gymnasium environment into `file`; returns a sentence."""
-    with_pictures = _rendered(spec.env_id, "rgb_array")
+def film_episode(act: Act, config: RunConfig, file: Path, seed: int) -> str:
+    """Record one episode of a run's environment into `file`; returns a sentence."""
+    with_pictures = _rendered(config, "rgb_array")
     steps = -1
 
     def frames() -> Iterator[np.ndarray]:
@@ -43,13 +43,13 @@ def film_episode(act: Act, spec: Spec, file: Path, seed: int) -> str:
     return f"{file}: {steps} steps."
 
 
-def show_episode(act: Act, spec: Spec, seed: int) -> None:
-    """Play one episode of a Gymnasium environment at its own speed: in the notebook that asks, or in a window."""
+def show_episode(act: Act, config: RunConfig, seed: int) -> None:
+    """Play one episode of a run's environment at its own speed: in the notebook that asks, or in a window."""
     if in_notebook():
-        with_pictures = _rendered(spec.env_id, "rgb_array")
+        with_pictures = _rendered(config, "rgb_array")
         send_frames((np.asarray(env.render()) for env in _play(with_pictures, act, seed)), _fps(with_pictures))
     else:
-        for _ in _play(_rendered(spec.env_id, "human"), act, seed):
+        for _ in _play(_rendered(config, "human"), act, seed):
             pass  # Gymnasium draws at each step
 
 
@@ -61,7 +61,7 @@ def film_flight(policy: Policy, env: VecEnv, file: Path, seed: int) -> str:
 
 
 def show_flight(policy: Policy, env: VecEnv, seed: int) -> None:
-    """Play one flight of a drone: in the notebook that asks, or in a window."""
+    """Play one flight in a scene: in the notebook that asks, or in a window."""
     if in_notebook():
         frames, fps, _ = _draw_flight(flight.record(policy, env, env.num_envs, seed), env)
         send_frames(frames, fps)
@@ -70,13 +70,13 @@ def show_flight(policy: Policy, env: VecEnv, seed: int) -> None:
         raise UserError("There is no display for a window; record the flight instead: --video flight.gif")
     from lemniscate.report import scene
 
-    scene.show(flight.record(policy, env, env.num_envs, seed), _drone_model(env))
+    scene.show(flight.record(policy, env, env.num_envs, seed), _model(env))
 
 
-def require_pictures(spec: Spec) -> None:
-    """Raise `UserError` where an environment cannot be recorded; a drone always can."""
-    if not spec.tracking:
-        _rendered(spec.env_id, "rgb_array").close()
+def require_pictures(config: RunConfig, env: VecEnv) -> None:
+    """Raise `UserError` where an environment cannot be recorded; one with a scene always can."""
+    if not env.scene:
+        _rendered(config, "rgb_array").close()
 
 
 def save_frames(frames: Iterable[np.ndarray], file: Path, fps: float) -> None:
@@ -157,14 +157,14 @@ def _fps(env: gym.Env) -> float:
     return float(env.metadata.get("render_fps", 30))
 
 
-def _rendered(env_id: str, mode: str) -> gym.Env:
+def _rendered(config: RunConfig, mode: str) -> gym.Env:
     try:
-        env = make_one(spec_of(env_id), render_mode=mode)
+        env = registry.make_rendered(config.env, mode, config.env_kwargs, config.wrappers, config.backend)
         env.reset(seed=0)
         env.render()
         return env
     except Exception as error:  # pygame, GLFW and MuJoCo each have their own
-        raise UserError(f"{env_id} cannot be shown here: {error}") from error
+        raise UserError(f"{config.env} cannot be shown here: {error}") from error
 
 
 def _draw_flight(track: flight.Flight, env: VecEnv) -> tuple[Iterable[np.ndarray], float, str]:
@@ -172,7 +172,7 @@ def _draw_flight(track: flight.Flight, env: VecEnv) -> tuple[Iterable[np.ndarray
     from lemniscate.report import scene
 
     fps = 1 / (FLIGHT_STRIDE * track.time_step)
-    rendered = scene.render(track, _drone_model(env), FLIGHT_STRIDE)
+    rendered = scene.render(track, _model(env), FLIGHT_STRIDE)
     if rendered is not None:
         return rendered, fps, "rendered by MuJoCo"
     how = (
@@ -182,7 +182,5 @@ def _draw_flight(track: flight.Flight, env: VecEnv) -> tuple[Iterable[np.ndarray
     return flight.animate(track, FLIGHT_STRIDE), fps, how
 
 
-def _drone_model(env: VecEnv) -> Any:
-    from lemniscate.envs.crazyflow import simulator
-
-    return simulator(env.spec.env_id, env.num_envs, env.device.type).model
+def _model(env: VecEnv) -> Any:
+    return env.scene.model if env.scene else None

@@ -1,4 +1,4 @@
-"""A drone's flight in MuJoCo, off screen or in a window.
+"""A flight in MuJoCo, off screen or in a window.
 
 OpenGL is chosen when MuJoCo is imported, and a driver that does not work can take the process with it. So what is
 rendered off screen is rendered in a process of its own: `python -m lemniscate.report.scene FOLDER`.

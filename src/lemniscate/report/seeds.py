@@ -1,7 +1,7 @@
-"""What several seeds say together: Agarwal et al. 2021, arXiv:2108.13264.
+"""Statistics over several seeds: Agarwal et al. 2021, arXiv:2108.13264.
 
 Intervals are percentile bootstraps (section 4.1): seeds are drawn again with replacement, of each group on its own.
-They are always the same for the same scores.
+The random generator has a fixed seed, so the same scores give the same intervals.
 """
 
 from collections.abc import Sequence
@@ -36,7 +36,7 @@ def mean_interval(curves: np.ndarray, confidence: float = 0.95, resamples: int =
 
 
 def probability_of_improvement(x: Sequence[float] | np.ndarray, y: Sequence[float] | np.ndarray) -> np.ndarray:
-    """P(X > Y): the share of pairs of a run of x [..., n] and one of y [..., m] that the first wins; a tie is half.
+    """P(X > Y): the share of pairs, a run of x [..., n] and one of y [..., m], in which x is higher; a tie is half.
 
     1/(nm) Σᵢ Σⱼ S(xᵢ, yⱼ) with S = 1, ½, 0 for more, equal, less: the paper's probability of improvement on one task,
     which is the U statistic of Mann and Whitney 1947 over nm.
@@ -61,5 +61,5 @@ def _drawn_again(scores: np.ndarray, rng: np.random.Generator, resamples: int) -
 
 
 def _percentiles(resampled: np.ndarray, confidence: float) -> np.ndarray:
-    """The middle `confidence` of what resampling gave, along its first dimension."""
+    """The ends of the middle `confidence` of resampled values, along their first dimension."""
     return np.quantile(resampled, [(1 - confidence) / 2, (1 + confidence) / 2], axis=0)

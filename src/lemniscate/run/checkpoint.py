@@ -1,11 +1,11 @@
 """Checkpoints: a directory of raw tensors and JSON, no pickle, a sha256 for each file.
 
-    step-N/tensors.safetensors   every tensor of the State
-    step-N/state.json            every number of it, the Spec, the Config
-    step-N/manifest.json         format version, sha256 of the two
+    step-N/tensors.safetensors   the tensors of the State
+    step-N/state.json            the numbers of the State, the Spec, the Config
+    step-N/manifest.json         format version, sha256 of the other two
 
-Written under another name, synced, then renamed: under its own name a checkpoint is whole or absent. The hashes find
-damage, not malice; but nothing in these files can be executed.
+A checkpoint is written under another name, synced, then renamed: under its own name it is whole or absent. The hashes
+find damage, not malice; but nothing in these files can be executed.
 """
 
 import dataclasses
@@ -26,16 +26,16 @@ from lemniscate.errors import UserError
 from lemniscate.spec import Action, ObservationPart, Spec
 
 FORMAT = 1
-PARTS = ("tensors.safetensors", "state.json")
+FILES = ("tensors.safetensors", "state.json")
 
 
 class DamagedCheckpointError(UserError):
-    """A checkpoint whose files are missing, or not what their hashes say."""
+    """A checkpoint with a file that is missing or does not match its hash."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Checkpoint:
-    """What `read` found: tensors and numbers by name, and the record that `write` was given."""
+    """The content of a checkpoint: tensors and numbers by name, and the record that `write` was given."""
 
     path: Path
     tensors: dict[str, Tensor]
@@ -43,9 +43,9 @@ class Checkpoint:
     record: dict[str, Any]
 
     def restore(self, state: Any) -> None:
-        """Put everything back into a State of the same make: generators, what has a `state_dict`, numbers."""
-        for name, value in _parts(state):
-            mine = self.part(name)
+        """Restore every field of a State of the same Config: generators, objects with a `state_dict`, numbers."""
+        for name, value in state.saved().items():
+            mine = self.tensors_of(name)
             if isinstance(value, torch.Generator):
                 value.set_state(mine["state"])
             elif hasattr(value, "load_state_dict"):
@@ -53,7 +53,7 @@ class Checkpoint:
             else:
                 setattr(state, name, self.numbers[name])
 
-    def part(self, name: str) -> dict[str, Tensor]:
+    def tensors_of(self, name: str) -> dict[str, Tensor]:
         """The tensors of one field of the State; of a module, its state_dict."""
         prefix = f"{name}."
         return {key.removeprefix(prefix): t for key, t in self.tensors.items() if key.startswith(prefix)}
@@ -62,12 +62,12 @@ class Checkpoint:
 def write(directory: Path, state: Any, step: int, record: dict[str, Any], keep: int) -> Path:
     """Write `directory/step-N` with every field of the dataclass `state`, and delete all but the newest `keep`.
 
-    `record` is any JSON: what a reader needs to know beside the state.
+    `record` is any JSON that a reader needs beside the state.
     """
     final = directory / f"step-{step}"
     tensors: dict[str, Tensor] = {}
     numbers: dict[str, Any] = {}
-    for name, value in _parts(state):
+    for name, value in state.saved().items():
         if isinstance(value, torch.Generator):
             tensors[f"{name}.state"] = value.get_state()
         elif hasattr(value, "state_dict"):
@@ -79,9 +79,9 @@ def write(directory: Path, state: Any, step: int, record: dict[str, Any], keep: 
         shutil.rmtree(stale)
     temporary = directory / f"step-{step}.tmp"
     temporary.mkdir()
-    save_file(_apart(tensors), temporary / PARTS[0])
-    (temporary / PARTS[1]).write_text(_json({"numbers": numbers, "record": record}))
-    hashes = {name: _sha256(temporary / name) for name in PARTS}
+    save_file(_to_save(tensors), temporary / FILES[0])
+    (temporary / FILES[1]).write_text(_json({"numbers": numbers, "record": record}))
+    hashes = {name: _sha256(temporary / name) for name in FILES}
     (temporary / "manifest.json").write_text(_json({"format": FORMAT, "sha256": hashes}))
     for path in temporary.iterdir():
         _sync(path)
@@ -96,22 +96,22 @@ def write(directory: Path, state: Any, step: int, record: dict[str, Any], keep: 
 
 
 def read(path: Path) -> Checkpoint:
-    """Read one checkpoint directory, every byte of it checked.
+    """Read one checkpoint directory and check every byte of it.
 
     Raises:
         DamagedCheckpointError: naming the file and what is wrong with it.
     """
     _verify(path)
     try:
-        tensors = load_file(path / PARTS[0])
-        state = json.loads((path / PARTS[1]).read_bytes())
+        tensors = load_file(path / FILES[0])
+        state = json.loads((path / FILES[1]).read_bytes())
         return Checkpoint(path, tensors, state["numbers"], state["record"])
     except (SafetensorError, ValueError, KeyError, TypeError) as error:
         raise DamagedCheckpointError(f"{path} cannot be read: {error}.") from error
 
 
 def is_whole(path: Path) -> bool:
-    """Whether a checkpoint directory is what was written, every byte of it."""
+    """Whether every file of a checkpoint directory matches its hash."""
     try:
         _verify(path)
     except DamagedCheckpointError:
@@ -120,7 +120,7 @@ def is_whole(path: Path) -> bool:
 
 
 def list_steps(directory: Path) -> list[int]:
-    """The steps of the checkpoints in a run's `checkpoints`, ascending."""
+    """The steps of the checkpoints in a run's `checkpoints` directory, ascending."""
     names = (p.name.removeprefix("step-") for p in directory.glob("step-*") if p.is_dir())
     return sorted(int(name) for name in names if name.isdigit())
 
@@ -136,20 +136,19 @@ def spec_from_json(record: dict[str, Any]) -> Spec:
     """The Spec that `spec_to_json` came from."""
     action = _tuples(record["action"])
     kind = {k.__name__: k for k in get_args(Action)}[action.pop("kind")]
-    layout = tuple(ObservationPart(**_tuples(part)) for part in record["layout"])
-    return Spec(**{**_tuples(record), "action": kind(**action), "layout": layout})
+    parts = tuple(ObservationPart(**_tuples(part)) for part in record["observation_parts"])
+    return Spec(**{**_tuples(record), "action": kind(**action), "observation_parts": parts})
 
 
 def _tuples(record: dict[str, Any]) -> dict[str, Any]:
     return {name: tuple(value) if isinstance(value, list) else value for name, value in record.items()}
 
 
-def _parts(state: Any) -> list[tuple[str, Any]]:
-    return list(state.saved().items())
+def _to_save(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    """The tensors on the CPU, no two of them in the same memory, which safetensors refuses.
 
-
-def _apart(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The same on the CPU; those that share memory, as safetensors refuses it, become copies. A replay shares none."""
+    Only tensors that share memory are copied; a replay buffer, the largest, shares none.
+    """
     at = {name: t.untyped_storage().data_ptr() for name, t in tensors.items()}
     times = Counter(at.values())
     return {name: (t.clone() if times[at[name]] > 1 else t).detach().cpu().contiguous() for name, t in tensors.items()}
@@ -159,9 +158,9 @@ def _verify(path: Path) -> None:
     manifest = _parse(path / "manifest.json")
     if manifest.get("format") != FORMAT:
         raise UserError(f"{path} has format {manifest.get('format')!r}; this version of lemniscate reads {FORMAT}.")
-    for name in PARTS:
+    for name in FILES:
         if _sha256(path / name) != manifest.get("sha256", {}).get(name):
-            raise DamagedCheckpointError(f"{path / name} is not what was written: its sha256 differs.")
+            raise DamagedCheckpointError(f"{path / name} is damaged: its sha256 differs from the one that was written.")
 
 
 def _json(record: Any) -> str:
@@ -184,7 +183,7 @@ def _parse(path: Path) -> dict[str, Any]:
             return parsed
     except ValueError:
         pass
-    raise DamagedCheckpointError(f"{path} is not JSON any more.")
+    raise DamagedCheckpointError(f"{path} is damaged: it is not JSON.")
 
 
 def _sync(path: Path) -> None:

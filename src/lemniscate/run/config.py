@@ -1,18 +1,18 @@
-"""The settings that algorithms share, and the ranges of all settings."""
+"""The settings that every algorithm has, and how the values of all settings are checked."""
 
 import dataclasses
 import json
 import math
-from dataclasses import dataclass
-from typing import Annotated, Any, Literal, Self, get_args, get_origin, get_type_hints
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Self, Union, get_args, get_origin, get_type_hints
 
 import torch
 
-from lemniscate.data.action_noise import ActionNoise, Kind
-from lemniscate.errors import UserError, unknown_name
-from lemniscate.nn.activations import Activation
-from lemniscate.nn.actor_critic import ActorCritic
-from lemniscate.nn.networks import Layers, Matmul
+from lemniscate.errors import UserError
+from lemniscate.glossary import unknown_field
+from lemniscate.run.seeding import Generators
 from lemniscate.spec import Spec
 
 
@@ -29,8 +29,9 @@ class Range:
 
     def __str__(self) -> str:
         if self.high < math.inf:
-            return f"{'above' if self.above else 'from'} {self.low:g} to {self.high:g}"
-        return f"{'above' if self.above else 'at least'} {self.low:g}"
+            high = f"{self.high:,.0f}" if self.high >= 1e6 else f"{self.high:g}"
+            return f"{'above' if self.above else 'from'} {self.low:g} to {high}"
+        return f"{'above' if self.above else 'at least'} {self.low:g}" if self.low > -math.inf else ""
 
 
 Count = Annotated[int, Range(1)]
@@ -41,6 +42,70 @@ Positive = Annotated[float, Range(0, above=True)]
 NonNegative = Annotated[float, Range(0)]
 Finite = Annotated[float, Range()]
 LogStd = Annotated[float, Range(-10, 5)]
+
+
+def options_of(hint: Any) -> tuple[Any, ...]:
+    """The types that a field may have: those of a union, or the one."""
+    return get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+
+
+def checked(name: str, value: Any, hint: Any) -> Any:
+    """`value` as the field `name` holds it.
+
+    NumPy's scalars and arrays become Python's, 1e6 a whole number where one is wanted, lists tuples.
+
+    Raises:
+        UserError: a value that no option of `hint` has room for.
+    """
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    options = options_of(hint)
+    if value is None and NoneType in options:
+        return None
+    wanted: list[str] = []
+    for option in options:
+        if get_origin(option) is tuple and isinstance(value, Iterable) and not isinstance(value, str | Mapping):
+            return tuple(checked(name, item, get_args(option)[0]) for item in value)
+        try:
+            return _convert(value, option)
+        except ValueError as error:
+            wanted.append(str(error))
+    raise UserError(f"{name} must be {' or '.join(wanted)}, not {value!r}.")
+
+
+def _convert(value: Any, option: Any) -> Any:
+    """`value` as an `option` that is no union. Raises `ValueError` with what would be right."""
+    kind = get_origin(option) or option
+    if kind is Annotated or kind in (int, float):
+        number, *limits = get_args(option) if kind is Annotated else (kind,)
+        return _number(value, number, *(limit for limit in limits if isinstance(limit, Range)))
+    if kind is NoneType:
+        raise ValueError("None")
+    if kind is Literal and value not in get_args(option):
+        raise ValueError(f"one of {', '.join(map(str, get_args(option)))}")
+    if kind is tuple:
+        several = "names, such as ('module:name',)" if get_args(option)[0] is str else "numbers, such as (64, 64)"
+        raise ValueError(f"several {several}")
+    for basic, wanted in ((bool, "True or False"), (str, "a text"), (dict, "a dictionary, such as {'gravity': -5}")):
+        if kind is basic and not isinstance(value, basic):
+            raise ValueError(wanted)
+    if kind is dict:
+        try:
+            json.dumps(value)
+        except TypeError:  # it could not be saved with the run
+            raise ValueError("a dictionary of what JSON can hold") from None
+    return value
+
+
+def _number(value: Any, kind: type, limits: Range = Range()) -> int | float:
+    """A finite number within `limits`; 1e6 is whole."""
+    if isinstance(value, int | float) and not isinstance(value, bool) and value in limits:
+        number = float(value)
+        if kind is float:
+            return number
+        if isinstance(value, int) or number.is_integer():
+            return int(value)
+    raise ValueError(f"{'a whole number' if kind is int else 'a number'} {limits}".strip())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,48 +139,40 @@ class RunConfig:
     """episodes of each evaluation"""
     video_every: Natural = 0
     """steps between recordings of an episode into videos/step-N; 0: none"""
+    warm_start: str | None = None
+    """run or checkpoint whose networks this run begins with"""
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    """arguments of the environment, as JSON: '{"dynamics": "first_principles"}'"""
+    wrappers: tuple[str, ...] = ()
+    """wrappers of each environment, the first innermost: module:name or module:name(key=value)"""
 
     def __post_init__(self) -> None:
         hints = get_type_hints(type(self), include_extras=True)
         for name in self.names():
-            value, hint = getattr(self, name), hints[name]
-            if get_origin(hint) is not tuple:
-                self._check(name, value, hint)
-            elif isinstance(value, (tuple, list)):
-                for item in value:
-                    self._check(name, item, get_args(hint)[0])
-            else:
-                raise UserError(f"{name} must be several numbers, such as (64, 64), not {value!r}.")
-
-    @staticmethod
-    def _check(name: str, value: Any, hint: Any) -> None:
-        options = [hint] if get_origin(hint) in (Annotated, Literal) else get_args(hint)
-        if value is None and type(None) in options:
-            return
-        for option in options:
-            if get_origin(option) is Literal and value not in get_args(option):
-                raise UserError(f"{name} must be one of {', '.join(get_args(option))}, not {value!r}.")
-            if get_origin(option) is Annotated:
-                kind, limits = get_args(option)
-                number = isinstance(value, int if kind is int else (int, float)) and not isinstance(value, bool)
-                if not (number and value in limits):
-                    what = "a whole number" if kind is int else "a number"
-                    raise UserError(f"{name} must be {what} {limits}, not {value!r}.")
+            object.__setattr__(self, name, checked(name, getattr(self, name), hints[name]))
 
     @property
     def gradient_steps(self) -> int:
         """The number of gradient steps of the whole run."""
         raise NotImplementedError
 
+    def generators(self, device: torch.device) -> Generators:
+        """New random generators, seeded by the run's seed."""
+        return Generators(self.seed, device)
+
     def networks(self, spec: Spec) -> Any:
         """New networks for the spaces in `spec`, a module with a `policy`. Raises `UserError` if they do not fit."""
         raise NotImplementedError
+
+    def notices(self, spec: Spec, device: torch.device) -> list[str]:
+        """Sentences that a person should read before a run of this Config starts."""
+        return []
 
     def replace(self, **changes: object) -> Self:
         """A copy with some fields changed. Raises `UserError` for an unknown field or a value out of range."""
         for name in changes:
             if name not in self.names():
-                raise unknown_name("field", name, self.names())
+                raise unknown_field(name, self.names())
         return dataclasses.replace(self, **changes)
 
     @classmethod
@@ -129,158 +186,8 @@ class RunConfig:
 
     @classmethod
     def from_json(cls, record: dict[str, Any]) -> Self:
-        """The Config that `to_json` came from."""
-        return cls().replace(**{k: tuple(v) if isinstance(v, list) else v for k, v in record.items()})
-
-
-@dataclass(frozen=True, kw_only=True)
-class OnPolicyConfig(RunConfig):
-    """The settings of algorithms that learn from their newest rollout."""
-
-    num_steps: Count = 128
-    """steps of each environment between updates, T; usually 16 to 2048, so that N · T is about 2048"""
-    gamma: Fraction = 0.99
-    """discount factor γ; usually 0.9 to 0.999"""
-    hidden: tuple[Count, ...] = (64, 64)
-    """widths of the hidden layers of the policy, and of the value"""
-    activation: Activation = "tanh"
-    """activation function between the layers"""
-    network: str = "mlp"
-    """mlp, layer_norm (the same with layer normalization), simba (residual blocks of one width), or module:Class"""
-    initial_log_std: LogStd = -0.5
-    """initial log σ of a Gaussian policy, in units of half the action range; usually -1 to 0"""
-    normalize_observations: bool = True
-    """normalize observations by their running mean and standard deviation, inside the policy"""
-    scale_rewards: bool = True
-    """divide rewards by the running standard deviation of the discounted return"""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.layers.check()
-
-    def networks(self, spec: Spec) -> ActorCritic:
-        """New networks for the spaces in `spec`: the policy and V(s)."""
-        return ActorCritic(spec, self.layers, self.initial_log_std, self.normalize_observations)
-
-    @property
-    def layers(self) -> Layers:
-        """The hidden layers of the policy, and of the value."""
-        return Layers(self.hidden, self.activation, self.network)
-
-    @property
-    def num_rows(self) -> int:
-        """The number of rows of a rollout, T · N."""
-        return self.num_steps * self.num_envs
-
-    @property
-    def num_rollouts(self) -> int:
-        """The number of rollouts of the whole run."""
-        return -(-self.total_steps // self.num_rows)
-
-    def _require_rows(self, field: str, rows: int) -> None:
-        """Raise `UserError` if `field`, which standardizes, would have a single row to do it with."""
-        if rows == 1 and getattr(self, field):
-            raise UserError(f"{field} needs batches of 2 rows or more; these have 1.")
-
-
-@dataclass(frozen=True, kw_only=True)
-class OffPolicyConfig(RunConfig):
-    """The settings of algorithms that learn from a replay buffer."""
-
-    num_envs: Count = 1
-    """number of parallel environments, N; usually 1 to 8"""
-    gamma: Fraction = 0.99
-    """discount factor γ; usually 0.95 to 0.999"""
-    buffer_size: Count = 1_000_000
-    """transitions in the replay buffer; the oldest are replaced"""
-    batch_size: Count = 256
-    """rows of each gradient step, M; usually 64 to 512"""
-    learning_starts: Natural = 5_000
-    """environment steps with random actions before the first update; usually 1,000 to 25,000"""
-    update_every: Count = 1
-    """steps of each environment between updates"""
-    num_updates: Count = 1
-    """gradient steps of the critics at each update; so num_updates / (N · update_every) for each environment step"""
-    log_every: Count = 500
-    """steps of each environment between lines of metrics; evaluations and checkpoints wait for the next one"""
-    actor_learning_rate: Positive = 3e-4
-    """step size of the policy's Adam; usually 1e-4 to 1e-3"""
-    critic_learning_rate: Positive = 3e-4
-    """step size of the critics' Adam; usually 1e-4 to 1e-3"""
-    final_learning_rate: Fraction = 1.0
-    """final value of both as a fraction of the initial one, annealed linearly; 1: constant"""
-    tau: Fraction = 0.005
-    """τ, the share by which the target networks move at each update; usually 0.001 to 0.02"""
-    policy_delay: Count = 1
-    """gradient steps of the critics for each of the policy and the target networks; usually 1 or 2"""
-    action_noise: Kind = "white"
-    """noise of actions in training: white, ou (Ornstein–Uhlenbeck) or coloured"""
-    noise_time: Positive = 6.7
-    """correlation time of Ornstein–Uhlenbeck noise in steps; θ = 0.15 of DDPG's paper is 1 / 0.15"""
-    noise_exponent: NonNegative = 1.0
-    """β of coloured noise, whose power falls as f^(−β); 1 is pink"""
-    hidden: tuple[Count, ...] = (256, 256)
-    """widths of the policy's hidden layers"""
-    critic_hidden: tuple[Count, ...] = (256, 256)
-    """widths of each critic's hidden layers"""
-    activation: Activation = "relu"
-    """activation function between the layers; simba has its own"""
-    network: str = "mlp"
-    """mlp, layer_norm (the same with layer normalization), simba (residual blocks of one width), or module:Class"""
-    matmul: Matmul = "float32"
-    """precision of the products between hidden layers; bfloat16 is faster where the processor has it"""
-    normalize_observations: bool = False
-    """normalize observations by their running mean and standard deviation, inside the policy"""
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for layers in self.network_settings[:2]:
-            layers.check()
-        if self.learning_starts >= self.total_steps:
-            raise UserError(
-                f"learning_starts must be below total_steps, or nothing is ever learned: {self.learning_starts:,} is"
-                f" not below {self.total_steps:,}."
-            )
-        if not self.gradient_steps:
-            raise UserError(
-                f"update_every {self.update_every:,} is so large that nothing is ever learned: after learning_starts"
-                f" each environment takes {self.steps_per_env - self.learning_starts // self.num_envs:,} steps."
-            )
-        for name in ("batch_size", "num_envs"):
-            if self.capacity < (rows := getattr(self, name)):
-                raise UserError(
-                    f"The replay buffer must hold a batch, and a step of every environment: the smaller of buffer_size"
-                    f" {self.buffer_size:,} and the {self.num_envs * self.steps_per_env:,} steps of the run is"
-                    f" below {name} {rows:,}."
-                )
-
-    @property
-    def network_settings(self) -> tuple[Layers, Layers, bool]:
-        """The hidden layers of the policy and of each critic, and whether observations are normalized."""
-        shared = self.activation, self.network, self.matmul
-        return Layers(self.hidden, *shared), Layers(self.critic_hidden, *shared), self.normalize_observations
-
-    @property
-    def capacity(self) -> int:
-        """The rows of the replay buffer: no more than the run can fill."""
-        return min(self.buffer_size, self.num_envs * self.steps_per_env)
-
-    @property
-    def steps_per_env(self) -> int:
-        """Steps of each environment in the whole run: the first multiple of log_every that reaches total_steps."""
-        return -(-self.total_steps // (self.num_envs * self.log_every)) * self.log_every
-
-    @property
-    def gradient_steps(self) -> int:
-        """The number of gradient steps of the critics in the whole run."""
-        updates = self.steps_per_env // self.update_every
-        return self.num_updates * (updates - self.learning_starts // self.num_envs // self.update_every)
-
-    def make_action_noise(self, spec: Spec, device: torch.device) -> ActionNoise:
-        """Action noise for the environments of a run; a sequence is as long as an episode may be."""
-        shape, length = (self.num_envs, spec.bounded_box().size), spec.max_episode_steps or 1000
-        return ActionNoise(self.action_noise, shape, length, device, time=self.noise_time, exponent=self.noise_exponent)
-
-    def updates_at(self, step: int) -> bool:
-        """Whether an update follows environment step `step`."""
-        return step > self.learning_starts and step // self.num_envs % self.update_every == 0
+        """The Config that `to_json` came from. Raises `UserError` for one that another version wrote."""
+        strangers = [name for name in record if name not in cls.names()]
+        if strangers:
+            raise UserError(f"This was written by another version of lemniscate: there is no field {strangers[0]} now.")
+        return cls().replace(**record)

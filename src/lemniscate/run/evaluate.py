@@ -1,14 +1,14 @@
-"""Flying a policy without learning. Nothing here is shared with training: not environments, nor random numbers."""
+"""Playing episodes without learning. Nothing here is shared with training: not environments, nor random numbers."""
 
-import math
-from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import partial
 
 import torch
 from torch import Tensor
 
+from lemniscate.envs.backend import Summary
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.nn.actor_critic import ActorQ
 from lemniscate.nn.policies import Policy
@@ -22,7 +22,11 @@ EVALUATION = 1
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What a policy achieved; the tracking errors only where there is a reference to track."""
+    """The result of an evaluation. `returns` and `lengths` are ordered by environment, then by time.
+
+    `measures` has the mean of everything that the environment measures, over all steps of all episodes, and the
+    summaries that it declares, such as `rmse_mm`. `terminated` is how many episodes ended by the environment's rules.
+    """
 
     env_id: str
     episodes: int
@@ -31,17 +35,15 @@ class Evaluation:
     returns: list[float]
     lengths: list[int]
     terminated: int
-    rmse_mm: float | None = None
-    rmse_after_1s_mm: float | None = None
+    measures: dict[str, float] = field(default_factory=dict)
     q_bias: QBias | None = None
     date: str = field(default="", compare=False)
 
     def to_json(self) -> dict[str, object]:
-        """Without what the environment does not have."""
-        scores: dict[str, object] = {
-            name: value for name, value in vars(self).items() if value is not None and name != "date"
-        }
-        return scores | ({"q_bias": self.q_bias.to_json()} if self.q_bias else {})
+        """One object of JSON, with the measures among the other numbers."""
+        apart = ("measures", "q_bias", "date")
+        scores: dict[str, object] = {name: value for name, value in vars(self).items() if name not in apart}
+        return scores | self.measures | ({"q_bias": self.q_bias.to_json()} if self.q_bias else {})
 
     def to_course(self) -> dict[str, object]:
         """The dictionary that a course on DDPG hands in with a policy; the time is ISO 8601."""
@@ -58,14 +60,14 @@ class Evaluation:
 def play_episodes(
     policy: Policy, env: VecEnv, episodes: int, seed: int, deterministic: bool = True
 ) -> Iterator[tuple[Tensor, Tensor, Step, Tensor]]:
-    """Play `episodes` whole episodes; yields (obs, action, step, the mask [N] of the copies that still count).
+    """Play `episodes` whole episodes; yields (obs, action, step, the mask [N] of the environments that still count).
 
-    Every copy has its own share of the episodes, fixed beforehand: taking the first that end would favour short ones.
-    Raises `UserError` when an episode of an environment without a time limit takes more than 20,000 steps.
+    Every environment has its own share of the episodes, fixed beforehand: taking the first that end would favour short
+    ones. Raises `UserError` when an episode of an environment without a time limit takes more than 20,000 steps.
     """
     noise = partial(policy.draw_noise, (env.num_envs,), generator(seed, env.device, EVALUATION, 1))
-    copies = torch.arange(env.num_envs, device=env.device)
-    left = episodes // env.num_envs + (copies < episodes % env.num_envs).int()
+    numbers = torch.arange(env.num_envs, device=env.device)
+    left = episodes // env.num_envs + (numbers < episodes % env.num_envs).int()
     env.restart(derive(seed, EVALUATION, 0))
     age = torch.zeros_like(left)
     while (left > 0).any():
@@ -86,48 +88,69 @@ def evaluate(
     deterministic: bool = True,
     critic: tuple[ActorQ, float] | None = None,
 ) -> Evaluation:
-    """Mean return over `episodes` whole episodes from starts drawn with `seed`; for drones the tracking error too.
+    """Returns, lengths and measures of `episodes` whole episodes from starts drawn with `seed`.
 
-    With a `critic`, networks and γ, also what Q says of each beginning, beside what followed.
+    With a `critic`, networks and γ, also what Q predicts at each beginning, beside the return that followed.
     """
-    running = torch.zeros(2, env.num_envs, device=env.device)
-    ended: list[Tensor] = []
-    errors: list[Tensor] = []
-    terminated = 0
+    table = EpisodeTable(env.num_envs, env.device)
     q_bias_meter = QBiasMeter(*critic, env.num_envs, generator(seed, env.device, EVALUATION, 2)) if critic else None
     for obs, action, step, counts in play_episodes(policy, env, episodes, seed, deterministic):
         if q_bias_meter:
             q_bias_meter.follow(obs, action, step, counts)
-        if env.spec.tracking:
-            error = step.next_obs[:, slice(*env.spec.tracking)].square().sum(-1)
-            errors.append(torch.stack([error, running[1]], dim=-1)[counts])
-        running = running + torch.stack([step.reward, torch.ones_like(step.reward)]) * counts
-        done = (step.terminated | step.truncated) & counts
-        if done.any():
-            ended.append(torch.stack([*running[:, done], torch.nonzero(done)[:, 0]]))
-            terminated += int((step.terminated & counts).sum())
-            running = running * ~done
-    table = torch.cat(ended, dim=1)
-    returns, lengths = table[:2, table[2].argsort(stable=True)]  # by copy, then by time
-    mean, std = returns.mean().item(), returns.std(correction=0).item()
-    scores = Evaluation(
-        env.spec.env_id,
-        episodes,
-        mean,
-        std,
-        returns.tolist(),
-        lengths.int().tolist(),
-        terminated,
+        table.add(step, counts)
+    returns, lengths = table.returns_and_lengths()
+    return Evaluation(
+        env_id=env.spec.env_id,
+        episodes=episodes,
+        mean_return=returns.mean().item(),
+        std_return=returns.std(correction=0).item(),
+        returns=returns.tolist(),
+        lengths=lengths.int().tolist(),
+        terminated=table.terminated,
+        measures=table.measures(env.summaries),
         q_bias=q_bias_meter.q_bias() if q_bias_meter else None,
         date=datetime.now(UTC).isoformat(timespec="seconds"),
     )
-    if not errors or env.spec.time_step is None:
-        return scores
-    squared, step_index = torch.cat(errors).unbind(-1)
-    late = squared[step_index >= 1 / env.spec.time_step]
-    after_1s = _root_mean_mm(late) if len(late) else math.nan
-    return replace(scores, rmse_mm=_root_mean_mm(squared), rmse_after_1s_mm=after_1s)
 
 
-def _root_mean_mm(squared_m: Tensor) -> float:
-    return 1000 * squared_m.mean().sqrt().item()
+class EpisodeTable:
+    """Adds up N parallel environments step by step: returns, lengths, and the rows of their measures."""
+
+    def __init__(self, num_envs: int, device: torch.device) -> None:
+        self.terminated = 0
+        self._running = torch.zeros(2, num_envs, device=device)
+        """[return, length] of the episode under way in each environment"""
+        self._numbers = torch.arange(num_envs, device=device)
+        self._ended: list[Tensor] = []
+        self._measured: dict[str, list[Tensor]] = {}
+
+    def add(self, step: Step, counts: Tensor) -> None:
+        """One step of every environment, of which only those in `counts` [N] count."""
+        done = (step.terminated | step.truncated) & counts
+        for name, values in step.measures.items():
+            row = torch.stack([values, self._running[1], done])[:, counts & ~values.isnan()]
+            self._measured.setdefault(name, []).append(row)
+        self._running = self._running + torch.stack([step.reward, torch.ones_like(step.reward)]) * counts
+        if done.any():
+            self._ended.append(torch.stack([*self._running, self._numbers])[:, done])
+            self.terminated += int((step.terminated & counts).sum())
+            self._running = self._running * ~done
+
+    def returns_and_lengths(self) -> Tensor:
+        """[2, episodes]: ordered by environment, then by time."""
+        table = torch.cat(self._ended, dim=1)
+        return table[:2, table[2].argsort(stable=True)]  # they stand by time, which a stable order keeps
+
+    def measures(self, summaries: Sequence[Summary]) -> dict[str, float]:
+        """The mean of every measure over all rows; then the summaries of those that there are."""
+        tables = {name: torch.cat(rows, dim=1) for name, rows in self._measured.items()}
+        means = {name: table[0].mean().item() for name, table in tables.items()}
+        return means | {s.name: _summarize(s, *tables[s.measure]) for s in summaries if s.measure in tables}
+
+
+def _summarize(summary: Summary, values: Tensor, age: Tensor, last: Tensor) -> float:
+    """One number from the rows of a measure [B]: its values, the steps before each, whether it ends an episode."""
+    rows = (age >= summary.skip) & (last.bool() if summary.kind == "last" else True)
+    chosen = values[rows]
+    mean = chosen.square().mean().sqrt() if summary.kind == "rms" else chosen.mean()
+    return summary.scale * mean.item()

@@ -1,11 +1,8 @@
-"""Where metrics go. A logger is one small class with `write` and `close`, and one line in `LOGGERS`."""
+"""Where metrics go. A logger is one class with `write` and `close`; a tracker is a logger that has to be asked for."""
 
 import json
 import math
-import os
-import sys
 from collections.abc import Callable, Mapping
-from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -16,19 +13,22 @@ NO_EPISODES = Episodes([], [])
 
 
 class Logger(Protocol):
-    """One place for metrics."""
+    """One place for metrics. Made as `Class(run directory, config, step)`; a resumed run has a step above 0."""
 
     def write(self, step: int, metrics: Metrics, episodes: Episodes = NO_EPISODES) -> None:
-        """Take the metrics of one update, and the whole episodes that ended in it."""
+        """Write the metrics of one update, and the whole episodes that ended in it."""
         ...
 
     def close(self, pictures: list[Path]) -> None:
-        """Flush; take the run's final pictures along if there is a place for them."""
+        """Write what is still pending, and the final pictures of the run where the logger takes pictures."""
         ...
 
 
+LoggerClass = Callable[[Path, Mapping[str, Any], int], Logger]
+
+
 class JsonLines:
-    """`metrics.jsonl`, one line an update: always written. A resumed run first drops the lines it will write again."""
+    """`metrics.jsonl`, one line per update. A resumed run first removes the lines after its checkpoint."""
 
     def __init__(self, path: Path, config: Mapping[str, Any], step: int) -> None:
         self._path = path / "metrics.jsonl"
@@ -41,7 +41,7 @@ class JsonLines:
     def write(self, step: int, metrics: Metrics, episodes: Episodes = NO_EPISODES) -> None:
         """Append a line; `episode/returns` and `episode/lengths` are lists, in the order in which episodes ended.
 
-        What is not a number is left out: JSON has no word for it.
+        Metrics that are NaN or infinite are left out: JSON has no such numbers.
         """
         line: dict[str, Any] = {"step": step} | {name: x for name, x in metrics.items() if math.isfinite(x)}
         if episodes.returns:
@@ -75,56 +75,17 @@ class TensorBoard:
         self._writer.close()
 
 
-class WeightsAndBiases:
-    """W&B (extra `wandb`). Without a key or a network it records offline, and says how to upload later."""
-
-    def __init__(self, path: Path, config: Mapping[str, Any], step: int) -> None:
-        wandb: Any = import_module("wandb")
-        self._wandb = wandb
-        mode = os.environ.get("WANDB_MODE", "online")
-        if mode == "online" and not os.environ.get("WANDB_API_KEY") and not wandb.login(prompt=False):
-            mode = "offline"
-        options = {
-            "project": os.environ.get("WANDB_PROJECT", "lemniscate"),
-            "name": os.environ.get("WANDB_NAME", path.name),
-            "tags": [str(config["env"]), *filter(None, os.environ.get("WANDB_TAGS", "").split(","))],
-            "config": dict(config),
-            "dir": str(path),
-            "id": _stable_id(path),
-            "resume": "allow" if mode == "online" else None,
-        }
-        settings = wandb.Settings(init_timeout=20, silent=True)
-        try:
-            self._run = wandb.init(mode=mode, settings=settings, **options)
-        except (wandb.errors.CommError, wandb.errors.AuthenticationError):
-            mode = "offline"
-            wandb.teardown()
-            self._run = wandb.init(mode=mode, settings=settings, **{**options, "resume": None})
-        if mode == "offline":
-            print(f"W&B records offline; upload later with: wandb sync {path}/wandb/offline-run-*", file=sys.stderr)
-
-    def write(self, step: int, metrics: Metrics, episodes: Episodes = NO_EPISODES) -> None:
-        """Log one row."""
-        self._run.log(dict(metrics), step=step)
-
-    def close(self, pictures: list[Path]) -> None:
-        """Upload the pictures and finish."""
-        if pictures:
-            self._run.log(
-                {picture.stem: self._wandb.Image(str(picture)) for picture in pictures if picture.suffix == ".png"}
-            )
-        self._run.finish()
-
-
-LOGGERS: dict[str, Callable[[Path, Mapping[str, Any], int], Logger]] = {
-    "jsonl": JsonLines,
-    "tensorboard": TensorBoard,
-    "wandb": WeightsAndBiases,
-}
+TRACKERS = {"wandb": ("wandb", "lemniscate.run.wandb_logger:WeightsAndBiases")}
+"""name: (the extra that installs it, module:Class); beside these, any `module:Class` of a user's own"""
 
 
 def read_metrics(path: Path, last_bytes: int | None = None) -> list[dict[str, Any]]:
-    """The lines of a run's `metrics.jsonl`, or those within its end; a last one that a crash cut off is left out."""
+    """The lines of a run's `metrics.jsonl`, without a last one that a crash cut off.
+
+    Args:
+        path: the run directory.
+        last_bytes: read only the lines that lie whole within the last so many bytes.
+    """
     file = path / "metrics.jsonl"
     if not file.exists():
         return []
@@ -140,11 +101,3 @@ def read_metrics(path: Path, last_bytes: int | None = None) -> list[dict[str, An
             except ValueError:
                 break
     return lines
-
-
-def _stable_id(path: Path) -> str:
-    """One id for a run directory, so that a resumed run continues its own curve."""
-    file = path / "wandb-id"
-    if not file.exists():
-        file.write_text(os.urandom(6).hex())
-    return file.read_text()

@@ -1,4 +1,4 @@
-"""Is Q honest? What it says of the first action of an episode, beside the discounted return that followed."""
+"""The bias of Q: its value for the first action of each episode, beside the discounted return that followed."""
 
 import math
 from dataclasses import dataclass
@@ -7,17 +7,18 @@ import torch
 from torch import Generator, Tensor, nn
 
 from lemniscate.nn.actor_critic import ActorQ
-from lemniscate.run.config import OffPolicyConfig, RunConfig
+from lemniscate.run.config import RunConfig
+from lemniscate.run.off_policy import OffPolicyConfig
 from lemniscate.types import Step
 
 
 @dataclass(frozen=True)
 class QBias:
-    """Episode by episode, in the order of an evaluation's returns: copy by copy, then as they ended.
+    """Predicted and realised returns of each episode, in the order of an evaluation's returns.
 
-    `realised` is Σ γ^t r_t; where the clock ended the episode, what Q expects from there on is added, since Q speaks of
-    what follows too. Under SAC both hold the price of the policy's entropy in every state but the first; yet Q speaks
-    of the random policy, so that what the deterministic one does better (or worse) is part of the difference.
+    `predicted` is Q(s₀, a₀). `realised` is Σ γ^t r_t, plus γ^T Q(s_T, a_T) where a time limit ended the episode after T
+    steps, since Q counts what follows too. Under SAC both include the entropy bonus of every state but the first. There
+    Q is that of the random policy, so a difference between the random and the deterministic policy is part of the bias.
     """
 
     predicted: list[float]
@@ -25,17 +26,17 @@ class QBias:
 
     @property
     def means(self) -> tuple[float, float]:
-        """Of what was predicted, and of what came."""
+        """The means of `predicted` and of `realised`."""
         return sum(self.predicted) / len(self.predicted), sum(self.realised) / len(self.realised)
 
     @property
     def bias(self) -> float:
-        """How much more was predicted than came, as a share of what came; not finite if nothing did."""
+        """(mean predicted − mean realised) / |mean realised|; infinite if the mean realised return is 0."""
         predicted, realised = self.means
         return (predicted - realised) / abs(realised) if realised else math.inf
 
     def to_json(self) -> dict[str, object]:
-        """With the bias, where it is a number."""
+        """A dictionary that survives JSON; it has `bias` only if that is finite."""
         return {**vars(self), **({"bias": self.bias} if math.isfinite(self.bias) else {})}
 
     def __str__(self) -> str:
@@ -52,25 +53,25 @@ def _short(value: float) -> str:
 
 
 class QBiasMeter:
-    """Follows an evaluation step by step.
+    """The measurement of a `QBias`, step by step of an evaluation.
 
     Args:
-        networks: whose Q is asked.
-        gamma: γ of its training.
-        num_envs: copies that are followed.
-        generator: samples the entropy of a random policy.
+        networks: the policy and the Q that is measured.
+        gamma: the discount γ that Q was trained with.
+        num_envs: parallel environments of the evaluation.
+        generator: of the noise that the entropy of a random policy is sampled with.
     """
 
     def __init__(self, networks: ActorQ, gamma: float, num_envs: int, generator: Generator) -> None:
         self._networks, self._gamma, self._generator = networks, gamma, generator
         self._running = torch.zeros(3, num_envs, device=generator.device)
-        """[predicted, realised, steps] of the episode under way in each copy"""
-        self._copies = torch.arange(num_envs, device=generator.device)
+        """[predicted, realised, steps] of the present episode of each environment"""
+        self._env_indices = torch.arange(num_envs, device=generator.device)
         self._ended: list[Tensor] = []
 
     @torch.no_grad()
     def follow(self, obs: Tensor, action: Tensor, step: Step, counts: Tensor) -> None:
-        """One step of every copy; only the copies in `counts` [N] count."""
+        """Take one step of every environment; only those in the mask `counts` [N] count."""
         networks = self._networks
         predicted, realised, age = self._running
         begins = age == 0
@@ -83,16 +84,16 @@ class QBiasMeter:
             last = step.next_obs
             value = networks.q(last, networks.policy(last).mode()) + networks.entropy_bonus(last, self._generator)
             followed = realised + self._gamma**age * value * ~step.terminated
-            self._ended.append(torch.stack([predicted, followed, self._copies])[:, done])
+            self._ended.append(torch.stack([predicted, followed, self._env_indices])[:, done])
         self._running = torch.stack([predicted, realised, age]) * ~done
 
     def q_bias(self) -> QBias:
-        """Of all episodes that ended."""
+        """The bias over all episodes that ended."""
         table = torch.cat(self._ended, dim=1)
         predicted, realised = table[:2, table[2].argsort(stable=True)].tolist()
         return QBias(predicted, realised)
 
 
 def critic_of(networks: nn.Module, config: RunConfig) -> tuple[ActorQ, float] | None:
-    """The networks and γ, where there is a Q to ask."""
+    """The networks and γ of an algorithm that has a Q; None for the others."""
     return (networks, config.gamma) if isinstance(networks, ActorQ) and isinstance(config, OffPolicyConfig) else None

@@ -1,51 +1,47 @@
 """What surrounds a training loop: the generator that the loop is written over.
 
     for env in run.until(config.total_steps, state):
-        ...one update...
+        ...one update, one `run.log`...
 
-Between two bodies the generator logs, evaluates, saves and stops; the loop knows nothing of it.
+Between two bodies of the loop the generator evaluates, saves, calls the callbacks and stops; the loop does not see it.
 
-A checkpoint is a place where the run starts anew: there the environments restart from a seed derived from (run seed,
-step), in a run that goes on as in one that is resumed. So both end in the same bits, whatever the simulator.
+At a planned checkpoint the environments restart from a seed derived from (run seed, step), in a run that goes on as in
+one that is resumed. So both end in the same bits, whatever the simulator.
 """
 
-import shutil
 import signal
-import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 from typing import TypeVar
 
 import torch
-from filelock import FileLock, Timeout
 
-from lemniscate.data.replay import bytes_per_transition
+from lemniscate.console import ProgressBar, say
 from lemniscate.envs.episodes import Episodes
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import NonFiniteError, UserError
-from lemniscate.nn.networks import has_bfloat16
-from lemniscate.run import checkpoint
-from lemniscate.run.config import OffPolicyConfig, RunConfig
-from lemniscate.run.directory import create_directory, newest_resumable
+from lemniscate.run.config import RunConfig
+from lemniscate.run.directory import Saver
 from lemniscate.run.evaluate import evaluate
-from lemniscate.run.loggers import LOGGERS, NO_EPISODES, Logger
-from lemniscate.run.progress import ProgressBar
+from lemniscate.run.loggers import NO_EPISODES, JsonLines, Logger, LoggerClass, TensorBoard
 from lemniscate.run.q_bias import critic_of
 from lemniscate.run.seeding import derive, globals_undisturbed, seed_globals
 from lemniscate.run.state import TrainState
+from lemniscate.run.warm_start import load_networks
 
 WORTH_COMPILING = 15_000
-"""gradient steps of a run from which on a native one is sooner done"""
+"""gradient steps from which on a run ends sooner if they are compiled"""
 
 TRAINING = 0
 """the stream of seeds that training environments restart from"""
 
-
 S = TypeVar("S", bound=TrainState)
+Watch = Callable[[int, Mapping[str, float], TrainState], bool]
+"""(step, metrics, state) of a logged line, to whether the run is to stop; it leaves the state as it is"""
 
 
 class Stopped(KeyboardInterrupt):
@@ -57,7 +53,7 @@ class Stopped(KeyboardInterrupt):
 
 
 class Run:
-    """A run directory, its loggers, and its environments."""
+    """The surroundings of one training loop: run directory, loggers, environments."""
 
     def __init__(
         self,
@@ -66,72 +62,72 @@ class Run:
         config: RunConfig,
         envs: tuple[VecEnv, VecEnv],
         *,
-        loggers: tuple[str, ...] = ("jsonl", "tensorboard"),
+        loggers: Sequence[LoggerClass] = (JsonLines, TensorBoard),
         progress: bool = True,
         film: Callable[[TrainState], None] | None = None,
+        watch: Watch | None = None,
     ) -> None:
         self.path, self.algorithm, self.config = path, algorithm, config
         self.env, self.eval_env = envs
         self.spec = self.env.spec
-        self._logger_names, self._visible, self._film = loggers, progress, film
-        self._loggers: list[Logger] = []
+        self.seconds = 0.0
+        """how long the training loop took"""
+        self._saver = Saver(path, algorithm, config, self.spec)
+        self._logger_classes, self._loggers = loggers, list[Logger]()
+        self._visible, self._film, self._watch = progress, film, watch
+        self._bar = ProgressBar(config.total_steps, 0, visible=False)
+        self._recent_returns: list[float] = []
+        self._unwatched: list[tuple[int, dict[str, float]]] = []
+        """logged lines that callbacks have not seen"""
         self._stop_signal = 0
-        self._recent: list[float] = []
-        self._lock = FileLock(path / ".lock", timeout=0)
-
-    def announce(self) -> None:
-        """Say what the run is about to take; to be called before there is a state."""
-        config = self.config
-        if self._visible and isinstance(config, OffPolicyConfig):
-            size = config.capacity * bytes_per_transition(self.spec) / 1e6
-            print(
-                f"It will remember {config.capacity:,} transitions: {size:,.1f} MB, and as much in each checkpoint.",
-                file=sys.stderr,
-            )
-            if config.matmul == "bfloat16" and not has_bfloat16(self.env.device):
-                print("This processor has no products in bfloat16; --matmul float32 is faster.", file=sys.stderr)
+        self._line_time, self._line_step = 0.0, 0
+        """when the last line was logged, and at which step"""
+        self._body_time, self._body_began = 0.0, 0.0
+        """seconds spent in bodies of the loop since the last line, and when the present body began"""
 
     def restore(self, state: S) -> S:
-        """Fill `state` from the newest checkpoint to resume from, if there is one; then open the loggers.
+        """Restore `state` from the newest planned checkpoint, if there is one; then open the loggers.
 
-        A new run gets its directory here: what no state can be made for leaves nothing behind.
+        The directory of a new run is created here: a state that cannot be made leaves nothing behind. A warm start is
+        saved as a checkpoint at step 0, so that from then on the run does not depend on where its networks came from.
         """
-        if not (self.path / "config.json").exists():
-            create_directory(self.path, "config.json", {"algorithm": self.algorithm, "config": self.config.to_json()})
-        try:
-            self._lock.acquire()
-        except Timeout:
-            raise UserError(f"{self.path} is being trained by another process.") from None
-        found = newest_resumable(self.path)
-        if found:
-            found.restore(state)
-        elif checkpoint.list_steps(self.path / "checkpoints"):
-            print(f"{self.path} has no planned checkpoint to go on from; it begins again at step 0.", file=sys.stderr)
-        self._forget_after(state.step)
-        self._choose_engine(state)
-        config = {"algorithm": self.algorithm, **self.config.to_json()}
-        for name in self._logger_names:
-            self._loggers.append(LOGGERS[name](self.path, config, state.step))
+        saver = self._saver
+        if self.config.warm_start and not saver.exists:  # first, since it may fail
+            self._begin_warm(state)
+        saver.open()
+        restored = saver.restore(state)
+        if self.config.warm_start and not restored:
+            if saver.exists:
+                self._begin_warm(state)
+            saver.save(state, planned=True)
+        if is_compiled(self.config):
+            if self._visible:
+                say("Compiling: up to a minute the first time, 5 to 10 s from then on.")
+            state.compile()
+        record = {"algorithm": self.algorithm, **self.config.to_json()}
+        self._loggers += [make(self.path, record, state.step) for make in self._logger_classes]
         return state
 
     def until(self, total_steps: int, state: TrainState) -> Iterator[VecEnv]:
-        """The environments, once for each update, until `total_steps` are taken.
+        """The environments, once for each update, until `total_steps` are taken or a callback stops the run.
 
         Raises:
             Stopped: after a signal, when the current update is done and saved.
         """
         self._bar = ProgressBar(total_steps, state.step, self._visible)
         started = time.monotonic()
-        self._clock, self._clock_step = started, state.step
+        self._line_time, self._line_step = started, state.step
         try:
-            with self._catching_signals():
+            with signals_to(self._stop, signal.SIGINT, signal.SIGTERM):
                 if state.step == 0:
                     self._record(state)
                 self._restart(state)
-                while state.step < total_steps:
-                    before = state.step
+                going_on = True
+                while going_on and state.step < total_steps:
+                    before, self._body_began = state.step, time.monotonic()
                     yield self.env
-                    self._between(state, before, total_steps)
+                    self._body_time += time.monotonic() - self._body_began
+                    going_on = self._between(state, before, total_steps)
         finally:
             self.seconds = time.monotonic() - started
             self._bar.close()
@@ -147,66 +143,87 @@ class Run:
             if name.startswith(("losses/", "gradient")) and not -float("inf") < value < float("inf"):
                 raise NonFiniteError(f"{name} is {value} in the update that ends at step {state.step:,}.")
         if episodes.returns:
-            self._recent = (self._recent + episodes.returns)[-100:]
+            self._recent_returns = (self._recent_returns + episodes.returns)[-100:]
             numbers["episode/return"] = sum(episodes.returns) / len(episodes.returns)
             numbers["episode/length"] = sum(episodes.lengths) / len(episodes.lengths)
-        now = time.monotonic()
-        numbers["time/steps_per_second"] = (state.step - self._clock_step) / max(now - self._clock, 1e-9)
-        self._clock, self._clock_step = now, state.step
-        self._write(state.step, numbers, episodes)
-        self._bar.update(state.step, sum(self._recent) / len(self._recent) if self._recent else None)
+        self._write(state.step, numbers | self._times(state.step), episodes)
+        recent = self._recent_returns
+        self._bar.update(state.step, sum(recent) / len(recent) if recent else None)
 
     def close(self, pictures: list[Path] | None = None) -> None:
-        """Close loggers and environments, and give the directory free."""
+        """Close the loggers and the environments, and unlock the directory."""
         for logger in self._loggers:
             logger.close(pictures or [])
         self.env.close()
         self.eval_env.close()
-        self._lock.release()
+        self._saver.close()
 
-    def _choose_engine(self, state: TrainState) -> None:
-        if engine_of(self.config) == "on":
-            if self._visible:
-                print(
-                    "Compiling: half a minute or a whole one the first time, 5 to 10 s from then on.", file=sys.stderr
-                )
-            state.compile()
+    def _times(self, step: int) -> dict[str, float]:
+        """The speed since the last line, everything included, and the seconds of the loop's bodies by their use."""
+        now = time.monotonic()
+        collect, body = self.env.collecting.take(), self._body_time + now - self._body_began
+        speed = (step - self._line_step) / max(now - self._line_time, 1e-9)
+        self._line_time, self._line_step = now, step
+        self._body_time, self._body_began = 0.0, now
+        return {"time/steps_per_second": speed, "time/collect": collect, "time/learn": body - collect}
+
+    def _between(self, state: TrainState, before: int, total_steps: int) -> bool:
+        """Do what is due after an update; returns whether the run goes on."""
+        if _passed(self.config.evaluate_every, before, state.step):
+            self._evaluate(state)
+        if _passed(self.config.video_every, before, state.step):
+            self._record(state)
+        finished = state.step >= total_steps
+        planned = finished or _passed(self._checkpoint_interval(), before, state.step)
+        if planned:
+            self._saver.save(state, planned=True)
+        stop = self._asked_to_stop(state, planned)
+        if stop and not finished:
+            self._tell_stop(state.step)
+        elif planned and not finished:
+            self._restart(state)
+        return not (stop or finished)
+
+    def _asked_to_stop(self, state: TrainState, saved: bool) -> bool:
+        """Whether a callback or a signal stops the run. The state is saved then, and where a callback fails."""
+        lines, self._unwatched = self._unwatched, []
+        stop = True
+        try:
+            with globals_undisturbed():
+                answers = [self._watch(step, numbers, state) for step, numbers in lines] if self._watch else []
+            stop = any(answers) or bool(self._stop_signal)
+        finally:
+            if stop and not saved:
+                self._saver.save(state, planned=False)
+        return stop
+
+    def _tell_stop(self, step: int) -> None:
+        message = (
+            f"Stopped at step {step:,}; the policy is saved. Go on with: lemniscate resume {self.path}\n"
+            f"It resumes at step {self._saver.last_planned:,}, the last planned checkpoint, and ends in the same bits"
+            " as a run that was never stopped."
+        )
+        if self._stop_signal:
+            raise Stopped(message, self._stop_signal)
+        say(message)
 
     def _restart(self, state: TrainState) -> None:
         seed = derive(self.config.seed, TRAINING, state.step)
-        seed_globals(seed)  # nothing here draws from them, but somebody's environment may
+        seed_globals(seed)  # nothing here draws from them, but a user's environment may
         self.env.restart(seed, state.step)
         state.on_restart()
 
+    def _begin_warm(self, state: TrainState) -> None:
+        sentence = load_networks(state.networks, self.config, self.spec)
+        state.on_warm_start()
+        if self._visible:
+            say(sentence)
+
     def _checkpoint_interval(self) -> int:
-        """As asked for; else a fifth of the run, but room for three whole episodes of each copy between restarts."""
+        """As configured; else a fifth of the run, or three whole episodes of each environment if that is longer."""
         longest = self.spec.max_episode_steps or 0
         fifth = -(-self.config.total_steps // 5)
         return self.config.checkpoint_every or max(fifth, 3 * longest * self.config.num_envs)
-
-    def _between(self, state: TrainState, before: int, total_steps: int) -> None:
-        every, interval = self.config.evaluate_every, self._checkpoint_interval()
-        if every and state.step // every > before // every:
-            self._evaluate(state)
-        every = self.config.video_every
-        if every and state.step // every > before // every:
-            self._record(state)
-        finished = state.step >= total_steps
-        planned = finished or state.step // interval > before // interval
-        if planned:
-            self._save(state, planned=True)
-        if planned and not finished:
-            self._restart(state)
-        if self._stop_signal and not finished:
-            if not planned:
-                self._save(state, planned=False)
-            last = newest_resumable(self.path)
-            message = (
-                f"Stopped at step {state.step:,}; the policy is saved. Go on with: lemniscate resume {self.path}\n"
-                f"It takes up the run at step {last.numbers['step'] if last else 0:,}, the last planned checkpoint, and"
-                " ends in the bits of a run that was never stopped."
-            )
-            raise Stopped(message, self._stop_signal)
 
     def _record(self, state: TrainState) -> None:
         if not (self.config.video_every and self._film):
@@ -215,7 +232,7 @@ class Run:
             with globals_undisturbed():
                 self._film(state)
         except (UserError, OSError) as error:  # no display any more, a full disk: it costs this recording, not the run
-            print(f"No recording at step {state.step:,}: {error}", file=sys.stderr)
+            say(f"No recording at step {state.step:,}: {error}")
 
     def _evaluate(self, state: TrainState) -> None:
         try:
@@ -224,11 +241,10 @@ class Run:
                 episodes, seed = self.config.evaluate_episodes, self.config.seed
                 scores = evaluate(state.policy, self.eval_env, episodes, seed, critic=critic)
         except UserError as error:  # an endless episode costs this evaluation, not the run
-            print(f"No evaluation at step {state.step:,}: {error}", file=sys.stderr)
+            say(f"No evaluation at step {state.step:,}: {error}")
             return
         metrics = {"evaluation/return": scores.mean_return, "evaluation/length": sum(scores.lengths) / scores.episodes}
-        if scores.rmse_after_1s_mm is not None:
-            metrics["evaluation/rmse_after_1s_mm"] = scores.rmse_after_1s_mm
+        metrics |= {f"evaluation/{name}": value for name, value in scores.measures.items()}
         if scores.q_bias:
             predicted, realised = scores.q_bias.means
             metrics |= {"evaluation/q": predicted, "evaluation/q_realised": realised}
@@ -238,49 +254,34 @@ class Run:
     def _write(self, step: int, numbers: dict[str, float], episodes: Episodes = NO_EPISODES) -> None:
         for logger in self._loggers:
             logger.write(step, numbers, episodes)
+        self._unwatched.append((step, numbers))
 
-    def _save(self, state: TrainState, planned: bool) -> None:
-        record = {
-            "algorithm": self.algorithm,
-            "planned": planned,
-            "config": self.config.to_json(),
-            "spec": checkpoint.spec_to_json(self.spec),
-        }
-        try:
-            # An unplanned one is kept beside the planned ones, never in the place of one.
-            keep = self.config.keep_checkpoints + (not planned)
-            checkpoint.write(self.path / "checkpoints", state, state.step, record, keep)
-        except OSError as error:  # a full disk costs this checkpoint, not the run, and not the checkpoints before it
-            print(f"The checkpoint at step {state.step:,} could not be written: {error}.", file=sys.stderr)
-
-    def _forget_after(self, step: int) -> None:
-        """Checkpoints beyond the one resumed from are damaged or unplanned; the run will come by there again."""
-        for later in checkpoint.list_steps(self.path / "checkpoints"):
-            if later > step:
-                shutil.rmtree(self.path / "checkpoints" / f"step-{later}")
-
-    @contextmanager
-    def _catching_signals(self) -> Iterator[None]:
-        """Ctrl-C and SIGTERM wait for the end of the update; a second Ctrl-C does not wait."""
-        if threading.current_thread() is not threading.main_thread():
-            yield
-            return
-
-        def remember(signum: int, _frame: FrameType | None) -> None:
-            if self._stop_signal:
-                raise KeyboardInterrupt
-            self._stop_signal = signum
-
-        previous = {signum: signal.signal(signum, remember) for signum in (signal.SIGINT, signal.SIGTERM)}
-        try:
-            yield
-        finally:
-            for signum, handler in previous.items():
-                signal.signal(signum, handler)
+    def _stop(self, signum: int, _frame: FrameType | None) -> None:
+        """Stop after the current update; asked again, at once."""
+        if self._stop_signal:
+            raise KeyboardInterrupt
+        self._stop_signal = signum
 
 
-def engine_of(config: RunConfig) -> str:
-    """The engine asked for; of itself, "native" for a run that is long enough to repay it, else "off"."""
-    if config.compile != "auto":
-        return config.compile
-    return "on" if config.gradient_steps >= WORTH_COMPILING else "off"
+def is_compiled(config: RunConfig) -> bool:
+    """Whether a run is compiled: as configured; with "auto", if it is long enough to repay the compilation."""
+    return config.compile == "on" or (config.compile == "auto" and config.gradient_steps >= WORTH_COMPILING)
+
+
+def _passed(every: int, before: int, after: int) -> bool:
+    """Whether a multiple of `every` steps lies after `before` and not after `after`; 0 stands for never."""
+    return every > 0 and after // every > before // every
+
+
+@contextmanager
+def signals_to(handler: Callable[[int, FrameType | None], None], *signums: int) -> Iterator[None]:
+    """Inside, `handler` receives these signals; where it cannot, off the main thread, they are left alone."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    previous = {signum: signal.signal(signum, handler) for signum in signums}
+    try:
+        yield
+    finally:
+        for signum, handler_before in previous.items():
+            signal.signal(signum, handler_before)

@@ -1,8 +1,8 @@
-"""Randomness with names. One run seed; everything else is derived from it."""
+"""Random generators and their seeds, which are all derived from the one seed of the run."""
 
 import os
 import random
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 
 import numpy as np
@@ -35,30 +35,52 @@ def set_seeds(seed: int, deterministic: bool = True) -> None:
 
 
 def seed_globals(seed: int) -> None:
-    """The generators that belong to nobody: Python's, NumPy's old one, torch's on every device."""
+    """Seed the global generators: Python's, NumPy's legacy one, torch's on every device."""
     random.seed(seed)
-    np.random.seed(seed)  # noqa: NPY002  (other people's environments use it)
+    np.random.seed(seed)  # noqa: NPY002  (users' environments may draw from it)
     torch.manual_seed(seed)
     torch.cuda.manual_seed_all(seed)
 
 
 @contextmanager
 def globals_undisturbed() -> Iterator[None]:
-    """Whatever happens inside, Python's, NumPy's and torch's CPU generators go on afterwards as if it had not."""
+    """Restore the global generators afterwards: Python's, NumPy's legacy one, torch's on the CPU and on every GPU."""
     states = random.getstate(), np.random.get_state(), torch.get_rng_state()  # noqa: NPY002
+    gpus = torch.cuda.get_rng_state_all() if torch.cuda.is_initialized() else []
     try:
         yield
     finally:
         random.setstate(states[0])
         np.random.set_state(states[1])  # noqa: NPY002
         torch.set_rng_state(states[2])
+        if gpus:
+            torch.cuda.set_rng_state_all(gpus)
 
 
 def derive(seed: int, *path: int) -> int:
-    """A seed in 0 … 2³¹ − 1 for one use, unrelated to that of any other (seed, path): NumPy's SeedSequence."""
+    """A seed in 0 … 2³¹ − 1, unrelated to that of any other (seed, path); by NumPy's SeedSequence."""
     return int(np.random.SeedSequence(seed, spawn_key=path).generate_state(1)[0] >> 1)
 
 
 def generator(seed: int, device: torch.device, *path: int) -> torch.Generator:
-    """A named random generator: part of `State`, hence of every checkpoint."""
+    """A random generator of a run's own, seeded with `derive(seed, *path)`; as a field of `State` it is saved."""
     return torch.Generator(device).manual_seed(derive(seed, *path))
+
+
+class Generators:
+    """The random generators of a run, each with its own stream of the run's seed."""
+
+    def __init__(self, seed: int, device: torch.device) -> None:
+        self.action = generator(seed, device, 2)
+        """of the policy's actions, and of the noise in losses"""
+        self.minibatch = generator(seed, device, 3)
+        """of the rows of minibatches"""
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        """The state of each generator."""
+        return {name: stream.get_state() for name, stream in vars(self).items()}
+
+    def load_state_dict(self, states: Mapping[str, torch.Tensor]) -> None:
+        """Restore what `state_dict` returned."""
+        for name, stream in vars(self).items():
+            stream.set_state(states[name])

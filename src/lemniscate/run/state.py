@@ -1,42 +1,16 @@
 """Training states: what a checkpoint holds, and what a run asks of it."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from typing import Any, Generic, TypeVar
 
-import torch
-from torch import Generator, Tensor
-
-from lemniscate.data.action_noise import ActionNoise
-from lemniscate.data.replay import ReplayBuffer
-from lemniscate.nn.actor_critic import ActorCritic
-from lemniscate.nn.normalizer import RewardScale
 from lemniscate.nn.policies import Policy
 from lemniscate.optim.adam import Adam
 from lemniscate.optim.compiled import Compiled
 from lemniscate.optim.learner import Learner
-from lemniscate.run.seeding import generator
+from lemniscate.run.seeding import Generators
 
 Networks = TypeVar("Networks", bound=Any)
-
-
-class Generators:
-    """The random generators of a run, each with its own stream of the run's seed."""
-
-    def __init__(self, seed: int, device: torch.device) -> None:
-        self.action: Generator = generator(seed, device, 2)
-        """of the policy's actions, and of the noise in losses"""
-        self.minibatch: Generator = generator(seed, device, 3)
-        """of the rows of minibatches"""
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """The state of each generator."""
-        return {name: stream.get_state() for name, stream in vars(self).items()}
-
-    def load_state_dict(self, states: Mapping[str, Tensor]) -> None:
-        """Restore what `state_dict` returned."""
-        for name, stream in vars(self).items():
-            stream.set_state(states[name])
 
 
 @dataclass(kw_only=True)
@@ -83,34 +57,3 @@ class TrainState(Generic[Networks]):
         device = next(self.networks.parameters()).device
         for owner, name in self.per_step_methods():
             vars(owner)[name] = Compiled(getattr(owner, name), device)  # over the method of the class
-
-
-@dataclass(kw_only=True)
-class OnPolicyState(TrainState[ActorCritic]):
-    """The training state of the algorithms that learn from their newest rollout."""
-
-    reward_scale: RewardScale
-
-    def on_restart(self) -> None:
-        """Forget the running returns."""
-        self.reward_scale.on_restart()
-
-
-@dataclass(kw_only=True)
-class OffPolicyState(TrainState[Networks]):
-    """The training state of the algorithms that learn from a replay buffer."""
-
-    targets: Any
-    """target networks: copies that follow slowly"""
-    replay: ReplayBuffer
-    action_noise: ActionNoise
-    updates: int = 0
-    """gradient steps of the critics taken"""
-
-    def on_restart(self) -> None:
-        """Begin new sequences of action noise."""
-        self.action_noise.on_restart()
-
-    def on_warm_start(self) -> None:
-        """Copy the loaded networks into the targets."""
-        self.targets.load_state_dict(self.networks.target().state_dict())

@@ -1,9 +1,9 @@
-"""What a set of runs consists of: several algorithms times several seeds, a run directory for each.
+"""The directory of a sweep: several algorithms times several seeds, a run directory for each.
 
-    sweep.json          the seeds, and the Config of each algorithm
+    sweep.json        the seeds, and the Config of each algorithm
     ppo-1/, sac-1/…   the runs
 
-A run that has not begun is a directory with nothing but its `config.json`: it is resumed, from step 0, like any other.
+A run that has not begun is a directory with only a `config.json`; it is resumed from step 0, like any other.
 """
 
 import json
@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from lemniscate.errors import UserError
-from lemniscate.run.directory import SET, create_directory
+from lemniscate.run.directory import SWEEP, create_directory
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Sweep:
 
     @property
     def runs(self) -> dict[Path, dict[str, Any]]:
-        """The run directories, and what their `config.json` says: every algorithm with the first seed, and so on."""
+        """The run directories and the content of their `config.json`, ordered by seed, then by algorithm."""
         return {
             self.path / f"{algorithm}-{seed}": {"algorithm": algorithm, "config": {**config, "seed": seed}}
             for seed in self.seeds
@@ -33,25 +33,25 @@ class Sweep:
         }
 
     def create(self) -> None:
-        """Write `sweep.json` into a new directory. Raises `UserError` if there is something already."""
-        create_directory(self.path, SET, {"seeds": self.seeds, "configs": self.configs})
+        """Write `sweep.json` into a new directory. Raises `UserError` if the directory exists already."""
+        create_directory(self.path, SWEEP, {"seeds": self.seeds, "configs": self.configs})
 
     def create_runs(self) -> None:
-        """Make the run directories that are not there yet."""
+        """Create the run directories that do not exist yet."""
         for path, record in self.runs.items():
             if not (path / "config.json").exists():
                 create_directory(path, "config.json", record)
 
 
 def is_sweep(path: Path) -> bool:
-    """Whether a directory holds a set of runs."""
-    return (path / SET).exists()
+    """Whether a directory is that of a sweep."""
+    return (path / SWEEP).exists()
 
 
 def read_sweep(path: Path) -> Sweep:
-    """The set in a directory. Raises `UserError` if there is none."""
+    """The sweep in a directory. Raises `UserError` if there is none."""
     try:
-        record = json.loads((path / SET).read_text())
+        record = json.loads((path / SWEEP).read_text())
         return Sweep(path, record["seeds"], record["configs"])
     except (OSError, ValueError, KeyError, TypeError):
-        raise UserError(f"{path} is not a set of runs: it holds no {SET} that can be read.") from None
+        raise UserError(f"{path} is not a sweep: it holds no {SWEEP} that can be read.") from None

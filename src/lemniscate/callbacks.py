@@ -1,0 +1,78 @@
+"""Callbacks: functions of the user's that see a run while it trains, and may stop it."""
+
+from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
+from typing import Any
+
+import torch
+
+from lemniscate import named
+from lemniscate.errors import UserError
+from lemniscate.policy import TrainedPolicy
+from lemniscate.run.config import RunConfig
+from lemniscate.run.run import Watch
+from lemniscate.run.seeding import generator
+from lemniscate.run.state import TrainState
+from lemniscate.spec import Spec
+
+Callback = Callable[[int, Mapping[str, float], TrainedPolicy], object]
+"""(step, metrics, policy) of a logged line; a true result stops the run"""
+
+
+class PolicySnapshot(TrainedPolicy):
+    """The policy of a run at the line that a callback is shown. Its weights are copied when it is first used.
+
+    A callback may keep a policy that it has used. One that it has not used raises `UserError` later.
+    """
+
+    def __init__(self, copy_networks: Callable[[], Any], spec: Spec, config: RunConfig, step: int) -> None:
+        self.spec, self.config, self.step = spec, config, step
+        self._copy_networks = copy_networks
+        self._noise = generator(config.seed, torch.device("cpu"), 4)
+
+    def __getattr__(self, name: str) -> Any:  # called for what is not there: the networks, until they are copied
+        if name != "networks":
+            raise AttributeError(f"A policy has no attribute {name!r}.")
+        self.networks = self._copy_networks().eval()
+        return self.networks
+
+    def expire(self) -> None:
+        """Refuse to copy the weights from now on: the run goes on to change them."""
+        self._copy_networks = _too_late
+
+
+def watch_with(
+    callbacks: Sequence[Callback | str],
+    copy_networks: Callable[[TrainState], Any],
+    spec: Spec,
+    config: RunConfig,
+) -> Watch:
+    """What a run calls after each logged line: every callback in turn, each with a policy of its own.
+
+    Args:
+        callbacks: functions, or names of functions as `module:function`.
+        copy_networks: networks on the CPU that share nothing with those of the state.
+        spec: of the policy.
+        config: of the run.
+
+    Raises:
+        UserError: a callback that cannot be loaded or called.
+    """
+    functions = [named.find(one) if isinstance(one, str) else one for one in callbacks]
+    for function in functions:
+        if not callable(function):
+            raise UserError(f"A callback must be a function of (step, metrics, policy), not {function!r}.")
+
+    def watch(step: int, metrics: Mapping[str, float], state: TrainState) -> bool:
+        stop = False
+        for function in functions:
+            policy = PolicySnapshot(lambda: copy_networks(state), spec, config, step)
+            stop = bool(function(step, MappingProxyType(dict(metrics)), policy)) or stop
+            policy.expire()
+        return stop
+
+    return watch
+
+
+def _too_late() -> Any:
+    raise UserError("This policy was not used while its callback ran, and the run has changed since; use it there.")

@@ -1,0 +1,220 @@
+"""The commands. What a program reads goes to standard output (`evaluate --json`), what a person reads to the error one.
+
+Exit codes: 0 done, 1 training could not go on, 2 a mistake in what was asked, 130 stopped by Ctrl-C, 143 by SIGTERM.
+
+This module is light: help, and a mistake that can be seen without torch, take no time. `commands` does the work.
+"""
+
+import argparse
+import re
+import sys
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from pathlib import Path
+from shutil import get_terminal_size
+from typing import Any, NoReturn
+
+from lemniscate.algos import ALGORITHMS
+from lemniscate.console import say
+from lemniscate.errors import NonFiniteError, SweepError, UserError, WorkerError, is_installed, unknown_name
+
+COMMANDS = {
+    "train": "Train a policy, or one for each of several algorithms and seeds, to compare them.",
+    "resume": "Continue an interrupted run or sweep.",
+    "evaluate": "Play whole episodes with the newest policy of a run.",
+    "watch": "Show one episode in a window, or record it.",
+    "plot": "Draw the curves of a run, or compare several, grouped by all but the seed.",
+    "envs": "List the environments, their backends, and the preset that fits.",
+    "check": "Check that an environment is suitable for training.",
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; returns the exit code."""
+    given = argparse.Namespace(command=None)
+    try:
+        given = parse(sys.argv[1:] if arguments is None else arguments)
+        getattr(import_module("lemniscate.cli.commands"), given.command)(given)
+    except UserError as error:
+        say(error)
+        return 2
+    except (NonFiniteError, WorkerError) as error:
+        learning = given.command in ("train", "resume")
+        say(f"{error} Training stopped; the last checkpoint is as it was." if learning else error)
+        return 1
+    except SweepError as error:
+        say(error)
+        return 1
+    except KeyboardInterrupt as stopped:  # a run that was asked to stop has a sentence and a signal of its own
+        say(str(stopped) or "Interrupted.")
+        return 128 + getattr(stopped, "signum", 2)
+    except SystemExit as done:  # argparse has printed help, or the version
+        return int(done.code or 0)
+    return 0
+
+
+def parse(arguments: Sequence[str]) -> argparse.Namespace:
+    """The command and its options. Raises `UserError` with one sentence on what is not understood."""
+    words = _normalized(arguments)
+    parser, commands = _parsers()
+    if not words:
+        parser.print_help()
+        parser.exit()
+    if not words[0].startswith("-"):
+        if words[0] not in COMMANDS:
+            raise unknown_name("command", words[0], COMMANDS)
+        if words[0] == "train":
+            return _parse_train(commands["train"], words[1:])
+    given, rest = parser.parse_known_args(words)
+    if rest:
+        options = [option for option in commands[given.command]._option_string_actions if option.startswith("--")]
+        raise unknown_argument(rest, lambda flag: unknown_name("option", flag, options))
+    return given
+
+
+def algorithms() -> dict[str, str]:
+    """The algorithms, and the first line of each file, read from there: to import them is to import torch."""
+    folder = Path(__file__).parents[1] / "algos"
+    lines = {name: (folder / f"{name}.py").read_text().partition("\n")[0] for name in ALGORITHMS}
+    return {name: line.removeprefix('"""') for name, line in lines.items()}
+
+
+def add_train_options(parser: argparse.ArgumentParser) -> None:
+    """What `lemniscate train` takes besides the fields of a Config."""
+    parser.add_argument("--env", metavar="ID", help="environment id, or module:Class of your own")
+    parser.add_argument("--run", type=Path, metavar="DIR", help="run directory; must not exist [runs/…]")
+    parser.add_argument("--preset", metavar="NAME", help="tuned settings [those of the environment]")
+    parser.add_argument("--seeds", metavar="LIST", help="train one run per seed, such as 1-5 or 1,3,7, in parallel")
+    _add_endings(parser)
+
+
+class Parser(argparse.ArgumentParser):
+    """argparse, but a mistake is one sentence, and help has a line for most options."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(allow_abbrev=False, formatter_class=_Help, **options)
+
+    def error(self, message: str) -> NoReturn:
+        """Raise the `UserError` for a value that is missing."""
+        raise UserError(f"{message[0].upper()}{message[1:]}; --help lists what there is.")
+
+
+class _Help(argparse.RawDescriptionHelpFormatter):
+    """A wide first column; --[no-]flag where there are both; `INT …` for several; the epilog as it is."""
+
+    def __init__(self, prog: str) -> None:
+        super().__init__(prog, max_help_position=31, width=min(get_terminal_size((112, 24)).columns, 120) - 2)
+
+    def _format_action_invocation(self, action: argparse.Action) -> str:
+        if isinstance(action, argparse.BooleanOptionalAction):
+            return action.option_strings[0].replace("--", "--[no-]", 1)
+        if action.option_strings and action.nargs != 0:
+            return f"{action.option_strings[0]} {action.metavar}{' …' if action.nargs == '+' else ''}"
+        return super()._format_action_invocation(action)
+
+
+def _parsers() -> tuple[Parser, dict[str, Parser]]:
+    """The parser of everything, and that of each command."""
+    parser = Parser(prog="lemniscate", description="Train, evaluate and watch reinforcement-learning policies.")
+    parser.add_argument("--version", action=_Version, nargs=0, help="print the version")
+    commands = parser.add_subparsers(dest="command", required=True, title="commands", metavar="COMMAND")
+    subs = {name: commands.add_parser(name, help=text, description=text) for name, text in COMMANDS.items()}
+    subs["train"].usage = "lemniscate train ALGORITHM --env ID [--run DIR] [--preset NAME] [--FIELD VALUE …]"
+
+    subs["resume"].add_argument("run", type=Path, metavar="RUN", help="a run or a sweep")
+    _add_endings(subs["resume"])
+
+    sub = subs["evaluate"]
+    sub.add_argument("run", type=Path, metavar="RUN", help="a run or a checkpoint")
+    sub.add_argument("--episodes", type=int, default=100, metavar="INT", help="how many [100]")
+    sub.add_argument("--seed", type=int, default=0, metavar="INT", help="seed of the starts [0]")
+    sub.add_argument("--env-args", metavar="JSON", help="arguments of the environment [as in training]")
+    sub.add_argument("--backend", metavar="NAME", help="simulation backend [as in training]")
+    sub.add_argument("--json", action="store_true", help="print one JSON object on standard output")
+
+    sub = subs["watch"]
+    sub.add_argument("run", type=Path, metavar="RUN", help="a run or a checkpoint")
+    sub.add_argument("--video", type=Path, metavar="FILE", help=".gif, .webp or .mp4 instead of a window")
+    sub.add_argument("--seed", type=int, default=0, metavar="INT", help="seed of the start [0]")
+
+    subs["plot"].add_argument("runs", type=Path, nargs="+", metavar="RUN", help="runs or sweeps")
+
+    subs["envs"].add_argument("filter", nargs="?", default="", metavar="FILTER", help="a part of the id")
+
+    subs["check"].add_argument("env", metavar="ENV", help="an id, or module:Class of your own")
+    subs["check"].add_argument("--backend", metavar="NAME", help="simulation backend [chosen from the id]")
+    return parser, subs
+
+
+def _add_endings(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--track", metavar="LOGGER", help="additional logger: wandb, or module:Class of your own")
+    parser.add_argument(
+        "--callbacks", nargs="+", metavar="FUNCTION", help="module:function that sees each update and may stop the run"
+    )
+    parser.add_argument("--report", action="store_true", help="evaluate the final policy, and draw plots and videos")
+    parser.add_argument(
+        "--score", action="store_true", help="evaluate the final policy over 100 episodes and store the result"
+    )
+
+
+class _Version(argparse.Action):
+    """Prints the installed version; looking it up takes a while, so only when asked."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> NoReturn:
+        from importlib.metadata import version
+
+        print(f"lemniscate {version('lemniscate')}")
+        parser.exit()
+
+
+def _parse_train(parser: Parser, words: list[str]) -> argparse.Namespace:
+    titles = algorithms()
+    asks = "-h" in words or "--help" in words
+    if asks and (words[0].startswith("-") or "," in words[0]):
+        add_train_options(parser)
+        listed = "\n".join(f"  {name:<12}{title}" for name, title in titles.items())
+        parser.epilog = (
+            f"algorithms (several, such as ppo,sac, with --seeds; or a module of your own):\n{listed}\n\n"
+            "lemniscate train ALGORITHM --help lists the fields of that algorithm."
+        )
+        parser.print_help()
+        parser.exit()
+    names = list(dict.fromkeys(words[0].split(","))) if words and not words[0].startswith("-") else []
+    strangers = [name for name in names if name not in titles and not _is_own(name)]
+    misplaced = [word for word in words if word in titles]
+    if misplaced and (strangers or not names):
+        raise UserError(f"The algorithm comes first, then its fields: lemniscate train {misplaced[0]} …")
+    if not names:
+        raise UserError(f"Which algorithm? lemniscate train ALGORITHM …, with one of {', '.join(titles)}.")
+    if strangers:
+        raise unknown_name("algorithm", strangers[0], titles)
+    from lemniscate.cli.fields import parse_fields  # imports torch
+
+    return parse_fields(names, words[1:])
+
+
+def _is_own(name: str) -> bool:
+    """Whether `name` is of somebody's own algorithm: a module that is there, or one in a package."""
+    if not name.isidentifier():
+        return "." in name
+    return Path(f"{name}.py").exists() or Path(name).is_dir() or is_installed(name)
+
+
+def _normalized(arguments: Sequence[str]) -> list[str]:
+    """Flags with dashes for underscores, and a negative number joined to its flag, which argparse would misread."""
+    words: list[str] = []
+    for word in arguments:
+        if words and re.match(r"-[\d.]", word) and re.fullmatch(r"--[\w-]+", words[-1]):
+            words[-1] += f"={word}"
+        elif word.startswith("--"):
+            flag, equals, value = word.partition("=")
+            words.append(flag.replace("_", "-") + equals + value)
+        else:
+            words.append(word)
+    return words
+
+
+def unknown_argument(rest: list[str], sentence_for: Callable[[str], UserError]) -> UserError:
+    """The sentence for the arguments that no parser understood: `sentence_for` the first flag among them."""
+    flags = [word.partition("=")[0] for word in rest if word.startswith("-")]
+    return sentence_for(flags[0]) if flags else UserError(f"Unknown argument {rest[0]!r}; --help lists what there is.")

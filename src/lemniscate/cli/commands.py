@@ -1,0 +1,104 @@
+"""The commands' work: each takes what `parse` understood."""
+
+import argparse
+import json
+from typing import Any
+
+from lemniscate import api, sweep
+from lemniscate.algos import ALGORITHMS
+from lemniscate.cli.fields import read_json
+from lemniscate.console import say
+from lemniscate.envs import registry
+from lemniscate.envs.check import check as check_environment
+from lemniscate.errors import UserError
+from lemniscate.presets import best, choose
+from lemniscate.report import pictures
+from lemniscate.run.run import is_compiled
+from lemniscate.run.sweep_file import is_sweep
+
+MARKS = {"good": "✓", "note": "·", "bad": "✗"}
+
+
+def train(given: argparse.Namespace) -> None:
+    """Train one policy, or with --seeds one for each algorithm and seed."""
+    shared = {"run": given.run, "preset": given.preset, "track": given.track, "report": given.report, **given.fields}
+    if given.seeds is not None or "," in given.algorithm:
+        if given.callbacks:
+            raise UserError("--callbacks sees one run: it does not go with --seeds.")
+        if "seed" in given.fields:
+            raise UserError("Several runs have several seeds: --seeds 1-5, not --seed.")
+        if given.seeds is None:
+            raise UserError("Algorithms are compared over several seeds: add --seeds 1-5.")
+        say(f"Everything is in {sweep.train_sweep(given.algorithm, given.env, given.seeds, **shared).path}")
+        return
+    config = api.config_for(given.algorithm, given.env, given.preset, **given.fields)
+    if config.backend:
+        registry.require_backend(config.backend)
+    preset, _ = choose(given.algorithm, config.env, given.preset)
+    what = f"{given.algorithm} on {config.num_envs} × {config.env}, backend {config.backend}"
+    say(f"{what}: preset {preset}, seed {config.seed}, {'compiled' if is_compiled(config) else 'not compiled'}")
+    run = api.train(given.algorithm, config.env, **shared, **_callbacks(given))
+    if given.score:
+        api.final_return(run.path)
+    say(f"Trained in {run.seconds:.1f} s. Everything is in {run.path}")
+
+
+def resume(given: argparse.Namespace) -> None:
+    """Continue an interrupted run or sweep."""
+    if is_sweep(given.run):
+        if given.callbacks:
+            raise UserError(f"--callbacks sees one run: {given.run} is a sweep.")
+        run = sweep.resume_sweep(given.run, track=given.track, report=given.report)
+    else:
+        run = api.resume(given.run, track=given.track, report=given.report, **_callbacks(given))
+        if given.score:
+            api.final_return(run.path)
+    say(f"Done. Everything is in {run.path}")
+
+
+def evaluate(given: argparse.Namespace) -> None:
+    """Play whole episodes: scores as JSON on standard output, or as a sentence."""
+    own: dict[str, Any] = {} if given.env_args is None else {"env_kwargs": read_json("--env-args", given.env_args)}
+    policy = api.load(given.run)
+    scores = api.evaluate(policy, episodes=given.episodes, seed=given.seed, backend=given.backend, **own)
+    if given.json:
+        print(json.dumps(scores.to_json()))
+    else:
+        say(pictures.sentence(scores))
+
+
+def watch(given: argparse.Namespace) -> None:
+    """Show one episode in a window, or record it."""
+    said = api.watch(api.load(given.run), seed=given.seed, video=given.video)
+    if said:
+        say(said)
+
+
+def plot(given: argparse.Namespace) -> None:
+    """Draw the curves of one run, or compare several, grouped by all but the seed."""
+    for file in api.plot(*given.runs):
+        say(file)
+
+
+def envs(given: argparse.Namespace) -> None:
+    """List the environments, the backend of each, and the presets that fit."""
+    for env_id in registry.known_ids():
+        if given.filter.lower() in env_id.lower():
+            presets = ((algorithm, best(algorithm, env_id)) for algorithm in ALGORITHMS)
+            fitting = ", ".join(f"{algorithm}: {preset}" for algorithm, preset in presets if preset != "default")
+            say(f"{env_id:<40} {registry.backend_for(env_id):<12} {fitting or 'default'}")
+
+
+def check(given: argparse.Namespace) -> None:
+    """Say what was found about an environment; what keeps it from being trained on is an error."""
+    bad = 0
+    for finding in check_environment(given.env, given.backend):
+        bad += finding.grade == "bad"
+        say(f"{MARKS[finding.grade]} {finding.sentence}")
+    if bad:
+        raise UserError(f"{given.env} is not suitable for training: {bad} finding{'s' * (bad > 1)} above.")
+
+
+def _callbacks(given: argparse.Namespace) -> dict[str, Any]:
+    names = [name for word in given.callbacks or () for name in word.split(",")]
+    return {"callbacks": names} if names else {}

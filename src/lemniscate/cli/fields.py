@@ -1,0 +1,209 @@
+"""The options of `lemniscate train ALGORITHM`: one for each field of the algorithm's Config, generated from it."""
+
+import argparse
+import ast
+import inspect
+import json
+from contextlib import nullcontext, suppress
+from itertools import pairwise
+from textwrap import dedent, fill
+from types import NoneType
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+
+from lemniscate import glossary
+from lemniscate.algos import find
+from lemniscate.cli import Parser, add_train_options, unknown_argument
+from lemniscate.errors import UserError, prefix_errors
+from lemniscate.presets import PRESETS, names
+from lemniscate.run.config import RunConfig, options_of
+
+GROUPS: dict[str, tuple[str, ...]] = {
+    "run": ("seed", "total_steps", "device", "threads", "compile", "matmul", "warm_start"),
+    "environment": ("env_kwargs", "wrappers", "backend", "num_envs"),
+    "algorithm": (),
+    "networks": (
+        "network",
+        "hidden",
+        "critic_hidden",
+        "activation",
+        "initial_log_std",
+        "normalize_observations",
+    ),
+    "logging and checkpoints": (
+        "log_every",
+        "checkpoint_every",
+        "keep_checkpoints",
+        "evaluate_every",
+        "evaluate_episodes",
+        "video_every",
+    ),
+}
+"""the fields under each heading of the help; those that are not named here are the algorithm's"""
+
+SPELLED = {"env_kwargs": "--env-args"}
+"""flags with a name of their own"""
+
+
+def parse_fields(algorithms: list[str], words: list[str]) -> argparse.Namespace:
+    """What `words` say for all of `algorithms`; the fields of their Configs as a dictionary `fields`.
+
+    Raises:
+        UserError: a flag that one of the algorithms does not have, or a value that cannot be read.
+    """
+    fields: dict[str, Any] = {}
+    given = argparse.Namespace()
+    for algorithm in algorithms:
+        with prefix_errors(algorithm) if len(algorithms) > 1 else nullcontext():
+            given, own = _parse(algorithm, words)
+            fields |= own
+    given.command, given.algorithm, given.fields = "train", ",".join(algorithms), fields
+    return given
+
+
+def flag(name: str) -> str:
+    """How a field is written on the command line."""
+    return SPELLED.get(name, f"--{name.replace('_', '-')}")
+
+
+def read(name: str, hint: Any, text: Any) -> Any:
+    """The value that `text` (of a tuple, several texts) stands for; what cannot be read as `hint` says stays as it is.
+
+    The Config then says what would be right. Raises `UserError` for a dictionary that is not JSON.
+    """
+    options = options_of(hint)
+    if isinstance(text, list):
+        item = next(get_args(option)[0] for option in options if get_origin(option) is tuple)
+        parts = [part for word in text for part in _split(word)]
+        return () if parts == ["none"] else tuple(read(name, item, part) for part in parts)
+    if NoneType in options and text == "none":
+        return None
+    if any(_is_dict(option) for option in options):
+        return read_json(flag(name), text)
+    kinds = [_number(option) for option in options]
+    for kind in (int, float) if int in kinds else (float,) if float in kinds else ():
+        with suppress(ValueError):
+            return kind(text)
+    return text
+
+
+def read_json(option: str, text: str) -> dict[str, Any]:
+    """The dictionary that `text` is in JSON. Raises `UserError` for anything else."""
+    try:
+        value = json.loads(text)
+    except ValueError:
+        value = None
+    if not isinstance(value, dict):
+        raise UserError(f"""{option} must be a JSON object, such as '{{"gravity": -5}}', not {text}""")
+    return value
+
+
+def field_help(config: type[RunConfig]) -> dict[str, str]:
+    """The docstring below each field, read from the source of the Config and of those it inherits from."""
+    found: dict[str, str] = {}
+    for kind in reversed(config.__mro__[:-1]):
+        try:
+            (tree,) = ast.parse(dedent(inspect.getsource(kind))).body
+        except (OSError, TypeError):  # typed into an interpreter, say
+            continue
+        for field, below in pairwise(tree.body if isinstance(tree, ast.ClassDef) else []):
+            match field, below:
+                case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(text))):
+                    found[name] = " ".join(text.split())
+    return found
+
+
+def _parse(algorithm: str, words: list[str]) -> tuple[argparse.Namespace, dict[str, Any]]:
+    config = find(algorithm).Config
+    hints = get_type_hints(config, include_extras=True)
+    given, rest = _parser(algorithm, config, hints).parse_known_args(words)
+    if rest:
+        known = [*config.names(), "run", "preset", "seeds", "track", "report", "score", "callbacks"]
+        raise unknown_argument(rest, lambda word: glossary.unknown_field(word[2:].replace("-", "_"), known, flag))
+    values = {name: value for name, value in vars(given).items() if name in hints and name != "env"}
+    return given, {name: read(name, hints[name], value) for name, value in values.items()}
+
+
+def _parser(algorithm: str, config: type[RunConfig], hints: dict[str, Any]) -> Parser:
+    parser = Parser(
+        prog=f"lemniscate train {algorithm}",
+        usage=f"lemniscate train {algorithm} --env ID [--run DIR] [--preset NAME] [--FIELD VALUE …]",
+        epilog=_presets(algorithm),
+    )
+    add_train_options(parser)
+    texts, defaults = field_help(config), config()
+    grouped = {name for members in GROUPS.values() for name in members} | {"env"}
+    for title, members in GROUPS.items():
+        own = [name for name in config.names() if name not in grouped] if title == "algorithm" else members
+        group = parser.add_argument_group(title)
+        for name in own:
+            if name in hints:
+                _add(group, name, hints[name], texts.get(name, ""), getattr(defaults, name))
+    return parser
+
+
+def _presets(algorithm: str) -> str:
+    """The presets of an algorithm, and what the brackets of its help mean."""
+    listed = fill(f"presets: {', '.join(names(algorithm) if algorithm in PRESETS else ['default'])}", 110)
+    return f"{listed}\n[…] is the default, where neither --preset nor the environment's own preset says otherwise."
+
+
+def _add(group: argparse._ArgumentGroup, name: str, hint: Any, text: str, default: Any) -> None:
+    flags = list(dict.fromkeys([flag(name), f"--{name.replace('_', '-')}"]))
+    options = options_of(hint)
+    choices = [str(choice) for option in options if get_origin(option) is Literal for choice in get_args(option)]
+    if choices:
+        text += f" {{{', '.join(choices)}}}"
+    if default not in ((), {}) and "(default" not in text:
+        text += f" [{_shown(default)}]"
+    shared: dict[str, Any] = {"dest": name, "default": argparse.SUPPRESS, "help": text.replace("%", "%%")}
+    if bool in options:
+        group.add_argument(*flags, action=argparse.BooleanOptionalAction, **shared)
+    elif any(get_origin(option) is tuple for option in options):
+        group.add_argument(*flags, nargs="+", metavar=_metavar(options), **shared)
+    else:
+        group.add_argument(*flags, metavar=_metavar(options), **shared)
+
+
+def _metavar(options: tuple[Any, ...]) -> str:
+    """INT, FLOAT, NAME or JSON; `|none` where nothing is a value too."""
+    kinds: list[str] = []
+    for option in options:
+        if get_origin(option) is tuple:
+            kinds.append(_metavar(options_of(get_args(option)[0])))
+        elif option is not NoneType:
+            number = _number(option)
+            kinds.append("INT" if number is int else "FLOAT" if number else "JSON" if _is_dict(option) else "NAME")
+    return "|".join([*dict.fromkeys(kinds), *(["none"] if NoneType in options else [])])
+
+
+def _number(option: Any) -> type | None:
+    """Int or float, if it is one of them, with a range or without."""
+    kind = get_args(option)[0] if get_origin(option) is Annotated else option
+    return kind if kind in (int, float) else None
+
+
+def _is_dict(option: Any) -> bool:
+    return option is dict or get_origin(option) is dict
+
+
+def _shown(value: Any) -> str:
+    """A default, as it would be typed."""
+    if isinstance(value, bool):
+        return "on" if value else "off"
+    if isinstance(value, tuple):
+        return " ".join(map(_shown, value))
+    if isinstance(value, int):
+        return f"{value:_}" if value >= 10_000 else str(value)
+    return "none" if value is None else str(value)
+
+
+def _split(word: str) -> list[str]:
+    """The parts between commas that are in no bracket: "a:b(x=1,y=2),c:d" is two."""
+    parts, depth = [""], 0
+    for character in word:
+        depth += (character in "([{") - (character in ")]}")
+        if character == "," and depth == 0:
+            parts.append("")
+        else:
+            parts[-1] += character
+    return [part.strip() for part in parts if part.strip()]

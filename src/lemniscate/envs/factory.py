@@ -1,0 +1,86 @@
+"""How Gymnasium's environments are made: by an id, from a class or a function, with arguments and wrappers."""
+
+import inspect
+import multiprocessing
+import signal
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from multiprocessing import parent_process
+from typing import Any
+
+import gymnasium as gym
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+
+import lemniscate.envs.toy  # noqa: F401  (registers the toys)
+from lemniscate import named
+from lemniscate.envs.workers import WatchedVectorEnv
+from lemniscate.errors import UserError
+
+Maker = EnvSpec | Callable[..., Any]
+"""an entry of Gymnasium's registry, or a function (or class) that makes an environment"""
+
+
+def maker_of(env: str) -> Maker:
+    """How an environment is made: a registered id, `module:id`, or `module:name` of a class or function of one's own.
+
+    Raises `UserError` if it is not there, or is neither.
+    """
+    if ":" not in env:
+        return gym.spec(env)
+    _, _, name = env.rpartition(":")
+    if not named.is_passed(env):
+        named.module_of(env)  # to import a module may register ids
+        if name in gym.registry:
+            return gym.spec(name)
+    found = named.find(env)
+    if isinstance(found, type) and issubclass(found, gym.Env):
+        return EnvSpec(name.rpartition(".")[2], entry_point=found)
+    if (isinstance(found, type) and issubclass(found, VectorEnv)) or (callable(found) and not isinstance(found, type)):
+        return found
+    raise UserError(f"{env} cannot be made: {name} is neither an environment class, nor a function, nor an id.")
+
+
+def makes_vector(maker: Maker) -> bool:
+    """Whether it makes N environments at once: an id registered so, a `VectorEnv`, or what takes `num_envs`."""
+    if isinstance(maker, EnvSpec):
+        return maker.entry_point is None
+    is_class = isinstance(maker, type) and issubclass(maker, VectorEnv)
+    return is_class or "num_envs" in inspect.signature(maker).parameters
+
+
+def make_one(maker: Maker, wrappers: Sequence[Callable[..., Any]] = (), **kwargs: Any) -> gym.Env:
+    """One environment, by its maker: a worker process may not know the id.
+
+    There, Ctrl-C is left to the parent, which stops the run in order.
+    """
+    if parent_process() is not None:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    env = gym.make(maker, **kwargs) if isinstance(maker, EnvSpec) else maker(**kwargs)
+    for wrap in wrappers:
+        env = wrap(env)
+    if not isinstance(env, gym.Env):
+        raise TypeError(f"it is a {type(env).__name__}, and no gymnasium.Env")
+    return env
+
+
+def make_vector(
+    maker: Maker, num_envs: int, kwargs: Mapping[str, Any], wrappers: Sequence[Callable[..., Any]], workers: bool
+) -> tuple[VectorEnv, int | None]:
+    """N environments of a maker, and their time limit in steps; with `workers`, each in a process of its own."""
+    if makes_vector(maker):
+        make = partial(gym.make_vec, maker) if isinstance(maker, EnvSpec) else maker
+        envs = make(num_envs=num_envs, **kwargs)
+        return envs, envs.spec.max_episode_steps if envs.spec else None
+    makers = [partial(make_one, maker, wrappers, **kwargs)] * num_envs
+    if not workers:
+        envs = SyncVectorEnv(makers, autoreset_mode=AutoresetMode.DISABLED)
+        return envs, _time_limit(envs.envs[0])
+    multiprocessing.get_context("forkserver").set_forkserver_preload([__name__])  # imported once, for all
+    one = makers[0]()
+    one.close()
+    return WatchedVectorEnv(makers, context="forkserver", autoreset_mode=AutoresetMode.DISABLED), _time_limit(one)
+
+
+def _time_limit(env: gym.Env) -> int | None:
+    return env.spec.max_episode_steps if env.spec else None

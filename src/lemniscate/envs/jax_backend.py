@@ -1,0 +1,186 @@
+"""Environments that are functions of their state, in JAX: one compiled call a step, JAX to torch without a copy.
+
+    act → step → true observation, reward, ends → reset what ended → where to act next
+
+is traced once into a single XLA program, so every row is real.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lemniscate.errors import UserError
+from lemniscate.types import Step
+
+if TYPE_CHECKING:
+    import jax
+
+State: TypeAlias = Any
+"""a pytree of arrays"""
+
+Outcome: TypeAlias = tuple[Any, Any, Any, Any, dict[str, Any]]
+"""observation [N, O], reward [N], terminated [N], truncated [N], and measures by name, [N] each"""
+
+
+class JaxEnvs(Protocol):
+    """N parallel environments as pure functions of their state, fit to be traced."""
+
+    num_envs: int
+    device: Any
+    action_size: int
+    """A; actions are [N, A] float32 in [-1, 1]"""
+
+    def init(self, key: jax.Array) -> State:
+        """The state before the first reset, in which all randomness comes from `key`."""
+        ...
+
+    def reset(self, state: State, mask: jax.Array, stagger: jax.Array) -> tuple[State, jax.Array, jax.Array]:
+        """Begin an episode in the environments of `mask` [N] bool.
+
+        With `stagger`, a bool scalar, episodes may begin late or be cut early; which of all N begin such a fragment
+        is returned as [N] bool.
+
+        Returns:
+            (state, observation [N, O] float32, fragment [N])
+        """
+        ...
+
+    def step(self, state: State, action: jax.Array) -> tuple[State, Outcome]:
+        """Act in every environment, and reset none."""
+        ...
+
+
+class Programs:
+    """The two compiled programs of N environments: `restart(seed, stagger)` and `step(state, action, stagger)`."""
+
+    def __init__(self, envs: JaxEnvs) -> None:
+        import jax
+
+        def restart(seed: jax.Array, stagger: jax.Array) -> tuple[State, jax.Array, jax.Array]:
+            return envs.reset(envs.init(jax.random.key(seed)), jax.numpy.ones(envs.num_envs, dtype=bool), stagger)
+
+        def step(state: State, action: jax.Array, stagger: jax.Array) -> tuple[State, tuple[Any, ...]]:
+            state, (next_obs, reward, terminated, truncated, measures) = envs.step(state, action)
+            truncated = truncated & ~terminated
+            state, obs, fragment = envs.reset(state, terminated | truncated, stagger)
+            return state, (obs, next_obs, reward, terminated, truncated, fragment, measures)
+
+        self.envs = envs
+        self.restart, self.step = self._compile(restart, step)
+
+    def _compile(self, restart: Callable, step: Callable) -> tuple[Callable, Callable]:
+        """Both, traced one after the other, since tracing may use one object, but compiled side by side."""
+        import jax
+
+        seed, stagger = jax.device_put((np.uint32(0), np.bool_(False)), self.envs.device)
+        action = jax.device_put(np.zeros((self.envs.num_envs, self.envs.action_size), np.float32), self.envs.device)
+        lowered_restart = jax.jit(restart).lower(seed, stagger)
+        lowered_step = jax.jit(step).lower(lowered_restart.out_info[0], action, stagger)
+        with ThreadPoolExecutor(2) as pool:
+            programs = list(pool.map(lambda lowered: lowered.compile(), (lowered_restart, lowered_step)))
+        return programs[0], programs[1]
+
+
+class JaxBackend:
+    """N environments that are stepped by compiled programs; what a subclass adds is their making, and the Spec."""
+
+    compiled = True
+
+    def __init__(self, programs: Programs, num_envs: int, device: torch.device, *, stagger: bool) -> None:
+        import jax
+
+        self.num_envs, self.device = num_envs, device
+        self._programs, self._from_dlpack = programs, jax.dlpack.from_dlpack
+        # Committed to the device like everything that follows, or the step would be compiled a second time.
+        self._put = lambda value: jax.device_put(value, programs.envs.device)
+        self._stagger = self._put(np.bool_(stagger))
+        self._valid = torch.ones(num_envs, dtype=torch.bool, device=device)
+
+    def restart(self, seed: int) -> Tensor:
+        """Begin again from `seed`."""
+        self._state, obs, fragment = self._programs.restart(self._put(np.uint32(seed)), self._stagger)
+        self.counts = ~torch.from_dlpack(fragment)
+        return torch.from_dlpack(obs)
+
+    def step(self, action: Tensor) -> Step:
+        """[N, A] actions in [-1, 1]; every row of the answer is real."""
+        command = self._from_dlpack(action.contiguous())
+        self._state, (*out, measures) = self._programs.step(self._state, command, self._stagger)
+        obs, next_obs, reward, terminated, truncated, fragment = map(torch.from_dlpack, out)
+        self.counts = (self.counts | terminated | truncated) & ~fragment
+        named = {name: torch.from_dlpack(values) for name, values in measures.items()}
+        return Step(obs, next_obs, reward, terminated, truncated, self._valid, named)
+
+    def close(self) -> None:
+        """Nothing to give back: the programs are shared."""
+
+
+def jax_device(device: torch.device) -> str:
+    """What JAX calls a device of torch's. Raises `UserError` for cuda where JAX sees no GPU."""
+    import jax
+
+    if device.type == "cuda" and not any(d.platform == "gpu" for d in jax.devices()):
+        raise UserError("JAX sees no GPU, so this cannot run on cuda; it comes with: pip install 'jax[cuda12]'")
+    return "gpu" if device.type == "cuda" else "cpu"
+
+
+class Vectorized:
+    """`JaxEnvs` from the two functions of a single environment, with a time limit.
+
+    `reset(key) -> (state, obs [O])` and `step(state, action [A]) -> (state, obs [O], reward, terminated, measures)` are
+    pure functions of one environment. With staggering, the first episode of each is cut after a random number of
+    steps, uniform up to the time limit.
+    """
+
+    def __init__(
+        self, reset: Callable, step: Callable, num_envs: int, action_size: int, max_steps: int, device: Any
+    ) -> None:
+        self.num_envs, self.action_size, self.device = num_envs, action_size, device
+        self._reset, self._step, self._max_steps = reset, step, max_steps
+
+    def init(self, key: jax.Array) -> State:
+        """Keys, and environments that have not begun."""
+        import jax
+
+        key, begin = jax.random.split(key)
+        states, obs = jax.vmap(self._reset)(jax.random.split(begin, self.num_envs))
+        nothing = jax.numpy.zeros(self.num_envs, dtype=int)
+        return {"key": key, "env": states, "obs": obs, "age": nothing, "limit": nothing}
+
+    def reset(self, state: State, mask: jax.Array, stagger: jax.Array) -> tuple[State, jax.Array, jax.Array]:
+        """Fresh states where `mask`; a limit of 0 is that of an environment before its first episode."""
+        import jax
+
+        jnp = jax.numpy
+        key, begin, where = jax.random.split(state["key"], 3)
+        fresh, fresh_obs = jax.vmap(self._reset)(jax.random.split(begin, self.num_envs))
+
+        def choose(new: jax.Array, old: jax.Array) -> jax.Array:
+            return jnp.where(mask.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+
+        fragment = mask & stagger & (state["limit"] == 0)
+        cut = jax.random.randint(where, (self.num_envs,), 1, self._max_steps + 1)
+        limit = jnp.where(fragment, cut, self._max_steps)
+        obs = choose(fresh_obs, state["obs"])
+        state = {
+            "key": key,
+            "env": jax.tree.map(choose, fresh, state["env"]),
+            "obs": obs,
+            "age": choose(jnp.zeros_like(state["age"]), state["age"]),
+            "limit": choose(limit, state["limit"]),
+        }
+        return state, obs, fragment
+
+    def step(self, state: State, action: jax.Array) -> tuple[State, Outcome]:
+        """Every environment one step on."""
+        import jax
+
+        env, obs, reward, terminated, measures = jax.vmap(self._step)(state["env"], action)
+        age = state["age"] + 1
+        return {**state, "env": env, "obs": obs, "age": age}, (obs, reward, terminated, age >= state["limit"], measures)

@@ -1,0 +1,97 @@
+"""Objects of a user's own by name: `module:name` in a file, the object itself where it was passed in this process."""
+
+import ast
+import importlib
+import sys
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from lemniscate.errors import UserError
+
+_PASSED: dict[str, Any] = {}
+"""every object that was passed in this process, by its name"""
+
+
+def name_of(thing: object) -> str:
+    """The name by which `find` returns an object: `module:qualname`. A string is taken to be a name already.
+
+    A lambda or a local class gets a name too, which is of use in this process only.
+    """
+    if isinstance(thing, str):
+        return thing
+    module = getattr(thing, "__module__", type(thing).__module__)
+    qualname = getattr(thing, "__qualname__", f"<{type(thing).__name__}>")
+    name, number = f"{module}:{qualname}", 1
+    while "<" in qualname and _PASSED.get(name, thing) is not thing:
+        number += 1
+        name = f"{module}:{qualname}#{number}"
+    _PASSED[name] = thing
+    return name
+
+
+def is_passed(name: str) -> bool:
+    """Whether an object of this name was passed in this process."""
+    return name in _PASSED
+
+
+def find(name: str) -> Any:
+    """The object that `name` names.
+
+    Raises:
+        UserError: no such module or object; an object that only the process that was given it can know.
+    """
+    if name in _PASSED:
+        return _PASSED[name]
+    found: Any = module_of(name)
+    module_name, _, qualname = name.rpartition(":")
+    for part in qualname.split("."):
+        if not hasattr(found, part):
+            again = "; it was defined in another program: pass the object again." if module_name == "__main__" else "."
+            raise UserError(f"{name} cannot be found: {module_name} has no {qualname}{again}")
+        found = getattr(found, part)
+    return found
+
+
+def module_of(name: str) -> ModuleType:
+    """The module of `module:name`, imported; it is looked for in the working directory too. Raises `UserError`."""
+    module_name, _, qualname = name.rpartition(":")
+    if not module_name or not qualname:
+        raise UserError(f"{name!r} is no name of an object; it has the form module:name.")
+    if "<" in name:
+        raise UserError(f"{name} is not kept in any file, since it was made inside a program: pass the object again.")
+    if str(Path.cwd()) not in sys.path:
+        sys.path.insert(0, str(Path.cwd()))
+    try:
+        return importlib.import_module(module_name)
+    except ImportError as error:
+        raise UserError(f"{name} cannot be found: {error}.") from error
+
+
+def find_callable(text: str) -> Callable[..., Any]:
+    """The function or class that `module:name` names, or with `module:name(key=value, …)` one with these arguments.
+
+    The values are literals of Python: numbers, strings, True, None, and lists, tuples and dictionaries of these.
+
+    Raises:
+        UserError: as `find`; arguments that are no literals; an object that cannot be called.
+    """
+    name, opening, rest = (text, "", "") if is_passed(text) else text.partition("(")
+    found = find(name.strip())
+    if not callable(found):
+        raise UserError(f"{name} is neither a function nor a class.")
+    if not opening:
+        return found
+    try:
+        call = ast.parse(f"f({rest}", mode="eval").body
+        if not isinstance(call, ast.Call) or any(keyword.arg is None for keyword in call.keywords):
+            raise ValueError("not a call")
+        keywords = {str(keyword.arg): ast.literal_eval(keyword.value) for keyword in call.keywords}
+        positional = [ast.literal_eval(value) for value in call.args]
+    except (SyntaxError, ValueError) as error:
+        raise UserError(f"{text!r} cannot be read; it has the form module:name(key=1.0, other='text').") from error
+    if positional:
+        raise UserError(f"The arguments of {name} need their names: {name}(key=value, …).")
+    return partial(found, **keywords)

@@ -1,0 +1,146 @@
+"""Settings and training state of the algorithms that learn from a replay buffer."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from lemniscate.data.action_noise import ActionNoise, Kind
+from lemniscate.data.replay import ReplayBuffer, bytes_per_transition
+from lemniscate.errors import UserError
+from lemniscate.nn.activations import Activation
+from lemniscate.nn.networks import Layers, Matmul, has_bfloat16
+from lemniscate.run.config import Count, Fraction, Natural, NonNegative, Positive, RunConfig
+from lemniscate.run.state import Networks, TrainState
+from lemniscate.spec import Spec
+
+
+@dataclass(frozen=True, kw_only=True)
+class OffPolicyConfig(RunConfig):
+    """The settings of algorithms that learn from a replay buffer."""
+
+    num_envs: Count = 1
+    """number of parallel environments, N; usually 1 to 8"""
+    gamma: Fraction = 0.99
+    """discount factor γ; usually 0.95 to 0.999"""
+    buffer_size: Count = 1_000_000
+    """transitions in the replay buffer; the oldest are replaced"""
+    batch_size: Count = 256
+    """rows of each gradient step, M; usually 64 to 512"""
+    learning_starts: Natural = 5_000
+    """environment steps with random actions before the first update; usually 1,000 to 25,000"""
+    update_every: Count = 1
+    """steps of each environment between updates"""
+    num_updates: Count = 1
+    """gradient steps of the critics at each update; so num_updates / (N · update_every) for each environment step"""
+    log_every: Count = 500
+    """steps of each environment between lines of metrics; evaluations and checkpoints wait for the next one"""
+    actor_learning_rate: Positive = 3e-4
+    """step size of the policy's Adam; usually 1e-4 to 1e-3"""
+    critic_learning_rate: Positive = 3e-4
+    """step size of the critics' Adam; usually 1e-4 to 1e-3"""
+    final_learning_rate: Fraction = 1.0
+    """final value of both as a fraction of the initial one, annealed linearly; 1: constant"""
+    tau: Fraction = 0.005
+    """τ, the share by which the target networks move at each update; usually 0.001 to 0.02"""
+    policy_delay: Count = 1
+    """gradient steps of the critics for each of the policy and the target networks; usually 1 or 2"""
+    action_noise: Kind = "white"
+    """noise of actions in training: white, ou (Ornstein–Uhlenbeck) or coloured"""
+    noise_time: Positive = 6.7
+    """correlation time of Ornstein–Uhlenbeck noise in steps; θ = 0.15 of DDPG's paper is 1 / 0.15"""
+    noise_exponent: NonNegative = 1.0
+    """β of coloured noise, whose power falls as f^(−β); 1 is pink"""
+    hidden: tuple[Count, ...] = (256, 256)
+    """widths of the policy's hidden layers"""
+    critic_hidden: tuple[Count, ...] = (256, 256)
+    """widths of each critic's hidden layers"""
+    activation: Activation = "relu"
+    """activation function between the layers; simba has its own"""
+    network: str = "mlp"
+    """mlp, layer_norm (the same with layer normalization), simba (residual blocks of one width), or module:Class"""
+    matmul: Matmul = "float32"
+    """precision of the products between hidden layers; bfloat16 is faster where the processor has it"""
+    normalize_observations: bool = False
+    """normalize observations by their running mean and standard deviation, inside the policy"""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for layers in self.network_settings[:2]:
+            layers.check()
+        if self.learning_starts >= self.total_steps:
+            raise UserError(
+                f"learning_starts must be below total_steps, or nothing is ever learned: {self.learning_starts:,} is"
+                f" not below {self.total_steps:,}."
+            )
+        if not self.gradient_steps:
+            raise UserError(
+                f"update_every {self.update_every:,} is so large that nothing is ever learned: after learning_starts"
+                f" each environment takes {self.steps_per_env - self.learning_starts // self.num_envs:,} steps."
+            )
+        for name in ("batch_size", "num_envs"):
+            if self.capacity < (rows := getattr(self, name)):
+                raise UserError(
+                    f"The replay buffer must hold a batch, and a step of every environment: the smaller of buffer_size"
+                    f" {self.buffer_size:,} and the {self.num_envs * self.steps_per_env:,} steps of the run is"
+                    f" below {name} {rows:,}."
+                )
+
+    def notices(self, spec: Spec, device: torch.device) -> list[str]:
+        """The size of the replay buffer; and products in bfloat16 where the processor has none."""
+        size = self.capacity * bytes_per_transition(spec) / 1e6
+        notices = [f"Replay buffer: {self.capacity:,} transitions, {size:,.1f} MB (also in each checkpoint)."]
+        if self.matmul == "bfloat16" and not has_bfloat16(device):
+            notices.append("This processor has no products in bfloat16; --matmul float32 is faster.")
+        return notices
+
+    @property
+    def network_settings(self) -> tuple[Layers, Layers, bool]:
+        """The hidden layers of the policy and of each critic, and whether observations are normalized."""
+        shared = self.activation, self.network, self.matmul
+        return Layers(self.hidden, *shared), Layers(self.critic_hidden, *shared), self.normalize_observations
+
+    @property
+    def capacity(self) -> int:
+        """The rows of the replay buffer: no more than the run can fill."""
+        return min(self.buffer_size, self.num_envs * self.steps_per_env)
+
+    @property
+    def steps_per_env(self) -> int:
+        """Steps of each environment in the whole run: the first multiple of log_every that reaches total_steps."""
+        return -(-self.total_steps // (self.num_envs * self.log_every)) * self.log_every
+
+    @property
+    def gradient_steps(self) -> int:
+        """The number of gradient steps of the critics in the whole run."""
+        updates = self.steps_per_env // self.update_every
+        return self.num_updates * (updates - self.learning_starts // self.num_envs // self.update_every)
+
+    def make_action_noise(self, spec: Spec, device: torch.device) -> ActionNoise:
+        """Action noise for the environments of a run; a sequence is as long as an episode may be."""
+        shape, length = (self.num_envs, spec.bounded_box().size), spec.max_episode_steps or 1000
+        return ActionNoise(self.action_noise, shape, length, device, time=self.noise_time, exponent=self.noise_exponent)
+
+    def updates_at(self, step: int) -> bool:
+        """Whether an update follows environment step `step`."""
+        return step > self.learning_starts and step // self.num_envs % self.update_every == 0
+
+
+@dataclass(kw_only=True)
+class OffPolicyState(TrainState[Networks]):
+    """The training state of the algorithms that learn from a replay buffer."""
+
+    targets: Any
+    """target networks: copies that follow slowly"""
+    replay: ReplayBuffer
+    action_noise: ActionNoise
+    updates: int = 0
+    """gradient steps of the critics taken"""
+
+    def on_restart(self) -> None:
+        """Begin new sequences of action noise."""
+        self.action_noise.on_restart()
+
+    def on_warm_start(self) -> None:
+        """Copy the loaded networks into the targets."""
+        self.targets.load_state_dict(self.networks.target().state_dict())

@@ -1,0 +1,73 @@
+"""Settings and training state of the algorithms that learn from their newest rollout."""
+
+from dataclasses import dataclass
+
+from lemniscate.errors import UserError
+from lemniscate.nn.activations import Activation
+from lemniscate.nn.actor_critic import ActorCritic
+from lemniscate.nn.networks import Layers
+from lemniscate.nn.normalizer import RewardScale
+from lemniscate.run.config import Count, Fraction, LogStd, RunConfig
+from lemniscate.run.state import TrainState
+from lemniscate.spec import Spec
+
+
+@dataclass(frozen=True, kw_only=True)
+class OnPolicyConfig(RunConfig):
+    """The settings of algorithms that learn from their newest rollout."""
+
+    num_steps: Count = 128
+    """steps of each environment between updates, T; usually 16 to 2048, so that N · T is about 2048"""
+    gamma: Fraction = 0.99
+    """discount factor γ; usually 0.9 to 0.999"""
+    hidden: tuple[Count, ...] = (64, 64)
+    """widths of the hidden layers of the policy, and of the value"""
+    activation: Activation = "tanh"
+    """activation function between the layers"""
+    network: str = "mlp"
+    """mlp, layer_norm (the same with layer normalization), simba (residual blocks of one width), or module:Class"""
+    initial_log_std: LogStd = -0.5
+    """initial log σ of a Gaussian policy, in units of half the action range; usually -1 to 0"""
+    normalize_observations: bool = True
+    """normalize observations by their running mean and standard deviation, inside the policy"""
+    scale_rewards: bool = True
+    """divide rewards by the running standard deviation of the discounted return"""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.layers.check()
+
+    def networks(self, spec: Spec) -> ActorCritic:
+        """New networks for the spaces in `spec`: the policy and V(s)."""
+        return ActorCritic(spec, self.layers, self.initial_log_std, self.normalize_observations)
+
+    @property
+    def layers(self) -> Layers:
+        """The hidden layers of the policy, and of the value."""
+        return Layers(self.hidden, self.activation, self.network)
+
+    @property
+    def num_rows(self) -> int:
+        """The number of rows of a rollout, T · N."""
+        return self.num_steps * self.num_envs
+
+    @property
+    def num_rollouts(self) -> int:
+        """The number of rollouts of the whole run."""
+        return -(-self.total_steps // self.num_rows)
+
+    def _require_rows(self, field: str, rows: int) -> None:
+        """Raise `UserError` if `field`, which standardizes, would have a single row to do it with."""
+        if rows == 1 and getattr(self, field):
+            raise UserError(f"{field} needs batches of 2 rows or more; these have 1.")
+
+
+@dataclass(kw_only=True)
+class OnPolicyState(TrainState[ActorCritic]):
+    """The training state of the algorithms that learn from their newest rollout."""
+
+    reward_scale: RewardScale
+
+    def on_restart(self) -> None:
+        """Forget the running returns."""
+        self.reward_scale.on_restart()

@@ -1,0 +1,60 @@
+"""The logger of Weights & Biases (extra `wandb`)."""
+
+import os
+from collections.abc import Mapping
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from lemniscate.console import say
+from lemniscate.envs.episodes import Episodes
+from lemniscate.run.loggers import NO_EPISODES, Metrics
+
+
+class WeightsAndBiases:
+    """A W&B run. Without a key or a network it is recorded offline, and a line says how to upload it later."""
+
+    def __init__(self, path: Path, config: Mapping[str, Any], step: int) -> None:
+        wandb: Any = import_module("wandb")
+        self._wandb = wandb
+        mode = os.environ.get("WANDB_MODE", "online")
+        if mode == "online" and not os.environ.get("WANDB_API_KEY") and not wandb.login(prompt=False):
+            mode = "offline"
+        options = {
+            "project": os.environ.get("WANDB_PROJECT", "lemniscate"),
+            "name": os.environ.get("WANDB_NAME", path.name),
+            "tags": [str(config["env"]), *filter(None, os.environ.get("WANDB_TAGS", "").split(","))],
+            "config": dict(config),
+            "dir": str(path),
+            "id": _stable_id(path),
+            "resume": "allow" if mode == "online" else None,
+        }
+        settings = wandb.Settings(init_timeout=20, silent=True)
+        try:
+            self._run = wandb.init(mode=mode, settings=settings, **options)
+        except (wandb.errors.CommError, wandb.errors.AuthenticationError):
+            mode = "offline"
+            wandb.teardown()
+            self._run = wandb.init(mode=mode, settings=settings, **{**options, "resume": None})
+        if mode == "offline":
+            say(f"W&B records offline; upload later with: wandb sync {path}/wandb/offline-run-*")
+
+    def write(self, step: int, metrics: Metrics, episodes: Episodes = NO_EPISODES) -> None:
+        """Log one row."""
+        self._run.log(dict(metrics), step=step)
+
+    def close(self, pictures: list[Path]) -> None:
+        """Upload the pictures and finish."""
+        if pictures:
+            self._run.log(
+                {picture.stem: self._wandb.Image(str(picture)) for picture in pictures if picture.suffix == ".png"}
+            )
+        self._run.finish()
+
+
+def _stable_id(path: Path) -> str:
+    """The W&B id of a run directory, kept in a file so that a resumed run continues its own curve."""
+    file = path / "wandb-id"
+    if not file.exists():
+        file.write_text(os.urandom(6).hex())
+    return file.read_text()

@@ -1,0 +1,112 @@
+"""The contract of an algorithm as checks for a test suite; the library's own algorithms pass the same ones.
+
+    from lemniscate.testing import ALGORITHM_CONTRACT
+
+    @pytest.mark.parametrize("check", ALGORITHM_CONTRACT)
+    def test_contract(check, tmp_path):
+        check(my_algorithm, tmp_path, env="CartPole-v1", total_steps=4_000)
+
+Each check takes the algorithm (its name or module), an empty folder, and the arguments of `lemniscate.train`; it raises
+`AssertionError` with a sentence. Choose settings with which a run takes a few seconds and several updates.
+"""
+
+import dataclasses
+import inspect
+import math
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import torch
+
+from lemniscate import algos, api
+from lemniscate.run import checkpoint
+from lemniscate.run.config import RunConfig
+from lemniscate.run.loggers import read_metrics
+from lemniscate.run.state import TrainState
+
+SIGNATURES = {"init": ["config", "spec", "device"], "train": ["config", "run"]}
+
+
+def check_names(algorithm: str | ModuleType, folder: Path, **settings: Any) -> None:
+    """The module has `Config`, `State`, `init` and `train`, of the common kinds and with the common arguments."""
+    module = algos.find(algorithm)
+    for name, base in (("Config", RunConfig), ("State", TrainState)):
+        kind = getattr(module, name, None)
+        assert inspect.isclass(kind), f"There is no class {name}."
+        assert issubclass(kind, base), f"{name} must be a subclass of {base.__name__}."
+        assert dataclasses.is_dataclass(kind), f"{name} must be a dataclass."
+    for name, expected in SIGNATURES.items():
+        function = getattr(module, name, None)
+        assert callable(function), f"There is no function {name}({', '.join(expected)})."
+        found = list(inspect.signature(function).parameters)
+        assert found == expected, f"{name} must take ({', '.join(expected)}), not ({', '.join(found)})."
+    module.Config()  # every setting has a default
+
+
+def check_training(algorithm: str | ModuleType, folder: Path, **settings: Any) -> None:
+    """A run reaches its last step with finite metrics, and its policy can be loaded and evaluated."""
+    run = api.train(algorithm, run=folder / "run", progress=False, **settings)
+    total = run.policy.config.total_steps
+    assert run.policy.step >= total, f"The run ended at step {run.policy.step}, before its {total} steps."
+    metrics = read_metrics(run.path)
+    assert metrics, "No metrics were logged: call run.log after every update."
+    bad = {name for line in metrics for name, x in line.items() if isinstance(x, float) and not math.isfinite(x)}
+    assert not bad, f"These metrics are not finite: {', '.join(sorted(bad))}."
+    scores = api.evaluate(api.load(run.path), episodes=2, seed=0)
+    assert scores == api.evaluate(run.policy, episodes=2, seed=0), "The loaded policy differs from the trained one."
+
+
+def check_seeds(algorithm: str | ModuleType, folder: Path, **settings: Any) -> None:
+    """The seed determines the run: the same one gives the same bits, another one others."""
+    again = {"seed": 1, **settings}
+    runs = [api.train(algorithm, run=folder / f"run-{i}", progress=False, **again).path for i in range(2)]
+    assert _same(*map(_last_checkpoint, runs)), "Two runs with the same seed end in different bits."
+    other = api.train(algorithm, run=folder / "other", progress=False, **{**again, "seed": again["seed"] + 1}).path
+    assert not _same(_last_checkpoint(runs[0]), _last_checkpoint(other)), "Another seed ends in the same bits."
+
+
+def check_resume(algorithm: str | ModuleType, folder: Path, **settings: Any) -> None:
+    """A run that was stopped and resumed ends in the bits of one that was not."""
+    whole = api.train(algorithm, run=folder / "whole", progress=False, **settings)
+    half = whole.policy.config.total_steps // 2
+    stopped = folder / "stopped"
+    api.train(algorithm, run=stopped, progress=False, callbacks=[lambda step, *_: step >= half], **settings)
+    api.resume(stopped, progress=False)
+    difference = _difference(_last_checkpoint(whole.path), _last_checkpoint(stopped))
+    assert difference is None, f"{difference} differs after a resume: is it a field of State that is saved?"
+
+
+def check_compilation(algorithm: str | ModuleType, folder: Path, **settings: Any) -> None:
+    """A compiled run computes what one without compilation does, to rounding, for its first update."""
+    rows = []
+    for compile in ("off", "on"):
+        path = api.train(algorithm, run=folder / compile, progress=False, **{**settings, "compile": compile}).path
+        rows.append({name: x for name, x in read_metrics(path)[0].items() if name.startswith("losses/")})
+    off, on = rows
+    for name, value in off.items():
+        assert math.isclose(value, on[name], rel_tol=1e-3, abs_tol=1e-5), (
+            f"Compiled, {name} is {on[name]}, not {value}."
+        )
+
+
+ALGORITHM_CONTRACT = (check_names, check_training, check_seeds, check_resume)
+"""all checks but `check_compilation`, which takes a minute"""
+
+
+def _last_checkpoint(path: Path) -> checkpoint.Checkpoint:
+    last = checkpoint.list_steps(path / "checkpoints")[-1]
+    return checkpoint.read(path / "checkpoints" / f"step-{last}")
+
+
+def _same(one: checkpoint.Checkpoint, other: checkpoint.Checkpoint) -> bool:
+    return _difference(one, other) is None
+
+
+def _difference(one: checkpoint.Checkpoint, other: checkpoint.Checkpoint) -> str | None:
+    """The name of the first tensor or number that differs."""
+    for name in {**one.tensors, **other.tensors}:
+        both = name in one.tensors and name in other.tensors
+        if not (both and torch.equal(one.tensors[name], other.tensors[name])):
+            return name
+    return next((name for name, x in one.numbers.items() if other.numbers.get(name) != x), None)

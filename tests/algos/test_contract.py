@@ -1,0 +1,25 @@
+"""Every algorithm passes the contract that `lemniscate.testing` offers for algorithms of one's own."""
+
+import pytest
+
+from lemniscate.algos import ALGORITHMS
+from lemniscate.testing import ALGORITHM_CONTRACT
+
+ON_POLICY = {"env": "CartPole-v1", "num_envs": 4, "num_steps": 32, "total_steps": 1280, "hidden": (8,)}
+OFF_POLICY = {
+    "env": "Pendulum-v1",
+    "num_envs": 2,
+    "total_steps": 400,
+    "log_every": 20,
+    "learning_starts": 50,
+    "batch_size": 16,
+    "hidden": (8,),
+    "critic_hidden": (8,),
+}
+
+
+@pytest.mark.parametrize("check", ALGORITHM_CONTRACT, ids=lambda check: check.__name__)
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_the_contract_holds(check, algorithm, tmp_path):
+    settings = OFF_POLICY if algorithm in ("ddpg", "td3", "sac") else ON_POLICY
+    check(algorithm, tmp_path, **settings, checkpoint_every=settings["total_steps"] // 4, evaluate_episodes=2)

@@ -1,0 +1,171 @@
+"""Environments by id, class and function, with arguments and wrappers; and what they measure."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+import environments
+from lemniscate.envs import registry, toy
+from lemniscate.errors import UserError
+
+
+class Reach(gym.Env):
+    """Episodes of `length` steps; success is reached in the last one, or never in every other environment."""
+
+    observation_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+    action_space = gym.spaces.Discrete(2)
+    metadata = {"render_modes": [], "measures": ["height"]}  # noqa: RUF012
+
+    def __init__(self, length=4, reward=1.0, render_mode=None):
+        self.length, self.reward = length, reward
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.t += 1
+        info = {"is_success": self.t == self.length, "unnamed": 7.0}
+        if self.t != 2:
+            info["height"] = float(self.t)
+        return np.zeros(1, np.float32), self.reward, self.t == self.length, False, info
+
+
+class PlusOne(gym.RewardWrapper):
+    def __init__(self, env, by=1.0):
+        super().__init__(env)
+        self.by = by
+
+    def reward(self, reward):
+        return reward + self.by
+
+
+def times_ten(env):
+    return gym.wrappers.TransformReward(env, lambda reward: 10 * reward)
+
+
+def reward_of(env, **kwargs):
+    made = registry.make(env, 2, **kwargs)
+    try:
+        made.restart(0)
+        return made.step(torch.zeros(2, dtype=torch.int64)).reward[0].item()
+    finally:
+        made.close()
+
+
+def test_an_environment_is_named_in_four_ways():
+    assert reward_of(f"{__name__}:Reach", kwargs={"reward": 2.0}) == 2
+    assert reward_of(Reach, kwargs={"reward": 3.0}) == 3
+    assert reward_of(lambda reward=4.0: Reach(reward=reward)) == 4
+    assert reward_of(lambda reward: Reach(reward=reward), kwargs={"reward": 5.0}) == 5
+    assert reward_of(lambda num_envs: toy.Countdown(num_envs, "DISABLED")) == 1
+
+
+@pytest.mark.parametrize("backend", ["gymnasium", "gymnasium-async"])
+def test_wrappers_are_applied_in_order(backend):
+    wrappers = (f"{__name__}:PlusOne", times_ten, f"{__name__}:PlusOne(by=0.5)")
+    assert reward_of(Reach, wrappers=wrappers, backend=backend) == 20.5
+    assert reward_of(Reach, wrappers=(times_ten, PlusOne), backend=backend) == 11
+
+
+def test_gymnasiums_own_arguments_and_wrappers():
+    assert registry.make("Pendulum-v1", 2).spec.max_episode_steps == 200
+    assert registry.make("Pendulum-v1", 2, kwargs={"max_episode_steps": 7}).spec.max_episode_steps == 7
+    limited = registry.make(Reach, 2, wrappers=["gymnasium.wrappers:TimeLimit(max_episode_steps=3)"])
+    assert limited.spec.max_episode_steps == 3
+    limited.restart(0)
+    for t in range(3):
+        step = limited.step(torch.zeros(2, dtype=torch.int64))
+        assert step.truncated.all() == (t == 2)
+    stacked = registry.make("CartPole-v1", 2, wrappers=["gymnasium.wrappers:FrameStackObservation(stack_size=3)"])
+    assert stacked.spec.observation_parts[0].shape == (3, 4)
+
+
+def test_wrappers_choose_the_backend_that_can_wrap():
+    assert registry.backend_for("CartPole-v1") == "envpool"
+    assert registry.backend_for("CartPole-v1", ("gymnasium.wrappers:ClipReward",)) == "gymnasium"
+
+
+@pytest.mark.parametrize(
+    ("env", "fields", "said"),
+    [
+        ("Pendulum-v1", {"kwargs": {"gravity": 1}}, "Pendulum-v1 cannot be made with gravity=1"),
+        ("Pendulum-v1", {"kwargs": ["g"]}, "The arguments of an environment are a dictionary"),
+        (Reach, {"wrappers": [f"{__name__}:PlusOne(of=2)"]}, "unexpected keyword argument 'of'"),
+        (Reach, {"wrappers": ["gymnasium.wrappers:Nothing"]}, "gymnasium.wrappers has no Nothing"),
+        (Reach, {"wrappers": ["math:sqrt"]}, "cannot be made with math:sqrt: must be real number"),
+        ("EnvPool/Pong-v5", {"wrappers": ["m:f"]}, "The envpool backend cannot wrap EnvPool/Pong-v5"),
+        ("DroneLanding-v0", {"wrappers": ["m:f"]}, "The crazyflow backend cannot wrap DroneLanding-v0"),
+        ("DroneLanding-v0", {"kwargs": {"dynamic": 1}}, "did you mean dynamics"),
+        ("DroneLanding-v0", {"kwargs": {"dynamics": "heavy"}}, "cannot be made with {'dynamics': 'heavy'}"),
+        ("Countdown-v0", {"wrappers": [times_ten]}, "it takes no wrappers"),
+        (Reach(), {}, "env is an environment that is made already; give its class"),
+        (3, {}, "env is 3; give its class"),
+        (lambda: 3, {}, "it is a int, and no gymnasium.Env"),
+        (dict, {}, "neither an environment class, nor a function, nor an id"),
+    ],
+)
+def test_what_cannot_be_made_is_said(env, fields, said):
+    with pytest.raises(UserError) as raised:
+        registry.make(env, 2, **fields)
+    assert said in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+def test_measures_are_what_the_metadata_names_and_success():
+    env = registry.make(Reach, 2)
+    env.restart(0)
+    steps = [env.step(torch.zeros(2, dtype=torch.int64)).measures for _ in range(5)]
+    assert set(steps[0]) == {"is_success", "height"}
+    assert [step["is_success"][0].item() for step in steps] == [0, 0, 0, 1, 0]
+    assert steps[0]["height"].tolist() == [1, 1]
+    assert "height" not in steps[1]
+
+
+def test_a_measure_of_some_environments_is_nan_in_the_others():
+    def make():
+        env = Reach()
+        env.metadata = {"render_modes": [], "measures": ["height"]}
+        return env
+
+    class Half(gym.Wrapper):
+        def reset(self, *, seed=None, options=None):
+            self.first = seed == 0
+            return super().reset(seed=seed, options=options)
+
+        def step(self, action):
+            *rest, info = super().step(action)
+            return (*rest, info if self.first else {})
+
+    env = registry.make(make, 2, wrappers=[Half])
+    env.restart(0)
+    measures = env.step(torch.zeros(2, dtype=torch.int64)).measures
+    assert measures["height"][0] == 1
+    assert measures["height"][1].isnan()
+
+
+def test_actions_of_another_shape_are_refused():
+    env = registry.make("CartPole-v1", 4)
+    env.restart(0)
+    with pytest.raises(UserError, match=r"Actions have the shape \(4,\) in 4 × CartPole-v1, not \(3,\)"):
+        env.step(torch.zeros(3, dtype=torch.int64))
+
+
+@pytest.mark.parametrize(
+    ("shape", "laid_out"),
+    [((9, 12, 3), (9, 12, 3)), ((3, 9, 12), (9, 12, 3)), ((4, 84, 84), (84, 84, 4)), ((4, 9, 12, 3), (9, 12, 12)), ((4, 3, 9, 12), (9, 12, 12))],
+)  # fmt: skip
+def test_images_are_brought_to_one_layout(shape, laid_out):
+    """Channels first or last, stacked or not: pixel (y, x) of picture s and channel c stands at s · C + c."""
+    env = registry.make(lambda: environments.Pictures(shape), 2)
+    obs = env.restart(0)
+    assert env.spec.image
+    assert env.spec.observation_parts[0].shape == laid_out
+    raw = np.stack([environments.Pictures(shape).reset(seed=seed)[0] for seed in (0, 1)])
+    channel_axis = int(np.argmin(shape[-3:])) - 3
+    expected = np.moveaxis(raw, channel_axis, -1)
+    if len(shape) == 4:
+        expected = np.moveaxis(expected, 1, -2)
+    assert torch.equal(obs.view(2, *laid_out), torch.from_numpy(expected.reshape(2, *laid_out)))

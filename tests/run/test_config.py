@@ -1,0 +1,110 @@
+"""What a Config takes, what it makes of it, and what it says of the rest."""
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+import pytest
+import torch
+
+from lemniscate.algos import ppo
+from lemniscate.errors import UserError
+from lemniscate.run.config import RunConfig
+
+
+@dataclass(frozen=True, kw_only=True)
+class Config(RunConfig):
+    """One field of each kind."""
+
+    plain: float = 1.0
+    whole: int = 1
+    flag: bool = True
+    word: str | None = None
+    which: Literal["a", "b"] | float = "a"
+    words: tuple[str, ...] = ()
+    arguments: dict[str, Any] = field(default_factory=dict)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "kept"),
+    [
+        ("total_steps", 1e6, 1_000_000),
+        ("total_steps", np.int64(3), 3),
+        ("total_steps", np.float64(1e5), 100_000),
+        ("total_steps", torch.tensor(7), 7),
+        ("seed", np.uint32(2**32 - 1), 2**32 - 1),
+        ("gamma", np.float32(0.5), 0.5),
+        ("gamma", 1, 1.0),
+        ("hidden", [32, 16.0], (32, 16)),
+        ("hidden", np.array([32, 16]), (32, 16)),
+        ("hidden", (), ()),
+        ("hidden", range(1, 3), (1, 2)),
+        ("max_grad_norm", None, None),
+        ("normalize_advantage", np.bool_(False), False),
+    ],
+)
+def test_numbers_of_every_kind_become_pythons(name, value, kept):
+    value = getattr(ppo.Config(**{name: value}), name)
+    assert value == kept
+    assert type(value) is type(kept)
+    assert all(type(item) is int for item in (value if isinstance(value, tuple) else ()))
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("epochs", 1.5, "epochs must be a whole number at least 1, not 1.5."),
+        ("epochs", True, "epochs must be a whole number at least 1, not True."),
+        ("epochs", float("nan"), "epochs must be a whole number at least 1, not nan."),
+        ("epochs", float("inf"), "epochs must be a whole number at least 1, not inf."),
+        ("epochs", "3", "epochs must be a whole number at least 1, not '3'."),
+        ("epochs", None, "epochs must be a whole number at least 1, not None."),
+        ("seed", -1, "seed must be a whole number from 0 to 4,294,967,295, not -1."),
+        ("gamma", 2, "gamma must be a number from 0 to 1, not 2."),
+        ("target_kl", 0, "target_kl must be a number above 0 or None, not 0."),
+        ("hidden", 64, "hidden must be several numbers, such as (64, 64), not 64."),
+        ("hidden", "64", "hidden must be several numbers, such as (64, 64), not '64'."),
+        ("hidden", [8, 0], "hidden must be a whole number at least 1, not 0."),
+        ("activation", "x", "activation must be one of tanh, relu, elu, silu, not 'x'."),
+        ("normalize_advantage", "no", "normalize_advantage must be True or False, not 'no'."),
+        ("env", 3, "env must be a text, not 3."),
+    ],
+)
+def test_a_value_that_does_not_fit_is_told_with_what_would(name, value, said):
+    with pytest.raises(UserError) as caught:
+        ppo.Config(**{name: value})
+    assert str(caught.value) == said
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("plain", "x", "plain must be a number, not 'x'."),
+        ("whole", 0.5, "whole must be a whole number, not 0.5."),
+        ("word", 3, "word must be a text or None, not 3."),
+        ("which", "c", "which must be one of a, b or a number, not 'c'."),
+        ("words", "x", "words must be several names, such as ('module:name',), not 'x'."),
+        ("words", [3], "words must be a text, not 3."),
+        ("arguments", "x", "arguments must be a dictionary, such as {'gravity': -5}, not 'x'."),
+        (
+            "arguments",
+            {"x": object},
+            "arguments must be a dictionary of what JSON can hold, not {'x': <class 'object'>}.",
+        ),
+    ],
+)
+def test_fields_of_ones_own_are_checked_by_their_types(name, value, said):
+    with pytest.raises(UserError) as caught:
+        Config(**{name: value})
+    assert str(caught.value) == said
+
+
+def test_fields_of_every_kind_are_the_same_after_json():
+    config = Config(word="w", which=0.5, words=["a", "b"], arguments={"x": [1, 2]}, plain=2)
+    assert (config.which, config.words, config.plain) == (0.5, ("a", "b"), 2.0)
+    assert Config.from_json(config.to_json()) == config
+
+
+def test_a_config_of_another_version_is_refused():
+    with pytest.raises(UserError, match="written by another version of lemniscate: there is no field engine now"):
+        ppo.Config.from_json({**ppo.Config().to_json(), "engine": "auto"})
