@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import re
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Self, get_args, get_origin, get_type_hints
 
@@ -58,8 +59,9 @@ class RunConfig:
     total_steps: Count = 1_000_000
     """environment steps of the whole run, summed over the parallel environments; it ends with the update that reaches
     them"""
-    device: Literal["auto", "cpu", "cuda"] = "cpu"
-    """device of the networks, and of simulators that can use it; auto takes cuda if there is one"""
+    device: str = "cpu"
+    """device of the networks, and of simulators that can use it: cpu, cuda, cuda:N (GPU N, from 0) or mps; auto takes
+    cuda if there is one"""
     threads: Count = 1
     """CPU threads for torch; results differ in rounding between thread counts"""
     compile: Literal["auto", "on", "off"] = "auto"
@@ -86,6 +88,8 @@ class RunConfig:
                     self._check(name, item, get_args(hint)[0])
             else:
                 raise UserError(f"{name} must be several numbers, such as (64, 64), not {value!r}.")
+        if not re.fullmatch(r"auto|cpu|mps|cuda(:(0|[1-9][0-9]*))?", str(self.device)):
+            raise UserError(f"device must be one of auto, cpu, cuda, cuda:N (like cuda:1), mps, not {self.device!r}.")
 
     @staticmethod
     def _check(name: str, value: Any, hint: Any) -> None:
