@@ -8,9 +8,7 @@ import torch
 
 import lemniscate as lem
 from conftest import tiny_off_policy
-from lemniscate.envs import toy
-from lemniscate.envs.gymnasium import GymnasiumBackend
-from lemniscate.envs.vec_env import VecEnv
+from lemniscate.envs import registry
 from lemniscate.nn.actor_critic import ActorQ, SoftActorQ
 from lemniscate.nn.networks import Layers
 from lemniscate.report import curves
@@ -20,8 +18,6 @@ from lemniscate.run.loggers import read_metrics
 from lemniscate.run.q_bias import QBias
 from lemniscate.spec import Box, ObservationPart, Spec
 from test_off_policy import Levers
-
-CPU = torch.device("cpu")
 
 
 def networks(spec, **fields):
@@ -33,11 +29,8 @@ def networks(spec, **fields):
 @pytest.mark.parametrize(
     ("length", "horizon", "gamma"), [(5, None, 0.9), (None, 4, 0.9), (5, None, 1.0), (None, 4, 0.0)]
 )
-def test_what_followed_is_the_discounted_return_and_after_a_time_out_what_q_expects(
-    monkeypatch, mode, length, horizon, gamma
-):
-    monkeypatch.setattr(toy, "Countdown", Levers)
-    env = VecEnv(GymnasiumBackend("Countdown-v0", 3, CPU, mode=mode, length=length, horizon=horizon))
+def test_what_followed_is_the_discounted_return_and_after_a_time_out_what_q_expects(mode, length, horizon, gamma):
+    env = registry.make(Levers, 3, kwargs={"mode": mode, "length": length, "horizon": horizon})
     nets = networks(env.spec)
     q_bias = evaluate(nets.policy, env, 8, seed=0, critic=(nets, gamma)).q_bias
     predicted, realised = [], []
@@ -56,12 +49,11 @@ def test_what_followed_is_the_discounted_return_and_after_a_time_out_what_q_expe
 @pytest.mark.parametrize("timed_out", [False, True])
 def test_entropy_counts_from_the_second_step_on(monkeypatch, rng, timed_out):
     """Two steps of reward 1, γ = ½, at a temperature of 2; after a time-out with the state in which the clock stopped."""
-    monkeypatch.setattr(toy, "Countdown", Levers)
     ends = {"length": None, "horizon": 2} if timed_out else {"length": 2}
-    env = VecEnv(GymnasiumBackend("Countdown-v0", 1, CPU, **ends))
+    env = registry.make(Levers, 1, kwargs=ends)
     nets = networks(env.spec, initial_temperature=2.0)
     seen = []
-    monkeypatch.setattr(ActorQ, "entropy_bonus", lambda *_: seen.append(1) or torch.tensor([10.0]))
+    monkeypatch.setattr(SoftActorQ, "entropy_bonus", lambda *_: seen.append(1) or torch.tensor([10.0]))
     q_bias = evaluate(nets.policy, env, 1, seed=0, critic=(nets, 0.5)).q_bias
     last = torch.tensor([[0.0, 0.0, 2.0]])
     follows = nets.q(last, nets.policy(last).mode()).item() + 10 if timed_out else 0
