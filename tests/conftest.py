@@ -51,7 +51,7 @@ def tiny_off_policy(**fields):
     """Keyword arguments of `lem.train` for an algorithm that learns from memory, over in a moment."""
     defaults = {
         "num_envs": 2,
-        "num_steps": 8,
+        "log_every": 8,
         "total_steps": 256,
         "learning_starts": 32,
         "buffer_size": 100,  # less than the run: the ring goes round
