@@ -80,8 +80,14 @@ class RunConfig:
             elif isinstance(value, (tuple, list)):
                 for item in value:
                     self._check(name, item, get_args(hint)[0])
+            elif name == "wrappers":
+                raise UserError(f"wrappers must be several names, such as ('module:Class',), not {value!r}.")
             else:
                 raise UserError(f"{name} must be several numbers, such as (64, 64), not {value!r}.")
+        try:
+            json.dumps(self.env_kwargs)
+        except TypeError as error:
+            raise UserError(f"env_kwargs must be a dictionary that JSON can keep: {error}.") from None
 
     @staticmethod
     def _check(name: str, value: Any, hint: Any) -> None:
