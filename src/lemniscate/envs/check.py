@@ -12,7 +12,8 @@ from gymnasium.vector import AutoresetMode
 
 from lemniscate.envs import registry
 from lemniscate.envs.factory import make_one, maker_of
-from lemniscate.envs.spaces import follow, is_image, observation_parts
+from lemniscate.envs.images import is_image
+from lemniscate.envs.spaces import follow, observation_parts
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import NonFiniteError, UserError
 from lemniscate.spec import Action, Box, Discrete, MultiDiscrete

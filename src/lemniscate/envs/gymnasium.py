@@ -13,7 +13,7 @@ from torch import Tensor
 
 from lemniscate.envs.backend import Summary
 from lemniscate.envs.episodes import Stagger
-from lemniscate.envs.factory import make_one, make_vector, maker_of, makes_vector
+from lemniscate.envs.factory import make_one, make_vector, maker_of, makes_vector, sentences
 from lemniscate.envs.masks import ActionMasks
 from lemniscate.envs.measures import SUMMARIES, measured, measures_of
 from lemniscate.envs.spaces import (
@@ -83,10 +83,8 @@ class GymnasiumBackend:
             raise UserError(f"{env} makes {num_envs} environments at once, so there is none for a process of its own.")
         wraps = tuple(map(find_callable, wrappers))
         self._build = partial(make_vector, maker, num_envs, dict(kwargs or {}), wraps, self.workers)
-        try:
+        with sentences(env, kwargs, wrappers):
             self._envs, limit = self._build()
-        except (gym.error.Error, ImportError, TypeError, ValueError, AssertionError) as error:
-            raise UserError(f"{env} cannot be made{_with(kwargs or {}, wrappers)}: {error}") from error
         self.mode = self._envs.metadata.get("autoreset_mode")
         if not isinstance(self.mode, AutoresetMode):
             raise UserError(f"{env} does not say when it resets: its metadata needs an autoreset_mode.")
@@ -184,8 +182,3 @@ class AsyncGymnasiumBackend(GymnasiumBackend):
     def ids(cls) -> Collection[str]:
         """None."""
         return ()
-
-
-def _with(kwargs: Mapping[str, Any], wrappers: Sequence[str]) -> str:
-    given = [f"{name}={value!r}" for name, value in kwargs.items()] + list(wrappers)
-    return f" with {', '.join(given)}" if given else ""
