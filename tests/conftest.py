@@ -48,7 +48,7 @@ def tiny_fields(env="Countdown-v0", **fields):
 
 
 def tiny_off_policy(**fields):
-    """Keyword arguments of `lem.train` for an algorithm that learns from memory, over in a moment."""
+    """Keyword arguments of `lem.train` for an off-policy algorithm, over in a moment."""
     defaults = {
         "num_envs": 2,
         "log_every": 8,

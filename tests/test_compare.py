@@ -16,7 +16,7 @@ from lemniscate.run import checkpoint
 
 @dataclasses.dataclass
 class Weightless:
-    """A State of which nothing is asked."""
+    """A training state without networks."""
 
     step: int = 0
 

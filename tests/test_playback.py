@@ -3,6 +3,7 @@
 import io
 import textwrap
 
+import gymnasium as gym
 import nbformat
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from lemniscate.report import playback
 @pytest.fixture(scope="module")
 def policy(tmp_path_factory):
     path = tmp_path_factory.mktemp("watch") / "run"
-    return lem.train("ppo", "CartPole-v1", run=path, progress=False, total_steps=2048, engine="eager").policy
+    return lem.train("ppo", "CartPole-v1", run=path, progress=False, total_steps=2048, compile="off").policy
 
 
 def test_a_notebook_shows_the_episode_while_it_is_played(tmp_path):
@@ -24,7 +25,7 @@ def test_a_notebook_shows_the_episode_while_it_is_played(tmp_path):
     cell = textwrap.dedent(
         f"""
         import lemniscate as lem
-        run = lem.train("ppo", "CartPole-v1", run={str(tmp_path / "run")!r}, progress=False, total_steps=2048, engine="eager")
+        run = lem.train("ppo", "CartPole-v1", run={str(tmp_path / "run")!r}, progress=False, total_steps=2048, compile="off")
         lem.watch(run.policy, seed=1)
         """
     )
@@ -72,11 +73,10 @@ def test_a_terminal_is_no_notebook():
 
 def test_a_window_is_opened_and_closed(policy, monkeypatch):
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    opened = []
-    rendered = playback._rendered
-    monkeypatch.setattr(playback, "_rendered", lambda *asked: opened.append(rendered(*asked)) or opened[-1])
+    opened, make = [], gym.make
+    monkeypatch.setattr(gym, "make", lambda *spec, **kwargs: opened.append(make(*spec, **kwargs)) or opened[-1])
     assert lem.watch(policy, seed=3) is None
-    (env,) = opened
+    (env,) = (env for env in opened if env.render_mode)
     assert env.render_mode == "human"
     assert not env.unwrapped.isopen
 

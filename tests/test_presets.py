@@ -3,23 +3,37 @@
 import pytest
 
 from lemniscate import presets
+from lemniscate.algos import ALGORITHMS
 from lemniscate.errors import UserError
 from lemniscate.presets.on_policy import FIGURE_EIGHT
 
 
 @pytest.mark.parametrize("algorithm", presets.PRESETS)
-def test_each_environment_gets_its_own_unasked(algorithm):
-    assert presets.PRESETS[algorithm][0].name == "default"
-    for preset in presets.PRESETS[algorithm][1:]:
+def test_each_environment_gets_its_own_unless_another_is_named(algorithm):
+    for preset in presets.PRESETS[algorithm]:
         name, config = presets.choose(algorithm, preset.config.env, None)
         assert config.env == preset.config.env
-        assert name != "default"
+        assert name != "default" or preset.name == "paper"
         assert preset.source
         assert preset.date
-    assert presets.choose(algorithm, "Acrobot-v1", None)[0] == "default"
 
 
-def test_one_name_may_serve_several_environments():
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_an_unknown_environment_gets_the_defaults_of_the_config(algorithm):
+    for name in (None, "default"):
+        config = ALGORITHMS[algorithm].Config(env="Acrobot-v1")
+        assert presets.choose(algorithm, "Acrobot-v1", name) == ("default", config)
+    assert presets.names(algorithm)[0] == "default"
+
+
+def test_the_settings_of_the_paper_are_a_preset():
+    config = presets.choose("ppo", "Walker2d-v5", "paper")[1]
+    assert config.env == "Walker2d-v5"
+    assert (config.num_steps, config.epochs, config.minibatch_size, config.learning_rate) == (256, 10, 64, 3e-4)
+    assert (config.gamma, config.gae_lambda, config.clip, config.desired_kl) == (0.99, 0.95, 0.2, None)
+
+
+def test_one_name_may_be_of_several_environments():
     assert presets.choose("ppo", "LunarLander-v3", "course")[1].hidden == (128, 128)
     assert presets.choose("ppo", FIGURE_EIGHT, "course")[1].num_envs == 1024
     assert presets.choose("ppo", None, "course")[1].env == FIGURE_EIGHT
@@ -34,11 +48,11 @@ def test_the_course_has_the_settings_of_its_notebook():
     assert (config.batch_size, config.hidden, config.critic_hidden) == (256, (256, 256), (256, 256))
     assert (config.actor_learning_rate, config.critic_learning_rate, config.final_learning_rate) == (3e-4, 3e-4, 1.0)
     assert (config.gamma, config.tau, config.policy_delay) == (0.99, 0.005, 2)
-    assert (config.noise, config.noise_std) == ("white", 0.1)
+    assert (config.action_noise, config.noise_std) == ("white", 0.1)
     assert (config.num_envs, config.num_updates, config.update_every) == (1, 1, 1)
-    assert (config.architecture, config.activation, config.normalize_observations) == ("mlp", "relu", False)
+    assert (config.network, config.activation, config.normalize_observations) == ("mlp", "relu", False)
 
 
-def test_an_unknown_one_is_named():
+def test_an_unknown_name_is_an_error_with_the_nearest_one():
     with pytest.raises(UserError, match="did you mean hopper"):
         presets.choose("ppo", "Hopper-v5", "hoper")

@@ -1,4 +1,4 @@
-"""ReplayBuffer: every transition whole, in the ring it belongs to, and back in every bit."""
+"""ReplayBuffer: whole transitions in a ring, drawn uniformly, restored bit for bit."""
 
 from types import SimpleNamespace
 
@@ -18,15 +18,15 @@ SPEC = Spec("x", (ObservationPart((), (3,)),), Box((-1.0, -1.0), (1.0, 1.0)))
 
 
 def numbered(first, count):
-    """Transitions whose every number says which one it belongs to."""
+    """Transitions, every number of which says to which one it belongs."""
     n = torch.arange(first, first + count, dtype=torch.float32)
     return Transition(
         n[:, None].expand(-1, 3), -n[:, None].expand(-1, 2), 2 * n, n[:, None].expand(-1, 3) + 0.5, n % 2 == 0
     )
 
 
-def of(rows):
-    """Which ones these are; fails if a row is put together from several."""
+def numbers_of(rows):
+    """The numbers of these transitions; fails if a row is put together from several."""
     n = rows.obs[:, 0]
     assert torch.equal(rows.obs, n[:, None].expand(-1, 3))
     assert torch.equal(rows.action, -n[:, None].expand(-1, 2))
@@ -37,20 +37,20 @@ def of(rows):
 
 
 @given(st.lists(st.integers(0, 7), max_size=30), st.integers(7, 20))
-def test_it_holds_the_last_ones_each_of_one_piece(counts, capacity):
+def test_it_holds_the_last_transitions_each_of_them_whole(counts, capacity):
     replay, written = ReplayBuffer(SPEC, capacity, CPU), 0
     for count in counts:
         replay.extend(numbered(written, count))
         written += count
     assert len(replay) == min(written, capacity)
-    held = of(replay.transitions[: len(replay)])
+    held = numbers_of(replay.transitions[: len(replay)])
     assert sorted(held) == list(range(max(0, written - capacity), written))
 
 
-def test_every_row_is_drawn_and_none_that_is_not_filled(rng):
+def test_every_filled_row_is_drawn_and_no_other(rng):
     replay = ReplayBuffer(SPEC, 50, CPU)
     replay.extend(numbered(0, 8))
-    rows = replay.draw(400, 20, rng)
+    rows = replay.sample_indices(400, 20, rng)
     assert rows.shape == (400, 20)
     counts = torch.bincount(rows.flatten(), minlength=8)
     assert len(counts) == 8
@@ -58,7 +58,7 @@ def test_every_row_is_drawn_and_none_that_is_not_filled(rng):
 
 
 @pytest.mark.parametrize("written", [0, 5, 10, 13])
-def test_it_comes_back_in_every_bit_and_goes_on_alike(written):
+def test_a_checkpoint_restores_it_bit_for_bit(written):
     replay, other = ReplayBuffer(SPEC, 10, CPU), ReplayBuffer(SPEC, 10, CPU)
     other.extend(numbered(100, 7))
     if written:
@@ -73,7 +73,7 @@ def test_it_comes_back_in_every_bit_and_goes_on_alike(written):
         assert torch.equal(mine, its)
 
 
-def test_what_is_saved_is_not_copied():
+def test_state_dict_copies_nothing():
     replay = ReplayBuffer(SPEC, 10, CPU)
     replay.extend(numbered(0, 4))
     saved = replay.state_dict()
@@ -92,7 +92,7 @@ def test_an_image_stays_bytes():
     assert ReplayBuffer(image, 5, CPU).transitions.next_obs.dtype == torch.uint8
 
 
-def test_what_does_not_fit_is_refused_with_what_would(monkeypatch):
+def test_a_capacity_beyond_the_free_memory_is_refused_with_one_that_fits(monkeypatch):
     monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=3700))
     with pytest.raises(UserError, match="choose buffer_size at most 100"):
         ReplayBuffer(SPEC, 101, CPU)

@@ -5,6 +5,7 @@ import math
 
 import pytest
 import torch
+from test_off_policy import Levers
 
 import lemniscate as lem
 from conftest import tiny_off_policy
@@ -17,7 +18,6 @@ from lemniscate.run.evaluate import evaluate
 from lemniscate.run.loggers import read_metrics
 from lemniscate.run.q_bias import QBias
 from lemniscate.spec import Box, ObservationPart, Spec
-from test_off_policy import Levers
 
 
 def networks(spec, **fields):

@@ -49,5 +49,7 @@ def _with_own_code(method: Callable[P, R]) -> Callable[P, R]:
     """
     assert isinstance(method, MethodType)
     function = method.__func__
-    copied = FunctionType(function.__code__.replace(), function.__globals__, function.__name__)
+    code, names = function.__code__.replace(), function.__globals__
+    copied = FunctionType(code, names, function.__name__, function.__defaults__, function.__closure__)
+    copied.__kwdefaults__ = function.__kwdefaults__
     return MethodType(copied, method.__self__)

@@ -1,0 +1,67 @@
+"""Policy and critics for the spaces of an environment."""
+
+import pytest
+import torch
+
+from helpers import equal, spec_of
+from lemniscate.errors import UserError
+from lemniscate.nn.actor_critic import ActorCritic, ActorQ, SoftActorQ
+from lemniscate.nn.networks import Layers
+from lemniscate.nn.normalizer import NoNorm, RunningNorm
+from lemniscate.nn.policies import DeterministicPolicy, SquashedGaussianPolicy
+
+SMALL = Layers((8,))
+
+
+def test_policy_and_value_share_one_normalizer():
+    networks = ActorCritic(spec_of(), Layers(), normalize_observations=True)
+    assert networks.policy.normalizer is networks.value.normalizer
+    assert isinstance(networks.policy.normalizer, RunningNorm)
+    assert type(ActorCritic(spec_of(), Layers()).policy.normalizer) is NoNorm
+
+
+def test_policy_and_critics_share_one_normalizer():
+    networks = ActorQ(spec_of(), SMALL, SMALL, True, critics=2)
+    assert all(q.normalizer is networks.policy.normalizer for q in networks.critics.members)
+    names = [name for name, _ in networks.named_buffers()]  # named once, saved under each name
+    assert names == ["policy.normalizer.mean", "policy.normalizer.var", "policy.normalizer.count"]
+
+
+@pytest.mark.parametrize(("kind", "policy"), [(ActorQ, DeterministicPolicy), (SoftActorQ, SquashedGaussianPolicy)])
+def test_targets_are_copies_behind_the_same_normalizer(kind, policy):
+    extra = {"initial_temperature": 0.5} if kind is SoftActorQ else {}
+    networks = kind(spec_of(), SMALL, SMALL, True, critics=2, **extra)
+    assert isinstance(networks.policy, policy)
+    targets = networks.target()
+    followed = networks.critics if kind is SoftActorQ else networks
+    assert all(equal(followed.parameters(), targets.parameters()))
+    assert not any(parameter.requires_grad for parameter in targets.parameters())
+    with torch.no_grad():
+        for parameter in networks.parameters():
+            parameter.add_(1.0)
+    assert not any(equal(followed.parameters(), targets.parameters()))
+    critics = targets if kind is SoftActorQ else targets.critics
+    assert all(q.normalizer is networks.policy.normalizer for q in critics.members)
+
+
+def test_q_is_the_smallest_of_the_critics():
+    networks = ActorQ(spec_of(), SMALL, SMALL, False, critics=3)
+    obs, action = torch.randn(20, 5), torch.rand(20, 2) * 2 - 1
+    each = torch.stack([q(obs, action) for q in networks.critics.members])
+    assert torch.equal(networks.q(obs, action), each.min(0).values)
+    assert len(set(each.argmin(0).tolist())) > 1
+
+
+def test_the_entropy_bonus_is_the_temperature_times_the_entropy(rng):
+    networks = SoftActorQ(spec_of(), SMALL, SMALL, False, critics=2, initial_temperature=0.3)
+    obs, again = torch.randn(20, 5), torch.Generator().manual_seed(0)
+    bonus = networks.entropy_bonus(obs, rng)
+    _, log_prob = networks.policy(obs).sample_with_log_prob(torch.randn(20, 2, generator=again))
+    torch.testing.assert_close(bonus, -0.3 * log_prob)
+    deterministic = ActorQ(spec_of(), SMALL, SMALL, False, critics=1)
+    assert torch.equal(deterministic.entropy_bonus(obs, rng), torch.zeros(20))
+
+
+def test_discrete_actions_are_refused():
+    with pytest.raises(UserError, match="has Discrete actions; this algorithm needs continuous ones"):
+        ActorQ(spec_of("discrete"), SMALL, SMALL, False, critics=1)

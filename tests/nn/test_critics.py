@@ -1,0 +1,37 @@
+"""V(s), the critics Q(s, a), and the temperature."""
+
+import pytest
+import torch
+
+from helpers import spec_of
+from lemniscate.nn.actor_critic import ActorCritic, ActorQ
+from lemniscate.nn.critics import Temperature
+from lemniscate.nn.networks import Layers
+
+
+def test_a_value_is_one_number_for_each_observation():
+    value, obs = ActorCritic(spec_of(), Layers()).value, torch.randn(20, 5)
+    assert value(obs).shape == (20,)
+    assert value(obs.view(4, 5, 5)).shape == (4, 5)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_critics_are_c_independent_networks(count):
+    critics = ActorQ(spec_of(), Layers((8,)), Layers((8,)), False, critics=count).critics
+    obs, action = torch.randn(20, 5), torch.randn(20, 2)
+    values = critics(obs, action)
+    assert values.shape == (count, 20)
+    assert critics(obs.view(4, 5, 5), action.view(4, 5, 2)).shape == (count, 4, 5)
+    assert torch.equal(critics.first(obs, action), values[0])
+    assert len({value.sum().item() for value in values}) == count
+    values[0].sum().backward()
+    moved = [any(p.grad is not None and p.grad.any() for p in q.parameters()) for q in critics.members]
+    assert moved == [True] + [False] * (count - 1)
+
+
+def test_the_temperature_is_positive_and_starts_where_the_setting_says():
+    temperature = Temperature(0.3)
+    assert temperature().item() == pytest.approx(0.3)
+    with torch.no_grad():
+        temperature.log_alpha.sub_(20.0)
+    assert temperature() > 0

@@ -1,0 +1,67 @@
+"""Hidden layers: initialization, layer norm, SimBa, products in bfloat16, activations."""
+
+import torch
+
+from lemniscate.nn.activations import Tanh
+from lemniscate.nn.networks import Bfloat16Linear, Layers
+
+
+def test_layers_are_orthogonal_with_their_gains():
+    first, _, last = Layers((4,)).network(6, 2, last_gain=0.01)
+    torch.testing.assert_close(first.weight @ first.weight.T, 2 * torch.eye(4))
+    torch.testing.assert_close(last.weight @ last.weight.T, 1e-4 * torch.eye(2))
+    assert not first.bias.any()
+    assert not last.bias.any()
+
+
+def test_the_fast_tanh_equals_tanh():
+    x = torch.linspace(-20, 20, 10_001)
+    torch.testing.assert_close(Tanh()(x), torch.tanh(x), atol=2e-7, rtol=0)
+    y = torch.linspace(-5, 5, 101, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(Tanh(), y)
+
+
+def test_a_bfloat16_layer_rounds_both_factors_and_the_product_in_both_directions(rng):
+    layer, x = Bfloat16Linear(40, 30), torch.randn(20, 40, generator=rng, requires_grad=True)
+    out, back = layer(x), torch.randn(20, 30, generator=rng)
+    out.backward(back)
+    short = {name: tensor.detach().bfloat16().double() for name, tensor in (("x", x), ("w", layer.weight), ("g", back))}
+    exact = {
+        "out": short["x"] @ short["w"].T + layer.bias.detach().double(),
+        "x": short["g"] @ short["w"],
+        "w": short["g"].T @ short["x"],
+        "b": back.double().sum(0),
+    }
+    product = layer(x) - layer.bias
+    torch.testing.assert_close(product, product.bfloat16().float(), rtol=1e-6, atol=1e-7)
+    for ours, name in ((out, "out"), (x.grad, "x"), (layer.weight.grad, "w"), (layer.bias.grad, "b")):
+        assert ours.dtype == torch.float32
+        torch.testing.assert_close(ours.double(), exact[name], rtol=2**-8, atol=2**-8)
+    assert not torch.equal(out, torch.nn.functional.linear(x, layer.weight, layer.bias))
+
+
+def test_only_products_between_hidden_layers_are_in_bfloat16():
+    for kind, count in (("mlp", 2), ("layer_norm", 2), ("simba", 6)):
+        layers = Layers((8, 8, 8), "relu", kind, "bfloat16").network(6, 2, last_gain=1.0)
+        linear = [module for module in layers.modules() if isinstance(module, torch.nn.Linear)]
+        short = [isinstance(module, Bfloat16Linear) for module in linear]
+        assert short == [False, *[True] * count, False]
+
+
+def test_layer_norm_is_between_a_layer_and_its_activation():
+    kinds = [type(layer).__name__ for layer in Layers((4, 5), "relu", "layer_norm").network(6, 2, last_gain=1.0)]
+    assert kinds == ["Linear", "LayerNorm", "ReLU", "Linear", "LayerNorm", "ReLU", "Linear"]
+
+
+def test_simba_is_residual_blocks_between_a_layer_and_a_norm(rng):
+    first, one, two, norm, last = Layers((4, 4), "relu", "simba").network(6, 2, last_gain=0.01)
+    x = torch.randn(7, 6, generator=rng)
+    hidden = first(x)
+    for block in (one, two):
+        before, inner, _, outer = block.layers
+        assert (inner.weight.shape, outer.weight.shape) == ((16, 4), (4, 16))
+        hidden = hidden + torch.relu(before(hidden) @ inner.weight.T + inner.bias) @ outer.weight.T + outer.bias
+    network = Layers((4, 4), "relu", "simba").network(6, 2, last_gain=0.01)
+    network.load_state_dict(torch.nn.Sequential(first, one, two, norm, last).state_dict())
+    torch.testing.assert_close(network(x), last(norm(hidden)))
+    assert isinstance(norm, torch.nn.LayerNorm)
