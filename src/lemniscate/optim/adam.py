@@ -120,7 +120,7 @@ class Adam:
             total.backward(inputs=self._inputs)
         with torch.no_grad():
             self._count.add_(1)
-            bias = -(self._log_betas * self._count).expm1()  # as a power, βᵗ would be computed for each parameter
+            bias = 1 - (self._log_betas * self._count).exp()  # as a power, βᵗ would be computed for each parameter
             norm = self._adam(
                 self.vector, gradient, self._mean, self._square, (self._rates * bias**self._powers).to(gradient)
             )
