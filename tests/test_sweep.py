@@ -37,8 +37,8 @@ SMALL = [
     "16",
     "--minibatch-size",
     "16",
-    "--engine",
-    "eager",
+    "--compile",
+    "off",
 ]
 
 

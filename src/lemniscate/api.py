@@ -380,11 +380,18 @@ def loggers_with(track: str | LoggerClass | None) -> tuple[LoggerClass, ...]:
 
 
 def device_for(name: str) -> torch.device:
-    """cpu, cuda, or with auto the better one that is there. Raises `UserError` for cuda without a GPU."""
-    if name == "cuda" and not torch.cuda.is_available():
-        raise UserError("device is cuda, but torch sees no GPU; use cpu or auto.")
+    """The device of that name; auto is cuda where there is a GPU, else cpu. Raises `UserError` for one not there."""
+    gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
     if name == "auto":
-        name = "cuda" if torch.cuda.is_available() else "cpu"
+        name = "cuda" if gpus else "cpu"
+    kind, _, index = name.partition(":")
+    if kind == "cuda" and not gpus:
+        raise UserError(f"device is {name}, but torch sees no GPU; use cpu or auto.")
+    if kind == "cuda" and int(index or 0) >= gpus:
+        there = ", ".join(f"cuda:{i}" for i in range(gpus))
+        raise UserError(f"device is {name}, but the GPUs that torch sees are: {there}.")
+    if kind == "mps" and not torch.backends.mps.is_available():
+        raise UserError("device is mps, but torch sees no Apple GPU; use cpu or auto.")
     return torch.device(name)
 
 

@@ -14,6 +14,14 @@ Flags = tuple[bool, ...]
 """a constant for each gradient step, [K]"""
 
 
+def wide_float(device: torch.device) -> torch.dtype:
+    """The type of sums over a whole run: float64; float32 on mps, which has no float64.
+
+    There, moments lose digits only after some ten million observations.
+    """
+    return torch.float32 if device.type == "mps" else torch.float64
+
+
 @dataclass(frozen=True)
 class Record:
     """Tensors that share their leading dimensions."""

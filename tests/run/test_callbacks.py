@@ -87,11 +87,11 @@ def test_the_policy_is_that_of_its_step(tmp_path):
 
 
 def test_the_weights_are_copied_only_if_they_are_used(tmp_path, monkeypatch):
-    from lemniscate.algos import ppo
+    from lemniscate.algos.ppo import Config
 
     made, kept = [], []
-    networks = ppo.networks
-    monkeypatch.setattr(ppo, "networks", lambda *args: made.append(1) or networks(*args))
+    networks = Config.networks
+    monkeypatch.setattr(Config, "networks", lambda *args: made.append(1) or networks(*args))
     train(tmp_path / "r", callbacks=[lambda step, _, policy: kept.append(policy)])
     assert len(made) == 1
     with pytest.raises(lem.UserError, match="not used while its callback ran"):
@@ -147,9 +147,9 @@ def test_a_callback_is_named_as_module_and_function(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("callback", "said"),
     [
-        ("stop", "callback must be named as module:name, not 'stop'"),
-        ("no_such_module:stop", "callback no_such_module:stop cannot be loaded: No module named 'no_such_module'"),
-        ("math:cosin", "callback math:cosin cannot be loaded. There is no name in math 'cosin': did you mean .*cos"),
+        ("stop", "'stop' is no name of an object; it has the form module:name"),
+        ("no_such_module:stop", "no_such_module:stop cannot be found: No module named 'no_such_module'"),
+        ("math:cosin", "math:cosin cannot be found: math has no cosin"),
         ("math:pi", r"A callback must be a function of \(step, metrics, policy\), not 3.14"),
     ],
 )

@@ -9,10 +9,8 @@ from test_off_policy import Levers
 
 import lemniscate as lem
 from conftest import tiny_off_policy
-from lemniscate.envs import toy
-from lemniscate.envs.gymnasium import GymnasiumBackend
-from lemniscate.envs.vec_env import VecEnv
-from lemniscate.nn.actor_critic import ActorQ
+from lemniscate.envs import registry
+from lemniscate.nn.actor_critic import ActorQ, SoftActorQ
 from lemniscate.nn.networks import Layers
 from lemniscate.report import curves
 from lemniscate.report.pictures import sentence
@@ -21,23 +19,18 @@ from lemniscate.run.loggers import read_metrics
 from lemniscate.run.q_bias import QBias
 from lemniscate.spec import Box, ObservationPart, Spec
 
-CPU = torch.device("cpu")
-
 
 def networks(spec, **fields):
     torch.manual_seed(0)
-    return ActorQ(spec, Layers((4,)), Layers((8,)), False, **{"twin": True, **fields})
+    return (SoftActorQ if fields else ActorQ)(spec, Layers((4,)), Layers((8,)), False, critics=2, **fields)
 
 
 @pytest.mark.parametrize("mode", ["NEXT_STEP", "SAME_STEP", "DISABLED"])
 @pytest.mark.parametrize(
     ("length", "horizon", "gamma"), [(5, None, 0.9), (None, 4, 0.9), (5, None, 1.0), (None, 4, 0.0)]
 )
-def test_what_followed_is_the_discounted_return_and_after_a_time_out_what_q_expects(
-    monkeypatch, mode, length, horizon, gamma
-):
-    monkeypatch.setattr(toy, "Countdown", Levers)
-    env = VecEnv(GymnasiumBackend("Countdown-v0", 3, CPU, mode=mode, length=length, horizon=horizon))
+def test_what_followed_is_the_discounted_return_and_after_a_time_out_what_q_expects(mode, length, horizon, gamma):
+    env = registry.make(Levers, 3, kwargs={"mode": mode, "length": length, "horizon": horizon})
     nets = networks(env.spec)
     q_bias = evaluate(nets.policy, env, 8, seed=0, critic=(nets, gamma)).q_bias
     predicted, realised = [], []
@@ -56,12 +49,11 @@ def test_what_followed_is_the_discounted_return_and_after_a_time_out_what_q_expe
 @pytest.mark.parametrize("timed_out", [False, True])
 def test_entropy_counts_from_the_second_step_on(monkeypatch, rng, timed_out):
     """Two steps of reward 1, γ = ½, at a temperature of 2; after a time-out with the state in which the clock stopped."""
-    monkeypatch.setattr(toy, "Countdown", Levers)
     ends = {"length": None, "horizon": 2} if timed_out else {"length": 2}
-    env = VecEnv(GymnasiumBackend("Countdown-v0", 1, CPU, **ends))
-    nets = networks(env.spec, temperature=2.0)
+    env = registry.make(Levers, 1, kwargs=ends)
+    nets = networks(env.spec, initial_temperature=2.0)
     seen = []
-    monkeypatch.setattr(ActorQ, "entropy_bonus", lambda *_: seen.append(1) or torch.tensor([10.0]))
+    monkeypatch.setattr(SoftActorQ, "entropy_bonus", lambda *_: seen.append(1) or torch.tensor([10.0]))
     q_bias = evaluate(nets.policy, env, 1, seed=0, critic=(nets, 0.5)).q_bias
     last = torch.tensor([[0.0, 0.0, 2.0]])
     follows = nets.q(last, nets.policy(last).mode()).item() + 10 if timed_out else 0
@@ -69,7 +61,7 @@ def test_entropy_counts_from_the_second_step_on(monkeypatch, rng, timed_out):
     monkeypatch.undo()
     obs = torch.randn(20_000, 3, generator=rng)
     policy = nets.policy(obs)
-    noise = nets.policy.noise((20_000,), torch.Generator().manual_seed(5))
+    noise = nets.policy.draw_noise((20_000,), torch.Generator().manual_seed(5))
     mine = -2 * policy.sample_with_log_prob(noise)[1].mean()
     assert nets.entropy_bonus(obs, torch.Generator().manual_seed(5)).mean().item() == pytest.approx(
         mine.item(), abs=1e-4
@@ -101,7 +93,7 @@ def test_nothing_followed():
 def test_of_two_critics_the_lower_is_asked(rng):
     nets = networks(Spec("x", (ObservationPart((), (3,)),), Box((-1.0,), (1.0,))))
     obs, action = torch.randn(50, 3, generator=rng), torch.randn(50, 1, generator=rng)
-    one, two = nets.critic(obs, action)
+    one, two = nets.critics(obs, action)
     assert 0 < (one < two).sum() < 50
     assert torch.equal(nets.q(obs, action), torch.min(one, two))
 

@@ -30,10 +30,10 @@ LOUD = "import sys, lemniscate.cli; sys.exit(lemniscate.cli.main())"
 
 OFF_POLICY = {
     # name: algorithm and fields; in Pendulum-v1, whose episodes are longer than the distance of checkpoints
-    "ddpg": {"noise": "ou", "policy_delay": 2, "normalize_observations": True},
-    "ddpg-pink": {"noise": "coloured", "update_every": 2, "num_updates": 3, "architecture": "simba"},
-    "td3": {"architecture": "layer_norm"},
-    "sac": {"noise": "coloured"},
+    "ddpg": {"action_noise": "ou", "policy_delay": 2, "normalize_observations": True},
+    "ddpg-pink": {"action_noise": "coloured", "update_every": 2, "num_updates": 3, "network": "simba"},
+    "td3": {"network": "layer_norm"},
+    "sac": {"action_noise": "coloured"},
 }
 
 
@@ -81,8 +81,8 @@ def test_unasked_there_are_five_checkpoints_or_as_many_as_leave_episodes_whole(t
 def test_what_follows_episodes_is_restarted_with_the_environments(tmp_path, monkeypatch):
     """At the start and at each planned checkpoint but the last, after which nothing is played."""
     told = []
-    restart = RewardScale.restart
-    monkeypatch.setattr(RewardScale, "restart", lambda self: told.append(int(self.count)) or restart(self))
+    restart = RewardScale.on_restart
+    monkeypatch.setattr(RewardScale, "on_restart", lambda self: told.append(int(self.count)) or restart(self))
     train(tmp_path / "run", "CartPole-v1", scale_rewards=True, total_steps=256, checkpoint_every=64)
     assert told == [0, 64, 128, 192]
 
@@ -255,10 +255,10 @@ def command(*arguments, stderr=subprocess.DEVNULL, **options):
     )
 
 
-def long_run(path, env, updates=150, engine="eager"):
+def long_run(path, env, updates=150, compile="off"):
     """Arguments of a run of some seconds with a checkpoint every eighth update."""
     if env in OFF_POLICY:
-        fields = tiny_off_policy(**OFF_POLICY[env], total_steps=16 * updates, checkpoint_every=128, engine=engine)
+        fields = tiny_off_policy(**OFF_POLICY[env], total_steps=16 * updates, checkpoint_every=128, compile=compile)
         flags = [f"--{name.replace('_', '-')}" for name in fields]
         values = [() if value is True else value if isinstance(value, tuple) else (value,) for value in fields.values()]
         given = [part for flag, value in zip(flags, values, strict=True) for part in (flag, *value)]
@@ -282,10 +282,10 @@ def test_killed_at_random_and_resumed_it_ends_in_the_same_bits(tmp_path, env):
     check_kills(tmp_path, long_run(tmp_path / "whole", env), long_run(tmp_path / "killed", env), kills=3)
 
 
-def test_a_native_run_goes_on_to_the_same_bits(tmp_path):
+def test_a_compiled_run_goes_on_to_the_same_bits(tmp_path):
     """From a checkpoint on in a new process: what was compiled there is compiled again here."""
     whole, half = tmp_path / "whole", tmp_path / "half"
-    assert command(*long_run(whole, "ddpg", updates=40, engine="native")).wait() == 0
+    assert command(*long_run(whole, "ddpg", updates=40, compile="on")).wait() == 0
     shutil.copytree(whole, half)
     for step in checkpoint.list_steps(half / "checkpoints")[1:]:
         shutil.rmtree(half / "checkpoints" / f"step-{step}")

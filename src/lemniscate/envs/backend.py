@@ -51,11 +51,15 @@ class Backend(Protocol):
     A backend is a class in a file of its own and a line in `registry.BACKENDS`; a user's own is named `module:Class`.
     `tests/envs/test_contract.py` holds each to this contract.
 
-    It may have more. `summaries`: a tuple of `Summary`. `scene`: a `Scene` or None, which is then drawn where a
-    Gymnasium environment would be rendered. `compiled = True`: a step is a program for one number of environments, so
-    evaluation takes as many as training did. `wraps = True`: it takes `wrappers`. `package`: what has to be installed.
-    `in_process`: the name of the backend that evaluates its policies, where it uses other processes itself.
-    `make_rendered(env, mode, kwargs, wrappers)`, a class method: one `gymnasium.Env` that renders itself.
+    A backend may have more, each of which is asked for by its name:
+
+    - `summaries`: a tuple of `Summary`;
+    - `scene`: a `Scene` or None, which is drawn where a Gymnasium environment would be rendered;
+    - `compiled = True`: a step is a program for one number of environments, so evaluation takes as many as training;
+    - `package`: what has to be installed;
+    - `in_process`: the name of the backend that evaluates its policies, where it uses other processes itself;
+    - `wraps(env) -> bool`, a class method: whether it can put `wrappers` around;
+    - `make_rendered(env, mode, kwargs, wrappers)`, a class method: one `gymnasium.Env` that renders itself.
     """
 
     spec: Spec

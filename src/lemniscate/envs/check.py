@@ -11,8 +11,9 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
 from lemniscate.envs import registry
-from lemniscate.envs.factory import make_one, maker_of, makes_vector
-from lemniscate.envs.spaces import follow, is_image, observation_parts
+from lemniscate.envs.factory import make_one, maker_of
+from lemniscate.envs.images import is_image
+from lemniscate.envs.spaces import follow, observation_parts
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import NonFiniteError, UserError
 from lemniscate.spec import Action, Box, Discrete, MultiDiscrete
@@ -44,7 +45,7 @@ def check(env_id: str, backend: str | None = None) -> Iterator[Finding]:
         return
     try:
         yield from _spaces(env, served_by)
-        if registry.can_wrap(served_by) and not makes_vector(maker_of(env_id)):
+        if registry.can_wrap(served_by, env_id):
             yield from _gymnasium(env_id)
         yield from _behaviour(env)
     finally:

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lemniscate.types import Step
+from lemniscate.types import Step, wide_float
 
 LOG_ROWS = 1024
 """steps after which the books are brought up to date, asked or not"""
@@ -28,7 +28,7 @@ class EpisodeStatistics:
 
     def __init__(self, num_envs: int, device: torch.device) -> None:
         self._log: list[tuple[Tensor, ...]] = []
-        self._running = torch.zeros(2, num_envs, dtype=torch.float64, device=device)
+        self._running = torch.zeros(2, num_envs, dtype=wide_float(device), device=device)
         self._ended: list[Tensor] = []
 
     def log(self, step: Step, counts: Tensor) -> None:
@@ -48,7 +48,7 @@ class EpisodeStatistics:
     def _book(self) -> None:
         reward, terminated, truncated, valid, counts = (torch.stack(column) for column in zip(*self._log, strict=True))
         done = (terminated | truncated) & valid
-        running = episode_sums(torch.stack([reward * valid, valid]).double(), done, self._running)
+        running = episode_sums(torch.stack([reward * valid, valid]).to(self._running.dtype), done, self._running)
         self._ended.append(running[:, done & counts])  # by time, then by copy
         self._running = running[:, -1] * ~done[-1]
         self._log = []

@@ -3,7 +3,8 @@
 import inspect
 import multiprocessing
 import signal
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import partial
 from multiprocessing import parent_process
 from typing import Any
@@ -84,3 +85,14 @@ def make_vector(
 
 def _time_limit(env: gym.Env) -> int | None:
     return env.spec.max_episode_steps if env.spec else None
+
+
+@contextmanager
+def sentences(env: str, kwargs: Mapping[str, Any] | None, wrappers: Sequence[str]) -> Iterator[None]:
+    """An error that the making of an environment raises, as a `UserError` that names the arguments and wrappers."""
+    try:
+        yield
+    except (gym.error.Error, ImportError, TypeError, ValueError, AssertionError) as error:
+        given = [f"{name}={value!r}" for name, value in (kwargs or {}).items()] + list(wrappers)
+        with_these = f" with {', '.join(given)}" if given else ""
+        raise UserError(f"{env} cannot be made{with_these}: {error}") from error

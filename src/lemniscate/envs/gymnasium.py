@@ -13,7 +13,7 @@ from torch import Tensor
 
 from lemniscate.envs.backend import Summary
 from lemniscate.envs.episodes import Stagger
-from lemniscate.envs.factory import make_one, make_vector, maker_of, makes_vector
+from lemniscate.envs.factory import make_one, make_vector, maker_of, makes_vector, sentences
 from lemniscate.envs.masks import ActionMasks
 from lemniscate.envs.measures import SUMMARIES, measured, measures_of
 from lemniscate.envs.spaces import (
@@ -44,7 +44,7 @@ class GymnasiumBackend:
     Measures are the entries of `info` that the environment's metadata names in `measures`, and `is_success`.
     """
 
-    workers, wraps = False, True
+    workers = False
     summaries: tuple[Summary, ...] = SUMMARIES
 
     @classmethod
@@ -56,6 +56,11 @@ class GymnasiumBackend:
     def serves(cls, env: str) -> bool:
         """Registered ids, and classes and functions of one's own. Raises `UserError` if these are not there."""
         return bool(maker_of(env)) if ":" in env else env in gym.registry
+
+    @classmethod
+    def wraps(cls, env: str) -> bool:
+        """Whether it is made of single environments."""
+        return not makes_vector(maker_of(env))
 
     @classmethod
     def make_rendered(cls, env: str, mode: str, kwargs: Mapping[str, Any], wrappers: Sequence[str]) -> gym.Env:
@@ -74,14 +79,12 @@ class GymnasiumBackend:
     ) -> None:
         self.num_envs, self.device = num_envs, device
         maker = maker_of(env)
-        if makes_vector(maker) and (wrappers or self.workers):
-            raise UserError(f"{env} is {num_envs} environments at once: it takes no wrappers, and no process each.")
+        if makes_vector(maker) and self.workers:
+            raise UserError(f"{env} makes {num_envs} environments at once, so there is none for a process of its own.")
         wraps = tuple(map(find_callable, wrappers))
         self._build = partial(make_vector, maker, num_envs, dict(kwargs or {}), wraps, self.workers)
-        try:
+        with sentences(env, kwargs, wrappers):
             self._envs, limit = self._build()
-        except (gym.error.Error, ImportError, TypeError, ValueError, AssertionError) as error:
-            raise UserError(f"{env} cannot be made{_with(kwargs or {}, wrappers)}: {error}") from error
         self.mode = self._envs.metadata.get("autoreset_mode")
         if not isinstance(self.mode, AutoresetMode):
             raise UserError(f"{env} does not say when it resets: its metadata needs an autoreset_mode.")
@@ -179,8 +182,3 @@ class AsyncGymnasiumBackend(GymnasiumBackend):
     def ids(cls) -> Collection[str]:
         """None."""
         return ()
-
-
-def _with(kwargs: Mapping[str, Any], wrappers: Sequence[str]) -> str:
-    given = [f"{name}={value!r}" for name, value in kwargs.items()] + list(wrappers)
-    return f" with {', '.join(given)}" if given else ""

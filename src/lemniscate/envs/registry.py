@@ -36,7 +36,7 @@ def backend_for(env: str, wrappers: Sequence[str] = ()) -> str:
     serving = [name for name in BACKENDS if backend_class(name).serves(env)]
     if not serving:
         raise unknown_name("environment", env, known_ids())
-    return next((name for name in serving if not wrappers or can_wrap(name)), serving[0])
+    return next((name for name in serving if not wrappers or can_wrap(name, env)), serving[0])
 
 
 def backend_class(backend: str) -> type["Backend"]:
@@ -58,9 +58,10 @@ def require_backend(backend: str) -> str:
     return backend
 
 
-def can_wrap(backend: str) -> bool:
-    """Whether a backend steps single environments of Gymnasium's interface, which wrappers can be put around."""
-    return getattr(backend_class(backend), "wraps", False)
+def can_wrap(backend: str, env: str) -> bool:
+    """Whether a backend makes `env` of single environments of Gymnasium's interface, which can be wrapped."""
+    wraps = getattr(backend_class(backend), "wraps", None)
+    return wraps is not None and wraps(env)
 
 
 def is_compiled(backend: str) -> bool:
@@ -150,7 +151,9 @@ def make(
     chosen = backend or backend_for(name, wraps)
     if not backend_class(chosen).serves(name):
         raise UserError(f"{name} cannot be served by the {chosen} backend; {backend_for(name, wraps)} serves it.")
-    if wraps and not can_wrap(chosen):
-        raise UserError(f"The {chosen} backend cannot wrap {name}; the gymnasium backend wraps what Gymnasium makes.")
+    if wraps and not can_wrap(chosen, name):
+        raise UserError(
+            f"The {chosen} backend cannot wrap {name}; wrappers go around single environments of the gymnasium backend."
+        )
     made = backend_class(chosen)(name, num_envs, torch.device(device), stagger=stagger, kwargs=kwargs, wrappers=wraps)
     return VecEnv(made)

@@ -1,6 +1,5 @@
 """Gymnasium spaces, read once into records; observations flattened, actions scaled."""
 
-import math
 from functools import lru_cache
 from typing import Any
 
@@ -8,11 +7,9 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
+from lemniscate.envs.images import image_part, is_image
 from lemniscate.errors import UserError
 from lemniscate.spec import Action, Box, Discrete, MultiBinary, MultiDiscrete, ObservationPart
-
-IMAGE_CHANNELS = 16
-"""an image has at most so many channels, and a stack of images at most so many images"""
 
 
 def observation_parts(space: gym.Space, env_id: str, path: tuple[str | int, ...] = ()) -> tuple[ObservationPart, ...]:
@@ -23,7 +20,7 @@ def observation_parts(space: gym.Space, env_id: str, path: tuple[str | int, ...]
     order of its own keys (Gymnasium sorts them), a Tuple in its order. Raises `UserError` for anything else.
     """
     if not path and is_image(space):
-        return (_image_part(tuple(map(int, space.shape or ()))),)
+        return (image_part(tuple(map(int, space.shape or ()))),)
     if isinstance(space, spaces.Box | spaces.MultiBinary):
         return (ObservationPart(path, tuple(map(int, space.shape))),)
     if isinstance(space, spaces.Discrete):
@@ -40,28 +37,6 @@ def observation_parts(space: gym.Space, env_id: str, path: tuple[str | int, ...]
         f"{env_id} observes a {type(space).__name__}, whose size is not fixed; what a network can look at is Box,"
         " Discrete, MultiDiscrete, MultiBinary, and Dict and Tuple of these."
     )
-
-
-def is_image(space: gym.Space) -> bool:
-    """Whether observations are images of bytes, or stacks of images: they stay bytes, for a convolutional network."""
-    return isinstance(space, spaces.Box) and space.dtype == np.uint8 and bool(_image_axes(space.shape))
-
-
-def _image_axes(shape: tuple[int, ...]) -> tuple[int, ...]:
-    """The order of an image's axes that puts height and width first, then the stack if there is one, then channels."""
-    if len(shape) == 4 and shape[0] <= IMAGE_CHANNELS:
-        inner = tuple(axis + 1 for axis in _image_axes(shape[1:]))
-        return (*inner[:2], 0, *inner[2:]) if inner else ()
-    if len(shape) != 3 or min(shape[0], shape[2]) > IMAGE_CHANNELS:
-        return ()
-    return (0, 1, 2) if shape[2] <= shape[0] else (1, 2, 0)
-
-
-def _image_part(own: tuple[int, ...]) -> ObservationPart:
-    axes = _image_axes(own)
-    height, width, *channels = (own[axis] for axis in axes)
-    shape = (height, width, math.prod(channels))
-    return ObservationPart((), shape) if own == shape else ObservationPart((), shape, own_shape=own, axes=axes)
 
 
 def flatten_observation(parts: tuple[ObservationPart, ...], obs: Any, *, image: bool = False) -> np.ndarray:

@@ -83,9 +83,7 @@ class VecEnv:
 
     def _require_finite(self, **quantities: Tensor) -> None:
         for name, values in quantities.items():
-            if values.dtype is torch.uint8 or math.isfinite(
-                values.sum().item()
-            ):  # a NaN shows in the sum, which is cheap
+            if values.dtype is torch.uint8 or math.isfinite(values.sum().item()):  # a NaN shows in the sum
                 continue
             bad = torch.nonzero(~torch.isfinite(values))
             if len(bad):

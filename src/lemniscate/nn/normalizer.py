@@ -3,13 +3,15 @@
 The observation normalizer is part of the policy, and evaluated with it; the reward scale is for training only.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Self
 
 import torch
 from torch import Tensor, nn
 
 from lemniscate.maths import merge_moments
-from lemniscate.types import Rollout
+from lemniscate.types import Rollout, wide_float
 
 
 class NoNorm(nn.Module):
@@ -35,7 +37,16 @@ class ScaleBytes(NoNorm):
         return super().forward(obs).float() / 255
 
 
-class RunningNorm(NoNorm):
+class WideBuffers(nn.Module):
+    """A module whose buffers are of `wide_float`, also after a move to another device."""
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        if wide_float(fn(torch.zeros(0)).device) != torch.float64:  # else `fn` could not move them there
+            self._buffers.update({name: buffer.float() for name, buffer in self.named_buffers(recurse=False)})
+        return super()._apply(fn, recurse)
+
+
+class RunningNorm(WideBuffers, NoNorm):
     """(x − mean) / std, with the moments of all training observations, clipped to ±`clip`.
 
     The statistics are buffers and change in `update` only; calling the module never changes them. Before the first
@@ -63,14 +74,14 @@ class RunningNorm(NoNorm):
         """Merge finite observations [B, O or more] into the statistics; B may be 0."""
         if not len(obs):
             return
-        obs = super().forward(obs).double()
+        obs = super().forward(obs).to(self.mean.dtype)
         count = torch.full_like(self.count, len(obs))
         moments = merge_moments(self.mean, self.var, self.count, obs.mean(0), obs.var(0, correction=0), count)
         for buffer, new in zip((self.mean, self.var, self.count), moments, strict=True):
             buffer.copy_(new)
 
 
-class RewardScale(nn.Module):
+class RewardScale(WideBuffers):
     """r / std of the discounted return so far, clipped to ±`clip`; the returns are those of N running episodes.
 
     The mean is not subtracted, which would reward surviving or dying. Before the first update rewards are unscaled.
@@ -99,7 +110,7 @@ class RewardScale(nn.Module):
     def scale(self, rollout: Rollout) -> Rollout:
         """The rollout [T, N] with scaled rewards, after its returns Σ γ^k r_{t−k} have joined the statistics."""
         returns = []
-        counted = rollout.reward.double() * rollout.valid
+        counted = rollout.reward.to(self.var.dtype) * rollout.valid
         for reward, done in zip(counted, rollout.done, strict=True):
             self.running = self.gamma * self.running + reward
             returns.append(self.running)

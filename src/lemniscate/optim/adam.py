@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.func import functional_call, grad_and_value
 
 from lemniscate.optim.vector import ParameterVector
-from lemniscate.types import Loss, Metrics
+from lemniscate.types import Loss, Metrics, wide_float
 
 LossFunction = Callable[..., Loss]
 """loss(networks, *args)"""
@@ -85,7 +85,8 @@ class Adam:
         self._gradient = torch.zeros_like(self.vector)
         self._mean, self._square = torch.zeros_like(self.vector), torch.zeros_like(self.vector)
         self._adam = partial(adam, betas=betas, eps=eps, max_grad_norm=max_grad_norm or math.inf)
-        self._log_betas = torch.tensor(betas, dtype=torch.float64, device=self.vector.device).log()
+        device = self.vector.device
+        self._log_betas = torch.tensor(betas, dtype=torch.float64).log().to(device, wide_float(device))
         self._rates, self._powers = self._log_betas.new_ones(2), self._log_betas.new_tensor([-1, -0.5])
         self._count = self._log_betas.new_zeros(1)
         self._norm_name = f"gradient_norm/{name}" if name else "gradient_norm"

@@ -17,12 +17,12 @@ from collections import Counter
 from pathlib import Path
 from typing import Any, get_args
 
-import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from lemniscate.errors import UserError
+from lemniscate.run.state import TrainState
 from lemniscate.spec import Action, ObservationPart, Spec
 
 FORMAT = 1
@@ -42,25 +42,22 @@ class Checkpoint:
     numbers: dict[str, Any]
     record: dict[str, Any]
 
-    def restore(self, state: Any) -> None:
-        """Restore every field of a State of the same Config: generators, objects with a `state_dict`, numbers."""
+    def restore(self, state: TrainState) -> None:
+        """Restore every saved field of a State of the same Config."""
         for name, value in state.saved().items():
-            mine = self.tensors_of(name)
-            if isinstance(value, torch.Generator):
-                value.set_state(mine["state"])
-            elif hasattr(value, "load_state_dict"):
-                value.load_state_dict(mine)
+            if hasattr(value, "load_state_dict"):
+                value.load_state_dict(self.tensors_of(name))
             else:
                 setattr(state, name, self.numbers[name])
 
     def tensors_of(self, name: str) -> dict[str, Tensor]:
-        """The tensors of one field of the State; of a module, its state_dict."""
+        """The `state_dict` of one field of the State."""
         prefix = f"{name}."
         return {key.removeprefix(prefix): t for key, t in self.tensors.items() if key.startswith(prefix)}
 
 
-def write(directory: Path, state: Any, step: int, record: dict[str, Any], keep: int) -> Path:
-    """Write `directory/step-N` with every field of the dataclass `state`, and delete all but the newest `keep`.
+def write(directory: Path, state: TrainState, step: int, record: dict[str, Any], keep: int) -> Path:
+    """Write `directory/step-N` with the saved fields of `state`, and delete all but the newest `keep`.
 
     `record` is any JSON that a reader needs beside the state.
     """
@@ -68,9 +65,7 @@ def write(directory: Path, state: Any, step: int, record: dict[str, Any], keep: 
     tensors: dict[str, Tensor] = {}
     numbers: dict[str, Any] = {}
     for name, value in state.saved().items():
-        if isinstance(value, torch.Generator):
-            tensors[f"{name}.state"] = value.get_state()
-        elif hasattr(value, "state_dict"):
+        if hasattr(value, "state_dict"):
             tensors |= {f"{name}.{key}": t for key, t in value.state_dict().items()}
         else:
             numbers[name] = value

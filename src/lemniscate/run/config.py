@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from types import NoneType, UnionType
@@ -123,8 +124,9 @@ class RunConfig:
     total_steps: Count = 1_000_000
     """environment steps of the whole run, summed over the parallel environments; it ends with the update that reaches
     them"""
-    device: Literal["auto", "cpu", "cuda"] = "cpu"
-    """device of the networks, and of simulators that can use it; auto takes cuda if there is one"""
+    device: str = "cpu"
+    """device of the networks, and of simulators that can use it: cpu, cuda, cuda:N (GPU N, from 0) or mps; auto takes
+    cuda if there is one"""
     threads: Count = 1
     """CPU threads for torch; results differ in rounding between thread counts"""
     compile: Literal["auto", "on", "off"] = "auto"
@@ -150,6 +152,10 @@ class RunConfig:
         hints = get_type_hints(type(self), include_extras=True)
         for name in self.names():
             object.__setattr__(self, name, checked(name, getattr(self, name), hints[name]))
+        if not re.fullmatch(r"auto|cpu|mps|cuda(:(0|[1-9][0-9]*))?", self.device):
+            raise UserError(
+                f"device must be one of auto, cpu, cuda, cuda:N (such as cuda:1), mps, not {self.device!r}."
+            )
 
     @property
     def gradient_steps(self) -> int:

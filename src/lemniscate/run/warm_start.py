@@ -10,7 +10,7 @@ from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import find_checkpoint
 from lemniscate.spec import Spec
 
-FUNCTION = ("network", "architecture", "activation")
+FUNCTION = ("network", "activation")
 """fields of a Config that change what networks of the same shapes compute"""
 
 SHAPE = ("hidden", "normalize_observations")
