@@ -240,8 +240,8 @@ MUTANTS = [
     (
         "fragments are counted",
         "envs/episodes.py",
-        "done & whole]",
-        "done & (whole | done)]",
+        "done & counts]",
+        "done & (counts | done)]",
         "envs/test_episodes.py",
     ),
     (
@@ -740,13 +740,6 @@ MUTANTS = [
         "noise_std=config.noise_std, ",
         "",
         OFF + "actions_are_random_before_learning_starts_and_those_of_the_policy_afterwards",
-    ),
-    (
-        "compiled methods lose their defaults",
-        "optim/compiled.py",
-        "function.__name__, function.__defaults__, function.__closure__)",
-        "function.__name__, None, function.__closure__)",
-        "optim/test_compiled.py::test_methods_keep_their_defaults_and_may_call_super",
     ),
     (
         "the Fisher product is doubled",
