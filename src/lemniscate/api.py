@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 
-from lemniscate import presets
+from lemniscate import named, presets
 from lemniscate.algos import ALGORITHMS
 from lemniscate.envs import registry
 from lemniscate.envs.vec_env import VecEnv
@@ -56,6 +56,8 @@ def config_for(
     name, config = presets.choose(algorithm, env, preset)
     if name == "default" and env is None:
         raise UserError("Which environment? Name one with env; `lemniscate envs` lists them.")
+    if isinstance(wrappers := fields.get("wrappers"), list | tuple):
+        fields["wrappers"] = tuple(map(named.name_of, wrappers))
     config = config.replace(**fields)
     served_by = registry.backend_for(config.env, config.wrappers)
     return config if config.backend else config.replace(backend=served_by)
