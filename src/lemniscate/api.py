@@ -10,14 +10,9 @@ from typing import Any
 
 import torch
 
-<<<<<<< HEAD
 from lemniscate import algos, named, presets
 from lemniscate.callbacks import Callback, watch_with
 from lemniscate.console import say
-=======
-from lemniscate import named, presets
-from lemniscate.algos import ALGORITHMS
->>>>>>> env
 from lemniscate.envs import registry
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError, is_installed, missing_extra, unknown_name
@@ -65,7 +60,6 @@ def config_for(
     name, config = presets.choose(algos.name_of(algorithm), env, preset)
     if name == "default" and env is None:
         raise UserError("Which environment? Name one with env; `lemniscate envs` lists them.")
-<<<<<<< HEAD
     config = config.replace(**{name: _named(value) for name, value in fields.items()})
     return config if config.backend else config.replace(backend=registry.backend_for(config.env, config.wrappers))
 
@@ -75,13 +69,6 @@ def _named(value: object) -> object:
     if isinstance(value, list | tuple):
         return tuple(map(_named, value))
     return named.name_of(value) if callable(value) else value
-=======
-    if isinstance(wrappers := fields.get("wrappers"), list | tuple):
-        fields["wrappers"] = tuple(map(named.name_of, wrappers))
-    config = config.replace(**fields)
-    served_by = registry.backend_for(config.env, config.wrappers)
-    return config if config.backend else config.replace(backend=served_by)
->>>>>>> env
 
 
 def make_envs(config: RunConfig) -> tuple[VecEnv, VecEnv]:
