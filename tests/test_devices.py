@@ -164,7 +164,7 @@ def test_a_whole_run_on_the_second_gpu_resumes_and_its_policy_is_evaluated_anywh
         env, fields = "Countdown-v0", fields | tiny_fields(total_steps=64)
     else:
         env, fields = "Pendulum-v1", fields | tiny_off_policy(total_steps=64, log_every=8)
-        del fields["num_steps"]
+        fields.pop("num_steps", None)
     with pretend():
         lem.train(algorithm, env, **fields)
         last = max((tmp_path / "run" / "checkpoints").iterdir(), key=lambda path: int(path.name[5:]))
