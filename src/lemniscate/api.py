@@ -128,6 +128,9 @@ def train(
 def resume(
     run: str | Path,
     *,
+    env: str | Callable[..., Any] | None = None,
+    wrappers: Sequence[str | Callable[..., Any]] | None = None,
+    network: str | Callable[..., Any] | None = None,
     track: str | LoggerClass | None = None,
     callbacks: Sequence[Callback | str] = (),
     report: bool = False,
@@ -135,11 +138,14 @@ def resume(
 ) -> TrainedRun:
     """Resume an interrupted run from its newest whole planned checkpoint, and train it to its end.
 
-    The arguments are those of `train`, and are not saved with the run.
+    `env`, `wrappers` and `network` are only for a run that began with objects that no file holds, such as a lambda: the
+    same objects again. The other arguments are those of `train`, and are not saved with the run.
     """
     path = Path(run)
     algorithm, fields = read_config(path)
+    again = {"env": env, "wrappers": wrappers, "network": network}
     config = algos.find(algorithm).Config.from_json(fields)
+    config = config.replace(**{name: _named(value) for name, value in again.items() if value is not None})
     loggers = loggers_with(track)
     set_seeds(config.seed)
     return _train(path, algorithm, config, make_envs(config), loggers, callbacks, report or track is not None, progress)

@@ -122,9 +122,11 @@ class JaxBackend:
 
 
 def jax_device(device: torch.device) -> str:
-    """What JAX calls a device of torch's. Raises `UserError` for cuda where JAX sees no GPU."""
+    """JAX's name of a device of torch's. Raises `UserError` for cuda where JAX sees no GPU, cuda:1 and so on, and mps."""
     import jax
 
+    if device.type == "mps" or device.index:
+        raise UserError(f"JAX's environments run on cpu or cuda, the first GPU, not on {device}.")
     if device.type == "cuda" and not any(d.platform == "gpu" for d in jax.devices()):
         raise UserError("JAX sees no GPU, so this cannot run on cuda; it comes with: pip install 'jax[cuda12]'")
     return "gpu" if device.type == "cuda" else "cpu"

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from lemniscate.errors import UserError, unknown_name
-from lemniscate.named import find
+from lemniscate.named import find_callable
 from lemniscate.nn.activations import ACTIVATIONS, Activation
 
 Matmul = Literal["float32", "bfloat16"]
@@ -41,8 +41,8 @@ class Layers:
     Args:
         hidden: widths of the hidden layers.
         activation: between the layers.
-        kind: a name in `NETWORKS`, or `module:Class` of one's own: `Class(inputs, outputs)` makes a module that takes
-            [B, inputs] to [B, outputs].
+        kind: a name in `NETWORKS`, or one's own as `module:Class` or `module:Class(key=value, …)`: called with the
+            numbers of inputs and outputs it makes a module that takes [B, inputs] to [B, outputs].
         matmul: precision of the products between hidden layers.
     """
 
@@ -104,7 +104,7 @@ NETWORKS: dict[str, Callable[[Layers, int], tuple[list[nn.Module], int]]] = {
 
 def _own_network(name: str, inputs: int, outputs: int) -> nn.Module:
     try:
-        network = find(name)(inputs, outputs)
+        network = find_callable(name)(inputs, outputs)
         shape = network(torch.zeros(2, inputs)).shape
     except (TypeError, RuntimeError, AttributeError) as error:
         raise UserError(f"{name}({inputs}, {outputs}) must make a module for [2, {inputs}]: {error}") from None
