@@ -65,7 +65,7 @@ for world in (Endless, Levers, EndlessLevers, Greedy):
 
 def vectorize(env, num_envs=4, **kwargs):
     """A restarted VecEnv in Gymnasium, with arguments of the environment."""
-    vec = VecEnv(GymnasiumBackend(env, num_envs, CPU, **kwargs))
+    vec = VecEnv(GymnasiumBackend(env, num_envs, CPU, kwargs=kwargs))
     vec.restart(0)
     return vec
 

@@ -11,7 +11,7 @@ import torch
 
 import lemniscate as lem
 from conftest import tiny, tiny_fields, tiny_off_policy
-from lemniscate.algos import ALGORITHMS
+from lemniscate import algos
 from lemniscate.api import device_for
 from lemniscate.data.replay import interact
 from lemniscate.data.rollout import collect, collect_episodes
@@ -96,7 +96,7 @@ class Noise:
 
 def train_twice(case, device, directory):
     """Two updates, a checkpoint, two more; then the last two again from the checkpoint. The metrics of each update."""
-    module, (actions, settings) = ALGORITHMS[case.split()[0]], CASES[case]
+    module, (actions, settings) = algos.find(case.split()[0]), CASES[case]
     config = module.Config(env="Noise-v0", **settings)
     env = VecEnv(Noise(actions, config.num_envs, device))
     torch.manual_seed(0)
@@ -164,7 +164,7 @@ def test_a_whole_run_on_the_second_gpu_resumes_and_its_policy_is_evaluated_anywh
         env, fields = "Countdown-v0", fields | tiny_fields(total_steps=64)
     else:
         env, fields = "Pendulum-v1", fields | tiny_off_policy(total_steps=64, log_every=8)
-        del fields["num_steps"]
+        fields.pop("num_steps", None)
     with pretend():
         lem.train(algorithm, env, **fields)
         last = max((tmp_path / "run" / "checkpoints").iterdir(), key=lambda path: int(path.name[5:]))
@@ -181,7 +181,7 @@ MUTANTS = [
     ("noise is drawn on the CPU", "nn/policies.py", ", generator=generator, device=generator.device", "", "ppo box"),
     ("positions on the CPU by a mask on the GPU", "data/action_noise.py", "[done.cpu()]", "[done]", "ddpg box"),
     ("the replay buffer stays on the CPU", "data/replay.py", "dtype=kind, device=device)", "dtype=kind)", "td3 box"),
-    ("rows are drawn by the CPU's generator", "run/state.py", "generator(seed, device, 3)", 'generator(seed, torch.device("cpu"), 3)', "ppo box"),
+    ("rows are drawn by the CPU's generator", "run/seeding.py", "generator(seed, device, 3)", 'generator(seed, torch.device("cpu"), 3)', "ppo box"),
     ("rows are drawn with no generator's device", "data/replay.py", "generator=generator, device=generator.device)", "generator=generator)", "sac box"),
     ("the reward scale stays on the CPU", "algos/a2c.py", "RewardScale(config.num_envs, config.gamma).to(device)", "RewardScale(config.num_envs, config.gamma)", "a2c box"),
     ("the networks stay on the CPU", "algos/trpo.py", "config.networks(spec).to(device)", "config.networks(spec)", "trpo box"),
@@ -213,7 +213,7 @@ def test_a_config_names_a_device_that_another_computer_may_have(name):
     assert tiny(device=name).device == name
 
 
-@pytest.mark.parametrize("name", ["tpu", "gpu", "cuda:", "cuda:-1", "cuda:01", "mps:0", "cpu ", "", None, 1])
+@pytest.mark.parametrize("name", ["tpu", "gpu", "cuda:", "cuda:-1", "cuda:01", "mps:0", "cpu ", ""])
 def test_other_names_of_devices_are_refused(name):
     with pytest.raises(UserError, match="device must be one of auto, cpu, cuda, cuda:N"):
         tiny(device=name)

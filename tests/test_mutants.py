@@ -177,7 +177,7 @@ MUTANTS = [
     ),
     (
         "noise 0 chooses what is impossible",
-        "maths/distributions.py",
+        "maths/discrete.py",
         "cumulative <= noise",
         "cumulative < noise",
         "maths/test_distributions.py",

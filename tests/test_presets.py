@@ -3,7 +3,7 @@
 import pytest
 
 from lemniscate import presets
-from lemniscate.algos import ALGORITHMS
+from lemniscate.algos import ALGORITHMS, find
 from lemniscate.errors import UserError
 from lemniscate.presets.on_policy import FIGURE_EIGHT
 
@@ -21,7 +21,7 @@ def test_each_environment_gets_its_own_unless_another_is_named(algorithm):
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_an_unknown_environment_gets_the_defaults_of_the_config(algorithm):
     for name in (None, "default"):
-        config = ALGORITHMS[algorithm].Config(env="Acrobot-v1")
+        config = find(algorithm).Config(env="Acrobot-v1")
         assert presets.choose(algorithm, "Acrobot-v1", name) == ("default", config)
     assert presets.names(algorithm)[0] == "default"
 

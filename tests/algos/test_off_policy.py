@@ -253,7 +253,7 @@ def test_the_size_of_the_replay_buffer_is_printed_before_it_is_allocated(tmp_pat
     with pytest.raises(UserError, match="choose buffer_size at most"):
         lem.train(algo.__name__.rpartition(".")[2], "Pendulum-v1", run=tmp_path / "r", progress=True, **fields)
     printed = capsys.readouterr().err
-    assert "100,000,000,000 transitions: 3,300,000.0 MB" in printed  # 33 bytes each
+    assert "100,000,000,000 transitions, 3,300,000.0 MB" in printed  # 33 bytes each
     assert "no products in bfloat16" in printed
 
 

@@ -146,6 +146,28 @@ def test_a_measure_of_some_environments_is_nan_in_the_others():
     assert measures["height"][1].isnan()
 
 
+class Same(toy.Countdown):
+    """Resets in the step of an end, and keeps the true info of that step apart."""
+
+    def __init__(self, num_envs):
+        super().__init__(num_envs, "SAME_STEP", length=3)
+        self.metadata["measures"] = ["height"]
+
+    def step(self, actions):
+        *rest, info = super().step(actions)
+        info["height"], info["_height"] = self.t.astype(float), np.ones(self.num_envs, bool)
+        if "final_obs" in info:
+            info["final_info"] = {"height": info["final_obs"][:, 2], "_height": info["_final_obs"]}
+        return (*rest, info)
+
+
+def test_the_measure_of_a_last_step_is_that_before_the_reset():
+    env = registry.make(Same, 2)
+    env.restart(0)
+    heights = [env.step(torch.zeros(2, dtype=torch.int64)).measures["height"].tolist() for _ in range(4)]
+    assert heights == [[1, 1], [2, 2], [3, 3], [1, 1]]
+
+
 def test_actions_of_another_shape_are_refused():
     env = registry.make("CartPole-v1", 4)
     env.restart(0)

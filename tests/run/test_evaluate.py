@@ -1,3 +1,4 @@
+import itertools
 from dataclasses import replace
 
 import gymnasium as gym
@@ -103,10 +104,14 @@ class Climbs(gym.Env):
 
 
 def test_what_is_measured_is_averaged_over_the_rows_that_count():
-    """Ten episodes in four environments: two of them stop counting after two episodes, and go on playing."""
-    env = registry.make(Climbs, 4)
+    """Environment i has episodes of i + 1 steps; those that have had their share of the ten go on, and do not count."""
+    numbers = itertools.count()
+    env = registry.make(lambda: Climbs(length=1 + next(numbers) % 4), 4)
     scores = evaluate(ActorCritic(env.spec, Layers((4,))).policy, env, 10, seed=0)
-    assert scores.measures == {"height": 2.5, "is_success": 0.25, "is_success_at_end": 1.0}
+    rows = 3 * 1 + 3 * 2 + 2 * 3 + 2 * 4
+    heights = 3 * 1 + 3 * (1 + 2) + 2 * (1 + 2 + 3) + 2 * (1 + 2 + 3 + 4)
+    expected = {"height": heights / rows, "is_success": 10 / rows, "is_success_at_end": 1.0}
+    assert scores.measures == pytest.approx(expected)
     assert scores.to_json() | scores.measures == scores.to_json()
 
 
@@ -130,10 +135,10 @@ def test_a_policy_is_evaluated_in_another_world(tmp_path):
 
 def test_an_environment_that_no_file_can_keep_is_asked_for_again(tmp_path):
     fields = {"num_envs": 2, "num_steps": 8, "total_steps": 64, "minibatch_size": 16, "progress": False}
-    made = lem.train("ppo", lambda: Climbs(length=3), run=tmp_path / "run", **fields)
+    wrappers = [lambda env: gym.wrappers.TransformReward(env, lambda reward: 2 * reward)]
+    made = lem.train("ppo", lambda: Climbs(length=3), run=tmp_path / "run", wrappers=wrappers, **fields)
     policy = lem.load(made.path)
-    assert lem.evaluate(policy, episodes=2).lengths == [3, 3]
+    assert lem.evaluate(policy, episodes=2).returns == [6, 6]
     named._PASSED.clear()  # as another process would have it
     with pytest.raises(UserError, match="pass the object again"):
         lem.evaluate(policy, episodes=2)
-    assert lem.evaluate(policy, env=lambda: Climbs(length=3), episodes=2).lengths == [3, 3]

@@ -5,10 +5,10 @@ import math
 
 import pytest
 import torch
-from test_off_policy import Levers
 
 import lemniscate as lem
 from conftest import tiny_off_policy
+from helpers import Levers
 from lemniscate.envs import registry
 from lemniscate.nn.actor_critic import ActorQ, SoftActorQ
 from lemniscate.nn.networks import Layers

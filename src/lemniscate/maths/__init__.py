@@ -1,14 +1,7 @@
 """The mathematics: pure functions on tensors, each with its equation and a test against brute force."""
 
-from lemniscate.maths.distributions import (
-    Bernoulli,
-    Categorical,
-    Deterministic,
-    Distribution,
-    Gaussian,
-    MultiCategorical,
-    SquashedGaussian,
-)
+from lemniscate.maths.discrete import Bernoulli, Categorical, MultiCategorical
+from lemniscate.maths.distributions import Deterministic, Distribution, Gaussian, SquashedGaussian
 from lemniscate.maths.losses import clipped_surrogate, policy_gradient, surrogate, value_loss
 from lemniscate.maths.noise import coloured, ornstein_uhlenbeck, uniform
 from lemniscate.maths.returns import episode_return, gae, polyak, reward_to_go, td_target
