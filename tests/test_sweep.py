@@ -23,8 +23,8 @@ from lemniscate.run.sweep_progress import SweepProgress
 
 SEEDS = ["--seeds", "1-2"]
 ENV = "environments:Copy-box-v0"
-SHARED = {"num_envs": 4, "num_steps": 64, "total_steps": 5_200, "hidden": (16,)}
-FLAGS = ["--num-envs", "4", "--num-steps", "64", "--total-steps", "5_200", "--hidden", "16"]
+SHARED = {"num_envs": 4, "total_steps": 5_200, "hidden": (16,)}
+FLAGS = ["--num-envs", "4", "--total-steps", "5_200", "--hidden", "16"]
 FEW = {"num_envs": 4, "num_steps": 8, "total_steps": 256, "hidden": (16,), "minibatch_size": 16}
 SMALL = [
     "--num-envs",
@@ -222,7 +222,7 @@ def test_the_command_ends_in_1_if_a_run_has_failed(monkeypatch, capsys):
         (["ppo,ddpg", "--env", "Pendulum-v1", "--clip", "0.1", *SEEDS], "ddpg: There is no field '--clip'"),
         (
             ["ppo,ddpg", "--env", "Pendulum-v1", "--gamma", "2", *SEEDS],
-            "ppo: gamma must be a number from 0 to 1, not 2.0.",
+            "ppo: gamma must be a number from 0 to 1, not 2.",
         ),
         (["ppo,ddpg", "--env", "Pendulum-v1", "--total-steps", "900", *SEEDS], "ddpg: learning_starts must be below"),
         (["ppo,ddpg", "--env", "CartPole-v1", *SEEDS], "ddpg: CartPole-v1 has Discrete actions"),

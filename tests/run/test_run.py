@@ -40,7 +40,7 @@ OFF_POLICY = {
 ON_POLICY = {
     # name: algorithm and fields; in CartPole-v1
     "reinforce": {"scale_rewards": True},
-    "reinforce-episodes": {"episodes": 1, "baseline": "mean", "returns": "whole"},
+    "reinforce-episodes": {"episodes": 1, "baseline": "mean", "returns": "episode"},
     "a2c": {"gae_lambda": 0.9},
     "trpo": {"final_critic_learning_rate": 0.1},
 }

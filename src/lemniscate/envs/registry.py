@@ -84,13 +84,15 @@ def make_rendered(
 ) -> "gym.Env":
     """One environment of Gymnasium's interface that renders itself in `mode`, "rgb_array" or "human".
 
-    Raises `UserError` if its backend has none.
+    Where `backend` cannot render, as EnvPool cannot, the first backend that serves the environment and can does it.
+    Raises `UserError` if none can.
     """
     chosen = backend or backend_for(env, wrappers)
-    make_one = getattr(backend_class(chosen), "make_rendered", None)
-    if make_one is None:
-        raise UserError(f"the {chosen} backend renders no single environment.")
-    return make_one(env, mode, kwargs, wrappers)
+    for name in (chosen, *BACKENDS):
+        make_one = getattr(backend_class(name), "make_rendered", None)
+        if make_one and backend_class(name).serves(env):
+            return make_one(env, mode, kwargs, wrappers)
+    raise UserError(f"the {chosen} backend renders no single environment.")
 
 
 def name_of(env: object) -> str:
