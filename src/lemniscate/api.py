@@ -1,4 +1,4 @@
-"""The front door: train, resume, load, evaluate, watch, plot, make_envs."""
+"""The verbs: train, resume, load, evaluate, watch, plot, make_envs."""
 
 import json
 from collections.abc import Callable, Mapping, Sequence
@@ -72,7 +72,7 @@ def _named(value: object) -> object:
 
 
 def make_envs(config: RunConfig) -> tuple[VecEnv, VecEnv]:
-    """Two vectors of `config.env` that share nothing: (for training, its copies staggered; for evaluation).
+    """Two vectors of environments that share nothing: one for training, staggered, and one for evaluation.
 
     They are restarted with seeds of different streams, so no start of one is ever a start of the other.
     """

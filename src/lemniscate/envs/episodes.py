@@ -9,7 +9,7 @@ from torch import Tensor
 from lemniscate.types import Step, wide_float
 
 LOG_ROWS = 1024
-"""steps after which the books are brought up to date, asked or not"""
+"""steps after which the logged ones are summed up"""
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class Stagger:
         if limit is not None:
             self._steps_left = np.random.default_rng(seed).integers(1, limit, num_envs, endpoint=True)
         self.counts = np.full(num_envs, limit is None)
-        """[N] bool: the copy's present episode began at its beginning and is not to be cut"""
+        """[N] bool: the environment's present episode began at its beginning and is not to be cut"""
 
     def apply(self, terminated: np.ndarray, truncated: np.ndarray) -> np.ndarray:
         """After one more step in every copy: `truncated` [N], with the cuts that are due."""

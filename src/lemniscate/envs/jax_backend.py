@@ -122,7 +122,7 @@ class JaxBackend:
 
 
 def jax_device(device: torch.device) -> str:
-    """JAX's name of a device of torch's. Raises `UserError` for cuda where JAX sees no GPU, cuda:1 and so on, and mps."""
+    """The name of a torch device in JAX. Raises `UserError` for mps, cuda:1, …, and cuda where JAX sees no GPU."""
     import jax
 
     if device.type == "mps" or device.index:

@@ -23,7 +23,7 @@ class ToyEnv(VectorEnv):
         self.action_space = batch_space(self.single_action_space, num_envs)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
-        """Reset all copies, or those of `options["reset_mask"]`."""
+        """Reset all environments, or those of `options["reset_mask"]`."""
         mask = (options or {}).get("reset_mask")
         if mask is None:
             super().reset(seed=seed)

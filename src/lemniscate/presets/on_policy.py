@@ -161,7 +161,9 @@ PPO = [
         "search by hand, 7 runs, on seeds 101 and 102",
         "2026-11",
     ),
-    Preset("paper", PAPER, "Schulman et al. 2017, table 3, on 8 copies with a running normalizer", "2026-11"),
+    Preset(
+        "paper", PAPER, "Schulman et al. 2017, table 3, on 8 parallel environments with a running normalizer", "2026-11"
+    ),
 ]
 
 REINFORCE: list[Preset] = []

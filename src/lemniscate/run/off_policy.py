@@ -131,7 +131,7 @@ class OffPolicyState(TrainState[Networks]):
     """The training state of the algorithms that learn from a replay buffer."""
 
     targets: Any
-    """target networks: copies that follow slowly"""
+    """target networks, which follow the others slowly"""
     replay: ReplayBuffer
     action_noise: ActionNoise
     updates: int = 0
