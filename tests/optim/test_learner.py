@@ -104,7 +104,7 @@ def test_each_combination_of_flags_is_a_program_of_its_own(monkeypatch):
     assert len(programs) == 4
 
 
-@pytest.mark.parametrize(("steps", "calls"), [(1, 1), (4, 1), (6, 2), (7, 7), (8, 2), (12, 3)])
+@pytest.mark.parametrize(("steps", "calls"), [(1, 1), (4, 1), (5, 5), (6, 2), (7, 7), (8, 2), (10, 5), (12, 3)])
 def test_calls_are_of_one_size_and_of_at_most_four_steps(monkeypatch, steps, calls):
     monkeypatch.setattr(torch, "compile", lambda *_, **__: lambda *args, **flags: means(count(*args, **flags)))
     learner = Learner(count, [Adam(small_networks()[0])])
