@@ -109,4 +109,4 @@ def test_a_training_command_walks_through_few_files(tmp_path):
     files, lines, table = traced(COMMAND, *command.split(), folder=tmp_path)
     assert files <= 28, table
     assert lines <= 4000, table
-    assert {"algos/ppo.py", "cli.py", "run/run.py"} <= set(table.split())
+    assert {"algos/ppo.py", "cli/__init__.py", "run/run.py"} <= set(table.split())
