@@ -7,9 +7,10 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from lemniscate.api import TrainedRun, config_for, evaluate, load, make_envs, plot, resume, train, watch
+    from lemniscate.api import TrainedRun, config_for, make_envs, resume, train
     from lemniscate.errors import NonFiniteError, SweepError, UserError
     from lemniscate.policy import TrainedPolicy
+    from lemniscate.results import evaluate, load, plot, watch
     from lemniscate.run.evaluate import Evaluation
     from lemniscate.run.run import Stopped
     from lemniscate.run.seeding import set_seeds
@@ -47,16 +48,16 @@ MODULES = {
     "TrainedSweep": "sweep",
     "UserError": "errors",
     "config_for": "api",
-    "evaluate": "api",
-    "load": "api",
+    "evaluate": "results",
+    "load": "results",
     "make_envs": "api",
-    "plot": "api",
+    "plot": "results",
     "resume": "api",
     "resume_sweep": "sweep",
     "set_seeds": "run.seeding",
     "train": "api",
     "train_sweep": "sweep",
-    "watch": "api",
+    "watch": "results",
 }
 """where each public name is defined"""
 

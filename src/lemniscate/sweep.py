@@ -17,7 +17,7 @@ from types import FrameType
 
 from filelock import FileLock, Timeout
 
-from lemniscate import api
+from lemniscate import api, results
 from lemniscate.algos import ALGORITHMS, find
 from lemniscate.console import say
 from lemniscate.envs import registry
@@ -118,7 +118,7 @@ def _train(runs: Sweep, track: str | None, report: bool, progress: bool) -> Trai
     except Timeout:
         raise UserError(f"{runs.path} is being trained by another process.") from None
     if any(map(is_finished, runs.runs)):
-        for picture in api.plot(runs.path):
+        for picture in results.plot(runs.path):
             say(picture)
     if failed:
         sentences = "".join(f"\n{name}: {sentence}" for name, sentence in failed.items())
@@ -188,7 +188,7 @@ class _Processes:
                 continue
             del self._running[run]
             if code == 0:
-                sentence = f"done, final return {api.final_return(run):.1f}"
+                sentence = f"done, final return {results.final_return(run):.1f}"
             elif self._stop_signal:
                 sentence = f"stopped at step {step:,}"
             else:

@@ -19,7 +19,7 @@ from typing import Any
 
 import torch
 
-from lemniscate import algos, api
+from lemniscate import algos, api, results
 from lemniscate.run import checkpoint
 from lemniscate.run.config import RunConfig
 from lemniscate.run.loggers import read_metrics
@@ -53,8 +53,8 @@ def check_training(algorithm: str | ModuleType, folder: Path, **settings: Any) -
     assert metrics, "No metrics were logged: call run.log after every update."
     bad = {name for line in metrics for name, x in line.items() if isinstance(x, float) and not math.isfinite(x)}
     assert not bad, f"These metrics are not finite: {', '.join(sorted(bad))}."
-    scores = api.evaluate(api.load(run.path), episodes=2, seed=0)
-    assert scores == api.evaluate(run.policy, episodes=2, seed=0), "The loaded policy differs from the trained one."
+    scores = results.evaluate(results.load(run.path), episodes=2, seed=0)
+    assert scores == results.evaluate(run.policy, episodes=2, seed=0), "The loaded policy differs from the trained one."
 
 
 def check_seeds(algorithm: str | ModuleType, folder: Path, **settings: Any) -> None:

@@ -4,7 +4,7 @@ import argparse
 import json
 from typing import Any
 
-from lemniscate import api, sweep
+from lemniscate import api, results, sweep
 from lemniscate.algos import ALGORITHMS
 from lemniscate.cli.fields import read_json
 from lemniscate.console import say
@@ -39,7 +39,7 @@ def train(given: argparse.Namespace) -> None:
     say(f"{what}: preset {preset}, seed {config.seed}, {'compiled' if is_compiled(config) else 'not compiled'}")
     run = api.train(given.algorithm, config.env, **shared, **_callbacks(given))
     if given.score:
-        api.final_return(run.path)
+        results.final_return(run.path)
     say(f"Trained in {run.seconds:.1f} s. Everything is in {run.path}")
 
 
@@ -52,15 +52,15 @@ def resume(given: argparse.Namespace) -> None:
     else:
         run = api.resume(given.run, track=given.track, report=given.report, **_callbacks(given))
         if given.score:
-            api.final_return(run.path)
+            results.final_return(run.path)
     say(f"Done. Everything is in {run.path}")
 
 
 def evaluate(given: argparse.Namespace) -> None:
     """Play whole episodes: scores as JSON on standard output, or as a sentence."""
     own: dict[str, Any] = {} if given.env_args is None else {"env_kwargs": read_json("--env-args", given.env_args)}
-    policy = api.load(given.run)
-    scores = api.evaluate(policy, episodes=given.episodes, seed=given.seed, backend=given.backend, **own)
+    policy = results.load(given.run)
+    scores = results.evaluate(policy, episodes=given.episodes, seed=given.seed, backend=given.backend, **own)
     if given.json:
         print(json.dumps(scores.to_json()))
     else:
@@ -69,14 +69,14 @@ def evaluate(given: argparse.Namespace) -> None:
 
 def watch(given: argparse.Namespace) -> None:
     """Show one episode in a window, or record it."""
-    said = api.watch(api.load(given.run), seed=given.seed, video=given.video)
+    said = results.watch(results.load(given.run), seed=given.seed, video=given.video)
     if said:
         say(said)
 
 
 def plot(given: argparse.Namespace) -> None:
     """Draw the curves of one run, or compare several, grouped by all but the seed."""
-    for file in api.plot(*given.runs):
+    for file in results.plot(*given.runs):
         say(file)
 
 
