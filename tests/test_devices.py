@@ -12,12 +12,12 @@ import torch
 import lemniscate as lem
 from conftest import tiny, tiny_fields, tiny_off_policy
 from lemniscate import algos
-from lemniscate.api import device_for
 from lemniscate.data.replay import interact
 from lemniscate.data.rollout import collect, collect_episodes
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError
 from lemniscate.run import checkpoint
+from lemniscate.run.environments import device_for
 from lemniscate.spec import Box, Discrete, MultiDiscrete, ObservationPart, Spec
 from lemniscate.types import Step
 from pretend_device import CPU, pretend, whole

@@ -7,10 +7,11 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from lemniscate.api import TrainedRun, config_for, make_envs, resume, train
+    from lemniscate.api import TrainedRun, config_for, resume, train
     from lemniscate.errors import NonFiniteError, SweepError, UserError
     from lemniscate.policy import TrainedPolicy
     from lemniscate.results import evaluate, load, plot, watch
+    from lemniscate.run.environments import make_envs
     from lemniscate.run.evaluate import Evaluation
     from lemniscate.run.run import Stopped
     from lemniscate.run.seeding import set_seeds
@@ -50,7 +51,7 @@ MODULES = {
     "config_for": "api",
     "evaluate": "results",
     "load": "results",
-    "make_envs": "api",
+    "make_envs": "run.environments",
     "plot": "results",
     "resume": "api",
     "resume_sweep": "sweep",

@@ -18,9 +18,10 @@ from lemniscate.errors import UserError, is_installed, missing_extra, unknown_na
 from lemniscate.policy import TrainedPolicy
 from lemniscate.report import pictures as pictures_of
 from lemniscate.report import playback
-from lemniscate.results import evaluation_env, watch
+from lemniscate.results import watch
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import read_config, require_absent
+from lemniscate.run.environments import make_envs
 from lemniscate.run.loggers import TRACKERS, JsonLines, LoggerClass, TensorBoard
 from lemniscate.run.q_bias import critic_of
 from lemniscate.run.run import Run
@@ -61,17 +62,6 @@ def _named(value: object) -> object:
     if isinstance(value, list | tuple):
         return tuple(map(_named, value))
     return named.name_of(value) if callable(value) else value
-
-
-def make_envs(config: RunConfig) -> tuple[VecEnv, VecEnv]:
-    """Two vectors of environments that share nothing: one for training, staggered, and one for evaluation.
-
-    They are restarted with seeds of different streams, so no start of one is ever a start of the other.
-    """
-    device = str(device_for(config.device))
-    world = {"kwargs": config.env_kwargs, "wrappers": config.wrappers, "backend": config.backend}
-    train_env = registry.make(config.env, config.num_envs, device=device, stagger=True, **world)
-    return train_env, evaluation_env(config, config.evaluate_episodes, device=device)
 
 
 def train(
@@ -192,22 +182,6 @@ def loggers_with(track: str | LoggerClass | None) -> tuple[LoggerClass, ...]:
         if not is_installed(extra):
             raise missing_extra(extra, extra)
     return JsonLines, TensorBoard, named.find(track) if isinstance(track, str) else track
-
-
-def device_for(name: str) -> torch.device:
-    """The device of that name; auto is cuda where there is a GPU, else cpu. Raises `UserError` for one not there."""
-    gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
-    if name == "auto":
-        name = "cuda" if gpus else "cpu"
-    kind, _, index = name.partition(":")
-    if kind == "cuda" and not gpus:
-        raise UserError(f"device is {name}, but torch sees no GPU; use cpu or auto.")
-    if kind == "cuda" and int(index or 0) >= gpus:
-        there = ", ".join(f"cuda:{i}" for i in range(gpus))
-        raise UserError(f"device is {name}, but the GPUs that torch sees are: {there}.")
-    if kind == "mps" and not torch.backends.mps.is_available():
-        raise UserError("device is mps, but torch sees no Apple GPU; use cpu or auto.")
-    return torch.device(name)
 
 
 def fresh_directory(env_id: str, name: str) -> Path:

@@ -15,8 +15,8 @@ from lemniscate.report import compare, curves, playback
 from lemniscate.report import pictures as pictures_of
 from lemniscate.report.groups import group
 from lemniscate.run import checkpoint
-from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import find_checkpoint, is_finished, read_config
+from lemniscate.run.environments import evaluation_env
 from lemniscate.run.evaluate import Evaluation
 from lemniscate.run.evaluate import evaluate as evaluate_module
 from lemniscate.run.loggers import read_metrics
@@ -152,28 +152,6 @@ def final_return(run: str | Path) -> float:
         temporary.write_text(json.dumps(known) + "\n")
         temporary.replace(file)
     return known["mean_return"]
-
-
-def evaluation_env(
-    config: RunConfig,
-    episodes: int,
-    *,
-    env: str | Callable[..., Any] | None = None,
-    env_kwargs: Mapping[str, Any] | None = None,
-    backend: str | None = None,
-    device: str = "cpu",
-) -> VecEnv:
-    """A few environments of a run, or of another `env`; as many as in training where a program is compiled for these.
-
-    `env_kwargs` change those of the run; in another environment they are the only ones.
-    """
-    name = config.env if env is None else registry.name_of(env)
-    kwargs = {**(config.env_kwargs if name == config.env else {}), **(env_kwargs or {})}
-    if env is None and backend is None:
-        backend = registry.for_evaluation(config.backend)
-    served_by = backend or registry.backend_for(name, config.wrappers)
-    num_envs = config.num_envs if registry.is_compiled(served_by) else min(episodes, 16)
-    return registry.make(name, num_envs, kwargs=kwargs, wrappers=config.wrappers, device=device, backend=backend)
 
 
 def _final_returns(runs: list[Path]) -> dict[Path, float]:

@@ -24,6 +24,7 @@ from lemniscate.envs import registry
 from lemniscate.errors import SweepError, UserError, prefix_errors
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import is_finished
+from lemniscate.run.environments import device_for
 from lemniscate.run.loggers import read_metrics
 from lemniscate.run.run import Stopped, signals_to
 from lemniscate.run.sweep_file import Sweep, read_sweep
@@ -256,7 +257,7 @@ def _require_trainable(configs: dict[str, RunConfig], seeds: list[int], track: s
     env = registry.make(some.env, 1, backend=some.backend)
     env.close()
     for name, config in configs.items():
-        api.device_for(config.device)
+        device_for(config.device)
         for seed in seeds:
             config.replace(seed=seed)
         with prefix_errors(name):

@@ -1,0 +1,60 @@
+"""The environments of a run: for training, and for evaluation."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+
+from lemniscate.envs import registry
+from lemniscate.envs.vec_env import VecEnv
+from lemniscate.errors import UserError
+from lemniscate.run.config import RunConfig
+
+
+def make_envs(config: RunConfig) -> tuple[VecEnv, VecEnv]:
+    """Two vectors of environments that share nothing: one for training, staggered, and one for evaluation.
+
+    They are restarted with seeds of different streams, so no start of one is ever a start of the other.
+    """
+    device = str(device_for(config.device))
+    world = {"kwargs": config.env_kwargs, "wrappers": config.wrappers, "backend": config.backend}
+    train_env = registry.make(config.env, config.num_envs, device=device, stagger=True, **world)
+    return train_env, evaluation_env(config, config.evaluate_episodes, device=device)
+
+
+def evaluation_env(
+    config: RunConfig,
+    episodes: int,
+    *,
+    env: str | Callable[..., Any] | None = None,
+    env_kwargs: Mapping[str, Any] | None = None,
+    backend: str | None = None,
+    device: str = "cpu",
+) -> VecEnv:
+    """A few environments of a run, or of another `env`; as many as in training where a program is compiled for these.
+
+    `env_kwargs` change those of the run; in another environment they are the only ones.
+    """
+    name = config.env if env is None else registry.name_of(env)
+    kwargs = {**(config.env_kwargs if name == config.env else {}), **(env_kwargs or {})}
+    if env is None and backend is None:
+        backend = registry.for_evaluation(config.backend)
+    served_by = backend or registry.backend_for(name, config.wrappers)
+    num_envs = config.num_envs if registry.is_compiled(served_by) else min(episodes, 16)
+    return registry.make(name, num_envs, kwargs=kwargs, wrappers=config.wrappers, device=device, backend=backend)
+
+
+def device_for(name: str) -> torch.device:
+    """The device of that name; auto is cuda where there is a GPU, else cpu. Raises `UserError` for one not there."""
+    gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if name == "auto":
+        name = "cuda" if gpus else "cpu"
+    kind, _, index = name.partition(":")
+    if kind == "cuda" and not gpus:
+        raise UserError(f"device is {name}, but torch sees no GPU; use cpu or auto.")
+    if kind == "cuda" and int(index or 0) >= gpus:
+        there = ", ".join(f"cuda:{i}" for i in range(gpus))
+        raise UserError(f"device is {name}, but the GPUs that torch sees are: {there}.")
+    if kind == "mps" and not torch.backends.mps.is_available():
+        raise UserError("device is mps, but torch sees no Apple GPU; use cpu or auto.")
+    return torch.device(name)
