@@ -82,10 +82,10 @@ def test_one_that_dies_is_named():
 
 
 def test_one_that_hangs_is_named_and_closing_kills_it(monkeypatch):
-    monkeypatch.setattr(WatchedVectorEnv, "patience", 2.0)
     env = registry.make("envs.test_workers:Stubborn", 3, backend="gymnasium-async")
     try:
-        env.restart(0)  # its copies get the seeds 0, 1, 2
+        env.restart(0)  # the environments get the seeds 0, 1, 2
+        monkeypatch.setattr(WatchedVectorEnv, "patience", 2.0)  # not before: to start takes longer on a busy machine
         with pytest.raises(WorkerError, match=r"Environment 2 has not answered for 2 s\."):
             step(env, 3)
         processes = env.backend._envs.processes
