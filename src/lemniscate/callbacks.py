@@ -47,7 +47,7 @@ def watch_with(
     spec: Spec,
     config: RunConfig,
 ) -> Watch:
-    """What a run calls after each logged line: every callback in turn, each with a policy of its own.
+    """The function that a run calls after each logged line: every callback in turn, each with a policy of its own.
 
     Args:
         callbacks: functions, or names of functions as `module:function`.

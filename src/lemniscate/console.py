@@ -1,4 +1,4 @@
-"""What a person reads: lines and a progress bar on standard error. Standard output is left to programs."""
+"""Text for people: lines and a progress bar on standard error. Standard output is left to programs."""
 
 import sys
 import time

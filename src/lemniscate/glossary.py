@@ -1,4 +1,4 @@
-"""What other libraries call the fields of a Config: the table of docs/glossary.md, in which unknown names are looked up.
+"""The names that other libraries have for the fields of a Config: the table of docs/glossary.md, in which unknown names are looked up.
 
 `python -m lemniscate.glossary` prints the table for that page.
 """

@@ -90,13 +90,13 @@ class ObservationPart:
 
     @cached_property
     def size(self) -> int:
-        """How many numbers it is in the flat observation."""
+        """The number of its values in the flat observation."""
         return sum(self.nvec) if self.nvec else math.prod(self.shape)
 
 
 @dataclass(frozen=True)
 class Spec:
-    """What a policy has to know of an environment; saved with every checkpoint.
+    """The description of an environment that a policy needs; saved with every checkpoint.
 
     `observation_parts` are the parts of the flat observation in their order; their sizes sum to O. With `image`, the
     only part is an image of bytes, height × width × channels, and stays bytes. `max_episode_steps` is the time limit.

@@ -80,7 +80,7 @@ def algorithms() -> dict[str, str]:
 
 
 def add_train_options(parser: argparse.ArgumentParser) -> None:
-    """What `lemniscate train` takes besides the fields of a Config."""
+    """The options of `lemniscate train` besides the fields of a Config."""
     parser.add_argument("--env", metavar="ID", help="environment id, or module:Class of your own")
     parser.add_argument("--run", type=Path, metavar="DIR", help="run directory; must not exist [runs/…]")
     parser.add_argument("--preset", metavar="NAME", help="tuned settings [those of the environment]")

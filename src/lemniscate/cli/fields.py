@@ -45,7 +45,7 @@ SPELLED = {"env_kwargs": "--env-args"}
 
 
 def parse_fields(algorithms: list[str], words: list[str]) -> argparse.Namespace:
-    """What `words` say for all of `algorithms`; the fields of their Configs as a dictionary `fields`.
+    """The options in `words`, for all of `algorithms`; the fields of their Configs as a dictionary `fields`.
 
     Raises:
         UserError: a flag that one of the algorithms does not have, or a value that cannot be read.
@@ -61,7 +61,7 @@ def parse_fields(algorithms: list[str], words: list[str]) -> argparse.Namespace:
 
 
 def flag(name: str) -> str:
-    """How a field is written on the command line."""
+    """The flag of a field on the command line."""
     return SPELLED.get(name, f"--{name.replace('_', '-')}")
 
 

@@ -32,7 +32,7 @@ class EpisodeStatistics:
         self._ended: list[Tensor] = []
 
     def log(self, step: Step, counts: Tensor) -> None:
-        """One step of every copy; `counts` [N] is False where the episode is a fragment."""
+        """One step of every environment; `counts` [N] is False where the episode is a fragment."""
         self._log.append((step.reward, step.terminated, step.truncated, step.valid, counts))
         if len(self._log) == LOG_ROWS:
             self._book()
@@ -49,13 +49,13 @@ class EpisodeStatistics:
         reward, terminated, truncated, valid, counts = (torch.stack(column) for column in zip(*self._log, strict=True))
         done = (terminated | truncated) & valid
         running = episode_sums(torch.stack([reward * valid, valid]).to(self._running.dtype), done, self._running)
-        self._ended.append(running[:, done & counts])  # by time, then by copy
+        self._ended.append(running[:, done & counts])  # by time, then by environment
         self._running = running[:, -1] * ~done[-1]
         self._log = []
 
 
 def episode_sums(rows: Tensor, done: Tensor, carried: Tensor) -> Tensor:
-    """What had run up in each episode by each row.
+    """The running sums of each episode, at each row.
 
     Args:
         rows: quantities to sum, [K, T, N].
@@ -73,7 +73,7 @@ def episode_sums(rows: Tensor, done: Tensor, carried: Tensor) -> Tensor:
 
 
 class Stagger:
-    """The first episode of each copy is cut after a random number of steps, uniform up to the time limit.
+    """The first episode of each environment is cut after a random number of steps, uniform up to the time limit.
 
     A cut counts as a truncation. Without a limit there are no cuts, and every episode is whole.
     """
@@ -86,7 +86,7 @@ class Stagger:
         """[N] bool: the environment's present episode began at its beginning and is not to be cut"""
 
     def apply(self, terminated: np.ndarray, truncated: np.ndarray) -> np.ndarray:
-        """After one more step in every copy: `truncated` [N], with the cuts that are due."""
+        """After one more step in every environment: `truncated` [N], with the cuts that are due."""
         if self.counts.all():
             return truncated
         self._steps_left -= 1

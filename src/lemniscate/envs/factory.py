@@ -1,4 +1,4 @@
-"""How Gymnasium's environments are made: by an id, from a class or a function, with arguments and wrappers."""
+"""The making of Gymnasium's environments: by an id, from a class or a function, with arguments and wrappers."""
 
 import inspect
 import multiprocessing
@@ -23,7 +23,7 @@ Maker = EnvSpec | Callable[..., Any]
 
 
 def maker_of(env: str) -> Maker:
-    """How an environment is made: a registered id, `module:id`, or `module:name` of a class or function of one's own.
+    """The maker of an environment: a registered id, `module:id`, or `module:name` of a class or function of one's own.
 
     Raises `UserError` if it is not there, or is neither.
     """

@@ -49,7 +49,7 @@ class GymnasiumBackend:
 
     @classmethod
     def ids(cls) -> Collection[str]:
-        """What Gymnasium's registry holds."""
+        """The ids of Gymnasium's registry."""
         return gym.registry
 
     @classmethod

@@ -119,7 +119,7 @@ def _scale(box: Box) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
 
 
 def physical_action(action: np.ndarray, kind: Action) -> np.ndarray:
-    """What a policy chose, as `env.step` wants it: in the environment's own units and shape, [N, …]."""
+    """Actions of a policy in the units and the shape of the environment, as `env.step` takes them, [N, …]."""
     if isinstance(kind, Discrete):
         return action + kind.start
     if isinstance(kind, Box):

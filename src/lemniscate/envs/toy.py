@@ -36,11 +36,11 @@ class ToyEnv(VectorEnv):
         return self._observe(), {}
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict]:
-        """One step of every copy; in NEXT_STEP, a copy that has ended ignores its action and resets."""
+        """One step of every environment; in NEXT_STEP, one that has ended ignores its action and resets."""
         mode = self.metadata["autoreset_mode"]
         ignored = self._done if mode is AutoresetMode.NEXT_STEP else np.zeros(self.num_envs, dtype=bool)
         if mode is AutoresetMode.DISABLED:
-            assert not self._done.any(), "a copy that has ended was stepped without a reset"
+            assert not self._done.any(), "an environment that has ended was stepped without a reset"
         self._begin(ignored)
         # A reset row pays a reward too, as crazyflow's does: nobody may learn from it.
         reward = np.where(ignored, 100.0, self._reward(np.asarray(actions)))
@@ -75,7 +75,7 @@ class ToyEnv(VectorEnv):
 class Countdown(ToyEnv):
     """Every step pays 1, whatever is done; an episode terminates after `length` steps, is truncated after `horizon`.
 
-    The observation is (copy, episode, step), so every row says who it is and a misaligned one is seen. With k steps
+    The observation is (environment, episode, step), so every row says who it is and a misaligned one is seen. With k steps
     left before the termination V = (1 − γ^k) / (1 − γ); if it never terminates V = 1 / (1 − γ), however often it is
     truncated.
     """

@@ -20,15 +20,15 @@ class WatchedVectorEnv(AsyncVectorEnv):
     patience: float = 60.0
 
     def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        """As Gymnasium's. Raises `WorkerError` if a worker died or does not answer."""
+        """Gymnasium's, with the timeout. Raises `WorkerError` if a worker died or does not answer."""
         return self._watched(lambda: self.reset_async(seed=seed, options=options), self.reset_wait)
 
     def step(self, actions: Any) -> Any:
-        """As Gymnasium's. Raises `WorkerError` if a worker died or does not answer."""
+        """Gymnasium's, with the timeout. Raises `WorkerError` if a worker died or does not answer."""
         return self._watched(lambda: self.step_async(actions), self.step_wait)
 
     def _check_spaces(self) -> None:
-        """As Gymnasium's, which waits without end; so first ask whether every worker is there."""
+        """Gymnasium's, which waits without end; so every worker has to answer once before."""
         try:
             self._watched(lambda: self.call_async("metadata"), self.call_wait)
         except WorkerError:

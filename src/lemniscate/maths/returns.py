@@ -56,7 +56,7 @@ def reward_to_go(
     *,
     gamma: float = 0.99,
 ) -> Float[Tensor, "T N"]:
-    """What follows each action: Sutton & Barto 2018, section 13.3.
+    """The discounted rewards that follow each action: Sutton & Barto 2018, section 13.3.
 
         G_t = r_t + γ G_{t+1}       up to the end of the episode
 

@@ -49,7 +49,7 @@ def clip_fraction(log_ratio: Tensor, clip: float) -> Tensor:
 
 
 def ratio_statistics(log_ratio: Tensor, clip: float) -> dict[str, Tensor]:
-    """What to watch of how far a policy has moved: the two KL estimates and the clip fraction, by their usual names."""
+    """The distance that a policy has moved: the two KL estimates and the clip fraction, by their usual names."""
     return {
         "approx_kl": kl_k3(log_ratio),
         "old_approx_kl": kl_k1(log_ratio),

@@ -96,7 +96,7 @@ def backtrack(
     shrink: float = 0.8,
     attempts: int = 10,
 ) -> tuple[Float[Tensor, " P"], float]:
-    """Where to stand after a step: the farthest of start + shrinkʲ · step that keeps both promises.
+    """Backtracking line search: the farthest point start + shrinkʲ · step that meets both conditions.
 
     Promised are a loss below that at the start, and a KL within δ (arXiv:1502.05477, appendix C). Nothing is moved and
     nothing has to be put back: the caller goes where this says.

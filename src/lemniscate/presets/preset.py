@@ -1,4 +1,4 @@
-"""What a preset is."""
+"""The record of a preset."""
 
 from dataclasses import dataclass
 

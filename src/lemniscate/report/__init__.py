@@ -1,1 +1,1 @@
-"""What people look at: plots, flights, videos."""
+"""Pictures for people: plots, flights, videos."""

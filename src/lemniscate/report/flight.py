@@ -122,7 +122,7 @@ def animate(flight: Flight, every: int = 4) -> list[np.ndarray]:
 
 
 def _rotate_x_axis(quaternion: np.ndarray) -> np.ndarray:
-    """Where the body's x axis points in the world; quaternion xyzw."""
+    """The direction of the body's x axis in the world, from quaternions xyzw."""
     x, y, z, w = quaternion
     return np.array([1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)])
 

@@ -12,14 +12,19 @@ from lemniscate.run.evaluate import Evaluation, evaluate
 
 
 def sentence(scores: Evaluation) -> str:
-    """What an evaluation says to a person."""
+    """The scores of an evaluation in one sentence, or two."""
     said = (
         f"{scores.mean_return:.1f} ± {scores.std_return:.1f} return over {scores.episodes} episodes of {scores.env_id}"
     )
     if scores.measures:
-        measures = ", ".join(f"{name} {value:.4g}" for name, value in scores.measures.items())
-        said += f", {scores.terminated} of them terminated; {measures}"
+        said += f", {scores.terminated} of them terminated; {', '.join(_in_words(*m) for m in scores.measures.items())}"
     return f"{said}.\n{scores.q_bias}." if scores.q_bias else f"{said}."
+
+
+def _in_words(name: str, value: float) -> str:
+    """A measure in words; the ending of a name in millimetres is its unit."""
+    words = name.removesuffix("_mm").replace("_", " ")
+    return f"{words} {value:.4g} mm" if name.endswith("_mm") else f"{words} {value:.4g}"
 
 
 def report(

@@ -1,1 +1,1 @@
-"""What surrounds training: the loop's generator, checkpoints, logs, evaluation, seeds."""
+"""The surroundings of training: the loop's generator, checkpoints, logs, evaluation, seeds."""

@@ -1,4 +1,4 @@
-"""What surrounds a training loop: the generator that the loop is written over.
+"""The surroundings of a training loop: the generator that the loop is written over.
 
     for env in run.until(config.total_steps, state):
         ...one update, one `run.log`...
@@ -220,7 +220,7 @@ class Run:
             say(sentence)
 
     def _checkpoint_interval(self) -> int:
-        """As configured; else a fifth of the run, or three whole episodes of each environment if that is longer."""
+        """The configured interval; else a fifth of the run, or three whole episodes of each environment if that is longer."""
         longest = self.spec.max_episode_steps or 0
         fifth = -(-self.config.total_steps // 5)
         return self.config.checkpoint_every or max(fifth, 3 * longest * self.config.num_envs)
