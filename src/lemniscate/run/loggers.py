@@ -1,4 +1,4 @@
-"""Destinations of metrics. A logger is one class with `write` and `close`; a tracker is a logger that has to be asked for."""
+"""Destinations of metrics. A logger is one class with `write` and `close`; a tracker is a logger on request."""
 
 import json
 import math

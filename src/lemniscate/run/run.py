@@ -220,7 +220,7 @@ class Run:
             say(sentence)
 
     def _checkpoint_interval(self) -> int:
-        """The configured interval; else a fifth of the run, or three whole episodes of each environment if that is longer."""
+        """The configured interval; else a fifth of the run, or three episodes of each environment if that is longer."""
         longest = self.spec.max_episode_steps or 0
         fifth = -(-self.config.total_steps // 5)
         return self.config.checkpoint_every or max(fifth, 3 * longest * self.config.num_envs)
