@@ -97,9 +97,10 @@ def test_the_pictures_of_training_are_drawn(name, fields):
     assert all(axes.lines for axes in figure.axes)
 
 
-def test_every_command_of_the_readme_is_understood():
+def test_every_command_of_the_readme_is_understood(monkeypatch):
     from lemniscate.cli import parse
 
+    monkeypatch.chdir(ROOT / "examples")  # where the algorithm of one's own is
     lines = re.findall(r"^lemniscate ([^#\n]+)", (ROOT / "README.md").read_text(), re.MULTILINE)
     assert len(lines) >= 6
     for line in lines:

@@ -76,8 +76,8 @@ class Countdown(ToyEnv):
     """Every step pays 1, whatever is done; an episode terminates after `length` steps, is truncated after `horizon`.
 
     The observation is (environment, episode, step), so every row says who it is and a misaligned one is seen. With k
-    steps left before the termination V = (1 − γ^k) / (1 − γ); if it never terminates V = 1 / (1 − γ), however often it is
-    truncated.
+    steps left before the termination V = (1 − γ^k) / (1 − γ); if it never terminates V = 1 / (1 − γ), however often it
+    is truncated.
     """
 
     def __init__(
