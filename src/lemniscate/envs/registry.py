@@ -74,7 +74,8 @@ def for_evaluation(backend: str | None) -> str | None:
     if backend is None:
         return None
     found = backend_class(backend)
-    if not is_installed(getattr(found, "package", "lemniscate")):
+    package = getattr(found, "package", None)
+    if package and not is_installed(package):
         return None
     return getattr(found, "in_process", backend)
 
