@@ -88,7 +88,7 @@ def test_at_the_end_there_is_one_table_and_one_picture(trained):
 
 def test_the_sweep_is_plotted_again_without_playing(trained, monkeypatch):
     path, _ = trained
-    monkeypatch.setattr(lem.api, "evaluate", None)
+    monkeypatch.setattr(lem.results, "evaluate", None)
     assert {picture.parent for picture in lem.plot(path)} == {path / "plots"}
 
 

@@ -62,7 +62,10 @@ MODULES = {
 }
 """where each public name is defined"""
 
-SUBMODULES = ("algos", "api", "course", "data", "envs", "errors", "maths", "nn", "policy", "presets", "sweep", "types")
+SUBMODULES = (
+    *("algos", "api", "course", "data", "envs", "errors", "maths", "nn", "optim", "policy", "presets", "report"),
+    *("results", "run", "spec", "sweep", "testing", "types"),
+)
 """what `lemniscate.NAME` imports by itself"""
 
 
