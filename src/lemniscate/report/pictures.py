@@ -1,5 +1,6 @@
 """Everything a finished run is shown with: numbers in a sentence, plots, an animation."""
 
+import math
 from pathlib import Path
 
 from lemniscate.console import say
@@ -17,7 +18,8 @@ def sentence(scores: Evaluation) -> str:
         f"{scores.mean_return:.1f} ± {scores.std_return:.1f} return over {scores.episodes} episodes of {scores.env_id}"
     )
     if scores.measures:
-        said += f", {scores.terminated} of them terminated; {', '.join(_in_words(*m) for m in scores.measures.items())}"
+        words = [_in_words(name, value) for name, value in scores.measures.items() if math.isfinite(value)]
+        said += f", {scores.terminated} of them terminated; {', '.join(words)}"
     return f"{said}.\n{scores.q_bias}." if scores.q_bias else f"{said}."
 
 
