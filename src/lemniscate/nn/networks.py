@@ -129,21 +129,26 @@ class Residual(nn.Module):
 
 
 class ImageEncoder(nn.Module):
-    """Three strided 3 × 3 convolutions with ReLU (16, 32, 32 channels), each halving height and width."""
+    """Two convolutions with ReLU, 16 and 32 channels.
+
+    8 × 8 pixels in steps of 4, then 4 × 4 in steps of 2 (Mnih et al. 2013, arXiv:1312.5602, section 4.1); in images
+    with a side below 36 pixels, such as a grid world's, 3 × 3 in steps of 1, then of 2.
+    """
 
     def __init__(self, shape: tuple[int, int, int]) -> None:
         super().__init__()
-        self.shape = shape
-        channels = (shape[2], 16, 32, 32)
-        layers: list[nn.Module] = []
-        for i in range(3):
-            convolution = nn.Conv2d(channels[i], channels[i + 1], kernel_size=3, stride=2, padding=1)
-            layers += [_orthogonal(convolution, 2**0.5), nn.ReLU()]
-        self.layers = nn.Sequential(*layers, nn.Flatten())
-        height, width, _ = shape
-        for _ in range(3):
-            height, width = (height + 1) // 2, (width + 1) // 2
-        self.size = channels[-1] * height * width
+        self.shape = height, width, channels = shape
+        if min(height, width) < 36:
+            first = nn.Conv2d(channels, 16, kernel_size=3, padding=1)
+            second = nn.Conv2d(16, 32, kernel_size=3, stride=2, padding=1)
+        else:
+            first = nn.Conv2d(channels, 16, kernel_size=8, stride=4)
+            second = nn.Conv2d(16, 32, kernel_size=4, stride=2)
+        self.layers = nn.Sequential(
+            _orthogonal(first, 2**0.5), nn.ReLU(), _orthogonal(second, 2**0.5), nn.ReLU(), nn.Flatten()
+        )
+        with torch.no_grad():
+            self.size = self.layers(torch.zeros(1, channels, height, width)).shape[-1]
         """length of what comes out"""
 
     def forward(self, pixels: Tensor) -> Tensor:
