@@ -1,9 +1,12 @@
 """Hidden layers: initialization, layer norm, SimBa, products in bfloat16, activations."""
 
+import math
+
+import pytest
 import torch
 
 from lemniscate.nn.activations import Tanh
-from lemniscate.nn.networks import Bfloat16Linear, Layers
+from lemniscate.nn.networks import Bfloat16Linear, ImageEncoder, Layers
 
 
 def test_layers_are_orthogonal_with_their_gains():
@@ -65,3 +68,33 @@ def test_simba_is_residual_blocks_between_a_layer_and_a_norm(rng):
     network.load_state_dict(torch.nn.Sequential(first, one, two, norm, last).state_dict())
     torch.testing.assert_close(network(x), last(norm(hidden)))
     assert isinstance(norm, torch.nn.LayerNorm)
+
+
+@pytest.mark.parametrize(
+    ("shape", "size"), [((84, 84, 4), 32 * 9 * 9), ((96, 60, 3), 32 * 10 * 6), ((7, 7, 3), 32 * 4 * 4)]
+)
+def test_images_of_any_size_become_normalized_features(shape, size):
+    """Adam could not silence them: what two images differ in stays of the size of a normalized number."""
+    encoder = ImageEncoder(shape)
+    image = torch.full((2, 5, math.prod(shape)), 0.4)
+    image[:, :, -1] = -0.5
+    features = encoder(image)
+    assert features.shape == (2, 5, size) == (2, 5, encoder.size)
+    torch.testing.assert_close(features.var(-1, correction=0), torch.ones(2, 5), atol=1e-3, rtol=0)
+    with torch.no_grad():
+        encoder.layers[0].bias.fill_(-1e-3)
+    moved = image.clone()
+    moved[:, :, : shape[2]] = -0.5
+    assert (encoder(moved) - features).abs().max() > 1e-3
+
+
+def test_the_layout_of_an_image_is_height_width_channels():
+    """A bright column of the second channel reaches the convolution as a column of that channel."""
+    encoder = ImageEncoder((40, 44, 2))
+    pixels = torch.zeros(40, 44, 2)
+    pixels[:, 7, 1] = 1
+    seen = []
+    encoder.layers[0].register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
+    encoder(pixels.flatten())
+    assert seen[0].shape == (1, 2, 40, 44)
+    assert seen[0][0, 1, :, 7].eq(1).all() and seen[0].sum() == 40

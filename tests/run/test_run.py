@@ -78,6 +78,22 @@ def test_unasked_there_are_five_checkpoints_or_as_many_as_leave_episodes_whole(t
     assert len(checkpoint.list_steps(tmp_path / "r" / "checkpoints")) == planned
 
 
+def test_a_time_limit_that_episodes_hardly_reach_does_not_keep_a_run_without_checkpoints(tmp_path):
+    """Four copies: one each 12,000 steps, where 27,000 steps of each are allowed."""
+    limit = {"max_episode_steps": 27_000}
+    train(
+        tmp_path / "r",
+        "CartPole-v1",
+        env_kwargs=limit,
+        backend="gymnasium",
+        total_steps=24_000,
+        num_steps=1_500,
+        epochs=1,
+        minibatch_size=6_000,
+    )
+    assert checkpoint.list_steps(tmp_path / "r" / "checkpoints") == [12_000, 24_000]
+
+
 def test_what_follows_episodes_is_restarted_with_the_environments(tmp_path, monkeypatch):
     """At the start and at each planned checkpoint but the last, after which nothing is played."""
     told = []

@@ -30,11 +30,11 @@ class NoNorm(nn.Module):
 
 
 class ScaleBytes(NoNorm):
-    """Bytes to numbers from 0 to 1."""
+    """Bytes to numbers from -½ to ½."""
 
     def forward(self, obs: Tensor) -> Tensor:
         """[…, O or more] uint8 to […, O]."""
-        return super().forward(obs).float() / 255
+        return super().forward(obs).float() / 255 - 0.5
 
 
 class WideBuffers(nn.Module):

@@ -220,8 +220,11 @@ class Run:
             say(sentence)
 
     def _checkpoint_interval(self) -> int:
-        """The configured interval; else a fifth of the run, or three episodes of each environment if that is longer."""
-        longest = self.spec.max_episode_steps or 0
+        """The configured interval; else a fifth of the run, or three episodes of each environment if that is longer.
+
+        Where a limit is above 1,000 steps, as the 27,000 of Atari's, episodes hardly ever last so long.
+        """
+        longest = min(self.spec.max_episode_steps or 0, 1000)
         fifth = -(-self.config.total_steps // 5)
         return self.config.checkpoint_every or max(fifth, 3 * longest * self.config.num_envs)
 
