@@ -88,11 +88,16 @@ def notebook(record: dict, folder: Path) -> str:
     for number, cell in enumerate(record["cells"]):
         source = "".join(cell["source"])
         if cell["cell_type"] == "markdown":
-            parts.append(FORMULA.sub(lambda found: convert(found[1].replace("\n", " ")), source))
+            parts.append(FORMULA.sub(formula, source))
         else:
             parts.append(fenced(source, "python"))
             parts += map(partial(output, folder, number), cell["outputs"], range(len(cell["outputs"])))
     return "\n\n".join(filter(None, parts)) + "\n"
+
+
+def formula(found: re.Match[str]) -> str:
+    """A formula as MathML, in a span because a line that begins with <math> would be a paragraph of its own."""
+    return f"<span>{convert(found[1].replace(chr(10), ' '))}</span>"
 
 
 def output(folder: Path, cell: int, record: dict, number: int) -> str:
