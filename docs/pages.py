@@ -113,7 +113,7 @@ def output(folder: Path, cell: int, record: dict, number: int) -> str:
         return f'<div class="output">{"".join(data["text/html"])}</div>'
     lines = COLOUR.sub("", "".join(data.get("text/plain", ""))).split("\n")
     said = "\n".join(line.rstrip("\r").rpartition("\r")[2] for line in lines).strip("\n")  # as a terminal shows it
-    return fenced(said, "text") if said.strip() else ""
+    return fenced(said, "output") if said.strip() else ""
 
 
 def fenced(text: str, language: str) -> str:
