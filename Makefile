@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
-.PHONY: setup fly test test-long check bench bench-returns tutorials lock clean
+.PHONY: setup fly test test-long check wheel docs docs-serve bench bench-returns tutorials lock clean
 
 setup: .venv/.ready
 
@@ -29,11 +29,21 @@ check: setup  ## style, types, floors
 	$(BIN)/pyright
 	$(BIN)/lint-imports
 
-bench: .venv/.peers  ## the README's speed tables, beside the peers: an hour on a quiet machine
+wheel: setup  ## dist/lemniscate-….whl
+	$(BIN)/python -m pip wheel --quiet --no-deps --no-build-isolation --wheel-dir dist .
+
+docs: setup  ## the documentation site in build/site; warnings are errors
+	$(BIN)/python docs/pages.py
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
+
+docs-serve: docs  ## the site at http://localhost:8000
+	$(BIN)/python -m http.server --directory build/site
+
+bench: .venv/.peers  ## the tables of docs/speed.md, beside the peers: an hour on a quiet machine
 	$(BIN)/python benchmarks/figure_eight.py
 	$(BIN)/python benchmarks/speed.py
 
-bench-returns: setup  ## the README's returns, seed by seed: a day; returns.py takes some of them too
+bench-returns: setup  ## the tables of docs/results.md, seed by seed: a day; returns.py takes some of them too
 	$(BIN)/python benchmarks/returns.py reinforce a2c trpo ppo ddpg td3 sac
 
 .venv/.peers: .venv/.ready
@@ -44,7 +54,7 @@ tutorials: setup  ## the notebooks, from docs/tutorial/*.py
 	$(BIN)/jupytext --quiet --update --to notebook docs/tutorial/*.py
 
 lock: setup  ## renew requirements.lock from pyproject.toml
-	$(BIN)/pip-compile --quiet --strip-extras --extra box2d --extra classic-control --extra drone --extra envpool --extra mujoco --extra dev --no-emit-index-url --no-emit-find-links --no-emit-trusted-host --no-header --allow-unsafe --annotation-style=line --constraint constraints.txt --output-file requirements.lock pyproject.toml
+	$(BIN)/pip-compile --quiet --strip-extras --extra box2d --extra classic-control --extra drone --extra envpool --extra mujoco --extra docs --extra dev --no-emit-index-url --no-emit-find-links --no-emit-trusted-host --no-header --allow-unsafe --annotation-style=line --constraint constraints.txt --output-file requirements.lock pyproject.toml
 	sed -i 's/+cpu//' requirements.lock
 
 clean:

@@ -1,6 +1,6 @@
 """The drone's figures: presets over seeds, each in a process of its own from start to evaluated.
 
-    make bench                                            the presets of the README, seeds 1 to 5
+    make bench                                            the presets of docs/results.md, seeds 1 to 5
     .venv/bin/python benchmarks/figure_eight.py --presets figure-eight --seeds 1 2 3
 
 Each row of `benchmarks/results/figure_eight.jsonl` says with which commit, versions and machine it was made. Every seed

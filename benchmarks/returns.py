@@ -1,6 +1,6 @@
 """Final returns of the presets over seeds: mean, std and IQM of the last policy, deterministic, in Gymnasium itself.
 
-    .venv/bin/python benchmarks/returns.py ppo                       every environment of the README, every seed
+    .venv/bin/python benchmarks/returns.py ppo                       every environment of docs/results.md, every seed
     .venv/bin/python benchmarks/returns.py ppo --envs Hopper-v5 --seeds 1 2
     .venv/bin/python benchmarks/returns.py ddpg --runs DIR           keep the runs there, and go on with unfinished ones
     .venv/bin/python benchmarks/returns.py ppo trpo --table          the table of what has been run, and the pictures
@@ -98,7 +98,7 @@ def measured(algorithm, env, steps):
 
 
 def summary(algorithm):
-    """The README's rows of what has been run."""
+    """The rows of docs/results.md of what has been run."""
     from lemniscate.report.seeds import bootstrap_interval, iqm
 
     for env, (marks, _) in RUNS[algorithm].items():

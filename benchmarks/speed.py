@@ -124,7 +124,7 @@ def measured(what, env=None):
 
 
 def summary():
-    """The README's table: medians, and the medians of ratios within a round."""
+    """The table of docs/speed.md: medians, and the medians of ratios within a round."""
     print("| environment | lemniscate | beside it | | lemniscate is |")
     print("|---|---|---|---|---|")
     for env in ENVS:
@@ -302,7 +302,7 @@ def take_turns(processes, turns):
 
 
 def replay_summary():
-    """The README's table of it: medians, and the medians of ratios within a round."""
+    """The table of docs/speed.md of it: medians, and the medians of ratios within a round."""
     speeds = measured("replay")
     print("| DDPG, Hopper-v5 | steps/s | × sb3 | × sbx |")
     print("|---|---|---|---|")

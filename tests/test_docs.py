@@ -1,8 +1,13 @@
 """What the documents say is in the code, and what they show runs."""
 
+import ast
+import json
 import re
 import runpy
 import shlex
+import sys
+import textwrap
+import tomllib
 from importlib import import_module
 from pathlib import Path
 
@@ -10,6 +15,20 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 SOURCE = ROOT / "src" / "lemniscate"
+PAGES = [str(p.relative_to(ROOT)) for p in (*ROOT.glob("*.md"), *sorted(ROOT.glob("docs/**/*.md")))]
+MAKEFILE = (ROOT / "Makefile").read_text()
+
+
+def text_of(page):
+    return (ROOT / page).read_text()
+
+
+def blocks(page, language):
+    return re.findall(rf"^```{language}\n(.*?)^```$", text_of(page), re.DOTALL | re.MULTILINE)
+
+
+def with_blocks(language):
+    return [(page, block) for page in PAGES for block in blocks(page, language)]
 
 
 def equation_rows():
@@ -32,21 +51,137 @@ def test_every_line_that_the_notes_quote_is_there(file, code):
     assert code in (SOURCE / file).read_text()
 
 
-@pytest.mark.parametrize(
-    "page", ["README.md", "CONTRIBUTING.md", *(str(p.relative_to(ROOT)) for p in ROOT.glob("docs/**/*.md"))]
-)
+def anchors(page):
+    """The anchors of a page's headings."""
+    prose = re.sub(r"^```.*?^```$", "", text_of(page), flags=re.DOTALL | re.MULTILINE)
+    titles = re.findall(r"^#+ (.+)$", prose, re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+@pytest.mark.parametrize("page", [*PAGES, "llms.txt"])
 def test_every_link_leads_somewhere(page):
-    links = re.findall(r"\]\(([^)#]+)\)", (ROOT / page).read_text())
+    links = re.findall(r"\]\(([^)\s]+)\)", text_of(page))
     for link in links:
-        assert link.startswith("https://") or ((ROOT / page).parent / link).exists(), link
+        if not link.startswith("https://"):
+            name, _, anchor = link.partition("#")
+            target = (ROOT / page).parent / name if name else ROOT / page
+            assert target.is_file(), link
+            assert not anchor or anchor in anchors(target.resolve().relative_to(ROOT)), link
 
 
-def test_the_python_of_the_readme_runs(tmp_path, monkeypatch):
+@pytest.mark.parametrize("page", PAGES)
+def test_every_file_that_a_page_names_is_there(page):
+    folders = "benchmarks|docs|tests|examples|src"
+    for name in re.findall(rf"`\.?/?((?:{folders})/[\w./-]+\.\w+)[` ]", text_of(page)):
+        assert (ROOT / name).is_file(), name
+    for name in re.findall(r"<!-- file: (.+?) -->", text_of(page)):
+        assert (ROOT / name).is_file(), name
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_lists_and_tables_begin_after_an_empty_line(page):
+    """On GitHub they need not; on the site they would be a part of the paragraph."""
+    prose = re.sub(r"^```.*?^```$", "", text_of(page), flags=re.DOTALL | re.MULTILINE)
+    assert not re.search(r"^(?![-|#\s]|\d+\. ).+\n(- |\| |1\. )", prose, re.MULTILINE)
+
+
+@pytest.mark.parametrize(
+    ("page", "code"), [(page, code) for page, code in with_blocks("python") if "lander" not in page]
+)
+def test_python_runs(page, code, tmp_path, monkeypatch):
+    """A block that imports is a program, another the inside of a function."""
     monkeypatch.chdir(tmp_path)
-    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    if "import " not in code:
+        ast.parse(f"def function():\n{textwrap.indent(code, '    ')}")
+        return
     scope = {}
-    exec(code.replace("total_steps=20_000", "total_steps=2_048, progress=False"), scope)
-    assert scope["action"] in (0, 1)
+    exec(re.sub(r"total_steps=[\d_]+", "total_steps=2_048, report=False", code), scope)
+    assert "action" not in scope or scope["action"] in (0, 1)
+
+
+def test_the_home_page_is_short():
+    page = text_of("README.md")
+    assert len(page.splitlines()) <= 100
+    (code,) = blocks("README.md", "python")
+    assert len(code.splitlines()) <= 8
+    figures = [line for line in page.splitlines() if re.match(r"\| [A-Z]\w+", line)]
+    assert 1 <= len(figures) <= 10
+    tables = text_of("docs/results.md")
+    for line in figures:
+        algorithm, env, steps, value, seeds, _ = (cell.strip() for cell in line.strip("| ").split("|"))
+        row = rf"^\| {algorithm.split()[0]} .?.?\| {env} \| {steps} \| {value} \|.*\| {seeds} \|"
+        assert "495 of 500" in line or re.search(row, tables, re.MULTILINE), line
+
+
+def shell_lines():
+    """(page, words) of every command in a block."""
+    found = []
+    for page, block in [*with_blocks(""), *with_blocks("sh")]:
+        for line in block.replace("\\\n", " ").splitlines():
+            if re.match(r"([A-Z_]+=\S+ )?(lemniscate|make|pip|docker|python|benchmarks/\S+|\.venv/\S+) ", line):
+                words = shlex.split(line, comments=True)
+                found.append((page, words[1:] if "=" in words[0] else words))
+    return found
+
+
+def test_there_are_commands():
+    assert len(shell_lines()) >= 40
+
+
+@pytest.mark.parametrize(("page", "words"), shell_lines(), ids=lambda x: x if isinstance(x, str) else " ".join(x))
+def test_every_command_is_understood(page, words, monkeypatch):
+    from lemniscate.cli import parse
+
+    monkeypatch.chdir(ROOT / "examples")  # where the files of one's own are
+    program = words[0]
+    if words[:2] == ["docker", "run"]:
+        program, words = "lemniscate", words[words.index("lemniscate") :]
+    if program == "lemniscate" and words[1].startswith("--"):
+        with pytest.raises(SystemExit, match=r"^0$"):
+            parse(words[1:])
+    elif program == "lemniscate":
+        parse(words[1:])
+    elif program == "make":
+        for target in (word for word in words[1:] if "=" not in word):
+            assert re.search(rf"^{target}:", MAKEFILE, re.MULTILINE), target
+    elif program == "pip":
+        extras = tomllib.loads(text_of("pyproject.toml"))["project"]["optional-dependencies"]
+        for names in re.findall(r"^\.\[(.+)\]$", " ".join(words[2:]), re.MULTILINE):
+            assert set(names.split(",")) <= set(extras)
+
+
+def constants():
+    """Every string of the source, the parts of f-strings too."""
+    trees = [ast.parse(file.read_text()) for file in SOURCE.rglob("*.py")]
+    return [
+        node.value
+        for tree in trees
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Constant) and node.value.__class__ is str
+    ]
+
+
+def test_every_message_that_is_quoted_can_be_said():
+    messages = [line for block in blocks("docs/faq.md", "output") for line in block.splitlines()]
+    assert len(messages) >= 15
+    said = constants()
+    for message in messages:
+        for part in message.split("…"):
+            assert any(part.strip() in constant for constant in said), part
+
+
+def test_what_is_counted_is_counted():
+    sys.path.insert(0, str(ROOT / "tests" / "envs"))
+    try:
+        mutants, contract = import_module("test_mutants").MUTANTS, import_module("test_contract").EVERY
+    finally:
+        sys.path.pop(0)
+    golden = json.loads(text_of("tests/algos/golden.json"))
+    guarantees = " ".join(text_of("docs/guarantees.md").split())
+    assert f"each of {len(mutants)} wrong versions" in " ".join(text_of("README.md").split())
+    assert f"**{len(mutants)} wrong versions**" in guarantees
+    assert f"**{len(golden)} golden records**" in guarantees
+    assert f"on {len(contract)} environments" in guarantees
 
 
 def test_the_python_of_the_lander_runs(tmp_path, monkeypatch):
@@ -95,16 +230,6 @@ def test_baselines_lower_the_variance_of_the_gradient_in_the_picture():
 def test_the_pictures_of_training_are_drawn(name, fields):
     figure = drawing(name)["draw"](steps=4096, **fields)
     assert all(axes.lines for axes in figure.axes)
-
-
-def test_every_command_of_the_readme_is_understood(monkeypatch):
-    from lemniscate.cli import parse
-
-    monkeypatch.chdir(ROOT / "examples")  # where the algorithm of one's own is
-    lines = re.findall(r"^lemniscate ([^#\n]+)", (ROOT / "README.md").read_text(), re.MULTILINE)
-    assert len(lines) >= 6
-    for line in lines:
-        parse(shlex.split(line))
 
 
 def test_every_field_has_its_docstring():

@@ -6,6 +6,8 @@ Names are imported at their first use, so that `import lemniscate` and `lemnisca
 from importlib import import_module
 from typing import TYPE_CHECKING
 
+__version__ = "0.2.0"
+
 if TYPE_CHECKING:
     from lemniscate.api import TrainedRun, config_for, resume, train
     from lemniscate.errors import NonFiniteError, SweepError, UserError

@@ -102,6 +102,13 @@ def table() -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
+def words_of(library: str) -> str:
+    """A table in Markdown of the fields that a library has a name for: its name, and the one here."""
+    column = 1 + LIBRARIES.index(library)
+    lines = [(library, "lemniscate"), ("---", "---"), *((row[column], row[0]) for row in rows() if "`" in row[column])]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
 def names_in(cell: str) -> list[str]:
     """The names in backticks: `a` gives a, and `a["b"]["c"]` a, b and c."""
     return [name for code in re.findall("`([^`]+)`", cell) for name in re.findall(r"\w+", code)]

@@ -14,6 +14,7 @@ from pathlib import Path
 from shutil import get_terminal_size
 from typing import Any, NoReturn
 
+from lemniscate import __version__
 from lemniscate.algos import ALGORITHMS
 from lemniscate.console import say
 from lemniscate.errors import NonFiniteError, SweepError, UserError, WorkerError, is_installed, unknown_name
@@ -116,7 +117,7 @@ class _Help(argparse.RawDescriptionHelpFormatter):
 def _parsers() -> tuple[Parser, dict[str, Parser]]:
     """The parser of everything, and that of each command."""
     parser = Parser(prog="lemniscate", description="Train, evaluate and watch reinforcement-learning policies.")
-    parser.add_argument("--version", action=_Version, nargs=0, help="print the version")
+    parser.add_argument("--version", action="version", version=f"lemniscate {__version__}", help="print the version")
     commands = parser.add_subparsers(dest="command", required=True, title="commands", metavar="COMMAND")
     subs = {name: commands.add_parser(name, help=text, description=text) for name, text in COMMANDS.items()}
     subs["train"].usage = "lemniscate train ALGORITHM --env ID [--run DIR] [--preset NAME] [--FIELD VALUE …]"
@@ -155,16 +156,6 @@ def _add_endings(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--score", action="store_true", help="evaluate the final policy over 100 episodes and store the result"
     )
-
-
-class _Version(argparse.Action):
-    """Prints the installed version; looking it up takes a while, so only when asked."""
-
-    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> NoReturn:
-        from importlib.metadata import version
-
-        print(f"lemniscate {version('lemniscate')}")
-        parser.exit()
 
 
 def _parse_train(parser: Parser, words: list[str]) -> argparse.Namespace:
