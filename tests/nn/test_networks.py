@@ -97,4 +97,5 @@ def test_the_layout_of_an_image_is_height_width_channels():
     encoder.layers[0].register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
     encoder(pixels.flatten())
     assert seen[0].shape == (1, 2, 40, 44)
-    assert seen[0][0, 1, :, 7].eq(1).all() and seen[0].sum() == 40
+    assert seen[0][0, 1, :, 7].eq(1).all()
+    assert seen[0].sum() == 40
