@@ -7,7 +7,7 @@ from typing import Any
 import torch
 
 from lemniscate import named
-from lemniscate.errors import UserError
+from lemniscate.errors import UserError, shown
 from lemniscate.policy import TrainedPolicy
 from lemniscate.run.config import RunConfig
 from lemniscate.run.run import Watch
@@ -42,7 +42,7 @@ class PolicySnapshot(TrainedPolicy):
 
 
 def watch_with(
-    callbacks: Sequence[Callback | str],
+    callbacks: Callback | str | Sequence[Callback | str],
     copy_networks: Callable[[TrainState], Any],
     spec: Spec,
     config: RunConfig,
@@ -50,7 +50,7 @@ def watch_with(
     """The function that a run calls after each logged line: every callback in turn, each with a policy of its own.
 
     Args:
-        callbacks: functions, or names of functions as `module:function`.
+        callbacks: functions, or names of functions as `module:function`; or one of these.
         copy_networks: networks on the CPU that share nothing with those of the state.
         spec: of the policy.
         config: of the run.
@@ -58,10 +58,11 @@ def watch_with(
     Raises:
         UserError: a callback that cannot be loaded or called.
     """
-    functions = [named.find(one) if isinstance(one, str) else one for one in callbacks]
+    several = [callbacks] if isinstance(callbacks, str) or callable(callbacks) else callbacks
+    functions = [named.find(one) if isinstance(one, str) else one for one in several]
     for function in functions:
         if not callable(function):
-            raise UserError(f"A callback must be a function of (step, metrics, policy), not {function!r}.")
+            raise UserError(f"A callback must be a function of (step, metrics, policy), not {shown(function)}.")
 
     def watch(step: int, metrics: Mapping[str, float], state: TrainState) -> bool:
         stop = False

@@ -51,6 +51,12 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> UserError:
     return UserError(f"There is no {kind} {name!r}: {hint}")
 
 
+def shown(value: object) -> str:
+    """A value in a sentence: as it is written if that is short, else its type."""
+    text = repr(value)
+    return text if len(text) <= 60 and not text.startswith("<") and "\n" not in text else f"a {type(value).__name__}"
+
+
 def is_installed(package: str) -> bool:
     """Whether an optional package can be imported."""
     try:
@@ -61,4 +67,6 @@ def is_installed(package: str) -> bool:
 
 def missing_extra(package: str, extra: str) -> UserError:
     """The sentence for an optional package that is not installed."""
-    return UserError(f"{package} is not installed; in the project's folder: pip install '.[{extra}]'")
+    return UserError(
+        f"{package} is not installed; it comes with the extra {extra}: in lemniscate's folder, pip install '.[{extra}]'"
+    )

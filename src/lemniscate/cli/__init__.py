@@ -26,7 +26,15 @@ COMMANDS = {
     "plot": "Draw the curves of a run, or compare several, grouped by all but the seed.",
     "envs": "List the environments, their backends, and the preset that fits.",
     "check": "Check that an environment is suitable for training.",
+    "completion": "Print a script for your shell that completes commands, options and names.",
 }
+
+SHELLS = {
+    "bash": "~/.local/share/bash-completion/completions/lemniscate",
+    "zsh": "~/.lemniscate.zsh   and in ~/.zshrc: source ~/.lemniscate.zsh",
+    "fish": "~/.config/fish/completions/lemniscate.fish",
+}
+"""where each reads the script of `completion`"""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -55,11 +63,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
     """The command and its options. Raises `UserError` with one sentence on what is not understood."""
-    words = _normalized(arguments)
-    parser, commands = _parsers()
-    if not words:
-        parser.print_help()
-        parser.exit()
+    words = _normalized(arguments) or ["--help"]
+    parser, commands = parsers()
     if not words[0].startswith("-"):
         if words[0] not in COMMANDS:
             raise unknown_name("command", words[0], COMMANDS)
@@ -113,7 +118,7 @@ class _Help(argparse.RawDescriptionHelpFormatter):
         return super()._format_action_invocation(action)
 
 
-def _parsers() -> tuple[Parser, dict[str, Parser]]:
+def parsers() -> tuple[Parser, dict[str, Parser]]:
     """The parser of everything, and that of each command."""
     parser = Parser(prog="lemniscate", description="Train, evaluate and watch reinforcement-learning policies.")
     parser.add_argument("--version", action=_Version, nargs=0, help="print the version")
@@ -143,6 +148,10 @@ def _parsers() -> tuple[Parser, dict[str, Parser]]:
 
     subs["check"].add_argument("env", metavar="ENV", help="an id, or module:Class of your own")
     subs["check"].add_argument("--backend", metavar="NAME", help="simulation backend [chosen from the id]")
+
+    subs["completion"].add_argument("shell", choices=SHELLS, metavar="SHELL", help=", ".join(SHELLS))
+    written = "\n".join(f"  lemniscate completion {shell} > {file}" for shell, file in SHELLS.items())
+    subs["completion"].epilog = f"Write it once, again after an upgrade, and open a new shell:\n{written}"
     return parser, subs
 
 

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, Self, Union, get_args, get_origin, g
 
 import torch
 
-from lemniscate.errors import UserError
+from lemniscate.errors import UserError, shown
 from lemniscate.glossary import unknown_field
 from lemniscate.run.seeding import Generators
 from lemniscate.spec import Spec
@@ -71,7 +71,7 @@ def checked(name: str, value: Any, hint: Any) -> Any:
             return _convert(value, option)
         except ValueError as error:
             wanted.append(str(error))
-    raise UserError(f"{name} must be {' or '.join(wanted)}, not {value!r}.")
+    raise UserError(f"{name} must be {' or '.join(wanted)}, not {shown(value)}.")
 
 
 def _convert(value: Any, option: Any) -> Any:

@@ -4,10 +4,13 @@ import os
 import random
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 import torch
 import torch.utils.deterministic as deterministic_mode
+
+from lemniscate.errors import UserError, shown
 
 
 def set_seeds(seed: int, deterministic: bool = True) -> None:
@@ -20,8 +23,11 @@ def set_seeds(seed: int, deterministic: bool = True) -> None:
         seed: 0 … 2³² − 1.
         deterministic: cuDNN's deterministic kernels without benchmarking, torch's deterministic algorithms (a warning
             where there is none), cuBLAS's fixed workspace.
+
+    Raises:
+        UserError: another seed.
     """
-    seed_globals(seed)
+    seed_globals(_checked(seed))
     torch.backends.cudnn.deterministic = deterministic
     torch.backends.cudnn.benchmark = False
     torch.use_deterministic_algorithms(deterministic, warn_only=True)
@@ -32,6 +38,14 @@ def set_seeds(seed: int, deterministic: bool = True) -> None:
         flags = os.environ.get("XLA_FLAGS", "")
         if "xla_gpu_deterministic_ops" not in flags:
             os.environ["XLA_FLAGS"] = f"{flags} --xla_gpu_deterministic_ops=true".strip()
+
+
+def _checked(seed: Any) -> int:
+    """A seed as Python's own int."""
+    number = seed.tolist() if hasattr(seed, "tolist") else seed  # NumPy's and torch's
+    if isinstance(number, bool) or not isinstance(number, int | float) or not 0 <= number < 2**32 or number % 1:
+        raise UserError(f"seed must be a whole number from 0 to {2**32 - 1:,}, not {shown(seed)}.")
+    return int(number)
 
 
 def seed_globals(seed: int) -> None:
