@@ -1,4 +1,4 @@
-"""Completion in bash, zsh and fish: what may follow a word is written into a script, so that pressing TAB starts nothing."""
+"""Completion in bash, zsh and fish: a script with all that may follow a word, so that pressing TAB starts nothing."""
 
 import argparse
 import shlex
