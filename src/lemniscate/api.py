@@ -18,10 +18,10 @@ from lemniscate.errors import UserError, is_installed, missing_extra, shown, unk
 from lemniscate.policy import TrainedPolicy
 from lemniscate.report import pictures as pictures_of
 from lemniscate.report import playback
-from lemniscate.results import TrainedRun, load, watch
+from lemniscate.results import TrainedRun, finished_run, path_of, watch
 from lemniscate.run.config import RunConfig
-from lemniscate.run.directory import is_finished, path_of, read_config, require_absent
-from lemniscate.run.environments import evaluation_env, make_envs
+from lemniscate.run.directory import is_finished, read_config, require_absent
+from lemniscate.run.environments import make_envs
 from lemniscate.run.loggers import TRACKERS, JsonLines, LoggerClass, TensorBoard
 from lemniscate.run.q_bias import critic_of
 from lemniscate.run.run import Run
@@ -131,20 +131,9 @@ def resume(
     config = config.replace(**{name: _named(value) for name, value in again.items() if value is not None})
     loggers = loggers_with(track)
     if is_finished(path):
-        return _finished(path, report, progress)
+        return finished_run(path, report, progress)
     set_seeds(config.seed)
     return _train(path, algorithm, config, make_envs(config), loggers, callbacks, report or track is not None, progress)
-
-
-def _finished(path: Path, report: bool, progress: bool) -> TrainedRun:
-    policy = load(path)
-    if progress:
-        say(f"{path} is finished, at step {policy.step:,}: there is nothing to resume.")
-    if report:
-        env, episodes = evaluation_env(policy.config, policy.config.evaluate_episodes), policy.config.evaluate_episodes
-        pictures_of.report(policy.module, env, path, episodes, critic_of(policy.networks, policy.config))
-        env.close()
-    return TrainedRun(path, policy, 0.0)
 
 
 def _train(

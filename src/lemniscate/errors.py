@@ -8,6 +8,8 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from difflib import get_close_matches
 from importlib.util import find_spec
+from pathlib import Path
+from shlex import quote
 
 
 class UserError(ValueError):
@@ -55,6 +57,11 @@ def shown(value: object) -> str:
     """A value in a sentence: as it is written if that is short, else its type."""
     text = repr(value)
     return text if len(text) <= 60 and not text.startswith("<") and "\n" not in text else f"a {type(value).__name__}"
+
+
+def resume_line(path: Path) -> str:
+    """The command that resumes a run or a sweep."""
+    return f"lemniscate resume {quote(str(path))}"
 
 
 def is_installed(package: str) -> bool:

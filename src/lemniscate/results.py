@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -10,14 +11,14 @@ from lemniscate import algos
 from lemniscate.console import say
 from lemniscate.envs import registry
 from lemniscate.envs.vec_env import VecEnv
-from lemniscate.errors import UserError
+from lemniscate.errors import UserError, shown
 from lemniscate.policy import TrainedPolicy
 from lemniscate.report import compare, curves, playback
 from lemniscate.report import pictures as pictures_of
 from lemniscate.report.groups import group
 from lemniscate.run import checkpoint
 from lemniscate.run.config import Count, Natural, checked
-from lemniscate.run.directory import find_checkpoint, is_finished, path_of, read_config
+from lemniscate.run.directory import find_checkpoint, is_finished, read_config
 from lemniscate.run.environments import evaluation_env
 from lemniscate.run.evaluate import Evaluation
 from lemniscate.run.evaluate import evaluate as evaluate_module
@@ -40,6 +41,27 @@ class TrainedRun:
 
 Trained = str | Path | TrainedRun | TrainedPolicy
 """what has a policy: the path of a run or a checkpoint, what `train` returned, or the policy itself"""
+
+
+def path_of(run: object) -> Path:
+    """The directory of a run: of its path, or of what `train` returned. Raises `UserError` for anything else."""
+    path = getattr(run, "path", run)
+    if isinstance(path, str | PathLike):
+        return Path(path)
+    raise UserError(f"A run is a directory, such as 'runs/lander', or what train returned, not {shown(run)}.")
+
+
+def finished_run(path: Path, report: bool, progress: bool) -> TrainedRun:
+    """A run that has taken all its steps, as it is; with `report` it is evaluated and drawn again."""
+    policy = load(path)
+    if progress:
+        say(f"{path} is finished, at step {policy.step:,}: there is nothing to resume.")
+    if report:
+        episodes = policy.config.evaluate_episodes
+        env = evaluation_env(policy.config, episodes)
+        pictures_of.report(policy.module, env, path, episodes, critic_of(policy.networks, policy.config))
+        env.close()
+    return TrainedRun(path, policy, 0.0)
 
 
 def load(run: Trained) -> TrainedPolicy:

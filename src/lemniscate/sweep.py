@@ -21,9 +21,9 @@ from lemniscate import api, named, results
 from lemniscate.algos import ALGORITHMS, find
 from lemniscate.console import say
 from lemniscate.envs import registry
-from lemniscate.errors import SweepError, UserError, prefix_errors, shown
+from lemniscate.errors import SweepError, UserError, prefix_errors, resume_line, shown
 from lemniscate.run.config import RunConfig
-from lemniscate.run.directory import is_finished, path_of, resume_line
+from lemniscate.run.directory import is_finished
 from lemniscate.run.environments import device_for
 from lemniscate.run.loggers import read_metrics
 from lemniscate.run.run import Stopped, signals_to
@@ -91,7 +91,7 @@ def train_sweep(
     options = _options(track, callbacks, report)
     _require_trainable(configs, numbers)
     stem = f"{'-'.join(names)}-{len(numbers)}-seeds"
-    path = path_of(run) if run is not None else api.fresh_directory(next(iter(configs.values())).env, stem)
+    path = results.path_of(run) if run is not None else api.fresh_directory(next(iter(configs.values())).env, stem)
     records = {name: config.to_json() for name, config in configs.items()}
     but_seed = {name: {k: v for k, v in record.items() if k != "seed"} for name, record in records.items()}
     runs = Sweep(path, numbers, but_seed)
@@ -108,7 +108,7 @@ def resume_sweep(
     progress: bool = True,
 ) -> TrainedSweep:
     """Resume an interrupted sweep: train the runs that are not finished or have not begun."""
-    return _train(read_sweep(path_of(path)), _options(track, callbacks, report), progress)
+    return _train(read_sweep(results.path_of(path)), _options(track, callbacks, report), progress)
 
 
 def at_once(threads: int) -> int:

@@ -26,15 +26,10 @@ COMMANDS = {
     "plot": "Draw the curves of a run, or compare several, grouped by all but the seed.",
     "envs": "List the environments, their backends, and the preset that fits.",
     "check": "Check that an environment is suitable for training.",
-    "completion": "Print a script for your shell that completes commands, options and names.",
+    "completion": "Print the script with which a shell completes; its first line says where to write it.",
 }
 
-SHELLS = {
-    "bash": "~/.local/share/bash-completion/completions/lemniscate",
-    "zsh": "~/.lemniscate.zsh   and in ~/.zshrc: source ~/.lemniscate.zsh",
-    "fish": "~/.config/fish/completions/lemniscate.fish",
-}
-"""where each reads the script of `completion`"""
+SHELLS = ("bash", "zsh", "fish")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -150,8 +145,6 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
     subs["check"].add_argument("--backend", metavar="NAME", help="simulation backend [chosen from the id]")
 
     subs["completion"].add_argument("shell", choices=SHELLS, metavar="SHELL", help=", ".join(SHELLS))
-    written = "\n".join(f"  lemniscate completion {shell} > {file}" for shell, file in SHELLS.items())
-    subs["completion"].epilog = f"Write it once, again after an upgrade, and open a new shell:\n{written}"
     return parser, subs
 
 

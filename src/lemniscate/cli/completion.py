@@ -14,6 +14,13 @@ from lemniscate.presets import names
 from lemniscate.run.config import options_of
 from lemniscate.run.loggers import TRACKERS
 
+FILES = {
+    "bash": "~/.local/share/bash-completion/completions/lemniscate",
+    "zsh": "~/.lemniscate.zsh; and in ~/.zshrc: source ~/.lemniscate.zsh",
+    "fish": "~/.config/fish/completions/lemniscate.fish",
+}
+"""where each shell reads the script"""
+
 BASH = """_lemniscate() {
   local here=${COMP_WORDS[COMP_CWORD]} before=${COMP_WORDS[COMP_CWORD-1]} command=${COMP_WORDS[1]} known=""
   [ "$command" = train ] && command=${COMP_WORDS[2]}
@@ -33,7 +40,8 @@ autoload -Uz bashcompinit && bashcompinit
 
 def script(shell: str) -> str:
     """The script for one of `SHELLS`."""
-    return _fish() if shell == "fish" else (ZSH if shell == "zsh" else "") + _bash()
+    where = f"# Write it once, and again after an upgrade: lemniscate completion {shell} > {FILES[shell]}\n"
+    return where + (_fish() if shell == "fish" else (ZSH if shell == "zsh" else "") + _bash())
 
 
 def _bash() -> str:

@@ -27,15 +27,6 @@ class Bfloat16Linear(nn.Linear):
         return nn.functional.linear(input.bfloat16(), self.weight.bfloat16()).to(input.dtype) + self.bias
 
 
-def has_bfloat16(device: torch.device) -> bool:
-    """Whether the processor, or on mps Metal, has products in bfloat16; elsewhere they are emulated, and slow."""
-    if device.type == "cuda":
-        return torch.cuda.is_bf16_supported(including_emulation=False)
-    if device.type == "mps":
-        return torch.backends.mps.is_macos_or_newer(14, 0)
-    return any(able for name, able in torch.cpu.get_capabilities().items() if "bf16" in name)
-
-
 @dataclass(frozen=True)
 class Layers:
     """The settings of a network between its inputs and its outputs.

@@ -1,8 +1,6 @@
 """The run directory: its creation, its config, its lock, and the checkpoints in it."""
 
 import json
-import os
-import shlex
 import shutil
 from pathlib import Path
 from typing import Any
@@ -10,7 +8,7 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from lemniscate.console import say
-from lemniscate.errors import UserError, shown
+from lemniscate.errors import UserError, resume_line
 from lemniscate.run import checkpoint
 from lemniscate.run.config import RunConfig
 from lemniscate.run.state import TrainState
@@ -19,19 +17,6 @@ from lemniscate.spec import Spec
 UNFINISHED = "config.json.tmp"
 SWEEP = "sweep.json"
 """the file that the directory of a sweep has in the place of a `config.json`"""
-
-
-def path_of(run: object) -> Path:
-    """The directory of a run: of its path, or of what `train` returned. Raises `UserError` for anything else."""
-    path = getattr(run, "path", run)
-    if isinstance(path, str | os.PathLike):
-        return Path(path)
-    raise UserError(f"A run is a directory, such as 'runs/lander', or what train returned, not {shown(run)}.")
-
-
-def resume_line(path: Path) -> str:
-    """The command that resumes a run or a sweep."""
-    return f"lemniscate resume {shlex.quote(str(path))}"
 
 
 def require_absent(path: Path) -> None:

@@ -23,10 +23,10 @@ import torch
 from lemniscate.console import ProgressBar, say
 from lemniscate.envs.episodes import Episodes
 from lemniscate.envs.vec_env import VecEnv
-from lemniscate.errors import NonFiniteError, UserError
+from lemniscate.errors import NonFiniteError, UserError, resume_line
 from lemniscate.optim.compiled import stopping
 from lemniscate.run.config import RunConfig
-from lemniscate.run.directory import Saver, resume_line
+from lemniscate.run.directory import Saver
 from lemniscate.run.evaluate import evaluate
 from lemniscate.run.loggers import NO_EPISODES, JsonLines, Logger, LoggerClass, TensorBoard
 from lemniscate.run.q_bias import critic_of

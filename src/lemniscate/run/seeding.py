@@ -41,9 +41,8 @@ def set_seeds(seed: int, deterministic: bool = True) -> None:
 
 
 def _checked(seed: Any) -> int:
-    """A seed as Python's own int."""
     number = seed.tolist() if hasattr(seed, "tolist") else seed  # NumPy's and torch's
-    if isinstance(number, bool) or not isinstance(number, int | float) or not 0 <= number < 2**32 or number % 1:
+    if type(number) not in (int, float) or not 0 <= number < 2**32 or number % 1:
         raise UserError(f"seed must be a whole number from 0 to {2**32 - 1:,}, not {shown(seed)}.")
     return int(number)
 
