@@ -135,7 +135,6 @@ def test_a_path_with_spaces_is_quoted_where_it_is_to_be_typed(run):
         (None, r"obs has the shape \(\)"),
         ("left", r"obs has the shape \(\)"),
         ((np.zeros(4), {}), "it is what `reset` or `step` returned"),
-        (torch.zeros(4, requires_grad=True), "requires grad"),
     ],
 )
 def test_what_is_no_observation_is_refused(run, obs, said):

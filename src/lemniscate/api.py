@@ -184,7 +184,7 @@ def loggers_with(track: str | LoggerClass | None) -> tuple[LoggerClass, ...]:
         extra, track = TRACKERS[track]
         if not is_installed(extra):
             raise missing_extra(extra, extra)
-    logger = named.find(track) if isinstance(track, str) else track
+    logger: Any = named.find(track) if isinstance(track, str) else track
     if not callable(logger):
         raise UserError(f"track must be a logger's name or class, not {shown(track)}.")
     return JsonLines, TensorBoard, logger

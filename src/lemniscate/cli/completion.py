@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from typing import Literal, get_args, get_origin, get_type_hints
 
 from lemniscate.algos import ALGORITHMS, find
-from lemniscate.cli import COMMANDS, SHELLS, parsers
+from lemniscate.cli import COMMANDS, SHELLS, Parser, parsers
 from lemniscate.cli.fields import flag, parser_of
 from lemniscate.envs import registry
 from lemniscate.nn.networks import NETWORKS
@@ -65,7 +65,7 @@ def _fish() -> str:
     return "".join(f"complete -c lemniscate {line}\n" for line in lines)
 
 
-def _parsers() -> dict[str, argparse.ArgumentParser]:
+def _parsers() -> dict[str, Parser]:
     """The parser of each command, and in the place of `train` that of each algorithm."""
     return {name: parser for name, parser in parsers()[1].items() if name != "train"} | {
         name: parser_of(name) for name in ALGORITHMS

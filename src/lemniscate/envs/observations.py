@@ -26,7 +26,7 @@ def read_observation(spec: Spec, obs: Any) -> tuple[np.ndarray, bool]:
         else:
             batched = _is_batch(spec, obs)
             flat = flatten_observation(spec.observation_parts, obs, image=spec.image)
-    except (KeyError, IndexError, TypeError, ValueError, RuntimeError) as error:
+    except (KeyError, IndexError, TypeError, ValueError) as error:
         raise _unreadable(spec, obs, error) from None
     if not np.isfinite(flat).all():
         number = flat[~np.isfinite(flat)][0]
