@@ -46,7 +46,7 @@ def config_for(
     if isinstance(algorithm, RunConfig):
         if preset is not None:
             raise UserError("A Config has a value for every field: it does not go with a preset.")
-        name, config = "given", algorithm.replace(env=env, backend=None) if env else algorithm
+        name, config = "given", algorithm if env is None else algorithm.replace(env=env, backend=None)
     else:
         name, config = presets.choose(algos.name_of(algorithm), env, preset)
     config = config.replace(**{name: _named(value) for name, value in fields.items()})
@@ -59,6 +59,8 @@ def _named(value: object) -> object:
     """A value of a Config: functions and classes, and those in a sequence, by their names."""
     if isinstance(value, list | tuple):
         return tuple(map(_named, value))
+    if isinstance(value, TrainedRun):  # to start warm from
+        return str(value.path)
     return named.name_of(value) if callable(value) else value
 
 
@@ -95,8 +97,7 @@ def train(
         UserError: see `config_for`; a run directory that exists.
     """
     config = config_for(algorithm, env, preset, **fields)
-    own = sys.modules[type(config).__module__] if isinstance(algorithm, RunConfig) else algorithm
-    algorithm = algos.name_of(own)
+    algorithm = algos.name_of(sys.modules[type(config).__module__] if isinstance(algorithm, RunConfig) else algorithm)
     path = path_of(run) if run is not None else fresh_directory(config.env, f"{algorithm}-{config.seed}")
     loggers = loggers_with(track)
     require_absent(path)

@@ -1,5 +1,6 @@
 """Callbacks: functions of the user's that see a run while it trains, and may stop it."""
 
+import inspect
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
@@ -58,10 +59,10 @@ def watch_with(
     Raises:
         UserError: a callback that cannot be loaded or called.
     """
-    several = [callbacks] if isinstance(callbacks, str) or callable(callbacks) else callbacks
+    several = callbacks if isinstance(callbacks, list | tuple) else [callbacks]
     functions = [named.find(one) if isinstance(one, str) else one for one in several]
     for function in functions:
-        if not callable(function):
+        if not _takes_three(function):
             raise UserError(f"A callback must be a function of (step, metrics, policy), not {shown(function)}.")
 
     def watch(step: int, metrics: Mapping[str, float], state: TrainState) -> bool:
@@ -73,6 +74,17 @@ def watch_with(
         return stop
 
     return watch
+
+
+def _takes_three(function: Any) -> bool:
+    """Whether it can be called with three arguments; what does not tell, such as a built-in function, may be."""
+    try:
+        inspect.signature(function).bind(0, {}, None)
+    except ValueError:
+        pass
+    except TypeError:
+        return False
+    return callable(function)
 
 
 def _too_late() -> Any:

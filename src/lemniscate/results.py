@@ -107,6 +107,7 @@ def evaluate(
         UserError: numbers out of range; an environment that cannot be made, or whose spaces differ.
     """
     policy, episodes, seed = load(policy), checked("episodes", episodes, Count), checked("seed", seed, Natural)
+    env_kwargs = checked("env_kwargs", env_kwargs, dict | None)
     vec = evaluation_env(policy.config, episodes, env=env, env_kwargs=env_kwargs, backend=backend)
     if not vec.spec.fits(policy.spec):
         vec.close()
@@ -180,9 +181,9 @@ def plot(*runs: str | Path | TrainedRun | list[str | Path | TrainedRun]) -> list
     return pictures
 
 
-def final_return(run: str | Path) -> float:
+def final_return(run: str | Path | TrainedRun) -> float:
     """Mean return of a run's newest policy over 100 episodes; kept in `final.json` until there is a newer policy."""
-    path = Path(run)
+    path = path_of(run)
     file = path / "final.json"
     known: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {}
     if known.get("step") not in checkpoint.list_steps(path / "checkpoints")[-1:]:

@@ -18,7 +18,7 @@ from types import FrameType
 from filelock import FileLock, Timeout
 
 from lemniscate import api, named, results
-from lemniscate.algos import ALGORITHMS, find
+from lemniscate.algos import ALGORITHMS, name_of
 from lemniscate.console import say
 from lemniscate.envs import registry
 from lemniscate.errors import SweepError, UserError, prefix_errors, resume_line, shown
@@ -247,11 +247,10 @@ def _failure_of(run: Path, code: int) -> str:
 
 def algorithms_of(names: str | Iterable[str]) -> list[str]:
     """The names in "ppo,sac" or in a list, each once. Raises `UserError` for one that is unknown."""
-    split = [name.strip() for name in (names.split(",") if isinstance(names, str) else names)]
+    several = names.split(",") if isinstance(names, str) else names if isinstance(names, Iterable) else [names]
+    split = [name_of(name.strip() if isinstance(name, str) else name) for name in several]
     if not split:
         raise UserError(f"Name at least one algorithm: {', '.join(ALGORITHMS)}.")
-    for name in split:
-        find(name)
     return list(dict.fromkeys(split))
 
 
@@ -275,6 +274,9 @@ def _require_trainable(configs: dict[str, RunConfig], seeds: list[int]) -> None:
     env = registry.make(some.env, 1, backend=some.backend)
     env.close()
     for name, config in configs.items():
+        for own in (config.env, *config.wrappers, getattr(config, "network", "")):
+            if "<" in own or own.startswith("__main__:"):
+                raise UserError(f"Each run of a sweep has a process of its own: put {own} into a module, to import it.")
         device_for(config.device)
         for seed in seeds:
             config.replace(seed=seed)

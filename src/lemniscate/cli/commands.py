@@ -6,6 +6,7 @@ from typing import Any
 
 from lemniscate import api, results, sweep
 from lemniscate.algos import ALGORITHMS
+from lemniscate.cli.completion import script
 from lemniscate.cli.fields import read_json
 from lemniscate.console import say
 from lemniscate.envs import registry
@@ -100,8 +101,6 @@ def check(given: argparse.Namespace) -> None:
 
 def completion(given: argparse.Namespace) -> None:
     """Print the script with which a shell completes."""
-    from lemniscate.cli.completion import script
-
     print(script(given.shell), end="")
 
 

@@ -96,5 +96,6 @@ def sentences(env: str, kwargs: Mapping[str, Any] | None, wrappers: Sequence[str
         given = [f"{name}={value!r}" for name, value in (kwargs or {}).items()] + list(wrappers)
         with_these = f" with {', '.join(given)}" if given else ""
         said = str(error).partition(" was raised from the environment creator")[0]
-        hint = "; give it in env_kwargs (--env-args)" if "required positional argument" in said else ""
-        raise UserError(f"{env} cannot be made{with_these}: {said}{hint}") from error
+        if "required positional argument" in said:
+            said += "; it is given in env_kwargs (--env-args), or with a wrapper: module:Name(key=value)"
+        raise UserError(f"{env} cannot be made{with_these}: {said}") from error

@@ -122,8 +122,7 @@ def _require_below(counts: int | np.ndarray, action: np.ndarray) -> np.ndarray:
     """The int64 actions themselves. Raises `UserError` unless each is from 0 to below its count."""
     wrong = action.view(np.uint64) >= counts  # without its sign, a negative number is a large one
     if wrong.any():
-        most = np.broadcast_to(counts, action.shape)[wrong][0] - 1
-        raise UserError(f"Actions must be whole numbers from 0 to {most}, not {action[wrong][0]}.")
+        raise UserError(f"Actions must be whole numbers from 0 to below {counts}, not {action[wrong][0]}.")
     return action
 
 

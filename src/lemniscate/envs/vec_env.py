@@ -8,7 +8,7 @@ from torch import Tensor
 
 from lemniscate.envs.backend import Backend, Scene, Summary
 from lemniscate.envs.episodes import Episodes, EpisodeStatistics
-from lemniscate.errors import NonFiniteError, UserError, shown
+from lemniscate.errors import NonFiniteError, UserError, wrong_action
 from lemniscate.spec import Box, Discrete, MultiBinary, Spec
 from lemniscate.types import Step
 
@@ -49,13 +49,14 @@ class VecEnv:
         """seconds that the functions of `data` spend acting and stepping"""
         self.steps = 0
         self._statistics = EpisodeStatistics(self.num_envs, self.device)
-        self._action_shape, self._action_dtype = _action_layout(self.spec, self.num_envs)
+        self._actions: tuple[torch.Size, torch.dtype] | None = None  # before it is restarted, none is right
 
     def restart(self, seed: int, steps: int = 0) -> Tensor:
         """Begin again from `seed`; also stored as `obs`, [N, O]. `steps` is what the run has taken so far."""
         self.steps = steps
         self._statistics = EpisodeStatistics(self.num_envs, self.device)
         self.obs = self.backend.restart(seed)
+        self._actions = _action_layout(self.spec, self.num_envs)
         self._require_finite(observation=self.obs)
         return self.obs
 
@@ -66,11 +67,8 @@ class VecEnv:
             NonFiniteError: an observation or a reward is NaN or infinite; nothing has learned from it yet.
             UserError: actions of another kind or shape.
         """
-        shape, dtype = self._action_shape, self._action_dtype
-        if not isinstance(action, Tensor) or action.shape != shape or action.dtype is not dtype:
-            given = f"{list(action.shape)} of {action.dtype}" if isinstance(action, Tensor) else shown(action)
-            where = f"{self.num_envs} × {self.spec.env_id}"
-            raise UserError(f"Actions in {where} are a tensor {list(shape)} of {dtype}, not {given}.")
+        if not isinstance(action, Tensor) or (action.shape, action.dtype) != self._actions:
+            raise wrong_action(f"{self.num_envs} × {self.spec.env_id}", action, self._actions)
         counts = self.backend.counts
         step = self.backend.step(action)
         self._require_finite(observation=step.next_obs, reward=step.reward)

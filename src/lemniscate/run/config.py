@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from pathlib import PurePath
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Self, Union, get_args, get_origin, get_type_hints
 
@@ -60,6 +61,8 @@ def checked(name: str, value: Any, hint: Any) -> Any:
     """
     if hasattr(value, "tolist"):
         value = value.tolist()
+    if isinstance(value, torch.device | PurePath):
+        value = str(value)
     options = options_of(hint)
     if value is None and NoneType in options:
         return None

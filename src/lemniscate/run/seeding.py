@@ -20,14 +20,14 @@ def set_seeds(seed: int, deterministic: bool = True) -> None:
     is derived from this one (`derive`). XLA on a GPU is told to be deterministic if JAX has not started yet.
 
     Args:
-        seed: 0 … 2³² − 1.
+        seed: 0 … 2³² − 1; another raises `UserError`.
         deterministic: cuDNN's deterministic kernels without benchmarking, torch's deterministic algorithms (a warning
             where there is none), cuBLAS's fixed workspace.
-
-    Raises:
-        UserError: another seed.
     """
-    seed_globals(_checked(seed))
+    number: Any = seed.tolist() if hasattr(seed, "tolist") else seed  # NumPy's and torch's
+    if type(number) not in (int, float) or not 0 <= number < 2**32 or number % 1:
+        raise UserError(f"seed must be a whole number from 0 to {2**32 - 1:,}, not {shown(seed)}.")
+    seed_globals(int(number))
     torch.backends.cudnn.deterministic = deterministic
     torch.backends.cudnn.benchmark = False
     torch.use_deterministic_algorithms(deterministic, warn_only=True)
@@ -38,13 +38,6 @@ def set_seeds(seed: int, deterministic: bool = True) -> None:
         flags = os.environ.get("XLA_FLAGS", "")
         if "xla_gpu_deterministic_ops" not in flags:
             os.environ["XLA_FLAGS"] = f"{flags} --xla_gpu_deterministic_ops=true".strip()
-
-
-def _checked(seed: Any) -> int:
-    number = seed.tolist() if hasattr(seed, "tolist") else seed  # NumPy's and torch's
-    if type(number) not in (int, float) or not 0 <= number < 2**32 or number % 1:
-        raise UserError(f"seed must be a whole number from 0 to {2**32 - 1:,}, not {shown(seed)}.")
-    return int(number)
 
 
 def seed_globals(seed: int) -> None:
