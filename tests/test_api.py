@@ -130,7 +130,7 @@ def test_an_environment_whose_package_is_missing_is_said(monkeypatch):
 
 
 def test_an_observation_of_the_wrong_size_is_named(cartpole):
-    with pytest.raises(lem.UserError, match=r"CartPole-v1 observes obs \(4,\); this observation cannot be read"):
+    with pytest.raises(lem.UserError, match=r"CartPole-v1 observes obs \(4,\), or a batch of these"):
         cartpole.policy.act(np.zeros(3))
 
 

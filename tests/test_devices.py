@@ -18,6 +18,7 @@ from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError
 from lemniscate.run import checkpoint
 from lemniscate.run.environments import device_for
+from lemniscate.run.off_policy import has_bfloat16
 from lemniscate.spec import Box, Discrete, MultiDiscrete, ObservationPart, Spec
 from lemniscate.types import Step
 from pretend_device import CPU, pretend, whole
@@ -245,3 +246,10 @@ def test_a_device_that_is_not_there_is_refused_in_one_sentence(name, gpus, apple
     with pytest.raises(UserError) as refused:
         device_for(name)
     assert str(refused.value) == found
+
+
+@pytest.mark.parametrize("new", [True, False])
+def test_bfloat16_on_mps_is_a_matter_of_metal_not_of_the_cpu(monkeypatch, new):
+    monkeypatch.setattr(torch.backends.mps, "is_macos_or_newer", lambda major, minor: new and (major, minor) == (14, 0))
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: {"amx_bf16": not new})
+    assert has_bfloat16(torch.device("mps")) == new

@@ -64,7 +64,7 @@ def test_a_callable_with_arguments():
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("nowhere:Thing", "nowhere:Thing cannot be found: No module named 'nowhere'"),
+        ("nowhere:Thing", "nowhere:Thing cannot be found: there is no module nowhere here"),
         ("test_named:Nothing", "test_named has no Nothing"),
         ("Mine", "'Mine' is no name of an object; it has the form module:name"),
         ("test_named:Mine(x=open('/etc/passwd'))", "cannot be read; it has the form"),

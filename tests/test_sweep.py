@@ -49,10 +49,11 @@ def final_hash(run):
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    """A sweep of PPO and DDPG, and its lines on standard error."""
+    """A sweep of PPO and DDPG with a callback, and its lines on standard error."""
     path = tmp_path_factory.mktemp("sweeps") / "both"
     with contextlib.redirect_stderr(io.StringIO()) as said:
-        code = main(["train", "ppo,ddpg", "--env", ENV, "--seeds", "1-2", "--run", str(path), *FLAGS])
+        options = ["--env", ENV, "--seeds", "1-2", "--run", str(path), "--callbacks", "environments:tell"]
+        code = main(["train", "ppo,ddpg", *options, *FLAGS])
     assert code == 0, said.getvalue()
     return path, said.getvalue()
 
@@ -67,6 +68,12 @@ def test_a_sweep_is_a_run_for_each_algorithm_and_seed(trained):
     assert set(runs) == {"ppo-1", "ppo-2", "ddpg-1", "ddpg-2"}
     assert runs["ddpg-2"]["algorithm"] == "ddpg"
     assert runs["ddpg-2"]["config"]["seed"] == 2
+
+
+def test_every_run_of_a_sweep_calls_the_callbacks(trained):
+    path, _ = trained
+    for run in ("ppo-1", "ppo-2", "ddpg-1", "ddpg-2"):
+        assert "called at " in (path / run / sweep.LOG).read_text()
 
 
 @pytest.mark.parametrize(("algorithm", "seed"), [("ppo", 2), ("ddpg", 1)])

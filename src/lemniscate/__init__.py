@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 __version__ = "0.2.0"
 
 if TYPE_CHECKING:
-    from lemniscate.api import TrainedRun, config_for, resume, train
+    from lemniscate.api import config_for, resume, train
     from lemniscate.errors import NonFiniteError, SweepError, UserError
     from lemniscate.policy import TrainedPolicy
-    from lemniscate.results import evaluate, load, plot, watch
+    from lemniscate.results import TrainedRun, evaluate, load, plot, watch
     from lemniscate.run.environments import make_envs
     from lemniscate.run.evaluate import Evaluation
     from lemniscate.run.run import Stopped
@@ -47,7 +47,7 @@ MODULES = {
     "Stopped": "run.run",
     "SweepError": "errors",
     "TrainedPolicy": "policy",
-    "TrainedRun": "api",
+    "TrainedRun": "results",
     "TrainedSweep": "sweep",
     "UserError": "errors",
     "config_for": "api",

@@ -1,7 +1,7 @@
 """The verbs that begin or continue a run: train, resume; and the Config and the environments of one."""
 
+import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 from types import ModuleType
@@ -14,13 +14,13 @@ from lemniscate.callbacks import Callback, watch_with
 from lemniscate.console import say
 from lemniscate.envs import registry
 from lemniscate.envs.vec_env import VecEnv
-from lemniscate.errors import UserError, is_installed, missing_extra, unknown_name
+from lemniscate.errors import UserError, is_installed, missing_extra, shown, unknown_name
 from lemniscate.policy import TrainedPolicy
 from lemniscate.report import pictures as pictures_of
 from lemniscate.report import playback
-from lemniscate.results import watch
+from lemniscate.results import TrainedRun, finished_run, path_of, watch
 from lemniscate.run.config import RunConfig
-from lemniscate.run.directory import read_config, require_absent
+from lemniscate.run.directory import is_finished, read_config, require_absent
 from lemniscate.run.environments import make_envs
 from lemniscate.run.loggers import TRACKERS, JsonLines, LoggerClass, TensorBoard
 from lemniscate.run.q_bias import critic_of
@@ -29,31 +29,29 @@ from lemniscate.run.seeding import set_seeds
 from lemniscate.run.state import TrainState
 
 
-@dataclass(frozen=True)
-class TrainedRun:
-    """The result of `train` and `resume`: the run directory, the final policy, the seconds of the training loop."""
-
-    path: Path
-    policy: TrainedPolicy
-    seconds: float
-
-
 def config_for(
-    algorithm: str | ModuleType,
+    algorithm: str | ModuleType | RunConfig,
     env: str | Callable[..., Any] | None = None,
     preset: str | None = None,
     **fields: object,
 ) -> RunConfig:
-    """The Config of a preset, with some fields changed.
+    """The Config of a preset, or the Config given, with some fields changed.
 
     Raises:
         UserError: an unknown algorithm, environment, preset or field, or a value out of range.
     """
+    if isinstance(env, RunConfig) or "config" in fields:
+        raise UserError("A Config knows its algorithm and takes its place: lem.train(config).")
     env = None if env is None else registry.name_of(env)
-    name, config = presets.choose(algos.name_of(algorithm), env, preset)
+    if isinstance(algorithm, RunConfig):
+        if preset is not None:
+            raise UserError("A Config has a value for every field: it does not go with a preset.")
+        name, config = "given", algorithm if env is None else algorithm.replace(env=env, backend=None)
+    else:
+        name, config = presets.choose(algos.name_of(algorithm), env, preset)
+    config = config.replace(**{name: _named(value) for name, value in fields.items()})
     if name == "default" and env is None:
         raise UserError("Which environment? Name one with env; `lemniscate envs` lists them.")
-    config = config.replace(**{name: _named(value) for name, value in fields.items()})
     return config if config.backend else config.replace(backend=registry.backend_for(config.env, config.wrappers))
 
 
@@ -61,11 +59,13 @@ def _named(value: object) -> object:
     """A value of a Config: functions and classes, and those in a sequence, by their names."""
     if isinstance(value, list | tuple):
         return tuple(map(_named, value))
+    if isinstance(value, TrainedRun):  # to start warm from
+        return str(value.path)
     return named.name_of(value) if callable(value) else value
 
 
 def train(
-    algorithm: str | ModuleType,
+    algorithm: str | ModuleType | RunConfig,
     env: str | Callable[..., Any] | None = None,
     *,
     run: str | Path | None = None,
@@ -79,7 +79,8 @@ def train(
     """Train a policy.
 
     Args:
-        algorithm: a name in `lemniscate.algos.ALGORITHMS`; a module of your own, or its name.
+        algorithm: a name in `lemniscate.algos.ALGORITHMS`; a module of your own, or its name; or a Config, such as
+            that of `config_for`.
         env: an id, `module:Class`, a class, or a function that makes an environment; a preset may have its own.
         run: where to keep everything; by default a new directory under `runs/`.
         preset: by name; the best known for the environment unless given.
@@ -95,9 +96,9 @@ def train(
     Raises:
         UserError: see `config_for`; a run directory that exists.
     """
-    algorithm = algos.name_of(algorithm)
     config = config_for(algorithm, env, preset, **fields)
-    path = Path(run) if run is not None else fresh_directory(config.env, f"{algorithm}-{config.seed}")
+    algorithm = algos.name_of(sys.modules[type(config).__module__] if isinstance(algorithm, RunConfig) else algorithm)
+    path = path_of(run) if run is not None else fresh_directory(config.env, f"{algorithm}-{config.seed}")
     loggers = loggers_with(track)
     require_absent(path)
     set_seeds(config.seed)  # before JAX starts, which reads its flags then
@@ -108,7 +109,7 @@ def train(
 
 
 def resume(
-    run: str | Path,
+    run: str | Path | TrainedRun,
     *,
     env: str | Callable[..., Any] | None = None,
     wrappers: Sequence[str | Callable[..., Any]] | None = None,
@@ -120,15 +121,18 @@ def resume(
 ) -> TrainedRun:
     """Resume an interrupted run from its newest whole planned checkpoint, and train it to its end.
 
+    A run that is finished stays as it is; with `report` it is evaluated and drawn again.
     `env`, `wrappers` and `network` are only for a run that began with objects that no file holds, such as a lambda: the
     same objects again. The other arguments are those of `train`, and are not saved with the run.
     """
-    path = Path(run)
+    path = path_of(run)
     algorithm, fields = read_config(path)
     again = {"env": env, "wrappers": wrappers, "network": network}
     config = algos.find(algorithm).Config.from_json(fields)
     config = config.replace(**{name: _named(value) for name, value in again.items() if value is not None})
     loggers = loggers_with(track)
+    if is_finished(path):
+        return finished_run(path, report, progress)
     set_seeds(config.seed)
     return _train(path, algorithm, config, make_envs(config), loggers, callbacks, report or track is not None, progress)
 
@@ -181,7 +185,10 @@ def loggers_with(track: str | LoggerClass | None) -> tuple[LoggerClass, ...]:
         extra, track = TRACKERS[track]
         if not is_installed(extra):
             raise missing_extra(extra, extra)
-    return JsonLines, TensorBoard, named.find(track) if isinstance(track, str) else track
+    logger: Any = named.find(track) if isinstance(track, str) else track
+    if not callable(logger):
+        raise UserError(f"track must be a logger's name or class, not {shown(track)}.")
+    return JsonLines, TensorBoard, logger
 
 
 def fresh_directory(env_id: str, name: str) -> Path:

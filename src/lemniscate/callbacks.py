@@ -1,5 +1,6 @@
 """Callbacks: functions of the user's that see a run while it trains, and may stop it."""
 
+import inspect
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
@@ -7,7 +8,7 @@ from typing import Any
 import torch
 
 from lemniscate import named
-from lemniscate.errors import UserError
+from lemniscate.errors import UserError, shown
 from lemniscate.policy import TrainedPolicy
 from lemniscate.run.config import RunConfig
 from lemniscate.run.run import Watch
@@ -42,7 +43,7 @@ class PolicySnapshot(TrainedPolicy):
 
 
 def watch_with(
-    callbacks: Sequence[Callback | str],
+    callbacks: Callback | str | Sequence[Callback | str],
     copy_networks: Callable[[TrainState], Any],
     spec: Spec,
     config: RunConfig,
@@ -50,7 +51,7 @@ def watch_with(
     """The function that a run calls after each logged line: every callback in turn, each with a policy of its own.
 
     Args:
-        callbacks: functions, or names of functions as `module:function`.
+        callbacks: functions, or names of functions as `module:function`; or one of these.
         copy_networks: networks on the CPU that share nothing with those of the state.
         spec: of the policy.
         config: of the run.
@@ -58,10 +59,11 @@ def watch_with(
     Raises:
         UserError: a callback that cannot be loaded or called.
     """
-    functions = [named.find(one) if isinstance(one, str) else one for one in callbacks]
+    several = callbacks if isinstance(callbacks, list | tuple) else [callbacks]
+    functions = [named.find(one) if isinstance(one, str) else one for one in several]
     for function in functions:
-        if not callable(function):
-            raise UserError(f"A callback must be a function of (step, metrics, policy), not {function!r}.")
+        if not _takes_three(function):
+            raise UserError(f"A callback must be a function of (step, metrics, policy), not {shown(function)}.")
 
     def watch(step: int, metrics: Mapping[str, float], state: TrainState) -> bool:
         stop = False
@@ -72,6 +74,17 @@ def watch_with(
         return stop
 
     return watch
+
+
+def _takes_three(function: Any) -> bool:
+    """Whether it can be called with three arguments; what does not tell, such as a built-in function, may be."""
+    try:
+        inspect.signature(function).bind(0, {}, None)
+    except ValueError:
+        pass
+    except TypeError:
+        return False
+    return callable(function)
 
 
 def _too_late() -> Any:

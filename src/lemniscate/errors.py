@@ -8,6 +8,9 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from difflib import get_close_matches
 from importlib.util import find_spec
+from pathlib import Path
+from shlex import quote
+from typing import Any
 
 
 class UserError(ValueError):
@@ -35,11 +38,11 @@ def prefix_errors(name: str) -> Iterator[None]:
         raise UserError(f"{name}: {error}") from None
 
 
-def unknown_name(kind: str, name: str, known: Iterable[str]) -> UserError:
+def unknown_name(kind: str, name: object, known: Iterable[str]) -> UserError:
     """The sentence for a name that is not in a table: the nearest names, or all of them when few."""
     names = sorted(known)
     plain = {choice.lower().lstrip("-"): choice for choice in names}
-    typed = name.lower().lstrip("-")
+    typed = str(name).lower().lstrip("-")
     close = [typed] if typed in plain else get_close_matches(typed, plain, n=3, cutoff=0.5)
     near = [plain[match] for match in close]
     if near:
@@ -49,6 +52,26 @@ def unknown_name(kind: str, name: str, known: Iterable[str]) -> UserError:
     else:
         hint = "nothing known is near it."
     return UserError(f"There is no {kind} {name!r}: {hint}")
+
+
+def shown(value: object) -> str:
+    """A value in a sentence: as it is written if that is short, else its type."""
+    text = repr(value)
+    return text if len(text) <= 60 and not text.startswith("<") and "\n" not in text else f"a {type(value).__name__}"
+
+
+def wrong_action(env: str, action: Any, layout: tuple[Any, Any] | None) -> UserError:
+    """The sentence for actions without the shape and the type in `layout`, which is None before a restart."""
+    if layout is None:
+        return UserError(f"{env}: the environments are to be restarted before their first step.")
+    is_array = hasattr(action, "dtype")
+    given = f"{type(action).__name__} {list(action.shape)} of {action.dtype}" if is_array else shown(action)
+    return UserError(f"{env}: actions are a Tensor {list(layout[0])} of {layout[1]}, not {given}.")
+
+
+def resume_line(path: Path) -> str:
+    """The command that resumes a run or a sweep."""
+    return f"lemniscate resume {quote(str(path))}"
 
 
 def is_installed(package: str) -> bool:
@@ -61,4 +84,6 @@ def is_installed(package: str) -> bool:
 
 def missing_extra(package: str, extra: str) -> UserError:
     """The sentence for an optional package that is not installed."""
-    return UserError(f"{package} is not installed; in the project's folder: pip install '.[{extra}]'")
+    return UserError(
+        f"{package} is not installed; it comes with the extra {extra}: in lemniscate's folder, pip install '.[{extra}]'"
+    )

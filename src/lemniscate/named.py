@@ -11,6 +11,9 @@ from typing import Any
 
 from lemniscate.errors import UserError
 
+WHERE = "here; run in its folder, or add that folder to PYTHONPATH"
+"""ends the sentence on a module that cannot be found"""
+
 _PASSED: dict[str, Any] = {}
 """every object that was passed in this process, by its name"""
 
@@ -66,7 +69,11 @@ def module_of(name: str) -> ModuleType:
         sys.path.insert(0, str(Path.cwd()))
     try:
         return importlib.import_module(module_name)
-    except ImportError as error:
+    except ModuleNotFoundError as error:
+        if error.name and f"{module_name}.".startswith(f"{error.name}."):
+            raise UserError(f"{name} cannot be found: there is no module {error.name} {WHERE}.") from None
+        raise UserError(f"{name} cannot be found: {error}.") from error
+    except (ImportError, SyntaxError, ValueError, TypeError) as error:
         raise UserError(f"{name} cannot be found: {error}.") from error
 
 

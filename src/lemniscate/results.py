@@ -2,6 +2,8 @@
 
 import json
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -9,12 +11,13 @@ from lemniscate import algos
 from lemniscate.console import say
 from lemniscate.envs import registry
 from lemniscate.envs.vec_env import VecEnv
-from lemniscate.errors import UserError
+from lemniscate.errors import UserError, shown
 from lemniscate.policy import TrainedPolicy
 from lemniscate.report import compare, curves, playback
 from lemniscate.report import pictures as pictures_of
 from lemniscate.report.groups import group
 from lemniscate.run import checkpoint
+from lemniscate.run.config import Count, Natural, checked
 from lemniscate.run.directory import find_checkpoint, is_finished, read_config
 from lemniscate.run.environments import evaluation_env
 from lemniscate.run.evaluate import Evaluation
@@ -27,13 +30,51 @@ FINAL_EPISODES = 100
 """that a run's final policy is judged by where runs are compared"""
 
 
-def load(path: str | Path) -> TrainedPolicy:
+@dataclass(frozen=True)
+class TrainedRun:
+    """The result of `train` and `resume`: the run directory, the final policy, the seconds of the training loop."""
+
+    path: Path
+    policy: TrainedPolicy
+    seconds: float
+
+
+Trained = str | Path | TrainedRun | TrainedPolicy
+"""what has a policy: the path of a run or a checkpoint, what `train` returned, or the policy itself"""
+
+
+def path_of(run: object) -> Path:
+    """The directory of a run: of its path, or of what `train` returned. Raises `UserError` for anything else."""
+    path = getattr(run, "path", run)
+    if isinstance(path, str | PathLike):
+        return Path(path)
+    raise UserError(f"A run is a directory, such as 'runs/lander', or what train returned, not {shown(run)}.")
+
+
+def finished_run(path: Path, report: bool, progress: bool) -> TrainedRun:
+    """A run that has taken all its steps, as it is; with `report` it is evaluated and drawn again."""
+    policy = load(path)
+    if progress:
+        say(f"{path} is finished, at step {policy.step:,}: there is nothing to resume.")
+    if report:
+        episodes = policy.config.evaluate_episodes
+        env = evaluation_env(policy.config, episodes)
+        pictures_of.report(policy.module, env, path, episodes, critic_of(policy.networks, policy.config))
+        env.close()
+    return TrainedRun(path, policy, 0.0)
+
+
+def load(run: Trained) -> TrainedPolicy:
     """The policy of a run (its newest whole checkpoint) or of one checkpoint. Nothing in the files is executed.
+
+    What `train` returned has its policy already, and a policy is returned as it is.
 
     Raises:
         UserError: neither a run nor a checkpoint, or a run without a whole checkpoint; a damaged checkpoint.
     """
-    found = find_checkpoint(Path(path))
+    if isinstance(run, TrainedRun | TrainedPolicy):
+        return run.policy if isinstance(run, TrainedRun) else run
+    found = find_checkpoint(path_of(run))
     algorithm, spec = algos.find(found.record["algorithm"]), checkpoint.spec_from_json(found.record["spec"])
     config = algorithm.Config.from_json(found.record["config"])
     networks = config.networks(spec)
@@ -42,7 +83,7 @@ def load(path: str | Path) -> TrainedPolicy:
 
 
 def evaluate(
-    policy: TrainedPolicy,
+    policy: Trained,
     env: str | Callable[..., Any] | None = None,
     episodes: int = 100,
     seed: int = 0,
@@ -54,7 +95,7 @@ def evaluate(
     """Play whole episodes from starts drawn with `seed`, none of which training ever saw.
 
     Args:
-        policy: from `load` or `train`.
+        policy: from `load` or `train`, or the path of a run or a checkpoint.
         env: an id, `module:Class`, a class, or a function that makes an environment; by default the one of training.
         episodes: how many.
         seed: of the starts.
@@ -65,9 +106,8 @@ def evaluate(
     Raises:
         UserError: numbers out of range; an environment that cannot be made, or whose spaces differ.
     """
-    if episodes < 1:
-        raise UserError(f"episodes must be a whole number at least 1, not {episodes}.")
-    _check_seed(seed)
+    policy, episodes, seed = load(policy), checked("episodes", episodes, Count), checked("seed", seed, Natural)
+    env_kwargs = checked("env_kwargs", env_kwargs, dict | None)
     vec = evaluation_env(policy.config, episodes, env=env, env_kwargs=env_kwargs, backend=backend)
     if not vec.spec.fits(policy.spec):
         vec.close()
@@ -81,11 +121,11 @@ def evaluate(
         vec.close()
 
 
-def watch(policy: TrainedPolicy, *, seed: int = 0, video: str | Path | None = None) -> str | None:
+def watch(policy: Trained, *, seed: int = 0, video: str | Path | None = None) -> str | None:
     """Show one episode: below the cell in a notebook, in a window elsewhere, or recorded into a file.
 
     Args:
-        policy: from `load` or `train`.
+        policy: from `load` or `train`, or the path of a run or a checkpoint.
         seed: of the start.
         video: a .gif, .webp or .mp4 to record into.
 
@@ -95,7 +135,7 @@ def watch(policy: TrainedPolicy, *, seed: int = 0, video: str | Path | None = No
     Raises:
         UserError: nothing to show it on, or another kind of file.
     """
-    _check_seed(seed)
+    policy, seed = load(policy), checked("seed", seed, Natural)
     if video is not None:
         playback.check_film(Path(video))
     env = _scene_env(policy)
@@ -108,8 +148,8 @@ def watch(policy: TrainedPolicy, *, seed: int = 0, video: str | Path | None = No
     return playback.show_episode(policy.act, policy.config, seed)
 
 
-def plot(*runs: str | Path) -> list[Path]:
-    """Draw the curves of a run into its `plots/`, or compare several, grouped by all but the seed.
+def plot(*runs: str | Path | TrainedRun | list[str | Path | TrainedRun]) -> list[Path]:
+    """Draw the curves of a run into its `plots/`, or compare several, or a list of them, grouped by all but the seed.
 
     In a notebook they are also shown below the cell.
 
@@ -119,7 +159,10 @@ def plot(*runs: str | Path) -> list[Path]:
     table on standard error. The final policies of finished runs are compared over 100 episodes each. Returns the
     pictures.
     """
-    paths = [Path(run) for run in runs]
+    given = [run for one in runs for run in (one if isinstance(one, list | tuple) else [one])]
+    paths = [path_of(run) for run in given]
+    if not paths:
+        raise UserError("There is nothing to plot: name one run or several, such as plot('runs/lander').")
     found = [run for path in paths for run in _members(path)]
     folder = paths[0] / "plots" if len(paths) == 1 else Path("plots")
     if found != paths[:1]:
@@ -138,9 +181,9 @@ def plot(*runs: str | Path) -> list[Path]:
     return pictures
 
 
-def final_return(run: str | Path) -> float:
+def final_return(run: str | Path | TrainedRun) -> float:
     """Mean return of a run's newest policy over 100 episodes; kept in `final.json` until there is a newer policy."""
-    path = Path(run)
+    path = path_of(run)
     file = path / "final.json"
     known: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {}
     if known.get("step") not in checkpoint.list_steps(path / "checkpoints")[-1:]:
@@ -182,8 +225,3 @@ def _scene_env(policy: TrainedPolicy) -> VecEnv | None:
         return None
     env = evaluation_env(config, config.evaluate_episodes)
     return env if env.scene else None
-
-
-def _check_seed(seed: int) -> None:
-    if seed < 0:
-        raise UserError(f"seed must be a whole number at least 0, not {seed}.")

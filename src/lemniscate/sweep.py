@@ -10,18 +10,18 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
 from filelock import FileLock, Timeout
 
-from lemniscate import api, results
-from lemniscate.algos import ALGORITHMS, find
+from lemniscate import api, named, results
+from lemniscate.algos import ALGORITHMS, name_of
 from lemniscate.console import say
 from lemniscate.envs import registry
-from lemniscate.errors import SweepError, UserError, prefix_errors
+from lemniscate.errors import SweepError, UserError, prefix_errors, resume_line, shown
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import is_finished
 from lemniscate.run.environments import device_for
@@ -57,6 +57,7 @@ def train_sweep(
     run: str | Path | None = None,
     preset: str | None = None,
     track: str | None = None,
+    callbacks: Sequence[str] = (),
     report: bool = False,
     progress: bool = True,
     **fields: object,
@@ -70,6 +71,7 @@ def train_sweep(
         run: the sweep's directory; by default a new one under `runs/`.
         preset: by name, for every algorithm; the best known for the environment unless given.
         track: as in `train`, for every run.
+        callbacks: names of functions, as `module:function`: every run calls them in its own process.
         report: as in `train`, for every run.
         progress: the live lines on standard error.
         **fields: any fields that the Configs of all the algorithms have.
@@ -86,22 +88,27 @@ def train_sweep(
             configs[name] = api.config_for(name, env, preset, **fields)
     if len({config.env for config in configs.values()}) > 1:
         raise UserError("These presets are for different environments; name the one of the whole sweep with env.")
-    _require_trainable(configs, numbers, track)
+    options = _options(track, callbacks, report)
+    _require_trainable(configs, numbers)
     stem = f"{'-'.join(names)}-{len(numbers)}-seeds"
-    path = Path(run) if run is not None else api.fresh_directory(next(iter(configs.values())).env, stem)
+    path = results.path_of(run) if run is not None else api.fresh_directory(next(iter(configs.values())).env, stem)
     records = {name: config.to_json() for name, config in configs.items()}
     but_seed = {name: {k: v for k, v in record.items() if k != "seed"} for name, record in records.items()}
     runs = Sweep(path, numbers, but_seed)
     runs.create()
-    return _train(runs, track, report, progress)
+    return _train(runs, options, progress)
 
 
 def resume_sweep(
-    path: str | Path, *, track: str | None = None, report: bool = False, progress: bool = True
+    path: str | Path | TrainedSweep,
+    *,
+    track: str | None = None,
+    callbacks: Sequence[str] = (),
+    report: bool = False,
+    progress: bool = True,
 ) -> TrainedSweep:
     """Resume an interrupted sweep: train the runs that are not finished or have not begun."""
-    api.loggers_with(track)
-    return _train(read_sweep(Path(path)), track, report, progress)
+    return _train(read_sweep(results.path_of(path)), _options(track, callbacks, report), progress)
 
 
 def at_once(threads: int) -> int:
@@ -110,8 +117,20 @@ def at_once(threads: int) -> int:
     return max(1, cores // threads)
 
 
-def _train(runs: Sweep, track: str | None, report: bool, progress: bool) -> TrainedSweep:
-    options = [*(["--track", track] if track else []), *(["--report"] if report else [])]
+def _options(track: str | None, callbacks: Sequence[str], report: bool) -> list[str]:
+    """The options of each run's process. Raises `UserError` for a tracker or a callback that it could not find."""
+    names = [callbacks] if isinstance(callbacks, str) else list(callbacks)
+    for name in (track, *names):
+        if not isinstance(name, str | None):
+            raise UserError(f"Each run of a sweep has a process of its own: name {shown(name)} as 'module:name'.")
+    api.loggers_with(track)
+    for name in names:
+        named.find(name)
+    options = ["--track", track] if track else []
+    return options + (["--callbacks", *names] if names else []) + (["--report"] if report else [])
+
+
+def _train(runs: Sweep, options: list[str], progress: bool) -> TrainedSweep:
     try:
         with FileLock(runs.path / ".lock", timeout=0):
             runs.create_runs()
@@ -161,7 +180,7 @@ class _Processes:
                 process.wait()
             self._bars.close()
         if self._stop_signal and not all(map(is_finished, self._runs.runs)):
-            said = f"Stopped; the runs that had begun are saved. Go on with: lemniscate resume {path}"
+            said = f"Stopped; the runs that had begun are saved. Go on with: {resume_line(path)}"
             raise Stopped(said, self._stop_signal)
         return self._failed
 
@@ -228,11 +247,10 @@ def _failure_of(run: Path, code: int) -> str:
 
 def algorithms_of(names: str | Iterable[str]) -> list[str]:
     """The names in "ppo,sac" or in a list, each once. Raises `UserError` for one that is unknown."""
-    split = [name.strip() for name in (names.split(",") if isinstance(names, str) else names)]
+    several = names.split(",") if isinstance(names, str) else names if isinstance(names, Iterable) else [names]
+    split = [name_of(name.strip() if isinstance(name, str) else name) for name in several]
     if not split:
         raise UserError(f"Name at least one algorithm: {', '.join(ALGORITHMS)}.")
-    for name in split:
-        find(name)
     return list(dict.fromkeys(split))
 
 
@@ -250,13 +268,15 @@ def _seeds_of(seeds: str | int | Iterable[int]) -> list[int]:
     return list(dict.fromkeys(numbers))
 
 
-def _require_trainable(configs: dict[str, RunConfig], seeds: list[int], track: str | None) -> None:
+def _require_trainable(configs: dict[str, RunConfig], seeds: list[int]) -> None:
     """Raise `UserError` where a run could not begin: one sentence now, instead of one from each run."""
-    api.loggers_with(track)
     some = next(iter(configs.values()))
     env = registry.make(some.env, 1, backend=some.backend)
     env.close()
     for name, config in configs.items():
+        for own in (config.env, *config.wrappers, getattr(config, "network", "")):
+            if "<" in own or own.startswith("__main__:"):
+                raise UserError(f"Each run of a sweep has a process of its own: put {own} into a module, to import it.")
         device_for(config.device)
         for seed in seeds:
             config.replace(seed=seed)

@@ -22,4 +22,5 @@ OFF_POLICY = {
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_the_contract_holds(check, algorithm, tmp_path):
     settings = OFF_POLICY if algorithm in ("ddpg", "td3", "sac") else ON_POLICY
+    settings = settings | ({"minibatch_size": 64} if algorithm == "ppo" else {})
     check(algorithm, tmp_path, **settings, checkpoint_every=settings["total_steps"] // 4, evaluate_episodes=2)

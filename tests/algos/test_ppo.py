@@ -113,6 +113,10 @@ def test_advantages_are_estimated_again_before_each_epoch_on_request(recomputed)
     ("fields", "message"),
     [
         ({"minibatch_size": 1}, "normalize_advantage needs"),
+        (
+            {"minibatch_size": 2049},
+            "minibatch_size 2,049 is above the 32 rows of a rollout, num_envs 4 times num_steps 8",
+        ),
         ({"gamma": 1.5}, "gamma must be a number from 0 to 1, not 1.5"),
         ({"clip": 0.0}, "clip must be a number above 0"),
         ({"num_envs": 0}, "num_envs must be a whole number at least 1"),

@@ -118,7 +118,7 @@ def test_masks_images_and_native_backends_are_played():
 def test_a_module_that_is_not_there():
     from lemniscate.errors import UserError
 
-    with pytest.raises(UserError, match="nowhere:Env cannot be found: No module named 'nowhere'"):
+    with pytest.raises(UserError, match="nowhere:Env cannot be found: there is no module nowhere here"):
         list(check("nowhere:Env"))
     with pytest.raises(UserError, match=r"envs\.test_check has no Nothing"):
         list(check("envs.test_check:Nothing"))

@@ -171,7 +171,9 @@ def test_the_measure_of_a_last_step_is_that_before_the_reset():
 def test_actions_of_another_shape_are_refused():
     env = registry.make("CartPole-v1", 4)
     env.restart(0)
-    with pytest.raises(UserError, match=r"Actions have the shape \(4,\) in 4 × CartPole-v1, not \(3,\)"):
+    with pytest.raises(
+        UserError, match=r"4 × CartPole-v1: actions are a Tensor \[4\] of torch.int64, not Tensor \[3\]"
+    ):
         env.step(torch.zeros(3, dtype=torch.int64))
 
 

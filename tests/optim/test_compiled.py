@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from helpers import CPU
-from lemniscate.optim.compiled import Compiled
+from lemniscate.optim.compiled import Compiled, stopping
 
 
 class Scale:
@@ -57,3 +57,16 @@ def test_where_the_compiler_fails_it_prints_one_sentence_and_calls_the_fallback(
     for _ in range(2):
         assert method(torch.tensor(1.0)) == (-1 if fallback else 6)
     assert capsys.readouterr().err == "torch.compile failed (no compiler); continuing without compilation.\n"
+
+
+def test_a_compiler_that_ctrl_c_has_stopped_is_no_failure_to_report(monkeypatch, capsys):
+    def interrupted(*_):
+        stopping.set()
+        raise RuntimeError("the compiler got the signal, too")
+
+    monkeypatch.setattr(torch, "compile", lambda *_, **__: interrupted)
+    try:
+        assert Compiled(Scale(3).twice, CPU)(torch.tensor(1.0)) == 6
+    finally:
+        stopping.clear()
+    assert capsys.readouterr().err == ""

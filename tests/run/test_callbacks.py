@@ -148,7 +148,10 @@ def test_a_callback_is_named_as_module_and_function(tmp_path, monkeypatch):
     ("callback", "said"),
     [
         ("stop", "'stop' is no name of an object; it has the form module:name"),
-        ("no_such_module:stop", "no_such_module:stop cannot be found: No module named 'no_such_module'"),
+        (
+            "no_such_module:stop",
+            "no_such_module:stop cannot be found: there is no module no_such_module here; run in its folder",
+        ),
         ("math:cosin", "math:cosin cannot be found: math has no cosin"),
         ("math:pi", r"A callback must be a function of \(step, metrics, policy\), not 3.14"),
     ],

@@ -7,7 +7,7 @@ from types import ModuleType
 from typing import Any
 
 from lemniscate import named
-from lemniscate.errors import UserError, unknown_name
+from lemniscate.errors import UserError, shown, unknown_name
 
 ALGORITHMS = ("reinforce", "a2c", "trpo", "ppo", "ddpg", "td3", "sac")
 
@@ -28,7 +28,7 @@ def find(algorithm: str | ModuleType) -> Any:
     own = _import(algorithm) if isinstance(algorithm, str) else algorithm
     missing = [name for name in REQUIRED if not hasattr(own, name)]
     if missing:
-        name = algorithm if isinstance(algorithm, str) else getattr(own, "__name__", repr(own))
+        name = algorithm if isinstance(algorithm, str) else getattr(own, "__name__", shown(own))
         raise UserError(f"{name} is not an algorithm: it has no {' and no '.join(missing)}.")
     return own
 
@@ -48,7 +48,8 @@ def _import(name: str) -> Any:
         return import_module(name)
     except ModuleNotFoundError as error:
         if error.name in (name, name.partition(".")[0]):
-            raise unknown_name("algorithm", name, ALGORITHMS) from None
+            said = unknown_name("algorithm", name, ALGORITHMS)
+            raise UserError(f"{said} A module of your own is not {named.WHERE}.") from None
         raise UserError(f"The algorithm {name} cannot be imported: {error}.") from error
     except (ImportError, SyntaxError, ValueError, TypeError) as error:
         raise UserError(f"The algorithm {name} cannot be imported: {error}.") from error

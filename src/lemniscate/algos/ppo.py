@@ -69,7 +69,8 @@ class Config(OnPolicyConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._require_rows("normalize_advantage", min(self.minibatch_size, self.num_rows))
+        self._require_minibatch("minibatch_size")
+        self._require_rows("normalize_advantage", self.minibatch_size)
 
     @property
     def gradient_steps(self) -> int:

@@ -27,7 +27,10 @@ COMMANDS = {
     "plot": "Draw the curves of a run, or compare several, grouped by all but the seed.",
     "envs": "List the environments, their backends, and the preset that fits.",
     "check": "Check that an environment is suitable for training.",
+    "completion": "Print the script with which a shell completes; its first line says where to write it.",
 }
+
+SHELLS = ("bash", "zsh", "fish")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -56,11 +59,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
     """The command and its options. Raises `UserError` with one sentence on what is not understood."""
-    words = _normalized(arguments)
-    parser, commands = _parsers()
-    if not words:
-        parser.print_help()
-        parser.exit()
+    words = _normalized(arguments) or ["--help"]
+    parser, commands = parsers()
     if not words[0].startswith("-"):
         if words[0] not in COMMANDS:
             raise unknown_name("command", words[0], COMMANDS)
@@ -114,7 +114,7 @@ class _Help(argparse.RawDescriptionHelpFormatter):
         return super()._format_action_invocation(action)
 
 
-def _parsers() -> tuple[Parser, dict[str, Parser]]:
+def parsers() -> tuple[Parser, dict[str, Parser]]:
     """The parser of everything, and that of each command."""
     parser = Parser(prog="lemniscate", description="Train, evaluate and watch reinforcement-learning policies.")
     parser.add_argument("--version", action="version", version=f"lemniscate {__version__}", help="print the version")
@@ -144,6 +144,8 @@ def _parsers() -> tuple[Parser, dict[str, Parser]]:
 
     subs["check"].add_argument("env", metavar="ENV", help="an id, or module:Class of your own")
     subs["check"].add_argument("--backend", metavar="NAME", help="simulation backend [chosen from the id]")
+
+    subs["completion"].add_argument("shell", choices=SHELLS, metavar="SHELL", help=", ".join(SHELLS))
     return parser, subs
 
 

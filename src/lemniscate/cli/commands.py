@@ -6,6 +6,7 @@ from typing import Any
 
 from lemniscate import api, results, sweep
 from lemniscate.algos import ALGORITHMS
+from lemniscate.cli.completion import script
 from lemniscate.cli.fields import read_json
 from lemniscate.console import say
 from lemniscate.envs import registry
@@ -23,13 +24,12 @@ def train(given: argparse.Namespace) -> None:
     """Train one policy, or with --seeds one for each algorithm and seed."""
     shared = {"run": given.run, "preset": given.preset, "track": given.track, "report": given.report, **given.fields}
     if given.seeds is not None or "," in given.algorithm:
-        if given.callbacks:
-            raise UserError("--callbacks sees one run: it does not go with --seeds.")
         if "seed" in given.fields:
             raise UserError("Several runs have several seeds: --seeds 1-5, not --seed.")
         if given.seeds is None:
             raise UserError("Algorithms are compared over several seeds: add --seeds 1-5.")
-        say(f"Everything is in {sweep.train_sweep(given.algorithm, given.env, given.seeds, **shared).path}")
+        runs = sweep.train_sweep(given.algorithm, given.env, given.seeds, **shared, **_callbacks(given))
+        say(f"Everything is in {runs.path}")
         return
     config = api.config_for(given.algorithm, given.env, given.preset, **given.fields)
     if config.backend:
@@ -46,14 +46,14 @@ def train(given: argparse.Namespace) -> None:
 def resume(given: argparse.Namespace) -> None:
     """Continue an interrupted run or sweep."""
     if is_sweep(given.run):
-        if given.callbacks:
-            raise UserError(f"--callbacks sees one run: {given.run} is a sweep.")
-        run = sweep.resume_sweep(given.run, track=given.track, report=given.report)
+        path = sweep.resume_sweep(given.run, track=given.track, report=given.report, **_callbacks(given)).path
     else:
         run = api.resume(given.run, track=given.track, report=given.report, **_callbacks(given))
+        path = run.path if run.seconds else None
         if given.score:
             results.final_return(run.path)
-    say(f"Done. Everything is in {run.path}")
+    if path:  # a finished run has had its sentence
+        say(f"Done. Everything is in {path}")
 
 
 def evaluate(given: argparse.Namespace) -> None:
@@ -97,6 +97,11 @@ def check(given: argparse.Namespace) -> None:
         say(f"{MARKS[finding.grade]} {finding.sentence}")
     if bad:
         raise UserError(f"{given.env} is not suitable for training: {bad} finding{'s' * (bad > 1)} above.")
+
+
+def completion(given: argparse.Namespace) -> None:
+    """Print the script with which a shell completes."""
+    print(script(given.shell), end="")
 
 
 def _callbacks(given: argparse.Namespace) -> dict[str, Any]:

@@ -115,7 +115,7 @@ def field_help(config: type[RunConfig]) -> dict[str, str]:
 def _parse(algorithm: str, words: list[str]) -> tuple[argparse.Namespace, dict[str, Any]]:
     config = find(algorithm).Config
     hints = get_type_hints(config, include_extras=True)
-    given, rest = _parser(algorithm, config, hints).parse_known_args(words)
+    given, rest = parser_of(algorithm).parse_known_args(words)
     if rest:
         known = [*config.names(), "run", "preset", "seeds", "track", "report", "score", "callbacks"]
         raise unknown_argument(rest, lambda word: glossary.unknown_field(word[2:].replace("-", "_"), known, flag))
@@ -123,7 +123,10 @@ def _parse(algorithm: str, words: list[str]) -> tuple[argparse.Namespace, dict[s
     return given, {name: read(name, hints[name], value) for name, value in values.items()}
 
 
-def _parser(algorithm: str, config: type[RunConfig], hints: dict[str, Any]) -> Parser:
+def parser_of(algorithm: str) -> Parser:
+    """The parser of `lemniscate train ALGORITHM`, with an option for each field."""
+    config = find(algorithm).Config
+    hints = get_type_hints(config, include_extras=True)
     parser = Parser(
         prog=f"lemniscate train {algorithm}",
         usage=f"lemniscate train {algorithm} --env ID [--run DIR] [--preset NAME] [--FIELD VALUE …]",

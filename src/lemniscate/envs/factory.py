@@ -95,4 +95,7 @@ def sentences(env: str, kwargs: Mapping[str, Any] | None, wrappers: Sequence[str
     except (gym.error.Error, ImportError, TypeError, ValueError, AssertionError) as error:
         given = [f"{name}={value!r}" for name, value in (kwargs or {}).items()] + list(wrappers)
         with_these = f" with {', '.join(given)}" if given else ""
-        raise UserError(f"{env} cannot be made{with_these}: {error}") from error
+        said = str(error).partition(" was raised from the environment creator")[0]
+        if "required positional argument" in said:
+            said += "; it is given in env_kwargs (--env-args), or with a wrapper: module:Name(key=value)"
+        raise UserError(f"{env} cannot be made{with_these}: {said}") from error

@@ -29,3 +29,16 @@ class ActionMasks:
                     f"{self._env_id} rules out every action of environment {number}: its action_mask is all zero."
                 )
         return np.concatenate([flat, self._masks.astype(flat.dtype)], axis=-1)
+
+
+def read_mask(mask: Any, batch: int, n: int) -> np.ndarray:
+    """The action masks [B, n] of `info["action_mask"]`, [n] or [B, n]; None permits every action.
+
+    Raises:
+        UserError: another shape, or a row that permits nothing.
+    """
+    mask = np.ones(n) if mask is None else np.asarray(mask)
+    if mask.shape not in ((n,), (batch, n)) or not mask.any(-1).all():
+        wrong = "permits nothing" if mask.shape[-1:] == (n,) else f"has the shape {mask.shape}"
+        raise UserError(f"An action_mask is ({n},) or a batch, ({batch}, {n}), of 1 and 0; this one {wrong}.")
+    return np.broadcast_to(mask, (batch, n))

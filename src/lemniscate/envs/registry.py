@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from lemniscate import named
-from lemniscate.errors import UserError, is_installed, unknown_name
+from lemniscate.errors import UserError, is_installed, shown, unknown_name
 
 if TYPE_CHECKING:
     import gymnasium as gym
@@ -107,7 +107,7 @@ def name_of(env: object) -> str:
     if isinstance(env, str):
         return env
     if not callable(env):
-        what = "an environment that is made already" if hasattr(env, "step") else f"{env!r}"
+        what = "an environment that is made already" if hasattr(env, "step") else shown(env)
         raise UserError(f"env is {what}; give its class, its id, or a function that makes it: several are needed.")
     return named.name_of(env)
 
@@ -148,6 +148,8 @@ def make(
 
     from lemniscate.envs.vec_env import VecEnv
 
+    if not isinstance(num_envs, int) or num_envs < 1:
+        raise UserError(f"num_envs must be a whole number at least 1, not {shown(num_envs)}.")
     name, wraps = name_of(env), tuple(map(named.name_of, wrappers))
     if kwargs is not None and not isinstance(kwargs, Mapping):
         raise UserError(f"The arguments of an environment are a dictionary, such as {{'x': 1}}, not {kwargs!r}.")

@@ -118,12 +118,22 @@ def _scale(box: Box) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     return low, high, middle, half
 
 
+def _require_below(counts: int | np.ndarray, action: np.ndarray) -> np.ndarray:
+    """The int64 actions themselves. Raises `UserError` unless each is from 0 to below its count."""
+    wrong = action.view(np.uint64) >= counts  # without its sign, a negative number is a large one
+    if wrong.any():
+        raise UserError(f"Actions must be whole numbers from 0 to below {counts}, not {action[wrong][0]}.")
+    return action
+
+
 def physical_action(action: np.ndarray, kind: Action) -> np.ndarray:
     """Actions of a policy in the units and the shape of the environment, as `env.step` takes them, [N, …]."""
-    if isinstance(kind, Discrete):
-        return action + kind.start
     if isinstance(kind, Box):
         action = scale_action(action, kind)
+    elif isinstance(kind, Discrete):
+        return _require_below(kind.n, action) + kind.start
     elif isinstance(kind, MultiDiscrete):
-        action = action + np.array(kind.start)
+        action = _require_below(np.array(kind.nvec), action) + np.array(kind.start)
+    else:
+        _require_below(2, action)
     return action if kind.shape is None else action.reshape(-1, *kind.shape)

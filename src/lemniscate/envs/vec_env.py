@@ -8,7 +8,7 @@ from torch import Tensor
 
 from lemniscate.envs.backend import Backend, Scene, Summary
 from lemniscate.envs.episodes import Episodes, EpisodeStatistics
-from lemniscate.errors import NonFiniteError, UserError
+from lemniscate.errors import NonFiniteError, UserError, wrong_action
 from lemniscate.spec import Box, Discrete, MultiBinary, Spec
 from lemniscate.types import Step
 
@@ -49,13 +49,14 @@ class VecEnv:
         """seconds that the functions of `data` spend acting and stepping"""
         self.steps = 0
         self._statistics = EpisodeStatistics(self.num_envs, self.device)
-        self._action_shape = _action_shape(self.spec, self.num_envs)
+        self._actions: tuple[torch.Size, torch.dtype] | None = None  # before it is restarted, none is right
 
     def restart(self, seed: int, steps: int = 0) -> Tensor:
         """Begin again from `seed`; also stored as `obs`, [N, O]. `steps` is what the run has taken so far."""
         self.steps = steps
         self._statistics = EpisodeStatistics(self.num_envs, self.device)
         self.obs = self.backend.restart(seed)
+        self._actions = _action_layout(self.spec, self.num_envs)
         self._require_finite(observation=self.obs)
         return self.obs
 
@@ -64,13 +65,10 @@ class VecEnv:
 
         Raises:
             NonFiniteError: an observation or a reward is NaN or infinite; nothing has learned from it yet.
-            UserError: actions of another shape.
+            UserError: actions of another kind or shape.
         """
-        if action.shape != self._action_shape:
-            raise UserError(
-                f"Actions have the shape {tuple(self._action_shape)} in {self.num_envs} × {self.spec.env_id}, not"
-                f" {tuple(action.shape)}."
-            )
+        if not isinstance(action, Tensor) or (action.shape, action.dtype) != self._actions:
+            raise wrong_action(f"{self.num_envs} × {self.spec.env_id}", action, self._actions)
         counts = self.backend.counts
         step = self.backend.step(action)
         self._require_finite(observation=step.next_obs, reward=step.reward)
@@ -107,10 +105,10 @@ class VecEnv:
         self.backend.close()
 
 
-def _action_shape(spec: Spec, num_envs: int) -> torch.Size:
+def _action_layout(spec: Spec, num_envs: int) -> tuple[torch.Size, torch.dtype]:
     action = spec.action
     if isinstance(action, Discrete):
-        return torch.Size((num_envs,))
+        return torch.Size((num_envs,)), torch.int64
     if isinstance(action, Box):
-        return torch.Size((num_envs, action.size))
-    return torch.Size((num_envs, action.n if isinstance(action, MultiBinary) else len(action.nvec)))
+        return torch.Size((num_envs, action.size)), torch.float32
+    return torch.Size((num_envs, action.n if isinstance(action, MultiBinary) else len(action.nvec))), torch.int64

@@ -27,13 +27,6 @@ class Bfloat16Linear(nn.Linear):
         return nn.functional.linear(input.bfloat16(), self.weight.bfloat16()).to(input.dtype) + self.bias
 
 
-def has_bfloat16(device: torch.device) -> bool:
-    """Whether the processor has products in bfloat16; elsewhere they are emulated, and slow."""
-    if device.type == "cuda":
-        return torch.cuda.is_bf16_supported(including_emulation=False)
-    return any(able for name, able in torch.cpu.get_capabilities().items() if "bf16" in name)
-
-
 @dataclass(frozen=True)
 class Layers:
     """The settings of a network between its inputs and its outputs.

@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Callable
+from threading import Event
 from types import FunctionType, MethodType
 from typing import Any, Generic, ParamSpec, TypeVar
 
@@ -11,11 +12,15 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
+stopping = Event()
+"""set while a run that was asked to stop ends its update: Ctrl-C reaches the compiler, too, which fails then"""
+
+
 class Compiled(Generic[P, R]):
     """A method, compiled at its first call; every later call must have arguments of the same shapes.
 
     Nothing is checked at a call: for small networks the checks would cost as much as the work. Where `torch.compile`
-    fails, a sentence says so and `fallback` is called instead.
+    fails, a sentence says so (unless the run is `stopping`) and `fallback` is called instead.
     """
 
     def __init__(self, method: Callable[P, R], device: torch.device, fallback: Callable[P, R] | None = None) -> None:
@@ -35,8 +40,9 @@ class Compiled(Generic[P, R]):
         try:
             return self._compiled(*args, **kwargs)
         except RuntimeError as error:
-            reason = str(error).strip().partition("\n")[0]
-            print(f"torch.compile failed ({reason}); continuing without compilation.", file=sys.stderr)
+            if not stopping.is_set():
+                reason = str(error).strip().partition("\n")[0]
+                print(f"torch.compile failed ({reason}); continuing without compilation.", file=sys.stderr)
             self._chosen = self._fallback
             return self._fallback(*args, **kwargs)
 

@@ -50,4 +50,4 @@ def choose(algorithm: str, env_id: str | None, name: str | None) -> tuple[str, R
     if not named:
         raise unknown_name("preset", name, names(algorithm))
     config = next((config for config in named if config.env == env_id), named[0])
-    return name, config.replace(env=env_id) if env_id else config
+    return name, config if env_id is None else config.replace(env=env_id)

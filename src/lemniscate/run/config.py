@@ -6,12 +6,13 @@ import math
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from pathlib import PurePath
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Self, Union, get_args, get_origin, get_type_hints
 
 import torch
 
-from lemniscate.errors import UserError
+from lemniscate.errors import UserError, shown
 from lemniscate.glossary import unknown_field
 from lemniscate.run.seeding import Generators
 from lemniscate.spec import Spec
@@ -60,6 +61,8 @@ def checked(name: str, value: Any, hint: Any) -> Any:
     """
     if hasattr(value, "tolist"):
         value = value.tolist()
+    if isinstance(value, torch.device | PurePath):
+        value = str(value)
     options = options_of(hint)
     if value is None and NoneType in options:
         return None
@@ -71,7 +74,7 @@ def checked(name: str, value: Any, hint: Any) -> Any:
             return _convert(value, option)
         except ValueError as error:
             wanted.append(str(error))
-    raise UserError(f"{name} must be {' or '.join(wanted)}, not {value!r}.")
+    raise UserError(f"{name} must be {' or '.join(wanted)}, not {shown(value)}.")
 
 
 def _convert(value: Any, option: Any) -> Any:

@@ -8,7 +8,7 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from lemniscate.console import say
-from lemniscate.errors import UserError
+from lemniscate.errors import UserError, resume_line
 from lemniscate.run import checkpoint
 from lemniscate.run.config import RunConfig
 from lemniscate.run.state import TrainState
@@ -22,7 +22,7 @@ SWEEP = "sweep.json"
 def require_absent(path: Path) -> None:
     """Raise `UserError` if a run directory exists already; one whose creation failed half-way does not count."""
     if path.exists() and (not path.is_dir() or set(path.iterdir()) - {path / UNFINISHED}):
-        raise UserError(f"{path} exists already; go on with it (lemniscate resume {path}) or choose another --run.")
+        raise UserError(f"{path} exists already; go on with it ({resume_line(path)}) or choose another --run.")
 
 
 def create_directory(path: Path, name: str, record: dict[str, Any]) -> None:

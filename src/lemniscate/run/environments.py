@@ -7,7 +7,7 @@ import torch
 
 from lemniscate.envs import registry
 from lemniscate.envs.vec_env import VecEnv
-from lemniscate.errors import UserError
+from lemniscate.errors import UserError, shown
 from lemniscate.run.config import RunConfig
 
 
@@ -16,6 +16,8 @@ def make_envs(config: RunConfig) -> tuple[VecEnv, VecEnv]:
 
     They are restarted with seeds of different streams, so no start of one is ever a start of the other.
     """
+    if not isinstance(config, RunConfig):
+        raise UserError(f"make_envs needs a Config, such as config_for('ppo', 'CartPole-v1'), not {shown(config)}.")
     device = str(device_for(config.device))
     world = {"kwargs": config.env_kwargs, "wrappers": config.wrappers, "backend": config.backend}
     train_env = registry.make(config.env, config.num_envs, device=device, stagger=True, **world)

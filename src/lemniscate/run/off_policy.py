@@ -9,7 +9,7 @@ from lemniscate.data.action_noise import ActionNoise, Kind
 from lemniscate.data.replay import ReplayBuffer, bytes_per_transition
 from lemniscate.errors import UserError
 from lemniscate.nn.activations import Activation
-from lemniscate.nn.networks import Layers, Matmul, has_bfloat16
+from lemniscate.nn.networks import Layers, Matmul
 from lemniscate.run.config import Count, Fraction, Natural, NonNegative, Positive, RunConfig
 from lemniscate.run.state import Networks, TrainState
 from lemniscate.spec import Spec
@@ -144,3 +144,12 @@ class OffPolicyState(TrainState[Networks]):
     def on_warm_start(self) -> None:
         """Copy the loaded networks into the targets."""
         self.targets.load_state_dict(self.networks.target().state_dict())
+
+
+def has_bfloat16(device: torch.device) -> bool:
+    """Whether the processor, or on mps Metal, has products in bfloat16; elsewhere they are emulated, and slow."""
+    if device.type == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    if device.type == "mps":
+        return torch.backends.mps.is_macos_or_newer(14, 0)
+    return any(able for name, able in torch.cpu.get_capabilities().items() if "bf16" in name)

@@ -56,6 +56,12 @@ class OnPolicyConfig(RunConfig):
         """The number of rollouts of the whole run."""
         return -(-self.total_steps // self.num_rows)
 
+    def _require_minibatch(self, field: str) -> None:
+        """Raise `UserError` if `field`, the size of minibatches, is above the rows of a rollout."""
+        if getattr(self, field) > self.num_rows:
+            rows = f"{self.num_rows:,} rows of a rollout, num_envs {self.num_envs:,} times num_steps {self.num_steps:,}"
+            raise UserError(f"{field} {getattr(self, field):,} is above the {rows}.")
+
     def _require_rows(self, field: str, rows: int) -> None:
         """Raise `UserError` if `field`, which standardizes, would have a single row to do it with."""
         if rows == 1 and getattr(self, field):

@@ -23,7 +23,8 @@ import torch
 from lemniscate.console import ProgressBar, say
 from lemniscate.envs.episodes import Episodes
 from lemniscate.envs.vec_env import VecEnv
-from lemniscate.errors import NonFiniteError, UserError
+from lemniscate.errors import NonFiniteError, UserError, resume_line
+from lemniscate.optim.compiled import stopping
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import Saver
 from lemniscate.run.evaluate import evaluate
@@ -129,6 +130,7 @@ class Run:
                     self._body_time += time.monotonic() - self._body_began
                     going_on = self._between(state, before, total_steps)
         finally:
+            stopping.clear()
             self.seconds = time.monotonic() - started
             self._bar.close()
 
@@ -199,7 +201,7 @@ class Run:
 
     def _tell_stop(self, step: int) -> None:
         message = (
-            f"Stopped at step {step:,}; the policy is saved. Go on with: lemniscate resume {self.path}\n"
+            f"Stopped at step {step:,}; the policy is saved. Go on with: {resume_line(self.path)}\n"
             f"It resumes at step {self._saver.last_planned:,}, the last planned checkpoint, and ends in the same bits"
             " as a run that was never stopped."
         )
@@ -264,6 +266,7 @@ class Run:
         if self._stop_signal:
             raise KeyboardInterrupt
         self._stop_signal = signum
+        stopping.set()
 
 
 def is_compiled(config: RunConfig) -> bool:

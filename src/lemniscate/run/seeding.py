@@ -4,10 +4,13 @@ import os
 import random
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 import torch
 import torch.utils.deterministic as deterministic_mode
+
+from lemniscate.errors import UserError, shown
 
 
 def set_seeds(seed: int, deterministic: bool = True) -> None:
@@ -17,11 +20,14 @@ def set_seeds(seed: int, deterministic: bool = True) -> None:
     is derived from this one (`derive`). XLA on a GPU is told to be deterministic if JAX has not started yet.
 
     Args:
-        seed: 0 … 2³² − 1.
+        seed: 0 … 2³² − 1; another raises `UserError`.
         deterministic: cuDNN's deterministic kernels without benchmarking, torch's deterministic algorithms (a warning
             where there is none), cuBLAS's fixed workspace.
     """
-    seed_globals(seed)
+    number: Any = seed.tolist() if hasattr(seed, "tolist") else seed  # NumPy's and torch's
+    if type(number) not in (int, float) or not 0 <= number < 2**32 or number % 1:
+        raise UserError(f"seed must be a whole number from 0 to {2**32 - 1:,}, not {shown(seed)}.")
+    seed_globals(int(number))
     torch.backends.cudnn.deterministic = deterministic
     torch.backends.cudnn.benchmark = False
     torch.use_deterministic_algorithms(deterministic, warn_only=True)

@@ -1,0 +1,89 @@
+"""Completion in bash, zsh and fish: a script with all that may follow a word, so that pressing TAB starts nothing."""
+
+import argparse
+import shlex
+from collections.abc import Iterable
+from typing import Literal, get_args, get_origin, get_type_hints
+
+from lemniscate.algos import ALGORITHMS, find
+from lemniscate.cli import COMMANDS, SHELLS, Parser, parsers
+from lemniscate.cli.fields import flag, parser_of
+from lemniscate.envs import registry
+from lemniscate.nn.networks import NETWORKS
+from lemniscate.presets import names
+from lemniscate.run.config import options_of
+from lemniscate.run.loggers import TRACKERS
+
+FILES = {
+    "bash": "~/.local/share/bash-completion/completions/lemniscate",
+    "zsh": "~/.lemniscate.zsh; and in ~/.zshrc: source ~/.lemniscate.zsh",
+    "fish": "~/.config/fish/completions/lemniscate.fish",
+}
+"""where each shell reads the script"""
+
+BASH = """_lemniscate() {
+  local here=${COMP_WORDS[COMP_CWORD]} before=${COMP_WORDS[COMP_CWORD-1]} command=${COMP_WORDS[1]} known=""
+  [ "$command" = train ] && command=${COMP_WORDS[2]}
+  case "$COMP_CWORD $command $before $here" in
+CASES
+  esac
+  COMPREPLY=($(compgen -W "$known" -- "$here"))
+}
+complete -o default -F _lemniscate lemniscate
+"""
+"""what has no answer is completed as a file, since runs and films are paths"""
+
+ZSH = """(( $+functions[compdef] )) || { autoload -Uz compinit && compinit }
+autoload -Uz bashcompinit && bashcompinit
+"""
+
+
+def script(shell: str) -> str:
+    """The script for one of `SHELLS`."""
+    where = f"# Write it once, and again after an upgrade: lemniscate completion {shell} > {FILES[shell]}\n"
+    return where + (_fish() if shell == "fish" else (ZSH if shell == "zsh" else "") + _bash())
+
+
+def _bash() -> str:
+    cases = [("1 *", COMMANDS), *((f"* * {word} *", words) for word, words in _followers().items())]
+    cases += [(f"* {name} * -*", _options(parser)) for name, parser in _parsers().items()]
+    lines = (f"    {pattern.replace(' ', chr(92) + ' ')}) known='{' '.join(words)}' ;;" for pattern, words in cases)
+    return BASH.replace("CASES", "\n".join(lines))
+
+
+def _fish() -> str:
+    followers = _followers()
+    lines = [f"-n __fish_use_subcommand -f -a {name} -d {shlex.quote(text)}" for name, text in COMMANDS.items()]
+    for word in COMMANDS.keys() & followers.keys():
+        after = f"test (count (commandline -opc)) = 2; and __fish_seen_subcommand_from {word}"
+        lines.append(f"-n '{after}' -f -a '{' '.join(followers[word])}'")
+    for name, parser in _parsers().items():
+        for option, action in _options(parser).items():
+            known = f" -x -a '{' '.join(followers[option])}'" if option in followers else " -r" * (action.nargs != 0)
+            text = shlex.quote((action.help or "").replace("%%", "%"))
+            lines.append(f"-n '__fish_seen_subcommand_from {name}' -l {option[2:]}{known} -d {text}")
+    return "".join(f"complete -c lemniscate {line}\n" for line in lines)
+
+
+def _parsers() -> dict[str, Parser]:
+    """The parser of each command, and in the place of `train` that of each algorithm."""
+    return {name: parser for name, parser in parsers()[1].items() if name != "train"} | {
+        name: parser_of(name) for name in ALGORITHMS
+    }
+
+
+def _options(parser: argparse.ArgumentParser) -> dict[str, argparse.Action]:
+    return {name: action for name, action in parser._option_string_actions.items() if name.startswith("--")}
+
+
+def _followers() -> dict[str, Iterable[str]]:
+    """What may follow a command or an option, where that is one of a few words."""
+    ids, presets = registry.known_ids(), {preset: None for name in ALGORITHMS for preset in names(name)}
+    found: dict[str, Iterable[str]] = {"train": ALGORITHMS, "completion": SHELLS, "check": ids, "--env": ids}
+    found |= {"--preset": presets, "--backend": registry.BACKENDS, "--track": TRACKERS, "--network": NETWORKS}
+    for name in ALGORITHMS:
+        for field, hint in get_type_hints(find(name).Config).items():
+            for option in options_of(hint):
+                if get_origin(option) is Literal:
+                    found[flag(field)] = get_args(option)
+    return found

@@ -1,0 +1,65 @@
+"""Raw observations, as an environment returns them, read for a policy: one or a batch, checked."""
+
+from typing import Any
+
+import numpy as np
+
+from lemniscate.envs.spaces import flatten_observation, follow
+from lemniscate.errors import UserError
+from lemniscate.spec import Spec
+
+
+def read_observation(spec: Spec, obs: Any) -> tuple[np.ndarray, bool]:
+    """The flat observations [B, O] of one observation or a batch, and whether it was a batch.
+
+    Args:
+        spec: of the environment.
+        obs: an array, a number, or a dictionary or tuple of these; or the flat observation [O] or [B, O].
+
+    Raises:
+        UserError: another shape than the environment's, or a number that is not finite.
+    """
+    try:
+        if not isinstance(obs, dict | tuple) and _is_flat(spec, np.asarray(obs)):
+            flat = np.asarray(obs, dtype=np.uint8 if spec.image else np.float32)
+            flat, batched = flat.reshape(-1, spec.observation_size), flat.ndim == 2
+        else:
+            batched = _is_batch(spec, obs)
+            flat = flatten_observation(spec.observation_parts, obs, image=spec.image)
+    except (KeyError, IndexError, TypeError, ValueError) as error:
+        raise _unreadable(spec, obs, error) from None
+    if not np.isfinite(flat).all():
+        number = flat[~np.isfinite(flat)][0]
+        raise UserError(f"This observation of {spec.env_id} has a number that is {number}; all must be finite.")
+    return flat, batched
+
+
+def _is_flat(spec: Spec, obs: np.ndarray) -> bool:
+    """Whether it is [O] or [B, O], laid out as policies see it, and not as the environment returns it."""
+    first = spec.observation_parts[0]
+    counted = bool(first.nvec) and np.issubdtype(obs.dtype, np.integer)  # numbers that are yet to become one-hot
+    right_size = obs.ndim in (1, 2) and obs.shape[-1] == spec.observation_size
+    return right_size and obs.shape != first.shape and not counted
+
+
+def _is_batch(spec: Spec, obs: Any) -> bool:
+    """Whether each part has one dimension more than the environment gives it; `ValueError` for any other shape."""
+    sizes: set[tuple[int, ...]] = set()
+    for part in spec.observation_parts:
+        shape, own = np.shape(follow(part.path, obs)), part.own_shape or part.shape
+        extra = len(shape) - len(own)
+        if extra not in (0, 1) or shape[extra:] != own:
+            raise ValueError(f"{part.name} has the shape {shape}")
+        sizes.add(shape[:extra])
+    if len(sizes) > 1:
+        raise ValueError(f"its parts are batches of different sizes, {sizes}")
+    return sizes != {()}
+
+
+def _unreadable(spec: Spec, obs: Any, error: Exception) -> UserError:
+    shapes = ", ".join(f"{part.name} {part.own_shape or part.shape}" for part in spec.observation_parts)
+    if isinstance(obs, tuple) and len(obs) > 1 and isinstance(obs[-1], dict):
+        reason = "it is what `reset` or `step` returned, of which it is the first part"
+    else:
+        reason = f"no {error} in it" if isinstance(error, KeyError) else str(error)
+    return UserError(f"{spec.env_id} observes {shapes}, or a batch of these; this cannot be read: {reason}.")

@@ -1,0 +1,177 @@
+"""What is asked wrongly is answered in one sentence, in Python as on the command line; what is meant well is taken."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+import lemniscate as lem
+from conftest import tiny_fields
+from lemniscate.cli import main
+from lemniscate.envs import registry
+from lemniscate.errors import UserError, missing_extra, shown
+
+
+class Sized(gym.Env):
+    """Five steps; it cannot be made without a size."""
+
+    observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+    action_space = gym.spaces.Discrete(2)
+
+    def __init__(self, size):
+        self.size = size
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        self.t += 1
+        return np.zeros(2, np.float32), 1.0, self.t == 5, False, {}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    path = tmp_path_factory.mktemp("a folder") / "cartpole"
+    fields = tiny_fields("CartPole-v1", backend="gymnasium", total_steps=64)
+    return lem.train("ppo", "CartPole-v1", run=path, progress=False, **fields)
+
+
+def tree(path):
+    """Every file with its content."""
+    return {file: file.read_bytes() for file in path.rglob("*") if file.is_file()}
+
+
+def test_a_path_a_run_and_a_policy_are_evaluated_alike(run):
+    scores = [lem.evaluate(which, episodes=2).returns for which in (run, run.policy, run.path, str(run.path))]
+    assert scores == scores[:1] * 4
+    assert lem.load(run) is lem.load(run.policy) is run.policy
+
+
+def test_runs_are_plotted_one_by_one_or_in_a_list(run):
+    pictures = lem.plot(run)
+    assert pictures == lem.plot([str(run.path)])
+    assert {picture.parent for picture in pictures} == {run.path / "plots"}
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda run: lem.plot(), "nothing to plot: name one run or several"),
+        (lambda run: lem.plot([]), "nothing to plot"),
+        (lambda run: lem.plot(run.policy), "A run is a directory, .* not a TrainedPolicy"),
+        (lambda run: lem.load(None), "A run is a directory, .* not None"),
+        (lambda run: lem.resume(run.policy), "A run is a directory, .* not a TrainedPolicy"),
+        (lambda run: lem.watch(3), "A run is a directory, .* not 3"),
+        (lambda run: lem.evaluate(run, episodes="3"), "episodes must be a whole number at least 1, not '3'"),
+        (lambda run: lem.evaluate(run, episodes=2.5), "episodes must be a whole number at least 1, not 2.5"),
+        (lambda run: lem.evaluate(run, seed=None), "seed must be a whole number at least 0, not None"),
+        (lambda run: lem.set_seeds(-1), "seed must be a whole number from 0 to 4,294,967,295, not -1"),
+        (lambda run: lem.set_seeds(None), "seed must be a whole number .* not None"),
+        (lambda run: lem.set_seeds(1.5), "seed must be a whole number .* not 1.5"),
+        (lambda run: lem.train("ppo", gym.make("CartPole-v1")), "made already; give its class, its id, or a function"),
+        (lambda run: lem.train("ppo", run.policy.config), r"takes its place: lem.train\(config\)"),
+        (lambda run: lem.train("ppo", config=run.policy.config), r"takes its place: lem.train\(config\)"),
+        (lambda run: lem.train(run.policy.config, preset="course"), "does not go with a preset"),
+        (lambda run: lem.train(lem.run.config.RunConfig()), "lemniscate.run.config is not an algorithm"),
+        (lambda run: lem.train("ppo", "CartPole-v1", track=3), "track must be a logger's name or class, not 3"),
+        (lambda run: lem.train("ppo", Sized), "required positional argument: 'size'; give it in env_kwargs"),
+        (lambda run: lem.train_sweep("ppo", "CartPole-v1", 1, callbacks=[print]), "has a process of its own: name"),
+        (lambda run: lem.train_sweep("ppo", "CartPole-v1", 1, callbacks=["math:cosy"]), "math has no cosy"),
+    ],
+)  # fmt: skip
+def test_a_mistake_is_one_sentence(run, call, said, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UserError, match=said):
+        call(run)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("kind", [np.int64, np.float32, torch.tensor, float])
+def test_whole_numbers_of_any_kind_are_taken(run, kind):
+    assert lem.evaluate(run, episodes=kind(2), seed=kind(3)) == lem.evaluate(run, episodes=2, seed=3)
+    lem.set_seeds(kind(3))
+    assert torch.initial_seed() == 3
+
+
+def test_a_config_knows_its_algorithm(run, tmp_path):
+    config = lem.config_for(run.policy.config, seed=np.int64(2))
+    again = lem.train(config, run=tmp_path / "again", progress=False)
+    assert again.policy.config == run.policy.config.replace(seed=2)
+    other = lem.train(config, Sized, run=tmp_path / "other", progress=False, env_kwargs={"size": 1})
+    assert other.policy.config.env == "test_misuse:Sized"
+
+
+def test_a_finished_run_is_left_as_it_is(run, capsys):
+    before = tree(run.path)
+    again = lem.resume(run)
+    assert tree(run.path) == before
+    assert capsys.readouterr().err == f"{run.path} is finished, at step 64: there is nothing to resume.\n"
+    assert again.seconds == 0
+    assert main(["resume", str(run.path)]) == 0
+    assert capsys.readouterr().err.count("\n") == 1
+    assert tree(run.path) == before
+
+
+def test_a_finished_run_is_reported_again(run, capsys):
+    lem.resume(run, report=True)
+    assert "return over 4 episodes" in capsys.readouterr().err
+
+
+def test_a_path_with_spaces_is_quoted_where_it_is_to_be_typed(run):
+    with pytest.raises(UserError, match=f"lemniscate resume '{run.path}'"):
+        lem.train("ppo", "CartPole-v1", run=run.path)
+
+
+@pytest.mark.parametrize(
+    ("obs", "said"),
+    [
+        ([np.nan, 0, 0, 0], "CartPole-v1 has a number that is nan; all must be finite"),
+        ([[0, 0, 0, 0], [0, -np.inf, 0, 0]], "has a number that is -inf"),
+        (np.zeros((2, 5, 4)), r"observes obs \(4,\), or a batch of these; .*: obs has the shape \(2, 5, 4\)"),
+        (np.zeros(8), r"obs has the shape \(8,\)"),
+        (np.zeros((2, 2)), r"obs has the shape \(2, 2\)"),
+        (None, r"obs has the shape \(\)"),
+        ("left", r"obs has the shape \(\)"),
+        ((np.zeros(4), {}), "it is what `reset` or `step` returned"),
+    ],
+)
+def test_what_is_no_observation_is_refused(run, obs, said):
+    with pytest.raises(UserError, match=said):
+        run.policy.act(obs)
+
+
+@pytest.mark.parametrize("backend", ["gymnasium", "envpool"])
+@pytest.mark.parametrize(
+    ("action", "said"),
+    [
+        (np.zeros(4, np.int64), r"actions are a Tensor \[4\] of torch.int64, not ndarray \[4\] of int64"),
+        ([0, 0, 0, 0], r"not \[0, 0, 0, 0\]"),
+        (torch.zeros(3, dtype=torch.int64), r"not Tensor \[3\] of torch.int64"),
+        (torch.zeros(4), r"not Tensor \[4\] of torch.float32"),
+        (torch.tensor([0, 1, 2, 0]), "whole numbers from 0 to below 2, not 2"),
+        (torch.tensor([0, 1, -1, 0]), "whole numbers from 0 to below 2, not -1"),
+    ],
+)
+def test_no_wrong_action_reaches_a_simulator(backend, action, said):
+    env = registry.make("CartPole-v1", 4, backend=backend)
+    env.restart(0)
+    with pytest.raises(UserError, match=said):
+        env.step(action)
+    env.step(torch.zeros(4, dtype=torch.int64))
+    env.close()
+
+
+def test_a_missing_module_is_named_with_where_it_is_looked_for(run):
+    config = run.policy.config.replace(env="nowhere_to_be_found:Env")
+    with pytest.raises(UserError, match=r"no module nowhere_to_be_found here; run in its folder, or add .* PYTHONPATH"):
+        lem.train(config)
+
+
+def test_the_install_line_of_an_extra_works_in_a_clone():
+    assert str(missing_extra("crazyflow", "drone")).endswith("pip install '.[drone]'")
+
+
+def test_values_are_shown_short():
+    assert [shown(x) for x in ("3", None, [1], "x" * 99, gym)] == ["'3'", "None", "[1]", "a str", "a module"]
