@@ -18,7 +18,7 @@ from lemniscate.errors import UserError, is_installed, missing_extra, unknown_na
 from lemniscate.policy import TrainedPolicy
 from lemniscate.report import pictures as pictures_of
 from lemniscate.report import playback
-from lemniscate.results import watch
+from lemniscate.results import evaluate
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import read_config, require_absent
 from lemniscate.run.environments import make_envs
@@ -154,7 +154,7 @@ def _train(
     def film(state: TrainState) -> None:
         kind = "mp4" if is_installed("imageio_ffmpeg") else "gif"
         policy = TrainedPolicy(copy_networks(state), spec, config, state.step)
-        watch(policy, video=path / "videos" / f"step-{state.step}.{kind}")
+        evaluate(policy, episodes=1, video=path / "videos" / f"step-{state.step}.{kind}")
 
     watcher = watch_with(callbacks, copy_networks, spec, config) if callbacks else None
     run = Run(path, algorithm, config, envs, loggers=loggers, progress=progress, film=film, watch=watcher)
