@@ -102,7 +102,7 @@ def train(
     require_absent(path)
     set_seeds(config.seed)  # before JAX starts, which reads its flags then
     envs = make_envs(config)
-    if config.video_every:
+    if config.video_every or config.video_every_episodes:
         playback.require_pictures(config, envs[0])
     return _train(path, algorithm, config, envs, loggers, callbacks, report or track is not None, progress)
 

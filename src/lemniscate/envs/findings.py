@@ -40,8 +40,8 @@ def learnable(rollouts: Sequence[Rollout], spec: Spec) -> Iterator[Finding]:
     if alike and terminated and not truncated and lengths[0] > 1:
         yield Finding(
             NOTE,
-            f"Each of {len(lengths)} episodes terminated after exactly {int(lengths[0])} steps: if that is a time limit,"
-            " report it as truncated, or learning takes the value there to be 0.",
+            f"Each of {len(lengths)} episodes terminated after exactly {int(lengths[0])} steps: if that is a time"
+            " limit, report it as truncated, or learning takes the value there to be 0.",
         )
     if (rewards == rewards[0]).all() and (rewards[0] == 0 or alike or not len(lengths)):
         yield Finding(
