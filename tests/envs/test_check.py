@@ -203,7 +203,7 @@ def test_arguments_and_wrappers_are_checked_too():
         found("Long", env_kwargs={"edge": 0.5}),
         found("Long", env_kwargs={"edge": 1}, wrappers=[limit]),
     )
-    assert [sentence for grade, sentence in unlimited if grade == "note"][0].startswith("It has no time limit")
+    assert next(sentence for grade, sentence in unlimited if grade == "note").startswith("It has no time limit")
     assert {grade for grade, _ in limited} == {"good"}, limited
     assert any("by the time limit" in sentence and "and 0 by" not in sentence for _, sentence in limited)
 

@@ -93,7 +93,7 @@ def show_flights(
     else:
         frames, how = _draw(track, env)
         _give(frames, 1 / (FLIGHT_STRIDE * track.time_step), video)
-        tell(f"The flights are {how}.")
+        tell(how)
     return scores
 
 
@@ -205,16 +205,16 @@ def _draw(track: flight.Flight, env: VecEnv) -> tuple[Iterable[np.ndarray], str]
     """Frames of all flights, one after the other, and how they are drawn."""
     from lemniscate.report import scene
 
-    first, *others = (track.one(number) for number in range(track.position.shape[1]))
-    rendered = scene.render(first, _model(env), FLIGHT_STRIDE)
-    if rendered is not None:
-        more = (scene.render(other, _model(env), FLIGHT_STRIDE) for other in others)
-        return chain(rendered, *(frames for frames in more if frames is not None)), "rendered by MuJoCo"
+    flights = [track.one(number) for number in range(track.position.shape[1])]
+    first = scene.render(flights[0], _model(env), FLIGHT_STRIDE)
+    if first is not None:
+        more = (scene.render(one, _model(env), FLIGHT_STRIDE) for one in flights[1:])
+        return chain(first, chain.from_iterable(frames for frames in more if frames is not None)), "Rendered by MuJoCo."
     how = (
-        "drawn with matplotlib, since there is no off-screen OpenGL; for a MuJoCo rendering install EGL or OSMesa"
-        " (Debian: libegl1 and libgl1-mesa-dri, or libosmesa6)"
+        "Drawn with matplotlib, since there is no off-screen OpenGL; for a MuJoCo rendering install EGL or OSMesa"
+        " (Debian: libegl1 and libgl1-mesa-dri, or libosmesa6)."
     )
-    return chain.from_iterable(flight.animate(one, FLIGHT_STRIDE) for one in (first, *others)), how
+    return chain.from_iterable(flight.animate(one, FLIGHT_STRIDE) for one in flights), how
 
 
 def _model(env: VecEnv) -> Any:
