@@ -85,9 +85,7 @@ def _autoreset(env: VecEnv) -> Iterator[Finding]:
     if mode is AutoresetMode.SAME_STEP:
         yield Finding(GOOD, "Resets in the step that ends an episode, and gives the final observation in its info.")
     elif mode is AutoresetMode.NEXT_STEP:
-        yield Finding(
-            GOOD, "Resets in the step after an end: the action of that step is ignored, no row to learn from."
-        )
+        yield Finding(GOOD, "Resets in the step after an end; the action of that step is ignored and not learned from.")
     else:
         yield Finding(GOOD, "Is reset here, right after an episode's end; the final observation is kept.")
 
