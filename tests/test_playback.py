@@ -21,7 +21,7 @@ from lemniscate.report import playback
 @pytest.fixture(scope="module")
 def policy(tmp_path_factory):
     path = tmp_path_factory.mktemp("watch") / "run"
-    return lem.train("ppo", "CartPole-v1", run=path, progress=False, total_steps=2048, compile="off").policy
+    return lem.train("ppo", "CartPole-v1", run=path, progress=False, total_steps=256, compile="off").policy
 
 
 def test_a_notebook_shows_the_episode_while_it_is_played(tmp_path):
