@@ -8,6 +8,7 @@ import sys
 import gymnasium as gym
 import numpy as np
 import pytest
+from PIL import Image
 
 import lemniscate as lem
 from conftest import tiny_fields
@@ -302,15 +303,70 @@ def test_an_algorithm_of_ones_own_has_its_fields_in_its_help(tmp_path, monkeypat
         (["evaluate", "nowhere", "again"], "Unknown argument 'again'"),
         (["resume", "nowhere"], "nowhere is not a run directory"),
         (["check", "CartPole-v1", "--backend", "foo"], "There is no backend 'foo'"),
-        (["watch"], "The following arguments are required: RUN"),
+        (["watch"], "Watch what? lemniscate watch RUN; before training, lemniscate watch --random --env ID."),
+        (["watch", "--env", "CartPole-v1"], "Watch what?"),
+        (["watch", "--random", "--env", "CartPole-v1"], "There is no display for a window; record a film instead"),
+        (["check", "test_cli:Broken", "--env-args", "x"], "--env-args must be a JSON object"),
     ],
 )  # fmt: skip
-def test_a_mistake_is_one_line_and_exit_code_2(capsys, arguments, said):
+def test_a_mistake_is_one_line_and_exit_code_2(capsys, monkeypatch, arguments, said):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"):
+        monkeypatch.delenv(name, raising=False)
     assert main(arguments) == 2
     out, err = capsys.readouterr()
     assert out == ""
     assert said in err
     assert len(err.strip().splitlines()) == 1
+
+
+def test_the_film_of_an_evaluation_shows_the_episodes_whose_figures_are_printed(run, capsys, tmp_path):
+    evaluation = ["evaluate", str(run), "--episodes", "3", "--json", "--video", str(tmp_path / "film.gif")]
+    assert main(evaluation) == 0
+    lengths = json.loads(capsys.readouterr().out)["lengths"]
+    assert len(lengths) == 3
+    with Image.open(tmp_path / "film.gif") as film:  # equal frames are merged into longer ones
+        seconds = sum(film.seek(i) or film.info["duration"] for i in range(film.n_frames)) / 1000
+    assert seconds == pytest.approx((sum(lengths) + 3) / 50)
+
+
+class Sometimes(Broken):
+    """Has a measure that it never gives."""
+
+    def step(self, action):
+        obs, reward, terminated, truncated, _ = super().step(action)
+        return obs, reward, terminated, truncated, {"is_success": np.nan}
+
+
+def test_a_measure_without_rows_is_null(tmp_path, capsys):
+    assert main(["train", "ppo", "--env", "test_cli:Sometimes", *TINY, "--run", str(tmp_path / "run")]) == 0
+    assert main(["evaluate", str(tmp_path / "run"), "--episodes", "2", "--json"]) == 0
+    scores = json.loads(capsys.readouterr().out, parse_constant=pytest.fail)
+    assert scores["is_success"] is None
+
+
+def test_a_random_policy_needs_no_run(capsys, tmp_path):
+    words = ["watch", "--random", "--env", "CartPole-v1", "--episodes", "3", "--video", str(tmp_path / "film.gif")]
+    assert main(words) == 0
+    said = capsys.readouterr().err.splitlines()
+    lengths = [int(line.rpartition(" ")[2]) for line in said[:3]]
+    assert said[:3] == [f"Episode {i + 1}: return {n:.1f}, length {n}" for i, n in enumerate(lengths)]
+    assert said[3].startswith(f"{np.mean(lengths):.1f} ± {np.std(lengths):.1f} return over 3 episodes of CartPole-v1")
+    assert said[4] == f"Recorded in {tmp_path / 'film.gif'}."
+
+
+def test_check_is_a_list_and_a_verdict(capsys):
+    wrapper = "gymnasium.wrappers:TimeLimit(max_episode_steps=7)"
+    assert main(["check", "CartPole-v1", "--env-args", '{"sutton_barto_reward": true}', "--wrappers", wrapper]) == 0
+    said = capsys.readouterr().err.splitlines()
+    assert {line[:2] for line in said[:-1]} <= {"✓ ", "! ", "  "}
+    assert "Served by gymnasium" in said[0]
+    assert said[-1].startswith("CartPole-v1 is suitable for training")
+    assert main(["check", "test_cli:number"]) == 2
+    assert "test_cli:number cannot be made: it makes an int, not a gymnasium.Env" in capsys.readouterr().err
+
+
+def number():
+    return 3
 
 
 def test_an_episode_is_filmed(run, capsys):

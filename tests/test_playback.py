@@ -1,7 +1,11 @@
-"""Episodes shown where a person sits: in a notebook and in a window; films are in test_cli."""
+"""Episodes shown where a person sits: in a notebook and in a window, or recorded."""
 
 import io
+import os
+import subprocess
+import sys
 import textwrap
+from pathlib import Path
 
 import gymnasium as gym
 import nbformat
@@ -17,7 +21,7 @@ from lemniscate.report import playback
 @pytest.fixture(scope="module")
 def policy(tmp_path_factory):
     path = tmp_path_factory.mktemp("watch") / "run"
-    return lem.train("ppo", "CartPole-v1", run=path, progress=False, total_steps=2048, compile="off").policy
+    return lem.train("ppo", "CartPole-v1", run=path, progress=False, total_steps=256, compile="off").policy
 
 
 def test_a_notebook_shows_the_episode_while_it_is_played(tmp_path):
@@ -71,19 +75,124 @@ def test_a_terminal_is_no_notebook():
     assert not playback.in_notebook()
 
 
-def test_a_window_is_opened_and_closed(policy, monkeypatch):
+def test_a_window_is_opened_and_closed(policy, monkeypatch, capsys):
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     opened, make = [], gym.make
     monkeypatch.setattr(gym, "make", lambda *spec, **kwargs: opened.append(make(*spec, **kwargs)) or opened[-1])
-    assert lem.watch(policy, seed=3) is None
+    scores = lem.watch(policy, seed=3, episodes=2, random=True)
     (env,) = (env for env in opened if env.render_mode)
     assert env.render_mode == "human"
     assert not env.unwrapped.isopen
+    told = [f"Episode {i + 1}: return {n:.1f}, length {n}" for i, n in enumerate(scores.lengths)]
+    assert capsys.readouterr().err.splitlines()[:2] == told
 
 
-def test_a_film_lasts_as_long_as_the_episode(policy, tmp_path):
-    said = lem.watch(policy, seed=3, video=tmp_path / "film.gif")
-    steps = int(said.split(": ")[1].split()[0])
-    with Image.open(tmp_path / "film.gif") as film:  # equal frames are merged into longer ones
-        seconds = sum(film.seek(i) or film.info["duration"] for i in range(film.n_frames)) / 1000
-    assert seconds == pytest.approx((steps + 1) / 50)
+def test_without_a_display_it_is_said_at_once(policy, monkeypatch):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(gym, "make", lambda *_, **__: pytest.fail("an environment was made"))
+    with pytest.raises(lem.UserError, match="There is no display for a window; record a film instead: --video"):
+        lem.watch(policy)
+
+
+NOISE = """
+import gymnasium as gym
+gym.register("Loud-v0", entry_point="test_playback:Loud", max_episode_steps=5)
+import lemniscate as lem
+lem.watch(env="Loud-v0", random=True, video="film.gif")
+"""
+
+
+class Loud(gym.Env):
+    """Draws with pygame, display and sound included, as Box2D's environments do."""
+
+    observation_space = gym.spaces.Box(-1, 1, (1,))
+    action_space = gym.spaces.Discrete(2)
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012
+    render_mode = "rgb_array"
+
+    def __init__(self, render_mode=None):
+        pass
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        return np.zeros(1, np.float32), 0.0, False, False, {}
+
+    def render(self):
+        import pygame
+
+        pygame.init()
+        pygame.display.set_mode((8, 8))
+        return np.zeros((8, 8, 3), np.uint8)
+
+
+def test_pygame_is_quiet_while_a_film_is_made(tmp_path):
+    names = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER", "XDG_RUNTIME_DIR", "PYGAME_HIDE_SUPPORT_PROMPT")
+    quiet = {name: value for name, value in os.environ.items() if name not in names}
+    paths = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
+    command = [sys.executable, "-W", "ignore", "-c", NOISE]
+    done = subprocess.run(command, cwd=tmp_path, env=quiet | {"PYTHONPATH": paths}, capture_output=True, text=True)
+    assert done.stderr.splitlines() == ["Episode 1: return 0.0, length 5", "Recorded in film.gif."]
+    assert done.stdout == ""
+
+
+def delays_of(file):
+    """The milliseconds that each frame of an animated picture is shown; equal frames are merged into longer ones."""
+    delays = []
+    with Image.open(file) as film:
+        for i in range(film.n_frames):
+            film.seek(i)
+            film.load()
+            delays.append(film.info["duration"])
+    return delays
+
+
+def test_a_film_lasts_as_long_as_its_episodes(policy, tmp_path):
+    scores = lem.watch(policy, seed=3, episodes=2, random=True, video=tmp_path / "film.gif")
+    assert sum(delays_of(tmp_path / "film.gif")) == pytest.approx(1000 * (sum(scores.lengths) + 2) / 50)
+
+
+@pytest.mark.parametrize("kind", ["gif", "webp"])
+@pytest.mark.parametrize("fps", [20, 30, 60, 125])
+def test_a_picture_keeps_the_time_with_delays_that_a_browser_shows(fps, kind, tmp_path):
+    """Browsers take a delay of less than 2 hundredths of a second for 10."""
+    file = tmp_path / f"film.{kind}"
+    shades = np.random.default_rng(0).integers(0, 255, (2 * fps, 8, 8, 3), dtype=np.uint8)
+    playback.save_frames(iter(shades), file, fps)
+    delays = delays_of(file)
+    assert sum(delays) == pytest.approx(2000, abs=30)
+    assert min(delays) >= 20
+
+
+@pytest.fixture
+def unwritten(monkeypatch):
+    """Films are drawn, and not written: that takes time."""
+    monkeypatch.setattr(playback, "save_frames", lambda frames, file, fps: [None for _ in frames])
+
+
+def test_sampled_actions_come_from_the_seed_and_random_ones_are_another_policy(policy, unwritten):
+    def lengths(**how):
+        return lem.watch(policy, episodes=2, video="film.gif", **how).lengths
+
+    sampled = lengths(deterministic=False, seed=4)
+    assert lengths(deterministic=False, seed=4) == sampled
+    others = [lengths(seed=4), lengths(random=True, seed=4), lengths(deterministic=False, seed=5)]
+    assert sampled not in others
+    assert lengths(random=True, seed=4) == others[1]
+
+
+def test_what_is_watched_is_what_is_evaluated(policy, unwritten):
+    how = {"env": "CartPole-v1", "episodes": 3, "seed": 7}
+    evaluated = lem.evaluate(policy, **how, backend="gymnasium")
+    assert lem.evaluate(policy, **how, video="film.gif").lengths == evaluated.lengths
+    assert lem.watch(policy, **how, video="film.gif").returns == evaluated.returns
+
+
+def test_another_environment_must_fit(policy):
+    with pytest.raises(lem.UserError, match="A policy for CartPole-v1 cannot act in Pendulum-v1"):
+        lem.watch(policy, "Pendulum-v1", video="film.gif")
+    with pytest.raises(lem.UserError, match="Watch what"):
+        lem.watch(random=True)

@@ -18,7 +18,7 @@ from lemniscate.errors import UserError, is_installed, missing_extra, shown, unk
 from lemniscate.policy import TrainedPolicy
 from lemniscate.report import pictures as pictures_of
 from lemniscate.report import playback
-from lemniscate.results import TrainedRun, finished_run, path_of, watch
+from lemniscate.results import TrainedRun, evaluate, finished_run, path_of
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import is_finished, read_config, require_absent
 from lemniscate.run.environments import make_envs
@@ -103,7 +103,7 @@ def train(
     require_absent(path)
     set_seeds(config.seed)  # before JAX starts, which reads its flags then
     envs = make_envs(config)
-    if config.video_every:
+    if config.video_every or config.video_every_episodes:
         playback.require_pictures(config, envs[0])
     return _train(path, algorithm, config, envs, loggers, callbacks, report or track is not None, progress)
 
@@ -158,7 +158,7 @@ def _train(
     def film(state: TrainState) -> None:
         kind = "mp4" if is_installed("imageio_ffmpeg") else "gif"
         policy = TrainedPolicy(copy_networks(state), spec, config, state.step)
-        watch(policy, video=path / "videos" / f"step-{state.step}.{kind}")
+        evaluate(policy, episodes=1, video=path / "videos" / f"step-{state.step}.{kind}")
 
     watcher = watch_with(callbacks, copy_networks, spec, config) if callbacks else None
     run = Run(path, algorithm, config, envs, loggers=loggers, progress=progress, film=film, watch=watcher)

@@ -57,6 +57,7 @@ FIELDS = """
 `evaluate_every` | `eval_freq` | – | – | – | `eval_every`, `eval_interval`
 `evaluate_episodes` | `n_eval_episodes` | – | – | – | `eval_episodes`, `num_eval_episodes`
 `video_every` | `VecVideoRecorder` | `capture_video` | – | `video_interval` | `record_video`
+`video_every_episodes` | – | – | – | – | `episode_trigger`
 `buffer_size` | `buffer_size` | `buffer_size` | `replay_size` | – | `replay_capacity`, `capacity`, `memory_size`
 `batch_size` | `batch_size` | `batch_size` | `batch_size` | – | `minibatch_size`
 `learning_starts` | `learning_starts` | `learning_starts` | `start_steps`, `update_after` | – | `warmup_steps`

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -15,11 +16,13 @@ from lemniscate.errors import UserError, shown
 from lemniscate.policy import TrainedPolicy
 from lemniscate.report import compare, curves, playback
 from lemniscate.report import pictures as pictures_of
+from lemniscate.report.display import require_display
+from lemniscate.report.film import check_film
 from lemniscate.report.groups import group
 from lemniscate.run import checkpoint
-from lemniscate.run.config import Count, Natural, checked
+from lemniscate.run.config import Count, Natural, RunConfig, checked
 from lemniscate.run.directory import find_checkpoint, is_finished, read_config
-from lemniscate.run.environments import evaluation_env
+from lemniscate.run.environments import evaluation_env, world_of
 from lemniscate.run.evaluate import Evaluation
 from lemniscate.run.evaluate import evaluate as evaluate_module
 from lemniscate.run.loggers import read_metrics
@@ -91,6 +94,7 @@ def evaluate(
     deterministic: bool = True,
     backend: str | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
+    video: str | Path | None = None,
 ) -> Evaluation:
     """Play whole episodes from starts drawn with `seed`, none of which training ever saw.
 
@@ -102,50 +106,92 @@ def evaluate(
         deterministic: act by the mode of the distribution.
         backend: simulation backend; that of training unless named, or by the id if `env` is another.
         env_kwargs: arguments of the environment that are to be other than in training.
+        video: a .gif, .webp or .mp4 to record all episodes into. They are then played one after the other, in a
+            rendered environment, without a measurement of the Q bias.
 
     Raises:
-        UserError: numbers out of range; an environment that cannot be made, or whose spaces differ.
+        UserError: numbers out of range; an environment that cannot be made, or whose spaces differ; with `video`, one
+            that renders no pictures, or another kind of file.
     """
     policy, episodes, seed = load(policy), checked("episodes", episodes, Count), checked("seed", seed, Natural)
     env_kwargs = checked("env_kwargs", env_kwargs, dict | None)
-    vec = evaluation_env(policy.config, episodes, env=env, env_kwargs=env_kwargs, backend=backend)
-    if not vec.spec.fits(policy.spec):
-        vec.close()
-        raise UserError(
-            f"A policy for {policy.spec.env_id} cannot act in {vec.spec.env_id}: observation or action spaces differ."
-        )
+    if video is not None:
+        check_film(Path(video))
+    elsewhere: dict[str, Any] = {"env": env, "env_kwargs": env_kwargs, "backend": backend}
+    vec = _fitting_env(policy, episodes, **elsewhere)
     try:
+        if video is not None:
+            how = {"episodes": episodes, "seed": seed, "deterministic": deterministic, "video": Path(video)}
+            return _show(policy, vec, world_of(policy.config, **elsewhere), tell=lambda text: None, **how)
         critic = critic_of(policy.networks, policy.config)
         return evaluate_module(policy.module, vec, episodes, seed, deterministic, critic)
     finally:
         vec.close()
 
 
-def watch(policy: Trained, *, seed: int = 0, video: str | Path | None = None) -> str | None:
-    """Show one episode: below the cell in a notebook, in a window elsewhere, or recorded into a file.
+def watch(
+    policy: Trained | None = None,
+    env: str | Callable[..., Any] | None = None,
+    *,
+    episodes: int = 1,
+    seed: int = 0,
+    deterministic: bool = True,
+    random: bool = False,
+    video: str | Path | None = None,
+    env_kwargs: Mapping[str, Any] | None = None,
+) -> Evaluation:
+    """Show episodes: below the cell in a notebook, in a window elsewhere, or recorded into a film.
+
+    Says return and length of each on standard error, then their means and standard deviations.
 
     Args:
-        policy: from `load` or `train`, or the path of a run or a checkpoint.
-        seed: of the start.
-        video: a .gif, .webp or .mp4 to record into.
-
-    Returns:
-        A sentence on what was recorded, if anything.
+        policy: from `load` or `train`, or the path of a run or a checkpoint; none for uniformly random actions in
+            `env`.
+        env: as in `evaluate`.
+        episodes: how many.
+        seed: of the starts, and of the actions where they are drawn.
+        deterministic: act by the mode of the distribution; otherwise actions are drawn from it.
+        random: act uniformly at random, in the environment of the policy.
+        video: a .gif, .webp or .mp4 to record all episodes into.
+        env_kwargs: as in `evaluate`.
 
     Raises:
-        UserError: nothing to show it on, or another kind of file.
+        UserError: nothing to show it on; an environment that renders no pictures; another kind of file.
     """
-    policy, seed = load(policy), checked("seed", seed, Natural)
-    if video is not None:
-        playback.check_film(Path(video))
-    env = _scene_env(policy)
-    if env and video is not None:
-        return playback.film_flight(policy.module, env, Path(video), seed)
-    if env:
-        return playback.show_flight(policy.module, env, seed)
-    if video is not None:
-        return playback.film_episode(policy.act, policy.config, Path(video), seed)
-    return playback.show_episode(policy.act, policy.config, seed)
+    policy = None if policy is None else load(policy)
+    episodes, seed = checked("episodes", episodes, Count), checked("seed", seed, Natural)
+    if policy is None and env is None:
+        raise UserError("Watch what? Name a run, or an environment to act in at random.")
+    if video is None:
+        require_display()
+    else:
+        check_film(Path(video))
+    elsewhere: dict[str, Any] = {"env": env, "env_kwargs": env_kwargs}
+    config = policy.config if policy else RunConfig(env=registry.name_of(env))
+    vec = _fitting_env(policy, episodes, **elsewhere) if policy else evaluation_env(config, episodes, **elsewhere)
+    file = None if video is None else Path(video)
+    how = {"episodes": episodes, "seed": seed, "deterministic": deterministic, "video": file}
+    try:
+        scores = _show(None if random else policy, vec, world_of(config, **elsewhere), **how)
+    finally:
+        vec.close()
+    if episodes > 1 or scores.measures:
+        say(pictures_of.sentence(scores))
+    if file:
+        say(f"Recorded in {file}.")
+    return scores
+
+
+def _show(
+    policy: TrainedPolicy | None, vec: VecEnv, world: dict[str, Any], *, deterministic: bool, **how: Any
+) -> Evaluation:
+    """Play flights where `vec` has a scene, else episodes in a rendered environment; at random without a policy."""
+    if vec.scene:
+        return playback.show_flights(policy.module if policy else None, vec, deterministic=deterministic, **how)
+    if policy is None:
+        return playback.show_episodes(None, world, **how)
+    drawn = TrainedPolicy(policy.networks, policy.spec, policy.config.replace(seed=how["seed"]), policy.step)
+    return playback.show_episodes(partial(drawn.act, deterministic=deterministic), world, **how)
 
 
 def plot(*runs: str | Path | TrainedRun | list[str | Path | TrainedRun]) -> list[Path]:
@@ -225,3 +271,14 @@ def _scene_env(policy: TrainedPolicy) -> VecEnv | None:
         return None
     env = evaluation_env(config, config.evaluate_episodes)
     return env if env.scene else None
+
+
+def _fitting_env(policy: TrainedPolicy, episodes: int, **elsewhere: Any) -> VecEnv:
+    """The environments of an evaluation. Raises `UserError` where the policy cannot act."""
+    vec = evaluation_env(policy.config, episodes, **elsewhere)
+    if not vec.spec.fits(policy.spec):
+        vec.close()
+        raise UserError(
+            f"A policy for {policy.spec.env_id} cannot act in {vec.spec.env_id}: observation or action spaces differ."
+        )
+    return vec

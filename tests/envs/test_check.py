@@ -6,6 +6,7 @@ import pytest
 
 import environments  # noqa: F401  (registers the copies)
 from lemniscate.envs.check import check
+from lemniscate.errors import UserError
 
 
 class Fine(gym.Env):
@@ -72,20 +73,139 @@ class Stuck(Fine):
         return super().reset(seed=seed)[0], {"action_mask": [0, 0]}
 
 
-def found(name):
-    return [(finding.grade, finding.sentence) for finding in check(f"envs.test_check:{name}")]
+class Sound(Fine):
+    """Walks by its action, is paid for where it is, and cuts its episodes itself: nothing to remark."""
+
+    def step(self, action):
+        self.place = np.clip(self.place + 0.1 * (2 * int(action) - 1), -1, 1)
+        self.t += 1
+        return self.look(), float(self.place), bool(abs(self.place) == 1), self.t == 30, {}
+
+    def reset(self, *, seed=None, options=None):
+        self.place = 0.0
+        return super().reset(seed=seed)
+
+    def look(self):
+        return np.array([self.place, self.np_random.uniform(-1, 1)], dtype=np.float32)
+
+
+class Reuses(Sound):
+    """Fills one array again and again."""
+
+    def __init__(self):
+        self.array = np.zeros(2, dtype=np.float32)
+
+    def look(self):
+        self.array[:] = super().look()
+        return self.array
+
+
+class Constant(Sound):
+    """Always looks the same, and returns the same array: nobody sees it change."""
+
+    array = np.zeros(2, dtype=np.float32)
+
+    def look(self):
+        return self.array
+
+
+class Strict(Sound):
+    """Refuses what its mask rules out."""
+
+    action_space = gym.spaces.Discrete(4, start=2)
+
+    def reset(self, *, seed=None, options=None):
+        obs, _ = super().reset(seed=seed)
+        return obs, self.draw()
+
+    def step(self, action):
+        assert self.mask[action - 2], "this action is not legal now"
+        obs, reward, terminated, truncated, _ = super().step(action % 2)
+        return obs, reward, terminated, truncated, self.draw()
+
+    def draw(self):
+        self.mask = np.zeros(4, dtype=np.int8)
+        self.mask[self.np_random.choice(4, 2, replace=False)] = 1
+        return {"action_mask": self.mask.copy()}
+
+
+class Scales(Sound):
+    observation_space = gym.spaces.Box(-1e7, 1e7, (2,), np.float32)
+
+    def look(self):
+        return super().look() * np.array([1e6, 1e-6], dtype=np.float32)
+
+
+class Unrewarded(Sound):
+    def step(self, action):
+        obs, _, *rest = super().step(action)
+        return obs, 0.0, *rest
+
+
+class Pixels(Sound):
+    """Images of floats."""
+
+    observation_space = gym.spaces.Box(0, 1, (20, 20, 3), np.float32)
+
+    def look(self):
+        return np.full((20, 20, 3), (self.place + 1) / 2, dtype=np.float32)
+
+
+class Stacked(Sound):
+    observation_space = gym.spaces.Box(0, 255, (4, 20, 20), np.uint8)
+
+    def look(self):
+        return np.full((4, 20, 20), int(100 * self.place + 100), dtype=np.uint8)
+
+
+class Long(Sound):
+    """Has an argument, and never cuts its episodes."""
+
+    def __init__(self, edge):
+        self.edge = edge
+
+    def step(self, action):
+        obs, reward, _, _, info = super().step(action)
+        return obs, reward, abs(self.place) >= self.edge, False, info
+
+
+def found(name, **options):
+    return [(finding.grade, finding.sentence) for finding in check(f"envs.test_check:{name}", **options)]
 
 
 def test_a_good_environment():
-    findings = found("Fine")
-    assert not [sentence for grade, sentence in findings if grade == "bad"]
+    findings = found("Sound")
+    assert {grade for grade, _ in findings} == {"good"}, findings
     text = " ".join(sentence for _, sentence in findings)
     assert "observes 2 numbers" in text
     assert "one of 2 choices" in text
-    assert "has no time limit" in text
-    assert "100 episodes ended by its rules" in text
+    assert "episodes ended by its rules and" in text
     assert "the final observation is kept" in text
     assert "Its observations are float32" in text
+
+
+@pytest.mark.parametrize("name", ["Strict", "Constant"])
+def test_masks_and_an_observation_that_never_changes_are_no_fault(name):
+    assert not [sentence for grade, sentence in found(name) if grade == "bad" or "copy" in sentence]
+
+
+def test_an_array_that_is_used_again_is_named_as_that_and_as_nothing_else():
+    ((_, sentence),) = [finding for finding in found("Reuses") if finding[0] != "good"]
+    assert "into the array that it returned before" in sentence
+    assert "return a copy" in sentence
+
+
+def test_arguments_and_wrappers_are_checked_too():
+    assert found("Long") == [("bad", found("Long")[0][1])]
+    assert "missing 1 required positional argument: 'edge'" in found("Long")[0][1]
+    limit = "gymnasium.wrappers:TimeLimit(max_episode_steps=15)"
+    unlimited, limited = (
+        found("Long", env_kwargs={"edge": 0.5}),
+        found("Long", env_kwargs={"edge": 1}, wrappers=[limit]),
+    )
+    assert next(sentence for grade, sentence in unlimited if grade == "note").startswith("It has no time limit")
+    assert {grade for grade, _ in limited} == {"good"}, limited
+    assert any("by the time limit" in sentence and "and 0 by" not in sentence for _, sentence in limited)
 
 
 def test_the_mode_of_a_vector_environment_is_told():
@@ -100,6 +220,14 @@ def test_the_mode_of_a_vector_environment_is_told():
         ("Nan", "bad", "The reward of environment 0 is nan"),
         ("WrongType", "bad", "Gymnasium's checker: The first element returned by `env.reset()`"),
         ("Rich", "note", "train with --scale-rewards"),
+        ("Fine", "note", "It has no time limit"),
+        ("Fine", "note", "look whether step() uses its argument"),
+        ("Fine", "note", "terminated after exactly 20 steps: if that is a time limit, report it as truncated"),
+        ("Fine", "note", "Every reward was 1, whatever was done"),
+        ("Unrewarded", "note", "Every reward was 0, whatever was done"),
+        ("Scales", "note", "Observations reach 1e+06 in obs[0] and 1e-06 in obs[1]"),
+        ("Pixels", "note", "The array obs (20, 20, 3) becomes 1,200 numbers without their places"),
+        ("Stacked", "good", "an image of 20 × 20 bytes with 4 channels, from arrays (4, 20, 20)"),
         ("Stillborn", "bad", "It cannot be made: OSError: no such robot."),
         ("Breaks", "bad", "It cannot be played with random actions: AttributeError: 'Breaks' object has no attribute"),
         ("Stuck", "bad", "rules out every action of environment 0: its action_mask is all zero."),
@@ -116,8 +244,6 @@ def test_masks_images_and_native_backends_are_played():
 
 
 def test_a_module_that_is_not_there():
-    from lemniscate.errors import UserError
-
     with pytest.raises(UserError, match="nowhere:Env cannot be found: there is no module nowhere here"):
         list(check("nowhere:Env"))
     with pytest.raises(UserError, match=r"envs\.test_check has no Nothing"):

@@ -103,7 +103,7 @@ def test_wrappers_choose_the_backend_that_can_wrap():
         ("Countdown-v0", {"wrappers": [times_ten]}, "The gymnasium backend cannot wrap Countdown-v0"),
         (Reach(), {}, "env is an environment that is made already; give its class"),
         (3, {}, "env is 3; give its class"),
-        (lambda: 3, {}, "it is a int, and no gymnasium.Env"),
+        (lambda: 3, {}, "cannot be made: it makes an int, not a gymnasium.Env"),
         (dict, {}, "neither an environment class, nor a function, nor an id"),
     ],
 )

@@ -143,6 +143,17 @@ def test_recordings_change_no_bit_of_training_and_survive_a_resume(tmp_path, env
     assert {video.name: video.read_bytes() for video in (path / "videos").iterdir()} == videos
 
 
+def test_films_by_the_number_of_training_episodes(tmp_path, monkeypatch):
+    monkeypatch.setattr(lem.api, "is_installed", lambda name: name != "imageio_ffmpeg")
+    path = tmp_path / "r"
+    train(path, "CartPole-v1", video_every_episodes=5)
+    lines = read_metrics(path)
+    ended = np.cumsum([len(line.get("episode/returns", ())) for line in lines])
+    due = [line["step"] for line, now, before in zip(lines, ended, [0, *ended], strict=False) if now // 5 > before // 5]
+    assert 1 < len(due) < len(lines)
+    assert {film.name for film in (path / "videos").iterdir()} == {f"step-{step}.gif" for step in (0, *due)}
+
+
 def test_what_cannot_be_recorded_is_told_before_training(tmp_path):
     with pytest.raises(lem.UserError, match="Countdown-v0"):
         train(tmp_path / "r", video_every=64)

@@ -131,18 +131,27 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
     sub.add_argument("--seed", type=int, default=0, metavar="INT", help="seed of the starts [0]")
     sub.add_argument("--env-args", metavar="JSON", help="arguments of the environment [as in training]")
     sub.add_argument("--backend", metavar="NAME", help="simulation backend [as in training]")
+    sub.add_argument("--video", type=Path, metavar="FILE", help=".gif, .webp or .mp4 to record all episodes into")
     sub.add_argument("--json", action="store_true", help="print one JSON object on standard output")
 
     sub = subs["watch"]
-    sub.add_argument("run", type=Path, metavar="RUN", help="a run or a checkpoint")
+    sub.usage = "lemniscate watch RUN [options]\n       lemniscate watch --random --env ID [options]"
+    sub.add_argument("run", type=Path, nargs="?", metavar="RUN", help="a run or a checkpoint")
+    sub.add_argument("--episodes", type=int, default=1, metavar="INT", help="how many [1]")
+    sub.add_argument("--sample", action="store_true", help="draw actions from the policy [the most likely ones]")
+    sub.add_argument("--random", action="store_true", help="act uniformly at random")
     sub.add_argument("--video", type=Path, metavar="FILE", help=".gif, .webp or .mp4 instead of a window")
-    sub.add_argument("--seed", type=int, default=0, metavar="INT", help="seed of the start [0]")
+    sub.add_argument("--seed", type=int, default=0, metavar="INT", help="seed of the starts [0]")
+    sub.add_argument("--env", metavar="ID", help="environment [that of training]; without RUN, with --random")
+    sub.add_argument("--env-args", metavar="JSON", help="arguments of the environment [as in training]")
 
     subs["plot"].add_argument("runs", type=Path, nargs="+", metavar="RUN", help="runs or sweeps")
 
     subs["envs"].add_argument("filter", nargs="?", default="", metavar="FILTER", help="a part of the id")
 
     subs["check"].add_argument("env", metavar="ENV", help="an id, or module:Class of your own")
+    subs["check"].add_argument("--env-args", metavar="JSON", help="arguments of the environment")
+    subs["check"].add_argument("--wrappers", nargs="+", default=[], metavar="NAME", help="wrappers, as in training")
     subs["check"].add_argument("--backend", metavar="NAME", help="simulation backend [chosen from the id]")
 
     subs["completion"].add_argument("shell", choices=SHELLS, metavar="SHELL", help=", ".join(SHELLS))

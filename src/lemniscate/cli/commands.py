@@ -2,12 +2,14 @@
 
 import argparse
 import json
+from shutil import get_terminal_size
+from textwrap import fill
 from typing import Any
 
 from lemniscate import api, results, sweep
 from lemniscate.algos import ALGORITHMS
 from lemniscate.cli.completion import script
-from lemniscate.cli.fields import read_json
+from lemniscate.cli.fields import read, read_json
 from lemniscate.console import say
 from lemniscate.envs import registry
 from lemniscate.envs.check import check as check_environment
@@ -17,7 +19,7 @@ from lemniscate.report import pictures
 from lemniscate.run.run import is_compiled
 from lemniscate.run.sweep_file import is_sweep
 
-MARKS = {"good": "✓", "note": "·", "bad": "✗"}
+MARKS = {"good": "✓", "note": "!", "bad": "✗"}
 
 
 def train(given: argparse.Namespace) -> None:
@@ -58,20 +60,28 @@ def resume(given: argparse.Namespace) -> None:
 
 def evaluate(given: argparse.Namespace) -> None:
     """Play whole episodes: scores as JSON on standard output, or as a sentence."""
-    own: dict[str, Any] = {} if given.env_args is None else {"env_kwargs": read_json("--env-args", given.env_args)}
-    policy = results.load(given.run)
-    scores = results.evaluate(policy, episodes=given.episodes, seed=given.seed, backend=given.backend, **own)
+    own = {"env_kwargs": _env_args(given), "backend": given.backend, "video": given.video}
+    scores = results.evaluate(results.load(given.run), episodes=given.episodes, seed=given.seed, **own)
     if given.json:
-        print(json.dumps(scores.to_json()))
+        print(json.dumps(scores.to_json(), allow_nan=False))
     else:
         say(pictures.sentence(scores))
 
 
 def watch(given: argparse.Namespace) -> None:
-    """Show one episode in a window, or record it."""
-    said = results.watch(results.load(given.run), seed=given.seed, video=given.video)
-    if said:
-        say(said)
+    """Show episodes in a window, or record them."""
+    if not given.run and not (given.random and given.env):
+        raise UserError("Watch what? lemniscate watch RUN; before training, lemniscate watch --random --env ID.")
+    results.watch(
+        results.load(given.run) if given.run else None,
+        given.env,
+        episodes=given.episodes,
+        seed=given.seed,
+        deterministic=not given.sample,
+        random=given.random,
+        video=given.video,
+        env_kwargs=_env_args(given),
+    )
 
 
 def plot(given: argparse.Namespace) -> None:
@@ -90,13 +100,22 @@ def envs(given: argparse.Namespace) -> None:
 
 
 def check(given: argparse.Namespace) -> None:
-    """Say what was found about an environment; what keeps it from being trained on is an error."""
-    bad = 0
-    for finding in check_environment(given.env, given.backend):
-        bad += finding.grade == "bad"
-        say(f"{MARKS[finding.grade]} {finding.sentence}")
-    if bad:
-        raise UserError(f"{given.env} is not suitable for training: {bad} finding{'s' * (bad > 1)} above.")
+    """Say what was found about an environment, as a list; what keeps it from being trained on is an error."""
+    wrappers = read("wrappers", tuple[str, ...], given.wrappers)
+    grades = {grade: 0 for grade in MARKS}
+    width = min(get_terminal_size((112, 24)).columns, 120)
+    for finding in check_environment(given.env, given.backend, _env_args(given), wrappers):
+        grades[finding.grade] += 1
+        say(fill(finding.sentence, width, initial_indent=f"{MARKS[finding.grade]} ", subsequent_indent="  "))
+    if bad := grades["bad"]:
+        raise UserError(f"{given.env} is not suitable for training: {bad} finding{'s' * (bad > 1)} above, marked ✗.")
+    notes = grades["note"]
+    look = f"; look at the {notes} note{'s' * (notes > 1)} above, marked !" if notes else ""
+    say(f"{given.env} is suitable for training{look}.")
+
+
+def _env_args(given: argparse.Namespace) -> dict[str, Any] | None:
+    return None if given.env_args is None else read_json("--env-args", given.env_args)
 
 
 def completion(given: argparse.Namespace) -> None:

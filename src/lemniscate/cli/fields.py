@@ -36,6 +36,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
         "evaluate_every",
         "evaluate_episodes",
         "video_every",
+        "video_every_episodes",
     ),
 }
 """the fields under each heading of the help; those that are not named here are the algorithm's"""

@@ -61,7 +61,8 @@ def make_one(maker: Maker, wrappers: Sequence[Callable[..., Any]] = (), **kwargs
     for wrap in wrappers:
         env = wrap(env)
     if not isinstance(env, gym.Env):
-        raise TypeError(f"it is a {type(env).__name__}, and no gymnasium.Env")
+        kind = type(env).__name__
+        raise TypeError(f"it makes {'an' if kind[0] in 'aeiouAEIOU' else 'a'} {kind}, not a gymnasium.Env")
     return env
 
 

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError
 from lemniscate.nn.policies import Policy
-from lemniscate.run.evaluate import play_episodes
+from lemniscate.run.evaluate import EpisodeTable, play_episodes
 
 BLUE, ORANGE, GREY = "#1f5fa8", "#e07b1a", "#9aa0a6"
 
@@ -28,6 +28,11 @@ class Flight:
     attitude: np.ndarray
     time_step: float
 
+    def one(self, number: int) -> "Flight":
+        """One of the flights, from its start to its end."""
+        flown, own = ~np.isnan(self.position[:, number, 0]), slice(number, number + 1)
+        return Flight(self.position[flown, own], self.reference[flown, own], self.attitude[flown, own], self.time_step)
+
     @property
     def error_mm(self) -> np.ndarray:
         """Distance to the reference, [T, M]."""
@@ -39,14 +44,26 @@ class Flight:
         return self.time_step * np.arange(1, len(self.position) + 1)
 
 
-def record(policy: Policy, env: VecEnv, flights: int, seed: int) -> Flight:
-    """Play from the starts that `evaluate` plays from, and keep the tracks."""
+def record(
+    policy: Policy | None,
+    env: VecEnv,
+    flights: int,
+    seed: int,
+    deterministic: bool = True,
+    table: EpisodeTable | None = None,
+) -> Flight:
+    """Play from the starts that `evaluate` plays from, and keep the tracks; in `table` also what `evaluate` keeps.
+
+    Without a policy, actions are uniformly random.
+    """
     scene = env.scene
     if scene is None:
         raise UserError(f"{env.spec.env_id} has no reference to track, so no flight can be drawn against one.")
     flights = min(flights, env.num_envs)
     rows = []
-    for _, _, step, counts in play_episodes(policy, env, flights, seed):
+    for _, _, step, counts in play_episodes(policy, env, flights, seed, deterministic):
+        if table:
+            table.add(step, counts)
         row = torch.where(counts[:, None], step.next_obs, torch.nan)[:flights]
         rows.append(row.cpu().numpy())
     track = np.stack(rows)

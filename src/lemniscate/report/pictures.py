@@ -8,7 +8,7 @@ from lemniscate.envs.vec_env import VecEnv
 from lemniscate.nn.actor_critic import ActorQ
 from lemniscate.nn.policies import Policy
 from lemniscate.report import curves, flight
-from lemniscate.report.playback import film_flight
+from lemniscate.report.playback import show_flights
 from lemniscate.run.evaluate import Evaluation, evaluate
 
 
@@ -43,7 +43,9 @@ def report(
     for picture in pictures:
         say(picture)
     if env.scene:
-        say(film_flight(policy, env, path / "videos" / "flight.gif", seed=0))
+        film = path / "videos" / "flight.gif"
+        show_flights(policy, env, 1, seed=0, video=film, tell=lambda text: None)
+        say(film)
     return pictures
 
 

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterable
 from itertools import pairwise
 from pathlib import Path
 
@@ -43,8 +44,8 @@ def render(flight: Flight, model: mujoco.MjModel, every: int) -> np.ndarray | No
     return None
 
 
-def show(flight: Flight, model: mujoco.MjModel) -> None:
-    """Play the first flight in MuJoCo's window, at its own speed, until it ends or the window is closed."""
+def show(flights: Iterable[Flight], model: mujoco.MjModel) -> None:
+    """Play the flights one by one in MuJoCo's window, at their own speed, until they end or the window is closed."""
     from mujoco import viewer
 
     data = mujoco.MjData(model)
@@ -52,15 +53,16 @@ def show(flight: Flight, model: mujoco.MjModel) -> None:
         assert window.user_scn is not None
         window.cam.lookat[:], window.cam.azimuth = CAMERA[0], CAMERA[1]
         window.cam.elevation, window.cam.distance = CAMERA[2], CAMERA[3]
-        for t, (position, attitude) in enumerate(zip(flight.position[:, 0], flight.attitude[:, 0], strict=True)):
-            if not window.is_running():
-                return
-            _place(model, data, position, attitude)
-            window.user_scn.ngeom = 0
-            _line(window.user_scn, flight.reference[::5, 0], REFERENCE, width=3)
-            _line(window.user_scn, flight.position[max(0, t - 100) : t + 1 : 2, 0], TRAIL, width=4)
-            window.sync()
-            time.sleep(flight.time_step)
+        for flight in flights:
+            for t in range(len(flight.position)):
+                if not window.is_running():
+                    return
+                _place(model, data, flight.position[t, 0], flight.attitude[t, 0])
+                window.user_scn.ngeom = 0
+                _line(window.user_scn, flight.reference[::5, 0], REFERENCE, width=3)
+                _line(window.user_scn, flight.position[max(0, t - 100) : t + 1 : 2, 0], TRAIL, width=4)
+                window.sync()
+                time.sleep(flight.time_step)
 
 
 def _place(model: mujoco.MjModel, data: mujoco.MjData, position: np.ndarray, attitude: np.ndarray) -> None:

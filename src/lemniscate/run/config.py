@@ -144,6 +144,8 @@ class RunConfig:
     """episodes of each evaluation"""
     video_every: Natural = 0
     """steps between recordings of an episode into videos/step-N; 0: none"""
+    video_every_episodes: Natural = 0
+    """training episodes between such recordings; 0: none"""
     warm_start: str | None = None
     """run or checkpoint whose networks this run begins with"""
     env_kwargs: dict[str, Any] = field(default_factory=dict)

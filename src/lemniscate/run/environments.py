@@ -37,13 +37,24 @@ def evaluation_env(
 
     `env_kwargs` change those of the run; in another environment they are the only ones.
     """
+    world = world_of(config, env, env_kwargs, backend)
+    served_by = world["backend"] or registry.backend_for(world["env"], config.wrappers)
+    num_envs = config.num_envs if registry.is_compiled(served_by) else min(episodes, 16)
+    return registry.make(num_envs=num_envs, device=device, **world)
+
+
+def world_of(
+    config: RunConfig,
+    env: str | Callable[..., Any] | None = None,
+    env_kwargs: Mapping[str, Any] | None = None,
+    backend: str | None = None,
+) -> dict[str, Any]:
+    """What `registry.make` is told of the environment that a run is evaluated in: env, kwargs, wrappers, backend."""
     name = config.env if env is None else registry.name_of(env)
     kwargs = {**(config.env_kwargs if name == config.env else {}), **(env_kwargs or {})}
     if env is None and backend is None:
         backend = registry.for_evaluation(config.backend)
-    served_by = backend or registry.backend_for(name, config.wrappers)
-    num_envs = config.num_envs if registry.is_compiled(served_by) else min(episodes, 16)
-    return registry.make(name, num_envs, kwargs=kwargs, wrappers=config.wrappers, device=device, backend=backend)
+    return {"env": name, "kwargs": kwargs, "wrappers": config.wrappers, "backend": backend}
 
 
 def device_for(name: str) -> torch.device:

@@ -1,14 +1,15 @@
 """Playing episodes without learning. Nothing here is shared with training: not environments, nor random numbers."""
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from functools import partial
 
 import torch
 from torch import Tensor
 
 from lemniscate.envs.backend import Summary
+from lemniscate.envs.random_action import random_action
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.nn.actor_critic import ActorQ
 from lemniscate.nn.policies import Policy
@@ -40,10 +41,11 @@ class Evaluation:
     date: str = field(default="", compare=False)
 
     def to_json(self) -> dict[str, object]:
-        """One object of JSON, with the measures among the other numbers."""
+        """One object of JSON, with the measures among the other numbers; a measure that is not finite is None."""
         apart = ("measures", "q_bias", "date")
         scores: dict[str, object] = {name: value for name, value in vars(self).items() if name not in apart}
-        return scores | self.measures | ({"q_bias": self.q_bias.to_json()} if self.q_bias else {})
+        measures = {name: value if math.isfinite(value) else None for name, value in self.measures.items()}
+        return scores | measures | ({"q_bias": self.q_bias.to_json()} if self.q_bias else {})
 
     def to_course(self) -> dict[str, object]:
         """The dictionary that a course on DDPG hands in with a policy; the time is ISO 8601."""
@@ -58,26 +60,34 @@ class Evaluation:
 
 @torch.no_grad()
 def play_episodes(
-    policy: Policy, env: VecEnv, episodes: int, seed: int, deterministic: bool = True
+    policy: Policy | None, env: VecEnv, episodes: int, seed: int, deterministic: bool = True
 ) -> Iterator[tuple[Tensor, Tensor, Step, Tensor]]:
     """Play `episodes` whole episodes; yields (obs, action, step, the mask [N] of the environments that still count).
 
     Every environment has its own share of the episodes, fixed beforehand: taking the first that end would favour short
-    ones. Raises `UserError` when an episode of an environment without a time limit takes more than 20,000 steps.
+    ones. Without a policy, actions are uniformly random. Raises `UserError` when an episode of an environment without a
+    time limit takes more than 20,000 steps.
     """
-    noise = partial(policy.draw_noise, (env.num_envs,), generator(seed, env.device, EVALUATION, 1))
+    rng = generator(seed, env.device, EVALUATION, 1)
     numbers = torch.arange(env.num_envs, device=env.device)
     left = episodes // env.num_envs + (numbers < episodes % env.num_envs).int()
     env.restart(derive(seed, EVALUATION, 0))
     age = torch.zeros_like(left)
     while (left > 0).any():
         env.require_end(int(age.max()))
-        obs, distribution = env.obs, policy(env.obs)
-        action = distribution.mode() if deterministic else distribution.sample(noise())
+        obs = env.obs
+        action = _act(policy, deterministic, env, rng)
         step = env.step(action)
         yield obs, action, step, (left > 0) & step.valid
         done = (step.terminated | step.truncated) & step.valid
         left, age = left - done.int(), (age + 1) * (~done & (left > 0))
+
+
+def _act(policy: Policy | None, deterministic: bool, env: VecEnv, rng: torch.Generator) -> Tensor:
+    if policy is None:
+        return random_action(env.spec, env.obs, rng)
+    distribution = policy(env.obs)
+    return distribution.mode() if deterministic else distribution.sample(policy.draw_noise((env.num_envs,), rng))
 
 
 def evaluate(
@@ -98,19 +108,7 @@ def evaluate(
         if q_bias_meter:
             q_bias_meter.follow(obs, action, step, counts)
         table.add(step, counts)
-    returns, lengths = table.returns_and_lengths()
-    return Evaluation(
-        env_id=env.spec.env_id,
-        episodes=episodes,
-        mean_return=returns.mean().item(),
-        std_return=returns.std(correction=0).item(),
-        returns=returns.tolist(),
-        lengths=lengths.int().tolist(),
-        terminated=table.terminated,
-        measures=table.measures(env.summaries),
-        q_bias=q_bias_meter.q_bias() if q_bias_meter else None,
-        date=datetime.now(UTC).isoformat(timespec="seconds"),
-    )
+    return table.evaluation(env.spec.env_id, env.summaries, q_bias_meter.q_bias() if q_bias_meter else None)
 
 
 class EpisodeTable:
@@ -135,6 +133,22 @@ class EpisodeTable:
             self._ended.append(torch.stack([*self._running, self._numbers])[:, done])
             self.terminated += int((step.terminated & counts).sum())
             self._running = self._running * ~done
+
+    def evaluation(self, env_id: str, summaries: Sequence[Summary], q_bias: QBias | None = None) -> Evaluation:
+        """The result, from all episodes that ended."""
+        returns, lengths = self.returns_and_lengths()
+        return Evaluation(
+            env_id=env_id,
+            episodes=len(returns),
+            mean_return=returns.mean().item(),
+            std_return=returns.std(correction=0).item(),
+            returns=returns.tolist(),
+            lengths=lengths.int().tolist(),
+            terminated=self.terminated,
+            measures=self.measures(summaries),
+            q_bias=q_bias,
+            date=datetime.now(UTC).isoformat(timespec="seconds"),
+        )
 
     def returns_and_lengths(self) -> Tensor:
         """[2, episodes]: ordered by environment, then by time."""

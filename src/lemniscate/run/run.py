@@ -28,7 +28,7 @@ from lemniscate.optim.compiled import stopping
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import Saver
 from lemniscate.run.evaluate import evaluate
-from lemniscate.run.loggers import NO_EPISODES, JsonLines, Logger, LoggerClass, TensorBoard
+from lemniscate.run.loggers import NO_EPISODES, JsonLines, Logger, LoggerClass, TensorBoard, read_metrics
 from lemniscate.run.q_bias import critic_of
 from lemniscate.run.seeding import derive, globals_undisturbed, seed_globals
 from lemniscate.run.state import TrainState
@@ -80,6 +80,8 @@ class Run:
         self._recent_returns: list[float] = []
         self._unwatched: list[tuple[int, dict[str, float]]] = []
         """logged lines that callbacks have not seen"""
+        self._episodes, self._filmed = 0, 0
+        """whole training episodes so far, and at the last look whether to film"""
         self._stop_signal = 0
         self._line_time, self._line_step = 0.0, 0
         """when the last line was logged, and at which step"""
@@ -107,6 +109,8 @@ class Run:
             state.compile()
         record = {"algorithm": self.algorithm, **self.config.to_json()}
         self._loggers += [make(self.path, record, state.step) for make in self._logger_classes]
+        self._episodes = sum(len(line.get("episode/returns", ())) for line in read_metrics(self.path))
+        self._filmed = self._episodes
         return state
 
     def until(self, total_steps: int, state: TrainState) -> Iterator[VecEnv]:
@@ -120,7 +124,7 @@ class Run:
         self._line_time, self._line_step = started, state.step
         try:
             with signals_to(self._stop, signal.SIGINT, signal.SIGTERM):
-                if state.step == 0:
+                if state.step == 0 and (self.config.video_every or self.config.video_every_episodes):
                     self._record(state)
                 self._restart(state)
                 going_on = True
@@ -145,6 +149,7 @@ class Run:
             if name.startswith(("losses/", "gradient")) and not -float("inf") < value < float("inf"):
                 raise NonFiniteError(f"{name} is {value} in the update that ends at step {state.step:,}.")
         if episodes.returns:
+            self._episodes += len(episodes.returns)
             self._recent_returns = (self._recent_returns + episodes.returns)[-100:]
             numbers["episode/return"] = sum(episodes.returns) / len(episodes.returns)
             numbers["episode/length"] = sum(episodes.lengths) / len(episodes.lengths)
@@ -173,7 +178,9 @@ class Run:
         """Do what is due after an update; returns whether the run goes on."""
         if _passed(self.config.evaluate_every, before, state.step):
             self._evaluate(state)
-        if _passed(self.config.video_every, before, state.step):
+        filmed, self._filmed = self._filmed, self._episodes
+        by_episodes = _passed(self.config.video_every_episodes, filmed, self._episodes)
+        if by_episodes or _passed(self.config.video_every, before, state.step):
             self._record(state)
         finished = state.step >= total_steps
         planned = finished or _passed(self._checkpoint_interval(), before, state.step)
@@ -231,7 +238,7 @@ class Run:
         return self.config.checkpoint_every or max(fifth, 3 * longest * self.config.num_envs)
 
     def _record(self, state: TrainState) -> None:
-        if not (self.config.video_every and self._film):
+        if not self._film:
             return
         try:
             with globals_undisturbed():
@@ -275,7 +282,7 @@ def is_compiled(config: RunConfig) -> bool:
 
 
 def _passed(every: int, before: int, after: int) -> bool:
-    """Whether a multiple of `every` steps lies after `before` and not after `after`; 0 stands for never."""
+    """Whether a multiple of `every` lies after `before` and not after `after`; 0 stands for never."""
     return every > 0 and after // every > before // every
 
 
