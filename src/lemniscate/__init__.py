@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from lemniscate.api import TrainedRun, config_for, resume, train
+    from lemniscate.envs.vector_view import make_vec
     from lemniscate.errors import NonFiniteError, SweepError, UserError
     from lemniscate.policy import TrainedPolicy
-    from lemniscate.results import evaluate, load, plot, watch
+    from lemniscate.results import evaluate, load, plot, save, watch
     from lemniscate.run.environments import make_envs
     from lemniscate.run.evaluate import Evaluation
     from lemniscate.run.run import Stopped
@@ -30,9 +31,11 @@ __all__ = [
     "evaluate",
     "load",
     "make_envs",
+    "make_vec",
     "plot",
     "resume",
     "resume_sweep",
+    "save",
     "set_seeds",
     "train",
     "train_sweep",
@@ -52,9 +55,11 @@ MODULES = {
     "evaluate": "results",
     "load": "results",
     "make_envs": "run.environments",
+    "make_vec": "envs.vector_view",
     "plot": "results",
     "resume": "api",
     "resume_sweep": "sweep",
+    "save": "results",
     "set_seeds": "run.seeding",
     "train": "api",
     "train_sweep": "sweep",
