@@ -10,9 +10,10 @@ __version__ = "0.2.0"
 
 if TYPE_CHECKING:
     from lemniscate.api import config_for, resume, train
+    from lemniscate.envs.vector_view import make_vec
     from lemniscate.errors import NonFiniteError, SweepError, UserError
     from lemniscate.policy import TrainedPolicy
-    from lemniscate.results import TrainedRun, evaluate, load, plot, watch
+    from lemniscate.results import TrainedRun, evaluate, load, plot, save, watch
     from lemniscate.run.environments import make_envs
     from lemniscate.run.evaluate import Evaluation
     from lemniscate.run.run import Stopped
@@ -32,9 +33,11 @@ __all__ = [
     "evaluate",
     "load",
     "make_envs",
+    "make_vec",
     "plot",
     "resume",
     "resume_sweep",
+    "save",
     "set_seeds",
     "train",
     "train_sweep",
@@ -54,9 +57,11 @@ MODULES = {
     "evaluate": "results",
     "load": "results",
     "make_envs": "run.environments",
+    "make_vec": "envs.vector_view",
     "plot": "results",
     "resume": "api",
     "resume_sweep": "sweep",
+    "save": "results",
     "set_seeds": "run.seeding",
     "train": "api",
     "train_sweep": "sweep",

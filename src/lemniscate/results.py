@@ -1,6 +1,7 @@
-"""The verbs for what a run has left: load, evaluate, watch, plot."""
+"""The verbs for what a run has left: load, save, evaluate, watch, plot."""
 
 import json
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -83,6 +84,32 @@ def load(run: Trained) -> TrainedPolicy:
     networks = config.networks(spec)
     networks.load_state_dict(found.tensors_of("networks"))
     return TrainedPolicy(networks, spec, config, found.numbers["step"])
+
+
+def save(policy: Any, path: str | Path) -> Path:
+    """Store a policy for `load`: weights, normalizer, Config and Spec, as a checkpoint without pickle.
+
+    Args:
+        policy: from `load`, or what `train` returned. It may begin another run (`warm_start=path`), but not resume
+            its own: a run's checkpoints also hold optimizers and random generators.
+        path: a new directory, or a policy stored before, which is replaced.
+
+    Raises:
+        UserError: something else is at `path`, or it cannot be written.
+    """
+    path, policy = Path(path), getattr(policy, "policy", policy)
+    if not isinstance(policy, TrainedPolicy):
+        raise UserError(f"What can be stored is a policy, from load or train, not a {type(policy).__name__}.")
+    if path.exists() and not (path / "manifest.json").exists():
+        raise UserError(f"{path} exists already, and is not a stored policy; choose another path.")
+    algorithm = algos.name_of(sys.modules[type(policy.config).__module__])
+    record = {"algorithm": algorithm, "config": policy.config.to_json(), "spec": checkpoint.spec_to_json(policy.spec)}
+    try:
+        fields = {"networks": policy.networks, "step": policy.step}
+        checkpoint.write_fields(path, fields, {**record, "planned": False})
+    except OSError as error:
+        raise UserError(f"{path} cannot be written: {error}.") from error
+    return path
 
 
 def evaluate(

@@ -1,4 +1,4 @@
-"""Checks of functions that a reader writes: correct, or wrong in a well-known way.
+"""Checks of functions and classes that a reader writes: correct, or wrong in a well-known way.
 
     from lemniscate import course
 
@@ -6,20 +6,28 @@
 
     course.check(gae)
 
-A function is compared with the library's of the same name on small cases, each with one difficulty. Where a value
-differs, the result is compared with those of well-known mistakes, and the mistake that agrees is named.
+A function is compared with a reference on small cases, each with one difficulty. Where a value differs, the result is
+compared with those of well-known mistakes, and the mistake that agrees is named. A class, or a function with effects,
+is judged by what it does; a whole training loop (`skeleton`) by what it learns.
 """
 
 import copy
-import sys
+import inspect
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from lemniscate.course.exercises import EXERCISES, Case, Exercise, Function
+from lemniscate.console import say
+from lemniscate.course.exercise import Case, Exercise, Function, Inspection, Note
+from lemniscate.course.exercises import EXERCISES
+from lemniscate.course.skeletons import skeleton
 from lemniscate.errors import unknown_name
+from lemniscate.run.seeding import globals_undisturbed, seed_globals
+
+__all__ = ["EXERCISES", "Finding", "check", "skeleton"]
 
 
 @dataclass(frozen=True)
@@ -36,13 +44,18 @@ class Finding:
     def __str__(self) -> str:
         return f"{'✓' if self.right else '✗'} {self.name}: {self.sentence}"
 
+    def _ipython_display_(self) -> None:
+        """Nothing: as the last value of a cell it has been printed already."""
+
 
 def check(function: Function, name: str | None = None) -> Finding:
-    """Compare a function with the library's; prints the finding, and returns it.
+    """Judge a solution of an exercise; prints the finding, and returns it.
 
     Args:
-        function: takes what `lemniscate.maths` documents under its name, and returns the same.
-        name: the name of the library's function; by default its own name.
+        function: the solution: a function or a class. What `lemniscate.maths` has under its name takes and returns the
+            same as there; docs/courses.md has the others. A method is given as it stands in its class,
+            `Trainer.calculate_pg_loss`: what it uses of `self` is put there.
+        name: the name of the exercise; by default that of the function.
 
     Raises:
         UserError: a name that is no exercise.
@@ -50,9 +63,29 @@ def check(function: Function, name: str | None = None) -> Finding:
     name = name or function.__name__
     if name not in EXERCISES:
         raise unknown_name("exercise", name, EXERCISES)
-    finding = _find(name, EXERCISES[name], function)
-    print(finding, file=sys.stderr)
+    exercise = EXERCISES[name]
+    is_inspection = isinstance(exercise, Inspection)
+    finding = _inspect(name, exercise, function) if is_inspection else _find(name, exercise, function)
+    say(finding)
     return finding
+
+
+def _inspect(name: str, inspection: Inspection, thing: Function) -> Finding:
+    notes: list[str] = []
+    try:
+        with globals_undisturbed():
+            seed_globals(0)
+            for sentence in inspection.points(thing):
+                if not isinstance(sentence, Note):
+                    return Finding(name, False, sentence)
+                notes.append(f" Note: {sentence}")
+    except Exception as error:  # whatever it raises is a finding too
+        return Finding(name, False, _raised(error))
+    return Finding(name, True, f"right.{''.join(notes)}")
+
+
+def _raised(error: Exception) -> str:
+    return f"it raised {type(error).__name__}: {error}"
 
 
 def _find(name: str, exercise: Exercise, function: Function) -> Finding:
@@ -68,7 +101,7 @@ def _complaint(exercise: Exercise, function: Function, case: Case) -> str | None
     try:
         return _off(exercise, function, case)
     except Exception as error:  # whatever the function raises is a finding too
-        return f"it raised {type(error).__name__}: {error}"
+        return _raised(error)
 
 
 def _off(exercise: Exercise, function: Function, case: Case) -> str | None:
@@ -85,7 +118,9 @@ def _off(exercise: Exercise, function: Function, case: Case) -> str | None:
             return f"{what} has no gradient; was something detached, or computed under no_grad?"
         if not _close(mine, right):
             return _apart(what, mine.detach(), right.detach()) + _cause(exercise, function)
-    if exercise.is_loss and not _close(*(_slope(exercise, of, case) for of in (function, exercise.right))):
+    if exercise.gradient_in is not None and not _close(
+        *(_slope(exercise, of, case) for of in (function, exercise.right))
+    ):
         return f"the value is right, but its gradient is not.{_cause(exercise, function)}"
     return None
 
@@ -97,17 +132,28 @@ def _ask(exercise: Exercise, function: Function, case: Case) -> tuple[Any, ...]:
         parameters = [[nn.Parameter(tensor) for tensor in arg] for arg in args if isinstance(arg, list)]
         function(*map(iter, parameters), *args[len(parameters) :], **case.options)  # as `module.parameters()` comes
         return tuple(parameter for network in parameters for parameter in network)
-    if exercise.is_loss:
-        args[0].requires_grad_()
-    answer = function(*args, **case.options)
+    if exercise.gradient_in is not None:
+        args[exercise.gradient_in].requires_grad_()
+    answer = _call(function, args, case)
     return answer if isinstance(answer, tuple) else (answer,)
 
 
 def _slope(exercise: Exercise, function: Function, case: Case) -> Tensor:
-    """The gradient of a loss in its first argument."""
-    args = copy.deepcopy(case.args)
-    (slope,) = torch.autograd.grad(function(args[0].requires_grad_(), *args[1:], **case.options), args[0])
+    """The gradient of a loss, or of the sum of several, in the argument that counts."""
+    args, place = copy.deepcopy(case.args), exercise.gradient_in or 0
+    answer = _call(function, (*args[:place], args[place].requires_grad_(), *args[place + 1 :]), case)
+    total = torch.stack(answer).sum() if isinstance(answer, tuple) else answer
+    (slope,) = torch.autograd.grad(total, args[place])
     return slope
+
+
+def _call(function: Function, args: tuple[Any, ...], case: Case) -> Any:
+    """Call a function with the options of a case; a method with a `self` that has them as attributes."""
+    plain = getattr(function, "__func__", function)
+    if inspect.isfunction(plain) and next(iter(inspect.signature(plain).parameters), None) == "self":
+        held = copy.deepcopy({**case.options, **case.attributes})
+        return plain(SimpleNamespace(**held, config=SimpleNamespace(**held, device="cpu")), *args)
+    return function(*args, **copy.deepcopy(dict(case.options)))
 
 
 def _close(mine: Tensor, right: Tensor) -> bool:
@@ -134,7 +180,9 @@ def _same(exercise: Exercise, one: Function, other: Function) -> bool:
             pairs = zip(_ask(exercise, one, case), _ask(exercise, other, case), strict=True)
             if not all(a.shape == b.shape and _close(a.to(b.dtype), b) for a, b in pairs):
                 return False
-            if exercise.is_loss and not _close(_slope(exercise, one, case), _slope(exercise, other, case)):
+            if exercise.gradient_in is not None and not _close(
+                _slope(exercise, one, case), _slope(exercise, other, case)
+            ):
                 return False
         except Exception:  # it fails in a later case, so it is none of the known mistakes
             return False

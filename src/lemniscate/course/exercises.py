@@ -1,40 +1,14 @@
 """Functions to write as an exercise, each with test cases and its well-known mistakes."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from lemniscate import maths
-
-Function = Callable[..., Any]
-
-
-@dataclass(frozen=True)
-class Case:
-    """Arguments of a function, and what is special about them."""
-
-    about: str
-    args: tuple[Any, ...]
-    options: Mapping[str, float] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class Exercise:
-    """A function to write: its reference, the cases it is compared on, and its usual mistakes."""
-
-    right: Function
-    outputs: tuple[str, ...]
-    """names of what it returns"""
-    cases: Sequence[Case]
-    mistakes: Mapping[str, Function]
-    """by description: a function that makes the mistake"""
-    is_loss: bool = False
-    """the gradient in the first argument counts too"""
-    in_place: bool = False
-    """it changes the parameters of two networks in place, and returns nothing"""
+from lemniscate.course import agents, drone, lander, loop, replay, saving, setup
+from lemniscate.course.exercise import Case, Exercise, Function, Inspection, drawn
 
 
 def _column(*numbers: float) -> Tensor:
@@ -47,15 +21,11 @@ def _flags(*rows: int, length: int = 4) -> Tensor:
     return flags
 
 
-def _drawn(*shape: int) -> Tensor:
-    return torch.randn(shape, generator=torch.Generator().manual_seed(sum(shape)))
-
-
 VALUES = (_column(1.0, -0.5, 2.0, 0.5), _column(0.3, 1.2, -0.4, 0.8), _column(0.9, -0.7, 0.6, 1.5))
 """r, V(s) and V(s') of four steps of one environment"""
 DISCOUNTS = {"gamma": 0.9, "lam": 0.8}
 NEVER, LAST = _flags(), _flags(3)
-TWO = (_drawn(5, 2), _drawn(2, 5).T.contiguous(), _drawn(2, 5).T.contiguous() + 1)
+TWO = (drawn(5, 2), drawn(2, 5).T.contiguous(), drawn(2, 5).T.contiguous() + 1)
 TWO_ENDS = (torch.tensor([[0, 0], [1, 0], [0, 0], [0, 1], [0, 0]]).bool(),)
 TWO_DONE = (torch.tensor([[0, 1], [1, 0], [0, 0], [0, 1], [1, 0]]).bool(),)
 
@@ -84,7 +54,7 @@ def _clipped_value_alone(v: Tensor, target: Tensor, old: Tensor | None = None, c
     return maths.value_loss(v if old is None else old + (v - old).clamp(-clip, clip), target)
 
 
-EXERCISES: dict[str, Exercise] = {
+EXERCISES: dict[str, Exercise | Inspection] = {
     "gae": Exercise(
         maths.gae,
         ("advantage", "target"),
@@ -140,8 +110,8 @@ EXERCISES: dict[str, Exercise] = {
         maths.td_target,
         ("target",),
         [
-            Case("nothing ends", (_drawn(6), _drawn(6) + 1, torch.zeros(6).bool()), {"gamma": 0.9}),
-            Case("some end", (_drawn(6), _drawn(6) + 1, torch.tensor([0, 1, 0, 0, 1, 1]).bool()), {"gamma": 0.9}),
+            Case("nothing ends", (drawn(6), drawn(6) + 1, torch.zeros(6).bool()), {"gamma": 0.9}),
+            Case("some end", (drawn(6), drawn(6) + 1, torch.tensor([0, 1, 0, 0, 1, 1]).bool()), {"gamma": 0.9}),
         ],
         {
             "a value follows a death": lambda r, n, te, **o: maths.td_target(r, n, _without(te), **o),
@@ -154,13 +124,13 @@ EXERCISES: dict[str, Exercise] = {
     "policy_gradient": Exercise(
         maths.policy_gradient,
         ("loss",),
-        [Case("eight actions", (_drawn(8), _drawn(8) + 0.5))],
+        [Case("eight actions", (drawn(8), drawn(8) + 0.5))],
         {
             "the sign: optimizers descend": lambda log_prob, weight: -maths.policy_gradient(log_prob, weight),
             "the sum in place of the mean": lambda log_prob, weight: -(log_prob * weight).sum(),
             "π in place of log π": lambda log_prob, weight: maths.policy_gradient(log_prob.exp(), weight),
         },
-        is_loss=True,
+        gradient_in=0,
     ),
     "clipped_surrogate": Exercise(
         maths.clipped_surrogate,
@@ -169,7 +139,7 @@ EXERCISES: dict[str, Exercise] = {
             Case("ratios of one", (torch.zeros(4), torch.tensor([1.0, 2.0, -1.0, 0.5])), {"clip": 0.2}),
             Case("good actions", (torch.tensor([-0.5, -0.1, 0.1, 0.5]), torch.ones(4)), {"clip": 0.2}),
             Case("bad actions", (torch.tensor([-0.5, -0.1, 0.1, 0.5]), -torch.ones(4)), {"clip": 0.2}),
-            Case("of all kinds", (_drawn(12) / 3, _drawn(12).flip(0)), {"clip": 0.1}),
+            Case("of all kinds", (drawn(12) / 3, drawn(12).flip(0)), {"clip": 0.1}),
         ],
         {
             "the sign: optimizers descend": lambda x, a, clip: -maths.clipped_surrogate(x, a, clip),
@@ -183,14 +153,14 @@ EXERCISES: dict[str, Exercise] = {
                 -torch.min(x * a, x.clamp(1 - clip, 1 + clip) * a).mean()
             ),
         },
-        is_loss=True,
+        gradient_in=0,
     ),
     "value_loss": Exercise(
         maths.value_loss,
         ("loss",),
         [
-            Case("without a clip", (_drawn(6), _drawn(6) + 1)),
-            Case("with a clip", (_drawn(8), _drawn(8).flip(0), _drawn(8) + 0.3, 0.2)),
+            Case("without a clip", (drawn(6), drawn(6) + 1)),
+            Case("with a clip", (drawn(8), drawn(8).flip(0), drawn(8) + 0.3, 0.2)),
         ],
         {
             "the conventional half is missing": lambda *a: 2 * maths.value_loss(*a),
@@ -199,12 +169,12 @@ EXERCISES: dict[str, Exercise] = {
             "the clip is left out": lambda v, target, *_: maths.value_loss(v, target),
             "only the clipped value counts": _clipped_value_alone,
         },
-        is_loss=True,
+        gradient_in=0,
     ),
     "polyak": Exercise(
         maths.polyak,
         ("target[0]", "target[1]", "online[0]", "online[1]"),
-        [Case("two tensors", ([_drawn(3), _drawn(2, 2)], [_drawn(3) + 1, _drawn(2, 2) - 1], 0.1))],
+        [Case("two tensors", ([drawn(3), drawn(2, 2)], [drawn(3) + 1, drawn(2, 2) - 1], 0.1))],
         {
             "the target is to be changed in place": lambda target, online, tau: None,
             "τ and 1 − τ are exchanged": lambda target, online, tau: maths.polyak(target, online, 1 - tau),
@@ -214,4 +184,18 @@ EXERCISES: dict[str, Exercise] = {
         },
         in_place=True,
     ),
+    **drone.EXERCISES,
+    **lander.EXERCISES,
+    "sample_categorical": Inspection(agents.sample_categorical),
+    "Agent": Inspection(agents.agent),
+    "Actor": Inspection(agents.actor),
+    "QNetwork": Inspection(agents.q_network),
+    "set_seeds": Inspection(setup.set_seeds),
+    "make_envs": Inspection(setup.make_envs),
+    "save_model": Inspection(saving.save_model),
+    "load_model": Inspection(saving.load_model),
+    "sync_envs": Inspection(setup.sync_envs),
+    "ReplayBuffer": Inspection(replay.replay_buffer),
+    "add_to_replay": Inspection(replay.add_to_replay),
+    "train": Inspection(loop.train),
 }

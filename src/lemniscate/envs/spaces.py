@@ -137,3 +137,16 @@ def physical_action(action: np.ndarray, kind: Action) -> np.ndarray:
     else:
         _require_below(2, action)
     return action if kind.shape is None else action.reshape(-1, *kind.shape)
+
+
+def normalized_action(action: np.ndarray, kind: Action) -> np.ndarray:
+    """The inverse of `physical_action`: actions [N, …] of an environment, as a policy gives them."""
+    if isinstance(kind, Discrete):
+        return (action - kind.start).astype(np.int64)
+    flat = action.reshape(len(action), -1)
+    if isinstance(kind, MultiBinary):
+        return flat
+    if isinstance(kind, MultiDiscrete):
+        return (flat - np.array(kind.start)).astype(np.int64)
+    _, _, middle, half = _scale(kind)
+    return ((flat - middle) / np.where(half > 0, half, 1)).astype(np.float32)

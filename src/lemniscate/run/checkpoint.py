@@ -14,6 +14,7 @@ import json
 import os
 import shutil
 from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, get_args
 
@@ -62,18 +63,25 @@ def write(directory: Path, state: TrainState, step: int, record: dict[str, Any],
     `record` is any JSON that a reader needs beside the state.
     """
     final = directory / f"step-{step}"
+    for stale in directory.glob("*.tmp"):
+        shutil.rmtree(stale)
+    write_fields(final, state.saved(), record)
+    for old in list_steps(directory)[:-keep]:
+        shutil.rmtree(directory / f"step-{old}")
+    return final
+
+
+def write_fields(final: Path, fields: Mapping[str, Any], record: dict[str, Any]) -> None:
+    """Write the checkpoint `final` with these fields, in the place of one that is there."""
     tensors: dict[str, Tensor] = {}
     numbers: dict[str, Any] = {}
-    for name, value in state.saved().items():
+    for name, value in fields.items():
         if hasattr(value, "state_dict"):
             tensors |= {f"{name}.{key}": t for key, t in value.state_dict().items()}
         else:
             numbers[name] = value
-    directory.mkdir(parents=True, exist_ok=True)
-    for stale in directory.glob("*.tmp"):
-        shutil.rmtree(stale)
-    temporary = directory / f"step-{step}.tmp"
-    temporary.mkdir()
+    temporary = final.with_name(f"{final.name}.tmp")
+    temporary.mkdir(parents=True)
     save_file(_to_save(tensors), temporary / FILES[0])
     (temporary / FILES[1]).write_text(_json({"numbers": numbers, "record": record}))
     hashes = {name: _sha256(temporary / name) for name in FILES}
@@ -84,10 +92,7 @@ def write(directory: Path, state: TrainState, step: int, record: dict[str, Any],
     if final.exists():
         shutil.rmtree(final)
     temporary.rename(final)
-    _sync(directory)
-    for old in list_steps(directory)[:-keep]:
-        shutil.rmtree(directory / f"step-{old}")
-    return final
+    _sync(final.parent)
 
 
 def read(path: Path) -> Checkpoint:

@@ -1,0 +1,208 @@
+"""The judgement of a whole training loop: by what it learns in small worlds that each punish one mistake.
+
+In every world the better of two actions is known, and one mistake makes the other one look better. A loop that passes
+them all is trained on CartPole-v1.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+
+from lemniscate.console import say
+from lemniscate.course.exercise import Function
+from lemniscate.envs.vector_view import VectorView, make_vec
+
+STEPS, NUM_ENVS = 2_048, 8
+CARTPOLE_STEPS, CARTPOLE_RETURN, CARTPOLE_EPISODES = 60_000, 400, 20
+
+
+@dataclass(frozen=True)
+class Move:
+    """What an action in a state causes: a reward, the next state, and how the episode ends there, if it does."""
+
+    reward: float
+    state: int
+    ends: str = ""
+    """death, time-out, or nothing"""
+    next_bonus: float = 0.0
+    """added to the first reward of the next episode"""
+
+
+@dataclass(frozen=True)
+class World:
+    """A small world: its moves, where episodes begin, the better action in state 0, and what the other one reveals."""
+
+    moves: Mapping[int, tuple[Move, Move]]
+    starts: Mapping[int, float]
+    """state: probability"""
+    mistake: str
+    better: int = 0
+    seen: Mapping[int, int] | None = None
+    """by state: the state that it looks like"""
+
+
+class WorldEnv(gym.Env):
+    """A world as an environment; a state is seen as a one-hot vector."""
+
+    def __init__(self, world: int) -> None:
+        self.world = WORLDS[world]
+        self.observation_space = gym.spaces.Box(0, 1, (6,), np.float32)
+        self.action_space = gym.spaces.Discrete(2)
+        self._bonus = 0.0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+        """A state to begin in."""
+        super().reset(seed=seed)
+        self._state = int(self.np_random.choice(list(self.world.starts), p=list(self.world.starts.values())))
+        return one_hot(self.world, self._state), {}
+
+    def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict]:
+        """The move of that action."""
+        move = self.world.moves[self._state][int(action)]
+        reward, self._bonus, self._state = move.reward + self._bonus, move.next_bonus, move.state
+        return one_hot(self.world, self._state), reward, move.ends == "death", move.ends == "time-out", {}
+
+
+def one_hot(world: World, state: int) -> np.ndarray:
+    """How a state looks, [6]."""
+    return np.eye(6, dtype=np.float32)[(world.seen or {}).get(state, state)]
+
+
+def _both(*move: Any, **more: Any) -> tuple[Move, Move]:
+    return Move(*move, **more), Move(*move, **more)
+
+
+WORLDS = (
+    World(  # 0: the reward comes at once
+        {0: (Move(1, 0, "death"), Move(0, 0, "death"))},
+        {0: 1.0},
+        "it takes the action without the reward. Likely: the sign of the policy's loss is turned, or its gradient does"
+        " not reach the policy",
+    ),
+    World(  # 1: a small reward now, or a large one two steps later, and nothing to be seen of it until then
+        {
+            0: (Move(0, 1), Move(0.1, 2)),
+            1: _both(0, 3),
+            2: _both(0, 4),
+            3: _both(1, 0, "death"),
+            4: _both(0, 0, "death"),
+        },
+        {0: 1.0},
+        "it takes a small reward now, not the large one two steps later. Likely: there is no chain in the advantage,"
+        " or it does not go backwards",
+        seen={2: 1, 4: 3},
+    ),
+    World(  # 2: a death that looks like a good state, or a reward
+        {0: (Move(0.5, 3, "death"), Move(0, 2, "death")), 2: _both(2, 3, "death"), 3: _both(0, 3, "death")},
+        {0: 0.5, 2: 0.25, 3: 0.25},
+        "it looks for a death in a good state. Likely: a value follows a death (~terminated is missing)",
+    ),
+    World(  # 3: the next episode pays for this one's second action
+        {0: (Move(0.3, 0, "death"), Move(0, 0, "death", next_bonus=1))},
+        {0: 1.0},
+        "it takes the action that pays in the next episode only. Likely: the chain is not cut where an episode ends",
+    ),
+    World(  # 4: the same, at a time-out
+        {0: (Move(0.3, 1, "time-out"), Move(0, 1, "time-out", next_bonus=1)), 1: _both(0, 1, "death")},
+        {0: 0.8, 1: 0.2},
+        "it takes the action that pays in the episode after the time-out. Likely: the chain is cut at deaths alone;"
+        " done is terminated | truncated",
+    ),
+    World(  # 5: a time-out in a good state, or a small reward and death
+        {0: (Move(0, 1, "time-out"), Move(0.5, 0, "death")), 1: _both(1, 0, "death")},
+        {0: 0.5, 1: 0.5},
+        "it avoids a time-out in a good state. Likely: a time-out is taken for a death, or V is not trained",
+    ),
+    World(  # 6: a time-out in a bad state, while most episodes begin well
+        {0: (Move(0, 2, "death"), Move(0, 2, "time-out")), 1: _both(1, 0, "death"), 2: _both(-1, 0, "death")},
+        {0: 0.4, 1: 0.45, 2: 0.15},
+        "it goes to a time-out in a bad state. Likely: V(s') is that of the next episode's first observation;"
+        ' infos["final_obs"] is not used, or V is taken from the next row',
+    ),
+)
+
+
+def train(function: Function) -> Iterator[str]:
+    """`train(envs, total_steps, seed)`, returning what acts: an agent with `act`, or a function of observations."""
+    say(f"{len(WORLDS)} small worlds, then CartPole-v1: up to a minute.")
+    for number in range(len(WORLDS)):
+        yield from in_world(function, number)
+    envs = make_vec("CartPole-v1", NUM_ENVS, backend="gymnasium")
+    act = _trained(function, envs, CARTPOLE_STEPS, close=False)
+    mean = _mean_return(act, envs)
+    if mean < CARTPOLE_RETURN:
+        yield (
+            f"all small worlds are right, but on CartPole-v1 the mean return after {CARTPOLE_STEPS:,} steps is"
+            f" {mean:.0f}; {CARTPOLE_RETURN} is expected. None of the known mistakes; are the settings those of the"
+            " skeleton?"
+        )
+
+
+def in_world(function: Function, number: int) -> Iterator[str]:
+    """Train in one small world, and look at the action in its state 0."""
+    world = WORLDS[number]
+    with _ratios_of(function) as ratios:
+        act = _trained(function, make_vec(WorldEnv, NUM_ENVS, env_kwargs={"world": number}), STEPS)
+    choice = int(np.asarray(act(np.stack([one_hot(world, 0)])))[0])
+    if choice != world.better:
+        yield f"small world {number + 1} of {len(WORLDS)}: {world.mistake}."
+    yield from _clipping(ratios)
+
+
+def _trained(function: Function, envs: VectorView, steps: int, close: bool = True) -> Callable[[np.ndarray], Any]:
+    made = function(envs, total_steps=steps, seed=1)
+    if close:
+        envs.close()
+    return getattr(made, "act", made)
+
+
+def _mean_return(act: Callable[[np.ndarray], Any], envs: VectorView) -> float:
+    """Over the first episodes that end, from unseen starts; each environment plays equally many."""
+    obs, _ = envs.reset(seed=12_345)
+    running, returns = np.zeros(envs.num_envs), [[] for _ in range(envs.num_envs)]
+    while min(map(len, returns)) < CARTPOLE_EPISODES // envs.num_envs + 1:
+        obs, reward, terminated, truncated, _ = envs.step(np.asarray(act(obs)))
+        running += reward
+        for i in np.flatnonzero(terminated | truncated):
+            returns[i].append(running[i])
+            running[i] = 0.0
+    envs.close()
+    return float(np.mean([episode for row in returns for episode in row[: CARTPOLE_EPISODES // envs.num_envs + 1]]))
+
+
+@contextmanager
+def _ratios_of(function: Function) -> Iterator[list[float]]:
+    """The largest |log ratio| of each call of `clipped_surrogate`, where the file of the function has one."""
+    names: dict[str, Any] = getattr(function, "__globals__", {})
+    found, own = [], names.get("clipped_surrogate")
+    if own is None:
+        yield found
+        return
+
+    def watched(log_ratio: torch.Tensor, *args: Any, **options: Any) -> Any:
+        found.append(log_ratio.detach().abs().max().item())
+        return own(log_ratio, *args, **options)
+
+    names["clipped_surrogate"] = watched
+    try:
+        yield found
+    finally:
+        names["clipped_surrogate"] = own
+
+
+def _clipping(ratios: list[float]) -> Iterator[str]:
+    if ratios and max(ratios) < 1e-6:
+        yield (
+            "the ratio is 1 in every gradient step, so the clip never acts. Likely: the old log-probabilities are"
+            " computed again in each epoch; they belong before the epochs."
+        )
+    elif ratios and ratios[0] > 1e-3:
+        yield (
+            "the ratio is not 1 in the first gradient step. Likely: the old log-probabilities are of other actions,"
+            " or of other rows (the minibatch chooses rows of each column)."
+        )
