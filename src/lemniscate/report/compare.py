@@ -11,9 +11,10 @@ import numpy as np
 from lemniscate.console import say
 from lemniscate.envs.registry import file_name
 from lemniscate.report.comparison_plot import draw
-from lemniscate.report.curves import COLORS, plot_runs, training_minutes
+from lemniscate.report.curves import plot_runs, training_minutes
 from lemniscate.report.groups import Group, Scores
 from lemniscate.report.seeds import bootstrap_interval, iqm
+from lemniscate.report.style import COLORS
 from lemniscate.run.directory import is_finished, read_config
 
 ONE_SEED = "One seed says nothing about which is better: train more with --seeds 1-5."

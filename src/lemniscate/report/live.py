@@ -7,7 +7,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from lemniscate.report.curves import finish
+from lemniscate.report.style import finish
 from lemniscate.report.playback import in_notebook
 
 
