@@ -11,7 +11,7 @@ from lemniscate.envs import registry
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError
 from lemniscate.policy import TrainedPolicy
-from lemniscate.report import compare, curves, playback
+from lemniscate.report import compare, curves, playback, run_page
 from lemniscate.report import pictures as pictures_of
 from lemniscate.report.groups import group
 from lemniscate.run import checkpoint
@@ -20,7 +20,7 @@ from lemniscate.run.environments import evaluation_env
 from lemniscate.run.evaluate import Evaluation
 from lemniscate.run.evaluate import evaluate as evaluate_module
 from lemniscate.run.loggers import read_metrics
-from lemniscate.run.q_bias import critic_of
+from lemniscate.run.q_bias import QBias, critic_of
 from lemniscate.run.sweep_file import is_sweep, read_sweep
 
 FINAL_EPISODES = 100
@@ -108,38 +108,70 @@ def watch(policy: TrainedPolicy, *, seed: int = 0, video: str | Path | None = No
     return playback.show_episode(policy.act, policy.config, seed)
 
 
-def plot(*runs: str | Path) -> list[Path]:
+def plot(*runs: str | Path, by: str = "step") -> list[Path]:
     """Draw the curves of a run into its `plots/`, or compare several, grouped by all but the seed.
 
-    In a notebook they are also shown below the cell.
+    Beside the pictures stands `report.html`, a page with all of them, the final evaluation, the settings, the commands
+    that do it again, and what to try next. In a notebook the pictures are also shown below the cell.
 
     Where the environment has a scene, flights are drawn too; where there is a Q, its predictions beside the returns.
 
     A sweep stands for its runs, and has a `plots/` of its own; other comparisons are drawn into `plots/` here, with a
-    table on standard error. The final policies of finished runs are compared over 100 episodes each. Returns the
-    pictures.
+    table on standard error. The newest policy of one run is evaluated, of several the final policy of each that is
+    finished: over 100 episodes, kept in `final.json`.
+
+    Args:
+        *runs: run directories, or those of sweeps.
+        by: the horizontal axis of the learning curve: "step", "episode" or "minute". By episode the curve is the moving
+            average of 20 episodes.
+
+    Returns:
+        The files, the page last.
+
+    Raises:
+        UserError: no runs, or without metrics; another axis.
     """
+    curves.require_by(by)
     paths = [Path(run) for run in runs]
     found = [run for path in paths for run in _members(path)]
     folder = paths[0] / "plots" if len(paths) == 1 else Path("plots")
-    if found != paths[:1]:
-        return compare.report(group(found), _final_returns(found), folder)
-    pictures = curves.plot_runs(found, folder)
-    if any((paths[0] / "checkpoints").glob("step-*")):
-        policy = load(paths[0])
-        if critic_of(policy.networks, policy.config):
-            q_bias = evaluate(policy, episodes=policy.config.evaluate_episodes).q_bias
-            pictures += [curves.draw_q_bias(q_bias, paths[0], folder / "q.png")] if q_bias else []
-        if env := _scene_env(policy):
-            flights = policy.config.evaluate_episodes
-            pictures += pictures_of.draw_flight(policy.module, env, folder, flights, seed=0)
+    if found == paths[:1]:
+        files = _plot_run(paths[0], folder, by)
+    else:
+        files = compare.report(group(found), _final_returns(found), folder, by)
     if playback.in_notebook():
-        playback.show_pictures(pictures)
-    return pictures
+        playback.show_pictures(file for file in files if file.suffix == ".png")
+    return files
+
+
+def _plot_run(run: Path, folder: Path, by: str) -> list[Path]:
+    """The pictures of one run, and its page. What cannot be evaluated here is left out, and a line says so."""
+    pictures, scores = curves.plot_runs([run], folder, by=by), None
+    if checkpoint.list_steps(run / "checkpoints"):
+        try:
+            scores = final_scores(run)
+            if "q_bias" in scores:
+                q_bias = QBias(scores["q_bias"]["predicted"], scores["q_bias"]["realised"])
+                pictures.append(curves.draw_q_bias(q_bias, run, folder / "q.png"))
+            policy = load(run)
+            if env := _scene_env(policy):
+                flights = policy.config.evaluate_episodes
+                pictures += pictures_of.draw_flight(policy.module, env, folder, flights, seed=0)
+        except UserError as error:
+            say(f"{run} is drawn without an evaluation: {error}")
+    return [*pictures, run_page.write(run, pictures, scores)]
 
 
 def final_return(run: str | Path) -> float:
-    """Mean return of a run's newest policy over 100 episodes; kept in `final.json` until there is a newer policy."""
+    """Mean return of a run's newest policy over 100 episodes, from `final_scores`."""
+    return final_scores(run)["mean_return"]
+
+
+def final_scores(run: str | Path) -> dict[str, Any]:
+    """Scores of a run's newest policy over 100 episodes; kept in `final.json` until there is a newer policy.
+
+    They are those of `Evaluation.to_json`, with the `step` of the policy and the `seed` of the starts.
+    """
     path = Path(run)
     file = path / "final.json"
     known: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {}
@@ -151,7 +183,7 @@ def final_return(run: str | Path) -> float:
         temporary = file.with_suffix(".tmp")
         temporary.write_text(json.dumps(known) + "\n")
         temporary.replace(file)
-    return known["mean_return"]
+    return known
 
 
 def _final_returns(runs: list[Path]) -> dict[Path, float]:

@@ -23,7 +23,7 @@ COMMANDS = {
     "resume": "Continue an interrupted run or sweep.",
     "evaluate": "Play whole episodes with the newest policy of a run.",
     "watch": "Show one episode in a window, or record it.",
-    "plot": "Draw the curves of a run, or compare several, grouped by all but the seed.",
+    "plot": "Draw the curves of a run and its report.html, or compare several, grouped by all but the seed.",
     "envs": "List the environments, their backends, and the preset that fits.",
     "check": "Check that an environment is suitable for training.",
 }
@@ -138,6 +138,9 @@ def _parsers() -> tuple[Parser, dict[str, Parser]]:
     sub.add_argument("--seed", type=int, default=0, metavar="INT", help="seed of the start [0]")
 
     subs["plot"].add_argument("runs", type=Path, nargs="+", metavar="RUN", help="runs or sweeps")
+    subs["plot"].add_argument(
+        "--by", default="step", metavar="AXIS", help="learning curve by step, episode or minute [step]"
+    )
 
     subs["envs"].add_argument("filter", nargs="?", default="", metavar="FILTER", help="a part of the id")
 

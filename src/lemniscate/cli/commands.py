@@ -76,7 +76,7 @@ def watch(given: argparse.Namespace) -> None:
 
 def plot(given: argparse.Namespace) -> None:
     """Draw the curves of one run, or compare several, grouped by all but the seed."""
-    for file in results.plot(*given.runs):
+    for file in results.plot(*given.runs, by=given.by):
         say(file)
 
 
