@@ -123,7 +123,9 @@ def q_biased(evidence: Evidence) -> str | None:
         return None
     if bias < 0:
         return f"Q under-estimates the return by {-bias:.0%}: train longer, or raise --critic-learning-rate."
-    return f"Q over-estimates the return by {bias:.0%}: lower --critic-learning-rate; of one critic, try td3 or sac."
+    two_critics = {"target_noise", "initial_temperature"} & set(evidence.config)
+    other = "" if two_critics else " or try td3 or sac, which believe the lesser of two critics"
+    return f"Q over-estimates the return by {bias:.0%}: lower --critic-learning-rate{other}."
 
 
 def still_rising(evidence: Evidence) -> str | None:

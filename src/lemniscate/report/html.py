@@ -36,7 +36,7 @@ a { color: var(--accent); }
 .cards div { padding: 0.7rem 0.9rem; border-radius: 0.5rem; background: var(--card); }
 .cards strong { display: block; font-size: 1.3rem; font-variant-numeric: tabular-nums; }
 .wide { overflow-x: auto; }
-table { border-collapse: collapse; font-size: 0.92rem; font-variant-numeric: tabular-nums; }
+table { border-collapse: collapse; overflow-wrap: normal; font-size: 0.92rem; font-variant-numeric: tabular-nums; }
 th, td { padding: 0.3rem 1.4rem 0.3rem 0; border-bottom: 1px solid var(--line); text-align: left; vertical-align: top; }
 th { color: var(--soft); font-weight: 600; }
 td { min-width: 4rem; }
@@ -47,7 +47,8 @@ figure img, figure video { max-width: 100%; height: auto; border-radius: 0.4rem;
 @media (prefers-color-scheme: dark) { .plot { filter: invert(0.93) hue-rotate(180deg); } }
 .bars { display: block; width: 100%; max-width: 30rem; height: 7rem; fill: var(--accent); }
 pre { margin: 0.3rem 0 0.9rem; padding: 0.7rem 0.9rem; border-radius: 0.5rem; background: var(--card);
-  overflow-x: auto; overflow-wrap: normal; }
+  white-space: pre-wrap; overflow-x: auto; }
+.whole { white-space: nowrap; }
 code { font: 0.86rem/1.5 ui-monospace, monospace; }
 summary { cursor: pointer; margin: 0.8rem 0; color: var(--accent); }
 footer { margin-top: 3rem; border-top: 1px solid var(--line); padding-top: 0.6rem; }
@@ -105,12 +106,20 @@ def table(heading: Sequence[str], rows: Iterable[Sequence[str]]) -> Html:
 
 def bullets(sentences: Iterable[str]) -> Html:
     """A list of sentences."""
-    return element("ul", *(element("li", sentence) for sentence in sentences))
+    return element("ul", *(element("li", _unbroken(sentence)) for sentence in sentences))
 
 
 def command(line: str) -> Html:
     """A line for a terminal."""
-    return element("pre", element("code", line))
+    return element("pre", element("code", _unbroken(line)))
+
+
+def _unbroken(text: str) -> Html:
+    """Text that no browser breaks within a flag such as --learning-rate."""
+    words = (
+        element("span", word, class_="whole") if word.startswith("--") else escape(word) for word in text.split(" ")
+    )
+    return Html(" ".join(words))
 
 
 def link(text: str, file: Path, page: Path) -> Html:
@@ -145,7 +154,7 @@ def histogram(values: Sequence[float], caption: str) -> Html:
         for i, h in enumerate(40 * counts / tallest)
     )
     drawn = element("svg", *bars, viewBox="0 0 100 40", preserveAspectRatio="none", class_="bars", role="img")
-    return element("figure", drawn, element("figcaption", f"{caption}, from {edges[0]:,.6g} to {edges[-1]:,.6g}"))
+    return element("figure", drawn, element("figcaption", f"{caption}, from {edges[0]:,.1f} to {edges[-1]:,.1f}"))
 
 
 def _embedded(file: Path) -> str:

@@ -87,7 +87,7 @@ def evaluation(scores: Mapping[str, Any] | None) -> list[Html]:
     rows = [
         ("return, mean ± standard deviation", f"{scores['mean_return']:,.1f} ± {scores['std_return']:,.1f}"),
         ("episodes, from starts that training never saw", f"{len(returns):,}, seed {scores.get('seed', 0)}"),
-        ("worst, median, best return", ", ".join(f"{x:,.6g}" for x in np.percentile(returns, [0, 50, 100]))),
+        ("worst, median, best return", ", ".join(f"{x:,.1f}" for x in np.percentile(returns, [0, 50, 100]))),
         ("length, mean", f"{np.mean(lengths):,.1f} steps"),
         ("terminated by the environment's rules", f"{scores['terminated']:,} of {len(returns):,}"),
         *((words(name), number(name, value)) for name, value in measures(scores).items()),
