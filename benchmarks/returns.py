@@ -16,6 +16,7 @@ import tempfile
 from contextlib import nullcontext
 from itertools import pairwise
 from pathlib import Path
+from textwrap import fill
 
 import numpy as np
 from common import RESULTS, append, provenance, rows
@@ -117,29 +118,43 @@ def summary(algorithm):
             print(f"| {name} | {spread} | {len(means)} | {seconds / 60:.1f} min |")
 
 
+def smoothed(curve, grid):
+    """The returns of a stored curve at the steps of `grid`, averaged over a tenth of the run around each."""
+    steps, returns = np.array(curve).T
+    width = grid[-1] / 20
+    weights = np.abs(steps - grid[:, None]) <= width
+    weights[np.arange(len(grid)), np.abs(steps - grid[:, None]).argmin(axis=1)] = True
+    return (weights @ returns) / weights.sum(axis=1)
+
+
 def draw(algorithm):
-    """Training returns of every seed, one panel for each environment."""
+    """Training returns, a panel for each environment: the mean of the seeds, a band from the lowest to the highest."""
     from matplotlib.figure import Figure
+
+    from lemniscate.report.style import COLORS, finish, save
 
     lines = {env: measured(algorithm, env, marks[-1]) for env, (marks, _) in RUNS[algorithm].items()}
     shown = [env for env in lines if lines[env]]
     if not shown:
         return
-    columns, height = min(4, len(shown)), -(-len(shown) // 4)
-    figure = Figure(figsize=(2.75 * columns, 2.75 * height), layout="constrained")
+    columns = min(3, len(shown))
+    height = -(-len(shown) // columns)
+    figure = Figure(figsize=(3.6 * columns, 2.8 * height + 0.4), layout="constrained")
     panels = figure.subplots(height, columns, squeeze=False).flatten()
     for env, axes in zip(shown, panels, strict=False):
-        axes.set_title(env, fontsize=10)
-        unit, word = (1e6, "million") if RUNS[algorithm][env][0][-1] >= MILLION else (1e3, "thousand")
-        for row in lines[env]:
-            steps, values = zip(*row["curve"], strict=True)
-            axes.plot(np.array(steps) / unit, values, color="#3465a4", alpha=0.5, linewidth=1)
-        axes.set_xlabel(f"{word} steps", fontsize=8)
-        axes.tick_params(labelsize=8)
-        axes.spines[["top", "right"]].set_visible(False)
+        unit, word = (1e6, "million ") if RUNS[algorithm][env][0][-1] >= MILLION else (1, "")
+        grid = np.linspace(0, min(row["curve"][-1][0] for row in lines[env]), 100)
+        curves = np.stack([smoothed(row["curve"], grid) for row in lines[env]])
+        axes.fill_between(grid / unit, curves.min(axis=0), curves.max(axis=0), color=COLORS[0], alpha=0.2, linewidth=0)
+        axes.plot(grid / unit, curves.mean(axis=0), color=COLORS[0], linewidth=1.8)
+        axes.set_title(f"{env}, {len(curves)} seed{'s' * (len(curves) > 1)}", loc="left", fontsize=10)
+        axes.set(xlabel=f"{word}environment steps", ylabel="return in training")
+        finish(axes)
     for axes in panels[len(shown) :]:
         axes.set_visible(False)
-    figure.savefig(RESULTS / f"returns-{algorithm}.png", dpi=120)
+    title = f"{algorithm.upper()}: mean over seeds, band from lowest to highest; averaged over a tenth of the run"
+    figure.suptitle(fill(title, 42 * columns), x=0.01, ha="left", fontsize=10)
+    save(figure, RESULTS / f"returns-{algorithm}.png")
 
 
 def main():

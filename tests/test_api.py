@@ -26,7 +26,8 @@ def pendulum(tmp_path_factory):
 
 def test_a_run_directory_holds_what_is_promised(cartpole):
     names = {p.name for p in cartpole.path.iterdir()}
-    assert {"config.json", "metrics.jsonl", "tensorboard", "checkpoints"} <= names
+    assert {"config.json", "metrics.jsonl", "checkpoints"} <= names
+    assert len(list(cartpole.path.glob("events.out.tfevents.*"))) == 1
     record = json.loads((cartpole.path / "config.json").read_text())
     assert record["algorithm"] == "ppo"
     assert record["config"]["env"] == "CartPole-v1"
@@ -39,7 +40,7 @@ def test_a_run_directory_holds_what_is_promised(cartpole):
 def test_tensorboard_holds_the_metrics_and_the_config(cartpole):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    events = EventAccumulator(str(cartpole.path / "tensorboard")).Reload()
+    events = EventAccumulator(str(cartpole.path)).Reload()
     assert "losses/policy" in events.Tags()["scalars"]
     assert len(events.Scalars("losses/policy")) == 8
     text = events.Tensors("config/text_summary")[0].tensor_proto.string_val[0].decode()

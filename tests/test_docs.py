@@ -190,7 +190,7 @@ def test_the_python_of_the_lander_runs(tmp_path, monkeypatch):
     assert len(code.splitlines()) <= 10
     scope = {}
     exec(code.replace("seed=1)\npictures", "seed=1, total_steps=1600, progress=False)\npictures"), scope)
-    assert [picture.name for picture in scope["pictures"]] == ["learning_curve.png", "diagnostics.png"]
+    assert [picture.name for picture in scope["pictures"]] == ["learning_curve.png", "diagnostics.png", "report.html"]
     assert scope["run"].policy.step == 1600
     assert (tmp_path / "lander.gif").stat().st_size > 10_000
 

@@ -12,8 +12,9 @@ if TYPE_CHECKING:
     from lemniscate.api import config_for, resume, train
     from lemniscate.envs.vector_view import make_vec
     from lemniscate.errors import NonFiniteError, SweepError, UserError
+    from lemniscate.plots import plot
     from lemniscate.policy import TrainedPolicy
-    from lemniscate.results import TrainedRun, evaluate, load, plot, save, watch
+    from lemniscate.results import TrainedRun, evaluate, load, save, watch
     from lemniscate.run.environments import make_envs
     from lemniscate.run.evaluate import Evaluation
     from lemniscate.run.run import Stopped
@@ -58,7 +59,7 @@ MODULES = {
     "load": "results",
     "make_envs": "run.environments",
     "make_vec": "envs.vector_view",
-    "plot": "results",
+    "plot": "plots",
     "resume": "api",
     "resume_sweep": "sweep",
     "save": "results",
@@ -71,7 +72,7 @@ MODULES = {
 
 SUBMODULES = (
     *("algos", "api", "course", "data", "envs", "errors", "maths", "nn", "optim", "policy", "presets", "report"),
-    *("results", "run", "spec", "sweep", "testing", "types"),
+    *("plots", "results", "run", "spec", "sweep", "testing", "types"),
 )
 """what `lemniscate.NAME` imports by itself"""
 

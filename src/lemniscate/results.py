@@ -1,6 +1,5 @@
 """The verbs for what a run has left: load, save, evaluate, watch, plot."""
 
-import json
 import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -15,23 +14,17 @@ from lemniscate.envs import registry
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError, shown
 from lemniscate.policy import TrainedPolicy
-from lemniscate.report import compare, curves, playback
 from lemniscate.report import pictures as pictures_of
+from lemniscate.report import playback
 from lemniscate.report.display import require_display
 from lemniscate.report.film import check_film
-from lemniscate.report.groups import group
 from lemniscate.run import checkpoint
 from lemniscate.run.config import Count, Natural, RunConfig, checked
-from lemniscate.run.directory import find_checkpoint, is_finished, read_config
+from lemniscate.run.directory import find_checkpoint
 from lemniscate.run.environments import evaluation_env, world_of
 from lemniscate.run.evaluate import Evaluation
 from lemniscate.run.evaluate import evaluate as evaluate_module
-from lemniscate.run.loggers import read_metrics
 from lemniscate.run.q_bias import critic_of
-from lemniscate.run.sweep_file import is_sweep, read_sweep
-
-FINAL_EPISODES = 100
-"""that a run's final policy is judged by where runs are compared"""
 
 
 @dataclass(frozen=True)
@@ -219,85 +212,6 @@ def _show(
         return playback.show_episodes(None, world, **how)
     drawn = TrainedPolicy(policy.networks, policy.spec, policy.config.replace(seed=how["seed"]), policy.step)
     return playback.show_episodes(partial(drawn.act, deterministic=deterministic), world, **how)
-
-
-def plot(*runs: str | Path | TrainedRun | list[str | Path | TrainedRun]) -> list[Path]:
-    """Draw the curves of a run into its `plots/`, or compare several, or a list of them, grouped by all but the seed.
-
-    In a notebook they are also shown below the cell.
-
-    Where the environment has a scene, flights are drawn too; where there is a Q, its predictions beside the returns.
-
-    A sweep stands for its runs, and has a `plots/` of its own; other comparisons are drawn into `plots/` here, with a
-    table on standard error. The final policies of finished runs are compared over 100 episodes each. Returns the
-    pictures.
-    """
-    given = [run for one in runs for run in (one if isinstance(one, list | tuple) else [one])]
-    paths = [path_of(run) for run in given]
-    if not paths:
-        raise UserError("There is nothing to plot: name one run or several, such as plot('runs/lander').")
-    found = [run for path in paths for run in _members(path)]
-    folder = paths[0] / "plots" if len(paths) == 1 else Path("plots")
-    if found != paths[:1]:
-        return compare.report(group(found), _final_returns(found), folder)
-    pictures = curves.plot_runs(found, folder)
-    if any((paths[0] / "checkpoints").glob("step-*")):
-        policy = load(paths[0])
-        if critic_of(policy.networks, policy.config):
-            q_bias = evaluate(policy, episodes=policy.config.evaluate_episodes).q_bias
-            pictures += [curves.draw_q_bias(q_bias, paths[0], folder / "q.png")] if q_bias else []
-        if env := _scene_env(policy):
-            flights = policy.config.evaluate_episodes
-            pictures += pictures_of.draw_flight(policy.module, env, folder, flights, seed=0)
-    if playback.in_notebook():
-        playback.show_pictures(pictures)
-    return pictures
-
-
-def final_return(run: str | Path | TrainedRun) -> float:
-    """Mean return of a run's newest policy over 100 episodes; kept in `final.json` until there is a newer policy."""
-    path = path_of(run)
-    file = path / "final.json"
-    known: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {}
-    if known.get("step") not in checkpoint.list_steps(path / "checkpoints")[-1:]:
-        policy = load(path)
-        say(f"Evaluating {path}: {FINAL_EPISODES} episodes.")
-        scores = evaluate(policy, episodes=FINAL_EPISODES, seed=0)
-        known = {"step": policy.step, "seed": 0, **scores.to_json()}
-        temporary = file.with_suffix(".tmp")
-        temporary.write_text(json.dumps(known) + "\n")
-        temporary.replace(file)
-    return known["mean_return"]
-
-
-def _final_returns(runs: list[Path]) -> dict[Path, float]:
-    """The final returns of the finished runs; a line names each run that cannot be evaluated here."""
-    returns: dict[Path, float] = {}
-    for run in filter(is_finished, runs):
-        try:
-            returns[run] = final_return(run)
-        except UserError as error:
-            say(f"{run} has no final return: {error}")
-    return returns
-
-
-def _members(path: Path) -> list[Path]:
-    """A run itself, or those of a sweep that have something to show."""
-    if not is_sweep(path):
-        read_config(path)
-    runs = [run for run in (read_sweep(path).runs if is_sweep(path) else [path]) if read_metrics(run)]
-    if not runs:
-        raise UserError(f"{path} has no metrics to plot yet.")
-    return runs
-
-
-def _scene_env(policy: TrainedPolicy) -> VecEnv | None:
-    """Environments to draw flights in, where the backend has a scene for them."""
-    config = policy.config
-    if not hasattr(registry.backend_class(config.backend or registry.backend_for(config.env)), "scene"):
-        return None
-    env = evaluation_env(config, config.evaluate_episodes)
-    return env if env.scene else None
 
 
 def _fitting_env(policy: TrainedPolicy, episodes: int, **elsewhere: Any) -> VecEnv:

@@ -17,7 +17,7 @@ from types import FrameType
 
 from filelock import FileLock, Timeout
 
-from lemniscate import api, named, results
+from lemniscate import api, named, plots, results
 from lemniscate.algos import ALGORITHMS, name_of
 from lemniscate.console import say
 from lemniscate.envs import registry
@@ -138,7 +138,7 @@ def _train(runs: Sweep, options: list[str], progress: bool) -> TrainedSweep:
     except Timeout:
         raise UserError(f"{runs.path} is being trained by another process.") from None
     if any(map(is_finished, runs.runs)):
-        for picture in results.plot(runs.path):
+        for picture in plots.plot(runs.path):
             say(picture)
     if failed:
         sentences = "".join(f"\n{name}: {sentence}" for name, sentence in failed.items())
@@ -208,7 +208,7 @@ class _Processes:
                 continue
             del self._running[run]
             if code == 0:
-                sentence = f"done, final return {results.final_return(run):.1f}"
+                sentence = f"done, final return {plots.final_return(run):.1f}"
             elif self._stop_signal:
                 sentence = f"stopped at step {step:,}"
             else:

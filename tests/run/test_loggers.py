@@ -7,7 +7,7 @@ import pytest
 
 from lemniscate.envs.episodes import Episodes
 from lemniscate.report.curves import episode_returns
-from lemniscate.run.loggers import JsonLines, read_metrics
+from lemniscate.run.loggers import JsonLines, TensorBoard, read_metrics
 from lemniscate.run.wandb_logger import WeightsAndBiases
 
 
@@ -166,3 +166,35 @@ def test_seconds_spent_collecting_and_learning_are_logged(tmp_path, monkeypatch)
         assert 0 < line["time/learn"] < 0.2
         seconds = 32 / line["time/steps_per_second"]
         assert line["time/collect"] + line["time/learn"] <= seconds
+
+
+def points(folder):
+    """(TensorBoard's name of each run, the steps and values of `x` in it)."""
+    from tensorboard.backend.event_processing.event_multiplexer import EventMultiplexer
+
+    runs = EventMultiplexer().AddRunsFromDirectory(str(folder)).Reload()
+    return {name: [(e.step, e.value) for e in runs.Scalars(name, "x")] for name in runs.Runs()}
+
+
+def write_events(path, step, steps, value):
+    board = TensorBoard(path, {"gamma": 0.9}, step)
+    for at in steps:
+        board.write(at, {"x": value})
+    board.close([])
+
+
+def test_tensorboard_names_each_run_after_its_directory(tmp_path):
+    write_events(tmp_path / "runs" / "first", 0, [10], 1.0)
+    write_events(tmp_path / "runs" / "sweep" / "ppo-1", 0, [10], 2.0)
+    assert points(tmp_path / "runs") == {"first": [(10, 1.0)], "sweep/ppo-1": [(10, 2.0)]}
+
+
+def test_tensorboard_forgets_what_was_logged_after_the_checkpoint(tmp_path):
+    write_events(tmp_path / "runs" / "r", 0, [10, 20, 30], 1.0)
+    write_events(tmp_path / "runs" / "r", 20, [30, 40], 2.0)
+    assert points(tmp_path / "runs") == {"r": [(10, 1.0), (20, 1.0), (30, 2.0), (40, 2.0)]}
+
+
+def test_a_run_with_nothing_left_to_do_adds_no_event_file(tmp_path):
+    write_events(tmp_path, 20, [], 1.0)
+    assert list(tmp_path.iterdir()) == []

@@ -24,7 +24,7 @@ COMMANDS = {
     "resume": "Continue an interrupted run or sweep.",
     "evaluate": "Play whole episodes with the newest policy of a run.",
     "watch": "Show one episode in a window, or record it.",
-    "plot": "Draw the curves of a run, or compare several, grouped by all but the seed.",
+    "plot": "Draw the curves of a run and its report.html, or compare several, grouped by all but the seed.",
     "envs": "List the environments, their backends, and the preset that fits.",
     "check": "Check that an environment is suitable for training.",
     "completion": "Print the script with which a shell completes; its first line says where to write it.",
@@ -146,6 +146,9 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
     sub.add_argument("--env-args", metavar="JSON", help="arguments of the environment [as in training]")
 
     subs["plot"].add_argument("runs", type=Path, nargs="+", metavar="RUN", help="runs or sweeps")
+    subs["plot"].add_argument(
+        "--by", default="step", metavar="AXIS", help="learning curve by step, episode or minute [step]"
+    )
 
     subs["envs"].add_argument("filter", nargs="?", default="", metavar="FILTER", help="a part of the id")
 

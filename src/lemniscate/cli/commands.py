@@ -6,7 +6,7 @@ from shutil import get_terminal_size
 from textwrap import fill
 from typing import Any
 
-from lemniscate import api, results, sweep
+from lemniscate import api, plots, results, sweep
 from lemniscate.algos import ALGORITHMS
 from lemniscate.cli.completion import script
 from lemniscate.cli.fields import read, read_json
@@ -41,7 +41,7 @@ def train(given: argparse.Namespace) -> None:
     say(f"{what}: preset {preset}, seed {config.seed}, {'compiled' if is_compiled(config) else 'not compiled'}")
     run = api.train(given.algorithm, config.env, **shared, **_callbacks(given))
     if given.score:
-        results.final_return(run.path)
+        plots.final_return(run.path)
     say(f"Trained in {run.seconds:.1f} s. Everything is in {run.path}")
 
 
@@ -53,7 +53,7 @@ def resume(given: argparse.Namespace) -> None:
         run = api.resume(given.run, track=given.track, report=given.report, **_callbacks(given))
         path = run.path if run.seconds else None
         if given.score:
-            results.final_return(run.path)
+            plots.final_return(run.path)
     if path:  # a finished run has had its sentence
         say(f"Done. Everything is in {path}")
 
@@ -86,7 +86,7 @@ def watch(given: argparse.Namespace) -> None:
 
 def plot(given: argparse.Namespace) -> None:
     """Draw the curves of one run, or compare several, grouped by all but the seed."""
-    for file in results.plot(*given.runs):
+    for file in plots.plot(*given.runs, by=given.by):
         say(file)
 
 

@@ -10,44 +10,63 @@ import numpy as np
 
 from lemniscate.console import say
 from lemniscate.envs.registry import file_name
+from lemniscate.report import comparison_page
 from lemniscate.report.comparison_plot import draw
-from lemniscate.report.curves import COLORS, plot_runs, training_minutes
+from lemniscate.report.curves import plot_runs, training_minutes
 from lemniscate.report.groups import Group, Scores
+from lemniscate.report.html import Html
 from lemniscate.report.seeds import bootstrap_interval, iqm
+from lemniscate.report.style import COLORS
 from lemniscate.run.directory import is_finished, read_config
 
 ONE_SEED = "One seed says nothing about which is better: train more with --seeds 1-5."
 UNFINISHED = "Nothing is ranked before two seeds of each are finished: continue with lemniscate resume."
 
 
-def report(groups: list[Group], scores: Scores, folder: Path) -> list[Path]:
-    """A table on standard error and pictures in `folder`, for each environment; returns the pictures."""
-    pictures: list[Path] = []
+def report(groups: list[Group], scores: Scores, folder: Path, by: str = "step") -> list[Path]:
+    """A table on standard error, pictures in `folder`, and a page with all of it; returns the files.
+
+    Args:
+        groups: in any environments; each has its own table and pictures.
+        scores: final returns of the finished runs.
+        folder: of the files.
+        by: "step", "episode" or "minute", the horizontal axis of the learning curves.
+    """
+    files: list[Path] = []
+    parts: list[Html] = []
+    page = folder / "report.html"
     envs = list(dict.fromkeys(one.env for one in groups))
     for env in envs:
         same = [one for one in groups if one.env == env]
         for line in [f"{env}:", *table(same, scores), *remarks(same, scores)]:
             say(line)
         ending = ".png" if len(envs) == 1 else f"-{file_name(env)}.png"
-        pictures.append(draw(same, scores, folder / f"comparison{ending}", _why_unranked(same, scores)))
+        pictures = [draw(same, scores, folder / f"comparison{ending}", _why_unranked(same, scores))]
         runs = [run for one in same for run in one.runs]
         apart = len(same) == 1 and len(runs) <= len(COLORS)
         labels = [run.name if apart else one.label for one in same for run in one.runs]
-        pictures += plot_runs(runs, folder, labels, ending)
-    return pictures
+        pictures += plot_runs(runs, folder, labels, ending, by)
+        parts.append(comparison_page.part(page, same, scores, rows(same, scores), remarks(same, scores), pictures))
+        files += pictures
+    return [*files, comparison_page.write(page, envs, parts)]
 
 
 def table(groups: list[Group], scores: Scores) -> list[str]:
-    """The lines of the table: a heading, and one for each group."""
-    highest = max((abs(score) for one in groups for score in one.finals(scores)), default=0)
-    digits = 0 if highest >= 1000 else 1 if highest >= 100 else 2
-    rows = [["", "seeds", "final return", "IQM [95 %]", "worst seed", "minutes"]]
-    rows += [[one.label, *_cells(one, scores, digits)] for one in groups]
-    first, *others = (max(map(len, column)) for column in zip(*rows, strict=True))
+    """The lines of the table, in columns: a heading, and one for each group."""
+    cells = rows(groups, scores)
+    first, *others = (max(map(len, column)) for column in zip(*cells, strict=True))
     return [
         "  ".join([row[0].ljust(first), *(cell.rjust(width) for cell, width in zip(row[1:], others, strict=True))])
-        for row in rows
+        for row in cells
     ]
+
+
+def rows(groups: list[Group], scores: Scores) -> list[list[str]]:
+    """The cells of the table: a heading, and a row for each group."""
+    highest = max((abs(score) for one in groups for score in one.finals(scores)), default=0)
+    digits = 0 if highest >= 1000 else 1 if highest >= 100 else 2
+    heading = ["", "seeds", "final return", "IQM [95 %]", "worst seed", "minutes"]
+    return [heading, *([one.label, *_cells(one, scores, digits)] for one in groups)]
 
 
 def _cells(one: Group, scores: Scores, digits: int) -> list[str]:

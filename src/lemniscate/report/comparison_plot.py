@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.axis import YAxis
 from matplotlib.figure import Figure
 
-from lemniscate.report.curves import COLORS, episode_returns, finish, legend_above, save, smooth, training_minutes
+from lemniscate.report.curves import episode_returns, smooth, training_minutes
 from lemniscate.report.groups import Group, Scores
 from lemniscate.report.seeds import (
     bootstrap_interval,
@@ -19,6 +19,7 @@ from lemniscate.report.seeds import (
     mean_interval,
     probability_of_improvement,
 )
+from lemniscate.report.style import COLORS, finish, legend_above, save
 from lemniscate.run.directory import is_finished
 
 POINTS = 200

@@ -1,85 +1,97 @@
 """Learning curves, of one run or of several side by side."""
 
-import math
-import textwrap
-from collections.abc import Iterator, Sequence
-from itertools import zip_longest
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter
 
+from lemniscate.errors import unknown_name
+from lemniscate.report.diagnostics import diagnostics, draw_metric
+from lemniscate.report.style import COLORS, finish, legend_above, run_styles, save
 from lemniscate.run.directory import read_config
 from lemniscate.run.loggers import read_metrics
 from lemniscate.run.q_bias import QBias
 
-DIAGNOSTICS = (
-    "losses/value",
-    "explained_variance",
-    "approx_kl",
-    "kl",
-    "step_fraction",
-    "clip_fraction",
-    "losses/critic",
-    "losses/actor",
-    "q",
-    "losses/entropy",
-    "temperature",
-    "gradient_norm",
-    "gradient_norm/critic",
-    "gradient_norm/actor",
-)
-"""the metrics of an update that are drawn, where an algorithm has them"""
+BY = {"step": "environment steps", "episode": "episode", "minute": "minutes of training"}
+"""what a learning curve can be drawn against, and the label of that axis"""
+
+WINDOW = 20
+"""the fewest episodes of a moving average"""
 
 POINTS = 3000
 """the most episodes of a run that are drawn, evenly chosen"""
 
-COLORS = mpl.colormaps["tab10"].colors  # pyright: ignore[reportAttributeAccessIssue]
+
+def plot_runs(
+    runs: list[Path], folder: Path, labels: Sequence[str] | None = None, ending: str = ".png", by: str = "step"
+) -> list[Path]:
+    """Draw the curves of runs into a folder; runs of one label (by default their name) have one colour."""
+    name = "learning_curve" if by == "step" else f"learning_curve_by_{by}"
+    return [
+        learning_curve(runs, folder / f"{name}{ending}", labels, by),
+        diagnostics(runs, folder / f"diagnostics{ending}", labels),
+    ]
 
 
-def learning_curve(runs: list[Path], file: Path, labels: Sequence[str] | None = None) -> Path:
-    """Return of each whole training episode against steps, and the mean of the last 20, or of 2 % if that is more."""
+def learning_curve(runs: list[Path], file: Path, labels: Sequence[str] | None = None, by: str = "step") -> Path:
+    """Return of each whole training episode, and the mean of the last ones: of 20, or of 2 % if that is more.
+
+    By episode the mean is that of the last 20 always. The line is interrupted where no episode ended for long.
+
+    Args:
+        runs: one, or several in different colours.
+        file: of the picture.
+        labels: of the runs; by default their names.
+        by: "step", "episode" or "minute", the horizontal axis.
+    """
     figure = Figure(figsize=(7, 4), layout="constrained")
     axes = figure.subplots()
-    for run, color, label in _styles(runs, labels):
-        steps, returns = episode_returns(run)
-        if len(steps):
-            some = np.linspace(0, len(steps) - 1, min(len(steps), POINTS)).astype(int)
-            axes.plot(steps[some], returns[some], ".", color=color, alpha=0.25, markersize=3)
-            axes.plot(steps[some], smooth(returns)[some], color=color, linewidth=1.5, label=label)
-    if not axes.has_data():
-        axes.text(0.5, 0.5, "no whole training episode yet", transform=axes.transAxes, ha="center", color="grey")
-    axes.set(xlabel="environment steps", ylabel="return of an episode")
+    several = len(runs) > 1
+    drawn = [_draw_episodes(axes, run, by, color, label * several) for run, color, label in run_styles(runs, labels)]
+    windows = sorted(filter(None, drawn))
+    axes.set(xlabel=BY[by], ylabel="return of an episode")
     axes.set_title(_title(runs), loc="left")
+    axes.set_xlim(left=0)
     finish(axes)
-    if len(runs) > 1:
+    if windows:
+        few, many, color = windows[0], windows[-1], "grey" if several else COLORS[0]
+        last = f"{few:,}" if few == many else f"{few:,} to {many:,}"
+        axes.plot([], [], ".", color=color, label="an episode")
+        axes.plot([], [], color=color, linewidth=1.5, label=f"mean of the last {last}")
         legend_above(figure)
+    else:
+        axes.text(0.5, 0.5, "no whole training episode yet", transform=axes.transAxes, ha="center", color="grey")
     return save(figure, file)
 
 
-def diagnostics(runs: list[Path], file: Path, labels: Sequence[str] | None = None) -> Path:
-    """Metrics of the updates: losses, KL, entropy, Q, gradient norms; three panels in a row."""
-    logs = {run: read_metrics(run) for run in runs}
-    logged = {name for lines in logs.values() for line in lines for name in line}
-    names = [name for name in DIAGNOSTICS if name in logged]
-    height = max(1, math.ceil(len(names) / 3))
-    figure = Figure(figsize=(10, 2.75 * height), layout="constrained")
-    panels = figure.subplots(height, 3, squeeze=False).flat
-    for axes, name in zip_longest(panels, names):
-        if name is None:
-            axes.set_visible(False)
-            continue
-        for run, color, label in _styles(runs, labels):
-            _curve(axes, logs[run], name, color, label, width=1.5 if len(runs) <= 5 else 0.7)
-        axes.set_title(name, loc="left", fontsize=10)
-        finish(axes)
-    if len(runs) > 1:
-        legend_above(figure)
-    return save(figure, file)
+def require_by(by: str) -> None:
+    """Raise `UserError` for an axis that a learning curve does not have."""
+    if by not in BY:
+        raise unknown_name("axis", by, BY)
+
+
+def _draw_episodes(axes: Axes, run: Path, by: str, color: object, label: str) -> int:
+    """The episodes of a run as dots, their moving average as a line; returns over how many, 0 if there is none yet."""
+    steps, returns = episode_returns(run)
+    if not len(steps):
+        return 0
+    window = WINDOW if by == "episode" else window_of(returns)
+    some = np.linspace(0, len(steps) - 1, min(len(steps), POINTS)).astype(int)
+    x, averages = _positions(run, steps, by)[some], moving_average(returns, window)[some]
+    axes.plot(x, returns[some], ".", color=color, alpha=0.25 if len(x) > 300 else 0.5, markersize=3)
+    interrupted = gaps(steps) & (by != "episode")
+    cuts = np.flatnonzero(np.diff(np.cumsum([False, *interrupted])[some])) + 1
+    axes.plot(np.insert(x, cuts, np.nan), np.insert(averages, cuts, np.nan), color=color, linewidth=1.5, label=label)
+    return window
+
+
+def _positions(run: Path, steps: np.ndarray, by: str) -> np.ndarray:
+    """Where the episodes that ended at `steps` lie on the horizontal axis."""
+    if by == "episode":
+        return np.arange(1.0, len(steps) + 1)
+    return np.interp(steps, *training_minutes(run)) if by == "minute" else steps
 
 
 def draw_q_bias(q_bias: QBias, run: Path, file: Path) -> Path:
@@ -96,9 +108,9 @@ def draw_q_bias(q_bias: QBias, run: Path, file: Path) -> Path:
     axes.set(xlabel="discounted return that followed", ylabel="Q(s₀, a₀)")
     axes.set_title(str(q_bias).partition(": ")[2], loc="left", fontsize=10)
     for history in beside:
-        _curve(history, log, "evaluation/q", COLORS[0], "Q(s₀, a₀)", width=1.5)
-        _curve(history, log, "evaluation/q_realised", "grey", "discounted return", width=1.5)
-        history.set_xlabel("environment steps")
+        draw_metric(history, log, "evaluation/q", COLORS[0], "Q(s₀, a₀)", width=1.5)
+        draw_metric(history, log, "evaluation/q_realised", "grey", "discounted return", width=1.5)
+        history.set(xlabel="environment steps", ylabel="discounted return")
         history.set_title("at the evaluations of the run", loc="left", fontsize=10)
     for panel in (axes, *beside):
         finish(panel)
@@ -134,36 +146,26 @@ def training_minutes(run: Path) -> tuple[np.ndarray, np.ndarray]:
     return np.array(steps), np.array(seconds) / 60
 
 
-def plot_runs(runs: list[Path], folder: Path, labels: Sequence[str] | None = None, ending: str = ".png") -> list[Path]:
-    """Draw the curves of runs into a folder; runs of one label (by default their name) have one colour."""
-    return [
-        learning_curve(runs, folder / f"learning_curve{ending}", labels),
-        diagnostics(runs, folder / f"diagnostics{ending}", labels),
-    ]
+def gaps(steps: np.ndarray) -> np.ndarray:
+    """Whether no episode ended for long between each two that ended at `steps` [episodes]: [episodes − 1].
+
+    Long is more than three times the usual (median) time between two, and more than a twentieth of all steps.
+    """
+    pauses = np.diff(steps)
+    return pauses > max(3 * np.median(pauses), steps[-1] / 20) if len(pauses) else np.zeros(0, dtype=bool)
+
+
+def window_of(returns: np.ndarray) -> int:
+    """The number of episodes of a moving average of `returns`: 20, or 2 % of all if that is more."""
+    return max(WINDOW, len(returns) // 50)
 
 
 def smooth(returns: np.ndarray) -> np.ndarray:
-    """The mean of the last 20 episodes at each of them, or of the last 2 % of all if that is more."""
-    return _moving_average(returns, max(20, len(returns) // 50))
+    """The mean of the last episodes at each of them, as many as `window_of` says."""
+    return moving_average(returns, window_of(returns))
 
 
-def _styles(runs: list[Path], labels: Sequence[str] | None) -> Iterator[tuple[Path, object, str]]:
-    """(run, colour, label) of each; one colour for one label."""
-    names = list(labels or (run.name for run in runs))
-    different = list(dict.fromkeys(names))
-    for run, name in zip(runs, names, strict=True):
-        yield run, COLORS[different.index(name) % 10], name
-
-
-def _curve(axes: Axes, log: list[dict[str, Any]], name: str, color: object, label: str, width: float) -> None:
-    rows = [(line["step"], line[name]) for line in log if name in line]
-    if not rows:
-        return
-    steps, values = np.array(rows).T
-    axes.plot(steps, values, color=color, linewidth=width, label=label)
-
-
-def _moving_average(values: np.ndarray, window: int) -> np.ndarray:
+def moving_average(values: np.ndarray, window: int) -> np.ndarray:
     """The mean of the last `window` values at each place, of fewer at the beginning."""
     total = np.cumsum(np.insert(values, 0, 0.0))
     start = np.maximum(0, np.arange(1, len(values) + 1) - window)
@@ -173,29 +175,3 @@ def _moving_average(values: np.ndarray, window: int) -> np.ndarray:
 def _title(runs: list[Path]) -> str:
     algorithm, config = read_config(runs[0])
     return f"{algorithm.upper() if len(runs) == 1 else f'{len(runs)} runs'} on {config['env']}"
-
-
-def finish(axes: Axes) -> None:
-    """Remove two spines, draw a grid, and write 100k for a hundred thousand steps."""
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.grid(alpha=0.3)
-    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-
-
-def legend_above(figure: Figure) -> None:
-    """One legend for all panels, each label once, in as many columns as fit."""
-    letters = int(13 * figure.get_figwidth())
-    once: dict[str, Any] = {}
-    for axes in figure.axes:
-        for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
-            once.setdefault(textwrap.fill(label, letters), handle)
-    columns = max(1, letters // (8 + max(map(len, once), default=0)))
-    if once:
-        figure.legend(once.values(), once.keys(), loc="outside upper left", frameon=False, fontsize=9, ncols=columns)
-
-
-def save(figure: Figure, file: Path) -> Path:
-    """Write a picture."""
-    file.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(file, dpi=150)
-    return file

@@ -7,7 +7,7 @@ from lemniscate.console import say
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.nn.actor_critic import ActorQ
 from lemniscate.nn.policies import Policy
-from lemniscate.report import curves, flight
+from lemniscate.report import curves, flight, run_page
 from lemniscate.report.playback import show_flights
 from lemniscate.run.evaluate import Evaluation, evaluate
 
@@ -18,21 +18,16 @@ def sentence(scores: Evaluation) -> str:
         f"{scores.mean_return:.1f} ± {scores.std_return:.1f} return over {scores.episodes} episodes of {scores.env_id}"
     )
     if scores.measures:
-        words = [_in_words(name, value) for name, value in scores.measures.items() if math.isfinite(value)]
+        finite = {name: value for name, value in scores.measures.items() if math.isfinite(value)}
+        words = [f"{run_page.words(name)} {run_page.number(name, value)}" for name, value in finite.items()]
         said += f", {scores.terminated} of them terminated; {', '.join(words)}"
     return f"{said}.\n{scores.q_bias}." if scores.q_bias else f"{said}."
-
-
-def _in_words(name: str, value: float) -> str:
-    """A measure in words; the ending of a name in millimetres is its unit."""
-    words = name.removesuffix("_mm").replace("_", " ")
-    return f"{words} {value:.4g} mm" if name.endswith("_mm") else f"{words} {value:.4g}"
 
 
 def report(
     policy: Policy, env: VecEnv, path: Path, episodes: int, critic: tuple[ActorQ, float] | None = None
 ) -> list[Path]:
-    """Evaluate from unseen starts, draw everything there is to draw; says what it did, returns the pictures."""
+    """Evaluate from unseen starts, draw everything there is to draw, and write the run's page; returns the pictures."""
     scores = evaluate(policy, env, episodes, seed=0, critic=critic)
     say(sentence(scores))
     pictures = curves.plot_runs([path], path / "plots")
@@ -46,6 +41,7 @@ def report(
         film = path / "videos" / "flight.gif"
         show_flights(policy, env, 1, seed=0, video=film, tell=lambda text: None)
         say(film)
+    say(run_page.write(path, pictures, {"seed": 0, **scores.to_json()}))
     return pictures
 
 

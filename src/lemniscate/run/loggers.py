@@ -3,6 +3,7 @@
 import json
 import math
 from collections.abc import Callable, Mapping
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -56,14 +57,24 @@ class JsonLines:
 
 
 class TensorBoard:
-    """Event files in `tensorboard/`, with the config as a table under Text."""
+    """Event files in the run directory, with the config as a table under Text.
+
+    TensorBoard names a run after the directory that its events lie in: under `--logdir runs` by the run's own name. The
+    file begins with the first line, so that a run with nothing left to do adds none; that of a resumed run tells
+    TensorBoard to forget what was logged after the checkpoint.
+    """
 
     def __init__(self, path: Path, config: Mapping[str, Any], step: int) -> None:
+        self._path, self._config, self._step = path, config, step
+
+    @cached_property
+    def _writer(self) -> Any:
         from torch.utils.tensorboard import SummaryWriter
 
-        self._writer = SummaryWriter(str(path / "tensorboard"), purge_step=step + 1 if step else None)
-        rows = "\n".join(f"|{name}|{value}|" for name, value in config.items())
-        self._writer.add_text("config", f"|field|value|\n|-|-|\n{rows}")
+        writer = SummaryWriter(str(self._path), purge_step=self._step + 1 if self._step else None)
+        rows = "\n".join(f"|{name}|{value}|" for name, value in self._config.items())
+        writer.add_text("config", f"|field|value|\n|-|-|\n{rows}")
+        return writer
 
     def write(self, step: int, metrics: Metrics, episodes: Episodes = NO_EPISODES) -> None:
         """Add a scalar for each metric."""
@@ -72,7 +83,8 @@ class TensorBoard:
 
     def close(self, pictures: list[Path]) -> None:
         """Flush and close."""
-        self._writer.close()
+        if "_writer" in vars(self):
+            self._writer.close()
 
 
 TRACKERS = {"wandb": ("wandb", "lemniscate.run.wandb_logger:WeightsAndBiases")}

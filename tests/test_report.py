@@ -1,0 +1,372 @@
+"""Pictures and pages of runs: axes, gaps, titles, report.html, and the rules of what to try next."""
+
+import json
+import re
+import shlex
+import shutil
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+import lemniscate as lem
+from lemniscate.cli import parse
+from lemniscate.report import advice, commands, curves, diagnostics, html, playback, run_page, style
+from lemniscate.report.advice import Evidence
+from test_compare import write_run, write_runs
+
+PAGE = (Path(__file__).parents[1] / "docs" / "glossary.md").read_text()
+SCORES = {
+    "env_id": "CartPole-v1",
+    "episodes": 4,
+    "mean_return": 20.0,
+    "std_return": 11.2,
+    "returns": [5.0, 15.0, 25.0, 35.0],
+    "lengths": [5, 15, 25, 35],
+    "terminated": 3,
+    "tracking_error": 0.25,
+    "rmse_mm": 7.5,
+    "seed": 0,
+}
+
+
+@pytest.fixture(autouse=True)
+def _here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def drawn(monkeypatch, module, draw):
+    """The figure that a function saves."""
+    figures = []
+    monkeypatch.setattr(module, "save", lambda figure, file: figures.append(figure) or style.save(figure, file))
+    draw()
+    return figures[0]
+
+
+def curve(monkeypatch, run, by="step"):
+    """(axes, x and y of the moving average) of a run's learning curve."""
+    figure = drawn(monkeypatch, curves, lambda: curves.learning_curve([run], Path("x.png"), by=by))
+    (axes,) = figure.axes
+    _, line, *_ = axes.lines
+    return axes, *np.asarray(line.get_xydata()).T
+
+
+def with_lines(run, lines):
+    (run / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    return run
+
+
+def without_policy(run):
+    shutil.rmtree(run / "checkpoints")
+    return run
+
+
+def test_dots_and_line_of_a_learning_curve_are_in_its_legend(tmp_path, monkeypatch):
+    axes, *_ = curve(monkeypatch, write_run(tmp_path / "r"))
+    assert [text.get_text() for text in axes.figure.legends[0].texts] == ["an episode", "mean of the last 20"]
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("environment steps", "return of an episode")
+    assert axes.xaxis.get_major_formatter()(100_000) == "100,000"
+
+
+def test_a_curve_is_interrupted_where_no_episode_ended_for_long(tmp_path, monkeypatch):
+    ended = [*range(100, 1_000, 100), *range(6_000, 7_000, 100)]
+    lines = [{"step": step, "episode/returns": [float(step)]} for step in ended]
+    run = with_lines(write_run(tmp_path / "r"), lines)
+    _, x, y = curve(monkeypatch, run)
+    assert x[np.flatnonzero(np.isnan(y)) + 1].tolist() == [6_000]
+    _, x, y = curve(monkeypatch, run, by="episode")
+    assert not np.isnan(y).any()
+
+
+def test_slow_but_regular_episodes_leave_no_gap():
+    assert not curves.gaps(np.array([1000.0, 2000, 3000, 4500, 5000])).any()
+    assert curves.gaps(np.array([1000.0])).tolist() == []
+
+
+def test_by_episode_the_curve_is_the_moving_average_of_20(tmp_path, monkeypatch):
+    returns = [float(i % 7) for i in range(1_500)]
+    run = with_lines(write_run(tmp_path / "r"), [{"step": 10_000, "episode/returns": returns}])
+    axes, x, y = curve(monkeypatch, run, by="episode")
+    assert axes.get_xlabel() == "episode"
+    assert x[-1] == 1_500
+    assert y[-1] == pytest.approx(np.mean(returns[-20:]))
+    _, _, y = curve(monkeypatch, run)
+    assert y[-1] == pytest.approx(np.mean(returns[-30:]))
+
+
+def test_by_minute_the_curve_ends_with_the_training(tmp_path, monkeypatch):
+    _, x, _ = curve(monkeypatch, write_run(tmp_path / "r", rate=50.0), by="minute")
+    assert x[-1] == pytest.approx(10_000 / 50 / 60)
+
+
+def test_another_axis_is_refused(tmp_path):
+    with pytest.raises(lem.UserError, match="There is no axis 'episodes': did you mean episode"):
+        lem.plot(write_run(tmp_path / "r"), by="episodes")
+
+
+def test_one_spike_does_not_flatten_a_panel():
+    values = np.array([*np.linspace(1, 2, 50), 1e6])
+    assert style.robust_range(values) == (1.0, 2.0)
+    assert style.robust_range(np.array([3.0, 3.0, 3.0, 9.0])) == (3.0, 9.0)
+    axes = Figure().subplots()
+    axes.plot(np.arange(51), values)
+    style.limit_axis(axes)
+    assert axes.get_ylim()[1] < 2.1
+    assert axes.lines[-1].get_xydata().tolist() == [[50, 1]]  # the triangle at the upper edge
+    assert axes.get_title("right") == "▲ to 1e+06"
+
+
+def test_diagnostics_have_plain_titles_and_the_units_of_the_glossary(tmp_path, monkeypatch):
+    lines = [
+        {"step": s, "approx_kl": 0.01, "old_approx_kl": 0.01, "losses/mine": 1.0, "time/x": 1.0} for s in (1, 2, 3)
+    ]
+    run = with_lines(write_run(tmp_path / "r"), lines)
+    figure = drawn(monkeypatch, diagnostics, lambda: diagnostics.diagnostics([run], Path("x.png")))
+    shown = [axes for axes in figure.axes if axes.get_visible()]
+    assert [axes.get_title("left") for axes in shown] == ["Approximate KL divergence", "losses/mine"]
+    assert [axes.get_ylabel() for axes in shown] == ["nats", ""]
+    assert {axes.get_xlabel() for axes in shown} == {"environment steps"}
+
+
+def test_every_metric_with_a_title_is_in_the_glossary():
+    for name in diagnostics.TITLES:
+        word = name.replace("gradient_norm", "") if "/" in name and name.startswith("gradient") else name
+        assert f"{word}`" in PAGE, name
+
+
+class Page(HTMLParser):
+    """The elements of a page, in balance, and its text."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.seen, self.text = [], [], ""
+        self.feed(text)
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        self.seen.append((tag, dict(attrs)))
+        self.open += [tag] if tag not in html.WITHOUT_END else []
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text += data
+
+
+def page_of(run, scores=SCORES, pictures=()):
+    return run_page.write(run, pictures, scores).read_text()
+
+
+def test_the_page_of_a_run_is_one_file(tmp_path):
+    run = write_run(tmp_path / "r", gamma=0.9)
+    text = page_of(run, pictures=curves.plot_runs([run], run / "plots"))
+    page = Page(text)
+    assert text.startswith("<!DOCTYPE html>")
+    sources = [attrs["src"] for tag, attrs in page.seen if "src" in attrs]
+    assert len(sources) == 2
+    assert all(source.startswith("data:image/png;base64,") for source in sources)
+    assert not {"script", "link", "iframe"} & {tag for tag, _ in page.seen}
+    assert "prefers-color-scheme: dark" in text
+    assert "20.0 ± 11.2" in page.text
+    assert "7.5 mm" in page.text
+    assert "3 of 4" in page.text
+    assert advice.ONE_SEED in page.text
+
+
+def test_what_differs_from_the_defaults_is_marked(tmp_path):
+    text = page_of(write_run(tmp_path / "r", gamma=0.9, hidden=(8, 16)))
+    marked = re.findall(r"<td>(\w+)</td><td><mark>([^<]*)</mark></td><td>([^<]*)</td>", text)
+    assert ("gamma", "0.9", "0.99") in marked
+    assert ("hidden", "8 16", "64 64") in marked
+    assert "clip" not in {name for name, *_ in marked}
+
+
+def test_nothing_in_the_files_of_a_run_becomes_markup(tmp_path):
+    """Each text that a run's directory holds, and the directory's own name."""
+    evil = '"><script>alert(1)</script><img src=x onerror=alert(1)>&\ud800'
+    run = write_run(tmp_path / "<b>r")
+    record = json.loads((run / "config.json").read_text())
+    record["config"] = dict.fromkeys(record["config"], evil) | {
+        "total_steps": 10,
+        evil: evil,
+        "env_kwargs": {evil: evil},
+    }
+    (run / "config.json").write_text(json.dumps({"algorithm": evil, "config": record["config"]}))
+    text = page_of(run, {**SCORES, evil: 1.0})
+    page = Page(text)
+    assert {tag for tag, _ in page.seen} & {"script", "img", "b"} == set()
+    assert "alert(1)" in page.text
+
+
+def test_a_small_film_is_in_the_page_and_a_large_one_is_linked(tmp_path, monkeypatch):
+    run = write_run(tmp_path / "r")
+    (run / "videos").mkdir()
+    (run / "videos" / "step 1.mp4").write_bytes(b"film")
+    assert 'video src="data:video/mp4;base64,ZmlsbQ=="' in page_of(run)
+    monkeypatch.setattr(html, "MOST_BYTES", 3)
+    assert 'href="../videos/step%201.mp4"' in page_of(run)
+
+
+def test_a_run_without_anything_has_a_page(tmp_path):
+    run = with_lines(write_run(tmp_path / "r"), [])
+    assert "not been evaluated" in Page(page_of(run, None)).text
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "fields"),
+    [
+        ("ppo", {"hidden": (8, 16), "normalize_advantage": False, "target_kl": 0.05, "desired_kl": None}),
+        ("ppo", {"env_kwargs": {"gravity": 9.0, "x y": "a'b"}, "wrappers": ("m:f(x=1,y=2)",), "initial_log_std": -1.0}),
+        ("sac", {"target_entropy": -3.0, "critic_hidden": (), "env": "Pendulum-v1"}),
+    ],
+)
+def test_the_command_of_the_page_trains_the_same_run(tmp_path, algorithm, fields):
+    run = write_run(tmp_path / "r", algorithm, **{"env": "CartPole-v1", **fields}, seed=7)
+    record = json.loads((run / "config.json").read_text())
+    _, *words = shlex.split(commands.train(algorithm, record["config"]))
+    given = parse(words)
+    again = lem.config_for(given.algorithm, given.env, given.preset, **given.fields)
+    assert again.to_json() == record["config"]
+
+
+def test_the_page_of_a_comparison(tmp_path, monkeypatch):
+    runs = [*write_runs(tmp_path / "a", gamma=0.9), write_run(tmp_path / "b" / "x", gamma=0.8, score=1e6)]
+    page_of(runs[0])
+    *_, file = lem.plot(*runs)
+    assert file == Path("plots/report.html")
+    page = Page(file.read_text())
+    assert len([attrs for tag, attrs in page.seen if tag == "img"]) == 3
+    links = [attrs["href"] for tag, attrs in page.seen if tag == "a"]
+    assert [(file.parent / link).resolve() for link in links] == [runs[0] / "plots" / "report.html"]
+    assert "--seeds 1,2,3" in page.text
+    assert "gamma0.90.8" in page.text  # the row of what differs
+
+
+def test_plot_of_a_run_returns_its_page_last(tmp_path):
+    run = without_policy(write_run(tmp_path / "r"))
+    assert lem.plot(run)[-1] == run / "plots" / "report.html"
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_notebook_shows_the_pictures_of_every_plot(tmp_path, monkeypatch, count):
+    shown = []
+    monkeypatch.setattr("IPython.display.display", lambda image: shown.append(image.filename))
+    monkeypatch.setattr(playback, "in_notebook", lambda: True)
+    files = lem.plot(*map(without_policy, write_runs(tmp_path / "a")[:count]))
+    assert shown == [str(file) for file in files[:-1]]
+    assert len(shown) == 1 + count
+
+
+def evidence(lines=(), scores=None, **config):
+    return Evidence({"total_steps": 1_000, "learning_rate": 1.0, **config}, lines, scores or {})
+
+
+def logged(**metrics):
+    return [dict(zip(metrics, values, strict=True)) for values in zip(*metrics.values(), strict=True)]
+
+
+def returned(returns):
+    return [{"episode/returns": [float(x) for x in returns]}]
+
+
+NOISE = np.random.default_rng(0).normal(size=200)
+
+
+@pytest.mark.parametrize(
+    ("rule", "fires", "silent"),
+    [
+        (
+            advice.kl_above_target,
+            [
+                (evidence(logged(approx_kl=[0, 0.05]), desired_kl=0.01), "0.05, 5 times its target of 0.01"),
+                (evidence(logged(approx_kl=[0.031] * 9), epochs=3), "or take fewer --epochs"),
+            ],
+            [
+                evidence(logged(approx_kl=[0.019] * 9), desired_kl=0.01),
+                evidence(logged(approx_kl=[0.029] * 9)),
+                evidence(logged(approx_kl=[9, 9, 0.01, 0.01])),
+                evidence(),
+            ],
+        ),
+        (
+            advice.ratios_clipped,
+            [(evidence(logged(clip_fraction=[0.5])), "50% of the late")],
+            [evidence(logged(clip_fraction=[0.4])), evidence()],
+        ),
+        (
+            advice.value_explains_nothing,
+            [(evidence([*logged(explained_variance=[0.05]), *returned([1, 2, 3])]), "5% of the variance")],
+            [
+                evidence([*logged(explained_variance=[0.5]), *returned([1, 2, 3])]),
+                evidence([*logged(explained_variance=[0.0]), *returned([1, 500, 500, 500])]),
+                evidence(),
+            ],
+        ),
+        (
+            advice.exploration_collapsed,
+            [
+                (evidence(logged(policy_std=[1.0, 0.05] + [0.01] * 8), entropy_coef=0.0), "raise --entropy-coef"),
+                (evidence(logged(**{"losses/entropy": [1.0] + [0.01] * 9})), "entropy is 1% of what it was"),
+            ],
+            [
+                evidence(logged(policy_std=np.linspace(1, 0.01, 10))),
+                evidence(logged(**{"losses/entropy": [1.0] + [0.01] * 9}), initial_temperature=1.0),
+                evidence(),
+            ],
+        ),
+        (
+            advice.gradient_clipped,
+            [(evidence(logged(gradient_norm=[11.0]), max_grad_norm=0.5, value_coef=1.0), "1/22 of its norm")],
+            [evidence(logged(gradient_norm=[4.9]), max_grad_norm=0.5, value_coef=1.0), evidence()],
+        ),
+        (
+            advice.q_biased,
+            [
+                (evidence(scores={"q_bias": {"bias": 0.8}}), "over-estimates the return by 80%"),
+                (evidence(scores={"q_bias": {"bias": 0.8}}, target_noise=0.2), "lower --critic-learning-rate."),
+                (evidence(scores={"q_bias": {"bias": -0.8}}), "under-estimates the return by 80%"),
+            ],
+            [evidence(scores={"q_bias": {"bias": 0.4}}), evidence(scores={"q_bias": {}}), evidence()],
+        ),
+        (
+            advice.still_rising,
+            [(evidence(returned(np.arange(200) + NOISE)), "--total-steps 2_000")],
+            [
+                evidence(returned(np.minimum(np.arange(200), 100) + NOISE)),
+                evidence(returned(range(20))),
+                evidence(),
+            ],
+        ),
+        (
+            advice.fell_back,
+            [(evidence(returned([*range(100), *[20] * 40])), "Returns fell from 89.5 to 20")],
+            [evidence(returned(range(140))), evidence(returned([9, 1, 1])), evidence()],
+        ),
+        (advice.no_episode, [(evidence([{"step": 1}]), "No whole episode")], [evidence(returned([1])), evidence()]),
+    ],
+    ids=lambda value: getattr(value, "__name__", ""),
+)
+def test_each_rule_speaks_of_what_it_measures_and_is_silent_otherwise(rule, fires, silent):
+    for given, said in fires:
+        assert said in rule(given)
+    for given in silent:
+        assert rule(given) is None
+
+
+def test_every_rule_is_asked():
+    rules = {
+        value
+        for name, value in vars(advice).items()
+        if getattr(value, "__annotations__", {}).get("evidence") is Evidence
+    }
+    assert rules - {advice.sentences} == set(advice.RULES)
+    assert advice.sentences(evidence([{"step": 1, "clip_fraction": 0.5}])) != []
+
+
+def test_seeds_that_differ_are_pointed_at():
+    assert "from 100 to 200" in advice.seeds_differ([100.0, 200.0])
+    assert advice.seeds_differ([100.0, 101.0]) is None
+    assert advice.seeds_differ([100.0]) is None
