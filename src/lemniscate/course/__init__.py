@@ -11,13 +11,13 @@ differs, the result is compared with those of well-known mistakes, and the mista
 """
 
 import copy
-import sys
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from lemniscate.console import say
 from lemniscate.course.exercises import EXERCISES, Case, Exercise, Function
 from lemniscate.errors import unknown_name
 
@@ -36,6 +36,9 @@ class Finding:
     def __str__(self) -> str:
         return f"{'✓' if self.right else '✗'} {self.name}: {self.sentence}"
 
+    def _ipython_display_(self) -> None:
+        """Nothing: as the last value of a cell it has been printed already."""
+
 
 def check(function: Function, name: str | None = None) -> Finding:
     """Compare a function with the library's; prints the finding, and returns it.
@@ -51,7 +54,7 @@ def check(function: Function, name: str | None = None) -> Finding:
     if name not in EXERCISES:
         raise unknown_name("exercise", name, EXERCISES)
     finding = _find(name, EXERCISES[name], function)
-    print(finding, file=sys.stderr)
+    say(finding)
     return finding
 
 

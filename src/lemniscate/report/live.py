@@ -7,8 +7,8 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
+from lemniscate.console import in_notebook
 from lemniscate.report.curves import finish
-from lemniscate.report.playback import in_notebook
 
 
 class LiveCurve:
