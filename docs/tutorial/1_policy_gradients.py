@@ -110,7 +110,7 @@ course.check(clipped_surrogate)
 # %%
 ppo.gae, ppo.clipped_surrogate = gae, clipped_surrogate
 runs = [first] + [lem.train(name, env="CartPole-v1", seed=1, total_steps=STEPS) for name in ("a2c", "trpo", "ppo")]
-lem.plot(*[run.path for run in runs])
+pictures = lem.plot(*[run.path for run in runs])
 
 # %% [markdown]
 # One seed ranks nothing: which curve is higher here is chance as much as merit. `lemniscate train reinforce,a2c,trpo,ppo

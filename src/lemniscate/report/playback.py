@@ -12,7 +12,6 @@ import gymnasium as gym
 import numpy as np
 from PIL import Image
 
-from lemniscate.console import in_notebook
 from lemniscate.envs import registry
 from lemniscate.envs.vec_env import PATIENCE, VecEnv
 from lemniscate.errors import UserError, is_installed
@@ -102,6 +101,15 @@ def check_film(file: Path) -> None:
         raise UserError(f"{file} must end in .gif, .webp or .mp4.")
     if file.suffix == ".mp4" and not is_installed("imageio_ffmpeg"):
         raise UserError(f"{file} needs ffmpeg (pip install 'lemniscate[video]'); a .gif or .webp does not.")
+
+
+def in_notebook() -> bool:
+    """Whether this is a cell of a notebook, which can show pictures, and not a terminal."""
+    if "IPython" not in sys.modules:
+        return False
+    from IPython.core.getipython import get_ipython
+
+    return hasattr(get_ipython(), "kernel")
 
 
 def show_pictures(files: Iterable[Path]) -> None:

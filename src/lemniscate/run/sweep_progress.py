@@ -10,7 +10,7 @@ from lemniscate.console import CellText, drawn_bar, in_notebook, say
 
 
 class SweepProgress:
-    """Bars in a terminal, live lines in a notebook, else lines at each tenth of the sweep. The end of a run is a line."""
+    """Bars in a terminal, lines in a notebook, else one at each tenth of the sweep. The end of a run is a line."""
 
     def __init__(self, totals: Mapping[str, int], steps: Mapping[str, int], visible: bool = True) -> None:
         self._console = Console(stderr=True)
