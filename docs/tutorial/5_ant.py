@@ -154,21 +154,22 @@ for one, kl in zip(runs, ("approx_kl", "kl", "approx_kl"), strict=True):
     lines = [line for line in read_metrics(one.path) if "episode/return" in line]
     panels[0].plot([line["step"] for line in lines], [line["episode/return"] for line in lines])
     panels[1].plot([line["step"] for line in lines], [line[kl] for line in lines], label=one.path.name)
-    scores = lem.evaluate(one.policy, episodes=10, seed=0)
-    print(f"{one.path.name:22} {scores.mean_return:5.0f} ± {scores.std_return:.0f}, {scores.terminated} of 10 fell")
 panels[0].set(title="return of an episode", xlabel="environment steps")
 panels[1].set(title="KL of an update", xlabel="environment steps", yscale="log")
 panels[1].legend(frameon=False)
 
 # %% [markdown]
-# One seed ranks nothing. An ant that stands still is paid 1 for each step that it stays upright, so about 1,000 an
-# episode; walking begins above that.
+# One seed ranks nothing.
 #
-# ## Look
+# ## Evaluate, and look
 #
-# The policy in a plain loop of Gymnasium's, NumPy in, NumPy out; every other frame of the first ten seconds.
+# The policy acts by its mean, from starts that training never saw. An ant that stands still is paid 1 for each step on its
+# legs, about 1,000 an episode; walking begins above that. The film is a plain loop of Gymnasium's, NumPy in, NumPy out.
 
 # %%
+scores = lem.evaluate(run.policy, episodes=10, seed=0)
+print(f"{scores.mean_return:.0f} ± {scores.std_return:.0f}, {scores.terminated} of {scores.episodes} fell")
+
 ant = gym.make("Ant-v5", render_mode="rgb_array", width=240, height=180)
 obs, _ = ant.reset(seed=0)
 frames = []
