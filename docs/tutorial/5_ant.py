@@ -20,8 +20,8 @@ from lemniscate import course
 from lemniscate.algos import ppo
 from lemniscate.data.rollout import collect
 from lemniscate.maths import clip_fraction, kl_k3
+from lemniscate.notebook import show_film
 from lemniscate.report.live import LiveCurve
-from lemniscate.report.notebook import show_film
 from lemniscate.run.loggers import read_metrics
 
 STEPS = 150_000
@@ -84,6 +84,7 @@ for axes, A in zip(panels, (torch.tensor([1.0]), torch.tensor([-1.0])), strict=T
     axes.plot(ratio, [-clipped_surrogate(r.log()[None], A, 0.2) for r in ratio], label="L")
     axes.set(title=f"A = {A.item():+.0f}", xlabel="ratio r", ylabel="objective", xticks=[0.5, 0.8, 1, 1.2, 1.5])
     axes.legend(frameon=False)
+    axes.grid(alpha=0.3)
 
 cases = torch.tensor([[0.5, 1.0, 1.5], [0.5, 1.0, 1.5]], requires_grad=True)
 (-6 * clipped_surrogate(cases.log().flatten(), torch.tensor([1.0] * 3 + [-1.0] * 3), 0.2)).backward()
@@ -129,6 +130,8 @@ for clip, name in ((0.1, "ε = 0.1"), (0.2, "ε = 0.2"), (1e6, "not clipped")):
 panels[0].set(title="KL from π_old to π", xlabel="epoch", yscale="log")
 panels[1].set(title="share of ratios outside 1 ± 0.2", xlabel="epoch")
 panels[0].legend(frameon=False)
+for axes in panels:
+    axes.grid(alpha=0.3)
 
 # %% [markdown]
 # ## Train
@@ -157,6 +160,8 @@ for one, kl in zip(runs, ("approx_kl", "kl", "approx_kl"), strict=True):
 panels[0].set(title="return of an episode", xlabel="environment steps")
 panels[1].set(title="KL of an update", xlabel="environment steps", yscale="log")
 panels[1].legend(frameon=False)
+for axes in panels:
+    axes.grid(alpha=0.3)
 
 # %% [markdown]
 # One seed ranks nothing.

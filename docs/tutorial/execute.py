@@ -27,7 +27,8 @@ def execute(file):
     for number, cell in enumerate(notebook.cells):
         cell.id, cell.metadata = f"cell-{number}", {}
     with tempfile.TemporaryDirectory() as folder:
-        NotebookClient(notebook, timeout=1800, record_timing=False, resources={"metadata": {"path": folder}}).execute()
+        options = {"timeout": 1800, "record_timing": False, "coalesce_streams": True}
+        NotebookClient(notebook, resources={"metadata": {"path": folder}}, **options).execute()
     notebook.metadata = METADATA
     return notebook
 

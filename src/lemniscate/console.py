@@ -7,6 +7,8 @@ import sys
 import time
 from typing import Any
 
+from lemniscate.notebook import CellText, drawn_bar
+
 
 def in_notebook() -> bool:
     """Whether this is a cell of a notebook, which can show pictures, and not a terminal."""
@@ -20,34 +22,6 @@ def in_notebook() -> bool:
 def say(text: object) -> None:
     """Print one line on standard error; in a notebook on standard output."""
     print(text, file=sys.stdout if in_notebook() else sys.stderr, flush=True)
-
-
-class CellText:
-    """Text below the cell of a notebook, replaced in place at most five times a second; a saved notebook has the last.
-
-    It needs no widgets, which a stored notebook cannot show.
-    """
-
-    def __init__(self) -> None:
-        self._place: Any = None
-        self._text, self._shown_at = "", -float("inf")
-
-    def show(self, text: str) -> None:
-        """Replace the text, now or with a later one."""
-        self._text = text
-        if time.monotonic() - self._shown_at >= 0.2:
-            self.flush()
-
-    def flush(self) -> None:
-        """Show the newest text."""
-        from IPython.display import display
-
-        plain = {"text/plain": self._text}
-        if self._place:
-            self._place.update(plain, raw=True)
-        elif self._text:
-            self._place = display(plain, raw=True, display_id=True)
-        self._shown_at = time.monotonic()
 
 
 class ProgressBar:
@@ -81,12 +55,6 @@ class ProgressBar:
             self._bar.stop()
         if self._cell:
             self._cell.flush()
-
-
-def drawn_bar(fraction: float, width: int = 20) -> str:
-    """A bar of `width` characters, filled from the left."""
-    filled = round(width * min(1.0, fraction))
-    return "━" * filled + "╌" * (width - filled)
 
 
 def _live_bar(total: int, done: int) -> Any:

@@ -6,7 +6,8 @@ from datetime import timedelta
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
-from lemniscate.console import CellText, drawn_bar, in_notebook, say
+from lemniscate.console import in_notebook, say
+from lemniscate.notebook import CellText, drawn_bar
 
 
 class SweepProgress:
