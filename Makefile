@@ -50,8 +50,8 @@ bench-returns: setup  ## the tables of docs/results.md, seed by seed: a day; ret
 	$(BIN)/python -m pip install --quiet --constraint requirements.lock --no-build-isolation --editable '.[bench]'
 	touch $@
 
-tutorials: setup  ## the notebooks, from docs/tutorial/*.py
-	$(BIN)/jupytext --quiet --update --to notebook docs/tutorial/*.py
+tutorials: setup  ## the notebooks with their outputs, from docs/tutorial/*.py: some ten minutes
+	$(BIN)/python docs/tutorial/execute.py
 
 lock: setup  ## renew requirements.lock from pyproject.toml
 	$(BIN)/pip-compile --quiet --strip-extras --extra box2d --extra classic-control --extra drone --extra envpool --extra mujoco --extra docs --extra dev --no-emit-index-url --no-emit-find-links --no-emit-trusted-host --no-header --allow-unsafe --annotation-style=line --constraint constraints.txt --output-file requirements.lock pyproject.toml

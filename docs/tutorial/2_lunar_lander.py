@@ -10,6 +10,7 @@ import torch
 import lemniscate as lem
 from lemniscate import course
 from lemniscate.algos import ppo
+from lemniscate.notebook import show_film
 
 STEPS = 300_000
 
@@ -64,14 +65,15 @@ ppo.gae, ppo.value_loss = gae, value_loss
 run = lem.train("ppo", env="LunarLander-v3", seed=1, total_steps=STEPS)
 scores = lem.evaluate(run.policy, episodes=20, seed=0)
 print(f"{scores.mean_return:.0f} ± {scores.std_return:.0f}")
-lem.plot(run.path)
+pictures = lem.plot(run.path)
 
 # %% [markdown]
 # `losses/value` falls and `explained_variance` climbs towards 1: the critic predicts the returns well. `approx_kl` and
 # `clip_fraction` say how far each update moved the policy. Entropy falls as the policy becomes more certain.
 
 # %%
-lem.watch(run.policy, video="lander.gif")
+lem.watch(run.policy, video="lander.webp")
+show_film("lander.webp")
 
 # %% [markdown]
 # **Try.** `gamma=0.9`: how does it land, and why? Take `done` for `terminated` in `gae`, and watch what becomes of hovering.

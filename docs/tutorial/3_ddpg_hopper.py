@@ -64,7 +64,7 @@ run = lem.train(
     critic_hidden=(64, 64),
     evaluate_every=STEPS // 3,
 )
-lem.plot(run.path)
+pictures = lem.plot(run.path)
 
 # %% [markdown]
 # ## The overestimation bias of Q

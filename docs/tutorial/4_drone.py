@@ -62,7 +62,7 @@ print(
 )
 
 # %%
-lem.plot(run.path)
+pictures = lem.plot(run.path)
 
 # %% [markdown]
 # `flight.png` is the path over the reference, `error.png` the distance over time; the first second is the way from the

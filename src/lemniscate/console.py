@@ -1,51 +1,72 @@
-"""Text for people: lines and a progress bar on standard error. Standard output is left to programs."""
+"""Text for people: lines and a progress bar, on standard error or below the cell of a notebook.
+
+Standard output is left to programs; in a notebook nothing reads it, and standard error looks like a failure there.
+"""
 
 import sys
 import time
 from typing import Any
 
+from lemniscate.notebook import CellText, drawn_bar
+
+
+def in_notebook() -> bool:
+    """Whether this is a cell of a notebook, which can show pictures, and not a terminal."""
+    if "IPython" not in sys.modules:
+        return False
+    from IPython.core.getipython import get_ipython
+
+    return hasattr(get_ipython(), "kernel")
+
 
 def say(text: object) -> None:
-    """Print one line on standard error."""
-    print(text, file=sys.stderr, flush=True)
+    """Print one line on standard error; in a notebook on standard output."""
+    print(text, file=sys.stdout if in_notebook() else sys.stderr, flush=True)
 
 
 class ProgressBar:
-    """Steps, steps per second, return and time left: a live bar in a terminal or a notebook, else ten lines a run."""
+    """Steps, steps per second, return and time left: a live bar in a terminal, a live line in a notebook, else ten."""
 
     def __init__(self, total: int, done: int, visible: bool = True) -> None:
-        from rich.console import Console  # here, because commands that train nothing need not wait for it
-
-        console = Console(stderr=True)
-        live = visible and (console.is_terminal or console.is_jupyter)
-        self._bar: Any = _live_bar(console) if live else None
-        self._lines = visible and not live
+        self._cell = CellText() if visible and in_notebook() else None
+        self._bar: Any = _live_bar(total, done) if visible and not self._cell else None
+        self._lines = visible and not self._cell and not self._bar
         self._total, self._tenth = total, 10 * done // total
         self._started, self._done_before = time.monotonic(), done
-        if self._bar:
-            self._task = self._bar.add_task("", total=total, completed=done, steps="", speed="", ret="–")
-            self._bar.start()
 
     def update(self, step: int, episode_return: float | None) -> None:
         """Show that `step` is reached, and the mean return of the last episodes."""
-        rate = (step - self._done_before) / (time.monotonic() - self._started + 1e-9)
+        seconds = time.monotonic() - self._started + 1e-9
+        rate = (step - self._done_before) / seconds
         ret = "–" if episode_return is None else f"{episode_return:.1f}"
         steps, speed = f"{step:,} of {self._total:,} steps", f"{rate:,.0f} steps/s"
+        left = f"{(self._total - step) / rate:.0f} s left" if step < self._total else f"{seconds:.0f} s"
         if self._bar:
-            self._bar.update(self._task, completed=step, steps=steps, speed=speed, ret=ret)
+            self._bar.update(self._bar.task_ids[0], completed=step, steps=steps, speed=speed, ret=ret)
+        elif self._cell:
+            self._cell.show(f"{drawn_bar(step / self._total)} {steps}  {speed}  return {ret}  {left}")
         elif self._lines and 10 * step // self._total > self._tenth:
             self._tenth = 10 * step // self._total
-            left = max(0.0, (self._total - step) / rate)
-            say(f"{steps}  {speed}  return {ret}  {left:.0f} s left")
+            say(f"{steps}  {speed}  return {ret}  {left}")
 
     def close(self) -> None:
-        """Leave the terminal as it was."""
+        """Leave the terminal as it was, or the last line below the cell."""
         if self._bar:
             self._bar.stop()
+        if self._cell:
+            self._cell.flush()
 
 
-def _live_bar(console: Any) -> Any:
+def _live_bar(total: int, done: int) -> Any:
+    """A started bar with one task; None where standard error is no terminal."""
+    from rich.console import Console  # here, because commands that train nothing need not wait for it
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        return None
     numbers = TextColumn("{task.percentage:>3.0f}%  {task.fields[speed]}  return {task.fields[ret]}  left")
-    return Progress(TextColumn("{task.fields[steps]}"), BarColumn(), numbers, TimeRemainingColumn(), console=console)
+    bar = Progress(TextColumn("{task.fields[steps]}"), BarColumn(), numbers, TimeRemainingColumn(), console=console)
+    bar.add_task("", total=total, completed=done, steps="", speed="", ret="–")
+    bar.start()
+    return bar

@@ -7,7 +7,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from lemniscate.report.playback import in_notebook
+from lemniscate.console import in_notebook
 from lemniscate.report.style import finish
 
 
@@ -48,9 +48,9 @@ class LiveCurve:
         """The curves so far as a PNG; `config` has the title and the length of the run."""
         figure = Figure(figsize=(7, 3), layout="constrained")
         axes = figure.subplots()
-        for (name, points), style in zip(self._curves.items(), ("-", "o-"), strict=True):
+        for points, style, label in zip(self._curves.values(), ("-", "o-"), ("training", "evaluation"), strict=True):
             if points:
-                axes.plot(*zip(*points, strict=True), style, label=name, linewidth=1.5, markersize=4)
+                axes.plot(*zip(*points, strict=True), style, label=label, linewidth=1.5, markersize=4)
         axes.set(xlabel="environment steps", ylabel="return of an episode", xlim=(0, config.total_steps))
         axes.set_title(f"{config.env}, seed {config.seed}", loc="left")
         axes.legend(frameon=False)

@@ -6,16 +6,18 @@ from datetime import timedelta
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
-from lemniscate.console import say
+from lemniscate.console import in_notebook, say
+from lemniscate.notebook import CellText, drawn_bar
 
 
 class SweepProgress:
-    """Bars in a terminal or a notebook; elsewhere lines at each tenth of the sweep. The end of a run is a line."""
+    """Bars in a terminal, lines in a notebook, else one at each tenth of the sweep. The end of a run is a line."""
 
     def __init__(self, totals: Mapping[str, int], steps: Mapping[str, int], visible: bool = True) -> None:
         self._console = Console(stderr=True)
-        live = visible and (self._console.is_terminal or self._console.is_jupyter)
-        self._visible, self._lines = visible, visible and not live
+        self._cell = CellText() if visible and in_notebook() else None
+        live = visible and not self._cell and self._console.is_terminal
+        self._visible, self._lines = visible, visible and not live and not self._cell
         self._totals = totals
         self._steps = {name: min(step, totals[name]) for name, step in steps.items()}
         self._under_way: dict[str, str] = {}
@@ -58,18 +60,24 @@ class SweepProgress:
 
     def say(self, text: str) -> None:
         """Print a line above the bars."""
-        if self._visible:
+        if self._cell:
+            say(text)
+        elif self._visible:
             self._console.print(text, highlight=False, markup=False, soft_wrap=True)
 
     def close(self) -> None:
         """Leave the terminal as it was."""
         self._bars.stop()
+        if self._cell:
+            self._cell.flush()
 
     def _show_total(self) -> None:
         taken, total = sum(self._steps.values()), sum(self._totals.values())
         said = f"{self._ended} of {len(self._totals)} runs ended, {taken:,} of {total:,} steps"
         self._bars.update(self._whole, completed=taken, said=said)
+        lines = "".join(f"\n  {name}: {line}" for name, line in self._under_way.items())
+        if self._cell:
+            self._cell.show(f"{drawn_bar(taken / total)} {said}{lines}")
         if self._lines and 10 * taken // total > self._tenth:
             self._tenth = 10 * taken // total
-            lines = "".join(f"\n  {name}: {line}" for name, line in self._under_way.items())
             say(f"{10 * self._tenth} % of all steps{lines}")
