@@ -79,8 +79,7 @@ def train(
     """Train a policy.
 
     Args:
-        algorithm: a name in `lemniscate.algos.ALGORITHMS`; a module of your own, or its name; or a Config, such as
-            that of `config_for`.
+        algorithm: a name in `lemniscate.algos.ALGORITHMS`; a module of your own, or its name; or a Config.
         env: an id, `module:Class`, a class, or a function that makes an environment; a preset may have its own.
         run: where to keep everything; by default a new directory under `runs/`.
         preset: by name; the best known for the environment unless given.
