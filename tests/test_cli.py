@@ -298,7 +298,11 @@ def test_an_algorithm_of_ones_own_has_its_fields_in_its_help(tmp_path, monkeypat
         (["train", "ppo", "--seeds", "1-2", "--seed", "3"], "Several runs have several seeds: --seeds 1-5, not --seed."),
         (["evaluate", "nowhere"], "nowhere is not a run directory"),
         (["evaluate", "nowhere", "--episods", "3"], "There is no option '--episods': did you mean --episodes?"),
-        (["evaluate", "nowhere", "--episodes", "x"], "Argument --episodes: invalid int value: 'x'"),
+        (["train", "./mine.py", "--env", "CartPole-v1"], "There is no algorithm './mine.py'"),
+        (["train", "ppo", "--env", ""], "There is no environment ''"),
+        (["train", "ppo", "--env", "CartPole-v1", "--preset", ""], "There is no preset ''"),
+        (["train", "ppo", "--scale-rewards", "false"], "a switch has no value: --flag or --no-flag."),
+        (["envs", "nowhere"], "There is no environment 'nowhere'"),
         (["evaluate", "nowhere", "--env-args", "x"], "--env-args must be a JSON object"),
         (["evaluate", "nowhere", "again"], "Unknown argument 'again'"),
         (["resume", "nowhere"], "nowhere is not a run directory"),
@@ -392,6 +396,21 @@ def test_a_seed_below_zero_is_a_sentence(run, capsys):
     for command in ("watch", "evaluate"):
         assert main([command, str(run), "--seed", "-1"]) == 2
         assert "seed must be a whole number at least 0, not -1." in capsys.readouterr().err
+
+
+def test_numbers_are_read_as_in_training(run, capsys):
+    assert main(["evaluate", str(run), "--episodes", "2e0", "--seed", "1_0", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["episodes"] == 2
+    assert main(["evaluate", str(run), "--episodes", "x"]) == 2
+    assert "episodes must be a whole number at least 1, not 'x'." in capsys.readouterr().err
+
+
+def test_a_folder_that_cannot_be_written_is_a_sentence(run, tmp_path, capsys):
+    (tmp_path / "file").touch()
+    assert main(["watch", str(run), "--video", str(tmp_path / "file" / "film.gif")]) == 1
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert said.startswith(str(tmp_path / "file"))
+    assert "irectory" in said or "exists" in said
 
 
 def test_a_film_that_cannot_be_written_is_a_sentence(run, capsys):

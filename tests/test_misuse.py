@@ -79,6 +79,15 @@ def test_runs_are_plotted_one_by_one_or_in_a_list(run):
         (lambda run: lem.train("ppo", Sized), "required positional argument: 'size'; give it in env_kwargs"),
         (lambda run: lem.train_sweep("ppo", "CartPole-v1", 1, callbacks=[print]), "has a process of its own: name"),
         (lambda run: lem.train_sweep("ppo", "CartPole-v1", 1, callbacks=["math:cosy"]), "math has no cosy"),
+        (lambda run: lem.train_sweep("ppo", "CartPole-v1", 1, seed=3), "given as seeds, not as seed"),
+        (lambda run: lem.train_sweep("ppo", lambda: gym.make("CartPole-v1"), 1), "into a module, to import it"),
+        (lambda run: lem.train_sweep(None, "CartPole-v1", 1), "None is not an algorithm"),
+        (lambda run: lem.train("ppo", "CartPole-v1", preset=3), "There is no preset 3"),
+        (lambda run: lem.train("ppo", "CartPole-v1", callbacks=3), "A callback must be a function of"),
+        (lambda run: lem.train("ppo", "CartPole-v1", callbacks=lambda step: None), "A callback must be a function of"),
+        (lambda run: lem.train("ppo", ""), "There is no environment ''"),
+        (lambda run: lem.evaluate(run, env_kwargs=3), "env_kwargs must be a dictionary"),
+        (lambda run: lem.make_envs("CartPole-v1"), "make_envs needs a Config, .* not 'CartPole-v1'"),
     ],
 )  # fmt: skip
 def test_a_mistake_is_one_sentence(run, call, said, tmp_path, monkeypatch):
@@ -99,6 +108,8 @@ def test_a_config_knows_its_algorithm(run, tmp_path):
     config = lem.config_for(run.policy.config, seed=np.int64(2))
     again = lem.train(config, run=tmp_path / "again", progress=False)
     assert again.policy.config == run.policy.config.replace(seed=2)
+    warm = lem.train(config, run=tmp_path / "warm", warm_start=run, device=torch.device("cpu"), progress=False)
+    assert warm.policy.config.warm_start == str(run.path)
     other = lem.train(config, Sized, run=tmp_path / "other", progress=False, env_kwargs={"size": 1})
     assert other.policy.config.env == "test_misuse:Sized"
 
@@ -156,6 +167,8 @@ def test_what_is_no_observation_is_refused(run, obs, said):
 )
 def test_no_wrong_action_reaches_a_simulator(backend, action, said):
     env = registry.make("CartPole-v1", 4, backend=backend)
+    with pytest.raises(UserError, match="are to be restarted before their first step"):
+        env.step(torch.zeros(4, dtype=torch.int64))
     env.restart(0)
     with pytest.raises(UserError, match=said):
         env.step(action)

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from itertools import count
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, cast
 
 import torch
 
@@ -79,8 +79,7 @@ def train(
     """Train a policy.
 
     Args:
-        algorithm: a name in `lemniscate.algos.ALGORITHMS`; a module of your own, or its name; or a Config, such as
-            that of `config_for`.
+        algorithm: a name in `lemniscate.algos.ALGORITHMS`; a module of your own, or its name; or a Config.
         env: an id, `module:Class`, a class, or a function that makes an environment; a preset may have its own.
         run: where to keep everything; by default a new directory under `runs/`.
         preset: by name; the best known for the environment unless given.
@@ -186,9 +185,9 @@ def loggers_with(track: str | LoggerClass | None) -> tuple[LoggerClass, ...]:
         if not is_installed(extra):
             raise missing_extra(extra, extra)
     logger: Any = named.find(track) if isinstance(track, str) else track
-    if not callable(logger):
-        raise UserError(f"track must be a logger's name or class, not {shown(track)}.")
-    return JsonLines, TensorBoard, logger
+    if callable(logger):
+        return JsonLines, TensorBoard, cast("LoggerClass", logger)
+    raise UserError(f"track must be a logger's name or class, not {shown(track)}.")
 
 
 def fresh_directory(env_id: str, name: str) -> Path:

@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from lemniscate.console import say
+from lemniscate.console import in_notebook, say
 from lemniscate.envs import registry
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError
@@ -58,7 +58,7 @@ def plot(*runs: str | Path | TrainedRun | list[str | Path | TrainedRun], by: str
         files = _plot_run(paths[0], folder, by)
     else:
         files = compare.report(group(found), _final_returns(found), folder, by)
-    if playback.in_notebook():
+    if in_notebook():
         playback.show_pictures(file for file in files if file.suffix == ".png")
     return files
 

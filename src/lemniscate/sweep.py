@@ -81,6 +81,8 @@ def train_sweep(
         Stopped: Ctrl-C or SIGTERM, when every run has saved itself; go on with `resume_sweep`.
         SweepError: some runs failed; the others are trained and compared.
     """
+    if "seed" in fields:
+        raise UserError("Several runs have several seeds: they are given as seeds, not as seed.")
     names, numbers = algorithms_of(algorithms), _seeds_of(seeds)
     configs: dict[str, RunConfig] = {}
     for name in names:

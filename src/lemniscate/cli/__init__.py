@@ -52,6 +52,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt as stopped:  # a run that was asked to stop has a sentence and a signal of its own
         say(str(stopped) or "Interrupted.")
         return 128 + getattr(stopped, "signum", 2)
+    except OSError as error:  # a disk that is full, a folder that cannot be written
+        if error.filename is None:
+            raise
+        say(f"{error.filename}: {error.strerror}.")
+        return 1
     except SystemExit as done:  # argparse has printed help, or the version
         return int(done.code or 0)
     return 0
@@ -127,8 +132,8 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
 
     sub = subs["evaluate"]
     sub.add_argument("run", type=Path, metavar="RUN", help="a run or a checkpoint")
-    sub.add_argument("--episodes", type=int, default=100, metavar="INT", help="how many [100]")
-    sub.add_argument("--seed", type=int, default=0, metavar="INT", help="seed of the starts [0]")
+    sub.add_argument("--episodes", default=100, metavar="INT", help="how many [100]")
+    sub.add_argument("--seed", default=0, metavar="INT", help="seed of the starts [0]")
     sub.add_argument("--env-args", metavar="JSON", help="arguments of the environment [as in training]")
     sub.add_argument("--backend", metavar="NAME", help="simulation backend [as in training]")
     sub.add_argument("--video", type=Path, metavar="FILE", help=".gif, .webp or .mp4 to record all episodes into")
@@ -137,11 +142,11 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
     sub = subs["watch"]
     sub.usage = "lemniscate watch RUN [options]\n       lemniscate watch --random --env ID [options]"
     sub.add_argument("run", type=Path, nargs="?", metavar="RUN", help="a run or a checkpoint")
-    sub.add_argument("--episodes", type=int, default=1, metavar="INT", help="how many [1]")
+    sub.add_argument("--episodes", default=1, metavar="INT", help="how many [1]")
     sub.add_argument("--sample", action="store_true", help="draw actions from the policy [the most likely ones]")
     sub.add_argument("--random", action="store_true", help="act uniformly at random")
     sub.add_argument("--video", type=Path, metavar="FILE", help=".gif, .webp or .mp4 instead of a window")
-    sub.add_argument("--seed", type=int, default=0, metavar="INT", help="seed of the starts [0]")
+    sub.add_argument("--seed", default=0, metavar="INT", help="seed of the starts [0]")
     sub.add_argument("--env", metavar="ID", help="environment [that of training]; without RUN, with --random")
     sub.add_argument("--env-args", metavar="JSON", help="arguments of the environment [as in training]")
 
@@ -201,7 +206,7 @@ def _parse_train(parser: Parser, words: list[str]) -> argparse.Namespace:
 def _is_own(name: str) -> bool:
     """Whether `name` is of somebody's own algorithm: a module that is there, or one in a package."""
     if not name.isidentifier():
-        return "." in name
+        return "." in name and all(part.isidentifier() for part in re.split(r"[.:]", name))
     return Path(f"{name}.py").exists() or Path(name).is_dir() or is_installed(name)
 
 
@@ -222,4 +227,6 @@ def _normalized(arguments: Sequence[str]) -> list[str]:
 def unknown_argument(rest: list[str], sentence_for: Callable[[str], UserError]) -> UserError:
     """The sentence for the arguments that no parser understood: `sentence_for` the first flag among them."""
     flags = [word.partition("=")[0] for word in rest if word.startswith("-")]
-    return sentence_for(flags[0]) if flags else UserError(f"Unknown argument {rest[0]!r}; --help lists what there is.")
+    is_switch = rest[0].lower() in ("true", "false", "on", "off", "yes", "no")
+    hint = "a switch has no value: --flag or --no-flag." if is_switch else "--help lists what there is."
+    return sentence_for(flags[0]) if flags else UserError(f"Unknown argument {rest[0]!r}; {hint}")

@@ -8,12 +8,12 @@ from typing import Any
 
 from lemniscate import api, plots, results, sweep
 from lemniscate.algos import ALGORITHMS
-from lemniscate.cli.completion import script
-from lemniscate.cli.fields import read, read_json
+from lemniscate.cli.completion import completion as completion
+from lemniscate.cli.fields import number, read, read_json
 from lemniscate.console import say
 from lemniscate.envs import registry
 from lemniscate.envs.check import check as check_environment
-from lemniscate.errors import UserError
+from lemniscate.errors import UserError, unknown_name
 from lemniscate.presets import best, choose
 from lemniscate.report import pictures
 from lemniscate.run.run import is_compiled
@@ -48,20 +48,20 @@ def train(given: argparse.Namespace) -> None:
 def resume(given: argparse.Namespace) -> None:
     """Continue an interrupted run or sweep."""
     if is_sweep(given.run):
-        path = sweep.resume_sweep(given.run, track=given.track, report=given.report, **_callbacks(given)).path
+        run = sweep.resume_sweep(given.run, track=given.track, report=given.report, **_callbacks(given))
     else:
         run = api.resume(given.run, track=given.track, report=given.report, **_callbacks(given))
-        path = run.path if run.seconds else None
         if given.score:
             plots.final_return(run.path)
-    if path:  # a finished run has had its sentence
-        say(f"Done. Everything is in {path}")
+        if not run.seconds:  # it was finished, which has been said
+            return
+    say(f"Done. Everything is in {run.path}")
 
 
 def evaluate(given: argparse.Namespace) -> None:
     """Play whole episodes: scores as JSON on standard output, or as a sentence."""
     own = {"env_kwargs": _env_args(given), "backend": given.backend, "video": given.video}
-    scores = results.evaluate(results.load(given.run), episodes=given.episodes, seed=given.seed, **own)
+    scores = results.evaluate(given.run, episodes=number(given.episodes), seed=number(given.seed), **own)
     if given.json:
         print(json.dumps(scores.to_json(), allow_nan=False))
     else:
@@ -73,10 +73,10 @@ def watch(given: argparse.Namespace) -> None:
     if not given.run and not (given.random and given.env):
         raise UserError("Watch what? lemniscate watch RUN; before training, lemniscate watch --random --env ID.")
     results.watch(
-        results.load(given.run) if given.run else None,
+        given.run,
         given.env,
-        episodes=given.episodes,
-        seed=given.seed,
+        episodes=number(given.episodes),
+        seed=number(given.seed),
         deterministic=not given.sample,
         random=given.random,
         video=given.video,
@@ -92,11 +92,13 @@ def plot(given: argparse.Namespace) -> None:
 
 def envs(given: argparse.Namespace) -> None:
     """List the environments, the backend of each, and the presets that fit."""
-    for env_id in registry.known_ids():
-        if given.filter.lower() in env_id.lower():
-            presets = ((algorithm, best(algorithm, env_id)) for algorithm in ALGORITHMS)
-            fitting = ", ".join(f"{algorithm}: {preset}" for algorithm, preset in presets if preset != "default")
-            say(f"{env_id:<40} {registry.backend_for(env_id):<12} {fitting or 'default'}")
+    found = [env_id for env_id in registry.known_ids() if given.filter.lower() in env_id.lower()]
+    if not found:
+        raise unknown_name("environment", given.filter, registry.known_ids())
+    for env_id in found:
+        presets = ((algorithm, best(algorithm, env_id)) for algorithm in ALGORITHMS)
+        fitting = ", ".join(f"{algorithm}: {preset}" for algorithm, preset in presets if preset != "default")
+        say(f"{env_id:<40} {registry.backend_for(env_id):<12} {fitting or 'default'}")
 
 
 def check(given: argparse.Namespace) -> None:
@@ -116,11 +118,6 @@ def check(given: argparse.Namespace) -> None:
 
 def _env_args(given: argparse.Namespace) -> dict[str, Any] | None:
     return None if given.env_args is None else read_json("--env-args", given.env_args)
-
-
-def completion(given: argparse.Namespace) -> None:
-    """Print the script with which a shell completes."""
-    print(script(given.shell), end="")
 
 
 def _callbacks(given: argparse.Namespace) -> dict[str, Any]:

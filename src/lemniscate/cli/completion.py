@@ -38,10 +38,10 @@ autoload -Uz bashcompinit && bashcompinit
 """
 
 
-def script(shell: str) -> str:
-    """The script for one of `SHELLS`."""
-    where = f"# Write it once, and again after an upgrade: lemniscate completion {shell} > {FILES[shell]}\n"
-    return where + (_fish() if shell == "fish" else (ZSH if shell == "zsh" else "") + _bash())
+def completion(given: argparse.Namespace) -> None:
+    """Print the script with which a shell, one of `SHELLS`, completes."""
+    print(f"# Write it once, and again after an upgrade: lemniscate completion {given.shell} > {FILES[given.shell]}")
+    print(_fish() if given.shell == "fish" else (ZSH if given.shell == "zsh" else "") + _bash(), end="")
 
 
 def _bash() -> str:

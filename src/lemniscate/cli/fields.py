@@ -80,8 +80,12 @@ def read(name: str, hint: Any, text: Any) -> Any:
         return None
     if any(_is_dict(option) for option in options):
         return read_json(flag(name), text)
-    kinds = [_number(option) for option in options]
-    for kind in (int, float) if int in kinds else (float,) if float in kinds else ():
+    return number(text) if any(map(_number, options)) else text
+
+
+def number(text: Any) -> Any:
+    """The number that `text` stands for, 1e6 and 1_000 too; what is none stays, for the sentence on it."""
+    for kind in (int, float):
         with suppress(ValueError):
             return kind(text)
     return text
@@ -114,11 +118,10 @@ def field_help(config: type[RunConfig]) -> dict[str, str]:
 
 
 def _parse(algorithm: str, words: list[str]) -> tuple[argparse.Namespace, dict[str, Any]]:
-    config = find(algorithm).Config
-    hints = get_type_hints(config, include_extras=True)
+    hints = get_type_hints(find(algorithm).Config, include_extras=True)
     given, rest = parser_of(algorithm).parse_known_args(words)
     if rest:
-        known = [*config.names(), "run", "preset", "seeds", "track", "report", "score", "callbacks"]
+        known = [*hints, "run", "preset", "seeds", "track", "report", "score", "callbacks"]
         raise unknown_argument(rest, lambda word: glossary.unknown_field(word[2:].replace("-", "_"), known, flag))
     values = {name: value for name, value in vars(given).items() if name in hints and name != "env"}
     return given, {name: read(name, hints[name], value) for name, value in values.items()}

@@ -75,7 +75,7 @@ class Careful(gym.Wrapper):
         return self.env.spec
 
     @property
-    def _np_random(self) -> np.random.Generator | None:
+    def _np_random(self) -> np.random.Generator | None:  # pyright: ignore[reportIncompatibleMethodOverride]
         return self.env.unwrapped._np_random
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:

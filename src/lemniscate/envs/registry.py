@@ -148,8 +148,6 @@ def make(
 
     from lemniscate.envs.vec_env import VecEnv
 
-    if not isinstance(num_envs, int) or num_envs < 1:
-        raise UserError(f"num_envs must be a whole number at least 1, not {shown(num_envs)}.")
     name, wraps = name_of(env), tuple(map(named.name_of, wrappers))
     if kwargs is not None and not isinstance(kwargs, Mapping):
         raise UserError(f"The arguments of an environment are a dictionary, such as {{'x': 1}}, not {kwargs!r}.")

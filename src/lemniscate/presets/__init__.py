@@ -43,7 +43,7 @@ def choose(algorithm: str, env_id: str | None, name: str | None) -> tuple[str, R
     Where several environments have a preset of one name, the environment decides. The Config's `env` is `env_id` if one
     is given. Raises `UserError` with the nearest names for an unknown preset.
     """
-    name = name or best(algorithm, env_id)
+    name = best(algorithm, env_id) if name is None else name
     named = [preset.config for preset in of(algorithm) if preset.name == name]
     if name == "default":
         named = [find(algorithm).Config()]

@@ -5,16 +5,8 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from lemniscate.console import in_notebook
 from lemniscate.errors import UserError
-
-
-def in_notebook() -> bool:
-    """Whether this is a cell of a notebook, which can show pictures, and not a terminal."""
-    if "IPython" not in sys.modules:
-        return False
-    from IPython.core.getipython import get_ipython
-
-    return hasattr(get_ipython(), "kernel")
 
 
 def require_display() -> None:

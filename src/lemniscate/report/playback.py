@@ -14,14 +14,14 @@ import numpy as np
 import torch
 from PIL import Image
 
-from lemniscate.console import say
+from lemniscate.console import in_notebook, say
 from lemniscate.envs import registry
 from lemniscate.envs.measures import SUMMARIES, measures_of
 from lemniscate.envs.vec_env import PATIENCE, VecEnv
 from lemniscate.errors import UserError
 from lemniscate.nn.policies import Policy
 from lemniscate.report import flight
-from lemniscate.report.display import in_notebook, quiet_sdl
+from lemniscate.report.display import quiet_sdl
 from lemniscate.report.film import save_frames
 from lemniscate.run.config import RunConfig
 from lemniscate.run.environments import world_of

@@ -44,7 +44,7 @@ def read_config(path: Path) -> tuple[str, dict[str, Any]]:
         raise UserError(f"{path} is a sweep: name one of its runs, such as {runs[0] if runs else path / '…'}.")
     try:
         record = json.loads((path / "config.json").read_text())
-        return record["algorithm"], record["config"]
+        return record["algorithm"], dict(record["config"])
     except (OSError, ValueError, KeyError, TypeError):
         raise UserError(f"{path} is not a run directory: it holds no config.json that can be read.") from None
 

@@ -4,7 +4,6 @@ import os
 import random
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any
 
 import numpy as np
 import torch
@@ -24,7 +23,7 @@ def set_seeds(seed: int, deterministic: bool = True) -> None:
         deterministic: cuDNN's deterministic kernels without benchmarking, torch's deterministic algorithms (a warning
             where there is none), cuBLAS's fixed workspace.
     """
-    number: Any = seed.tolist() if hasattr(seed, "tolist") else seed  # NumPy's and torch's
+    number = getattr(seed, "tolist", lambda: seed)()  # of NumPy's and torch's scalars
     if type(number) not in (int, float) or not 0 <= number < 2**32 or number % 1:
         raise UserError(f"seed must be a whole number from 0 to {2**32 - 1:,}, not {shown(seed)}.")
     seed_globals(int(number))
