@@ -184,10 +184,9 @@ def loggers_with(track: str | LoggerClass | None) -> tuple[LoggerClass, ...]:
         extra, track = TRACKERS[track]
         if not is_installed(extra):
             raise missing_extra(extra, extra)
-    logger: Any = named.find(track) if isinstance(track, str) else track
-    if callable(logger):
-        return JsonLines, TensorBoard, cast("LoggerClass", logger)
-    raise UserError(f"track must be a logger's name or class, not {shown(track)}.")
+    if not (isinstance(track, str) or callable(track)):
+        raise UserError(f"track must be a logger's name or class, not {shown(track)}.")
+    return JsonLines, TensorBoard, named.find(track) if isinstance(track, str) else track
 
 
 def fresh_directory(env_id: str, name: str) -> Path:

@@ -59,8 +59,8 @@ def watch_with(
     Raises:
         UserError: a callback that cannot be loaded or called.
     """
-    several = callbacks if isinstance(callbacks, list | tuple) else [callbacks]
-    functions: list[Any] = [named.find(one) if isinstance(one, str) else one for one in several]
+    several: Sequence[Any] = callbacks if isinstance(callbacks, list | tuple) else [callbacks]
+    functions = [named.find(one) if isinstance(one, str) else one for one in several]
     for function in functions:
         if not _takes_three(function):
             raise UserError(f"A callback must be a function of (step, metrics, policy), not {shown(function)}.")

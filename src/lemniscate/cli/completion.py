@@ -1,8 +1,8 @@
 """Completion in bash, zsh and fish: a script with all that may follow a word, so that pressing TAB starts nothing."""
 
 import argparse
-import shlex
 from collections.abc import Iterable
+from shlex import quote
 from typing import Literal, get_args, get_origin, get_type_hints
 
 from lemniscate.algos import ALGORITHMS, find
@@ -53,16 +53,19 @@ def _bash() -> str:
 
 def _fish() -> str:
     followers = _followers()
-    lines = [f"-n __fish_use_subcommand -f -a {name} -d {shlex.quote(text)}" for name, text in COMMANDS.items()]
-    for word in COMMANDS.keys() & followers.keys():
+    variables = {word: f"__lemniscate_{word.strip('-').replace('-', '_')}" for word in followers}
+    lines = [f"set -g {variables[word]} {' '.join(words)}" for word, words in followers.items()]
+    begin = "complete -c lemniscate -n"
+    lines += [f"{begin} __fish_use_subcommand -f -a {name} -d {quote(text)}" for name, text in COMMANDS.items()]
+    for word in (command for command in COMMANDS if command in followers):
         after = f"test (count (commandline -opc)) = 2; and __fish_seen_subcommand_from {word}"
-        lines.append(f"-n '{after}' -f -a '{' '.join(followers[word])}'")
+        lines.append(f"{begin} '{after}' -f -a '${variables[word]}'")
     for name, parser in _parsers().items():
         for option, action in _options(parser).items():
-            known = f" -x -a '{' '.join(followers[option])}'" if option in followers else " -r" * (action.nargs != 0)
-            text = shlex.quote((action.help or "").replace("%%", "%"))
-            lines.append(f"-n '__fish_seen_subcommand_from {name}' -l {option[2:]}{known} -d {text}")
-    return "".join(f"complete -c lemniscate {line}\n" for line in lines)
+            known = f"-x -a '${variables[option]}'" if option in followers else "-r" if action.nargs != 0 else ""
+            text = quote((action.help or "").replace("%%", "%"))
+            lines.append(f"{begin} '__fish_seen_subcommand_from {name}' -l {option[2:]} {known} -d {text}")
+    return "\n".join([*lines, ""])
 
 
 def _parsers() -> dict[str, Parser]:

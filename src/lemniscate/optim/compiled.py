@@ -13,7 +13,8 @@ R = TypeVar("R")
 
 
 stopping = Event()
-"""set while a run that was asked to stop ends its update: Ctrl-C reaches the compiler, too, which fails then"""
+"""set while a run that was asked to stop ends its update: nothing more is compiled, and a compiler that Ctrl-C has
+reached, too, has not failed"""
 
 
 class Compiled(Generic[P, R]):
@@ -36,15 +37,16 @@ class Compiled(Generic[P, R]):
         return self._chosen(*args, **kwargs) if self._chosen else self._first_call(*args, **kwargs)
 
     def _first_call(self, *args: P.args, **kwargs: P.kwargs) -> R:
-        self._chosen = self._compiled
-        try:
-            return self._compiled(*args, **kwargs)
-        except RuntimeError as error:
-            if not stopping.is_set():
-                reason = str(error).strip().partition("\n")[0]
-                print(f"torch.compile failed ({reason}); continuing without compilation.", file=sys.stderr)
-            self._chosen = self._fallback
-            return self._fallback(*args, **kwargs)
+        if not stopping.is_set():
+            self._chosen = self._compiled
+            try:
+                return self._compiled(*args, **kwargs)
+            except RuntimeError as error:
+                if not stopping.is_set():
+                    reason = str(error).strip().partition("\n")[0]
+                    print(f"torch.compile failed ({reason}); continuing without compilation.", file=sys.stderr)
+        self._chosen = self._fallback
+        return self._fallback(*args, **kwargs)
 
 
 def _with_own_code(method: Callable[P, R]) -> Callable[P, R]:
