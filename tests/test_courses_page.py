@@ -9,6 +9,8 @@ import pytest
 from lemniscate.cli import parse
 
 PAGE = (Path(__file__).parents[1] / "docs" / "courses.md").read_text()
+
+
 def test_the_python_of_the_page_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     code = "\n".join(re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL))

@@ -220,6 +220,7 @@ def test_a_run_without_anything_has_a_page(tmp_path):
     [
         ("ppo", {"hidden": (8, 16), "normalize_advantage": False, "target_kl": 0.05, "desired_kl": None}),
         ("ppo", {"env_kwargs": {"gravity": 9.0, "x y": "a'b"}, "wrappers": ("m:f(x=1,y=2)",), "initial_log_std": -1.0}),
+        ("ppo", {"preset": "default"}),
         ("sac", {"target_entropy": -3.0, "critic_hidden": (), "env": "Pendulum-v1"}),
     ],
 )
@@ -301,7 +302,7 @@ NOISE = np.random.default_rng(0).normal(size=200)
             [(evidence([*logged(explained_variance=[0.05]), *returned([1, 2, 3])]), "5% of the variance")],
             [
                 evidence([*logged(explained_variance=[0.5]), *returned([1, 2, 3])]),
-                evidence([*logged(explained_variance=[0.0]), *returned([1, 500, 500, 500])]),
+                evidence([*logged(explained_variance=[0.0]), *returned([1, 500, 503, 497])]),
                 evidence(),
             ],
         ),
@@ -336,6 +337,7 @@ NOISE = np.random.default_rng(0).normal(size=200)
             [(evidence(returned(np.arange(200) + NOISE)), "--total-steps 2_000")],
             [
                 evidence(returned(np.minimum(np.arange(200), 100) + NOISE)),
+                evidence(returned(0.006 * np.arange(200) + NOISE)),
                 evidence(returned(range(20))),
                 evidence(),
             ],

@@ -48,7 +48,7 @@ def robust_range(values: np.ndarray) -> tuple[float, float]:
 
 def limit_axis(axes: Axes) -> None:
     """End the y axis where the outliers of its lines begin; triangles at the edge mark them, the title the furthest."""
-    lines = [(line.get_color(), *points.T) for line in axes.lines if len(points := np.asarray(line.get_xydata()))]
+    lines = [(line.get_color(), *np.asarray(line.get_xydata()).T) for line in axes.lines]
     if not lines:
         return
     values = np.concatenate([y for _, _, y in lines])
