@@ -36,12 +36,13 @@ def seeds(python=True, numpy=True, torch_=True, cudnn=True, benchmark=True, seed
 
 def test_seeds_are_set_and_the_check_leaves_none_behind():
     before = random.getstate(), torch.get_rng_state(), torch.backends.cudnn.benchmark
+    deterministic = torch.are_deterministic_algorithms_enabled()
     assert course.check(seeds(), "set_seeds")
     assert course.check(lem.set_seeds)
     assert random.getstate() == before[0]
     assert torch.equal(torch.get_rng_state(), before[1])
     assert torch.backends.cudnn.benchmark == before[2]
-    assert not torch.are_deterministic_algorithms_enabled()
+    assert torch.are_deterministic_algorithms_enabled() == deterministic
 
 
 @pytest.mark.parametrize(

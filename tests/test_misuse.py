@@ -76,7 +76,7 @@ def test_runs_are_plotted_one_by_one_or_in_a_list(run):
         (lambda run: lem.train(run.policy.config, preset="course"), "does not go with a preset"),
         (lambda run: lem.train(lem.run.config.RunConfig()), "lemniscate.run.config is not an algorithm"),
         (lambda run: lem.train("ppo", "CartPole-v1", track=3), "track must be a logger's name or class, not 3"),
-        (lambda run: lem.train("ppo", Sized), "required positional argument: 'size'; give it in env_kwargs"),
+        (lambda run: lem.train("ppo", Sized), "required positional argument: 'size'; it is given in env_kwargs"),
         (lambda run: lem.train_sweep("ppo", "CartPole-v1", 1, callbacks=[print]), "has a process of its own: name"),
         (lambda run: lem.train_sweep("ppo", "CartPole-v1", 1, callbacks=["math:cosy"]), "math has no cosy"),
         (lambda run: lem.train_sweep("ppo", "CartPole-v1", 1, seed=3), "given as seeds, not as seed"),

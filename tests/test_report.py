@@ -12,8 +12,9 @@ import pytest
 from matplotlib.figure import Figure
 
 import lemniscate as lem
+from lemniscate import plots
 from lemniscate.cli import parse
-from lemniscate.report import advice, commands, curves, diagnostics, html, playback, run_page, style
+from lemniscate.report import advice, commands, curves, diagnostics, html, run_page, style
 from lemniscate.report.advice import Evidence
 from test_compare import write_run, write_runs
 
@@ -255,7 +256,7 @@ def test_plot_of_a_run_returns_its_page_last(tmp_path):
 def test_a_notebook_shows_the_pictures_of_every_plot(tmp_path, monkeypatch, count):
     shown = []
     monkeypatch.setattr("IPython.display.display", lambda image: shown.append(image.filename))
-    monkeypatch.setattr(playback, "in_notebook", lambda: True)
+    monkeypatch.setattr(plots, "in_notebook", lambda: True)
     files = lem.plot(*map(without_policy, write_runs(tmp_path / "a")[:count]))
     assert shown == [str(file) for file in files[:-1]]
     assert len(shown) == 1 + count

@@ -129,7 +129,13 @@ def test_learning_rates_fall_to_zero_where_the_settings_say_so(algo):
 @EACH
 def test_a_single_row_has_no_standard_deviation(algo):
     with pytest.raises(UserError, match=r"(standardize|normalize_advantage) needs batches of 2 rows"):
-        small(algo, num_envs=1, num_steps=1, **({} if algo is reinforce else {"normalize_advantage": True}))
+        small(
+            algo,
+            num_envs=1,
+            num_steps=1,
+            **({} if algo is reinforce else {"normalize_advantage": True}),
+            **({"minibatch_size": 1} if algo is ppo else {}),
+        )
 
 
 def compiled_equals_eager(algo, env, programs):

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from lemniscate.envs import registry
-from lemniscate.envs.check import _random
+from lemniscate.envs.random_action import random_action
 from lemniscate.errors import UserError
 
 envpool = pytest.importorskip("envpool")
@@ -65,9 +65,9 @@ def test_a_time_limit_cuts_and_shows_the_true_final_observation(part):
         assert torch.equal(begun, short.restart(3))
         assert first is None or torch.equal(begun, first)  # the same seed, the same beginning
         first = begun
-        rng, going = np.random.default_rng(0), torch.ones(N, dtype=torch.bool)
+        rng, going = torch.Generator().manual_seed(0), torch.ones(N, dtype=torch.bool)
         for t in range(LIMIT):
-            action = torch.from_numpy(_random(usual, rng))
+            action = random_action(usual.spec, usual.obs, rng)
             step, cut = usual.step(action), short.step(action)
             for name in ("next_obs", "reward", "terminated"):
                 if name != "terminated" or t < LIMIT - 1:  # EnvPool says truncated where both come together
@@ -139,10 +139,10 @@ def test_lives_of_an_atari_game_are_episodes_if_asked():
     """Breakout has five lives; without a ball in play, nothing is lost but by random actions."""
 
     def lengths(**kwargs):
-        env, rng = registry.make("EnvPool/Breakout-v5", 4, kwargs=kwargs), np.random.default_rng(0)
+        env, rng = registry.make("EnvPool/Breakout-v5", 4, kwargs=kwargs), torch.Generator().manual_seed(0)
         env.restart(0)
         for _ in range(600):
-            env.step(torch.from_numpy(_random(env, rng)))
+            env.step(random_action(env.spec, env.obs, rng))
         found = env.take_episodes().lengths
         env.close()
         return found

@@ -73,6 +73,7 @@ def test_a_run_goes_on_when_its_evaluation_cannot(monkeypatch, tmp_path, capsys)
         "env_kwargs": {"length": None},
         "num_envs": 2,
         "num_steps": 32,
+        "minibatch_size": 64,
         "total_steps": 128,
         "evaluate_every": 64,
         "progress": False,

@@ -145,7 +145,7 @@ def normalized_action(action: np.ndarray, kind: Action) -> np.ndarray:
         return (action - kind.start).astype(np.int64)
     flat = action.reshape(len(action), -1)
     if isinstance(kind, MultiBinary):
-        return flat
+        return flat.astype(np.int64)
     if isinstance(kind, MultiDiscrete):
         return (flat - np.array(kind.start)).astype(np.int64)
     _, _, middle, half = _scale(kind)
