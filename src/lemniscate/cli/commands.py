@@ -3,7 +3,6 @@
 import argparse
 import json
 from shutil import get_terminal_size
-from textwrap import fill
 from typing import Any
 
 from lemniscate import api, plots, results, sweep
@@ -13,13 +12,12 @@ from lemniscate.cli.fields import number, read, read_json
 from lemniscate.console import say
 from lemniscate.envs import registry
 from lemniscate.envs.check import check as check_environment
+from lemniscate.envs.findings import BAD, verdict
 from lemniscate.errors import UserError, unknown_name
 from lemniscate.presets import best, choose
 from lemniscate.report import pictures
 from lemniscate.run.run import is_compiled
 from lemniscate.run.sweep_file import is_sweep
-
-MARKS = {"good": "✓", "note": "!", "bad": "✗"}
 
 
 def train(given: argparse.Namespace) -> None:
@@ -103,17 +101,13 @@ def envs(given: argparse.Namespace) -> None:
 
 def check(given: argparse.Namespace) -> None:
     """Say what was found about an environment, as a list; what keeps it from being trained on is an error."""
-    wrappers = read("wrappers", tuple[str, ...], given.wrappers)
-    grades = {grade: 0 for grade in MARKS}
-    width = min(get_terminal_size((112, 24)).columns, 120)
+    found, wrappers = [], read("wrappers", tuple[str, ...], given.wrappers)
     for finding in check_environment(given.env, given.backend, _env_args(given), wrappers):
-        grades[finding.grade] += 1
-        say(fill(finding.sentence, width, initial_indent=f"{MARKS[finding.grade]} ", subsequent_indent="  "))
-    if bad := grades["bad"]:
-        raise UserError(f"{given.env} is not suitable for training: {bad} finding{'s' * (bad > 1)} above, marked ✗.")
-    notes = grades["note"]
-    look = f"; look at the {notes} note{'s' * (notes > 1)} above, marked !" if notes else ""
-    say(f"{given.env} is suitable for training{look}.")
+        found.append(finding)
+        say(finding.listed(min(get_terminal_size((112, 24)).columns, 120)))
+    if any(finding.grade == BAD for finding in found):
+        raise UserError(verdict(given.env, found))
+    say(verdict(given.env, found))
 
 
 def _env_args(given: argparse.Namespace) -> dict[str, Any] | None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from textwrap import fill
 
 import torch
 from torch import Tensor
@@ -10,6 +11,7 @@ from lemniscate.spec import Spec
 from lemniscate.types import Rollout
 
 GOOD, NOTE, BAD = "good", "note", "bad"
+MARKS = {GOOD: "✓", NOTE: "!", BAD: "✗"}
 WILD = 1e4
 """a ratio of sizes of observations from which on a network does not see the small ones"""
 LARGE = 100
@@ -22,6 +24,19 @@ class Finding:
 
     grade: str
     sentence: str
+
+    def listed(self, width: int) -> str:
+        """The sentence as an item of a list, wrapped at `width` columns."""
+        return fill(self.sentence, width, initial_indent=f"{MARKS[self.grade]} ", subsequent_indent="  ")
+
+
+def verdict(env_id: str, findings: Sequence[Finding]) -> str:
+    """Whether an environment is fit to be learned in, in one sentence."""
+    bad, notes = (sum(finding.grade == grade for finding in findings) for grade in (BAD, NOTE))
+    if bad:
+        return f"{env_id} is not suitable for training: {bad} finding{'s' * (bad > 1)} above, marked {MARKS[BAD]}."
+    look = f"; look at the {notes} note{'s' * (notes > 1)} above, marked {MARKS[NOTE]}" if notes else ""
+    return f"{env_id} is suitable for training{look}."
 
 
 def learnable(rollouts: Sequence[Rollout], spec: Spec) -> Iterator[Finding]:

@@ -13,6 +13,9 @@ from lemniscate.envs.findings import BAD, GOOD, NOTE, Finding
 from lemniscate.envs.images import is_image
 from lemniscate.envs.spaces import follow, observation_parts
 
+BESIDE_THE_POINT = ("infinity. This is probably", "we recommend using a symmetric and normalized space")
+"""warnings about spaces that learning here does not mind: it normalizes observations and scales actions itself"""
+
 
 def api_findings(make: Callable[[], gym.Env], env_id: str, wrapped: bool) -> Iterator[Finding]:
     """The result of Gymnasium's checker, and whether observations are copies; `wrapped` in a user's own wrappers."""
@@ -27,8 +30,9 @@ def api_findings(make: Callable[[], gym.Env], env_id: str, wrapped: bool) -> Ite
             found.append(Finding(BAD, f"Gymnasium's checker: {one_line(error)}"))
         finally:
             env.close()
-    told = sorted({one_line(warning.message) for warning in caught if warning.category is UserWarning})
-    found += [Finding(NOTE, f"Gymnasium's checker: {sentence}") for sentence in told]
+    told = {one_line(warning.message) for warning in caught if warning.category is UserWarning}
+    minded = sorted(sentence for sentence in told if not any(part in sentence for part in BESIDE_THE_POINT))
+    found += [Finding(NOTE, f"Gymnasium's checker: {sentence}") for sentence in minded]
     yield from found or [Finding(GOOD, "Gymnasium's checker finds nothing.")]
     if careful.reuses:
         yield Finding(

@@ -80,8 +80,8 @@ class Run:
         self._recent_returns: list[float] = []
         self._unwatched: list[tuple[int, dict[str, float]]] = []
         """logged lines that callbacks have not seen"""
-        self._episodes, self._filmed = 0, 0
-        """whole training episodes so far, and at the last look whether to film"""
+        self._episodes = 0
+        """whole training episodes so far"""
         self._stop_signal = 0
         self._line_time, self._line_step = 0.0, 0
         """when the last line was logged, and at which step"""
@@ -110,7 +110,6 @@ class Run:
         record = {"algorithm": self.algorithm, **self.config.to_json()}
         self._loggers += [make(self.path, record, state.step) for make in self._logger_classes]
         self._episodes = sum(len(line.get("episode/returns", ())) for line in read_metrics(self.path))
-        self._filmed = self._episodes
         return state
 
     def until(self, total_steps: int, state: TrainState) -> Iterator[VecEnv]:
@@ -129,10 +128,11 @@ class Run:
                 self._restart(state)
                 going_on = True
                 while going_on and state.step < total_steps:
-                    before, self._body_began = state.step, time.monotonic()
+                    before, episodes_before = state.step, self._episodes
+                    self._body_began = time.monotonic()
                     yield self.env
                     self._body_time += time.monotonic() - self._body_began
-                    going_on = self._between(state, before, total_steps)
+                    going_on = self._between(state, before, episodes_before, total_steps)
         finally:
             stopping.clear()
             self.seconds = time.monotonic() - started
@@ -174,12 +174,11 @@ class Run:
         self._body_time, self._body_began = 0.0, now
         return {"time/steps_per_second": speed, "time/collect": collect, "time/learn": body - collect}
 
-    def _between(self, state: TrainState, before: int, total_steps: int) -> bool:
+    def _between(self, state: TrainState, before: int, episodes_before: int, total_steps: int) -> bool:
         """Do what is due after an update; returns whether the run goes on."""
         if _passed(self.config.evaluate_every, before, state.step):
             self._evaluate(state)
-        filmed, self._filmed = self._filmed, self._episodes
-        by_episodes = _passed(self.config.video_every_episodes, filmed, self._episodes)
+        by_episodes = _passed(self.config.video_every_episodes, episodes_before, self._episodes)
         if by_episodes or _passed(self.config.video_every, before, state.step):
             self._record(state)
         finished = state.step >= total_steps
