@@ -7,6 +7,7 @@ from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
+import pytest
 import torch
 
 from lemniscate.algos import ppo, sac
@@ -227,12 +228,29 @@ class CompiledCalls:
         torch.compile = counted
 
 
-def require_in_own_process(module, call):
+COMPILERS = ["eager", pytest.param("inductor", marks=pytest.mark.long)]
+"""of torch.compile: "eager" traces the program and calls it, in a few seconds; "inductor" makes machine code of it"""
+
+
+def compile_with(compiler):
+    """From here on torch.compile traces as before, but leaves the program to another compiler than its own."""
+    original = torch.compile
+
+    def compiled(function, options, **others):
+        guards = {"guard_filter_fn": options["guard_filter_fn"]}
+        return original(function, backend=compiler, options=guards, **others)
+
+    if compiler != "inductor":
+        torch.compile = compiled
+
+
+def require_in_own_process(module, call, compiler="inductor"):
     """Run `call` of a test module in a new process: the shape checks of this one are not for the compiler."""
     folder = Path(sys.modules[module].__file__).parent
     paths = [str(folder), str(TESTS), *filter(None, [os.environ.get("PYTHONPATH")])]
+    prepare = f"import helpers; helpers.compile_with('{compiler}')"
     done = subprocess.run(
-        [sys.executable, "-c", f"from {module.rpartition('.')[2]} import *; {call}"],
+        [sys.executable, "-c", f"{prepare}; from {module.rpartition('.')[2]} import *; {call}"],
         cwd=folder,
         env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
         capture_output=True,

@@ -40,7 +40,7 @@ def test_a_network_and_a_logger_of_ones_own(tmp_path):
 def test_an_environment_of_ones_own_with_arguments_and_a_wrapper(tmp_path):
     own = ["--env", "own_environment:Balance", "--env-args", '{"wind": 0.5}']
     own += ["--wrappers", "own_environment:scaled(factor=0.1)"]
-    steps = ["--total-steps", "2_000", "--learning-starts", "500", "--run", tmp_path / "run"]
+    steps = ["--total-steps", "700", "--learning-starts", "500", "--run", tmp_path / "run"]
     run([*LEMNISCATE, "train", "sac", *own, *steps])
     run([*LEMNISCATE, "evaluate", tmp_path / "run", "--episodes", "2", "--env-args", '{"wind": 0}'])
     assert run([*LEMNISCATE, "check", "own_environment:Balance"]).stderr

@@ -14,15 +14,15 @@ from matplotlib.figure import Figure
 
 from lemniscate.maths import gae
 
-END, WALKS, STEPS = 10, 20_000, 1000
+END, STEPS = 10, 1000
 LAMBDAS = torch.cat([torch.linspace(0, 0.9, 19), torch.linspace(0.91, 1, 10)])
 COLORS = {0.0: "#3465a4", 0.9: "#4e9a06", 1.0: "#cc0000"}
 
 
-def walk():
+def walk(walks):
     """Positions before and after each step, rewards, ends, and which rows are of the walk, all [T, N]."""
     generator = torch.Generator().manual_seed(1)
-    moves = 2 * torch.randint(2, (STEPS, WALKS), generator=generator) - 1
+    moves = 2 * torch.randint(2, (STEPS, walks), generator=generator) - 1
     after = END // 2 + moves.cumsum(0)
     outside = (after <= 0) | (after >= END)
     times_outside = outside.cumsum(0)
@@ -47,9 +47,9 @@ def errors(lam, rollout, valid, pair, q):
     return (weights * mean.square()).sum().sqrt(), (weights * variance).sum().sqrt()
 
 
-def draw():
+def draw(walks=20_000):
     """One walk at three λ; the error over many walks at every λ."""
-    before, after, reward, ended, valid = walk()
+    before, after, reward, ended, valid = walk(walks)
     rollout = (reward, critic(before), critic(after), ended)
     figure = Figure(figsize=(10, 4), layout="constrained")
     one, many = figure.subplots(1, 2)
@@ -83,7 +83,7 @@ def draw():
         f"λ = {LAMBDAS[best]:.2f}", (LAMBDAS[best], total[best]), (0, 8), textcoords="offset points", ha="center"
     )
     many.set(xlabel="λ", ylabel="error of the estimate", ylim=(0, None))
-    many.set_title(f"{WALKS:,} walks", loc="left")
+    many.set_title(f"{walks:,} walks", loc="left")
     many.legend(frameon=False, fontsize=8)
     for axes in (one, many):
         axes.spines[["top", "right"]].set_visible(False)

@@ -10,6 +10,7 @@ import environments  # noqa: F401  (registers Copy-box-v0)
 import lemniscate as lem
 from conftest import tiny_off_policy
 from helpers import (
+    COMPILERS,
     CPU,
     MODES,
     CompiledCalls,
@@ -209,9 +210,14 @@ def compiled_equals_eager(algo, delay=1, updates=1, matmul="float32"):
     assert sum(programs) == 2 * delay
 
 
-@pytest.mark.parametrize("case", ["ddpg, delay=2, updates=2", "td3, delay=2", "sac", "ddpg, matmul='bfloat16'"])
-def test_compiled_updates_equal_eager_ones(case):
-    require_in_own_process(__name__, f"compiled_equals_eager({case})")
+@pytest.mark.parametrize("compiler", COMPILERS)
+@pytest.mark.parametrize("case", ["ddpg, delay=2, updates=2", "td3, delay=2", "ddpg, matmul='bfloat16'"])
+def test_traced_updates_equal_eager_ones(case, compiler):
+    require_in_own_process(__name__, f"compiled_equals_eager({case})", compiler)
+
+
+def test_compiled_updates_equal_eager_ones():
+    require_in_own_process(__name__, "compiled_equals_eager(sac)")
 
 
 @EACH

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import environments
-from helpers import MODES, CompiledCalls, begin, copy_of, equal, one_rollout, require_in_own_process, small
+from helpers import COMPILERS, MODES, CompiledCalls, begin, copy_of, equal, one_rollout, require_in_own_process, small
 from lemniscate.algos import a2c, ppo, reinforce, trpo
 from lemniscate.data.rollout import collect
 from lemniscate.errors import UserError
@@ -156,6 +156,7 @@ def compiled_equals_eager(algo, env, programs):
     assert min(compiled.calls) >= 3
 
 
+@pytest.mark.parametrize("compiler", COMPILERS)
 @pytest.mark.parametrize(
     "case",
     [
@@ -165,5 +166,5 @@ def compiled_equals_eager(algo, env, programs):
         "reinforce, 'CartPole-v1', programs=3",  # act, the policy, the value
     ],
 )
-def test_compiled_updates_equal_eager_ones(case):
-    require_in_own_process(__name__, f"compiled_equals_eager({case})")
+def test_traced_updates_equal_eager_ones(case, compiler):
+    require_in_own_process(__name__, f"compiled_equals_eager({case})", compiler)

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from helpers import CPU, CompiledCalls, numbers, require_in_own_process, small_networks
+from helpers import COMPILERS, CPU, CompiledCalls, numbers, require_in_own_process, small_networks
 from lemniscate.algos import ppo
 from lemniscate.maths import means
 from lemniscate.optim.adam import Adam
@@ -62,11 +62,14 @@ def programs_are_not_mixed_up():
         torch.testing.assert_close(act(obs, noise), one.networks.policy.act(obs, noise))
 
 
-@pytest.mark.parametrize(
-    "call", ["compiled_equals_eager('box')", "compiled_equals_eager('discrete')", "programs_are_not_mixed_up()"]
-)
-def test_compiled_steps_equal_eager_ones(call):
-    require_in_own_process(__name__, call)
+@pytest.mark.parametrize("compiler", COMPILERS)
+@pytest.mark.parametrize("call", ["compiled_equals_eager('discrete')", "programs_are_not_mixed_up()"])
+def test_traced_steps_equal_eager_ones(call, compiler):
+    require_in_own_process(__name__, call, compiler)
+
+
+def test_compiled_steps_equal_eager_ones():
+    require_in_own_process(__name__, "compiled_equals_eager('box')")
 
 
 def count(config, state, data, minibatches, *, weight, update):
