@@ -12,6 +12,8 @@ from lemniscate.report.curves import training_minutes
 from lemniscate.report.groups import group
 from lemniscate.report.seeds import bootstrap_interval, improvement_interval, iqm
 from lemniscate.run import checkpoint
+from lemniscate.run.files import write_json
+from lemniscate.run.metrics import to_line
 
 
 @dataclasses.dataclass
@@ -28,14 +30,14 @@ def write_run(path, algorithm="ppo", env="CartPole-v1", seed=1, score=100.0, *, 
     """A run directory as training leaves it, of 1,000 steps in ten lines, without the weights."""
     config = lem.config_for(algorithm, env, seed=seed, **{"total_steps": 10_000, **fields}).to_json()
     path.mkdir(parents=True)
-    (path / "config.json").write_text(json.dumps({"algorithm": algorithm, "config": config}))
+    write_json(path / "config.json", {"algorithm": algorithm, "config": config})
     last = 10_000 if taken is None else taken
-    with (path / "metrics.jsonl").open("w") as file:
+    with (path / "metrics.jsonl").open("wb") as file:
         for step in range(1_000, last + 1, 1_000):
             returns = [score * step / 10_000] * 3
-            file.write(json.dumps({"step": step, "time/steps_per_second": rate, "episode/returns": returns}) + "\n")
+            file.write(to_line({"step": step, "time/steps_per_second": rate, "episode/returns": returns}))
     checkpoint.write(path / "checkpoints", Weightless(), last, {"planned": True}, keep=1)
-    (path / "final.json").write_text(json.dumps({"step": last, "mean_return": score}))
+    write_json(path / "final.json", {"step": last, "mean_return": score})
     return path
 
 
@@ -94,7 +96,7 @@ def test_the_time_of_training_is_added_up_from_its_speed(tmp_path):
         {"step": 100, "evaluation/return": 1.0},
         {"step": 400, "time/steps_per_second": 5.0},
     ]
-    (run / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    (run / "metrics.jsonl").write_bytes(b"".join(map(to_line, lines)))
     steps, minutes = training_minutes(run)
     assert steps.tolist() == [0, 100, 400]
     assert (60 * minutes).tolist() == pytest.approx([0, 10, 70])

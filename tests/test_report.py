@@ -1,6 +1,5 @@
 """Pictures and pages of runs: axes, gaps, titles, report.html, and the rules of what to try next."""
 
-import json
 import re
 import shlex
 import shutil
@@ -16,6 +15,8 @@ from lemniscate import plots
 from lemniscate.cli import parse
 from lemniscate.report import advice, commands, curves, diagnostics, html, run_page, style
 from lemniscate.report.advice import Evidence
+from lemniscate.run.files import read_json, write_json
+from lemniscate.run.metrics import to_line
 from test_compare import write_run, write_runs
 
 PAGE = (Path(__file__).parents[1] / "docs" / "glossary.md").read_text()
@@ -55,7 +56,7 @@ def curve(monkeypatch, run, by="step"):
 
 
 def with_lines(run, lines):
-    (run / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    (run / "metrics.jsonl").write_bytes(b"".join(map(to_line, lines)))
     return run
 
 
@@ -189,13 +190,13 @@ def test_nothing_in_the_files_of_a_run_becomes_markup(tmp_path):
     """Each text that a run's directory holds, and the directory's own name."""
     evil = '"><script>alert(1)</script><img src=x onerror=alert(1)>&\ud800'
     run = write_run(tmp_path / "<b>r")
-    record = json.loads((run / "config.json").read_text())
+    record = read_json(run / "config.json")
     record["config"] = dict.fromkeys(record["config"], evil) | {
         "total_steps": 10,
         evil: evil,
         "env_kwargs": {evil: evil},
     }
-    (run / "config.json").write_text(json.dumps({"algorithm": evil, "config": record["config"]}))
+    write_json(run / "config.json", {"algorithm": evil, "config": record["config"]})
     text = page_of(run, {**SCORES, evil: 1.0})
     page = Page(text)
     assert {tag for tag, _ in page.seen} & {"script", "img", "b"} == set()
@@ -227,7 +228,7 @@ def test_a_run_without_anything_has_a_page(tmp_path):
 )
 def test_the_command_of_the_page_trains_the_same_run(tmp_path, algorithm, fields):
     run = write_run(tmp_path / "r", algorithm, **{"env": "CartPole-v1", **fields}, seed=7)
-    record = json.loads((run / "config.json").read_text())
+    record = read_json(run / "config.json")
     _, *words = shlex.split(commands.train(algorithm, record["config"]))
     given = parse(words)
     again = lem.config_for(given.algorithm, given.env, given.preset, **given.fields)

@@ -18,7 +18,8 @@ from lemniscate import sweep
 from lemniscate.cli import main
 from lemniscate.run import checkpoint
 from lemniscate.run.directory import is_finished
-from lemniscate.run.loggers import read_metrics
+from lemniscate.run.files import read_json, write_json
+from lemniscate.run.metrics import read_metrics
 from lemniscate.run.sweep_progress import SweepProgress
 
 SEEDS = ["--seeds", "1-2"]
@@ -157,12 +158,12 @@ def test_two_processes_do_not_train_one_sweep(trained):
 
 def test_the_policy_is_played_anew_when_there_is_a_newer_checkpoint(trained, tmp_path, capsys):
     run = shutil.copytree(trained[0] / "ppo-1", tmp_path / "run")
-    known = json.loads((run / "final.json").read_text())
+    known = read_json(run / "final.json")
     assert lem.plots.final_return(run) == known["mean_return"]
     assert capsys.readouterr().err == ""
     newest = run / "checkpoints" / f"step-{known['step']}"
     newest.rename(newest.with_name(f"step-{known['step'] + 1}"))
-    (run / "final.json").write_text(json.dumps(known | {"mean_return": 7.0}))
+    write_json(run / "final.json", known | {"mean_return": 7.0})
     assert lem.plots.final_return(run) == known["mean_return"]
     assert "Evaluating" in capsys.readouterr().err
 

@@ -11,7 +11,7 @@ __version__ = "0.2.0"
 if TYPE_CHECKING:
     from lemniscate.api import config_for, resume, train
     from lemniscate.envs.vector_view import make_vec
-    from lemniscate.errors import NonFiniteError, SweepError, UserError
+    from lemniscate.errors import NonFiniteError, NotStoredError, SweepError, UserError
     from lemniscate.plots import plot
     from lemniscate.policy import TrainedPolicy
     from lemniscate.results import TrainedRun, evaluate, load, save, watch
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Evaluation",
     "NonFiniteError",
+    "NotStoredError",
     "Stopped",
     "SweepError",
     "TrainedPolicy",
@@ -49,6 +50,7 @@ MODULES = {
     "Evaluation": "run.evaluate",
     "NonFiniteError": "errors",
     "Stopped": "run.run",
+    "NotStoredError": "errors",
     "SweepError": "errors",
     "TrainedPolicy": "policy",
     "TrainedRun": "results",

@@ -14,7 +14,7 @@ from lemniscate.callbacks import Callback, watch_with
 from lemniscate.console import say
 from lemniscate.envs import registry
 from lemniscate.envs.vec_env import VecEnv
-from lemniscate.errors import UserError, is_installed, missing_extra, shown, unknown_name
+from lemniscate.errors import NotStoredError, UserError, is_installed, missing_extra, shown, unknown_name
 from lemniscate.policy import TrainedPolicy
 from lemniscate.report import pictures as pictures_of
 from lemniscate.report import playback
@@ -171,7 +171,13 @@ def _train(
             pictures = pictures_of.report(state.policy, run.eval_env, path, config.evaluate_episodes, critic)
     finally:
         run.close(pictures)
-    return TrainedRun(path, TrainedPolicy(state.networks.cpu(), spec, config, state.step), run.seconds)
+    trained = TrainedRun(path, TrainedPolicy(state.networks.cpu(), spec, config, state.step), run.seconds)
+    try:
+        run.require_stored()
+    except NotStoredError as error:
+        error.run = trained
+        raise
+    return trained
 
 
 def loggers_with(track: str | LoggerClass | None) -> tuple[LoggerClass, ...]:

@@ -21,6 +21,12 @@ class NonFiniteError(ArithmeticError):
     """A NaN or an infinity where training would have learned from it: names quantity, environment and step."""
 
 
+class NotStoredError(RuntimeError):
+    """The disk refused the last checkpoint of a run; `run` is what `train` would have returned, in memory."""
+
+    run: Any = None
+
+
 class WorkerError(RuntimeError):
     """The process of an environment died, or does not answer: names which."""
 

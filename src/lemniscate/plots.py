@@ -1,6 +1,5 @@
 """The verb for the curves of runs, plot, and the final returns that runs are compared by."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,8 @@ from lemniscate.results import TrainedRun, evaluate, load, path_of
 from lemniscate.run import checkpoint
 from lemniscate.run.directory import is_finished, read_config
 from lemniscate.run.environments import evaluation_env
-from lemniscate.run.loggers import read_metrics
+from lemniscate.run.files import DamagedFileError, read_json, write_json
+from lemniscate.run.metrics import read_metrics
 from lemniscate.run.q_bias import QBias
 from lemniscate.run.sweep_file import is_sweep, read_sweep
 
@@ -93,16 +93,24 @@ def final_scores(run: str | Path | TrainedRun) -> dict[str, Any]:
     """
     path = path_of(run)
     file = path / "final.json"
-    known: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {}
+    known = _known_scores(file)
     if known.get("step") not in checkpoint.list_steps(path / "checkpoints")[-1:]:
         policy = load(path)
         say(f"Evaluating {path}: {FINAL_EPISODES} episodes.")
         scores = evaluate(policy, episodes=FINAL_EPISODES, seed=0)
         known = {"step": policy.step, "seed": 0, **scores.to_json()}
-        temporary = file.with_suffix(".tmp")
-        temporary.write_text(json.dumps(known) + "\n")
-        temporary.replace(file)
+        write_json(file, known)
     return known
+
+
+def _known_scores(file: Path) -> dict[str, Any]:
+    """The scores that were kept; none if the file is not there, or damaged, so that they are found again."""
+    try:
+        return read_json(file)
+    except DamagedFileError as error:
+        if file.exists():
+            say(error)
+        return {}
 
 
 def _final_returns(runs: list[Path]) -> dict[Path, float]:

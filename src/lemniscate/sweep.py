@@ -25,7 +25,7 @@ from lemniscate.errors import SweepError, UserError, prefix_errors, resume_line,
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import is_finished
 from lemniscate.run.environments import device_for
-from lemniscate.run.loggers import read_metrics
+from lemniscate.run.metrics import read_metrics
 from lemniscate.run.run import Stopped, signals_to
 from lemniscate.run.sweep_file import Sweep, read_sweep
 from lemniscate.run.sweep_progress import SweepProgress

@@ -22,7 +22,7 @@ import torch
 from lemniscate import algos, api, results
 from lemniscate.run import checkpoint
 from lemniscate.run.config import RunConfig
-from lemniscate.run.loggers import read_metrics
+from lemniscate.run.metrics import read_metrics
 from lemniscate.run.state import TrainState
 
 SIGNATURES = {"init": ["config", "spec", "device"], "train": ["config", "run"]}

@@ -15,7 +15,7 @@ from conftest import tiny_fields, tiny_off_policy
 from lemniscate.envs import toy
 from lemniscate.report import live
 from lemniscate.run import checkpoint
-from lemniscate.run.loggers import read_metrics
+from lemniscate.run.metrics import read_metrics
 
 CASES = {
     "ppo": ("CartPole-v1", tiny_fields("CartPole-v1", checkpoint_every=64)),

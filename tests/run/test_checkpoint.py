@@ -12,7 +12,7 @@ import torch
 from conftest import tiny
 from lemniscate.algos import ppo
 from lemniscate.run import checkpoint
-from lemniscate.run.checkpoint import DamagedCheckpointError
+from lemniscate.run.files import DamagedFileError
 from lemniscate.spec import Box, Discrete, MultiBinary, MultiDiscrete, ObservationPart, Spec
 from lemniscate.types import Batch
 
@@ -101,7 +101,7 @@ def test_every_flipped_bit_is_seen(tmp_path):
         data = bytearray(victim.read_bytes())
         data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
         victim.write_bytes(data)
-        with pytest.raises(DamagedCheckpointError, match=victim.name):
+        with pytest.raises(DamagedFileError, match=victim.name):
             checkpoint.read(bad)
 
 
@@ -110,7 +110,7 @@ def test_missing_truncated_and_foreign_files_are_named(tmp_path, name):
     path = write(tmp_path / "c", state_with_history())
     for damage in (lambda f: f.unlink(), lambda f: f.write_bytes(f.read_bytes()[:10]) if f.exists() else f.touch()):
         damage(path / name)
-        with pytest.raises(DamagedCheckpointError, match=name):
+        with pytest.raises(DamagedFileError, match=name):
             checkpoint.read(path)
 
 
@@ -126,7 +126,7 @@ def test_a_pickle_is_never_executed(tmp_path):
     for name in (*checkpoint.FILES, "manifest.json"):
         kept = (path / name).read_bytes()
         (path / name).write_bytes(evil)
-        with pytest.raises(DamagedCheckpointError):
+        with pytest.raises(DamagedFileError):
             checkpoint.read(path)
         (path / name).write_bytes(kept)
     assert not marker.exists()

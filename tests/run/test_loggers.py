@@ -1,4 +1,6 @@
-import json
+import re
+import resource
+import signal
 import sys
 import time
 from types import ModuleType, SimpleNamespace
@@ -7,7 +9,8 @@ import pytest
 
 from lemniscate.envs.episodes import Episodes
 from lemniscate.report.curves import episode_returns
-from lemniscate.run.loggers import JsonLines, TensorBoard, read_metrics
+from lemniscate.run.loggers import JsonLines, TensorBoard
+from lemniscate.run.metrics import damage, read_metrics, to_line
 from lemniscate.run.wandb_logger import WeightsAndBiases
 
 
@@ -43,22 +46,58 @@ def test_what_is_not_a_number_is_left_out(tmp_path):
     log = JsonLines(tmp_path, {}, 0)
     log.write(10, {"x": float("nan"), "y": float("inf"), "z": 1.0})
     log.close([])
-    assert (tmp_path / "metrics.jsonl").read_text() == '{"step": 10, "z": 1.0}\n'
+    assert read_metrics(tmp_path) == [{"step": 10, "z": 1.0}]
 
 
 def test_a_line_that_a_crash_cut_off_is_left_out(tmp_path):
-    (tmp_path / "metrics.jsonl").write_text(json.dumps({"step": 1}) + '\n{"step": 2, "x"')
+    (tmp_path / "metrics.jsonl").write_bytes(to_line({"step": 1}) + to_line({"step": 2, "x": 1})[:-3])
     assert read_metrics(tmp_path) == [{"step": 1}]
 
 
 def test_of_the_end_of_a_file_only_whole_lines_are_read(tmp_path):
-    lines = [json.dumps({"step": step}) + "\n" for step in range(8)]
-    (tmp_path / "metrics.jsonl").write_text("".join(lines))
+    lines = [to_line({"step": step}) for step in range(8)]
+    (tmp_path / "metrics.jsonl").write_bytes(b"".join(lines))
     for count in range(1, 9):
         size = count * len(lines[0])
         assert [line["step"] for line in read_metrics(tmp_path, size)] == list(range(8 - count, 8))
         assert [line["step"] for line in read_metrics(tmp_path, size + 1)] == list(range(8 - count, 8))
         assert [line["step"] for line in read_metrics(tmp_path, size - 1)] == list(range(9 - count, 8))
+
+
+def test_every_flipped_bit_of_a_line_is_seen_and_no_other_line_is_lost(tmp_path):
+    lines = [to_line({"step": step, "x": 0.5}) for step in (1, 2, 3)]
+    for position in range(8 * len(lines[1])):
+        damaged = bytearray(lines[1])
+        damaged[position // 8] ^= 1 << position % 8
+        (tmp_path / "metrics.jsonl").write_bytes(lines[0] + damaged + lines[2])
+        assert {1, 3} >= {line["step"] for line in read_metrics(tmp_path)} >= {1}
+        assert re.search("line 2 is damaged|lines 2, 3 are damaged", damage(tmp_path, 3) or "")
+
+
+def test_lines_that_are_missing_at_the_end_are_told(tmp_path):
+    (tmp_path / "metrics.jsonl").write_bytes(to_line({"step": 10}))
+    assert damage(tmp_path, 10) is None
+    assert "ends at step 10; its lines up to step 30 are lost" in damage(tmp_path, 30)
+
+
+def test_lines_that_the_disk_refuses_are_written_later(tmp_path, capsys):
+    """Beyond the limit on the size of files, write() fails as on a full disk; before it, it takes a part."""
+    log = JsonLines(tmp_path, {}, 0)
+    log.write(10, {"x": 1.0})
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (60, before[1]))
+        for step in (20, 30, 40):
+            log.write(step, {"x": 1.0})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, ignored)
+    assert (tmp_path / "metrics.jsonl").stat().st_size == 60
+    assert capsys.readouterr().err.count("cannot be written: File too large. Its lines are kept until it can.") == 1
+    log.write(50, {"x": 1.0})
+    log.close([])
+    assert [line["step"] for line in read_metrics(tmp_path)] == [10, 20, 30, 40, 50]
 
 
 class FakeWandb(ModuleType):

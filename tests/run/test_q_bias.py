@@ -15,7 +15,7 @@ from lemniscate.nn.networks import Layers
 from lemniscate.report import curves
 from lemniscate.report.pictures import sentence
 from lemniscate.run.evaluate import evaluate
-from lemniscate.run.loggers import read_metrics
+from lemniscate.run.metrics import read_metrics
 from lemniscate.run.q_bias import QBias
 from lemniscate.spec import Box, ObservationPart, Spec
 

@@ -21,7 +21,7 @@ from lemniscate.envs import toy
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.run import checkpoint
 from lemniscate.run.evaluate import EVALUATION
-from lemniscate.run.loggers import read_metrics
+from lemniscate.run.metrics import read_metrics
 from lemniscate.run.run import TRAINING
 from lemniscate.run.seeding import derive
 
@@ -61,7 +61,7 @@ def train(path, env="Countdown-v0", **fields):
 def final_hashes(path: Path) -> dict[str, str]:
     """sha256 of every file of the last checkpoint."""
     last = checkpoint.list_steps(path / "checkpoints")[-1]
-    return {"step": last, **json.loads((path / "checkpoints" / f"step-{last}" / "manifest.json").read_text())["sha256"]}
+    return {"step": last, **json.loads((path / "checkpoints" / f"step-{last}" / "manifest.json").read_text())["files"]}
 
 
 def history(path: Path) -> list[dict]:

@@ -17,7 +17,15 @@ from typing import Any, NoReturn
 from lemniscate import __version__
 from lemniscate.algos import ALGORITHMS
 from lemniscate.console import say
-from lemniscate.errors import NonFiniteError, SweepError, UserError, WorkerError, is_installed, unknown_name
+from lemniscate.errors import (
+    NonFiniteError,
+    NotStoredError,
+    SweepError,
+    UserError,
+    WorkerError,
+    is_installed,
+    unknown_name,
+)
 
 COMMANDS = {
     "train": "Train a policy, or one for each of several algorithms and seeds, to compare them.",
@@ -46,16 +54,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         learning = given.command in ("train", "resume")
         say(f"{error} Training stopped; the last checkpoint is as it was." if learning else error)
         return 1
-    except SweepError as error:
+    except (NotStoredError, SweepError) as error:
         say(error)
         return 1
     except KeyboardInterrupt as stopped:  # a run that was asked to stop has a sentence and a signal of its own
         say(str(stopped) or "Interrupted.")
         return 128 + getattr(stopped, "signum", 2)
+    except BrokenPipeError:  # whoever read the output has read enough
+        return 141
     except OSError as error:  # a disk that is full, a folder that cannot be written
-        if error.filename is None:
+        if error.errno is None:
             raise
-        say(f"{error.filename}: {error.strerror}.")
+        say(f"{error.filename or 'A file could not be written'}: {error.strerror}.")
         return 1
     except SystemExit as done:  # argparse has printed help, or the version
         return int(done.code or 0)

@@ -11,7 +11,7 @@ from lemniscate.errors import unknown_name
 from lemniscate.report.diagnostics import diagnostics, draw_metric
 from lemniscate.report.style import COLORS, finish, legend_above, run_styles, save
 from lemniscate.run.directory import read_config
-from lemniscate.run.loggers import read_metrics
+from lemniscate.run.metrics import read_metrics
 from lemniscate.run.q_bias import QBias
 
 BY = {"step": "environment steps", "episode": "episode", "minute": "minutes of training"}

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from lemniscate.report.style import finish, legend_above, limit_axis, run_styles, save
-from lemniscate.run.loggers import read_metrics
+from lemniscate.run.metrics import read_metrics
 
 TITLES = {
     "losses/policy": ("Policy loss", ""),

@@ -14,7 +14,7 @@ from lemniscate.report import advice, commands, html
 from lemniscate.report.curves import training_minutes
 from lemniscate.report.html import Html, element, section
 from lemniscate.run.directory import read_config
-from lemniscate.run.loggers import read_metrics
+from lemniscate.run.metrics import read_metrics
 
 CAPTIONS = {
     "learning_curve": "Return of each whole training episode, from a policy that explores",

@@ -10,11 +10,9 @@ find damage, not malice; but nothing in these files can be executed.
 
 import dataclasses
 import hashlib
-import json
-import os
-import shutil
 from collections import Counter
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, get_args
 
@@ -22,16 +20,23 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from lemniscate.errors import UserError
+from lemniscate.errors import NonFiniteError, UserError
+from lemniscate.run.files import (
+    DamagedFileError,
+    make_directory,
+    open_regular,
+    parsing,
+    read_json,
+    remove,
+    sync,
+    write_json,
+)
 from lemniscate.run.state import TrainState
 from lemniscate.spec import Action, ObservationPart, Spec
 
-FORMAT = 1
-FILES = ("tensors.safetensors", "state.json")
-
-
-class DamagedCheckpointError(UserError):
-    """A checkpoint with a file that is missing or does not match its hash."""
+FORMAT = 2
+TENSORS, STATE, MANIFEST = "tensors.safetensors", "state.json", "manifest.json"
+FILES = (TENSORS, STATE)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,12 +49,13 @@ class Checkpoint:
     record: dict[str, Any]
 
     def restore(self, state: TrainState) -> None:
-        """Restore every saved field of a State of the same Config."""
-        for name, value in state.saved().items():
-            if hasattr(value, "load_state_dict"):
-                value.load_state_dict(self.tensors_of(name))
-            else:
-                setattr(state, name, self.numbers[name])
+        """Restore every saved field of a State of the same Config. Raises `DamagedFileError` if one does not fit."""
+        with parsing(self.path):
+            for name, value in state.saved().items():
+                if hasattr(value, "load_state_dict"):
+                    value.load_state_dict(self.tensors_of(name))
+                else:
+                    setattr(state, name, self.numbers[name])
 
     def tensors_of(self, name: str) -> dict[str, Tensor]:
         """The `state_dict` of one field of the State."""
@@ -61,18 +67,22 @@ def write(directory: Path, state: TrainState, step: int, record: dict[str, Any],
     """Write `directory/step-N` with the saved fields of `state`, and delete all but the newest `keep`.
 
     `record` is any JSON that a reader needs beside the state.
+
+    Raises:
+        OSError: it could not be written; the checkpoints before are untouched, and nothing is left of this one.
+        NonFiniteError: a NaN or an infinity in a parameter or an optimizer; nothing is written.
     """
     final = directory / f"step-{step}"
     for stale in directory.glob("*.tmp"):
-        shutil.rmtree(stale)
+        remove(stale)
     write_fields(final, state.saved(), record)
     for old in list_steps(directory)[:-keep]:
-        shutil.rmtree(directory / f"step-{old}")
+        remove(directory / f"step-{old}")
     return final
 
 
 def write_fields(final: Path, fields: Mapping[str, Any], record: dict[str, Any]) -> None:
-    """Write the checkpoint `final` with these fields, in the place of one that is there."""
+    """Write the checkpoint `final` with these fields, in the place of one that is there; raises as `write`."""
     tensors: dict[str, Tensor] = {}
     numbers: dict[str, Any] = {}
     for name, value in fields.items():
@@ -80,41 +90,56 @@ def write_fields(final: Path, fields: Mapping[str, Any], record: dict[str, Any])
             tensors |= {f"{name}.{key}": t for key, t in value.state_dict().items()}
         else:
             numbers[name] = value
-    temporary = final.with_name(f"{final.name}.tmp")
-    temporary.mkdir(parents=True)
-    save_file(_to_save(tensors), temporary / FILES[0])
-    (temporary / FILES[1]).write_text(_json({"numbers": numbers, "record": record}))
-    hashes = {name: _sha256(temporary / name) for name in FILES}
-    (temporary / "manifest.json").write_text(_json({"format": FORMAT, "sha256": hashes}))
-    for path in temporary.iterdir():
-        _sync(path)
-    _sync(temporary)
-    if final.exists():
-        shutil.rmtree(final)
-    temporary.rename(final)
-    _sync(final.parent)
+    if name := _not_finite(tensors):
+        raise NonFiniteError(f"{name} has a value that is not finite; {final} is not written.")
+    temporary, replaced = final.with_name(f"{final.name}.tmp"), final.with_name(f"{final.name}.old.tmp")
+    make_directory(final.parent)
+    remove(temporary)
+    try:
+        temporary.mkdir()
+        save_file(_to_save(tensors), temporary / TENSORS)
+        sync(temporary / TENSORS)
+        write_json(temporary / STATE, {"numbers": numbers, "record": record})
+        write_json(
+            temporary / MANIFEST, {"format": FORMAT, "files": {name: _sha256(temporary / name) for name in FILES}}
+        )
+        sync(temporary)
+        if final.exists():
+            remove(replaced)
+            final.rename(replaced)
+        temporary.rename(final)
+        sync(final.parent)
+        remove(replaced)
+    except SafetensorError as error:  # its word for an error of the disk
+        raise OSError(str(error)) from error
+    finally:
+        with suppress(OSError):
+            remove(temporary)
 
 
 def read(path: Path) -> Checkpoint:
     """Read one checkpoint directory and check every byte of it.
 
     Raises:
-        DamagedCheckpointError: naming the file and what is wrong with it.
+        DamagedFileError: naming the file and what is wrong with it.
     """
     _verify(path)
     try:
-        tensors = load_file(path / FILES[0])
-        state = json.loads((path / FILES[1]).read_bytes())
-        return Checkpoint(path, tensors, state["numbers"], state["record"])
-    except (SafetensorError, ValueError, KeyError, TypeError) as error:
-        raise DamagedCheckpointError(f"{path} cannot be read: {error}.") from error
+        tensors = load_file(path / TENSORS)
+    except SafetensorError as error:
+        raise DamagedFileError(f"{path / TENSORS} cannot be read: {error}.") from error
+    if name := _not_finite(tensors):
+        raise DamagedFileError(f"{path / TENSORS} has a value that is not finite in {name}.")
+    state = read_json(path / STATE)
+    with parsing(path / STATE):
+        return Checkpoint(path, tensors, dict(state["numbers"]), dict(state["record"]))
 
 
 def is_whole(path: Path) -> bool:
     """Whether every file of a checkpoint directory matches its hash."""
     try:
         _verify(path)
-    except DamagedCheckpointError:
+    except DamagedFileError:
         return False
     return True
 
@@ -154,41 +179,23 @@ def _to_save(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     return {name: (t.clone() if times[at[name]] > 1 else t).detach().cpu().contiguous() for name, t in tensors.items()}
 
 
+def _not_finite(tensors: Mapping[str, Tensor]) -> str | None:
+    """The name of a tensor with a NaN or an infinity. Replayed rows were looked at when they were collected."""
+    looked_at = (name for name in tensors if not name.startswith("replay."))
+    return next((name for name in looked_at if not bool(tensors[name].isfinite().all())), None)
+
+
 def _verify(path: Path) -> None:
-    manifest = _parse(path / "manifest.json")
+    manifest = read_json(path / MANIFEST)
     if manifest.get("format") != FORMAT:
         raise UserError(f"{path} has format {manifest.get('format')!r}; this version of lemniscate reads {FORMAT}.")
+    with parsing(path / MANIFEST):
+        hashes = {name: manifest["files"][name] for name in FILES}
     for name in FILES:
-        if _sha256(path / name) != manifest.get("sha256", {}).get(name):
-            raise DamagedCheckpointError(f"{path / name} is damaged: its sha256 differs from the one that was written.")
-
-
-def _json(record: Any) -> str:
-    return json.dumps(record, indent=1)
+        if _sha256(path / name) != hashes[name]:
+            raise DamagedFileError(f"{path / name} is damaged: its sha256 differs from the one that was written.")
 
 
 def _sha256(path: Path) -> str:
-    if not path.is_file():
-        raise DamagedCheckpointError(f"{path} is missing.")
-    with path.open("rb") as file:
+    with open_regular(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _parse(path: Path) -> dict[str, Any]:
-    if not path.is_file():
-        raise DamagedCheckpointError(f"{path} is missing.")
-    try:
-        parsed = json.loads(path.read_bytes())
-        if isinstance(parsed, dict):
-            return parsed
-    except ValueError:
-        pass
-    raise DamagedCheckpointError(f"{path} is damaged: it is not JSON.")
-
-
-def _sync(path: Path) -> None:
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

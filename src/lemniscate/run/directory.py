@@ -1,7 +1,6 @@
 """The run directory: its creation, its config, its lock, and the checkpoints in it."""
 
-import json
-import shutil
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -11,42 +10,62 @@ from lemniscate.console import say
 from lemniscate.errors import UserError, resume_line
 from lemniscate.run import checkpoint
 from lemniscate.run.config import RunConfig
+from lemniscate.run.files import (
+    DamagedFileError,
+    make_directory,
+    parsing,
+    read_json,
+    remove,
+    replace_file,
+    sync,
+    write_json,
+)
+from lemniscate.run.metrics import METRICS, damage
 from lemniscate.run.state import TrainState
 from lemniscate.spec import Spec
 
-UNFINISHED = "config.json.tmp"
+CONFIG, LOCK = "config.json", ".lock"
 SWEEP = "sweep.json"
 """the file that the directory of a sweep has in the place of a `config.json`"""
+UNFINISHED = {LOCK, f"{CONFIG}.tmp", f"{SWEEP}.tmp"}
+"""what the creation of a directory leaves where it fails half-way"""
 
 
 def require_absent(path: Path) -> None:
     """Raise `UserError` if a run directory exists already; one whose creation failed half-way does not count."""
-    if path.exists() and (not path.is_dir() or set(path.iterdir()) - {path / UNFINISHED}):
+    if path.exists() and (not path.is_dir() or {file.name for file in path.iterdir()} - UNFINISHED):
         raise UserError(f"{path} exists already; go on with it ({resume_line(path)}) or choose another --run.")
 
 
 def create_directory(path: Path, name: str, record: dict[str, Any]) -> None:
     """Create a directory with the one file `name` that says what it is. Raises `UserError` if it exists already."""
     require_absent(path)
-    temporary = path / UNFINISHED
     try:
-        path.mkdir(parents=True, exist_ok=True)
-        temporary.write_text(json.dumps(record, indent=1) + "\n")
-        temporary.replace(path / name)
+        make_directory(path)
+        write_json(path / name, record)
     except OSError as error:
-        raise UserError(f"{path} cannot be created: {error.strerror}.") from error
+        raise UserError(f"{path} cannot be created: {error.strerror or error}.") from error
 
 
 def read_config(path: Path) -> tuple[str, dict[str, Any]]:
-    """The algorithm's name and the config of a run directory. Raises `UserError` if it is not one."""
+    """The algorithm's name and the config of a run directory; if its file is damaged, those in the newest checkpoint.
+
+    Raises `UserError` if it is not a run.
+    """
     if (path / SWEEP).exists():
-        runs = sorted(file.parent for file in path.glob("*/config.json"))
+        runs = sorted(file.parent for file in path.glob(f"*/{CONFIG}"))
         raise UserError(f"{path} is a sweep: name one of its runs, such as {runs[0] if runs else path / '…'}.")
     try:
-        record = json.loads((path / "config.json").read_text())
+        record = read_json(path / CONFIG)
+    except DamagedFileError as error:
+        found = _newest(path, planned_only=False)
+        if found is None:
+            reason = f": {error}" if (path / CONFIG).is_file() else f": it holds no {CONFIG} that can be read."
+            raise UserError(f"{path} is not a run directory{reason}") from None
+        say(f"{error} Taking the config in {found.path}.")
+        record = found.record
+    with parsing(path / CONFIG):
         return record["algorithm"], dict(record["config"])
-    except (OSError, ValueError, KeyError, TypeError):
-        raise UserError(f"{path} is not a run directory: it holds no config.json that can be read.") from None
 
 
 def is_finished(path: Path) -> bool:
@@ -75,7 +94,7 @@ def _newest(path: Path, planned_only: bool) -> checkpoint.Checkpoint | None:
     for step in reversed(checkpoint.list_steps(path / "checkpoints")):
         try:
             found = checkpoint.read(path / "checkpoints" / f"step-{step}")
-        except checkpoint.DamagedCheckpointError as error:
+        except DamagedFileError as error:
             say(f"{error} Taking the one before.")
             continue
         if found.record["planned"] or not planned_only:
@@ -88,23 +107,30 @@ class Saver:
 
     def __init__(self, path: Path, algorithm: str, config: RunConfig, spec: Spec) -> None:
         self.path = path
-        self.exists = (path / "config.json").exists()
+        self.exists = (path / CONFIG).exists() or bool(checkpoint.list_steps(path / "checkpoints"))
         """whether the run directory was there before this process"""
         self._config, self._checkpoints = config, path / "checkpoints"
         self._identity = {"algorithm": algorithm, "config": config.to_json()}
         self._record = {**self._identity, "spec": checkpoint.spec_to_json(spec)}
-        self._lock = FileLock(path / ".lock", timeout=0)
+        self._lock = FileLock(path / LOCK, timeout=0)
         self.last_planned = 0
         """the step that `resume` would go on from"""
+        self.failure: OSError | None = None
+        """why the last checkpoint could not be written, if it could not"""
 
     def open(self) -> None:
-        """Create the directory if it is new, and lock it. Raises `UserError` if another process trains in it."""
-        if not self.exists:
-            create_directory(self.path, "config.json", self._identity)
+        """Lock the directory, then create it if it is new. Raises `UserError` if another process trains in it."""
         try:
+            make_directory(self.path)
             self._lock.acquire()
         except Timeout:
             raise UserError(f"{self.path} is being trained by another process.") from None
+        except OSError as error:
+            raise UserError(f"{self.path} cannot be written: {error.strerror or error}.") from error
+        if not self.exists:
+            create_directory(self.path, CONFIG, self._identity)
+        elif not _is_whole(self.path / CONFIG):
+            write_json(self.path / CONFIG, self._identity)
 
     def restore(self, state: TrainState) -> bool:
         """Restore the newest whole planned checkpoint, if there is one, and delete those after it.
@@ -116,23 +142,52 @@ class Saver:
         if found:
             found.restore(state)
             self.last_planned = state.step
+            self._keep_damaged_metrics(found.record.get("logged", 0))
         elif steps:
             say(f"{self.path} has no planned checkpoint to go on from; it begins again at step 0.")
         for step in steps:
             if step > state.step:
-                shutil.rmtree(self._checkpoints / f"step-{step}")
+                remove(self._checkpoints / f"step-{step}")
         return found is not None
 
-    def save(self, state: TrainState, planned: bool) -> None:
-        """Write a checkpoint. A full disk costs this checkpoint; neither the run nor the checkpoints before it."""
+    def _keep_damaged_metrics(self, logged: int) -> None:
+        """Copy metrics that are damaged, before they are written again without what is damaged."""
+        if sentence := damage(self.path, logged):
+            file = self.path / METRICS
+            names = (file.with_name(f"metrics.damaged-{n}.jsonl") for n in count(1))
+            kept = next(name for name in names if not name.exists())
+            if file.is_file() and not file.is_symlink():
+                replace_file(kept, file.read_bytes())
+                sentence += f" It is kept as {kept}."
+            say(sentence)
+
+    def save(self, state: TrainState, planned: bool, logged: int) -> None:
+        """Write a checkpoint, and have the disk store the metrics up to it. What fails costs only this checkpoint.
+
+        `logged` is the step of the last line of metrics.
+
+        Raises `NonFiniteError` where the state has a NaN or an infinity; the checkpoints before are untouched.
+        """
         # An unplanned checkpoint is kept beside the planned ones, never in the place of one.
         keep = self._config.keep_checkpoints + (not planned)
+        self.failure = None
         try:
-            checkpoint.write(self._checkpoints, state, state.step, {**self._record, "planned": planned}, keep)
+            if (self.path / METRICS).exists():
+                sync(self.path / METRICS)
+            record = {**self._record, "planned": planned, "logged": logged}
+            checkpoint.write(self._checkpoints, state, state.step, record, keep)
             self.last_planned = state.step if planned else self.last_planned
         except OSError as error:
+            self.failure = error
             say(f"The checkpoint at step {state.step:,} could not be written: {error}.")
 
     def close(self) -> None:
         """Unlock the directory."""
         self._lock.release()
+
+
+def _is_whole(path: Path) -> bool:
+    try:
+        return bool(read_json(path))
+    except DamagedFileError:
+        return False

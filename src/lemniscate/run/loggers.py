@@ -1,13 +1,15 @@
 """Destinations of metrics. A logger is one class with `write` and `close`; a tracker is a logger on request."""
 
-import json
 import math
 from collections.abc import Callable, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol
 
+from lemniscate.console import say
 from lemniscate.envs.episodes import Episodes
+from lemniscate.run.files import replace_file
+from lemniscate.run.metrics import METRICS, read_metrics, to_line
 
 Metrics = Mapping[str, float]
 NO_EPISODES = Episodes([], [])
@@ -29,15 +31,18 @@ LoggerClass = Callable[[Path, Mapping[str, Any], int], Logger]
 
 
 class JsonLines:
-    """`metrics.jsonl`, one line per update. A resumed run first removes the lines after its checkpoint."""
+    """`metrics.jsonl`, one line per update. A resumed run first removes the lines after its checkpoint.
+
+    Lines that the disk refuses are kept, and written with the next one that it takes.
+    """
 
     def __init__(self, path: Path, config: Mapping[str, Any], step: int) -> None:
-        self._path = path / "metrics.jsonl"
+        self._path = path / METRICS
         lines = [line for line in read_metrics(path) if line["step"] <= step] if step else []
-        temporary = self._path.with_suffix(".tmp")
-        temporary.write_text("".join(json.dumps(line) + "\n" for line in lines))
-        temporary.replace(self._path)
-        self._file = self._path.open("a")
+        replace_file(self._path, b"".join(map(to_line, lines)))
+        self._file = self._path.open("ab", buffering=0)
+        self._unwritten = b""
+        self._failed = False
 
     def write(self, step: int, metrics: Metrics, episodes: Episodes = NO_EPISODES) -> None:
         """Append a line; `episode/returns` and `episode/lengths` are lists, in the order in which episodes ended.
@@ -48,12 +53,25 @@ class JsonLines:
         if episodes.returns:
             line |= {"episode/returns": [float(f"{r:.6g}") for r in episodes.returns]}
             line |= {"episode/lengths": episodes.lengths}
-        self._file.write(json.dumps(line) + "\n")
-        self._file.flush()
+        self._unwritten += to_line(line)
+        self._flush()
 
     def close(self, pictures: list[Path]) -> None:
         """Close the file."""
+        self._flush()
+        if self._unwritten:
+            say(f"{self._path} lacks its last {self._unwritten.count(10)} lines: the disk refused them.")
         self._file.close()
+
+    def _flush(self) -> None:
+        try:
+            while self._unwritten:  # the disk may take a part
+                self._unwritten = self._unwritten[self._file.write(self._unwritten) :]
+            self._failed = False
+        except OSError as error:
+            if not self._failed:
+                say(f"{self._path} cannot be written: {error.strerror}. Its lines are kept until it can.")
+            self._failed = True
 
 
 class TensorBoard:
@@ -66,50 +84,40 @@ class TensorBoard:
 
     def __init__(self, path: Path, config: Mapping[str, Any], step: int) -> None:
         self._path, self._config, self._step = path, config, step
+        self._failed = False
 
     @cached_property
     def _writer(self) -> Any:
         from torch.utils.tensorboard import SummaryWriter
 
-        writer = SummaryWriter(str(self._path), purge_step=self._step + 1 if self._step else None)
+        goes_on = self._step or any(self._path.glob("events.out.tfevents.*"))
+        writer = SummaryWriter(str(self._path), purge_step=self._step + 1 if goes_on else None)
         rows = "\n".join(f"|{name}|{value}|" for name, value in self._config.items())
         writer.add_text("config", f"|field|value|\n|-|-|\n{rows}")
         return writer
 
     def write(self, step: int, metrics: Metrics, episodes: Episodes = NO_EPISODES) -> None:
         """Add a scalar for each metric."""
-        for name, value in metrics.items():
-            self._writer.add_scalar(name, value, step)
+        if self._failed:
+            return
+        try:
+            for name, value in metrics.items():
+                self._writer.add_scalar(name, value, step)
+        except OSError as error:
+            self._fail(error)
 
     def close(self, pictures: list[Path]) -> None:
         """Flush and close."""
-        if "_writer" in vars(self):
-            self._writer.close()
+        try:
+            if "_writer" in vars(self) and not self._failed:
+                self._writer.close()
+        except OSError as error:
+            self._fail(error)
+
+    def _fail(self, error: OSError) -> None:
+        self._failed = True
+        say(f"TensorBoard's events cannot be written: {error}. They end here; {METRICS} goes on.")
 
 
 TRACKERS = {"wandb": ("wandb", "lemniscate.run.wandb_logger:WeightsAndBiases")}
 """name: (the extra that installs it, module:Class); beside these, any `module:Class` of a user's own"""
-
-
-def read_metrics(path: Path, last_bytes: int | None = None) -> list[dict[str, Any]]:
-    """The lines of a run's `metrics.jsonl`, without a last one that a crash cut off.
-
-    Args:
-        path: the run directory.
-        last_bytes: read only the lines that lie whole within the last so many bytes.
-    """
-    file = path / "metrics.jsonl"
-    if not file.exists():
-        return []
-    lines = []
-    with file.open("rb") as text:
-        start = file.stat().st_size - last_bytes if last_bytes else 0
-        if start > 0:
-            text.seek(start - 1)
-            text.readline()
-        for line in text:
-            try:
-                lines.append(json.loads(line))
-            except ValueError:
-                break
-    return lines

@@ -23,12 +23,13 @@ import torch
 from lemniscate.console import ProgressBar, say
 from lemniscate.envs.episodes import Episodes
 from lemniscate.envs.vec_env import VecEnv
-from lemniscate.errors import NonFiniteError, UserError, resume_line
+from lemniscate.errors import NonFiniteError, NotStoredError, UserError, resume_line
 from lemniscate.optim.compiled import stopping
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import Saver
 from lemniscate.run.evaluate import evaluate
-from lemniscate.run.loggers import NO_EPISODES, JsonLines, Logger, LoggerClass, TensorBoard, read_metrics
+from lemniscate.run.loggers import NO_EPISODES, JsonLines, Logger, LoggerClass, TensorBoard
+from lemniscate.run.metrics import read_metrics
 from lemniscate.run.q_bias import critic_of
 from lemniscate.run.seeding import derive, globals_undisturbed, seed_globals
 from lemniscate.run.state import TrainState
@@ -82,6 +83,8 @@ class Run:
         """logged lines that callbacks have not seen"""
         self._episodes = 0
         """whole training episodes so far"""
+        self._logged = 0
+        """the step of the last line of metrics"""
         self._stop_signal = 0
         self._line_time, self._line_step = 0.0, 0
         """when the last line was logged, and at which step"""
@@ -102,14 +105,16 @@ class Run:
         if self.config.warm_start and not restored:
             if saver.exists:
                 self._begin_warm(state)
-            saver.save(state, planned=True)
+            saver.save(state, planned=True, logged=0)
         if is_compiled(self.config):
             if self._visible:
                 say("Compiling: up to a minute the first time, 5 to 10 s from then on.")
             state.compile()
         record = {"algorithm": self.algorithm, **self.config.to_json()}
         self._loggers += [make(self.path, record, state.step) for make in self._logger_classes]
-        self._episodes = sum(len(line.get("episode/returns", ())) for line in read_metrics(self.path))
+        lines = read_metrics(self.path)
+        self._episodes = sum(len(line.get("episode/returns", ())) for line in lines)
+        self._logged = max((line["step"] for line in lines), default=0)
         return state
 
     def until(self, total_steps: int, state: TrainState) -> Iterator[VecEnv]:
@@ -157,6 +162,14 @@ class Run:
         recent = self._recent_returns
         self._bar.update(state.step, sum(recent) / len(recent) if recent else None)
 
+    def require_stored(self) -> None:
+        """Raise `NotStoredError` if the disk refused the last checkpoint."""
+        if failure := self._saver.failure:
+            raise NotStoredError(
+                f"The final checkpoint of {self.path} is not stored: {failure}. When the disk takes it, go on with"
+                f" {resume_line(self.path)}; it resumes at step {self._saver.last_planned:,}."
+            )
+
     def close(self, pictures: list[Path] | None = None) -> None:
         """Close the loggers and the environments, and unlock the directory."""
         for logger in self._loggers:
@@ -184,7 +197,7 @@ class Run:
         finished = state.step >= total_steps
         planned = finished or _passed(self._checkpoint_interval(), before, state.step)
         if planned:
-            self._saver.save(state, planned=True)
+            self._saver.save(state, planned=True, logged=0)
         stop = self._asked_to_stop(state, planned)
         if stop and not finished:
             self._tell_stop(state.step)
@@ -202,12 +215,13 @@ class Run:
             stop = any(answers) or bool(self._stop_signal)
         finally:
             if stop and not saved:
-                self._saver.save(state, planned=False)
+                self._saver.save(state, planned=False, logged=self._logged)
         return stop
 
     def _tell_stop(self, step: int) -> None:
+        saved = "not saved" if self._saver.failure else "saved"
         message = (
-            f"Stopped at step {step:,}; the policy is saved. Go on with: {resume_line(self.path)}\n"
+            f"Stopped at step {step:,}; the policy is {saved}. Go on with: {resume_line(self.path)}\n"
             f"It resumes at step {self._saver.last_planned:,}, the last planned checkpoint, and ends in the same bits"
             " as a run that was never stopped."
         )
@@ -265,6 +279,7 @@ class Run:
     def _write(self, step: int, numbers: dict[str, float], episodes: Episodes = NO_EPISODES) -> None:
         for logger in self._loggers:
             logger.write(step, numbers, episodes)
+        self._logged = step
         self._unwatched.append((step, numbers))
 
     def _stop(self, signum: int, _frame: FrameType | None) -> None:

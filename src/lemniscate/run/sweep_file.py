@@ -6,13 +6,14 @@
 A run that has not begun is a directory with only a `config.json`; it is resumed from step 0, like any other.
 """
 
-import json
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from lemniscate.errors import UserError
-from lemniscate.run.directory import SWEEP, create_directory
+from lemniscate.run.directory import CONFIG, SWEEP, create_directory
+from lemniscate.run.files import DamagedFileError, parsing, read_json
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ class Sweep:
     def create_runs(self) -> None:
         """Create the run directories that do not exist yet."""
         for path, record in self.runs.items():
-            if not (path / "config.json").exists():
+            if not (path / CONFIG).exists():
                 create_directory(path, "config.json", record)
 
 
@@ -51,7 +52,12 @@ def is_sweep(path: Path) -> bool:
 def read_sweep(path: Path) -> Sweep:
     """The sweep in a directory. Raises `UserError` if there is none."""
     try:
-        record = json.loads((path / SWEEP).read_text())
-        return Sweep(path, record["seeds"], record["configs"])
-    except (OSError, ValueError, KeyError, TypeError):
-        raise UserError(f"{path} is not a sweep: it holds no {SWEEP} that can be read.") from None
+        record = read_json(path / SWEEP)
+    except DamagedFileError as error:
+        reason = f": {error}" if (path / SWEEP).exists() else f": it holds no {SWEEP} that can be read."
+        raise UserError(f"{path} is not a sweep{reason}") from None
+    with parsing(path / SWEEP):
+        sweep = Sweep(path, [int(seed) for seed in record["seeds"]], dict(record["configs"]))
+        if unsafe := [name for name in sweep.configs if not re.fullmatch(r"[\w.:-]*\w", name) or ".." in name]:
+            raise ValueError(f"{unsafe[0]!r} is no name of an algorithm")
+        return sweep

@@ -1,0 +1,130 @@
+"""Files that can be trusted after a crash, and read without trust.
+
+What is written is written aside, synced, then renamed: under its own name it is whole or absent, also after a power
+cut. JSON carries the sha256 of its content. What is read is a regular file of a bounded size: no link is followed, no
+pipe is waited for, and nothing in it is executed.
+"""
+
+import errno
+import hashlib
+import json
+import os
+import shutil
+import stat
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from io import BufferedReader
+from pathlib import Path
+from typing import Any
+
+from lemniscate.errors import UserError
+
+MAX_JSON_BYTES = 64 * 2**20
+"""more than any JSON that is written here"""
+
+HASH = "sha256"
+
+
+class DamagedFileError(UserError):
+    """A file that is missing, or is not what was written: names it."""
+
+
+def write_json(path: Path, record: Mapping[str, Any]) -> None:
+    """Write a record with the sha256 of its content, in the place of a file that is there. Raises `OSError`."""
+    replace_file(path, (json.dumps({HASH: _hash_of(record), **record}, indent=1) + "\n").encode())
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """What `write_json` was given.
+
+    Raises:
+        DamagedFileError: the file is missing, is no regular file, or has another content than was written.
+    """
+    with open_regular(path) as file:
+        content = file.read(MAX_JSON_BYTES + 1)
+    try:
+        record = json.loads(content)
+        is_record = isinstance(record, dict) and len(content) <= MAX_JSON_BYTES
+        if is_record and HASH not in record:
+            raise DamagedFileError(f"{path} has no sha256: it is damaged, or of another version of lemniscate.")
+        if is_record and record.pop(HASH) == _hash_of(record):
+            return record
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError):
+        raise DamagedFileError(f"{path} is damaged: it is not JSON.") from None
+    raise DamagedFileError(f"{path} is damaged: its sha256 differs from the one that was written.")
+
+
+def replace_file(path: Path, content: bytes) -> None:
+    """Write a file whole or not at all. Raises `OSError`, and leaves nothing behind then."""
+    temporary = path.with_name(f"{path.name}.tmp")
+    remove(temporary)
+    try:
+        with temporary.open("xb") as file:  # "x" does not follow a link
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+        sync(path.parent)
+    except BaseException:
+        with suppress(OSError):
+            remove(temporary)
+        raise
+
+
+def open_regular(path: Path) -> BufferedReader:
+    """A file, opened to be read. Raises `DamagedFileError` if it is missing, a link, a pipe or a directory."""
+    try:
+        handle = os.open(path, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0))
+    except FileNotFoundError:
+        raise DamagedFileError(f"{path} is missing.") from None
+    except OSError as error:
+        reason = "it is a link" if error.errno == errno.ELOOP else error.strerror
+        raise DamagedFileError(f"{path} cannot be read: {reason}.") from None
+    if not stat.S_ISREG(os.fstat(handle).st_mode):
+        os.close(handle)
+        raise DamagedFileError(f"{path} cannot be read: it is no regular file.")
+    return os.fdopen(handle, "rb")
+
+
+@contextmanager
+def parsing(path: Path) -> Iterator[None]:
+    """Turns the errors of a record with other content than expected into a `DamagedFileError` that names `path`."""
+    try:
+        yield
+    except UserError:
+        raise
+    except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+        reason = str(error).partition("\n")[0].rstrip(".:")
+        raise DamagedFileError(f"{path} cannot be read: {type(error).__name__}, {reason}.") from error
+
+
+def remove(path: Path) -> None:
+    """Remove what is at `path`, if anything: a file, a link (not what it leads to), or a directory."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def make_directory(path: Path) -> None:
+    """Make a directory and those above it, synced. Raises `FileExistsError` where a link or a file is in its place."""
+    if path.is_symlink() or (path.exists() and not path.is_dir()):
+        raise FileExistsError(errno.EEXIST, "there is a link or a file in the place of a directory", str(path))
+    if not path.exists():
+        if path.parent != path:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        path.mkdir(exist_ok=True)
+        sync(path.parent)
+
+
+def sync(path: Path) -> None:
+    """Have the disk store a file, or the names in a directory, before anything that follows. Raises `OSError`."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _hash_of(record: Mapping[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()

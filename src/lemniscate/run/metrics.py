@@ -1,0 +1,66 @@
+"""`metrics.jsonl`: a line of JSON for each update, each ending in the CRC-32 of what is before it."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+from zlib import crc32
+
+from lemniscate.console import say
+from lemniscate.run.files import DamagedFileError, open_regular
+
+METRICS = "metrics.jsonl"
+MARK = b', "crc32": "'
+
+
+def to_line(record: Mapping[str, Any]) -> bytes:
+    """A record, which is not empty, as a line."""
+    body = json.dumps(record)[:-1].encode()
+    return body + MARK + f'{crc32(body):08x}"}}\n'.encode()
+
+
+def from_line(line: bytes) -> dict[str, Any] | None:
+    """The record of a line; None if the line is not whole."""
+    body, _, rest = line.rpartition(MARK)
+    return json.loads(body + b"}") if rest == f'{crc32(body):08x}"}}\n'.encode() else None
+
+
+def read_metrics(path: Path, last_bytes: int | None = None) -> list[dict[str, Any]]:
+    """The whole lines of a run's metrics; damaged ones, and a last one that a crash cut off, are left out.
+
+    Args:
+        path: the run directory.
+        last_bytes: read only the lines that lie whole within the last so many bytes.
+    """
+    lines = _lines(path, last_bytes)
+    return [record for record in map(from_line, lines) if record is not None]
+
+
+def damage(path: Path, logged: int) -> str | None:
+    """What is wrong with a run's metrics, in a sentence. `logged` is the step that they are known to reach."""
+    file, lines = path / METRICS, _lines(path)
+    if lines and not lines[-1].endswith(b"\n"):  # cut off by a crash
+        lines.pop()
+    records = list(map(from_line, lines))
+    damaged = [str(number) for number, record in enumerate(records, start=1) if record is None]
+    if damaged:
+        several = f"lines {', '.join(damaged[:5])}{' and others' if len(damaged) > 5 else ''} are"
+        return f"{file}: {several if len(damaged) > 1 else f'line {damaged[0]} is'} damaged, and left out."
+    last = max((record["step"] for record in records if record), default=0)
+    return f"{file} ends at step {last:,}; its lines up to step {logged:,} are lost." if last < logged else None
+
+
+def _lines(path: Path, last_bytes: int | None = None) -> list[bytes]:
+    file = path / METRICS
+    if not file.exists() and not file.is_symlink():
+        return []
+    try:
+        with open_regular(file) as text:
+            start = file.stat().st_size - last_bytes if last_bytes else 0
+            if start > 0:
+                text.seek(start - 1)
+                text.readline()
+            return text.readlines()
+    except DamagedFileError as error:
+        say(error)
+        return []
