@@ -3,12 +3,15 @@
 import json
 import os
 import random
+import re
+import resource
 import shutil
 import signal
 import subprocess
 import sys
 import threading
 import time
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -253,18 +256,54 @@ def test_a_loss_that_is_not_finite_stops_training(tmp_path, monkeypatch):
         train(tmp_path / "r")
 
 
-def test_a_full_disk_costs_a_checkpoint_and_not_the_run(tmp_path, monkeypatch, capsys):
-    calls = []
+@contextmanager
+def largest_file(size):
+    """Beyond `size` bytes of a file, the system refuses to write, as on a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, ignored)
 
-    def sometimes_full(fd):
-        calls.append(fd)
-        if len(calls) == 1:
-            raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(os, "fsync", sometimes_full)
-    train(tmp_path / "r", checkpoint_every=64)
-    assert "checkpoint at step 64 could not be written" in capsys.readouterr().err
-    assert checkpoint.list_steps(tmp_path / "r" / "checkpoints")[-1] == 256
+def test_a_full_disk_costs_a_checkpoint_and_not_the_run(tmp_path, capsys):
+    with ExitStack() as full:
+
+        def fill(step, *_):
+            if step == 96:
+                full.enter_context(largest_file(500))
+            if step == 160:
+                full.close()
+
+        fields = {**tiny_fields(), "checkpoint_every": 64}
+        path = lem.train("ppo", "Countdown-v0", run=tmp_path / "r", callbacks=[fill], progress=False, **fields).path
+    said = capsys.readouterr().err
+    assert len(re.findall(r"The checkpoint at step \d+ could not be written: .*File too large", said)) == 1
+    assert checkpoint.list_steps(path / "checkpoints")[-1] == 256
+    assert [line["step"] for line in read_metrics(path)] == list(range(32, 257, 32))
+    assert not list(path.rglob("*.tmp"))
+
+
+def test_a_policy_that_the_disk_refuses_is_not_lost_and_no_success(tmp_path, capsys):
+    train(tmp_path / "whole")
+    with ExitStack() as full:
+
+        def fill(step, *_):
+            if step == 192:
+                full.enter_context(largest_file(500))
+
+        with pytest.raises(lem.NotStoredError, match=r"is not stored: .*resumes at step \d+") as refused:
+            lem.train("ppo", "Countdown-v0", run=tmp_path / "r", callbacks=[fill], progress=False, **tiny_fields())
+    policy = refused.value.run.policy
+    whole = lem.load(tmp_path / "whole")
+    assert all(
+        torch.equal(a, b) for a, b in zip(policy.networks.parameters(), whole.networks.parameters(), strict=True)
+    )
+    lem.resume(tmp_path / "r", progress=False)
+    assert final_hashes(tmp_path / "r") == final_hashes(tmp_path / "whole")
 
 
 def test_two_processes_do_not_share_a_directory(tmp_path):

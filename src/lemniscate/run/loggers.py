@@ -1,8 +1,11 @@
 """Destinations of metrics. A logger is one class with `write` and `close`; a tracker is a logger on request."""
 
 import math
+import os
+import time
 from collections.abc import Callable, Mapping
 from functools import cached_property
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -86,37 +89,41 @@ class TensorBoard:
         self._path, self._config, self._step = path, config, step
         self._failed = False
 
-    @cached_property
-    def _writer(self) -> Any:
-        from torch.utils.tensorboard import SummaryWriter
-
-        goes_on = self._step or any(self._path.glob("events.out.tfevents.*"))
-        writer = SummaryWriter(str(self._path), purge_step=self._step + 1 if goes_on else None)
-        rows = "\n".join(f"|{name}|{value}|" for name, value in self._config.items())
-        writer.add_text("config", f"|field|value|\n|-|-|\n{rows}")
-        return writer
-
     def write(self, step: int, metrics: Metrics, episodes: Episodes = NO_EPISODES) -> None:
-        """Add a scalar for each metric."""
-        if self._failed:
-            return
-        try:
-            for name, value in metrics.items():
-                self._writer.add_scalar(name, value, step)
-        except OSError as error:
-            self._fail(error)
+        """Add a scalar for each metric. After an error of the disk, nothing more is written."""
+        values = [{"tag": name, "simple_value": value} for name, value in metrics.items()]
+        if not self._failed:
+            try:
+                self._add(self._records, step=step, summary={"value": values})
+            except OSError as error:
+                self._failed = True
+                say(f"TensorBoard's events end before step {step:,}: {error.strerror}. {METRICS} goes on.")
 
     def close(self, pictures: list[Path]) -> None:
-        """Flush and close."""
-        try:
-            if "_writer" in vars(self) and not self._failed:
-                self._writer.close()
-        except OSError as error:
-            self._fail(error)
+        """Close the file."""
+        if "_records" in vars(self):
+            self._records.close()
 
-    def _fail(self, error: OSError) -> None:
-        self._failed = True
-        say(f"TensorBoard's events cannot be written: {error}. They end here; {METRICS} goes on.")
+    @cached_property
+    def _records(self) -> Any:
+        """A new file of events, begun. Nothing is buffered, nor written by a thread: what fails, fails at its call."""
+        from tensorboard.summary.writer.record_writer import RecordWriter
+        from torch.utils.tensorboard.summary import text
+
+        goes_on = self._step > 0 or any(self._path.glob("events.out.tfevents.*"))
+        name = f"events.out.tfevents.{time.time_ns()}.{os.getpid()}"
+        records = RecordWriter((self._path / name).open("xb", buffering=0))
+        rows = "\n".join(f"|{name}|{value}|" for name, value in self._config.items())
+        self._add(records, file_version="brain.Event:2")
+        if goes_on:
+            self._add(records, step=self._step + 1, session_log={"status": "START"})
+        self._add(records, summary=text("config", f"|field|value|\n|-|-|\n{rows}"))
+        return records
+
+    @staticmethod
+    def _add(records: Any, **parts: Any) -> None:
+        event = import_module("tensorboard.compat.proto.event_pb2").Event
+        records.write(event(wall_time=time.time(), **parts).SerializeToString())
 
 
 TRACKERS = {"wandb": ("wandb", "lemniscate.run.wandb_logger:WeightsAndBiases")}
