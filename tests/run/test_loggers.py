@@ -216,6 +216,7 @@ def points(folder):
 
 
 def write_events(path, step, steps, value):
+    path.mkdir(parents=True, exist_ok=True)
     board = TensorBoard(path, {"gamma": 0.9}, step)
     for at in steps:
         board.write(at, {"x": value})
