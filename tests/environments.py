@@ -3,6 +3,7 @@
 import os
 import signal
 import sys
+import time
 
 import gymnasium as gym
 import numpy as np
@@ -149,3 +150,17 @@ class Pictures(gym.Env):
 def tell(step, metrics, policy):
     """A callback."""
     print(f"called at {step}", flush=True)
+
+
+class Hanging(Copy):
+    """Hangs in the fiftieth step of the process."""
+
+    def __init__(self):
+        super().__init__("box")
+        self.steps = 0
+
+    def step(self, action):
+        self.steps += 1
+        if self.steps == 50:
+            time.sleep(1000)
+        return super().step(action)

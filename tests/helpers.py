@@ -203,6 +203,9 @@ class Loop:
         for _ in range(self.updates):
             yield self.env
 
+    def steps(self, count):
+        return range(count)
+
     def log(self, state, metrics, episodes):
         self.metrics = metrics
 

@@ -176,6 +176,18 @@ def command(*arguments):
     return subprocess.Popen(arguments, stderr=subprocess.PIPE, text=True, start_new_session=True)
 
 
+def test_runs_end_with_the_sweep_that_is_killed_and_it_goes_on(tmp_path):
+    path = tmp_path / "killed"
+    process = command("train", "ppo", "--env", "Countdown-v0", "--seeds", "1", "--run", path, "--total-steps", "1e6")
+    while len(read_metrics(path / "ppo-1")) < 2:
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.005)
+    process.kill()
+    process.communicate()
+    with FileLock(path / "ppo-1" / ".lock", timeout=2):
+        pass
+
+
 def test_ctrl_c_stops_every_run_and_the_sweep_goes_on_to_the_same_bits(tmp_path):
     path = tmp_path / "stopped"
     fields = [*SMALL, "--total-steps", "3_200", "--checkpoint-every", "512"]

@@ -22,6 +22,7 @@ from lemniscate.algos import ALGORITHMS, name_of
 from lemniscate.console import say
 from lemniscate.envs import registry
 from lemniscate.errors import SweepError, UserError, prefix_errors, resume_line, shown
+from lemniscate.owner import OWNED
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import is_finished
 from lemniscate.run.environments import device_for
@@ -180,6 +181,7 @@ class _Processes:
             self._stop()
             for process in self._running.values():
                 process.wait()
+                _close_input(process)
             self._bars.close()
         if self._stop_signal and not all(map(is_finished, self._runs.runs)):
             said = f"Stopped; the runs that had begun are saved. Go on with: {resume_line(path)}"
@@ -189,13 +191,14 @@ class _Processes:
     def _start(self, run: Path) -> None:
         """Start a process in a session of its own, so that Ctrl-C at the terminal reaches only this process.
 
-        Each run then gets the signal from here, once.
+        Each run then gets the signal from here, once. Its standard input is a pipe that closes when this process ends,
+        however it ends; then the run ends, too.
         """
         command = [sys.executable, "-m", "lemniscate.cli", "resume", str(run), "--score", *self._options]
-        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path)), OWNED: "1"}
         with (run / LOG).open("a") as log:
             self._running[run] = subprocess.Popen(
-                command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment, start_new_session=True
+                command, stdin=subprocess.PIPE, stdout=log, stderr=log, env=environment, start_new_session=True
             )
         if self._stop_signal:  # the signal came while the process was started
             self._running[run].terminate()
@@ -209,6 +212,7 @@ class _Processes:
             if code is None:
                 continue
             del self._running[run]
+            _close_input(process)
             if code == 0:
                 sentence = f"done, final return {plots.final_return(run):.1f}"
             elif self._stop_signal:
@@ -222,6 +226,11 @@ class _Processes:
         self._stop_signal = self._stop_signal or signum
         for process in self._running.values():
             process.terminate()
+
+
+def _close_input(process: subprocess.Popen) -> None:
+    if process.stdin:
+        process.stdin.close()
 
 
 def _signals() -> list[int]:

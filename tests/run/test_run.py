@@ -315,19 +315,24 @@ def test_two_processes_do_not_share_a_directory(tmp_path):
 
 
 def command(*arguments, stderr=subprocess.DEVNULL, **options):
-    environment = {**os.environ, "COLUMNS": "200"}
+    tests = str(Path(__file__).parents[1])
+    environment = {**os.environ, "COLUMNS": "200", "PYTHONPATH": os.pathsep.join([tests, *filter(None, sys.path)])}
     return subprocess.Popen(
         [sys.executable, "-c", LOUD, *map(str, arguments)], stderr=stderr, text=True, env=environment, **options
     )
+
+
+def words_for(name, value):
+    """A field as it is written on the command line."""
+    values = [] if value is True else value if isinstance(value, tuple) else [value]
+    return [f"--{name.replace('_', '-')}", *map(str, values)]
 
 
 def long_run(path, env, updates=150, compile="off"):
     """Arguments of a run of some seconds with a checkpoint every eighth update."""
     if env in OFF_POLICY:
         fields = tiny_off_policy(**OFF_POLICY[env], total_steps=16 * updates, checkpoint_every=128, compile=compile)
-        flags = [f"--{name.replace('_', '-')}" for name in fields]
-        values = [() if value is True else value if isinstance(value, tuple) else (value,) for value in fields.values()]
-        given = [part for flag, value in zip(flags, values, strict=True) for part in (flag, *value)]
+        given = [word for name, value in fields.items() for word in words_for(name, value)]
         return ["train", env, "--env", "Pendulum-v1", "--run", path, *given]
     fields = tiny_fields(env, hidden=(32, 32), total_steps=32 * updates, checkpoint_every=32 * 8, epochs=4)
     flags = ["--run", path]
@@ -424,6 +429,39 @@ def test_stopped_and_resumed_it_ends_in_the_same_bits(tmp_path):
     assert command("resume", path).wait() == 0
     assert final_hashes(path) == final_hashes(whole)
     assert history(path) == history(whole)
+
+
+def test_many_steps_between_two_lines_are_stopped_amid_and_resumed_to_the_same_bits(tmp_path):
+    fields = {**OFF_POLICY["sac"], "log_every": 1000, "total_steps": 16_000, "checkpoint_every": 4000, "compile": "off"}
+    words = [word for name, value in tiny_off_policy(**fields).items() for word in words_for(name, value)]
+    train_sac = ["train", "sac", "--env", "Pendulum-v1", *words, "--run"]
+    assert command(*train_sac, tmp_path / "whole").wait() == 0
+    process = command(*train_sac, tmp_path / "r", stderr=subprocess.PIPE)
+    wait_for(lambda: len(read_metrics(tmp_path / "r")) >= 3, process)
+    time.sleep(0.2)
+    process.send_signal(signal.SIGINT)
+    assert "the policy is saved" in process.communicate()[1]
+    assert process.returncode == 130
+    assert lem.load(tmp_path / "r").step % 2000
+    assert command("resume", tmp_path / "r").wait() == 0
+    assert final_hashes(tmp_path / "r") == final_hashes(tmp_path / "whole")
+    assert history(tmp_path / "r") == history(tmp_path / "whole")
+
+
+@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGTERM])
+def test_an_update_that_hangs_is_interrupted(tmp_path, signum):
+    small = {"total_steps": 1000, "num_envs": 2, "num_steps": 8, "minibatch_size": 16, "compile": "off"}
+    steps = [word for name, value in small.items() for word in words_for(name, value)]
+    process = command("train", "ppo", "--env", "environments:Hanging", *steps, "--run", tmp_path / "r", stderr=-1)
+    wait_for(lambda: len(read_metrics(tmp_path / "r")) == 6, process)
+    time.sleep(0.5)
+    asked = time.monotonic()
+    process.send_signal(signum)
+    said = process.communicate()[1]
+    assert time.monotonic() - asked < 6  # two seconds, and as long as a busy machine takes to end a process
+    assert process.returncode == 128 + signum
+    assert "Stopped in the middle of an update" in said
+    assert "Traceback" not in said
 
 
 def test_a_stop_on_a_planned_checkpoint_keeps_it(tmp_path, monkeypatch):

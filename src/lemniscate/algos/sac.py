@@ -120,7 +120,7 @@ def train(config: Config, run: Run) -> State:
     state = run.restore(init(config, run.spec, run.env.device))
     for env in run.until(config.total_steps, state):
         metrics: list[Metrics] = []
-        for _ in range(config.log_every):
+        for _ in run.steps(config.log_every):
             policy, random = state.networks.policy, state.step < config.learning_starts
             interact(env, policy, state.replay, state.action_noise, state.rng.action, random=random)
             state.step += env.num_envs

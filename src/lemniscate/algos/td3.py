@@ -115,7 +115,7 @@ def train(config: Config, run: Run) -> State:
     state = run.restore(init(config, run.spec, run.env.device))
     for env in run.until(config.total_steps, state):
         metrics: list[Metrics] = []
-        for _ in range(config.log_every):
+        for _ in run.steps(config.log_every):
             policy, rng = state.networks.policy, state.rng.action
             random = state.step < config.learning_starts
             interact(env, policy, state.replay, state.action_noise, rng, noise_std=config.noise_std, random=random)

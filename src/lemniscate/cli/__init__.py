@@ -26,6 +26,7 @@ from lemniscate.errors import (
     is_installed,
     unknown_name,
 )
+from lemniscate.owner import end_with_owner
 
 COMMANDS = {
     "train": "Train a policy, or one for each of several algorithms and seeds, to compare them.",
@@ -45,6 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
     given = argparse.Namespace(command=None)
     try:
+        end_with_owner()
         given = parse(sys.argv[1:] if arguments is None else arguments)
         getattr(import_module("lemniscate.cli.commands"), given.command)(given)
     except UserError as error:

@@ -2,11 +2,10 @@
 
 import inspect
 import multiprocessing
-import signal
+import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
-from multiprocessing import parent_process
 from typing import Any
 
 import gymnasium as gym
@@ -15,7 +14,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
 import lemniscate.envs.toy  # noqa: F401  (registers the toys)
 from lemniscate import named
-from lemniscate.envs.workers import WatchedVectorEnv
+from lemniscate.envs.workers import WatchedVectorEnv, Worker
 from lemniscate.errors import UserError
 
 Maker = EnvSpec | Callable[..., Any]
@@ -51,12 +50,7 @@ def makes_vector(maker: Maker) -> bool:
 
 
 def make_one(maker: Maker, wrappers: Sequence[Callable[..., Any]] = (), **kwargs: Any) -> gym.Env:
-    """One environment, by its maker: a worker process may not know the id.
-
-    There, Ctrl-C is left to the parent, which stops the run in order.
-    """
-    if parent_process() is not None:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """One environment, by its maker: a worker process may not know the id."""
     env = gym.make(maker, **kwargs) if isinstance(maker, EnvSpec) else maker(**kwargs)
     for wrap in wrappers:
         env = wrap(env)
@@ -81,7 +75,8 @@ def make_vector(
     multiprocessing.get_context("forkserver").set_forkserver_preload([__name__])  # imported once, for all
     one = makers[0]()
     one.close()
-    return WatchedVectorEnv(makers, context="forkserver", autoreset_mode=AutoresetMode.DISABLED), _time_limit(one)
+    in_workers = [partial(Worker, make, os.getpid()) for make in makers]
+    return WatchedVectorEnv(in_workers, context="forkserver", autoreset_mode=AutoresetMode.DISABLED), _time_limit(one)
 
 
 def _time_limit(env: gym.Env) -> int | None:

@@ -1,17 +1,60 @@
 """Environments in a process each, watched: one that dies or hangs is named, and closing never hangs."""
 
 import multiprocessing
+import os
+import queue
+import signal
 import time
-from collections.abc import Callable
+import traceback
+from collections.abc import Callable, Iterable
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 from gymnasium.vector import AsyncVectorEnv
+from gymnasium.vector.async_vector_env import AsyncState
 
 from lemniscate.errors import WorkerError
+from lemniscate.owner import end_when_closed
 
 CLOSING_SECONDS = 2.0
 """how long workers may take to close their environments before they are killed"""
+
+
+class RaisedInWorkerError(RuntimeError):
+    """What an environment raised, as a sentence: an exception of its own may not come through a pipe."""
+
+
+class Worker(gym.Wrapper):
+    """An environment in a process of its own, which ends with the process that it works for.
+
+    Ctrl-C is left to that process, which stops the run in order.
+    """
+
+    def __init__(self, make: Callable[[], gym.Env], owner: int) -> None:
+        process = multiprocessing.parent_process()
+        if process and os.getpid() != owner:  # the owner makes one, too, to look at its spaces
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
+            end_when_closed(process.sentinel)
+        super().__init__(make())
+
+    def reset(self, **options: Any) -> Any:
+        """The environment's. Raises `RaisedInWorkerError` for whatever it raises."""
+        return _told(self.env.reset, **options)
+
+    def step(self, action: Any) -> Any:
+        """The environment's. Raises `RaisedInWorkerError` for whatever it raises."""
+        return _told(self.env.step, action)
+
+
+def _told(call: Callable[..., Any], *args: Any, **options: Any) -> Any:
+    try:
+        return call(*args, **options)
+    except Exception as error:
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        what = f"{type(error).__name__}: {str(error).rstrip('.')}"
+        raise RaisedInWorkerError(f"{what} ({Path(place.filename).name}, line {place.lineno})") from None
 
 
 class WatchedVectorEnv(AsyncVectorEnv):
@@ -44,6 +87,16 @@ class WatchedVectorEnv(AsyncVectorEnv):
         except (multiprocessing.TimeoutError, EOFError, ConnectionError) as error:
             raise WorkerError(self._diagnosis()) from error
 
+    def _raise_if_errors(self, successes: Iterable[bool]) -> None:
+        """Gymnasium's, as one sentence that names the environment, and without waiting for a word that never comes."""
+        failed = [index for index, success in enumerate(successes) if not success]
+        if failed:
+            said = f"Environment {failed[0]} failed"
+            with suppress(queue.Empty):
+                index, _, error, _ = self.error_queue.get(timeout=1.0)
+                said = f"Environment {index} raised {error}"
+            raise WorkerError(f"{said}.")
+
     def _diagnosis(self) -> str:
         for i, process in enumerate(self.processes):
             process.join(timeout=0.1)  # one that has just closed its pipe may not be dead yet
@@ -53,7 +106,8 @@ class WatchedVectorEnv(AsyncVectorEnv):
         return f"Environment {', '.join(silent) or 'unknown'} has not answered for {self.patience:g} s."
 
     def close_extras(self, timeout: float | None = None, terminate: bool = False) -> None:
-        """Ask every worker to close its environment; kill those that do not."""
+        """Ask every worker to close its environment; kill those that do not, or are in the middle of a step."""
+        terminate = terminate or self._state is not AsyncState.DEFAULT
         for pipe in self.parent_pipes:
             if pipe is not None and not pipe.closed:
                 with suppress(OSError):

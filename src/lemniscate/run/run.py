@@ -9,6 +9,7 @@ At a planned checkpoint the environments restart from a seed derived from (run s
 one that is resumed. So both end in the same bits, whatever the simulator.
 """
 
+import os
 import signal
 import threading
 import time
@@ -37,6 +38,9 @@ from lemniscate.run.warm_start import load_networks
 
 WORTH_COMPILING = 15_000
 """gradient steps from which on a run ends sooner if they are compiled"""
+
+PATIENCE = 1.0
+"""seconds that an update has to end by itself after a signal, then to be interrupted"""
 
 TRAINING = 0
 """the stream of seeds that training environments restart from"""
@@ -86,6 +90,11 @@ class Run:
         self._logged = 0
         """the step of the last line of metrics"""
         self._stop_signal = 0
+        self._cut_short = False
+        """whether the body of the loop took fewer steps than it was to: its state is nobody's to resume from"""
+        self._hurry, self._ended = threading.Timer(PATIENCE, self._ask_again), threading.Event()
+        self._hurry.daemon = True
+        """asks again to stop; whether the loop has ended"""
         self._line_time, self._line_step = 0.0, 0
         """when the last line was logged, and at which step"""
         self._body_time, self._body_began = 0.0, 0.0
@@ -139,9 +148,19 @@ class Run:
                     self._body_time += time.monotonic() - self._body_began
                     going_on = self._between(state, before, episodes_before, total_steps)
         finally:
+            self._ended.set()
+            self._hurry.cancel()
             stopping.clear()
             self.seconds = time.monotonic() - started
             self._bar.close()
+
+    def steps(self, count: int) -> Iterator[int]:
+        """The numbers below `count`, for a body of the loop that takes many steps; asked to stop, it takes fewer."""
+        for number in range(count):
+            self._cut_short = bool(self._stop_signal)
+            if self._cut_short:
+                return
+            yield number
 
     def log(self, state: TrainState, metrics: Mapping[str, torch.Tensor | float], episodes: Episodes) -> None:
         """Write one line of metrics.
@@ -172,6 +191,7 @@ class Run:
 
     def close(self, pictures: list[Path] | None = None) -> None:
         """Close the loggers and the environments, and unlock the directory."""
+        self._ended.set()
         for logger in self._loggers:
             logger.close(pictures or [])
         self.env.close()
@@ -189,15 +209,16 @@ class Run:
 
     def _between(self, state: TrainState, before: int, episodes_before: int, total_steps: int) -> bool:
         """Do what is due after an update; returns whether the run goes on."""
-        if _passed(self.config.evaluate_every, before, state.step):
+        whole = not self._cut_short  # else it evaluates, films and plans what the next process will do
+        if whole and _passed(self.config.evaluate_every, before, state.step):
             self._evaluate(state)
         by_episodes = _passed(self.config.video_every_episodes, episodes_before, self._episodes)
-        if by_episodes or _passed(self.config.video_every, before, state.step):
+        if whole and (by_episodes or _passed(self.config.video_every, before, state.step)):
             self._record(state)
-        finished = state.step >= total_steps
-        planned = finished or _passed(self._checkpoint_interval(), before, state.step)
+        finished = whole and state.step >= total_steps
+        planned = finished or (whole and _passed(self._checkpoint_interval(), before, state.step))
         if planned:
-            self._saver.save(state, planned=True, logged=0)
+            self._saver.save(state, planned=True, logged=self._logged)
         stop = self._asked_to_stop(state, planned)
         if stop and not finished:
             self._tell_stop(state.step)
@@ -214,7 +235,7 @@ class Run:
                 answers = [self._watch(step, numbers, state) for step, numbers in lines] if self._watch else []
             stop = any(answers) or bool(self._stop_signal)
         finally:
-            if stop and not saved:
+            if stop and not saved and state.step > self._saver.last_planned:
                 self._saver.save(state, planned=False, logged=self._logged)
         return stop
 
@@ -283,11 +304,24 @@ class Run:
         self._unwatched.append((step, numbers))
 
     def _stop(self, signum: int, _frame: FrameType | None) -> None:
-        """Stop after the current update; asked again, at once."""
+        """Stop after the current update; asked again, or if that takes longer than `PATIENCE`, at once."""
         if self._stop_signal:
-            raise KeyboardInterrupt
+            self._hurry.cancel()
+            raise Stopped(
+                f"Stopped in the middle of an update, which is not saved. Go on with: {resume_line(self.path)}\n"
+                f"It resumes at step {self._saver.last_planned:,}, the last planned checkpoint.",
+                self._stop_signal,
+            )
         self._stop_signal = signum
         stopping.set()
+        self._hurry.start()
+
+    def _ask_again(self) -> None:
+        """In a thread: send the signal again; where even that is not heard, end the process."""
+        signal.pthread_kill(threading.main_thread().ident or 0, self._stop_signal)
+        if not self._ended.wait(PATIENCE):
+            say(f"Stopped; the update did not let itself be interrupted. Go on with: {resume_line(self.path)}")
+            os._exit(128 + self._stop_signal)
 
 
 def is_compiled(config: RunConfig) -> bool:
