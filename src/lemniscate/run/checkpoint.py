@@ -80,7 +80,8 @@ def write_fields(final: Path, fields: Mapping[str, Any], record: dict[str, Any])
             tensors |= {f"{name}.{key}": t for key, t in value.state_dict().items()}
         else:
             numbers[name] = value
-    temporary = final.with_name(f"{final.name}.tmp")
+    temporary, old = final.with_name(f"{final.name}.tmp"), final.with_name(f"{final.name}.old")
+    shutil.rmtree(temporary, ignore_errors=True)
     temporary.mkdir(parents=True)
     save_file(_to_save(tensors), temporary / FILES[0])
     (temporary / FILES[1]).write_text(_json({"numbers": numbers, "record": record}))
@@ -89,10 +90,12 @@ def write_fields(final: Path, fields: Mapping[str, Any], record: dict[str, Any])
     for path in temporary.iterdir():
         _sync(path)
     _sync(temporary)
-    if final.exists():
-        shutil.rmtree(final)
+    if final.exists():  # at every moment one of them is whole, under some name
+        shutil.rmtree(old, ignore_errors=True)
+        final.rename(old)
     temporary.rename(final)
     _sync(final.parent)
+    shutil.rmtree(old, ignore_errors=True)
 
 
 def read(path: Path) -> Checkpoint:
