@@ -91,7 +91,17 @@ def test_train_with_a_report_leaves_pictures(tmp_path, capsys):
     path = tmp_path / "r"
     assert main(["train", "ppo", "--env", "CartPole-v1", "--run", str(path), "--report", *TINY]) == 0
     assert (path / "plots" / "learning_curve.png").stat().st_size > 5000
-    assert "over 4 episodes" in capsys.readouterr().err
+    assert "over 100 episodes of CartPole-v1" in capsys.readouterr().err
+
+
+def test_the_score_is_said_and_is_that_of_the_page(tmp_path, capsys):
+    path = tmp_path / "r"
+    assert main(["train", "ppo", "--env", "CartPole-v1", "--run", str(path), "--report", "--score", *TINY]) == 0
+    said = capsys.readouterr().err
+    final = json.loads((path / "final.json").read_text())
+    assert f"Final return {final['mean_return']:.1f} over 100 episodes." in said
+    assert said.count("Evaluating") == 1
+    assert f"{final['mean_return']:,.1f} ± {final['std_return']:,.1f}" in (path / "plots" / "report.html").read_text()
 
 
 def test_plot_of_several_runs(run, tmp_path, monkeypatch):
@@ -258,6 +268,16 @@ def test_an_algorithm_of_ones_own_has_its_fields_in_its_help(tmp_path, monkeypat
     assert parse(["train", "bold", "--courage", "1"]).fields == {"courage": 1}
 
 
+def test_an_algorithm_is_named_by_its_module_and_its_own_name_too(tmp_path, monkeypatch):
+    (tmp_path / "several.py").write_text("from lemniscate.algos import a2c")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    assert main(["train", "several:a2c", "--env", "CartPole-v1", "--total-steps", "64"]) == 0
+    (run,) = (tmp_path / "runs").iterdir()
+    assert run.name == "CartPole-v1-several_a2c-1"
+    assert lem.load(run).step == 80
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
@@ -278,6 +298,8 @@ def test_an_algorithm_of_ones_own_has_its_fields_in_its_help(tmp_path, monkeypat
         (["train", "ppo", "CartPole-v1"], "Unknown argument 'CartPole-v1'"),
         (["train", "ppo", "--env", "CartPole-v1", "--preset", "corse"], "There is no preset 'corse': did you mean course"),
         (["train", "ppo", "--env", "CartPole-v1", "--gama", "1"], "There is no field '--gama': did you mean --gamma"),
+        (["train", "ppo", "--env", "CartPole-v1", "-seed", "3"], "There is no field '-seed': did you mean --seed"),
+        (["train", "mine:algo", "--env", "CartPole-v1"], "mine:algo cannot be found: there is no module mine here"),
         (["train", "ppo", "--lr", "1"], "There is no --lr: here it is --learning-rate."),
         (["train", "sac", "--lr", "1"], "There is no --lr: here it is --actor-learning-rate or --critic-learning-rate."),
         (["train", "ppo", "--batch-size=32"], "There is no --batch-size: here it is --minibatch-size."),

@@ -106,7 +106,9 @@ def test_the_table_says_what_the_seeds_say_together(tmp_path):
     a = write_runs(tmp_path / "a", seeds=(1, 2, 3, 4), rate=100.0)
     b = [write_run(tmp_path / "b", algorithm="sac", env="Pendulum-v1")]
     groups = group([*a, *b])
-    head, ppo, sac = compare.table(groups, {**{run: 1000.0 * (i + 1) for i, run in enumerate(a)}, b[0]: -7.0})
+    head, ppo, sac = compare.table(
+        compare.rows(groups, {**{run: 1000.0 * (i + 1) for i, run in enumerate(a)}, b[0]: -7.0})
+    )
     assert head.split() == ["seeds", "final", "return", "IQM", "[95", "%]", "worst", "seed", "minutes"]
     assert ppo.split() == ["PPO", "4", "2,500", "±", "1,118", "2,500", "[1,000,", "4,000]", "1,000", "1.7"]
     assert sac.split() == ["SAC", "1", "-7", "–", "-7", "1.7"]

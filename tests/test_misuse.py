@@ -5,10 +5,12 @@ import numpy as np
 import pytest
 import torch
 
+import environments  # noqa: F401  (registers the copies)
 import lemniscate as lem
 from conftest import tiny_fields
 from lemniscate.cli import main
 from lemniscate.envs import registry
+from lemniscate.envs.observations import read_observation
 from lemniscate.errors import UserError, missing_extra, shown
 
 
@@ -31,6 +33,26 @@ class Sized(gym.Env):
         return np.zeros(2, np.float32), 1.0, self.t == 5, False, {}
 
 
+class Missing(gym.Wrapper):
+    """A wrapper that cannot be made."""
+
+    def __init__(self, env):
+        raise ValueError("a part is lost")
+
+
+class Unseen(Sized):
+    """An environment whose `render` returns no picture."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012
+    render_mode = "rgb_array"
+
+    def __init__(self, picture=None, render_mode=None):
+        self.picture = picture
+
+    def render(self):
+        return None if self.picture is None else np.full((4, 4, 3), self.picture)
+
+
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     path = tmp_path_factory.mktemp("a folder") / "cartpole"
@@ -51,7 +73,7 @@ def test_a_path_a_run_and_a_policy_are_evaluated_alike(run):
 
 def test_runs_are_plotted_one_by_one_or_in_a_list(run):
     pictures = lem.plot(run)
-    assert pictures == lem.plot([str(run.path)])
+    assert pictures == lem.plot([str(run.path)]) == lem.plot(run.policy) == lem.plot(lem.load(run.path))
     assert {picture.parent for picture in pictures} == {run.path / "plots"}
 
 
@@ -60,9 +82,9 @@ def test_runs_are_plotted_one_by_one_or_in_a_list(run):
     [
         (lambda run: lem.plot(), "nothing to plot: name one run or several"),
         (lambda run: lem.plot([]), "nothing to plot"),
-        (lambda run: lem.plot(run.policy), "A run is a directory, .* not a TrainedPolicy"),
+        (lambda run: lem.plot(lem.TrainedPolicy), "A run is a directory, .* not a type"),
         (lambda run: lem.load(None), "A run is a directory, .* not None"),
-        (lambda run: lem.resume(run.policy), "A run is a directory, .* not a TrainedPolicy"),
+        (lambda run: lem.resume(3), "A run is a directory, .* not 3"),
         (lambda run: lem.watch(3), "A run is a directory, .* not 3"),
         (lambda run: lem.evaluate(run, episodes="3"), "episodes must be a whole number at least 1, not '3'"),
         (lambda run: lem.evaluate(run, episodes=2.5), "episodes must be a whole number at least 1, not 2.5"),
@@ -82,11 +104,31 @@ def test_runs_are_plotted_one_by_one_or_in_a_list(run):
         (lambda run: lem.train_sweep("ppo", "CartPole-v1", 1, seed=3), "given as seeds, not as seed"),
         (lambda run: lem.train_sweep("ppo", lambda: gym.make("CartPole-v1"), 1), "into a module, to import it"),
         (lambda run: lem.train_sweep(None, "CartPole-v1", 1), "None is not an algorithm"),
+        (lambda run: lem.train_sweep("ppo", Sized, 1, env_kwargs={"size": 1}, run=run.path), "exists already"),
+        (lambda run: lem.train_sweep("ppo", Sized, 1, env_kwargs={"size": 1}, run=run.path, wrappers=[Missing]), "is lost"),
+        (lambda run: lem.train_sweep("ppo", "CartPole-v1", 1, callbacks=print), "has a process of its own: name"),
         (lambda run: lem.train("ppo", "CartPole-v1", preset=3), "There is no preset 3"),
         (lambda run: lem.train("ppo", "CartPole-v1", callbacks=3), "A callback must be a function of"),
         (lambda run: lem.train("ppo", "CartPole-v1", callbacks=lambda step: None), "A callback must be a function of"),
         (lambda run: lem.train("ppo", ""), "There is no environment ''"),
         (lambda run: lem.evaluate(run, env_kwargs=3), "env_kwargs must be a dictionary"),
+        (lambda run: lem.evaluate(run, env_kwargs="x"), "env_kwargs must be a dictionary"),
+        (lambda run: lem.evaluate(run, video=3), "video must be a path, such as 'film.gif', not 3"),
+        (lambda run: lem.evaluate(run, backend=3), "There is no backend 3"),
+        (lambda run: lem.watch(run, env_kwargs="x", video="film.gif"), "env_kwargs must be a dictionary"),
+        (lambda run: lem.watch(run, video=3), "video must be a path, such as 'film.gif', not 3"),
+        (lambda run: lem.watch(env=Unseen, random=True, video="film.gif"), r"renders no pictures: render\(\) .* None"),
+        (lambda run: lem.watch(env=Unseen, env_kwargs={"picture": 0.5}, random=True, video="film.gif"), "renders no pictures: .*float64"),
+        (lambda run: lem.train("ppo", Unseen, video_every=64), "renders no pictures"),
+        (lambda run: lem.save(run, None), "A run is a directory, .* not None"),
+        (lambda run: lem.make_vec("CartPole-v1", 0), "num_envs must be a whole number at least 1, not 0"),
+        (lambda run: lem.make_vec("CartPole-v1", 2.5), "num_envs must be a whole number at least 1, not 2.5"),
+        (lambda run: lem.make_vec("CartPole-v1", "3"), "num_envs must be a whole number at least 1, not '3'"),
+        (lambda run: lem.make_vec("CartPole-v1", wrappers="a:b"), r"wrappers must be several, such as \[MyWrapper\], not 'a:b'"),
+        (lambda run: lem.make_vec("CartPole-v1", wrappers=3), "wrappers must be several, .* not 3"),
+        (lambda run: lem.make_vec("CartPole-v1", backend=3), "There is no backend 3"),
+        (lambda run: run.policy.act(np.zeros(4), action_mask=[1, 0]), "CartPole-v1 has no action mask"),
+        (lambda run: lem.train("ppo", "CartPole-v1", callbacks=[3]), "A callback must be a function of"),
         (lambda run: lem.make_envs("CartPole-v1"), "make_envs needs a Config, .* not 'CartPole-v1'"),
     ],
 )  # fmt: skip
@@ -127,7 +169,7 @@ def test_a_finished_run_is_left_as_it_is(run, capsys):
 
 def test_a_finished_run_is_reported_again(run, capsys):
     lem.resume(run, report=True)
-    assert "return over 4 episodes" in capsys.readouterr().err
+    assert "return over 100 episodes" in capsys.readouterr().err
 
 
 def test_a_path_with_spaces_is_quoted_where_it_is_to_be_typed(run):
@@ -151,6 +193,26 @@ def test_a_path_with_spaces_is_quoted_where_it_is_to_be_typed(run):
 def test_what_is_no_observation_is_refused(run, obs, said):
     with pytest.raises(UserError, match=said):
         run.policy.act(obs)
+
+
+@pytest.mark.parametrize(
+    ("obs", "said"),
+    [
+        (np.full((9, 12, 3), 0.5, np.float32), "its numbers are float32; those of an image are whole, from 0 to 255"),
+        (np.full((2, 9, 12, 3), np.nan), "its numbers are float64"),
+        (np.full(9 * 12 * 3, 0.5), "its numbers are float64"),
+        (np.full((9, 12, 3), 256), "its numbers are from 256 to 256; those of an image are whole, from 0 to 255"),
+        (np.full((9, 12, 3), -1), "its numbers are from -1 to -1"),
+    ],
+)
+def test_what_is_no_image_of_bytes_is_refused(obs, said):
+    spec = registry.make("Copy-image-v0", 1).spec
+    with pytest.raises(UserError, match=f"Copy-image-v0 observes .*: {said}"):
+        read_observation(spec, obs)
+    for kind in (np.uint8, np.int64, list):
+        image = np.full((9, 12, 3), 200)
+        flat, batched = read_observation(spec, image.tolist() if kind is list else image.astype(kind))
+        assert (flat.dtype, flat[0, 0], batched) == (np.uint8, 200, False)
 
 
 @pytest.mark.parametrize("backend", ["gymnasium", "envpool"])

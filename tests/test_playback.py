@@ -15,6 +15,7 @@ from nbclient import NotebookClient
 from PIL import Image
 
 import lemniscate as lem
+from lemniscate import notebook as cells
 from lemniscate.report import playback
 
 
@@ -62,10 +63,10 @@ def test_frames_are_sent_at_their_own_speed_but_no_faster_than_a_browser_takes(m
 
     sent, now = [], [0.0]
     monkeypatch.setattr("IPython.display.display", display)
-    monkeypatch.setattr(playback.time, "monotonic", lambda: now[0])
-    monkeypatch.setattr(playback.time, "sleep", lambda seconds: now.__setitem__(0, now[0] + seconds))
+    monkeypatch.setattr(cells.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(cells.time, "sleep", lambda seconds: now.__setitem__(0, now[0] + seconds))
     frames = [np.full((8, 8, 3), shade, dtype=np.uint8) for shade in range(0, 200, 2)]
-    playback.send_frames(frames, fps=50)
+    cells.send_frames(frames, fps=50)
     shades = [int(np.asarray(Image.open(io.BytesIO(jpeg)))[0, 0, 0]) for jpeg in sent]
     assert shades == pytest.approx(range(0, 200, 4), abs=2)
     assert now[0] == pytest.approx(2.0, abs=0.05)
@@ -165,6 +166,12 @@ def test_a_picture_keeps_the_time_with_delays_that_a_browser_shows(fps, kind, tm
     delays = delays_of(file)
     assert sum(delays) == pytest.approx(2000, abs=30)
     assert min(delays) >= 20
+
+
+def test_without_ffmpeg_the_extra_is_named_with_a_line_that_works(tmp_path, monkeypatch):
+    monkeypatch.setattr("lemniscate.report.film.is_installed", lambda package: False)
+    with pytest.raises(lem.UserError, match=r"imageio_ffmpeg is not installed; .* pip install '\.\[video\]'"):
+        playback.save_frames([], tmp_path / "film.mp4", 30)
 
 
 @pytest.fixture

@@ -360,6 +360,21 @@ def test_each_rule_speaks_of_what_it_measures_and_is_silent_otherwise(rule, fire
         assert rule(given) is None
 
 
+@pytest.mark.parametrize("algorithm", ["reinforce", "a2c", "trpo", "ppo", "ddpg", "td3", "sac"])
+def test_no_rule_names_a_flag_that_the_algorithm_does_not_have(algorithm):
+    lines = logged(
+        approx_kl=[9.0] * 9, clip_fraction=[1.0] * 9, explained_variance=[0.0] * 9, gradient_norm=[1e9] * 9,
+        policy_std=[1.0] + [0.01] * 8,
+    )  # fmt: skip
+    config = lem.config_for(algorithm, "Pendulum-v1").to_json()
+    for returns, bias in ((np.arange(200) + NOISE, 0.8), ([*range(100), *[20] * 40], -0.8), ([], 0)):
+        told = advice.sentences(Evidence(config, [*lines, *returned(returns)], {"q_bias": {"bias": bias}}))
+        assert len(told) >= 3
+        flags = {flag.replace("-", "_") for said in told for flag in re.findall(r"--([a-z-]+)", said)}
+        assert flags
+        assert flags <= set(config)
+
+
 def test_every_rule_is_asked():
     rules = {
         value

@@ -1,10 +1,14 @@
 """A policy stored with `lem.save`, and read again."""
 
+import itertools
+import os
+
 import pytest
 import torch
 
 import lemniscate as lem
 from conftest import tiny_fields
+from lemniscate.run import checkpoint
 
 
 @pytest.fixture(scope="module")
@@ -37,6 +41,46 @@ def test_a_stored_policy_is_replaced_and_nothing_else_is(run, tmp_path):
         lem.save(policy, tmp_path / "file" / "best")
     with pytest.raises(lem.UserError, match="not a dict"):
         lem.save({}, tmp_path / "other")
+
+
+def test_a_planned_checkpoint_is_not_replaced(run):
+    planned = run.path / "checkpoints" / "step-256"
+    before = {file: file.read_bytes() for file in planned.iterdir()}
+    with pytest.raises(lem.UserError, match="exists already, and is not a stored policy"):
+        lem.save(run, planned)
+    assert {file: file.read_bytes() for file in planned.iterdir()} == before
+
+
+def test_after_a_save_that_failed_half_way_the_next_one_succeeds(run, tmp_path):
+    (tmp_path / "best.tmp").mkdir()
+    (tmp_path / "best.tmp" / "state.json").write_text("{")
+    assert lem.load(lem.save(run, tmp_path / "best")).step == 256
+    assert [file.name for file in tmp_path.iterdir()] == ["best"]
+
+
+@pytest.mark.parametrize("last", [1, 2])
+def test_a_stored_policy_is_there_until_another_is_in_its_place(run, tmp_path, monkeypatch, last):
+    """Two saves in a row fail, the first when it puts the new one into the place of the old, the second at once."""
+
+    def refuse(name, after):
+        call, calls = getattr(os, name), itertools.count(1)
+
+        def refusing(*arguments, **options):
+            if next(calls) > after:
+                raise OSError(5, "Input/output error")
+            return call(*arguments, **options)
+
+        monkeypatch.setattr(os, name, refusing)
+
+    path = lem.save(run, tmp_path / "best")
+    for name, after in (("rename", last - 1), ("fsync", 0)):
+        refuse(name, after)
+        with pytest.raises(lem.UserError, match="cannot be written"):
+            lem.save(run, path)
+        monkeypatch.undo()
+        assert any(map(checkpoint.is_whole, tmp_path.iterdir()))
+    lem.save(run, path)
+    assert [file.name for file in tmp_path.iterdir()] == ["best"]
 
 
 def test_a_run_begins_with_a_stored_policy(run, tmp_path):

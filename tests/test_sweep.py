@@ -159,12 +159,12 @@ def test_two_processes_do_not_train_one_sweep(trained):
 def test_the_policy_is_played_anew_when_there_is_a_newer_checkpoint(trained, tmp_path, capsys):
     run = shutil.copytree(trained[0] / "ppo-1", tmp_path / "run")
     known = read_json(run / "final.json")
-    assert lem.plots.final_return(run) == known["mean_return"]
+    assert lem.results.final_return(run) == known["mean_return"]
     assert capsys.readouterr().err == ""
     newest = run / "checkpoints" / f"step-{known['step']}"
     newest.rename(newest.with_name(f"step-{known['step'] + 1}"))
     write_json(run / "final.json", known | {"mean_return": 7.0})
-    assert lem.plots.final_return(run) == known["mean_return"]
+    assert lem.results.final_return(run) == known["mean_return"]
     assert "Evaluating" in capsys.readouterr().err
 
 

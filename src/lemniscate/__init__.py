@@ -10,15 +10,17 @@ __version__ = "0.2.0"
 
 if TYPE_CHECKING:
     from lemniscate.api import config_for, resume, train
+    from lemniscate.envs.check import check
     from lemniscate.envs.vector_view import make_vec
     from lemniscate.errors import NonFiniteError, NotStoredError, SweepError, UserError
     from lemniscate.plots import plot
     from lemniscate.policy import TrainedPolicy
-    from lemniscate.results import TrainedRun, evaluate, load, save, watch
+    from lemniscate.results import evaluate, watch
     from lemniscate.run.environments import make_envs
     from lemniscate.run.evaluate import Evaluation
     from lemniscate.run.run import Stopped
     from lemniscate.run.seeding import set_seeds
+    from lemniscate.stored import TrainedRun, load, save
     from lemniscate.sweep import TrainedSweep, resume_sweep, train_sweep
 
 __all__ = [
@@ -31,6 +33,7 @@ __all__ = [
     "TrainedRun",
     "TrainedSweep",
     "UserError",
+    "check",
     "config_for",
     "evaluate",
     "load",
@@ -53,18 +56,19 @@ MODULES = {
     "NotStoredError": "errors",
     "SweepError": "errors",
     "TrainedPolicy": "policy",
-    "TrainedRun": "results",
+    "TrainedRun": "stored",
     "TrainedSweep": "sweep",
     "UserError": "errors",
+    "check": "envs.check",
     "config_for": "api",
     "evaluate": "results",
-    "load": "results",
+    "load": "stored",
     "make_envs": "run.environments",
     "make_vec": "envs.vector_view",
     "plot": "plots",
     "resume": "api",
     "resume_sweep": "sweep",
-    "save": "results",
+    "save": "stored",
     "set_seeds": "run.seeding",
     "train": "api",
     "train_sweep": "sweep",
@@ -74,7 +78,7 @@ MODULES = {
 
 SUBMODULES = (
     *("algos", "api", "course", "data", "envs", "errors", "maths", "nn", "optim", "policy", "presets", "report"),
-    *("plots", "results", "run", "spec", "sweep", "testing", "types"),
+    *("plots", "results", "run", "spec", "stored", "sweep", "testing", "types"),
 )
 """what `lemniscate.NAME` imports by itself"""
 

@@ -10,23 +10,21 @@ from typing import Any
 import torch
 
 from lemniscate import algos, named, presets
-from lemniscate.callbacks import Callback, watch_with
+from lemniscate.callbacks import Callback, call_callbacks, find_callbacks
 from lemniscate.console import say
 from lemniscate.envs import registry
-from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import NotStoredError, UserError, is_installed, missing_extra, shown, unknown_name
 from lemniscate.policy import TrainedPolicy
-from lemniscate.report import pictures as pictures_of
 from lemniscate.report import playback
-from lemniscate.results import TrainedRun, evaluate, finished_run, path_of
+from lemniscate.results import draw_run, evaluate
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import is_finished, read_config, require_absent
 from lemniscate.run.environments import make_envs
 from lemniscate.run.loggers import TRACKERS, JsonLines, LoggerClass, TensorBoard
-from lemniscate.run.q_bias import critic_of
 from lemniscate.run.run import Run
 from lemniscate.run.seeding import set_seeds
 from lemniscate.run.state import TrainState
+from lemniscate.stored import TrainedRun, load, path_of
 
 
 def config_for(
@@ -59,8 +57,8 @@ def _named(value: object) -> object:
     """A value of a Config: functions and classes, and those in a sequence, by their names."""
     if isinstance(value, list | tuple):
         return tuple(map(_named, value))
-    if isinstance(value, TrainedRun):  # to start warm from
-        return str(value.path)
+    if isinstance(value, TrainedRun | TrainedPolicy):  # to start warm from
+        return str(path_of(value))
     return named.name_of(value) if callable(value) else value
 
 
@@ -71,7 +69,7 @@ def train(
     run: str | Path | None = None,
     preset: str | None = None,
     track: str | LoggerClass | None = None,
-    callbacks: Sequence[Callback | str] = (),
+    callbacks: Callback | str | Sequence[Callback | str] = (),
     report: bool = False,
     progress: bool = True,
     **fields: object,
@@ -93,61 +91,86 @@ def train(
         **fields: any field of the algorithm's Config, such as seed, total_steps or warm_start.
 
     Raises:
-        UserError: see `config_for`; a run directory that exists.
+        UserError: see `config_for`; a run directory that exists; an environment that cannot be made, or that the
+            algorithm cannot learn; a device, tracker or callback that is not there.
+        NonFiniteError: an observation, a reward or a loss is NaN or infinite; the last checkpoint is as it was.
+        WorkerError: the process of an environment died.
+        Stopped: Ctrl-C or SIGTERM, when the run has saved itself; go on with `resume`.
     """
     config = config_for(algorithm, env, preset, **fields)
     algorithm = algos.name_of(sys.modules[type(config).__module__] if isinstance(algorithm, RunConfig) else algorithm)
     path = path_of(run) if run is not None else fresh_directory(config.env, f"{algorithm}-{config.seed}")
-    loggers = loggers_with(track)
+    loggers, functions = loggers_with(track), find_callbacks(callbacks)
     require_absent(path)
-    set_seeds(config.seed)  # before JAX starts, which reads its flags then
-    envs = make_envs(config)
-    if config.video_every or config.video_every_episodes:
-        playback.require_pictures(config, envs[0])
-    return _train(path, algorithm, config, envs, loggers, callbacks, report or track is not None, progress)
+    return _train(path, algorithm, config, loggers, functions, report or track is not None, progress)
 
 
 def resume(
-    run: str | Path | TrainedRun,
+    run: str | Path | TrainedRun | TrainedPolicy,
     *,
     env: str | Callable[..., Any] | None = None,
     wrappers: Sequence[str | Callable[..., Any]] | None = None,
     network: str | Callable[..., Any] | None = None,
     track: str | LoggerClass | None = None,
-    callbacks: Sequence[Callback | str] = (),
+    callbacks: Callback | str | Sequence[Callback | str] = (),
     report: bool = False,
     progress: bool = True,
 ) -> TrainedRun:
     """Resume an interrupted run from its newest whole planned checkpoint, and train it to its end.
 
     A run that is finished stays as it is; with `report` it is evaluated and drawn again.
-    `env`, `wrappers` and `network` are only for a run that began with objects that no file holds, such as a lambda: the
-    same objects again. The other arguments are those of `train`, and are not saved with the run.
+
+    Args:
+        run: its directory, or what `train` returned.
+        env: only of a run that began with an object that no file holds, such as a lambda: the same object again.
+        wrappers: the same.
+        network: the same.
+        track: as in `train`, and the following; none of them is saved with the run.
+        callbacks: functions that see each logged line.
+        report: evaluate the final policy, and draw it.
+        progress: the live line on standard error.
+
+    Raises:
+        UserError: no run directory, or one that another process trains in or another version wrote; an object that no
+            file holds and that was not passed again; a tracker or a callback that is not there.
+        NonFiniteError: an observation, a reward or a loss is NaN or infinite; the last checkpoint is as it was.
+        WorkerError: the process of an environment died.
+        Stopped: Ctrl-C or SIGTERM, when the run has saved itself.
     """
     path = path_of(run)
     algorithm, fields = read_config(path)
     again = {"env": env, "wrappers": wrappers, "network": network}
     config = algos.find(algorithm).Config.from_json(fields)
     config = config.replace(**{name: _named(value) for name, value in again.items() if value is not None})
-    loggers = loggers_with(track)
+    loggers, functions = loggers_with(track), find_callbacks(callbacks)
     if is_finished(path):
-        return finished_run(path, report, progress)
-    set_seeds(config.seed)
-    return _train(path, algorithm, config, make_envs(config), loggers, callbacks, report or track is not None, progress)
+        return _finished(path, report, progress)
+    return _train(path, algorithm, config, loggers, functions, report or track is not None, progress)
+
+
+def _finished(path: Path, report: bool, progress: bool) -> TrainedRun:
+    """A run that has taken all its steps, as it is; with `report` it is evaluated and drawn again."""
+    run = TrainedRun(path, load(path), 0.0)
+    if progress:
+        say(f"{path} is finished, at step {run.policy.step:,}: there is nothing to resume.")
+    if report:
+        _report(run)
+    return run
 
 
 def _train(
     path: Path,
     algorithm: str,
     config: RunConfig,
-    envs: tuple[VecEnv, VecEnv],
     loggers: tuple[LoggerClass, ...],
-    callbacks: Sequence[Callback | str],
-    draw: bool,
+    callbacks: Sequence[Callback],
+    report: bool,
     progress: bool,
 ) -> TrainedRun:
-    module, spec = algos.find(algorithm), envs[0].spec
+    set_seeds(config.seed)  # before JAX starts, which reads its flags then
     torch.set_num_threads(config.threads)
+    envs = make_envs(config)
+    spec = envs[0].spec
 
     def copy_networks(state: TrainState) -> Any:
         networks = config.networks(spec)
@@ -159,25 +182,34 @@ def _train(
         policy = TrainedPolicy(copy_networks(state), spec, config, state.step)
         evaluate(policy, episodes=1, video=path / "videos" / f"step-{state.step}.{kind}")
 
-    watcher = watch_with(callbacks, copy_networks, spec, config) if callbacks else None
-    run = Run(path, algorithm, config, envs, loggers=loggers, progress=progress, film=film, watch=watcher)
+    observer = call_callbacks(callbacks, copy_networks, spec, config) if callbacks else None
+    run = Run(path, algorithm, config, envs, loggers=loggers, progress=progress, film=film, observer=observer)
     pictures: list[Path] = []
     try:
+        if (config.video_every or config.video_every_episodes) and not path.exists():
+            playback.require_pictures(config, envs[0])
         for notice in config.notices(spec, envs[0].device) if progress else ():
             say(notice)
-        state = module.train(config, run)
-        if draw:
-            critic = critic_of(state.networks, config)
-            pictures = pictures_of.report(state.policy, run.eval_env, path, config.evaluate_episodes, critic)
+        state = algos.find(algorithm).train(config, run)
+        trained = TrainedRun(path, TrainedPolicy(state.networks.cpu(), spec, config, state.step, path), run.seconds)
+        if report:
+            pictures = _report(trained)
     finally:
         run.close(pictures)
-    trained = TrainedRun(path, TrainedPolicy(state.networks.cpu(), spec, config, state.step), run.seconds)
     try:
         run.require_stored()
     except NotStoredError as error:
         error.run = trained
         raise
     return trained
+
+
+def _report(run: TrainedRun) -> list[Path]:
+    """Evaluate a run's final policy, draw it, and name the files; returns the pictures."""
+    files = draw_run(run, film=True)
+    for file in files:
+        say(file)
+    return [file for file in files if file.suffix == ".png"]
 
 
 def loggers_with(track: str | LoggerClass | None) -> tuple[LoggerClass, ...]:
@@ -197,6 +229,6 @@ def loggers_with(track: str | LoggerClass | None) -> tuple[LoggerClass, ...]:
 
 def fresh_directory(env_id: str, name: str) -> Path:
     """A directory under `runs/` that is not there yet."""
-    stem = f"{registry.file_name(env_id)}-{name}"
+    stem = registry.file_name(f"{env_id}-{name}")
     names = (Path("runs") / (stem if n == 1 else f"{stem}-{n}") for n in count(1))
     return next(path for path in names if not path.exists())

@@ -1,6 +1,5 @@
 """Callbacks: functions of the user's that see a run while it trains, and may stop it."""
 
-import inspect
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
@@ -11,7 +10,7 @@ from lemniscate import named
 from lemniscate.errors import UserError, shown
 from lemniscate.policy import TrainedPolicy
 from lemniscate.run.config import RunConfig
-from lemniscate.run.run import Watch
+from lemniscate.run.run import Observer
 from lemniscate.run.seeding import generator
 from lemniscate.run.state import TrainState
 from lemniscate.spec import Spec
@@ -42,19 +41,8 @@ class PolicySnapshot(TrainedPolicy):
         self._copy_networks = _too_late
 
 
-def watch_with(
-    callbacks: Callback | str | Sequence[Callback | str],
-    copy_networks: Callable[[TrainState], Any],
-    spec: Spec,
-    config: RunConfig,
-) -> Watch:
-    """The function that a run calls after each logged line: every callback in turn, each with a policy of its own.
-
-    Args:
-        callbacks: functions, or names of functions as `module:function`; or one of these.
-        copy_networks: networks on the CPU that share nothing with those of the state.
-        spec: of the policy.
-        config: of the run.
+def find_callbacks(callbacks: Callback | str | Sequence[Callback | str]) -> list[Callback]:
+    """The functions themselves: of functions, or names of functions as `module:function`, or one of these.
 
     Raises:
         UserError: a callback that cannot be loaded or called.
@@ -62,10 +50,24 @@ def watch_with(
     several: Sequence[Any] = callbacks if isinstance(callbacks, list | tuple) else [callbacks]
     functions = [named.find(one) if isinstance(one, str) else one for one in several]
     for function in functions:
-        if not _takes_three(function):
+        if not named.takes(function, 3):
             raise UserError(f"A callback must be a function of (step, metrics, policy), not {shown(function)}.")
+    return functions
 
-    def watch(step: int, metrics: Mapping[str, float], state: TrainState) -> bool:
+
+def call_callbacks(
+    functions: Sequence[Callback], copy_networks: Callable[[TrainState], Any], spec: Spec, config: RunConfig
+) -> Observer:
+    """The function that a run calls after each logged line: every callback in turn, each with a policy of its own.
+
+    Args:
+        functions: the callbacks.
+        copy_networks: networks on the CPU that share nothing with those of the state.
+        spec: of the policy.
+        config: of the run.
+    """
+
+    def observe(step: int, metrics: Mapping[str, float], state: TrainState) -> bool:
         stop = False
         for function in functions:
             policy = PolicySnapshot(lambda: copy_networks(state), spec, config, step)
@@ -73,18 +75,7 @@ def watch_with(
             policy.expire()
         return stop
 
-    return watch
-
-
-def _takes_three(function: Any) -> bool:
-    """Whether it can be called with three arguments; what does not tell, such as a built-in function, may be."""
-    try:
-        inspect.signature(function).bind(0, {}, None)
-    except ValueError:
-        pass
-    except TypeError:
-        return False
-    return callable(function)
+    return observe
 
 
 def _too_late() -> Any:

@@ -2,6 +2,7 @@
 
 import ast
 import importlib
+import inspect
 import sys
 from collections.abc import Callable
 from functools import partial
@@ -75,6 +76,17 @@ def module_of(name: str) -> ModuleType:
         raise UserError(f"{name} cannot be found: {error}.") from error
     except (ImportError, SyntaxError, ValueError, TypeError) as error:
         raise UserError(f"{name} cannot be found: {error}.") from error
+
+
+def takes(function: Any, count: int) -> bool:
+    """Whether it can be called with so many arguments; what does not tell, such as a built-in function, may be."""
+    try:
+        inspect.signature(function).bind(*range(count))
+    except ValueError:
+        pass
+    except TypeError:
+        return False
+    return callable(function)
 
 
 def find_callable(text: str) -> Callable[..., Any]:

@@ -1,9 +1,30 @@
-"""What is shown below the cell of a notebook, so that a saved notebook holds it: a line of progress, a film."""
+"""What is shown below the cell of a notebook, so that a saved notebook holds it: progress, pictures, frames, a film."""
 
+import io
 import time
 from base64 import b64encode
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
+
+NOTEBOOK_FPS = 25
+"""more frames a second than a browser is sent; the others are left out"""
+
+
+class Place:
+    """A place below the cell for one object, which the next one replaces; a saved notebook holds the last."""
+
+    def __init__(self) -> None:
+        self._handle: Any = None
+
+    def show(self, shown: Any, **how: Any) -> None:
+        """Show an object in the place of the one before; `how` is for IPython's `display`."""
+        from IPython.display import display
+
+        if self._handle is None:
+            self._handle = display(shown, display_id=True, **how)
+        else:
+            self._handle.update(shown, **how)
 
 
 class CellText:
@@ -13,7 +34,7 @@ class CellText:
     """
 
     def __init__(self) -> None:
-        self._place: Any = None
+        self._place = Place()
         self._text, self._shown_at = "", -float("inf")
 
     def show(self, text: str) -> None:
@@ -24,20 +45,39 @@ class CellText:
 
     def flush(self) -> None:
         """Show the newest text."""
-        from IPython.display import display
-
-        plain = {"text/plain": self._text}
-        if self._place:
-            self._place.update(plain, raw=True)
-        elif self._text:
-            self._place = display(plain, raw=True, display_id=True)
+        if self._text:
+            self._place.show({"text/plain": self._text}, raw=True)
         self._shown_at = time.monotonic()
 
 
-def drawn_bar(fraction: float, width: int = 20) -> str:
-    """A bar of `width` characters, filled from the left."""
-    filled = round(width * min(1.0, fraction))
-    return "━" * filled + "╌" * (width - filled)
+def drawn_bar(fraction: float) -> str:
+    """A bar of 20 characters, filled from the left."""
+    filled = round(20 * min(1.0, fraction))
+    return "━" * filled + "╌" * (20 - filled)
+
+
+def show_pictures(files: Iterable[Path]) -> None:
+    """Show pictures below the cell."""
+    from IPython.display import Image, display
+
+    for file in files:
+        display(Image(filename=str(file)))
+
+
+def send_frames(frames: Iterable[Any], fps: float) -> None:
+    """Show frames, arrays [H, W, 3] of uint8, one after the other below the cell, at their own speed."""
+    import PIL.Image
+    from IPython.display import Image
+
+    stride = max(1, round(fps / NOTEBOOK_FPS))
+    place, started = Place(), time.monotonic()
+    for i, frame in enumerate(frames):
+        if i % stride:
+            continue
+        jpeg = io.BytesIO()
+        PIL.Image.fromarray(frame).save(jpeg, format="JPEG", quality=85)
+        place.show(Image(jpeg.getvalue(), format="jpeg"))
+        time.sleep(max(0.0, started + i / fps - time.monotonic()))
 
 
 def show_film(file: str | Path) -> None:

@@ -1,5 +1,6 @@
 """A trained policy, for those who have NumPy and an environment of their own."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -8,6 +9,7 @@ import torch
 from lemniscate.envs.masks import read_mask
 from lemniscate.envs.observations import read_observation
 from lemniscate.envs.spaces import physical_action
+from lemniscate.errors import UserError
 from lemniscate.nn.policies import Policy
 from lemniscate.run.config import RunConfig
 from lemniscate.run.seeding import generator
@@ -17,15 +19,23 @@ from lemniscate.spec import Discrete, Spec
 class TrainedPolicy:
     """A policy from a run or a checkpoint: NumPy in, NumPy out."""
 
-    def __init__(self, networks: Any, spec: Spec, config: RunConfig, step: int) -> None:
+    path: Path | None = None
+    """the run or the checkpoint that it came from"""
+
+    def __init__(self, networks: Any, spec: Spec, config: RunConfig, step: int, path: Path | None = None) -> None:
         self.networks = networks.eval()
-        self.spec, self.config, self.step = spec, config, step
+        self.spec, self.config, self.step, self.path = spec, config, step, path
         self._noise = generator(config.seed, torch.device("cpu"), 4)
 
     @property
     def module(self) -> Policy:
         """The policy itself, a function of torch tensors."""
         return self.networks.policy
+
+    @property
+    def is_masked(self) -> bool:
+        """Whether its environment says at each step which actions are valid."""
+        return isinstance(self.spec.action, Discrete) and self.spec.action.masked
 
     @torch.no_grad()
     def act(self, obs: Any, deterministic: bool = True, action_mask: Any = None) -> np.ndarray:
@@ -41,9 +51,12 @@ class TrainedPolicy:
             In the environment's own units and shape, [A] or [B, A] for Box; a scalar array or [B] for Discrete.
 
         Raises:
-            UserError: an observation or a mask of another shape, or that is not finite.
+            UserError: an observation or a mask of another shape, or that is not finite; a mask where the environment
+                of training gave none.
         """
         flat, batched = read_observation(self.spec, obs)
+        if action_mask is not None and not self.is_masked:
+            raise UserError(f"{self.spec.env_id} has no action mask, so this policy cannot follow one.")
         if isinstance(self.spec.action, Discrete) and self.spec.action.masked:
             mask = read_mask(action_mask, len(flat), self.spec.action.n)
             flat = np.concatenate([flat, mask.astype(flat.dtype)], axis=-1)

@@ -1,18 +1,17 @@
-"""The verbs for what a run has left: load, save, evaluate, watch, plot."""
+"""The verbs for what a run has left: evaluate, watch; the final scores that runs are compared by; a run's pictures."""
 
-import sys
+import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from lemniscate import algos
 from lemniscate.console import say
 from lemniscate.envs import registry
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError, shown
+from lemniscate.named import takes
 from lemniscate.policy import TrainedPolicy
 from lemniscate.report import pictures as pictures_of
 from lemniscate.report import playback
@@ -20,93 +19,22 @@ from lemniscate.report.display import require_display
 from lemniscate.report.film import check_film
 from lemniscate.run import checkpoint
 from lemniscate.run.config import Count, Natural, RunConfig, checked
-from lemniscate.run.directory import find_checkpoint
-from lemniscate.run.environments import evaluation_env, world_of
+from lemniscate.run.environments import env_arguments, evaluation_env
 from lemniscate.run.evaluate import Evaluation
-from lemniscate.run.evaluate import evaluate as evaluate_module
+from lemniscate.run.evaluate import evaluate as evaluate_policy
+from lemniscate.run.files import DamagedFileError, read_json, write_json
 from lemniscate.run.q_bias import critic_of
+from lemniscate.stored import Trained, TrainedRun, load, path_of
 
+Agent = Callable[[Any], Any]
+"""a function of one observation, as Gymnasium's environment returns it, to an action for its `step`"""
 
-@dataclass(frozen=True)
-class TrainedRun:
-    """The result of `train` and `resume`: the run directory, the final policy, the seconds of the training loop."""
-
-    path: Path
-    policy: TrainedPolicy
-    seconds: float
-
-
-Trained = str | Path | TrainedRun | TrainedPolicy
-"""what has a policy: the path of a run or a checkpoint, what `train` returned, or the policy itself"""
-
-
-def path_of(run: object) -> Path:
-    """The directory of a run: of its path, or of what `train` returned. Raises `UserError` for anything else."""
-    path = getattr(run, "path", run)
-    if isinstance(path, str | PathLike):
-        return Path(path)
-    raise UserError(f"A run is a directory, such as 'runs/lander', or what train returned, not {shown(run)}.")
-
-
-def finished_run(path: Path, report: bool, progress: bool) -> TrainedRun:
-    """A run that has taken all its steps, as it is; with `report` it is evaluated and drawn again."""
-    policy = load(path)
-    if progress:
-        say(f"{path} is finished, at step {policy.step:,}: there is nothing to resume.")
-    if report:
-        episodes = policy.config.evaluate_episodes
-        env = evaluation_env(policy.config, episodes)
-        pictures_of.report(policy.module, env, path, episodes, critic_of(policy.networks, policy.config))
-        env.close()
-    return TrainedRun(path, policy, 0.0)
-
-
-def load(run: Trained) -> TrainedPolicy:
-    """The policy of a run (its newest whole checkpoint) or of one checkpoint. Nothing in the files is executed.
-
-    What `train` returned has its policy already, and a policy is returned as it is.
-
-    Raises:
-        UserError: neither a run nor a checkpoint, or a run without a whole checkpoint; a damaged checkpoint.
-    """
-    if isinstance(run, TrainedRun | TrainedPolicy):
-        return run.policy if isinstance(run, TrainedRun) else run
-    found = find_checkpoint(path_of(run))
-    algorithm, spec = algos.find(found.record["algorithm"]), checkpoint.spec_from_json(found.record["spec"])
-    config = algorithm.Config.from_json(found.record["config"])
-    networks = config.networks(spec)
-    networks.load_state_dict(found.tensors_of("networks"))
-    return TrainedPolicy(networks, spec, config, found.numbers["step"])
-
-
-def save(policy: Any, path: str | Path) -> Path:
-    """Store a policy for `load`: weights, normalizer, Config and Spec, as a checkpoint without pickle.
-
-    Args:
-        policy: from `load`, or what `train` returned. It may begin another run (`warm_start=path`), but not resume
-            its own: a run's checkpoints also hold optimizers and random generators.
-        path: a new directory, or a policy stored before, which is replaced.
-
-    Raises:
-        UserError: something else is at `path`, or it cannot be written.
-    """
-    path, policy = Path(path), getattr(policy, "policy", policy)
-    if not isinstance(policy, TrainedPolicy):
-        raise UserError(f"What can be stored is a policy, from load or train, not a {type(policy).__name__}.")
-    if path.exists() and not (path / "manifest.json").exists():
-        raise UserError(f"{path} exists already, and is not a stored policy; choose another path.")
-    algorithm = algos.name_of(sys.modules[type(policy.config).__module__])
-    record = {"algorithm": algorithm, "config": policy.config.to_json(), "spec": checkpoint.spec_to_json(policy.spec)}
-    try:
-        fields = {"networks": policy.networks, "step": policy.step}
-        checkpoint.write_fields(path, fields, {**record, "planned": False})
-    except OSError as error:
-        raise UserError(f"{path} cannot be written: {error}.") from error
-    return path
+FINAL_EPISODES = 100
+"""that a run's final policy is judged by where runs are compared"""
 
 
 def evaluate(
-    policy: Trained,
+    policy: Trained | Agent,
     env: str | Callable[..., Any] | None = None,
     episodes: int = 100,
     seed: int = 0,
@@ -119,38 +47,44 @@ def evaluate(
     """Play whole episodes from starts drawn with `seed`, none of which training ever saw.
 
     Args:
-        policy: from `load` or `train`, or the path of a run or a checkpoint.
-        env: an id, `module:Class`, a class, or a function that makes an environment; by default the one of training.
+        policy: from `load` or `train`, or the path of a run or a checkpoint; or a function of one observation, as the
+            environment returns it, to an action for its `step`.
+        env: an id, `module:Class`, a class, or a function that makes an environment; by default the one of training. A
+            function as a policy needs one, of Gymnasium's interface.
         episodes: how many.
         seed: of the starts.
         deterministic: act by the mode of the distribution.
         backend: simulation backend; that of training unless named, or by the id if `env` is another.
         env_kwargs: arguments of the environment that are to be other than in training.
-        video: a .gif, .webp or .mp4 to record all episodes into. They are then played one after the other, in a
-            rendered environment, without a measurement of the Q bias.
+        video: a .gif, .webp or .mp4 to record all episodes into. They are then played one after the other in one
+            rendered environment, without a measurement of the Q bias. The first 16 starts are the same; from the 17th
+            on, and in other backends than gymnasium, returns may differ from those without a film. Of flights in a
+            scene, which are those without a film, the first of each parallel environment is recorded.
 
     Raises:
-        UserError: numbers out of range; an environment that cannot be made, or whose spaces differ; with `video`, one
-            that renders no pictures, or another kind of file.
+        UserError: numbers out of range; an environment that cannot be made, or whose spaces differ; an episode that
+            does not end in an environment without a time limit; with `video`, an environment that renders no pictures,
+            or another kind of file.
     """
-    policy, episodes, seed = load(policy), checked("episodes", episodes, Count), checked("seed", seed, Natural)
-    env_kwargs = checked("env_kwargs", env_kwargs, dict | None)
-    if video is not None:
-        check_film(Path(video))
-    elsewhere: dict[str, Any] = {"env": env, "env_kwargs": env_kwargs, "backend": backend}
-    vec = _fitting_env(policy, episodes, **elsewhere)
+    agent = policy if callable(policy) else load(policy)
+    episodes, seed, file = checked("episodes", episodes, Count), checked("seed", seed, Natural), _film(video)
+    elsewhere: dict[str, Any] = {"env": env, "env_kwargs": _kwargs(env_kwargs), "backend": backend}
+    how: dict[str, Any] = {"episodes": episodes, "seed": seed, "tell": lambda text: None}
+    arguments = env_arguments(_config_of(agent, env), **elsewhere)
+    vec = _env_for(agent, episodes, **elsewhere)
     try:
-        if video is not None:
-            how = {"episodes": episodes, "seed": seed, "deterministic": deterministic, "video": Path(video)}
-            return _show(policy, vec, world_of(policy.config, **elsewhere), tell=lambda text: None, **how)
-        critic = critic_of(policy.networks, policy.config)
-        return evaluate_module(policy.module, vec, episodes, seed, deterministic, critic)
+        if file:
+            return _show(agent, vec, arguments, deterministic=deterministic, video=file, **how)
+        if not isinstance(agent, TrainedPolicy):
+            return playback.play_single(playback.act_by(agent), arguments, **how)
+        critic = critic_of(agent.networks, agent.config)
+        return evaluate_policy(agent.module, vec, episodes, seed, deterministic, critic)
     finally:
         vec.close()
 
 
 def watch(
-    policy: Trained | None = None,
+    policy: Trained | Agent | None = None,
     env: str | Callable[..., Any] | None = None,
     *,
     episodes: int = 1,
@@ -165,8 +99,7 @@ def watch(
     Says return and length of each on standard error, then their means and standard deviations.
 
     Args:
-        policy: from `load` or `train`, or the path of a run or a checkpoint; none for uniformly random actions in
-            `env`.
+        policy: as in `evaluate`; none for uniformly random actions in `env`.
         env: as in `evaluate`.
         episodes: how many.
         seed: of the starts, and of the actions where they are drawn.
@@ -176,50 +109,139 @@ def watch(
         env_kwargs: as in `evaluate`.
 
     Raises:
-        UserError: nothing to show it on; an environment that renders no pictures; another kind of file.
+        UserError: nothing to show it on; numbers out of range; an environment that cannot be made, renders no pictures,
+            or whose spaces differ; an episode that does not end; more flights than parallel environments; another kind
+            of file.
     """
-    policy = None if policy is None else load(policy)
-    episodes, seed = checked("episodes", episodes, Count), checked("seed", seed, Natural)
-    if policy is None and env is None:
+    agent = policy if policy is None or callable(policy) else load(policy)
+    episodes, seed, file = checked("episodes", episodes, Count), checked("seed", seed, Natural), _film(video)
+    if agent is None and env is None:
         raise UserError("Watch what? Name a run, or an environment to act in at random.")
-    if video is None:
+    elsewhere: dict[str, Any] = {"env": env, "env_kwargs": _kwargs(env_kwargs)}
+    arguments = env_arguments(_config_of(agent, env), **elsewhere)
+    if file is None:
         require_display()
-    else:
-        check_film(Path(video))
-    elsewhere: dict[str, Any] = {"env": env, "env_kwargs": env_kwargs}
-    config = policy.config if policy else RunConfig(env=registry.name_of(env))
-    vec = _fitting_env(policy, episodes, **elsewhere) if policy else evaluation_env(config, episodes, **elsewhere)
-    file = None if video is None else Path(video)
-    how = {"episodes": episodes, "seed": seed, "deterministic": deterministic, "video": file}
+    vec = _env_for(agent, episodes, **elsewhere)
     try:
-        scores = _show(None if random else policy, vec, world_of(config, **elsewhere), **how)
+        if vec.scene and episodes > vec.num_envs:
+            raise UserError(f"At most {vec.num_envs} flights of this run can be shown, not {episodes}.")
+        shown_by = None if random else agent
+        how = {"episodes": episodes, "seed": seed, "deterministic": deterministic, "video": file}
+        scores = _show(shown_by, vec, arguments, **how)
     finally:
         vec.close()
     if episodes > 1 or scores.measures:
-        say(pictures_of.sentence(scores))
+        say(pictures_of.sentence(scores.to_json()))
     if file:
         say(f"Recorded in {file}.")
     return scores
 
 
-def _show(
-    policy: TrainedPolicy | None, vec: VecEnv, world: dict[str, Any], *, deterministic: bool, **how: Any
-) -> Evaluation:
-    """Play flights where `vec` has a scene, else episodes in a rendered environment; at random without a policy."""
-    if vec.scene:
-        return playback.show_flights(policy.module if policy else None, vec, deterministic=deterministic, **how)
-    if policy is None:
-        return playback.show_episodes(None, world, **how)
-    drawn = TrainedPolicy(policy.networks, policy.spec, policy.config.replace(seed=how["seed"]), policy.step)
-    return playback.show_episodes(partial(drawn.act, deterministic=deterministic), world, **how)
+def final_return(run: str | Path | TrainedRun) -> float:
+    """Mean return of a run's newest policy over 100 episodes, from `final_scores`."""
+    return final_scores(run)["mean_return"]
 
 
-def _fitting_env(policy: TrainedPolicy, episodes: int, **elsewhere: Any) -> VecEnv:
+def final_scores(run: str | Path | TrainedRun) -> dict[str, Any]:
+    """Scores of a run's newest policy over 100 episodes; kept in `final.json` until there is a newer policy.
+
+    They are those of `Evaluation.to_json`, with the `step` of the policy and the `seed` of the starts.
+    """
+    path = path_of(run)
+    file = path / "final.json"
+    known = _known_scores(file)
+    if known.get("step") not in checkpoint.list_steps(path / "checkpoints")[-1:]:
+        policy = load(run)
+        say(f"Evaluating {path}: {FINAL_EPISODES} episodes.")
+        scores = evaluate(policy, episodes=FINAL_EPISODES, seed=0)
+        known = {"step": policy.step, "seed": 0, **scores.to_json()}
+        write_json(file, known)
+    return known
+
+
+def _known_scores(file: Path) -> dict[str, Any]:
+    """The scores that were kept; none where the file is not there, or is damaged: they can be found again."""
+    if not os.path.lexists(file):
+        return {}
+    try:
+        return read_json(file)
+    except DamagedFileError as error:
+        say(error)
+        return {}
+
+
+def draw_run(run: str | Path | TrainedRun, by: str = "step", *, film: bool = False) -> list[Path]:
+    """Draw a run and its final scores into its `plots/`, and write its page; returns the files, the page last.
+
+    What cannot be evaluated here is left out, and a line says so. With `film` a flight is recorded too, where there is
+    a scene.
+    """
+    path, scores, flights = path_of(run), None, list[Path]()
+    if checkpoint.list_steps(path / "checkpoints"):
+        try:
+            scores = final_scores(run)
+            say(pictures_of.sentence(scores))
+            flights = _draw_flights(load(run), path, film)
+        except UserError as error:
+            say(f"{path} is drawn without an evaluation: {error}")
+    return pictures_of.draw_run(path, scores, flights, by)
+
+
+def _draw_flights(policy: TrainedPolicy, path: Path, film: bool) -> list[Path]:
+    """The pictures of a policy's flights, into the `plots/` of a run; none where there is no scene."""
+    episodes = policy.config.evaluate_episodes
+    env = evaluation_env(policy.config, episodes)
+    try:
+        return pictures_of.draw_flights(policy.module, env, path, episodes, film) if env.scene else []
+    finally:
+        env.close()
+
+
+def _film(video: str | Path | None) -> Path | None:
+    """The file of a film. Raises `UserError` for one that could not be written."""
+    if not isinstance(video, str | PathLike | None):
+        raise UserError(f"video must be a path, such as 'film.gif', not {shown(video)}.")
+    if video is not None:
+        check_film(Path(video))
+    return None if video is None else Path(video)
+
+
+def _kwargs(env_kwargs: Mapping[str, Any] | None) -> dict[str, Any] | None:
+    return checked("env_kwargs", env_kwargs, dict | None)
+
+
+def _config_of(agent: TrainedPolicy | Agent | None, env: str | Callable[..., Any] | None) -> RunConfig:
+    """The Config of a policy; without one, that of `env` alone. Raises `UserError` for a function without `env`."""
+    if isinstance(agent, TrainedPolicy):
+        return agent.config
+    if agent is not None and not takes(agent, 1):
+        raise UserError(f"A policy that is a function takes one observation; {shown(agent)} does not.")
+    if env is None:
+        raise UserError("A function acts in an environment that is named with it, such as env='CartPole-v1'.")
+    return RunConfig(env=registry.name_of(env))
+
+
+def _env_for(agent: TrainedPolicy | Agent | None, episodes: int, **elsewhere: Any) -> VecEnv:
     """The environments of an evaluation. Raises `UserError` where the policy cannot act."""
-    vec = evaluation_env(policy.config, episodes, **elsewhere)
-    if not vec.spec.fits(policy.spec):
+    vec = evaluation_env(_config_of(agent, elsewhere["env"]), episodes, **elsewhere)
+    if isinstance(agent, TrainedPolicy) and not vec.spec.fits(agent.spec):
         vec.close()
         raise UserError(
-            f"A policy for {policy.spec.env_id} cannot act in {vec.spec.env_id}: observation or action spaces differ."
+            f"A policy for {agent.spec.env_id} cannot act in {vec.spec.env_id}: observation or action spaces differ."
         )
     return vec
+
+
+def _show(
+    agent: TrainedPolicy | Agent | None, vec: VecEnv, arguments: dict[str, Any], *, deterministic: bool, **how: Any
+) -> Evaluation:
+    """Play flights where `vec` has a scene, else episodes in a rendered environment; at random without an agent."""
+    if isinstance(agent, TrainedPolicy):
+        if vec.scene:
+            return playback.show_flights(agent.module, vec, deterministic=deterministic, **how)
+        drawn = TrainedPolicy(agent.networks, agent.spec, agent.config.replace(seed=how["seed"]), agent.step)
+        act = partial(drawn.act, deterministic=deterministic)
+        return playback.show_episodes(act if drawn.is_masked else playback.act_by(act), arguments, **how)
+    if vec.scene and agent is None:
+        return playback.show_flights(None, vec, **how)
+    return playback.show_episodes(playback.act_by(agent) if agent else None, arguments, **how)

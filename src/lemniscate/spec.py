@@ -48,7 +48,7 @@ class Discrete:
 
 @dataclass(frozen=True)
 class MultiDiscrete:
-    """One of n_k actions for each of K levers; the environment floor adds `start`."""
+    """One of n_k actions for each of K components; the environment floor adds `start`."""
 
     nvec: tuple[int, ...]
     start: tuple[int, ...]
@@ -57,7 +57,7 @@ class MultiDiscrete:
 
 @dataclass(frozen=True)
 class MultiBinary:
-    """n switches, each on or off."""
+    """n binary components, each 1 or 0."""
 
     n: int
     shape: tuple[int, ...] | None = None

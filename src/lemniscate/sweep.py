@@ -14,15 +14,17 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 from filelock import FileLock, Timeout
 
-from lemniscate import api, named, plots, results
+from lemniscate import api, named, plots
 from lemniscate.algos import ALGORITHMS, name_of
 from lemniscate.console import say
 from lemniscate.envs import registry
 from lemniscate.errors import SweepError, UserError, prefix_errors, resume_line, shown
 from lemniscate.owner import OWNED
+from lemniscate.results import final_return
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import is_finished
 from lemniscate.run.environments import device_for
@@ -31,6 +33,7 @@ from lemniscate.run.run import Stopped, signals_to
 from lemniscate.run.sweep_file import Sweep, read_sweep
 from lemniscate.run.sweep_progress import SweepProgress
 from lemniscate.run.warm_start import load_networks
+from lemniscate.stored import path_of
 
 LOG = "log.txt"
 """standard output and error of a run, in its directory"""
@@ -58,7 +61,7 @@ def train_sweep(
     run: str | Path | None = None,
     preset: str | None = None,
     track: str | None = None,
-    callbacks: Sequence[str] = (),
+    callbacks: str | Sequence[str] = (),
     report: bool = False,
     progress: bool = True,
     **fields: object,
@@ -94,7 +97,7 @@ def train_sweep(
     options = _options(track, callbacks, report)
     _require_trainable(configs, numbers)
     stem = f"{'-'.join(names)}-{len(numbers)}-seeds"
-    path = results.path_of(run) if run is not None else api.fresh_directory(next(iter(configs.values())).env, stem)
+    path = path_of(run) if run is not None else api.fresh_directory(next(iter(configs.values())).env, stem)
     records = {name: config.to_json() for name, config in configs.items()}
     but_seed = {name: {k: v for k, v in record.items() if k != "seed"} for name, record in records.items()}
     runs = Sweep(path, numbers, but_seed)
@@ -106,12 +109,12 @@ def resume_sweep(
     path: str | Path | TrainedSweep,
     *,
     track: str | None = None,
-    callbacks: Sequence[str] = (),
+    callbacks: str | Sequence[str] = (),
     report: bool = False,
     progress: bool = True,
 ) -> TrainedSweep:
     """Resume an interrupted sweep: train the runs that are not finished or have not begun."""
-    return _train(read_sweep(results.path_of(path)), _options(track, callbacks, report), progress)
+    return _train(read_sweep(path_of(path)), _options(track, callbacks, report), progress)
 
 
 def at_once(threads: int) -> int:
@@ -120,9 +123,9 @@ def at_once(threads: int) -> int:
     return max(1, cores // threads)
 
 
-def _options(track: str | None, callbacks: Sequence[str], report: bool) -> list[str]:
+def _options(track: str | None, callbacks: str | Sequence[str], report: bool) -> list[str]:
     """The options of each run's process. Raises `UserError` for a tracker or a callback that it could not find."""
-    names = [callbacks] if isinstance(callbacks, str) else list(callbacks)
+    names: list[Any] = list(callbacks) if isinstance(callbacks, list | tuple) else [callbacks]
     for name in (track, *names):
         if not isinstance(name, str | None):
             raise UserError(f"Each run of a sweep has a process of its own: name {shown(name)} as 'module:name'.")
@@ -214,7 +217,7 @@ class _Processes:
             del self._running[run]
             _close_input(process)
             if code == 0:
-                sentence = f"done, final return {plots.final_return(run):.1f}"
+                sentence = f"done, final return {final_return(run):.1f}"
             elif self._stop_signal:
                 sentence = f"stopped at step {step:,}"
             else:
@@ -281,17 +284,18 @@ def _seeds_of(seeds: str | int | Iterable[int]) -> list[int]:
 
 def _require_trainable(configs: dict[str, RunConfig], seeds: list[int]) -> None:
     """Raise `UserError` where a run could not begin: one sentence now, instead of one from each run."""
-    some = next(iter(configs.values()))
-    env = registry.make(some.env, 1, backend=some.backend)
-    env.close()
     for name, config in configs.items():
-        for own in (config.env, *config.wrappers, getattr(config, "network", "")):
-            if "<" in own or own.startswith("__main__:"):
-                raise UserError(f"Each run of a sweep has a process of its own: put {own} into a module, to import it.")
+        for thing in (config.env, *config.wrappers, getattr(config, "network", "")):
+            if "<" in thing or thing.startswith("__main__:"):
+                said = f"Each run of a sweep has a process of its own: put {thing} into a module, to import it."
+                raise UserError(said)
         device_for(config.device)
         for seed in seeds:
             config.replace(seed=seed)
+        own = {"kwargs": config.env_kwargs, "wrappers": config.wrappers, "backend": config.backend}
         with prefix_errors(name):
+            env = registry.make(config.env, 1, **own)
+            env.close()
             networks = config.networks(env.spec)
             if config.warm_start:
                 load_networks(networks, config, env.spec)

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import environments  # noqa: F401  (registers the copies)
+import lemniscate as lem
 from lemniscate.envs.check import check
 from lemniscate.errors import UserError
 
@@ -208,6 +209,40 @@ def test_arguments_and_wrappers_are_checked_too():
     assert any("by the time limit" in sentence and "and 0 by" not in sentence for _, sentence in limited)
 
 
+class Renamed(gym.ObservationWrapper):
+    """Observes a number less."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.observation_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+
+    def observation(self, observation):
+        return observation[:1]
+
+
+def narrow():
+    return Renamed(WrongSpace())
+
+
+class WrongSpace(Sound):
+    """Its space is right only when it is wrapped."""
+
+    observation_space = gym.spaces.Box(-1, 1, (3,), np.float32)
+
+
+def test_a_function_is_checked_as_what_it_makes():
+    assert "bad" not in {grade for grade, _ in found("narrow")}
+    assert "bad" in {grade for grade, _ in found("WrongSpace")}
+
+
+def test_a_class_and_a_wrapper_are_checked_from_python():
+    findings = lem.check(Long, env_kwargs={"edge": 1}, wrappers=[lambda env: gym.wrappers.TimeLimit(env, 15)])
+    assert {finding.grade for finding in findings} == {"good"}, findings
+    assert str(findings[0]).startswith("✓ Served by gymnasium; observes 2 numbers")
+    with pytest.raises(UserError, match="made already"):
+        lem.check(Sound())
+
+
 def test_the_mode_of_a_vector_environment_is_told():
     assert any("the action of that step is ignored" in finding.sentence for finding in check("Countdown-v0"))
 
@@ -219,7 +254,7 @@ def test_the_mode_of_a_vector_environment_is_told():
         ("Blind", "note", "Another seed gives the same"),
         ("Nan", "bad", "The reward of environment 0 is nan"),
         ("WrongType", "bad", "Gymnasium's checker: The first element returned by `env.reset()`"),
-        ("Rich", "note", "train with --scale-rewards"),
+        ("Rich", "note", "train with --scale-rewards (on-policy)"),
         ("Fine", "note", "It has no time limit"),
         ("Fine", "note", "look whether step() uses its argument"),
         ("Fine", "note", "terminated after exactly 20 steps: if that is a time limit, report it as truncated"),

@@ -78,6 +78,7 @@ class Config(OnPolicyConfig):
         if self.episodes and self.compile == "on":
             raise UserError("Batches of whole episodes differ in size and cannot be compiled: use --compile off.")
         if not self.episodes:
+            self._require_minibatch("critic_minibatch_size")
             self._require_rows("standardize", self.num_rows)
 
     @property

@@ -67,6 +67,7 @@ class Config(OnPolicyConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        self._require_minibatch("critic_minibatch_size")
         self._require_rows("normalize_advantage", self.num_rows)
 
     @property

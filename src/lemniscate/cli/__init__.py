@@ -32,7 +32,7 @@ COMMANDS = {
     "train": "Train a policy, or one for each of several algorithms and seeds, to compare them.",
     "resume": "Continue an interrupted run or sweep.",
     "evaluate": "Play whole episodes with the newest policy of a run.",
-    "watch": "Show one episode in a window, or record it.",
+    "watch": "Show episodes in a window, or record them.",
     "plot": "Draw the curves of a run and its report.html, or compare several, grouped by all but the seed.",
     "envs": "List the environments, their backends, and the preset that fits.",
     "check": "Check that an environment is suitable for training.",
@@ -216,9 +216,9 @@ def _parse_train(parser: Parser, words: list[str]) -> argparse.Namespace:
 
 
 def _is_own(name: str) -> bool:
-    """Whether `name` is of somebody's own algorithm: a module that is there, or one in a package."""
+    """Whether `name` is of somebody's own algorithm: a module that is there, one in a package, or `module:name`."""
     if not name.isidentifier():
-        return "." in name and all(part.isidentifier() for part in re.split(r"[.:]", name))
+        return all(part.isidentifier() for part in re.split(r"[.:]", name))
     return Path(f"{name}.py").exists() or Path(name).is_dir() or is_installed(name)
 
 

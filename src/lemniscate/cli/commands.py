@@ -11,13 +11,14 @@ from lemniscate.cli.completion import completion as completion
 from lemniscate.cli.fields import number, read, read_json
 from lemniscate.console import say
 from lemniscate.envs import registry
-from lemniscate.envs.check import check as check_environment
+from lemniscate.envs.check import each_finding
 from lemniscate.envs.findings import BAD, verdict
 from lemniscate.errors import UserError, unknown_name
 from lemniscate.presets import best, choose
 from lemniscate.report import pictures
 from lemniscate.run.run import is_compiled
 from lemniscate.run.sweep_file import is_sweep
+from lemniscate.stored import TrainedRun
 
 
 def train(given: argparse.Namespace) -> None:
@@ -39,7 +40,7 @@ def train(given: argparse.Namespace) -> None:
     say(f"{what}: preset {preset}, seed {config.seed}, {'compiled' if is_compiled(config) else 'not compiled'}")
     run = api.train(given.algorithm, config.env, **shared, **_callbacks(given))
     if given.score:
-        plots.final_return(run.path)
+        _say_score(run)
     say(f"Trained in {run.seconds:.1f} s. Everything is in {run.path}")
 
 
@@ -50,7 +51,7 @@ def resume(given: argparse.Namespace) -> None:
     else:
         run = api.resume(given.run, track=given.track, report=given.report, **_callbacks(given))
         if given.score:
-            plots.final_return(run.path)
+            _say_score(run)
         if not run.seconds:  # it was finished, which has been said
             return
     say(f"Done. Everything is in {run.path}")
@@ -63,7 +64,7 @@ def evaluate(given: argparse.Namespace) -> None:
     if given.json:
         print(json.dumps(scores.to_json(), allow_nan=False))
     else:
-        say(pictures.sentence(scores))
+        say(pictures.sentence(scores.to_json()))
 
 
 def watch(given: argparse.Namespace) -> None:
@@ -102,12 +103,17 @@ def envs(given: argparse.Namespace) -> None:
 def check(given: argparse.Namespace) -> None:
     """Say what was found about an environment, as a list; what keeps it from being trained on is an error."""
     found, wrappers = [], read("wrappers", tuple[str, ...], given.wrappers)
-    for finding in check_environment(given.env, given.backend, _env_args(given), wrappers):
+    for finding in each_finding(given.env, given.backend, _env_args(given), wrappers):
         found.append(finding)
         say(finding.listed(min(get_terminal_size((112, 24)).columns, 120)))
     if any(finding.grade == BAD for finding in found):
         raise UserError(verdict(given.env, found))
     say(verdict(given.env, found))
+
+
+def _say_score(run: TrainedRun) -> None:
+    score = results.final_return(run)
+    say(f"Final return {score:.1f} over {results.FINAL_EPISODES} episodes.")
 
 
 def _env_args(given: argparse.Namespace) -> dict[str, Any] | None:

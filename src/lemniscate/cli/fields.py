@@ -13,8 +13,9 @@ from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 from lemniscate import glossary
 from lemniscate.algos import find
 from lemniscate.cli import Parser, add_train_options, unknown_argument
-from lemniscate.errors import UserError, prefix_errors
+from lemniscate.errors import UserError, prefix_errors, unknown_name
 from lemniscate.presets import PRESETS, names
+from lemniscate.report.commands import flag
 from lemniscate.run.config import RunConfig, options_of
 
 GROUPS: dict[str, tuple[str, ...]] = {
@@ -41,9 +42,6 @@ GROUPS: dict[str, tuple[str, ...]] = {
 }
 """the fields under each heading of the help; those that are not named here are the algorithm's"""
 
-SPELLED = {"env_kwargs": "--env-args"}
-"""flags with a name of their own"""
-
 
 def parse_fields(algorithms: list[str], words: list[str]) -> argparse.Namespace:
     """The options in `words`, for all of `algorithms`; the fields of their Configs as a dictionary `fields`.
@@ -59,11 +57,6 @@ def parse_fields(algorithms: list[str], words: list[str]) -> argparse.Namespace:
             fields |= own
     given.command, given.algorithm, given.fields = "train", ",".join(algorithms), fields
     return given
-
-
-def flag(name: str) -> str:
-    """The flag of a field on the command line."""
-    return SPELLED.get(name, f"--{name.replace('_', '-')}")
 
 
 def read(name: str, hint: Any, text: Any) -> Any:
@@ -122,9 +115,16 @@ def _parse(algorithm: str, words: list[str]) -> tuple[argparse.Namespace, dict[s
     given, rest = parser_of(algorithm).parse_known_args(words)
     if rest:
         known = [*hints, "run", "preset", "seeds", "track", "report", "score", "callbacks"]
-        raise unknown_argument(rest, lambda word: glossary.unknown_field(word[2:].replace("-", "_"), known, flag))
+        raise unknown_argument(rest, lambda word: _unknown_flag(word, known))
     values = {name: value for name, value in vars(given).items() if name in hints and name != "env"}
     return given, {name: read(name, hints[name], value) for name, value in values.items()}
+
+
+def _unknown_flag(word: str, known: list[str]) -> UserError:
+    name = word.lstrip("-").replace("-", "_")
+    if name in known:  # it was written with one dash
+        return unknown_name("field", word, [flag(name)])
+    return glossary.unknown_field(name, known, flag)
 
 
 def parser_of(algorithm: str) -> Parser:

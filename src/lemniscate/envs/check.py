@@ -1,13 +1,14 @@
-"""Is this environment fit to be learned in? Gymnasium's own checker, and what it does not look at."""
+"""Whether an environment is suitable for training: Gymnasium's own checker, and what it does not look at."""
 
 import time
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode
 
 from lemniscate.envs import registry
@@ -25,12 +26,32 @@ NUM_ENVS, STEPS = 4, 500
 
 
 def check(
-    env_id: str,
+    env: str | Callable[..., Any],
     backend: str | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
-    wrappers: Sequence[str] = (),
+    wrappers: Sequence[str | Callable[..., Any]] = (),
+) -> list[Finding]:
+    """Check that an environment is suitable for training, with Gymnasium's own checker and by random play.
+
+    Args:
+        env: an id, `module:Class`, a class, or a function that makes an environment.
+        backend: a simulation backend; by default the first that serves `env`.
+        env_kwargs: arguments of the environment.
+        wrappers: around each single environment, the first innermost.
+
+    Returns:
+        Everything found, each a sentence with a grade; what keeps the environment from being made is the last.
+
+    Raises:
+        UserError: no such environment, backend or wrapper.
+    """
+    return list(each_finding(registry.name_of(env), backend, env_kwargs, registry.names_of(wrappers)))
+
+
+def each_finding(
+    env_id: str, backend: str | None, env_kwargs: Mapping[str, Any] | None, wrappers: Sequence[str]
 ) -> Iterator[Finding]:
-    """Everything found, one by one; the first that keeps it from being made is the last."""
+    """The findings of `check`, one by one."""
     served_by = registry.backend_for(env_id, wrappers) if backend is None else registry.require_backend(backend)
     try:
         with warnings.catch_warnings():
@@ -45,8 +66,9 @@ def check(
     try:
         yield from _spaces(env, served_by)
         if registry.can_wrap(served_by, env_id):
-            make = partial(make_one, maker_of(env_id), tuple(map(find_callable, wrappers)), **(env_kwargs or {}))
-            yield from api_findings(make, env_id, wrapped=bool(wrappers))
+            maker = maker_of(env_id)
+            make = partial(make_one, maker, tuple(map(find_callable, wrappers)), **(env_kwargs or {}))
+            yield from api_findings(make, env_id, wrapped=bool(wrappers) or not isinstance(maker, EnvSpec))
         yield from _behaviour(env)
     finally:
         env.close()
@@ -97,7 +119,7 @@ def _describe(action: Action) -> str:
         return f"one of {action.n} choices" + (", masked" if action.masked else "")
     if isinstance(action, MultiDiscrete):
         return f"{len(action.nvec)} choices, of {', '.join(map(str, action.nvec))}"
-    return f"{action.n} switches"
+    return f"{action.n} binary choices"
 
 
 def _behaviour(env: VecEnv) -> Iterator[Finding]:

@@ -21,7 +21,7 @@ class Episodes:
 
 
 class EpisodeStatistics:
-    """Steps are logged one by one and booked many at once, since [T, N] costs hardly more than [N].
+    """Returns and lengths, summed up over many logged steps at once, since [T, N] costs hardly more than [N].
 
     Fragments (episodes that staggering began late or cut early) and ignored actions (`valid` False) are not counted.
     """
@@ -35,17 +35,17 @@ class EpisodeStatistics:
         """One step of every environment; `counts` [N] is False where the episode is a fragment."""
         self._log.append((step.reward, step.terminated, step.truncated, step.valid, counts))
         if len(self._log) == LOG_ROWS:
-            self._book()
+            self._sum_up()
 
     def take(self) -> Episodes:
         """The whole episodes that ended since the last call."""
         if self._log:
-            self._book()
+            self._sum_up()
         returns, lengths = torch.cat([self._running[:, :0], *self._ended], dim=1)
         self._ended = []
         return Episodes(returns.tolist(), lengths.int().tolist())
 
-    def _book(self) -> None:
+    def _sum_up(self) -> None:
         reward, terminated, truncated, valid, counts = (torch.stack(column) for column in zip(*self._log, strict=True))
         done = (terminated | truncated) & valid
         running = episode_sums(torch.stack([reward * valid, valid]).to(self._running.dtype), done, self._running)

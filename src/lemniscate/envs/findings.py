@@ -25,13 +25,16 @@ class Finding:
     grade: str
     sentence: str
 
+    def __str__(self) -> str:
+        return self.listed(112)
+
     def listed(self, width: int) -> str:
         """The sentence as an item of a list, wrapped at `width` columns."""
         return fill(self.sentence, width, initial_indent=f"{MARKS[self.grade]} ", subsequent_indent="  ")
 
 
 def verdict(env_id: str, findings: Sequence[Finding]) -> str:
-    """Whether an environment is fit to be learned in, in one sentence."""
+    """Whether an environment is suitable for training, in one sentence."""
     bad, notes = (sum(finding.grade == grade for finding in findings) for grade in (BAD, NOTE))
     if bad:
         return f"{env_id} is not suitable for training: {bad} finding{'s' * (bad > 1)} above, marked {MARKS[BAD]}."
@@ -68,7 +71,7 @@ def learnable(rollouts: Sequence[Rollout], spec: Spec) -> Iterator[Finding]:
         yield Finding(
             NOTE,
             f"Rewards reach {rewards.abs().max():.3g}, which makes the first value errors too large; train with"
-            " --scale-rewards.",
+            " --scale-rewards (on-policy), or pay less.",
         )
     if not spec.image:
         yield from _sizes(torch.cat([rollout.obs[rollout.valid] for rollout in rollouts]), spec)

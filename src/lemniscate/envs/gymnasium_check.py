@@ -18,7 +18,14 @@ BESIDE_THE_POINT = ("infinity. This is probably", "we recommend using a symmetri
 
 
 def api_findings(make: Callable[[], gym.Env], env_id: str, wrapped: bool) -> Iterator[Finding]:
-    """The result of Gymnasium's checker, and whether observations are copies; `wrapped` in a user's own wrappers."""
+    """The result of Gymnasium's checker, and whether observations are copies.
+
+    Args:
+        make: makes one environment.
+        env_id: its name.
+        wrapped: the environment is checked as `make` returns it, with the wrappers of the user's own; otherwise what is
+            inside of Gymnasium's.
+    """
     found: list[Finding] = []
     env = make()
     careful = Careful(env if wrapped else env.unwrapped)
@@ -96,8 +103,9 @@ class Careful(gym.Wrapper):
         return obs, reward, terminated, truncated, info
 
     def _copied(self, obs: Any, info: Any) -> tuple[Any, Any]:
-        kept = self._copy is None or not data_equivalence(self._copy, self._copy, exact=True)  # there is a NaN
-        self.reuses = self.reuses or not (kept or data_equivalence(self._returned, self._copy, exact=True))
+        """Copies of both. Notes whether the observation before has changed since it was copied, and the new mask."""
+        comparable = self._copy is not None and data_equivalence(self._copy, self._copy, exact=True)  # not with a NaN
+        self.reuses |= comparable and not data_equivalence(self._returned, self._copy, exact=True)
         self._returned, self._copy = obs, deepcopy(obs)
         if isinstance(info, dict):
             self._mask = info.get("action_mask", self._mask)

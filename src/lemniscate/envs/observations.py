@@ -17,9 +17,12 @@ def read_observation(spec: Spec, obs: Any) -> tuple[np.ndarray, bool]:
         obs: an array, a number, or a dictionary or tuple of these; or the flat observation [O] or [B, O].
 
     Raises:
-        UserError: another shape than the environment's, or a number that is not finite.
+        UserError: another shape than the environment's, or a number that is not finite; for an image, numbers that are
+            not whole or not from 0 to 255.
     """
     try:
+        if spec.image:
+            _require_bytes(np.asarray(obs))
         if not isinstance(obs, dict | tuple) and _is_flat(spec, np.asarray(obs)):
             flat = np.asarray(obs, dtype=np.uint8 if spec.image else np.float32)
             flat, batched = flat.reshape(-1, spec.observation_size), flat.ndim == 2
@@ -32,6 +35,15 @@ def read_observation(spec: Spec, obs: Any) -> tuple[np.ndarray, bool]:
         number = flat[~np.isfinite(flat)][0]
         raise UserError(f"This observation of {spec.env_id} has a number that is {number}; all must be finite.")
     return flat, batched
+
+
+def _require_bytes(obs: np.ndarray) -> None:
+    """`ValueError` unless the numbers of an image fit into bytes; a cast would make black of what is divided by 255."""
+    right = "; those of an image are whole, from 0 to 255"
+    if not np.issubdtype(obs.dtype, np.integer):
+        raise ValueError(f"its numbers are {obs.dtype}{right}")
+    if obs.size and (obs.min() < 0 or obs.max() > 255):
+        raise ValueError(f"its numbers are from {obs.min()} to {obs.max()}{right}")
 
 
 def _is_flat(spec: Spec, obs: np.ndarray) -> bool:

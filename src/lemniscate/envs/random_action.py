@@ -10,7 +10,7 @@ def random_action(spec: Spec, obs: Tensor, generator: Generator) -> Tensor:
     """One action for each of the observations [N, O + n], as `VecEnv.step` takes them.
 
     Uniform in [-1, 1]^A for a Box, over the n choices of a Discrete (those that the mask in `obs` allows), and over the
-    choices of each lever or switch.
+    choices of each component of a MultiDiscrete or MultiBinary.
     """
     action, drawn = spec.action, {"generator": generator, "device": obs.device}
     num_envs = len(obs)

@@ -44,6 +44,8 @@ def backend_class(backend: str) -> type["Backend"]:
 
     Raises `UserError` with the nearest names for one that is not known.
     """
+    if not isinstance(backend, str):
+        raise unknown_name("backend", backend, BACKENDS)
     if backend in BACKENDS:
         module, _, name = BACKENDS[backend].partition(":")
         return getattr(importlib.import_module(module), name)
@@ -64,7 +66,7 @@ def can_wrap(backend: str, env: str) -> bool:
     return wraps is not None and wraps(env)
 
 
-def is_compiled(backend: str) -> bool:
+def has_fixed_num_envs(backend: str) -> bool:
     """Whether a backend's step is a program for one number of environments, which others of that number share."""
     return getattr(backend_class(backend), "compiled", False)
 
@@ -112,6 +114,21 @@ def name_of(env: object) -> str:
     return named.name_of(env)
 
 
+def names_of(wrappers: "Sequence[str | Callable[..., Any]]") -> tuple[str, ...]:
+    """The names of wrappers for a Config. Raises `UserError` for what is not several of them."""
+    if not isinstance(wrappers, list | tuple):
+        raise UserError(f"wrappers must be several, such as [MyWrapper], not {shown(wrappers)}.")
+    return tuple(map(named.name_of, wrappers))
+
+
+def _checked_count(num_envs: Any) -> int:
+    """The number of environments as an int. Raises `UserError` unless it is a whole number of at least 1."""
+    number = getattr(num_envs, "tolist", lambda: num_envs)()  # of NumPy's and torch's scalars
+    if type(number) not in (int, float) or number < 1 or number % 1:
+        raise UserError(f"num_envs must be a whole number at least 1, not {shown(num_envs)}.")
+    return int(number)
+
+
 def file_name(env: str) -> str:
     """An environment's name as a part of a file's name."""
     return re.sub(r"[^\w.-]+", "_", env)
@@ -142,16 +159,16 @@ def make(
 
     Raises:
         UserError: an unknown environment or backend, arguments that it does not take, spaces nobody can act in, a
-            missing extra.
+            missing extra; a number of environments below 1.
     """
     import torch
 
     from lemniscate.envs.vec_env import VecEnv
 
-    name, wraps = name_of(env), tuple(map(named.name_of, wrappers))
+    name, wraps, num_envs = name_of(env), names_of(wrappers), _checked_count(num_envs)
     if kwargs is not None and not isinstance(kwargs, Mapping):
         raise UserError(f"The arguments of an environment are a dictionary, such as {{'x': 1}}, not {kwargs!r}.")
-    chosen = backend or backend_for(name, wraps)
+    chosen = backend_for(name, wraps) if backend is None else backend
     if not backend_class(chosen).serves(name):
         raise UserError(f"{name} cannot be served by the {chosen} backend; {backend_for(name, wraps)} serves it.")
     if wraps and not can_wrap(chosen, name):

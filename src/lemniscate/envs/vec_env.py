@@ -90,11 +90,7 @@ class VecEnv:
 
     def require_end(self, age: int) -> None:
         """Raise `UserError` where an episode of `age` steps has had its chance to end, and there is no time limit."""
-        if self.spec.max_episode_steps is None and age >= PATIENCE:
-            raise UserError(
-                f"An episode of {self.spec.env_id} has not ended after {PATIENCE:,} steps, and there is no time limit;"
-                " give it one, with max_episode_steps where it is registered."
-            )
+        require_end(self.spec.env_id, age, self.spec.max_episode_steps)
 
     def take_episodes(self) -> Episodes:
         """The whole episodes that ended since the last call."""
@@ -103,6 +99,15 @@ class VecEnv:
     def close(self) -> None:
         """Give back processes and windows."""
         self.backend.close()
+
+
+def require_end(env_id: str, age: int, limit: int | None) -> None:
+    """Raise `UserError` where an episode of `age` steps has had its chance to end, and there is no time `limit`."""
+    if limit is None and age >= PATIENCE:
+        raise UserError(
+            f"An episode of {env_id} has not ended after {PATIENCE:,} steps, and there is no time limit;"
+            " give it one, with max_episode_steps where it is registered."
+        )
 
 
 def _action_layout(spec: Spec, num_envs: int) -> tuple[torch.Size, torch.dtype]:

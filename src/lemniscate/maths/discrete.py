@@ -69,7 +69,7 @@ class MultiCategorical:
 
 @dataclass(frozen=True)
 class Bernoulli:
-    """n independent switches, on with probability σ(logit): logits [B, n]."""
+    """n independent binary components, 1 with probability σ(logit): logits [B, n]."""
 
     logits: Tensor
 

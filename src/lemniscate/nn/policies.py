@@ -104,7 +104,7 @@ class MultiCategoricalPolicy(Policy):
 
 
 class BernoulliPolicy(Policy):
-    """n independent switches."""
+    """n independent binary components."""
 
     def __init__(self, normalizer: NoNorm, net: nn.Module, n: int) -> None:
         super().__init__(normalizer, net)

@@ -11,7 +11,11 @@ from typing import Any
 
 import numpy as np
 
+from lemniscate.report.commands import flag
 from lemniscate.report.curves import moving_average, window_of
+
+SMALLER_STEPS = (("lower", "learning_rate"), ("lower", "actor_learning_rate"), ("lower", "max_kl"))
+"""cures of a policy that changes too fast, by the field that its algorithm has"""
 
 ONE_SEED = "One seed says nothing about another setting or algorithm: train several with --seeds 1-5."
 
@@ -38,10 +42,10 @@ class Evidence:
         values = self.values(name)
         return float(np.median(values[len(values) // 2 :])) if len(values) else None
 
-    @property
-    def learning_rate_flag(self) -> str:
-        """The flag of the policy's learning rate."""
-        return "--learning-rate" if "learning_rate" in self.config else "--actor-learning-rate"
+    def advise(self, said: str, *cures: tuple[str, str]) -> str:
+        """A sentence on what was measured, and the cures whose field the run's Config has: (what to do, the field)."""
+        there = [f"{what} {flag(field)}" for what, field in cures if field in self.config]
+        return f"{said}: {' or '.join(there)}." if there else f"{said}."
 
 
 def sentences(evidence: Evidence) -> list[str]:
@@ -56,12 +60,12 @@ def kl_above_target(evidence: Evidence) -> str | None:
     `docs/notes/ppo.md`.
     """
     kl = evidence.late("approx_kl")
-    target = evidence.config.get("target_kl") or evidence.config.get("desired_kl")
+    target = next(filter(None, map(evidence.config.get, ("target_kl", "desired_kl", "max_kl"))), None)
     if kl is None or kl <= (2 * target if target else 0.03):
         return None
     beside = f"{kl / target:.0f} times its target of {target:g}" if target else "and 0.003 to 0.03 is usual"
-    fewer = " or take fewer --epochs" if "epochs" in evidence.config else ""
-    return f"The KL divergence of the late updates is {kl:.2g}, {beside}: lower {evidence.learning_rate_flag}{fewer}."
+    said = f"The KL divergence of the late updates is {kl:.2g}, {beside}"
+    return evidence.advise(said, *SMALLER_STEPS, ("take fewer", "epochs"))
 
 
 def ratios_clipped(evidence: Evidence) -> str | None:
@@ -69,7 +73,8 @@ def ratios_clipped(evidence: Evidence) -> str | None:
     share = evidence.late("clip_fraction")
     if share is None or share <= 0.4:
         return None
-    return f"{share:.0%} of the late probability ratios are clipped: lower --learning-rate or take fewer --epochs."
+    said = f"{share:.0%} of the late probability ratios are clipped"
+    return evidence.advise(said, *SMALLER_STEPS, ("take fewer", "epochs"))
 
 
 def value_explains_nothing(evidence: Evidence) -> str | None:
@@ -80,10 +85,9 @@ def value_explains_nothing(evidence: Evidence) -> str | None:
     explained, late = evidence.late("explained_variance"), evidence.returns[len(evidence.returns) // 2 :]
     if explained is None or explained >= 0.1 or (len(late) and late.std() <= 0.02 * abs(late.mean())):
         return None
-    return (
-        f"The value explains {max(0.0, explained):.0%} of the variance of its targets, no more than a constant would:"
-        " more --epochs, a lower --gae-lambda, or observations that hold what decides the return."
-    )
+    said = f"The value explains {max(0.0, explained):.0%} of the variance of its targets, no more than a constant would"
+    cures = ("take more", "epochs"), ("take more", "critic_epochs"), ("lower", "gae_lambda")
+    return f"{evidence.advise(said, *cures)} Or the observations do not hold what decides the return."
 
 
 def exploration_collapsed(evidence: Evidence) -> str | None:
@@ -99,8 +103,9 @@ def exploration_collapsed(evidence: Evidence) -> str | None:
     left = spread[len(spread) // 4] / spread[0]
     if left >= 0.1:
         return None
-    cure = "raise --entropy-coef" if "entropy_coef" in evidence.config else f"lower {evidence.learning_rate_flag}"
-    return f"After a quarter of the run the policy's {name} is {max(0.0, left):.0%} of what it was at first: {cure}."
+    said = f"After a quarter of the run the policy's {name} is {max(0.0, left):.0%} of what it was at first"
+    cures = (("raise", "entropy_coef"),) if "entropy_coef" in evidence.config else SMALLER_STEPS
+    return evidence.advise(said, *cures)
 
 
 def gradient_clipped(evidence: Evidence) -> str | None:
@@ -108,9 +113,11 @@ def gradient_clipped(evidence: Evidence) -> str | None:
     norm, limit = evidence.late("gradient_norm"), evidence.config.get("max_grad_norm")
     if norm is None or not limit or norm <= 10 * limit or "value_coef" not in evidence.config:
         return None
-    cure = "a lower --value-coef" if evidence.config.get("scale_rewards", True) else "--scale-rewards"
+    cure = ("lower", "value_coef") if evidence.config.get("scale_rewards", True) else ("add", "scale_rewards")
     share = f"1/{norm / limit:.0f}"
-    return f"The gradient is clipped to {share} of its norm, usually because the value's loss is large: {cure}."
+    return evidence.advise(
+        f"The gradient is clipped to {share} of its norm, usually because the value's loss is large", cure
+    )
 
 
 def q_biased(evidence: Evidence) -> str | None:
@@ -122,10 +129,11 @@ def q_biased(evidence: Evidence) -> str | None:
     if bias is None or abs(bias) <= 0.5:
         return None
     if bias < 0:
-        return f"Q under-estimates the return by {-bias:.0%}: train longer, or raise --critic-learning-rate."
+        said, longer = f"Q under-estimates the return by {-bias:.0%}", ("train longer with", "total_steps")
+        return evidence.advise(said, longer, ("raise", "critic_learning_rate"))
+    said = evidence.advise(f"Q over-estimates the return by {bias:.0%}", ("lower", "critic_learning_rate"))
     two_critics = {"target_noise", "initial_temperature"} & set(evidence.config)
-    other = "" if two_critics else " or try td3 or sac, which believe the lesser of two critics"
-    return f"Q over-estimates the return by {bias:.0%}: lower --critic-learning-rate{other}."
+    return said if two_critics else f"{said} Or try td3 or sac, which believe the lesser of two critics."
 
 
 def still_rising(evidence: Evidence) -> str | None:
@@ -161,10 +169,8 @@ def fell_back(evidence: Evidence) -> str | None:
     fall, error = averages.max() - averages[-1], returns[-window:].std() / np.sqrt(window)
     if fall <= 3 * error or fall <= 0.2 * np.ptp(averages):
         return None
-    return (
-        f"Returns fell from {averages.max():,.4g} to {averages[-1]:,.4g} before the end: lower"
-        f" {evidence.learning_rate_flag}, and keep more policies with --keep-checkpoints."
-    )
+    said = f"Returns fell from {averages.max():,.4g} to {averages[-1]:,.4g} before the end"
+    return f"{evidence.advise(said, *SMALLER_STEPS)} With --keep-checkpoints more of the earlier policies are kept."
 
 
 def no_episode(evidence: Evidence) -> str | None:

@@ -1,4 +1,4 @@
-"""The command lines that train, resume and evaluate a run again, from what its directory holds."""
+"""The command lines that train and evaluate a run again, from what its directory holds."""
 
 import json
 import shlex
@@ -34,23 +34,22 @@ def train(algorithm: str, config: Mapping[str, Any], *, seeds: str | None = None
     return shlex.join(words)
 
 
-def resume(run: Path) -> str:
-    """The command that continues a run."""
-    return shlex.join(["lemniscate", "resume", str(run)])
-
-
 def evaluate(run: Path, episodes: int, seed: int) -> str:
     """The command that evaluates a run's newest policy."""
     return shlex.join(["lemniscate", "evaluate", str(run), "--episodes", str(episodes), "--seed", str(seed)])
 
 
+def flag(name: str) -> str:
+    """The flag of a field on the command line."""
+    return "--env-args" if name == "env_kwargs" else f"--{name.replace('_', '-')}"
+
+
 def _option(name: str, value: Any) -> list[str]:
     """The words of one field on the command line."""
-    flag = "--env-args" if name == "env_kwargs" else f"--{name.replace('_', '-')}"
     if isinstance(value, bool):
-        return [flag if value else flag.replace("--", "--no-", 1)]
+        return [flag(name) if value else flag(name).replace("--", "--no-", 1)]
     if isinstance(value, list):
-        return [flag, *map(str, value or ["none"])]
+        return [flag(name), *map(str, value or ["none"])]
     if isinstance(value, dict):
-        return [flag, json.dumps(value)]
-    return [flag, "none" if value is None else str(value)]
+        return [flag(name), json.dumps(value)]
+    return [flag(name), "none" if value is None else str(value)]

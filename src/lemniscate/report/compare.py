@@ -17,7 +17,7 @@ from lemniscate.report.groups import Group, Scores
 from lemniscate.report.html import Html
 from lemniscate.report.seeds import bootstrap_interval, iqm
 from lemniscate.report.style import COLORS
-from lemniscate.run.directory import is_finished, read_config
+from lemniscate.run.directory import is_finished
 
 ONE_SEED = "One seed says nothing about which is better: train more with --seeds 1-5."
 UNFINISHED = "Nothing is ranked before two seeds of each are finished: continue with lemniscate resume."
@@ -38,7 +38,8 @@ def report(groups: list[Group], scores: Scores, folder: Path, by: str = "step") 
     envs = list(dict.fromkeys(one.env for one in groups))
     for env in envs:
         same = [one for one in groups if one.env == env]
-        for line in [f"{env}:", *table(same, scores), *remarks(same, scores)]:
+        cells, said = rows(same, scores), remarks(same, scores)
+        for line in [f"{env}:", *table(cells), *said]:
             say(line)
         ending = ".png" if len(envs) == 1 else f"-{file_name(env)}.png"
         pictures = [draw(same, scores, folder / f"comparison{ending}", _why_unranked(same, scores))]
@@ -46,14 +47,13 @@ def report(groups: list[Group], scores: Scores, folder: Path, by: str = "step") 
         apart = len(same) == 1 and len(runs) <= len(COLORS)
         labels = [run.name if apart else one.label for one in same for run in one.runs]
         pictures += plot_runs(runs, folder, labels, ending, by)
-        parts.append(comparison_page.part(page, same, scores, rows(same, scores), remarks(same, scores), pictures))
+        parts.append(comparison_page.part(page, same, scores, cells, said, pictures))
         files += pictures
     return [*files, comparison_page.write(page, envs, parts)]
 
 
-def table(groups: list[Group], scores: Scores) -> list[str]:
-    """The lines of the table, in columns: a heading, and one for each group."""
-    cells = rows(groups, scores)
+def table(cells: list[list[str]]) -> list[str]:
+    """The lines of the table whose `rows` are given, in columns."""
     first, *others = (max(map(len, column)) for column in zip(*cells, strict=True))
     return [
         "  ".join([row[0].ljust(first), *(cell.rjust(width) for cell, width in zip(row[1:], others, strict=True))])
@@ -86,7 +86,7 @@ def _cells(one: Group, scores: Scores, digits: int) -> list[str]:
 def remarks(groups: list[Group], scores: Scores) -> list[str]:
     """Sentences on runs of unequal length, unfinished runs, and groups of one seed."""
     said: list[str] = []
-    lengths = {one.label: read_config(one.runs[0])[1]["total_steps"] for one in groups}
+    lengths = {one.label: one.config["total_steps"] for one in groups}
     if len(set(lengths.values())) > 1:
         each = "; ".join(f"{label}: {steps:,}" for label, steps in lengths.items())
         said.append(f"They have not taken the same number of steps: {each}.")

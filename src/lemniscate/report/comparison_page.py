@@ -54,10 +54,7 @@ def part(
 
 def _differences(groups: Sequence[Group]) -> list[Html]:
     """The fields that are not the same in all groups."""
-    kinds: list[dict[str, Any]] = []
-    for one in groups:
-        algorithm, config = read_config(one.runs[0])
-        kinds.append({"algorithm": algorithm, **config})
+    kinds = [{"algorithm": one.algorithm, **one.config} for one in groups]
     names = [name for name in dict.fromkeys(name for kind in kinds for name in kind) if name != "seed"]
     differ = [name for name in names if any(kind.get(name) != kinds[0].get(name) for kind in kinds)]
     if not differ:
@@ -79,6 +76,5 @@ def _run(run: Path, scores: Scores, page: Path) -> tuple[str, ...]:
 
 
 def _command(one: Group) -> str:
-    records = [read_config(run) for run in one.runs]
-    seeds = ",".join(str(config.get("seed")) for _, config in records)
-    return commands.train(*records[0], seeds=seeds)
+    seeds = ",".join(str(read_config(run)[1].get("seed")) for run in one.runs)
+    return commands.train(one.algorithm, one.config, seeds=seeds)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from lemniscate.errors import UserError, is_installed
+from lemniscate.errors import UserError, is_installed, missing_extra
 
 PICTURE_FPS = 50
 """frames a second that an animated picture has at most: browsers show one with shorter delays far too slowly"""
@@ -19,6 +19,14 @@ def save_frames(frames: Iterable[np.ndarray], file: Path, fps: float) -> None:
     """Write frames [H, W, 3] uint8 as an animated picture (.gif, .webp) or a video (.mp4, extra `video`)."""
     check_film(file)
     file.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        _write(frames, file, fps)
+    except BaseException:  # what draws the frames may fail: no half of a film is left
+        file.unlink(missing_ok=True)
+        raise
+
+
+def _write(frames: Iterable[np.ndarray], file: Path, fps: float) -> None:
     if file.suffix == ".mp4":
         from imageio import v2 as imageio
 
@@ -41,7 +49,7 @@ def check_film(file: Path) -> None:
     if file.suffix not in (".gif", ".webp", ".mp4"):
         raise UserError(f"{file} must end in .gif, .webp or .mp4.")
     if file.suffix == ".mp4" and not is_installed("imageio_ffmpeg"):
-        raise UserError(f"{file} needs ffmpeg (pip install 'lemniscate[video]'); a .gif or .webp does not.")
+        raise missing_extra("imageio_ffmpeg", "video")
 
 
 def _timed(frames: Iterable[np.ndarray], fps: float) -> Iterator[Image.Image]:

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError
 from lemniscate.nn.policies import Policy
+from lemniscate.report.style import finish, save
 from lemniscate.run.evaluate import EpisodeTable, play_episodes
 
 BLUE, ORANGE, GREY = "#1f5fa8", "#e07b1a", "#9aa0a6"
@@ -52,20 +53,22 @@ def record(
     deterministic: bool = True,
     table: EpisodeTable | None = None,
 ) -> Flight:
-    """Play from the starts that `evaluate` plays from, and keep the tracks; in `table` also what `evaluate` keeps.
+    """Play what `evaluate` plays, and keep the tracks; in `table` also what `evaluate` keeps.
 
-    Without a policy, actions are uniformly random.
+    Of more flights than there are environments, the track of each environment's first is kept. Without a policy,
+    actions are uniformly random. Raises `UserError` where there is no scene.
     """
     scene = env.scene
     if scene is None:
         raise UserError(f"{env.spec.env_id} has no reference to track, so no flight can be drawn against one.")
-    flights = min(flights, env.num_envs)
-    rows = []
+    rows, first = [], torch.ones(env.num_envs, dtype=torch.bool, device=env.device)
     for _, _, step, counts in play_episodes(policy, env, flights, seed, deterministic):
         if table:
             table.add(step, counts)
-        row = torch.where(counts[:, None], step.next_obs, torch.nan)[:flights]
-        rows.append(row.cpu().numpy())
+        if (first & counts).any():
+            row = torch.where((first & counts)[:, None], step.next_obs, torch.nan)[:flights]
+            rows.append(row.cpu().numpy())
+        first = first & ~((step.terminated | step.truncated) & counts)
     track = np.stack(rows)
     position = track[..., scene.position]
     return Flight(position, position + track[..., scene.error], track[..., scene.attitude], scene.time_step)
@@ -86,9 +89,9 @@ def draw_path(flight: Flight, file: Path) -> Path:
     late = flight.error_mm[flight.time > 1]
     axes.set_title(f"Tracking error after the first second: {_rms(late):.1f} mm", loc="left")
     axes.set(xlabel="x / m", ylabel="z / m", aspect="equal")
-    axes.spines[["top", "right"]].set_visible(False)
+    finish(axes)
     axes.legend(frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=3)
-    return _save(figure, file)
+    return save(figure, file)
 
 
 def draw_error(flight: Flight, file: Path) -> Path:
@@ -102,21 +105,20 @@ def draw_error(flight: Flight, file: Path) -> Path:
     axes.plot(flight.time, np.nanmax(error, axis=1), color=GREY, linewidth=0.8, label="worst")
     axes.set(xlabel="time / s", ylabel="tracking error / mm", yscale="log", xlim=(0, flight.time[-1]))
     axes.set_title(f"{error.shape[1]} flights from unseen starts", loc="left")
-    axes.yaxis.set_major_formatter("{x:g}")
-    axes.grid(alpha=0.3)
-    axes.spines[["top", "right"]].set_visible(False)
+    finish(axes)
     axes.legend(frameon=False, ncols=3)
-    return _save(figure, file)
+    return save(figure, file)
 
 
-def animate(flight: Flight, every: int = 4) -> list[np.ndarray]:
+def animate(flight: Flight, every: int) -> list[np.ndarray]:
     """Frames of the first flight drawn with matplotlib, one each `every` steps: [H, W, 3] uint8."""
     figure = Figure(figsize=(6, 3.6), dpi=90, layout="constrained")
     canvas = FigureCanvasAgg(figure)
     axes = figure.subplots()
     path, reference = flight.position[:, 0, [0, 2]], flight.reference[:, 0, [0, 2]]
     axes.plot(*reference.T, color=ORANGE, linewidth=4, alpha=0.3)
-    axes.set(xlabel="x / m", ylabel="z / m", aspect="equal", xlim=(-1.3, 1.3), ylim=(0.3, 1.7))
+    (left, low), (right, high) = _limits(np.concatenate([path, reference]))
+    axes.set(xlabel="x / m", ylabel="z / m", aspect="equal", xlim=(left, right), ylim=(low, high))
     axes.spines[["top", "right"]].set_visible(False)
     canvas.draw()
     background = canvas.copy_from_bbox(figure.bbox)
@@ -138,6 +140,13 @@ def animate(flight: Flight, every: int = 4) -> list[np.ndarray]:
     return frames
 
 
+def _limits(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The lower and the upper ends of axes that show `points` [B, 2] with a margin for the body itself."""
+    low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
+    margin = 0.1 + 0.1 * np.max(high - low)
+    return low - margin, high + margin
+
+
 def _rotate_x_axis(quaternion: np.ndarray) -> np.ndarray:
     """The direction of the body's x axis in the world, from quaternions xyzw."""
     x, y, z, w = quaternion
@@ -146,9 +155,3 @@ def _rotate_x_axis(quaternion: np.ndarray) -> np.ndarray:
 
 def _rms(error: np.ndarray) -> float:
     return float(np.sqrt(np.nanmean(np.square(error))))
-
-
-def _save(figure: Figure, file: Path) -> Path:
-    file.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(file, dpi=150)
-    return file

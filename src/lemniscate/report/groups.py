@@ -21,9 +21,16 @@ Scores = Mapping[Path, float]
 class Group:
     """Runs in one environment that differ in nothing but the seed."""
 
-    env: str
     label: str
     runs: list[Path]
+    algorithm: str
+    config: Mapping[str, Any]
+    """of its first run"""
+
+    @property
+    def env(self) -> str:
+        """The name of the environment."""
+        return self.config["env"]
 
     def finals(self, scores: Scores) -> list[float]:
         """The final return of each seed that has one."""
@@ -31,7 +38,7 @@ class Group:
 
 
 def group(runs: Iterable[Path]) -> list[Group]:
-    """Groups in the order of their first run. Runs alike even in their seed are told apart by where they are."""
+    """Groups in the order of their first run. Runs alike even in their seed are distinguished by their directory."""
     found: dict[Path, dict[str, Any]] = {}
     for run in runs:
         algorithm, config = read_config(run)
@@ -46,7 +53,8 @@ def group(runs: Iterable[Path]) -> list[Group]:
         groups.setdefault(_key(kind, but="seed"), []).append(run)
     kinds = [found[members[0]] for members in groups.values()]
     return [
-        Group(kind["env"], _label(kind, kinds), members) for kind, members in zip(kinds, groups.values(), strict=True)
+        Group(_label(kind, kinds), members, *read_config(members[0]))
+        for kind, members in zip(kinds, groups.values(), strict=True)
     ]
 
 

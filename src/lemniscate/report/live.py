@@ -8,6 +8,7 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from lemniscate.console import in_notebook
+from lemniscate.notebook import Place
 from lemniscate.report.style import finish
 
 
@@ -22,7 +23,7 @@ class LiveCurve:
     def __init__(self, seconds: float = 1.0) -> None:
         self.seconds = seconds
         self._drawn = -float("inf")
-        self._place: Any = None
+        self._place = Place()
         self._curves: dict[str, list[tuple[int, float]]] = {"episode/return": [], "evaluation/return": []}
 
     def __call__(self, step: int, metrics: Mapping[str, float], policy: Any) -> None:
@@ -32,17 +33,10 @@ class LiveCurve:
                 points.append((step, metrics[name]))
         due = time.monotonic() - self._drawn >= self.seconds or step >= policy.config.total_steps
         if due and any(self._curves.values()) and in_notebook():
-            self._show(policy.config)
+            from IPython.display import Image
+
+            self._place.show(Image(self.draw(policy.config), format="png"))
             self._drawn = time.monotonic()
-
-    def _show(self, config: Any) -> None:
-        from IPython.display import Image, display
-
-        picture = Image(self.draw(config), format="png")
-        if self._place is None:
-            self._place = display(picture, display_id=True)
-        else:
-            self._place.update(picture)
 
     def draw(self, config: Any) -> bytes:
         """The curves so far as a PNG; `config` has the title and the length of the run."""

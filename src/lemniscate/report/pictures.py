@@ -1,51 +1,50 @@
-"""Everything a finished run is shown with: numbers in a sentence, plots, an animation."""
+"""Everything a run is shown with: numbers in a sentence, plots, an animation, a page."""
 
-import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
-from lemniscate.console import say
 from lemniscate.envs.vec_env import VecEnv
-from lemniscate.nn.actor_critic import ActorQ
 from lemniscate.nn.policies import Policy
 from lemniscate.report import curves, flight, run_page
 from lemniscate.report.playback import show_flights
-from lemniscate.run.evaluate import Evaluation, evaluate
+from lemniscate.run.q_bias import QBias
 
 
-def sentence(scores: Evaluation) -> str:
-    """The scores of an evaluation in one sentence, or two."""
-    said = (
-        f"{scores.mean_return:.1f} ± {scores.std_return:.1f} return over {scores.episodes} episodes of {scores.env_id}"
-    )
-    if scores.measures:
-        finite = {name: value for name, value in scores.measures.items() if math.isfinite(value)}
-        words = [f"{run_page.words(name)} {run_page.number(name, value)}" for name, value in finite.items()]
-        said += f", {scores.terminated} of them terminated; {', '.join(words)}"
-    return f"{said}.\n{scores.q_bias}." if scores.q_bias else f"{said}."
+def sentence(scores: Mapping[str, Any]) -> str:
+    """The scores of an evaluation, as `Evaluation.to_json` has them, in one sentence, or two."""
+    mean, std = scores["mean_return"], scores["std_return"]
+    said = f"{mean:.1f} ± {std:.1f} return over {scores['episodes']} episodes of {scores['env_id']}"
+    if measures := run_page.measures(scores):
+        words = [f"{run_page.words(name)} {run_page.number(name, value)}" for name, value in measures.items()]
+        said += f", {scores['terminated']} of them terminated; {', '.join(words)}"
+    return f"{said}.\n{_q_bias(scores)}." if "q_bias" in scores else f"{said}."
 
 
-def report(
-    policy: Policy, env: VecEnv, path: Path, episodes: int, critic: tuple[ActorQ, float] | None = None
-) -> list[Path]:
-    """Evaluate from unseen starts, draw everything there is to draw, and write the run's page; returns the pictures."""
-    scores = evaluate(policy, env, episodes, seed=0, critic=critic)
-    say(sentence(scores))
-    pictures = curves.plot_runs([path], path / "plots")
-    if scores.q_bias:
-        pictures.append(curves.draw_q_bias(scores.q_bias, path, path / "plots" / "q.png"))
-    if env.scene:
-        pictures += draw_flight(policy, env, path / "plots", episodes, seed=0)
-    for picture in pictures:
-        say(picture)
-    if env.scene:
-        film = path / "videos" / "flight.gif"
-        show_flights(policy, env, 1, seed=0, video=film, tell=lambda text: None)
-        say(film)
-    say(run_page.write(path, pictures, {"seed": 0, **scores.to_json()}))
-    return pictures
+def draw_run(run: Path, scores: Mapping[str, Any] | None, flights: Sequence[Path], by: str) -> list[Path]:
+    """Draw the curves of a run and write its page; returns the files, the page last.
+
+    Args:
+        run: the run directory.
+        scores: of its newest policy, those of `results.final_scores`, if there are any.
+        flights: pictures of `draw_flights`, for the page.
+        by: "step", "episode" or "minute", the horizontal axis of the learning curve.
+    """
+    pictures = curves.plot_runs([run], run / "plots", by=by)
+    if scores and "q_bias" in scores:
+        pictures.append(curves.draw_q_bias(_q_bias(scores), run, run / "plots" / "q.png"))
+    pictures += flights
+    return [*pictures, run_page.write(run, pictures, scores)]
 
 
-def draw_flight(policy: Policy, env: VecEnv, folder: Path, flights: int, seed: int) -> list[Path]:
-    """Path and error of some flights, into `folder`."""
-    track = flight.record(policy, env, flights, seed)
+def draw_flights(policy: Policy, env: VecEnv, run: Path, flights: int, film: bool) -> list[Path]:
+    """Path and error of some flights in a scene, into the `plots/` of a run; with `film` one of them into `videos/`."""
+    track = flight.record(policy, env, flights, seed=0)
+    if film:
+        show_flights(policy, env, 1, seed=0, video=run / "videos" / "flight.gif", tell=lambda text: None)
+    folder = run / "plots"
     return [flight.draw_path(track, folder / "flight.png"), flight.draw_error(track, folder / "error.png")]
+
+
+def _q_bias(scores: Mapping[str, Any]) -> QBias:
+    return QBias(scores["q_bias"]["predicted"], scores["q_bias"]["realised"])

@@ -1,8 +1,5 @@
 """Playing episodes for a person: in a window, in a notebook, or into a film."""
 
-import io
-import sys
-import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from itertools import chain
@@ -12,19 +9,21 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch
-from PIL import Image
 
 from lemniscate.console import in_notebook, say
 from lemniscate.envs import registry
+from lemniscate.envs.factory import make_one, maker_of, sentences
 from lemniscate.envs.measures import SUMMARIES, measures_of
-from lemniscate.envs.vec_env import PATIENCE, VecEnv
-from lemniscate.errors import UserError
+from lemniscate.envs.vec_env import VecEnv, require_end
+from lemniscate.errors import UserError, shown
+from lemniscate.named import find_callable
 from lemniscate.nn.policies import Policy
+from lemniscate.notebook import send_frames
 from lemniscate.report import flight
 from lemniscate.report.display import quiet_sdl
 from lemniscate.report.film import save_frames
 from lemniscate.run.config import RunConfig
-from lemniscate.run.environments import world_of
+from lemniscate.run.environments import env_arguments
 from lemniscate.run.evaluate import EVALUATION, EpisodeTable, Evaluation
 from lemniscate.run.seeding import derive
 from lemniscate.types import Step
@@ -35,34 +34,59 @@ Tell = Callable[[str], object]
 
 ONE = torch.ones(1, dtype=torch.bool)
 
-NOTEBOOK_FPS = 25
-"""more frames a second than a browser is sent; the others are left out"""
-
 FLIGHT_STRIDE = 5
 """a flight is drawn at every so many-th step"""
 
 
 def show_episodes(
-    act: Act | None, world: dict[str, Any], episodes: int, seed: int, video: Path | None = None, tell: Tell = say
+    act: Act | None, arguments: dict[str, Any], episodes: int, seed: int, video: Path | None = None, tell: Tell = say
 ) -> Evaluation:
-    """Play episodes one after the other in a rendered environment of Gymnasium's interface; `world` as of `world_of`.
+    """Play episodes one after the other in a rendered environment of Gymnasium's interface.
 
-    They are shown in the notebook that asks, in a window elsewhere, or recorded into `video`. Without `act`, actions
-    are uniformly random. The first 16 starts are those that `evaluate` plays from in the gymnasium backend.
+    It is made with the `arguments` that `env_arguments` returns. The episodes are shown in the notebook that asks, in a
+    window elsewhere, or recorded into `video`. Without `act`, actions are uniformly random. The first 16 starts are
+    those that `evaluate` plays from in the gymnasium backend.
+
+    Raises:
+        UserError: an environment that cannot be made or renders no pictures; an episode without an end.
     """
     in_window = video is None and not in_notebook()
     table = EpisodeTable(1, torch.device("cpu"))
     with quiet_sdl(in_window):
-        env = _rendered(world, "human" if in_window else "rgb_array")
-        played = _play(env, act or _random(env, seed), episodes, seed, table, tell)
+        env = _rendered(arguments, "human" if in_window else "rgb_array")
+        played = _play(env, act or _random(env, seed), arguments["env"], episodes, seed, table, tell)
         try:
             if in_window:
                 deque(played, maxlen=0)  # Gymnasium draws at each step
             else:
-                _give((np.asarray(env.render()) for _ in played), _fps(env), video)
+                _give((_picture(env, arguments["env"]) for _ in played), _fps(env), video)
         finally:
             env.close()
-    return table.evaluation(world["env"], SUMMARIES)
+    return table.evaluation(arguments["env"], SUMMARIES)
+
+
+def play_single(act: Act, arguments: dict[str, Any], episodes: int, seed: int, tell: Tell = say) -> Evaluation:
+    """The same episodes, not shown: one after the other in one environment of Gymnasium's interface.
+
+    Raises:
+        UserError: an environment that cannot be made, or only several at once; an episode without an end.
+    """
+    name, kwargs, wrappers = (arguments[part] for part in ("env", "kwargs", "wrappers"))
+    table = EpisodeTable(1, torch.device("cpu"))
+    with sentences(name, kwargs, wrappers):
+        if not registry.can_wrap("gymnasium", name):
+            raise UserError(f"{name} makes several environments at once, and a function acts in a single one.")
+        env = make_one(maker_of(name), tuple(map(find_callable, wrappers)), **kwargs)
+    try:
+        deque(_play(env, act, name, episodes, seed, table, tell), maxlen=0)
+    finally:
+        env.close()
+    return table.evaluation(name, SUMMARIES)
+
+
+def act_by(function: Callable[[Any], Any]) -> Act:
+    """A function of the observation alone, as an `Act`."""
+    return lambda obs, action_mask=None: function(obs)
 
 
 def show_flights(
@@ -74,22 +98,22 @@ def show_flights(
     video: Path | None = None,
     tell: Tell = say,
 ) -> Evaluation:
-    """Play flights one after the other in a scene: the same, for environments that have one.
+    """Play flights in a scene: the same, for environments that have one.
 
-    Raises:
-        UserError: more flights than there are environments.
+    They are those of `evaluate`, and played together. Of more flights than there are environments, the first of each
+    is shown.
     """
-    if episodes > env.num_envs:
-        raise UserError(f"At most {env.num_envs} flights of this run can be shown, not {episodes}.")
     table = EpisodeTable(env.num_envs, env.device)
     track = flight.record(policy, env, episodes, seed, deterministic, table)
     scores = table.evaluation(env.spec.env_id, env.summaries)
+    if episodes > env.num_envs:
+        say(f"{env.num_envs} of the {episodes} flights are shown, the first of each environment.")
     for number, of_episode in enumerate(zip(scores.returns, scores.lengths, strict=True), start=1):
         tell(_sentence(number, *of_episode))
     if video is None and not in_notebook():
         from lemniscate.report import scene
 
-        scene.show((track.one(number) for number in range(episodes)), _model(env))
+        scene.show((track.one(number) for number in range(track.position.shape[1])), _model(env))
     else:
         frames, how = _draw(track, env)
         _give(frames, 1 / (FLIGHT_STRIDE * track.time_step), video)
@@ -101,57 +125,40 @@ def require_pictures(config: RunConfig, env: VecEnv) -> None:
     """Raise `UserError` where an environment cannot be recorded; one with a scene always can."""
     if not env.scene:
         with quiet_sdl(in_window=False):
-            _rendered(world_of(config), "rgb_array").close()
+            _rendered(env_arguments(config), "rgb_array").close()
 
 
-def show_pictures(files: Iterable[Path]) -> None:
-    """Show pictures below the cell."""
-    from IPython.display import Image as Shown
-    from IPython.display import display
+def _play(
+    env: gym.Env, act: Act, name: str, episodes: int, seed: int, table: EpisodeTable, tell: Tell
+) -> Iterator[None]:
+    """Reset and step through the episodes, counted in `table`.
 
-    for file in files:
-        display(Shown(filename=str(file)))
-
-
-def send_frames(frames: Iterable[np.ndarray], fps: float) -> None:
-    """Show frames [H, W, 3] uint8 one after the other below the cell, at their own speed."""
-    from IPython.display import Image as Shown
-    from IPython.display import display
-
-    stride = max(1, round(fps / NOTEBOOK_FPS))
-    place, started = None, time.monotonic()
-    for i, frame in enumerate(frames):
-        if i % stride:
-            continue
-        jpeg = io.BytesIO()
-        Image.fromarray(frame).save(jpeg, format="JPEG", quality=85)
-        shown = Shown(jpeg.getvalue(), format="jpeg")
-        if place is None:
-            place = display(shown, display_id=True)
-        else:
-            place.update(shown)
-        time.sleep(max(0.0, started + i / fps - time.monotonic()))
-
-
-def _play(env: gym.Env, act: Act, episodes: int, seed: int, table: EpisodeTable, tell: Tell) -> Iterator[None]:
-    """Reset and step through the episodes (the first steps of an endless one), counted in `table`.
-
-    Stops after each reset and each step, for a picture.
+    Stops after each reset and each step, for a picture. Raises `UserError` for an action of another kind, and for an
+    episode that does not end where there is no time limit.
     """
     first, names = derive(seed, EVALUATION, 0), measures_of(env.metadata)
-    limit = PATIENCE if env.spec is None or env.spec.max_episode_steps is None else sys.maxsize
+    limit = env.spec.max_episode_steps if env.spec else None
     for number in range(episodes):
         obs, info = env.reset(seed=first + number)
         yield
         total, length, done = 0.0, 0, False
         while not done:
-            obs, reward, terminated, truncated, info = env.step(act(obs, action_mask=info.get("action_mask")))
+            require_end(name, length, limit)
+            action = act(obs, action_mask=info.get("action_mask"))
+            _require_in(env.action_space, action, name)
+            obs, reward, terminated, truncated, info = env.step(action)
             total, length = total + float(reward), length + 1
-            truncated = truncated or length == limit
             done = terminated or truncated
             table.add(_step(reward, terminated, truncated, {name: info[name] for name in names if name in info}), ONE)
             yield
         tell(_sentence(number + 1, total, length))
+
+
+def _require_in(space: gym.Space, action: Any, name: str) -> None:
+    """Raise `UserError` for an action that is not of the space; of a Box the shape counts, the environment may clip."""
+    fits = np.shape(action) == space.shape if isinstance(space, gym.spaces.Box) else space.contains(action)
+    if not fits:
+        raise UserError(f"{name} takes actions of {space}, not {shown(action)}.")
 
 
 def _step(reward: Any, terminated: bool, truncated: bool, measures: dict[str, Any]) -> Step:
@@ -191,14 +198,32 @@ def _fps(env: gym.Env) -> float:
     return float(env.metadata.get("render_fps", 30))
 
 
-def _rendered(world: dict[str, Any], mode: str) -> gym.Env:
+def _rendered(arguments: dict[str, Any], mode: str) -> gym.Env:
+    """An environment that has rendered its first picture. Raises `UserError` where it cannot."""
+    name = arguments["env"]
     try:
-        env = registry.make_rendered(mode=mode, **world)
+        env = registry.make_rendered(mode=mode, **arguments)
         env.reset(seed=0)
         env.render()
-        return env
     except Exception as error:  # pygame, GLFW and MuJoCo each have their own
-        raise UserError(f"{world['env']} cannot be shown here: {error}") from error
+        raise UserError(f"{name} cannot be shown here: {error}") from error
+    try:
+        if mode == "rgb_array":
+            _picture(env, name)
+    except UserError:
+        env.close()
+        raise
+    return env
+
+
+def _picture(env: gym.Env, name: str) -> np.ndarray:
+    """What an environment renders, [H, W, 3] uint8. Raises `UserError` where that is no picture."""
+    picture: Any = env.render()
+    is_array = isinstance(picture, np.ndarray)
+    if is_array and picture.dtype == np.uint8 and picture.ndim == 3 and picture.shape[2] == 3:
+        return picture
+    what = f"an array {picture.shape} of {picture.dtype}" if is_array else shown(picture)
+    raise UserError(f"{name} renders no pictures: render() returns {what}; a picture is (height, width, 3) of uint8.")
 
 
 def _draw(track: flight.Flight, env: VecEnv) -> tuple[Iterable[np.ndarray], str]:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from lemniscate.errors import resume_line
 from lemniscate.report import advice, commands, html
 from lemniscate.report.curves import training_minutes
 from lemniscate.report.html import Html, element, section
@@ -165,7 +166,7 @@ def _commands(run: Path, algorithm: str, config: Mapping[str, Any]) -> list[Html
         "Train it again; with the same versions on the same kind of machine the result is the same": commands.train(
             algorithm, config
         ),
-        "Continue it where it was interrupted": commands.resume(run),
+        "Continue it where it was interrupted": resume_line(run),
         "Evaluate its newest policy from other starts": commands.evaluate(run, 100, 1),
     }
     return [part for title, line in lines.items() for part in (element("p", f"{title}:"), html.command(line))]

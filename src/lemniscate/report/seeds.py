@@ -20,19 +20,17 @@ def iqm(scores: Sequence[float] | np.ndarray, axis: int = -1) -> np.ndarray:
     return np.moveaxis(ordered, axis, -1) @ (weight / weight.sum())
 
 
-def bootstrap_interval(
-    scores: Sequence[float], confidence: float = 0.95, resamples: int = RESAMPLES
-) -> tuple[float, float]:
-    """Interval of the IQM over resampled seeds."""
+def bootstrap_interval(scores: Sequence[float], resamples: int = RESAMPLES) -> tuple[float, float]:
+    """95 % interval of the IQM over resampled seeds."""
     drawn = _drawn_again(np.asarray(scores, dtype=np.float64), np.random.default_rng(0), resamples)
-    low, high = _percentiles(iqm(drawn), confidence)
+    low, high = _percentiles(iqm(drawn))
     return float(low), float(high)
 
 
-def mean_interval(curves: np.ndarray, confidence: float = 0.95, resamples: int = 2_000) -> np.ndarray:
-    """Interval of the mean over resampled seeds at each point of `curves` [seeds, points]: (low, high), [2, points]."""
+def mean_interval(curves: np.ndarray, resamples: int = 2_000) -> np.ndarray:
+    """95 % interval of the mean over resampled seeds at each point of `curves` [seeds, points]: [2, points]."""
     means = _drawn_again(curves, np.random.default_rng(0), resamples).mean(axis=1)
-    return _percentiles(means, confidence)
+    return _percentiles(means)
 
 
 def probability_of_improvement(x: Sequence[float] | np.ndarray, y: Sequence[float] | np.ndarray) -> np.ndarray:
@@ -45,13 +43,11 @@ def probability_of_improvement(x: Sequence[float] | np.ndarray, y: Sequence[floa
     return (1 + np.sign(difference).mean(axis=(-2, -1))) / 2
 
 
-def improvement_interval(
-    x: Sequence[float], y: Sequence[float], confidence: float = 0.95, resamples: int = RESAMPLES
-) -> tuple[float, float]:
-    """Interval of P(X > Y) over resampled seeds of both."""
+def improvement_interval(x: Sequence[float], y: Sequence[float], resamples: int = RESAMPLES) -> tuple[float, float]:
+    """95 % interval of P(X > Y) over resampled seeds of both."""
     rng = np.random.default_rng(0)
     drawn = [_drawn_again(np.asarray(scores, dtype=np.float64), rng, resamples) for scores in (x, y)]
-    low, high = _percentiles(probability_of_improvement(*drawn), confidence)
+    low, high = _percentiles(probability_of_improvement(*drawn))
     return float(low), float(high)
 
 
@@ -60,6 +56,6 @@ def _drawn_again(scores: np.ndarray, rng: np.random.Generator, resamples: int) -
     return rng.choice(scores, (resamples, len(scores)))
 
 
-def _percentiles(resampled: np.ndarray, confidence: float) -> np.ndarray:
-    """The ends of the middle `confidence` of resampled values, along their first dimension."""
-    return np.quantile(resampled, [(1 - confidence) / 2, (1 + confidence) / 2], axis=0)
+def _percentiles(resampled: np.ndarray) -> np.ndarray:
+    """The ends of the middle 95 % of resampled values, along their first dimension."""
+    return np.quantile(resampled, [0.025, 0.975], axis=0)

@@ -15,13 +15,20 @@ def make_envs(config: RunConfig) -> tuple[VecEnv, VecEnv]:
     """Two vectors of environments that share nothing: one for training, staggered, and one for evaluation.
 
     They are restarted with seeds of different streams, so no start of one is ever a start of the other.
+
+    Raises:
+        UserError: as `lemniscate.envs.registry.make`; no Config; a device that is not there.
     """
     if not isinstance(config, RunConfig):
         raise UserError(f"make_envs needs a Config, such as config_for('ppo', 'CartPole-v1'), not {shown(config)}.")
     device = str(device_for(config.device))
-    world = {"kwargs": config.env_kwargs, "wrappers": config.wrappers, "backend": config.backend}
-    train_env = registry.make(config.env, config.num_envs, device=device, stagger=True, **world)
-    return train_env, evaluation_env(config, config.evaluate_episodes, device=device)
+    own = {"kwargs": config.env_kwargs, "wrappers": config.wrappers, "backend": config.backend}
+    train_env = registry.make(config.env, config.num_envs, device=device, stagger=True, **own)
+    try:
+        return train_env, evaluation_env(config, config.evaluate_episodes, device=device)
+    except BaseException:
+        train_env.close()
+        raise
 
 
 def evaluation_env(
@@ -37,19 +44,19 @@ def evaluation_env(
 
     `env_kwargs` change those of the run; in another environment they are the only ones.
     """
-    world = world_of(config, env, env_kwargs, backend)
-    served_by = world["backend"] or registry.backend_for(world["env"], config.wrappers)
-    num_envs = config.num_envs if registry.is_compiled(served_by) else min(episodes, 16)
-    return registry.make(num_envs=num_envs, device=device, **world)
+    arguments = env_arguments(config, env, env_kwargs, backend)
+    served_by = arguments["backend"] or registry.backend_for(arguments["env"], config.wrappers)
+    num_envs = config.num_envs if registry.has_fixed_num_envs(served_by) else min(episodes, 16)
+    return registry.make(num_envs=num_envs, device=device, **arguments)
 
 
-def world_of(
+def env_arguments(
     config: RunConfig,
     env: str | Callable[..., Any] | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
     backend: str | None = None,
 ) -> dict[str, Any]:
-    """What `registry.make` is told of the environment that a run is evaluated in: env, kwargs, wrappers, backend."""
+    """The arguments of `registry.make` for the evaluation of a run: env, kwargs, wrappers, backend."""
     name = config.env if env is None else registry.name_of(env)
     kwargs = {**(config.env_kwargs if name == config.env else {}), **(env_kwargs or {})}
     if env is None and backend is None:

@@ -46,7 +46,7 @@ TRAINING = 0
 """the stream of seeds that training environments restart from"""
 
 S = TypeVar("S", bound=TrainState)
-Watch = Callable[[int, Mapping[str, float], TrainState], bool]
+Observer = Callable[[int, Mapping[str, float], TrainState], bool]
 """(step, metrics, state) of a logged line, to whether the run is to stop; it leaves the state as it is"""
 
 
@@ -71,7 +71,7 @@ class Run:
         loggers: Sequence[LoggerClass] = (JsonLines, TensorBoard),
         progress: bool = True,
         film: Callable[[TrainState], None] | None = None,
-        watch: Watch | None = None,
+        observer: Observer | None = None,
     ) -> None:
         self.path, self.algorithm, self.config = path, algorithm, config
         self.env, self.eval_env = envs
@@ -80,10 +80,10 @@ class Run:
         """how long the training loop took"""
         self._saver = Saver(path, algorithm, config, self.spec)
         self._logger_classes, self._loggers = loggers, list[Logger]()
-        self._visible, self._film, self._watch = progress, film, watch
+        self._visible, self._film, self._observer = progress, film, observer
         self._bar = ProgressBar(config.total_steps, 0, visible=False)
         self._recent_returns: list[float] = []
-        self._unwatched: list[tuple[int, dict[str, float]]] = []
+        self._unobserved: list[tuple[int, dict[str, float]]] = []
         """logged lines that callbacks have not seen"""
         self._episodes = 0
         """whole training episodes so far"""
@@ -228,13 +228,15 @@ class Run:
 
     def _asked_to_stop(self, state: TrainState, saved: bool) -> bool:
         """Whether a callback or a signal stops the run. The state is saved then, and where a callback fails."""
-        lines, self._unwatched = self._unwatched, []
+        lines, self._unobserved = self._unobserved, []
         stop = True
         try:
             with globals_undisturbed():
-                answers = [self._watch(step, numbers, state) for step, numbers in lines] if self._watch else []
+                answers = [self._observer(step, numbers, state) for step, numbers in lines] if self._observer else []
             stop = any(answers) or bool(self._stop_signal)
         finally:
+            if self._stop_signal:
+                self._hurry.cancel()  # the update has ended; the disk may take its time
             if stop and not saved and state.step > self._saver.last_planned:
                 self._saver.save(state, planned=False, logged=self._logged)
         return stop
@@ -301,7 +303,7 @@ class Run:
         for logger in self._loggers:
             logger.write(step, numbers, episodes)
         self._logged = step
-        self._unwatched.append((step, numbers))
+        self._unobserved.append((step, numbers))
 
     def _stop(self, signum: int, _frame: FrameType | None) -> None:
         """Stop after the current update; asked again, or if that takes longer than `PATIENCE`, at once."""

@@ -43,13 +43,12 @@ def load_networks(networks: nn.Module, config: RunConfig, spec: Spec) -> str:
     if set(differing) & set(FUNCTION):
         raise UserError(f"warm_start: {name} does not fit: {settings[0]}.")
     found, own = source.tensors_of("networks"), networks.state_dict()
-    if not _difference(found, own):
+    if not difference(found, own):
         networks.load_state_dict(found)
         return f"Warm start: all networks of {name}."
     policy, own_policy = _policy(found), _policy(own)
-    difference = _difference(policy, own_policy)
-    if difference:
-        raise UserError(f"warm_start: the policy of {name} does not fit: {[*settings, difference][0]}.")
+    if differs := difference(policy, own_policy):
+        raise UserError(f"warm_start: the policy of {name} does not fit: {[*settings, differs][0]}.")
     networks.load_state_dict(policy, strict=False)
     return f"Warm start: the policy of {name}; the other networks are new."
 
@@ -58,7 +57,7 @@ def _policy(networks: dict[str, Tensor]) -> dict[str, Tensor]:
     return {name: tensor for name, tensor in networks.items() if name.startswith("policy.")}
 
 
-def _difference(theirs: dict[str, Tensor], mine: dict[str, Tensor]) -> str:
+def difference(theirs: dict[str, Tensor], mine: dict[str, Tensor]) -> str:
     """The first parameter that is missing on one side or has another shape; empty if there is none."""
     for name in [*mine, *theirs]:
         there, here = (list(side[name].shape) if name in side else "missing" for side in (theirs, mine))

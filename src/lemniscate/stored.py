@@ -1,0 +1,98 @@
+"""What a run has stored: its directory, its newest policy. `load` and `save`."""
+
+import sys
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+from lemniscate import algos
+from lemniscate.errors import UserError, shown
+from lemniscate.policy import TrainedPolicy
+from lemniscate.run import checkpoint
+from lemniscate.run.directory import find_checkpoint
+from lemniscate.run.files import parsing
+from lemniscate.run.warm_start import difference
+
+
+@dataclass(frozen=True)
+class TrainedRun:
+    """The result of `train` and `resume`: the run directory, the final policy, the seconds of the training loop."""
+
+    path: Path
+    policy: TrainedPolicy
+    seconds: float
+
+
+Trained = str | Path | TrainedRun | TrainedPolicy
+"""what has a policy: the path of a run or a checkpoint, what `train` returned, or the policy itself"""
+
+
+def path_of(run: object) -> Path:
+    """The directory of a run: of its path, of what `train` returned, or of a policy from `train` or `load`.
+
+    Raises:
+        UserError: anything else.
+    """
+    path = getattr(run, "path", run)
+    if isinstance(path, str | PathLike):
+        return Path(path)
+    raise UserError(f"A run is a directory, such as 'runs/lander', or what train returned, not {shown(run)}.")
+
+
+def load(run: Trained) -> TrainedPolicy:
+    """The policy of a run (its newest whole checkpoint) or of one checkpoint. Nothing in the files is executed.
+
+    What `train` returned has its policy already, and a policy is returned as it is.
+
+    Raises:
+        UserError: neither a run nor a checkpoint, or a run without a whole checkpoint; a damaged checkpoint; networks
+            of the user's own that have other parameters now.
+    """
+    if isinstance(run, TrainedRun | TrainedPolicy):
+        return run.policy if isinstance(run, TrainedRun) else run
+    path = path_of(run)
+    found = find_checkpoint(path)
+    with parsing(found.path):
+        algorithm, spec = algos.find(found.record["algorithm"]), checkpoint.spec_from_json(found.record["spec"])
+        config = algorithm.Config.from_json(found.record["config"])
+        step = found.numbers["step"]
+    networks, tensors = config.networks(spec), found.tensors_of("networks")
+    if differs := difference(tensors, networks.state_dict()):
+        raise UserError(f"{path} does not fit its networks: {differs}.")
+    networks.load_state_dict(tensors)
+    return TrainedPolicy(networks, spec, config, step, path)
+
+
+def save(policy: Any, path: str | Path) -> Path:
+    """Store a policy for `load`: weights, normalizer, Config and Spec, as a checkpoint without pickle.
+
+    Args:
+        policy: from `load`, or what `train` returned. It may begin another run (`warm_start=path`), but not resume
+            its own: a run's checkpoints also hold optimizers and random generators.
+        path: a new directory, or a policy stored before, which is replaced.
+
+    Raises:
+        UserError: something else is at `path`, or it cannot be written.
+    """
+    path, policy = path_of(path), getattr(policy, "policy", policy)
+    if not isinstance(policy, TrainedPolicy):
+        raise UserError(f"What can be stored is a policy, from load or train, not a {type(policy).__name__}.")
+    if path.exists() and not _is_stored(path):
+        raise UserError(f"{path} exists already, and is not a stored policy; choose another path.")
+    algorithm = algos.name_of(sys.modules[type(policy.config).__module__])
+    record = {"algorithm": algorithm, "config": policy.config.to_json(), "spec": checkpoint.spec_to_json(policy.spec)}
+    try:
+        fields = {"networks": policy.networks, "step": policy.step}
+        checkpoint.write_fields(path, fields, {**record, "planned": False, "stored": True})
+    except OSError as error:
+        raise UserError(f"{path} cannot be written: {error}.") from error
+    return path
+
+
+def _is_stored(path: Path) -> bool:
+    """Whether `save` has written what is at `path`: a checkpoint of a run is not to be replaced."""
+    try:
+        return bool(checkpoint.read(path).record.get("stored"))
+    except UserError:
+        return False
