@@ -72,11 +72,7 @@ def test_several_tensors_may_come_as_a_list():
 
 @pytest.mark.parametrize(
     ("ends", "wrong"),
-    [
-        (lambda flags: flags.all(), "return[1, 0]"),
-        (lambda flags: flags.any(), "return[0, 0]"),
-        (bool, "it raised RuntimeError: Boolean value of Tensor"),
-    ],
+    [(torch.all, "return["), (torch.any, "return["), (bool, "it raised RuntimeError: Boolean value of Tensor")],
 )
 def test_the_return_of_one_environment_is_not_ended_by_another(ends, wrong):
     def reward_to_go(reward, next_value, terminated, done, *, gamma):
@@ -116,7 +112,8 @@ def test_what_it_raises_is_said_with_the_line_that_raised(tmp_path):
     def gae(reward):
         return reward
 
-    assert course.check(gae).sentence.endswith("'lam'")  # nothing of it was reached
+    assert "it raised TypeError: " in course.check(gae).sentence
+    assert not course.check(gae).sentence.endswith(")")  # none of its lines was reached
     file = tmp_path / "mine.py"
     file.write_text("def polyak(*args):\n    later()\n\ndef later():\n    raise NotImplementedError('to be written')\n")
     scope = {}
@@ -182,9 +179,9 @@ class PPO:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        ((gae, "gea"), "There is no exercise 'gea': did you mean gae?"),
+        ((gae, "gea"), "There is no exercise 'gea': did you mean gae"),
         ((None,), 'Which exercise is None? Name it: course.check(solution, "gae").'),
-        ((partial(gae, lam=1.0),), "Which exercise is a partial? Name it"),
+        ((partial(gae, lam=1.0),), "Which exercise is functools.partial("),
         ((lambda x: x,), "Which exercise is a function? Name it"),
         ((None, "gae"), "What can be checked is a function or a class, not None."),
         ((PPO,), "PPO is judged by its methods: course.check(PPO.compute_advantages), course.check(PPO.compute_loss)."),
