@@ -39,7 +39,7 @@ docs: setup  ## the documentation site in build/site; warnings are errors
 docs-serve: docs  ## the site at http://localhost:8000
 	$(BIN)/python -m http.server --directory build/site
 
-bench: .venv/.peers  ## the tables of docs/speed.md, beside the peers: an hour on a quiet machine
+bench: .venv/.peers  ## the drone in docs/results.md, and the tables of docs/speed.md: an hour on a quiet machine
 	$(BIN)/python benchmarks/figure_eight.py
 	$(BIN)/python benchmarks/speed.py
 

@@ -122,7 +122,7 @@ def fenced(text: str, language: str) -> str:
 
 
 def main() -> None:
-    """Write every page anew."""
+    """Write every page again."""
     shutil.rmtree(OUT, ignore_errors=True)
     pages = [*(ROOT / "docs").rglob("*.md"), *(ROOT / "docs" / "tutorial").glob("*.ipynb")]
     for file in [*map(ROOT.joinpath, HOME), *pages, ROOT / "docs" / "style.css", ROOT / "docs" / "images" / "logo.svg"]:

@@ -28,6 +28,8 @@ class StopWhenSolved:
         return len(last) == self.updates and sum(last) / len(last) >= self.threshold
 
 
+stop_at_400 = StopWhenSolved(400)
+
 if __name__ == "__main__":
-    trained = lem.train("ppo", env="CartPole-v1", total_steps=100_000, callbacks=[StopWhenSolved(400)])
+    trained = lem.train("ppo", env="CartPole-v1", total_steps=100_000, callbacks=[stop_at_400])
     print(f"Stopped at step {trained.policy.step}: {lem.evaluate(trained.policy, episodes=20).mean_return:.0f}")

@@ -1,11 +1,14 @@
 """The right function is right, each well-known mistake is called by its name, and what is off is said."""
 
 import re
+from functools import partial
 
 import pytest
 import torch
 
+from course_findings import says
 from lemniscate import UserError, course, maths
+from lemniscate.course import ppo_from_scratch
 from lemniscate.course.exercise import Exercise
 
 COMPARED = {name: exercise for name, exercise in course.EXERCISES.items() if isinstance(exercise, Exercise)}
@@ -62,11 +65,63 @@ def test_what_is_off_is_said(spoil, said):
     assert re.search(said, finding.sentence), finding.sentence
 
 
-def test_what_it_raises_is_said():
+def test_several_tensors_may_come_as_a_list():
+    assert course.check(lambda *args, **options: list(maths.gae(*args, **options)), "gae")
+    says(lambda rewards, gamma: list(rewards), "discounted_returns", "it returned list")
+
+
+@pytest.mark.parametrize(
+    ("ends", "wrong"),
+    [(torch.all, "return["), (torch.any, "return["), (bool, "it raised RuntimeError: Boolean value of Tensor")],
+)
+def test_the_return_of_one_environment_is_not_ended_by_another(ends, wrong):
+    def reward_to_go(reward, next_value, terminated, done, *, gamma):
+        out, follows = torch.zeros_like(reward), next_value[-1]
+        for t in reversed(range(len(reward))):
+            if ends(done[t]):
+                follows = next_value[t] * ~terminated[t]
+            elif t == len(reward) - 1:
+                follows = next_value[t]
+            out[t] = follows = reward[t] + gamma * follows
+        return out
+
+    says(reward_to_go, "reward_to_go", f"case 4 of 4, two environments, ends of both kinds: {wrong}")
+
+
+def test_the_value_loss_is_given_an_old_value_without_a_clip_as_the_algorithm_gives_it():
+    def value_loss(value, target, old_value=None, clip=None):
+        if old_value is None:
+            return 0.5 * (value - target).square().mean()
+        near = old_value + (value - old_value).clamp(-clip, clip)
+        return 0.5 * torch.max((value - target) ** 2, (near - target) ** 2).mean()
+
+    says(value_loss, "value_loss", "case 3 of 3, with an old value, and None for the clip: it raised TypeError")
+
+
+def test_what_the_skeleton_promises_to_judge_passes_in_its_solution():
+    names = re.findall(r"`course.check\((\w+)\)`", ppo_from_scratch.__doc__)
+    assert names == ["gae", "clipped_surrogate", "value_loss"]
+    assert all(course.check(getattr(ppo_from_scratch, name)) for name in names)
+    assert str(course.check(ppo_from_scratch.value_loss)).endswith(
+        "right in 1 of 3 cases; the others give it more arguments."
+    )
+    says(lambda value, target: (value - target).square().mean(), "value_loss", "Likely: the conventional half")
+
+
+def test_what_it_raises_is_said_with_the_line_that_raised(tmp_path):
     def gae(reward):
         return reward
 
     assert "it raised TypeError: " in course.check(gae).sentence
+    assert not course.check(gae).sentence.endswith(")")  # none of its lines was reached
+    file = tmp_path / "mine.py"
+    file.write_text("def polyak(*args):\n    later()\n\ndef later():\n    raise NotImplementedError('to be written')\n")
+    scope = {}
+    exec(compile(file.read_text(), file, "exec"), scope)
+    says(scope["polyak"], "polyak", "it raised NotImplementedError: to be written, in later (mine.py:5)")
+    exec(compile(file.read_text(), "<cell>", "exec"), scope)
+    says(scope["polyak"], "polyak", "to be written, in later (line 5)")
+    says(lambda *args: torch.zeros(2) + torch.zeros(3), "polyak", "in <lambda> (test_course.py:")
 
 
 def test_a_loss_needs_its_gradient():
@@ -113,6 +168,25 @@ def test_what_a_gradient_raises_is_said():
     assert "it raised RuntimeError: " in course.check(clipped_surrogate).sentence
 
 
-def test_an_unknown_exercise_is_a_sentence():
-    with pytest.raises(UserError, match="gae"):
-        course.check(gae, "gea")
+class PPO:
+    def compute_advantages(self): ...
+
+    def compute_loss(self): ...
+
+    def select_actions(self): ...
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ((gae, "gea"), "There is no exercise 'gea': did you mean gae"),
+        ((None,), 'Which exercise is None? Name it: course.check(solution, "gae").'),
+        ((partial(gae, lam=1.0),), "Which exercise is functools.partial("),
+        ((lambda x: x,), "Which exercise is a function? Name it"),
+        ((None, "gae"), "What can be checked is a function or a class, not None."),
+        ((PPO,), "PPO is judged by its methods: course.check(PPO.compute_advantages), course.check(PPO.compute_loss)."),
+    ],
+)
+def test_what_is_no_exercise_is_a_sentence(arguments, said):
+    with pytest.raises(UserError, match=re.escape(said)):
+        course.check(*arguments)

@@ -67,20 +67,40 @@ def test_a_method_is_judged_as_it_stands_in_its_class(method):
     assert course.check(getattr(object.__new__(Trainer if method in METHODS[:3] else PPO), method.__name__))
 
 
-def test_the_loop_that_the_drone_course_gives_is_one_row_late_and_the_finding_says_so():
+def given_loop(delta):
+    """The loop that the drone's course gives, with the `delta` that is to be filled in."""
+
     def calculate_advantages(self, next_value):
         advantages, trace, last = torch.zeros_like(self.rewards_buffer), 0, len(self.rewards_buffer) - 1
         for t in reversed(range(last + 1)):
             goes_on = 1 - self.terminated_buffer[min(t + 1, last)]
             following = next_value if t == last else self.values_buffer[t + 1]
-            delta = self.rewards_buffer[t] + self.config.gamma * following * goes_on - self.values_buffer[t]
-            advantages[t] = trace = delta + self.config.gamma * self.config.gae_lambda * goes_on * trace
+            missing = delta(self.rewards_buffer[t], self.config.gamma, following, goes_on, self.values_buffer[t])
+            advantages[t] = trace = missing + self.config.gamma * self.config.gae_lambda * goes_on * trace
         return advantages + self.values_buffer, advantages
 
-    finding = course.check(calculate_advantages)
+    return calculate_advantages
+
+
+def test_the_loop_that_the_drone_course_gives_can_be_filled_in_and_its_late_row_is_noted():
+    finding = course.check(given_loop(lambda r, gamma, n, goes_on, v: r + gamma * n * goes_on - v))
+    assert finding
+    assert finding.sentence.startswith("right. Note: the loop that the course gives reads the flags one row too late")
+
+
+@pytest.mark.parametrize(
+    ("delta", "words"),
+    [
+        (lambda r, gamma, n, goes_on, v: r + gamma * n - v, "1 − terminated is left out of δ"),
+        (lambda r, gamma, n, goes_on, v: r + gamma * n * goes_on, "V(s) is not subtracted"),
+        (lambda r, gamma, n, goes_on, v: r + n * goes_on - v, "γ is left out of δ"),
+    ],
+)
+def test_a_wrong_delta_in_the_loop_that_the_course_gives_is_named(delta, words):
+    finding = course.check(given_loop(delta))
     assert not finding
-    assert "one row too late" in finding.sentence
-    assert "its own test expects it: there a right solution fails" in finding.sentence
+    assert f"Likely: {words}" in finding.sentence
+    assert "also, the flags are read one row too late" in finding.sentence
 
 
 def test_the_numbers_of_the_drone_course_are_reproduced():

@@ -20,6 +20,13 @@ def test_the_table_of_the_page_is_that_of_the_code():
     assert glossary.table() in PAGE
 
 
+def test_the_words_of_one_library_are_beside_ours():
+    lines = glossary.words_of("CleanRL").splitlines()
+    assert lines[:2] == ["| CleanRL | lemniscate |", "| --- | --- |"]
+    assert "| `clip_coef` | `clip` |" in lines
+    assert all(re.fullmatch(r"\| [^|]*`\w+`[^|]* \| `\w+`[^|]* \|", line) for line in lines[2:])  # none without a name
+
+
 def test_every_row_has_a_cell_for_each_library():
     assert {len(row) for row in glossary.rows()} == {1 + len(glossary.LIBRARIES)}
 

@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 import yaml
 
+import lemniscate
+
 ROOT = Path(__file__).parents[1]
 
 
@@ -27,6 +29,18 @@ def test_every_page_is_in_the_navigation_of_the_site_once():
     pages = {file.relative_to(ROOT / "docs").as_posix() for file in (ROOT / "docs").rglob("*.md")}
     tutorials = {f"tutorial/{file.stem}.md" for file in (ROOT / "docs" / "tutorial").glob("*.ipynb")}
     assert sorted(nav()) == sorted({*pages, *tutorials, "index.md", "contributing.md", "changelog.md"})
+
+
+def test_every_public_name_is_in_the_reference():
+    page = (ROOT / "docs" / "reference" / "lemniscate.md").read_text()
+    assert set(lemniscate.__all__) <= set(re.findall(r"^::: lemniscate\.(\w+)$", page, re.MULTILINE))
+
+
+def test_the_limits_in_the_note_on_a_record_are_those_that_are_tested():
+    note, walk = (ROOT / "docs" / "notes" / "record.md").read_text(), (ROOT / "tests" / "test_walk.py").read_text()
+    limits = re.findall(r'\("(?:ppo|sac)", (\d+), (\d+)\)', walk)
+    assert len(limits) == 2
+    assert all(f"{files} files with {int(lines):,} lines" in note for files, lines in limits)
 
 
 def test_the_site_is_built_without_a_warning_and_asks_nobody_else(tmp_path):

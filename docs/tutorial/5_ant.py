@@ -188,7 +188,8 @@ show_film("ant.webp")
 
 # %% [markdown]
 # `lemniscate train ppo --env Ant-v5 --total-steps 3_000_000 --seeds 1-5` takes eighteen minutes a seed on two cores, and
-# ends at 4,773 ± 231 ([README](../../README.md)); after a million steps it was 2,799 ± 253.
+# ended at 4,773 ± 231, after a million steps it was at 2,799 ± 253; both measured with older code
+# ([returns](../results.md)).
 #
 # **Try.** `clip=1e6`, with `desired_kl=None`: how large does the KL become, and what becomes of the walk? `epochs=1`? Half as
 # many ants, HalfCheetah, Humanoid? And write the whole loop yourself: [`algos/ppo.py`](../../src/lemniscate/algos/ppo.py) is

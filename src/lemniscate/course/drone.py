@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 from lemniscate import maths
-from lemniscate.course.exercise import Case, Exercise, Function, drawn
+from lemniscate.course import clipping
+from lemniscate.course.exercise import TWO_ENDS, Case, Exercise, Function, drawn, late
 
 
 def calculate_advantages(
@@ -34,23 +35,35 @@ def _buffers(change: Callable[[dict[str, Any]], dict[str, Any]]) -> Function:
 
 
 def _late(held: dict[str, Any]) -> dict[str, Any]:
-    flags = held["terminated_buffer"]
-    return {"terminated_buffer": torch.cat([flags[1:], flags[-1:]])}
+    return {"terminated_buffer": late(held["terminated_buffer"])}
 
 
-def _by_delta(*, baseline: bool = True, cut: bool = True) -> Function:
-    """`calculate_advantages`, with −V(s) left out of δ, or the chain not cut at a death."""
+def _without(part: str, is_late: bool) -> Function:
+    """`calculate_advantages` without a part of δ = r + γ (1 − terminated) V(s') − V(s), or of the chain."""
 
     def wrong(next_value: Tensor, **held: Any) -> tuple[Tensor, Tensor]:
-        ended, values = held["terminated_buffer"].bool(), held["values_buffer"]
+        flags, values = held["terminated_buffer"].bool(), held["values_buffer"]
+        ended = late(flags) if is_late else flags
         following = torch.cat([values[1:], next_value.reshape(1, -1)])
+        following = following if part == "1 − terminated" else following * ~ended
+        following = following if part == "γ" else held["gamma"] * following
         zero = torch.zeros_like(values)
-        delta = held["rewards_buffer"] + held["gamma"] * following * ~ended - (values if baseline else zero)
-        done = ended if cut else torch.zeros_like(ended)
+        delta = held["rewards_buffer"] + following - (zero if part == "V(s)" else values)
+        done = torch.zeros_like(ended) if part == "end of the chain" else ended
         advantages, _ = maths.gae(delta, zero, zero, ended, done, gamma=held["gamma"], lam=held["gae_lambda"])
         return advantages + values, advantages
 
     return wrong
+
+
+LEFT_OUT = {
+    "V(s) is not subtracted": "V(s)",
+    "γ is left out of δ": "γ",
+    "1 − terminated is left out of δ, so a value follows a death": "1 − terminated",
+    "the chain is not cut at a death": "end of the chain",
+}
+"""mistake: the part that is missing"""
+LATE = "; also, the flags are read one row too late, as in the loop that the course gives"
 
 
 def _held(rewards: Tensor, values: Tensor, ended: Tensor) -> dict[str, Any]:
@@ -59,12 +72,16 @@ def _held(rewards: Tensor, values: Tensor, ended: Tensor) -> dict[str, Any]:
 
 
 FOUR = (torch.ones(4, 1), torch.tensor([[0.5], [0.6], [0.7], [0.8]]))
-TWO_ENDS = torch.tensor([[0, 0], [1, 0], [0, 0], [0, 1], [0, 0]]).float()
 
 
 def calculate_pg_loss(mb_advantages: Tensor, ratio: Tensor, *, clip_coef: float) -> Tensor:
     """A scalar."""
     return maths.clipped_surrogate(ratio.log(), mb_advantages, clip_coef)
+
+
+def _pg_loss(wrong: Function) -> Function:
+    """`calculate_pg_loss` as a function of (log ratio, advantages, ε)."""
+    return lambda mb_advantages, ratio, *, clip_coef: wrong(ratio.log(), mb_advantages, clip_coef)
 
 
 def calculate_v_loss(
@@ -110,20 +127,22 @@ EXERCISES: dict[str, Exercise] = {
         [
             Case("no end", (torch.tensor([[0.9]]),), _held(*FOUR, torch.zeros(4, 1))),
             Case("a death at the last row", (torch.zeros(1, 1),), _held(*FOUR, torch.tensor([[0.0], [0], [0], [1]]))),
-            Case("two environments", (drawn(1, 2),), _held(drawn(5, 2), drawn(5, 2, seed=1), TWO_ENDS)),
+            Case("two environments", (drawn(1, 2),), _held(drawn(5, 2), drawn(5, 2, seed=1), TWO_ENDS.float())),
         ],
         {
-            "the flags are read one row too late. The loop that the course gives does so, and its own test expects it:"
-            " there a right solution fails. Row t holds what action t ended, so a crash is cut off from the action"
-            " before it; terminated_buffer[t] is right in every row": _buffers(_late),
             "the two are returned in the other order": lambda *a, **held: calculate_advantages(*a, **held)[::-1],
             "a value follows a death, and the chain is not cut": _buffers(
                 lambda held: {"terminated_buffer": torch.zeros_like(held["terminated_buffer"])}
             ),
-            "the chain is not cut at a death": _by_delta(cut=False),
             "λ is left out": _buffers(lambda held: {"gae_lambda": 1.0}),
             "there is no chain": _buffers(lambda held: {"gae_lambda": 0.0}),
-            "V(s) is not subtracted": _by_delta(baseline=False),
+            **{words: _without(part, is_late=False) for words, part in LEFT_OUT.items()},
+            **{words + LATE: _without(part, is_late=True) for words, part in LEFT_OUT.items()},
+        },
+        accepted={
+            "the loop that the course gives reads the flags one row too late, and its own test expects that. Row t"
+            " holds what action t ended, so a crash is cut off from the action before it. With terminated_buffer[t] in"
+            " every row it is right, but fails the course's test": _buffers(_late),
         },
     ),
     "calculate_pg_loss": Exercise(
@@ -138,17 +157,7 @@ EXERCISES: dict[str, Exercise] = {
             Case("of all kinds", (drawn(12), (drawn(12, seed=1) / 3).exp()), {"clip_coef": 0.1}),
         ],
         {
-            "the sign: optimizers descend": lambda a, r, clip_coef: -maths.clipped_surrogate(r.log(), a, clip_coef),
-            "the larger objective is taken; of the negative losses it is the larger, of the objectives the smaller": (
-                lambda a, r, clip_coef: -maths.clipped_surrogate(r.log(), -a, clip_coef)
-            ),
-            "nothing is clipped": lambda a, r, clip_coef: -(a * r).mean(),
-            "only the clipped ratio counts": lambda a, r, clip_coef: (
-                -(a * r.clamp(1 - clip_coef, 1 + clip_coef)).mean()
-            ),
-            "the sum in place of the mean": lambda a, r, clip_coef: (
-                maths.clipped_surrogate(r.log(), a, clip_coef) * len(a)
-            ),
+            **{words: _pg_loss(wrong) for words, wrong in clipping.MISTAKES.items()},
             "the ratio is taken for its logarithm": lambda a, r, clip_coef: maths.clipped_surrogate(r, a, clip_coef),
         },
         gradient_in=1,

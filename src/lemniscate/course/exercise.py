@@ -1,13 +1,19 @@
 """What an exercise is: a function that is compared with a reference, or something that is judged by what it does."""
 
 import inspect
+import sysconfig
+import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import torch
 
 Function = Callable[..., Any]
+
+LIBRARIES = (str(Path(__file__).parents[1]), *(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib")))
+"""folders of code that is not the reader's"""
 
 
 @dataclass(frozen=True)
@@ -32,6 +38,8 @@ class Exercise:
     cases: Sequence[Case]
     mistakes: Mapping[str, Function]
     """by description: a function that makes the mistake"""
+    accepted: Mapping[str, Function] = field(default_factory=dict)
+    """by note: a function that differs from the reference, and is what a course asks for"""
     gradient_in: int | None = None
     """the argument in which the gradient of its outputs counts too"""
     in_place: bool = False
@@ -50,6 +58,15 @@ class Inspection:
     """
 
     points: Callable[[Function], Iterator[str]]
+
+
+TWO_ENDS = torch.tensor([[0, 0], [1, 0], [0, 0], [0, 1], [0, 0]]).bool()
+"""a death in each of two environments, [5, 2]"""
+
+
+def late(flags: torch.Tensor) -> torch.Tensor:
+    """The flag of row t + 1 in row t, and that of the last row there too."""
+    return torch.cat([flags[1:], flags[-1:]])
 
 
 def drawn(*shape: int, seed: int = 0) -> torch.Tensor:
@@ -71,3 +88,13 @@ def call_by_name(function: Function, **known: Any) -> Any:
         if needed and name not in known:
             raise TypeError(f"its parameter {name} is none of those that this exercise has: {', '.join(known)}")
     return function(**{name: known[name] for name in parameters if name in known})
+
+
+def raised(error: Exception) -> str:
+    """What a solution raised, and on which line of the reader's; in a cell of a notebook the line alone."""
+    own = [frame for frame in traceback.extract_tb(error.__traceback__) if not frame.filename.startswith(LIBRARIES)]
+    if not own:
+        return f"it raised {type(error).__name__}: {error}"
+    file, line = Path(own[-1].filename), own[-1].lineno
+    place = f"{file.name}:{line}" if file.is_file() else f"line {line}"
+    return f"it raised {type(error).__name__}: {error}, in {own[-1].name} ({place})"

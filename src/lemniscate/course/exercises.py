@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from lemniscate import maths
-from lemniscate.course import agents, drone, lander, loop, replay, saving, setup
-from lemniscate.course.exercise import Case, Exercise, Function, Inspection, drawn
+from lemniscate.course import agents, clipping, drone, lander, loop, replay, saving, setup
+from lemniscate.course.exercise import TWO_ENDS, Case, Exercise, Function, Inspection, drawn, late
 
 
 def _column(*numbers: float) -> Tensor:
@@ -26,12 +26,8 @@ VALUES = (_column(1.0, -0.5, 2.0, 0.5), _column(0.3, 1.2, -0.4, 0.8), _column(0.
 DISCOUNTS = {"gamma": 0.9, "lam": 0.8}
 NEVER, LAST = _flags(), _flags(3)
 TWO = (drawn(5, 2), drawn(2, 5).T.contiguous(), drawn(2, 5).T.contiguous() + 1)
-TWO_ENDS = (torch.tensor([[0, 0], [1, 0], [0, 0], [0, 1], [0, 0]]).bool(),)
-TWO_DONE = (torch.tensor([[0, 1], [1, 0], [0, 0], [0, 1], [1, 0]]).bool(),)
-
-
-def _late(flags: Tensor) -> Tensor:
-    return torch.cat([flags[1:], flags[-1:]])
+TWO_DONE = TWO_ENDS | torch.tensor([[0, 1], [0, 0], [0, 0], [0, 0], [1, 0]]).bool()
+"""the deaths, and a time-out in each of the two environments"""
 
 
 def _without(flags: Tensor) -> Tensor:
@@ -50,8 +46,8 @@ def _chain_by(decay: Callable[[float, float], float]) -> Function:
     return gae
 
 
-def _clipped_value_alone(v: Tensor, target: Tensor, old: Tensor | None = None, clip: float = 0.0) -> Tensor:
-    return maths.value_loss(v if old is None else old + (v - old).clamp(-clip, clip), target)
+def _clipped_value_alone(v: Tensor, target: Tensor, old: Any = None, clip: float | None = None) -> Tensor:
+    return maths.value_loss(v if clip is None else old + (v - old).clamp(-clip, clip), target)
 
 
 EXERCISES: dict[str, Exercise | Inspection] = {
@@ -63,7 +59,7 @@ EXERCISES: dict[str, Exercise | Inspection] = {
             Case("a death at the last row", (*VALUES, LAST, LAST), DISCOUNTS),
             Case("a death at row 1", (*VALUES, _flags(1), _flags(1)), DISCOUNTS),
             Case("a time-out at row 1", (*VALUES, NEVER, _flags(1)), DISCOUNTS),
-            Case("two environments, ends of both kinds", (*TWO, *TWO_ENDS, *TWO_DONE), DISCOUNTS),
+            Case("two environments, ends of both kinds", (*TWO, TWO_ENDS, TWO_DONE), DISCOUNTS),
         ],
         {
             "the chain is not cut at time-outs": lambda r, v, n, te, d, **o: maths.gae(r, v, n, te, te, **o),
@@ -71,7 +67,7 @@ EXERCISES: dict[str, Exercise | Inspection] = {
             "a time-out is taken for a death": lambda r, v, n, te, d, **o: maths.gae(r, v, n, d, d, **o),
             "a value follows a death": lambda r, v, n, te, d, **o: maths.gae(r, v, n, _without(te), d, **o),
             "the flags are read one row too late": lambda r, v, n, te, d, **o: maths.gae(
-                r, v, n, _late(te), _late(d), **o
+                r, v, n, late(te), late(d), **o
             ),
             "V(s') is taken from the next row, which after an end is another episode's": lambda r, v, n, te, d, **o: (
                 maths.gae(r, v, torch.cat([v[1:], n[-1:]]), te, d, **o)
@@ -90,9 +86,10 @@ EXERCISES: dict[str, Exercise | Inspection] = {
             Case("no end", (VALUES[0], VALUES[2], NEVER, NEVER), {"gamma": 0.9}),
             Case("a death at row 1", (VALUES[0], VALUES[2], _flags(1), _flags(1)), {"gamma": 0.9}),
             Case("a time-out at row 1", (VALUES[0], VALUES[2], NEVER, _flags(1)), {"gamma": 0.9}),
+            Case("two environments, ends of both kinds", (TWO[0], TWO[2], TWO_ENDS, TWO_DONE), {"gamma": 0.9}),
         ],
         {
-            "nothing stands for what the last row cuts off": lambda r, n, te, d, **o: maths.reward_to_go(
+            "V(s') of the last row is left out": lambda r, n, te, d, **o: maths.reward_to_go(
                 r, torch.where(d, n, 0.0), te, d, **o
             ),
             "a time-out is taken for a death": lambda r, n, te, d, **o: maths.reward_to_go(r, n, d, d, **o),
@@ -141,18 +138,7 @@ EXERCISES: dict[str, Exercise | Inspection] = {
             Case("bad actions", (torch.tensor([-0.5, -0.1, 0.1, 0.5]), -torch.ones(4)), {"clip": 0.2}),
             Case("of all kinds", (drawn(12) / 3, drawn(12).flip(0)), {"clip": 0.1}),
         ],
-        {
-            "the sign: optimizers descend": lambda x, a, clip: -maths.clipped_surrogate(x, a, clip),
-            "the larger of the two is taken": lambda x, a, clip: maths.clipped_surrogate(x, -a, clip).neg(),
-            "only the clipped ratio counts, so what went the wrong way has no gradient": lambda x, a, clip: (
-                -(x.exp().clamp(1 - clip, 1 + clip) * a).mean()
-            ),
-            "nothing is clipped": lambda x, a, clip: maths.surrogate(x, a),
-            "the sum in place of the mean": lambda x, a, clip: maths.clipped_surrogate(x, a, clip) * len(x),
-            "the ratio is exp of the difference of log-probabilities": lambda x, a, clip: (
-                -torch.min(x * a, x.clamp(1 - clip, 1 + clip) * a).mean()
-            ),
-        },
+        clipping.MISTAKES | clipping.RATIO_MISTAKES,
         gradient_in=0,
     ),
     "value_loss": Exercise(
@@ -161,6 +147,7 @@ EXERCISES: dict[str, Exercise | Inspection] = {
         [
             Case("without a clip", (drawn(6), drawn(6) + 1)),
             Case("with a clip", (drawn(8), drawn(8).flip(0), drawn(8) + 0.3, 0.2)),
+            Case("with an old value, and None for the clip", (drawn(8), drawn(8).flip(0), drawn(8) + 0.3, None)),
         ],
         {
             "the conventional half is missing": lambda *a: 2 * maths.value_loss(*a),

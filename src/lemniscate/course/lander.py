@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from lemniscate import maths
+from lemniscate.course import clipping
 from lemniscate.course.exercise import Case, Exercise, Function, drawn
 
 
@@ -193,18 +194,10 @@ EXERCISES: dict[str, Exercise] = {
         ("actor_loss", "critic_loss"),
         [Case("eight actions", LOSS_ARGS, LOSS_HELD, LOSS_SELF)],
         {
-            "the sign of the actor's loss: optimizers descend": _actor_loss(
-                lambda x, a, eps: -maths.clipped_surrogate(x, a, eps)
-            ),
-            "the larger of the two is taken": _actor_loss(lambda x, a, eps: -maths.clipped_surrogate(x, -a, eps)),
-            "nothing is clipped": _actor_loss(lambda x, a, eps: maths.surrogate(x, a)),
-            "only the clipped ratio counts": _actor_loss(
-                lambda x, a, eps: -(x.exp().clamp(1 - eps, 1 + eps) * a).mean()
-            ),
-            "the ratio is upside down: π_old / π": _actor_loss(lambda x, a, eps: maths.clipped_surrogate(-x, a, eps)),
-            "the ratio is exp of the difference of log-probabilities": _actor_loss(
-                lambda x, a, eps: -torch.min(x * a, x.clamp(1 - eps, 1 + eps) * a).mean()
-            ),
+            **{
+                f"in the actor's loss, {words}": _actor_loss(wrong)
+                for words, wrong in (clipping.MISTAKES | clipping.RATIO_MISTAKES).items()
+            },
             "a half before the critic's loss, which this course has not": _critic_loss(maths.value_loss),
             "the critic's error is not squared": _critic_loss(lambda v, target: (v - target).abs().mean()),
         },

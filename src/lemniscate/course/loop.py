@@ -1,9 +1,10 @@
 """The judgement of a whole training loop: by what it learns in small worlds that each punish one mistake.
 
-In every world the better of two actions is known, and one mistake makes the other one look better. A loop that passes
-them all is trained on CartPole-v1.
+In every world the better of two actions is known, and one mistake makes the other one look better; one more world has
+Box actions. A loop that passes them all is trained on CartPole-v1.
 """
 
+import inspect
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -14,11 +15,11 @@ import numpy as np
 import torch
 
 from lemniscate.console import say
-from lemniscate.course.exercise import Function
+from lemniscate.course.exercise import Function, raised
 from lemniscate.envs.vector_view import VectorView, make_vec
 
 STEPS, NUM_ENVS = 2_048, 8
-CARTPOLE_STEPS, CARTPOLE_RETURN, CARTPOLE_EPISODES = 60_000, 400, 20
+CARTPOLE_STEPS, CARTPOLE_RETURN, EPISODES_EACH = 60_000, 400, 3
 
 
 @dataclass(frozen=True)
@@ -68,6 +69,23 @@ class WorldEnv(gym.Env):
         return one_hot(self.world, self._state), reward, move.ends == "death", move.ends == "time-out", {}
 
 
+class BoxEnv(gym.Env):
+    """World 0 with a Box of two actions: the reward is the first minus the second."""
+
+    def __init__(self) -> None:
+        self.observation_space = gym.spaces.Box(0, 1, (6,), np.float32)
+        self.action_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+        """The only state."""
+        super().reset(seed=seed)
+        return one_hot(WORLDS[0], 0), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        """A death after one action."""
+        return one_hot(WORLDS[0], 0), float(action[0] - action[1]), True, False, {}
+
+
 def one_hot(world: World, state: int) -> np.ndarray:
     """How a state looks, [6]."""
     return np.eye(6, dtype=np.float32)[(world.seen or {}).get(state, state)]
@@ -100,7 +118,8 @@ WORLDS = (
     World(  # 2: a death that looks like a good state, or a reward
         {0: (Move(0.5, 3, "death"), Move(0, 2, "death")), 2: _both(2, 3, "death"), 3: _both(0, 3, "death")},
         {0: 0.5, 2: 0.25, 3: 0.25},
-        "it looks for a death in a good state. Likely: a value follows a death (~terminated is missing)",
+        "it prefers a death that looks like a good state to a reward. Likely: a value follows a death (~terminated is"
+        " missing)",
     ),
     World(  # 3: the next episode pays for this one's second action
         {0: (Move(0.3, 0, "death"), Move(0, 0, "death", next_bonus=1))},
@@ -129,9 +148,10 @@ WORLDS = (
 
 def train(function: Function) -> Iterator[str]:
     """`train(envs, total_steps, seed)`, returning what acts: an agent with `act`, or a function of observations."""
-    say(f"{len(WORLDS)} small worlds, then CartPole-v1: up to a minute.")
+    say(f"{len(WORLDS) + 1} small worlds, then CartPole-v1: up to a minute.")
     for number in range(len(WORLDS)):
         yield from in_world(function, number)
+    yield from with_box_actions(function)
     envs = make_vec("CartPole-v1", NUM_ENVS, backend="gymnasium")
     act = _trained(function, envs, CARTPOLE_STEPS, close=False)
     mean = _mean_return(act, envs)
@@ -150,8 +170,23 @@ def in_world(function: Function, number: int) -> Iterator[str]:
         act = _trained(function, make_vec(WorldEnv, NUM_ENVS, env_kwargs={"world": number}), STEPS)
     choice = int(np.asarray(act(np.stack([one_hot(world, 0)])))[0])
     if choice != world.better:
-        yield f"small world {number + 1} of {len(WORLDS)}: {world.mistake}."
+        yield f"small world {number + 1} of {len(WORLDS) + 1}: {world.mistake}."
     yield from _clipping(ratios)
+
+
+def with_box_actions(function: Function) -> Iterator[str]:
+    """Train in the small world with Box actions, and look at the actions [1, 2] in its only state."""
+    try:
+        act = _trained(function, make_vec(BoxEnv, NUM_ENVS), STEPS)
+        first, second = np.asarray(act(np.stack([one_hot(WORLDS[0], 0)])))[0]
+    except Exception as error:  # whatever it raises is a finding; this one is not of Discrete actions
+        yield f"in the small world with Box actions {raised(error)}"
+        return
+    if first - second < 0.5:
+        yield (
+            f"in the small world with Box actions it takes {first:.2g} and {second:.2g}, though the first minus the"
+            " second is the reward. Likely: the actions are not those whose log-probability is trained."
+        )
 
 
 def _trained(function: Function, envs: VectorView, steps: int, close: bool = True) -> Callable[[np.ndarray], Any]:
@@ -165,22 +200,22 @@ def _mean_return(act: Callable[[np.ndarray], Any], envs: VectorView) -> float:
     """Over the first episodes that end, from unseen starts; each environment plays equally many."""
     obs, _ = envs.reset(seed=12_345)
     running, returns = np.zeros(envs.num_envs), [[] for _ in range(envs.num_envs)]
-    while min(map(len, returns)) < CARTPOLE_EPISODES // envs.num_envs + 1:
+    while min(map(len, returns)) < EPISODES_EACH:
         obs, reward, terminated, truncated, _ = envs.step(np.asarray(act(obs)))
         running += reward
         for i in np.flatnonzero(terminated | truncated):
             returns[i].append(running[i])
             running[i] = 0.0
     envs.close()
-    return float(np.mean([episode for row in returns for episode in row[: CARTPOLE_EPISODES // envs.num_envs + 1]]))
+    return float(np.mean([episode for row in returns for episode in row[:EPISODES_EACH]]))
 
 
 @contextmanager
 def _ratios_of(function: Function) -> Iterator[list[float]]:
-    """The largest |log ratio| of each call of `clipped_surrogate`, where the file of the function has one."""
+    """The largest |log ratio| in each call of `clipped_surrogate(log_ratio, …)`, if the function's file has one."""
     names: dict[str, Any] = getattr(function, "__globals__", {})
     found, own = [], names.get("clipped_surrogate")
-    if own is None:
+    if own is None or "log_ratio" not in inspect.signature(own).parameters:  # it takes something else
         yield found
         return
 

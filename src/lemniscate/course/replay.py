@@ -15,19 +15,10 @@ SIZE = 6
 def _row(number: int, envs: int = 1) -> dict[str, Any]:
     """A transition in which every part says which one it is; every third one ends."""
     ones = np.full(envs, number, dtype=np.float32)
-    return {
-        "obs": np.stack([ones, ones], axis=1),
-        "next_obs": np.stack([ones, ones], axis=1) + 0.5,
-        "action": ones[:, None] / 10,
-        "actions": ones[:, None] / 10,
-        "reward": -ones,
-        "rewards": -ones,
-        "done": np.full(envs, number % 3 == 0),
-        "dones": np.full(envs, number % 3 == 0),
-        "terminated": np.full(envs, number % 3 == 0),
-        "terminations": np.full(envs, number % 3 == 0),
-        "infos": [{}] * envs,
-    }
+    obs = np.stack([ones, ones], axis=1)
+    row = {"obs": obs, "next_obs": obs + 0.5, "action": ones[:, None] / 10, "reward": -ones, "done": ones % 3 == 0}
+    names = {"actions": "action", "rewards": "reward", "dones": "done", "terminated": "done", "terminations": "done"}
+    return {**row, **{other: row[name] for other, name in names.items()}, "infos": [{}] * envs}
 
 
 def _made(buffer: Function) -> Any:
@@ -53,14 +44,18 @@ def replay_buffer(buffer: Function) -> Iterator[str]:
     reused = _row(1)
     call_by_name(made.add, **reused)
     call_by_name(made.add, **_row(2))
-    reused["obs"] += 100  # as an environment does that writes over its own observations
-    seen = set(_sampled(made)["obs"][:, 0].tolist())
-    if 101.0 in seen:
-        yield "a stored observation changed with the array it came from. Likely: it is not copied."
-    if 0.0 in seen:
+    for name in ("obs", "next_obs", "action", "reward"):
+        reused[name] += 100  # as an environment does that writes over its own arrays
+    reused["done"][:] = True
+    batch = _sampled(made)
+    seen = set(batch["obs"][:, 0].tolist())
+    if seen - {1.0, 2.0, 101.0}:
         yield "rows that were never written are sampled. Likely: it draws from the whole capacity."
-    if seen - {0.0, 101.0} != {1.0, 2.0}:
-        yield f"of two stored rows {len(seen)} were found in 3000 samples."
+    for name, changed in (("obs", 101), ("next_obs", 101.5), ("action", 100.1), ("reward", 99), ("done", True)):
+        if np.isclose(batch[name].astype(float), changed).any():
+            yield f"{name} of a stored row changed with the array that it came from. Likely: it is not copied."
+    if len(seen) < 2:
+        yield "of two stored rows one was found in 3000 samples."
     for number in range(3, 10):
         call_by_name(made.add, **_row(number))
     yield from _after_nine(_sampled(made))
@@ -72,7 +67,7 @@ def _after_nine(batch: dict[str, np.ndarray]) -> Iterator[str]:
     seen, counts = np.unique(numbers, return_counts=True)
     if set(seen.tolist()) != set(range(4, 10)):
         was = ", ".join(f"{number:g}" for number in seen)
-        why = "the last place is never used, or never sampled" if len(seen) == 5 else "it does not go round"
+        why = "the last place is never used, or sampled" if len(seen) == 5 else "the oldest rows are not overwritten"
         yield f"after nine rows in six places it holds {was}; it should hold 4 to 9. Likely: {why}."
         return
     if counts.max() > 1.5 * counts.min():
@@ -99,7 +94,9 @@ def add_to_replay(function: Function) -> Iterator[str]:
             {"final_obs": np.array([last, None], dtype=object), "_final_obs": np.array([True, False])} if ended else {}
         )
         flags = {"terminations": np.array([terminated, False]), "truncations": np.array([truncated, False])}
-        given = {"obs": np.zeros((2, 2), np.float32), "actions": np.zeros((2, 1), np.float32), "rewards": np.ones(2)}
+        number = np.arange(1, 3, dtype=np.float32)
+        row = {"obs": np.stack([number, number], axis=1), "action": number[:, None] / 10, "reward": -number}
+        given = {"obs": row["obs"].copy(), "actions": row["action"].copy(), "rewards": row["reward"].copy()}
         try:
             call_by_name(function, rb=rb, **given, next_obs=next_obs.copy(), **flags, infos=infos)
         except KeyError as error:
@@ -110,17 +107,35 @@ def add_to_replay(function: Function) -> Iterator[str]:
         if len(stored) != 1:
             yield f"it adds {len(stored)} times; one call of rb.add has the rows of all environments."
             return
-        args, named = stored[0]
-        yield from _stored(args, named, terminated, truncated, last)
+        order = _columns(*stored[0])
+        yield from _given(order, row)
+        yield from _stored(order, terminated, truncated, last)
 
 
-def _stored(args: tuple, named: dict[str, Any], terminated: bool, truncated: bool, last: np.ndarray) -> Iterator[str]:
-    order = dict(zip(("obs", "next_obs", "action", "reward", "done", "infos"), args, strict=False)) | named
-    done = order.get("done", order.get("dones", order.get("terminations")))
-    what = "time-out" if truncated else "death"
-    if done is None:
-        yield "rb.add(obs, next_obs, action, reward, done, infos) was not given done."
-    elif bool(done[0]) and truncated:
+def _columns(args: tuple[Any, ...], named: dict[str, Any]) -> dict[str, Any]:
+    """What `rb.add` was called with, by the names of its parameters."""
+    same = {"actions": "action", "rewards": "reward", "dones": "done", "terminations": "done"}
+    by_place = dict(zip(("obs", "next_obs", "action", "reward", "done", "infos"), args, strict=False))
+    return by_place | {same.get(name, name): value for name, value in named.items()}
+
+
+def _given(order: dict[str, Any], row: dict[str, np.ndarray]) -> Iterator[str]:
+    """Whether each column is there, and those that need no change are the step's."""
+    for name in ("obs", "next_obs", "action", "reward", "done"):
+        if name not in order:
+            yield f"rb.add(obs, next_obs, action, reward, done, infos) was not given {name}."
+            return
+    for name, want in row.items():
+        if not np.array_equal(np.ravel(order[name]), want.ravel()):
+            yield (
+                f"{name} is not that of the step. Likely: the order of the arguments, which is obs, next_obs, action,"
+                " reward, done, infos."
+            )
+
+
+def _stored(order: dict[str, Any], terminated: bool, truncated: bool, last: np.ndarray) -> Iterator[str]:
+    done, what = order["done"], "time-out" if truncated else "death"
+    if bool(done[0]) and truncated:
         yield (
             "a time-out is stored as done, so nothing is bootstrapped from it. Likely: terminated | truncated; done is"
             " terminated alone."

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from gymnasium.wrappers.utils import RunningMeanStd
 from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
@@ -15,7 +16,7 @@ from lemniscate.course.setup import normalizer, same_statistics, setting
 
 
 class _Moves(TorchFunctionMode):
-    """Counts the tensors that are moved to the CPU."""
+    """Counts the calls that move a tensor to the CPU."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -51,15 +52,22 @@ def save_model(function: Function) -> Iterator[str]:
     if not isinstance(saved, Mapping):
         yield f"the file holds a {type(saved).__name__}; it should hold a dictionary."
         return
-    yield from _learned(list(saved.values()), agent, optimizer)
-    yield from _observed(list(saved.values()), normalizer(envs).obs_rms)
-    tensors = len(agent.state_dict())
-    whose = "agent" if moves.count < tensors else "optimizer"
-    if moves.count < tensors + len(list(_moments(optimizer))):
-        yield (
-            f"tensors of the {whose} stay on their device, and without a GPU the file would not open. Likely: .cpu() is"
-            " missing."
+    parts = list(_parts(saved))
+    yield from _learned(parts, agent, optimizer)
+    yield from _observed(parts, normalizer(envs).obs_rms)
+    if moves.count < len(agent.state_dict()) + len(list(_moments(optimizer))):
+        yield Note(
+            "not every tensor of agent and optimizer was moved by .cpu(). A file with tensors of a GPU opens on a"
+            ' computer without one only with torch.load(path, map_location="cpu").'
         )
+
+
+def _parts(saved: Mapping[Any, Any]) -> Iterator[Any]:
+    """The values of a dictionary, and of the dictionaries and running statistics in it."""
+    for part in saved.values():
+        yield part
+        if isinstance(part, RunningMeanStd | Mapping):
+            yield from _parts(vars(part) if isinstance(part, RunningMeanStd) else part)
 
 
 def _learned(parts: list[Any], agent: nn.Module, optimizer: torch.optim.Optimizer) -> Iterator[str]:

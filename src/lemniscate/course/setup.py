@@ -40,7 +40,8 @@ def set_seeds(function: Function) -> Iterator[str]:
         if not torch.backends.cudnn.deterministic:
             yield "cuDNN may choose kernels that are not reproducible. Likely: cudnn.deterministic = True is missing."
         if torch.backends.cudnn.benchmark:
-            yield "cuDNN chooses kernels by how fast they are today. Likely: cudnn.benchmark = False is missing."
+            said = "cuDNN's benchmark mode may choose other kernels in each run."
+            yield f"{said} Likely: cudnn.benchmark = False is missing."
 
 
 @contextmanager
@@ -91,6 +92,10 @@ def _two(train: Any, evaluation: Any) -> Iterator[str]:
             yield "the statistics of training never change. Likely: update_running_mean = False belongs to evaluation."
         if norms[1].update_running_mean:
             yield "evaluation changes the statistics. Likely: eval_envs.update_running_mean = False is missing."
+    else:
+        yield Note(
+            "neither normalizes observations; save_model and sync_envs of the drone's course need NormalizeObservation."
+        )
 
 
 def normalizer(envs: Any) -> Any:
