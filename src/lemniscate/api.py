@@ -18,13 +18,15 @@ from lemniscate.policy import TrainedPolicy
 from lemniscate.report import playback
 from lemniscate.results import draw_run, evaluate
 from lemniscate.run.config import RunConfig
-from lemniscate.run.directory import is_finished, read_config, require_absent
+from lemniscate.run.directory import is_finished, read_record, require_absent
 from lemniscate.run.environments import make_envs
+from lemniscate.run.files import parsing
 from lemniscate.run.loggers import TRACKERS, JsonLines, LoggerClass, TensorBoard
 from lemniscate.run.run import Run
 from lemniscate.run.seeding import set_seeds
 from lemniscate.run.state import TrainState
-from lemniscate.stored import TrainedRun, load, path_of
+from lemniscate.run.trust import is_signed, require_trusted
+from lemniscate.stored import TrainedRun, load, own_code_of, path_of
 
 
 def config_for(
@@ -115,6 +117,7 @@ def resume(
     callbacks: Callback | str | Sequence[Callback | str] = (),
     report: bool = False,
     progress: bool = True,
+    trust: bool = False,
 ) -> TrainedRun:
     """Resume an interrupted run from its newest whole planned checkpoint, and train it to its end.
 
@@ -129,6 +132,7 @@ def resume(
         callbacks: functions that see each logged line.
         report: evaluate the final policy, and draw it.
         progress: the live line on standard error.
+        trust: import the code that the run names as `module:name` also if the run is not of this user and machine.
 
     Raises:
         UserError: no run directory, or one that another process trains in or another version wrote; an object that no
@@ -138,19 +142,23 @@ def resume(
         Stopped: Ctrl-C or SIGTERM, when the run has saved itself.
     """
     path = path_of(run)
-    algorithm, fields = read_config(path)
     again = {"env": env, "wrappers": wrappers, "network": network}
-    config = algos.find(algorithm).Config.from_json(fields)
-    config = config.replace(**{name: _named(value) for name, value in again.items() if value is not None})
+    given = {name: _named(value) for name, value in again.items() if value is not None}
+    record = read_record(path)
+    with parsing(path):
+        algorithm, fields = record["algorithm"], record["config"]
+        code = own_code_of({"algorithm": algorithm, "config": {**fields, **given}})
+        require_trusted(path, code, trusted=trust or is_signed(record))
+    config = algos.find(algorithm).Config.from_json(fields).replace(**given)
     loggers, functions = loggers_with(track), find_callbacks(callbacks)
     if is_finished(path):
-        return _finished(path, report, progress)
+        return _finished(path, report, progress, trust)
     return _train(path, algorithm, config, loggers, functions, report or track is not None, progress)
 
 
-def _finished(path: Path, report: bool, progress: bool) -> TrainedRun:
+def _finished(path: Path, report: bool, progress: bool, trust: bool) -> TrainedRun:
     """A run that has taken all its steps, as it is; with `report` it is evaluated and drawn again."""
-    run = TrainedRun(path, load(path), 0.0)
+    run = TrainedRun(path, load(path, trust=trust), 0.0)
     if progress:
         say(f"{path} is finished, at step {run.policy.step:,}: there is nothing to resume.")
     if report:

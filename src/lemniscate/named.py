@@ -67,7 +67,7 @@ def module_of(name: str) -> ModuleType:
     if "<" in name:
         raise UserError(f"{name} is not kept in any file, since it was made inside a program: pass the object again.")
     if str(Path.cwd()) not in sys.path:
-        sys.path.insert(0, str(Path.cwd()))
+        sys.path.append(str(Path.cwd()))
     try:
         return importlib.import_module(module_name)
     except ModuleNotFoundError as error:

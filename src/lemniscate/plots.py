@@ -18,7 +18,7 @@ Plotted = str | Path | TrainedRun | TrainedPolicy
 """what names a run: its directory, what `train` returned, or a policy that came from there"""
 
 
-def plot(*runs: Plotted | list[Plotted], by: str = "step") -> list[Path]:
+def plot(*runs: Plotted | list[Plotted], by: str = "step", trust: bool = False) -> list[Path]:
     """Draw the curves of a run into its `plots/`, or compare several, or a list of them, grouped by all but the seed.
 
     Beside the pictures stands `report.html`, a page with all of them, the final evaluation, the settings, the commands
@@ -35,6 +35,8 @@ def plot(*runs: Plotted | list[Plotted], by: str = "step") -> list[Path]:
         by: the horizontal axis of the learning curve: "step", "episode" or "minute". By episode the curve is the moving
             average of 20 episodes.
 
+        trust: import the code that a run names as `module:name` also if the run is not of this user and machine.
+
     Returns:
         The files, the page last.
 
@@ -48,21 +50,21 @@ def plot(*runs: Plotted | list[Plotted], by: str = "step") -> list[Path]:
         raise UserError("There is nothing to plot: name one run or several, such as plot('runs/lander').")
     found = [run for path in paths for run in _members(path)]
     if found == paths[:1]:
-        files = draw_run(paths[0], by)
+        files = draw_run(paths[0], by, trust=trust)
     else:
         folder = paths[0] / "plots" if len(paths) == 1 else Path("plots")
-        files = compare.report(group(found), _final_returns(found), folder, by)
+        files = compare.report(group(found), _final_returns(found, trust), folder, by)
     if in_notebook():
         show_pictures(file for file in files if file.suffix == ".png")
     return files
 
 
-def _final_returns(runs: list[Path]) -> dict[Path, float]:
+def _final_returns(runs: list[Path], trust: bool) -> dict[Path, float]:
     """The final returns of the finished runs; a line names each run that cannot be evaluated here."""
     returns: dict[Path, float] = {}
     for run in filter(is_finished, runs):
         try:
-            returns[run] = final_return(run)
+            returns[run] = final_return(run, trust=trust)
         except UserError as error:
             say(f"{run} has no final return: {error}")
     return returns

@@ -43,6 +43,7 @@ def evaluate(
     backend: str | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
     video: str | Path | None = None,
+    trust: bool = False,
 ) -> Evaluation:
     """Play whole episodes from starts drawn with `seed`, none of which training ever saw.
 
@@ -60,13 +61,14 @@ def evaluate(
             rendered environment, without a measurement of the Q bias. The first 16 starts are the same; from the 17th
             on, and in other backends than gymnasium, returns may differ from those without a film. Of flights in a
             scene, which are those without a film, the first of each parallel environment is recorded.
+        trust: import the code that the run names as `module:name` also if the run is not of this user and machine.
 
     Raises:
         UserError: numbers out of range; an environment that cannot be made, or whose spaces differ; an episode that
             does not end in an environment without a time limit; with `video`, an environment that renders no pictures,
             or another kind of file.
     """
-    agent = policy if callable(policy) else load(policy)
+    agent = policy if callable(policy) else load(policy, trust=trust)
     episodes, seed, file = checked("episodes", episodes, Count), checked("seed", seed, Natural), _film(video)
     elsewhere: dict[str, Any] = {"env": env, "env_kwargs": _kwargs(env_kwargs), "backend": backend}
     how: dict[str, Any] = {"episodes": episodes, "seed": seed, "tell": lambda text: None}
@@ -93,6 +95,7 @@ def watch(
     random: bool = False,
     video: str | Path | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
+    trust: bool = False,
 ) -> Evaluation:
     """Show episodes: below the cell in a notebook, in a window elsewhere, or recorded into a film.
 
@@ -107,13 +110,14 @@ def watch(
         random: act uniformly at random, in the environment of the policy.
         video: a .gif, .webp or .mp4 to record all episodes into.
         env_kwargs: as in `evaluate`.
+        trust: import the code that the run names as `module:name` also if the run is not of this user and machine.
 
     Raises:
         UserError: nothing to show it on; numbers out of range; an environment that cannot be made, renders no pictures,
             or whose spaces differ; an episode that does not end; more flights than parallel environments; another kind
             of file.
     """
-    agent = policy if policy is None or callable(policy) else load(policy)
+    agent = policy if policy is None or callable(policy) else load(policy, trust=trust)
     episodes, seed, file = checked("episodes", episodes, Count), checked("seed", seed, Natural), _film(video)
     if agent is None and env is None:
         raise UserError("Watch what? Name a run, or an environment to act in at random.")
@@ -137,12 +141,12 @@ def watch(
     return scores
 
 
-def final_return(run: str | Path | TrainedRun) -> float:
+def final_return(run: str | Path | TrainedRun, *, trust: bool = False) -> float:
     """Mean return of a run's newest policy over 100 episodes, from `final_scores`."""
-    return final_scores(run)["mean_return"]
+    return final_scores(run, trust=trust)["mean_return"]
 
 
-def final_scores(run: str | Path | TrainedRun) -> dict[str, Any]:
+def final_scores(run: str | Path | TrainedRun, *, trust: bool = False) -> dict[str, Any]:
     """Scores of a run's newest policy over 100 episodes; kept in `final.json` until there is a newer policy.
 
     They are those of `Evaluation.to_json`, with the `step` of the policy and the `seed` of the starts.
@@ -151,7 +155,7 @@ def final_scores(run: str | Path | TrainedRun) -> dict[str, Any]:
     file = path / "final.json"
     known = _known_scores(file)
     if known.get("step") not in checkpoint.list_steps(path / "checkpoints")[-1:]:
-        policy = load(run)
+        policy = load(run, trust=trust)
         say(f"Evaluating {path}: {FINAL_EPISODES} episodes.")
         scores = evaluate(policy, episodes=FINAL_EPISODES, seed=0)
         known = {"step": policy.step, "seed": 0, **scores.to_json()}
@@ -170,7 +174,7 @@ def _known_scores(file: Path) -> dict[str, Any]:
         return {}
 
 
-def draw_run(run: str | Path | TrainedRun, by: str = "step", *, film: bool = False) -> list[Path]:
+def draw_run(run: str | Path | TrainedRun, by: str = "step", *, film: bool = False, trust: bool = False) -> list[Path]:
     """Draw a run and its final scores into its `plots/`, and write its page; returns the files, the page last.
 
     What cannot be evaluated here is left out, and a line says so. With `film` a flight is recorded too, where there is
@@ -179,9 +183,9 @@ def draw_run(run: str | Path | TrainedRun, by: str = "step", *, film: bool = Fal
     path, scores, flights = path_of(run), None, list[Path]()
     if checkpoint.list_steps(path / "checkpoints"):
         try:
-            scores = final_scores(run)
+            scores = final_scores(run, trust=trust)
             say(pictures_of.sentence(scores))
-            flights = _draw_flights(load(run), path, film)
+            flights = _draw_flights(load(run, trust=trust), path, film)
         except UserError as error:
             say(f"{path} is drawn without an evaluation: {error}")
     return pictures_of.draw_run(path, scores, flights, by)

@@ -1,6 +1,7 @@
 """What a run has stored: its directory, its newest policy. `load` and `save`."""
 
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -12,6 +13,7 @@ from lemniscate.policy import TrainedPolicy
 from lemniscate.run import checkpoint
 from lemniscate.run.directory import find_checkpoint
 from lemniscate.run.files import parsing
+from lemniscate.run.trust import is_signed, own_code, require_trusted, signed
 from lemniscate.run.warm_start import difference
 
 
@@ -40,28 +42,40 @@ def path_of(run: object) -> Path:
     raise UserError(f"A run is a directory, such as 'runs/lander', or what train returned, not {shown(run)}.")
 
 
-def load(run: Trained) -> TrainedPolicy:
+def load(run: Trained, *, trust: bool = False) -> TrainedPolicy:
     """The policy of a run (its newest whole checkpoint) or of one checkpoint. Nothing in the files is executed.
 
     What `train` returned has its policy already, and a policy is returned as it is.
 
+    Args:
+        run: its directory or a checkpoint's; what `train` returned; a policy.
+        trust: import the code that the run names as `module:name` also if the run is not of this user and machine.
+
     Raises:
-        UserError: neither a run nor a checkpoint, or a run without a whole checkpoint; a damaged checkpoint; networks
-            of the user's own that have other parameters now.
+        UserError: neither a run nor a checkpoint, or a run without a whole checkpoint; a damaged checkpoint; a run from
+            elsewhere that names code of its own, without `trust`; networks of the user's own that have other parameters
+            now.
     """
     if isinstance(run, TrainedRun | TrainedPolicy):
         return run.policy if isinstance(run, TrainedRun) else run
     path = path_of(run)
     found = find_checkpoint(path)
     with parsing(found.path):
-        algorithm, spec = algos.find(found.record["algorithm"]), checkpoint.spec_from_json(found.record["spec"])
-        config = algorithm.Config.from_json(found.record["config"])
-        step = found.numbers["step"]
+        require_trusted(path, own_code_of(found.record), trusted=trust or is_signed(found.record))
+        name, fields, step = found.record["algorithm"], found.record["config"], found.numbers["step"]
+        spec = checkpoint.spec_from_json(found.record["spec"])
+    config = algos.find(name).Config.from_json(fields)
     networks, tensors = config.networks(spec), found.tensors_of("networks")
     if differs := difference(tensors, networks.state_dict()):
         raise UserError(f"{path} does not fit its networks: {differs}.")
     networks.load_state_dict(tensors)
     return TrainedPolicy(networks, spec, config, step, path)
+
+
+def own_code_of(record: Mapping[str, Any]) -> list[str]:
+    """The names of the code in a run's record that is not lemniscate's: its algorithm, environment, networks."""
+    name = record["algorithm"]
+    return [*([] if name in algos.ALGORITHMS else [str(name)]), *own_code(record["config"])]
 
 
 def save(policy: Any, path: str | Path) -> Path:
@@ -81,7 +95,8 @@ def save(policy: Any, path: str | Path) -> Path:
     if path.exists() and not _is_stored(path):
         raise UserError(f"{path} exists already, and is not a stored policy; choose another path.")
     algorithm = algos.name_of(sys.modules[type(policy.config).__module__])
-    record = {"algorithm": algorithm, "config": policy.config.to_json(), "spec": checkpoint.spec_to_json(policy.spec)}
+    record = signed({"algorithm": algorithm, "config": policy.config.to_json()})
+    record["spec"] = checkpoint.spec_to_json(policy.spec)
     try:
         fields = {"networks": policy.networks, "step": policy.step}
         checkpoint.write_fields(path, fields, {**record, "planned": False, "stored": True})

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -32,8 +32,9 @@ from lemniscate.run.metrics import read_metrics
 from lemniscate.run.run import Stopped, signals_to
 from lemniscate.run.sweep_file import Sweep, read_sweep
 from lemniscate.run.sweep_progress import SweepProgress
+from lemniscate.run.trust import require_trusted
 from lemniscate.run.warm_start import load_networks
-from lemniscate.stored import path_of
+from lemniscate.stored import own_code_of, path_of
 
 LOG = "log.txt"
 """standard output and error of a run, in its directory"""
@@ -102,7 +103,7 @@ def train_sweep(
     but_seed = {name: {k: v for k, v in record.items() if k != "seed"} for name, record in records.items()}
     runs = Sweep(path, numbers, but_seed)
     runs.create()
-    return _train(runs, options, progress)
+    return _train(runs, [*options, "--trust"], progress)  # code that was named here and now
 
 
 def resume_sweep(
@@ -112,9 +113,13 @@ def resume_sweep(
     callbacks: str | Sequence[str] = (),
     report: bool = False,
     progress: bool = True,
+    trust: bool = False,
 ) -> TrainedSweep:
-    """Resume an interrupted sweep: train the runs that are not finished or have not begun."""
-    return _train(read_sweep(path_of(path)), _options(track, callbacks, report), progress)
+    """Resume an interrupted sweep: train the runs that are not finished or have not begun. See `resume`."""
+    runs, options = read_sweep(path_of(path)), _options(track, callbacks, report)
+    for record in runs.runs.values():
+        require_trusted(runs.path, own_code_of(record), trusted=trust or runs.trusted)
+    return _train(replace(runs, trusted=trust or runs.trusted), [*options, *["--trust"] * trust], progress)
 
 
 def at_once(threads: int) -> int:

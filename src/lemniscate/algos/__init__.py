@@ -43,7 +43,7 @@ def _import(name: str) -> Any:
     if ":" in name:
         return named.find(name)
     if str(Path.cwd()) not in sys.path:
-        sys.path.insert(0, str(Path.cwd()))
+        sys.path.append(str(Path.cwd()))
     try:
         return import_module(name)
     except ModuleNotFoundError as error:

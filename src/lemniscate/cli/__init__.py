@@ -141,6 +141,10 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
 
     subs["resume"].add_argument("run", type=Path, metavar="RUN", help="a run or a sweep")
     _add_endings(subs["resume"])
+    for name in ("resume", "evaluate", "watch", "plot"):
+        subs[name].add_argument(
+            "--trust", action="store_true", help="import a run's own code (module:name) also if the run is not yours"
+        )
 
     sub = subs["evaluate"]
     sub.add_argument("run", type=Path, metavar="RUN", help="a run or a checkpoint")

@@ -46,10 +46,11 @@ def train(given: argparse.Namespace) -> None:
 
 def resume(given: argparse.Namespace) -> None:
     """Continue an interrupted run or sweep."""
+    options = {"track": given.track, "report": given.report, "trust": given.trust, **_callbacks(given)}
     if is_sweep(given.run):
-        run = sweep.resume_sweep(given.run, track=given.track, report=given.report, **_callbacks(given))
+        run = sweep.resume_sweep(given.run, **options)
     else:
-        run = api.resume(given.run, track=given.track, report=given.report, **_callbacks(given))
+        run = api.resume(given.run, **options)
         if given.score:
             _say_score(run)
         if not run.seconds:  # it was finished, which has been said
@@ -59,7 +60,7 @@ def resume(given: argparse.Namespace) -> None:
 
 def evaluate(given: argparse.Namespace) -> None:
     """Play whole episodes: scores as JSON on standard output, or as a sentence."""
-    own = {"env_kwargs": _env_args(given), "backend": given.backend, "video": given.video}
+    own = {"env_kwargs": _env_args(given), "backend": given.backend, "video": given.video, "trust": given.trust}
     scores = results.evaluate(given.run, episodes=number(given.episodes), seed=number(given.seed), **own)
     if given.json:
         print(json.dumps(scores.to_json(), allow_nan=False))
@@ -79,13 +80,14 @@ def watch(given: argparse.Namespace) -> None:
         deterministic=not given.sample,
         random=given.random,
         video=given.video,
+        trust=given.trust,
         env_kwargs=_env_args(given),
     )
 
 
 def plot(given: argparse.Namespace) -> None:
     """Draw the curves of one run, or compare several, grouped by all but the seed."""
-    for file in plots.plot(*given.runs, by=given.by):
+    for file in plots.plot(*given.runs, by=given.by, trust=given.trust):
         say(file)
 
 

@@ -22,6 +22,7 @@ from lemniscate.run.files import (
 )
 from lemniscate.run.metrics import METRICS, damage
 from lemniscate.run.state import TrainState
+from lemniscate.run.trust import signed
 from lemniscate.spec import Spec
 
 CONFIG, LOCK = "config.json", ".lock"
@@ -47,8 +48,8 @@ def create_directory(path: Path, name: str, record: dict[str, Any]) -> None:
         raise UserError(f"{path} cannot be created: {error.strerror or error}.") from error
 
 
-def read_config(path: Path) -> tuple[str, dict[str, Any]]:
-    """The algorithm's name and the config of a run directory; if its file is damaged, those in the newest checkpoint.
+def read_record(path: Path) -> dict[str, Any]:
+    """What a run's `config.json` holds: algorithm, config, signature. If it is damaged, as in the newest checkpoint.
 
     Raises `UserError` if it is not a run.
     """
@@ -56,16 +57,21 @@ def read_config(path: Path) -> tuple[str, dict[str, Any]]:
         runs = sorted(file.parent for file in path.glob(f"*/{CONFIG}"))
         raise UserError(f"{path} is a sweep: name one of its runs, such as {runs[0] if runs else path / '…'}.")
     try:
-        record = read_json(path / CONFIG)
+        return read_json(path / CONFIG)
     except DamagedFileError as error:
         found = _newest(path, planned_only=False)
         if found is None:
             reason = f": {error}" if (path / CONFIG).is_file() else f": it holds no {CONFIG} that can be read."
             raise UserError(f"{path} is not a run directory{reason}") from None
         say(f"{error} Taking the config in {found.path}.")
-        record = found.record
+        return found.record
+
+
+def read_config(path: Path) -> tuple[str, dict[str, Any]]:
+    """The algorithm's name and the config of a run directory. Raises `UserError` if it is not a run."""
+    record = read_record(path)
     with parsing(path / CONFIG):
-        return record["algorithm"], dict(record["config"])
+        return str(record["algorithm"]), dict(record["config"])
 
 
 def is_finished(path: Path) -> bool:
@@ -110,7 +116,7 @@ class Saver:
         self.exists = (path / CONFIG).exists() or bool(checkpoint.list_steps(path / "checkpoints"))
         """whether the run directory was there before this process"""
         self._config, self._checkpoints = config, path / "checkpoints"
-        self._identity = {"algorithm": algorithm, "config": config.to_json()}
+        self._identity = signed({"algorithm": algorithm, "config": config.to_json()})
         self._record = {**self._identity, "spec": checkpoint.spec_to_json(spec)}
         self._lock = FileLock(path / LOCK, timeout=0)
         self.last_planned = 0
