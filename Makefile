@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
-.PHONY: setup fly test test-long check wheel docs docs-serve bench bench-returns tutorials lock clean
+.PHONY: setup fly test test-long test-faults check wheel docs docs-serve bench bench-returns tutorials lock clean
 
 setup: .venv/.ready
 
@@ -18,10 +18,13 @@ fly: setup  ## train a drone to fly the figure eight, fly it from unseen starts,
 	$(BIN)/lemniscate train ppo --env DroneFigureEightTrajectory-v0 --report
 
 test: setup  ## the whole suite but the long ones
-	$(BIN)/python -m pytest -n auto -m "not long"
+	$(BIN)/python -m pytest -n auto -m "not long and not faults"
 
 test-long: setup  ## the tests that train for minutes
 	$(BIN)/python -m pytest -m long
+
+test-faults: setup  ## every way to break a run, many times: half an hour
+	$(BIN)/python -m pytest tests/faults -m faults -s
 
 check: setup  ## style, types, floors
 	$(BIN)/ruff check .

@@ -8,11 +8,13 @@ import shutil
 
 import pytest
 import torch
+from safetensors.torch import load_file
 
 from conftest import tiny
 from lemniscate.algos import ppo
 from lemniscate.run import checkpoint
 from lemniscate.run.files import DamagedFileError
+from lemniscate.run.tensors_file import TYPES, write_tensors
 from lemniscate.spec import Box, Discrete, MultiBinary, MultiDiscrete, ObservationPart, Spec
 from lemniscate.types import Batch
 
@@ -150,10 +152,11 @@ def test_a_full_disk_leaves_the_checkpoint_before(tmp_path, monkeypatch):
     assert not list(tmp_path.glob("*.tmp"))
 
 
-def test_only_what_shares_memory_is_copied():
-    """A million transitions are not: a part of a ring that is not full yet goes to the disk from where it lies."""
-    vector, ring = torch.arange(10.0), torch.arange(6.0)
-    apart = checkpoint._to_save({"a": vector[:5], "b": vector[5:], "c": ring[:4]})
-    assert apart["c"].data_ptr() == ring.data_ptr()
-    assert apart["a"].untyped_storage().data_ptr() != apart["b"].untyped_storage().data_ptr()
-    assert [len(t) for t in apart.values()] == [5, 5, 4]
+def test_tensors_of_every_type_and_shape_are_read_by_the_library(tmp_path):
+    vector = torch.arange(10.0)
+    tensors = {"part": vector[:5], "rest": vector[5:], "number": torch.tensor(3), "none": torch.zeros(0, 4)}
+    tensors |= {str(dtype): torch.ones(3, 1).to(dtype) for dtype in TYPES} | {"turned": torch.arange(6.0).view(2, 3).T}
+    write_tensors(tmp_path / "file", tensors)
+    found = load_file(tmp_path / "file")
+    assert found.keys() == tensors.keys()
+    assert all(torch.equal(found[name], tensors[name]) and found[name].dtype == tensors[name].dtype for name in tensors)

@@ -10,14 +10,13 @@ find damage, not malice; but nothing in these files can be executed.
 
 import dataclasses
 import hashlib
-from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, get_args
 
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 from torch import Tensor
 
 from lemniscate.errors import NonFiniteError, UserError
@@ -32,6 +31,7 @@ from lemniscate.run.files import (
     write_json,
 )
 from lemniscate.run.state import TrainState
+from lemniscate.run.tensors_file import write_tensors
 from lemniscate.spec import Action, ObservationPart, Spec
 
 FORMAT = 2
@@ -73,11 +73,11 @@ def write(directory: Path, state: TrainState, step: int, record: dict[str, Any],
         NonFiniteError: a NaN or an infinity in a parameter or an optimizer; nothing is written.
     """
     final = directory / f"step-{step}"
-    for stale in directory.glob("*.tmp"):
-        remove(stale)
+    stale = list(directory.glob("*.tmp"))
     write_fields(final, state.saved(), record)
-    for old in list_steps(directory)[:-keep]:
-        remove(directory / f"step-{old}")
+    for path in [*stale, *(directory / f"step-{old}" for old in list_steps(directory)[:-keep])]:
+        with suppress(OSError):  # the next one tries again
+            remove(path)
     return final
 
 
@@ -97,8 +97,7 @@ def write_fields(final: Path, fields: Mapping[str, Any], record: dict[str, Any])
     remove(temporary)
     try:
         temporary.mkdir()
-        save_file(_to_save(tensors), temporary / TENSORS)
-        sync(temporary / TENSORS)
+        write_tensors(temporary / TENSORS, tensors)
         write_json(temporary / STATE, {"numbers": numbers, "record": record})
         write_json(
             temporary / MANIFEST, {"format": FORMAT, "files": {name: _sha256(temporary / name) for name in FILES}}
@@ -109,12 +108,12 @@ def write_fields(final: Path, fields: Mapping[str, Any], record: dict[str, Any])
             final.rename(replaced)
         temporary.rename(final)
         sync(final.parent)
-        remove(replaced)
-    except SafetensorError as error:  # its word for an error of the disk
-        raise OSError(str(error)) from error
     finally:
         with suppress(OSError):
+            if replaced.exists() and not final.exists():
+                replaced.rename(final)
             remove(temporary)
+            remove(replaced)
 
 
 def read(path: Path) -> Checkpoint:
@@ -167,16 +166,6 @@ def spec_from_json(record: dict[str, Any]) -> Spec:
 
 def _tuples(record: dict[str, Any]) -> dict[str, Any]:
     return {name: tuple(value) if isinstance(value, list) else value for name, value in record.items()}
-
-
-def _to_save(tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The tensors on the CPU, no two of them in the same memory, which safetensors refuses.
-
-    Only tensors that share memory are copied; a replay buffer, the largest, shares none.
-    """
-    at = {name: t.untyped_storage().data_ptr() for name, t in tensors.items()}
-    times = Counter(at.values())
-    return {name: (t.clone() if times[at[name]] > 1 else t).detach().cpu().contiguous() for name, t in tensors.items()}
 
 
 def _not_finite(tensors: Mapping[str, Tensor]) -> str | None:

@@ -1,0 +1,29 @@
+"""A small run, and the processes that train it on a disk that is watched."""
+
+import pytest
+
+from conftest import tiny_fields
+from faults.disk import Trials
+from run.test_run import words_for
+
+CHOSEN = ("num_envs", "num_steps", "epochs", "minibatch_size", "hidden", "total_steps", "checkpoint_every", "compile")
+FIELDS = {**tiny_fields(), "total_steps": 24 * 32, "checkpoint_every": 6 * 32, "compile": "off", "hidden": (8,)}
+WORDS = [word for name, value in FIELDS.items() if name in CHOSEN for word in words_for(name, value)]
+TRAIN = ["train", "ppo", "--env", "Countdown-v0", *WORDS, "--run"]
+"""24 updates, a checkpoint at each sixth, 3 kept"""
+
+
+@pytest.fixture(scope="session")
+def trials(tmp_path_factory):
+    started = Trials(tmp_path_factory.mktemp("trials"))
+    yield started
+    started.close()
+
+
+@pytest.fixture(scope="session")
+def recorded(trials, tmp_path_factory):
+    """(the directory of the run that nothing happened to, the log of its events)."""
+    root, log = tmp_path_factory.mktemp("recorded"), tmp_path_factory.mktemp("log") / "events"
+    code, said = trials.run(root, *TRAIN, root / "r", log=log)
+    assert code == 0, said
+    return root / "r", log
