@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from lemniscate.algos import ppo, sac
+from lemniscate.algos import ppo, reinforce, sac, trpo
 from lemniscate.data.replay import interact
 from lemniscate.data.rollout import collect
 from lemniscate.envs import toy
@@ -75,7 +75,10 @@ def small(algo, env="Countdown-v0", **fields):
     """A Config of an on-policy algorithm that takes an update in a moment."""
     defaults = {"env": env, "num_envs": 4, "num_steps": 8, "total_steps": 100_000, "hidden": (16,)}
     defaults |= {"minibatch_size": 16} if algo is ppo else {}
-    return algo.Config(**{**defaults, **fields})
+    fields = {**defaults, **fields}
+    if algo in (trpo, reinforce):  # one minibatch, as far as the rows go
+        fields = {"critic_minibatch_size": min(128, fields["num_envs"] * fields["num_steps"]), **fields}
+    return algo.Config(**fields)
 
 
 def begin(algo, config, mode="DISABLED", **kwargs):

@@ -169,6 +169,32 @@ def test_a_mistake_is_one_sentence_and_leaves_nothing_behind(tmp_path, arguments
     assert not (tmp_path / "r").exists()
 
 
+class Counted(gym.Env):
+    """Counts those that are open; the fifth cannot be made."""
+
+    observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+    action_space = gym.spaces.Discrete(2)
+    open = 0
+
+    def __init__(self, most=None, render_mode=None):
+        if Counted.open == most:
+            raise ValueError("no more of these")
+        Counted.open += 1
+
+    def reset(self, *, seed=None, options=None):
+        return np.zeros(2, np.float32), {}
+
+    def close(self):
+        Counted.open -= 1
+
+
+@pytest.mark.parametrize("fields", [{"callbacks": [3]}, {"video_every": 64}, {"env_kwargs": {"most": 4}}])
+def test_after_a_mistake_no_environment_is_left_open(tmp_path, fields):
+    with pytest.raises(lem.UserError):
+        lem.train("ppo", Counted, run=tmp_path / "r", **tiny_fields() | fields)
+    assert Counted.open == 0
+
+
 def test_a_run_that_exists_is_refused(cartpole):
     with pytest.raises(lem.UserError, match="exists already"):
         lem.train("ppo", "CartPole-v1", run=cartpole.path)

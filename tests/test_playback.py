@@ -198,6 +198,41 @@ def test_what_is_watched_is_what_is_evaluated(policy, unwritten):
     assert lem.watch(policy, **how, video="film.gif").returns == evaluated.returns
 
 
+def test_an_episode_without_end_leaves_no_film(tmp_path, monkeypatch):
+    monkeypatch.setattr("lemniscate.envs.vec_env.PATIENCE", 30)
+    monkeypatch.setattr(playback, "PATIENCE", 30, raising=False)
+    policy = lem.train("ppo", Loud, run=tmp_path / "run", progress=False, total_steps=64, num_envs=2, num_steps=16,
+                       minibatch_size=32).policy  # fmt: skip
+    for play in (lem.evaluate, lem.watch):
+        with pytest.raises(lem.UserError, match=r"An episode of .*Loud has not ended after 30 steps"):
+            play(policy, episodes=1, video=tmp_path / "film.gif")
+    assert not (tmp_path / "film.gif").exists()
+
+
+def test_a_function_is_a_policy(policy, unwritten, capsys):
+    how = {"env": "CartPole-v1", "episodes": 3, "seed": 7}
+    scores = lem.evaluate(policy, **how, backend="gymnasium")
+    assert lem.evaluate(lambda obs: policy.act(obs), **how) == scores
+    assert lem.evaluate(lambda obs: policy.act(obs), **how, video="film.gif").returns == scores.returns
+    assert lem.watch(lambda obs: int(obs[2] > 0), **how, video="film.gif").episodes == 3
+    assert capsys.readouterr().err.count("Episode ") == 3
+
+
+@pytest.mark.parametrize(
+    ("function", "env", "said"),
+    [
+        (lambda obs: 0, None, "A function acts in an environment that is named with it"),
+        (lambda: 0, "CartPole-v1", "takes one observation; a function does not"),
+        (lambda obs: 7, "CartPole-v1", r"CartPole-v1 takes actions of Discrete\(2\), not 7"),
+        (lambda obs: 0.0, "Pendulum-v1", r"Pendulum-v1 takes actions of Box.*, not 0.0"),
+        (lambda obs: 0, "Countdown-v0", "Countdown-v0 makes several environments at once"),
+    ],
+)
+def test_a_function_that_cannot_act_is_refused_in_a_sentence(function, env, said):
+    with pytest.raises(lem.UserError, match=said):
+        lem.evaluate(function, env, episodes=1)
+
+
 def test_another_environment_must_fit(policy):
     with pytest.raises(lem.UserError, match="A policy for CartPole-v1 cannot act in Pendulum-v1"):
         lem.watch(policy, "Pendulum-v1", video="film.gif")

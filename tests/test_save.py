@@ -11,6 +11,15 @@ from conftest import tiny_fields
 from lemniscate.run import checkpoint
 
 
+class Own(torch.nn.Sequential):
+    """A network of one's own, before or after its file is edited."""
+
+    width = 8
+
+    def __init__(self, inputs, outputs):
+        super().__init__(torch.nn.Linear(inputs, self.width), torch.nn.Linear(self.width, outputs))
+
+
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
@@ -81,6 +90,17 @@ def test_a_stored_policy_is_there_until_another_is_in_its_place(run, tmp_path, m
         assert any(map(checkpoint.is_whole, tmp_path.iterdir()))
     lem.save(run, path)
     assert [file.name for file in tmp_path.iterdir()] == ["best"]
+
+
+def test_a_network_that_was_edited_since_is_named(tmp_path, monkeypatch):
+    fields = tiny_fields("CartPole-v1") | {"network": Own}
+    run = lem.train("ppo", env="CartPole-v1", run=tmp_path / "run", progress=False, **fields)
+    assert lem.load(run.path).config.network == "test_save:Own"
+    monkeypatch.setattr(Own, "width", 16)
+    with pytest.raises(
+        lem.UserError, match=r"run does not fit its networks: policy\..* is \[8, 4\] there and \[16, 4\]"
+    ):
+        lem.load(run.path)
 
 
 def test_a_run_begins_with_a_stored_policy(run, tmp_path):

@@ -24,6 +24,7 @@ from lemniscate.run import checkpoint
 from lemniscate.run.config import RunConfig
 from lemniscate.run.metrics import read_metrics
 from lemniscate.run.state import TrainState
+from lemniscate.stored import load
 
 SIGNATURES = {"init": ["config", "spec", "device"], "train": ["config", "run"]}
 
@@ -53,7 +54,7 @@ def check_training(algorithm: str | ModuleType, folder: Path, **settings: Any) -
     assert metrics, "No metrics were logged: call run.log after every update."
     bad = {name for line in metrics for name, x in line.items() if isinstance(x, float) and not math.isfinite(x)}
     assert not bad, f"These metrics are not finite: {', '.join(sorted(bad))}."
-    scores = results.evaluate(results.load(run.path), episodes=2, seed=0)
+    scores = results.evaluate(load(run.path), episodes=2, seed=0)
     assert scores == results.evaluate(run.policy, episodes=2, seed=0), "The loaded policy differs from the trained one."
 
 

@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from helpers import begin, copy_of, equal, one_rollout, small
-from lemniscate.algos import trpo
+from lemniscate.algos import reinforce, trpo
 from lemniscate.data.rollout import collect
+from lemniscate.errors import UserError
 
 
 @pytest.mark.parametrize("env", ["Pendulum-v1", "Matching-v0"])
@@ -121,3 +122,11 @@ def test_advantages_are_standardized_only_on_request(standardized):
     start = state.parameters.vector.clone()
     a, b = (stepped(config, state, x, start) - start for x in (batch, other))
     assert torch.allclose(a, b, rtol=1e-3, atol=1e-5) == standardized
+
+
+@pytest.mark.parametrize("algo", [trpo, reinforce])
+def test_minibatches_of_the_value_have_no_more_rows_than_the_rollout(algo):
+    fields = {"num_envs": 4, "num_steps": 8, **({"episodes": 0, "baseline": "value"} if algo is reinforce else {})}
+    algo.Config(**fields, critic_minibatch_size=32)
+    with pytest.raises(UserError, match="critic_minibatch_size 33 is above the 32 rows of a rollout"):
+        algo.Config(**fields, critic_minibatch_size=33)

@@ -22,7 +22,7 @@ def one_by_one(rewards, done, valid, whole):
 
 
 @pytest.mark.parametrize("every", [1, 7, 10_000], ids=lambda every: f"asked every {every} steps")
-def test_the_books_agree_with_adding_up_one_by_one(rng, every):
+def test_the_sums_agree_with_adding_up_one_by_one(rng, every):
     steps, copies = LOG_ROWS + 300, 3
     reward = torch.randn(steps, copies, generator=rng)
     terminated, truncated, ignored, fragment = torch.rand(4, steps, copies, generator=rng) < 0.05

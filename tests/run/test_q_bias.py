@@ -102,7 +102,7 @@ def test_it_is_said_written_and_drawn(tmp_path, capsys):
     run = lem.train("td3", "Pendulum-v1", run=tmp_path / "r", progress=False, **tiny_off_policy(evaluate_every=128))
     scores = lem.evaluate(run.policy, episodes=3)
     assert len(scores.q_bias.predicted) == 3
-    assert sentence(scores).count("\n") == 1
+    assert sentence(scores.to_json()).count("\n") == 1
     assert json.loads(json.dumps(scores.to_json()))["q_bias"]["bias"] == scores.q_bias.bias
     lines = [json.loads(line) for line in (tmp_path / "r" / "metrics.jsonl").read_text().splitlines()]
     assert sum("evaluation/q_bias" in line for line in lines) == 2

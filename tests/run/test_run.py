@@ -42,10 +42,10 @@ OFF_POLICY = {
 
 ON_POLICY = {
     # name: algorithm and fields; in CartPole-v1
-    "reinforce": {"scale_rewards": True},
+    "reinforce": {"scale_rewards": True, "critic_minibatch_size": 32},
     "reinforce-episodes": {"episodes": 1, "baseline": "mean", "returns": "episode"},
     "a2c": {"gae_lambda": 0.9},
-    "trpo": {"final_critic_learning_rate": 0.1},
+    "trpo": {"final_critic_learning_rate": 0.1, "critic_minibatch_size": 32},
 }
 
 

@@ -17,6 +17,8 @@ def train(path, algorithm="ppo", env="CartPole-v1", **fields):
         small = tiny_off_policy()
     if algorithm == "ppo":
         small = tiny_fields(env)
+    if algorithm == "trpo":
+        small |= {"critic_minibatch_size": 32}
     return lem.train(algorithm, env, run=path, progress=False, **{**small, **fields})
 
 

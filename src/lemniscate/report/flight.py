@@ -86,8 +86,11 @@ def draw_path(flight: Flight, file: Path) -> Path:
     axes.plot([], [], color=GREY, linewidth=0.8, label=f"first second of {flight.position.shape[1] - 1} other starts")
     axes.plot(*path[:, [0, 2]].T, color=BLUE, linewidth=1.2, label="flown")
     axes.plot(*path[0, [0, 2]], "o", color=BLUE, markersize=5)
-    late = flight.error_mm[flight.time > 1]
-    axes.set_title(f"Tracking error after the first second: {_rms(late):.1f} mm", loc="left")
+    if first_second.all():
+        axes.set_title(f"Tracking error: {_rms(flight.error_mm):.1f} mm", loc="left")
+    else:
+        late = flight.error_mm[~first_second]
+        axes.set_title(f"Tracking error after the first second: {_rms(late):.1f} mm", loc="left")
     axes.set(xlabel="x / m", ylabel="z / m", aspect="equal")
     finish(axes)
     axes.legend(frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=3)

@@ -1,5 +1,6 @@
 """Playing episodes for a person: in a window, in a notebook, or into a film."""
 
+import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from itertools import chain
@@ -204,7 +205,9 @@ def _rendered(arguments: dict[str, Any], mode: str) -> gym.Env:
     try:
         env = registry.make_rendered(mode=mode, **arguments)
         env.reset(seed=0)
-        env.render()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Gymnasium's on pictures, which are looked at below
+            env.render()
     except Exception as error:  # pygame, GLFW and MuJoCo each have their own
         raise UserError(f"{name} cannot be shown here: {error}") from error
     try:

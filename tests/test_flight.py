@@ -1,0 +1,95 @@
+"""Flights in a scene: which are recorded, where they are drawn, and that their environments are closed."""
+
+import gymnasium as gym
+import mujoco
+import numpy as np
+import pytest
+
+import lemniscate as lem
+from lemniscate.envs.backend import Scene
+from lemniscate.envs.gymnasium import GymnasiumBackend
+from lemniscate.report import flight, playback
+
+MODEL = """<mujoco><worldbody><body mocap="true"><geom size="0.1"/></body></worldbody></mujoco>"""
+
+
+class Glider(gym.Env):
+    """Drifts from a random start along x, ten metres away; an episode is 5 steps."""
+
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (10,), np.float32)
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t, self.start = 0, self.np_random.uniform()
+        return self.look(), {}
+
+    def step(self, action):
+        self.t += 1
+        return self.look(), self.start, False, self.t == 5, {}
+
+    def look(self):
+        return np.array([10 + 0.1 * self.t, 0, self.start, 0, 0, 0, 1, 0, 0, 0.1], dtype=np.float32)
+
+
+class Aviary(GymnasiumBackend):
+    """Says for each environment whether it has a scene; always as many of them as in training."""
+
+    compiled = True
+    open = 0
+
+    def __init__(self, *arguments, **options):
+        super().__init__(*arguments, **options)
+        self.scene = Scene(mujoco.MjModel.from_xml_string(MODEL), 0.1, slice(0, 3), slice(3, 7), slice(7, 10))
+        Aviary.open += 1
+
+    def close(self):
+        super().close()
+        Aviary.open -= 1
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    fields = {"num_envs": 2, "num_steps": 8, "total_steps": 32, "minibatch_size": 16, "evaluate_episodes": 2}
+    path = tmp_path_factory.mktemp("flights") / "run"
+    return lem.train("ppo", Glider, backend="test_flight:Aviary", run=path, progress=False, **fields)
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """The flights that are drawn into films; nothing is rendered."""
+    flights = []
+    monkeypatch.setattr(playback, "_draw", lambda track, env: (flights.append(track) or [], "Drawn."))
+    monkeypatch.setattr(playback, "save_frames", lambda frames, file, fps: None)
+    return flights
+
+
+def test_more_flights_than_environments_are_evaluated_as_without_a_film(run, drawn, capsys):
+    filmed, plain = lem.evaluate(run, episodes=5, video="film.gif"), lem.evaluate(run, episodes=5)
+    assert filmed.returns == plain.returns
+    assert filmed.episodes == 5
+    (track,) = drawn
+    assert track.position.shape == (5, 2, 3)  # one flight of each environment, to its end
+    assert not np.isnan(track.position).any()
+    assert "2 of the 5 flights are shown" in capsys.readouterr().err
+
+
+def test_no_more_flights_are_shown_to_a_person_than_there_are(run, drawn):
+    with pytest.raises(lem.UserError, match="At most 2 flights of this run can be shown, not 5"):
+        lem.watch(run, episodes=5, video="film.gif")
+    assert lem.watch(run, episodes=2, video="film.gif").episodes == 2
+
+
+def test_a_scene_that_is_known_when_environments_are_made_is_drawn_and_they_are_closed(run):
+    files = lem.plot(run)
+    assert {"flight.png", "error.png"} <= {file.name for file in files}
+    assert Aviary.open == 0
+
+
+def test_a_flight_is_drawn_wherever_it_is():
+    """Far from the origin too."""
+    there = np.array([[[10 + 0.1 * t, 0.0, 5.0]] for t in range(5)])
+    attitude = np.tile([0.0, 0.0, 0.0, 1.0], (5, 1, 1))
+    last = flight.animate(flight.Flight(there, there + np.array([0, 0, 0.2]), attitude, 0.1), every=1)[-1]
+    blue = np.array([0x1F, 0x5F, 0xA8])
+    assert (np.abs(last.astype(int) - blue).max(axis=-1) < 40).any()
