@@ -60,13 +60,14 @@ def test_the_solution_finds_the_better_action_of_the_hardest_worlds():
     assert in_worlds(program(), 1, 6) is None
 
 
-def test_a_clipped_loss_of_the_ratio_is_none_of_the_log_ratio():
+def test_a_clipped_loss_of_the_ratio_is_none_of_the_log_ratio(monkeypatch):
+    monkeypatch.setattr(loop, "STEPS", 256)
     ratios = [
         ("def clipped_surrogate(log_ratio: Tensor,", "def clipped_surrogate(ratio: Tensor,"),
         ("    ratio = log_ratio.exp()\n", ""),
         ("distribution.log_prob(a) - old, adv", "(distribution.log_prob(a) - old).exp(), adv"),
     ]
-    assert in_worlds(program(ratios), 0) is None
+    assert not any("the ratio" in sentence for sentence in loop.in_world(program(ratios), 0))
 
 
 def of_box(changes=()):
