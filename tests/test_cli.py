@@ -275,7 +275,7 @@ def test_an_algorithm_is_named_by_its_module_and_its_own_name_too(tmp_path, monk
     assert main(["train", "several:a2c", "--env", "CartPole-v1", "--total-steps", "64"]) == 0
     (run,) = (tmp_path / "runs").iterdir()
     assert run.name == "CartPole-v1-several_a2c-1"
-    assert lem.load(run).step == 80
+    assert lem.load(run).step == 256
 
 
 @pytest.mark.parametrize(

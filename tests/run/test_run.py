@@ -24,6 +24,7 @@ from lemniscate.envs import toy
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.run import checkpoint
 from lemniscate.run.evaluate import EVALUATION
+from lemniscate.run.files import read_json, write_json
 from lemniscate.run.metrics import read_metrics
 from lemniscate.run.run import TRAINING
 from lemniscate.run.seeding import derive
@@ -513,8 +514,8 @@ def test_environments_that_draw_from_global_generators_resume_exactly_too(tmp_pa
 def test_a_checkpoint_of_a_newer_format_is_refused_and_not_deleted(tmp_path):
     train(tmp_path / "r")
     manifest = tmp_path / "r" / "checkpoints" / "step-256" / "manifest.json"
-    manifest.write_text(manifest.read_text().replace('"format": 1', '"format": 2'))
-    with pytest.raises(lem.UserError, match="has format 2; this version of lemniscate reads 1"):
+    write_json(manifest, {**read_json(manifest), "format": 3})
+    with pytest.raises(lem.UserError, match="has format 3; this version of lemniscate reads 2"):
         lem.resume(tmp_path / "r", progress=False)
     assert manifest.exists()
 

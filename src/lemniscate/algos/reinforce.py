@@ -71,10 +71,8 @@ class Config(OnPolicyConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.episodes and (self.returns, self.baseline) != ("to_go", "value"):
-            cut = f"returns {self.returns}, baseline {self.baseline} need whole episodes"
-            raise UserError(
-                f"{cut}, which num_steps cuts: use episodes 1 or more, or returns to_go and baseline value."
-            )
+            cut = f"returns {self.returns}, baseline {self.baseline} need whole episodes, which num_steps cuts"
+            raise UserError(f"{cut}: use episodes 1 or more, or returns to_go and baseline value.")
         if self.episodes and self.compile == "on":
             raise UserError("Batches of whole episodes differ in size and cannot be compiled: use --compile off.")
         if not self.episodes:

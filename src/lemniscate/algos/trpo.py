@@ -12,16 +12,7 @@ from torch import Tensor
 from torch.func import grad
 
 from lemniscate.data.rollout import collect, epoch_minibatches, one_minibatch
-from lemniscate.maths import (
-    backtrack,
-    explained_variance,
-    gae,
-    means,
-    natural_step,
-    standardize,
-    surrogate,
-    value_loss,
-)
+from lemniscate.maths import backtrack, explained_variance, gae, means, natural_step, standardize, surrogate, value_loss
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.critics import Value
 from lemniscate.nn.normalizer import RewardScale

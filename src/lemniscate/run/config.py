@@ -135,8 +135,7 @@ class RunConfig:
     compile: Literal["auto", "on", "off"] = "auto"
     """compile the gradient steps and the policy; auto compiles long runs, where it saves time"""
     checkpoint_every: Natural = 0
-    """steps between checkpoints, at each of which the environments restart; 0: a fifth of the run, or three episodes of
-    every environment if that is longer"""
+    """steps between checkpoints, where environments restart; 0: a fifth of the run, or three episodes"""
     keep_checkpoints: Count = 3
     """number of newest checkpoints kept"""
     evaluate_every: Natural = 0
