@@ -135,7 +135,7 @@ class RunConfig:
     compile: Literal["auto", "on", "off"] = "auto"
     """compile the gradient steps and the policy; auto compiles long runs, where it saves time"""
     checkpoint_every: Natural = 0
-    """steps between checkpoints, and restarts; 0: a fifth of the run, or three episodes if that is longer"""
+    """steps between checkpoints, and restarts; 0: a fifth of the run, or 3 episodes"""
     keep_checkpoints: Count = 3
     """number of newest checkpoints kept"""
     evaluate_every: Natural = 0
