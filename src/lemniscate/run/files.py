@@ -44,13 +44,13 @@ def read_json(path: Path) -> dict[str, Any]:
         content = file.read(MAX_JSON_BYTES + 1)
     try:
         record = json.loads(content)
-        is_record = isinstance(record, dict) and len(content) <= MAX_JSON_BYTES
-        if is_record and HASH not in record:
-            raise DamagedFileError(f"{path} has no sha256: it is damaged, or of another version of lemniscate.")
-        if is_record and record.pop(HASH) == _hash_of(record):
-            return record
-    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError):
+    except (ValueError, RecursionError):
         raise DamagedFileError(f"{path} is damaged: it is not JSON.") from None
+    is_record = isinstance(record, dict) and len(content) <= MAX_JSON_BYTES
+    if is_record and HASH not in record:
+        raise DamagedFileError(f"{path} has no sha256: it is damaged, or of another version of lemniscate.")
+    if is_record and record.pop(HASH) == _hash_of(record):
+        return record
     raise DamagedFileError(f"{path} is damaged: its sha256 differs from the one that was written.")
 
 
