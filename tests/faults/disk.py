@@ -192,13 +192,13 @@ class Disk:
         return entries
 
 
-def states(events, root, seed=0, every=1):
-    """(events so far, kind, writer of the state) for power cuts after each `every`-th event, four kinds of each."""
+def states(events, root, seed=0, every=1, draws=1):
+    """(events so far, kind, writer of the state) for power cuts after each `every`-th event, `draws` of kind "any"."""
     disk, rng = Disk(root), random.Random(seed)
     for number, event in enumerate(events, start=1):
         disk.apply(event)
         if number % every == 0:
-            for how in ("synced", "names", "all", "any"):
+            for how in ("synced", "names", "all", *["any"] * draws):
                 yield number, how, lambda folder, how=how: disk.write_state(folder, rng, how)
 
 
