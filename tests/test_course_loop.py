@@ -29,6 +29,13 @@ MISTAKES = {
 }  # fmt: skip
 
 
+@pytest.fixture(autouse=True)
+def fewer_steps(request, monkeypatch):
+    """Half the steps show every mistake too; the long test takes all."""
+    if "long" not in request.keywords:
+        monkeypatch.setattr(loop, "STEPS", loop.STEPS // 2)
+
+
 def program(changes=()):
     """`train` of the solution with some of its lines changed."""
     text = SOLUTION
