@@ -328,7 +328,10 @@ NOISE = np.random.default_rng(0).normal(size=200)
             advice.q_biased,
             [
                 (evidence(scores={"q_bias": {"bias": 0.8}}), "over-estimates the return by 80%"),
-                (evidence(scores={"q_bias": {"bias": 0.8}}, target_noise=0.2), "lower --critic-learning-rate."),
+                (
+                    evidence(scores={"q_bias": {"bias": 0.8}}, critic_learning_rate=1.0),
+                    "lower --critic-learning-rate. Or try td3",
+                ),
                 (evidence(scores={"q_bias": {"bias": -0.8}}), "under-estimates the return by 80%"),
             ],
             [evidence(scores={"q_bias": {"bias": 0.4}}), evidence(scores={"q_bias": {}}), evidence()],
