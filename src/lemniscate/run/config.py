@@ -139,9 +139,9 @@ class RunConfig:
     keep_checkpoints: Count = 3
     """number of newest checkpoints kept"""
     evaluate_every: Natural = 0
-    """steps between evaluations during training; 0: only at the end"""
+    """steps between evaluations during training; 0: none"""
     evaluate_episodes: Count = 20
-    """episodes of each evaluation"""
+    """episodes of each evaluation during training"""
     video_every: Natural = 0
     """steps between recordings of an episode into videos/step-N; 0: none"""
     video_every_episodes: Natural = 0
