@@ -330,13 +330,8 @@ NOISE = np.random.default_rng(0).normal(size=200)
             [
                 (evidence(scores={"q_bias": {"bias": 0.8}}), "over-estimates the return by 80%"),
                 (
-<<<<<<< HEAD
                     evidence(scores={"q_bias": {"bias": 0.8}}, target_noise=0.2, critic_learning_rate=1e-3),
                     "lower --critic-learning-rate.",
-=======
-                    evidence(scores={"q_bias": {"bias": 0.8}}, critic_learning_rate=1.0),
-                    "lower --critic-learning-rate. Or try td3",
->>>>>>> code
                 ),
                 (evidence(scores={"q_bias": {"bias": -0.8}}), "under-estimates the return by 80%"),
             ],

@@ -141,7 +141,7 @@ class RunConfig:
     evaluate_every: Natural = 0
     """steps between evaluations during training; 0: none"""
     evaluate_episodes: Count = 20
-    """episodes of each evaluation during training"""
+    """episodes of each evaluation in training"""
     video_every: Natural = 0
     """steps between recordings of an episode into videos/step-N; 0: none"""
     video_every_episodes: Natural = 0
