@@ -1,15 +1,15 @@
 """A disk that is watched and that can fail (`disk.c`), and the states that one may hold after a power cut."""
 
-import json
-import os
 import random
 import shutil
 import subprocess
-import sys
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from tempfile import mkdtemp
+
+from forks import LEMNISCATE, Forks, command
 
 HERE = Path(__file__).parent
 
@@ -22,59 +22,38 @@ def library():
     return built
 
 
-SERVER = """
-import ctypes, json, os, sys, traceback
-import torch
-import lemniscate.cli.commands
-from lemniscate.cli import main
-
-torch.set_num_threads(1)
-disk = ctypes.CDLL(sys.argv[1])
-for line in sys.stdin:
-    trial = json.loads(line)
-    if not os.fork():
-        output = os.open(trial["output"], os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
-        os.dup2(output, 1), os.dup2(output, 2)
-        code = 70
-        disk.disk_watch(trial["root"].encode(), trial["log"].encode(), *trial["fail"], trial["kill"])
-        try:
-            code = main(trial["arguments"])
-        except BaseException:
-            traceback.print_exc()
-        sys.stdout.flush(), sys.stderr.flush()
-        os._exit(code)
-    print(os.waitstatus_to_exitcode(os.wait()[1]), flush=True)
-"""
-
-
 class Trials:
-    """Commands of lemniscate on a watched disk, each in a process forked from one that has imported everything."""
+    """Commands of lemniscate on a watched disk."""
 
-    def __init__(self, folder):
-        self.output = folder / "output.txt"
-        environment = {**os.environ, "LD_PRELOAD": str(library())}
-        environment |= {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "COLUMNS": "200"}
-        program = [sys.executable, "-c", SERVER, library()]
-        self._server = subprocess.Popen(program, stdin=-1, stdout=-1, text=True, env=environment)
+    def __init__(self):
+        self._forks = Forks(
+            f"{LEMNISCATE}; import ctypes; disk = ctypes.CDLL('{library()}')", LD_PRELOAD=str(library())
+        )
 
-    def run(self, root, *arguments, log="", fail=(0, 0, 0), kill=0):
+    def run(self, root, *arguments, log="", fail=(0, 0, 0), kill=0, after=None):
         """Run a command while the disk below `root` is watched; returns its exit code and what it wrote.
 
         Args:
-            root: the directory; it exists.
+            root: the directory; it exists. Nothing is watched below "".
             arguments: of the command.
             log: a file for the events.
             fail: (first event, last event, errno) that fail.
             kill: the number of the event before which the process kills itself.
+            after: seconds from its start, after which it is killed.
         """
-        trial = {"root": str(root), "log": str(log), "fail": fail, "kill": kill, "output": str(self.output)}
-        print(json.dumps({**trial, "arguments": list(map(str, arguments))}), file=self._server.stdin, flush=True)
-        code = int(self._server.stdout.readline())
-        return code, self.output.read_text()
+        watched = f"{str(root)!r}.encode(), {str(log)!r}.encode(), {fail[0]}, {fail[1]}, {fail[2]}, {kill}"
+        before = f"from __main__ import disk; disk.disk_watch({watched})"
+        process = command(*arguments, before=before, server=self._forks)
+        if after is not None:
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(after)
+            process.kill()
+        said = "".join(process.communicate())
+        return process.returncode, said
 
     def close(self):
         """End the process that they are forked from."""
-        self._server.communicate()
+        self._forks.close()
 
 
 @dataclass(frozen=True)

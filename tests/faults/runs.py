@@ -14,8 +14,8 @@ TRAIN = ["train", "ppo", "--env", "Countdown-v0", *WORDS, "--run"]
 
 
 @pytest.fixture(scope="session")
-def trials(tmp_path_factory):
-    started = Trials(tmp_path_factory.mktemp("trials"))
+def trials():
+    started = Trials()
     yield started
     started.close()
 

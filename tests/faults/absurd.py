@@ -1,0 +1,184 @@
+"""Absurd numbers for every numeric field, and what a run does with them before its first update."""
+
+import math
+import os
+import resource
+import signal
+import sys
+import traceback
+import warnings
+from collections import Counter
+
+import numpy as np
+import psutil
+import torch
+from hypothesis import strategies as st
+
+from lemniscate import api
+from lemniscate.algos import ALGORITHMS, find
+from lemniscate.cli import parse
+from lemniscate.cli.fields import _number
+from lemniscate.envs import registry
+from lemniscate.errors import UserError
+from lemniscate.machine import require_threads
+from lemniscate.run.config import _hints_of, options_of
+from lemniscate.run.environments import device_for, evaluation_env, make_envs, require_memory
+
+MEMORY, SECONDS = 2 * 10**9, 5
+"""bytes that the cases of one process may take, and processor time of one case"""
+
+VALUES = (
+    *(0, -1, 1, 2, 10**6, 10**9, 10**12, 10**18, 2**63, 10**400, -(10**400), 10**5000, 0.5, 1e-300, 5e-324, 1e38),
+    *(3.5e38, 1e300, -1e300, math.nan, math.inf, -math.inf, True, False, None, "", "x", "10**9", b"x", {}, object()),
+    *((), (0,), (10**9,), (10**5, 10**5), (math.nan,), (10**400,), [1] * 2_000, 1j, np.float64("nan"), np.array([])),
+    *(np.int64(2**63 - 1), np.uint64(2**64 - 1), torch.tensor(math.inf), torch.tensor([10**9, 1]), torch.zeros(0)),
+)
+WORDS = (
+    "10**9",
+    "1e400",
+    "1" + "0" * 400,
+    "9" * 5_000,
+    "nan",
+    "-inf",
+    "1e-400",
+    "1_000_000_000_000",
+    "０",
+    "1,2,,3",
+    "",
+)
+
+numbers = st.one_of(
+    st.integers(-3, 300),
+    st.integers(),
+    st.floats(),
+    st.floats(0, 1),
+    st.sampled_from([10**exponent for exponent in range(4, 20)]),
+    st.sampled_from(VALUES[:24]),
+)
+texts = st.one_of(
+    numbers.filter(lambda x: abs(x) < 10**4000 if isinstance(x, int) else True).map(str), st.sampled_from(WORDS)
+)
+
+
+def numeric_fields(algorithm):
+    """The names of the fields that hold a number, or several."""
+    hints = _hints_of(find(algorithm).Config)
+
+    def is_numeric(option):
+        return _number(option) is not None or any(_number(part) for part in getattr(option, "__args__", ()))
+
+    return [name for name, hint in hints.items() if any(map(is_numeric, options_of(hint)))]
+
+
+def base(algorithm):
+    """Fields of a run that is made in a moment."""
+    fields = {"num_envs": 2, "hidden": (8,), "evaluate_episodes": 1, "total_steps": 10**5, "backend": "gymnasium"}
+    small = {
+        "num_steps": 8,
+        "minibatch_size": 16,
+        "critic_minibatch_size": 16,
+        "critic_hidden": (8,),
+        "buffer_size": 1_000,
+    }
+    return {**fields, **{name: value for name, value in small.items() if name in find(algorithm).Config.names()}}
+
+
+def env_of(algorithm):
+    return "Pendulum-v1" if algorithm in ("ddpg", "td3", "sac") else "CartPole-v1"
+
+
+def begin(algorithm, config):
+    """Do what a run does before its first update; of what is large and allowed, all but the making."""
+    device = device_for(config.device)
+    require_threads(config.threads)
+    registry.require_room(config.env, config.num_envs, config.backend)
+    env = evaluation_env(config, 1)
+    env.close()
+    require_memory(config, env.spec, device)
+    widths = (*config.hidden, *getattr(config, "critic_hidden", ()))
+    if config.num_envs <= 16 and max(widths, default=0) <= 500 and sum(config.memory(env.spec).values()) < 10**8:
+        envs = make_envs(config)
+        find(algorithm).init(config, env.spec, device)
+        for made in envs:
+            made.close()
+
+
+def by_fields(algorithm, **fields):
+    """From Python."""
+    begin(algorithm, api.config_for(algorithm, env_of(algorithm), **{**base(algorithm), **fields}))
+
+
+def by_words(algorithm, *words):
+    """From the command line."""
+    given = parse(["train", algorithm, "--env", env_of(algorithm), *words])
+    by_fields(algorithm, **given.fields)
+
+
+def systematic():
+    """(function, its arguments) for every numeric field of every algorithm with every value."""
+    for algorithm in ALGORITHMS:
+        for name in numeric_fields(algorithm):
+            yield from ((by_fields, (algorithm,), {name: value}) for value in VALUES)
+            yield from ((by_words, (algorithm, f"--{name.replace('_', '-')}={word}"), {}) for word in WORDS)
+
+
+@st.composite
+def drawn(draw):
+    """The same at random, several fields at once."""
+    algorithm = draw(st.sampled_from(ALGORITHMS if isinstance(ALGORITHMS, tuple) else list(ALGORITHMS)))
+    names = draw(st.lists(st.sampled_from(numeric_fields(algorithm)), min_size=1, max_size=6, unique=True))
+    if draw(st.booleans()):
+        several = st.lists(numbers, max_size=3)
+        return by_fields, (algorithm,), {name: draw(several if "hidden" in name else numbers) for name in names}
+    return by_words, (algorithm, *(f"--{name.replace('_', '-')}={draw(texts)}" for name in names)), {}
+
+
+class Accepted(Exception):
+    """What stops a case that would go on for long."""
+
+
+def answer(function, args, fields):
+    """Whether a case is taken or refused. Raises whatever is neither, an answer that is not one sentence included."""
+    signal.setitimer(signal.ITIMER_PROF, SECONDS)
+    try:
+        function(*args, **fields)
+    except Accepted:
+        return "taken"
+    except UserError as error:
+        said = str(error)
+        assert said.strip(), "no sentence"
+        assert "\n" not in said, said
+        assert len(said) < 700, said
+        return "refused"
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
+    return "taken"
+
+
+def in_own_process(work):
+    """What `work(counts)` counts, in a process of 2 GB. Fails with the traceback, or the signal, that ends it."""
+    read_end, write_end = os.pipe()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the threads of another test's JAX do nothing here
+        child = os.fork()
+    if not child:
+        code = 1
+        try:
+            most = psutil.Process().memory_info().vms + MEMORY
+            resource.setrlimit(resource.RLIMIT_AS, (most, most))
+            counts = Counter()
+            work(counts)
+            os.write(write_end, f"{counts['taken']} {counts['refused']}".encode())
+            code = 0
+        except BaseException:
+            traceback.print_exc()
+        sys.stdout.flush(), sys.stderr.flush()
+        os._exit(code)
+    os.close(write_end)
+    _, status, used = os.wait4(child, 0)
+    with os.fdopen(read_end) as pipe:
+        counted = pipe.read()
+    assert os.waitstatus_to_exitcode(status) == 0, os.waitstatus_to_exitcode(status)
+    assert used.ru_maxrss * 1024 < MEMORY
+    taken, refused = map(int, counted.split())
+    return Counter(taken=taken, refused=refused)
