@@ -10,6 +10,7 @@ setup: .venv/.ready
 .venv/.ready: requirements.lock pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Python 3.11 or newer is needed; name one with make PYTHON=python3.12"; exit 2; }
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	@echo "Installing into .venv what requirements.lock names: some minutes, in silence"
 	$(BIN)/python -m pip install --quiet --requirement requirements.lock
 	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
 	touch $@
@@ -18,13 +19,13 @@ fly: setup  ## train a drone to fly the figure eight, fly it from unseen starts,
 	$(BIN)/lemniscate train ppo --env DroneFigureEightTrajectory-v0 --report
 
 test: setup  ## the whole suite but the long ones
-	$(BIN)/python -m pytest -n auto -m "not long and not faults"
+	$(BIN)/python -m pytest -n auto --dist loadfile -m "not long and not faults"
 
 test-long: setup  ## the tests that train for minutes
 	$(BIN)/python -m pytest -m long
 
 test-faults: setup  ## every way to break a run, many times: half an hour
-	$(BIN)/python -m pytest tests/faults -m faults -s
+	$(BIN)/python -m pytest -n auto --dist load -m faults -rP
 
 check: setup  ## style, types, floors
 	$(BIN)/ruff check .

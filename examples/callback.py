@@ -1,6 +1,8 @@
 """A callback: it sees the step, the metrics and the policy after every update, and may stop the run.
 
-python examples/callback.py
+cd examples
+lemniscate train ppo --env CartPole-v1 --callbacks 'callback:StopWhenSolved(threshold=400)'
+python callback.py
 """
 
 from collections.abc import Mapping
@@ -28,8 +30,6 @@ class StopWhenSolved:
         return len(last) == self.updates and sum(last) / len(last) >= self.threshold
 
 
-stop_at_400 = StopWhenSolved(400)
-
 if __name__ == "__main__":
-    trained = lem.train("ppo", env="CartPole-v1", total_steps=100_000, callbacks=[stop_at_400])
+    trained = lem.train("ppo", env="CartPole-v1", total_steps=100_000, callbacks=[StopWhenSolved(400)])
     print(f"Stopped at step {trained.policy.step}: {lem.evaluate(trained.policy, episodes=20).mean_return:.0f}")

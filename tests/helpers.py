@@ -1,8 +1,7 @@
 """Environments with known values, and the steps that many tests share."""
 
-import os
-import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import gymnasium as gym
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from forks import Forks
 from lemniscate.algos import ppo, reinforce, sac, trpo
 from lemniscate.data.replay import interact
 from lemniscate.data.rollout import collect
@@ -253,14 +253,16 @@ def compile_with(compiler):
 def require_in_own_process(module, call, compiler="inductor"):
     """Run `call` of a test module in a new process: the shape checks of this one are not for the compiler."""
     folder = Path(sys.modules[module].__file__).parent
-    paths = [str(folder), str(TESTS), *filter(None, [os.environ.get("PYTHONPATH")])]
-    prepare = f"import helpers; helpers.compile_with('{compiler}')"
-    done = subprocess.run(
-        [sys.executable, "-c", f"{prepare}; from {module.rpartition('.')[2]} import *; {call}"],
-        cwd=folder,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(paths)},
-        capture_output=True,
-        text=True,
+    prepare = (
+        f"import sys; sys.path[:0] = {[str(folder), str(TESTS)]!r}; import helpers; helpers.compile_with({compiler!r})"
     )
-    assert done.returncode == 0, done.stderr
-    assert "torch.compile failed" not in done.stderr
+    process = compilers().start(f"{prepare}; from {module.rpartition('.')[2]} import *; {call}", folder)
+    said = process.communicate()[1]
+    assert process.returncode == 0, said
+    assert "torch.compile failed" not in said
+
+
+@cache
+def compilers():
+    """A process with torch's compiler, and without the checks of shapes."""
+    return Forks("import gymnasium, hypothesis.strategies, pytest, torch, torch._dynamo, torch._inductor.compile_fx")

@@ -290,6 +290,9 @@ def test_an_algorithm_is_named_by_its_module_and_its_own_name_too(tmp_path, monk
         (["train", "ppo,sacc", "--seeds", "1-2"], "There is no algorithm 'sacc': did you mean sac"),
         (["train", "--seed", "3", "ppo"], "The algorithm comes first, then its fields: lemniscate train ppo"),
         (["train", "CartPole-v1", "ppo"], "The algorithm comes first, then its fields: lemniscate train ppo"),
+        (["train", "ppo", "sac", "--seeds", "1-2"], "Several algorithms are one word: lemniscate train ppo,sac --seeds"),
+        (["train", "ppo,", "sac"], "Several algorithms are one word: lemniscate train ppo,sac --seeds 1-5"),
+        (["train", "ppo", "--env", "mine"], "There is no environment 'mine': one of your own is named as module:Class."),
         (["train", "nowhere.to"], "There is no algorithm 'nowhere.to'"),
         (["train", "json"], "json is not an algorithm: it has no Config and no train."),
         (["train", "ppo"], "Which environment?"),
@@ -309,8 +312,8 @@ def test_an_algorithm_is_named_by_its_module_and_its_own_name_too(tmp_path, monk
         (["train", "ppo", "--logdir", "x"], "There is no --logdir: here it is --run."),
         (["train", "ppo", "--env", "CartPole-v1", "--gamma", "x"], "gamma must be a number from 0 to 1, not 'x'."),
         (["train", "ppo", "--env", "CartPole-v1", "--gamma", "3"], "gamma must be a number from 0 to 1, not 3."),
-        (["train", "ppo", "--env", "CartPole-v1", "--epochs", "1.5"], "epochs must be a whole number at least 1, not 1.5."),
-        (["train", "ppo", "--env", "CartPole-v1", "--hidden", "8,x"], "hidden must be a whole number at least 1, not 'x'."),
+        (["train", "ppo", "--env", "CartPole-v1", "--epochs", "1.5"], "epochs must be a whole number from 1 to 10,000, not 1.5."),
+        (["train", "ppo", "--env", "CartPole-v1", "--hidden", "8,x"], "hidden must be a whole number from 1 to 1,000,000, not 'x'."),
         (["train", "ppo", "--env", "CartPole-v1", "--clip-value", "0"], "clip_value must be a number above 0 or None, not 0."),
         (["train", "ppo", "--env", "CartPole-v1", "--minibatch-size", "1"], "normalize_advantage needs batches of 2"),
         (["train", "ppo", "--env", "CartPole-v1", "--activation", "x"], "activation must be one of tanh, relu, elu, silu, not 'x'"),
@@ -318,7 +321,7 @@ def test_an_algorithm_is_named_by_its_module_and_its_own_name_too(tmp_path, monk
         (["train", "ppo", "--env", "test_cli:Nothing"], "test_cli:Nothing cannot be found: test_cli has no Nothing."),
         (["train", "ppo,sac", "--env", "CartPole-v1"], "Algorithms are compared over several seeds: add --seeds 1-5."),
         (["train", "ppo", "--seeds", "1-2", "--seed", "3"], "Several runs have several seeds: --seeds 1-5, not --seed."),
-        (["evaluate", "nowhere"], "nowhere is not a run directory"),
+        (["evaluate", "nowhere"], "nowhere is not a run directory: it does not exist."),
         (["evaluate", "nowhere", "--episods", "3"], "There is no option '--episods': did you mean --episodes?"),
         (["train", "./mine.py", "--env", "CartPole-v1"], "There is no algorithm './mine.py'"),
         (["train", "ppo", "--env", ""], "There is no environment ''"),
@@ -424,7 +427,7 @@ def test_numbers_are_read_as_in_training(run, capsys):
     assert main(["evaluate", str(run), "--episodes", "2e0", "--seed", "1_0", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["episodes"] == 2
     assert main(["evaluate", str(run), "--episodes", "x"]) == 2
-    assert "episodes must be a whole number at least 1, not 'x'." in capsys.readouterr().err
+    assert "episodes must be a whole number from 1 to 1,000,000, not 'x'." in capsys.readouterr().err
 
 
 def test_a_folder_that_cannot_be_written_is_a_sentence(run, tmp_path, capsys):

@@ -115,6 +115,25 @@ def test_the_table_says_what_the_seeds_say_together(tmp_path):
     assert len({len(line) for line in (head, ppo, sac)}) == 1
 
 
+@pytest.mark.parametrize(
+    ("ppo", "sac", "share"),
+    [
+        ([1.0, 2.0], [4.0, 3.0], "SAC is better than PPO in 100% [95 %: 100% to 100%] of"),
+        ([1.0, 4.0, 5.0, 6.0, 7.0], [0.0, 2.0, 3.0, 3.0, 3.0], "PPO is better than SAC in 84% [95 %: "),
+    ],
+)
+def test_it_is_said_which_is_better_and_how_certain_that_is(tmp_path, ppo, sac, share):
+    runs = [
+        write_run(tmp_path / f"{name}-{seed}", algorithm=name, env="Pendulum-v1", seed=seed)
+        for name in ("ppo", "sac")
+        for seed in range(len(ppo))
+    ]
+    said = compare.remarks(group(runs), dict(zip(runs, [*ppo, *sac], strict=True)))
+    (sentence,) = [line for line in said if "is better than" in line]
+    assert sentence.startswith(share)
+    assert (compare.FEW_SEEDS in said) == (len(ppo) < 5)
+
+
 def drawn(monkeypatch, *runs):
     """The figure of the comparison that `lem.plot` draws."""
     figures = {}

@@ -102,9 +102,15 @@ def test_the_skeleton_is_the_solution_with_its_gaps(tmp_path):
     file = course.skeleton("ppo", tmp_path / "mine.py")
     text = file.read_text()
     assert "solution" not in text
+    assert "    python mine.py" in text
     assert text.count('raise NotImplementedError("to be written")') == SOLUTION.count("# <solution>") == 5
     kept = re.sub(r"# <solution>.*?# </solution>", "", SOLUTION, flags=re.DOTALL)
-    assert text.replace('raise NotImplementedError("to be written")', "").split() == kept.split()
+    assert (
+        text.replace("python mine.py", "python ppo.py")
+        .replace('raise NotImplementedError("to be written")', "")
+        .split()
+        == kept.split()
+    )
     scope = {"__name__": "mine"}
     exec(compile(text, "mine.py", "exec"), scope)
     finding = course.check(scope["train"])

@@ -1,49 +1,59 @@
 """The examples run: as programs, and by their names on the command line."""
 
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
+from forks import command, forks
+
 EXAMPLES = Path(__file__).parents[1] / "examples"
-LEMNISCATE = [sys.executable, "-m", "lemniscate.cli"]
 
 
-def run(command, folder=EXAMPLES):
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    return done
+def program(name, folder):
+    """Run an example as a program; what it prints on standard output."""
+    code = f"import runpy, sys; sys.path.insert(0, {str(EXAMPLES)!r}); runpy.run_path({str(EXAMPLES / name)!r}, run_name='__main__')"
+    return done(forks().start(code, folder))[0]
+
+
+def lemniscate(*words):
+    """Run a command where the examples are; (standard output, standard error)."""
+    return done(command(*words, cwd=EXAMPLES))
+
+
+def done(process):
+    said = process.communicate()
+    assert process.returncode == 0, said
+    return said
 
 
 @pytest.mark.parametrize("name", sorted(path.name for path in EXAMPLES.glob("*.py") if path.name != "own_logger.py"))
 def test_a_program_runs(name, tmp_path):
-    assert run([sys.executable, EXAMPLES / name], tmp_path).stdout.strip()
+    assert program(name, tmp_path).strip()
 
 
 def test_an_algorithm_of_ones_own_has_the_command_line_and_its_presets(tmp_path):
-    steps = ["--total-steps", "4_096", "--run", tmp_path / "run"]
-    done = run([*LEMNISCATE, "train", "own_algorithm", "--env", "CartPole-v1", *steps])
-    assert "preset careful" in done.stderr
-    assert "episodes of CartPole-v1" in run([*LEMNISCATE, "evaluate", tmp_path / "run", "--episodes", "2"]).stderr
-    assert "--beta" in run([*LEMNISCATE, "train", "own_algorithm", "--help"]).stdout
+    path = tmp_path / "run"
+    steps = ["--total-steps", "4_096", "--run", path]
+    assert "preset careful" in lemniscate("train", "own_algorithm", "--env", "CartPole-v1", *steps)[1]
+    assert "episodes of CartPole-v1" in lemniscate("evaluate", path, "--episodes", "2")[1]
+    assert "--beta" in lemniscate("train", "own_algorithm", "--help")[0]
 
 
 def test_a_network_and_a_logger_of_ones_own(tmp_path):
     own = ["--network", "own_network:Fourier", "--track", "own_logger:Csv"]
-    steps = ["--total-steps", "4_096", "--run", tmp_path / "run"]
-    run([*LEMNISCATE, "train", "ppo", "--env", "CartPole-v1", *own, *steps])
-    assert (tmp_path / "run" / "metrics.csv").read_text().count("losses/policy") == 8
-    run([*LEMNISCATE, "evaluate", tmp_path / "run", "--episodes", "2"])
+    path = tmp_path / "run"
+    lemniscate("train", "ppo", "--env", "CartPole-v1", *own, "--total-steps", "4_096", "--run", path)
+    assert (path / "metrics.csv").read_text().count("losses/policy") == 8
+    lemniscate("evaluate", path, "--episodes", "2")
 
 
 def test_an_environment_of_ones_own_with_arguments_and_a_wrapper(tmp_path):
     own = ["--env", "own_environment:Balance", "--env-args", '{"wind": 0.5}']
     own += ["--wrappers", "own_environment:scaled(factor=0.1)"]
     steps = ["--total-steps", "700", "--learning-starts", "500", "--run", tmp_path / "run"]
-    run([*LEMNISCATE, "train", "sac", *own, *steps])
-    run([*LEMNISCATE, "evaluate", tmp_path / "run", "--episodes", "2", "--env-args", '{"wind": 0}'])
-    assert run([*LEMNISCATE, "check", "own_environment:Balance"]).stderr
+    lemniscate("train", "sac", *own, *steps)
+    lemniscate("evaluate", tmp_path / "run", "--episodes", "2", "--env-args", '{"wind": 0}')
+    assert lemniscate("check", "own_environment:Balance")[1]
 
 
 def test_the_contract_holds_for_the_algorithm_of_ones_own(tmp_path, monkeypatch):

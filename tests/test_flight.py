@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import lemniscate as lem
+from lemniscate import results
 from lemniscate.envs.backend import Scene
 from lemniscate.envs.gymnasium import GymnasiumBackend
 from lemniscate.report import flight, playback
@@ -84,6 +85,10 @@ def test_a_scene_that_is_known_when_environments_are_made_is_drawn_and_they_are_
     files = lem.plot(run)
     assert {"flight.png", "error.png"} <= {file.name for file in files}
     assert Aviary.open == 0
+
+
+def test_the_film_of_a_report_is_named_before_its_page(run, drawn):
+    assert [file.name for file in results.draw_run(run, film=True)[-2:]] == ["flight.gif", "report.html"]
 
 
 def test_a_flight_is_drawn_wherever_it_is():

@@ -1,14 +1,12 @@
 """Wrong versions of the maths that the suite must kill: each is written into a copy of the package and tested."""
 
-import json
-import os
 import re
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+
+from forks import Forks
 
 ROOT = Path(__file__).parents[1]
 
@@ -130,14 +128,14 @@ MUTANTS = [
         "envs/gymnasium.py",
         "~self._resetting, done",
         "valid, done",
-        "envs/test_contract.py",
+        "envs/test_contract.py::test_each_row_is_what_its_action_caused",
     ),
     (
         "the reset observation is the final one",
         "envs/gymnasium.py",
         "in np.flatnonzero(done):",
         "in np.flatnonzero(done & False):",
-        "envs/test_contract.py",
+        "envs/test_contract.py::test_each_row_is_what_its_action_caused",
     ),
     (
         "reset rows reach the batch",
@@ -758,37 +756,15 @@ MUTANTS = [
 ]
 
 
-SERVER = """
-import json, os, sys
-import gymnasium, hypothesis.strategies, matplotlib.figure, pytest, torch._dynamo, torch.distributed.tensor, torch.func
-
-for line in sys.stdin:
-    package, tests, output = json.loads(line)
-    child = os.fork()
-    if not child:
-        file = os.open(output, os.O_WRONLY | os.O_CREAT)
-        os.dup2(file, 1), os.dup2(file, 2)
-        sys.path.insert(0, package)
-        os.environ["PYTHONPATH"] = package
-        os.environ["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"
-        code = pytest.main(["-x", "-q", "-p", "no:cacheprovider", "-m", "not long", "-o", "addopts=", tests])
-        sys.stdout.flush(), sys.stderr.flush()
-        os._exit(code)
-    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
-"""
-"""Runs each mutant's tests in a fork of itself: what is slow to import is there, and no lemniscate yet. Without the
-checks of shapes, which take longer to build than the tests to run."""
+IMPORTS = "import gymnasium, hypothesis.strategies, matplotlib.figure, pytest, torch._dynamo, torch.distributed.tensor, torch.func"
+"""what is slow to import, and no lemniscate yet"""
 
 
 @pytest.fixture(scope="module")
 def server():
-    environment = {**os.environ, "PYTHONDONTWRITEBYTECODE": "1"}
-    command = [sys.executable, "-c", SERVER]
-    with subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=ROOT, env=environment, text=True
-    ) as process:
-        yield process
-        process.stdin.close()
+    started = Forks(IMPORTS, PYTHONDONTWRITEBYTECODE="1", PYTEST_DISABLE_PLUGIN_AUTOLOAD="1")
+    yield started
+    started.close()
 
 
 @pytest.mark.parametrize("mutant", MUTANTS, ids=[mutant[0].replace(" ", "-") for mutant in MUTANTS])
@@ -799,9 +775,19 @@ def test_the_suite_kills(server, tmp_path, mutant):
     text = file.read_text()
     assert text.count(right) == 1, f"{name} no longer has this line once: {right}"
     file.write_text(text.replace(right, wrong))
-    server.stdin.write(json.dumps([str(tmp_path), str(ROOT / "tests" / tests), str(tmp_path / "output")]) + "\n")
-    server.stdin.flush()
-    code, said = int(server.stdout.readline()), (tmp_path / "output").read_text()
+    options = [
+        "-x",
+        "-q",
+        "-p",
+        "no:cacheprovider",
+        "-m",
+        "not long and not faults",
+        "-o",
+        "addopts=",
+    ]  # unshaped: faster
+    code = f"import sys, pytest; sys.path.insert(0, {str(tmp_path)!r}); sys.exit(pytest.main({[*options, str(ROOT / 'tests' / tests)]!r}))"
+    process = server.start(code, ROOT, PYTHONPATH=str(tmp_path))
+    code, said = process.wait(), "".join(process.communicate())
     assert code == 1, said[-2000:]
     assert "1 failed" in said
     # Hypothesis shows two failures that it found in one test as a group, whose lines begin with a bar.

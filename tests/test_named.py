@@ -66,6 +66,16 @@ def test_a_callable_with_arguments():
     [
         ("nowhere:Thing", "nowhere:Thing cannot be found: there is no module nowhere here"),
         ("test_named:Nothing", "test_named has no Nothing"),
+        ("test_named:mine", "test_named has no mine: did you mean Mine?"),
+        (
+            "./test_named.py:Mine",
+            "names a file; name its module, without folder and ending, in that folder: test_named:",
+        ),
+        ("test_named:Mine.y2", "test_named has no Mine.y2."),
+        (
+            "test_named.py:Mine",
+            "names a file; name its module, without folder and ending, in that folder: test_named:Mine.",
+        ),
         ("Mine", "'Mine' is no name of an object; it has the form module:name"),
         ("test_named:Mine(x=open('/etc/passwd'))", "cannot be read; it has the form"),
         ("test_named:Mine(x=1", "cannot be read; it has the form"),
@@ -79,3 +89,11 @@ def test_a_wrong_name_is_said(text, said):
     with pytest.raises(UserError) as raised:
         named.find_callable(text)
     assert said in str(raised.value)
+
+
+def test_a_folder_is_no_module(tmp_path, monkeypatch):
+    (tmp_path / "boat").mkdir()
+    (tmp_path / "boat" / "boat.py").write_text("class Boat: ...")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UserError, match="boat:Boat cannot be found: boat is a folder here; run inside of it"):
+        named.find("boat:Boat")

@@ -7,13 +7,13 @@ import os
 import shutil
 import signal
 import subprocess
-import sys
 import time
 
 import pytest
 from filelock import FileLock
 
 import lemniscate as lem
+from forks import command
 from lemniscate import sweep
 from lemniscate.cli import main
 from lemniscate.run import checkpoint
@@ -102,8 +102,8 @@ def test_the_sweep_is_plotted_again_without_playing(trained, monkeypatch):
 
 def test_what_needs_one_run_says_so_of_a_sweep(trained, capsys):
     path, _ = trained
-    for command in ("evaluate", "watch"):
-        assert main([command, str(path)]) == 2
+    for verb in ("evaluate", "watch"):
+        assert main([verb, str(path)]) == 2
         said = f"{path} is a sweep: name one of its runs, such as {path / 'ddpg-1'}.\n"
         assert capsys.readouterr().err == said
     with pytest.raises(lem.UserError, match="is a sweep"):
@@ -168,17 +168,27 @@ def test_the_policy_is_played_anew_when_there_is_a_newer_checkpoint(trained, tmp
     assert "Evaluating" in capsys.readouterr().err
 
 
-def command(*arguments):
-    """The command line in a process that has one core, so that runs train one after the other."""
-    one_core = "import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})"
-    loud = f"{one_core}; import sys, lemniscate.cli; sys.exit(lemniscate.cli.main())"
-    arguments = [sys.executable, "-c", loud, *map(str, arguments)]
-    return subprocess.Popen(arguments, stderr=subprocess.PIPE, text=True, start_new_session=True)
+ONE_CORE = "import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})"
+"""a sweep trains its runs one after the other"""
 
 
 def test_runs_end_with_the_sweep_that_is_killed_and_it_goes_on(tmp_path):
     path = tmp_path / "killed"
-    process = command("train", "ppo", "--env", "Countdown-v0", "--seeds", "1", "--run", path, "--total-steps", "1e6")
+    process = command(
+        "train",
+        "ppo",
+        "--env",
+        "Countdown-v0",
+        "--seeds",
+        "1",
+        "--run",
+        path,
+        "--total-steps",
+        "1e6",
+        "--compile",
+        "off",
+        before=ONE_CORE,
+    )
     while len(read_metrics(path / "ppo-1")) < 2:
         assert process.poll() is None, process.communicate()
         time.sleep(0.005)
@@ -191,7 +201,9 @@ def test_runs_end_with_the_sweep_that_is_killed_and_it_goes_on(tmp_path):
 def test_ctrl_c_stops_every_run_and_the_sweep_goes_on_to_the_same_bits(tmp_path):
     path = tmp_path / "stopped"
     fields = [*SMALL, "--total-steps", "3_200", "--checkpoint-every", "512"]
-    process = command("train", "ppo", "--env", "Countdown-v0", "--seeds", "1,2", "--run", path, *fields)
+    process = command(
+        "train", "ppo", "--env", "Countdown-v0", "--seeds", "1,2", "--run", path, *fields, before=ONE_CORE
+    )
     while len(read_metrics(path / "ppo-1")) < 20:
         assert process.poll() is None, process.communicate()
         time.sleep(0.005)
@@ -204,7 +216,7 @@ def test_ctrl_c_stops_every_run_and_the_sweep_goes_on_to_the_same_bits(tmp_path)
     with FileLock(path / "ppo-1" / ".lock", timeout=0):  # nobody trains any more
         assert lem.load(path / "ppo-1").step == read_metrics(path / "ppo-1")[-1]["step"] < 3_200
     assert not (path / "ppo-2" / "metrics.jsonl").exists()
-    process = command("resume", path)
+    process = command("resume", path, before=ONE_CORE)
     assert "1 at a time" in process.communicate()[1]
     assert process.returncode == 0
     config = json.loads((path / "ppo-2" / "config.json").read_text())["config"]

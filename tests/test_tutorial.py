@@ -8,6 +8,7 @@ import matplotlib.pyplot as plt
 import nbformat
 import pytest
 
+from lemniscate import results
 from lemniscate.algos import ddpg, ppo, reinforce
 
 TUTORIALS = sorted((Path(__file__).parents[1] / "docs" / "tutorial").glob("[0-9]_*.py"))
@@ -58,6 +59,7 @@ def test_it_runs_and_every_function_in_it_is_right(file, tmp_path, monkeypatch, 
                          (ddpg, "polyak"), (reinforce, "reward_to_go")):  # fmt: skip
         monkeypatch.setattr(module, name, getattr(module, name))  # so that it is put back
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(results, "FINAL_EPISODES", 4)
     monkeypatch.setenv("MUJOCO_GL", "egl")  # there is no display here
     code, found = re.subn(r"^STEPS = [\d_]+$", "STEPS = 3_000", file.read_text(), flags=re.MULTILINE)
     assert found == 1

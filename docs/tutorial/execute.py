@@ -30,6 +30,14 @@ def execute(file):
         options = {"timeout": 1800, "record_timing": False, "coalesce_streams": True}
         NotebookClient(notebook, resources={"metadata": {"path": folder}}, **options).execute()
     notebook.metadata = METADATA
+    return without_words_for_pictures(notebook)
+
+
+def without_words_for_pictures(notebook):
+    """The notebook without the names of objects, such as <Figure size 900x300 with 2 Axes>, beside their pictures."""
+    for output in (output for cell in notebook.cells for output in cell.get("outputs", ())):
+        if len(output.get("data", ())) > 1 and output.data["text/plain"].startswith("<"):
+            del output.data["text/plain"]
     return notebook
 
 

@@ -14,13 +14,14 @@ from lemniscate.callbacks import Callback, call_callbacks, find_callbacks
 from lemniscate.console import say
 from lemniscate.envs import registry
 from lemniscate.errors import NotStoredError, UserError, is_installed, missing_extra, shown, unknown_name
+from lemniscate.machine import require_threads
 from lemniscate.policy import TrainedPolicy
 from lemniscate.report import playback
 from lemniscate.results import draw_run, evaluate
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import is_finished, read_record, require_absent
 from lemniscate.run.environments import make_envs
-from lemniscate.run.files import parsing
+from lemniscate.run.files import make_directory, parsing
 from lemniscate.run.loggers import TRACKERS, JsonLines, LoggerClass, TensorBoard
 from lemniscate.run.run import Run
 from lemniscate.run.seeding import set_seeds
@@ -85,9 +86,10 @@ def train(
         preset: by name; the best known for the environment unless given.
         track: a logger beside the local ones: "wandb", the `module:Class` of your own, or the class itself; it gets
             the final pictures too.
-        callbacks: functions of (step, metrics, policy), or their names as `module:function`. They are called after
-            each logged line with a read-only view of its metrics and a copy of the policy, and can change nothing in
-            the run; one that returns True stops it, saved. An exception that one raises also leaves it saved.
+        callbacks: functions of (step, metrics, policy), or names as `module:function` or `module:Class(key=value, …)`.
+            They are called after each logged line with a read-only view of its metrics and a copy of the policy, and
+            can change nothing in the run; one that returns True stops it, saved. An exception that one raises also
+            leaves it saved.
         report: evaluate the final policy, and draw it into `plots/` and `videos/`.
         progress: the live line on standard error.
         **fields: any field of the algorithm's Config, such as seed, total_steps or warm_start.
@@ -102,7 +104,7 @@ def train(
     config = config_for(algorithm, env, preset, **fields)
     algorithm = algos.name_of(sys.modules[type(config).__module__] if isinstance(algorithm, RunConfig) else algorithm)
     path = path_of(run) if run is not None else fresh_directory(config.env, f"{algorithm}-{config.seed}")
-    loggers, functions = loggers_with(track), find_callbacks(callbacks)
+    loggers, functions = loggers_with(track), find_callbacks(callbacks) if callbacks else []
     require_absent(path)
     return _train(path, algorithm, config, loggers, functions, report or track is not None, progress)
 
@@ -150,7 +152,7 @@ def resume(
         code = own_code_of({"algorithm": algorithm, "config": {**fields, **given}})
         require_trusted(path, code, trusted=trust or is_signed(record))
     config = algos.find(algorithm).Config.from_json(fields).replace(**given)
-    loggers, functions = loggers_with(track), find_callbacks(callbacks)
+    loggers, functions = loggers_with(track), find_callbacks(callbacks) if callbacks else []
     if is_finished(path):
         return _finished(path, report, progress, trust)
     return _train(path, algorithm, config, loggers, functions, report or track is not None, progress)
@@ -175,6 +177,7 @@ def _train(
     report: bool,
     progress: bool,
 ) -> TrainedRun:
+    require_threads(config.threads)
     set_seeds(config.seed)  # before JAX starts, which reads its flags then
     torch.set_num_threads(config.threads)
     envs = make_envs(config)
@@ -188,6 +191,7 @@ def _train(
     def film(state: TrainState) -> None:
         kind = "mp4" if is_installed("imageio_ffmpeg") else "gif"
         policy = TrainedPolicy(copy_networks(state), spec, config, state.step)
+        make_directory(path / "videos")
         evaluate(policy, episodes=1, video=path / "videos" / f"step-{state.step}.{kind}")
 
     observer = call_callbacks(callbacks, copy_networks, spec, config) if callbacks else None

@@ -1,6 +1,7 @@
 """Callbacks: functions of the user's that see a run while it trains, and may stop it."""
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from types import MappingProxyType
 from typing import Any
 
@@ -42,17 +43,29 @@ class PolicySnapshot(TrainedPolicy):
 
 
 def find_callbacks(callbacks: Callback | str | Sequence[Callback | str]) -> list[Callback]:
-    """The functions themselves: of functions, or names of functions as `module:function`, or one of these.
+    """The functions themselves: of functions, or names of functions, as in `train`, or one of these.
 
     Raises:
         UserError: a callback that cannot be loaded or called.
     """
     several: Sequence[Any] = callbacks if isinstance(callbacks, list | tuple) else [callbacks]
-    functions = [named.find(one) if isinstance(one, str) else one for one in several]
+    functions = [_by_name(one) if isinstance(one, str) else one for one in several]
     for function in functions:
         if not named.takes(function, 3):
             raise UserError(f"A callback must be a function of (step, metrics, policy), not {shown(function)}.")
     return functions
+
+
+def _by_name(name: str) -> Any:
+    """The function `module:function`, or an object of `module:Class(key=value, …)`. Raises `UserError`."""
+    found = named.find_callable(name)
+    made = found.func if isinstance(found, partial) else found
+    if not isinstance(made, type):
+        return found
+    try:
+        return found()
+    except TypeError as error:
+        raise UserError(f"{name} cannot be made; give its arguments as module:Class(key=value, …): {error}.") from error
 
 
 def call_callbacks(

@@ -3,9 +3,11 @@
 Standard output is left to programs; in a notebook nothing reads it, and standard error looks like a failure there.
 """
 
+import select
 import sys
 import time
-from typing import Any
+from contextlib import suppress
+from typing import Any, TextIO
 
 from lemniscate.notebook import CellText, drawn_bar
 
@@ -20,8 +22,22 @@ def in_notebook() -> bool:
 
 
 def say(text: object) -> None:
-    """Print one line on standard error; in a notebook on standard output."""
-    print(text, file=sys.stdout if in_notebook() else sys.stderr, flush=True)
+    """Print one line on standard error; in a notebook on standard output.
+
+    A line that is not taken within a second, since a pager stands still, or not at all any more, is left out: no run
+    waits or ends for want of a reader.
+    """
+    stream = sys.stdout if in_notebook() else sys.stderr
+    with suppress(OSError):
+        if _takes_a_line(stream):
+            print(text, file=stream, flush=True)
+
+
+def _takes_a_line(stream: TextIO, seconds: float = 1.0) -> bool:
+    try:
+        return bool(select.select((), (stream,), (), seconds)[1])
+    except (OSError, ValueError, TypeError):  # no file of the system
+        return True
 
 
 class ProgressBar:
@@ -52,7 +68,8 @@ class ProgressBar:
     def close(self) -> None:
         """Leave the terminal as it was, or the last line below the cell."""
         if self._bar:
-            self._bar.stop()
+            with suppress(OSError):  # the terminal may be gone
+                self._bar.stop()
         if self._cell:
             self._cell.flush()
 

@@ -4,6 +4,7 @@ The command line prints a `UserError` as it is and exits with 2; anything else i
 traceback.
 """
 
+import math
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from difflib import get_close_matches
@@ -44,11 +45,14 @@ def prefix_errors(name: str) -> Iterator[None]:
         raise UserError(f"{name}: {error}") from None
 
 
-def unknown_name(kind: str, name: object, known: Iterable[str]) -> UserError:
-    """The sentence for a name that is not in a table: the nearest names, or all of them when few."""
+def unknown_name(
+    kind: str, name: object, known: Iterable[str], otherwise: str = "nothing known is near it."
+) -> UserError:
+    """The sentence for a name that is not in a table: the nearest names, or all of them when few, or `otherwise`."""
     names = sorted(known)
     plain = {choice.lower().lstrip("-"): choice for choice in names}
-    typed = str(name).lower().lstrip("-")
+    written = repr(name) if isinstance(name, str) else shown(name)
+    typed = (name if isinstance(name, str) else written).lower().lstrip("-")
     close = [typed] if typed in plain else get_close_matches(typed, plain, n=3, cutoff=0.5)
     near = [plain[match] for match in close]
     if near:
@@ -56,14 +60,21 @@ def unknown_name(kind: str, name: object, known: Iterable[str]) -> UserError:
     elif len(names) <= 12:
         hint = f"there is {', '.join(names)}."
     else:
-        hint = "nothing known is near it."
-    return UserError(f"There is no {kind} {name!r}: {hint}")
+        hint = otherwise
+    return UserError(f"There is no {kind} {written}: {hint}")
 
 
 def shown(value: object) -> str:
     """A value in a sentence: as it is written if that is short, else its type."""
-    text = repr(value)
-    return text if len(text) <= 60 and not text.startswith("<") and "\n" not in text else f"a {type(value).__name__}"
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):  # Python writes no whole number of more than 4,300 digits
+        text = "<"
+    if len(text) <= 60 and not text.startswith("<") and "\n" not in text:
+        return text
+    if isinstance(value, int):
+        return f"a number of {int(math.log10(abs(value))) + 1:,} digits"
+    return f"a {type(value).__name__}"
 
 
 def wrong_action(env: str, action: Any, layout: tuple[Any, Any] | None) -> UserError:

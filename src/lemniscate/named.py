@@ -5,6 +5,7 @@ import importlib
 import inspect
 import sys
 from collections.abc import Callable
+from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
 from types import ModuleType
@@ -50,13 +51,28 @@ def find(name: str) -> Any:
     if name in _PASSED:
         return _PASSED[name]
     found: Any = module_of(name)
-    module_name, _, qualname = name.rpartition(":")
+    qualname = name.rpartition(":")[2]
     for part in qualname.split("."):
         if not hasattr(found, part):
-            again = "; it was defined in another program: pass the object again." if module_name == "__main__" else "."
-            raise UserError(f"{name} cannot be found: {module_name} has no {qualname}{again}")
+            raise _absent(name, found, part)
         found = getattr(found, part)
     return found
+
+
+def _absent(name: str, inside: Any, part: str) -> UserError:
+    """The sentence for an object that is not in its module, or not in its class."""
+    module_name, _, qualname = name.rpartition(":")
+    if isinstance(inside, ModuleType) and not getattr(inside, "__file__", None) and hasattr(inside, "__path__"):
+        return UserError(f"{name} cannot be found: {module_name} is a folder here; run inside of it.")
+    known = {attribute.lower(): attribute for attribute in dir(inside)}
+    near = get_close_matches(part.lower(), known, n=1)
+    if module_name == "__main__":
+        hint = "; it was defined in another program: pass the object again."
+    elif near:
+        hint = f": did you mean {known[near[0]]}?"
+    else:
+        hint = "."
+    return UserError(f"{name} cannot be found: {module_name} has no {qualname}{hint}")
 
 
 def module_of(name: str) -> ModuleType:
@@ -64,6 +80,9 @@ def module_of(name: str) -> ModuleType:
     module_name, _, qualname = name.rpartition(":")
     if not module_name or not qualname:
         raise UserError(f"{name!r} is no name of an object; it has the form module:name.")
+    if module_name.endswith(".py"):
+        module = f"{Path(module_name).stem}:{qualname}"
+        raise UserError(f"{name} names a file; name its module, without folder and ending, in that folder: {module}.")
     if "<" in name:
         raise UserError(f"{name} is not kept in any file, since it was made inside a program: pass the object again.")
     if str(Path.cwd()) not in sys.path:

@@ -10,7 +10,8 @@ from lemniscate.report import compare, curves
 from lemniscate.report.groups import group
 from lemniscate.results import draw_run, final_return
 from lemniscate.run.directory import is_finished, read_config
-from lemniscate.run.metrics import read_metrics
+from lemniscate.run.files import make_directory
+from lemniscate.run.metrics import damage, read_metrics
 from lemniscate.run.sweep_file import is_sweep, read_sweep
 from lemniscate.stored import TrainedRun, path_of
 
@@ -34,7 +35,6 @@ def plot(*runs: Plotted | list[Plotted], by: str = "step", trust: bool = False) 
         *runs: run directories, or those of sweeps; what `train` returned; policies from `train` or `load`.
         by: the horizontal axis of the learning curve: "step", "episode" or "minute". By episode the curve is the moving
             average of 20 episodes.
-
         trust: import the code that a run names as `module:name` also if the run is not of this user and machine.
 
     Returns:
@@ -49,6 +49,8 @@ def plot(*runs: Plotted | list[Plotted], by: str = "step", trust: bool = False) 
     if not paths:
         raise UserError("There is nothing to plot: name one run or several, such as plot('runs/lander').")
     found = [run for path in paths for run in _members(path)]
+    if len(paths) == 1:
+        make_directory(paths[0] / "plots")
     if found == paths[:1]:
         files = draw_run(paths[0], by, trust=trust)
     else:
@@ -77,4 +79,6 @@ def _members(path: Path) -> list[Path]:
     runs = [run for run in (read_sweep(path).runs if is_sweep(path) else [path]) if read_metrics(run)]
     if not runs:
         raise UserError(f"{path} has no metrics to plot yet.")
+    for sentence in filter(None, (damage(run, logged=0) for run in runs)):
+        say(sentence)
     return runs

@@ -18,11 +18,11 @@ from lemniscate.report import playback
 from lemniscate.report.display import require_display
 from lemniscate.report.film import check_film
 from lemniscate.run import checkpoint
-from lemniscate.run.config import Count, Natural, RunConfig, checked
+from lemniscate.run.config import Episodes, Natural, RunConfig, checked
 from lemniscate.run.environments import env_arguments, evaluation_env
 from lemniscate.run.evaluate import Evaluation
 from lemniscate.run.evaluate import evaluate as evaluate_policy
-from lemniscate.run.files import DamagedFileError, read_json, write_json
+from lemniscate.run.files import DamagedFileError, make_directory, read_json, write_json
 from lemniscate.run.q_bias import critic_of
 from lemniscate.stored import Trained, TrainedRun, load, path_of
 
@@ -69,7 +69,7 @@ def evaluate(
             or another kind of file.
     """
     agent = policy if callable(policy) else load(policy, trust=trust)
-    episodes, seed, file = checked("episodes", episodes, Count), checked("seed", seed, Natural), _film(video)
+    episodes, seed, file = checked("episodes", episodes, Episodes), checked("seed", seed, Natural), _film(video)
     elsewhere: dict[str, Any] = {"env": env, "env_kwargs": _kwargs(env_kwargs), "backend": backend}
     how: dict[str, Any] = {"episodes": episodes, "seed": seed, "tell": lambda text: None}
     arguments = env_arguments(_config_of(agent, env), **elsewhere)
@@ -118,7 +118,7 @@ def watch(
             of file.
     """
     agent = policy if policy is None or callable(policy) else load(policy, trust=trust)
-    episodes, seed, file = checked("episodes", episodes, Count), checked("seed", seed, Natural), _film(video)
+    episodes, seed, file = checked("episodes", episodes, Episodes), checked("seed", seed, Natural), _film(video)
     if agent is None and env is None:
         raise UserError("Watch what? Name a run, or an environment to act in at random.")
     elsewhere: dict[str, Any] = {"env": env, "env_kwargs": _kwargs(env_kwargs)}
@@ -181,6 +181,7 @@ def draw_run(run: str | Path | TrainedRun, by: str = "step", *, film: bool = Fal
     a scene.
     """
     path, scores, flights = path_of(run), None, list[Path]()
+    make_directory(path / "plots")
     if checkpoint.list_steps(path / "checkpoints"):
         try:
             scores = final_scores(run, trust=trust)

@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -23,13 +24,15 @@ from lemniscate.algos import ALGORITHMS, name_of
 from lemniscate.console import say
 from lemniscate.envs import registry
 from lemniscate.errors import SweepError, UserError, prefix_errors, resume_line, shown
+from lemniscate.machine import require_threads
 from lemniscate.owner import OWNED
 from lemniscate.results import final_return
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import is_finished
-from lemniscate.run.environments import device_for
+from lemniscate.run.environments import device_for, require_memory
+from lemniscate.run.files import open_log, open_regular
 from lemniscate.run.metrics import read_metrics
-from lemniscate.run.run import Stopped, signals_to
+from lemniscate.run.run import Stopped, stop_signals_to
 from lemniscate.run.sweep_file import Sweep, read_sweep
 from lemniscate.run.sweep_progress import SweepProgress
 from lemniscate.run.trust import require_trusted
@@ -41,6 +44,9 @@ LOG = "log.txt"
 
 PROGRESS_BYTES = 2**17
 """bytes at the end of a run's metrics that its progress is read from"""
+
+MOST_SEEDS = 1_000
+"""of a sweep, each of which is a directory and a process"""
 
 POLL_SECONDS = 0.3
 """seconds between two looks at the processes"""
@@ -176,7 +182,7 @@ class _Processes:
         places = at_once(max(config["threads"] for config in self._runs.configs.values()))
         try:
             self._bars.say(f"{path}: {count} of {len(self._runs.runs)} runs to train, {places} at a time")
-            with signals_to(self._stop, *_signals()):
+            with stop_signals_to(self._stop):
                 while self._running or (self._waiting and not self._stop_signal):
                     while self._waiting and len(self._running) < places and not self._stop_signal:
                         self._start(self._waiting.pop(0))
@@ -204,7 +210,7 @@ class _Processes:
         """
         command = [sys.executable, "-m", "lemniscate.cli", "resume", str(run), "--score", *self._options]
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path)), OWNED: "1"}
-        with (run / LOG).open("a") as log:
+        with open_log(run / LOG) as log:
             self._running[run] = subprocess.Popen(
                 command, stdin=subprocess.PIPE, stdout=log, stderr=log, env=environment, start_new_session=True
             )
@@ -241,12 +247,6 @@ def _close_input(process: subprocess.Popen) -> None:
         process.stdin.close()
 
 
-def _signals() -> list[int]:
-    """The signals that stop a sweep; of a closed terminal only where nohup has not told it to ignore them."""
-    hang_up = [signal.SIGHUP] if signal.getsignal(signal.SIGHUP) is signal.SIG_DFL else []
-    return [signal.SIGINT, signal.SIGTERM, *hang_up]
-
-
 def _progress_of(run: Path) -> tuple[int, float | None, float | None]:
     """(step, mean return of the last 100 episodes, steps per second) in the last lines of a run's metrics."""
     lines = read_metrics(run, PROGRESS_BYTES)
@@ -258,9 +258,10 @@ def _progress_of(run: Path) -> tuple[int, float | None, float | None]:
 
 def _failure_of(run: Path, code: int) -> str:
     """The signal that ended a process, or else the last line that it wrote."""
-    if code < 0 or code in (130, 143):
+    if code < 0 or code in (129, 130, 143):
         return f"{signal.strsignal(-code if code < 0 else code - 128)}."
-    written = (run / LOG).read_text().split("\n")
+    with open_regular(run / LOG) as log:
+        written = log.read().decode(errors="replace").split("\n")
     return next((line for line in reversed(written) if line.strip()), f"Exit code {code}.")
 
 
@@ -276,15 +277,19 @@ def algorithms_of(names: str | Iterable[str]) -> list[str]:
 def _seeds_of(seeds: str | int | Iterable[int]) -> list[int]:
     """The seeds in "1-5,8", a number or a list, each once."""
     if not isinstance(seeds, str):
-        seeds = ",".join(map(str, seeds if isinstance(seeds, Iterable) else [seeds]))
-    numbers: list[int] = []
+        seeds = getattr(seeds, "tolist", lambda: seeds)()  # of NumPy's and torch's arrays
+        given = islice(seeds, MOST_SEEDS + 1) if isinstance(seeds, Iterable) else [seeds]
+        seeds = ",".join(seed if isinstance(seed, str) else shown(seed) for seed in given)
+    numbers: dict[int, None] = {}
     for part in seeds.split(","):
-        ends = re.fullmatch(r"(\d+)(?:-(\d+))?", part.strip())
-        between = range(int(ends[1]), int(ends[2] or ends[1]) + 1) if ends else ()
+        ends = re.fullmatch(r"([0-9]{1,20})(?:-([0-9]{1,20}))?", part.strip())
+        between = range(int(ends[1]), int(ends[2] or ends[1]) + 1) if ends else range(0)
         if not between:
-            raise UserError(f"seeds must be numbers such as 1-5 or 1,3,7, not {seeds!r}.")
-        numbers += between
-    return list(dict.fromkeys(numbers))
+            raise UserError(f"seeds must be numbers such as 1-5 or 1,3,7, not {shown(seeds)}.")
+        numbers |= dict.fromkeys(between[: MOST_SEEDS + 1])
+        if len(numbers) > MOST_SEEDS:
+            raise UserError(f"A sweep takes at most {MOST_SEEDS:,} seeds, and there are more in {shown(seeds)}.")
+    return list(numbers)
 
 
 def _require_trainable(configs: dict[str, RunConfig], seeds: list[int]) -> None:
@@ -294,13 +299,15 @@ def _require_trainable(configs: dict[str, RunConfig], seeds: list[int]) -> None:
             if "<" in thing or thing.startswith("__main__:"):
                 said = f"Each run of a sweep has a process of its own: put {thing} into a module, to import it."
                 raise UserError(said)
-        device_for(config.device)
+        device = device_for(config.device)
+        require_threads(config.threads)
         for seed in seeds:
             config.replace(seed=seed)
         own = {"kwargs": config.env_kwargs, "wrappers": config.wrappers, "backend": config.backend}
         with prefix_errors(name):
             env = registry.make(config.env, 1, **own)
             env.close()
+            require_memory(config, env.spec, device)
             networks = config.networks(env.spec)
             if config.warm_start:
                 load_networks(networks, config, env.spec)

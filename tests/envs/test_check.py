@@ -52,6 +52,16 @@ class WrongType(Fine):
         return [5.0, 5.0]
 
 
+class Double(Fine):
+    def look(self):
+        return np.zeros(2)
+
+
+class Outside(Fine):
+    def look(self):
+        return np.array([0.0, 50.0], dtype=np.float32)
+
+
 class Rich(Fine):
     def pay(self):
         return 1e4
@@ -254,6 +264,8 @@ def test_the_mode_of_a_vector_environment_is_told():
         ("Blind", "note", "Another seed gives the same"),
         ("Nan", "bad", "The reward of environment 0 is nan"),
         ("WrongType", "bad", "Gymnasium's checker: The first element returned by `env.reset()`"),
+        ("Double", "bad", "It is float64, the space float32: return obs.astype(np.float32)."),
+        ("Outside", "bad", "Its number 1 is 50, outside of [-1, 1]."),
         ("Rich", "note", "train with --scale-rewards (on-policy)"),
         ("Fine", "note", "It has no time limit"),
         ("Fine", "note", "look whether step() uses its argument"),

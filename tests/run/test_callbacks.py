@@ -93,7 +93,7 @@ def test_the_weights_are_copied_only_if_they_are_used(tmp_path, monkeypatch):
     networks = Config.networks
     monkeypatch.setattr(Config, "networks", lambda *args: made.append(1) or networks(*args))
     train(tmp_path / "r", callbacks=[lambda step, _, policy: kept.append(policy)])
-    assert len(made) == 1
+    assert len(made) == 2  # those that are trained, and before them their shapes, for an estimate of the memory
     with pytest.raises(lem.UserError, match="not used while its callback ran"):
         kept[0].act(OBS["ppo"])
 
@@ -106,7 +106,10 @@ def test_a_callback_stops_the_run_which_can_be_resumed(tmp_path, capsys, stop_at
     assert run.policy.step == lem.load(path).step == stop_at
     said = capsys.readouterr().err
     if stop_at < 256:
-        assert f"Stopped at step {stop_at}; the policy is saved. Go on with: lemniscate resume {path}" in said
+        assert (
+            f"Stopped by a callback at step {stop_at}; the policy is saved. Go on with: lemniscate resume {path}"
+            in said
+        )
         assert f"It resumes at step {stop_at // 64 * 64}, the last planned checkpoint" in said
     else:
         assert "Stopped" not in said
@@ -144,6 +147,18 @@ def test_a_callback_is_named_as_module_and_function(tmp_path, monkeypatch):
     assert train(tmp_path / "r", callbacks=["my_callbacks:stop"]).policy.step == 64
 
 
+class Above:
+    def __init__(self, limit):
+        self.limit = limit
+
+    def __call__(self, step, metrics, policy):
+        return step >= self.limit
+
+
+def test_a_callback_of_a_class_is_named_with_its_arguments(tmp_path):
+    assert train(tmp_path / "r", callbacks=["test_callbacks:Above(limit=64)"]).policy.step == 64
+
+
 @pytest.mark.parametrize(
     ("callback", "said"),
     [
@@ -153,7 +168,10 @@ def test_a_callback_is_named_as_module_and_function(tmp_path, monkeypatch):
             "no_such_module:stop cannot be found: there is no module no_such_module here; run in its folder",
         ),
         ("math:cosin", "math:cosin cannot be found: math has no cosin"),
-        ("math:pi", r"A callback must be a function of \(step, metrics, policy\), not 3.14"),
+        ("math:pi", "math:pi is neither a function nor a class"),
+        ("test_callbacks:Above", r"test_callbacks:Above cannot be made; .*required positional argument: 'limit'"),
+        ("test_callbacks:Above(limits=64)", "unexpected keyword argument 'limits'"),
+        ("math:pow", r"A callback must be a function of \(step, metrics, policy\), not a builtin_function_or_method"),
     ],
 )
 def test_a_callback_that_cannot_be_called_is_told_before_anything_is_made(tmp_path, callback, said):

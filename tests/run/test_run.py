@@ -2,13 +2,10 @@
 
 import json
 import os
-import random
 import re
 import resource
 import shutil
 import signal
-import subprocess
-import sys
 import threading
 import time
 from contextlib import ExitStack, contextmanager
@@ -20,6 +17,7 @@ import torch
 
 import lemniscate as lem
 from conftest import tiny_fields, tiny_off_policy
+from forks import command
 from lemniscate.envs import toy
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.run import checkpoint
@@ -28,9 +26,6 @@ from lemniscate.run.files import read_json, write_json
 from lemniscate.run.metrics import read_metrics
 from lemniscate.run.run import TRAINING
 from lemniscate.run.seeding import derive
-
-LOUD = "import sys, lemniscate.cli; sys.exit(lemniscate.cli.main())"
-
 
 OFF_POLICY = {
     # name: algorithm and fields; in Pendulum-v1, whose episodes are longer than the distance of checkpoints
@@ -315,14 +310,6 @@ def test_two_processes_do_not_share_a_directory(tmp_path):
         lem.resume(tmp_path / "r", progress=False)
 
 
-def command(*arguments, stderr=subprocess.DEVNULL, **options):
-    tests = str(Path(__file__).parents[1])
-    environment = {**os.environ, "COLUMNS": "200", "PYTHONPATH": os.pathsep.join([tests, *filter(None, sys.path)])}
-    return subprocess.Popen(
-        [sys.executable, "-c", LOUD, *map(str, arguments)], stderr=stderr, text=True, env=environment, **options
-    )
-
-
 def words_for(name, value):
     """A field as it is written on the command line."""
     values = [] if value is True else value if isinstance(value, tuple) else [value]
@@ -336,7 +323,7 @@ def long_run(path, env, updates=150, compile="off"):
         given = [word for name, value in fields.items() for word in words_for(name, value)]
         return ["train", env, "--env", "Pendulum-v1", "--run", path, *given]
     fields = tiny_fields(env, hidden=(32, 32), total_steps=32 * updates, checkpoint_every=32 * 8, epochs=4)
-    flags = ["--run", path]
+    flags = ["--run", path, "--compile", compile]
     for name in ("num_envs", "num_steps", "total_steps", "epochs", "minibatch_size", "checkpoint_every"):
         flags += [f"--{name.replace('_', '-')}", fields[name]]
     return ["train", "ppo", "--env", env, "--preset", "paper", "--hidden", "32", "32", *flags]
@@ -348,12 +335,7 @@ def wait_for(condition, process=None):
         time.sleep(0.005)
 
 
-@pytest.mark.parametrize("env", ["Countdown-v0", "CartPole-v1", "ddpg"])
-def test_killed_at_random_and_resumed_it_ends_in_the_same_bits(tmp_path, env):
-    """SIGKILL on real processes, several times in one run, at times drawn again in each test run."""
-    check_kills(tmp_path, long_run(tmp_path / "whole", env), long_run(tmp_path / "killed", env), kills=3)
-
-
+@pytest.mark.long
 def test_a_compiled_run_goes_on_to_the_same_bits(tmp_path):
     """From a checkpoint on in a new process: what was compiled there is compiled again here."""
     whole, half = tmp_path / "whole", tmp_path / "half"
@@ -361,7 +343,7 @@ def test_a_compiled_run_goes_on_to_the_same_bits(tmp_path):
     shutil.copytree(whole, half)
     for step in checkpoint.list_steps(half / "checkpoints")[1:]:
         shutil.rmtree(half / "checkpoints" / f"step-{step}")
-    resumed = command("resume", half, stderr=subprocess.PIPE)
+    resumed = command("resume", half)
     said = resumed.communicate()[1]
     assert resumed.returncode == 0
     assert "Compiling" in said
@@ -370,33 +352,10 @@ def test_a_compiled_run_goes_on_to_the_same_bits(tmp_path):
     assert history(half) == history(whole)
 
 
-def check_kills(tmp_path, whole, killed, kills):
-    assert command(*whole).wait() == 0
-    path, arguments = tmp_path / "killed", killed
-    seed = random.SystemRandom().randrange(10**6)
-    rng = random.Random(seed)
-    killed_at = []
-    for _ in range(kills):
-        process = command(*arguments)
-        reached = len(read_metrics(path))
-        wait_for(lambda: len(read_metrics(path)) > reached or process.poll() is not None)  # noqa: B023
-        try:
-            process.wait(rng.uniform(0, 0.6))
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
-            killed_at.append(len(read_metrics(path)))
-        arguments = ["resume", path]
-    assert killed_at, "the run was over before the first kill"
-    assert command(*arguments).wait() == 0
-    assert final_hashes(path) == final_hashes(tmp_path / "whole"), f"kill times from seed {seed}"
-    assert history(path) == history(tmp_path / "whole"), f"kill times from seed {seed}"
-
-
 def test_ctrl_c_at_a_terminal_reaches_the_workers_too_and_harms_nothing(tmp_path):
     path = tmp_path / "r"
     arguments = [*long_run(path, "CartPole-v1", updates=3000), "--backend", "gymnasium-async"]
-    process = command(*arguments, stderr=subprocess.PIPE, start_new_session=True)
+    process = command(*arguments)
     wait_for(lambda: len(read_metrics(path)) > 5, process)
     os.killpg(process.pid, signal.SIGINT)
     said = process.communicate()[1]
@@ -408,7 +367,7 @@ def test_ctrl_c_at_a_terminal_reaches_the_workers_too_and_harms_nothing(tmp_path
 @pytest.mark.parametrize(("signum", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_leaves_a_checkpoint_and_says_how_to_go_on(tmp_path, signum, code):
     path = tmp_path / "r"
-    process = command(*long_run(path, "CartPole-v1", updates=3000), stderr=subprocess.PIPE)
+    process = command(*long_run(path, "CartPole-v1", updates=3000))
     wait_for(lambda: len(read_metrics(path)) > 20, process)
     process.send_signal(signum)
     said = process.communicate()[1]
@@ -437,7 +396,7 @@ def test_many_steps_between_two_lines_are_stopped_amid_and_resumed_to_the_same_b
     words = [word for name, value in tiny_off_policy(**fields).items() for word in words_for(name, value)]
     train_sac = ["train", "sac", "--env", "Pendulum-v1", *words, "--run"]
     assert command(*train_sac, tmp_path / "whole").wait() == 0
-    process = command(*train_sac, tmp_path / "r", stderr=subprocess.PIPE)
+    process = command(*train_sac, tmp_path / "r")
     wait_for(lambda: len(read_metrics(tmp_path / "r")) >= 2, process)
     time.sleep(0.1)
     process.send_signal(signal.SIGINT)
@@ -453,7 +412,7 @@ def test_many_steps_between_two_lines_are_stopped_amid_and_resumed_to_the_same_b
 def test_an_update_that_hangs_is_interrupted(tmp_path, signum):
     small = {"total_steps": 1000, "num_envs": 2, "num_steps": 8, "minibatch_size": 16, "compile": "off"}
     steps = [word for name, value in small.items() for word in words_for(name, value)]
-    process = command("train", "ppo", "--env", "environments:Hanging", *steps, "--run", tmp_path / "r", stderr=-1)
+    process = command("train", "ppo", "--env", "environments:Hanging", *steps, "--run", tmp_path / "r")
     wait_for(lambda: len(read_metrics(tmp_path / "r")) == 6, process)
     time.sleep(0.5)
     asked = time.monotonic()
@@ -533,14 +492,3 @@ def test_training_off_the_main_thread_leaves_signals_alone(tmp_path):
     thread.start()
     thread.join()
     assert not failures
-
-
-@pytest.mark.long
-def test_a_drone_killed_at_random_ends_in_the_same_bits(tmp_path):
-    pytest.importorskip("lemniscate.envs.crazyflow")
-
-    def arguments(path):
-        fields = ["--total-steps", 400_000, "--checkpoint-every", 50_000]
-        return ["train", "ppo", "--env", "DroneFigureEightTrajectory-v0", "--run", path, *fields]
-
-    check_kills(tmp_path, arguments(tmp_path / "whole"), arguments(tmp_path / "killed"), kills=4)

@@ -23,7 +23,7 @@ def find(algorithm: str | ModuleType) -> Any:
     Raises:
         UserError: there is no such module, it cannot be imported, or it lacks `Config` or `train`.
     """
-    if algorithm in ALGORITHMS:
+    if isinstance(algorithm, str) and algorithm in ALGORITHMS:
         return import_module(f"{__name__}.{algorithm}")
     own = _import(algorithm) if isinstance(algorithm, str) else algorithm
     missing = [name for name in REQUIRED if not hasattr(own, name)]

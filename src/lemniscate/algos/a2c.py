@@ -15,7 +15,7 @@ from lemniscate.maths import explained_variance, gae, means, policy_gradient, st
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.optim.adam import Adam, linear
-from lemniscate.run.config import Count, Fraction, LogStd, NonNegative, Positive
+from lemniscate.run.config import Count, Epsilon, Fraction, LogStd, NonNegative, Positive
 from lemniscate.run.on_policy import OnPolicyConfig, OnPolicyState
 from lemniscate.run.run import Run
 from lemniscate.spec import Spec
@@ -34,7 +34,7 @@ class Config(OnPolicyConfig):
     """Adam's initial step size; usually 3e-4 to 3e-3"""
     final_learning_rate: Fraction = 0.0
     """final learning rate as a fraction of the initial one, annealed linearly; 1: constant"""
-    adam_eps: Positive = 1e-5
+    adam_eps: Epsilon = 1e-5
     """Adam's ε; usually 1e-8 to 1e-5"""
     gae_lambda: Fraction = 0.95
     """trace decay λ of the advantage estimate; 1 is the paper's n-step return, 0 the one-step TD error"""

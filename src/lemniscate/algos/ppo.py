@@ -6,6 +6,7 @@ Departures from the paper, and why: docs/notes/ppo.md.
 
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Annotated
 
 import torch
 from torch import Tensor
@@ -23,7 +24,7 @@ from lemniscate.maths import (
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.optim.adam import Adam, adapt_to_kl, linear
-from lemniscate.run.config import Count, Fraction, NonNegative, Positive
+from lemniscate.run.config import Count, Epsilon, Fraction, NonNegative, Positive, Range, Repeats
 from lemniscate.run.on_policy import OnPolicyConfig, OnPolicyState
 from lemniscate.run.run import Run
 from lemniscate.spec import Spec
@@ -34,7 +35,7 @@ from lemniscate.types import Batch, Loss, Metrics, Rollout
 class Config(OnPolicyConfig):
     """The settings of PPO."""
 
-    epochs: Count = 10
+    epochs: Repeats = 10
     """passes over each rollout; usually 3 to 15"""
     minibatch_size: Count = 256
     """rows of each gradient step, M; at most N · T, usually 64 to 1024"""
@@ -44,9 +45,9 @@ class Config(OnPolicyConfig):
     """final learning rate as a fraction of the initial one, annealed linearly; not used with desired_kl"""
     desired_kl: Positive | None = 0.01
     """adapt the learning rate, by factors of 1.5, to this KL of an epoch; usually 0.005 to 0.02; none: anneal it"""
-    adam_eps: Positive = 1e-5
+    adam_eps: Epsilon = 1e-5
     """Adam's ε; usually 1e-8 to 1e-5"""
-    adam_beta2: Fraction = 0.999
+    adam_beta2: Annotated[float, Range(0, 0.999999)] = 0.999
     """Adam's decay of squared gradients; usually 0.99 to 0.999"""
     gae_lambda: Fraction = 0.95
     """trace decay λ of the advantage estimate, usually 0.9 to 1; 0 is one-step TD, 1 Monte Carlo"""

@@ -6,7 +6,7 @@ Departures, and why: docs/notes/reinforce.md.
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from torch import Tensor
@@ -28,7 +28,7 @@ from lemniscate.nn.critics import Value
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.nn.policies import Policy
 from lemniscate.optim.adam import Adam, linear
-from lemniscate.run.config import Count, Fraction, LogStd, Natural, NonNegative, Positive
+from lemniscate.run.config import Count, Fraction, LogStd, NonNegative, NumEnvs, Positive, Range, Repeats
 from lemniscate.run.on_policy import OnPolicyConfig, OnPolicyState
 from lemniscate.run.run import Run
 from lemniscate.spec import Spec
@@ -39,7 +39,7 @@ from lemniscate.types import Batch, Loss, Metrics, Rollout
 class Config(OnPolicyConfig):
     """The settings of REINFORCE."""
 
-    num_envs: Count = 8
+    num_envs: NumEnvs = 8
     """number of parallel environments, N; usually 8 to 64"""
     num_steps: Count = 256
     """steps of each environment between updates, T; usually 128 to 2048"""
@@ -47,7 +47,7 @@ class Config(OnPolicyConfig):
     """initial log σ of a Gaussian policy, in units of half the action range; usually -1 to 0"""
     scale_rewards: bool = False
     """divide rewards by the running standard deviation of the discounted return"""
-    episodes: Natural = 0
+    episodes: Annotated[int, Range(0, 10_000)] = 0
     """whole episodes of each environment between updates; 0: num_steps steps, bootstrapped where they end"""
     returns: Literal["episode", "to_go"] = "to_go"
     """return used as weight: of the whole episode, or the reward-to-go"""
@@ -61,7 +61,7 @@ class Config(OnPolicyConfig):
     """final learning rate as a fraction of the initial one, annealed linearly; 1: constant"""
     entropy_coef: NonNegative = 0.0
     """weight of the entropy bonus; usually 0 to 0.01"""
-    critic_epochs: Count = 10
+    critic_epochs: Repeats = 10
     """passes of the value over each batch; usually 5 to 80"""
     critic_minibatch_size: Count = 128
     """rows of each gradient step of the value; usually 64 to 512"""

@@ -18,7 +18,7 @@ from lemniscate.nn.critics import Value
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.optim.adam import Adam, linear
 from lemniscate.optim.vector import PolicyVector
-from lemniscate.run.config import Count, Fraction, NonNegative, Positive, Range
+from lemniscate.run.config import Count, Fraction, NonNegative, Positive, Range, Repeats
 from lemniscate.run.on_policy import OnPolicyConfig, OnPolicyState
 from lemniscate.run.run import Run
 from lemniscate.spec import Spec
@@ -37,9 +37,9 @@ class Config(OnPolicyConfig):
     """backtracking line search; without it this is the natural policy gradient"""
     shrink: Annotated[float, Range(0.01, 0.99)] = 0.8
     """backtracking factor of the step length; usually 0.5 to 0.8"""
-    attempts: Count = 10
+    attempts: Repeats = 10
     """step lengths tried before the policy stays as it is; usually 10"""
-    cg_iterations: Count = 10
+    cg_iterations: Repeats = 10
     """iterations of the conjugate gradient; usually 10 to 25"""
     damping: NonNegative = 0.1
     """added to the diagonal of the Fisher matrix; usually 0.01 to 0.1"""
@@ -47,7 +47,7 @@ class Config(OnPolicyConfig):
     """trace decay λ of the advantage estimate; usually 0.9 to 1"""
     normalize_advantage: bool = True
     """standardize advantages within each rollout"""
-    critic_epochs: Count = 20
+    critic_epochs: Repeats = 20
     """passes of the value over each rollout; usually 5 to 80"""
     critic_minibatch_size: Count = 128
     """rows of each gradient step of the value; usually 64 to 512"""

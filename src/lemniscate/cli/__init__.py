@@ -10,6 +10,7 @@ import re
 import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
+from itertools import takewhile
 from pathlib import Path
 from shutil import get_terminal_size
 from typing import Any, NoReturn
@@ -26,7 +27,6 @@ from lemniscate.errors import (
     is_installed,
     unknown_name,
 )
-from lemniscate.owner import end_with_owner
 
 COMMANDS = {
     "train": "Train a policy, or one for each of several algorithms and seeds, to compare them.",
@@ -46,7 +46,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
     given = argparse.Namespace(command=None)
     try:
-        end_with_owner()
         given = parse(sys.argv[1:] if arguments is None else arguments)
         getattr(import_module("lemniscate.cli.commands"), given.command)(given)
     except UserError as error:
@@ -56,8 +55,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         learning = given.command in ("train", "resume")
         say(f"{error} Training stopped; the last checkpoint is as it was." if learning else error)
         return 1
-    except (NotStoredError, SweepError) as error:
-        say(error)
+    except (NotStoredError, SweepError, MemoryError) as error:
+        say(str(error) or "The memory is full: choose smaller numbers.")
         return 1
     except KeyboardInterrupt as stopped:  # a run that was asked to stop has a sentence and a signal of its own
         say(str(stopped) or "Interrupted.")
@@ -185,7 +184,10 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
 def _add_endings(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--track", metavar="LOGGER", help="additional logger: wandb, or module:Class of your own")
     parser.add_argument(
-        "--callbacks", nargs="+", metavar="FUNCTION", help="module:function that sees each update and may stop the run"
+        "--callbacks",
+        nargs="+",
+        metavar="FUNCTION",
+        help="sees each update and may stop the run: module:function, or 'module:Class(key=value)'",
     )
     parser.add_argument("--report", action="store_true", help="evaluate the final policy, and draw plots and videos")
     parser.add_argument(
@@ -205,6 +207,9 @@ def _parse_train(parser: Parser, words: list[str]) -> argparse.Namespace:
         )
         parser.print_help()
         parser.exit()
+    apart = list(takewhile(titles.__contains__, (word.strip(",") for word in words)))
+    if len(apart) > 1:
+        raise UserError(f"Several algorithms are one word: lemniscate train {','.join(apart)} --seeds 1-5 …")
     names = list(dict.fromkeys(words[0].split(","))) if words and not words[0].startswith("-") else []
     strangers = [name for name in names if name not in titles and not _is_own(name)]
     misplaced = [word for word in words if word in titles]

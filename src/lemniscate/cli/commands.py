@@ -14,6 +14,7 @@ from lemniscate.envs import registry
 from lemniscate.envs.check import each_finding
 from lemniscate.envs.findings import BAD, verdict
 from lemniscate.errors import UserError, unknown_name
+from lemniscate.owner import end_with_owner
 from lemniscate.presets import best, choose
 from lemniscate.report import pictures
 from lemniscate.run.run import is_compiled
@@ -45,7 +46,8 @@ def train(given: argparse.Namespace) -> None:
 
 
 def resume(given: argparse.Namespace) -> None:
-    """Continue an interrupted run or sweep."""
+    """Continue an interrupted run or sweep. A sweep's runs are begun by this command too, and end with the sweep."""
+    end_with_owner()
     options = {"track": given.track, "report": given.report, "trust": given.trust, **_callbacks(given)}
     if is_sweep(given.run):
         run = sweep.resume_sweep(given.run, **options)

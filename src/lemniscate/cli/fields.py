@@ -15,8 +15,7 @@ from lemniscate.algos import find
 from lemniscate.cli import Parser, add_train_options, unknown_argument
 from lemniscate.errors import UserError, prefix_errors, unknown_name
 from lemniscate.presets import PRESETS, names
-from lemniscate.report.commands import flag
-from lemniscate.run.config import RunConfig, options_of
+from lemniscate.run.config import RunConfig, flag, options_of
 
 GROUPS: dict[str, tuple[str, ...]] = {
     "run": ("seed", "total_steps", "device", "threads", "compile", "matmul", "warm_start"),
@@ -88,7 +87,7 @@ def read_json(option: str, text: str) -> dict[str, Any]:
     """The dictionary that `text` is in JSON. Raises `UserError` for anything else."""
     try:
         value = json.loads(text)
-    except ValueError:
+    except (ValueError, RecursionError):
         value = None
     if not isinstance(value, dict):
         raise UserError(f"""{option} must be a JSON object, such as '{{"gravity": -5}}', not {text}""")

@@ -25,7 +25,7 @@ def skeleton(name: str = "ppo", path: str | Path | None = None) -> Path:
     if path.exists():
         raise UserError(f"{path} exists already; name another file with path.")
     try:
-        path.write_text(text(name))
+        path.write_text(text(name).replace(f"python {name}.py", f"python {path.name}"))
     except OSError as error:
         raise UserError(f"{path} cannot be written: {error.strerror}.") from error
     return path

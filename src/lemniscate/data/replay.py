@@ -2,13 +2,13 @@
 
 import math
 
-import psutil
 import torch
 from torch import Generator, Tensor
 
 from lemniscate.data.action_noise import ActionNoise
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError
+from lemniscate.machine import free_memory
 from lemniscate.maths import uniform
 from lemniscate.nn.policies import Policy
 from lemniscate.spec import Spec
@@ -23,7 +23,7 @@ class ReplayBuffer:
 
     def __init__(self, spec: Spec, capacity: int, device: torch.device) -> None:
         num_bytes = capacity * bytes_per_transition(spec)
-        free = torch.cuda.mem_get_info(device)[0] if device.type == "cuda" else psutil.virtual_memory().available
+        free = free_memory(device)
         if num_bytes > free:
             raise UserError(
                 f"A replay buffer of {capacity:,} transitions of {spec.env_id} takes {num_bytes / 1e6:,.0f} MB, and"

@@ -9,6 +9,7 @@ from torch import Generator, Tensor
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError
 from lemniscate.nn.policies import Policy
+from lemniscate.spec import Box, Spec
 from lemniscate.types import Rollout
 
 
@@ -50,6 +51,13 @@ def collect_episodes(env: VecEnv, policy: Policy, episodes: int, generator: Gene
             done = (step.terminated | step.truncated) & step.valid
             ended, age = ended + done.int(), (age + 1) * ~done
         return Rollout.stack(rows)
+
+
+def rollout_bytes(spec: Spec, num_steps: int, num_envs: int) -> int:
+    """The memory that a rollout takes while its steps [N, …] are stacked to [T, N, …]; of each step 1 kB of its own."""
+    action = spec.action.size if isinstance(spec.action, Box) else 2
+    obs = spec.observation_size * (1 if spec.image else 4)
+    return num_steps * (num_envs * (3 * obs + 2 * (4 * action + 7)) + 1_000)
 
 
 def one_minibatch(valid_rows: Tensor, num_rows: int) -> Tensor:

@@ -79,6 +79,11 @@ class EnvpoolBackend:
         return env.startswith(PREFIX) or (env in GYMNASIUM_IDS and is_installed("envpool"))
 
     @classmethod
+    def room(cls, env: str) -> tuple[int, int]:
+        """Those of the smallest, CartPole; no files."""
+        return 10_000, 0
+
+    @classmethod
     def make_rendered(cls, env: str, mode: str, kwargs: Mapping[str, Any], wrappers: Sequence[str]) -> gym.Env:
         """One environment that renders itself in `mode`: Gymnasium's where it is the same, else EnvPool's."""
         if env in GYMNASIUM_IDS and not kwargs:

@@ -63,6 +63,11 @@ class GymnasiumBackend:
         return not makes_vector(maker_of(env))
 
     @classmethod
+    def room(cls, env: str) -> tuple[int, int]:
+        """Those of arrays, or of the objects of a single environment with its wrappers; no files."""
+        return 8_000 if cls.wraps(env) else 200, 0
+
+    @classmethod
     def make_rendered(cls, env: str, mode: str, kwargs: Mapping[str, Any], wrappers: Sequence[str]) -> gym.Env:
         """One environment that renders itself in `mode`."""
         return make_one(maker_of(env), tuple(map(find_callable, wrappers)), render_mode=mode, **kwargs)
@@ -182,3 +187,8 @@ class AsyncGymnasiumBackend(GymnasiumBackend):
     def ids(cls) -> Collection[str]:
         """None."""
         return ()
+
+    @classmethod
+    def room(cls, env: str) -> tuple[int, int]:
+        """Those of a process of Python with NumPy and Gymnasium, and of its pipes."""
+        return 100_000_000, 5

@@ -34,7 +34,8 @@ def api_findings(make: Callable[[], gym.Env], env_id: str, wrapped: bool) -> Ite
         try:
             check_env(careful, skip_render_check=True, skip_close_check=wrapped)
         except Exception as error:
-            found.append(Finding(BAD, f"Gymnasium's checker: {one_line(error)}"))
+            why = _why_outside(careful) if "not within the observation space" in str(error) else ""
+            found.append(Finding(BAD, f"Gymnasium's checker: {one_line(error)}{why}"))
         finally:
             env.close()
     told = {one_line(warning.message) for warning in caught if warning.category is UserWarning}
@@ -49,6 +50,23 @@ def api_findings(make: Callable[[], gym.Env], env_id: str, wrapped: bool) -> Ite
         )
     if not any(finding.grade == BAD for finding in found):
         yield from _dtypes(make, env_id)
+
+
+def _why_outside(env: gym.Env) -> str:
+    """What differs between the first observation and its space, a Box, in a sentence after that of Gymnasium's."""
+    space, obs = env.observation_space, np.asarray(env.reset(seed=0)[0])
+    if not isinstance(space, gym.spaces.Box):
+        return ""
+    if not np.can_cast(obs.dtype, space.dtype):
+        return f" It is {obs.dtype}, the space {space.dtype}: return obs.astype(np.{space.dtype})."
+    if obs.shape != space.shape:
+        return f" Its shape is {obs.shape}, that of the space {space.shape}."
+    outside = np.argwhere((obs < space.low) | (obs > space.high))
+    if not len(outside):
+        return ""
+    place = tuple(outside[0])
+    bounds = f"[{space.low[place]:g}, {space.high[place]:g}]"
+    return f" Its number {', '.join(map(str, place))} is {obs[place]:g}, outside of {bounds}."
 
 
 def _dtypes(make: Callable[[], gym.Env], env_id: str) -> Iterator[Finding]:

@@ -69,7 +69,8 @@ class Programs:
             state, (next_obs, reward, terminated, truncated, measures) = envs.step(state, action)
             truncated = truncated & ~terminated
             state, obs, fragment = envs.reset(state, terminated | truncated, stagger)
-            return state, (obs, next_obs, reward, terminated, truncated, fragment, measures)
+            flags = jax.numpy.stack((terminated, truncated, fragment))  # each array costs a conversion
+            return state, (obs, next_obs, reward, flags, measures)
 
         self.envs = envs
         self.restart, self.step = self._compile(restart, step)
@@ -112,7 +113,8 @@ class JaxBackend:
         """[N, A] actions in [-1, 1]; every row of the answer is real."""
         command = self._from_dlpack(action.contiguous())
         self._state, (*out, measures) = self._programs.step(self._state, command, self._stagger)
-        obs, next_obs, reward, terminated, truncated, fragment = map(torch.from_dlpack, out)
+        obs, next_obs, reward, flags = map(torch.from_dlpack, out)
+        terminated, truncated, fragment = flags
         self.counts = (self.counts | terminated | truncated) & ~fragment
         named = {name: torch.from_dlpack(values) for name, values in measures.items()}
         return Step(obs, next_obs, reward, terminated, truncated, self._valid, named)

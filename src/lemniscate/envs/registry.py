@@ -22,6 +22,9 @@ BACKENDS = {
 }
 """each is imported when it is used; the first that serves an id runs it"""
 
+MOST_ENVS = 1_000_000
+"""parallel environments that may be asked for"""
+
 
 def known_ids() -> list[str]:
     """Every environment id that can be asked for, sorted."""
@@ -35,7 +38,7 @@ def backend_for(env: str, wrappers: Sequence[str] = ()) -> str:
     """
     serving = [name for name in BACKENDS if backend_class(name).serves(env)]
     if not serving:
-        raise unknown_name("environment", env, known_ids())
+        raise unknown_name("environment", env, known_ids(), "one of your own is named as module:Class.")
     return next((name for name in serving if not wrappers or can_wrap(name, env)), serving[0])
 
 
@@ -122,11 +125,34 @@ def names_of(wrappers: "Sequence[str | Callable[..., Any]]") -> tuple[str, ...]:
 
 
 def _checked_count(num_envs: Any) -> int:
-    """The number of environments as an int. Raises `UserError` unless it is a whole number of at least 1."""
+    """The number of environments as an int. Raises `UserError` unless it is a whole number that makes sense."""
     number = getattr(num_envs, "tolist", lambda: num_envs)()  # of NumPy's and torch's scalars
     if type(number) not in (int, float) or number < 1 or number % 1:
         raise UserError(f"num_envs must be a whole number at least 1, not {shown(num_envs)}.")
+    if number > MOST_ENVS:
+        raise UserError(f"num_envs must be at most {MOST_ENVS:,}, not {shown(num_envs)}.")
     return int(number)
+
+
+def require_room(env: str, num_envs: int, backend: str) -> None:
+    """Raise `UserError` where N environments of a backend need more memory than is free, or more open files."""
+    import torch
+
+    from lemniscate.machine import free_memory, most_open_files
+
+    found: Any = backend_class(backend)
+    each, files = found.room(env) if hasattr(found, "room") else (0, 0)
+    free = free_memory(torch.device("cpu"))
+    if num_envs * each > free:
+        raise UserError(
+            f"{num_envs:,} × {env} in the {backend} backend take at least {num_envs * each // 10**6:,} MB, and"
+            f" {free // 10**6:,} MB are free: choose num_envs at most {max(1, free // each):,}."
+        )
+    if num_envs * files > most_open_files():
+        raise UserError(
+            f"{num_envs:,} × {env} in the {backend} backend need {num_envs * files:,} open files, and this process may"
+            f" have {most_open_files():,} (`ulimit -n`): choose num_envs at most {most_open_files() // files:,}."
+        )
 
 
 def file_name(env: str) -> str:
@@ -159,7 +185,7 @@ def make(
 
     Raises:
         UserError: an unknown environment or backend, arguments that it does not take, spaces nobody can act in, a
-            missing extra; a number of environments below 1.
+            missing extra; a number of environments below 1, or of more than the memory holds.
     """
     import torch
 
@@ -175,5 +201,6 @@ def make(
         raise UserError(
             f"The {chosen} backend cannot wrap {name}; wrappers go around single environments of the gymnasium backend."
         )
+    require_room(name, num_envs, chosen)
     made = backend_class(chosen)(name, num_envs, torch.device(device), stagger=stagger, kwargs=kwargs, wrappers=wraps)
     return VecEnv(made)

@@ -64,11 +64,13 @@ class VecEnv:
         """Act in every environment and move `obs` on; actions as in `Backend.step`.
 
         Raises:
-            NonFiniteError: an observation or a reward is NaN or infinite; nothing has learned from it yet.
+            NonFiniteError: an action, an observation or a reward is NaN or infinite; nothing has learned from it yet.
             UserError: actions of another kind or shape.
         """
         if not isinstance(action, Tensor) or (action.shape, action.dtype) != self._actions:
             raise wrong_action(f"{self.num_envs} × {self.spec.env_id}", action, self._actions)
+        if action.is_floating_point():
+            self._require_finite(action=action)
         counts = self.backend.counts
         step = self.backend.step(action)
         self._require_finite(observation=step.next_obs, reward=step.reward)
@@ -105,8 +107,8 @@ def require_end(env_id: str, age: int, limit: int | None) -> None:
     """Raise `UserError` where an episode of `age` steps has had its chance to end, and there is no time `limit`."""
     if limit is None and age >= PATIENCE:
         raise UserError(
-            f"An episode of {env_id} has not ended after {PATIENCE:,} steps, and there is no time limit;"
-            " give it one, with max_episode_steps where it is registered."
+            f"An episode of {env_id} has not ended after {PATIENCE:,} steps, and there is no time limit: return"
+            " truncated in its step(), or train with --wrappers 'gymnasium.wrappers:TimeLimit(max_episode_steps=1000)'."
         )
 
 

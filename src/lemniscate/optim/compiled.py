@@ -26,6 +26,7 @@ class Compiled(Generic[P, R]):
 
     def __init__(self, method: Callable[P, R], device: torch.device, fallback: Callable[P, R] | None = None) -> None:
         options: dict[str, Any] = {"guard_filter_fn": torch.compiler.skip_all_guards_unsafe}
+        options["deterministic"] = torch.are_deterministic_algorithms_enabled()
         if device.type == "cpu":
             options["cpp_wrapper"] = True
         self._compiled = torch.compile(_with_own_code(method), fullgraph=True, dynamic=False, options=options)

@@ -44,6 +44,8 @@ def choose(algorithm: str, env_id: str | None, name: str | None) -> tuple[str, R
     is given. Raises `UserError` with the nearest names for an unknown preset.
     """
     name = best(algorithm, env_id) if name is None else name
+    if not isinstance(name, str):
+        raise unknown_name("preset", name, names(algorithm))
     named = [preset.config for preset in of(algorithm) if preset.name == name]
     if name == "default":
         named = [find(algorithm).Config()]

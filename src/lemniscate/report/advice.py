@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from lemniscate.report.commands import flag
 from lemniscate.report.curves import moving_average, window_of
+from lemniscate.run.config import flag
 
 SMALLER_STEPS = (("lower", "learning_rate"), ("lower", "actor_learning_rate"), ("lower", "max_kl"))
 """cures of a policy that changes too fast, by the field that its algorithm has"""

@@ -8,6 +8,7 @@ from typing import Any
 
 from lemniscate import algos
 from lemniscate.errors import UserError
+from lemniscate.run.config import flag
 
 
 def default_fields(algorithm: str) -> dict[str, Any]:
@@ -37,11 +38,6 @@ def train(algorithm: str, config: Mapping[str, Any], *, seeds: str | None = None
 def evaluate(run: Path, episodes: int, seed: int) -> str:
     """The command that evaluates a run's newest policy."""
     return shlex.join(["lemniscate", "evaluate", str(run), "--episodes", str(episodes), "--seed", str(seed)])
-
-
-def flag(name: str) -> str:
-    """The flag of a field on the command line."""
-    return "--env-args" if name == "env_kwargs" else f"--{name.replace('_', '-')}"
 
 
 def _option(name: str, value: Any) -> list[str]:

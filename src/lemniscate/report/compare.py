@@ -4,6 +4,7 @@ What Agarwal et al. 2021, arXiv:2108.13264, ask of a comparison: intervals inste
 probability of improvement. Nothing is ranked on one seed.
 """
 
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +16,12 @@ from lemniscate.report.comparison_plot import draw
 from lemniscate.report.curves import plot_runs, training_minutes
 from lemniscate.report.groups import Group, Scores
 from lemniscate.report.html import Html
-from lemniscate.report.seeds import bootstrap_interval, iqm
+from lemniscate.report.seeds import bootstrap_interval, improvement_interval, iqm, probability_of_improvement
 from lemniscate.report.style import COLORS
 from lemniscate.run.directory import is_finished
 
 ONE_SEED = "One seed says nothing about which is better: train more with --seeds 1-5."
+FEW_SEEDS = "Below five seeds of each, intervals are too narrow to be believed: train more with --seeds 1-5."
 UNFINISHED = "Nothing is ranked before two seeds of each are finished: continue with lemniscate resume."
 
 
@@ -84,7 +86,7 @@ def _cells(one: Group, scores: Scores, digits: int) -> list[str]:
 
 
 def remarks(groups: list[Group], scores: Scores) -> list[str]:
-    """Sentences on runs of unequal length, unfinished runs, and groups of one seed."""
+    """Sentences on which is better, runs of unequal length, unfinished runs, and groups of few seeds."""
     said: list[str] = []
     lengths = {one.label: one.config["total_steps"] for one in groups}
     if len(set(lengths.values())) > 1:
@@ -93,8 +95,21 @@ def remarks(groups: list[Group], scores: Scores) -> list[str]:
     unfinished = [run for one in groups for run in one.runs if not is_finished(run)]
     if unfinished:
         said.append(f"Not finished, so in the curves alone: {', '.join(map(str, unfinished))}.")
-    unranked = _why_unranked(groups, scores)
-    return [*said, unranked] if unranked else said
+    if unranked := _why_unranked(groups, scores):
+        return [*said, unranked]
+    said += [_improvement(*pair, scores) for pair in combinations(groups, 2)]
+    few = len(groups) > 1 and min(len(one.finals(scores)) for one in groups) < 5
+    return [*said, FEW_SEEDS] if few else said
+
+
+def _improvement(one: Group, other: Group, scores: Scores) -> str:
+    """The probability that the better of two groups is better, with its interval, as a sentence."""
+    x, y = one.finals(scores), other.finals(scores)
+    if probability_of_improvement(x, y) < 0.5:
+        one, other, x, y = other, one, y, x
+    low, high = improvement_interval(x, y)
+    share = f"{probability_of_improvement(x, y):.0%} [95 %: {low:.0%} to {high:.0%}]"
+    return f"{one.label} is better than {other.label} in {share} of the pairs of a seed of each."
 
 
 def _why_unranked(groups: list[Group], scores: Scores) -> str | None:

@@ -64,7 +64,7 @@ def diagnostics(runs: list[Path], file: Path, labels: Sequence[str] | None = Non
         axes.set_ylabel(unit, fontsize=8)
         axes.set_xlabel("environment steps" if i >= len(names) - 3 else "", fontsize=9)
         axes.set_xlim(left=0)
-        finish(axes)
+        finish(axes, ticks=3)  # a panel is narrow
         limit_axis(axes)
     if len(runs) > 1:
         legend_above(figure)

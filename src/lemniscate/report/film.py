@@ -10,6 +10,7 @@ import numpy as np
 from PIL import Image
 
 from lemniscate.errors import UserError, is_installed, missing_extra
+from lemniscate.run.files import remove
 
 PICTURE_FPS = 50
 """frames a second that an animated picture has at most: browsers show one with shorter delays far too slowly"""
@@ -19,6 +20,7 @@ def save_frames(frames: Iterable[np.ndarray], file: Path, fps: float) -> None:
     """Write frames [H, W, 3] uint8 as an animated picture (.gif, .webp) or a video (.mp4, extra `video`)."""
     check_film(file)
     file.parent.mkdir(parents=True, exist_ok=True)
+    remove(file)  # writing would follow a link
     try:
         _write(frames, file, fps)
     except BaseException:  # what draws the frames may fail: no half of a film is left

@@ -13,6 +13,8 @@ from urllib.parse import quote
 
 import numpy as np
 
+from lemniscate.run.files import replace_file
+
 MOST_BYTES = 5_000_000
 """the largest film that is embedded; a larger one is linked"""
 
@@ -81,7 +83,7 @@ def write_page(file: Path, title: str, *inside: str) -> Path:
     )
     page = f"<!DOCTYPE html>\n{element('html', head, element('body', *inside), lang='en')}\n"
     file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_bytes(page.encode("utf-8", errors="xmlcharrefreplace"))
+    replace_file(file, page.encode("utf-8", errors="xmlcharrefreplace"))
     return file
 
 

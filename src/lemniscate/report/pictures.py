@@ -8,6 +8,7 @@ from lemniscate.envs.vec_env import VecEnv
 from lemniscate.nn.policies import Policy
 from lemniscate.report import curves, flight, run_page
 from lemniscate.report.playback import show_flights
+from lemniscate.run.files import make_directory
 from lemniscate.run.q_bias import QBias
 
 
@@ -27,23 +28,26 @@ def draw_run(run: Path, scores: Mapping[str, Any] | None, flights: Sequence[Path
     Args:
         run: the run directory.
         scores: of its newest policy, those of `results.final_scores`, if there are any.
-        flights: pictures of `draw_flights`, for the page.
+        flights: what `draw_flights` returned.
         by: "step", "episode" or "minute", the horizontal axis of the learning curve.
     """
     pictures = curves.plot_runs([run], run / "plots", by=by)
     if scores and "q_bias" in scores:
         pictures.append(curves.draw_q_bias(_q_bias(scores), run, run / "plots" / "q.png"))
-    pictures += flights
-    return [*pictures, run_page.write(run, pictures, scores)]
+    pictures += [file for file in flights if file.suffix == ".png"]
+    films = [file for file in flights if file not in pictures]
+    return [*pictures, *films, run_page.write(run, pictures, scores)]
 
 
 def draw_flights(policy: Policy, env: VecEnv, run: Path, flights: int, film: bool) -> list[Path]:
     """Path and error of some flights in a scene, into the `plots/` of a run; with `film` one of them into `videos/`."""
     track = flight.record(policy, env, flights, seed=0)
+    folder, video = run / "plots", run / "videos" / "flight.gif"
     if film:
-        show_flights(policy, env, 1, seed=0, video=run / "videos" / "flight.gif", tell=lambda text: None)
-    folder = run / "plots"
-    return [flight.draw_path(track, folder / "flight.png"), flight.draw_error(track, folder / "error.png")]
+        make_directory(video.parent)
+        show_flights(policy, env, 1, seed=0, video=video, tell=lambda text: None)
+    drawn = [flight.draw_path(track, folder / "flight.png"), flight.draw_error(track, folder / "error.png")]
+    return [*drawn, video] if film else drawn
 
 
 def _q_bias(scores: Mapping[str, Any]) -> QBias:

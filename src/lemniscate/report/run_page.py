@@ -2,6 +2,7 @@
 
 import math
 import platform
+import stat
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
@@ -157,7 +158,8 @@ def _headline(run: Path, scores: Mapping[str, Any] | None) -> list[tuple[str, st
 
 def _films(run: Path, page: Path) -> list[Html]:
     """The newest film of a run, if it has any."""
-    films = [file for file in (run / "videos").glob("*") if file.suffix in (".gif", ".webp", ".mp4")]
+    files = (file for file in (run / "videos").glob("*") if file.suffix in (".gif", ".webp", ".mp4"))
+    films = [file for file in files if stat.S_ISREG(file.lstat().st_mode)]
     return [section("Film", html.film(max(films, key=lambda file: file.stat().st_mtime), page))] if films else []
 
 

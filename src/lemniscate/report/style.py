@@ -1,5 +1,6 @@
 """The look of the pictures: colours, numbers on axes, legends, files."""
 
+import io
 import textwrap
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -10,6 +11,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, StrMethodFormatter
+
+from lemniscate.run.files import replace_file
 
 COLORS = mpl.colormaps["tab10"].colors  # pyright: ignore[reportAttributeAccessIssue]
 
@@ -25,11 +28,11 @@ def run_styles(runs: list[Path], labels: Sequence[str] | None = None) -> Iterato
         yield run, COLORS[different.index(name) % 10], name
 
 
-def finish(axes: Axes) -> None:
-    """Remove two spines, draw a grid, and write 100,000 for a hundred thousand."""
+def finish(axes: Axes, ticks: int = 5) -> None:
+    """Remove two spines, draw a grid, write 100,000 for a hundred thousand; at most so many `ticks` and one more."""
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(alpha=0.3)
-    axes.xaxis.set_major_locator(MaxNLocator(5))
+    axes.xaxis.set_major_locator(MaxNLocator(ticks))
     for axis in (axes.xaxis, axes.yaxis):
         axis.set_major_formatter(StrMethodFormatter("{x:,.10g}"))
 
@@ -84,6 +87,8 @@ def legend_above(figure: Figure) -> None:
 
 def save(figure: Figure, file: Path) -> Path:
     """Write a picture."""
+    picture = io.BytesIO()
+    figure.savefig(picture, dpi=150, format=file.suffix.removeprefix("."))
     file.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(file, dpi=150)
+    replace_file(file, picture.getvalue())
     return file

@@ -6,16 +6,24 @@ import math
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import cache
+from itertools import islice
 from pathlib import PurePath
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Self, Union, get_args, get_origin, get_type_hints
 
 import torch
 
+from lemniscate.envs.registry import MOST_ENVS
 from lemniscate.errors import UserError, shown
 from lemniscate.glossary import unknown_field
 from lemniscate.run.seeding import Generators
 from lemniscate.spec import Spec
+
+MOST_WHOLE, MOST_REAL = 10**15, 1e38
+"""the largest numbers of a field: float64, and so JSON, counts exactly to 9e15; the float32 of networks ends at 3e38"""
+MOST_ITEMS = 1_000
+"""the most values of a field that has several"""
 
 
 @dataclass(frozen=True)
@@ -27,22 +35,27 @@ class Range:
     above: bool = False
 
     def __contains__(self, x: float) -> bool:
-        return math.isfinite(x) and (self.low < x if self.above else self.low <= x) and x <= self.high
+        return -math.inf < x < math.inf and (self.low < x if self.above else self.low <= x) and x <= self.high
 
     def __str__(self) -> str:
         if self.high < math.inf:
-            high = f"{self.high:,.0f}" if self.high >= 1e6 else f"{self.high:g}"
+            high = f"{self.high:,.0f}" if self.high >= 1000 else f"{self.high:g}"
             return f"{'above' if self.above else 'from'} {self.low:g} to {high}"
         return f"{'above' if self.above else 'at least'} {self.low:g}" if self.low > -math.inf else ""
 
 
 Count = Annotated[int, Range(1)]
 Natural = Annotated[int, Range(0)]
+NumEnvs = Annotated[int, Range(1, MOST_ENVS)]
+Episodes = Annotated[int, Range(1, 1_000_000)]  # the return of each is kept
+Repeats = Annotated[int, Range(1, 10_000)]  # within one update
+Width = Annotated[int, Range(1, 1_000_000)]
 Seed = Annotated[int, Range(0, 2**32 - 1)]
 Fraction = Annotated[float, Range(0, 1)]
 Positive = Annotated[float, Range(0, above=True)]
 NonNegative = Annotated[float, Range(0)]
 Finite = Annotated[float, Range()]
+Epsilon = Annotated[float, Range(1e-30, 1)]  # a smaller one is a zero in float32
 LogStd = Annotated[float, Range(-10, 5)]
 
 
@@ -69,7 +82,10 @@ def checked(name: str, value: Any, hint: Any) -> Any:
     wanted: list[str] = []
     for option in options:
         if get_origin(option) is tuple and isinstance(value, Iterable) and not isinstance(value, str | Mapping):
-            return tuple(checked(name, item, get_args(option)[0]) for item in value)
+            items = list(islice(value, MOST_ITEMS + 1))
+            if len(items) > MOST_ITEMS:
+                raise UserError(f"{name} has more than {MOST_ITEMS:,} values.")
+            return tuple(checked(name, item, get_args(option)[0]) for item in items)
         try:
             return _convert(value, option)
         except ValueError as error:
@@ -95,21 +111,32 @@ def _convert(value: Any, option: Any) -> Any:
             raise ValueError(wanted)
     if kind is dict:
         try:
-            json.dumps(value)
-        except TypeError:  # it could not be saved with the run
+            json.dumps(value, allow_nan=False)
+        except (TypeError, ValueError, RecursionError):  # it could not be saved with the run
             raise ValueError("a dictionary of what JSON can hold") from None
     return value
 
 
 def _number(value: Any, kind: type, limits: Range = Range()) -> int | float:
     """A finite number within `limits`; 1e6 is whole."""
-    if isinstance(value, int | float) and not isinstance(value, bool) and value in limits:
-        number = float(value)
-        if kind is float:
-            return number
-        if isinstance(value, int) or number.is_integer():
-            return int(value)
-    raise ValueError(f"{'a whole number' if kind is int else 'a number'} {limits}".strip())
+    name, most = ("a whole number", MOST_WHOLE) if kind is int else ("a number", MOST_REAL)
+    wanted = f"{name} {limits}".strip()
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        if most < abs(value) < math.inf and not limits.high < math.inf:
+            raise ValueError(f"{wanted}, and at most {most:g}")
+        if value in limits and (kind is float or isinstance(value, int) or value.is_integer()):
+            return kind(value)
+    raise ValueError(wanted)
+
+
+def flag(name: str) -> str:
+    """The flag of a field on the command line."""
+    return "--env-args" if name == "env_kwargs" else f"--{name.replace('_', '-')}"
+
+
+@cache
+def _hints_of(config: type) -> dict[str, Any]:
+    return get_type_hints(config, include_extras=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,7 +147,7 @@ class RunConfig:
     """environment id; `lemniscate envs` lists them"""
     backend: str | None = None
     """simulation backend (default: chosen from the id)"""
-    num_envs: Count = 16
+    num_envs: NumEnvs = 16
     """number of parallel environments, N; usually 8 to 64"""
     seed: Seed = 1
     """seed of the run, from which all others are derived"""
@@ -130,7 +157,7 @@ class RunConfig:
     device: str = "cpu"
     """device of the networks, and of simulators that can use it: cpu, cuda, cuda:N (GPU N, from 0) or mps; auto takes
     cuda if there is one"""
-    threads: Count = 1
+    threads: Annotated[int, Range(1, 1024)] = 1
     """CPU threads for torch; results differ in rounding between thread counts"""
     compile: Literal["auto", "on", "off"] = "auto"
     """compile the gradient steps and the policy; auto compiles long runs, where it saves time"""
@@ -140,7 +167,7 @@ class RunConfig:
     """number of newest checkpoints kept"""
     evaluate_every: Natural = 0
     """steps between evaluations during training; 0: none"""
-    evaluate_episodes: Count = 20
+    evaluate_episodes: Episodes = 20
     """episodes of each evaluation in training"""
     video_every: Natural = 0
     """steps between recordings of an episode into videos/step-N; 0: none"""
@@ -154,7 +181,7 @@ class RunConfig:
     """wrappers of each environment, the first innermost: module:name or module:name(key=value)"""
 
     def __post_init__(self) -> None:
-        hints = get_type_hints(type(self), include_extras=True)
+        hints = _hints_of(type(self))
         for name in self.names():
             object.__setattr__(self, name, checked(name, getattr(self, name), hints[name]))
         if not re.fullmatch(r"auto|cpu|mps|cuda(:(0|[1-9][0-9]*))?", self.device):
@@ -174,6 +201,10 @@ class RunConfig:
     def networks(self, spec: Spec) -> Any:
         """New networks for the spaces in `spec`, a module with a `policy`. Raises `UserError` if they do not fit."""
         raise NotImplementedError
+
+    def memory(self, spec: Spec) -> dict[str, int]:
+        """Bytes that training takes at least, beside networks and environments, by the field that they grow with."""
+        return {}
 
     def notices(self, spec: Spec, device: torch.device) -> list[str]:
         """Sentences that a person should read before a run of this Config starts."""

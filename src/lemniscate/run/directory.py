@@ -61,8 +61,9 @@ def read_record(path: Path) -> dict[str, Any]:
     except DamagedFileError as error:
         found = _newest(path, planned_only=False)
         if found is None:
-            reason = f": {error}" if (path / CONFIG).is_file() else f": it holds no {CONFIG} that can be read."
-            raise UserError(f"{path} is not a run directory{reason}") from None
+            reason = str(error) if (path / CONFIG).is_file() else f"it holds no {CONFIG} that can be read."
+            reason = reason if path.exists() else "it does not exist."
+            raise UserError(f"{path} is not a run directory: {reason}") from None
         say(f"{error} Taking the config in {found.path}.")
         return found.record
 
@@ -97,15 +98,18 @@ def find_checkpoint(path: Path) -> checkpoint.Checkpoint:
 
 
 def _newest(path: Path, planned_only: bool) -> checkpoint.Checkpoint | None:
-    for step in reversed(checkpoint.list_steps(path / "checkpoints")):
+    """The newest whole checkpoint. One that a running process deletes meanwhile has been followed by another."""
+    steps = checkpoint.list_steps(path / "checkpoints")
+    for step in reversed(steps):
+        folder = path / "checkpoints" / f"step-{step}"
         try:
-            found = checkpoint.read(path / "checkpoints" / f"step-{step}")
+            found = checkpoint.read(folder)
+            if found.record["planned"] or not planned_only:
+                return found
         except DamagedFileError as error:
-            say(f"{error} Taking the one before.")
-            continue
-        if found.record["planned"] or not planned_only:
-            return found
-    return None
+            if folder.exists():
+                say(f"{error} Taking the one before.")
+    return None if steps == checkpoint.list_steps(path / "checkpoints") else _newest(path, planned_only)
 
 
 class Saver:

@@ -1,4 +1,4 @@
-"""The environments of a run: for training, and for evaluation."""
+"""The environments of a run, for training and for evaluation, and whether there is room for it."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -8,7 +8,13 @@ import torch
 from lemniscate.envs import registry
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError, shown
+from lemniscate.machine import free_memory
+from lemniscate.nn.networks import NETWORKS
 from lemniscate.run.config import RunConfig
+from lemniscate.spec import Spec
+
+BYTES_PER_PARAMETER = 16
+"""of a parameter, its gradient, and the two moments of its optimizer"""
 
 
 def make_envs(config: RunConfig) -> tuple[VecEnv, VecEnv]:
@@ -17,17 +23,19 @@ def make_envs(config: RunConfig) -> tuple[VecEnv, VecEnv]:
     They are restarted with seeds of different streams, so no start of one is ever a start of the other.
 
     Raises:
-        UserError: as `lemniscate.envs.registry.make`; no Config; a device that is not there.
+        UserError: as `lemniscate.envs.registry.make`; no Config; a device that is not there; a run that takes more
+            memory than is free.
     """
     if not isinstance(config, RunConfig):
         raise UserError(f"make_envs needs a Config, such as config_for('ppo', 'CartPole-v1'), not {shown(config)}.")
-    device = str(device_for(config.device))
+    device = device_for(config.device)
     own = {"kwargs": config.env_kwargs, "wrappers": config.wrappers, "backend": config.backend}
-    train_env = registry.make(config.env, config.num_envs, device=device, stagger=True, **own)
+    eval_env = evaluation_env(config, config.evaluate_episodes, device=str(device))  # the few, before the many
     try:
-        return train_env, evaluation_env(config, config.evaluate_episodes, device=device)
+        require_memory(config, eval_env.spec, device)
+        return registry.make(config.env, config.num_envs, device=str(device), stagger=True, **own), eval_env
     except BaseException:
-        train_env.close()
+        eval_env.close()
         raise
 
 
@@ -78,3 +86,24 @@ def device_for(name: str) -> torch.device:
     if kind == "mps" and not torch.backends.mps.is_available():
         raise UserError("device is mps, but torch sees no Apple GPU; use cpu or auto.")
     return torch.device(name)
+
+
+def require_memory(config: RunConfig, spec: Spec, device: torch.device) -> None:
+    """Raise `UserError` where a run takes more memory than is free, with the field that takes most, and its limit."""
+    parts = {"hidden": _network_bytes(config, spec), **config.memory(spec)}
+    total, free, most = sum(parts.values()), free_memory(device), max(parts, key=lambda name: parts[name])
+    if total > free:
+        value, left = getattr(config, most), f"{free // 10**6:,} MB"
+        taken = f"{total // 10**6:,} MB, of which {parts[most] // 10**6:,} MB"
+        limit = (free - total + parts[most]) * value // parts[most] if isinstance(value, int) else 0
+        advice = f"choose {most} at most {limit:,}" if limit > 0 else f"choose a smaller {most}"
+        raise UserError(f"This run takes at least {taken} are for {most} {value}; {left} are free: {advice}.")
+
+
+def _network_bytes(config: RunConfig, spec: Spec) -> int:
+    """The size of the networks, made without their numbers; 0 for those of one's own, which may need these."""
+    if getattr(config, "network", "") not in NETWORKS:
+        return 0
+    with torch.device("meta"):
+        networks = config.networks(spec)
+    return BYTES_PER_PARAMETER * sum(parameter.numel() for parameter in networks.parameters())

@@ -15,7 +15,7 @@ from lemniscate.nn.actor_critic import ActorQ
 from lemniscate.nn.policies import Policy
 from lemniscate.run.q_bias import QBias, QBiasMeter
 from lemniscate.run.seeding import derive, generator
-from lemniscate.types import Step
+from lemniscate.types import Step, wide_float
 
 EVALUATION = 1
 """the stream of seeds that training never draws from"""
@@ -116,7 +116,7 @@ class EpisodeTable:
 
     def __init__(self, num_envs: int, device: torch.device) -> None:
         self.terminated = 0
-        self._running = torch.zeros(2, num_envs, device=device)
+        self._running = torch.zeros(2, num_envs, dtype=wide_float(device), device=device)
         """[return, length] of the episode under way in each environment"""
         self._numbers = torch.arange(num_envs, device=device)
         self._ended: list[Tensor] = []

@@ -13,7 +13,7 @@ import shutil
 import stat
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from io import BufferedReader
+from io import BufferedReader, FileIO
 from pathlib import Path
 from typing import Any
 
@@ -73,17 +73,26 @@ def replace_file(path: Path, content: bytes) -> None:
 
 def open_regular(path: Path) -> BufferedReader:
     """A file, opened to be read. Raises `DamagedFileError` if it is missing, a link, a pipe or a directory."""
+    return os.fdopen(_open(path, os.O_RDONLY), "rb")
+
+
+def open_log(path: Path) -> FileIO:
+    """A file, opened to be written at its end; new if it is missing. Raises `DamagedFileError` as `open_regular`."""
+    return FileIO(_open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT), "ab")
+
+
+def _open(path: Path, flags: int) -> int:
     try:
-        handle = os.open(path, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0))
+        handle = os.open(path, flags | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0), 0o666)
     except FileNotFoundError:
         raise DamagedFileError(f"{path} is missing.") from None
     except OSError as error:
         reason = "it is a link" if error.errno == errno.ELOOP else error.strerror
-        raise DamagedFileError(f"{path} cannot be read: {reason}.") from None
+        raise DamagedFileError(f"{path} cannot be opened: {reason}.") from None
     if not stat.S_ISREG(os.fstat(handle).st_mode):
         os.close(handle)
-        raise DamagedFileError(f"{path} cannot be read: it is no regular file.")
-    return os.fdopen(handle, "rb")
+        raise DamagedFileError(f"{path} cannot be opened: it is no regular file.")
+    return handle
 
 
 @contextmanager

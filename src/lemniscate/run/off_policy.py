@@ -10,7 +10,7 @@ from lemniscate.data.replay import ReplayBuffer, bytes_per_transition
 from lemniscate.errors import UserError
 from lemniscate.nn.activations import Activation
 from lemniscate.nn.networks import Layers, Matmul
-from lemniscate.run.config import Count, Fraction, Natural, NonNegative, Positive, RunConfig
+from lemniscate.run.config import Count, Fraction, Natural, NonNegative, NumEnvs, Positive, RunConfig, Width
 from lemniscate.run.state import Networks, TrainState
 from lemniscate.spec import Spec
 
@@ -19,7 +19,7 @@ from lemniscate.spec import Spec
 class OffPolicyConfig(RunConfig):
     """The settings of algorithms that learn from a replay buffer."""
 
-    num_envs: Count = 1
+    num_envs: NumEnvs = 1
     """number of parallel environments, N; usually 1 to 8"""
     gamma: Fraction = 0.99
     """discount factor γ; usually 0.95 to 0.999"""
@@ -51,9 +51,9 @@ class OffPolicyConfig(RunConfig):
     """correlation time of Ornstein–Uhlenbeck noise in steps; θ = 0.15 of DDPG's paper is 1 / 0.15"""
     noise_exponent: NonNegative = 1.0
     """β of coloured noise, whose power falls as f^(−β); 1 is pink"""
-    hidden: tuple[Count, ...] = (256, 256)
+    hidden: tuple[Width, ...] = (256, 256)
     """widths of the policy's hidden layers"""
-    critic_hidden: tuple[Count, ...] = (256, 256)
+    critic_hidden: tuple[Width, ...] = (256, 256)
     """widths of each critic's hidden layers"""
     activation: Activation = "relu"
     """activation function between the layers; simba has its own"""
@@ -85,6 +85,19 @@ class OffPolicyConfig(RunConfig):
                     f" {self.buffer_size:,} and the {self.num_envs * self.steps_per_env:,} steps of the run is"
                     f" below {name} {rows:,}."
                 )
+
+    def memory(self, spec: Spec) -> dict[str, int]:
+        """Those of the replay buffer, the action noise, the minibatches of an update, and the metrics of a line."""
+        actions, length = spec.bounded_box().size, spec.max_episode_steps or 1000
+        width = max((*self.hidden, *self.critic_hidden), default=0)
+        updates = -(-self.log_every // self.update_every)
+        return {
+            "buffer_size": self.capacity * bytes_per_transition(spec),
+            "num_envs": 4 * self.num_envs * actions * length,
+            "num_updates": self.num_updates * (8 * self.batch_size + 1_000),
+            "batch_size": 4 * self.batch_size * width,
+            "log_every": 1_000 * updates,
+        }
 
     def notices(self, spec: Spec, device: torch.device) -> list[str]:
         """The size of the replay buffer; and products in bfloat16 where the processor has none."""

@@ -2,12 +2,13 @@
 
 from dataclasses import dataclass
 
+from lemniscate.data.rollout import rollout_bytes
 from lemniscate.errors import UserError
 from lemniscate.nn.activations import Activation
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.networks import Layers
 from lemniscate.nn.normalizer import RewardScale
-from lemniscate.run.config import Count, Fraction, LogStd, RunConfig
+from lemniscate.run.config import Count, Fraction, LogStd, RunConfig, Width
 from lemniscate.run.state import TrainState
 from lemniscate.spec import Spec
 
@@ -20,7 +21,7 @@ class OnPolicyConfig(RunConfig):
     """steps of each environment between updates, T; usually 16 to 2048, so that N · T is about 2048"""
     gamma: Fraction = 0.99
     """discount factor γ; usually 0.9 to 0.999"""
-    hidden: tuple[Count, ...] = (64, 64)
+    hidden: tuple[Width, ...] = (64, 64)
     """widths of the hidden layers of the policy, and of the value"""
     activation: Activation = "tanh"
     """activation function between the layers"""
@@ -40,6 +41,11 @@ class OnPolicyConfig(RunConfig):
     def networks(self, spec: Spec) -> ActorCritic:
         """New networks for the spaces in `spec`: the policy and V(s)."""
         return ActorCritic(spec, self.layers, self.initial_log_std, self.normalize_observations)
+
+    def memory(self, spec: Spec) -> dict[str, int]:
+        """Those of a rollout, and of its rows in the widest layer."""
+        rows = 4 * self.num_rows * max(self.hidden, default=0)
+        return {"num_steps": rows + rollout_bytes(spec, self.num_steps, self.num_envs)}
 
     @property
     def layers(self) -> Layers:

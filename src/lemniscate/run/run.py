@@ -95,6 +95,8 @@ class Run:
         self._hurry, self._ended = threading.Timer(PATIENCE, self._ask_again), threading.Event()
         self._hurry.daemon = True
         """asks again to stop; whether the loop has ended"""
+        self._require_finite: Callable[[], None] = lambda: None
+        """raises `NonFiniteError` where a parameter of the state is not finite"""
         self._line_time, self._line_step = 0.0, 0
         """when the last line was logged, and at which step"""
         self._body_time, self._body_began = 0.0, 0.0
@@ -135,8 +137,9 @@ class Run:
         self._bar = ProgressBar(total_steps, state.step, self._visible)
         started = time.monotonic()
         self._line_time, self._line_step = started, state.step
+        self._require_finite = state.require_finite
         try:
-            with signals_to(self._stop, signal.SIGINT, signal.SIGTERM):
+            with stop_signals_to(self._stop):
                 if state.step == 0 and (self.config.video_every or self.config.video_every_episodes):
                     self._record(state)
                 self._restart(state)
@@ -160,18 +163,20 @@ class Run:
             self._cut_short = bool(self._stop_signal)
             if self._cut_short:
                 return
+            self._require_finite()
             yield number
 
     def log(self, state: TrainState, metrics: Mapping[str, torch.Tensor | float], episodes: Episodes) -> None:
         """Write one line of metrics.
 
         Raises:
-            NonFiniteError: a loss or the gradient is NaN or infinite; the last checkpoint is untouched.
+            NonFiniteError: a loss, the gradient or a parameter is NaN or infinite; the last checkpoint is untouched.
         """
         numbers = {name: float(value) for name, value in metrics.items()}
         for name, value in numbers.items():
             if name.startswith(("losses/", "gradient")) and not -float("inf") < value < float("inf"):
                 raise NonFiniteError(f"{name} is {value} in the update that ends at step {state.step:,}.")
+        state.require_finite()
         if episodes.returns:
             self._episodes += len(episodes.returns)
             self._recent_returns = (self._recent_returns + episodes.returns)[-100:]
@@ -243,8 +248,9 @@ class Run:
 
     def _tell_stop(self, step: int) -> None:
         saved = "not saved" if self._saver.failure else "saved"
+        by = "" if self._stop_signal else "by a callback "
         message = (
-            f"Stopped at step {step:,}; the policy is {saved}. Go on with: {resume_line(self.path)}\n"
+            f"Stopped {by}at step {step:,}; the policy is {saved}. Go on with: {resume_line(self.path)}\n"
             f"It resumes at step {self._saver.last_planned:,}, the last planned checkpoint, and ends in the same bits"
             " as a run that was never stopped."
         )
@@ -337,12 +343,16 @@ def _passed(every: int, before: int, after: int) -> bool:
 
 
 @contextmanager
-def signals_to(handler: Callable[[int, FrameType | None], None], *signums: int) -> Iterator[None]:
-    """Inside, `handler` receives these signals; where it cannot, off the main thread, they are left alone."""
+def stop_signals_to(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
+    """Inside, `handler` receives Ctrl-C, SIGTERM, and the end of the terminal unless nohup has it ignored.
+
+    Off the main thread, where no handler can be, they are left alone.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    previous = {signum: signal.signal(signum, handler) for signum in signums}
+    hang_up = [signal.SIGHUP] if signal.getsignal(signal.SIGHUP) is signal.SIG_DFL else []
+    previous = {signum: signal.signal(signum, handler) for signum in (signal.SIGINT, signal.SIGTERM, *hang_up)}
     try:
         yield
     finally:

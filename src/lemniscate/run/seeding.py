@@ -29,7 +29,8 @@ def set_seeds(seed: int, deterministic: bool = True) -> None:
     seed_globals(int(number))
     torch.backends.cudnn.deterministic = deterministic
     torch.backends.cudnn.benchmark = False
-    torch.use_deterministic_algorithms(deterministic, warn_only=True)
+    # As `use_deterministic_algorithms` with warn_only, which also imports the compiler; `Compiled` tells it itself.
+    torch.set_deterministic_debug_mode("warn" if deterministic else "default")
     # It costs time, and nothing here reads uninitialized memory.
     deterministic_mode.fill_uninitialized_memory = False  # pyright: ignore[reportAttributeAccessIssue]
     if deterministic:

@@ -1,13 +1,16 @@
 """Training states: what a checkpoint holds, and what a run asks of it."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from typing import Any, Generic, TypeVar
 
+from lemniscate.errors import NonFiniteError
 from lemniscate.nn.policies import Policy
 from lemniscate.optim.adam import Adam
 from lemniscate.optim.compiled import Compiled
 from lemniscate.optim.learner import Learner
+from lemniscate.optim.vector import ParameterVector
 from lemniscate.run.seeding import Generators
 
 Networks = TypeVar("Networks", bound=Any)
@@ -40,6 +43,16 @@ class TrainState(Generic[Networks]):
     def optimizers(self) -> list[Adam]:
         """All optimizers of the state."""
         return [value for value in vars(self).values() if isinstance(value, Adam)]
+
+    def require_finite(self) -> None:
+        """Raise `NonFiniteError` where a parameter is NaN or infinite."""
+        vectors = [value.vector for value in vars(self).values() if isinstance(value, Adam | ParameterVector)]
+        if not math.isfinite(sum(vector.sum().item() for vector in vectors)):  # a NaN shows in the sum
+            for name, values in self.networks.named_parameters():
+                bad = values[~values.isfinite()]
+                if len(bad):
+                    said = f"The parameter {name} is {bad[0].item()} after the update"
+                    raise NonFiniteError(f"{said} that ends at step {self.step:,}.")
 
     def on_restart(self) -> None:
         """Forget the running episodes: the environments have been restarted."""

@@ -1,6 +1,7 @@
 """The live lines of a sweep: one bar for all its runs, and one for each run that is under way."""
 
 from collections.abc import Mapping
+from contextlib import suppress
 from datetime import timedelta
 
 from rich.console import Console
@@ -16,8 +17,8 @@ class SweepProgress:
     def __init__(self, totals: Mapping[str, int], steps: Mapping[str, int], visible: bool = True) -> None:
         self._console = Console(stderr=True)
         self._cell = CellText() if visible and in_notebook() else None
-        live = visible and not self._cell and self._console.is_terminal
-        self._visible, self._lines = visible, visible and not live and not self._cell
+        self._live = visible and not self._cell and self._console.is_terminal
+        self._visible, self._lines = visible, visible and not self._live and not self._cell
         self._totals = totals
         self._steps = {name: min(step, totals[name]) for name, step in steps.items()}
         self._under_way: dict[str, str] = {}
@@ -31,7 +32,7 @@ class SweepProgress:
             TextColumn("{task.percentage:>3.0f}%  {task.fields[said]}"),
             console=self._console,
             transient=True,
-            disable=not live,
+            disable=not self._live,
         )
         self._whole = self._bars.add_task("all", total=sum(totals.values()), said="")
         self._bars.start()
@@ -60,14 +61,16 @@ class SweepProgress:
 
     def say(self, text: str) -> None:
         """Print a line above the bars."""
-        if self._cell:
-            say(text)
+        if self._live:
+            with suppress(OSError):  # the terminal may be gone
+                self._console.print(text, highlight=False, markup=False, soft_wrap=True)
         elif self._visible:
-            self._console.print(text, highlight=False, markup=False, soft_wrap=True)
+            say(text)
 
     def close(self) -> None:
         """Leave the terminal as it was."""
-        self._bars.stop()
+        with suppress(OSError):
+            self._bars.stop()
         if self._cell:
             self._cell.flush()
 

@@ -8,6 +8,7 @@ from typing import Any
 
 from lemniscate.console import say
 from lemniscate.envs.episodes import Episodes
+from lemniscate.run.files import open_regular, replace_file
 from lemniscate.run.loggers import NO_EPISODES, Metrics
 
 
@@ -55,6 +56,7 @@ class WeightsAndBiases:
 def _stable_id(path: Path) -> str:
     """The W&B id of a run directory, kept in a file so that a resumed run continues its own curve."""
     file = path / "wandb-id"
-    if not file.exists():
-        file.write_text(os.urandom(6).hex())
-    return file.read_text()
+    if not os.path.lexists(file):
+        replace_file(file, os.urandom(6).hex().encode())
+    with open_regular(file) as text:
+        return text.read(100).decode(errors="replace")
