@@ -1,19 +1,23 @@
-"""Absurd numbers for every numeric field, and what a run does with them before its first update."""
+"""Absurd numbers for every numeric field and verb, what a run does with them before its first update, and the answers.
 
+A process of its own counts the answers: `count("systematic", "folder", 0, 1000, 1)` is the program of a fork.
+"""
+
+import itertools
+import json
 import math
-import os
 import resource
 import signal
-import sys
-import traceback
-import warnings
 from collections import Counter
+from pathlib import Path
 
 import numpy as np
 import psutil
 import torch
+from hypothesis import HealthCheck, Phase, given, seed, settings
 from hypothesis import strategies as st
 
+import lemniscate as lem
 from lemniscate import api
 from lemniscate.algos import ALGORITHMS, find
 from lemniscate.cli import parse
@@ -122,6 +126,35 @@ def systematic():
             yield from ((by_words, (algorithm, f"--{name.replace('_', '-')}={word}"), {}) for word in WORDS)
 
 
+class Accepted(Exception):
+    """What stops a case that would go on for long."""
+
+
+def stop(obs):
+    """A policy that stops the case where it would begin."""
+    raise Accepted
+
+
+def verbs(folder):
+    """The other numbers that Python's verbs take, with every value; what is taken stops where it would begin."""
+    for value in VALUES:
+        yield lem.evaluate, (stop, "CartPole-v1"), {"episodes": value}
+        yield lem.evaluate, (stop, "CartPole-v1"), {"seed": value}
+        yield lem.watch, (stop, "CartPole-v1"), {"episodes": value, "video": folder / "film.gif"}
+        yield lem.watch, (stop, "CartPole-v1"), {"seed": value, "video": folder / "film.gif"}
+        yield lem.set_seeds, (value,), {}
+        yield lem.make_vec, ("Countdown-v0", value), {}
+        yield lem.train_sweep, ("ppo", "Countdown-v0", value), {"run": folder / "there", "num_envs": 2}
+        yield lem.config_for, (value, "CartPole-v1"), {}
+        yield lem.config_for, ("ppo", value), {}
+        yield lem.config_for, ("ppo", "CartPole-v1", value), {}
+        yield lem.train, ("ppo", "CartPole-v1"), {"track": value, "run": folder / "there"}
+        yield lem.train, ("ppo", "CartPole-v1"), {"callbacks": [value], "run": folder / "there"}
+        yield lem.train, ("ppo", "CartPole-v1"), {"env_kwargs": {"x": value}, "run": folder / "there"}
+    for seeds in ("1-1000000000000", "1-" + "9" * 5_000, range(10**12), itertools.count(), "5-1", "nan", "1-1001"):
+        yield lem.train_sweep, ("ppo", "Countdown-v0", seeds), {"run": folder / "there"}
+
+
 @st.composite
 def drawn(draw):
     """The same at random, several fields at once."""
@@ -131,10 +164,6 @@ def drawn(draw):
         several = st.lists(numbers, max_size=3)
         return by_fields, (algorithm,), {name: draw(several if "hidden" in name else numbers) for name in names}
     return by_words, (algorithm, *(f"--{name.replace('_', '-')}={draw(texts)}" for name in names)), {}
-
-
-class Accepted(Exception):
-    """What stops a case that would go on for long."""
 
 
 def answer(function, args, fields):
@@ -155,30 +184,40 @@ def answer(function, args, fields):
     return "taken"
 
 
-def in_own_process(work):
-    """What `work(counts)` counts, in a process of 2 GB. Fails with the traceback, or the signal, that ends it."""
-    read_end, write_end = os.pipe()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the threads of another test's JAX do nothing here
-        child = os.fork()
-    if not child:
-        code = 1
-        try:
-            most = psutil.Process().memory_info().vms + MEMORY
-            resource.setrlimit(resource.RLIMIT_AS, (most, most))
-            counts = Counter()
-            work(counts)
-            os.write(write_end, f"{counts['taken']} {counts['refused']}".encode())
-            code = 0
-        except BaseException:
-            traceback.print_exc()
-        sys.stdout.flush(), sys.stderr.flush()
-        os._exit(code)
-    os.close(write_end)
-    _, status, used = os.wait4(child, 0)
-    with os.fdopen(read_end) as pipe:
-        counted = pipe.read()
-    assert os.waitstatus_to_exitcode(status) == 0, os.waitstatus_to_exitcode(status)
-    assert used.ru_maxrss * 1024 < MEMORY
-    taken, refused = map(int, counted.split())
-    return Counter(taken=taken, refused=refused)
+def randomly(first, cases):
+    """Answers of `cases` random cases, from the seed `first` on."""
+    counts = Counter()
+
+    @seed(first)
+    @settings(
+        max_examples=cases,
+        database=None,
+        deadline=None,
+        phases=[Phase.generate],
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(drawn())
+    def check(case):
+        counts[answer(*case)] += 1
+
+    check()
+    return counts
+
+
+def count(what, folder, first, last, every):
+    """Print the answers of the cases `first`, `first + every`, … below `last`, with at most 2 GB more than there was."""
+    most = psutil.Process().memory_info().vms + MEMORY
+    resource.setrlimit(resource.RLIMIT_AS, (most, most))
+    if what == "random":
+        counts = randomly(first, last - first)
+    else:
+        counts = Counter()
+        for case in itertools.islice(systematic() if what == "systematic" else verbs(Path(folder)), first, last, every):
+            try:
+                counts[answer(*case)] += 1
+            except BaseException:
+                print(f"{case[0].__name__} {case[1:]!s:.300}")
+                raise
+    resident = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    assert resident < MEMORY, f"{resident:,} bytes"
+    print(json.dumps(counts))

@@ -1,111 +1,49 @@
 """Absurd numbers: one sentence each, or a run that begins; no traceback, no crash, no memory, nothing left behind."""
 
 import itertools
+import json
 import math
 from collections import Counter
 
 import pytest
-from hypothesis import HealthCheck, Phase, given, seed, settings
 
 import lemniscate as lem
-from faults.absurd import (
-    VALUES,
-    Accepted,
-    answer,
-    by_fields,
-    by_words,
-    drawn,
-    env_of,
-    in_own_process,
-    numeric_fields,
-    systematic,
-)
+from faults.absurd import by_fields, by_words, env_of, numeric_fields, systematic, verbs
+from forks import Forks
 from lemniscate.algos import ALGORITHMS, find
 from lemniscate.errors import UserError
 
 TOTAL, PER_PROCESS = 20_000, 1_000
 
 
-def stop(obs):
-    raise Accepted
-
-
-def verbs(folder):
-    """The other numbers that Python's verbs take, with every value; what is taken stops where it would begin."""
-    (folder / "there").mkdir(exist_ok=True)
-    (folder / "there" / "file").touch()
-    for value in VALUES:
-        yield lem.evaluate, (stop, "CartPole-v1"), {"episodes": value}
-        yield lem.evaluate, (stop, "CartPole-v1"), {"seed": value}
-        yield lem.watch, (stop, "CartPole-v1"), {"episodes": value, "video": folder / "film.gif"}
-        yield lem.watch, (stop, "CartPole-v1"), {"seed": value, "video": folder / "film.gif"}
-        yield lem.set_seeds, (value,), {}
-        yield lem.make_vec, ("Countdown-v0", value), {}
-        yield lem.train_sweep, ("ppo", "Countdown-v0", value), {"run": folder / "there", "num_envs": 2}
-        yield lem.config_for, (value, "CartPole-v1"), {}
-        yield lem.config_for, ("ppo", value), {}
-        yield lem.config_for, ("ppo", "CartPole-v1", value), {}
-        yield lem.train, ("ppo", "CartPole-v1"), {"track": value, "run": folder / "there"}
-        yield lem.train, ("ppo", "CartPole-v1"), {"callbacks": [value], "run": folder / "there"}
-        yield lem.train, ("ppo", "CartPole-v1"), {"env_kwargs": {"x": value}, "run": folder / "there"}
-    for seeds in ("1-1000000000000", "1-" + "9" * 5_000, range(10**12), itertools.count(), "5-1", "nan", "1-1001"):
-        yield lem.train_sweep, ("ppo", "Countdown-v0", seeds), {"run": folder / "there"}
-
-
-def counted(cases):
-    """The answers of these cases, in processes of 2 GB."""
-    total = Counter()
-    for chunk in chunks(cases):
-
-        def work(counts, chunk=chunk):
-            for case in chunk:
-                try:
-                    counts[answer(*case)] += 1
-                except BaseException:
-                    print(f"{case[0].__name__} {case[1:]!s:.300}")
-                    raise
-
-        total += in_own_process(work)
-    return total
-
-
-def chunks(cases):
-    while chunk := list(itertools.islice(cases, PER_PROCESS)):
-        yield chunk
-
-
-def randomly(count, number):
-    """The answers of `count` random cases."""
-
-    def work(counts):
-        @seed(number)
-        @settings(
-            max_examples=count,
-            database=None,
-            deadline=None,
-            phases=[Phase.generate],
-            suppress_health_check=list(HealthCheck),
-        )
-        @given(drawn())
-        def check(case):
-            counts[answer(*case)] += 1
-
-        check()
-
-    return in_own_process(work)
+@pytest.fixture(scope="module")
+def processes():
+    """A process that has the cases, from which those that answer them are forked."""
+    forks = Forks("import faults.absurd")
+    yield forks
+    forks.close()
 
 
 @pytest.mark.parametrize("total", [pytest.param(TOTAL, marks=pytest.mark.faults), 150])
-def test_every_absurd_number_gets_one_sentence_or_a_run(tmp_path, monkeypatch, total):
-    monkeypatch.chdir(tmp_path)
-    every = 1 if total == TOTAL else 197
-    counts = counted(itertools.islice(systematic(), 0, None, every))
-    counts += counted(itertools.islice(verbs(tmp_path), 0, None, 1 if total == TOTAL else 61))
-    for number in itertools.count():
-        left = total - counts.total()
-        if left <= 0:
-            break
-        counts += randomly(min(left, PER_PROCESS), number)
+def test_every_absurd_number_gets_one_sentence_or_a_run(tmp_path, processes, total):
+    (tmp_path / "there").mkdir()
+    (tmp_path / "there" / "file").touch()
+
+    def counted(what, cases, every=1):
+        """The answers of all these cases, in processes of 2 GB."""
+        total = Counter()
+        for first in range(0, cases, PER_PROCESS * every):
+            program = f"count({what!r}, {str(tmp_path)!r}, {first}, {min(cases, first + PER_PROCESS * every)}, {every})"
+            process = processes.start(f"from faults.absurd import count; {program}", tmp_path)
+            said, errors = process.communicate()
+            assert process.returncode == 0, (process.returncode, program, said, errors)
+            total += Counter(json.loads(said.splitlines()[-1]))
+        return total
+
+    every_field, every_verb = (1, 1) if total == TOTAL else (197, 61)
+    counts = counted("systematic", sum(1 for _ in systematic()), every_field)
+    counts += counted("verbs", sum(1 for _ in verbs(tmp_path)), every_verb)
+    counts += counted("random", total - counts.total())
     assert counts["taken"] > total / 20
     assert {path.name for path in tmp_path.rglob("*")} == {"there", "file"}
     print(
