@@ -1,12 +1,11 @@
 """What a machine has left: the least of its own memory, its container's, and the limit of the process."""
 
-import resource
 from pathlib import Path
 
 import pytest
 import torch
 
-from faults.absurd import in_own_process
+from forks import Forks
 from lemniscate import machine
 
 CPU = torch.device("cpu")
@@ -30,12 +29,20 @@ def test_the_limit_of_a_container_counts(tmp_path, monkeypatch, folder, limit, u
     assert machine.free_memory(CPU) > 500_000_000
 
 
-def test_the_limit_of_the_process_counts():
-    def work(counts):
-        assert 0 < machine.free_memory(CPU) <= 2 * 10**9
-        most = resource.getrlimit(resource.RLIMIT_AS)[0]
-        resource.setrlimit(resource.RLIMIT_AS, (most - 2 * 10**9, most))
-        assert machine.free_memory(CPU) == 0
-        counts["taken"] += 1
+LIMITED = """
+import resource
+most = psutil.Process().memory_info().vms + 2 * 10**9
+for limit in (most, most - 2 * 10**9):
+    resource.setrlimit(resource.RLIMIT_AS, (limit, most))
+    print(machine.free_memory(torch.device("cpu")))
+"""
 
-    assert in_own_process(work)["taken"] == 1
+
+def test_the_limit_of_the_process_counts():
+    forks = Forks("import psutil, torch; from lemniscate import machine")
+    said, errors = forks.start(f"from __main__ import machine, psutil, torch\n{LIMITED}").communicate()
+    forks.close()
+    assert not errors
+    free, none = map(int, said.split())
+    assert 10**9 < free <= 2 * 10**9
+    assert none == 0

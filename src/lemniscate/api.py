@@ -14,7 +14,6 @@ from lemniscate.callbacks import Callback, call_callbacks, find_callbacks
 from lemniscate.console import say
 from lemniscate.envs import registry
 from lemniscate.errors import NotStoredError, UserError, is_installed, missing_extra, shown, unknown_name
-from lemniscate.machine import require_threads
 from lemniscate.policy import TrainedPolicy
 from lemniscate.report import playback
 from lemniscate.results import draw_run, evaluate
@@ -177,7 +176,6 @@ def _train(
     report: bool,
     progress: bool,
 ) -> TrainedRun:
-    require_threads(config.threads)
     set_seeds(config.seed)  # before JAX starts, which reads its flags then
     torch.set_num_threads(config.threads)
     envs = make_envs(config)

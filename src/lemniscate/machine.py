@@ -1,6 +1,5 @@
-"""What this machine still has: memory, and processors."""
+"""What this machine still has: memory, and files to open."""
 
-import os
 import resource
 import sys
 from pathlib import Path
@@ -8,31 +7,25 @@ from pathlib import Path
 import psutil
 import torch
 
-from lemniscate.errors import UserError
-
 CGROUPS = Path("/sys/fs/cgroup")
-FEWEST_MOST_THREADS = 64
-"""threads that every machine may be asked for, so that a run of a larger one can be resumed"""
 
 
-def free_memory(device: torch.device) -> int:
+def free_memory(device: torch.device | None = None) -> int:
     """Bytes that this process can still take: of the GPU; else of the machine, its container and its own limit."""
-    if device.type == "cuda":
+    if device and device.type == "cuda":
         return torch.cuda.mem_get_info(device)[0]
-    return max(0, min([psutil.virtual_memory().available, *_left_in_cgroups(), *_left_of_own_limit()]))
-
-
-def require_threads(threads: int) -> None:
-    """Raise `UserError` for more threads than this machine could ever use."""
-    cores = os.cpu_count() or 1
-    most = max(FEWEST_MOST_THREADS, 4 * cores)
-    if threads > most:
-        raise UserError(f"threads is {threads:,}, and this machine has {cores:,} processors: choose at most {most:,}.")
+    own = _limit(resource.RLIMIT_AS) - psutil.Process().memory_info().vms
+    return max(0, min(psutil.virtual_memory().available, own, *_left_in_cgroups()))
 
 
 def most_open_files() -> int:
     """The open files that this process may have."""
-    most, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+    return _limit(resource.RLIMIT_NOFILE)
+
+
+def _limit(kind: int) -> int:
+    """The most of a resource that this process may have (`ulimit`)."""
+    most, _ = resource.getrlimit(kind)
     return sys.maxsize if most == resource.RLIM_INFINITY else most
 
 
@@ -63,9 +56,3 @@ def _groups() -> list[Path]:
             own = root / path.lstrip("/")
             groups += [own, *(parent for parent in own.parents if parent.is_relative_to(root))]
     return groups
-
-
-def _left_of_own_limit() -> list[int]:
-    """Bytes of address space left, where there is a limit (`ulimit -v`)."""
-    most, _ = resource.getrlimit(resource.RLIMIT_AS)
-    return [] if most == resource.RLIM_INFINITY else [most - psutil.Process().memory_info().vms]

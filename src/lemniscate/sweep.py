@@ -24,7 +24,6 @@ from lemniscate.algos import ALGORITHMS, name_of
 from lemniscate.console import say
 from lemniscate.envs import registry
 from lemniscate.errors import SweepError, UserError, prefix_errors, resume_line, shown
-from lemniscate.machine import require_threads
 from lemniscate.owner import OWNED
 from lemniscate.results import final_return
 from lemniscate.run.config import RunConfig
@@ -300,7 +299,6 @@ def _require_trainable(configs: dict[str, RunConfig], seeds: list[int]) -> None:
                 said = f"Each run of a sweep has a process of its own: put {thing} into a module, to import it."
                 raise UserError(said)
         device = device_for(config.device)
-        require_threads(config.threads)
         for seed in seeds:
             config.replace(seed=seed)
         own = {"kwargs": config.env_kwargs, "wrappers": config.wrappers, "backend": config.backend}

@@ -1,15 +1,11 @@
 """ReplayBuffer: whole transitions in a ring, drawn uniformly, restored bit for bit."""
 
-from types import SimpleNamespace
-
-import psutil
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
 from lemniscate.data.replay import ReplayBuffer, bytes_per_transition
-from lemniscate.errors import UserError
 from lemniscate.spec import Box, ObservationPart, Spec
 from lemniscate.types import Transition
 
@@ -90,10 +86,3 @@ def test_a_million_of_hopper_fit_into_130_megabytes():
 def test_an_image_stays_bytes():
     image = Spec("x", (ObservationPart((), (4, 4, 3)),), Box((-1.0,), (1.0,)), image=True)
     assert ReplayBuffer(image, 5, CPU).transitions.next_obs.dtype == torch.uint8
-
-
-def test_a_capacity_beyond_the_free_memory_is_refused_with_one_that_fits(monkeypatch):
-    monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=3700))
-    with pytest.raises(UserError, match="choose buffer_size at most 100"):
-        ReplayBuffer(SPEC, 101, CPU)
-    ReplayBuffer(SPEC, 100, CPU)

@@ -24,7 +24,6 @@ from lemniscate.cli import parse
 from lemniscate.cli.fields import _number
 from lemniscate.envs import registry
 from lemniscate.errors import UserError
-from lemniscate.machine import require_threads
 from lemniscate.run.config import _hints_of, options_of
 from lemniscate.run.environments import device_for, evaluation_env, make_envs, require_memory
 
@@ -94,7 +93,6 @@ def env_of(algorithm):
 def begin(algorithm, config):
     """Do what a run does before its first update; of what is large and allowed, all but the making."""
     device = device_for(config.device)
-    require_threads(config.threads)
     registry.require_room(config.env, config.num_envs, config.backend)
     env = evaluation_env(config, 1)
     env.close()

@@ -62,18 +62,13 @@ def test_every_absurd_number_gets_one_sentence_or_a_run(tmp_path, processes, tot
         (f"--total-steps 1{'0' * 400}", r"at least 1, and at most 1e\+15, not a number of 401 digits"),
         ("--clip 1e300", r"clip must be a number above 0, and at most 1e\+38, not 1e\+300"),
         ("--evaluate-episodes 1e12", "evaluate_episodes must be a whole number from 1 to 1,000,000"),
-        ("--threads 100000", "threads must be a whole number from 1 to 1,024"),
+        ("--threads 100000", "threads must be a whole number from 1 to 256"),
         ("--num-envs 1e6 --backend gymnasium-async", "1,000,000 × CartPole-v1 in the gymnasium-async backend take at"),
     ],
 )  # fmt: skip
 def test_numbers_that_crashed_once_are_answered(words, said):
     with pytest.raises(UserError, match=said):
         by_words("ppo", *words.split())
-
-
-def test_threads_are_bounded_by_the_machine():
-    with pytest.raises(UserError, match=r"threads is 1,024, and this machine has \d+ processors: choose at most"):
-        by_fields("ppo", threads=1024)
 
 
 def test_off_policy_memory_is_estimated_before_it_is_taken():

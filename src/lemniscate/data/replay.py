@@ -7,8 +7,6 @@ from torch import Generator, Tensor
 
 from lemniscate.data.action_noise import ActionNoise
 from lemniscate.envs.vec_env import VecEnv
-from lemniscate.errors import UserError
-from lemniscate.machine import free_memory
 from lemniscate.maths import uniform
 from lemniscate.nn.policies import Policy
 from lemniscate.spec import Spec
@@ -16,19 +14,9 @@ from lemniscate.types import Step, Transition
 
 
 class ReplayBuffer:
-    """The last `capacity` transitions of all parallel environments, preallocated on `device`.
-
-    Raises `UserError` if they do not fit into the free memory.
-    """
+    """The last `capacity` transitions of all parallel environments, preallocated on `device`."""
 
     def __init__(self, spec: Spec, capacity: int, device: torch.device) -> None:
-        num_bytes = capacity * bytes_per_transition(spec)
-        free = free_memory(device)
-        if num_bytes > free:
-            raise UserError(
-                f"A replay buffer of {capacity:,} transitions of {spec.env_id} takes {num_bytes / 1e6:,.0f} MB, and"
-                f" {free / 1e6:,.0f} MB are free: choose buffer_size at most {capacity * free // num_bytes:,}."
-            )
         columns = {
             name: torch.zeros(capacity, *shape, dtype=kind, device=device) for name, shape, kind in _columns(spec)
         }

@@ -127,22 +127,18 @@ def names_of(wrappers: "Sequence[str | Callable[..., Any]]") -> tuple[str, ...]:
 def _checked_count(num_envs: Any) -> int:
     """The number of environments as an int. Raises `UserError` unless it is a whole number that makes sense."""
     number = getattr(num_envs, "tolist", lambda: num_envs)()  # of NumPy's and torch's scalars
-    if type(number) not in (int, float) or number < 1 or number % 1:
-        raise UserError(f"num_envs must be a whole number at least 1, not {shown(num_envs)}.")
-    if number > MOST_ENVS:
-        raise UserError(f"num_envs must be at most {MOST_ENVS:,}, not {shown(num_envs)}.")
+    if type(number) not in (int, float) or not 1 <= number <= MOST_ENVS or number % 1:
+        raise UserError(f"num_envs must be a whole number from 1 to {MOST_ENVS:,}, not {shown(num_envs)}.")
     return int(number)
 
 
 def require_room(env: str, num_envs: int, backend: str) -> None:
     """Raise `UserError` where N environments of a backend need more memory than is free, or more open files."""
-    import torch
-
     from lemniscate.machine import free_memory, most_open_files
 
     found: Any = backend_class(backend)
     each, files = found.room(env) if hasattr(found, "room") else (0, 0)
-    free = free_memory(torch.device("cpu"))
+    free = free_memory()
     if num_envs * each > free:
         raise UserError(
             f"{num_envs:,} × {env} in the {backend} backend take at least {num_envs * each // 10**6:,} MB, and"

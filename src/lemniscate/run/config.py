@@ -157,7 +157,7 @@ class RunConfig:
     device: str = "cpu"
     """device of the networks, and of simulators that can use it: cpu, cuda, cuda:N (GPU N, from 0) or mps; auto takes
     cuda if there is one"""
-    threads: Annotated[int, Range(1, 1024)] = 1
+    threads: Annotated[int, Range(1, 256)] = 1
     """CPU threads for torch; results differ in rounding between thread counts"""
     compile: Literal["auto", "on", "off"] = "auto"
     """compile the gradient steps and the policy; auto compiles long runs, where it saves time"""

@@ -47,6 +47,14 @@ class Evaluation:
         measures = {name: value if math.isfinite(value) else None for name, value in self.measures.items()}
         return scores | measures | ({"q_bias": self.q_bias.to_json()} if self.q_bias else {})
 
+    def means(self) -> dict[str, float]:
+        """The numbers of one line of metrics."""
+        means = {"return": self.mean_return, "length": sum(self.lengths) / self.episodes, **self.measures}
+        if self.q_bias:
+            means["q"], means["q_realised"] = self.q_bias.means
+            means["q_bias"] = self.q_bias.bias
+        return means
+
     def to_course(self) -> dict[str, object]:
         """The dictionary that a course on DDPG hands in with a policy; the time is ISO 8601."""
         return {

@@ -95,8 +95,6 @@ class Run:
         self._hurry, self._ended = threading.Timer(PATIENCE, self._ask_again), threading.Event()
         self._hurry.daemon = True
         """asks again to stop; whether the loop has ended"""
-        self._require_finite: Callable[[], None] = lambda: None
-        """raises `NonFiniteError` where a parameter of the state is not finite"""
         self._line_time, self._line_step = 0.0, 0
         """when the last line was logged, and at which step"""
         self._body_time, self._body_began = 0.0, 0.0
@@ -137,7 +135,6 @@ class Run:
         self._bar = ProgressBar(total_steps, state.step, self._visible)
         started = time.monotonic()
         self._line_time, self._line_step = started, state.step
-        self._require_finite = state.require_finite
         try:
             with stop_signals_to(self._stop):
                 if state.step == 0 and (self.config.video_every or self.config.video_every_episodes):
@@ -163,7 +160,6 @@ class Run:
             self._cut_short = bool(self._stop_signal)
             if self._cut_short:
                 return
-            self._require_finite()
             yield number
 
     def log(self, state: TrainState, metrics: Mapping[str, torch.Tensor | float], episodes: Episodes) -> None:
@@ -280,30 +276,22 @@ class Run:
         return self.config.checkpoint_every or max(fifth, 3 * longest * self.config.num_envs)
 
     def _record(self, state: TrainState) -> None:
-        if not self._film:
-            return
         try:
             with globals_undisturbed():
-                self._film(state)
+                if self._film:
+                    self._film(state)
         except (UserError, OSError) as error:  # no display any more, a full disk: it costs this recording, not the run
             say(f"No recording at step {state.step:,}: {error}")
 
     def _evaluate(self, state: TrainState) -> None:
         try:
             with globals_undisturbed():
-                critic = critic_of(state.networks, self.config)
-                episodes, seed = self.config.evaluate_episodes, self.config.seed
-                scores = evaluate(state.policy, self.eval_env, episodes, seed, critic=critic)
+                config, critic = self.config, critic_of(state.networks, self.config)
+                scores = evaluate(state.policy, self.eval_env, config.evaluate_episodes, config.seed, critic=critic)
         except UserError as error:  # an endless episode costs this evaluation, not the run
             say(f"No evaluation at step {state.step:,}: {error}")
             return
-        metrics = {"evaluation/return": scores.mean_return, "evaluation/length": sum(scores.lengths) / scores.episodes}
-        metrics |= {f"evaluation/{name}": value for name, value in scores.measures.items()}
-        if scores.q_bias:
-            predicted, realised = scores.q_bias.means
-            metrics |= {"evaluation/q": predicted, "evaluation/q_realised": realised}
-            metrics |= {"evaluation/q_bias": scores.q_bias.bias}
-        self._write(state.step, metrics)
+        self._write(state.step, {f"evaluation/{name}": value for name, value in scores.means().items()})
 
     def _write(self, step: int, numbers: dict[str, float], episodes: Episodes = NO_EPISODES) -> None:
         for logger in self._loggers:
