@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
-.PHONY: setup fly test test-long test-faults check wheel docs docs-serve bench bench-returns tutorials lock clean
+.PHONY: setup fly test test-long test-faults test-soak check wheel docs docs-serve bench bench-returns tutorials lock clean
 
 setup: .venv/.ready
 
@@ -19,13 +19,16 @@ fly: setup  ## train a drone to fly the figure eight, fly it from unseen starts,
 	$(BIN)/lemniscate train ppo --env DroneFigureEightTrajectory-v0 --report
 
 test: setup  ## the whole suite but the long ones
-	$(BIN)/python -m pytest -n auto --dist loadfile -m "not long and not faults"
+	$(BIN)/python -m pytest -n auto --dist loadfile -m "not long and not faults and not soak"
 
 test-long: setup  ## the tests that train for minutes
 	$(BIN)/python -m pytest -m long
 
 test-faults: setup  ## every way to break a run, many times: half an hour
 	$(BIN)/python -m pytest -n auto --dist load -m faults -rP
+
+test-soak: setup  ## memory and open files of long runs, on every backend: two hours
+	$(BIN)/python -m pytest -m soak -s
 
 check: setup  ## style, types, floors
 	$(BIN)/ruff check .
