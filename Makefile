@@ -1,11 +1,13 @@
 # One command for each chore. Everything runs in .venv, which `make setup` makes from requirements.lock.
 PYTHON ?= python3
 BIN := .venv/bin
+ALONE := $(PYTHON) -c 'import fcntl, os, sys; lock = os.open("Makefile", os.O_RDONLY); fcntl.flock(lock, fcntl.LOCK_EX); os.set_inheritable(lock, True); os.execvp(sys.argv[1], sys.argv[1:])'
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
 .PHONY: setup fly test test-long test-faults test-soak check wheel docs docs-serve bench bench-returns tutorials lock clean
 
-setup: .venv/.ready
+setup:  ## .venv; of two at once, one installs and the other waits for it
+	@$(MAKE) --question .venv/.ready 2> /dev/null || $(ALONE) $(MAKE) --silent .venv/.ready
 
 .venv/.ready: requirements.lock pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Python 3.11 or newer is needed; name one with make PYTHON=python3.12"; exit 2; }

@@ -2,7 +2,9 @@
 
 import random
 import shutil
+import subprocess
 import time
+from pathlib import Path
 
 import pytest
 
@@ -78,3 +80,59 @@ def test_of_two_sweeps_in_a_new_directory_one_is_refused(whole, tmp_path, times)
         assert sorted(code for code, _ in answers) == [0, 2], answers
         assert final_hashes(path / "ppo-1")["tensors.safetensors"] == final_hashes(whole / "1")["tensors.safetensors"]
     print(f"{times} directories wanted by two sweeps, each trained by one")
+
+
+PROJECT = {
+    "requirements.lock": "",
+    "pyproject.toml": """
+[build-system]
+requires = []
+build-backend = "slow"
+backend-path = ["."]
+
+[project]
+name = "lemniscate"
+version = "1"
+""",
+    "slow.py": """
+import time
+from pathlib import Path
+from pathlib import Path
+from zipfile import ZipFile
+
+def build_editable(folder, config_settings=None, metadata_directory=None):
+    with Path("installed").open("a") as file:
+        file.write("begun ")
+        file.flush()
+        time.sleep(1)
+        file.write("ended ")
+    name = "lemniscate-1-py3-none-any.whl"
+    with ZipFile(Path(folder, name), "w") as wheel:
+        wheel.writestr("lemniscate-1.dist-info/METADATA", "Metadata-Version: 2.1\\nName: lemniscate\\nVersion: 1\\n")
+        wheel.writestr("lemniscate-1.dist-info/WHEEL", "Wheel-Version: 1.0\\nGenerator: slow\\nTag: py3-none-any\\n")
+        wheel.writestr("lemniscate-1.dist-info/RECORD", "")
+    return name
+""",
+}
+
+
+@pytest.mark.faults
+def test_of_two_installations_at_once_one_is_done_and_the_other_waits_for_it(tmp_path):
+    shutil.copy(Path(__file__).parents[2] / "Makefile", tmp_path)
+    for name, content in PROJECT.items():
+        (tmp_path / name).write_text(content)
+    rng, times = random.Random(4), 3
+    for _ in range(times):
+        (tmp_path / "requirements.lock").touch()
+        (tmp_path / "installed").unlink(missing_ok=True)
+        started = []
+        for _ in range(2):
+            started.append(
+                subprocess.Popen(["make", "setup"], cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+            )
+            time.sleep(rng.uniform(0, 1))
+        for process in started:
+            said, _ = process.communicate()
+            assert process.returncode == 0, said
+        assert (tmp_path / "installed").read_text() == "begun ended "
+    print(f"make setup {times} times twice at once: {times} installations")
