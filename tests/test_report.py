@@ -285,11 +285,11 @@ NOISE = np.random.default_rng(0).normal(size=200)
             advice.kl_above_target,
             [
                 (evidence(logged(approx_kl=[0, 0.05]), desired_kl=0.01), "0.05, 5 times its target of 0.01"),
-                (evidence(logged(approx_kl=[0.031] * 9), epochs=3), "or take fewer --epochs"),
+                (evidence(logged(approx_kl=[0.11] * 9), epochs=3), "or take fewer --epochs"),
             ],
             [
                 evidence(logged(approx_kl=[0.019] * 9), desired_kl=0.01),
-                evidence(logged(approx_kl=[0.029] * 9)),
+                evidence(logged(approx_kl=[0.09] * 9)),
                 evidence(logged(approx_kl=[9, 9, 0.01, 0.01])),
                 evidence(),
             ],

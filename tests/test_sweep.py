@@ -229,10 +229,11 @@ def test_ctrl_c_stops_every_run_and_the_sweep_goes_on_to_the_same_bits(tmp_path)
 def test_runs_that_fail_are_named_and_the_others_are_not_touched(tmp_path, capsys):
     with pytest.raises(lem.SweepError) as told:
         lem.train_sweep(["ppo"], "environments:Fragile", range(1, 4), run=tmp_path / "s", num_envs=2, total_steps=2_000)
-    first, nan, killed = str(told.value).splitlines()
+    first, nan, killed, again = str(told.value).splitlines()
     assert first == "2 of 3 runs could not go on; log.txt in each says more."
     assert nan.startswith("ppo-2: The reward of environment 0 is nan in the step after 0. Training stopped;")
-    assert killed == "ppo-3: Killed."
+    assert killed == "ppo-3: Killed, as the system does where memory has run out."
+    assert again == f"Try them again with: lemniscate resume {tmp_path / 's'}"
     assert lem.load(tmp_path / "s" / "ppo-1").step >= 2_000
     said = capsys.readouterr().err
     assert "PPO      1" in said

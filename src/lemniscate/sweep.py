@@ -158,7 +158,10 @@ def _train(runs: Sweep, options: list[str], progress: bool) -> TrainedSweep:
             say(picture)
     if failed:
         sentences = "".join(f"\n{name}: {sentence}" for name, sentence in failed.items())
-        raise SweepError(f"{len(failed)} of {len(runs.runs)} runs could not go on; {LOG} in each says more.{sentences}")
+        raise SweepError(
+            f"{len(failed)} of {len(runs.runs)} runs could not go on; {LOG} in each says more.{sentences}\n"
+            f"Try them again with: {resume_line(runs.path)}"
+        )
     return TrainedSweep(runs.path, list(runs.runs))
 
 
@@ -258,7 +261,8 @@ def _progress_of(run: Path) -> tuple[int, float | None, float | None]:
 def _failure_of(run: Path, code: int) -> str:
     """The signal that ended a process, or else the last line that it wrote."""
     if code < 0 or code in (129, 130, 143):
-        return f"{signal.strsignal(-code if code < 0 else code - 128)}."
+        why = ", as the system does where memory has run out" if code == -signal.SIGKILL else ""
+        return f"{signal.strsignal(-code if code < 0 else code - 128)}{why}."
     with open_regular(run / LOG) as log:
         written = log.read().decode(errors="replace").split("\n")
     return next((line for line in reversed(written) if line.strip()), f"Exit code {code}.")

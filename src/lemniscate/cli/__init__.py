@@ -35,7 +35,7 @@ COMMANDS = {
     "watch": "Show episodes in a window, or record them.",
     "plot": "Draw the curves of a run and its report.html, or compare several, grouped by all but the seed.",
     "envs": "List the environments, their backends, and the preset that fits.",
-    "check": "Check that an environment is suitable for training.",
+    "check": "Check that an environment is suitable for training, or that the files of a run are whole.",
     "completion": "Print the script with which a shell completes; its first line says where to write it.",
 }
 
@@ -172,7 +172,9 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
 
     subs["envs"].add_argument("filter", nargs="?", default="", metavar="FILTER", help="a part of the id")
 
-    subs["check"].add_argument("env", metavar="ENV", help="an id, or module:Class of your own")
+    subs["check"].add_argument(
+        "what", metavar="ENV|RUN", help="an id, or module:Class of your own; or a run or a sweep"
+    )
     subs["check"].add_argument("--env-args", metavar="JSON", help="arguments of the environment")
     subs["check"].add_argument("--wrappers", nargs="+", default=[], metavar="NAME", help="wrappers, as in training")
     subs["check"].add_argument("--backend", metavar="NAME", help="simulation backend [chosen from the id]")

@@ -20,7 +20,7 @@ LARGE = 100
 
 @dataclass(frozen=True)
 class Finding:
-    """One sentence about an environment. `grade` is "good", "note" (works, but look at it) or "bad"."""
+    """One sentence about what is checked. `grade` is "good", "note" (works, but look at it) or "bad"."""
 
     grade: str
     sentence: str
@@ -30,7 +30,8 @@ class Finding:
 
     def listed(self, width: int) -> str:
         """The sentence as an item of a list, wrapped at `width` columns."""
-        return fill(self.sentence, width, initial_indent=f"{MARKS[self.grade]} ", subsequent_indent="  ")
+        first, others = f"{MARKS[self.grade]} ", "  "
+        return fill(self.sentence, width, initial_indent=first, subsequent_indent=others, break_on_hyphens=False)
 
 
 def verdict(env_id: str, findings: Sequence[Finding]) -> str:

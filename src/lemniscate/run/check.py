@@ -1,0 +1,140 @@
+"""Whether the files of a run or a sweep are whole, and what can be done where one is not. Nothing is changed."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from filelock import FileLock, Timeout
+
+from lemniscate.envs.findings import BAD, GOOD, NOTE, Finding
+from lemniscate.errors import UserError, resume_line
+from lemniscate.run import checkpoint
+from lemniscate.run.directory import CONFIG, LOCK
+from lemniscate.run.files import DamagedFileError, read_json
+from lemniscate.run.metrics import METRICS, damage, read_metrics
+from lemniscate.run.sweep_file import SWEEP, is_sweep, read_sweep
+from lemniscate.run.trust import is_signed, own_code
+
+FINAL = "final.json"
+
+
+def is_stored(path: Path) -> bool:
+    """Whether a directory is that of a run or of a sweep, whole or not."""
+    return any((path / name).exists() for name in (CONFIG, SWEEP, "checkpoints"))
+
+
+def each_finding(path: Path) -> Iterator[Finding]:
+    """What was found in the files of a run, or of each run of a sweep, one by one."""
+    if not is_sweep(path):
+        yield from _of_run(path)
+        return
+    try:
+        sweep = read_sweep(path)
+    except UserError as error:
+        yield Finding(BAD, f"{error} Its runs can be resumed and plotted one by one.")
+        runs = sorted(folder for folder in path.iterdir() if is_stored(folder))
+    else:
+        yield Finding(GOOD, f"{SWEEP}: {', '.join(sweep.configs)} with {len(sweep.seeds)} seeds.")
+        runs = list(sweep.runs)
+    for run in runs:
+        for finding in _of_run(run):
+            yield Finding(finding.grade, f"{run.name}: {finding.sentence}")
+
+
+def verdict(path: Path, found: list[Finding]) -> str:
+    """What can be done with a run or a sweep, in a sentence or two."""
+    damaged = sum(finding.grade == BAD for finding in found)
+    if not damaged:
+        return f"{path} is whole."
+    repairable = (
+        _can_be_read(path / SWEEP)
+        if is_sweep(path)
+        else any(found.record["planned"] for found in _checkpoints(path)[0])
+    )
+    files = f"{damaged} finding{'s' * (damaged > 1)} above, marked ✗"
+    if repairable:
+        return f"{path} is damaged: {files}. What can be repaired, this repairs: {resume_line(path)}"
+    return f"{path} is damaged: {files}. There is nothing that it can be repaired from."
+
+
+def _of_run(path: Path) -> Iterator[Finding]:
+    whole, broken = _checkpoints(path)
+    if path.exists():
+        yield _config(path, whole)
+    yield from broken
+    yield _going_on(path, whole)
+    yield from _metrics(path, whole)
+    if (path / FINAL).exists():
+        if _can_be_read(path / FINAL):
+            yield Finding(GOOD, f"{FINAL}: the scores of the final policy.")
+        else:
+            yield Finding(BAD, f"{path / FINAL} is damaged; its scores are computed again where they are asked for.")
+    if left := sorted(file.relative_to(path).as_posix() for file in path.rglob("*.tmp")):
+        yield Finding(NOTE, f"Left by a write that was interrupted, and harmless: {', '.join(left)}.")
+    if (path / LOCK).exists() and _is_locked(path / LOCK):
+        yield Finding(NOTE, "It is being trained by another process, and may have changed meanwhile.")
+
+
+def _checkpoints(path: Path) -> tuple[list[checkpoint.Checkpoint], list[Finding]]:
+    """The checkpoints that are whole, the oldest first, and what is wrong with the others."""
+    whole, broken = [], []
+    for step in checkpoint.list_steps(path / "checkpoints"):
+        try:
+            whole.append(checkpoint.read(path / "checkpoints" / f"step-{step}"))
+        except UserError as error:
+            broken.append(Finding(BAD, str(error)))
+    return whole, broken
+
+
+def _config(path: Path, whole: list[checkpoint.Checkpoint]) -> Finding:
+    """Whether the config is whole, or can be taken from a checkpoint, and whether it names code that is not trusted."""
+    try:
+        record = read_json(path / CONFIG)
+        code = own_code(record["config"])
+        if code and not is_signed(record):
+            return Finding(NOTE, f"It is from elsewhere and names code of its own, {', '.join(code)}: see --trust.")
+        return Finding(GOOD, f"{CONFIG}: {record['algorithm']} on {record['config']['env']}.")
+    except (UserError, LookupError, TypeError) as error:
+        copy = f"{whole[-1].path} has a copy, which is taken." if whole else "No checkpoint has a copy."
+        reason = str(error) if isinstance(error, UserError) else f"{path / CONFIG} lacks what a run has."
+        return Finding(BAD, f"{reason} {copy}")
+
+
+def _going_on(path: Path, whole: list[checkpoint.Checkpoint]) -> Finding:
+    """The whole checkpoints, and what `resume` would do."""
+    steps = [found.numbers["step"] for found in whole]
+    planned = [found for found in whole if found.record["planned"]]
+    if not checkpoint.list_steps(path / "checkpoints"):
+        return Finding(GOOD, "It has not begun.")
+    if not planned:
+        return Finding(NOTE, "There is no whole planned checkpoint: resume would begin at step 0.")
+    last = planned[-1]
+    finished = last.numbers["step"] >= last.record["config"]["total_steps"]
+    what = "it is finished" if finished else f"resume goes on from step {last.numbers['step']:,}"
+    return Finding(GOOD, f"Whole checkpoints: {', '.join(f'{step:,}' for step in steps)}; {what}.")
+
+
+def _metrics(path: Path, whole: list[checkpoint.Checkpoint]) -> Iterator[Finding]:
+    logged = max((found.record.get("logged", 0) for found in whole), default=0)
+    if sentence := damage(path, logged):
+        yield Finding(BAD, f"{sentence} The other lines serve; resume keeps the damaged file beside the new one.")
+    elif lines := read_metrics(path):
+        yield Finding(GOOD, f"{METRICS}: {len(lines):,} lines up to step {lines[-1]['step']:,}.")
+
+
+def _can_be_read(file: Path) -> bool:
+    try:
+        return bool(read_json(file))
+    except DamagedFileError:
+        return False
+
+
+def _is_locked(file: Path) -> bool:
+    lock = FileLock(file, timeout=0)
+    try:
+        lock.acquire()
+    except Timeout:
+        return True
+    except OSError:  # read-only: nobody can train there
+        return False
+    lock.release()
+    return False

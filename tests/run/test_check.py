@@ -1,0 +1,123 @@
+"""`lemniscate check RUN`: every damaged file is named, with what can be done; nothing is changed."""
+
+import shutil
+
+import pytest
+from filelock import FileLock
+
+import lemniscate as lem
+from conftest import tiny, tiny_fields
+from lemniscate.cli import main
+from lemniscate.results import final_return
+from lemniscate.run.check import each_finding
+from lemniscate.run.sweep_file import Sweep
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    path = tmp_path_factory.mktemp("whole") / "r"
+    run = lem.train("ppo", "Countdown-v0", run=path, progress=False, **{**tiny_fields(), "total_steps": 256})
+    final_return(run)
+    return path
+
+
+@pytest.fixture
+def run(whole, tmp_path):
+    return shutil.copytree(whole, tmp_path / "r")
+
+
+def contents(path):
+    return {file: file.read_bytes() for file in path.rglob("*") if file.is_file()}
+
+
+def answer(path, capsys):
+    """The exit code, and the lines that are said."""
+    before = contents(path)
+    try:
+        code = main(["check", str(path)])
+    except SystemExit as exit:
+        code = exit.code
+    assert contents(path) == before
+    return code, " ".join(capsys.readouterr().err.split())
+
+
+def flip(file, place=0.5):
+    content = bytearray(file.read_bytes())
+    content[int(place * len(content))] ^= 1
+    file.write_bytes(content)
+
+
+def test_a_whole_run_is_said_to_be_whole(run, capsys):
+    code, said = answer(run, capsys)
+    assert code in (0, None)
+    assert said.endswith(f"{run} is whole.")
+    assert "✓ config.json: ppo on Countdown-v0." in said
+    assert "it is finished" in said
+    assert "✗" not in said
+
+
+@pytest.mark.parametrize(
+    ("file", "advice"),
+    [
+        ("config.json", "has a copy, which is taken"),
+        ("final.json", "computed again"),
+        ("metrics.jsonl", "resume keeps the damaged file beside the new one"),
+        ("checkpoints/step-256/tensors.safetensors", "resume goes on from step"),
+        ("checkpoints/step-256/state.json", "resume goes on from step"),
+        ("checkpoints/step-256/manifest.json", "resume goes on from step"),
+    ],
+)
+def test_a_damaged_file_is_named_with_what_can_be_done(run, capsys, file, advice):
+    flip(run / file)
+    code, said = answer(run, capsys)
+    assert code == 2
+    assert f"✗ {run / file}" in said
+    assert advice in said
+    assert f"lemniscate resume {run}" in said
+
+
+def test_a_run_without_any_copy_is_beyond_repair(run, capsys):
+    flip(run / "config.json")
+    shutil.rmtree(run / "checkpoints")
+    code, said = answer(run, capsys)
+    assert code == 2
+    assert "No checkpoint has a copy." in said
+    assert said.endswith("There is nothing that it can be repaired from.")
+
+
+def test_what_was_left_and_who_trains_is_noted(run, capsys):
+    (run / "checkpoints" / "step-300.tmp").mkdir()
+    with FileLock(run / ".lock"):
+        code, said = answer(run, capsys)
+    assert code in (0, None)
+    assert "! Left by a write that was interrupted, and harmless: checkpoints/step-300.tmp." in said
+    assert "! It is being trained by another process" in said
+
+
+def test_code_of_a_run_from_elsewhere_is_noted(run, monkeypatch, tmp_path):
+    from lemniscate.run.files import write_json
+
+    record = {"algorithm": "ppo", "config": {"env": "evil:Env"}}
+    write_json(run / "config.json", record)
+    assert any(
+        "from elsewhere and names code of its own, evil:Env" in str(finding.sentence) for finding in each_finding(run)
+    )
+
+
+def test_a_sweep_is_checked_run_by_run(tmp_path, capsys):
+    sweep = tmp_path / "s"
+    config = {name: value for name, value in tiny().to_json().items() if name != "seed"}
+    Sweep(sweep, [1, 2], {"ppo": config}).create()
+    Sweep(sweep, [1, 2], {"ppo": config}).create_runs()
+    code, said = answer(sweep, capsys)
+    assert code in (0, None)
+    assert "✓ sweep.json: ppo with 2 seeds." in said
+    assert "ppo-1: It has not begun." in said
+    flip(sweep / "ppo-2" / "config.json")
+    code, said = answer(sweep, capsys)
+    assert code == 2
+    assert f"✗ ppo-2: {sweep / 'ppo-2' / 'config.json'} is damaged" in said
+    flip(sweep / "sweep.json")
+    code, said = answer(sweep, capsys)
+    assert f"✗ {sweep} is not a sweep: {sweep / 'sweep.json'} is damaged" in said
+    assert "ppo-1: config.json: ppo on Countdown-v0." in said
