@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
@@ -65,7 +66,9 @@ def load(run: Trained, *, trust: bool = False) -> TrainedPolicy:
         name, fields, step = found.record["algorithm"], found.record["config"], found.numbers["step"]
         spec = checkpoint.spec_from_json(found.record["spec"])
     config = algos.find(name).Config.from_json(fields)
-    networks, tensors = config.networks(spec), found.tensors_of("networks")
+    with nullcontext() if own_code_of(found.record) else parsing(found.path):  # what one's own code raises is its own
+        networks = config.networks(spec)
+    tensors = found.tensors_of("networks")
     if differs := difference(tensors, networks.state_dict()):
         raise UserError(f"{path} does not fit its networks: {differs}.")
     networks.load_state_dict(tensors)

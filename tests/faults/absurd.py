@@ -56,11 +56,9 @@ numbers = st.one_of(
     st.floats(),
     st.floats(0, 1),
     st.sampled_from([10**exponent for exponent in range(4, 20)]),
-    st.sampled_from(VALUES[:24]),
+    st.sampled_from([value for value in VALUES[:24] if not isinstance(value, int) or abs(value) <= 10**400]),
 )
-texts = st.one_of(
-    numbers.filter(lambda x: abs(x) < 10**4000 if isinstance(x, int) else True).map(str), st.sampled_from(WORDS)
-)
+texts = st.one_of(numbers.map(str), st.sampled_from(WORDS))
 
 
 def numeric_fields(algorithm):

@@ -13,6 +13,7 @@ from conftest import tiny_fields
 from forks import command
 from lemniscate.errors import UserError
 from lemniscate.results import final_scores
+from lemniscate.run.check import each_finding
 from lemniscate.run.directory import read_config
 from lemniscate.run.files import read_json, write_json
 
@@ -95,6 +96,11 @@ def edit(path, name, rng):
         write_json(file.with_name("manifest.json"), {**manifest, "files": {**manifest["files"], "state.json": hashed}})
 
 
+def checked(path):
+    """What `lemniscate check` finds, each in a sentence."""
+    assert all(finding.sentence.endswith(".") for finding in each_finding(path))
+
+
 @pytest.mark.parametrize("times", [pytest.param(1500, marks=pytest.mark.faults), 40])
 def test_records_of_odd_content_and_right_hashes_are_a_sentence(run, tmp_path, capsys, times):
     names = ["config.json", "final.json", f"{STEP}/state.json", f"{STEP}/manifest.json"]
@@ -104,7 +110,7 @@ def test_records_of_odd_content_and_right_hashes_are_a_sentence(run, tmp_path, c
         path = shutil.copytree(run, tmp_path / "r")
         name = rng.choice(names)
         edit(path, name, rng)
-        for read in (lem.load, read_config, final_scores, lem.evaluate if number % 10 == 0 else lem.load):
+        for read in (lem.load, read_config, final_scores, checked, lem.evaluate if number % 10 == 0 else lem.load):
             try:
                 read(path)
             except UserError:

@@ -9,7 +9,7 @@ from lemniscate.envs.findings import BAD, GOOD, NOTE, Finding
 from lemniscate.errors import UserError, resume_line
 from lemniscate.run import checkpoint
 from lemniscate.run.directory import CONFIG, LOCK
-from lemniscate.run.files import DamagedFileError, read_json
+from lemniscate.run.files import DamagedFileError, parsing, read_json
 from lemniscate.run.metrics import METRICS, damage, read_metrics
 from lemniscate.run.sweep_file import SWEEP, is_sweep, read_sweep
 from lemniscate.run.trust import is_signed, own_code
@@ -48,7 +48,7 @@ def verdict(path: Path, found: list[Finding]) -> str:
     repairable = (
         _can_be_read(path / SWEEP)
         if is_sweep(path)
-        else any(found.record["planned"] for found in _checkpoints(path)[0])
+        else any(found.record.get("planned") for found in _checkpoints(path)[0])
     )
     files = f"{damaged} finding{'s' * (damaged > 1)} above, marked ✗"
     if repairable:
@@ -89,32 +89,36 @@ def _config(path: Path, whole: list[checkpoint.Checkpoint]) -> Finding:
     """Whether the config is whole, or can be taken from a checkpoint, and whether it names code that is not trusted."""
     try:
         record = read_json(path / CONFIG)
-        code = own_code(record["config"])
-        if code and not is_signed(record):
-            return Finding(NOTE, f"It is from elsewhere and names code of its own, {', '.join(code)}: see --trust.")
-        return Finding(GOOD, f"{CONFIG}: {record['algorithm']} on {record['config']['env']}.")
-    except (UserError, LookupError, TypeError) as error:
+        with parsing(path / CONFIG):
+            code, what = own_code(record["config"]), f"{record['algorithm']} on {record['config']['env']}"
+    except DamagedFileError as error:
         copy = f"{whole[-1].path} has a copy, which is taken." if whole else "No checkpoint has a copy."
-        reason = str(error) if isinstance(error, UserError) else f"{path / CONFIG} lacks what a run has."
-        return Finding(BAD, f"{reason} {copy}")
+        return Finding(BAD, f"{error} {copy}")
+    if code and not is_signed(record):
+        return Finding(NOTE, f"It is from elsewhere and names code of its own, {', '.join(code)}: see --trust.")
+    return Finding(GOOD, f"{CONFIG}: {what}.")
 
 
 def _going_on(path: Path, whole: list[checkpoint.Checkpoint]) -> Finding:
     """The whole checkpoints, and what `resume` would do."""
-    steps = [found.numbers["step"] for found in whole]
-    planned = [found for found in whole if found.record["planned"]]
+    planned = [found for found in whole if found.record.get("planned")]
     if not checkpoint.list_steps(path / "checkpoints"):
         return Finding(GOOD, "It has not begun.")
     if not planned:
         return Finding(NOTE, "There is no whole planned checkpoint: resume would begin at step 0.")
-    last = planned[-1]
-    finished = last.numbers["step"] >= last.record["config"]["total_steps"]
-    what = "it is finished" if finished else f"resume goes on from step {last.numbers['step']:,}"
-    return Finding(GOOD, f"Whole checkpoints: {', '.join(f'{step:,}' for step in steps)}; {what}.")
+    try:
+        with parsing(planned[-1].path):
+            steps = ", ".join(f"{found.numbers['step']:,}" for found in whole)
+            last, total = planned[-1].numbers["step"], planned[-1].record["config"]["total_steps"]
+            what = "it is finished" if last >= total else f"resume goes on from step {last:,}"
+    except DamagedFileError as error:
+        return Finding(BAD, str(error))
+    return Finding(GOOD, f"Whole checkpoints: {steps}; {what}.")
 
 
 def _metrics(path: Path, whole: list[checkpoint.Checkpoint]) -> Iterator[Finding]:
-    logged = max((found.record.get("logged", 0) for found in whole), default=0)
+    steps = [found.record.get("logged") for found in whole]
+    logged = max((step for step in steps if isinstance(step, int)), default=0)
     if sentence := damage(path, logged):
         yield Finding(BAD, f"{sentence} The other lines serve; resume keeps the damaged file beside the new one.")
     elif lines := read_metrics(path):

@@ -125,7 +125,7 @@ def read(path: Path) -> Checkpoint:
     _verify(path)
     try:
         tensors = load_file(path / TENSORS)
-    except SafetensorError as error:
+    except (SafetensorError, OSError, RuntimeError) as error:  # the last two: it has been deleted meanwhile
         raise DamagedFileError(f"{path / TENSORS} cannot be read: {error}.") from error
     if name := _not_finite(tensors):
         raise DamagedFileError(f"{path / TENSORS} has a value that is not finite in {name}.")

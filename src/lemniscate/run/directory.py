@@ -104,7 +104,7 @@ def _newest(path: Path, planned_only: bool) -> checkpoint.Checkpoint | None:
         folder = path / "checkpoints" / f"step-{step}"
         try:
             found = checkpoint.read(folder)
-            if found.record["planned"] or not planned_only:
+            if found.record.get("planned") or not planned_only:
                 return found
         except DamagedFileError as error:
             if folder.exists():
