@@ -10,7 +10,7 @@ __version__ = "0.2.0"
 
 if TYPE_CHECKING:
     from lemniscate.api import config_for, resume, train
-    from lemniscate.envs.check import check
+    from lemniscate.checks import check
     from lemniscate.envs.vector_view import make_vec
     from lemniscate.errors import NonFiniteError, NotStoredError, SweepError, UserError
     from lemniscate.plots import plot
@@ -59,7 +59,7 @@ MODULES = {
     "TrainedRun": "stored",
     "TrainedSweep": "sweep",
     "UserError": "errors",
-    "check": "envs.check",
+    "check": "checks",
     "config_for": "api",
     "evaluate": "results",
     "load": "stored",

@@ -27,26 +27,32 @@ def check_trial(trials, folder, whole, fail):
     return said
 
 
-def cases(count, every):
+def cases(count, first, every):
     """(first, last, errno): one event fails, or all from one on."""
-    for number in range(1, count + 1, every):
+    for number in range(first, count + 1, every):
         yield number, number, ERRORS[number % 4]
         yield number, 10**9, ERRORS[(number + 1) % 4]
 
 
-@pytest.mark.parametrize("every", [pytest.param(1, marks=pytest.mark.faults), 41])
-def test_an_error_of_the_disk_costs_a_checkpoint_at_most(recorded, trials, tmp_path, every):
+def quarters(short):
+    """(first, step) of a fourth of the calls each, for several processes; of a few for the short form."""
+    whole = [pytest.param(first, 4, marks=pytest.mark.faults) for first in (1, 2, 3, 4)]
+    return pytest.mark.parametrize(("first", "every"), [*whole, (1, short)])
+
+
+@quarters(short=41)
+def test_an_error_of_the_disk_costs_a_checkpoint_at_most(recorded, trials, tmp_path, first, every):
     whole, log = recorded
     count = len(read_log(log))
-    tried = [check_trial(trials, tmp_path / "disk", whole, fail) for fail in cases(count, every)]
+    tried = [check_trial(trials, tmp_path / "disk", whole, fail) for fail in cases(count, first, every)]
     print(f"{len(tried)} disks that failed, 0 tracebacks, 0 results lost")
 
 
-@pytest.mark.parametrize("every", [pytest.param(1, marks=pytest.mark.faults), 41])
-def test_killed_before_any_call_it_goes_on_to_the_same_bits(recorded, trials, tmp_path, every):
+@quarters(short=41)
+def test_killed_before_any_call_it_goes_on_to_the_same_bits(recorded, trials, tmp_path, first, every):
     whole, log = recorded
     folder, killed = tmp_path / "disk", 0
-    for number in range(1, len(read_log(log)) + 1, every):
+    for number in range(first, len(read_log(log)) + 1, every):
         code, said = trials.run(fresh(folder), *TRAIN, folder / "r", kill=number)
         assert code == -9, said
         again = ["resume"] if (folder / "r" / "config.json").exists() else TRAIN

@@ -172,9 +172,7 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
 
     subs["envs"].add_argument("filter", nargs="?", default="", metavar="FILTER", help="a part of the id")
 
-    subs["check"].add_argument(
-        "what", metavar="ENV|RUN", help="an id, or module:Class of your own; or a run or a sweep"
-    )
+    subs["check"].add_argument("what", metavar="ENV|RUN", help="an id, module:Class of your own, a run or a sweep")
     subs["check"].add_argument("--env-args", metavar="JSON", help="arguments of the environment")
     subs["check"].add_argument("--wrappers", nargs="+", default=[], metavar="NAME", help="wrappers, as in training")
     subs["check"].add_argument("--backend", metavar="NAME", help="simulation backend [chosen from the id]")

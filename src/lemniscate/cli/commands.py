@@ -2,26 +2,21 @@
 
 import argparse
 import json
-from functools import partial
-from pathlib import Path
 from shutil import get_terminal_size
 from typing import Any
 
 from lemniscate import api, plots, results, sweep
 from lemniscate.algos import ALGORITHMS
+from lemniscate.checks import each_finding, verdict
 from lemniscate.cli.completion import completion as completion
 from lemniscate.cli.fields import number, read, read_json
 from lemniscate.console import say
 from lemniscate.envs import registry
-from lemniscate.envs.check import each_finding
-from lemniscate.envs.findings import BAD, verdict
+from lemniscate.envs.findings import BAD
 from lemniscate.errors import UserError, unknown_name
 from lemniscate.owner import end_with_owner
 from lemniscate.presets import best, choose
 from lemniscate.report import pictures
-from lemniscate.run.check import each_finding as each_file_finding
-from lemniscate.run.check import is_stored
-from lemniscate.run.check import verdict as verdict_on_files
 from lemniscate.run.run import is_compiled
 from lemniscate.run.sweep_file import is_sweep
 from lemniscate.stored import TrainedRun
@@ -110,20 +105,14 @@ def envs(given: argparse.Namespace) -> None:
 
 
 def check(given: argparse.Namespace) -> None:
-    """Say what was found about an environment, or the files of a run, as a list; what is bad there is an error."""
-    path, found = Path(given.what), []
-    if is_stored(path):
-        findings, conclude = each_file_finding(path), partial(verdict_on_files, path)
-    else:
-        wrappers = read("wrappers", tuple[str, ...], given.wrappers)
-        findings = each_finding(given.what, given.backend, _env_args(given), wrappers)
-        conclude = partial(verdict, given.what)
-    for finding in findings:
+    """Say what was found about an environment or the files of a run, as a list; what is bad there is an error."""
+    found, wrappers = [], read("wrappers", tuple[str, ...], given.wrappers)
+    for finding in each_finding(given.what, given.backend, _env_args(given), wrappers):
         found.append(finding)
         say(finding.listed(min(get_terminal_size((112, 24)).columns, 120)))
     if any(finding.grade == BAD for finding in found):
-        raise UserError(conclude(found))
-    say(conclude(found))
+        raise UserError(verdict(given.what, found))
+    say(verdict(given.what, found))
 
 
 def _say_score(run: TrainedRun) -> None:

@@ -2,7 +2,7 @@
 
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -25,33 +25,10 @@ from lemniscate.types import Rollout
 NUM_ENVS, STEPS = 4, 500
 
 
-def check(
-    env: str | Callable[..., Any],
-    backend: str | None = None,
-    env_kwargs: Mapping[str, Any] | None = None,
-    wrappers: Sequence[str | Callable[..., Any]] = (),
-) -> list[Finding]:
-    """Check that an environment is suitable for training, with Gymnasium's own checker and by random play.
-
-    Args:
-        env: an id, `module:Class`, a class, or a function that makes an environment.
-        backend: a simulation backend; by default the first that serves `env`.
-        env_kwargs: arguments of the environment.
-        wrappers: around each single environment, the first innermost.
-
-    Returns:
-        Everything found, each a sentence with a grade; what keeps the environment from being made is the last.
-
-    Raises:
-        UserError: no such environment, backend or wrapper.
-    """
-    return list(each_finding(registry.name_of(env), backend, env_kwargs, registry.names_of(wrappers)))
-
-
 def each_finding(
     env_id: str, backend: str | None, env_kwargs: Mapping[str, Any] | None, wrappers: Sequence[str]
 ) -> Iterator[Finding]:
-    """The findings of `check`, one by one."""
+    """What was found about an environment, one by one. Raises `UserError` where there is none of that name."""
     served_by = registry.backend_for(env_id, wrappers) if backend is None else registry.require_backend(backend)
     try:
         with warnings.catch_warnings():

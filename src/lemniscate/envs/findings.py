@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from textwrap import fill
+from textwrap import wrap
 
 import torch
 from torch import Tensor
@@ -30,8 +30,8 @@ class Finding:
 
     def listed(self, width: int) -> str:
         """The sentence as an item of a list, wrapped at `width` columns."""
-        first, others = f"{MARKS[self.grade]} ", "  "
-        return fill(self.sentence, width, initial_indent=first, subsequent_indent=others, break_on_hyphens=False)
+        lines = wrap(self.sentence, width - 2, break_long_words=False, break_on_hyphens=False)
+        return f"{MARKS[self.grade]} " + "\n  ".join(lines)
 
 
 def verdict(env_id: str, findings: Sequence[Finding]) -> str:

@@ -121,3 +121,8 @@ def test_a_sweep_is_checked_run_by_run(tmp_path, capsys):
     code, said = answer(sweep, capsys)
     assert f"✗ {sweep} is not a sweep: {sweep / 'sweep.json'} is damaged" in said
     assert "ppo-1: config.json: ppo on Countdown-v0." in said
+
+
+def test_from_python_it_takes_a_path_or_what_train_returned(run):
+    assert [finding.grade for finding in lem.check(run)] == ["good"] * 4
+    assert lem.check(str(run)) == lem.check(run)
