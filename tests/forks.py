@@ -15,7 +15,7 @@ TESTS = Path(__file__).parent
 LEMNISCATE = "import sys, envpool, torch, torch.utils.tensorboard, lemniscate.cli.commands; torch.set_num_threads(1)"
 
 SERVER = """
-import json, os, sys, traceback
+import gc, json, os, sys
 
 def begin(job):
     os.setsid()
@@ -28,6 +28,8 @@ def begin(job):
     os.environ.update(job["environment"])
     exec(compile(job["code"], "<fork>", "exec"), {"__name__": "__main__"})
 
+gc.collect()
+gc.freeze()  # what is imported is not written to by a collection, and stays shared
 for line in sys.stdin:
     job = json.loads(line)
     waiter = os.fork()

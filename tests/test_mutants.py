@@ -23,14 +23,14 @@ MUTANTS = [
         "maths/returns.py",
         "next_value * ~terminated -",
         "next_value * ~done -",
-        "maths/test_returns.py",
+        "maths/test_returns.py::test_gae_is_the_double_sum",
     ),
     (
         "a death does not",
         "maths/returns.py",
         "next_value * ~terminated -",
         "next_value -",
-        "maths/test_returns.py",
+        "maths/test_returns.py::test_gae_is_the_double_sum",
     ),
     (
         "the chain runs on",
@@ -107,7 +107,7 @@ MUTANTS = [
         "maths/stats.py",
         " + delta.square() *",
         " + 0 * delta *",
-        "maths/test_stats.py",
+        "maths/test_stats.py::test_merged_moments_are_those_of_the_union",
     ),
     (
         "log-prob without the std",
@@ -121,7 +121,7 @@ MUTANTS = [
         "envs/spaces.py",
         "middle + half *",
         "middle + 0.5 * half *",
-        "envs/test_spaces.py",
+        "envs/test_spaces.py::test_the_unit_interval_maps_onto_the_bounds",
     ),
     (
         "reset rows are real",
@@ -170,7 +170,7 @@ MUTANTS = [
         "run/run.py",
         "if planned and not finished:",
         "if False:",
-        "run/test_run.py",
+        "run/test_run.py::test_what_follows_episodes_is_restarted_with_the_environments",
     ),
     (
         "the optimizer's moments are not restored",
@@ -233,14 +233,14 @@ MUTANTS = [
         "envs/episodes.py",
         "after_end[:1]), after_end[:-1]]",
         "after_end[:0]), after_end]",
-        "envs/test_episodes.py",
+        "envs/test_episodes.py::test_the_sums_agree_with_adding_up_one_by_one",
     ),
     (
         "fragments are counted",
         "envs/episodes.py",
         "done & counts]",
         "done & (counts | done)]",
-        "envs/test_episodes.py",
+        "envs/test_episodes.py::test_the_sums_agree_with_adding_up_one_by_one",
     ),
     (
         "a masked action may be chosen",
@@ -268,7 +268,7 @@ MUTANTS = [
         "maths/noise.py",
         " * math.sqrt(1 - phi * phi)",
         "",
-        "maths/test_noise.py",
+        "maths/test_noise.py::test_the_process_has_variance_one_at_every_step_and_forgets_exponentially",
     ),
     (
         "noise that forgets too fast",
@@ -282,28 +282,28 @@ MUTANTS = [
         "maths/noise.py",
         "(-exponent / 2)",
         "(-exponent)",
-        "maths/test_noise.py",
+        "maths/test_noise.py::test_the_power_falls_as_its_exponent_says",
     ),
     (
         "the highest frequency counts twice",
         "maths/noise.py",
         "ends[0] = ends[-1] = 1",
         "ends[0] = 1",
-        "maths/test_noise.py",
+        "maths/test_noise.py::test_coloured_noise_has_variance_one_at_every_step",
     ),
     (
         "a death bootstraps",
         "maths/returns.py",
         "gamma * next_value * ~terminated\n",
         "gamma * next_value\n",
-        "maths/test_returns.py",
+        "maths/test_returns.py::test_a_td_target_is_the_sum_row_by_row",
     ),
     (
         "the target runs away",
         "maths/returns.py",
         "mine.lerp_(theirs, tau)",
         "theirs.data.lerp_(mine.data, tau)",
-        "maths/test_returns.py",
+        "maths/test_returns.py::test_polyak_moves_the_target_alone_and_by_a_power",
     ),
     (
         "no correction for the squashing",
@@ -331,7 +331,7 @@ MUTANTS = [
         "maths/trust_region.py",
         "here.kl(there)",
         "-here.kl(there)",
-        "maths/test_trust_region.py",
+        "maths/test_trust_region.py::test_products_are_finite_differences_of_the_gradient_of_the_kl",
     ),
     (
         "the value in the Fisher matrix",
@@ -352,21 +352,21 @@ MUTANTS = [
         "maths/trust_region.py",
         "return start, 0.0",
         "return point, 0.0",
-        "maths/test_trust_region.py",
+        "maths/test_trust_region.py::test_backtracking_stands_on_the_farthest_point_that_keeps_both_promises",
     ),
     (
         "any KL will do",
         "maths/trust_region.py",
         " and kl <= max_kl",
         "",
-        "maths/test_trust_region.py",
+        "maths/test_trust_region.py::test_backtracking_stands_on_the_farthest_point_that_keeps_both_promises",
     ),
     (
         "any loss will do",
         "maths/trust_region.py",
         "loss < before and ",
         "",
-        "maths/test_trust_region.py",
+        "maths/test_trust_region.py::test_backtracking_stands_on_the_farthest_point_that_keeps_both_promises",
     ),
     (
         "directions that are not conjugate",
@@ -380,7 +380,7 @@ MUTANTS = [
         "maths/trust_region.py",
         "product, -gradient",
         "product, gradient",
-        "maths/test_trust_region.py",
+        "maths/test_trust_region.py::test_the_natural_step_has_its_length_and_nothing_of_that_length_goes_lower",
     ),
     (
         "a step √2 too short",
@@ -401,14 +401,14 @@ MUTANTS = [
         "maths/losses.py",
         "-(log_prob * weight)",
         "(log_prob * weight)",
-        "maths/test_losses.py",
+        "maths/test_losses.py::test_the_surrogate_is_the_mean_of_ratio_times_advantage_and_at_ratio_one_the_policy_gradient",
     ),
     (
         "what went before is forgotten",
         "maths/returns.py",
         "paid + weight * to_go[t]",
         "weight * to_go[t]",
-        "maths/test_returns.py",
+        "maths/test_returns.py::test_the_whole_return_is_that_of_the_first_row_of_the_episode",
     ),
     (
         "a reset row is an action",
@@ -576,7 +576,7 @@ MUTANTS = [
         "run/q_bias.py",
         " + networks.entropy_bonus(last, self._generator)",
         "",
-        "run/test_q_bias.py",
+        "run/test_q_bias.py::test_entropy_counts_from_the_second_step_on",
     ),
     (
         "the learning rate of Q never falls",
@@ -604,7 +604,7 @@ MUTANTS = [
         "run/q_bias.py",
         "realised + self._gamma**age * value * ~step.terminated",
         "realised",
-        "run/test_q_bias.py",
+        "run/test_q_bias.py::test_what_followed_is_the_discounted_return_and_after_a_time_out_what_q_expects",
     ),
     (
         "every call has the flags of the first",
@@ -639,28 +639,28 @@ MUTANTS = [
         "data/action_noise.py",
         "self._position[done.cpu()] = self._length",
         "pass",
-        "data/test_action_noise.py",
+        "data/test_action_noise.py::test_the_end_of_an_episode_begins_a_new_sequence_there_and_nowhere_else",
     ),
     (
         "every copy's noise is cut",
         "data/action_noise.py",
         "self._position[done.cpu()] = self._length",
         "self._position.fill_(self._length)",
-        "data/test_action_noise.py",
+        "data/test_action_noise.py::test_the_end_of_an_episode_begins_a_new_sequence_there_and_nowhere_else",
     ),
     (
         "a tie is lost",
         "report/seeds.py",
         "(1 + np.sign(difference)",
         "(1 + np.sign(difference - 1e-9)",
-        "test_seeds.py",
+        "test_seeds.py::test_the_probability_of_improvement_is_a_count_over_all_pairs",
     ),
     (
         "one seed is ranked",
         "report/compare.py",
         "len(one.finals(scores)) > 1",
         "one.finals(scores)",
-        "test_compare.py",
+        "test_compare.py::test_one_seed_ranks_nothing_and_that_is_said",
     ),
     (
         "the learning rate adapts the wrong way",
@@ -785,7 +785,9 @@ def test_the_suite_kills(server, tmp_path, mutant):
         "-o",
         "addopts=",
     ]  # unshaped: faster
-    code = f"import sys, pytest; sys.path.insert(0, {str(tmp_path)!r}); sys.exit(pytest.main({[*options, str(ROOT / 'tests' / tests)]!r}))"
+    run = f"code = pytest.main({[*options, str(ROOT / 'tests' / tests)]!r})"
+    end = "sys.stdout.flush(); os._exit(code)"  # without taking apart what it has imported
+    code = f"import os, sys, pytest; sys.path.insert(0, {str(tmp_path)!r}); {run}; {end}"
     process = server.start(code, ROOT, PYTHONPATH=str(tmp_path))
     code, said = process.wait(), "".join(process.communicate())
     assert code == 1, said[-2000:]
