@@ -1,6 +1,7 @@
 """The same seed gives the same bits, whatever else a run does and wherever it runs; what two threads change is printed."""
 
 import json
+from functools import partial
 from importlib.util import find_spec
 
 import pytest
@@ -58,6 +59,15 @@ def bits(path):
     return json.dumps([numbers, tensors, lines], sort_keys=True)
 
 
+def trained(folder, algorithm, backend, name, more=(), before="", server=None):
+    """The bits of a run of some hundred steps."""
+    path = folder / name.replace(" ", "-")
+    process = command(*words(algorithm, backend), *more, "--run", path, before=before, cwd=folder, server=server)
+    _, said = process.communicate()
+    assert process.returncode == 0, (name, said)
+    return bits(path)
+
+
 @pytest.fixture(scope="module")
 def elsewhere():
     """Processes with another hash seed and other numbers of threads in their environment."""
@@ -66,44 +76,31 @@ def elsewhere():
     forks.close()
 
 
-def check(folder, elsewhere, algorithm, backend, variants):
-    """Train one run as it is, then each variant; (how many were compared, whether 2 and 4 threads were as 1)."""
-
-    def run(name, more=(), before="", served_by=backend, server=None):
-        path = folder / name.replace(" ", "-")
-        process = command(*words(algorithm, served_by), *more, "--run", path, before=before, cwd=folder, server=server)
-        _, said = process.communicate()
-        assert process.returncode == 0, (name, said)
-        return bits(path)
-
+@pytest.mark.faults
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_a_seed_gives_the_same_bits_whatever_else_a_run_does(tmp_path, elsewhere, algorithm, backend):
+    run = partial(trained, tmp_path, algorithm, backend)
     expected, compared = run("base"), 0
-    for name in variants:
+    for name in BACKENDS[backend]:
         more, before = VARIANTS[name]
         if "wandb" not in more or find_spec("wandb"):
             assert run(name, more, before) == expected, name
             compared += 1
     assert run("elsewhere", server=elsewhere) == expected
     if backend == "gymnasium":
-        assert run("in processes", served_by="gymnasium-async") == expected
+        assert trained(tmp_path, algorithm, "gymnasium-async", "in processes") == expected
         compared += 1
-    threads = [run(f"{number} threads {again}", ["--threads", number]) for number in (2, 4) for again in (1, 2)]
-    assert threads[0] == threads[1], "two threads, twice"
-    assert threads[2] == threads[3], "four threads, twice"
-    return compared + 3, threads[0] == expected and threads[2] == expected
-
-
-@pytest.mark.faults
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_a_seed_gives_the_same_bits_whatever_else_a_run_does(tmp_path, elsewhere, algorithm):
-    total, as_one = 0, True
-    for backend, variants in BACKENDS.items():
-        (tmp_path / backend).mkdir()
-        compared, same = check(tmp_path / backend, elsewhere, algorithm, backend, variants)
-        total, as_one = total + compared, as_one and same
+    threads = {n: [run(f"{n} threads {again}", ["--threads", n]) for again in (1, 2)] for n in (2, 4)}
+    assert all(first == again for first, again in threads.values())
+    as_one = all(first == expected for first, _ in threads.values())
     print(
-        f"{algorithm}: {total} variants, 0 differ; 2 and 4 threads {'give' if as_one else 'do not give'} the bits of 1"
+        f"{algorithm}, {backend}: {compared + 3} variants, 0 differ; 2 and 4 threads {'as' if as_one else 'not as'} 1"
     )
 
 
-def test_a_seed_gives_the_same_bits_in_short(tmp_path, elsewhere):
-    check(tmp_path, elsewhere, "a2c", "gymnasium", ["with evaluations", "on one processor"])
+def test_a_seed_gives_the_same_bits_with_evaluations_and_on_one_processor(tmp_path):
+    run = partial(trained, tmp_path, "a2c", "gymnasium")
+    expected = run("base")
+    assert all(run(name, *VARIANTS[name]) == expected for name in ("with evaluations", "on one processor"))
+    assert run("another seed", ["--seed", 2]) != expected

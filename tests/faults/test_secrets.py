@@ -40,7 +40,12 @@ def with_keys():
     forks.close()
 
 
-@pytest.mark.parametrize("case", CASES)
+SHORT = ("exception", "worker", "misuse")
+
+
+@pytest.mark.parametrize(
+    "case", [case if case in SHORT else pytest.param(case, marks=pytest.mark.faults) for case in CASES]
+)
 def test_no_key_of_the_environment_is_written_or_said(tmp_path, with_keys, case):
     words, expected = CASES[case]
     if "wandb" in words and find_spec("wandb") is None:
