@@ -22,6 +22,10 @@ CLOSING_SECONDS = 2.0
 """how long workers may take to close their environments before they are killed"""
 
 
+MOST_LETTERS = 500
+"""of what an exception says"""
+
+
 class RaisedInWorkerError(RuntimeError):
     """What an environment raised, as a sentence: an exception of its own may not come through a pipe."""
 
@@ -34,10 +38,12 @@ class Worker(gym.Wrapper):
 
     def __init__(self, make: Callable[[], gym.Env], owner: int) -> None:
         process = multiprocessing.parent_process()
-        if process and os.getpid() != owner:  # the owner makes one, too, to look at its spaces
+        if process and os.getpid() != owner:
             signal.signal(signal.SIGINT, signal.SIG_IGN)
             end_when_closed(process.sentinel)
-        super().__init__(make())
+            super().__init__(_told(make))
+        else:  # the owner makes one, too, to look at its spaces
+            super().__init__(make())
 
     def reset(self, **options: Any) -> Any:
         """The environment's. Raises `RaisedInWorkerError` for whatever it raises."""
@@ -51,10 +57,18 @@ class Worker(gym.Wrapper):
 def _told(call: Callable[..., Any], *args: Any, **options: Any) -> Any:
     try:
         return call(*args, **options)
-    except Exception as error:
+    except BaseException as error:  # also what ends a process: this one ends with its owner
         place = traceback.extract_tb(error.__traceback__)[-1]
-        what = f"{type(error).__name__}: {str(error).rstrip('.')}"
-        raise RaisedInWorkerError(f"{what} ({Path(place.filename).name}, line {place.lineno})") from None
+        raise RaisedInWorkerError(f"{_words_of(error)} ({Path(place.filename).name}, line {place.lineno})") from None
+
+
+def _words_of(error: BaseException) -> str:
+    """The kind of an error, and the beginning of what it says."""
+    said = ""
+    with suppress(Exception):  # it may fail to say anything
+        said = " ".join(str(error).split())
+    said = f"{said[:MOST_LETTERS]}…" if len(said) > MOST_LETTERS else said.rstrip(".")
+    return f"{type(error).__name__}: {said}" if said else type(error).__name__
 
 
 class WatchedVectorEnv(AsyncVectorEnv):
