@@ -103,14 +103,14 @@ def left(before):
 
 
 def use(**kwargs):
-    """Make two environments, and take a step; what is said of the one that breaks."""
+    """Make two environments, and take a step; (when, what is said of the one that breaks)."""
     env = None
     try:
         env = registry.make(f"{__name__}:Broken", 2, kwargs=kwargs, backend="gymnasium-async")
         env.restart(0)
         env.step(torch.zeros(2, dtype=torch.int64))
     except WorkerError as error:
-        return str(error)
+        return time.time(), str(error)
     finally:
         if env:
             env.close()
@@ -128,8 +128,8 @@ def use(**kwargs):
 def test_a_worker_that_breaks_is_named_in_time(monkeypatch, tmp_path, capfd, way, place):
     monkeypatch.setattr(WatchedVectorEnv, "patience", PATIENCE)
     before = set(psutil.Process().children(recursive=True))
-    said = use(way=way, place=place, told=str(tmp_path / "broken"))
-    took = time.time() - (tmp_path / "broken").stat().st_mtime
+    when, said = use(way=way, place=place, told=str(tmp_path / "broken"))
+    took = when - (tmp_path / "broken").stat().st_mtime
     assert re.search(WAYS[way][1], said), said
     assert "nvironment " in said
     assert len(said) < 700, said

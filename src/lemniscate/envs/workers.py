@@ -30,6 +30,20 @@ class RaisedInWorkerError(RuntimeError):
     """What an environment raised, as a sentence: an exception of its own may not come through a pipe."""
 
 
+class Unmade(gym.Env):
+    """What is in the place of an environment whose constructor raised: raises that when its `metadata` is asked for."""
+
+    observation_space = action_space = gym.spaces.Discrete(1)
+
+    def __init__(self, error: RaisedInWorkerError) -> None:
+        self._error = error
+
+    @property
+    def metadata(self) -> dict[str, Any]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Raises what the constructor raised: the first question to every worker."""
+        raise self._error
+
+
 class Worker(gym.Wrapper):
     """An environment in a process of its own, which ends with the process that it works for.
 
@@ -41,7 +55,10 @@ class Worker(gym.Wrapper):
         if process and os.getpid() != owner:
             signal.signal(signal.SIGINT, signal.SIG_IGN)
             end_when_closed(process.sentinel)
-            super().__init__(_told(make))
+            try:
+                super().__init__(_told(make))
+            except RaisedInWorkerError as error:
+                super().__init__(Unmade(error))
         else:  # the owner makes one, too, to look at its spaces
             super().__init__(make())
 
