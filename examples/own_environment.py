@@ -49,6 +49,6 @@ def scaled(env: gym.Env, factor: float) -> gym.Env:
 
 if __name__ == "__main__":
     small = {"hidden": (64, 64), "critic_hidden": (64, 64), "batch_size": 128}
-    trained = lem.train("sac", env=Balance, env_kwargs={"wind": 0.5}, total_steps=5_000, learning_starts=500, **small)
+    trained = lem.train("sac", env=Balance, env_kwargs={"wind": 0.5}, total_steps=3_000, learning_starts=500, **small)
     print(lem.evaluate(trained.policy, episodes=20).mean_return)
     print(lem.evaluate(trained.policy, episodes=20, env_kwargs={"wind": 2.0}).mean_return)
