@@ -15,10 +15,11 @@ TESTS = Path(__file__).parent
 LEMNISCATE = "import sys, envpool, torch, torch.utils.tensorboard, lemniscate.cli.commands; torch.set_num_threads(1)"
 
 SERVER = """
-import gc, json, os, sys
+import gc, json, os, signal, sys
 
 def begin(job):
     os.setsid()
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's job in the background ignores it
     for name, number in (("out", 1), ("err", 2)):
         file = os.open(os.path.join(job["folder"], name), os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
         os.dup2(file, number)
@@ -65,6 +66,8 @@ class Forks:
     def start(self, code, cwd=".", **environment):
         """Start a program, given as text, in a session of its own."""
         folder = Path(mkdtemp(prefix="fork-"))
+        for name in ("out", "err"):  # it may be killed before it opens them
+            (folder / name).touch()
         job = {"code": code, "cwd": str(Path(cwd).resolve()), "folder": str(folder)}
         state = {name: value for name, value in os.environ.items() if name == "XDG_STATE_HOME"}
         job["environment"] = {**self._environment, **state, **environment}

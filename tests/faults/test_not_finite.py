@@ -3,6 +3,7 @@
 import itertools
 import math
 from collections import Counter
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from safetensors.torch import load_file
 
 import lemniscate as lem
+from helpers import require_in_own_process
 from lemniscate.algos import ALGORITHMS, find
 from lemniscate.cli import main
 
@@ -177,6 +179,11 @@ def test_the_sentence_of_a_parameter_names_it_and_the_step(tmp_path, capsys):
 @pytest.mark.faults
 @pytest.mark.parametrize("algorithm", ["ppo", "td3"])
 def test_a_compiled_run_stops_in_the_same_way(tmp_path, algorithm):
+    require_in_own_process(__name__, f"require_stops(Path({str(tmp_path)!r}), {algorithm!r})", "eager")
+
+
+def require_stops(tmp_path, algorithm):
+    """With absurd step sizes, and with rewards that are not numbers."""
     for number, fields in enumerate(rates(algorithm)[:2]):
         if algorithm == "ppo":
             fields["desired_kl"] = None
