@@ -4,7 +4,7 @@ BIN := .venv/bin
 ALONE := $(PYTHON) -c 'import fcntl, os, sys; lock = os.open("Makefile", os.O_RDONLY); fcntl.flock(lock, fcntl.LOCK_EX); os.set_inheritable(lock, True); os.execvp(sys.argv[1], sys.argv[1:])'
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
-.PHONY: setup fly test test-long test-faults test-soak check wheel docs docs-serve bench bench-returns tutorials lock clean
+.PHONY: setup fly test test-long test-faults test-cluster test-soak check wheel docs docs-serve bench bench-returns tutorials lock clean
 
 setup:  ## .venv; of two at once, one installs and the other waits for it
 	@$(MAKE) --question .venv/.ready 2> /dev/null || $(ALONE) $(MAKE) --silent .venv/.ready
@@ -21,13 +21,16 @@ fly: setup  ## train a drone to fly the figure eight, fly it from unseen starts,
 	$(BIN)/lemniscate train ppo --env DroneFigureEightTrajectory-v0 --report
 
 test: setup  ## the whole suite but the long ones
-	$(BIN)/python -m pytest -n auto --dist loadfile -m "not long and not faults and not soak"
+	$(BIN)/python -m pytest -n auto --dist loadfile -m "not long and not faults and not soak and not cluster"
 
 test-long: setup  ## the tests that train for minutes
 	$(BIN)/python -m pytest -m long
 
 test-faults: setup  ## every way to break a run, many times: half an hour
 	$(BIN)/python -m pytest -n auto --dist load -m faults -rP
+
+test-cluster: setup  ## runs of several processes: the same bits for any number, kills of a rank, hangs; a quarter of an hour
+	$(BIN)/python -m pytest -m cluster -rP
 
 test-soak: setup  ## memory and open files of long runs, on every backend: two hours
 	$(BIN)/python -m pytest -m soak -s

@@ -9,7 +9,7 @@ gets the command line, presets, checkpoints, exact resume, evaluation, sweeps an
 """
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
@@ -78,7 +78,7 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
 def loss(config: Config, networks: ActorCritic, batch: Batch) -> Loss:
     """−r A + β KL(π_old ‖ π) + ½ (V − target)² (eq. 8, with the value's loss), and its metrics."""
     log_ratio = networks.policy(batch.obs).log_prob(batch.action) - batch.log_prob
-    policy_loss, kl = surrogate(log_ratio, standardize(batch.advantage)), kl_k3(log_ratio)
+    policy_loss, kl = surrogate(log_ratio, batch.advantage), kl_k3(log_ratio)
     critic_loss = value_loss(networks.value(batch.obs), batch.target)
     return policy_loss + config.beta * kl + critic_loss, {
         "losses/policy": policy_loss.detach(),
@@ -87,9 +87,10 @@ def loss(config: Config, networks: ActorCritic, batch: Batch) -> Loss:
     }
 
 
-def learn(config: Config, state: State, batch: Batch, minibatches: Tensor) -> list[Metrics]:
-    """A gradient step on each minibatch, rows [K, M] of the batch."""
-    return [state.optimizer.step(partial(loss, config), batch[rows]) for rows in minibatches]
+def learn(config: Config, state: State, batch: Batch, minibatches: Tensor, advantage: Tensor) -> list[Metrics]:
+    """A gradient step on each minibatch, rows [K, M] of the batch, with its standardized advantages [K, M]."""
+    steps = (replace(batch[rows], advantage=a) for rows, a in zip(minibatches, advantage, strict=True))
+    return [state.optimizer.step(partial(loss, config), minibatch) for minibatch in steps]
 
 
 def update(config: Config, state: State, rollout: Rollout) -> Metrics:
@@ -99,10 +100,12 @@ def update(config: Config, state: State, rollout: Rollout) -> Metrics:
     batch, valid_rows = advantages(config, state.networks, rollout), rollout.valid_rows
     metrics: list[Metrics] = []
     for _ in range(config.epochs):
-        minibatches = epoch_minibatches(valid_rows, rollout.num_rows, config.minibatch_size, state.rng.minibatch)
-        metrics.append(means(state.learn(config, state, batch, minibatches)))
-    state.networks.policy.observe(rollout.obs[rollout.valid])
-    state.step += rollout.num_rows
+        size = config.minibatch_size // config.shards
+        minibatches = epoch_minibatches(valid_rows, rollout.num_rows, size, state.rng.minibatch)
+        advantage = standardize(batch.advantage[minibatches], state.shards)
+        metrics.append(means(state.learn(config, state, batch, minibatches, advantage)))
+    state.networks.policy.observe(rollout.obs, rollout.valid)
+    state.step += config.num_rows
     return means(metrics)
 
 

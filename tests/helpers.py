@@ -96,6 +96,20 @@ def one_rollout(algo, **fields):
     return config, state, collect(env, state.policy, config.num_steps, state.rng.action)
 
 
+def learned_with(algo, config, state, rollout):
+    """The advantages or weights of the policy's gradient steps of an update, one tensor for each call of `learn`."""
+    given = []
+
+    def record(config, state, batch, minibatches, *advantage, **flags):
+        if flags.get("update_policy", True):
+            given.extend(advantage or [batch.advantage[minibatches]])
+        return algo.learn(config, state, batch, minibatches, *advantage, **flags)
+
+    state.learn = record
+    algo.update(config, state, rollout)
+    return given
+
+
 def small_off_policy(algo, env="Levers-v0", **fields):
     """A Config of an off-policy algorithm that takes an update in a moment."""
     defaults = {

@@ -36,7 +36,7 @@ def write_run(path, algorithm="ppo", env="CartPole-v1", seed=1, score=100.0, *, 
         for step in range(1_000, last + 1, 1_000):
             returns = [score * step / 10_000] * 3
             file.write(to_line({"step": step, "time/steps_per_second": rate, "episode/returns": returns}))
-    checkpoint.write(path / "checkpoints", Weightless(), last, {"planned": True}, keep=1)
+    checkpoint.write(path / "checkpoints", Weightless().saved(), last, {"planned": True}, keep=1)
     write_json(path / "final.json", {"step": last, "mean_return": score})
     return path
 

@@ -13,7 +13,8 @@ import lemniscate as lem
 from conftest import tiny, tiny_fields, tiny_off_policy
 from lemniscate import algos
 from lemniscate.data.replay import interact
-from lemniscate.data.rollout import collect, collect_episodes
+from lemniscate.data.rollout import collect
+from lemniscate.data.whole_episodes import collect_episodes
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError
 from lemniscate.run import checkpoint
@@ -105,7 +106,7 @@ def train_twice(case, device, directory):
     env.restart(1)
     rows = [_update(module, config, env, state) for _ in range(2)]
     record = {"spec": checkpoint.spec_to_json(env.spec)}
-    path = checkpoint.write(directory, state, state.step, record, keep=1)
+    path = checkpoint.write(directory, state.whole(), state.step, record, keep=1)
     for _ in range(2):
         env.restart(2)
         state.on_restart()
@@ -120,7 +121,8 @@ def train_twice(case, device, directory):
         for key, tensor in value.state_dict().items()
         if key != "written"
     }
-    found = {name: value.device for name, value in [*tensors.items(), *vars(state.rng).items()]}
+    streams = {name: stream for name, (stream,) in vars(state.rng).items()}
+    found = {name: value.device for name, value in [*tensors.items(), *streams.items()]}
     assert found == dict.fromkeys(found, whole(device))
     return rows
 
@@ -182,13 +184,13 @@ MUTANTS = [
     ("noise is drawn on the CPU", "nn/policies.py", ", generator=generator, device=generator.device", "", "ppo box"),
     ("positions on the CPU by a mask on the GPU", "data/action_noise.py", "[done.cpu()]", "[done]", "ddpg box"),
     ("the replay buffer stays on the CPU", "data/replay.py", "dtype=kind, device=device)", "dtype=kind)", "td3 box"),
-    ("rows are drawn by the CPU's generator", "run/seeding.py", "generator(seed, device, 3)", 'generator(seed, torch.device("cpu"), 3)', "ppo box"),
-    ("rows are drawn with no generator's device", "data/replay.py", "generator=generator, device=generator.device)", "generator=generator)", "sac box"),
+    ("rows are drawn by the CPU's generator", "run/seeding.py", "self._streams(seed, device, shards, 3)", 'self._streams(seed, torch.device("cpu"), shards, 3)', "ppo box"),
+    ("rows are drawn with no generator's device", "data/replay.py", "generator=stream, device=stream.device)", "generator=stream)", "sac box"),
     ("the reward scale stays on the CPU", "algos/a2c.py", "RewardScale(config.num_envs, config.gamma).to(device)", "RewardScale(config.num_envs, config.gamma)", "a2c box"),
     ("the networks stay on the CPU", "algos/trpo.py", "config.networks(spec).to(device)", "config.networks(spec)", "trpo box"),
     ("Adam's scalars stay on the CPU", "optim/adam.py", ".log().to(device, wide_float(device))", ".log()", "a2c box"),
     ("the first GPU, whichever was asked for", "run/seeding.py", "torch.Generator(device)", "torch.Generator(device.type)", "ppo box"),
-    ("what ended is counted on the CPU", "data/rollout.py", "dtype=torch.int64, device=env.device)", "dtype=torch.int64)", "reinforce episodes"),
+    ("what ended is counted on the CPU", "data/whole_episodes.py", "dtype=torch.int64, device=env.device)", "dtype=torch.int64)", "reinforce episodes"),
     ("frequencies on the CPU", "maths/noise.py", ", dtype=normal.dtype, device=normal.device)", ", dtype=normal.dtype)", "td3 box"),
     ("float64 on mps", "types.py", 'device.type == "mps"', "False", "a2c box"),
 ]  # fmt: skip

@@ -140,8 +140,8 @@ MUTANTS = [
     (
         "reset rows reach the batch",
         "types.py",
-        "self.valid.flatten().nonzero()[:, 0]",
-        "torch.arange(self.num_rows)",
+        "part.flatten().nonzero()[:, 0] for",
+        "torch.arange(size) for",
         ON + "values_are_bootstrapped_at_time_limits_and_ignore_reset_rows",
     ),
     (
@@ -293,28 +293,28 @@ MUTANTS = [
     ),
     (
         "a death bootstraps",
-        "maths/returns.py",
+        "maths/targets.py",
         "gamma * next_value * ~terminated\n",
         "gamma * next_value\n",
         "maths/test_returns.py::test_a_td_target_is_the_sum_row_by_row",
     ),
     (
         "the target runs away",
-        "maths/returns.py",
+        "maths/targets.py",
         "mine.lerp_(theirs, tau)",
         "theirs.data.lerp_(mine.data, tau)",
         "maths/test_returns.py::test_polyak_moves_the_target_alone_and_by_a_power",
     ),
     (
         "no correction for the squashing",
-        "maths/distributions.py",
+        "maths/bounded.py",
         "(normal - _log_slope(u))",
         "(normal)",
         "maths/test_distributions.py",
     ),
     (
         "a slope that is half as steep",
-        "maths/distributions.py",
+        "maths/bounded.py",
         "return 2 * (math.log(2)",
         "return (math.log(2)",
         "maths/test_distributions.py",
@@ -322,8 +322,8 @@ MUTANTS = [
     (
         "the KL has the wrong sign",
         "algos/trpo.py",
-        "pi(here, batch.obs).kl(",
-        "-pi(here, batch.obs).kl(",
+        "pi(here, part.obs).kl(",
+        "-pi(here, part.obs).kl(",
         TRPO + "the_kl_stays_within_its_bound_at_every_update",
     ),
     (
@@ -426,14 +426,14 @@ MUTANTS = [
     ),
     (
         "fragments among whole episodes",
-        "data/rollout.py",
+        "data/whole_episodes.py",
         "(ended >= 1) & ",
         "",
         ROLLOUT + "whole_episodes_are_whole_and_as_many_from_each_environment",
     ),
     (
         "short episodes give more of them",
-        "data/rollout.py",
+        "data/whole_episodes.py",
         " & (ended <= episodes)",
         "",
         ROLLOUT + "whole_episodes_are_whole_and_as_many_from_each_environment",
@@ -455,8 +455,8 @@ MUTANTS = [
     (
         "weights are never standardized",
         "algos/reinforce.py",
-        "standardize(batch.advantage) if config.standardize else",
-        "",
+        "advantage=torch.cat(advantage)",
+        "advantage=learned.advantage",
         REINFORCE + "weights_are_standardized_only_on_request",
     ),
     (
@@ -497,8 +497,8 @@ MUTANTS = [
     (
         "reset rows are stored",
         "data/replay.py",
-        "rows if step.valid.all() else rows[step.valid]",
-        "rows",
+        "part if valid.all() else part[valid]",
+        "part",
         OFF + "values_are_bootstrapped_at_time_limits_and_ignore_reset_rows",
     ),
     (
@@ -567,7 +567,7 @@ MUTANTS = [
     (
         "statistics of rows that were ignored",
         "data/replay.py",
-        "policy.observe(obs[step.valid])",
+        "policy.observe(obs, step.valid)",
         "policy.observe(obs)",
         INTERACT + "the_normalizer_learns_from_the_stored_rows_and_no_others",
     ),
@@ -594,7 +594,7 @@ MUTANTS = [
     ),
     (
         "Q is the larger one",
-        "nn/actor_critic.py",
+        "nn/actor_q.py",
         "action).amin(0)",
         "action).amax(0)",
         "nn/test_actor_critic.py::test_q_is_the_smallest_of_the_critics",
@@ -630,8 +630,8 @@ MUTANTS = [
     (
         "the ring tears rows apart",
         "data/replay.py",
-        "ring[: count - room] = new[room:]",
-        "ring[: count - room] = new[: count - room]",
+        "ring[first : first + count - room] = new[room:]",
+        "ring[first : first + count - room] = new[: count - room]",
         "data/test_replay.py",
     ),
     (
@@ -693,15 +693,15 @@ MUTANTS = [
     (
         "the random generators are one",
         "run/seeding.py",
-        "self.minibatch = generator(seed, device, 3)",
+        "self.minibatch = self._streams(seed, device, shards, 3)",
         "self.minibatch = self.action",
         "run/test_seeding.py",
     ),
     (
         "the random generators have one stream",
         "run/seeding.py",
-        "self.minibatch = generator(seed, device, 3)",
-        "self.minibatch = generator(seed, device, 2)",
+        "self.minibatch = self._streams(seed, device, shards, 3)",
+        "self.minibatch = self._streams(seed, device, shards, 2)",
         "run/test_seeding.py",
     ),
     (
@@ -748,10 +748,52 @@ MUTANTS = [
     ),
     (
         "the targets have a normalizer of their own",
-        "nn/actor_critic.py",
+        "nn/actor_q.py",
         "{id(normalizer): normalizer}",
         "{}",
         "nn/test_actor_critic.py",
+    ),
+    (
+        "only the first shard's rows are counted",
+        "maths/stats.py",
+        "        for other in others:",
+        "        for other in ():",
+        "maths/test_stats.py::test_the_moments_of_shards_of_any_sizes_are_those_of_all_their_rows",
+    ),
+    (
+        "the gradient is that of the first shard",
+        "optim/shards.py",
+        "for part in parts])).mean(0)",
+        "for part in parts]))[0]",
+        "optim/test_shards.py",
+    ),
+    (
+        "every shard has the rows of the first",
+        "optim/shards.py",
+        "arg[size * i : size * (i + 1)]",
+        "arg[:size]",
+        "optim/test_shards.py",
+    ),
+    (
+        "minibatches are of one shard",
+        "data/rollout.py",
+        "parts.append(_cut(rows[order], most, min(size, most)))",
+        "parts.append(_cut(valid_rows[0][order], most, min(size, most)))",
+        ROLLOUT + "each_minibatch_has_as_many_rows_of_every_shard",
+    ),
+    (
+        "all shards draw the same",
+        "run/seeding.py",
+        "[(number, shard) for shard in range(shards)]",
+        "[(number, 0) for shard in range(shards)]",
+        "run/test_seeding.py",
+    ),
+    (
+        "a shard samples the rows of the first",
+        "data/replay.py",
+        "parts.append(shard * self._room + drawn)",
+        "parts.append(drawn)",
+        "data/test_replay.py",
     ),
 ]
 
@@ -781,7 +823,7 @@ def test_the_suite_kills(server, tmp_path, mutant):
         "-p",
         "no:cacheprovider",
         "-m",
-        "not long and not faults",
+        "not long and not faults and not cluster",
         "-o",
         "addopts=",
     ]  # unshaped: faster

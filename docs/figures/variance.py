@@ -15,7 +15,8 @@ import torch
 from matplotlib.figure import Figure
 
 from lemniscate.algos import reinforce
-from lemniscate.data.rollout import collect, collect_episodes
+from lemniscate.data.rollout import collect
+from lemniscate.data.whole_episodes import collect_episodes
 from lemniscate.envs.registry import make
 from lemniscate.maths import policy_gradient
 
@@ -43,7 +44,7 @@ def gradients(batches=60, updates=10, num_envs=4):
         rollout = collect_episodes(env, state.policy, 1, state.rng.action)
         for way, (returns, baseline) in WAYS.items():
             weighting = config.replace(episodes=1, returns=returns, baseline=baseline)
-            batch = reinforce.weights(weighting, state.networks, rollout)[rollout.valid_rows]
+            batch = reinforce.weights(weighting, state.networks, rollout)[rollout.valid_rows[0]]
             loss = policy_gradient(state.policy(batch.obs).log_prob(batch.action), batch.advantage)
             gradient = torch.autograd.grad(loss, list(state.policy.parameters()))
             of[way].append(torch.cat([part.flatten() for part in gradient]))

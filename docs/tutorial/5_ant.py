@@ -5,7 +5,6 @@
 # far it lets a policy go, put it in the place of the library's, and train an ant to walk.
 
 # %%
-from functools import partial
 from time import perf_counter
 
 import envpool
@@ -18,8 +17,8 @@ from PIL import Image
 import lemniscate as lem
 from lemniscate import course
 from lemniscate.algos import ppo
-from lemniscate.data.rollout import collect
-from lemniscate.maths import clip_fraction, kl_k3
+from lemniscate.data.rollout import collect, epoch_minibatches
+from lemniscate.maths import clip_fraction, kl_k3, standardize
 from lemniscate.notebook import show_film
 from lemniscate.report.live import LiveCurve
 from lemniscate.run.loggers import read_metrics
@@ -116,8 +115,8 @@ def epochs_on_one_rollout(config, epochs=20):
     rollout = collect(env, state.networks.policy, config.num_steps, state.rng.action)
     batch = ppo.advantages(config, state.networks, rollout)
     for _ in range(epochs):
-        for rows in torch.randperm(rollout.num_rows, generator=state.rng.minibatch).split(256):
-            state.optimizer.step(partial(ppo.loss, config), batch[rows])
+        for rows in epoch_minibatches(rollout.valid_rows, rollout.num_rows, 256, state.rng.minibatch):
+            ppo.learn(config, state, batch, rows[None], standardize(batch.advantage[rows])[None])
         with torch.no_grad():
             log_ratio = state.networks.policy(batch.obs).log_prob(batch.action) - batch.log_prob
         yield kl_k3(log_ratio), clip_fraction(log_ratio, 0.2)

@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING
 __version__ = "0.2.0"
 
 if TYPE_CHECKING:
-    from lemniscate.api import config_for, resume, train
+    from lemniscate.api import config_for, train
     from lemniscate.checks import check
     from lemniscate.envs.vector_view import make_vec
     from lemniscate.errors import NonFiniteError, NotStoredError, SweepError, UserError
     from lemniscate.plots import plot
     from lemniscate.policy import TrainedPolicy
     from lemniscate.results import evaluate, watch
+    from lemniscate.resumed import resume
     from lemniscate.run.environments import make_envs
     from lemniscate.run.evaluate import Evaluation
     from lemniscate.run.run import Stopped
@@ -66,7 +67,7 @@ MODULES = {
     "make_envs": "run.environments",
     "make_vec": "envs.vector_view",
     "plot": "plots",
-    "resume": "api",
+    "resume": "resumed",
     "resume_sweep": "sweep",
     "save": "stored",
     "set_seeds": "run.seeding",

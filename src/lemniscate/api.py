@@ -1,7 +1,9 @@
-"""The verbs that begin or continue a run: train, resume; and the Config and the environments of one."""
+"""The verb that begins a run, and the Config of one."""
 
+import os
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from itertools import count
 from pathlib import Path
 from types import ModuleType
@@ -18,15 +20,16 @@ from lemniscate.policy import TrainedPolicy
 from lemniscate.report import playback
 from lemniscate.results import draw_run, evaluate
 from lemniscate.run.config import RunConfig
-from lemniscate.run.directory import is_finished, read_record, require_absent
-from lemniscate.run.environments import make_envs
-from lemniscate.run.files import make_directory, parsing
+from lemniscate.run.directory import require_absent
+from lemniscate.run.environments import envs_of, make_envs
+from lemniscate.run.files import make_directory
+from lemniscate.run.launch import launch_run
 from lemniscate.run.loggers import TRACKERS, JsonLines, LoggerClass, TensorBoard
 from lemniscate.run.run import Run
 from lemniscate.run.seeding import set_seeds
 from lemniscate.run.state import TrainState
-from lemniscate.run.trust import is_signed, require_trusted
-from lemniscate.stored import TrainedRun, load, own_code_of, path_of
+from lemniscate.stored import TrainedRun, load, path_of
+from lemniscate.world import World
 
 
 def config_for(
@@ -49,16 +52,16 @@ def config_for(
         name, config = "given", algorithm if env is None else algorithm.replace(env=env, backend=None)
     else:
         name, config = presets.choose(algos.name_of(algorithm), env, preset)
-    config = config.replace(**{name: _named(value) for name, value in fields.items()})
+    config = config.replace(**{name: name_in_config(value) for name, value in fields.items()})
     if name == "default" and env is None:
         raise UserError("Which environment? Name one with env; `lemniscate envs` lists them.")
     return config if config.backend else config.replace(backend=registry.backend_for(config.env, config.wrappers))
 
 
-def _named(value: object) -> object:
+def name_in_config(value: object) -> object:
     """A value of a Config: functions and classes, and those in a sequence, by their names."""
     if isinstance(value, list | tuple):
-        return tuple(map(_named, value))
+        return tuple(map(name_in_config, value))
     if isinstance(value, TrainedRun | TrainedPolicy):  # to start warm from
         return str(path_of(value))
     return named.name_of(value) if callable(value) else value
@@ -74,6 +77,7 @@ def train(
     callbacks: Callback | str | Sequence[Callback | str] = (),
     report: bool = False,
     progress: bool = True,
+    processes: int = 1,
     **fields: object,
 ) -> TrainedRun:
     """Train a policy.
@@ -91,6 +95,7 @@ def train(
             leaves it saved.
         report: evaluate the final policy, and draw it into `plots/` and `videos/`.
         progress: the live line on standard error.
+        processes: of this machine, W; environments, minibatches and replay are divided among them. See `shards`.
         **fields: any field of the algorithm's Config, such as seed, total_steps or warm_start.
 
     Raises:
@@ -100,74 +105,34 @@ def train(
         WorkerError: the process of an environment died.
         Stopped: Ctrl-C or SIGTERM, when the run has saved itself; go on with `resume`.
     """
-    config = config_for(algorithm, env, preset, **fields)
-    algorithm = algos.name_of(sys.modules[type(config).__module__] if isinstance(algorithm, RunConfig) else algorithm)
-    path = path_of(run) if run is not None else fresh_directory(config.env, f"{algorithm}-{config.seed}")
-    loggers, functions = loggers_with(track), find_callbacks(callbacks) if callbacks else []
-    require_absent(path)
-    return _train(path, algorithm, config, loggers, functions, report or track is not None, progress)
+    with together() as world:
+        config = config_for(algorithm, env, preset, **fields)
+        name = algos.name_of(sys.modules[type(config).__module__] if isinstance(algorithm, RunConfig) else algorithm)
+        path = path_of(run) if run is not None else fresh_directory(config.env, f"{name}-{config.seed}")
+        loggers, functions = loggers_with(track), find_callbacks(callbacks) if callbacks else []
+        if world.is_first:
+            require_absent(path)
+        if processes > 1:
+            launched = launch_run(path, name, config, processes, track, callbacks, report, progress)
+            return TrainedRun(path, load(path, trust=True), launched)
+        if config.shards == 1:  # each process has one, unless more are asked for
+            config = config.replace(shards=world.size)
+        world.divide(config.shards)
+        path = world.from_first(path)
+        return train_here(world, path, name, config, loggers, functions, report or track is not None, progress)
 
 
-def resume(
-    run: str | Path | TrainedRun | TrainedPolicy,
-    *,
-    env: str | Callable[..., Any] | None = None,
-    wrappers: Sequence[str | Callable[..., Any]] | None = None,
-    network: str | Callable[..., Any] | None = None,
-    track: str | LoggerClass | None = None,
-    callbacks: Callback | str | Sequence[Callback | str] = (),
-    report: bool = False,
-    progress: bool = True,
-    trust: bool = False,
-) -> TrainedRun:
-    """Resume an interrupted run from its newest whole planned checkpoint, and train it to its end.
+def together() -> AbstractContextManager[World]:
+    """The world of this process: of those that `torchrun` has started, or its own."""
+    if "WORLD_SIZE" not in os.environ:
+        return nullcontext(World())
+    from lemniscate.processes import together
 
-    A run that is finished stays as it is; with `report` it is evaluated and drawn again.
-
-    Args:
-        run: its directory, or what `train` returned.
-        env: only of a run that began with an object that no file holds, such as a lambda: the same object again.
-        wrappers: the same.
-        network: the same.
-        track: as in `train`, and the following; none of them is saved with the run.
-        callbacks: functions that see each logged line.
-        report: evaluate the final policy, and draw it.
-        progress: the live line on standard error.
-        trust: import the code that the run names as `module:name` also if the run is not of this user and machine.
-
-    Raises:
-        UserError: no run directory, or one that another process trains in or another version wrote; an object that no
-            file holds and that was not passed again; a tracker or a callback that is not there.
-        NonFiniteError: an observation, a reward or a loss is NaN or infinite; the last checkpoint is as it was.
-        WorkerError: the process of an environment died.
-        Stopped: Ctrl-C or SIGTERM, when the run has saved itself.
-    """
-    path = path_of(run)
-    again = {"env": env, "wrappers": wrappers, "network": network}
-    given = {name: _named(value) for name, value in again.items() if value is not None}
-    record = read_record(path)
-    with parsing(path):
-        algorithm, fields = record["algorithm"], record["config"]
-        code = own_code_of({"algorithm": algorithm, "config": {**fields, **given}})
-        require_trusted(path, code, trusted=trust or is_signed(record))
-    config = algos.find(algorithm).Config.from_json(fields).replace(**given)
-    loggers, functions = loggers_with(track), find_callbacks(callbacks) if callbacks else []
-    if is_finished(path):
-        return _finished(path, report, progress, trust)
-    return _train(path, algorithm, config, loggers, functions, report or track is not None, progress)
+    return together()
 
 
-def _finished(path: Path, report: bool, progress: bool, trust: bool) -> TrainedRun:
-    """A run that has taken all its steps, as it is; with `report` it is evaluated and drawn again."""
-    run = TrainedRun(path, load(path, trust=trust), 0.0)
-    if progress:
-        say(f"{path} is finished, at step {run.policy.step:,}: there is nothing to resume.")
-    if report:
-        _report(run)
-    return run
-
-
-def _train(
+def train_here(
+    world: World,
     path: Path,
     algorithm: str,
     config: RunConfig,
@@ -176,9 +141,11 @@ def _train(
     report: bool,
     progress: bool,
 ) -> TrainedRun:
+    """Train in this process; of several, the first alone writes, reports and talks."""
+    progress, report = progress and world.is_first, report and world.is_first
     set_seeds(config.seed)  # before JAX starts, which reads its flags then
     torch.set_num_threads(config.threads)
-    envs = make_envs(config)
+    envs = make_envs(config) if world.size == 1 else envs_of(config, world)
     spec = envs[0].spec
 
     def copy_networks(state: TrainState) -> Any:
@@ -192,18 +159,19 @@ def _train(
         make_directory(path / "videos")
         evaluate(policy, episodes=1, video=path / "videos" / f"step-{state.step}.{kind}")
 
-    observer = call_callbacks(callbacks, copy_networks, spec, config) if callbacks else None
-    run = Run(path, algorithm, config, envs, loggers=loggers, progress=progress, film=film, observer=observer)
+    observer = call_callbacks(callbacks, copy_networks, spec, config) if callbacks and world.is_first else None
+    surroundings = {"loggers": loggers, "progress": progress, "film": film, "observer": observer}
+    run = Run(path, algorithm, config, envs, world=world, **surroundings)
     pictures: list[Path] = []
     try:
-        if (config.video_every or config.video_every_episodes) and not path.exists():
+        if world.is_first and (config.video_every or config.video_every_episodes) and not path.exists():
             playback.require_pictures(config, envs[0])
         for notice in config.notices(spec, envs[0].device) if progress else ():
             say(notice)
         state = algos.find(algorithm).train(config, run)
         trained = TrainedRun(path, TrainedPolicy(state.networks.cpu(), spec, config, state.step, path), run.seconds)
         if report:
-            pictures = _report(trained)
+            pictures = report_on(trained)
     finally:
         run.close(pictures)
     try:
@@ -214,7 +182,7 @@ def _train(
     return trained
 
 
-def _report(run: TrainedRun) -> list[Path]:
+def report_on(run: TrainedRun) -> list[Path]:
     """Evaluate a run's final policy, draw it, and name the files; returns the pictures."""
     files = draw_run(run, film=True)
     for file in files:

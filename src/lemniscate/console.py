@@ -3,6 +3,7 @@
 Standard output is left to programs; in a notebook nothing reads it, and standard error looks like a failure there.
 """
 
+import os
 import select
 import sys
 import time
@@ -21,15 +22,20 @@ def in_notebook() -> bool:
     return hasattr(get_ipython(), "kernel")
 
 
+def talks() -> bool:
+    """Whether this process is the one of its run that talks: rank 0, or the only one."""
+    return os.environ.get("RANK", "0") == "0"
+
+
 def say(text: object) -> None:
-    """Print one line on standard error; in a notebook on standard output.
+    """Print one line, if there is any, on standard error; in a notebook on standard output.
 
     A line that is not taken within a second, since a pager stands still, or not at all any more, is left out: no run
     waits or ends for want of a reader.
     """
     stream = sys.stdout if in_notebook() else sys.stderr
     with suppress(OSError):
-        if _takes_a_line(stream):
+        if str(text) and _takes_a_line(stream):
             print(text, file=stream, flush=True)
 
 

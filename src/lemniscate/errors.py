@@ -32,6 +32,10 @@ class WorkerError(RuntimeError):
     """The process of an environment died, or does not answer: names which."""
 
 
+class RankError(RuntimeError):
+    """Another process of a run failed: names which, with its sentence. It is empty where another process says it."""
+
+
 class SweepError(RuntimeError):
     """Some runs of a sweep failed: names each, with its sentence."""
 

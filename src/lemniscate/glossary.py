@@ -49,6 +49,7 @@ FIELDS = """
 `seed` | `seed` | `seed` | `seed` | `seed` | `random_seed`
 `backend` | `vec_env_cls` | – | – | (environment's own) | `simulator`
 `device` | `device` | `cuda` | – | `device` | `gpu`
+`shards` | – | – | – | – | `num_shards`
 `threads` | torch.set_num_threads | the same | the same | – | `num_threads`
 `compile` | – | LeanRL's `compile` | – | `torch_compile_mode` | `engine`, `torch_compile`, `jit`
 `warm_start` | `set_parameters` | – | – | `load_run`, `resume` | `checkpoint`, `pretrained`

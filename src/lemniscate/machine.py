@@ -1,5 +1,6 @@
 """What this machine still has: memory, and files to open."""
 
+import os
 import resource
 import sys
 from pathlib import Path
@@ -16,6 +17,11 @@ def free_memory(device: torch.device | None = None) -> int:
         return torch.cuda.mem_get_info(device)[0]
     own = _limit(resource.RLIMIT_AS) - psutil.Process().memory_info().vms
     return max(0, min(psutil.virtual_memory().available, own, *_left_in_cgroups()))
+
+
+def cores() -> int:
+    """The processors that this process may use; those of one run on this machine share them."""
+    return max(1, len(os.sched_getaffinity(0)) // int(os.environ.get("LOCAL_WORLD_SIZE", 1)))
 
 
 def most_open_files() -> int:

@@ -4,13 +4,15 @@ import os
 import select
 
 OWNED = "LEMNISCATE_OWNED"
-"""in the environment of a process whose standard input is a pipe from the process that it works for"""
+"""in the environment of a process that works for another: the file of the pipe from there"""
 
 
-def end_with_owner() -> None:
-    """End this process with its owner, if it was started with `OWNED`."""
-    if os.environ.pop(OWNED, None):
-        end_when_closed(0)
+def end_with_owner() -> bool:
+    """End this process with its owner, if it was started with `OWNED`; returns whether it was."""
+    pipe = os.environ.pop(OWNED, None)
+    if pipe:
+        end_when_closed(os.open(pipe, os.O_RDONLY | os.O_NONBLOCK))
+    return bool(pipe)
 
 
 def end_when_closed(pipe: int) -> None:

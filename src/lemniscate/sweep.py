@@ -210,8 +210,8 @@ class _Processes:
         Each run then gets the signal from here, once. Its standard input is a pipe that closes when this process ends,
         however it ends; then the run ends, too.
         """
-        command = [sys.executable, "-m", "lemniscate.cli", "resume", str(run), "--score", *self._options]
-        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path)), OWNED: "1"}
+        command = [sys.executable, "-m", "lemniscate", "resume", str(run), "--score", *self._options]
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path)), OWNED: "/dev/stdin"}
         with open_log(run / LOG) as log:
             self._running[run] = subprocess.Popen(
                 command, stdin=subprocess.PIPE, stdout=log, stderr=log, env=environment, start_new_session=True

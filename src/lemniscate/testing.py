@@ -20,6 +20,7 @@ from typing import Any
 import torch
 
 from lemniscate import algos, api, results
+from lemniscate.resumed import resume
 from lemniscate.run import checkpoint
 from lemniscate.run.config import RunConfig
 from lemniscate.run.metrics import read_metrics
@@ -73,7 +74,7 @@ def check_resume(algorithm: str | ModuleType, folder: Path, **settings: Any) -> 
     half = whole.policy.config.total_steps // 2
     stopped = folder / "stopped"
     api.train(algorithm, run=stopped, progress=False, callbacks=[lambda step, *_: step >= half], **settings)
-    api.resume(stopped, progress=False)
+    resume(stopped, progress=False)
     difference = _difference(_last_checkpoint(whole.path), _last_checkpoint(stopped))
     assert difference is None, f"{difference} differs after a resume: is it a field of State that is saved?"
 

@@ -1,10 +1,11 @@
 """Data records of tensors. Shapes: T time, N environments, B batch, O observation, A action."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from typing import Self
 
 import torch
-from torch import Tensor
+from torch import Generator, Tensor
 
 Metrics = dict[str, Tensor]
 """scalars by name"""
@@ -12,6 +13,10 @@ Loss = tuple[Tensor, Metrics]
 """a scalar to minimize, and its metrics"""
 Flags = tuple[bool, ...]
 """a constant for each gradient step, [K]"""
+
+
+Streams = tuple[Generator, ...]
+"""random generators, one for each shard held: its equal part of the rows is drawn from it"""
 
 
 def wide_float(device: torch.device) -> torch.dtype:
@@ -26,17 +31,23 @@ def wide_float(device: torch.device) -> torch.dtype:
 class Record:
     """Tensors that share their leading dimensions."""
 
-    def __getitem__(self, rows: Tensor | slice) -> Self:
-        return type(self)(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
+    def map(self, function: Callable[[Tensor], Tensor]) -> Self:
+        """The record of what `function` makes of each tensor."""
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        return type(self)(**{name: function(x) if isinstance(x, Tensor) else x for name, x in values.items()})
 
-    def flatten(self) -> Self:
-        """[T, N, …] to [T · N, …]."""
-        return type(self)(**{f.name: getattr(self, f.name).flatten(0, 1) for f in fields(self)})
+    def __getitem__(self, rows: Tensor | slice) -> Self:
+        return self.map(lambda x: x[rows])
+
+    def flatten(self, shards: int = 1) -> Self:
+        """[T, N, …] to [T · N, …], the rows of each shard together: an equal part of the N environments."""
+        return self.map(lambda x: x.unflatten(1, (shards, -1)).movedim(1, 0).flatten(0, 2))
 
     @classmethod
     def stack(cls, rows: list[Self]) -> Self:
         """Stack records along a new first dimension: T records [N, …] become one [T, N, …]."""
-        return cls(**{f.name: torch.stack([getattr(row, f.name) for row in rows]) for f in fields(cls)})
+        columns = {f.name: [getattr(row, f.name) for row in rows] for f in fields(cls)}
+        return cls(**{name: torch.stack(x) if isinstance(x[0], Tensor) else x[0] for name, x in columns.items()})
 
 
 @dataclass(frozen=True)
@@ -76,6 +87,8 @@ class Rollout(Record):
     terminated: Tensor
     truncated: Tensor
     valid: Tensor
+    shards: int = 1
+    """those held, each an equal part of the N environments"""
 
     @property
     def num_rows(self) -> int:
@@ -88,9 +101,10 @@ class Rollout(Record):
         return self.terminated | self.truncated
 
     @property
-    def valid_rows(self) -> Tensor:
-        """The indices [B], in the flattened rollout, of the rows whose action was not ignored."""
-        return self.valid.flatten().nonzero()[:, 0]
+    def valid_rows(self) -> list[Tensor]:
+        """Of each shard the indices [B], in the flattened rollout, of the rows whose action was not ignored."""
+        parts, size = self.valid.chunk(self.shards, dim=1), self.num_rows // self.shards
+        return [number * size + part.flatten().nonzero()[:, 0] for number, part in enumerate(parts)]
 
 
 @dataclass(frozen=True)

@@ -100,7 +100,7 @@ def test_rewards_of_any_size_are_scaled_only_on_request(algo, rng, scaled):
     config, state, rollout = one_rollout(algo, gamma=0.0, scale_rewards=scaled, **fields)
     batches = []
 
-    def record(config, state, batch, minibatches, **_):
+    def record(config, state, batch, minibatches, *_, **__):
         batches.append(batch)
         return [{"approx_kl": torch.zeros(()), "losses/value": torch.zeros(())}]
 

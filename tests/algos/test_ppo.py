@@ -95,9 +95,9 @@ def test_advantages_are_estimated_again_before_each_epoch_on_request(recomputed)
     config, state, rollout = one_rollout(recompute_advantages=recomputed, epochs=3, learning_rate=0.01)
     batches = []
 
-    def record(config, state, batch, minibatches):
+    def record(config, state, batch, minibatches, advantage):
         batches.append(batch)
-        return ppo.learn(config, state, batch, minibatches)
+        return ppo.learn(config, state, batch, minibatches, advantage)
 
     state.learn = record
     drawn_with = ppo.advantages(config, state.networks, rollout).log_prob

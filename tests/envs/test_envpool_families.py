@@ -6,6 +6,7 @@ import torch
 
 from lemniscate.envs import registry
 from lemniscate.envs.random_action import random_action
+from lemniscate.envs.rendered import make_rendered
 from lemniscate.errors import UserError
 
 envpool = pytest.importorskip("envpool")
@@ -153,7 +154,7 @@ def test_lives_of_an_atari_game_are_episodes_if_asked():
 
 
 def test_an_environment_is_rendered_by_envpool():
-    env = registry.make_rendered("EnvPool/Pong-v5", "rgb_array", {}, (), None)
+    env = make_rendered("EnvPool/Pong-v5", "rgb_array", {}, (), None)
     obs, _ = env.reset(seed=1)
     assert obs.shape == (4, 84, 84)
     assert env.step(np.int64(2))[0].shape == (4, 84, 84)

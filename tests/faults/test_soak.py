@@ -34,7 +34,7 @@ def start(kind, folder):
     algorithm, env, fields = KINDS[kind]
     words = [word for name, value in fields.items() for word in words_for(name, value)]
     seeds = ["--seeds", "1-500"] if kind == "sweep" else []
-    command = [sys.executable, "-m", "lemniscate.cli", "train", algorithm, "--env", env, *seeds, *words, "--run"]
+    command = [sys.executable, "-m", "lemniscate", "train", algorithm, "--env", env, *seeds, *words, "--run"]
     with (folder / f"{kind}.txt").open("w") as said:
         return subprocess.Popen([*command, str(folder / kind)], stdout=said, stderr=said)
 

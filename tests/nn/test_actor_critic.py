@@ -5,10 +5,11 @@ import torch
 
 from helpers import equal, spec_of
 from lemniscate.errors import UserError
-from lemniscate.nn.actor_critic import ActorCritic, ActorQ, SoftActorQ
+from lemniscate.nn.actor_critic import ActorCritic
+from lemniscate.nn.actor_q import ActorQ, SoftActorQ
+from lemniscate.nn.bounded_policies import DeterministicPolicy, SquashedGaussianPolicy
 from lemniscate.nn.networks import Layers
 from lemniscate.nn.normalizer import NoNorm, RunningNorm
-from lemniscate.nn.policies import DeterministicPolicy, SquashedGaussianPolicy
 
 SMALL = Layers((8,))
 

@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from lemniscate.nn.activations import Tanh
-from lemniscate.nn.networks import Bfloat16Linear, ImageEncoder, Layers
+from lemniscate.nn.images import ImageEncoder
+from lemniscate.nn.networks import Bfloat16Linear, Layers
 
 
 def test_layers_are_orthogonal_with_their_gains():

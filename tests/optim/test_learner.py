@@ -9,7 +9,7 @@ from torch import Tensor
 
 from helpers import COMPILERS, CPU, CompiledCalls, numbers, require_in_own_process, small_networks
 from lemniscate.algos import ppo
-from lemniscate.maths import means
+from lemniscate.maths import means, standardize
 from lemniscate.optim.adam import Adam
 from lemniscate.optim.compiled import Compiled
 from lemniscate.optim.learner import Learner
@@ -36,8 +36,9 @@ def compiled_equals_eager(actions):
     _, two = new_state(actions, max_grad_norm=0.1)
     learner = Learner(ppo.learn, [two.optimizer])
     batch, minibatches = numbers(actions), torch.randint(24, (6, 8), generator=torch.Generator().manual_seed(1))
+    given = config, batch, minibatches, standardize(batch.advantage[minibatches])
     for _ in range(2):
-        a, b = means(ppo.learn(config, one, batch, minibatches)), means(learner(config, two, batch, minibatches))
+        a, b = (means(learn(given[0], state, *given[1:])) for learn, state in ((ppo.learn, one), (learner, two)))
         assert a.keys() == b.keys()
         for name in a:
             torch.testing.assert_close(a[name], b[name])
@@ -55,7 +56,8 @@ def programs_are_not_mixed_up():
         act = Compiled(two.networks.policy.act, CPU)
         minibatches = torch.arange(24).view(-1, size)
         for _ in range(2):
-            a, b = (means(f(config, s, numbers(), minibatches)) for f, s in ((ppo.learn, one), (learner, two)))
+            data = numbers(), minibatches, numbers().advantage[minibatches]
+            a, b = (means(f(config, s, *data)) for f, s in ((ppo.learn, one), (learner, two)))
             torch.testing.assert_close(a, b)
         obs = torch.randn(size, 5, dtype=torch.float64)
         noise = torch.zeros(size, 2, dtype=torch.float64)
@@ -128,5 +130,6 @@ def test_without_a_compiler_it_prints_so_and_continues(monkeypatch, capsys):
     eager = partial(ppo.learn, config, one)
     for _ in range(2):
         minibatches: Tensor = torch.arange(24).view(3, 8)
-        assert means(eager(numbers(), minibatches)) == means(learner(config, two, numbers(), minibatches))
+        given = numbers(), minibatches, numbers().advantage[minibatches]
+        assert means(eager(*given)) == means(learner(config, two, *given))
     assert capsys.readouterr().err == "torch.compile failed (no compiler); continuing without compilation.\n"

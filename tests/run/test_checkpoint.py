@@ -26,7 +26,7 @@ def learn(state):
     """One gradient step on noise."""
     batch = Batch(torch.randn(4, 3), torch.randn(4, 1), *torch.randn(4, 4))
     state.optimizer.learning_rate = 1e-3
-    state.learn(tiny(), state, batch, torch.arange(4)[None])
+    state.learn(tiny(), state, batch, torch.arange(4)[None], batch.advantage[None])
 
 
 def state_with_history(seed=0):
@@ -36,13 +36,13 @@ def state_with_history(seed=0):
     learn(state)
     state.policy.observe(torch.randn(7, 3))
     state.reward_scale.var = torch.rand((), dtype=torch.float64)
-    torch.rand(5, generator=state.rng.action)
+    torch.rand(5, generator=state.rng.action[0])
     state.step = 123
     return state
 
 
 def write(folder, state, step=123, keep=3):
-    return checkpoint.write(folder, state, step, {"planned": True}, keep)
+    return checkpoint.write(folder, state.saved(), step, {"planned": True}, keep)
 
 
 def same(a, b):

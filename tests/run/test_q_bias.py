@@ -10,7 +10,7 @@ import lemniscate as lem
 from conftest import tiny_off_policy
 from helpers import Levers
 from lemniscate.envs import registry
-from lemniscate.nn.actor_critic import ActorQ, SoftActorQ
+from lemniscate.nn.actor_q import ActorQ, SoftActorQ
 from lemniscate.nn.networks import Layers
 from lemniscate.report import curves
 from lemniscate.report.pictures import sentence
@@ -61,7 +61,7 @@ def test_entropy_counts_from_the_second_step_on(monkeypatch, rng, timed_out):
     monkeypatch.undo()
     obs = torch.randn(20_000, 3, generator=rng)
     policy = nets.policy(obs)
-    noise = nets.policy.draw_noise((20_000,), torch.Generator().manual_seed(5))
+    noise = nets.policy.draw_noise((20_000,), (torch.Generator().manual_seed(5),))
     mine = -2 * policy.sample_with_log_prob(noise)[1].mean()
     assert nets.entropy_bonus(obs, torch.Generator().manual_seed(5)).mean().item() == pytest.approx(
         mine.item(), abs=1e-4

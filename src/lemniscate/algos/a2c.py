@@ -4,13 +4,13 @@ Collect a short rollout, take one gradient step on it, discard it.
 Departures from the paper, and why: docs/notes/a2c.md.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
 from torch import Tensor
 
-from lemniscate.data.rollout import collect, one_minibatch
+from lemniscate.data.rollout import collect, estimates, one_minibatch
 from lemniscate.maths import explained_variance, gae, means, policy_gradient, standardize, value_loss
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.normalizer import RewardScale
@@ -79,18 +79,17 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
 @torch.no_grad()
 def advantages(config: Config, networks: ActorCritic, rollout: Rollout) -> Batch:
     """The rows of a rollout with V(s), advantage and value target (section 4; with λ: arXiv:1506.02438, eq. 16)."""
-    value, next_value = networks.value(rollout.obs), networks.value(rollout.next_obs)
+    value, next_value, log_prob = estimates(networks, rollout)
     gamma, lam = config.gamma, config.gae_lambda
     advantage, target = gae(rollout.reward, value, next_value, rollout.terminated, rollout.done, gamma=gamma, lam=lam)
-    log_prob = networks.policy(rollout.obs).log_prob(rollout.action)
-    return Batch(rollout.obs, rollout.action, log_prob, value, advantage, target).flatten()  # [T, N, …] -> [B, …]
+    batch = Batch(rollout.obs, rollout.action, log_prob, value, advantage, target)
+    return batch.flatten(rollout.shards)  # [T, N, …] -> [B, …]
 
 
 def loss(config: Config, networks: ActorCritic, batch: Batch) -> Loss:
     """−log π(a|s) A − β H + c ½ (V − target)² (section 4), and its metrics."""
     distribution = networks.policy(batch.obs)
-    advantage = standardize(batch.advantage) if config.normalize_advantage else batch.advantage
-    policy_loss = policy_gradient(distribution.log_prob(batch.action), advantage)
+    policy_loss = policy_gradient(distribution.log_prob(batch.action), batch.advantage)
     critic_loss = value_loss(networks.value(batch.obs), batch.target)
     entropy = distribution.entropy().mean()
     total = policy_loss + config.value_coef * critic_loss - config.entropy_coef * entropy
@@ -101,9 +100,10 @@ def loss(config: Config, networks: ActorCritic, batch: Batch) -> Loss:
     }
 
 
-def learn(config: Config, state: State, batch: Batch, minibatches: Tensor) -> list[Metrics]:
+def learn(config: Config, state: State, batch: Batch, minibatches: Tensor, advantage: Tensor) -> list[Metrics]:
     """A clipped gradient step on each minibatch, rows [K, M] of the batch; in A2C there is one, the whole batch."""
-    return [state.optimizer.step(partial(loss, config), batch[rows]) for rows in minibatches]
+    steps = (replace(batch[rows], advantage=a) for rows, a in zip(minibatches, advantage, strict=True))
+    return [state.optimizer.step(partial(loss, config), minibatch) for minibatch in steps]
 
 
 def update(config: Config, state: State, rollout: Rollout) -> dict[str, Tensor | float]:
@@ -115,10 +115,14 @@ def update(config: Config, state: State, rollout: Rollout) -> dict[str, Tensor |
         rollout = state.reward_scale.scale(rollout)
     batch = advantages(config, networks, rollout)
     valid_rows = rollout.valid_rows
-    metrics = means(state.learn(config, state, batch, one_minibatch(valid_rows, rollout.num_rows)))
-    networks.policy.observe(rollout.obs[rollout.valid])  # last: the actions were drawn through the normalizer before
-    state.step += rollout.num_rows
-    explained = explained_variance(batch.value[valid_rows], batch.target[valid_rows])
+    rows = one_minibatch(valid_rows, rollout.num_rows)
+    advantage = batch.advantage[rows]
+    if config.normalize_advantage:
+        advantage = standardize(advantage, state.shards)
+    metrics = means(state.learn(config, state, batch, rows, advantage))
+    networks.policy.observe(rollout.obs, rollout.valid)  # last: the actions were drawn through the normalizer before
+    state.step += config.num_steps * config.num_envs
+    explained = explained_variance(batch.value, batch.target, valid_rows, state.shards)
     return {**metrics, **networks.policy.metrics(), "explained_variance": explained, "learning_rate": rate}
 
 

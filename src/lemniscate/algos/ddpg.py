@@ -10,11 +10,11 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from lemniscate.data.replay import ReplayBuffer, interact
+from lemniscate.data.replay import interact
 from lemniscate.maths import means, polyak, td_target, value_loss
-from lemniscate.nn.actor_critic import ActorQ
-from lemniscate.nn.critics import Critics
+from lemniscate.nn.actor_q import ActorQ
 from lemniscate.nn.policies import Policy
+from lemniscate.nn.q_values import Critics
 from lemniscate.optim.adam import Adam, linear
 from lemniscate.run.config import NonNegative
 from lemniscate.run.off_policy import OffPolicyConfig, OffPolicyState
@@ -51,7 +51,7 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
         targets=networks.target(),
         actor_optimizer=Adam(networks.policy, name="actor"),
         critic_optimizer=Adam(networks.critics, name="critic"),
-        replay=ReplayBuffer(spec, config.capacity, device),
+        replay=config.make_replay(spec, device),
         action_noise=config.make_action_noise(spec, device),
         rng=config.generators(device),
         learn=learn,
@@ -108,7 +108,7 @@ def train(config: Config, run: Run) -> State:
             policy, rng = state.networks.policy, state.rng.action
             random = state.step < config.learning_starts
             interact(env, policy, state.replay, state.action_noise, rng, noise_std=config.noise_std, random=random)
-            state.step += env.num_envs
+            state.step += config.num_envs
             if config.updates_at(state.step):
                 metrics.append(update(config, state))
         run.log(state, means(metrics), env.take_episodes())

@@ -11,7 +11,7 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from lemniscate.data.rollout import collect, epoch_minibatches
+from lemniscate.data.rollout import collect, epoch_minibatches, estimates
 from lemniscate.maths import (
     clipped_surrogate,
     explained_variance,
@@ -104,19 +104,18 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
 @torch.no_grad()
 def advantages(config: Config, networks: ActorCritic, rollout: Rollout) -> Batch:
     """The rows of a rollout with log π_old(a|s), V(s), advantage (eq. 11) and value target, [B, …]."""
-    value, next_value = networks.value(rollout.obs), networks.value(rollout.next_obs)
+    value, next_value, log_prob = estimates(networks, rollout)
     gamma, lam = config.gamma, config.gae_lambda
     advantage, target = gae(rollout.reward, value, next_value, rollout.terminated, rollout.done, gamma=gamma, lam=lam)
-    log_prob = networks.policy(rollout.obs).log_prob(rollout.action)
-    return Batch(rollout.obs, rollout.action, log_prob, value, advantage, target).flatten()  # [T, N, …] -> [B, …]
+    batch = Batch(rollout.obs, rollout.action, log_prob, value, advantage, target)
+    return batch.flatten(rollout.shards)  # [T, N, …] -> [B, …]
 
 
 def loss(config: Config, networks: ActorCritic, batch: Batch) -> Loss:
     """The loss of a minibatch [M, …], the negative of eq. 9, and its metrics."""
     distribution = networks.policy(batch.obs)
     log_ratio = distribution.log_prob(batch.action) - batch.log_prob  # log r_t(θ), below eq. 6
-    advantage = standardize(batch.advantage) if config.normalize_advantage else batch.advantage
-    policy_loss = clipped_surrogate(log_ratio, advantage, config.clip)  # −L^CLIP, eq. 7
+    policy_loss = clipped_surrogate(log_ratio, batch.advantage, config.clip)  # −L^CLIP, eq. 7
     critic_loss = value_loss(networks.value(batch.obs), batch.target, batch.value, config.clip_value)  # L^VF, eq. 9
     entropy = distribution.entropy().mean()  # S, eq. 9
     total = policy_loss + config.value_coef * critic_loss - config.entropy_coef * entropy  # −L^CLIP+VF+S, eq. 9
@@ -128,9 +127,10 @@ def loss(config: Config, networks: ActorCritic, batch: Batch) -> Loss:
     }
 
 
-def learn(config: Config, state: State, batch: Batch, minibatches: Tensor) -> list[Metrics]:
-    """A clipped gradient step on each minibatch, rows [K, M] of the batch."""
-    return [state.optimizer.step(partial(loss, config), batch[rows]) for rows in minibatches]
+def learn(config: Config, state: State, batch: Batch, minibatches: Tensor, advantage: Tensor) -> list[Metrics]:
+    """A clipped gradient step on each minibatch, rows [K, M] of the batch, with its advantages [K, M]."""
+    steps = (replace(batch[rows], advantage=a) for rows, a in zip(minibatches, advantage, strict=True))
+    return [state.optimizer.step(partial(loss, config), minibatch) for minibatch in steps]
 
 
 def update(config: Config, state: State, rollout: Rollout) -> dict[str, Tensor | float]:
@@ -146,21 +146,25 @@ def update(config: Config, state: State, rollout: Rollout) -> dict[str, Tensor |
     for epoch in range(config.epochs):
         if config.recompute_advantages and epoch > 0:
             batch = replace(advantages(config, networks, rollout), log_prob=collected.log_prob)
-        minibatches = epoch_minibatches(valid_rows, rollout.num_rows, config.minibatch_size, state.rng.minibatch)
+        size = config.minibatch_size // config.shards
+        minibatches = epoch_minibatches(valid_rows, rollout.num_rows, size, state.rng.minibatch)
+        advantage = batch.advantage[minibatches]
+        if config.normalize_advantage:
+            advantage = standardize(advantage, state.shards)
         state.optimizer.learning_rate = state.learning_rate
-        metrics.append(means(state.learn(config, state, batch, minibatches)))
+        metrics.append(means(state.learn(config, state, batch, minibatches, advantage)))
         kl = metrics[-1]["approx_kl"].item()
         if config.desired_kl is not None:
             state.learning_rate = adapt_to_kl(state.learning_rate, kl, config.desired_kl)
         if config.target_kl is not None and kl > config.target_kl:
             break
-    networks.policy.observe(rollout.obs[rollout.valid])  # last: old and new probabilities share a normalizer
-    state.step += rollout.num_rows
+    networks.policy.observe(rollout.obs, rollout.valid)  # last: old and new probabilities share a normalizer
+    state.step += config.num_steps * config.num_envs
     return {
         **means(metrics),
         **networks.policy.metrics(),
         "learning_rate": state.learning_rate,
-        "explained_variance": explained_variance(collected.value[valid_rows], collected.target[valid_rows]),
+        "explained_variance": explained_variance(collected.value, collected.target, valid_rows, state.shards),
     }
 
 

@@ -4,25 +4,17 @@ Collect, weight the log-probability of each action by the return that followed i
 Departures, and why: docs/notes/reinforce.md.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Annotated, Literal
 
 import torch
 from torch import Tensor
 
-from lemniscate.data.rollout import collect, collect_episodes, epoch_minibatches, one_minibatch
+from lemniscate.data.rollout import collect, epoch_minibatches, estimates, one_minibatch
+from lemniscate.data.whole_episodes import collect_episodes
 from lemniscate.errors import UserError
-from lemniscate.maths import (
-    episode_return,
-    explained_variance,
-    kl_k3,
-    means,
-    policy_gradient,
-    reward_to_go,
-    standardize,
-    value_loss,
-)
+from lemniscate.maths import episode_return, explained_variance, kl_k3, means, policy_gradient, reward_to_go, value_loss
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.critics import Value
 from lemniscate.nn.normalizer import RewardScale
@@ -73,6 +65,8 @@ class Config(OnPolicyConfig):
         if not self.episodes and (self.returns, self.baseline) != ("to_go", "value"):
             cut = f"returns {self.returns}, baseline {self.baseline} need whole episodes, which num_steps cuts"
             raise UserError(f"{cut}: use episodes 1 or more, or returns to_go and baseline value.")
+        if self.episodes and self.shards > 1:
+            raise UserError("Batches of whole episodes differ in size and cannot be divided: shards must be 1.")
         if self.episodes and self.compile == "on":
             raise UserError("Batches of whole episodes differ in size and cannot be compiled: use --compile off.")
         if not self.episodes:
@@ -111,23 +105,21 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
 @torch.no_grad()
 def weights(config: Config, networks: ActorCritic, rollout: Rollout) -> Batch:
     """The rows of a rollout with log π(a|s), V(s), weight (return minus baseline) and value target, [B, …]."""
-    value, next_value = torch.zeros_like(rollout.reward), torch.zeros_like(rollout.reward)
-    if config.baseline == "value":
-        value, next_value = networks.value(rollout.obs), networks.value(rollout.next_obs)
+    value, next_value, log_prob = estimates(networks, rollout)
+    if config.baseline != "value":
+        value, next_value = torch.zeros_like(value), torch.zeros_like(value)
     to_go = reward_to_go(rollout.reward, next_value, rollout.terminated, rollout.done, gamma=config.gamma)
     weight = to_go
     if config.returns == "episode":
         weight = episode_return(to_go, rollout.reward, rollout.done | ~rollout.valid, gamma=config.gamma)
     baseline = weight[rollout.valid].mean() if config.baseline == "mean" else value
-    log_prob = networks.policy(rollout.obs).log_prob(rollout.action)
-    return Batch(rollout.obs, rollout.action, log_prob, value, weight - baseline, to_go).flatten()
+    return Batch(rollout.obs, rollout.action, log_prob, value, weight - baseline, to_go).flatten(rollout.shards)
 
 
 def policy_loss(config: Config, policy: Policy, batch: Batch) -> Loss:
     """−log π(a|s) (G − b(s)) (Sutton & Barto, eq. 13.11) less an entropy bonus, and its metrics."""
     distribution = policy(batch.obs)
-    weight = standardize(batch.advantage) if config.standardize else batch.advantage
-    loss = policy_gradient(distribution.log_prob(batch.action), weight)
+    loss = policy_gradient(distribution.log_prob(batch.action), batch.advantage)
     entropy = distribution.entropy().mean()
     return loss - config.entropy_coef * entropy, {"losses/policy": loss.detach(), "losses/entropy": entropy.detach()}
 
@@ -154,18 +146,24 @@ def update(config: Config, state: State, rollout: Rollout) -> dict[str, Tensor |
         rollout = state.reward_scale.scale(rollout)
     batch = weights(config, state.networks, rollout)
     valid_rows = rollout.valid_rows
-    size = len(valid_rows) if config.episodes else rollout.num_rows
+    size = len(valid_rows[0]) if config.episodes else rollout.num_rows
+    learned = batch[one_minibatch(valid_rows, size)[0]]
+    if config.standardize:
+        advantage = state.shards.standardize(learned.advantage.chunk(rollout.shards))
+        learned = replace(learned, advantage=torch.cat(advantage))
+    all_rows = torch.arange(size, device=batch.obs.device)[None]
     metrics: dict[str, Tensor | float] = {"learning_rate": rate}
-    metrics |= means(state.learn(config, state, batch, one_minibatch(valid_rows, size), update_policy=True))
-    new_log_prob = policy(batch.obs[valid_rows]).log_prob(batch.action[valid_rows]).detach()
-    metrics["approx_kl"] = kl_k3(new_log_prob - batch.log_prob[valid_rows])
+    metrics |= means(state.learn(config, state, learned, all_rows, update_policy=True))
+    moved = [policy(batch.obs[r]).log_prob(batch.action[r]).detach() - batch.log_prob[r] for r in valid_rows]
+    metrics["approx_kl"] = state.shards.mean([kl_k3(x) for x in moved], [len(x) for x in moved])
     if config.baseline == "value":
+        part = config.critic_minibatch_size // config.shards
         for _ in range(config.critic_epochs):
-            minibatches = epoch_minibatches(valid_rows, size, config.critic_minibatch_size, state.rng.minibatch)
+            minibatches = epoch_minibatches(valid_rows, size, part, state.rng.minibatch)
             metrics |= means(state.learn(config, state, batch, minibatches, update_policy=False))
-        metrics["explained_variance"] = explained_variance(batch.value[valid_rows], batch.target[valid_rows])
-    policy.observe(rollout.obs[rollout.valid])  # last: the actions were drawn through the normalizer before
-    state.step += rollout.num_rows
+        metrics["explained_variance"] = explained_variance(batch.value, batch.target, valid_rows, state.shards)
+    policy.observe(rollout.obs, rollout.valid)  # last: the actions were drawn through the normalizer before
+    state.step += len(rollout.reward) * config.num_envs
     return {**metrics, **policy.metrics()}
 
 

@@ -10,11 +10,11 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from lemniscate.data.replay import ReplayBuffer, interact
+from lemniscate.data.replay import interact
 from lemniscate.maths import means, polyak, td_target, value_loss
-from lemniscate.nn.actor_critic import SoftActorQ
-from lemniscate.nn.critics import Critics, Temperature
+from lemniscate.nn.actor_q import SoftActorQ
 from lemniscate.nn.policies import Policy
+from lemniscate.nn.q_values import Critics, Temperature
 from lemniscate.optim.adam import Adam, linear
 from lemniscate.run.config import Finite, Positive
 from lemniscate.run.off_policy import OffPolicyConfig, OffPolicyState
@@ -55,7 +55,7 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
         actor_optimizer=Adam(networks.policy, name="actor"),
         critic_optimizer=Adam(networks.critics, name="critic"),
         temperature_optimizer=Adam(networks.temperature, name="temperature"),
-        replay=ReplayBuffer(spec, config.capacity, device),
+        replay=config.make_replay(spec, device),
         action_noise=config.make_action_noise(spec, device),
         rng=config.generators(device),
         learn=learn,
@@ -123,7 +123,7 @@ def train(config: Config, run: Run) -> State:
         for _ in run.steps(config.log_every):
             policy, random = state.networks.policy, state.step < config.learning_starts
             interact(env, policy, state.replay, state.action_noise, state.rng.action, random=random)
-            state.step += env.num_envs
+            state.step += config.num_envs
             if config.updates_at(state.step):
                 metrics.append(update(config, state))
         run.log(state, means(metrics), env.take_episodes())

@@ -10,11 +10,11 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from lemniscate.data.replay import ReplayBuffer, interact
-from lemniscate.maths import means, polyak, td_target, value_loss
-from lemniscate.nn.actor_critic import ActorQ
-from lemniscate.nn.critics import Critics
+from lemniscate.data.replay import interact
+from lemniscate.maths import means, normal, polyak, td_target, value_loss
+from lemniscate.nn.actor_q import ActorQ
 from lemniscate.nn.policies import Policy
+from lemniscate.nn.q_values import Critics
 from lemniscate.optim.adam import Adam, linear
 from lemniscate.run.config import Count, NonNegative
 from lemniscate.run.off_policy import OffPolicyConfig, OffPolicyState
@@ -57,7 +57,7 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
         targets=networks.target(),
         actor_optimizer=Adam(networks.policy, name="actor"),
         critic_optimizer=Adam(networks.critics, name="critic"),
-        replay=ReplayBuffer(spec, config.capacity, device),
+        replay=config.make_replay(spec, device),
         action_noise=config.make_action_noise(spec, device),
         rng=config.generators(device),
         learn=learn,
@@ -102,9 +102,7 @@ def update(config: Config, state: State) -> Metrics:
     state.actor_optimizer.learning_rate = linear(config.actor_learning_rate, config.final_learning_rate, progress)
     minibatches = state.replay.sample_indices(config.num_updates, config.batch_size, state.rng.minibatch)
     replay = state.replay.transitions
-    noise = torch.randn(
-        *minibatches.shape, replay.action.shape[-1], generator=state.rng.action, device=minibatches.device
-    )
+    noise = normal((*minibatches.shape, replay.action.shape[-1]), state.rng.action)
     update_actor = tuple((state.updates + k) % config.policy_delay == 0 for k in range(1, config.num_updates + 1))
     state.updates += config.num_updates
     return means(state.learn(config, state, replay, minibatches, noise, update_actor=update_actor))
@@ -119,7 +117,7 @@ def train(config: Config, run: Run) -> State:
             policy, rng = state.networks.policy, state.rng.action
             random = state.step < config.learning_starts
             interact(env, policy, state.replay, state.action_noise, rng, noise_std=config.noise_std, random=random)
-            state.step += env.num_envs
+            state.step += config.num_envs
             if config.updates_at(state.step):
                 metrics.append(update(config, state))
         run.log(state, means(metrics), env.take_episodes())

@@ -6,6 +6,7 @@ This module is light: help, and a mistake that can be seen without torch, take n
 """
 
 import argparse
+import os
 import re
 import sys
 from collections.abc import Callable, Sequence
@@ -17,16 +18,9 @@ from typing import Any, NoReturn
 
 from lemniscate import __version__
 from lemniscate.algos import ALGORITHMS
+from lemniscate.cli.endings import exit_code, sentence
 from lemniscate.console import say
-from lemniscate.errors import (
-    NonFiniteError,
-    NotStoredError,
-    SweepError,
-    UserError,
-    WorkerError,
-    is_installed,
-    unknown_name,
-)
+from lemniscate.errors import UserError, is_installed, unknown_name
 
 COMMANDS = {
     "train": "Train a policy, or one for each of several algorithms and seeds, to compare them.",
@@ -45,31 +39,19 @@ SHELLS = ("bash", "zsh", "fish")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
     given = argparse.Namespace(command=None)
+    if "RANK" in os.environ:  # torch has whole pages to say of a connection that ends
+        os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "ERROR")
     try:
         given = parse(sys.argv[1:] if arguments is None else arguments)
         getattr(import_module("lemniscate.cli.commands"), given.command)(given)
-    except UserError as error:
-        say(error)
-        return 2
-    except (NonFiniteError, WorkerError) as error:
-        learning = given.command in ("train", "resume")
-        say(f"{error} Training stopped; the last checkpoint is as it was." if learning else error)
-        return 1
-    except (NotStoredError, SweepError, MemoryError) as error:
-        say(str(error) or "The memory is full: choose smaller numbers.")
-        return 1
-    except KeyboardInterrupt as stopped:  # a run that was asked to stop has a sentence and a signal of its own
-        say(str(stopped) or "Interrupted.")
-        return 128 + getattr(stopped, "signum", 2)
-    except BrokenPipeError:  # whoever read the output has read enough
-        return 141
-    except OSError as error:  # a disk that is full, a folder that cannot be written
-        if error.errno is None:
-            raise
-        say(f"{error.filename or 'A file could not be written'}: {error.strerror}.")
-        return 1
     except SystemExit as done:  # argparse has printed help, or the version
         return int(done.code or 0)
+    except BaseException as error:
+        code = exit_code(error)
+        if code is None:
+            raise
+        say(sentence(error, given.command))
+        return code
     return 0
 
 
@@ -101,7 +83,7 @@ def add_train_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--env", metavar="ID", help="environment id, or module:Class of your own")
     parser.add_argument("--run", type=Path, metavar="DIR", help="run directory; must not exist [runs/…]")
     parser.add_argument("--preset", metavar="NAME", help="tuned settings [those of the environment]")
-    parser.add_argument("--seeds", metavar="LIST", help="train one run per seed, such as 1-5 or 1,3,7, in parallel")
+    parser.add_argument("--seeds", metavar="LIST", help="one run for each seed: 1-5 or 1,3,7")
     _add_endings(parser)
 
 
@@ -189,10 +171,10 @@ def _add_endings(parser: argparse.ArgumentParser) -> None:
         metavar="FUNCTION",
         help="sees each update and may stop the run: module:function, or 'module:Class(key=value)'",
     )
+    parser.add_argument("--processes", default=1, metavar="INT", help="processes of this machine for one run [1]")
+    parser.add_argument("--quiet", action="store_true", help="no progress on standard error")
     parser.add_argument("--report", action="store_true", help="evaluate the final policy, and draw plots and videos")
-    parser.add_argument(
-        "--score", action="store_true", help="evaluate the final policy over 100 episodes and store the result"
-    )
+    parser.add_argument("--score", action="store_true", help="store the final return over 100 episodes")
 
 
 def _parse_train(parser: Parser, words: list[str]) -> argparse.Namespace:

@@ -5,12 +5,12 @@ import json
 from shutil import get_terminal_size
 from typing import Any
 
-from lemniscate import api, plots, results, sweep
+from lemniscate import api, plots, results, resumed, sweep
 from lemniscate.algos import ALGORITHMS
 from lemniscate.checks import each_finding, verdict
 from lemniscate.cli.completion import completion as completion
 from lemniscate.cli.fields import number, read, read_json
-from lemniscate.console import say
+from lemniscate.console import say, talks
 from lemniscate.envs import registry
 from lemniscate.envs.findings import BAD
 from lemniscate.errors import UserError, unknown_name
@@ -25,39 +25,43 @@ from lemniscate.stored import TrainedRun
 def train(given: argparse.Namespace) -> None:
     """Train one policy, or with --seeds one for each algorithm and seed."""
     shared = {"run": given.run, "preset": given.preset, "track": given.track, "report": given.report, **given.fields}
+    shared["progress"] = not given.quiet
     if given.seeds is not None or "," in given.algorithm:
         if "seed" in given.fields:
             raise UserError("Several runs have several seeds: --seeds 1-5, not --seed.")
         if given.seeds is None:
             raise UserError("Algorithms are compared over several seeds: add --seeds 1-5.")
         runs = sweep.train_sweep(given.algorithm, given.env, given.seeds, **shared, **_callbacks(given))
-        say(f"Everything is in {runs.path}")
+        tell(f"Everything is in {runs.path}")
         return
     config = api.config_for(given.algorithm, given.env, given.preset, **given.fields)
     if config.backend:
         registry.require_backend(config.backend)
     preset, _ = choose(given.algorithm, config.env, given.preset)
     what = f"{given.algorithm} on {config.num_envs} × {config.env}, backend {config.backend}"
-    say(f"{what}: preset {preset}, seed {config.seed}, {'compiled' if is_compiled(config) else 'not compiled'}")
-    run = api.train(given.algorithm, config.env, **shared, **_callbacks(given))
+    tell(f"{what}: preset {preset}, seed {config.seed}, {'compiled' if is_compiled(config) else 'not compiled'}")
+    processes = number(given.processes)
+    run = api.train(given.algorithm, config.env, processes=processes, **shared, **_callbacks(given))
     if given.score:
         _say_score(run)
-    say(f"Trained in {run.seconds:.1f} s. Everything is in {run.path}")
+    tell(f"Trained in {run.seconds:.1f} s. Everything is in {run.path}")
 
 
 def resume(given: argparse.Namespace) -> None:
     """Continue an interrupted run or sweep. A sweep's runs are begun by this command too, and end with the sweep."""
-    end_with_owner()
+    owned = end_with_owner()
     options = {"track": given.track, "report": given.report, "trust": given.trust, **_callbacks(given)}
+    options["progress"] = not given.quiet
     if is_sweep(given.run):
         run = sweep.resume_sweep(given.run, **options)
     else:
-        run = api.resume(given.run, **options)
+        run = resumed.resume(given.run, processes=number(given.processes), **options)
         if given.score:
             _say_score(run)
         if not run.seconds:  # it was finished, which has been said
             return
-    say(f"Done. Everything is in {run.path}")
+    if not owned:
+        tell(f"Done. Everything is in {run.path}")
 
 
 def evaluate(given: argparse.Namespace) -> None:
@@ -115,7 +119,15 @@ def check(given: argparse.Namespace) -> None:
     say(verdict(given.what, found))
 
 
+def tell(text: str) -> None:
+    """Say it, where this process is the one that talks."""
+    if talks():
+        say(text)
+
+
 def _say_score(run: TrainedRun) -> None:
+    if not talks():
+        return
     score = results.final_return(run)
     say(f"Final return {score:.1f} over {results.FINAL_EPISODES} episodes.")
 

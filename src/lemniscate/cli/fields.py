@@ -18,7 +18,7 @@ from lemniscate.presets import PRESETS, names
 from lemniscate.run.config import RunConfig, flag, options_of
 
 GROUPS: dict[str, tuple[str, ...]] = {
-    "run": ("seed", "total_steps", "device", "threads", "compile", "matmul", "warm_start"),
+    "run": ("seed", "total_steps", "device", "threads", "shards", "compile", "matmul", "warm_start"),
     "environment": ("env_kwargs", "wrappers", "backend", "num_envs"),
     "algorithm": (),
     "networks": (

@@ -6,6 +6,7 @@ import torch
 from torch import Generator, Tensor
 
 from lemniscate.maths import coloured, ornstein_uhlenbeck
+from lemniscate.types import Streams
 
 Kind = Literal["white", "ou", "coloured"]
 
@@ -25,6 +26,8 @@ class ActionNoise:
         exponent: β.
     """
 
+    local = ("sequences", "position")
+
     def __init__(
         self, kind: Kind, shape: tuple[int, int], length: int, device: torch.device, *, time: float, exponent: float
     ) -> None:
@@ -34,11 +37,14 @@ class ActionNoise:
         self._position = torch.full((shape[0],), self._length)
         self._rows = torch.arange(shape[0])
 
-    def __call__(self, generator: Generator) -> Tensor:
-        """The noise of the next step, [N, A]."""
+    def __call__(self, streams: Streams) -> Tensor:
+        """The noise of the next step, [N, A]; an equal part of the environments draws from each stream."""
         due = self._position == self._length
         if due.any():
-            self._sequences[due] = self._new_sequences(int(due.sum()), generator)
+            parts = zip(self._sequences.chunk(len(streams)), due.chunk(len(streams)), streams, strict=True)
+            for sequences, where, stream in parts:
+                if where.any():
+                    sequences[where] = self._new_sequences(int(where.sum()), stream)
             self._position[due] = 0
         noise = self._sequences[self._rows, :, self._position]
         self._position += 1
@@ -51,6 +57,16 @@ class ActionNoise:
     def on_restart(self) -> None:
         """Begin new sequences everywhere: the environments have been restarted."""
         self._position.fill_(self._length)
+
+    @property
+    def num_envs(self) -> int:
+        """N."""
+        return len(self._position)
+
+    def hold(self, rows: slice) -> None:
+        """Keep only these environments."""
+        self._sequences, self._position = self._sequences[rows].clone(), self._position[rows].clone()
+        self._rows = torch.arange(len(self._position))
 
     def state_dict(self) -> dict[str, Tensor]:
         """The sequences, and the position in each."""

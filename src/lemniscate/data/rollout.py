@@ -1,55 +1,30 @@
 """Collecting rollouts and cutting them into minibatches."""
 
 import math
-from functools import partial
+from collections.abc import Sequence
 
 import torch
-from torch import Generator, Tensor
+from torch import Tensor
 
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError
+from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.policies import Policy
 from lemniscate.spec import Box, Spec
-from lemniscate.types import Rollout
+from lemniscate.types import Rollout, Streams
 
 
 @torch.no_grad()
-def collect(env: VecEnv, policy: Policy, num_steps: int, generator: Generator) -> Rollout:
+def collect(env: VecEnv, policy: Policy, num_steps: int, streams: Streams) -> Rollout:
     """Act `num_steps` times in every environment, from where it stands. Returns a rollout [T, N, …]."""
     rows = []
     with env.collecting:
-        for noise in policy.draw_noise((num_steps, env.num_envs), generator):
+        for noise in policy.draw_noise((num_steps, env.num_envs), streams):
             obs = env.obs
-            action = policy.act(obs, noise)
+            action = env.act(policy.act, noise)
             step = env.step(action)
-            rows.append(Rollout(obs, action, step.reward, step.next_obs, step.terminated, step.truncated, step.valid))
-        return Rollout.stack(rows)
-
-
-@torch.no_grad()
-def collect_episodes(env: VecEnv, policy: Policy, episodes: int, generator: Generator) -> Rollout:
-    """Act until every environment has completed `episodes` whole episodes, from where it stands.
-
-    Returns:
-        A rollout [T, N, …], T as large as it takes. The rows before an environment's first end and after its last are
-        not `valid`: each gives the same number of episodes, since those that end first are short ones.
-
-    Raises:
-        UserError: an episode of an environment without a time limit takes more than 20,000 steps.
-    """
-    rows, noise = [], partial(policy.draw_noise, (env.num_envs,), generator)
-    ended = torch.zeros(env.num_envs, dtype=torch.int64, device=env.device)
-    age = torch.zeros_like(ended)
-    with env.collecting:
-        while (ended <= episodes).any():
-            env.require_end(int(age.max()))
-            obs = env.obs
-            action = policy.act(obs, noise())
-            step = env.step(action)
-            whole = step.valid & (ended >= 1) & (ended <= episodes)
-            rows.append(Rollout(obs, action, step.reward, step.next_obs, step.terminated, step.truncated, whole))
-            done = (step.terminated | step.truncated) & step.valid
-            ended, age = ended + done.int(), (age + 1) * ~done
+            ends = step.terminated, step.truncated, step.valid
+            rows.append(Rollout(obs, action, step.reward, step.next_obs, *ends, len(streams)))
         return Rollout.stack(rows)
 
 
@@ -60,28 +35,45 @@ def rollout_bytes(spec: Spec, num_steps: int, num_envs: int) -> int:
     return num_steps * (num_envs * (3 * obs + 2 * (4 * action + 7)) + 1_000)
 
 
-def one_minibatch(valid_rows: Tensor, num_rows: int) -> Tensor:
+@torch.no_grad()
+def estimates(networks: ActorCritic, rollout: Rollout) -> tuple[Tensor, Tensor, Tensor]:
+    """V(s), V(s') and log π(a|s) of every row, [T, N] each; the networks are called with each shard alone."""
+    columns = []
+    for part in zip(
+        *(x.chunk(rollout.shards, 1) for x in (rollout.obs, rollout.next_obs, rollout.action)), strict=True
+    ):
+        obs, next_obs, action = (x.contiguous() for x in part)
+        columns.append((networks.value(obs), networks.value(next_obs), networks.policy(obs).log_prob(action)))
+    value, next_value, log_prob = (torch.cat(column, dim=1) for column in zip(*columns, strict=True))
+    return value, next_value, log_prob
+
+
+def one_minibatch(valid_rows: Sequence[Tensor], num_rows: int) -> Tensor:
     """All valid rows as one minibatch, in their order: indices [1, num_rows]; see `epoch_minibatches`."""
-    return _cut(valid_rows, num_rows, num_rows)
+    size = num_rows // len(valid_rows)
+    return torch.cat([_cut(rows, size, size) for rows in valid_rows], dim=1)
 
 
-def epoch_minibatches(valid_rows: Tensor, num_rows: int, size: int, generator: Generator) -> Tensor:
+def epoch_minibatches(valid_rows: Sequence[Tensor], num_rows: int, size: int, streams: Streams) -> Tensor:
     """The valid rows in a new random order, cut into the minibatches of one epoch: indices [K, M].
 
     K and M are the same in every epoch of a run, whatever the number of valid rows. Where rows are missing, the first
-    ones of the order are repeated.
+    ones of the order are repeated. Of several shards, each gives an equal part of every minibatch.
 
     Args:
-        valid_rows: indices of the rows to learn from, [B] int64.
-        num_rows: the number of rows of a rollout, at least B.
-        size: M; a rollout with fewer rows is one minibatch.
-        generator: of the order.
+        valid_rows: of each shard held, the indices of the rows to learn from, [B] int64.
+        num_rows: the number of rows of a rollout, at least the sum of B.
+        size: M / S, of each shard; a rollout with fewer rows is one minibatch.
+        streams: of the order.
 
     Raises:
         UserError: there is no valid row.
     """
-    order = torch.randperm(len(valid_rows), generator=generator, device=generator.device)
-    return _cut(valid_rows[order], num_rows, min(size, num_rows))
+    most, parts = num_rows // len(streams), []
+    for rows, stream in zip(valid_rows, streams, strict=True):
+        order = torch.randperm(len(rows), generator=stream, device=stream.device)
+        parts.append(_cut(rows[order], most, min(size, most)))
+    return torch.cat(parts, dim=1)
 
 
 def _cut(rows: Tensor, num_rows: int, size: int) -> Tensor:

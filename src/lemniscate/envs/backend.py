@@ -58,6 +58,8 @@ class Backend(Protocol):
     - `compiled = True`: a step is a program for one number of environments, so evaluation takes as many as training;
     - `package`: what has to be installed;
     - `in_process`: the name of the backend that evaluates its policies, where it uses other processes itself;
+    - `divides(env) -> bool`, a class method: whether `restart` takes several seeds, each for an equal part of the
+      environments, so that nothing of a part depends on the others; where it does not, each shard has a backend;
     - `room(env) -> (bytes, files)`, a class method: the memory and the open files that each takes at least;
     - `wraps(env) -> bool`, a class method: whether it can put `wrappers` around;
     - `make_rendered(env, mode, kwargs, wrappers)`, a class method: one `gymnasium.Env` that renders itself.

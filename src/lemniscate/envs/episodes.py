@@ -1,6 +1,7 @@
 """The episodes of N parallel environments: their returns and lengths, and their staggering."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -18,6 +19,15 @@ class Episodes:
 
     returns: list[float]
     lengths: list[int]
+    ends: list[int] = field(default_factory=list)
+    """for each a number that orders the ends, those of all processes: by time, then by environment"""
+
+    @classmethod
+    def merged(cls, parts: Sequence["Episodes"]) -> "Episodes":
+        """Those of several processes, in the order of their ends."""
+        rows = sorted((end, i, part) for part in parts for i, end in enumerate(part.ends))
+        columns = ([getattr(part, name)[i] for _, i, part in rows] for name in ("returns", "lengths", "ends"))
+        return cls(*columns)
 
 
 class EpisodeStatistics:
@@ -26,7 +36,10 @@ class EpisodeStatistics:
     Fragments (episodes that staggering began late or cut early) and ignored actions (`valid` False) are not counted.
     """
 
-    def __init__(self, num_envs: int, device: torch.device) -> None:
+    def __init__(self, num_envs: int, device: torch.device, first: int = 0, total: int | None = None) -> None:
+        self._rows, self._total = 0, total or num_envs
+        self._numbers = torch.arange(first, first + num_envs, dtype=wide_float(device), device=device)
+        """of these environments, among `total`"""
         self._log: list[tuple[Tensor, ...]] = []
         self._running = torch.zeros(2, num_envs, dtype=wide_float(device), device=device)
         self._ended: list[Tensor] = []
@@ -41,15 +54,19 @@ class EpisodeStatistics:
         """The whole episodes that ended since the last call."""
         if self._log:
             self._sum_up()
-        returns, lengths = torch.cat([self._running[:, :0], *self._ended], dim=1)
+        empty = self._running.new_zeros(3, 0)
+        returns, lengths, ends = torch.cat([empty, *self._ended], dim=1)
         self._ended = []
-        return Episodes(returns.tolist(), lengths.int().tolist())
+        return Episodes(returns.tolist(), lengths.int().tolist(), ends.long().tolist())
 
     def _sum_up(self) -> None:
         reward, terminated, truncated, valid, counts = (torch.stack(column) for column in zip(*self._log, strict=True))
         done = (terminated | truncated) & valid
         running = episode_sums(torch.stack([reward * valid, valid]).to(self._running.dtype), done, self._running)
-        self._ended.append(running[:, done & counts])  # by time, then by environment
+        rows = torch.arange(self._rows, self._rows + len(done), dtype=running.dtype, device=running.device)
+        ends = rows[:, None] * self._total + self._numbers
+        self._ended.append(torch.cat([running, ends[None]])[:, done & counts])  # by time, then by environment
+        self._rows += len(done)
         self._running = running[:, -1] * ~done[-1]
         self._log = []
 
@@ -78,10 +95,12 @@ class Stagger:
     A cut counts as a truncation. Without a limit there are no cuts, and every episode is whole.
     """
 
-    def __init__(self, num_envs: int, limit: int | None, seed: int) -> None:
+    def __init__(self, num_envs: int, limit: int | None, *seeds: int) -> None:
         self._steps_left = np.full(num_envs, -1)
         if limit is not None:
-            self._steps_left = np.random.default_rng(seed).integers(1, limit, num_envs, endpoint=True)
+            size = num_envs // len(seeds)
+            parts = [np.random.default_rng(seed).integers(1, limit, size, endpoint=True) for seed in seeds]
+            self._steps_left = np.concatenate(parts)
         self.counts = np.full(num_envs, limit is None)
         """[N] bool: the environment's present episode began at its beginning and is not to be cut"""
 

@@ -103,20 +103,25 @@ class GymnasiumBackend:
         self._measures = measures_of(self._envs.metadata)
         self.spec = Spec(env, parts, action, max_episode_steps=limit, image=is_image(space))
 
-    def restart(self, seed: int) -> Tensor:
+    @classmethod
+    def divides(cls, env: str) -> bool:
+        """Whether it is made of single environments, each of which has a seed of its own."""
+        return cls.wraps(env)
+
+    def restart(self, *seeds: int) -> Tensor:
         """Close the environments and build them again: some (Box2D) carry more over a reset than they tell."""
         if self._used:
             self._envs.close()
             self._envs, _ = self._build()
         self._used = True
         self._resetting = np.zeros(self.num_envs, dtype=bool)
-        self._stagger = Stagger(self.num_envs, self._stagger_up_to, seed)
+        self._stagger = Stagger(self.num_envs, self._stagger_up_to, *seeds)
         self.counts = self._tensor(self._stagger.counts)
         kind = self.spec.action
         self._masks = None
         if isinstance(kind, Discrete) and kind.masked:
             self._masks = ActionMasks(self.spec.env_id, self.num_envs, kind.n)
-        return self._tensor(self._observe(*self._envs.reset(seed=seed)))
+        return self._tensor(self._observe(*self._envs.reset(seed=self._env_seeds(seeds))))
 
     def step(self, action: Tensor) -> Step:
         """Step, then find the true successor of each row and where to act next, as the mode demands."""
@@ -151,6 +156,11 @@ class GymnasiumBackend:
         """Close the environments and their workers."""
         self._envs.close()
 
+    def _env_seeds(self, seeds: Sequence[int]) -> Any:
+        """One seed, from which Gymnasium counts up; several, each counted up for an equal part of the environments."""
+        each = self.num_envs // len(seeds)
+        return seeds[0] if len(seeds) == 1 else [seed + i for seed in seeds for i in range(each)]
+
     def _with_final(self, obs: np.ndarray, info: dict, done: np.ndarray) -> np.ndarray:
         if not done.any():
             return obs
@@ -174,21 +184,3 @@ class GymnasiumBackend:
 
     def _tensor(self, array: np.ndarray) -> Tensor:
         return torch.from_numpy(array).to(self.device)
-
-
-class AsyncGymnasiumBackend(GymnasiumBackend):
-    """The same, with a process for each environment. No id is served so unless it is asked for."""
-
-    workers = True
-    in_process = "gymnasium"
-    """the backend that evaluates what this one trained"""
-
-    @classmethod
-    def ids(cls) -> Collection[str]:
-        """None."""
-        return ()
-
-    @classmethod
-    def room(cls, env: str) -> tuple[int, int]:
-        """Those of a process of Python with NumPy and Gymnasium, and of its pipes."""
-        return 100_000_000, 5

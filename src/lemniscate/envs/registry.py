@@ -9,16 +9,15 @@ from lemniscate import named
 from lemniscate.errors import UserError, is_installed, shown, unknown_name
 
 if TYPE_CHECKING:
-    import gymnasium as gym
-
     from lemniscate.envs.backend import Backend
     from lemniscate.envs.vec_env import VecEnv
+    from lemniscate.maths import Shards
 
 BACKENDS = {
     "crazyflow": "lemniscate.envs.crazyflow:CrazyflowBackend",
     "envpool": "lemniscate.envs.envpool:EnvpoolBackend",
     "gymnasium": "lemniscate.envs.gymnasium:GymnasiumBackend",
-    "gymnasium-async": "lemniscate.envs.gymnasium:AsyncGymnasiumBackend",
+    "gymnasium-async": "lemniscate.envs.gymnasium_async:AsyncGymnasiumBackend",
 }
 """each is imported when it is used; the first that serves an id runs it"""
 
@@ -69,6 +68,12 @@ def can_wrap(backend: str, env: str) -> bool:
     return wraps is not None and wraps(env)
 
 
+def can_divide(backend: str, env: str) -> bool:
+    """Whether a backend takes a seed for each of several shards, and nothing of one depends on the others."""
+    divides = getattr(backend_class(backend), "divides", None)
+    return divides is not None and divides(env)
+
+
 def has_fixed_num_envs(backend: str) -> bool:
     """Whether a backend's step is a program for one number of environments, which others of that number share."""
     return getattr(backend_class(backend), "compiled", False)
@@ -83,22 +88,6 @@ def for_evaluation(backend: str | None) -> str | None:
     if package and not is_installed(package):
         return None
     return getattr(found, "in_process", backend)
-
-
-def make_rendered(
-    env: str, mode: str, kwargs: Mapping[str, Any], wrappers: Sequence[str], backend: str | None
-) -> "gym.Env":
-    """One environment of Gymnasium's interface that renders itself in `mode`, "rgb_array" or "human".
-
-    Where `backend` cannot render, as EnvPool cannot, the first backend that serves the environment and can does it.
-    Raises `UserError` if none can.
-    """
-    chosen = backend or backend_for(env, wrappers)
-    for name in (chosen, *BACKENDS):
-        make_one = getattr(backend_class(name), "make_rendered", None)
-        if make_one and backend_class(name).serves(env):
-            return make_one(env, mode, kwargs, wrappers)
-    raise UserError(f"the {chosen} backend renders no single environment.")
 
 
 def name_of(env: object) -> str:
@@ -165,6 +154,7 @@ def make(
     device: str = "cpu",
     stagger: bool = False,
     backend: str | None = None,
+    shards: "Shards | None" = None,
 ) -> "VecEnv":
     """N parallel environments on `device`; `restart` them before the first step.
 
@@ -178,6 +168,7 @@ def make(
         device: of the tensors: cpu, cuda, …
         stagger: spread the first episodes over time.
         backend: a name of `BACKENDS`, or `module:Class`; by default the first that serves `env`.
+        shards: those of a run; `num_envs` is the number in the shards held.
 
     Raises:
         UserError: an unknown environment or backend, arguments that it does not take, spaces nobody can act in, a
@@ -185,7 +176,9 @@ def make(
     """
     import torch
 
+    from lemniscate.envs.shards import BackendOfShards
     from lemniscate.envs.vec_env import VecEnv
+    from lemniscate.maths import ONE_SHARD
 
     name, wraps, num_envs = name_of(env), names_of(wrappers), _checked_count(num_envs)
     if kwargs is not None and not isinstance(kwargs, Mapping):
@@ -198,5 +191,10 @@ def make(
             f"The {chosen} backend cannot wrap {name}; wrappers go around single environments of the gymnasium backend."
         )
     require_room(name, num_envs, chosen)
-    made = backend_class(chosen)(name, num_envs, torch.device(device), stagger=stagger, kwargs=kwargs, wrappers=wraps)
-    return VecEnv(made)
+    shards, cls = shards or ONE_SHARD, backend_class(chosen)
+    together = len(shards.held) == 1 or can_divide(chosen, name)
+    sizes = [num_envs] if together else [num_envs // len(shards.held)] * len(shards.held)
+    options = {"stagger": stagger, "kwargs": kwargs, "wrappers": wraps}
+    made = [cls(name, size, torch.device(device), **options) for size in sizes]
+    backend_of_all: Any = made[0] if len(made) == 1 else BackendOfShards(made)
+    return VecEnv(backend_of_all, shards)

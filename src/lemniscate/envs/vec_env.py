@@ -2,13 +2,16 @@
 
 import math
 import time
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
 from lemniscate.envs.backend import Backend, Scene, Summary
 from lemniscate.envs.episodes import Episodes, EpisodeStatistics
+from lemniscate.envs.shards import act_over_shards
 from lemniscate.errors import NonFiniteError, UserError, wrong_action
+from lemniscate.maths import ONE_SHARD, Shards
 from lemniscate.spec import Box, Discrete, MultiBinary, Spec
 from lemniscate.types import Step
 
@@ -35,12 +38,20 @@ class Stopwatch:
 
 
 class VecEnv:
-    """A backend with its current observation and the statistics of its episodes."""
+    """A backend with its current observation and the statistics of its episodes.
 
-    def __init__(self, backend: Backend) -> None:
+    Args:
+        backend: N environments, those of the shards held.
+        shards: of the run.
+    """
+
+    def __init__(self, backend: Backend, shards: Shards = ONE_SHARD) -> None:
         self.backend = backend
         self.spec = backend.spec
         self.num_envs = backend.num_envs
+        self.shards = shards
+        size = backend.num_envs // len(shards.held)
+        self._first, self._total = shards.held[0] * size, shards.count * size
         self.device = backend.device
         self.summaries: tuple[Summary, ...] = getattr(backend, "summaries", ())
         self.scene: Scene | None = getattr(backend, "scene", None)
@@ -48,17 +59,21 @@ class VecEnv:
         self.collecting = Stopwatch()
         """seconds that the functions of `data` spend acting and stepping"""
         self.steps = 0
-        self._statistics = EpisodeStatistics(self.num_envs, self.device)
+        self._statistics = EpisodeStatistics(self.num_envs, self.device, self._first, self._total)
         self._actions: tuple[torch.Size, torch.dtype] | None = None  # before it is restarted, none is right
 
-    def restart(self, seed: int, steps: int = 0) -> Tensor:
-        """Begin again from `seed`; also stored as `obs`, [N, O]. `steps` is what the run has taken so far."""
+    def restart(self, *seeds: int, steps: int = 0) -> Tensor:
+        """Begin again, each shard from its seed; also stored as `obs`, [N, O]. `steps` is what the run has taken."""
         self.steps = steps
-        self._statistics = EpisodeStatistics(self.num_envs, self.device)
-        self.obs = self.backend.restart(seed)
+        self._statistics = EpisodeStatistics(self.num_envs, self.device, self._first, self._total)
+        self.obs = self.backend.restart(*seeds)
         self._actions = _action_layout(self.spec, self.num_envs)
         self._require_finite(observation=self.obs)
         return self.obs
+
+    def act(self, act: Callable[[Tensor, Tensor], Tensor], noise: Tensor) -> Tensor:
+        """`act(obs, noise)` for every environment, [N, …], the same bits for any number of processes."""
+        return act(self.obs, noise) if self.shards.count == 1 else act_over_shards(act, self.shards, self.obs, noise)
 
     def step(self, action: Tensor) -> Step:
         """Act in every environment and move `obs` on; actions as in `Backend.step`.
@@ -77,7 +92,7 @@ class VecEnv:
         if step.obs is not step.next_obs:
             self._require_finite(observation=step.obs)
         self.obs = step.obs
-        self.steps += self.num_envs
+        self.steps += self._total
         self._statistics.log(step, counts)
         return step
 
@@ -87,7 +102,7 @@ class VecEnv:
                 continue
             bad = torch.nonzero(~torch.isfinite(values))
             if len(bad):
-                value, number = values[tuple(bad[0])].item(), int(bad[0, 0])
+                value, number = values[tuple(bad[0])].item(), self._first + int(bad[0, 0])
                 raise NonFiniteError(f"The {name} of environment {number} is {value} in the step after {self.steps:,}.")
 
     def require_end(self, age: int) -> None:

@@ -1,11 +1,14 @@
 """The mathematics: pure functions on tensors, each with its equation and a test against brute force."""
 
+from lemniscate.maths.bounded import Deterministic, SquashedGaussian
 from lemniscate.maths.discrete import Bernoulli, Categorical, MultiCategorical
-from lemniscate.maths.distributions import Deterministic, Distribution, Gaussian, SquashedGaussian
+from lemniscate.maths.distributions import Distribution, Gaussian, tanh
 from lemniscate.maths.losses import clipped_surrogate, policy_gradient, surrogate, value_loss
-from lemniscate.maths.noise import coloured, ornstein_uhlenbeck, uniform
-from lemniscate.maths.returns import episode_return, gae, polyak, reward_to_go, td_target
+from lemniscate.maths.noise import coloured, normal, ornstein_uhlenbeck, uniform
+from lemniscate.maths.returns import episode_return, gae, reward_to_go
 from lemniscate.maths.stats import (
+    ONE_SHARD,
+    Shards,
     clip_fraction,
     explained_variance,
     kl_k1,
@@ -15,15 +18,18 @@ from lemniscate.maths.stats import (
     ratio_statistics,
     standardize,
 )
+from lemniscate.maths.targets import polyak, td_target
 from lemniscate.maths.trust_region import backtrack, conjugate_gradient, fisher_product, natural_step
 
 __all__ = [
+    "ONE_SHARD",
     "Bernoulli",
     "Categorical",
     "Deterministic",
     "Distribution",
     "Gaussian",
     "MultiCategorical",
+    "Shards",
     "SquashedGaussian",
     "backtrack",
     "clip_fraction",
@@ -39,6 +45,7 @@ __all__ = [
     "means",
     "merge_moments",
     "natural_step",
+    "normal",
     "ornstein_uhlenbeck",
     "policy_gradient",
     "polyak",
@@ -46,6 +53,7 @@ __all__ = [
     "reward_to_go",
     "standardize",
     "surrogate",
+    "tanh",
     "td_target",
     "uniform",
     "value_loss",

@@ -2,18 +2,17 @@
 
 from typing import Literal
 
-import torch
-from torch import Tensor, nn
+from torch import nn
+
+from lemniscate.maths import tanh
 
 Activation = Literal["tanh", "relu", "elu", "silu"]
 
 
 class Tanh(nn.Module):
-    """tanh(x) = 2σ(2x) − 1, three times faster than `torch.tanh` on a CPU; the two differ by at most 2e-7."""
+    """`lemniscate.maths.tanh`, any shape to the same shape."""
 
-    def forward(self, x: Tensor) -> Tensor:
-        """Any shape to the same shape."""
-        return torch.sigmoid(x * 2) * 2 - 1
+    forward = staticmethod(tanh)
 
 
 ACTIVATIONS = {"tanh": Tanh, "relu": nn.ReLU, "elu": nn.ELU, "silu": nn.SiLU}

@@ -1,9 +1,5 @@
-"""Value functions. Every critic shares the policy's observation normalizer."""
+"""The value V(s), which shares the policy's observation normalizer."""
 
-import math
-from collections.abc import Iterable
-
-import torch
 from torch import Tensor, nn
 
 from lemniscate.nn.normalizer import NoNorm
@@ -20,46 +16,3 @@ class Value(nn.Module):
     def forward(self, obs: Tensor) -> Tensor:
         """[…, O] to […]."""
         return self.net(self.normalizer(obs)).squeeze(-1)
-
-
-class QValue(nn.Module):
-    """Q(s, a), behind the policy's observation normalizer."""
-
-    def __init__(self, normalizer: NoNorm, encoder: nn.Module, net: nn.Module) -> None:
-        super().__init__()
-        self.normalizer = normalizer
-        self.encoder = encoder
-        self.net = net
-
-    def forward(self, obs: Tensor, action: Tensor) -> Tensor:
-        """[…, O] and […, A] to […]."""
-        features = self.encoder(self.normalizer(obs))
-        return self.net(torch.cat([features, action], dim=-1)).squeeze(-1)
-
-
-class Critics(nn.Module):
-    """C independent Q-values: one in DDPG; two in TD3 and SAC (Fujimoto et al. 2018, arXiv:1802.09477, section 4.2)."""
-
-    def __init__(self, members: Iterable[QValue]) -> None:
-        super().__init__()
-        self.members = nn.ModuleList(members)
-
-    def forward(self, obs: Tensor, action: Tensor) -> Tensor:
-        """[…, O] and […, A] to [C, …]."""
-        return torch.stack([q(obs, action) for q in self.members])
-
-    def first(self, obs: Tensor, action: Tensor) -> Tensor:
-        """Q₁(s, a) alone: […, O] and […, A] to […]."""
-        return self.members[0](obs, action)
-
-
-class Temperature(nn.Module):
-    """α > 0, the weight of the entropy in SAC; log α is the parameter."""
-
-    def __init__(self, initial: float) -> None:
-        super().__init__()
-        self.log_alpha = nn.Parameter(torch.tensor(math.log(initial)))
-
-    def forward(self) -> Tensor:
-        """α, a scalar."""
-        return self.log_alpha.exp()

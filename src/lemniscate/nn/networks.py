@@ -1,4 +1,4 @@
-"""Hidden layers: perceptrons, residual blocks, a convolutional encoder of images, and modules of one's own."""
+"""Hidden layers: perceptrons, residual blocks, and modules of one's own."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -60,7 +60,7 @@ class Layers:
         if self.kind not in NETWORKS:
             return _own_network(self.kind, inputs, outputs)
         layers, width = NETWORKS[self.kind](self, inputs)
-        return nn.Sequential(*layers, _orthogonal(nn.Linear(width, outputs), last_gain))
+        return nn.Sequential(*layers, orthogonal(nn.Linear(width, outputs), last_gain))
 
     @property
     def linear(self) -> type[nn.Linear]:
@@ -71,7 +71,7 @@ class Layers:
 def _mlp(layers: Layers, inputs: int, normalized: bool = False) -> tuple[list[nn.Module], int]:
     modules: list[nn.Module] = []
     for i, (before, after) in enumerate(pairwise((inputs, *layers.hidden))):
-        modules += [_orthogonal((layers.linear if i else nn.Linear)(before, after), 2**0.5)]
+        modules += [orthogonal((layers.linear if i else nn.Linear)(before, after), 2**0.5)]
         modules += [nn.LayerNorm(after)] if normalized else []
         modules += [ACTIVATIONS[layers.activation]()]
     return modules, layers.hidden[-1] if layers.hidden else inputs
@@ -84,7 +84,7 @@ def _layer_norm(layers: Layers, inputs: int) -> tuple[list[nn.Module], int]:
 def _simba(layers: Layers, inputs: int) -> tuple[list[nn.Module], int]:
     width = layers.hidden[-1]
     blocks = (Residual(width, layers.linear) for _ in layers.hidden)
-    return [_orthogonal(nn.Linear(inputs, width), 1.0), *blocks, nn.LayerNorm(width)], width
+    return [orthogonal(nn.Linear(inputs, width), 1.0), *blocks, nn.LayerNorm(width)], width
 
 
 NETWORKS: dict[str, Callable[[Layers, int], tuple[list[nn.Module], int]]] = {
@@ -113,7 +113,7 @@ class Residual(nn.Module):
         super().__init__()
         inner, outer = kind(width, 4 * width), kind(4 * width, width)
         self.layers = nn.Sequential(
-            nn.LayerNorm(width), _orthogonal(inner, 2**0.5), nn.ReLU(), _orthogonal(outer, 2**0.5)
+            nn.LayerNorm(width), orthogonal(inner, 2**0.5), nn.ReLU(), orthogonal(outer, 2**0.5)
         )
 
     def forward(self, x: Tensor) -> Tensor:
@@ -121,36 +121,8 @@ class Residual(nn.Module):
         return x + self.layers(x)
 
 
-class ImageEncoder(nn.Module):
-    """Two convolutions with ReLU, 16 and 32 channels, and layer normalization.
-
-    8 × 8 pixels in steps of 4, then 4 × 4 in steps of 2 (Mnih et al. 2013, arXiv:1312.5602, section 4.1); in images
-    with a side below 36 pixels, such as a grid world's, 3 × 3 in steps of 1, then of 2. Without the normalization a
-    policy's encoder, which learns from the advantage alone, may end with the same output for every image.
-    """
-
-    def __init__(self, shape: tuple[int, int, int]) -> None:
-        super().__init__()
-        self.shape = height, width, channels = shape
-        if min(height, width) < 36:
-            first = nn.Conv2d(channels, 16, kernel_size=3, padding=1)
-            second = nn.Conv2d(16, 32, kernel_size=3, stride=2, padding=1)
-        else:
-            first = nn.Conv2d(channels, 16, kernel_size=8, stride=4)
-            second = nn.Conv2d(16, 32, kernel_size=4, stride=2)
-        convolutions = [_orthogonal(first, 2**0.5), nn.ReLU(), _orthogonal(second, 2**0.5), nn.ReLU(), nn.Flatten()]
-        with torch.no_grad():
-            self.size = nn.Sequential(*convolutions)(torch.zeros(1, channels, height, width)).shape[-1]
-        """length of what comes out"""
-        self.layers = nn.Sequential(*convolutions, nn.LayerNorm(self.size))
-
-    def forward(self, pixels: Tensor) -> Tensor:
-        """[…, H · W · C] in [-½, ½] to […, `size`]."""
-        images = pixels.reshape(-1, *self.shape).movedim(-1, 1)
-        return self.layers(images).reshape(*pixels.shape[:-1], self.size)
-
-
-def _orthogonal(layer: nn.Linear | nn.Conv2d, gain: float) -> nn.Module:
+def orthogonal(layer: nn.Linear | nn.Conv2d, gain: float) -> nn.Module:
+    """The layer with orthogonal weights of this gain, and zero biases."""
     nn.init.orthogonal_(layer.weight, gain)
     assert layer.bias is not None
     nn.init.zeros_(layer.bias)

@@ -10,7 +10,7 @@ from typing import Self
 import torch
 from torch import Tensor, nn
 
-from lemniscate.maths import merge_moments
+from lemniscate.maths import ONE_SHARD, Shards, merge_moments
 from lemniscate.types import Rollout, wide_float
 
 
@@ -25,7 +25,7 @@ class NoNorm(nn.Module):
         """[…, O or more] to […, O]."""
         return obs[..., : self.size]
 
-    def update(self, obs: Tensor) -> None:
+    def update(self, obs: Tensor, valid: Tensor | None = None) -> None:
         """Nothing: there are no statistics."""
 
 
@@ -56,6 +56,7 @@ class RunningNorm(WideBuffers, NoNorm):
     mean: Tensor
     var: Tensor
     count: Tensor
+    shards: Shards = ONE_SHARD
 
     def __init__(self, size: int, clip: float = 10.0) -> None:
         super().__init__(size)
@@ -70,13 +71,14 @@ class RunningNorm(WideBuffers, NoNorm):
         return ((super().forward(obs) - mean) / std).clamp(-self.clip, self.clip)
 
     @torch.no_grad()
-    def update(self, obs: Tensor) -> None:
-        """Merge finite observations [B, O or more] into the statistics; B may be 0."""
-        if not len(obs):
-            return
-        obs = super().forward(obs).to(self.mean.dtype)
-        count = torch.full_like(self.count, len(obs))
-        moments = merge_moments(self.mean, self.var, self.count, obs.mean(0), obs.var(0, correction=0), count)
+    def update(self, obs: Tensor, valid: Tensor | None = None) -> None:
+        """Merge finite observations [..., N, O or more], those of `valid` [..., N], into the statistics."""
+        wide = super().forward(obs).to(self.mean.dtype)
+        mask = torch.ones(obs.shape[:-1], dtype=torch.bool, device=obs.device) if valid is None else valid
+        held = len(self.shards.held)
+        parts = zip(wide.chunk(held, -2), mask.chunk(held, -1), strict=True)
+        mean, var, count = self.shards.moments([rows[counted].T for rows, counted in parts])
+        moments = merge_moments(self.mean, self.var, self.count, mean, var, count.max())
         for buffer, new in zip((self.mean, self.var, self.count), moments, strict=True):
             buffer.copy_(new)
 
@@ -87,8 +89,10 @@ class RewardScale(WideBuffers):
     The mean is not subtracted, which would reward surviving or dying. Before the first update rewards are unscaled.
     """
 
+    local = ("running",)
     running: Tensor
     var: Tensor
+    shards: Shards = ONE_SHARD
 
     def __init__(self, num_envs: int, gamma: float, clip: float = 10.0) -> None:
         super().__init__()
@@ -101,6 +105,10 @@ class RewardScale(WideBuffers):
     def forward(self, reward: Tensor) -> Tensor:
         """Any shape to the same shape."""
         return (reward / (self.var + 1e-8).sqrt().to(reward.dtype)).clamp(-self.clip, self.clip)
+
+    def hold(self, rows: slice) -> None:
+        """Keep only the running returns of these environments."""
+        self.running = self.running[rows].clone()
 
     def on_restart(self) -> None:
         """Forget the running episodes: the environments have been restarted."""
@@ -115,8 +123,7 @@ class RewardScale(WideBuffers):
             self.running = self.gamma * self.running + reward
             returns.append(self.running)
             self.running = self.running * ~done
-        observed = torch.stack(returns)[rollout.valid]
-        count = torch.full_like(self.count, len(observed))
-        moments = merge_moments(self.mean, self.var, self.count, observed.mean(), observed.var(correction=0), count)
-        self.mean, self.var, self.count = moments
+        parts = (x.chunk(rollout.shards, 1) for x in (torch.stack(returns), rollout.valid))
+        moments = self.shards.moments([rows[counted] for rows, counted in zip(*parts, strict=True)])
+        self.mean, self.var, self.count = merge_moments(self.mean, self.var, self.count, *moments)
         return replace(rollout, reward=self(rollout.reward))

@@ -8,14 +8,13 @@ from torch import Generator, Tensor, nn
 from lemniscate.maths import (
     Bernoulli,
     Categorical,
-    Deterministic,
     Distribution,
     Gaussian,
     MultiCategorical,
-    SquashedGaussian,
 )
 from lemniscate.nn.normalizer import NoNorm
 from lemniscate.spec import Box, Discrete, MultiDiscrete
+from lemniscate.types import Streams
 
 
 class Policy(nn.Module):
@@ -34,17 +33,28 @@ class Policy(nn.Module):
         """The distribution over actions at each observation, [B, O]."""
         raise NotImplementedError
 
-    def draw_noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
-        """The random numbers that `Distribution.sample` needs for actions at observations [*shape, O]."""
+    def draw_noise(self, shape: Sequence[int], streams: Streams) -> Tensor:
+        """The random numbers that `Distribution.sample` needs for actions at observations [*shape, O].
+
+        An equal part of the last dimension of `shape` is drawn from each stream.
+        """
+        part = (*shape[:-1], shape[-1] // len(streams))
+        return torch.cat([self.noise(part, stream) for stream in streams], dim=len(part) - 1)
+
+    def noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
+        """Those that one generator draws."""
         raise NotImplementedError
 
     def metrics(self) -> dict[str, Tensor]:
         """Extra metrics of the policy, each a scalar."""
         return {}
 
-    def observe(self, obs: Tensor) -> None:
-        """Update the statistics of the normalizer, if it has any, with training observations [B, O]."""
-        self.normalizer.update(obs)
+    def observe(self, obs: Tensor, valid: Tensor | None = None) -> None:
+        """Update the statistics of the normalizer, if it has any, with observations [..., N, O] of training.
+
+        `valid` [..., N] is False in rows to leave out.
+        """
+        self.normalizer.update(obs, valid)
 
 
 class GaussianPolicy(Policy):
@@ -58,7 +68,7 @@ class GaussianPolicy(Policy):
         """[B, O] to N(μ [B, A], σ [A])."""
         return Gaussian(self.net(self.normalizer(obs)), self.log_std)
 
-    def draw_noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
+    def noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
         """Standard normal, [*shape, A]."""
         return torch.randn(*shape, *self.log_std.shape, generator=generator, device=generator.device)
 
@@ -81,7 +91,7 @@ class CategoricalPolicy(Policy):
             logits = logits.masked_fill(obs[..., -self.action.n :] == 0, -1e9)
         return Categorical(logits)
 
-    def draw_noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
+    def noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
         """Uniform in [0, 1), [*shape]."""
         return torch.rand(*shape, generator=generator, device=generator.device)
 
@@ -98,7 +108,7 @@ class MultiCategoricalPolicy(Policy):
         logits = self.net(self.normalizer(obs)).split(self.action.nvec, dim=-1)
         return MultiCategorical(tuple(Categorical(part) for part in logits))
 
-    def draw_noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
+    def noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
         """Uniform in [0, 1), [*shape, K]."""
         return torch.rand(*shape, len(self.action.nvec), generator=generator, device=generator.device)
 
@@ -114,39 +124,6 @@ class BernoulliPolicy(Policy):
         """[B, O] to logits [B, n]."""
         return Bernoulli(self.net(self.normalizer(obs)))
 
-    def draw_noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
+    def noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
         """Uniform in [0, 1), [*shape, n]."""
         return torch.rand(*shape, self.n, generator=generator, device=generator.device)
-
-
-class DeterministicPolicy(Policy):
-    """One action at each observation, tanh of a network: in [-1, 1]^A, which the env floor maps onto its bounds."""
-
-    def __init__(self, normalizer: NoNorm, net: nn.Module, size: int) -> None:
-        super().__init__(normalizer, net)
-        self.size = size
-
-    def forward(self, obs: Tensor) -> Deterministic:
-        """[B, O] to [B, A]."""
-        return Deterministic(torch.tanh(self.net(self.normalizer(obs))))
-
-    def draw_noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
-        """Zeros, [*shape, A]: the policy has no randomness of its own."""
-        return torch.zeros(*shape, self.size, device=generator.device)
-
-
-class SquashedGaussianPolicy(Policy):
-    """tanh(u), u ~ N(μ(s), σ(s)²); log σ is kept in [-5, 2], softly, as tanh moves from one end to the other."""
-
-    def __init__(self, normalizer: NoNorm, net: nn.Module, size: int) -> None:
-        super().__init__(normalizer, net)
-        self.size = size
-
-    def forward(self, obs: Tensor) -> SquashedGaussian:
-        """[B, O] to μ and log σ, [B, A] each."""
-        mean, log_std = self.net(self.normalizer(obs)).chunk(2, dim=-1)
-        return SquashedGaussian(mean, -5 + 3.5 * (torch.tanh(log_std) + 1))
-
-    def draw_noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
-        """Standard normal, [*shape, A]."""
-        return torch.randn(*shape, self.size, generator=generator, device=generator.device)

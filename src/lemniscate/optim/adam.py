@@ -90,6 +90,8 @@ class Adam:
         self._rates, self._powers = self._log_betas.new_ones(2), self._log_betas.new_tensor([-1, -0.5])
         self._count = self._log_betas.new_zeros(1)
         self._norm_name = f"gradient_norm/{name}" if name else "gradient_norm"
+        self.over_shards: Any = None
+        """the gradient where there are several shards"""
         self._inputs = list(self.module.parameters())
         for parameter, gradient in zip(self._inputs, self._parameters.views(self._gradient).values(), strict=True):
             parameter.grad = gradient
@@ -109,22 +111,31 @@ class Adam:
         return int(self._count)
 
     def step(self, loss: LossFunction, *args: Any) -> Metrics:
-        """One step down `loss(networks, *args)`; returns the metrics of the loss, and the gradient's norm."""
+        """One step down `loss(networks, *args)`; returns the metrics of the loss, and the gradient's norm.
+
+        Of several shards, each has an equal part of the rows in `args`, records and tensors [M, …]; see `optim.shards`.
+        """
+        gradient, metrics = (self.over_shards or self.gradient)(loss, *args)
+        return {**metrics, self._norm_name: self.descend(gradient)}
+
+    def gradient(self, loss: LossFunction, *args: Any) -> tuple[Tensor, Metrics]:
+        """The gradient [P] of `loss(networks, *args)`, valid until the next call, and the metrics of the loss."""
         if torch.compiler.is_compiling():
             differentiate = grad_and_value(partial(functional_call, self.module, args=(loss, *args)), has_aux=True)
             gradients, (_, metrics) = differentiate(self.views())
-            gradient = self._parameters.join(gradients)
-        else:
-            gradient = self._gradient.zero_()
-            total, metrics = self.module(loss, *args)
-            total.backward(inputs=self._inputs)
+            return self._parameters.join(gradients), metrics
+        total, metrics = self.module(loss, *args)
+        self._gradient.zero_()
+        total.backward(inputs=self._inputs)
+        return self._gradient, metrics
+
+    def descend(self, gradient: Tensor) -> Tensor:
+        """One step down a gradient [P]; returns its norm."""
         with torch.no_grad():
             self._count.add_(1)
             bias = 1 - (self._log_betas * self._count).exp()  # as a power, βᵗ would be computed for each parameter
-            norm = self._adam(
-                self.vector, gradient, self._mean, self._square, (self._rates * bias**self._powers).to(gradient)
-            )
-        return {**metrics, self._norm_name: norm}
+            scales = (self._rates * bias**self._powers).to(gradient)
+            return self._adam(self.vector, gradient, self._mean, self._square, scales)
 
     def views(self) -> dict[str, Tensor]:
         """The parameters of `module` by name, views of the vector as it is now."""

@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from threading import Event
 from types import FunctionType, MethodType
 from typing import Any, Generic, ParamSpec, TypeVar
@@ -15,6 +16,10 @@ R = TypeVar("R")
 stopping = Event()
 """set while a run that was asked to stop ends its update: nothing more is compiled, and a compiler that Ctrl-C has
 reached, too, has not failed"""
+
+
+around: Callable[[], AbstractContextManager[None]] = nullcontext
+"""entered while a program is compiled; several processes of a run let each other know"""
 
 
 class Compiled(Generic[P, R]):
@@ -41,7 +46,8 @@ class Compiled(Generic[P, R]):
         if not stopping.is_set():
             self._chosen = self._compiled
             try:
-                return self._compiled(*args, **kwargs)
+                with around():
+                    return self._compiled(*args, **kwargs)
             except RuntimeError as error:
                 if not stopping.is_set():
                     reason = str(error).strip().partition("\n")[0]

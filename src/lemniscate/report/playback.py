@@ -15,6 +15,7 @@ from lemniscate.console import in_notebook, say
 from lemniscate.envs import registry
 from lemniscate.envs.factory import make_one, maker_of, sentences
 from lemniscate.envs.measures import SUMMARIES, measures_of
+from lemniscate.envs.rendered import make_rendered
 from lemniscate.envs.vec_env import VecEnv, require_end
 from lemniscate.errors import UserError, shown
 from lemniscate.named import find_callable
@@ -203,7 +204,7 @@ def _rendered(arguments: dict[str, Any], mode: str) -> gym.Env:
     """An environment that has rendered its first picture. Raises `UserError` where it cannot."""
     name = arguments["env"]
     try:
-        env = registry.make_rendered(mode=mode, **arguments)
+        env = make_rendered(mode=mode, **arguments)
         env.reset(seed=0)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # Gymnasium's on pictures, which are looked at below

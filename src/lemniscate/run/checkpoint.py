@@ -34,7 +34,7 @@ from lemniscate.run.state import TrainState
 from lemniscate.run.tensors_file import write_tensors
 from lemniscate.spec import Action, ObservationPart, Spec
 
-FORMAT = 2
+FORMAT = 3
 TENSORS, STATE, MANIFEST = "tensors.safetensors", "state.json", "manifest.json"
 FILES = (TENSORS, STATE)
 
@@ -63,8 +63,8 @@ class Checkpoint:
         return {key.removeprefix(prefix): t for key, t in self.tensors.items() if key.startswith(prefix)}
 
 
-def write(directory: Path, state: TrainState, step: int, record: dict[str, Any], keep: int) -> Path:
-    """Write `directory/step-N` with the saved fields of `state`, and delete all but the newest `keep`.
+def write(directory: Path, fields: Mapping[str, Any], step: int, record: dict[str, Any], keep: int) -> Path:
+    """Write `directory/step-N` with the fields of a State, as of `whole`, and delete all but the newest `keep`.
 
     `record` is any JSON that a reader needs beside the state.
 
@@ -74,7 +74,7 @@ def write(directory: Path, state: TrainState, step: int, record: dict[str, Any],
     """
     final = directory / f"step-{step}"
     stale = list(directory.glob("*.tmp"))
-    write_fields(final, state.saved(), record)
+    write_fields(final, fields, record)
     for path in [*stale, *(directory / f"step-{old}" for old in list_steps(directory)[:-keep])]:
         with suppress(OSError):  # the next one tries again
             remove(path)
@@ -86,8 +86,9 @@ def write_fields(final: Path, fields: Mapping[str, Any], record: dict[str, Any])
     tensors: dict[str, Tensor] = {}
     numbers: dict[str, Any] = {}
     for name, value in fields.items():
-        if hasattr(value, "state_dict"):
-            tensors |= {f"{name}.{key}": t for key, t in value.state_dict().items()}
+        if hasattr(value, "state_dict") or isinstance(value, Mapping):
+            entries = value if isinstance(value, Mapping) else value.state_dict()
+            tensors |= {f"{name}.{key}": t for key, t in entries.items()}
         else:
             numbers[name] = value
     if name := _not_finite(tensors):

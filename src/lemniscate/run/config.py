@@ -146,7 +146,7 @@ class RunConfig:
     env: str = "CartPole-v1"
     """environment id; `lemniscate envs` lists them"""
     backend: str | None = None
-    """simulation backend (default: chosen from the id)"""
+    """simulation backend (default: by the id)"""
     num_envs: NumEnvs = 16
     """number of parallel environments, N; usually 8 to 64"""
     seed: Seed = 1
@@ -159,6 +159,8 @@ class RunConfig:
     cuda if there is one"""
     threads: Annotated[int, Range(1, 256)] = 1
     """CPU threads for torch; results differ in rounding between thread counts"""
+    shards: Annotated[int, Range(1, 4096)] = 1
+    """equal parts of the environments and of minibatches, S, which processes share"""
     compile: Literal["auto", "on", "off"] = "auto"
     """compile the gradient steps and the policy; auto compiles long runs, where it saves time"""
     checkpoint_every: Natural = 0
@@ -166,7 +168,7 @@ class RunConfig:
     keep_checkpoints: Count = 3
     """number of newest checkpoints kept"""
     evaluate_every: Natural = 0
-    """steps between evaluations during training; 0: none"""
+    """steps between evaluations; 0: none"""
     evaluate_episodes: Episodes = 20
     """episodes of each evaluation in training"""
     video_every: Natural = 0
@@ -188,6 +190,12 @@ class RunConfig:
             raise UserError(
                 f"device must be one of auto, cpu, cuda, cuda:N (such as cuda:1), mps, not {self.device!r}."
             )
+        self._require_divisible("num_envs")
+
+    def _require_divisible(self, name: str) -> None:
+        """Raise `UserError` if `shards` does not divide the field `name`."""
+        if getattr(self, name) % self.shards:
+            raise UserError(f"shards {self.shards:,} does not divide {name} {getattr(self, name):,}.")
 
     @property
     def gradient_steps(self) -> int:
@@ -196,7 +204,7 @@ class RunConfig:
 
     def generators(self, device: torch.device) -> Generators:
         """New random generators, seeded by the run's seed."""
-        return Generators(self.seed, device)
+        return Generators(self.seed, device, self.shards)
 
     def networks(self, spec: Spec) -> Any:
         """New networks for the spaces in `spec`, a module with a `policy`. Raises `UserError` if they do not fit."""

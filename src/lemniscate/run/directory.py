@@ -24,6 +24,7 @@ from lemniscate.run.metrics import METRICS, damage
 from lemniscate.run.state import TrainState
 from lemniscate.run.trust import signed
 from lemniscate.spec import Spec
+from lemniscate.world import World
 
 CONFIG, LOCK = "config.json", ".lock"
 SWEEP = "sweep.json"
@@ -115,9 +116,10 @@ def _newest(path: Path, planned_only: bool) -> checkpoint.Checkpoint | None:
 class Saver:
     """Saves the state of a run into its directory, and restores it from there. One process at a time may do so."""
 
-    def __init__(self, path: Path, algorithm: str, config: RunConfig, spec: Spec) -> None:
-        self.path = path
-        self.exists = (path / CONFIG).exists() or bool(checkpoint.list_steps(path / "checkpoints"))
+    def __init__(self, path: Path, algorithm: str, config: RunConfig, spec: Spec, world: World) -> None:
+        self.path, self._world = path, world
+        there = (path / CONFIG).exists() or bool(checkpoint.list_steps(path / "checkpoints"))
+        self.exists: bool = world.from_first(there)
         """whether the run directory was there before this process"""
         self._config, self._checkpoints = config, path / "checkpoints"
         self._identity = signed({"algorithm": algorithm, "config": config.to_json()})
@@ -125,11 +127,15 @@ class Saver:
         self._lock = FileLock(path / LOCK, timeout=0)
         self.last_planned = 0
         """the step that `resume` would go on from"""
+        self.planned_at = 0
+        """the step of the last planned checkpoint, stored or not"""
         self.failure: OSError | None = None
         """why the last checkpoint could not be written, if it could not"""
 
     def open(self) -> None:
         """Lock the directory, then create it if it is new. Raises `UserError` if another process trains in it."""
+        if not self._world.is_first:
+            return
         try:
             make_directory(self.path)
             self._lock.acquire()
@@ -147,11 +153,15 @@ class Saver:
 
         Checkpoints beyond the one restored are damaged or unplanned; the run will write them again.
         """
-        found = _newest(self.path, planned_only=True)
-        steps = checkpoint.list_steps(self._checkpoints)
+        found = _newest(self.path, planned_only=True) if self._world.is_first else None
+        found = self._world.from_first(found)
         if found:
             found.restore(state)
-            self.last_planned = state.step
+            self.last_planned = self.planned_at = state.step
+        if not self._world.is_first:
+            return found is not None
+        steps = checkpoint.list_steps(self._checkpoints)
+        if found:
             self._keep_damaged_metrics(found.record.get("logged", 0))
         elif steps:
             say(f"{self.path} has no planned checkpoint to go on from; it begins again at step 0.")
@@ -181,11 +191,16 @@ class Saver:
         # An unplanned checkpoint is kept beside the planned ones, never in the place of one.
         keep = self._config.keep_checkpoints + (not planned)
         self.failure = None
+        fields = state.whole()
+        if planned:
+            self.planned_at = state.step
+        if not self._world.is_first:
+            return
         try:
             if (self.path / METRICS).exists():
                 sync(self.path / METRICS)
             record = {**self._record, "planned": planned, "logged": logged}
-            checkpoint.write(self._checkpoints, state, state.step, record, keep)
+            checkpoint.write(self._checkpoints, fields, state.step, record, keep)
             self.last_planned = state.step if planned else self.last_planned
         except OSError as error:
             self.failure = error

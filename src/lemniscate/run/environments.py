@@ -9,9 +9,11 @@ from lemniscate.envs import registry
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError, shown
 from lemniscate.machine import free_memory
+from lemniscate.maths import Shards
 from lemniscate.nn.networks import NETWORKS
 from lemniscate.run.config import RunConfig
 from lemniscate.spec import Spec
+from lemniscate.world import World
 
 BYTES_PER_PARAMETER = 16
 """of a parameter, its gradient, and the two moments of its optimizer"""
@@ -29,14 +31,28 @@ def make_envs(config: RunConfig) -> tuple[VecEnv, VecEnv]:
     if not isinstance(config, RunConfig):
         raise UserError(f"make_envs needs a Config, such as config_for('ppo', 'CartPole-v1'), not {shown(config)}.")
     device = device_for(config.device)
-    own = {"kwargs": config.env_kwargs, "wrappers": config.wrappers, "backend": config.backend}
     eval_env = evaluation_env(config, config.evaluate_episodes, device=str(device))  # the few, before the many
     try:
         require_memory(config, eval_env.spec, device)
-        return registry.make(config.env, config.num_envs, device=str(device), stagger=True, **own), eval_env
+        return training_env(config, Shards(config.shards)), eval_env
     except BaseException:
         eval_env.close()
         raise
+
+
+def envs_of(config: RunConfig, world: World) -> tuple[VecEnv, VecEnv | None]:
+    """Those of one of several processes: only the first evaluates. Raises as `make_envs`."""
+    device = device_for(config.device)
+    eval_env = evaluation_env(config, config.evaluate_episodes, device=str(device)) if world.is_first else None
+    return training_env(config, world), eval_env
+
+
+def training_env(config: RunConfig, shards: Shards) -> VecEnv:
+    """The environments of the shards held, staggered."""
+    num_envs = config.num_envs * len(shards.held) // shards.count
+    own = {"kwargs": config.env_kwargs, "wrappers": config.wrappers, "backend": config.backend}
+    device = str(device_for(config.device))
+    return registry.make(config.env, num_envs, device=device, stagger=True, shards=shards, **own)
 
 
 def evaluation_env(

@@ -11,7 +11,7 @@ from torch import Tensor
 from lemniscate.envs.backend import Summary
 from lemniscate.envs.random_action import random_action
 from lemniscate.envs.vec_env import VecEnv
-from lemniscate.nn.actor_critic import ActorQ
+from lemniscate.nn.actor_q import ActorQ
 from lemniscate.nn.policies import Policy
 from lemniscate.run.q_bias import QBias, QBiasMeter
 from lemniscate.run.seeding import derive, generator
@@ -95,7 +95,7 @@ def _act(policy: Policy | None, deterministic: bool, env: VecEnv, rng: torch.Gen
     if policy is None:
         return random_action(env.spec, env.obs, rng)
     distribution = policy(env.obs)
-    return distribution.mode() if deterministic else distribution.sample(policy.draw_noise((env.num_envs,), rng))
+    return distribution.mode() if deterministic else distribution.sample(policy.draw_noise((env.num_envs,), (rng,)))
 
 
 def evaluate(

@@ -11,7 +11,7 @@ from lemniscate.errors import UserError
 from lemniscate.nn.activations import Activation
 from lemniscate.nn.networks import Layers, Matmul
 from lemniscate.run.config import Count, Fraction, Natural, NonNegative, NumEnvs, Positive, RunConfig, Width
-from lemniscate.run.state import Networks, TrainState
+from lemniscate.run.state import Networks, TrainState, rows_of
 from lemniscate.spec import Spec
 
 
@@ -20,7 +20,7 @@ class OffPolicyConfig(RunConfig):
     """The settings of algorithms that learn from a replay buffer."""
 
     num_envs: NumEnvs = 1
-    """number of parallel environments, N; usually 1 to 8"""
+    """parallel environments, N; usually 1 to 8"""
     gamma: Fraction = 0.99
     """discount factor γ; usually 0.95 to 0.999"""
     buffer_size: Count = 1_000_000
@@ -78,6 +78,7 @@ class OffPolicyConfig(RunConfig):
                 f"update_every {self.update_every:,} is so large that nothing is ever learned: after learning_starts"
                 f" each environment takes {self.steps_per_env - self.learning_starts // self.num_envs:,} steps."
             )
+        self._require_divisible("batch_size")
         for name in ("batch_size", "num_envs"):
             if self.capacity < (rows := getattr(self, name)):
                 raise UserError(
@@ -115,8 +116,9 @@ class OffPolicyConfig(RunConfig):
 
     @property
     def capacity(self) -> int:
-        """The rows of the replay buffer: no more than the run can fill."""
-        return min(self.buffer_size, self.num_envs * self.steps_per_env)
+        """The rows of the replay buffer: no more than the run can fill, and as many for each shard."""
+        rows = min(self.buffer_size, self.num_envs * self.steps_per_env)
+        return rows // self.shards * self.shards
 
     @property
     def steps_per_env(self) -> int:
@@ -128,6 +130,10 @@ class OffPolicyConfig(RunConfig):
         """The number of gradient steps of the critics in the whole run."""
         updates = self.steps_per_env // self.update_every
         return self.num_updates * (updates - self.learning_starts // self.num_envs // self.update_every)
+
+    def make_replay(self, spec: Spec, device: torch.device) -> ReplayBuffer:
+        """An empty replay buffer, with an equal part for each shard."""
+        return ReplayBuffer(spec, self.capacity, device, self.shards)
 
     def make_action_noise(self, spec: Spec, device: torch.device) -> ActionNoise:
         """Action noise for the environments of a run; a sequence is as long as an episode may be."""
@@ -149,6 +155,12 @@ class OffPolicyState(TrainState[Networks]):
     action_noise: ActionNoise
     updates: int = 0
     """gradient steps of the critics taken"""
+
+    def hold(self, held: range) -> None:
+        """Keep the generators, the replay buffers and the action noise of these shards."""
+        super().hold(held)
+        self.replay.hold(held)
+        self.action_noise.hold(rows_of(held, self.shards.count, self.action_noise.num_envs))
 
     def on_restart(self) -> None:
         """Begin new sequences of action noise."""

@@ -9,7 +9,7 @@ from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.networks import Layers
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.run.config import Count, Fraction, LogStd, RunConfig, Width
-from lemniscate.run.state import TrainState
+from lemniscate.run.state import TrainState, rows_of
 from lemniscate.spec import Spec
 
 
@@ -67,6 +67,7 @@ class OnPolicyConfig(RunConfig):
         if getattr(self, field) > self.num_rows:
             rows = f"{self.num_rows:,} rows of a rollout, num_envs {self.num_envs:,} times num_steps {self.num_steps:,}"
             raise UserError(f"{field} {getattr(self, field):,} is above the {rows}.")
+        self._require_divisible(field)
 
     def _require_rows(self, field: str, rows: int) -> None:
         """Raise `UserError` if `field`, which standardizes, would have a single row to do it with."""
@@ -79,6 +80,11 @@ class OnPolicyState(TrainState[ActorCritic]):
     """The training state of the algorithms that learn from their newest rollout."""
 
     reward_scale: RewardScale
+
+    def hold(self, held: range) -> None:
+        """Keep the generators and the running returns of these shards."""
+        super().hold(held)
+        self.reward_scale.hold(rows_of(held, self.shards.count, len(self.reward_scale.running)))
 
     def on_restart(self) -> None:
         """Forget the running returns."""

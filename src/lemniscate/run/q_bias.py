@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Generator, Tensor, nn
 
-from lemniscate.nn.actor_critic import ActorQ
+from lemniscate.nn.actor_q import ActorQ
 from lemniscate.run.config import RunConfig
 from lemniscate.run.off_policy import OffPolicyConfig
 from lemniscate.types import Step

@@ -25,7 +25,8 @@ from lemniscate.console import ProgressBar, say
 from lemniscate.envs.episodes import Episodes
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import NonFiniteError, NotStoredError, UserError, resume_line
-from lemniscate.optim.compiled import stopping
+from lemniscate.optim import compiled
+from lemniscate.run.agreement import episodes_of_all
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import Saver
 from lemniscate.run.evaluate import evaluate
@@ -35,12 +36,19 @@ from lemniscate.run.q_bias import critic_of
 from lemniscate.run.seeding import derive, globals_undisturbed, seed_globals
 from lemniscate.run.state import TrainState
 from lemniscate.run.warm_start import load_networks
+from lemniscate.world import World
 
 WORTH_COMPILING = 15_000
 """gradient steps from which on a run ends sooner if they are compiled"""
 
 PATIENCE = 1.0
 """seconds that an update has to end by itself after a signal, then to be interrupted"""
+
+PATIENCE_OF_SEVERAL = 6.0
+"""the same where several processes have to agree first"""
+
+AGREED_EVERY = 16
+"""steps of the environments after which several processes ask each other whether one is to stop"""
 
 TRAINING = 0
 """the stream of seeds that training environments restart from"""
@@ -66,20 +74,22 @@ class Run:
         path: Path,
         algorithm: str,
         config: RunConfig,
-        envs: tuple[VecEnv, VecEnv],
+        envs: tuple[VecEnv, VecEnv | None],
         *,
+        world: World | None = None,
         loggers: Sequence[LoggerClass] = (JsonLines, TensorBoard),
         progress: bool = True,
         film: Callable[[TrainState], None] | None = None,
         observer: Observer | None = None,
     ) -> None:
         self.path, self.algorithm, self.config = path, algorithm, config
+        self.world = world = world or World(config.shards)
         self.env, self.eval_env = envs
         self.spec = self.env.spec
         self.seconds = 0.0
         """how long the training loop took"""
-        self._saver = Saver(path, algorithm, config, self.spec)
-        self._logger_classes, self._loggers = loggers, list[Logger]()
+        self._saver = Saver(path, algorithm, config, self.spec, world)
+        self._logger_classes, self._loggers = loggers if world.is_first else (), list[Logger]()
         self._visible, self._film, self._observer = progress, film, observer
         self._bar = ProgressBar(config.total_steps, 0, visible=False)
         self._recent_returns: list[float] = []
@@ -89,10 +99,11 @@ class Run:
         """whole training episodes so far"""
         self._logged = 0
         """the step of the last line of metrics"""
-        self._stop_signal = 0
+        self._stop_signal, self._asked_at = 0, 0.0
         self._cut_short = False
         """whether the body of the loop took fewer steps than it was to: its state is nobody's to resume from"""
-        self._hurry, self._ended = threading.Timer(PATIENCE, self._ask_again), threading.Event()
+        self._patience = PATIENCE if world.size == 1 else PATIENCE_OF_SEVERAL
+        self._hurry, self._ended = threading.Timer(self._patience, self._ask_again), threading.Event()
         self._hurry.daemon = True
         """asks again to stop; whether the loop has ended"""
         self._line_time, self._line_step = 0.0, 0
@@ -115,13 +126,15 @@ class Run:
             if saver.exists:
                 self._begin_warm(state)
             saver.save(state, planned=True, logged=0)
+        state.join(self.world)
         if is_compiled(self.config):
             if self._visible:
                 say("Compiling: up to a minute the first time, 5 to 10 s from then on.")
+            compiled.around = self.world.busy
             state.compile()
         record = {"algorithm": self.algorithm, **self.config.to_json()}
         self._loggers += [make(self.path, record, state.step) for make in self._logger_classes]
-        lines = read_metrics(self.path)
+        lines = read_metrics(self.path) if self.world.is_first else []
         self._episodes = sum(len(line.get("episode/returns", ())) for line in lines)
         self._logged = max((line["step"] for line in lines), default=0)
         return state
@@ -137,6 +150,7 @@ class Run:
         self._line_time, self._line_step = started, state.step
         try:
             with stop_signals_to(self._stop):
+                self.world.begin(lambda: self.env.steps)
                 if state.step == 0 and (self.config.video_every or self.config.video_every_episodes):
                     self._record(state)
                 self._restart(state)
@@ -150,14 +164,15 @@ class Run:
         finally:
             self._ended.set()
             self._hurry.cancel()
-            stopping.clear()
+            compiled.stopping.clear()
             self.seconds = time.monotonic() - started
             self._bar.close()
 
     def steps(self, count: int) -> Iterator[int]:
         """The numbers below `count`, for a body of the loop that takes many steps; asked to stop, it takes fewer."""
         for number in range(count):
-            self._cut_short = bool(self._stop_signal)
+            if number % AGREED_EVERY == 0 or self.world.size == 1:
+                self._cut_short = any(self.world.each(bool(self._stop_signal)))
             if self._cut_short:
                 return
             yield number
@@ -173,6 +188,8 @@ class Run:
             if name.startswith(("losses/", "gradient")) and not -float("inf") < value < float("inf"):
                 raise NonFiniteError(f"{name} is {value} in the update that ends at step {state.step:,}.")
         state.require_finite()
+        if self.world.size > 1:
+            episodes = episodes_of_all(self.world, state, episodes)
         if episodes.returns:
             self._episodes += len(episodes.returns)
             self._recent_returns = (self._recent_returns + episodes.returns)[-100:]
@@ -195,8 +212,9 @@ class Run:
         self._ended.set()
         for logger in self._loggers:
             logger.close(pictures or [])
-        self.env.close()
-        self.eval_env.close()
+        for env in (self.env, self.eval_env):
+            if env:
+                env.close()
         self._saver.close()
 
     def _times(self, step: int) -> dict[str, float]:
@@ -219,7 +237,8 @@ class Run:
         finished = whole and state.step >= total_steps
         planned = finished or (whole and _passed(self._checkpoint_interval(), before, state.step))
         if planned:
-            self._saver.save(state, planned=True, logged=self._logged)
+            with self.world.busy():
+                self._saver.save(state, planned=True, logged=self._logged)
         stop = self._asked_to_stop(state, planned)
         if stop and not finished:
             self._tell_stop(state.step)
@@ -234,11 +253,13 @@ class Run:
         try:
             with globals_undisturbed():
                 answers = [self._observer(step, numbers, state) for step, numbers in lines] if self._observer else []
-            stop = any(answers) or bool(self._stop_signal)
+            said = self.world.each((any(answers), self._stop_signal))
+            self._stop_signal = max(signum for _, signum in said)
+            stop = any(asked for asked, _ in said) or bool(self._stop_signal)
         finally:
             if self._stop_signal:
                 self._hurry.cancel()  # the update has ended; the disk may take its time
-            if stop and not saved and state.step > self._saver.last_planned:
+            if stop and not saved and state.step > self._saver.planned_at:
                 self._saver.save(state, planned=False, logged=self._logged)
         return stop
 
@@ -251,13 +272,15 @@ class Run:
             " as a run that was never stopped."
         )
         if self._stop_signal:
-            raise Stopped(message, self._stop_signal)
-        say(message)
+            raise Stopped(message if self.world.is_first else "", self._stop_signal)
+        if self.world.is_first:
+            say(message)
 
     def _restart(self, state: TrainState) -> None:
-        seed = derive(self.config.seed, TRAINING, state.step)
+        seed, shards = derive(self.config.seed, TRAINING, state.step), state.shards
         seed_globals(seed)  # nothing here draws from them, but a user's environment may
-        self.env.restart(seed, state.step)
+        seeds = [derive(seed, shard) for shard in shards.held] if shards.count > 1 else [seed]
+        self.env.restart(*seeds, steps=state.step)
         state.on_restart()
 
     def _begin_warm(self, state: TrainState) -> None:
@@ -276,16 +299,20 @@ class Run:
         return self.config.checkpoint_every or max(fifth, 3 * longest * self.config.num_envs)
 
     def _record(self, state: TrainState) -> None:
+        if not self.world.is_first:
+            return
         try:
-            with globals_undisturbed():
+            with globals_undisturbed(), self.world.busy():
                 if self._film:
                     self._film(state)
         except (UserError, OSError) as error:  # no display any more, a full disk: it costs this recording, not the run
             say(f"No recording at step {state.step:,}: {error}")
 
     def _evaluate(self, state: TrainState) -> None:
+        if not self.eval_env:
+            return
         try:
-            with globals_undisturbed():
+            with globals_undisturbed(), self.world.busy():
                 config, critic = self.config, critic_of(state.networks, self.config)
                 scores = evaluate(state.policy, self.eval_env, config.evaluate_episodes, config.seed, critic=critic)
         except UserError as error:  # an endless episode costs this evaluation, not the run
@@ -301,6 +328,8 @@ class Run:
 
     def _stop(self, signum: int, _frame: FrameType | None) -> None:
         """Stop after the current update; asked again, or if that takes longer than `PATIENCE`, at once."""
+        if self._stop_signal and self.world.size > 1 and time.monotonic() - self._asked_at < self._patience - 1:
+            return  # a launcher sends on what each process has been sent
         if self._stop_signal:
             self._hurry.cancel()
             raise Stopped(
@@ -308,14 +337,14 @@ class Run:
                 f"It resumes at step {self._saver.last_planned:,}, the last planned checkpoint.",
                 self._stop_signal,
             )
-        self._stop_signal = signum
-        stopping.set()
+        self._stop_signal, self._asked_at = signum, time.monotonic()
+        compiled.stopping.set()
         self._hurry.start()
 
     def _ask_again(self) -> None:
         """In a thread: send the signal again; where even that is not heard, end the process."""
         signal.pthread_kill(threading.main_thread().ident or 0, self._stop_signal)
-        if not self._ended.wait(PATIENCE):
+        if not self._ended.wait(self._patience):
             say(f"Stopped; the update did not let itself be interrupted. Go on with: {resume_line(self.path)}")
             os._exit(128 + self._stop_signal)
 

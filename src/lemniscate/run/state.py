@@ -6,10 +6,12 @@ from dataclasses import dataclass, field, fields
 from typing import Any, Generic, TypeVar
 
 from lemniscate.errors import NonFiniteError
+from lemniscate.maths import ONE_SHARD, Shards
 from lemniscate.nn.policies import Policy
 from lemniscate.optim.adam import Adam
 from lemniscate.optim.compiled import Compiled
 from lemniscate.optim.learner import Learner
+from lemniscate.optim.shards import GradientOverShards
 from lemniscate.optim.vector import ParameterVector
 from lemniscate.run.seeding import Generators
 
@@ -30,6 +32,8 @@ class TrainState(Generic[Networks]):
     """the algorithm's gradient steps; in a compiled run, their compiled form"""
     step: int = 0
     """environment steps taken"""
+    shards: Shards = field(default=ONE_SHARD, metadata={"saved": False})
+    """those that the environments and every batch are divided into"""
 
     @property
     def policy(self) -> Policy:
@@ -39,6 +43,38 @@ class TrainState(Generic[Networks]):
     def saved(self) -> dict[str, Any]:
         """The fields that a checkpoint holds, by name."""
         return {f.name: getattr(self, f.name) for f in fields(self) if f.metadata.get("saved", True)}
+
+    def whole(self) -> dict[str, Any]:
+        """The fields that a checkpoint holds, numbers and tensors by name, of all shards; only rank 0 gets all."""
+        fields = self.saved()
+        for name, value in fields.items():
+            if hasattr(value, "state_dict"):
+                local = getattr(value, "local", ())
+                entries = value.state_dict().items()
+                fields[name] = {key: self.shards.to_first(t) if key in local else t for key, t in entries}
+        return fields
+
+    def join(self, shards: Shards) -> None:
+        """Keep what belongs to the shards held, and take part in what is computed over all of them.
+
+        A new state, and a restored one, is that of all shards. A field with `hold` keeps a part of itself: `local`
+        names the entries of its `state_dict` that have a row for each shard or environment.
+        """
+        if shards.count == 1:
+            return
+        self.shards = shards
+        for module in [*self.networks.modules(), *vars(self).values()]:
+            if isinstance(getattr(module, "shards", None), Shards):
+                module.shards = shards
+        for value in vars(self).values():
+            if isinstance(value, Adam):
+                value.over_shards = GradientOverShards(value, shards)
+        if len(shards.held) < shards.count:
+            self.hold(shards.held)
+
+    def hold(self, held: range) -> None:
+        """Keep of the fields that belong to shards what belongs to these."""
+        self.rng.hold(held)
 
     def optimizers(self) -> list[Adam]:
         """All optimizers of the state."""
@@ -66,7 +102,17 @@ class TrainState(Generic[Networks]):
 
     def compile(self) -> None:
         """Compile the gradient steps and `per_step_methods`, from the next call on."""
-        self.learn = Learner(self.learn, self.optimizers())
+        over_shards = [optimizer.over_shards for optimizer in self.optimizers() if optimizer.over_shards]
+        for gradient in over_shards:
+            gradient.compile()
+        if not over_shards:
+            self.learn = Learner(self.learn, self.optimizers())
         device = next(self.networks.parameters()).device
         for owner, name in self.per_step_methods():
             vars(owner)[name] = Compiled(getattr(owner, name), device)  # over the method of the class
+
+
+def rows_of(held: range, shards: int, rows: int) -> slice:
+    """The rows of the shards held, of so many rows in equal parts."""
+    size = rows // shards
+    return slice(held.start * size, held.stop * size)

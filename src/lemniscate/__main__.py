@@ -1,4 +1,4 @@
-"""`python -m lemniscate.cli`."""
+"""`python -m lemniscate`."""
 
 import sys
 

@@ -1,0 +1,39 @@
+"""What a person reads, and what the shell gets, where a command ends with an error."""
+
+from lemniscate.console import talks
+from lemniscate.errors import (
+    NonFiniteError,
+    NotStoredError,
+    RankError,
+    SweepError,
+    UserError,
+    WorkerError,
+)
+
+
+def exit_code(error: BaseException) -> int | None:
+    """The exit code for what ended a command; None for a mistake of our own."""
+    if isinstance(error, KeyboardInterrupt):
+        return 128 + getattr(error, "signum", 2)
+    if isinstance(error, BrokenPipeError):  # whoever read the output has read enough
+        return 141
+    if isinstance(error, UserError):
+        return 2
+    known = (NonFiniteError, WorkerError, NotStoredError, RankError, SweepError, MemoryError)
+    return 1 if isinstance(error, known) or (isinstance(error, OSError) and error.errno is not None) else None
+
+
+def sentence(error: BaseException, command: str | None) -> str:
+    """What a person reads of it; nothing where another process of the run says it."""
+    if isinstance(error, BrokenPipeError) or (isinstance(error, UserError) and not talks()):
+        return ""
+    ended = isinstance(error, NonFiniteError | WorkerError | RankError) and command in ("train", "resume")
+    if ended and str(error):
+        return f"{error} Training stopped; the last checkpoint is as it was."
+    if isinstance(error, KeyboardInterrupt):  # a run that was asked to stop has a sentence of its own
+        return str(error) or ("" if hasattr(error, "signum") else "Interrupted.")
+    if isinstance(error, MemoryError):
+        return str(error) or "The memory is full: choose smaller numbers."
+    if isinstance(error, OSError):  # a disk that is full, a folder that cannot be written
+        return f"{error.filename or 'A file could not be written'}: {error.strerror}."
+    return str(error)

@@ -1,0 +1,125 @@
+"""Gradients over shards: those of all rows at once, to rounding, in every algorithm's losses."""
+
+import copy
+from functools import partial
+
+import pytest
+import torch
+
+from helpers import begin, begin_off_policy, numbers, small, small_networks, small_off_policy
+from lemniscate.algos import a2c, ppo, reinforce, sac, trpo
+from lemniscate.data.rollout import collect
+from lemniscate.maths import Shards, standardize
+from lemniscate.optim.adam import Adam
+from lemniscate.optim.shards import GradientOverShards
+from lemniscate.types import Batch, Transition
+
+
+def twins(networks, **fields):
+    """Two optimizers of equal networks, the second one over four shards."""
+    one, two = (Adam(copy.deepcopy(networks), **fields) for _ in range(2))
+    two.over_shards = GradientOverShards(two, Shards(4))
+    for optimizer in (one, two):
+        optimizer.learning_rate = 0.01
+    return one, two
+
+
+def require_equal(one, two, loss, *args):
+    for _ in range(3):
+        a, b = (optimizer.step(loss, *args) for optimizer in (one, two))
+        assert a.keys() == b.keys()
+        for name in a:
+            torch.testing.assert_close(a[name].double(), b[name].double(), rtol=1e-6, atol=1e-12)
+    torch.testing.assert_close(one.vector, two.vector, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("actions", ["box", "discrete"])
+def test_a_step_over_four_shards_is_one_over_all_rows(actions):
+    networks, config = small_networks(actions, entropy_coef=0.1)
+    batch = numbers(actions)
+    batch = Batch(**{**vars(batch), "advantage": standardize(batch.advantage, Shards(4))})
+    require_equal(*twins(networks, max_grad_norm=0.1), partial(ppo.loss, config), batch)
+
+
+def test_the_gradient_of_each_shard_is_computed_with_its_rows_alone():
+    networks, config = small_networks()
+    sizes = []
+
+    def loss(networks, batch, scale):
+        sizes.append(len(batch))
+        total, metrics = ppo.loss(config, networks, batch)
+        return scale * total, metrics
+
+    _, two = twins(networks)
+    two.step(loss, numbers(), 2.0)
+    assert sizes == [6] * 5  # and once to know the names of the metrics
+
+
+def test_the_critics_of_sac_too(rng):
+    config = small_off_policy(sac, critic_hidden=(8,))
+    state, _ = begin_off_policy(sac, config)
+    batch = Transition(
+        **{n: x.double() if x.is_floating_point() else x for n, x in vars(state.replay.transitions[:48]).items()}
+    )
+    state.networks.double(), state.targets.double()
+    noise = torch.randn(48, 1, generator=rng, dtype=torch.float64)
+    require_equal(*twins(state.networks.critics), partial(sac.critic_loss, config, state), batch, noise)
+
+
+FIELDS = {
+    ppo: {"minibatch_size": 64, "epochs": 2, "normalize_observations": True, "desired_kl": 0.01},
+    a2c: {"scale_rewards": True},
+    trpo: {"critic_minibatch_size": 64, "critic_epochs": 2, "cg_iterations": 3},  # more of them magnify rounding
+    reinforce: {"critic_minibatch_size": 64, "critic_epochs": 2, "scale_rewards": True},
+}
+
+
+@pytest.mark.parametrize(("dtype", "rtol"), [(torch.float64, 1e-12), (torch.float32, 1e-5)])
+@pytest.mark.parametrize("algo", FIELDS)
+def test_updates_over_four_shards_are_those_over_all_rows(algo, dtype, rtol):
+    """Where all rows are one minibatch, so that the order of the rows is nobody's."""
+    config = small(algo, "Pendulum-v1", num_envs=8, num_steps=8, **FIELDS[algo])
+    states = [begin(algo, c)[0] for c in (config, config.replace(shards=4))]
+    _, env = begin(algo, config)
+    for state in states:
+        state.networks.to(dtype)
+    states[0], states[1] = (rebuilt(algo, config, state, dtype) for state in states)
+    states[1].join(Shards(4))
+    for _ in range(3):
+        rollout = collect(
+            env,
+            states[0].policy.float() if dtype is torch.float32 else Acting(states[0].policy),
+            8,
+            states[0].rng.action,
+        )
+        wide = rollout.map(lambda x: x.to(dtype) if x.is_floating_point() else x)
+        for state, shards in zip(states, (1, 4), strict=True):
+            algo.update(config.replace(shards=shards), state, type(wide)(**{**vars(wide), "shards": shards}))
+        one, two = (torch.cat([p.flatten() for p in state.networks.parameters()]) for state in states)
+        torch.testing.assert_close(one, two, rtol=rtol, atol=10 * rtol)
+        norms = [state.policy.normalizer.state_dict() for state in states]
+        for name in norms[0]:
+            torch.testing.assert_close(norms[0][name], norms[1][name], rtol=rtol, atol=rtol)
+
+
+class Acting:
+    """A policy in float64, as the environments see it."""
+
+    def __init__(self, policy):
+        self.policy, self.draw_noise = policy, policy.draw_noise
+
+    def act(self, obs, noise):
+        return self.policy.act(obs.double(), noise.double()).float()
+
+
+def rebuilt(algo, config, state, dtype):
+    """The state with optimizers of the networks as they are now."""
+    torch.manual_seed(0)
+    for name, value in vars(state).items():
+        if isinstance(value, Adam):
+            fresh = Adam(value.module.networks, max_grad_norm=getattr(config, "max_grad_norm", None))
+            fresh.learning_rate = 0.01
+            setattr(state, name, fresh)
+    if algo is trpo:
+        state.__post_init__()
+    return state
