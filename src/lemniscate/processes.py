@@ -1,6 +1,7 @@
 """Several processes of one run, as `torchrun` starts them: what they send each other, by `torch.distributed`."""
 
 import os
+import shutil
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
@@ -13,6 +14,7 @@ from torch import Tensor
 from torch.distributed import PrefixStore, TCPStore  # pyright: ignore[reportPrivateImportUsage]
 
 from lemniscate.errors import RankError
+from lemniscate.shared_memory import SharedMemory
 from lemniscate.watch import Watch
 from lemniscate.world import World
 
@@ -38,14 +40,16 @@ class Processes(World):
         store = PrefixStore(name, TCPStore(host, port, self.size, hosts_store, LONGEST))
         dist.init_process_group(backend, store=store, rank=self.rank, world_size=self.size, timeout=LONGEST)
         self._watch = Watch(PrefixStore(name, TCPStore(host, port, is_master=False)), self.rank, self.size)
-        self._begun = False
+        self._begun, self._memory = False, self._shared_memory()
 
     def gather(self, mine: Tensor) -> Tensor:
         """What every shard says, [S, …], from that of the shards held, [held, …]; also [N, …] from rows of shards."""
-        parts = [torch.empty_like(mine, memory_format=torch.contiguous_format) for _ in range(self.size)]
         with self._together():
+            if self._memory and self._memory.holds(mine):
+                return self._memory.gather(mine)
+            parts = [torch.empty_like(mine, memory_format=torch.contiguous_format) for _ in range(self.size)]
             dist.all_gather(parts, mine.contiguous())
-        return torch.cat(parts)
+            return torch.cat(parts)
 
     def to_first(self, mine: Tensor) -> Tensor:
         """The same for rank 0; the others get their own. Zeros fill up second dimensions that are shorter."""
@@ -93,6 +97,8 @@ class Processes(World):
     def close(self) -> None:
         """Leave the other processes."""
         self._watch.close()
+        if self._memory:
+            self._memory.close()
         with suppress(RuntimeError):
             dist.destroy_process_group()
 
@@ -103,8 +109,23 @@ class Processes(World):
         try:
             with self._watch.state("waiting"):
                 yield
-        except RuntimeError as error:
+        except (RuntimeError, OSError) as error:
             raise RankError(self._watch.why()) from error
+
+    def _shared_memory(self) -> SharedMemory | None:
+        """What all processes share, if they are on one machine, which has enough of it: ten times as fast as gloo."""
+        folder = self.from_first(SharedMemory.new_folder() if self.is_first else None)
+        memory = None
+        try:
+            with suppress(OSError, AttributeError):  # macOS cannot reserve a file's memory
+                memory = SharedMemory(folder, self.rank, self.size)
+            listening = all(self.each(memory is not None))
+            with suppress(OSError):
+                memory = memory.connect(folder) if memory and listening else None
+            return memory if all(self.each(memory is not None)) else None
+        finally:
+            if self.is_first:
+                shutil.rmtree(folder, ignore_errors=True)
 
 
 @contextmanager

@@ -45,12 +45,10 @@ class Shards:
         mine = [_moments(part) for part in parts]
         if self.count == 1:
             return mine[0]
-        first, *others = self.gather(torch.stack([torch.stack(torch.broadcast_tensors(*m)) for m in mine]))
-        merged = first.unbind()
-        for other in others:
-            merged = merge_moments(*merged, *other.unbind())
-        mean, var, count = merged
-        return mean, var, count
+        mean, var, count = self.gather(torch.stack([torch.stack(torch.broadcast_tensors(*m)) for m in mine])).unbind(1)
+        rows = count.sum(0).clamp(min=1)  # of nothing, too
+        middle = (mean * count).sum(0) / rows
+        return middle, ((var + (mean - middle).square()) * count).sum(0) / rows, rows
 
     def standardize(self, parts: Sequence[Tensor]) -> list[Tensor]:
         """`standardize` with the moments of all shards, for the rows [..., B] of each shard held."""
@@ -61,6 +59,11 @@ class Shards:
 
 ONE_SHARD = Shards()
 """all rows, in this process"""
+
+
+def at_most_8(shards: int) -> int:
+    """The number of shards, a divisor of all, that one compiled call computes one after the other."""
+    return next(n for n in range(8, 0, -1) if shards % n == 0)
 
 
 def _moments(rows: Tensor) -> Moments:

@@ -1,11 +1,12 @@
 """Gradients over several shards: that of each alone, and their mean in the order of the shards."""
 
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from lemniscate.maths import Shards
+from lemniscate.maths import Shards, at_most_8
 from lemniscate.optim.adam import Adam, LossFunction
 from lemniscate.optim.compiled import Compiled
 from lemniscate.types import Metrics, Record
@@ -14,8 +15,8 @@ from lemniscate.types import Metrics, Record
 class GradientOverShards:
     """`Adam.gradient` over all shards of a world.
 
-    Each shard's gradient is one call with that shard's rows alone, of the same shapes whichever process makes it; then
-    all are gathered, with the metrics of the loss, and averaged. So the result is the same for any number of processes.
+    Each shard's gradient is computed of that shard's rows alone, in the same shapes whichever process does it; then all
+    are gathered, with the metrics of the loss, and averaged. So the result is the same for any number of processes.
     """
 
     def __init__(self, optimizer: Adam, shards: Shards) -> None:
@@ -32,29 +33,37 @@ class GradientOverShards:
     def __call__(self, loss: LossFunction, *args: Any) -> tuple[Tensor, Metrics]:
         """The mean of the shards' gradients [P], and of their metrics."""
         held, function = len(self._shards.held), getattr(loss, "func", loss)  # without what is bound to it
-        parts = list(zip(*(_split(arg, held) for arg in args), strict=True))
         if function not in self._names:
             with torch.no_grad():
-                self._names[function] = list(self._optimizer.module(loss, *parts[0])[1])
-        row = self._row if self._programs is None else self._program(function)
-        mean = self._shards.gather(torch.stack([row(loss, *part) for part in parts])).mean(0)
-        size = len(self._optimizer.vector)
+                self._names[function] = list(self._optimizer.module(loss, *next(_parts(args, held)))[1])
+        at_once = at_most_8(held)
+        rows = self._rows if self._programs is None else self._program(function)
+        mean = self._shards.gather(torch.cat([rows(at_once, loss, *part) for part in _parts(args, held // at_once)]))
+        size, mean = len(self._optimizer.vector), mean.mean(0)
         return mean[:size], dict(zip(self._names[function], mean[size:], strict=True))
 
-    def _row(self, loss: LossFunction, *args: Any) -> Tensor:
-        """One shard's gradient, and after it the metrics, [P + m]."""
-        gradient, metrics = self._optimizer.gradient(loss, *args)
-        return torch.cat([gradient, *(value.detach().reshape(1).to(gradient) for value in metrics.values())])
+    def _rows(self, count: int, loss: LossFunction, *args: Any) -> Tensor:
+        """The gradient of each of so many shards, and after it the metrics, [count, P + m]."""
+        rows = []
+        for part in _parts(args, count):
+            gradient, metrics = self._optimizer.gradient(loss, *part)
+            rows.append(torch.cat([gradient, *(value.detach().reshape(1).to(gradient) for value in metrics.values())]))
+        return torch.stack(rows)
 
     def _program(self, function: Any) -> Compiled[..., Tensor]:
         assert self._programs is not None
         if function not in self._programs:
-            self._programs[function] = Compiled(self._functional, self._optimizer.vector.device, fallback=self._row)
+            self._programs[function] = Compiled(self._functional, self._optimizer.vector.device, fallback=self._rows)
         return self._programs[function]
 
-    def _functional(self, loss: LossFunction, *args: Any) -> Tensor:
+    def _functional(self, count: int, loss: LossFunction, *args: Any) -> Tensor:
         with torch.no_grad():  # of networks that only take part in a loss; `grad_and_value` differentiates all the same
-            return self._row(loss, *args)
+            return self._rows(count, loss, *args)
+
+
+def _parts(args: Sequence[Any], count: int) -> Iterator[tuple[Any, ...]]:
+    """The arguments with each of `count` equal parts of their rows."""
+    return zip(*(_split(arg, count) for arg in args), strict=True)
 
 
 def _split(arg: Any, held: int) -> list[Any]:
