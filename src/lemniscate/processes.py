@@ -1,6 +1,7 @@
 """Several processes of one run, as `torchrun` starts them: what they send each other, by `torch.distributed`."""
 
 import os
+import pickle
 import shutil
 import time
 from collections.abc import Callable, Iterator
@@ -40,7 +41,8 @@ class Processes(World):
         store = PrefixStore(name, TCPStore(host, port, self.size, hosts_store, LONGEST))
         dist.init_process_group(backend, store=store, rank=self.rank, world_size=self.size, timeout=LONGEST)
         self._watch = Watch(PrefixStore(name, TCPStore(host, port, is_master=False)), self.rank, self.size)
-        self._begun, self._memory = False, self._shared_memory()
+        self._begun, self._memory = False, None
+        self._memory = self._shared_memory()
 
     def gather(self, mine: Tensor) -> Tensor:
         """What every shard says, [S, …], from that of the shards held, [held, …]; also [N, …] from rows of shards."""
@@ -66,6 +68,8 @@ class Processes(World):
         """What every process says, in the order of the ranks: any objects."""
         said: list[Any] = [None] * self.size
         with self._together():
+            if self._memory and (data := self._memory.gather_bytes(pickle.dumps(mine))):
+                return [pickle.loads(each) for each in data]
             dist.all_gather_object(said, mine)
         return said
 

@@ -76,6 +76,15 @@ class SharedMemory:
             _hear(other)
         return places.clone(memory_format=torch.contiguous_format).view(-1).view(mine.dtype).view(-1, *mine.shape[1:])
 
+    def gather_bytes(self, mine: bytes) -> list[bytes]:
+        """What all processes say, of different lengths; nothing where one says too much. Raises as `gather`."""
+        lengths = self.gather(torch.tensor([len(mine)])).tolist()
+        if max(lengths) > CAPACITY:
+            return []
+        padded = torch.frombuffer(bytearray(mine.ljust(max(lengths))), dtype=torch.uint8)
+        rows = self.gather(padded).view(len(lengths), -1)
+        return [bytes(row.numpy())[:length] for row, length in zip(rows, lengths, strict=True)]
+
     def close(self) -> None:
         """Leave the others."""
         for other in self._others:

@@ -8,7 +8,6 @@ from torch import Tensor
 
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError
-from lemniscate.maths import at_most_8
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.policies import Policy
 from lemniscate.spec import Box, Spec
@@ -39,14 +38,10 @@ def rollout_bytes(spec: Spec, num_steps: int, num_envs: int) -> int:
 @torch.no_grad()
 def estimates(networks: ActorCritic, rollout: Rollout) -> tuple[Tensor, Tensor, Tensor]:
     """V(s), V(s') and log π(a|s) of every row, [T, N] each; the networks are called with each shard alone."""
-    at_once = at_most_8(rollout.shards)
-    columns = [
-        networks.estimates(obs, next_obs, action, at_once)
-        for obs, next_obs, action in zip(
-            *(x.chunk(rollout.shards // at_once, 1) for x in (rollout.obs, rollout.next_obs, rollout.action)),
-            strict=True,
-        )
-    ]
+    parts = (
+        (x.contiguous() for x in r.chunk(rollout.shards, 1)) for r in (rollout.obs, rollout.next_obs, rollout.action)
+    )
+    columns = [networks.estimates(*part) for part in zip(*parts, strict=True)]
     value, next_value, log_prob = (torch.cat(column, dim=1) for column in zip(*columns, strict=True))
     return value, next_value, log_prob
 

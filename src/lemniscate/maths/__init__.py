@@ -9,7 +9,6 @@ from lemniscate.maths.returns import episode_return, gae, reward_to_go
 from lemniscate.maths.stats import (
     ONE_SHARD,
     Shards,
-    at_most_8,
     clip_fraction,
     explained_variance,
     kl_k1,
@@ -32,7 +31,6 @@ __all__ = [
     "MultiCategorical",
     "Shards",
     "SquashedGaussian",
-    "at_most_8",
     "backtrack",
     "clip_fraction",
     "clipped_surrogate",

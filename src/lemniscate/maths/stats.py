@@ -61,11 +61,6 @@ ONE_SHARD = Shards()
 """all rows, in this process"""
 
 
-def at_most_8(shards: int) -> int:
-    """The number of shards, a divisor of all, that one compiled call computes one after the other."""
-    return next(n for n in range(8, 0, -1) if shards % n == 0)
-
-
 def _moments(rows: Tensor) -> Moments:
     count = rows.new_tensor(rows.shape[-1])
     if not rows.shape[-1]:

@@ -1,6 +1,5 @@
 """A policy and V(s) for the spaces of an environment: separate networks behind one normalizer."""
 
-import torch
 from torch import Tensor, nn
 
 from lemniscate.nn.critics import Value
@@ -27,14 +26,9 @@ class ActorCritic(nn.Module):
         self.policy = _policy(normalizer_of(spec, normalize_observations), spec, layers, initial_log_std)
         self.value = Value(self.policy.normalizer, network_of(spec, layers, 1, last_gain=1.0))
 
-    def estimates(self, obs: Tensor, next_obs: Tensor, action: Tensor, shards: int) -> tuple[Tensor, Tensor, Tensor]:
-        """V(s), V(s') and log π(a|s) of rows [T, N, …], [T, N] each; each of `shards` parts of N is computed alone."""
-        columns = []
-        for part in zip(*(x.chunk(shards, 1) for x in (obs, next_obs, action)), strict=True):
-            s, next_s, a = (x.contiguous() for x in part)
-            columns.append((self.value(s), self.value(next_s), self.policy(s).log_prob(a)))
-        value, next_value, log_prob = (torch.cat(column, dim=1) for column in zip(*columns, strict=True))
-        return value, next_value, log_prob
+    def estimates(self, obs: Tensor, next_obs: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """V(s), V(s') and log π(a|s) of rows […, …], […] each."""
+        return self.value(obs), self.value(next_obs), self.policy(obs).log_prob(action)
 
 
 def normalizer_of(spec: Spec, normalize_observations: bool) -> NoNorm:

@@ -118,11 +118,14 @@ class Adam:
         gradient, metrics = (self.over_shards or self.gradient)(loss, *args)
         return {**metrics, self._norm_name: self.descend(gradient)}
 
-    def gradient(self, loss: LossFunction, *args: Any) -> tuple[Tensor, Metrics]:
-        """The gradient [P] of `loss(networks, *args)`, valid until the next call, and the metrics of the loss."""
+    def gradient(self, loss: LossFunction, *args: Any, vector: Tensor | None = None) -> tuple[Tensor, Metrics]:
+        """The gradient [P] of `loss(networks, *args)`, valid until the next call, and the metrics of the loss.
+
+        In a compiled call it may be that at another `vector`.
+        """
         if torch.compiler.is_compiling():
             differentiate = grad_and_value(partial(functional_call, self.module, args=(loss, *args)), has_aux=True)
-            gradients, (_, metrics) = differentiate(self.views())
+            gradients, (_, metrics) = differentiate(self.views(vector))
             return self._parameters.join(gradients), metrics
         total, metrics = self.module(loss, *args)
         self._gradient.zero_()
@@ -137,9 +140,9 @@ class Adam:
             scales = (self._rates * bias**self._powers).to(gradient)
             return self._adam(self.vector, gradient, self._mean, self._square, scales)
 
-    def views(self) -> dict[str, Tensor]:
-        """The parameters of `module` by name, views of the vector as it is now."""
-        return self._parameters.views(self.vector)
+    def views(self, vector: Tensor | None = None) -> dict[str, Tensor]:
+        """The parameters of `module` by name, views of the vector as it is now, or of another one."""
+        return self._parameters.views(self.vector if vector is None else vector)
 
     def state_dict(self) -> dict[str, Tensor]:
         """Adam's two moments and its count; the parameters belong to the networks."""

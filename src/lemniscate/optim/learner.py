@@ -42,7 +42,8 @@ class Learner:
 
     def __call__(self, config: Any, state: Any, data: Any, *by_step: Tensor, **flags: Any) -> list[Metrics]:
         """The metrics of `learn`, averaged over the gradient steps of each compiled call."""
-        size = next(n for n in range(STEPS_PER_CALL, 0, -1) if len(by_step[0]) % n == 0)
+        most = 1 if self._optimizers[0].over_shards else STEPS_PER_CALL
+        size = next(n for n in range(most, 0, -1) if len(by_step[0]) % n == 0)
         metrics = []
         for i, chunk in enumerate(zip(*(tensor.split(size) for tensor in by_step), strict=True)):
             part = slice(size * i, size * (i + 1))

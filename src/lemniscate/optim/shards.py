@@ -2,14 +2,40 @@
 
 from collections.abc import Iterator, Sequence
 from typing import Any
+from weakref import WeakValueDictionary
 
 import torch
 from torch import Tensor
 
-from lemniscate.maths import Shards, at_most_8
+from lemniscate.maths import Shards
 from lemniscate.optim.adam import Adam, LossFunction
-from lemniscate.optim.compiled import Compiled
 from lemniscate.types import Metrics, Record
+
+_SHARDS: WeakValueDictionary[int, Shards] = WeakValueDictionary()
+"""by their ids, which compiled programs know"""
+
+
+@torch.library.custom_op("lemniscate::gather", mutates_args=())
+def _gather(mine: Tensor, count: int, shards: int) -> Tensor:
+    """`Shards.gather` as one operation of a compiled program, which neither looks into it nor merges it with others."""
+    rows = _SHARDS[shards].gather(mine)
+    return rows.clone() if rows is mine else rows
+
+
+@_gather.register_fake
+def _(mine: Tensor, count: int, shards: int) -> Tensor:
+    return mine.new_empty(count, *mine.shape[1:])
+
+
+@torch.library.custom_op("lemniscate::after", mutates_args=())
+def _after(x: Tensor, before: Tensor) -> Tensor:
+    """A copy of a tensor, once `before` is there."""
+    return x.clone()
+
+
+@_after.register_fake
+def _(x: Tensor, before: Tensor) -> Tensor:
+    return torch.empty_like(x)
 
 
 class GradientOverShards:
@@ -20,45 +46,42 @@ class GradientOverShards:
     """
 
     def __init__(self, optimizer: Adam, shards: Shards) -> None:
-        self._optimizer, self._shards = optimizer, shards
-        self._names: dict[Any, list[str]] = {}
-        self._programs: dict[Any, Compiled[..., Tensor]] | None = None
-
-    def compile(self) -> None:
-        """Compile the gradient of each loss, and the step that follows it, from the next call on."""
-        self._programs = {}
-        optimizer, device = self._optimizer, self._optimizer.vector.device
-        vars(optimizer)["descend"] = Compiled(optimizer.descend, device)
+        self._optimizer, self._shards, self._key = optimizer, shards, id(shards)
+        _SHARDS[self._key] = shards
 
     def __call__(self, loss: LossFunction, *args: Any) -> tuple[Tensor, Metrics]:
         """The mean of the shards' gradients [P], and of their metrics."""
-        held, function = len(self._shards.held), getattr(loss, "func", loss)  # without what is bound to it
-        if function not in self._names:
-            with torch.no_grad():
-                self._names[function] = list(self._optimizer.module(loss, *next(_parts(args, held)))[1])
-        at_once = at_most_8(held)
-        rows = self._rows if self._programs is None else self._program(function)
-        mean = self._shards.gather(torch.cat([rows(at_once, loss, *part) for part in _parts(args, held // at_once)]))
-        size, mean = len(self._optimizer.vector), mean.mean(0)
-        return mean[:size], dict(zip(self._names[function], mean[size:], strict=True))
-
-    def _rows(self, count: int, loss: LossFunction, *args: Any) -> Tensor:
-        """The gradient of each of so many shards, and after it the metrics, [count, P + m]."""
-        rows = []
-        for part in _parts(args, count):
-            gradient, metrics = self._optimizer.gradient(loss, *part)
+        compiling, metrics = torch.compiler.is_compiling(), {}
+        rows: list[Tensor] = []
+        for part in _parts(args, len(self._shards.held)):
+            vector = self._optimizer.vector
+            if compiling:
+                part, vector = _apart(part, vector, rows[-1] if rows else vector)
+            gradient, metrics = self._optimizer.gradient(loss, *part, vector=vector)
             rows.append(torch.cat([gradient, *(value.detach().reshape(1).to(gradient) for value in metrics.values())]))
-        return torch.stack(rows)
+        mine = torch.stack(rows)
+        gathered = _gather(mine, self._shards.count, self._key) if compiling else self._shards.gather(mine)
+        size, mean = len(self._optimizer.vector), gathered.mean(0)
+        return mean[:size], dict(zip(metrics, mean[size:], strict=True))
 
-    def _program(self, function: Any) -> Compiled[..., Tensor]:
-        assert self._programs is not None
-        if function not in self._programs:
-            self._programs[function] = Compiled(self._functional, self._optimizer.vector.device, fallback=self._rows)
-        return self._programs[function]
 
-    def _functional(self, count: int, loss: LossFunction, *args: Any) -> Tensor:
-        with torch.no_grad():  # of networks that only take part in a loss; `grad_and_value` differentiates all the same
-            return self._rows(count, loss, *args)
+def _apart(args: Sequence[Any], vector: Tensor, before: Tensor) -> tuple[list[Any], Tensor]:
+    """Copies of the arguments and of the parameters, made once `before` is there: those of each type by one operation.
+
+    So a compiler cannot merge the program of a shard with that of another one, and it is the same beside any others.
+    """
+    several = [list(vars(arg).values()) if isinstance(arg, Record) else [arg] for arg in args]
+    tensors = [x for xs in several for x in xs if isinstance(x, Tensor)] + [vector]
+    rest = {}
+    for dtype in dict.fromkeys(x.dtype for x in tensors):
+        same = [x.reshape(-1) for x in tensors if x.dtype == dtype]
+        rest[dtype] = iter(_after(torch.cat(same), before).split([len(x) for x in same]))
+
+    def copy(x: Any) -> Any:
+        return next(rest[x.dtype]).view(x.shape) if isinstance(x, Tensor) else x
+
+    copied = [arg.map(copy) if isinstance(arg, Record) else copy(arg) for arg in args]
+    return copied, copy(vector)
 
 
 def _parts(args: Sequence[Any], count: int) -> Iterator[tuple[Any, ...]]:

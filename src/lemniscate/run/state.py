@@ -102,11 +102,7 @@ class TrainState(Generic[Networks]):
 
     def compile(self) -> None:
         """Compile the gradient steps and `per_step_methods`, from the next call on."""
-        over_shards = [optimizer.over_shards for optimizer in self.optimizers() if optimizer.over_shards]
-        for gradient in over_shards:
-            gradient.compile()
-        if not over_shards:
-            self.learn = Learner(self.learn, self.optimizers())
+        self.learn = Learner(self.learn, self.optimizers())
         device = next(self.networks.parameters()).device
         for owner, name in self.per_step_methods():
             vars(owner)[name] = Compiled(getattr(owner, name), device)  # over the method of the class
