@@ -14,7 +14,7 @@ from filelock import FileLock
 
 import lemniscate as lem
 from forks import command
-from lemniscate import sweep
+from lemniscate import places, sweep
 from lemniscate.cli import main
 from lemniscate.run import checkpoint
 from lemniscate.run.directory import is_finished
@@ -74,7 +74,7 @@ def test_a_sweep_is_a_run_for_each_algorithm_and_seed(trained):
 def test_every_run_of_a_sweep_calls_the_callbacks(trained):
     path, _ = trained
     for run in ("ppo-1", "ppo-2", "ddpg-1", "ddpg-2"):
-        assert "called at " in (path / run / sweep.LOG).read_text()
+        assert "called at " in (path / run / places.LOG).read_text()
 
 
 @pytest.mark.parametrize(("algorithm", "seed"), [("ppo", 2), ("ddpg", 1)])
@@ -140,12 +140,10 @@ def test_a_run_whose_last_checkpoint_is_damaged_is_not_finished(trained, tmp_pat
 
 
 def test_runs_are_trained_side_by_side_where_there_are_cores(tmp_path, monkeypatch):
-    monkeypatch.setattr(sweep, "at_once", lambda threads: 2)
+    monkeypatch.setattr(places, "at_once", lambda threads: 2)
     most = []
-    poll = sweep._Processes._poll
-    monkeypatch.setattr(
-        sweep._Processes, "_poll", lambda processes: most.append(len(processes._running)) or poll(processes)
-    )
+    ended = places.Processes.ended
+    monkeypatch.setattr(places.Processes, "ended", lambda here: most.append(len(here.running)) or ended(here))
     lem.train_sweep("ppo", "Countdown-v0", "1-3", run=tmp_path / "set", progress=False, **FEW)
     assert max(most) == 2
 
@@ -278,10 +276,10 @@ def test_a_mistake_is_one_sentence_before_anything_starts(tmp_path, capsys, argu
 
 
 def test_seeds_are_given_as_ranges_and_lists():
-    assert sweep._seeds_of("1-3") == [1, 2, 3]
-    assert sweep._seeds_of("7,1-2, 7") == [7, 1, 2]
-    assert sweep._seeds_of(range(2)) == [0, 1]
-    assert sweep._seeds_of(5) == [5]
+    assert sweep.seeds_of("1-3") == [1, 2, 3]
+    assert sweep.seeds_of("7,1-2, 7") == [7, 1, 2]
+    assert sweep.seeds_of(range(2)) == [0, 1]
+    assert sweep.seeds_of(5) == [5]
 
 
 @pytest.mark.parametrize(("cores", "threads", "runs"), [(8, 1, 8), (8, 3, 2), (2, 4, 1)])

@@ -20,6 +20,21 @@ Callback = Callable[[int, Mapping[str, float], TrainedPolicy], object]
 """(step, metrics, policy) of a logged line; a true result stops the run"""
 
 
+class StopAt:
+    """Stops a run at its first logged line at or after so many steps; `resume` goes on with it.
+
+    Args:
+        steps: if they are planned checkpoints, nothing is computed again when the run goes on.
+    """
+
+    def __init__(self, steps: int) -> None:
+        self.steps = steps
+
+    def __call__(self, step: int, _metrics: Mapping[str, float], _policy: TrainedPolicy) -> bool:
+        """Whether the run has come so far."""
+        return step >= self.steps
+
+
 class PolicySnapshot(TrainedPolicy):
     """The policy of a run at the line that a callback is shown. Its weights are copied when it is first used.
 

@@ -4,11 +4,7 @@ A process resumes one run directory, whether its run has begun or not. So an int
 each of its runs ends in the same bits as if it had been trained alone.
 """
 
-import os
 import re
-import signal
-import subprocess
-import sys
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -24,12 +20,11 @@ from lemniscate.algos import ALGORITHMS, name_of
 from lemniscate.console import say
 from lemniscate.envs import registry
 from lemniscate.errors import SweepError, UserError, prefix_errors, resume_line, shown
-from lemniscate.owner import OWNED
+from lemniscate.places import LOG, Processes, failure_of
 from lemniscate.results import final_return
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import is_finished
 from lemniscate.run.environments import device_for, require_memory
-from lemniscate.run.files import open_log, open_regular
 from lemniscate.run.metrics import read_metrics
 from lemniscate.run.run import Stopped, stop_signals_to
 from lemniscate.run.sweep_file import Sweep, read_sweep
@@ -37,9 +32,6 @@ from lemniscate.run.sweep_progress import SweepProgress
 from lemniscate.run.trust import require_trusted
 from lemniscate.run.warm_start import load_networks
 from lemniscate.stored import own_code_of, path_of
-
-LOG = "log.txt"
-"""standard output and error of a run, in its directory"""
 
 PROGRESS_BYTES = 2**17
 """bytes at the end of a run's metrics that its progress is read from"""
@@ -93,7 +85,7 @@ def train_sweep(
     """
     if "seed" in fields:
         raise UserError("Several runs have several seeds: they are given as seeds, not as seed.")
-    names, numbers = algorithms_of(algorithms), _seeds_of(seeds)
+    names, numbers = algorithms_of(algorithms), seeds_of(seeds)
     configs: dict[str, RunConfig] = {}
     for name in names:
         with prefix_errors(name):
@@ -101,7 +93,7 @@ def train_sweep(
     if len({config.env for config in configs.values()}) > 1:
         raise UserError("These presets are for different environments; name the one of the whole sweep with env.")
     options = _options(track, callbacks, report)
-    _require_trainable(configs, numbers)
+    require_trainable(configs, numbers)
     stem = f"{'-'.join(names)}-{len(numbers)}-seeds"
     path = path_of(run) if run is not None else api.fresh_directory(next(iter(configs.values())).env, stem)
     records = {name: config.to_json() for name, config in configs.items()}
@@ -127,12 +119,6 @@ def resume_sweep(
     return _train(replace(runs, trusted=trust or runs.trusted), [*options, *["--trust"] * trust], progress)
 
 
-def at_once(threads: int) -> int:
-    """The number of runs, each of so many threads, that fit on the cores that this process may use; at least one."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, cores // threads)
-
-
 def _options(track: str | None, callbacks: str | Sequence[str], report: bool) -> list[str]:
     """The options of each run's process. Raises `UserError` for a tracker or a callback that it could not find."""
     names: list[Any] = list(callbacks) if isinstance(callbacks, list | tuple) else [callbacks]
@@ -150,7 +136,7 @@ def _train(runs: Sweep, options: list[str], progress: bool) -> TrainedSweep:
     try:
         with FileLock(runs.path / ".lock", timeout=0):
             runs.create_runs()
-            failed = _Processes(runs, options, progress).train()
+            failed = _Training(runs, options, progress).train()
     except Timeout:
         raise UserError(f"{runs.path} is being trained by another process.") from None
     if any(map(is_finished, runs.runs)):
@@ -165,39 +151,35 @@ def _train(runs: Sweep, options: list[str], progress: bool) -> TrainedSweep:
     return TrainedSweep(runs.path, list(runs.runs))
 
 
-class _Processes:
-    """The processes that train the runs of a sweep, and the sentences of those that failed."""
+class _Training:
+    """The runs of a sweep that are to be trained, and the sentences of those that failed."""
 
     def __init__(self, runs: Sweep, options: list[str], progress: bool) -> None:
-        self._runs, self._options = runs, options
+        self._runs, self._options = runs, ["--score", *options]
+        self._places = Processes(max(config["threads"] for config in runs.configs.values()))
         self._waiting = [run for run in runs.runs if not is_finished(run)]
-        self._running: dict[Path, subprocess.Popen] = {}
         self._failed: dict[str, str] = {}
         self._stop_signal = 0
         totals = {run.name: record["config"]["total_steps"] for run, record in runs.runs.items()}
-        steps = {run.name: _progress_of(run)[0] for run in runs.runs}
+        steps = {run.name: progress_of(run)[0] for run in runs.runs}
         self._bars = SweepProgress(totals, steps, progress)
 
     def train(self) -> dict[str, str]:
         """Train every run to its end; returns the sentences of those that failed. Raises `Stopped` after a signal."""
         path, count, told = self._runs.path, len(self._waiting), False
-        places = at_once(max(config["threads"] for config in self._runs.configs.values()))
         try:
-            self._bars.say(f"{path}: {count} of {len(self._runs.runs)} runs to train, {places} at a time")
+            self._bars.say(f"{path}: {count} of {len(self._runs.runs)} runs to train, {self._places.count} at a time")
             with stop_signals_to(self._stop):
-                while self._running or (self._waiting and not self._stop_signal):
-                    while self._waiting and len(self._running) < places and not self._stop_signal:
+                while self._places.running or (self._waiting and not self._stop_signal):
+                    while self._waiting and self._places.free and not self._stop_signal:
                         self._start(self._waiting.pop(0))
-                    self._poll()
                     if self._stop_signal and not told:
                         told = True
                         self._bars.say("Stopping: each run ends its update and saves itself.")
+                    self._look()
                     time.sleep(POLL_SECONDS)
         finally:
-            self._stop()
-            for process in self._running.values():
-                process.wait()
-                _close_input(process)
+            self._places.close()
             self._bars.close()
         if self._stop_signal and not all(map(is_finished, self._runs.runs)):
             said = f"Stopped; the runs that had begun are saved. Go on with: {resume_line(path)}"
@@ -205,67 +187,37 @@ class _Processes:
         return self._failed
 
     def _start(self, run: Path) -> None:
-        """Start a process in a session of its own, so that Ctrl-C at the terminal reaches only this process.
-
-        Each run then gets the signal from here, once. Its standard input is a pipe that closes when this process ends,
-        however it ends; then the run ends, too.
-        """
-        command = [sys.executable, "-m", "lemniscate", "resume", str(run), "--score", *self._options]
-        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path)), OWNED: "/dev/stdin"}
-        with open_log(run / LOG) as log:
-            self._running[run] = subprocess.Popen(
-                command, stdin=subprocess.PIPE, stdout=log, stderr=log, env=environment, start_new_session=True
-            )
+        self._places.start(run, self._options)
         if self._stop_signal:  # the signal came while the process was started
-            self._running[run].terminate()
+            self._places.stop([run])
 
-    def _poll(self) -> None:
+    def _look(self) -> None:
         """Show the progress of each run, and how those ended that have."""
-        for run, process in list(self._running.items()):
-            step, episode_return, rate = _progress_of(run)
-            self._bars.update(run.name, step, episode_return, rate)
-            code = process.poll()
-            if code is None:
-                continue
-            del self._running[run]
-            _close_input(process)
+        for run in self._places.running:
+            self._bars.update(run.name, *progress_of(run))
+        for run, code in self._places.ended().items():
+            step = progress_of(run)[0]
             if code == 0:
                 sentence = f"done, final return {final_return(run):.1f}"
             elif self._stop_signal:
                 sentence = f"stopped at step {step:,}"
             else:
-                sentence = self._failed[run.name] = _failure_of(run, code)
+                sentence = self._failed[run.name] = failure_of(run, code)
             self._bars.end(run.name, sentence)
 
     def _stop(self, signum: int = 0, _frame: FrameType | None = None) -> None:
         """Ask every process to save and stop; asked twice, it does not wait for the end of its update."""
         self._stop_signal = self._stop_signal or signum
-        for process in self._running.values():
-            process.terminate()
+        self._places.stop()
 
 
-def _close_input(process: subprocess.Popen) -> None:
-    if process.stdin:
-        process.stdin.close()
-
-
-def _progress_of(run: Path) -> tuple[int, float | None, float | None]:
+def progress_of(run: Path) -> tuple[int, float | None, float | None]:
     """(step, mean return of the last 100 episodes, steps per second) in the last lines of a run's metrics."""
     lines = read_metrics(run, PROGRESS_BYTES)
     returns = [ret for line in lines for ret in line.get("episode/returns", [])][-100:]
     rates = [line["time/steps_per_second"] for line in lines if "time/steps_per_second" in line]
     mean = sum(returns) / len(returns) if returns else None
     return (lines[-1]["step"] if lines else 0), mean, (rates[-1] if rates else None)
-
-
-def _failure_of(run: Path, code: int) -> str:
-    """The signal that ended a process, or else the last line that it wrote."""
-    if code < 0 or code in (129, 130, 143):
-        why = ", as the system does where memory has run out" if code == -signal.SIGKILL else ""
-        return f"{signal.strsignal(-code if code < 0 else code - 128)}{why}."
-    with open_regular(run / LOG) as log:
-        written = log.read().decode(errors="replace").split("\n")
-    return next((line for line in reversed(written) if line.strip()), f"Exit code {code}.")
 
 
 def algorithms_of(names: str | Iterable[str]) -> list[str]:
@@ -277,7 +229,7 @@ def algorithms_of(names: str | Iterable[str]) -> list[str]:
     return list(dict.fromkeys(split))
 
 
-def _seeds_of(seeds: str | int | Iterable[int]) -> list[int]:
+def seeds_of(seeds: str | int | Iterable[int]) -> list[int]:
     """The seeds in "1-5,8", a number or a list, each once."""
     if not isinstance(seeds, str):
         seeds = getattr(seeds, "tolist", lambda: seeds)()  # of NumPy's and torch's arrays
@@ -295,7 +247,7 @@ def _seeds_of(seeds: str | int | Iterable[int]) -> list[int]:
     return list(numbers)
 
 
-def _require_trainable(configs: dict[str, RunConfig], seeds: list[int]) -> None:
+def require_trainable(configs: dict[str, RunConfig], seeds: list[int]) -> None:
     """Raise `UserError` where a run could not begin: one sentence now, instead of one from each run."""
     for name, config in configs.items():
         for thing in (config.env, *config.wrappers, getattr(config, "network", "")):

@@ -8,11 +8,11 @@ import pytest
 import lemniscate as lem
 from conftest import tiny_fields
 from lemniscate.errors import UserError
+from lemniscate.places import LOG, failure_of
 from lemniscate.results import _known_scores, final_scores
 from lemniscate.run.directory import find_checkpoint, read_config
 from lemniscate.run.metrics import damage, read_metrics
 from lemniscate.run.sweep_file import Sweep, read_sweep
-from lemniscate.sweep import LOG, _failure_of
 from run.test_run import final_hashes, history
 
 FIELDS = {**tiny_fields(hidden=(2,)), "checkpoint_every": 128, "keep_checkpoints": 2}
@@ -55,7 +55,7 @@ READERS = {
     "state.json": found_in,
     "tensors.safetensors": found_in,
     "sweep.json": lambda path: (read_sweep(path).seeds, read_sweep(path).configs, read_sweep(path).trusted),
-    LOG: lambda path: bool(_failure_of(path, 1)),
+    LOG: lambda path: bool(failure_of(path, 1)),
 }
 
 

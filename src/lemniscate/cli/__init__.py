@@ -24,7 +24,8 @@ from lemniscate.errors import UserError, is_installed, unknown_name
 
 COMMANDS = {
     "train": "Train a policy, or one for each of several algorithms and seeds, to compare them.",
-    "resume": "Continue an interrupted run or sweep.",
+    "tune": "Search for the settings with which an algorithm learns an environment best.",
+    "resume": "Continue an interrupted run, sweep or search.",
     "evaluate": "Play whole episodes with the newest policy of a run.",
     "watch": "Show episodes in a window, or record them.",
     "plot": "Draw the curves of a run and its report.html, or compare several, grouped by all but the seed.",
@@ -62,8 +63,8 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
     if not words[0].startswith("-"):
         if words[0] not in COMMANDS:
             raise unknown_name("command", words[0], COMMANDS)
-        if words[0] == "train":
-            return _parse_train(commands["train"], words[1:])
+        if words[0] in ("train", "tune"):
+            return _parse_algorithm(words[0], commands[words[0]], words[1:])
     given, rest = parser.parse_known_args(words)
     if rest:
         options = [option for option in commands[given.command]._option_string_actions if option.startswith("--")]
@@ -85,6 +86,25 @@ def add_train_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--preset", metavar="NAME", help="tuned settings [those of the environment]")
     parser.add_argument("--seeds", metavar="LIST", help="one run for each seed: 1-5 or 1,3,7")
     _add_endings(parser)
+
+
+def add_tune_options(parser: argparse.ArgumentParser) -> None:
+    """The options of `lemniscate tune` besides the fields of a Config."""
+    parser.add_argument("--env", metavar="ID", help="environment id, or module:Class of your own")
+    parser.add_argument("--run", type=Path, metavar="DIR", help="directory of the search; must not exist [runs/…]")
+    parser.add_argument("--preset", metavar="NAME", help="settings that are not searched [those of the environment]")
+    parser.add_argument(
+        "--search", metavar="RANGES", help="fields as 'learning_rate=log:1e-4:1e-2, gamma=.9:.999, clip=0.1|0.2'"
+    )
+    parser.add_argument("--trials", default=40, metavar="INT", help="number of settings that are tried [40]")
+    parser.add_argument("--seeds", default="101-103", metavar="LIST", help="of each trial [101-103]")
+    parser.add_argument(
+        "--prune",
+        action=argparse.BooleanOptionalAction,
+        default=True,
+        help="end a trial after 1/9 or 1/3 of its steps if it is not among the best third [on]",
+    )
+    parser.add_argument("--quiet", action="store_true", help="no progress on standard error")
 
 
 class Parser(argparse.ArgumentParser):
@@ -120,7 +140,9 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
     subs = {name: commands.add_parser(name, help=text, description=text) for name, text in COMMANDS.items()}
     subs["train"].usage = "lemniscate train ALGORITHM --env ID [--run DIR] [--preset NAME] [--FIELD VALUE …]"
 
-    subs["resume"].add_argument("run", type=Path, metavar="RUN", help="a run or a sweep")
+    subs["tune"].usage = "lemniscate tune ALGORITHM --env ID --search RANGES [--trials INT] [--FIELD VALUE …]"
+
+    subs["resume"].add_argument("run", type=Path, metavar="RUN", help="a run, a sweep or a search")
     _add_endings(subs["resume"])
     for name in ("resume", "evaluate", "watch", "plot"):
         subs[name].add_argument(
@@ -177,15 +199,17 @@ def _add_endings(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--score", action="store_true", help="store the final return over 100 episodes")
 
 
-def _parse_train(parser: Parser, words: list[str]) -> argparse.Namespace:
-    titles = algorithms()
+def _parse_algorithm(command: str, parser: Parser, words: list[str]) -> argparse.Namespace:
+    """The words of `train` and `tune`, which begin with an algorithm."""
+    titles, verb = algorithms(), f"lemniscate {command}"
     asks = "-h" in words or "--help" in words
     if asks and (words[0].startswith("-") or "," in words[0]):
-        add_train_options(parser)
+        (add_train_options if command == "train" else add_tune_options)(parser)
         listed = "\n".join(f"  {name:<12}{title}" for name, title in titles.items())
+        several = "several, such as ppo,sac, with --seeds; " if command == "train" else ""
         parser.epilog = (
-            f"algorithms (several, such as ppo,sac, with --seeds; or a module of your own):\n{listed}\n\n"
-            "lemniscate train ALGORITHM --help lists the fields of that algorithm."
+            f"algorithms ({several}or a module of your own):\n{listed}\n\n"
+            f"{verb} ALGORITHM --help lists the fields of that algorithm."
         )
         parser.print_help()
         parser.exit()
@@ -193,17 +217,19 @@ def _parse_train(parser: Parser, words: list[str]) -> argparse.Namespace:
     if len(apart) > 1:
         raise UserError(f"Several algorithms are one word: lemniscate train {','.join(apart)} --seeds 1-5 …")
     names = list(dict.fromkeys(words[0].split(","))) if words and not words[0].startswith("-") else []
+    if command == "tune" and len(names) > 1:
+        raise UserError(f"A search is for one algorithm: {verb} {names[0]} …")
     strangers = [name for name in names if name not in titles and not _is_own(name)]
     misplaced = [word for word in words if word in titles]
     if misplaced and (strangers or not names):
-        raise UserError(f"The algorithm comes first, then its fields: lemniscate train {misplaced[0]} …")
+        raise UserError(f"The algorithm comes first, then its fields: {verb} {misplaced[0]} …")
     if not names:
-        raise UserError(f"Which algorithm? lemniscate train ALGORITHM …, with one of {', '.join(titles)}.")
+        raise UserError(f"Which algorithm? {verb} ALGORITHM …, with one of {', '.join(titles)}.")
     if strangers:
         raise unknown_name("algorithm", strangers[0], titles)
     from lemniscate.cli.fields import parse_fields  # imports torch
 
-    return parse_fields(names, words[1:])
+    return parse_fields(command, names, words[1:])
 
 
 def _is_own(name: str) -> bool:

@@ -9,7 +9,6 @@ from lemniscate import api, plots, results, resumed, sweep
 from lemniscate.algos import ALGORITHMS
 from lemniscate.checks import each_finding, verdict
 from lemniscate.cli.completion import completion as completion
-from lemniscate.cli.fields import number, read, read_json
 from lemniscate.console import say, talks
 from lemniscate.envs import registry
 from lemniscate.envs.findings import BAD
@@ -18,7 +17,8 @@ from lemniscate.owner import end_with_owner
 from lemniscate.presets import best, choose
 from lemniscate.report import pictures
 from lemniscate.run.run import is_compiled
-from lemniscate.run.sweep_file import is_sweep
+from lemniscate.run.sweep_file import is_search, is_sweep
+from lemniscate.run.texts import number, read, read_json
 from lemniscate.stored import TrainedRun
 
 
@@ -47,12 +47,34 @@ def train(given: argparse.Namespace) -> None:
     tell(f"Trained in {run.seconds:.1f} s. Everything is in {run.path}")
 
 
+def tune(given: argparse.Namespace) -> None:
+    """Search for the best settings."""
+    from lemniscate.tuning.tuner import tune
+
+    if given.search is None:
+        raise UserError("Search what? Name fields with their ranges: --search 'learning_rate=log:1e-4:1e-2'.")
+    fields = {"run": given.run, "preset": given.preset, "seeds": given.seeds, "prune": given.prune, **given.fields}
+    tuned = tune(
+        given.algorithm,
+        given.env,
+        search=given.search,
+        trials=number(given.trials),
+        progress=not given.quiet,
+        **fields,
+    )
+    tell(f"Everything is in {tuned.path}")
+
+
 def resume(given: argparse.Namespace) -> None:
-    """Continue an interrupted run or sweep. A sweep's runs are begun by this command too, and end with the sweep."""
+    """Continue an interrupted run, sweep or search. The runs of the latter two are begun by this command, too."""
     owned = end_with_owner()
     options = {"track": given.track, "report": given.report, "trust": given.trust, **_callbacks(given)}
     options["progress"] = not given.quiet
-    if is_sweep(given.run):
+    if is_search(given.run):
+        from lemniscate.tuning.tuner import resume_tuning
+
+        run = resume_tuning(given.run, progress=not given.quiet, trust=given.trust)
+    elif is_sweep(given.run):
         run = sweep.resume_sweep(given.run, **options)
     else:
         run = resumed.resume(given.run, processes=number(given.processes), **options)

@@ -1,21 +1,21 @@
-"""The options of `lemniscate train ALGORITHM`: one for each field of the algorithm's Config, generated from it."""
+"""The options of `lemniscate train ALGORITHM` and `tune`, one for each field of the algorithm's Config."""
 
 import argparse
 import ast
 import inspect
-import json
-from contextlib import nullcontext, suppress
+from contextlib import nullcontext
 from itertools import pairwise
 from textwrap import dedent, fill
 from types import NoneType
-from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from lemniscate import glossary
 from lemniscate.algos import find
-from lemniscate.cli import Parser, add_train_options, unknown_argument
+from lemniscate.cli import Parser, add_train_options, add_tune_options, unknown_argument
 from lemniscate.errors import UserError, prefix_errors, unknown_name
 from lemniscate.presets import PRESETS, names
 from lemniscate.run.config import RunConfig, flag, options_of
+from lemniscate.run.texts import is_dict, number_type, read
 
 GROUPS: dict[str, tuple[str, ...]] = {
     "run": ("seed", "total_steps", "device", "threads", "shards", "compile", "matmul", "warm_start"),
@@ -42,7 +42,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
 """the fields under each heading of the help; those that are not named here are the algorithm's"""
 
 
-def parse_fields(algorithms: list[str], words: list[str]) -> argparse.Namespace:
+def parse_fields(command: str, algorithms: list[str], words: list[str]) -> argparse.Namespace:
     """The options in `words`, for all of `algorithms`; the fields of their Configs as a dictionary `fields`.
 
     Raises:
@@ -52,46 +52,10 @@ def parse_fields(algorithms: list[str], words: list[str]) -> argparse.Namespace:
     given = argparse.Namespace()
     for algorithm in algorithms:
         with prefix_errors(algorithm) if len(algorithms) > 1 else nullcontext():
-            given, own = _parse(algorithm, words)
+            given, own = _parse(command, algorithm, words)
             fields |= own
-    given.command, given.algorithm, given.fields = "train", ",".join(algorithms), fields
+    given.command, given.algorithm, given.fields = command, ",".join(algorithms), fields
     return given
-
-
-def read(name: str, hint: Any, text: Any) -> Any:
-    """The value that `text` (of a tuple, several texts) stands for; what cannot be read as `hint` says stays as it is.
-
-    The Config then says what would be right. Raises `UserError` for a dictionary that is not JSON.
-    """
-    options = options_of(hint)
-    if isinstance(text, list):
-        item = next(get_args(option)[0] for option in options if get_origin(option) is tuple)
-        parts = [part for word in text for part in _split(word)]
-        return () if parts == ["none"] else tuple(read(name, item, part) for part in parts)
-    if NoneType in options and text == "none":
-        return None
-    if any(_is_dict(option) for option in options):
-        return read_json(flag(name), text)
-    return number(text) if any(map(_number, options)) else text
-
-
-def number(text: Any) -> Any:
-    """The number that `text` stands for, 1e6 and 1_000 too; what is none stays, for the sentence on it."""
-    for kind in (int, float):
-        with suppress(ValueError):
-            return kind(text)
-    return text
-
-
-def read_json(option: str, text: str) -> dict[str, Any]:
-    """The dictionary that `text` is in JSON. Raises `UserError` for anything else."""
-    try:
-        value = json.loads(text)
-    except (ValueError, RecursionError):
-        value = None
-    if not isinstance(value, dict):
-        raise UserError(f"""{option} must be a JSON object, such as '{{"gravity": -5}}', not {text}""")
-    return value
 
 
 def field_help(config: type[RunConfig]) -> dict[str, str]:
@@ -109,11 +73,12 @@ def field_help(config: type[RunConfig]) -> dict[str, str]:
     return found
 
 
-def _parse(algorithm: str, words: list[str]) -> tuple[argparse.Namespace, dict[str, Any]]:
+def _parse(command: str, algorithm: str, words: list[str]) -> tuple[argparse.Namespace, dict[str, Any]]:
     hints = get_type_hints(find(algorithm).Config, include_extras=True)
-    given, rest = parser_of(algorithm).parse_known_args(words)
+    given, rest = parser_of(algorithm, command).parse_known_args(words)
     if rest:
-        known = [*hints, "run", "preset", "seeds", "track", "report", "score", "callbacks"]
+        own = ["search", "trials", "prune"] if command == "tune" else ["track", "report", "score", "callbacks"]
+        known = [*hints, "run", "preset", "seeds", *own]
         raise unknown_argument(rest, lambda word: _unknown_flag(word, known))
     values = {name: value for name, value in vars(given).items() if name in hints and name != "env"}
     return given, {name: read(name, hints[name], value) for name, value in values.items()}
@@ -126,16 +91,16 @@ def _unknown_flag(word: str, known: list[str]) -> UserError:
     return glossary.unknown_field(name, known, flag)
 
 
-def parser_of(algorithm: str) -> Parser:
-    """The parser of `lemniscate train ALGORITHM`, with an option for each field."""
+def parser_of(algorithm: str, command: str = "train") -> Parser:
+    """The parser of `lemniscate train ALGORITHM` or `tune ALGORITHM`, with an option for each field."""
     config = find(algorithm).Config
     hints = get_type_hints(config, include_extras=True)
     parser = Parser(
-        prog=f"lemniscate train {algorithm}",
-        usage=f"lemniscate train {algorithm} --env ID [--run DIR] [--preset NAME] [--FIELD VALUE …]",
+        prog=f"lemniscate {command} {algorithm}",
+        usage=f"lemniscate {command} {algorithm} --env ID [--run DIR] [--preset NAME] [--FIELD VALUE …]",
         epilog=_presets(algorithm),
     )
-    add_train_options(parser)
+    (add_train_options if command == "train" else add_tune_options)(parser)
     texts, defaults = field_help(config), config()
     grouped = {name for members in GROUPS.values() for name in members} | {"env"}
     for title, members in GROUPS.items():
@@ -177,19 +142,9 @@ def _metavar(options: tuple[Any, ...]) -> str:
         if get_origin(option) is tuple:
             kinds.append(_metavar(options_of(get_args(option)[0])))
         elif option is not NoneType:
-            number = _number(option)
-            kinds.append("INT" if number is int else "FLOAT" if number else "JSON" if _is_dict(option) else "NAME")
+            number = number_type(option)
+            kinds.append("INT" if number is int else "FLOAT" if number else "JSON" if is_dict(option) else "NAME")
     return "|".join([*dict.fromkeys(kinds), *(["none"] if NoneType in options else [])])
-
-
-def _number(option: Any) -> type | None:
-    """Int or float, if it is one of them, with a range or without."""
-    kind = get_args(option)[0] if get_origin(option) is Annotated else option
-    return kind if kind in (int, float) else None
-
-
-def _is_dict(option: Any) -> bool:
-    return option is dict or get_origin(option) is dict
 
 
 def _shown(value: Any) -> str:
@@ -201,15 +156,3 @@ def _shown(value: Any) -> str:
     if isinstance(value, int):
         return f"{value:_}" if value >= 10_000 else str(value)
     return "none" if value is None else str(value)
-
-
-def _split(word: str) -> list[str]:
-    """The parts between commas that are in no bracket: "a:b(x=1,y=2),c:d" is two."""
-    parts, depth = [""], 0
-    for character in word:
-        depth += (character in "([{") - (character in ")]}")
-        if character == "," and depth == 0:
-            parts.append("")
-        else:
-            parts[-1] += character
-    return [part.strip() for part in parts if part.strip()]

@@ -3,11 +3,14 @@
 `default` is the Config of an algorithm as it stands: an environment without a preset of its own gets it.
 """
 
+from pathlib import Path
+
 from lemniscate.algos import find
 from lemniscate.errors import unknown_name
 from lemniscate.presets.off_policy import DDPG, SAC, TD3
 from lemniscate.presets.on_policy import A2C, PPO, REINFORCE, TRPO
 from lemniscate.presets.preset import Preset
+from lemniscate.presets.stored import read_preset
 from lemniscate.run.config import RunConfig
 
 PRESETS: dict[str, list[Preset]] = {
@@ -38,7 +41,9 @@ def best(algorithm: str, env_id: str | None) -> str:
 
 
 def choose(algorithm: str, env_id: str | None, name: str | None) -> tuple[str, RunConfig]:
-    """The preset asked for, or the best known for the environment, or the default: (its name, its Config).
+    """The preset asked for, by name or by its file, or the best known for the environment, or the default.
+
+    Returns (its name, its Config).
 
     Where several environments have a preset of one name, the environment decides. The Config's `env` is `env_id` if one
     is given. Raises `UserError` with the nearest names for an unknown preset.
@@ -46,6 +51,9 @@ def choose(algorithm: str, env_id: str | None, name: str | None) -> tuple[str, R
     name = best(algorithm, env_id) if name is None else name
     if not isinstance(name, str):
         raise unknown_name("preset", name, names(algorithm))
+    if name.endswith(".json"):
+        config = read_preset(Path(name), algorithm).config
+        return Path(name).stem, config if env_id is None else config.replace(env=env_id)
     named = [preset.config for preset in of(algorithm) if preset.name == name]
     if name == "default":
         named = [find(algorithm).Config()]

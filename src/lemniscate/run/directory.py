@@ -29,7 +29,9 @@ from lemniscate.world import World
 CONFIG, LOCK = "config.json", ".lock"
 SWEEP = "sweep.json"
 """the file that the directory of a sweep has in the place of a `config.json`"""
-UNFINISHED = {LOCK, f"{CONFIG}.tmp", f"{SWEEP}.tmp"}
+TUNE = "tune.json"
+"""that of a search"""
+UNFINISHED = {LOCK, *(f"{name}.tmp" for name in (CONFIG, SWEEP, TUNE))}
 """what the creation of a directory leaves where it fails half-way"""
 
 

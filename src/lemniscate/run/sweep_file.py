@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from lemniscate.errors import UserError
-from lemniscate.run.directory import CONFIG, SWEEP, create_directory
+from lemniscate.run.directory import CONFIG, SWEEP, TUNE, create_directory
 from lemniscate.run.files import DamagedFileError, parsing, read_json
 from lemniscate.run.trust import is_signed, signed
 
@@ -50,6 +50,11 @@ class Sweep:
 def is_sweep(path: Path) -> bool:
     """Whether a directory is that of a sweep."""
     return (path / SWEEP).exists()
+
+
+def is_search(path: Path) -> bool:
+    """Whether a directory is that of a search for settings, which has a sweep for each trial."""
+    return (path / TUNE).exists()
 
 
 def read_sweep(path: Path) -> Sweep:

@@ -20,10 +20,10 @@ from lemniscate.errors import UserError
 SIGNATURE = "signature"
 
 
-def signed(record: Mapping[str, Any]) -> dict[str, Any]:
-    """A record with this user's signature; without one where no key can be kept."""
-    key = _key()
-    return {**record, SIGNATURE: _signature_of(record, key)} if key else dict(record)
+def signed(record: Mapping[str, Any], names: Sequence[str] | None = None) -> dict[str, Any]:
+    """A record with this user's signature of all its parts, or of those named; without one where no key can be kept."""
+    key, parts = _key(), record if names is None else {name: record[name] for name in names}
+    return {**record, SIGNATURE: _signature_of(parts, key)} if key else dict(record)
 
 
 def is_signed(record: Mapping[str, Any], names: Sequence[str] = ("algorithm", "config")) -> bool:

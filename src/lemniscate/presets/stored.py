@@ -1,0 +1,71 @@
+"""A preset in a file of its own."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from lemniscate.algos import find
+from lemniscate.errors import UserError
+from lemniscate.run.config import RunConfig
+from lemniscate.run.files import DamagedFileError, parsing, read_json, write_json
+from lemniscate.run.trust import is_signed, own_code, signed
+
+SIGNED = ("algorithm", "fields")
+
+
+@dataclass(frozen=True)
+class StoredPreset:
+    """A Config with its provenance, in JSON: the fields in which it differs from the algorithm's defaults."""
+
+    name: str
+    algorithm: str
+    config: RunConfig
+    source: str
+    date: str
+
+    @property
+    def fields(self) -> dict[str, object]:
+        """The fields that have another value than the default."""
+        ours, defaults = self.config.to_json(), type(self.config)().to_json()
+        changed = [name for name, value in ours.items() if value != defaults[name] and name != "seed"]
+        return {name: ours[name] for name in dict.fromkeys(["env", *changed])}
+
+    def write(self, file: Path) -> None:
+        """Write it into a file."""
+        record = {"name": self.name, "algorithm": self.algorithm, "fields": self.fields}
+        write_json(file, signed(record | {"source": self.source, "date": self.date}, SIGNED))
+
+    def to_python(self) -> str:
+        """It as a value of `lemniscate.presets`, ready to be pasted there."""
+        fields = "".join(f"\n        {name}={_literal(value)}," for name, value in self.fields.items())
+        return (
+            f'Preset(\n    "{self.name}",\n    {self.algorithm}.Config({fields}\n    ),\n'
+            f'    "{self.source}",\n    "{self.date}",\n)'
+        )
+
+
+def read_preset(file: Path, algorithm: str) -> StoredPreset:
+    """The preset in a file.
+
+    Raises:
+        UserError: no such file, that of another algorithm, or one from elsewhere that names code of its own.
+    """
+    try:
+        record = read_json(file)
+    except DamagedFileError as error:
+        reason = str(error) if file.exists() else f"{file} does not exist."
+        raise UserError(f"There is no preset: {reason}") from None
+    with parsing(file):
+        if record["algorithm"] != algorithm:
+            raise UserError(f"{file} is a preset of {record['algorithm']}, not of {algorithm}.")
+        code = own_code(record["fields"])
+        if code and not is_signed(record, SIGNED):
+            raise UserError(f"{file} is not of this user and machine, and would execute code: {', '.join(code)}.")
+        config = find(algorithm).Config().replace(**record["fields"])
+        return StoredPreset(str(record["name"]), algorithm, config, str(record["source"]), str(record["date"]))
+
+
+def _literal(value: object) -> str:
+    """A value of JSON as Python has it; lists are tuples, and texts have double quotes."""
+    if isinstance(value, list):
+        return f"({', '.join(map(_literal, value))}{',' * (len(value) == 1)})"
+    return f'"{value}"' if isinstance(value, str) else repr(value)

@@ -1,0 +1,108 @@
+"""The directory of a search: what is searched, Optuna's journal of the trials, and a sweep for each trial.
+
+tune.json        algorithm, Config, search, seeds, number of trials
+study.journal    what Optuna knows of the trials
+trials/000/…     a sweep of one algorithm with all seeds
+preset.json      the settings of the best trial so far
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lemniscate import algos
+from lemniscate.errors import UserError, is_installed, missing_extra
+from lemniscate.run.config import RunConfig
+from lemniscate.run.directory import TUNE, create_directory
+from lemniscate.run.files import DamagedFileError, parsing, read_json
+from lemniscate.run.sweep_file import Sweep
+from lemniscate.run.trust import is_signed, own_code, require_trusted, signed
+from lemniscate.tuning.space import Space, read_space
+
+if TYPE_CHECKING:
+    import optuna
+
+JOURNAL, PRESET, TRIALS = "study.journal", "preset.json", "trials"
+SIGNED = ("algorithm", "config", "search", "seeds", "trials", "prune")
+
+REDUCTION = 3
+"""of the trials that reach a rung, one of so many goes on; each rung is so many times as far as the one before"""
+RUNGS = (1, REDUCTION)
+"""ninths of a run, after which a trial is compared with the others that have come so far"""
+NINTHS = REDUCTION**2
+
+
+@dataclass(frozen=True)
+class Search:
+    """What is searched, as `tune.json` has it."""
+
+    path: Path
+    algorithm: str
+    config: RunConfig
+    """of every trial, but for what is searched and the seed"""
+    search: dict[str, str]
+    seeds: list[int]
+    trials: int
+    prune: bool
+    trusted: bool = True
+
+    @property
+    def space(self) -> Space:
+        """The ranges of what is searched."""
+        return read_space(self.search, self.config)
+
+    def create(self) -> None:
+        """Write `tune.json` into a new directory. Raises `UserError` if the directory exists already."""
+        record = {name: getattr(self, name) for name in SIGNED} | {"config": self.config.to_json()}
+        create_directory(self.path, TUNE, signed(record))
+
+    def sweep(self, number: int, fields: dict[str, Any]) -> Sweep:
+        """The sweep of one trial."""
+        config = self.config.replace(**fields).to_json()
+        but_seed = {name: value for name, value in config.items() if name != "seed"}
+        return Sweep(self.path / TRIALS / f"{number:03d}", self.seeds, {self.algorithm: but_seed}, self.trusted)
+
+    def rungs(self) -> list[int]:
+        """The steps after which a trial may end, planned checkpoints all of them."""
+        return [ninths * self.config.checkpoint_every for ninths in RUNGS] if self.prune else []
+
+    def study(self) -> "optuna.Study":
+        """Optuna's study, new or as the journal has it."""
+        optuna = import_optuna()
+        backend = optuna.storages.journal.JournalFileBackend(str(self.path / JOURNAL))
+        sampler = optuna.samplers.TPESampler(seed=self.seeds[0], n_startup_trials=max(2, min(10, self.trials // 3)))
+        return optuna.create_study(
+            storage=optuna.storages.JournalStorage(backend),
+            study_name="lemniscate",
+            direction="maximize",
+            sampler=sampler,
+            pruner=optuna.pruners.SuccessiveHalvingPruner(min_resource=1, reduction_factor=REDUCTION),
+            load_if_exists=True,
+        )
+
+
+def import_optuna() -> Any:
+    """Optuna, which says nothing by itself. Raises `UserError` where it is not installed."""
+    if not is_installed("optuna"):
+        raise missing_extra("optuna", "tune")
+    import optuna
+
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    return optuna
+
+
+def read_search(path: Path, *, trust: bool = False) -> Search:
+    """The search in a directory. Raises `UserError` if there is none, or one from elsewhere that names code."""
+    try:
+        record = read_json(path / TUNE)
+    except DamagedFileError as error:
+        raise UserError(f"{path} is not a search: {error}") from None
+    with parsing(path / TUNE):
+        trusted = trust or is_signed(record, SIGNED)
+        algorithm = str(record["algorithm"])
+        code = own_code(record["config"]) + ([algorithm] if algorithm not in algos.ALGORITHMS else [])
+        require_trusted(path, code, trusted=trusted)
+        config = algos.find(algorithm).Config.from_json(record["config"])
+        seeds = [int(seed) for seed in record["seeds"]]
+        search = {str(name): str(text) for name, text in record["search"].items()}
+        return Search(path, algorithm, config, search, seeds, int(record["trials"]), bool(record["prune"]), trusted)
