@@ -756,15 +756,15 @@ MUTANTS = [
     (
         "only the first shard's rows are counted",
         "maths/stats.py",
-        "        for other in others:",
-        "        for other in ():",
+        "middle = (mean * count).sum(0) / rows",
+        "middle = mean[0]",
         "maths/test_stats.py::test_the_moments_of_shards_of_any_sizes_are_those_of_all_their_rows",
     ),
     (
         "the gradient is that of the first shard",
         "optim/shards.py",
-        "for part in parts])).mean(0)",
-        "for part in parts]))[0]",
+        "size, mean = len(self._optimizer.vector), gathered.mean(0)",
+        "size, mean = len(self._optimizer.vector), gathered[0]",
         "optim/test_shards.py",
     ),
     (

@@ -3,9 +3,12 @@
 import pytest
 
 from lemniscate import presets
-from lemniscate.algos import ALGORITHMS, find
+from lemniscate.algos import ALGORITHMS, find, ppo
 from lemniscate.errors import UserError
 from lemniscate.presets.on_policy import FIGURE_EIGHT
+from lemniscate.presets.preset import Preset
+from lemniscate.presets.stored import StoredPreset, read_preset
+from lemniscate.run.files import read_json, write_json
 
 
 @pytest.mark.parametrize("algorithm", presets.PRESETS)
@@ -56,3 +59,33 @@ def test_the_course_has_the_settings_of_its_notebook():
 def test_an_unknown_name_is_an_error_with_the_nearest_one():
     with pytest.raises(UserError, match="did you mean hopper"):
         presets.choose("ppo", "Hopper-v5", "hoper")
+
+
+def test_a_stored_preset_is_ready_to_be_pasted_whatever_its_provenance(tmp_path):
+    config = ppo.Config(env="CartPole-v1", hidden=(16,), gamma=0.98, network="layer_norm", desired_kl=None)
+    stored = StoredPreset("mine", "ppo", config, "lemniscate tune: " + ", ".join(["gamma=.9:.999"] * 40), "2026-11")
+    stored.write(tmp_path / "preset.json")
+    text = read_preset(tmp_path / "preset.json", "ppo").to_python()
+    assert max(map(len, text.splitlines())) <= 116  # in a list, four more
+    assert eval(text, {"Preset": Preset, "ppo": ppo}) == Preset("mine", config, stored.source, "2026-11")
+
+
+def test_a_stored_preset_is_chosen_by_its_file(tmp_path):
+    config = ppo.Config(env="CartPole-v1", gamma=0.98)
+    file = tmp_path / "preset.json"
+    StoredPreset("mine", "ppo", config, "by hand", "2026-11").write(file)
+    assert presets.choose("ppo", None, str(file))[1] == config
+    assert presets.choose("ppo", "Acrobot-v1", str(file))[1] == config.replace(env="Acrobot-v1")
+    with pytest.raises(UserError, match="is a preset of ppo, not of sac"):
+        presets.choose("sac", None, str(file))
+    with pytest.raises(UserError, match=r"There is no preset: .*elsewhere\.json does not exist"):
+        presets.choose("ppo", None, str(tmp_path / "elsewhere.json"))
+
+
+def test_a_stored_preset_from_elsewhere_executes_no_code(tmp_path):
+    config = ppo.Config(env="CartPole-v1", network="elsewhere:Net")
+    file = tmp_path / "preset.json"
+    StoredPreset("mine", "ppo", config, "by hand", "2026-11").write(file)
+    write_json(file, {**read_json(file), "signature": "of another user"})
+    with pytest.raises(UserError, match="would execute code: elsewhere:Net"):
+        read_preset(file, "ppo")

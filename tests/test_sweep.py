@@ -285,7 +285,7 @@ def test_seeds_are_given_as_ranges_and_lists():
 @pytest.mark.parametrize(("cores", "threads", "runs"), [(8, 1, 8), (8, 3, 2), (2, 4, 1)])
 def test_as_many_runs_at_once_as_cores_serve(monkeypatch, cores, threads, runs):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)))
-    assert sweep.at_once(threads) == runs
+    assert places.at_once(threads) == runs
 
 
 def test_without_a_terminal_progress_is_a_line_now_and_then(capsys):

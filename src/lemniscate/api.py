@@ -13,12 +13,13 @@ import torch
 
 from lemniscate import algos, named, presets
 from lemniscate.callbacks import Callback, call_callbacks, find_callbacks
+from lemniscate.cluster.connection import find_cluster
 from lemniscate.console import say
 from lemniscate.envs import registry
 from lemniscate.errors import NotStoredError, UserError, is_installed, missing_extra, shown, unknown_name
 from lemniscate.policy import TrainedPolicy
 from lemniscate.report import playback
-from lemniscate.results import draw_run, evaluate
+from lemniscate.results import evaluate, report_on
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import require_absent
 from lemniscate.run.environments import envs_of, make_envs
@@ -29,7 +30,7 @@ from lemniscate.run.run import Run
 from lemniscate.run.seeding import set_seeds
 from lemniscate.run.state import TrainState
 from lemniscate.stored import TrainedRun, load, path_of
-from lemniscate.world import World
+from lemniscate.world import CLUSTER, World
 
 
 def config_for(
@@ -78,6 +79,9 @@ def train(
     report: bool = False,
     progress: bool = True,
     processes: int = 1,
+    cluster: str | None = None,
+    workers: int | None = None,
+    storage: str | None = None,
     **fields: object,
 ) -> TrainedRun:
     """Train a policy.
@@ -96,6 +100,9 @@ def train(
         report: evaluate the final policy, and draw it into `plots/` and `videos/`.
         progress: the live line on standard error.
         processes: of this machine, W; environments, minibatches and replay are divided among them. See `shards`.
+        cluster: "ray" or "ray=ADDRESS": train in `workers` processes that Ray places, and replaces where they die.
+        workers: of the cluster; by default one.
+        storage: a folder, or an address in a cloud, that all machines of the cluster reach; by default of this one.
         **fields: any field of the algorithm's Config, such as seed, total_steps or warm_start.
 
     Raises:
@@ -105,6 +112,7 @@ def train(
         WorkerError: the process of an environment died.
         Stopped: Ctrl-C or SIGTERM, when the run has saved itself; go on with `resume`.
     """
+    there = find_cluster(cluster, workers, storage) if cluster or workers or storage else None
     with together() as world:
         config = config_for(algorithm, env, preset, **fields)
         name = algos.name_of(sys.modules[type(config).__module__] if isinstance(algorithm, RunConfig) else algorithm)
@@ -112,6 +120,10 @@ def train(
         loggers, functions = loggers_with(track), find_callbacks(callbacks) if callbacks else []
         if world.is_first:
             require_absent(path)
+        if there is not None:
+            from lemniscate.cluster.job import train_there
+
+            return train_there(path, name, config, there, track, callbacks, report, progress)
         if processes > 1:
             launched = launch_run(path, name, config, processes, track, callbacks, report, progress)
             return TrainedRun(path, load(path, trust=True), launched)
@@ -123,11 +135,13 @@ def train(
 
 
 def together() -> AbstractContextManager[World]:
-    """The world of this process: of those that `torchrun` has started, or its own."""
-    if "WORLD_SIZE" not in os.environ:
+    """The world of this process: of those that `torchrun` or Ray has started, or its own."""
+    if CLUSTER in os.environ:
+        from lemniscate.cluster.job import together
+    elif "WORLD_SIZE" in os.environ:
+        from lemniscate.processes import together
+    else:
         return nullcontext(World())
-    from lemniscate.processes import together
-
     return together()
 
 
@@ -180,14 +194,6 @@ def train_here(
         error.run = trained
         raise
     return trained
-
-
-def report_on(run: TrainedRun) -> list[Path]:
-    """Evaluate a run's final policy, draw it, and name the files; returns the pictures."""
-    files = draw_run(run, film=True)
-    for file in files:
-        say(file)
-    return [file for file in files if file.suffix == ".png"]
 
 
 def loggers_with(track: str | LoggerClass | None) -> tuple[LoggerClass, ...]:

@@ -35,6 +35,11 @@ class WorkerError(RuntimeError):
 class RankError(RuntimeError):
     """Another process of a run failed: names which, with its sentence. It is empty where another process says it."""
 
+    reason = ""
+    """the sentence, whoever says it"""
+    repeats = False
+    """whether the process failed by itself, and so would again; else it was killed, or hangs"""
+
 
 class SweepError(RuntimeError):
     """Some runs of a sweep failed: names each, with its sentence."""

@@ -96,7 +96,7 @@ class Processes(World):
         if not self._begun and self.rank:
             time.sleep(1.0)  # most likely it is everyone's mistake, and the first says so
         sentence = self._watch.fail(str(error) or type(error).__name__)
-        return error if sentence and self.rank == 0 else RankError(sentence)
+        return error if sentence and self.rank == 0 else self._error(sentence)
 
     def close(self) -> None:
         """Leave the other processes."""
@@ -114,7 +114,13 @@ class Processes(World):
             with self._watch.state("waiting"):
                 yield
         except (RuntimeError, OSError) as error:
-            raise RankError(self._watch.why()) from error
+            raise self._error(self._watch.why()) from error
+
+    def _error(self, sentence: str) -> RankError:
+        error, fault = RankError(sentence), self._watch.fault()
+        if fault:
+            error.reason, error.repeats = fault["sentence"], fault["by"] == fault["rank"]
+        return error
 
     def _shared_memory(self) -> SharedMemory | None:
         """What all processes share, if they are on one machine, which has enough of it: ten times as fast as gloo."""
@@ -133,9 +139,9 @@ class Processes(World):
 
 
 @contextmanager
-def together() -> Iterator[World]:
+def together(kind: type[Processes] = Processes) -> Iterator[World]:
     """The world that the environment variables of `torchrun` describe; what ends one process ends them all."""
-    world = Processes()
+    world = kind()
     try:
         yield world
     except Exception as error:

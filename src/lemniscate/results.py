@@ -174,6 +174,14 @@ def _known_scores(file: Path) -> dict[str, Any]:
         return {}
 
 
+def report_on(run: TrainedRun) -> list[Path]:
+    """Evaluate a run's final policy, draw it, and name the files; returns the pictures."""
+    files = draw_run(run, film=True)
+    for file in files:
+        say(file)
+    return [file for file in files if file.suffix == ".png"]
+
+
 def draw_run(run: str | Path | TrainedRun, by: str = "step", *, film: bool = False, trust: bool = False) -> list[Path]:
     """Draw a run and its final scores into its `plots/`, and write its page; returns the files, the page last.
 

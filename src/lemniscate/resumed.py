@@ -5,10 +5,12 @@ from pathlib import Path
 from typing import Any
 
 from lemniscate import algos
-from lemniscate.api import loggers_with, name_in_config, report_on, together, train_here
+from lemniscate.api import loggers_with, name_in_config, together, train_here
 from lemniscate.callbacks import Callback, find_callbacks
+from lemniscate.cluster.connection import find_cluster
 from lemniscate.console import say
 from lemniscate.policy import TrainedPolicy
+from lemniscate.results import report_on
 from lemniscate.run.directory import is_finished, read_record
 from lemniscate.run.files import parsing
 from lemniscate.run.launch import launch_run
@@ -28,6 +30,9 @@ def resume(
     report: bool = False,
     progress: bool = True,
     processes: int = 1,
+    cluster: str | None = None,
+    workers: int | None = None,
+    storage: str | None = None,
     trust: bool = False,
 ) -> TrainedRun:
     """Resume an interrupted run from its newest whole planned checkpoint, and train it to its end.
@@ -44,6 +49,9 @@ def resume(
         report: evaluate the final policy, and draw it.
         progress: the live line on standard error.
         processes: of this machine; any number that divides the run's `shards`, whatever it began with.
+        cluster: as in `train`: go on there, from what its storage has, or else this directory.
+        workers: as many as divide the run's `shards`; others stand by.
+        storage: the same as when the run began there.
         trust: import the code that the run names as `module:name` also if the run is not of this user and machine.
 
     Raises:
@@ -56,6 +64,7 @@ def resume(
     path = path_of(run)
     again = {"env": env, "wrappers": wrappers, "network": network}
     given = {name: name_in_config(value) for name, value in again.items() if value is not None}
+    there = find_cluster(cluster, workers, storage)
     with together() as world:
         record = world.from_first(read_record(path) if world.is_first else {})
         with parsing(path):
@@ -67,6 +76,10 @@ def resume(
         loggers, functions = loggers_with(track), find_callbacks(callbacks) if callbacks else []
         if world.from_first(world.is_first and is_finished(path)):
             return _finished(path, report and world.is_first, progress and world.is_first, trust)
+        if there is not None:
+            from lemniscate.cluster.job import train_there
+
+            return train_there(path, algorithm, config, there, track, callbacks, report, progress)
         if processes > 1 and world.size == 1:
             launched = launch_run(path, algorithm, config, processes, track, callbacks, report, progress)
             return TrainedRun(path, load(path, trust=True), launched)

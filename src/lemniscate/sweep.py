@@ -6,17 +6,18 @@ each of its runs ends in the same bits as if it had been trained alone.
 
 import re
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from filelock import FileLock, Timeout
 
 from lemniscate import api, named, plots
 from lemniscate.algos import ALGORITHMS, name_of
+from lemniscate.cluster.connection import Cluster, find_cluster
 from lemniscate.console import say
 from lemniscate.envs import registry
 from lemniscate.errors import SweepError, UserError, prefix_errors, resume_line, shown
@@ -25,16 +26,15 @@ from lemniscate.results import final_return
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import is_finished
 from lemniscate.run.environments import device_for, require_memory
-from lemniscate.run.metrics import read_metrics
 from lemniscate.run.run import Stopped, stop_signals_to
 from lemniscate.run.sweep_file import Sweep, read_sweep
-from lemniscate.run.sweep_progress import SweepProgress
+from lemniscate.run.sweep_progress import SweepProgress, progress_of
 from lemniscate.run.trust import require_trusted
 from lemniscate.run.warm_start import load_networks
 from lemniscate.stored import own_code_of, path_of
 
-PROGRESS_BYTES = 2**17
-"""bytes at the end of a run's metrics that its progress is read from"""
+if TYPE_CHECKING:
+    from lemniscate.cluster.tasks import RayTasks
 
 MOST_SEEDS = 1_000
 """of a sweep, each of which is a directory and a process"""
@@ -62,6 +62,8 @@ def train_sweep(
     callbacks: str | Sequence[str] = (),
     report: bool = False,
     progress: bool = True,
+    cluster: str | None = None,
+    workers: int | None = None,
     **fields: object,
 ) -> TrainedSweep:
     """Train every algorithm with every seed, and compare them: a table on standard error, pictures in `plots/`.
@@ -76,6 +78,8 @@ def train_sweep(
         callbacks: names of functions, as `module:function`: every run calls them in its own process.
         report: as in `train`, for every run.
         progress: the live lines on standard error.
+        cluster: "ray" or "ray=ADDRESS": train the runs as Ray tasks, wherever there is room.
+        workers: the most runs at a time there; by default as many as the cores serve.
         **fields: any fields that the Configs of all the algorithms have.
 
     Raises:
@@ -92,7 +96,7 @@ def train_sweep(
             configs[name] = api.config_for(name, env, preset, **fields)
     if len({config.env for config in configs.values()}) > 1:
         raise UserError("These presets are for different environments; name the one of the whole sweep with env.")
-    options = _options(track, callbacks, report)
+    there, options = find_cluster(cluster, workers), _options(track, callbacks, report)
     require_trainable(configs, numbers)
     stem = f"{'-'.join(names)}-{len(numbers)}-seeds"
     path = path_of(run) if run is not None else api.fresh_directory(next(iter(configs.values())).env, stem)
@@ -100,7 +104,7 @@ def train_sweep(
     but_seed = {name: {k: v for k, v in record.items() if k != "seed"} for name, record in records.items()}
     runs = Sweep(path, numbers, but_seed)
     runs.create()
-    return _train(runs, [*options, "--trust"], progress)  # code that was named here and now
+    return _train(runs, [*options, "--trust"], progress, there)  # code that was named here and now
 
 
 def resume_sweep(
@@ -110,13 +114,15 @@ def resume_sweep(
     callbacks: str | Sequence[str] = (),
     report: bool = False,
     progress: bool = True,
+    cluster: str | None = None,
+    workers: int | None = None,
     trust: bool = False,
 ) -> TrainedSweep:
     """Resume an interrupted sweep: train the runs that are not finished or have not begun. See `resume`."""
-    runs, options = read_sweep(path_of(path)), _options(track, callbacks, report)
+    runs, there, options = read_sweep(path_of(path)), find_cluster(cluster, workers), _options(track, callbacks, report)
     for record in runs.runs.values():
         require_trusted(runs.path, own_code_of(record), trusted=trust or runs.trusted)
-    return _train(replace(runs, trusted=trust or runs.trusted), [*options, *["--trust"] * trust], progress)
+    return _train(replace(runs, trusted=trust or runs.trusted), [*options, *["--trust"] * trust], progress, there)
 
 
 def _options(track: str | None, callbacks: str | Sequence[str], report: bool) -> list[str]:
@@ -132,11 +138,11 @@ def _options(track: str | None, callbacks: str | Sequence[str], report: bool) ->
     return options + (["--callbacks", *names] if names else []) + (["--report"] if report else [])
 
 
-def _train(runs: Sweep, options: list[str], progress: bool) -> TrainedSweep:
+def _train(runs: Sweep, options: list[str], progress: bool, cluster: Cluster | None) -> TrainedSweep:
     try:
         with FileLock(runs.path / ".lock", timeout=0):
             runs.create_runs()
-            failed = _Training(runs, options, progress).train()
+            failed = _Training(runs, options, progress, cluster).train()
     except Timeout:
         raise UserError(f"{runs.path} is being trained by another process.") from None
     if any(map(is_finished, runs.runs)):
@@ -151,12 +157,22 @@ def _train(runs: Sweep, options: list[str], progress: bool) -> TrainedSweep:
     return TrainedSweep(runs.path, list(runs.runs))
 
 
+def places_on(cluster: Cluster | None, configs: Iterable[Mapping[str, Any]]) -> "Processes | RayTasks":
+    """The places of a cluster, or of this machine, for runs of such Configs."""
+    threads = max(config["threads"] for config in configs)
+    if cluster is None:
+        return Processes(threads)
+    from lemniscate.cluster.tasks import RayTasks
+
+    return RayTasks(cluster, threads, gpu=any(config["device"].startswith("cuda") for config in configs))
+
+
 class _Training:
     """The runs of a sweep that are to be trained, and the sentences of those that failed."""
 
-    def __init__(self, runs: Sweep, options: list[str], progress: bool) -> None:
+    def __init__(self, runs: Sweep, options: list[str], progress: bool, cluster: Cluster | None) -> None:
         self._runs, self._options = runs, ["--score", *options]
-        self._places = Processes(max(config["threads"] for config in runs.configs.values()))
+        self._places = places_on(cluster, runs.configs.values())
         self._waiting = [run for run in runs.runs if not is_finished(run)]
         self._failed: dict[str, str] = {}
         self._stop_signal = 0
@@ -209,15 +225,6 @@ class _Training:
         """Ask every process to save and stop; asked twice, it does not wait for the end of its update."""
         self._stop_signal = self._stop_signal or signum
         self._places.stop()
-
-
-def progress_of(run: Path) -> tuple[int, float | None, float | None]:
-    """(step, mean return of the last 100 episodes, steps per second) in the last lines of a run's metrics."""
-    lines = read_metrics(run, PROGRESS_BYTES)
-    returns = [ret for line in lines for ret in line.get("episode/returns", [])][-100:]
-    rates = [line["time/steps_per_second"] for line in lines if "time/steps_per_second" in line]
-    mean = sum(returns) / len(returns) if returns else None
-    return (lines[-1]["step"] if lines else 0), mean, (rates[-1] if rates else None)
 
 
 def algorithms_of(names: str | Iterable[str]) -> list[str]:

@@ -13,8 +13,6 @@ Loss = tuple[Tensor, Metrics]
 """a scalar to minimize, and its metrics"""
 Flags = tuple[bool, ...]
 """a constant for each gradient step, [K]"""
-
-
 Streams = tuple[Generator, ...]
 """random generators, one for each shard held: its equal part of the rows is drawn from it"""
 

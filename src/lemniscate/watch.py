@@ -78,13 +78,13 @@ class Watch:
     def fail(self, reason: str) -> str:
         """Tell the others why this process ends; returns the sentence, empty if another one has failed before."""
         self._accuse(self._rank, f": {reason}")
-        fault = self._fault()
+        fault = self.fault()
         return fault["sentence"] if fault and fault["by"] == self._rank else ""
 
     def why(self) -> str:
         """Why the others cannot be reached; waits for one of them to be found out. Empty if another process says it."""
         deadline = time.monotonic() + self._patience + GRACE
-        while not (fault := self._fault()) and time.monotonic() < deadline:
+        while not (fault := self.fault()) and time.monotonic() < deadline:
             time.sleep(EVERY / 2)
             for rank, beat in self._others.items():
                 if beat.said["doing"] != "left" and time.monotonic() - beat.beats_at > 4 * EVERY:
@@ -106,7 +106,7 @@ class Watch:
                 if self._doing != "busy":  # ends this process even where C code never lets this thread run again
                     faulthandler.dump_traceback_later(self._patience + GRACE, exit=True, file=self._nowhere)
                 self._say(count)
-                if fault := self._fault():
+                if fault := self.fault():
                     self._end(fault)
                 self._look()
                 self._closed.wait(EVERY)
@@ -149,7 +149,8 @@ class Watch:
         with suppress(RuntimeError):
             self._store.compare_set("fault", "", json.dumps(fault))
 
-    def _fault(self) -> dict[str, Any] | None:
+    def fault(self) -> dict[str, Any] | None:
+        """What is said of the process at fault; None if there is none, or if nobody can be asked."""
         with suppress(RuntimeError):
             if self._store.check(["fault"]):
                 return json.loads(self._store.get("fault"))

@@ -6,10 +6,14 @@ belong to shards. Rank 0 writes.
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
 from typing import Any
 
 from lemniscate.errors import UserError
 from lemniscate.maths import Shards
+
+CLUSTER = "LEMNISCATE_CLUSTER"
+"""in the environment of a worker of a cluster: its kind"""
 
 
 class World(Shards):
@@ -48,3 +52,6 @@ class World(Shards):
     def busy(self) -> AbstractContextManager[None]:
         """A context in which this process may take as long as it likes."""
         return nullcontext()
+
+    def saved(self, path: Path) -> None:
+        """What follows a planned checkpoint in a run directory, in every process."""

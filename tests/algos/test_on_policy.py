@@ -160,10 +160,10 @@ def compiled_equals_eager(algo, env, programs):
 @pytest.mark.parametrize(
     "case",
     [
-        "trpo, 'Pendulum-v1', programs=3",  # act, the Fisher product, the value
-        "trpo, 'CartPole-v1', programs=3",
-        "a2c, 'Pendulum-v1', programs=2",
-        "reinforce, 'CartPole-v1', programs=3",  # act, the policy, the value
+        "trpo, 'Pendulum-v1', programs=4",  # act, the estimates, the Fisher product, the value
+        "trpo, 'CartPole-v1', programs=4",
+        "a2c, 'Pendulum-v1', programs=3",
+        "reinforce, 'CartPole-v1', programs=4",  # act, the estimates, the policy, the value
     ],
 )
 def test_traced_updates_equal_eager_ones(case, compiler):

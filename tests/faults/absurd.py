@@ -21,11 +21,11 @@ import lemniscate as lem
 from lemniscate import api
 from lemniscate.algos import ALGORITHMS, find
 from lemniscate.cli import parse
-from lemniscate.cli.fields import _number
 from lemniscate.envs import registry
 from lemniscate.errors import UserError
 from lemniscate.run.config import _hints_of, options_of
 from lemniscate.run.environments import device_for, evaluation_env, make_envs, require_memory
+from lemniscate.run.texts import number_type
 
 MEMORY, SECONDS = 2 * 10**9, 5
 """bytes that the cases of one process may take, and processor time of one case"""
@@ -66,7 +66,7 @@ def numeric_fields(algorithm):
     hints = _hints_of(find(algorithm).Config)
 
     def is_numeric(option):
-        return _number(option) is not None or any(_number(part) for part in getattr(option, "__args__", ()))
+        return number_type(option) is not None or any(number_type(part) for part in getattr(option, "__args__", ()))
 
     return [name for name, hint in hints.items() if any(map(is_numeric, options_of(hint)))]
 

@@ -86,10 +86,6 @@ class State(OnPolicyState):
     optimizer: Adam
     learning_rate: float
 
-    def per_step_methods(self) -> list[tuple[object, str]]:
-        """Those of every algorithm, and V(s) and log π(a|s) of a rollout, before each epoch."""
-        return [*super().per_step_methods(), (self.networks, "estimates")]
-
 
 def init(config: Config, spec: Spec, device: torch.device) -> State:
     """A new state, seeded by the run's seed."""

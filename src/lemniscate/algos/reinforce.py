@@ -15,8 +15,7 @@ from lemniscate.data.rollout import collect, epoch_minibatches, estimates, one_m
 from lemniscate.data.whole_episodes import collect_episodes
 from lemniscate.errors import UserError
 from lemniscate.maths import episode_return, explained_variance, kl_k3, means, policy_gradient, reward_to_go, value_loss
-from lemniscate.nn.actor_critic import ActorCritic
-from lemniscate.nn.critics import Value
+from lemniscate.nn.actor_critic import ActorCritic, Value
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.nn.policies import Policy
 from lemniscate.optim.adam import Adam, linear

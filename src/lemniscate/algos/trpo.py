@@ -14,8 +14,7 @@ from torch.func import grad
 
 from lemniscate.data.rollout import collect, epoch_minibatches, estimates, one_minibatch
 from lemniscate.maths import backtrack, explained_variance, gae, means, natural_step, surrogate, value_loss
-from lemniscate.nn.actor_critic import ActorCritic
-from lemniscate.nn.critics import Value
+from lemniscate.nn.actor_critic import ActorCritic, Value
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.optim.adam import Adam, linear
 from lemniscate.optim.vector import PolicyVector

@@ -2,7 +2,7 @@
 
 Exit codes: 0 done, 1 training could not go on, 2 a mistake in what was asked, 130 stopped by Ctrl-C, 143 by SIGTERM.
 
-This module is light: help, and a mistake that can be seen without torch, take no time. `commands` does the work.
+This module is light: help, and a mistake that is seen without torch, take no time. `training` and `inspection` work.
 """
 
 import argparse
@@ -34,6 +34,7 @@ COMMANDS = {
     "completion": "Print the script with which a shell completes; its first line says where to write it.",
 }
 
+TRAINING = ("train", "tune", "resume")
 SHELLS = ("bash", "zsh", "fish")
 
 
@@ -44,7 +45,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "ERROR")
     try:
         given = parse(sys.argv[1:] if arguments is None else arguments)
-        getattr(import_module("lemniscate.cli.commands"), given.command)(given)
+        work = import_module(f"lemniscate.cli.{'training' if given.command in TRAINING else 'inspection'}")
+        getattr(work, given.command)(given)
     except SystemExit as done:  # argparse has printed help, or the version
         return int(done.code or 0)
     except BaseException as error:
@@ -104,6 +106,7 @@ def add_tune_options(parser: argparse.ArgumentParser) -> None:
         default=True,
         help="end a trial after 1/9 or 1/3 of its steps if it is not among the best third [on]",
     )
+    _add_cluster(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress on standard error")
 
 
@@ -139,7 +142,6 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
     commands = parser.add_subparsers(dest="command", required=True, title="commands", metavar="COMMAND")
     subs = {name: commands.add_parser(name, help=text, description=text) for name, text in COMMANDS.items()}
     subs["train"].usage = "lemniscate train ALGORITHM --env ID [--run DIR] [--preset NAME] [--FIELD VALUE …]"
-
     subs["tune"].usage = "lemniscate tune ALGORITHM --env ID --search RANGES [--trials INT] [--FIELD VALUE …]"
 
     subs["resume"].add_argument("run", type=Path, metavar="RUN", help="a run, a sweep or a search")
@@ -194,9 +196,16 @@ def _add_endings(parser: argparse.ArgumentParser) -> None:
         help="sees each update and may stop the run: module:function, or 'module:Class(key=value)'",
     )
     parser.add_argument("--processes", default=1, metavar="INT", help="processes of this machine for one run [1]")
+    _add_cluster(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress on standard error")
     parser.add_argument("--report", action="store_true", help="evaluate the final policy, and draw plots and videos")
     parser.add_argument("--score", action="store_true", help="store the final return over 100 episodes")
+
+
+def _add_cluster(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--cluster", metavar="ray[=ADDRESS]", help="train on Ray: --workers INT [--storage DIR]")
+    parser.add_argument("--workers", metavar="INT", help=argparse.SUPPRESS)
+    parser.add_argument("--storage", metavar="DIR", help=argparse.SUPPRESS)
 
 
 def _parse_algorithm(command: str, parser: Parser, words: list[str]) -> argparse.Namespace:
@@ -207,10 +216,7 @@ def _parse_algorithm(command: str, parser: Parser, words: list[str]) -> argparse
         (add_train_options if command == "train" else add_tune_options)(parser)
         listed = "\n".join(f"  {name:<12}{title}" for name, title in titles.items())
         several = "several, such as ppo,sac, with --seeds; " if command == "train" else ""
-        parser.epilog = (
-            f"algorithms ({several}or a module of your own):\n{listed}\n\n"
-            f"{verb} ALGORITHM --help lists the fields of that algorithm."
-        )
+        parser.epilog = f"algorithms ({several}or a module of your own; ppo --help lists the fields of ppo):\n{listed}"
         parser.print_help()
         parser.exit()
     apart = list(takewhile(titles.__contains__, (word.strip(",") for word in words)))

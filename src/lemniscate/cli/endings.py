@@ -1,14 +1,7 @@
 """What a person reads, and what the shell gets, where a command ends with an error."""
 
 from lemniscate.console import talks
-from lemniscate.errors import (
-    NonFiniteError,
-    NotStoredError,
-    RankError,
-    SweepError,
-    UserError,
-    WorkerError,
-)
+from lemniscate.errors import NonFiniteError, NotStoredError, RankError, SweepError, UserError, WorkerError
 
 
 def exit_code(error: BaseException) -> int | None:

@@ -21,14 +21,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "run": ("seed", "total_steps", "device", "threads", "shards", "compile", "matmul", "warm_start"),
     "environment": ("env_kwargs", "wrappers", "backend", "num_envs"),
     "algorithm": (),
-    "networks": (
-        "network",
-        "hidden",
-        "critic_hidden",
-        "activation",
-        "initial_log_std",
-        "normalize_observations",
-    ),
+    "networks": ("network", "hidden", "critic_hidden", "activation", "initial_log_std", "normalize_observations"),
     "logging and checkpoints": (
         "log_every",
         "checkpoint_every",
@@ -75,10 +68,10 @@ def field_help(config: type[RunConfig]) -> dict[str, str]:
 
 def _parse(command: str, algorithm: str, words: list[str]) -> tuple[argparse.Namespace, dict[str, Any]]:
     hints = get_type_hints(find(algorithm).Config, include_extras=True)
-    given, rest = parser_of(algorithm, command).parse_known_args(words)
+    parser = parser_of(algorithm, command)
+    given, rest = parser.parse_known_args(words)
     if rest:
-        own = ["search", "trials", "prune"] if command == "tune" else ["track", "report", "score", "callbacks"]
-        known = [*hints, "run", "preset", "seeds", *own]
+        known = [action.dest for action in parser._actions]
         raise unknown_argument(rest, lambda word: _unknown_flag(word, known))
     values = {name: value for name, value in vars(given).items() if name in hints and name != "env"}
     return given, {name: read(name, hints[name], value) for name, value in values.items()}

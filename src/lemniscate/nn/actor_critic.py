@@ -2,18 +2,24 @@
 
 from torch import Tensor, nn
 
-from lemniscate.nn.critics import Value
 from lemniscate.nn.images import ImageEncoder
 from lemniscate.nn.networks import Layers
 from lemniscate.nn.normalizer import NoNorm, RunningNorm, ScaleBytes
-from lemniscate.nn.policies import (
-    BernoulliPolicy,
-    CategoricalPolicy,
-    GaussianPolicy,
-    MultiCategoricalPolicy,
-    Policy,
-)
+from lemniscate.nn.policies import BernoulliPolicy, CategoricalPolicy, GaussianPolicy, MultiCategoricalPolicy, Policy
 from lemniscate.spec import Action, Box, Discrete, MultiDiscrete, Spec
+
+
+class Value(nn.Module):
+    """V(s), behind the policy's observation normalizer."""
+
+    def __init__(self, normalizer: NoNorm, net: nn.Module) -> None:
+        super().__init__()
+        self.normalizer = normalizer
+        self.net = net
+
+    def forward(self, obs: Tensor) -> Tensor:
+        """[…, O] to […]."""
+        return self.net(self.normalizer(obs)).squeeze(-1)
 
 
 class ActorCritic(nn.Module):

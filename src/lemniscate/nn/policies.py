@@ -5,13 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Generator, Tensor, nn
 
-from lemniscate.maths import (
-    Bernoulli,
-    Categorical,
-    Distribution,
-    Gaussian,
-    MultiCategorical,
-)
+from lemniscate.maths import Bernoulli, Categorical, Distribution, Gaussian, MultiCategorical
 from lemniscate.nn.normalizer import NoNorm
 from lemniscate.spec import Box, Discrete, MultiDiscrete
 from lemniscate.types import Streams

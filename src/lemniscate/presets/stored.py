@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import wrap
 
 from lemniscate.algos import find
 from lemniscate.errors import UserError
@@ -37,10 +38,9 @@ class StoredPreset:
     def to_python(self) -> str:
         """It as a value of `lemniscate.presets`, ready to be pasted there."""
         fields = "".join(f"\n        {name}={_literal(value)}," for name, value in self.fields.items())
-        return (
-            f'Preset(\n    "{self.name}",\n    {self.algorithm}.Config({fields}\n    ),\n'
-            f'    "{self.source}",\n    "{self.date}",\n)'
-        )
+        source = "".join(f'\n    "{part}"' for part in wrap(self.source, 100, drop_whitespace=False))
+        config = f"{self.algorithm}.Config({fields}\n    )"
+        return f'Preset(\n    "{self.name}",\n    {config},{source},\n    "{self.date}",\n)'
 
 
 def read_preset(file: Path, algorithm: str) -> StoredPreset:

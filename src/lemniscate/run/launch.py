@@ -37,10 +37,7 @@ def launch_run(
     """
     if (path / CONFIG).exists() or config.shards > 1:
         World(config.shards, size=processes).divide(config.shards)
-    names = list(callbacks) if isinstance(callbacks, list | tuple) else [callbacks] if callbacks else []
-    for name in (config.env, *config.wrappers, getattr(config, "network", ""), track or "", *names):
-        if not isinstance(name, str) or "<" in name or name.startswith("__main__:"):
-            raise UserError(f"Each process has to import it: put {shown(name)} into a module, and name it.")
+    names = require_importable(config, track, callbacks)
     if not (path / CONFIG).exists():
         config = config.replace(shards=max(config.shards, processes))
         create_directory(path, CONFIG, signed({"algorithm": algorithm, "config": config.to_json()}))
@@ -49,6 +46,15 @@ def launch_run(
     began = time.monotonic()
     launch(["resume", str(path), *options], processes)
     return time.monotonic() - began
+
+
+def require_importable(config: RunConfig, track: object, callbacks: Any) -> list[str]:
+    """The names of the callbacks. Raises `UserError` for what another process could not import."""
+    names = list(callbacks) if isinstance(callbacks, list | tuple) else [callbacks] if callbacks else []
+    for name in (config.env, *config.wrappers, getattr(config, "network", ""), track or "", *names):
+        if not isinstance(name, str) or "<" in name or name.startswith("__main__:"):
+            raise UserError(f"Each process has to import it: put {shown(name)} into a module, and name it.")
+    return names
 
 
 def launch(words: Sequence[str], processes: int) -> None:

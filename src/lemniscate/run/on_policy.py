@@ -81,6 +81,10 @@ class OnPolicyState(TrainState[ActorCritic]):
 
     reward_scale: RewardScale
 
+    def per_step_methods(self) -> list[tuple[object, str]]:
+        """Those of every algorithm, and V(s) and log π(a|s) of a rollout."""
+        return [*super().per_step_methods(), (self.networks, "estimates")]
+
     def hold(self, held: range) -> None:
         """Keep the generators and the running returns of these shards."""
         super().hold(held)

@@ -239,6 +239,7 @@ class Run:
         if planned:
             with self.world.busy():
                 self._saver.save(state, planned=True, logged=self._logged)
+            self.world.saved(self.path)
         stop = self._asked_to_stop(state, planned)
         if stop and not finished:
             self._tell_stop(state.step)

@@ -1,14 +1,28 @@
-"""The live lines of a sweep: one bar for all its runs, and one for each run that is under way."""
+"""The progress of runs, as their metrics say it, and the live lines of a sweep: a bar for all, and one for each run."""
 
 from collections.abc import Mapping
 from contextlib import suppress
 from datetime import timedelta
+from pathlib import Path
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
 from lemniscate.console import in_notebook, say
 from lemniscate.notebook import CellText, drawn_bar
+from lemniscate.run.metrics import read_metrics
+
+PROGRESS_BYTES = 2**17
+"""bytes at the end of a run's metrics that its progress is read from"""
+
+
+def progress_of(run: Path) -> tuple[int, float | None, float | None]:
+    """(step, mean return of the last 100 episodes, steps per second) in the last lines of a run's metrics."""
+    lines = read_metrics(run, PROGRESS_BYTES)
+    returns = [ret for line in lines for ret in line.get("episode/returns", [])][-100:]
+    rates = [line["time/steps_per_second"] for line in lines if "time/steps_per_second" in line]
+    mean = sum(returns) / len(returns) if returns else None
+    return (lines[-1]["step"] if lines else 0), mean, (rates[-1] if rates else None)
 
 
 class SweepProgress:

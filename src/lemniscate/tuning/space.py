@@ -29,9 +29,11 @@ class Interval:
     whole: bool
 
     def draw(self, trial: Any, name: str) -> Any:
-        """The number that Optuna suggests."""
-        suggest = trial.suggest_int if self.whole else trial.suggest_float
-        return suggest(name, self.low, self.high, log=self.log)
+        """The number that Optuna suggests; of one with a fraction, six digits, which a preset can say."""
+        if self.whole:
+            return trial.suggest_int(name, self.low, self.high, log=self.log)
+        value = float(f"{trial.suggest_float(name, self.low, self.high, log=self.log):.6g}")
+        return min(max(value, self.low), self.high)
 
     def key_of(self, value: Any) -> Any:
         """What Optuna would have suggested for `value`; None if it is outside."""

@@ -15,6 +15,7 @@ from lemniscate.errors import UserError, is_installed, missing_extra
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import TUNE, create_directory
 from lemniscate.run.files import DamagedFileError, parsing, read_json
+from lemniscate.run.seeding import derive
 from lemniscate.run.sweep_file import Sweep
 from lemniscate.run.trust import is_signed, own_code, require_trusted, signed
 from lemniscate.tuning.space import Space, read_space
@@ -70,15 +71,20 @@ class Search:
         """Optuna's study, new or as the journal has it."""
         optuna = import_optuna()
         backend = optuna.storages.journal.JournalFileBackend(str(self.path / JOURNAL))
-        sampler = optuna.samplers.TPESampler(seed=self.seeds[0], n_startup_trials=max(2, min(10, self.trials // 3)))
         return optuna.create_study(
             storage=optuna.storages.JournalStorage(backend),
             study_name="lemniscate",
             direction="maximize",
-            sampler=sampler,
             pruner=optuna.pruners.SuccessiveHalvingPruner(min_resource=1, reduction_factor=REDUCTION),
             load_if_exists=True,
         )
+
+    def ask(self, study: "optuna.Study") -> "optuna.Trial":
+        """A new trial. What is proposed depends on the trials that are known, not on the process that asks."""
+        few = max(2, min(10, self.trials // 3))
+        seed = derive(self.seeds[0], len(study.trials))
+        study.sampler = import_optuna().samplers.TPESampler(seed=seed, n_startup_trials=few)
+        return study.ask()
 
 
 def import_optuna() -> Any:

@@ -18,9 +18,10 @@ from filelock import FileLock, Timeout
 
 from lemniscate import api
 from lemniscate.algos import name_of
+from lemniscate.cluster.connection import Cluster, find_cluster
 from lemniscate.console import say
 from lemniscate.errors import SweepError, UserError, resume_line, shown
-from lemniscate.places import LOG, Processes, failure_of
+from lemniscate.places import LOG, failure_of
 from lemniscate.presets.stored import StoredPreset
 from lemniscate.report import tuning as pictures
 from lemniscate.report.seeds import iqm
@@ -29,7 +30,7 @@ from lemniscate.run.metrics import read_metrics
 from lemniscate.run.run import Stopped, stop_signals_to
 from lemniscate.run.sweep_file import Sweep, is_sweep
 from lemniscate.stored import path_of
-from lemniscate.sweep import POLL_SECONDS, require_trainable, seeds_of
+from lemniscate.sweep import POLL_SECONDS, places_on, require_trainable, seeds_of
 from lemniscate.tuning.space import draw, read_space, read_texts
 from lemniscate.tuning.study import NINTHS, PRESET, RUNGS, Search, import_optuna, read_search
 
@@ -66,6 +67,8 @@ def tune(
     run: str | Path | None = None,
     preset: str | None = None,
     progress: bool = True,
+    cluster: str | None = None,
+    workers: int | None = None,
     **fields: object,
 ) -> Tuned:
     """Search for the settings with which an algorithm learns an environment best.
@@ -83,6 +86,8 @@ def tune(
         run: the search's directory; by default a new one under `runs/`.
         preset: the settings that are not searched; the best known for the environment unless given.
         progress: a line on standard error for each trial.
+        cluster: "ray" or "ray=ADDRESS": train the trials' runs as Ray tasks, wherever there is room.
+        workers: the most runs at a time there; by default as many as the cores serve.
         **fields: any other fields of the algorithm's Config, the same for all trials.
 
     Raises:
@@ -103,24 +108,31 @@ def tune(
         evaluate_every=config.total_steps,
         evaluate_episodes=fields.get("evaluate_episodes") or EPISODES,
     )
-    texts, numbers = read_texts(search), seeds_of(seeds)
+    there, texts, numbers = find_cluster(cluster, workers), read_texts(search), seeds_of(seeds)
     read_space(texts, config)
     require_trainable({algorithm: config}, numbers)
     path = path_of(run) if run is not None else api.fresh_directory(config.env, f"{algorithm}-tune")
     what = Search(path, algorithm, config, texts, numbers, trials, prune)
     what.create()
-    return _tune(what, progress)
+    return _tune(what, progress, there)
 
 
-def resume_tuning(path: str | Path | Tuned, *, progress: bool = True, trust: bool = False) -> Tuned:
+def resume_tuning(
+    path: str | Path | Tuned,
+    *,
+    progress: bool = True,
+    cluster: str | None = None,
+    workers: int | None = None,
+    trust: bool = False,
+) -> Tuned:
     """Go on with an interrupted search. Each run of each trial ends in the same bits as if it had not been stopped."""
-    return _tune(read_search(path_of(path), trust=trust), progress)
+    return _tune(read_search(path_of(path), trust=trust), progress, find_cluster(cluster, workers))
 
 
-def _tune(search: Search, progress: bool) -> Tuned:
+def _tune(search: Search, progress: bool, cluster: Cluster | None) -> Tuned:
     try:
         with FileLock(search.path / ".lock", timeout=0):
-            return _Tuner(search, progress).tune()
+            return _Tuner(search, progress, cluster).tune()
     except Timeout:
         raise UserError(f"{search.path} is being searched by another process.") from None
 
@@ -141,10 +153,10 @@ class _Trial:
 class _Tuner:
     """The trials of a search, and the processes that train their runs."""
 
-    def __init__(self, search: Search, progress: bool) -> None:
+    def __init__(self, search: Search, progress: bool, cluster: Cluster | None) -> None:
         self._search, self._progress = search, progress
         self._space, self._rungs, self._study = search.space, search.rungs(), search.study()
-        self._places = Processes(search.config.threads)
+        self._places = places_on(cluster, [search.config.to_json()])
         self._trials: list[_Trial] = []
         self._stop_signal = 0
 
@@ -217,7 +229,7 @@ class _Tuner:
             if trial is None:
                 if not self._missing:
                     return
-                trial = self._trial(self._study.ask())
+                trial = self._trial(self._search.ask(self._study))
                 self._queue(trial)
             run = trial.waiting.pop(0)
             until = [*self._rungs, None][trial.rung]

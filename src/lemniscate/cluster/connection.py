@@ -1,0 +1,85 @@
+"""The cluster that a user names, and the connection to it."""
+
+# pyright: reportMissingImports=false
+# Ray is an extra that no check of types needs.
+
+import logging
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from lemniscate.errors import UserError, is_installed, missing_extra, shown
+
+MOST_WORKERS = 4096
+
+
+@dataclass(frozen=True)
+class Cluster:
+    """Where the processes are: `ray` is this machine, or what RAY_ADDRESS says; `ray=ADDRESS` a cluster.
+
+    Args:
+        address: None for this machine, or for RAY_ADDRESS.
+        workers: number of processes; None for one of a run, or as many runs of a set as there are cores.
+        storage: a folder that all machines reach, or the address of one in a cloud; None: in the run directory.
+    """
+
+    address: str | None
+    workers: int | None
+    storage: str | None
+
+
+def find_cluster(cluster: object, workers: object = None, storage: object = None) -> Cluster | None:
+    """What a user names as `ray` or `ray=ADDRESS`; None if nothing is named.
+
+    Raises:
+        UserError: another name, or a number that is none; Ray is not installed.
+    """
+    if cluster is None:
+        for name, value in (("workers", workers), ("storage", storage)):
+            if value is not None:
+                raise UserError(f"{name} are of a cluster: add --cluster ray; on this machine, --processes.")
+        return None
+    kind, _, address = cluster.partition("=") if isinstance(cluster, str) else ("", "", "")
+    if kind != "ray":
+        raise UserError(f"cluster must be ray or ray=ADDRESS, not {shown(cluster)}.")
+    if workers is not None and not (type(workers) is int and 1 <= workers <= MOST_WORKERS):
+        raise UserError(f"workers must be a whole number from 1 to {MOST_WORKERS:,}, not {shown(workers)}.")
+    if not is_installed("ray"):
+        raise missing_extra("ray", "ray")
+    return Cluster(address or None, workers, None if storage is None else str(storage))
+
+
+@contextmanager
+def connected(cluster: Cluster) -> Iterator[None]:
+    """Ray, started on this machine unless there is one to connect to; it says nothing by itself.
+
+    Raises `UserError` if no cluster answers at the address.
+    """
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+    import ray
+
+    if ray.is_initialized():
+        yield
+        return
+    options: dict[str, Any] = {"logging_level": "ERROR", "log_to_driver": False}
+    if cluster.address is None and "RAY_ADDRESS" not in os.environ:
+        modules = os.pathsep.join([str(Path.cwd()), *filter(None, sys.path)])
+        options |= {"num_cpus": max(cluster.workers or 1, os.cpu_count() or 1), "include_dashboard": False}
+        options["runtime_env"] = {"env_vars": {"PYTHONPATH": modules}}
+    logging.disable(logging.WARNING)
+    try:
+        ray.init(cluster.address, **options)
+    except (ConnectionError, RuntimeError, ValueError) as error:
+        logging.disable(logging.NOTSET)
+        where = cluster.address or os.environ.get("RAY_ADDRESS", "this machine")
+        raise UserError(f"No Ray cluster answers at {where}: {str(error).partition(chr(10))[0]}") from None
+    try:
+        yield
+    finally:
+        ray.shutdown()
+        logging.disable(logging.NOTSET)
