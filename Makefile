@@ -29,7 +29,7 @@ test-long: setup  ## the tests that train for minutes
 test-faults: setup  ## every way to break a run, many times: half an hour
 	$(BIN)/python -m pytest -n auto --dist load -m faults -rP
 
-test-cluster: setup  ## runs of several processes: the same bits for any number, kills of a rank, hangs; a quarter of an hour
+test-cluster: .venv/.ray  ## runs of several processes and of Ray (240 MB): the same bits for any number, kills, hangs; half an hour
 	$(BIN)/python -m pytest -m cluster -rP
 
 test-soak: setup  ## memory and open files of long runs, on every backend: two hours
@@ -40,6 +40,10 @@ check: setup  ## style, types, floors
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
 	$(BIN)/lint-imports
+
+.venv/.ray: .venv/.ready
+	$(BIN)/python -m pip install --quiet --constraint requirements.lock --no-build-isolation --editable '.[ray]'
+	touch $@
 
 wheel: setup  ## dist/lemniscate-….whl
 	$(BIN)/python -m pip wheel --quiet --no-deps --no-build-isolation --wheel-dir dist .

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from lemniscate.run.seeding import set_seeds
     from lemniscate.stored import TrainedRun, load, save
     from lemniscate.sweep import TrainedSweep, resume_sweep, train_sweep
+    from lemniscate.tuning.tuner import Tuned, resume_tuning, tune
 
 __all__ = [
     "Evaluation",
@@ -33,6 +34,7 @@ __all__ = [
     "TrainedPolicy",
     "TrainedRun",
     "TrainedSweep",
+    "Tuned",
     "UserError",
     "check",
     "config_for",
@@ -43,10 +45,12 @@ __all__ = [
     "plot",
     "resume",
     "resume_sweep",
+    "resume_tuning",
     "save",
     "set_seeds",
     "train",
     "train_sweep",
+    "tune",
     "watch",
 ]
 
@@ -59,6 +63,7 @@ MODULES = {
     "TrainedPolicy": "policy",
     "TrainedRun": "stored",
     "TrainedSweep": "sweep",
+    "Tuned": "tuning.tuner",
     "UserError": "errors",
     "check": "checks",
     "config_for": "api",
@@ -69,17 +74,19 @@ MODULES = {
     "plot": "plots",
     "resume": "resumed",
     "resume_sweep": "sweep",
+    "resume_tuning": "tuning.tuner",
     "save": "stored",
     "set_seeds": "run.seeding",
     "train": "api",
     "train_sweep": "sweep",
+    "tune": "tuning.tuner",
     "watch": "results",
 }
 """where each public name is defined"""
 
 SUBMODULES = (
     *("algos", "api", "course", "data", "envs", "errors", "maths", "nn", "optim", "policy", "presets", "report"),
-    *("plots", "results", "run", "spec", "stored", "sweep", "testing", "types"),
+    *("plots", "results", "run", "spec", "stored", "sweep", "testing", "tuning", "types"),
 )
 """what `lemniscate.NAME` imports by itself"""
 
