@@ -109,3 +109,64 @@ if __name__ == "__main__":
     model.learn(steps, reset_num_timesteps=False)
     print((model.num_timesteps - 4096) / (time.perf_counter() - started))
 """
+
+EXCHANGE = """
+import json, statistics, sys, time, torch
+from lemniscate.processes import together
+rounds, sizes, spent = int(sys.argv[1]), map(int, sys.argv[2:]), {}
+with together() as world:
+    for size in sizes:
+        mine, times = torch.randn(1, size), []
+        for _ in range(20 * rounds):
+            started = time.perf_counter()
+            world.gather(mine)
+            times.append(1e3 * (time.perf_counter() - started))
+        spent[size] = statistics.median(times[2:])
+print(json.dumps(spent))
+"""
+
+RLLIB_CONFIG = """
+import json, logging, sys, time, torch
+torch.set_num_threads(1)
+import ray
+from ray.rllib.algorithms.ppo import PPOConfig
+from ray.rllib.core.rl_module.default_model_config import DefaultModelConfig
+
+def ppo(env, runners, num_envs, **training):
+    ray.init(num_cpus=3, log_to_driver=False, logging_level=logging.ERROR, include_dashboard=False)
+    config = PPOConfig().environment(env).framework("torch").debugging(log_level="ERROR")
+    config = config.env_runners(num_env_runners=runners, num_envs_per_env_runner=num_envs // max(runners, 1))
+    model = DefaultModelConfig(fcnet_hiddens=[64, 64], fcnet_activation="tanh", vf_share_layers=False)
+    training |= dict(vf_clip_param=float("inf"), kl_coeff=0.0, clip_param=0.2, grad_clip=0.5)
+    return config.training(**training).rl_module(model_config=model)
+"""
+
+RLLIB = (
+    RLLIB_CONFIG
+    + """
+fields = dict(train_batch_size_per_learner=2048, minibatch_size=64, num_epochs=10, lr=3e-4, gamma=0.99, lambda_=0.95)
+algorithm = ppo("HalfCheetah-v5", int(sys.argv[1]), 16, **fields).build_algo()
+for _ in range(2): algorithm.train()
+started, steps = time.perf_counter(), 0
+for _ in range(6): steps += algorithm.train()["env_runners"]["num_env_steps_sampled"]
+print(json.dumps(float(steps) / (time.perf_counter() - started)))
+"""
+)
+
+RLLIB_LANDER = (
+    RLLIB_CONFIG
+    + """
+fields = dict(train_batch_size_per_learner=16_384, minibatch_size=64, num_epochs=4, lr=3e-4, gamma=0.999, lambda_=0.98)
+config = ppo("LunarLander-v3", 2, 16, entropy_coeff=0.01, **fields).debugging(seed=int(sys.argv[1]))
+judge = dict(evaluation_num_env_runners=0, evaluation_config=dict(explore=False, num_envs_per_env_runner=16))
+config = config.evaluation(evaluation_interval=3, evaluation_duration=100, **judge)
+algorithm, steps, reached = config.build_algo(), 0, float("-inf")
+while steps < 1_000_000 and reached < 250:
+    result = algorithm.train()
+    steps += result["env_runners"]["num_env_steps_sampled"]
+    if "evaluation" in result:
+        reached = float(result["evaluation"]["env_runners"]["episode_return_mean"])
+        print(steps, reached, file=sys.stderr, flush=True)
+print(json.dumps([int(steps), reached]))
+"""
+)
