@@ -19,7 +19,9 @@ def ip(*words):
 
 @contextmanager
 def hosts(count, delay):
-    """Names of network namespaces: `ip netns exec NAME command` runs one there. Host i has the address 10.77.0.(i + 1).
+    """The beginning of a command that is to run on each host: a network namespace with a `/dev/shm` of its own.
+
+    Host i has the address 10.77.0.(i + 1), and the interface `lemI`.
 
     Args:
         count: of hosts, at most 200.
@@ -38,7 +40,8 @@ def hosts(count, delay):
             ip("-n", name, "link", "set", f"lem{i}", "up", "mtu", MTU)
             ip("-n", name, "link", "set", "lo", "up")
         threading.Thread(target=_relay, args=(ends, delay), daemon=True).start()
-        yield names
+        alone = ("sh", "-c", 'mount -t tmpfs none /dev/shm && exec "$@"', "-")
+        yield [["ip", "netns", "exec", name, *alone] for name in names]
     finally:
         for name in names:
             subprocess.run(["ip", "netns", "del", name], stderr=subprocess.DEVNULL)

@@ -4,8 +4,8 @@
     .venv/bin/python benchmarks/scale.py processes         only this
     .venv/bin/python benchmarks/scale.py --table           the tables of docs/scale.md of what has been measured
 
-    processes    PPO, 16 environments, 2048 rows, minibatches of 512: two processes beside one, without shards
-    shards       PPO, 16 × HalfCheetah-v5, minibatches of 512, one process: eight shards beside one
+    processes    PPO as in docs/speed.md, 64 environments, minibatches of 64: two processes beside one, without shards
+    shards       PPO as in docs/speed.md, 16 × HalfCheetah-v5, but minibatches of 512: eight shards beside one
     exchange     milliseconds to gather what each rank has, by its size, by the number of ranks, and by the time that a
                  packet takes from host to host: simulated hosts, each with one rank, of which at most two compute
     rllib        RLlib's PPO with our settings beside ours; PYTHON names an interpreter that has `ray[rllib]`
@@ -28,9 +28,9 @@ from common import append, provenance, rows
 from hosts import hosts
 from peers import EXCHANGE, RLLIB, RLLIB_LANDER
 
-SIZE = {"num_envs": 16, "num_steps": 128, "minibatch_size": 512, "epochs": 10, "total_steps": 100_000}
+SIZE = {"num_envs": 16, "num_steps": 128, "minibatch_size": 64, "epochs": 10, "learning_rate": 3e-4}
+STEPS = 100_000
 DELAYS, RANKS, FLOATS = (0.0, 0.0001, 0.0005, 0.002), (2, 4, 8, 16), (16, 12_000, 120_000)
-SHARED = {"num_envs": 16, "num_steps": 128, "minibatch_size": 64, "epochs": 10, "learning_rate": 3e-4}
 
 
 def say(*words):
@@ -40,8 +40,9 @@ def say(*words):
 def train(env, **fields):
     """Steps per second of PPO after the third update, and milliseconds of its two halves: medians over updates."""
     with tempfile.TemporaryDirectory() as scratch:
-        flags = [part for name, value in fields.items() for part in (f"--{name.replace('_', '-')}", str(value))]
-        command = [sys.executable, "-m", "lemniscate.cli", "train", "ppo", "--env", env, "--preset", "default"]
+        given = {**SIZE, "total_steps": STEPS, "checkpoint_every": STEPS, **fields}
+        flags = [part for name, value in given.items() for part in (f"--{name.replace('_', '-')}", str(value))]
+        command = [sys.executable, "-m", "lemniscate", "train", "ppo", "--env", env, "--preset", "paper"]
         done = subprocess.run(
             [*command, "--run", scratch + "/run", "--compile", "on", "--quiet", *flags], capture_output=True, text=True
         )
@@ -57,36 +58,38 @@ def compare(what, env, ways, rounds, stamp):
     for _ in range(rounds):
         speeds, halves = {}, {}
         for name, fields in ways.items():
-            speeds[name], halves[name] = train(env, **SIZE, **fields)
+            speeds[name], halves[name] = train(env, **fields)
         say(what, env, {name: round(speed) for name, speed in speeds.items()}, halves)
         append("scale", {"what": what, "env": env, "steps_per_second": speeds, "seconds": halves} | stamp)
 
 
 def processes(rounds, stamp):
     for env in ("Ant-v5", "Humanoid-v5"):
-        compare("processes", env, {"1": {}, "2": {"processes": 2}}, rounds, stamp)
+        size = {"num_envs": 64, "num_steps": 32}
+        compare("processes", env, {"1": size, "2": {**size, "processes": 2}}, rounds, stamp)
 
 
 def shards(rounds, stamp):
-    compare("shards", "HalfCheetah-v5", {"1": {}, "8": {"shards": 8}}, rounds, stamp)
+    size = {"minibatch_size": 512}
+    compare("shards", "HalfCheetah-v5", {"1": size, "8": {**size, "shards": 8}}, rounds, stamp)
 
 
 def exchange(rounds, stamp):
     """The gather that makes the mean of gradients, in the ring of gloo."""
     for delay in DELAYS:
         for size in RANKS:
-            with hosts(size, delay) as names:
+            with hosts(size, delay) as commands:
                 world = {"WORLD_SIZE": size, "MASTER_ADDR": "10.77.0.1", "MASTER_PORT": 29_500}
                 program = [sys.executable, "-c", EXCHANGE, str(rounds), *map(str, FLOATS)]
                 ranks = [
                     subprocess.Popen(
-                        ["ip", "netns", "exec", name, *program],
+                        [*there, *program],
                         env={**os.environ, **{k: str(v) for k, v in world.items()}, "RANK": str(rank)}
-                        | {"GLOO_SOCKET_IFNAME": f"lem{rank}", "OMP_NUM_THREADS": "1"},
+                        | {"GLOO_SOCKET_IFNAME": f"lem{rank}", "TORCH_CPP_LOG_LEVEL": "ERROR"},
                         stdout=subprocess.PIPE,
                         text=True,
                     )
-                    for rank, name in enumerate(names)
+                    for rank, there in enumerate(commands)
                 ]
                 said = [rank.communicate()[0] for rank in ranks]
             for floats, milliseconds in json.loads(said[0].splitlines()[-1]).items():
@@ -106,7 +109,7 @@ def rllib(rounds, stamp):
         return json.loads(done.stdout.splitlines()[-1])
 
     for _ in range(rounds):
-        speeds = {"lemniscate": train("HalfCheetah-v5", **SIZE | SHARED)[0]}
+        speeds = {"lemniscate": train("HalfCheetah-v5")[0]}
         speeds |= {f"RLlib, {n} runners": theirs(RLLIB, n) for n in (0, 1, 2)}
         say("rllib", {name: round(speed) for name, speed in speeds.items()})
         append("scale", {"what": "rllib", "env": "HalfCheetah-v5", "steps_per_second": speeds} | stamp)

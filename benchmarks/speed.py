@@ -75,7 +75,7 @@ def python(code, *arguments):
 def train(folder, env, *, algorithm="ppo", environment=None, wait=True, **fields):
     """`lemniscate train` in a process of its own."""
     flags = [part for name, value in fields.items() for part in (f"--{name.replace('_', '-')}", str(value))]
-    command = [sys.executable, "-m", "lemniscate.cli", "train", algorithm, "--env", env, "--run", str(folder), *flags]
+    command = [sys.executable, "-m", "lemniscate", "train", algorithm, "--env", env, "--run", str(folder), *flags]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, env={**os.environ, **(environment or {})}, text=True)
     if wait and process.wait():
         raise SystemExit(process.stderr.read())

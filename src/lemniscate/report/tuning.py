@@ -29,6 +29,46 @@ def draw(study: Any, names: Sequence[str], folder: Path) -> list[Path]:
     return files
 
 
+def draw_population(
+    tenths: Sequence[Sequence[dict[str, Any]]], best: int, names: Sequence[str], folder: Path
+) -> list[Path]:
+    """Draw how the numbers among the settings of a population changed; returns the files.
+
+    Args:
+        tenths: for each tenth of the runs, the settings of every member, and of whom it is a copy.
+        best: the member that is best in the end.
+        names: of the settings.
+        folder: of the picture.
+    """
+    numbers = [name for name in names if isinstance(tenths[0][0]["settings"][name], int | float)]
+    make_directory(folder)
+    if not numbers:
+        return []
+    size = (7, 0.6 + 2.2 * len(numbers))
+    return [_draw(folder / "population.png", size, lambda figure: _population(figure, tenths, best, numbers))]
+
+
+def _population(figure: Figure, tenths: Any, best: int, names: Sequence[str]) -> None:
+    """Each setting by tenth; in colour those that the best member's networks were trained with."""
+    ancestors = [best]
+    for members in reversed(tenths[1:]):
+        copy_of = members[ancestors[0]]["copy_of"]
+        ancestors.insert(0, ancestors[0] if copy_of is None else copy_of)
+    tenth = np.arange(1, len(tenths) + 1)
+    for axes, name in zip(figure.subplots(len(names), squeeze=False)[:, 0], names, strict=True):
+        values = np.array([[member["settings"][name] for member in members] for members in tenths])
+        axes.plot(tenth, values, "o", color="0.75", markersize=4)
+        path = values[np.arange(len(tenths)), ancestors]
+        axes.step(tenth, path, where="mid", color=COLORS[0], label="of the best member, and of those it is copied from")
+        if values.min() > 0 and values.max() > 10 * values.min():
+            axes.set_yscale("log")
+        axes.set(ylabel=name, xticks=tenth)
+        finish(axes)
+    figure.axes[0].legend(frameon=False, fontsize=9)
+    figure.axes[0].set_title("Settings of the population")
+    figure.axes[-1].set_xlabel("tenth of the steps")
+
+
 def _draw(file: Path, size: tuple[float, float], content: Any) -> Path:
     figure = Figure(size, layout="constrained")
     content(figure)

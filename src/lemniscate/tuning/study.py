@@ -1,20 +1,27 @@
 """The directory of a search: what is searched, Optuna's journal of the trials, and a sweep for each trial.
 
 tune.json        algorithm, Config, search, seeds, number of trials
-study.journal    what Optuna knows of the trials
+study.journal    what Optuna knows of the trials; of a population, population.json
 trials/000/…     a sweep of one algorithm with all seeds
 preset.json      the settings of the best trial so far
 """
 
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from lemniscate import algos
 from lemniscate.errors import UserError, is_installed, missing_extra
+from lemniscate.presets.stored import StoredPreset
+from lemniscate.report.seeds import iqm
 from lemniscate.run.config import RunConfig
-from lemniscate.run.directory import TUNE, create_directory
+from lemniscate.run.directory import TUNE, create_directory, is_finished
 from lemniscate.run.files import DamagedFileError, parsing, read_json
+from lemniscate.run.metrics import read_metrics
 from lemniscate.run.seeding import derive
 from lemniscate.run.sweep_file import Sweep
 from lemniscate.run.trust import is_signed, own_code, require_trusted, signed
@@ -24,13 +31,27 @@ if TYPE_CHECKING:
     import optuna
 
 JOURNAL, PRESET, TRIALS = "study.journal", "preset.json", "trials"
-SIGNED = ("algorithm", "config", "search", "seeds", "trials", "prune")
+SIGNED = ("algorithm", "config", "search", "seeds", "trials", "prune", "population")
+TENTHS = 10
+"""parts of the runs of a population, between which settings change"""
+RETURNS = 100
+"""newest training episodes that a trial is compared by before its end"""
 
 REDUCTION = 3
 """of the trials that reach a rung, one of so many goes on; each rung is so many times as far as the one before"""
 RUNGS = (1, REDUCTION)
 """ninths of a run, after which a trial is compared with the others that have come so far"""
 NINTHS = REDUCTION**2
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """The result of `tune`: the search's directory, the best settings and their score, and every trial's."""
+
+    path: Path
+    preset: StoredPreset
+    score: float
+    trials: list[dict[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -45,23 +66,36 @@ class Search:
     seeds: list[int]
     trials: int
     prune: bool
+    population: bool = False
     trusted: bool = True
 
     @property
     def space(self) -> Space:
         """The ranges of what is searched."""
-        return read_space(self.search, self.config)
+        return read_space(self.search, self.config, while_training=self.population)
+
+    @property
+    def what(self) -> str:
+        """What is searched, as a user would type it."""
+        return ", ".join(f"{name}={text}" for name, text in self.search.items())
 
     def create(self) -> None:
         """Write `tune.json` into a new directory. Raises `UserError` if the directory exists already."""
         record = {name: getattr(self, name) for name in SIGNED} | {"config": self.config.to_json()}
         create_directory(self.path, TUNE, signed(record))
 
-    def sweep(self, number: int, fields: dict[str, Any]) -> Sweep:
+    def sweep(self, name: str, fields: Mapping[str, Any]) -> Sweep:
         """The sweep of one trial."""
         config = self.config.replace(**fields).to_json()
         but_seed = {name: value for name, value in config.items() if name != "seed"}
-        return Sweep(self.path / TRIALS / f"{number:03d}", self.seeds, {self.algorithm: but_seed}, self.trusted)
+        return Sweep(self.path / TRIALS / name, self.seeds, {self.algorithm: but_seed}, self.trusted)
+
+    def preset(self, which: str, settings: Mapping[str, Any], score: float) -> StoredPreset:
+        """The best settings, with their provenance."""
+        seeds = ", ".join(map(str, self.seeds))
+        source = f"lemniscate tune: {which}, {self.what}, seeds {seeds}, score {score:,.1f}"
+        config = self.config.replace(**settings, evaluate_every=0, evaluate_episodes=20)
+        return StoredPreset(self.path.name, self.algorithm, config, source, f"{date.today():%Y-%m}")
 
     def rungs(self) -> list[int]:
         """The steps after which a trial may end, planned checkpoints all of them."""
@@ -111,4 +145,40 @@ def read_search(path: Path, *, trust: bool = False) -> Search:
         config = algos.find(algorithm).Config.from_json(record["config"])
         seeds = [int(seed) for seed in record["seeds"]]
         search = {str(name): str(text) for name, text in record["search"].items()}
-        return Search(path, algorithm, config, search, seeds, int(record["trials"]), bool(record["prune"]), trusted)
+        flags = bool(record["prune"]), bool(record["population"])
+        return Search(path, algorithm, config, search, seeds, int(record["trials"]), *flags, trusted)
+
+
+def has_come(run: Path, step: int | None) -> bool:
+    """Whether a run has come to this step, or, without one, to its end."""
+    if step is None:
+        return is_finished(run)
+    lines = read_metrics(run)
+    return bool(lines) and lines[-1]["step"] >= step
+
+
+def score_at(runs: Iterable[Path], step: int) -> float | None:
+    """The interquartile mean over seeds of the newest training episodes' returns; None if a run has had none."""
+    of = [[ret for line in read_metrics(run) for ret in _returns(line, step)][-RETURNS:] for run in runs]
+    return float(iqm([float(np.mean(episodes)) for episodes in of])) if all(of) else None
+
+
+def _returns(line: Mapping[str, Any], step: int) -> list[float]:
+    """Those of a line of the metrics, unless it was written long after a step, as where a run has gone on before."""
+    return line.get("episode/returns", []) if line["step"] <= step + step // 2 else []
+
+
+def final_score(runs: Iterable[Path]) -> float:
+    """The interquartile mean over seeds of the final policies' returns."""
+    return float(iqm([read_metrics(run)[-1]["evaluation/return"] for run in runs]))
+
+
+def as_text(settings: Mapping[str, Any]) -> str:
+    """Settings as a line says them."""
+    return ", ".join(f"{name} {_shown(value)}" for name, value in settings.items())
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, tuple):
+        return " ".join(map(str, value))
+    return f"{value:.3g}" if isinstance(value, float) else str(value)

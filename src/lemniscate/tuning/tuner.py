@@ -8,12 +8,10 @@ among the best third of all that have come so far. The score of a trial is the i
 import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from datetime import date
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import numpy as np
 from filelock import FileLock, Timeout
 
 from lemniscate import api
@@ -24,36 +22,36 @@ from lemniscate.errors import SweepError, UserError, resume_line, shown
 from lemniscate.places import LOG, failure_of
 from lemniscate.presets.stored import StoredPreset
 from lemniscate.report import tuning as pictures
-from lemniscate.report.seeds import iqm
-from lemniscate.run.directory import is_finished
-from lemniscate.run.metrics import read_metrics
 from lemniscate.run.run import Stopped, stop_signals_to
 from lemniscate.run.sweep_file import Sweep, is_sweep
 from lemniscate.stored import path_of
 from lemniscate.sweep import POLL_SECONDS, places_on, require_trainable, seeds_of
+from lemniscate.tuning.population import Population
 from lemniscate.tuning.space import draw, read_space, read_texts
-from lemniscate.tuning.study import NINTHS, PRESET, RUNGS, Search, import_optuna, read_search
+from lemniscate.tuning.study import (
+    NINTHS,
+    PRESET,
+    RUNGS,
+    TENTHS,
+    Search,
+    Tuned,
+    as_text,
+    final_score,
+    has_come,
+    import_optuna,
+    read_search,
+    score_at,
+)
 
 if TYPE_CHECKING:
     import optuna
 
 MOST_TRIALS = 10_000
+FEWEST_MEMBERS = 4
 SEEDS = "101-103"
 """of a search, none of which any result of this project was evaluated with"""
-RETURNS = 100
-"""newest training episodes that a trial is compared by before its end"""
 EPISODES = 50
 """that the final policy of each seed plays"""
-
-
-@dataclass(frozen=True)
-class Tuned:
-    """The result of `tune`: the search's directory, the best settings and their score, and every trial's."""
-
-    path: Path
-    preset: StoredPreset
-    score: float
-    trials: list[dict[str, Any]]
 
 
 def tune(
@@ -64,6 +62,7 @@ def tune(
     trials: int = 40,
     seeds: str | int | Iterable[int] = SEEDS,
     prune: bool = True,
+    population: bool = False,
     run: str | Path | None = None,
     preset: str | None = None,
     progress: bool = True,
@@ -83,6 +82,8 @@ def tune(
         trials: number of settings that are tried.
         seeds: of every trial; its score is the interquartile mean over them. Evaluate the result with other ones.
         prune: end a trial after a ninth or a third of its steps if it is not among the best third.
+        population: train all trials together instead, and change settings of the worse ones on the way, into those of
+            better ones and others near to them (population-based training); it has no `prune`.
         run: the search's directory; by default a new one under `runs/`.
         preset: the settings that are not searched; the best known for the environment unless given.
         progress: a line on standard error for each trial.
@@ -95,24 +96,28 @@ def tune(
         Stopped: Ctrl-C or SIGTERM, when every run has saved itself; go on with `resume_tuning`.
         SweepError: no trial has come to its end.
     """
-    import_optuna()
+    if not population:
+        import_optuna()
     if "seed" in fields:
         raise UserError("A search has several seeds: they are given as seeds, not as seed.")
+    for name in sorted({"checkpoint_every", "evaluate_every"} & set(fields)):
+        raise UserError(f"{name} follows from the search: at the end of each part of a run trials are compared.")
     algorithm = name_of(algorithm)
     config = api.config_for(algorithm, env, preset, **fields)
     if not isinstance(trials, int) or isinstance(trials, bool) or not 1 <= trials <= MOST_TRIALS:
         raise UserError(f"trials must be a whole number from 1 to {MOST_TRIALS:,}, not {shown(trials)}.")
-    ninth = -(-config.total_steps // NINTHS)
+    if population and trials < FEWEST_MEMBERS:
+        raise UserError(f"A population has {FEWEST_MEMBERS} members or more: trials must not be {trials}.")
     config = config.replace(
-        checkpoint_every=fields.get("checkpoint_every") or ninth,
+        checkpoint_every=-(-config.total_steps // (TENTHS if population else NINTHS)),
         evaluate_every=config.total_steps,
         evaluate_episodes=fields.get("evaluate_episodes") or EPISODES,
     )
     there, texts, numbers = find_cluster(cluster, workers), read_texts(search), seeds_of(seeds)
-    read_space(texts, config)
+    read_space(texts, config, while_training=population)
     require_trainable({algorithm: config}, numbers)
     path = path_of(run) if run is not None else api.fresh_directory(config.env, f"{algorithm}-tune")
-    what = Search(path, algorithm, config, texts, numbers, trials, prune)
+    what = Search(path, algorithm, config, texts, numbers, trials, prune, population)
     what.create()
     return _tune(what, progress, there)
 
@@ -132,6 +137,8 @@ def resume_tuning(
 def _tune(search: Search, progress: bool, cluster: Cluster | None) -> Tuned:
     try:
         with FileLock(search.path / ".lock", timeout=0):
+            if search.population:
+                return Population(search, progress, cluster).train()
             return _Tuner(search, progress, cluster).tune()
     except Timeout:
         raise UserError(f"{search.path} is being searched by another process.") from None
@@ -198,14 +205,13 @@ class _Tuner:
                 trial = self._trial(optuna.trial.Trial(self._study, frozen._trial_id))
                 trial.rung = len(frozen.intermediate_values)
                 self._queue(trial)
-        what = ", ".join(f"{name}={text}" for name, text in self._search.search.items())
         self._say(
             f"{self._search.path}: {len(self._trials) + self._missing} of {self._search.trials} trials to run, with"
-            f" {len(self._search.seeds)} seeds each, {self._places.count} runs at a time: {what}"
+            f" {len(self._search.seeds)} seeds each, {self._places.count} runs at a time: {self._search.what}"
         )
 
     def _trial(self, asked: "optuna.Trial") -> _Trial:
-        trial = _Trial(asked, self._search.sweep(asked.number, draw(self._space, asked)))
+        trial = _Trial(asked, self._search.sweep(f"{asked.number:03d}", draw(self._space, asked)))
         if not is_sweep(trial.sweep.path):
             trial.sweep.create()
         trial.sweep.create_runs()
@@ -214,13 +220,12 @@ class _Tuner:
 
     def _queue(self, trial: _Trial) -> None:
         """Let the runs of a trial wait for a place, in which they go on to its next rung, or to their end."""
-        trial.waiting = [run for run in trial.sweep.runs if not self._has_come(run, trial.rung)]
+        until = self._until(trial)
+        trial.waiting = [run for run in trial.sweep.runs if not has_come(run, until)]
 
-    def _has_come(self, run: Path, rung: int) -> bool:
-        if rung == len(self._rungs):
-            return is_finished(run)
-        lines = read_metrics(run)
-        return bool(lines) and lines[-1]["step"] >= self._rungs[rung]
+    def _until(self, trial: _Trial) -> int | None:
+        """The step to which the runs of a trial go on; None for their end."""
+        return [*self._rungs, None][trial.rung]
 
     def _fill(self) -> None:
         """Start runs where there are places: those of the trials that have come furthest first, then new trials."""
@@ -232,7 +237,7 @@ class _Tuner:
                 trial = self._trial(self._search.ask(self._study))
                 self._queue(trial)
             run = trial.waiting.pop(0)
-            until = [*self._rungs, None][trial.rung]
+            until = self._until(trial)
             options = ["--callbacks", f"lemniscate.callbacks:StopAt(steps={until})"] if until else []
             self._places.start(run, [*options, *["--trust"] * self._search.trusted])
             trial.training.add(run)
@@ -254,17 +259,15 @@ class _Tuner:
             self._study.tell(asked, state=import_optuna().trial.TrialState.FAIL)
             return self._end(trial, f"failed, {trial.failure}")
         if trial.rung == len(self._rungs):
-            score = float(iqm([read_metrics(run)[-1]["evaluation/return"] for run in trial.sweep.runs]))
+            score = final_score(trial.sweep.runs)
             self._study.tell(asked, score)
             self._end(trial, f"score {score:,.1f}")
             if self._study.best_trial.number == number:
                 self._preset().write(self._search.path / PRESET)
             return None
-        returns = [_newest_returns(run, self._rungs[trial.rung]) for run in trial.sweep.runs]
+        score, ninths = score_at(trial.sweep.runs, self._rungs[trial.rung]), RUNGS[trial.rung]
         trial.rung += 1
-        if all(returns):
-            ninths = RUNGS[trial.rung - 1]
-            score = float(iqm([float(np.mean(episodes)) for episodes in returns]))
+        if score is not None:
             asked.report(score, ninths)
             if asked.should_prune():
                 self._study.tell(asked, state=import_optuna().trial.TrialState.PRUNED)
@@ -274,8 +277,8 @@ class _Tuner:
 
     def _end(self, trial: _Trial, sentence: str) -> None:
         self._trials.remove(trial)
-        settings = ", ".join(f"{name} {_shown(value)}" for name, value in draw(self._space, _fixed(trial)).items())
-        self._say(f"trial {trial.asked.number}: {sentence}; {settings}")
+        settings = draw(self._space, import_optuna().trial.FixedTrial(trial.asked.params))
+        self._say(f"trial {trial.asked.number}: {sentence}; {as_text(settings)}")
 
     def _result(self) -> Tuned:
         """The best trial, and pictures of all."""
@@ -298,15 +301,10 @@ class _Tuner:
 
     def _preset(self) -> StoredPreset:
         """The settings of the best trial, with their provenance."""
-        best, search = self._study.best_trial, self._search
-        what = ", ".join(f"{name}={text}" for name, text in search.search.items())
-        seeds = ", ".join(map(str, search.seeds))
-        source = (
-            f"lemniscate tune: trial {best.number} of {search.trials}, {what}, seeds {seeds}, score {best.value:,.1f}"
-        )
-        fields = draw(self._space, import_optuna().trial.FixedTrial(best.params))
-        config = search.config.replace(**fields, evaluate_every=0, evaluate_episodes=20)
-        return StoredPreset(search.path.name, search.algorithm, config, source, f"{date.today():%Y-%m}")
+        best = self._study.best_trial
+        assert best.value is not None
+        settings = draw(self._space, import_optuna().trial.FixedTrial(best.params))
+        return self._search.preset(f"trial {best.number} of {self._search.trials}", settings, best.value)
 
     def _stop(self, signum: int = 0, _frame: FrameType | None = None) -> None:
         """Ask every process to save and stop; asked twice, it does not wait for the end of its update."""
@@ -316,19 +314,3 @@ class _Tuner:
     def _say(self, text: str) -> None:
         if self._progress:
             say(text)
-
-
-def _newest_returns(run: Path, step: int) -> list[float]:
-    """The returns of the newest training episodes up to a step."""
-    lines = (line for line in read_metrics(run) if line["step"] <= step + step // 2)
-    return [ret for line in lines for ret in line.get("episode/returns", [])][-RETURNS:]
-
-
-def _fixed(trial: _Trial) -> Any:
-    return import_optuna().trial.FixedTrial(trial.asked.params)
-
-
-def _shown(value: object) -> str:
-    if isinstance(value, tuple):
-        return " ".join(map(str, value))
-    return f"{value:.3g}" if isinstance(value, float) else str(value)
