@@ -83,7 +83,8 @@ class RayTasks:
         self._ray, self._connection = ray, ExitStack()
         self._connection.enter_context(connected(cluster))
         self._most, self._threads = cluster.workers, threads
-        self._task = ray.remote(num_cpus=threads, num_gpus=int(gpu), max_concurrency=2)(Task)
+        needs: dict[str, Any] = {"num_cpus": threads, "num_gpus": int(gpu), "max_concurrency": 2}
+        self._task = ray.remote(**needs)(Task)
         self._running: dict[Path, _Running] = {}
 
     @property
