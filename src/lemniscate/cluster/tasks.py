@@ -84,7 +84,7 @@ class RayTasks:
         self._connection.enter_context(connected(cluster))
         self._most, self._threads = cluster.workers, threads
         needs: dict[str, Any] = {"num_cpus": threads, "num_gpus": int(gpu), "max_concurrency": 2}
-        self._task = ray.remote(**needs)(Task)
+        self._task: Any = ray.remote(**needs)(Task)
         self._running: dict[Path, _Running] = {}
 
     @property
