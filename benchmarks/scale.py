@@ -4,7 +4,7 @@
     .venv/bin/python benchmarks/scale.py processes         only this
     .venv/bin/python benchmarks/scale.py --table           the tables of docs/scale.md of what has been measured
 
-    processes    PPO as in docs/speed.md, but minibatches of 512, 16 environments: two processes beside one, without shards
+    processes    PPO as in docs/speed.md, 16 environments, but minibatches of 512: two processes beside one, no shards
     shards       the same, 16 × HalfCheetah-v5, one process: eight shards beside one
     exchange     milliseconds to gather what each rank has, by its size, by the number of ranks, and by the time that a
                  packet takes from host to host: simulated hosts, each with one rank, of which at most two compute
