@@ -29,6 +29,7 @@ COMMANDS = {
     "evaluate": "Play whole episodes with the newest policy of a run.",
     "watch": "Show episodes in a window, or record them.",
     "plot": "Draw the curves of a run and its report.html, or compare several, grouped by all but the seed.",
+    "push": "Upload the policy of a run to the Hugging Face Hub, with a page about it.",
     "envs": "List the environments, their backends, and the preset that fits.",
     "check": "Check that an environment is suitable for training, or that the files of a run are whole.",
     "completion": "Print the script with which a shell completes; its first line says where to write it.",
@@ -149,13 +150,13 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
 
     subs["resume"].add_argument("run", type=Path, metavar="RUN", help="a run, a sweep or a search")
     _add_endings(subs["resume"])
-    for name in ("resume", "evaluate", "watch", "plot"):
+    for name in ("resume", "evaluate", "watch", "plot", "push"):
         subs[name].add_argument(
             "--trust", action="store_true", help="import a run's own code (module:name) also if the run is not yours"
         )
 
     sub = subs["evaluate"]
-    sub.add_argument("run", type=Path, metavar="RUN", help="a run or a checkpoint")
+    sub.add_argument("run", type=Path, metavar="RUN", help="a run, a checkpoint or hf://user/name")
     sub.add_argument("--episodes", default=100, metavar="INT", help="how many [100]")
     sub.add_argument("--seed", default=0, metavar="INT", help="seed of the starts [0]")
     sub.add_argument("--env-args", metavar="JSON", help="arguments of the environment [as in training]")
@@ -165,7 +166,7 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
 
     sub = subs["watch"]
     sub.usage = "lemniscate watch RUN [options]\n       lemniscate watch --random --env ID [options]"
-    sub.add_argument("run", type=Path, nargs="?", metavar="RUN", help="a run or a checkpoint")
+    sub.add_argument("run", type=Path, nargs="?", metavar="RUN", help="a run, a checkpoint or hf://user/name")
     sub.add_argument("--episodes", default=1, metavar="INT", help="how many [1]")
     sub.add_argument("--sample", action="store_true", help="draw actions from the policy [the most likely ones]")
     sub.add_argument("--random", action="store_true", help="act uniformly at random")
@@ -178,6 +179,12 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
     subs["plot"].add_argument(
         "--by", default="step", metavar="AXIS", help="learning curve by step, episode or minute [step]"
     )
+
+    sub = subs["push"]
+    sub.add_argument("run", type=Path, metavar="RUN", help="a run or a checkpoint")
+    sub.add_argument("name", metavar="USER/NAME", help="repository; new, or of a policy to be replaced")
+    sub.add_argument("--private", action="store_true", help="make a new repository private")
+    sub.add_argument("--license", metavar="NAME", help="licence on the page, as the Hub abbreviates it: mit [none]")
 
     subs["envs"].add_argument("filter", nargs="?", default="", metavar="FILTER", help="a part of the id")
 
