@@ -103,12 +103,12 @@ def test_all_is_in_one_commit_that_has_no_path_token_or_pickle(run, pushed):
 
 
 def test_an_upload_is_one_commit_and_deletes_the_figures_of_the_one_before(run, server):
-    before = {**server.files(NAME), "plots/old.png": b"", "videos/old.gif": b"", "LICENSE": b"", "notes/mine.md": b""}
+    before = {**server.files(NAME), "plots/old.png": b"", "replay.mp4": b"", "LICENSE": b"", "notes/mine.md": b""}
     first = store(server, NAME, before)
     assert lem.push(run, NAME) == f"{server.endpoint}/{NAME}"
     commits = [*server.repositories[NAME].commits]
     assert commits[-2] == first
-    assert set(before) - set(server.files(NAME)) == {"plots/old.png", "videos/old.gif"}
+    assert set(before) - set(server.files(NAME)) == {"plots/old.png", "replay.mp4"}
 
 
 def test_the_card_has_the_scores_for_the_hub_and_for_people(run, pushed):

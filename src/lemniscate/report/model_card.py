@@ -84,8 +84,7 @@ def _introduction(algorithm: str, config: RunConfig, step: int) -> str:
 
 
 def _film(folder: Path) -> list[str]:
-    films = [file for file in folder.rglob("*") if file.suffix in (".gif", ".webp")]
-    shown = [f"![An episode]({_link(file, folder)})" for file in films if file.parent.name == "videos"]
+    shown = [f"![An episode]({_link(file, folder)})" for file in sorted((folder / "videos").glob("*"))]
     return [*shown, *(["[Film](replay.mp4)"] if (folder / "replay.mp4").exists() else [])]
 
 

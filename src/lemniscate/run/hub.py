@@ -17,12 +17,13 @@ SCHEME = "hf:/"
 """the beginning of an address; `Path` has made one slash of two"""
 
 CHECKPOINT = (MANIFEST, *FILES)
+"""the files that are downloaded"""
 
 EXECUTABLE = (".bin", ".ckpt", ".joblib", ".pickle", ".pkl", ".pt", ".pth", ".py", ".zip")
 """endings of what other libraries store policies as, and which may execute code when it is read"""
 
-FOLDERS = ("export/", "plots/", "videos/")
-"""folders of a repository that belong to an upload as a whole: what the next one does not have is deleted"""
+REPLACED = ("export/", "plots/", "videos/", "replay.mp4", "final.json")
+"""beginnings of the paths that belong to one upload: what the next one does not have of them is deleted"""
 
 REASONS = {
     401: "it does not know your token; log in again with `hf auth login`, or renew HF_TOKEN",
@@ -121,7 +122,7 @@ def upload(folder: Path, name: str, private: bool) -> str:
         there = api.model_info(name)
         listed = [file.rfilename for file in there.siblings or ()]
         _require_replaceable(listed, public=private and not there.private)
-        stale = [file for file in listed if file.startswith(FOLDERS) and file not in files]
+        stale = [file for file in listed if file.startswith(REPLACED) and file not in files]
         deleted, added = map(CommitOperationDelete, stale), (CommitOperationAdd(*file) for file in files.items())
         api.create_commit(name, [*deleted, *added], commit_message="Upload a policy of lemniscate")
     return str(page)
