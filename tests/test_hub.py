@@ -19,6 +19,8 @@ from lemniscate.cli import main, parse
 from lemniscate.envs import toy
 from lemniscate.run import hub
 
+pytestmark = pytest.mark.filterwarnings("ignore:Use 'content=:DeprecationWarning")  # huggingface_hub's own
+
 NAME = "anna/cart.pole_v1"
 ADDRESS = f"hf://{NAME}"
 
@@ -66,6 +68,7 @@ def server(pushed, monkeypatch, tmp_path):
 def connect(patch, endpoint, cache):
     """Have `huggingface_hub` ask another Hub, keep its files elsewhere, and find no token of this machine's user."""
     patch.setattr(constants, "ENDPOINT", endpoint)
+    patch.setattr(constants, "HUGGINGFACE_CO_URL_TEMPLATE", endpoint + "/{repo_id}/resolve/{revision}/{filename}")
     patch.setattr(constants, "HF_HUB_CACHE", str(cache / "hub"))
     patch.setattr(_cache_assets, "HF_ASSETS_CACHE", str(cache / "assets"))
     patch.setattr(constants, "HF_TOKEN_PATH", str(cache / "token"))
@@ -305,11 +308,11 @@ def test_a_video_has_the_name_that_the_hub_plays(run, server, tmp_path):
 
 
 def test_a_run_begins_with_a_policy_on_the_hub(run, server, tmp_path, capsys):
-    config = {"num_envs": 4, "num_steps": 8, "total_steps": 32, "hidden": (16,), "minibatch_size": 16}
-    lem.train("ppo", env="CartPole-v1", run=tmp_path / "warm", warm_start=ADDRESS, **config)
+    config = tiny_fields("CartPole-v1", total_steps=32, warm_start=ADDRESS)
+    lem.train("ppo", env="CartPole-v1", run=tmp_path / "warm", **config)
     assert f"Warm start: all networks of {ADDRESS} at step 256." in capsys.readouterr().err
     with pytest.raises(lem.UserError, match="no such repository on the Hub"):
-        lem.train("ppo", env="CartPole-v1", run=tmp_path / "cold", warm_start="hf://anna/none", **config)
+        lem.train("ppo", env="CartPole-v1", run=tmp_path / "cold", **{**config, "warm_start": "hf://anna/none"})
     assert not (tmp_path / "cold").exists()
 
 

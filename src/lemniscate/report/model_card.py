@@ -11,6 +11,8 @@ from lemniscate.run.config import RunConfig
 from lemniscate.run.trust import own_code
 
 CARD = "README.md"
+TASK = "reinforcement-learning"
+"""the name of the field on the Hub"""
 
 
 def write(
@@ -51,13 +53,27 @@ def write(
 def _metadata(
     name: str, algorithm: str, config: RunConfig, scores: Mapping[str, Any] | None, license: str | None
 ) -> str:
-    """The front matter in YAML: library, tags, and the scores as a `model-index` in the Hub's words."""
-    from huggingface_hub import EvalResult, ModelCardData
+    """The front matter in YAML, by which the Hub lists a policy: library, tags, and the scores as a `model-index`."""
+    from huggingface_hub import ModelCardData
 
-    task = "reinforcement-learning"
-    result = scores and EvalResult(
-        task_type=task,
-        task_name=task,
+    data = ModelCardData(
+        library_name="lemniscate",
+        pipeline_tag=TASK,
+        license=license,
+        tags=[TASK, "lemniscate", config.env, algorithm],
+        model_name=name,
+        eval_results=[_result(config, scores)] if scores else None,
+    )
+    return f"---\n{data.to_yaml()}\n---"
+
+
+def _result(config: RunConfig, scores: Mapping[str, Any]) -> Any:
+    """The scores in the words of the Hub, where the return of an episode is its reward."""
+    from huggingface_hub import EvalResult
+
+    return EvalResult(
+        task_type=TASK,
+        task_name=TASK,
         dataset_type=config.env,
         dataset_name=config.env,
         metric_type="mean_reward",
@@ -65,15 +81,6 @@ def _metadata(
         metric_value=f"{scores['mean_return']:.2f} +/- {scores['std_return']:.2f}",
         metric_args={"episodes": scores["episodes"], "seed": scores["seed"], "training_seeds": [config.seed]},
     )
-    data = ModelCardData(
-        library_name="lemniscate",
-        pipeline_tag=task,
-        license=license,
-        tags=[task, "lemniscate", config.env, algorithm],
-        model_name=name,
-        eval_results=[result] if result else None,
-    )
-    return f"---\n{data.to_yaml()}\n---"
 
 
 def _introduction(algorithm: str, config: RunConfig, step: int) -> str:

@@ -170,7 +170,8 @@ def _answers(name: str) -> Iterator[None]:
         except errors.HfHubHTTPError as error:
             raise UserError(_refusal(error.response.status_code, error.server_message)) from None
         except (RuntimeError, ValueError) as error:
-            raise UserError(f"{_first_line(error)}.") from error
+            reasons = [_first_line(known) for known in (error, error.__cause__) if known]
+            raise UserError(f"{': '.join(reasons)}.") from error
         except (httpx2.HTTPError, OSError, errors.RevisionResolutionError) as error:
             if isinstance(error, OSError) and error.errno:  # of this machine's disk
                 raise
