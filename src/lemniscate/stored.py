@@ -35,17 +35,15 @@ def path_of(run: object) -> Path:
     """The directory of a run: of its path, of what `train` returned, or of a policy from `train` or `load`.
 
     Raises:
-        UserError: anything else.
+        UserError: anything else; a policy on the Hub.
     """
     path = getattr(run, "path", run)
-    if isinstance(path, str | PathLike):
-        if hub.is_address(path):
-            raise UserError(
-                f"{hub.read_address(path)} is on the Hub, and no run directory: it can be loaded, evaluated and"
-                " watched, and a run can begin with it (warm_start)."
-            )
-        return Path(path)
-    raise UserError(f"A run is a directory, such as 'runs/lander', or what train returned, not {shown(run)}.")
+    if not isinstance(path, str | PathLike):
+        raise UserError(f"A run is a directory, such as 'runs/lander', or what train returned, not {shown(run)}.")
+    if Path(path).parts[:1] == (hub.SCHEME,):
+        address = hub.read_address(path)
+        raise UserError(f"{address} is on the Hub, and no run directory: it can be loaded, evaluated and watched.")
+    return Path(path)
 
 
 def load(run: Trained, *, trust: bool = False) -> TrainedPolicy:

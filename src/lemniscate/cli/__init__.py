@@ -91,29 +91,6 @@ def add_train_options(parser: argparse.ArgumentParser) -> None:
     _add_endings(parser)
 
 
-def add_tune_options(parser: argparse.ArgumentParser) -> None:
-    """The options of `lemniscate tune` besides the fields of a Config."""
-    parser.add_argument("--env", metavar="ID", help="environment id, or module:Class of your own")
-    parser.add_argument("--run", type=Path, metavar="DIR", help="directory of the search; must not exist [runs/…]")
-    parser.add_argument("--preset", metavar="NAME", help="settings that are not searched [those of the environment]")
-    parser.add_argument(
-        "--search", metavar="RANGES", help="fields as 'learning_rate=log:1e-4:1e-2, gamma=.9:.999, clip=0.1|0.2'"
-    )
-    parser.add_argument("--trials", default=40, metavar="INT", help="number of settings that are tried [40]")
-    parser.add_argument("--seeds", default="101-103", metavar="LIST", help="of each trial [101-103]")
-    parser.add_argument(
-        "--prune",
-        action=argparse.BooleanOptionalAction,
-        default=True,
-        help="end a trial after 1/9 or 1/3 of its steps if it is not among the best third [on]",
-    )
-    parser.add_argument(
-        "--population", action="store_true", help="train all together; worse trials go on as copies of better ones"
-    )
-    _add_cluster(parser)
-    parser.add_argument("--quiet", action="store_true", help="no progress on standard error")
-
-
 class Parser(argparse.ArgumentParser):
     """argparse, but a mistake is one sentence, and help has a line for most options."""
 
@@ -206,13 +183,14 @@ def _add_endings(parser: argparse.ArgumentParser) -> None:
         help="sees each update and may stop the run: module:function, or 'module:Class(key=value)'",
     )
     parser.add_argument("--processes", default=1, metavar="INT", help="processes of this machine for one run [1]")
-    _add_cluster(parser)
+    add_cluster_options(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress on standard error")
     parser.add_argument("--report", action="store_true", help="evaluate the final policy, and draw plots and videos")
     parser.add_argument("--score", action="store_true", help="store the final return over 100 episodes")
 
 
-def _add_cluster(parser: argparse.ArgumentParser) -> None:
+def add_cluster_options(parser: argparse.ArgumentParser) -> None:
+    """The options of the commands that train on Ray."""
     parser.add_argument("--cluster", metavar="ray[=ADDRESS]", help="train on Ray: --workers INT [--storage DIR]")
     parser.add_argument("--workers", metavar="INT", help=argparse.SUPPRESS)
     parser.add_argument("--storage", metavar="DIR", help=argparse.SUPPRESS)
@@ -223,6 +201,8 @@ def _parse_algorithm(command: str, parser: Parser, words: list[str]) -> argparse
     titles, verb = algorithms(), f"lemniscate {command}"
     asks = "-h" in words or "--help" in words
     if asks and (words[0].startswith("-") or "," in words[0]):
+        from lemniscate.cli.tune_options import add_tune_options
+
         (add_train_options if command == "train" else add_tune_options)(parser)
         listed = "\n".join(f"  {name:<12}{title}" for name, title in titles.items())
         several = "several, such as ppo,sac, with --seeds; " if command == "train" else ""

@@ -13,8 +13,8 @@ from pathlib import Path
 from lemniscate.errors import UserError, is_installed, missing_extra, prefix_errors
 from lemniscate.run.checkpoint import FILES, MANIFEST
 
-SCHEME = "hf:/"
-"""the beginning of an address; `Path` has made one slash of two"""
+SCHEME = "hf:"
+"""the first part of an address as a path"""
 
 CHECKPOINT = (MANIFEST, *FILES)
 """the files that are downloaded"""
@@ -46,12 +46,12 @@ class Address:
 
 def is_address(place: object) -> bool:
     """Whether a path, or a string, is the address of a policy on the Hub."""
-    return isinstance(place, str | PathLike) and Path(place).as_posix().startswith(SCHEME)
+    return isinstance(place, str | PathLike) and Path(place).parts[:1] == (SCHEME,)
 
 
 def read_address(place: str | PathLike[str]) -> Address:
     """The parts of an address, `hf://user/name` or `hf://user/name@revision`. Raises `UserError` for another form."""
-    given = Path(place).as_posix().removeprefix(SCHEME)
+    given = "/".join(Path(place).parts[1:])  # where it is a `Path`, one slash has been made of two
     name, _, revision = given.partition("@")
     if name.count("/") != 1 or given.endswith("@"):
         raise UserError(f"hf://{given} is no policy on the Hub: hf://user/name, or hf://user/name@revision.")
