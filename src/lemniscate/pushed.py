@@ -14,15 +14,15 @@ from lemniscate.results import FINAL_EPISODES, evaluate, final_scores
 from lemniscate.run import hub
 from lemniscate.run.directory import CONFIG
 from lemniscate.run.files import write_json
-from lemniscate.stored import Trained, algorithm_of, load, save
+from lemniscate.stored import Trained, algorithm_of, load, write_unsigned
 
 
 def push(run: Trained, name: str, *, private: bool = False, license: str | None = None, trust: bool = False) -> str:
     """Upload the policy of a run to the Hugging Face Hub, as the model repository `name`, in one commit.
 
-    The files are those of `save`: raw tensors and JSON, each with its sha256. Beside them are a model card with the
-    scores, the command that trains it again and the lines that load it; the final scores of the run, its figures
-    (`plots/`), its newest film, or one that is made now if the environment can be rendered; and what
+    The files are those of `save`, without its signature: raw tensors and JSON, each with its sha256. Beside them are a
+    model card with the scores, the command that trains it again and the lines that load it; the final scores of the
+    run, its figures (`plots/`), its newest film, or one that is made now if the environment can be rendered; and what
     `lemniscate export` wrote (`export/`), if it did. `load("hf://user/name")` loads the policy.
 
     Args:
@@ -43,7 +43,8 @@ def push(run: Trained, name: str, *, private: bool = False, license: str | None 
     hub.require_uploads(name)
     policy = load(run, trust=trust)
     with TemporaryDirectory() as temporary:
-        folder = save(policy, Path(temporary) / "policy")
+        folder = Path(temporary) / "policy"
+        write_unsigned(policy, folder)
         _write_repository(folder, policy, name, license, trust)
         return hub.upload(folder, name, private)
 

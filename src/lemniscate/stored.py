@@ -110,14 +110,26 @@ def save(policy: Any, path: str | Path) -> Path:
         raise UserError(f"What can be stored is a policy, from load or train, not a {type(policy).__name__}.")
     if path.exists() and not _is_stored(path):
         raise UserError(f"{path} exists already, and is not a stored policy; choose another path.")
-    record = signed({"algorithm": algorithm_of(policy), "config": policy.config.to_json()})
-    record["spec"] = checkpoint.spec_to_json(policy.spec)
     try:
-        fields = {"networks": policy.networks, "step": policy.step}
-        checkpoint.write_fields(path, fields, {**record, "planned": False, "stored": True})
+        _write(policy, path, signed(_identity(policy)))
     except OSError as error:
         raise UserError(f"{path} cannot be written: {error}.") from error
     return path
+
+
+def write_unsigned(policy: TrainedPolicy, path: Path) -> None:
+    """Store a policy for others, without a signature: it would vouch for any run that repeats it. Raises `OSError`."""
+    _write(policy, path, _identity(policy))
+
+
+def _write(policy: TrainedPolicy, path: Path, identity: Mapping[str, Any]) -> None:
+    record = {**identity, "spec": checkpoint.spec_to_json(policy.spec), "planned": False, "stored": True}
+    checkpoint.write_fields(path, {"networks": policy.networks, "step": policy.step}, record)
+
+
+def _identity(policy: TrainedPolicy) -> dict[str, Any]:
+    """What a signature is of."""
+    return {"algorithm": algorithm_of(policy), "config": policy.config.to_json()}
 
 
 def algorithm_of(policy: TrainedPolicy) -> str:
