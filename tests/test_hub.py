@@ -258,6 +258,8 @@ def test_a_hub_that_is_down_is_a_sentence(run, server, monkeypatch):
 def test_a_run_without_a_policy_is_refused_before_the_hub_is_asked(server, tmp_path):
     with pytest.raises(lem.UserError, match="is not a run directory"):
         lem.push(tmp_path, NAME)
+    with pytest.raises(lem.UserError, match=r"Cannot have -- or \.\."):  # the name first: it costs nothing
+        lem.push(tmp_path, "anna/a--b")
     assert not server.asked
 
 
