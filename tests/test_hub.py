@@ -130,7 +130,7 @@ def test_the_card_has_the_scores_for_the_hub_and_for_people(run, pushed):
 
 def test_the_card_shows_files_that_are_there_and_lines_that_work(run, pushed, server):
     card = pushed["README.md"].decode()
-    links = [unquote(link) for link in re.findall(r"\]\((.+?)\)", card)]
+    links = [unquote(link) for link in re.findall(r"\]\(([^)\s]+)\)", card)]
     assert set(links) == {name for name in pushed if "/" in name}
     load, evaluate, train = re.findall(r"```\w*\n(.*?)\n```", card, re.DOTALL)
     scope = {}
