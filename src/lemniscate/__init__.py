@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from lemniscate.errors import NonFiniteError, NotStoredError, SweepError, UserError
     from lemniscate.plots import plot
     from lemniscate.policy import TrainedPolicy
+    from lemniscate.pushed import push
     from lemniscate.results import evaluate, watch
     from lemniscate.resumed import resume
     from lemniscate.run.environments import make_envs
@@ -43,6 +44,7 @@ __all__ = [
     "make_envs",
     "make_vec",
     "plot",
+    "push",
     "resume",
     "resume_sweep",
     "resume_tuning",
@@ -72,6 +74,7 @@ MODULES = {
     "make_envs": "run.environments",
     "make_vec": "envs.vector_view",
     "plot": "plots",
+    "push": "pushed",
     "resume": "resumed",
     "resume_sweep": "sweep",
     "resume_tuning": "tuning.tuner",
@@ -86,7 +89,7 @@ MODULES = {
 
 SUBMODULES = (
     *("algos", "api", "course", "data", "envs", "errors", "maths", "nn", "optim", "policy", "presets", "report"),
-    *("plots", "results", "run", "spec", "stored", "sweep", "testing", "tuning", "types"),
+    *("plots", "pushed", "results", "run", "spec", "stored", "sweep", "testing", "tuning", "types"),
 )
 """what `lemniscate.NAME` imports by itself"""
 
