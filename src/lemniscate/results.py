@@ -9,6 +9,7 @@ from typing import Any
 
 from lemniscate.console import say
 from lemniscate.envs import registry
+from lemniscate.envs.backend import Baseline
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError, shown
 from lemniscate.named import takes
@@ -42,6 +43,7 @@ def evaluate(
     deterministic: bool = True,
     backend: str | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
+    baseline: bool = False,
     video: str | Path | None = None,
     trust: bool = False,
 ) -> Evaluation:
@@ -57,6 +59,7 @@ def evaluate(
         deterministic: act by the mode of the distribution.
         backend: simulation backend; that of training unless named, or by the id if `env` is another.
         env_kwargs: arguments of the environment that are to be other than in training.
+        baseline: play the same episodes by the classical controller that the environment has for comparison.
         video: a .gif, .webp or .mp4 to record all episodes into. They are then played one after the other in one
             rendered environment, without a measurement of the Q bias. The first 16 starts are the same; from the 17th
             on, and in other backends than gymnasium, returns may differ from those without a film. Of flights in a
@@ -64,9 +67,9 @@ def evaluate(
         trust: import the code that the run names as `module:name` also if the run is not of this user and machine.
 
     Raises:
-        UserError: numbers out of range; an environment that cannot be made, or whose spaces differ; an episode that
-            does not end in an environment without a time limit; with `video`, an environment that renders no pictures,
-            or another kind of file.
+        UserError: numbers out of range; an environment that cannot be made, or whose spaces differ; one without a
+            baseline, if it is asked for; an episode that does not end in an environment without a time limit; with
+            `video`, an environment that renders no pictures, or another kind of file.
     """
     agent = policy if callable(policy) else load(policy, trust=trust)
     episodes, seed, file = checked("episodes", episodes, Episodes), checked("seed", seed, Natural), _film(video)
@@ -75,6 +78,8 @@ def evaluate(
     arguments = env_arguments(_config_of(agent, env), **elsewhere)
     vec = _env_for(agent, episodes, **elsewhere)
     try:
+        if baseline:
+            return evaluate_policy(_baseline_of(vec), vec, episodes, seed)
         if file:
             return _show(agent, vec, arguments, deterministic=deterministic, video=file, **how)
         if not isinstance(agent, TrainedPolicy):
@@ -243,6 +248,13 @@ def _env_for(agent: TrainedPolicy | Agent | None, episodes: int, **elsewhere: An
             f"A policy for {agent.spec.env_id} cannot act in {vec.spec.env_id}: observation or action spaces differ."
         )
     return vec
+
+
+def _baseline_of(vec: VecEnv) -> Baseline:
+    """The baseline of an environment. Raises `UserError` where there is none."""
+    if vec.baseline is None:
+        raise UserError(f"{vec.spec.env_id} has no baseline to compare with.")
+    return vec.baseline
 
 
 def _show(

@@ -138,6 +138,7 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
     sub.add_argument("--seed", default=0, metavar="INT", help="seed of the starts [0]")
     sub.add_argument("--env-args", metavar="JSON", help="arguments of the environment [as in training]")
     sub.add_argument("--backend", metavar="NAME", help="simulation backend [as in training]")
+    sub.add_argument("--baseline", action="store_true", help="play by the environment's classical controller instead")
     sub.add_argument("--video", type=Path, metavar="FILE", help=".gif, .webp or .mp4 to record all episodes into")
     sub.add_argument("--json", action="store_true", help="print one JSON object on standard output")
 

@@ -21,6 +21,7 @@ from lemniscate.run.texts import number, read, read_json
 def evaluate(given: argparse.Namespace) -> None:
     """Play whole episodes: scores as JSON on standard output, or as a sentence."""
     own = {"env_kwargs": _env_args(given), "backend": given.backend, "video": given.video, "trust": given.trust}
+    own["baseline"] = given.baseline
     scores = results.evaluate(given.run, episodes=number(given.episodes), seed=number(given.seed), **own)
     if given.json:
         print(json.dumps(scores.to_json(), allow_nan=False))

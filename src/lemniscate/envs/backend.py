@@ -7,6 +7,7 @@ from typing import Any, Literal, Protocol
 import torch
 from torch import Tensor
 
+from lemniscate.maths import Distribution
 from lemniscate.spec import Spec
 from lemniscate.types import Step
 
@@ -45,6 +46,14 @@ class Scene:
     error: slice
 
 
+class Baseline(Protocol):
+    """A controller that was not learned: a function of flat observations [N, O] to a distribution over actions."""
+
+    def __call__(self, obs: Tensor) -> Distribution:
+        """All probability on one action, [N, A]."""
+        ...
+
+
 class Backend(Protocol):
     """N parallel environments that are stepped together. Tensors go in and come out, all on one device.
 
@@ -55,6 +64,7 @@ class Backend(Protocol):
 
     - `summaries`: a tuple of `Summary`;
     - `scene`: a `Scene` or None, which is drawn where a Gymnasium environment would be rendered;
+    - `baseline`: a `Baseline` or None, a classical controller beside which policies are shown;
     - `compiled = True`: a step is a program for one number of environments, so evaluation takes as many as training;
     - `package`: what has to be installed;
     - `in_process`: the name of the backend that evaluates its policies, where it uses other processes itself;

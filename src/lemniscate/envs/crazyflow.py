@@ -14,131 +14,38 @@ import os
 import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import gymnasium as gym
-import numpy as np
 import torch
 
+from lemniscate.envs.air import CONDITIONS, read_ranges
 from lemniscate.envs.backend import Scene, Summary
-from lemniscate.envs.jax_backend import JaxBackend, Outcome, Programs, State, jax_device
+from lemniscate.envs.drones import Drones, Mixed
+from lemniscate.envs.jax_backend import JaxBackend, Programs, jax_device
+from lemniscate.envs.pd import GAINS, PD
 from lemniscate.envs.spaces import action_kind
 from lemniscate.errors import UserError, missing_extra, unknown_name
-from lemniscate.spec import Box, ObservationPart, Spec
-
-if TYPE_CHECKING:
-    import jax
+from lemniscate.spec import Box, Spec
 
 IDS = ("DroneFigureEightTrajectory-v0", "DroneLanding-v0", "DroneReachPos-v0", "DroneReachVel-v0")
+DYNAMICS = ("so_rpy", "so_rpy_rotor", "so_rpy_rotor_drag", "first_principles")
 CONTROL_HZ = 50
-AHEAD = 0.75
-"""the share of staggered episodes that begin ahead of their beginning"""
-STATE_PARTS = ("pos", "quat", "vel", "ang_vel")
-REFERENCE = "local_samples"
-"""the part of an observation that begins with the way to the reference"""
-
-
-class Drones:
-    """A crazyflow environment with its state apart (SimData, and every array that the object keeps beside it).
-
-    The environment's own methods are traced with its state put in and taken out again, so whatever it computes
-    (rewards, ends, goals, randomization) is computed by crazyflow's code.
-    """
-
-    def __init__(self, env_id: str, num_envs: int, device: str, kwargs: Mapping[str, Any]) -> None:
-        import jax
-        import jax.numpy as jnp
-
-        with _quietly():
-            made = gym.make_vec(env_id, num_envs=num_envs, device=device, **{"freq": CONTROL_HZ, **kwargs})
-        self.env = env = made.unwrapped
-        for name, value in vars(env).items():
-            if isinstance(value, np.ndarray):  # the reference trajectory: NumPy cannot be indexed by a tracer
-                setattr(env, name, jnp.asarray(value, device=env.device))
-        self.num_envs, self.device = num_envs, env.device
-        self.low, self.high = env.single_action_space.low, env.single_action_space.high
-        self.action_size = self.low.size
-        self.episode_steps = round(env.max_episode_time * env.freq)
-        """the time limit, in control steps"""
-        sizes = {name: space.shape[-1] for name, space in env.single_observation_space.spaces.items()}
-        names = (*STATE_PARTS, *(name for name in sizes if name not in STATE_PARTS))
-        self.parts = tuple(ObservationPart((name,), (sizes[name],)) for name in names)
-        """the flat observation: the drone's state first, then the task's own parts"""
-        start = sum(part.size for part in self.parts[: len(STATE_PARTS)])
-        self.error = slice(start, start + 3) if REFERENCE in names else None
-        self._arrays = [name for name, value in vars(env).items() if isinstance(value, jax.Array)]
-        self._initial = self._take()
-
-    def _take(self) -> State:
-        return self.env.sim.data, {name: getattr(self.env, name) for name in self._arrays}
-
-    @contextlib.contextmanager
-    def _at(self, state: State) -> Iterator[Any]:
-        """The environment in a state; afterwards no placeholder of a tracer stays behind in it."""
-        try:
-            self._put(state)
-            yield self.env
-        finally:
-            self._put(self._initial)
-
-    def _put(self, state: State) -> None:
-        self.env.sim.data = state[0]
-        for name, value in state[1].items():
-            setattr(self.env, name, value)
-
-    def _observe(self) -> jax.Array:
-        import jax.numpy as jnp
-
-        parts = self.env.obs()
-        return jnp.concatenate([parts[part.name] for part in self.parts], axis=-1)
-
-    def init(self, key: jax.Array) -> State:
-        """The state of drones that have not begun. Goals get keys of their own, which crazyflow never seeds."""
-        import jax
-
-        data, arrays = self._initial
-        arrays = {
-            name: jax.random.fold_in(key, i) if jax.numpy.issubdtype(value.dtype, jax.dtypes.prng_key) else value
-            for i, (name, value) in enumerate(arrays.items(), start=1)
-        }
-        return data.replace(core=data.core.replace(rng_key=key)), arrays
-
-    def reset(self, state: State, mask: jax.Array, stagger: jax.Array) -> tuple[State, jax.Array, jax.Array]:
-        """Reset the masked drones; those that begin ahead of the beginning are fragments.
-
-        Ahead means at a random step of the episode, and on the reference curve at that point of it.
-        """
-        import jax
-
-        with self._at(state) as env:
-            env._reset(mask=mask)
-            data = env.sim.data
-            key, whether, where = jax.random.split(data.core.rng_key, 3)
-            ahead = mask & stagger & jax.random.bernoulli(whether, AHEAD, (self.num_envs,))
-            steps = jax.random.randint(where, (self.num_envs,), 1, self.episode_steps) * ahead
-            pos = data.states.pos
-            if hasattr(env, "trajectory"):
-                pos = pos + (env.trajectory[steps - 1] - env.trajectory[-1])[:, None]
-            core = data.core.replace(rng_key=key, steps=data.core.steps + steps[:, None] * env.n_substeps)
-            env.sim.data = data.replace(states=data.states.replace(pos=pos), core=core)
-            return self._take(), self._observe(), ahead
-
-    def step(self, state: State, action: jax.Array) -> tuple[State, Outcome]:
-        """One control step of every drone."""
-        import jax.numpy as jnp
-
-        with self._at(state) as env:
-            env._apply_action(self.low + 0.5 * (jnp.clip(action, -1, 1) + 1) * (self.high - self.low))
-            env.sim.step(env.n_substeps)
-            obs = self._observe()
-            measures = {} if self.error is None else {"tracking_error": jnp.linalg.norm(obs[:, self.error], axis=-1)}
-            return self._take(), (obs, env.reward(), env.terminated(), env.truncated(), measures)
+MOST_HISTORY = 50
 
 
 @lru_cache(maxsize=4)
 def programs(env_id: str, num_envs: int, device: str, kwargs: tuple[tuple[str, Any], ...]) -> Programs:
     """The compiled programs of so many drones, built once a process: all vectors of a size share them."""
-    return Programs(Drones(env_id, num_envs, device, dict(kwargs)))
+    given = dict(kwargs)
+    ranges, history = read_ranges(given), given.pop("history", 0)
+    own = {name: value for name, value in given.items() if name not in CONDITIONS}
+    each = [{**own, "dynamics": name} for name in dynamics_of(own)] or [own]
+    with _quietly():
+        how = {"num_envs": num_envs // len(each), "device": device}
+        made = [gym.make_vec(env_id, **how, **{"freq": CONTROL_HZ, **arguments}).unwrapped for arguments in each]
+    drones = [Drones(one, ranges, history) for one in made]
+    return Programs(drones[0] if len(drones) == 1 else Mixed(drones))
 
 
 class CrazyflowBackend(JaxBackend):
@@ -178,15 +85,15 @@ class CrazyflowBackend(JaxBackend):
         assert not wrappers, "drones cannot be wrapped"
         _import()
         kwargs = dict(kwargs or {})
-        _check(env, kwargs)
+        _check(env, num_envs, kwargs)
         try:
-            shared = programs(env, num_envs, jax_device(device), tuple(sorted(kwargs.items())))
+            shared = programs(env, num_envs, jax_device(device), tuple(sorted(_hashable(kwargs).items())))
         except (TypeError, ValueError, KeyError, AssertionError) as error:
             if not kwargs:
                 raise
             raise UserError(f"{env} cannot be made with {kwargs}: {error}.") from error
         super().__init__(shared, num_envs, device, stagger=stagger)
-        self._drones = drones = shared.envs
+        self._drones = drones = shared.envs.drones[0] if isinstance(shared.envs, Mixed) else shared.envs
         assert isinstance(drones, Drones)
         action = action_kind(drones.env.single_action_space, env)
         assert isinstance(action, Box)
@@ -196,6 +103,16 @@ class CrazyflowBackend(JaxBackend):
                 Summary("rmse_mm", "tracking_error", "rms", scale=1000),
                 Summary("rmse_after_1s_mm", "tracking_error", "rms", scale=1000, skip=drones.env.freq),
             )
+
+    @property
+    def baseline(self) -> PD | None:
+        """A PD controller with the gains that are best in these dynamics, where there is a reference."""
+        drones, env = self._drones, self._drones.env
+        if drones.error is None or not isinstance(self.spec.action, Box):
+            return None
+        reference = slice(drones.error.start, drones.error.start + 3 * env.n_samples)
+        where = {"reference": reference, "velocity": slice(7, 10), "preview": env.samples_dt}
+        return PD(GAINS[drones.dynamics], drones.mass, self.spec.action, **where)
 
     @property
     def scene(self) -> Scene | None:
@@ -215,15 +132,36 @@ def _import() -> None:
         raise missing_extra("crazyflow", "drone") from error
 
 
-def _check(env_id: str, kwargs: Mapping[str, Any]) -> None:
-    """Raise `UserError` for an argument that the environment does not have, or that cannot be compared."""
+def _check(env_id: str, num_envs: int, kwargs: Mapping[str, Any]) -> None:
+    """Raise `UserError` for an argument that the environment does not have, or a value that it cannot take."""
     entry: Any = gym.spec(env_id).vector_entry_point
-    known = set(inspect.signature(entry).parameters) - {"num_envs", "device"}
+    known = {*inspect.signature(entry).parameters, *CONDITIONS, "history"} - {"num_envs", "device"}
     for name, value in kwargs.items():
         if name not in known:
             raise unknown_name(f"argument of {env_id}", name, known)
-        if not isinstance(value, (int, float, str, type(None))) and not callable(value):
+        several = name == "dynamics" and isinstance(value, list | tuple)
+        if not (name in CONDITIONS or several or isinstance(value, int | float | str | None) or callable(value)):
             raise UserError(f"{name} of {env_id} must be a number or a word, not {value!r}.")
+    history, several = kwargs.get("history", 0), dynamics_of(kwargs)
+    if not isinstance(history, int) or isinstance(history, bool) or not 0 <= history <= MOST_HISTORY:
+        raise UserError(f"history must be a whole number of steps from 0 to {MOST_HISTORY}, not {history!r}.")
+    for name in several:
+        if name not in DYNAMICS:
+            raise unknown_name("dynamics", str(name), DYNAMICS)
+    if several and num_envs % len(several):
+        raise UserError(f"{num_envs} drones cannot be divided equally among {len(several)} dynamics.")
+    read_ranges(kwargs)
+
+
+def dynamics_of(kwargs: Mapping[str, Any]) -> tuple[str, ...]:
+    """The names of the dynamics among the arguments; none where crazyflow is to choose."""
+    given = kwargs.get("dynamics")
+    return () if given is None else (given,) if isinstance(given, str) else tuple(given)
+
+
+def _hashable(kwargs: Mapping[str, Any]) -> dict[str, Any]:
+    """The same arguments with tuples for lists."""
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in kwargs.items()}
 
 
 @contextlib.contextmanager

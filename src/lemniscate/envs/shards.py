@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from lemniscate.envs.backend import Backend, Scene, Summary
+from lemniscate.envs.backend import Backend, Baseline, Scene, Summary
 from lemniscate.maths import Shards
 from lemniscate.types import Step
 
@@ -22,6 +22,7 @@ class BackendOfShards:
         self.num_envs = sum(backend.num_envs for backend in backends)
         self.summaries: tuple[Summary, ...] = getattr(backends[0], "summaries", ())
         self.scene: Scene | None = getattr(backends[0], "scene", None)
+        self.baseline: Baseline | None = getattr(backends[0], "baseline", None)
 
     @property
     def counts(self) -> Tensor:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from lemniscate.envs.backend import Backend, Scene, Summary
+from lemniscate.envs.backend import Backend, Baseline, Scene, Summary
 from lemniscate.envs.episodes import Episodes, EpisodeStatistics
 from lemniscate.envs.shards import act_over_shards
 from lemniscate.errors import NonFiniteError, UserError, wrong_action
@@ -55,6 +55,7 @@ class VecEnv:
         self.device = backend.device
         self.summaries: tuple[Summary, ...] = getattr(backend, "summaries", ())
         self.scene: Scene | None = getattr(backend, "scene", None)
+        self.baseline: Baseline | None = getattr(backend, "baseline", None)
         self.obs = torch.empty(0)
         self.collecting = Stopwatch()
         """seconds that the functions of `data` spend acting and stepping"""

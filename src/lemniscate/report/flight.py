@@ -8,6 +8,7 @@ import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from lemniscate.envs.backend import Baseline
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError
 from lemniscate.nn.policies import Policy
@@ -46,7 +47,7 @@ class Flight:
 
 
 def record(
-    policy: Policy | None,
+    policy: Policy | Baseline | None,
     env: VecEnv,
     flights: int,
     seed: int,
@@ -97,8 +98,8 @@ def draw_path(flight: Flight, file: Path) -> Path:
     return save(figure, file)
 
 
-def draw_error(flight: Flight, file: Path) -> Path:
-    """Distance to the reference over time: median, 10 % to 90 %, and the worst flight."""
+def draw_error(flight: Flight, file: Path, baseline: Flight | None = None) -> Path:
+    """Distance to the reference over time: median, 10 % to 90 %, and the worst flight; a baseline's median beside."""
     figure = Figure(figsize=(7, 3.6), layout="constrained")
     axes = figure.subplots()
     error = flight.error_mm
@@ -106,10 +107,13 @@ def draw_error(flight: Flight, file: Path) -> Path:
     axes.fill_between(flight.time, low, high, color=BLUE, alpha=0.25, linewidth=0, label="10 % to 90 %")
     axes.plot(flight.time, middle, color=BLUE, label="median")
     axes.plot(flight.time, np.nanmax(error, axis=1), color=GREY, linewidth=0.8, label="worst")
+    if baseline is not None:
+        its = np.nanmedian(baseline.error_mm, axis=1)
+        axes.plot(baseline.time, its, color=ORANGE, linewidth=1.2, label="median of the baseline")
     axes.set(xlabel="time / s", ylabel="tracking error / mm", yscale="log", xlim=(0, flight.time[-1]))
     axes.set_title(f"{error.shape[1]} flights from unseen starts", loc="left")
     finish(axes)
-    axes.legend(frameon=False, ncols=3)
+    axes.legend(frameon=False, ncols=4, fontsize=9)
     return save(figure, file)
 
 

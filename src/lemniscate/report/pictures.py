@@ -42,11 +42,12 @@ def draw_run(run: Path, scores: Mapping[str, Any] | None, flights: Sequence[Path
 def draw_flights(policy: Policy, env: VecEnv, run: Path, flights: int, film: bool) -> list[Path]:
     """Path and error of some flights in a scene, into the `plots/` of a run; with `film` one of them into `videos/`."""
     track = flight.record(policy, env, flights, seed=0)
+    beside = flight.record(env.baseline, env, flights, seed=0) if env.baseline else None
     folder, video = run / "plots", run / "videos" / "flight.gif"
     if film:
         make_directory(video.parent)
         show_flights(policy, env, 1, seed=0, video=video, tell=lambda text: None)
-    drawn = [flight.draw_path(track, folder / "flight.png"), flight.draw_error(track, folder / "error.png")]
+    drawn = [flight.draw_path(track, folder / "flight.png"), flight.draw_error(track, folder / "error.png", beside)]
     return [*drawn, video] if film else drawn
 
 

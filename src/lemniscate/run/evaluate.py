@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 import torch
 from torch import Tensor
 
-from lemniscate.envs.backend import Summary
+from lemniscate.envs.backend import Baseline, Summary
 from lemniscate.envs.random_action import random_action
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.nn.actor_q import ActorQ
@@ -68,7 +68,7 @@ class Evaluation:
 
 @torch.no_grad()
 def play_episodes(
-    policy: Policy | None, env: VecEnv, episodes: int, seed: int, deterministic: bool = True
+    policy: Policy | Baseline | None, env: VecEnv, episodes: int, seed: int, deterministic: bool = True
 ) -> Iterator[tuple[Tensor, Tensor, Step, Tensor]]:
     """Play `episodes` whole episodes; yields (obs, action, step, the mask [N] of the environments that still count).
 
@@ -91,15 +91,17 @@ def play_episodes(
         left, age = left - done.int(), (age + 1) * (~done & (left > 0))
 
 
-def _act(policy: Policy | None, deterministic: bool, env: VecEnv, rng: torch.Generator) -> Tensor:
+def _act(policy: Policy | Baseline | None, deterministic: bool, env: VecEnv, rng: torch.Generator) -> Tensor:
     if policy is None:
         return random_action(env.spec, env.obs, rng)
     distribution = policy(env.obs)
-    return distribution.mode() if deterministic else distribution.sample(policy.draw_noise((env.num_envs,), (rng,)))
+    if deterministic or not isinstance(policy, Policy):
+        return distribution.mode()
+    return distribution.sample(policy.draw_noise((env.num_envs,), (rng,)))
 
 
 def evaluate(
-    policy: Policy,
+    policy: Policy | Baseline,
     env: VecEnv,
     episodes: int,
     seed: int,

@@ -1,0 +1,59 @@
+"""A proportional-derivative controller that flies a drone along a previewed reference: the classical baseline.
+
+Wished acceleration = kp · position error + kd · velocity error + the reference's acceleration + gravity. The drone
+turns its thrust axis there, without yaw, and pushes as hard as that takes: Mellinger and Kumar 2011, section III,
+without their attitude loop, which the drone has itself.
+"""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from lemniscate.maths import Deterministic
+from lemniscate.spec import Box
+
+GRAVITY = 9.81
+GAINS = {
+    "so_rpy": (12.0, 6.0, 12.0, 6.0),
+    "so_rpy_rotor": (12.0, 6.0, 12.0, 6.0),
+    "so_rpy_rotor_drag": (12.0, 6.0, 12.0, 6.0),
+    "first_principles": (12.0, 6.0, 12.0, 6.0),
+}
+"""kp (1/s²) and kd (1/s) of the horizontal axes, then of the vertical one"""
+
+
+class PD:
+    """The controller, as a function of flat observations.
+
+    Args:
+        gains: kp, kd, kp_z, kd_z.
+        mass: that it believes in, kg.
+        action: the bounds of roll, pitch, yaw (rad) and thrust (N).
+        reference: where the observation has the reference less the position, at least three points, x, y, z each (m).
+        velocity: where it has the velocity (m/s).
+        preview: seconds from one point to the next.
+    """
+
+    def __init__(
+        self, gains: Sequence[float], mass: float, action: Box, reference: slice, velocity: slice, preview: float
+    ) -> None:
+        kp, kd, kp_z, kd_z = gains
+        self.kp, self.kd = torch.tensor((kp, kp, kp_z)), torch.tensor((kd, kd, kd_z))
+        self.mass, self.preview = mass, preview
+        self.low, self.high = torch.tensor(action.low), torch.tensor(action.high)
+        self.reference, self.velocity = reference, velocity
+
+    def __call__(self, obs: Tensor) -> Deterministic:
+        """The action [N, 4] at each observation [N, O]."""
+        points = obs[:, self.reference].unflatten(1, (-1, 3))
+        here, next_, after = points[:, 0], points[:, 1], points[:, 2]
+        velocity = (-3 * here + 4 * next_ - after) / (2 * self.preview)  # derivatives of the parabola through them
+        acceleration = (here - 2 * next_ + after) / self.preview**2
+        wish = self.kp * here + self.kd * (velocity - obs[:, self.velocity]) + acceleration
+        wish = wish + torch.tensor((0.0, 0.0, GRAVITY))
+        size = wish.norm(dim=1)
+        x, y, z = (wish / size[:, None]).unbind(1)
+        roll, pitch = -torch.asin(y.clamp(-1, 1)), torch.atan2(x, z)
+        command = torch.stack([roll, pitch, torch.zeros_like(roll), self.mass * size], dim=1)
+        return Deterministic((2 * (command - self.low) / (self.high - self.low) - 1).clamp(-1, 1))
