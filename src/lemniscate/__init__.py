@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from lemniscate.checks import check
     from lemniscate.envs.vector_view import make_vec
     from lemniscate.errors import NonFiniteError, NotStoredError, SweepError, UserError
+    from lemniscate.exporting.export import export
     from lemniscate.plots import plot
     from lemniscate.policy import TrainedPolicy
     from lemniscate.results import evaluate, watch
@@ -39,6 +40,7 @@ __all__ = [
     "check",
     "config_for",
     "evaluate",
+    "export",
     "load",
     "make_envs",
     "make_vec",
@@ -68,6 +70,7 @@ MODULES = {
     "check": "checks",
     "config_for": "api",
     "evaluate": "results",
+    "export": "exporting.export",
     "load": "stored",
     "make_envs": "run.environments",
     "make_vec": "envs.vector_view",
@@ -85,8 +88,8 @@ MODULES = {
 """where each public name is defined"""
 
 SUBMODULES = (
-    *("algos", "api", "course", "data", "envs", "errors", "maths", "nn", "optim", "policy", "presets", "report"),
-    *("plots", "results", "run", "spec", "stored", "sweep", "testing", "tuning", "types"),
+    *("algos", "api", "course", "data", "envs", "errors", "exporting", "maths", "nn", "optim", "policy", "presets"),
+    *("plots", "report", "results", "run", "spec", "stored", "sweep", "testing", "tuning", "types"),
 )
 """what `lemniscate.NAME` imports by itself"""
 

@@ -28,6 +28,7 @@ COMMANDS = {
     "resume": "Continue an interrupted run, sweep or search.",
     "evaluate": "Play whole episodes with the newest policy of a run.",
     "watch": "Show episodes in a window, or record them.",
+    "export": "Write a policy as C for microcontrollers and as ONNX, and measure how far these are from it.",
     "plot": "Draw the curves of a run and its report.html, or compare several, grouped by all but the seed.",
     "envs": "List the environments, their backends, and the preset that fits.",
     "check": "Check that an environment is suitable for training, or that the files of a run are whole.",
@@ -149,7 +150,7 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
 
     subs["resume"].add_argument("run", type=Path, metavar="RUN", help="a run, a sweep or a search")
     _add_endings(subs["resume"])
-    for name in ("resume", "evaluate", "watch", "plot"):
+    for name in ("resume", "evaluate", "watch", "export", "plot"):
         subs[name].add_argument(
             "--trust", action="store_true", help="import a run's own code (module:name) also if the run is not yours"
         )
@@ -173,6 +174,10 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
     sub.add_argument("--seed", default=0, metavar="INT", help="seed of the starts [0]")
     sub.add_argument("--env", metavar="ID", help="environment [that of training]; without RUN, with --random")
     sub.add_argument("--env-args", metavar="JSON", help="arguments of the environment [as in training]")
+
+    sub = subs["export"]
+    sub.add_argument("run", type=Path, metavar="RUN", help="a run or a checkpoint")
+    sub.add_argument("--to", type=Path, metavar="DIR", help="new directory; an export is replaced [RUN/export]")
 
     subs["plot"].add_argument("runs", type=Path, nargs="+", metavar="RUN", help="runs or sweeps")
     subs["plot"].add_argument(

@@ -21,6 +21,8 @@ import numpy as np
 import torch
 
 from lemniscate.envs.backend import Scene, Summary
+from lemniscate.envs.drone_interface import interface_of
+from lemniscate.envs.interface import Interface
 from lemniscate.envs.jax_backend import JaxBackend, Outcome, Programs, State, jax_device
 from lemniscate.envs.spaces import action_kind
 from lemniscate.errors import UserError, missing_extra, unknown_name
@@ -204,6 +206,11 @@ class CrazyflowBackend(JaxBackend):
         if drones.error is None:
             return None
         return Scene(drones.env.sim.mj_model, 1 / drones.env.freq, slice(0, 3), slice(3, 7), drones.error)
+
+    @property
+    def interface(self) -> Interface:
+        """Units, frames and times, for policies that leave Python."""
+        return interface_of(self._drones.env)
 
 
 def _import() -> None:
