@@ -26,8 +26,8 @@ class UntranslatableError(Exception):
 class Call:
     """One call of the graph: makes operations, and the values that they result in."""
 
-    def __init__(self, operations: list[Operation], fake: Any, name: str) -> None:
-        self.operations, self.name = operations, name
+    def __init__(self, operations: list[Operation], fake: Any, name: str, batch: str) -> None:
+        self.operations, self.name, self.batch = operations, name, batch
         self.fake = fake
         """the result as torch.export describes it: sizes and types, no numbers"""
 
@@ -55,7 +55,7 @@ class Call:
 
     def _own(self, fake: Tensor) -> tuple[int, ...]:
         first, *others = fake.shape if fake.shape else (0,)
-        if isinstance(first, int) or not all(isinstance(size, int) for size in others):
+        if str(first) != self.batch or not all(isinstance(size, int) for size in others):
             raise UntranslatableError(f"{self.name} mixes the observations of a batch")
         return tuple(others)
 

@@ -75,7 +75,7 @@ def run_tool(command: list[str], folder: Path, seconds: float = 120) -> str:
         raise UserError(f"{Path(command[0]).name} did not run: {str(error).partition(chr(10))[0]}.") from None
     if done.returncode:
         said = (done.stderr or done.stdout or "nothing was said").strip().splitlines()
-        first = next((line for line in said if "error" in line), said[0] if said else "")
+        first = next((line for line in said if "error:" in line), said[0] if said else "")
         raise UserError(f"{Path(command[0]).name} failed: {first}")
     return done.stdout
 

@@ -48,6 +48,8 @@ def _exported(module: nn.Module, inputs: int) -> torch.export.ExportedProgram:
             exported = torch.export.export(module, (torch.zeros(3, inputs),), dynamic_shapes=(batch,))
             return exported.run_decompositions(table)
     except Exception as error:  # whatever the code of a user's own network, or its tracing, raises
+        if "Constraints violated" in str(error):
+            raise UntranslatableError("it is made for one number of observations") from error
         lines = [line.strip() for line in str(error).splitlines() if line.strip()]
         raise UntranslatableError((lines or [type(error).__name__])[0].rstrip(".:")) from error
 
@@ -59,7 +61,7 @@ class _Translator:
         self.exported = exported
         self.operations: list[Operation] = []
         self.results: dict[Node, Any] = {}
-        self.obs = Value("obs", ())
+        self.obs, self.batch = Value("obs", ()), ""
 
     def program(self) -> Program:
         """All operations."""
@@ -77,12 +79,14 @@ class _Translator:
 
     def _placeholder(self, node: Node, spec: Any) -> Any:
         if spec.kind is InputKind.USER_INPUT:
-            self.obs = Value("obs", tuple(node.meta["val"].shape[1:]))
+            batch, *shape = node.meta["val"].shape
+            self.obs, self.batch = Value("obs", tuple(shape)), str(batch)
             return self.obs
-        return {**self.exported.state_dict, **self.exported.constants}[spec.target]
+        return {**self.exported.state_dict, **self.exported.constants}.get(spec.target)
 
     def _call(self, node: Node) -> Any:
-        name = "getitem" if node.target is operator.getitem else str(node.target).split(".")[1:2][0]
+        parts = str(node.target).split(".")
+        name = "getitem" if node.target is operator.getitem else parts[min(1, len(parts) - 1)]
         if name in CHECKS:
             return None
         args, kwargs = map_arg((node.args, node.kwargs), self.results.__getitem__)
@@ -90,6 +94,8 @@ class _Translator:
         if not any(isinstance(leaf, Value) or leaf is BATCH for leaf in given):
             assert callable(node.target)
             return node.target(*args, **kwargs)
+        if getattr(node.target, "__module__", "") == "_operator" and BATCH in given:  # on its way into a shape
+            return BATCH
         if name not in TRANSLATIONS:
             raise UntranslatableError(f"{name} has no translation")
-        return TRANSLATIONS[name](Call(self.operations, node.meta["val"], name), *args, **kwargs)
+        return TRANSLATIONS[name](Call(self.operations, node.meta["val"], name, self.batch), *args, **kwargs)

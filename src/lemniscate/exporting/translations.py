@@ -68,6 +68,15 @@ def _silu(call: Call, x: Value) -> Value:
     return call.add("Mul", x, call.add("Sigmoid", x))
 
 
+def _gelu(call: Call, x: Value, *, approximate: str = "none") -> Value:
+    if approximate == "none":
+        share = call.add("Erf", call.add("Mul", x, np.float32(0.5**0.5)))
+    else:
+        cube = call.add("Mul", call.add("Mul", call.add("Mul", x, x), x), np.float32(0.044715))
+        share = call.add("Tanh", call.add("Mul", call.add("Add", x, cube), np.float32((2 / np.pi) ** 0.5)))
+    return call.add("Mul", call.add("Mul", x, np.float32(0.5)), call.add("Add", share, np.float32(1)))
+
+
 def _power(call: Call, x: Any, exponent: Any) -> Value:
     if not isinstance(x, Value) or exponent not in (1, 2, 3, 4, 0.5, -0.5, -1, -2):
         raise UntranslatableError(f"pow with the exponent {exponent} has no translation")
@@ -158,6 +167,17 @@ def _slice(call: Call, x: Value, axis: int = 0, start: int | None = None, end: A
     return call.add("Slice", x, kind=x.kind, axis=own, start=begin)
 
 
+def _index(call: Call, x: Value, places: list[Any]) -> Value:
+    """x[:, places], for constant places along one axis."""
+    ((axis, indices), *others) = [(axis, index) for axis, index in enumerate(places) if index is not None]
+    if others or isinstance(indices, Value) or indices.ndim != 1 or axis == 0 or indices.dtype != torch.int64:
+        raise UntranslatableError("index with more than constant places along one axis has no translation")
+    size, shape = x.shape[axis - 1], (*x.shape[: axis - 1], 1, *x.shape[axis:])
+    starts = [index % size for index in indices.tolist()]
+    rows = [call.add("Slice", x, shape=shape, kind=x.kind, axis=axis - 1, start=start) for start in starts]
+    return call.add("Concat", *rows, kind=x.kind, axis=axis - 1)
+
+
 def _select(call: Call, x: Value, axis: int, index: int) -> Value:
     own = call.axis(axis, len(x.shape) + 1)
     shape = (*x.shape[:own], 1, *x.shape[own + 1 :])
@@ -222,6 +242,8 @@ TRANSLATIONS: dict[str, Translation] = {
     "ne": _not_equal,
     "logical_and": _comparison("And", "bool"),
     "logical_or": _comparison("Or", "bool"),
+    "bitwise_and": _comparison("And", "bool"),
+    "bitwise_or": _comparison("Or", "bool"),
     "logical_not": _unary("Not"),
     "bitwise_not": _unary("Not"),
     "where": _where,
@@ -230,6 +252,7 @@ TRANSLATIONS: dict[str, Translation] = {
     "leaky_relu": _leaky_relu,
     "elu": _elu,
     "silu": _silu,
+    "gelu": _gelu,
     "_softmax": _softmax,
     "clamp": _clamp,
     "hardtanh": _clamp,
@@ -252,6 +275,8 @@ TRANSLATIONS: dict[str, Translation] = {
     "argmax": _argmax,
     "slice": _slice,
     "select": _select,
+    "index": _index,
+    "index_select": lambda call, x, axis, indices: _index(call, x, [None] * (axis % (len(x.shape) + 1)) + [indices]),
     "split": _split,
     "split_with_sizes": _split,
     "permute": _permute,
