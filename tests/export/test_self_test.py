@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 import torch
+from exported import BOX, needs_compiler, policy_for
 from torch import nn
 
-from exported import BOX, needs_compiler, policy_for
 from lemniscate.algos import ppo, sac
 from lemniscate.exporting.actions import act_with
 from lemniscate.exporting.c_files import c_files
@@ -115,9 +115,7 @@ def test_the_text_itself_can_be_broken_too():
     policy = policy_for(normalize_observations=True)
     obs = np.random.default_rng(0).normal(0, 2, (1000, 7)).astype(np.float32)
     tests = self_tests(policy, obs)
-    files = c_files(
-        translate(Deployed(policy).eval(), 7), BOX, tests, act_with(policy)(tests), title="", origin=""
-    )
+    files = c_files(translate(Deployed(policy).eval(), 7), BOX, tests, act_with(policy)(tests), title="", origin="")
     for right, wrong in (
         ("policy_max((obs[i]", "(0.0F * policy_max(0.0F, 0.0F) + (obs[i]"),  # no lower clip
         ("a += weight[i] * x[i];\n            b", "a += weight[i] * x[i + 1];\n            b"),

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-
 from exported import exported, policy_for
+
 from lemniscate.exporting import target
 from lemniscate.spec import Box
 
@@ -14,7 +14,13 @@ pytestmark = pytest.mark.skipif(bool(missing), reason=f"not installed: {', '.joi
 @pytest.fixture(scope="module")
 def drone():
     """Of the size of the figure eight's: 43 numbers, two layers of 64, four actions."""
-    policy = policy_for(Box((-1.5,) * 3 + (0.05,), (1.5,) * 3 + (0.48,)), observations=43, hidden=(64, 64), normalize_observations=True, spread=0.1)
+    policy = policy_for(
+        Box((-1.5,) * 3 + (0.05,), (1.5,) * 3 + (0.48,)),
+        observations=43,
+        hidden=(64, 64),
+        normalize_observations=True,
+        spread=0.1,
+    )
     return exported(policy, rows=10_000)
 
 

@@ -145,6 +145,9 @@ class _Writer:
 
     def _elementwise(self, operation: Operation) -> Numbers:
         output = operation.output
+        for operand in operation.inputs:
+            if isinstance(operand, Value) and operand.size < output.size:
+                self._array(operand)  # once for all numbers that need it
         inputs = [self._broadcast(operand, output.shape) for operand in operation.inputs]
         kinds = [operand.kind if isinstance(operand, Value) else "float" for operand in operation.inputs]
         self.body.functions |= _functions(operation.name)
