@@ -37,7 +37,7 @@ class Exported:
         return c_files(self.program, self.policy.spec.action, obs, true, title="A policy.", origin="random ones")
 
     def host(self, *flags):
-        return HostPolicy(self.files(), host_compiler(), flags or ("-O1",))
+        return HostPolicy(self.files(), host_compiler(), flags or ("-O0",))
 
     def onnx(self, obs):
         return onnx_act(onnx_model(self.program, {"a": 1}))[0](obs)

@@ -1,14 +1,15 @@
 """The C itself: its functions, its warnings, its memory."""
 
 import ctypes
+import re
 import subprocess
 
 import numpy as np
 import pytest
-from exported import exported, needs_compiler, policy_for
+from exported import BOX, exported, needs_compiler, policy_for
 
 from lemniscate.errors import UserError
-from lemniscate.exporting.c_files import functions
+from lemniscate.exporting.c_files import c_files, functions
 from lemniscate.exporting.host import FLAGS, HostPolicy, host_compiler, run_tool
 
 pytestmark = needs_compiler
@@ -135,6 +136,21 @@ def test_a_header_of_cpp_too(tmp_path):
         if "did not run" in str(error):
             pytest.skip("there is no C++ compiler")
         raise
+
+
+def test_a_run_cannot_write_code_into_a_comment():
+    copy = exported(policy_for())
+    evil = "*/ int main(void) { return 1; }\n#error evil\\\n/*"
+    for name, text in c_files(copy.program, BOX, copy.obs[:2], copy.true[:2], title=evil, origin=evil).items():
+        assert text.count("#error") == text.count("* / int main(void)"), name
+        assert not re.search(r"^#error", text, re.MULTILINE)
+
+
+@pytest.mark.parametrize(("scale", "bound"), [(1, "1e-04F"), (1e6, "1e+01F")])
+def test_the_bound_of_the_self_test_grows_with_the_actions(scale, bound):
+    copy = exported(policy_for())
+    header = c_files(copy.program, BOX, copy.obs[:1], np.full((1, 3), scale), title="", origin="")["policy.h"]
+    assert f"#define POLICY_SELF_TEST_BOUND {bound}\n" in header
 
 
 def test_a_compiler_that_refuses_is_quoted():

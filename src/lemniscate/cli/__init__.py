@@ -155,8 +155,10 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
             "--trust", action="store_true", help="import a run's own code (module:name) also if the run is not yours"
         )
 
+    for sub in (subs["export"], subs["evaluate"]):
+        sub.add_argument("run", type=Path, metavar="RUN", help="a run or a checkpoint")
+    subs["export"].add_argument("--to", type=Path, metavar="DIR", help="new directory, or an export [RUN/export]")
     sub = subs["evaluate"]
-    sub.add_argument("run", type=Path, metavar="RUN", help="a run or a checkpoint")
     sub.add_argument("--episodes", default=100, metavar="INT", help="how many [100]")
     sub.add_argument("--seed", default=0, metavar="INT", help="seed of the starts [0]")
     sub.add_argument("--env-args", metavar="JSON", help="arguments of the environment [as in training]")
@@ -175,17 +177,12 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
     sub.add_argument("--env", metavar="ID", help="environment [that of training]; without RUN, with --random")
     sub.add_argument("--env-args", metavar="JSON", help="arguments of the environment [as in training]")
 
-    sub = subs["export"]
-    sub.add_argument("run", type=Path, metavar="RUN", help="a run or a checkpoint")
-    sub.add_argument("--to", type=Path, metavar="DIR", help="new directory; an export is replaced [RUN/export]")
-
     subs["plot"].add_argument("runs", type=Path, nargs="+", metavar="RUN", help="runs or sweeps")
     subs["plot"].add_argument(
         "--by", default="step", metavar="AXIS", help="learning curve by step, episode or minute [step]"
     )
 
     subs["envs"].add_argument("filter", nargs="?", default="", metavar="FILTER", help="a part of the id")
-
     subs["check"].add_argument("what", metavar="ENV|RUN", help="an id, module:Class of your own, a run or a sweep")
     subs["check"].add_argument("--env-args", metavar="JSON", help="arguments of the environment")
     subs["check"].add_argument("--wrappers", nargs="+", default=[], metavar="NAME", help="wrappers, as in training")

@@ -9,7 +9,6 @@ from torch import Tensor
 
 from lemniscate.envs.backend import Backend, Scene, Summary
 from lemniscate.envs.episodes import Episodes, EpisodeStatistics
-from lemniscate.envs.interface import Interface
 from lemniscate.envs.shards import act_over_shards
 from lemniscate.errors import NonFiniteError, UserError, wrong_action
 from lemniscate.maths import ONE_SHARD, Shards
@@ -56,7 +55,6 @@ class VecEnv:
         self.device = backend.device
         self.summaries: tuple[Summary, ...] = getattr(backend, "summaries", ())
         self.scene: Scene | None = getattr(backend, "scene", None)
-        self.interface: Interface = getattr(backend, "interface", Interface())
         self.obs = torch.empty(0)
         self.collecting = Stopwatch()
         """seconds that the functions of `data` spend acting and stepping"""

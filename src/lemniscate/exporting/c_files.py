@@ -43,17 +43,17 @@ def c_files(
     """
     body = body_of(program)
     places, scratch = body.places()
-    shared = {"title": title, "version": version()}
+    shared = {"title": comment(title), "version": version()}
     header = {
         "observations": program.obs.size,
         "actions": program.action.size,
         "tests": len(observations),
-        "bound": "5e-2F" if program.is_rounded else "1e-4F",
+        "bound": f"{self_test_bound(program, actions):.0e}F",
         "period": ""
         if period is None
         else f"#define POLICY_PERIOD {np.float32(period)!s}F /* seconds between two actions */\n",
         "safe": safe_sentence(action),
-        "origin": origin,
+        "origin": comment(origin),
     }
     source = {
         "constants": "\n\n".join(body.constants),
@@ -67,6 +67,17 @@ def c_files(
         "test_actions": _rows(actions),
     }
     return {"policy.c": fill("policy.c", {**shared, **source}), "policy.h": fill("policy.h", {**shared, **header})}
+
+
+def comment(text: str) -> str:
+    """Text, of a run's record perhaps, that does not end the comment that it stands in."""
+    return " ".join(text.replace("*/", "* /").replace("\\", "/").split())
+
+
+def self_test_bound(program: Program, actions: np.ndarray) -> float:
+    """What the self-test stays below: ten times what another order of sums may change, by the size of the actions."""
+    largest = float(np.abs(actions).max())
+    return 0.05 * max(1.0, largest) if program.is_rounded else 1e-5 * max(10.0, largest)
 
 
 def period_line(period: float | None) -> str:

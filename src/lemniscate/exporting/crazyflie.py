@@ -8,7 +8,7 @@ import numpy as np
 from lemniscate.envs.interface import Interface, Quantity, Reference
 from lemniscate.errors import UserError
 from lemniscate.exporting.c_code import braces
-from lemniscate.exporting.c_files import TEMPLATES, fill
+from lemniscate.exporting.c_files import TEMPLATES, comment, fill
 from lemniscate.exporting.provenance import version
 from lemniscate.spec import Action, Box
 
@@ -51,7 +51,7 @@ def crazyflie_files(
     if not rate or LOOP % rate:
         raise UserError(f"its {rate} actions a second do not divide the firmware's {LOOP}")
     reference = interface.reference
-    shared = {"title": title, "version": version(), "rate": rate}
+    shared = {"title": comment(title), "version": version(), "rate": rate}
     controller = {
         "reference": _reference(reference) if reference else "",
         "counter": "static uint32_t step; /* the point of the curve */\n" if reference else "",

@@ -4,7 +4,6 @@ import json
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -150,8 +149,3 @@ def _write(folder: Path, contents: Mapping[str, bytes]) -> None:
         if before.exists() and not folder.exists():
             before.replace(folder)
         raise
-
-
-def load_manifest(folder: str | Path) -> dict[str, Any]:
-    """The manifest of an export. Raises `UserError` where it is missing or damaged."""
-    return read_json(Path(folder) / MANIFEST)

@@ -15,7 +15,7 @@ from lemniscate.nn.normalizer import RunningNorm
 from lemniscate.policy import TrainedPolicy
 from lemniscate.run.environments import env_arguments
 from lemniscate.run.evaluate import play_episodes
-from lemniscate.spec import Action, Box, Discrete
+from lemniscate.spec import Action, Box
 
 ENVIRONMENTS, ROWS, TESTS = 16, 10_000, 64
 """environments side by side; observations at least; those of them that the self-test has"""
@@ -56,7 +56,7 @@ def fly(policy: TrainedPolicy, act: Act, rows: int = ROWS, seed: int = 0) -> Fli
             seen.append(obs[counts].numpy().copy())
             if sum(map(len, seen)) >= rows:
                 break
-        return Flights(np.concatenate(seen), env.interface)
+        return Flights(np.concatenate(seen), getattr(env.backend, "interface", Interface()))
     finally:
         env.close()
 
@@ -87,8 +87,3 @@ def origin(policy: TrainedPolicy, tests: int) -> str:
     """Where the observations of a self-test are from, in words."""
     edges = f", and {tests - TESTS} with one number far outside of them" if tests > TESTS else ""
     return f"{TESTS} of episodes of {policy.spec.env_id}{edges}"
-
-
-def is_masked(action: Action) -> bool:
-    """Whether observations end in a mask of the actions."""
-    return isinstance(action, Discrete) and action.masked

@@ -1,6 +1,6 @@
 """`parity.json`: how far the exported policies are from the policy itself, and what they cost."""
 
-import os
+import platform
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -85,7 +85,7 @@ def parity(
     record["multiplications"] = program.multiplications
     record["ns_per_action"] = {name: cost and round(cost) for name, cost in costs.items()}
     record["ns_are"] = "C in a loop in C, the others called from Python with one observation, all on one core"
-    return {**record, "machine": os.uname().machine, "missing": missing + said}, missing + said
+    return {**record, "machine": platform.machine(), "missing": missing + said}, missing + said
 
 
 def on_target(
