@@ -85,6 +85,11 @@ def test_products_of_bfloat16_are_rounded_as_in_training():
     assert np.median(differences) < 1e-6  # but where a sum in another order is rounded the other way
 
 
+def test_what_the_action_does_not_need_is_left_out():
+    text = exported(policy_for(algo=sac)).files()["policy.c"]
+    assert text.count("policy_tanh(") == 1 + 1  # its definition and the squash, none for the standard deviation
+
+
 def test_a_policy_without_hidden_layers():
     require_parity(exported(policy_for(hidden=())))
 

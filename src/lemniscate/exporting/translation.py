@@ -20,9 +20,10 @@ from lemniscate.exporting.operations import Operation, Program, Value
 from lemniscate.exporting.translations import TRANSLATIONS
 
 KEPT = (torch.ops.aten.linear.default, torch.ops.aten.layer_norm.default, torch.ops.aten.silu.default)
-"""taken as they are, where torch.export would split them further"""
+"""taken as they are, where others are split into simpler ones"""
 CHECKS = ("_assert_tensor_metadata", "_assert_scalar", "sym_constrain_range_for_size")
 """have no result"""
+KNOWN = {*TRANSLATIONS, *CHECKS}
 
 
 def translate(module: nn.Module, inputs: int) -> Program:
@@ -46,12 +47,29 @@ def _exported(module: nn.Module, inputs: int) -> torch.export.ExportedProgram:
         with warnings.catch_warnings(), torch.no_grad():
             warnings.simplefilter("ignore")  # torch's own, about its own parts
             exported = torch.export.export(module, (torch.zeros(3, inputs),), dynamic_shapes=(batch,))
-            return exported.run_decompositions(table)
+            is_known = {_name_of(node) for node in exported.graph.nodes if node.op == "call_function"} <= KNOWN
+            return exported if is_known else exported.run_decompositions(table)
     except Exception as error:  # whatever the code of a user's own network, or its tracing, raises
         if "Constraints violated" in str(error):
             raise UntranslatableError("it is made for one number of observations") from error
         lines = [line.strip() for line in str(error).splitlines() if line.strip()]
         raise UntranslatableError((lines or [type(error).__name__])[0].rstrip(".:")) from error
+
+
+def _name_of(node: Node) -> str:
+    """The name of torch's operation without its overload; one that works in place ends in an underscore."""
+    parts = str(node.target).split(".")
+    return "getitem" if node.target is operator.getitem else parts[min(1, len(parts) - 1)]
+
+
+def _needed(operations: list[Operation], action: Value) -> tuple[Operation, ...]:
+    """The operations that the action depends on, in their order: the mode needs no standard deviation, say."""
+    values, kept = {action}, list[Operation]()
+    for operation in reversed(operations):
+        if operation.output in values:
+            values.update(operand for operand in operation.inputs if isinstance(operand, Value))
+            kept.append(operation)
+    return tuple(reversed(kept))
 
 
 class _Translator:
@@ -75,7 +93,7 @@ class _Translator:
         action = self.results[node.args[0][0]]
         if not isinstance(action, Value):
             raise UntranslatableError("its actions do not depend on the observation")
-        return Program(self.obs, tuple(self.operations), action)
+        return Program(self.obs, _needed(self.operations, action), action)
 
     def _placeholder(self, node: Node, spec: Any) -> Any:
         if spec.kind is InputKind.USER_INPUT:
@@ -85,8 +103,7 @@ class _Translator:
         return {**self.exported.state_dict, **self.exported.constants}.get(spec.target)
 
     def _call(self, node: Node) -> Any:
-        parts = str(node.target).split(".")
-        name = "getitem" if node.target is operator.getitem else parts[min(1, len(parts) - 1)]
+        name = _name_of(node)
         if name in CHECKS:
             return None
         args, kwargs = map_arg((node.args, node.kwargs), self.results.__getitem__)

@@ -94,7 +94,7 @@ def _where(call: Call, condition: Any, a: Any, b: Any) -> Value:
     return call.add("Where", *chosen, kind=call.kind)
 
 
-def _cast(call: Call, x: Value, **_: Any) -> Value:
+def _cast(call: Call, x: Value, *_: Any, **__: Any) -> Value:
     return call.rounded(call.as_kind(x, call.kind))
 
 
@@ -248,6 +248,7 @@ TRANSLATIONS: dict[str, Translation] = {
     "bitwise_not": _unary("Not"),
     "where": _where,
     "_to_copy": _cast,
+    "to": _cast,
     "relu": _relu,
     "leaky_relu": _leaky_relu,
     "elu": _elu,
@@ -278,6 +279,7 @@ TRANSLATIONS: dict[str, Translation] = {
     "index": _index,
     "index_select": lambda call, x, axis, indices: _index(call, x, [None] * (axis % (len(x.shape) + 1)) + [indices]),
     "split": _split,
+    "chunk": _split,
     "split_with_sizes": _split,
     "permute": _permute,
     **{name: _reshape for name in ("view", "_unsafe_view", "reshape", "unsqueeze", "squeeze")},
