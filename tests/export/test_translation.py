@@ -17,6 +17,7 @@ INFINITY = float("inf")
 
 KINDS = {
     "bounded": BOX,
+    "one coordinate": Box((-2.0,), (2.0,)),
     "one bound": Box((-INFINITY, 0.0, -INFINITY, -1.0), (INFINITY, INFINITY, 2.0, 1.0)),
     "shaped": Box((-1.0,) * 4, (1.0, 2.0, 3.0, 4.0), (2, 2), "float64"),
     "discrete": Discrete(5, start=-2),
@@ -26,6 +27,7 @@ KINDS = {
 }
 SAFE = {
     "bounded": [0, 0, 0.25],
+    "one coordinate": [0],
     "one bound": [0, 1, 1, 0],
     "shaped": [0, 0.5, 1, 1.5],
     "discrete": [-2],

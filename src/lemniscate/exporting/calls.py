@@ -64,7 +64,8 @@ class Call:
     ) -> Value:
         """A new operation; numbers and tensors among its inputs become constants."""
         shape = self.shape if shape is None else shape
-        operands = tuple(constant(operand, len(shape)) for operand in inputs)
+        rank = 2 if name == "Linear" else len(shape)  # of constants: a weight [1, n] has no batch axis
+        operands = tuple(constant(operand, rank) for operand in inputs)
         value = Value(f"v{len(self.operations)}", shape, kind)
         self.operations.append(Operation(name, operands, value, settings))
         return value

@@ -123,11 +123,7 @@ def sentences(record: Mapping[str, Any]) -> list[str]:
     """What a person reads of it."""
     names = {"onnx": "ONNX", "c_host": "C", "c_cortex_m4f": "C on the simulated Cortex-M4F"}
     compared = {name: record[key] for key, name in names.items() if (record[key] or {}).get("observations")}
-    said = [
-        f"{name} differs from the policy by at most {each['max_abs_difference']:.1e}"
-        f" at {each['observations']:,} observations."
-        for name, each in compared.items()
-    ]
+    said = [_distance(name, each) for name, each in compared.items()]
     if sizes := record["c_cortex_m4f"]:
         counted = sizes.get("instructions_per_call")
         said.append(
@@ -138,3 +134,8 @@ def sentences(record: Mapping[str, Any]) -> list[str]:
         if each["above_tolerance"]:
             said.append(f"{name} is beyond {record['tolerance']:g} at {each['above_tolerance']:,} of them.")
     return said
+
+
+def _distance(name: str, compared: Mapping[str, Any]) -> str:
+    largest, rows = compared["max_abs_difference"], f"at {compared['observations']:,} observations."
+    return f"{name} differs from the policy by at most {largest:.1e} {rows}" if largest else f"{name} is exact {rows}"
