@@ -13,6 +13,7 @@ from lemniscate.exporting.deployed import Deployed
 from lemniscate.exporting.flights import EDGES, TESTS, self_tests
 from lemniscate.exporting.host import HostPolicy, host_compiler
 from lemniscate.exporting.translation import translate
+from lemniscate.spec import Discrete
 
 pytestmark = needs_compiler
 
@@ -128,6 +129,23 @@ def test_the_text_itself_can_be_broken_too():
         if right.startswith("policy_max"):
             text = text.replace(", (-10.0F)), 10.0F)", "), 10.0F)", 1)
         assert HostPolicy({**files, "policy.c": text}, host_compiler(), ("-O0", "-Wno-error")).self_test() > 1e-3, wrong
+
+
+def test_choices_that_hang_on_a_rounding_are_not_in_the_self_test():
+    policy = policy_for(Discrete(3))
+    obs = np.random.default_rng(0).normal(0, 2, (200, 7)).astype(np.float32)
+    act, low, high = (
+        act_with(policy),
+        obs[0],
+        next(row for row in obs if act_with(policy)(row[None]) != act_with(policy)(obs[:1])),
+    )
+    for _ in range(40):  # towards a point at which two actions are equally good
+        middle = (low + high) / 2
+        low, high = (middle, high) if act(middle[None]) == act(obs[:1]) else (low, middle)
+    obs[::2] = low
+    tests = self_tests(policy, obs)
+    assert len(tests) == TESTS
+    assert not (tests == low).all(1).any()
 
 
 def test_observations_of_the_self_test_are_real_and_from_all_over():
