@@ -4,8 +4,8 @@
     .venv/bin/python benchmarks/scale.py processes         only this
     .venv/bin/python benchmarks/scale.py --table           the tables of docs/scale.md of what has been measured
 
-    processes    PPO as in docs/speed.md, 64 environments, minibatches of 64: two processes beside one, without shards
-    shards       PPO as in docs/speed.md, 16 × HalfCheetah-v5, but minibatches of 512: eight shards beside one
+    processes    PPO as in docs/speed.md, 16 environments, but minibatches of 512: two processes beside one, no shards
+    shards       the same, 16 × HalfCheetah-v5, one process: eight shards beside one
     exchange     milliseconds to gather what each rank has, by its size, by the number of ranks, and by the time that a
                  packet takes from host to host: simulated hosts, each with one rank, of which at most two compute
     rllib        RLlib's PPO with our settings beside ours; PYTHON names an interpreter that has `ray[rllib]`
@@ -29,6 +29,7 @@ from hosts import hosts
 from peers import EXCHANGE, RLLIB, RLLIB_LANDER
 
 SIZE = {"num_envs": 16, "num_steps": 128, "minibatch_size": 64, "epochs": 10, "learning_rate": 3e-4}
+LARGE = {"minibatch_size": 512}
 STEPS = 100_000
 DELAYS, RANKS, FLOATS = (0.0, 0.0001, 0.0005, 0.002), (2, 4, 8, 16), (16, 12_000, 120_000)
 
@@ -65,13 +66,11 @@ def compare(what, env, ways, rounds, stamp):
 
 def processes(rounds, stamp):
     for env in ("Ant-v5", "Humanoid-v5"):
-        size = {"num_envs": 64, "num_steps": 32}
-        compare("processes", env, {"1": size, "2": {**size, "processes": 2}}, rounds, stamp)
+        compare("processes", env, {"1": LARGE, "2": {**LARGE, "processes": 2}}, rounds, stamp)
 
 
 def shards(rounds, stamp):
-    size = {"minibatch_size": 512}
-    compare("shards", "HalfCheetah-v5", {"1": size, "8": {**size, "shards": 8}}, rounds, stamp)
+    compare("shards", "HalfCheetah-v5", {"1": LARGE, "8": {**LARGE, "shards": 8}}, rounds, stamp)
 
 
 def exchange(rounds, stamp):

@@ -4,12 +4,16 @@ import os
 import random
 import re
 import signal
+import subprocess
+import sys
 import time
+from pathlib import Path
 
 import pytest
+from hosts import hosts
 
 import lemniscate as lem
-from cluster.worlds import KINDS, SHARDS, finish, outcome, ranks, train, wait_for, words
+from cluster.worlds import KINDS, SHARDS, finish, free_port, outcome, ranks, train, wait_for, words
 from forks import command
 from lemniscate.errors import UserError
 from lemniscate.world import World
@@ -183,6 +187,57 @@ def test_a_run_of_one_shard_cannot_go_on_with_two_processes(tmp_path):
     train(1, *words("ppo", shards=1, total_steps=640), "--run", tmp_path / "r", "--checkpoint-every", "320")
     with pytest.raises(UserError, match="2 processes cannot share 1 shards equally"):
         World(1, 0, 2).divide(1)
+
+
+def torchrun(*words, on=(), **environment):
+    """Start `torchrun … -m -- lemniscate …` in a process of its own; `on` is the beginning of the command."""
+    paths = os.pathsep.join(filter(None, sys.path))
+    return subprocess.Popen(
+        [*on, sys.executable, "-m", "torch.distributed.run", *map(str, words)],
+        env={**os.environ, "PYTHONPATH": paths, "OMP_NUM_THREADS": "1", **environment},
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def ends_well(*processes):
+    """Wait for all; fails unless all exit with 0."""
+    said = [process.communicate(timeout=300)[1] for process in processes]
+    assert [process.returncode for process in processes] == [0] * len(processes), said
+    assert "Traceback" not in "".join(said), said
+
+
+def test_torchrun_on_one_machine_gives_the_bits_of_one_process(tmp_path):
+    train(1, *words("ppo"), "--run", tmp_path / "one")
+    port = ["--master-port", free_port()]
+    ends_well(
+        torchrun("--nproc-per-node", 2, *port, "-m", "--", "lemniscate", *words("ppo"), "--run", tmp_path / "two")
+    )
+    assert outcome(tmp_path / "two") == outcome(tmp_path / "one")
+
+
+@pytest.mark.cluster
+@pytest.mark.skipif(os.geteuid() != 0 or not Path("/dev/net/tun").exists(), reason="only root makes simulated hosts")
+@pytest.mark.parametrize("kind", ["ppo", "sac"])
+def test_torchrun_on_two_hosts_gives_the_bits_of_one_process(tmp_path, kind):
+    """The line of docs/scale.md on two machines that share a network alone: no shared memory, a disk on the first."""
+    train(1, *words(kind), "--run", tmp_path / "one")
+    meet = ["--nnodes", 2, "--nproc-per-node", 2, "--rdzv-backend", "c10d", "--rdzv-endpoint", "10.77.0.1:29500"]
+    with hosts(2, 0.0005) as commands:
+        processes = []
+        for i, there in enumerate(commands):
+            name = [
+                "--local-addr",
+                f"10.77.0.{i + 1}",
+                "--rdzv-conf",
+                f"is_host={i == 0}",
+            ]  # no names are resolved here
+            own = [*meet, *name, "-m", "--", "lemniscate", *words(kind), "--run"]
+            path = tmp_path / ("two" if i == 0 else "not-there")
+            processes.append(torchrun(*own, path, on=there, GLOO_SOCKET_IFNAME=f"lem{i}"))
+        ends_well(*processes)
+    assert outcome(tmp_path / "two") == outcome(tmp_path / "one")
+    assert not (tmp_path / "not-there").exists()
 
 
 @pytest.mark.cluster
