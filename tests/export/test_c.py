@@ -49,7 +49,7 @@ BOUNDS = [
     ("log", "log(x)", True, 2, 3.4e38, 4e-7),
     ("sin", "sin(x)", False, -1000, 1000, 4e-7),
     ("cos", "cos(x)", False, -1000, 1000, 4e-7),
-    ("erf", "erf(x)", False, -1e30, 1e30, 6e-7),
+    ("erf", "erf(x)", False, -1e30, 1e30, 7e-7),
     ("floor", "floor(x)", False, -1e30, 1e30, 0),
 ]
 

@@ -137,7 +137,7 @@ static float policy_cos(float x)
 }
 
 // erf: exp abs
-/* The error function, with an error below 6e-7 (Abramowitz and Stegun 1964, 7.1.26). */
+/* The error function, with an error below 7e-7 (Abramowitz and Stegun 1964, 7.1.26). */
 static float policy_erf(float x)
 {
     const float t = 1.0F / (1.0F + 0.3275911F * policy_abs(x));

@@ -17,13 +17,13 @@ $period#define POLICY_SELF_TESTS $tests
 /* Acts at one raw observation, in the manifest's order; `action` is in the units of the environment. Returns 0, or 1
  * where an observation is NaN or infinite: the action is then the safe one,
  * $safe.
- * Takes always the same time but for that. Not reentrant: it has one static array of scratch. */
+ * Takes the same time at every finite observation. Not reentrant: it has one static array of scratch. */
 int policy_act(const float obs[POLICY_OBSERVATIONS], float action[POLICY_ACTIONS]);
 
 /* The largest difference from the actions of training's own policy, at POLICY_SELF_TESTS observations that are stored
  * beside the weights: $origin.
- * Below POLICY_SELF_TEST_BOUND where compiler and memory do as they should. A program that does not call it does not carry them, if it is
- * linked with -ffunction-sections -fdata-sections -Wl,--gc-sections. */
+ * It is below POLICY_SELF_TEST_BOUND where compiler and memory do as they should. A program that does not call it does
+ * not carry them, if it is linked with -ffunction-sections -fdata-sections -Wl,--gc-sections. */
 float policy_self_test(void);
 
 #ifdef __cplusplus
