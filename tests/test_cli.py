@@ -163,7 +163,7 @@ def test_bare_is_help_and_help_names_every_command(capsys):
     bare = capsys.readouterr().out
     assert main(["--help"]) == 0
     assert capsys.readouterr().out == bare
-    for command in ("train", "resume", "evaluate", "watch", "plot", "envs", "check"):
+    for command in ("train", "resume", "evaluate", "watch", "plot", "push", "envs", "check"):
         assert f"\n    {command} " in bare
 
 

@@ -24,6 +24,7 @@ CASES = [
     (["lemniscate", "train", "ppo", "--activation", "t"], ["tanh"]),
     (["lemniscate", "check", "Pendul"], ["Pendulum-v1"]),
     (["lemniscate", "evaluate", "--epi"], ["--episodes"]),
+    (["lemniscate", "push", "--pri"], ["--private"]),
     (["lemniscate", "completion", "z"], ["zsh"]),
 ]
 

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from lemniscate.exporting.export import export
     from lemniscate.plots import plot
     from lemniscate.policy import TrainedPolicy
+    from lemniscate.pushed import push
     from lemniscate.results import evaluate, watch
     from lemniscate.resumed import resume
     from lemniscate.run.environments import make_envs
@@ -45,6 +46,7 @@ __all__ = [
     "make_envs",
     "make_vec",
     "plot",
+    "push",
     "resume",
     "resume_sweep",
     "resume_tuning",
@@ -75,6 +77,7 @@ MODULES = {
     "make_envs": "run.environments",
     "make_vec": "envs.vector_view",
     "plot": "plots",
+    "push": "pushed",
     "resume": "resumed",
     "resume_sweep": "sweep",
     "resume_tuning": "tuning.tuner",
@@ -89,7 +92,7 @@ MODULES = {
 
 SUBMODULES = (
     *("algos", "api", "course", "data", "envs", "errors", "exporting", "maths", "nn", "optim", "policy", "presets"),
-    *("plots", "report", "results", "run", "spec", "stored", "sweep", "testing", "tuning", "types"),
+    *("plots", "pushed", "report", "results", "run", "spec", "stored", "sweep", "testing", "tuning", "types"),
 )
 """what `lemniscate.NAME` imports by itself"""
 

@@ -157,8 +157,10 @@ def test_images_and_policies_of_no_run_are_refused(tmp_path):
     image.close()
     with pytest.raises(lem.UserError, match="A policy for Copy-image-v0 looks at images; what can be exported"):
         lem.export(policy, tmp_path / "e")
-    with pytest.raises(lem.UserError, match="This policy is of no run: name the directory"):
+    with pytest.raises(lem.UserError, match="This policy is of no run here: name the directory"):
         lem.export(policy_for())
+    with pytest.raises(lem.UserError, match="of no run here"):
+        exporting._destination("hf://user/name", policy, None)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -30,6 +30,7 @@ COMMANDS = {
     "watch": "Show episodes in a window, or record them.",
     "export": "Write a policy as C for microcontrollers and as ONNX, and measure how far these are from it.",
     "plot": "Draw the curves of a run and its report.html, or compare several, grouped by all but the seed.",
+    "push": "Upload the policy of a run to the Hugging Face Hub, with a page about it.",
     "envs": "List the environments, their backends, and the preset that fits.",
     "check": "Check that an environment is suitable for training, or that the files of a run are whole.",
     "completion": "Print the script with which a shell completes; its first line says where to write it.",
@@ -91,29 +92,6 @@ def add_train_options(parser: argparse.ArgumentParser) -> None:
     _add_endings(parser)
 
 
-def add_tune_options(parser: argparse.ArgumentParser) -> None:
-    """The options of `lemniscate tune` besides the fields of a Config."""
-    parser.add_argument("--env", metavar="ID", help="environment id, or module:Class of your own")
-    parser.add_argument("--run", type=Path, metavar="DIR", help="directory of the search; must not exist [runs/…]")
-    parser.add_argument("--preset", metavar="NAME", help="settings that are not searched [those of the environment]")
-    parser.add_argument(
-        "--search", metavar="RANGES", help="fields as 'learning_rate=log:1e-4:1e-2, gamma=.9:.999, clip=0.1|0.2'"
-    )
-    parser.add_argument("--trials", default=40, metavar="INT", help="number of settings that are tried [40]")
-    parser.add_argument("--seeds", default="101-103", metavar="LIST", help="of each trial [101-103]")
-    parser.add_argument(
-        "--prune",
-        action=argparse.BooleanOptionalAction,
-        default=True,
-        help="end a trial after 1/9 or 1/3 of its steps if it is not among the best third [on]",
-    )
-    parser.add_argument(
-        "--population", action="store_true", help="train all together; worse trials go on as copies of better ones"
-    )
-    _add_cluster(parser)
-    parser.add_argument("--quiet", action="store_true", help="no progress on standard error")
-
-
 class Parser(argparse.ArgumentParser):
     """argparse, but a mistake is one sentence, and help has a line for most options."""
 
@@ -150,13 +128,13 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
 
     subs["resume"].add_argument("run", type=Path, metavar="RUN", help="a run, a sweep or a search")
     _add_endings(subs["resume"])
-    for name in ("resume", "evaluate", "watch", "export", "plot"):
+    for name in ("resume", "evaluate", "watch", "export", "plot", "push"):
         subs[name].add_argument(
             "--trust", action="store_true", help="import a run's own code (module:name) also if the run is not yours"
         )
 
     for sub in (subs["export"], subs["evaluate"]):
-        sub.add_argument("run", type=Path, metavar="RUN", help="a run or a checkpoint")
+        sub.add_argument("run", type=Path, metavar="RUN", help="a run, a checkpoint or hf://user/name")
     subs["export"].add_argument("--to", type=Path, metavar="DIR", help="new directory, or an export [RUN/export]")
     sub = subs["evaluate"]
     sub.add_argument("--episodes", default=100, metavar="INT", help="how many [100]")
@@ -168,7 +146,7 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
 
     sub = subs["watch"]
     sub.usage = "lemniscate watch RUN [options]\n       lemniscate watch --random --env ID [options]"
-    sub.add_argument("run", type=Path, nargs="?", metavar="RUN", help="a run or a checkpoint")
+    sub.add_argument("run", type=Path, nargs="?", metavar="RUN", help="a run, a checkpoint or hf://user/name")
     sub.add_argument("--episodes", default=1, metavar="INT", help="how many [1]")
     sub.add_argument("--sample", action="store_true", help="draw actions from the policy [the most likely ones]")
     sub.add_argument("--random", action="store_true", help="act uniformly at random")
@@ -181,6 +159,12 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
     subs["plot"].add_argument(
         "--by", default="step", metavar="AXIS", help="learning curve by step, episode or minute [step]"
     )
+
+    sub = subs["push"]
+    sub.add_argument("run", type=Path, metavar="RUN", help="a run or a checkpoint")
+    sub.add_argument("name", metavar="USER/NAME", help="repository; new, or of a policy to be replaced")
+    sub.add_argument("--private", action="store_true", help="make a new repository private")
+    sub.add_argument("--license", metavar="NAME", help="licence on the page, as the Hub abbreviates it: mit [none]")
 
     subs["envs"].add_argument("filter", nargs="?", default="", metavar="FILTER", help="a part of the id")
     subs["check"].add_argument("what", metavar="ENV|RUN", help="an id, module:Class of your own, a run or a sweep")
@@ -201,13 +185,14 @@ def _add_endings(parser: argparse.ArgumentParser) -> None:
         help="sees each update and may stop the run: module:function, or 'module:Class(key=value)'",
     )
     parser.add_argument("--processes", default=1, metavar="INT", help="processes of this machine for one run [1]")
-    _add_cluster(parser)
+    add_cluster_options(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress on standard error")
     parser.add_argument("--report", action="store_true", help="evaluate the final policy, and draw plots and videos")
     parser.add_argument("--score", action="store_true", help="store the final return over 100 episodes")
 
 
-def _add_cluster(parser: argparse.ArgumentParser) -> None:
+def add_cluster_options(parser: argparse.ArgumentParser) -> None:
+    """The options of the commands that train on Ray."""
     parser.add_argument("--cluster", metavar="ray[=ADDRESS]", help="train on Ray: --workers INT [--storage DIR]")
     parser.add_argument("--workers", metavar="INT", help=argparse.SUPPRESS)
     parser.add_argument("--storage", metavar="DIR", help=argparse.SUPPRESS)
@@ -218,6 +203,8 @@ def _parse_algorithm(command: str, parser: Parser, words: list[str]) -> argparse
     titles, verb = algorithms(), f"lemniscate {command}"
     asks = "-h" in words or "--help" in words
     if asks and (words[0].startswith("-") or "," in words[0]):
+        from lemniscate.cli.tune_options import add_tune_options
+
         (add_train_options if command == "train" else add_tune_options)(parser)
         listed = "\n".join(f"  {name:<12}{title}" for name, title in titles.items())
         several = "several, such as ppo,sac, with --seeds; " if command == "train" else ""

@@ -5,7 +5,7 @@ import json
 from shutil import get_terminal_size
 from typing import Any
 
-from lemniscate import plots, results
+from lemniscate import plots, pushed, results
 from lemniscate.algos import ALGORITHMS
 from lemniscate.checks import each_finding, verdict
 from lemniscate.cli.completion import completion as completion
@@ -56,6 +56,12 @@ def plot(given: argparse.Namespace) -> None:
     """Draw the curves of one run, or compare several, grouped by all but the seed."""
     for file in plots.plot(*given.runs, by=given.by, trust=given.trust):
         say(file)
+
+
+def push(given: argparse.Namespace) -> None:
+    """Upload the policy of a run to the Hub."""
+    page = pushed.push(given.run, given.name, private=given.private, license=given.license, trust=given.trust)
+    say(f"Uploaded: {page}. It is loaded from hf://{given.name}.")
 
 
 def envs(given: argparse.Namespace) -> None:

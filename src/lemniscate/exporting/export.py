@@ -22,6 +22,7 @@ from lemniscate.exporting.parity import onnx_act, parity, sentences
 from lemniscate.exporting.translation import translate
 from lemniscate.policy import TrainedPolicy
 from lemniscate.run.files import DamagedFileError, make_directory, read_json, remove, replace_file, sync, write_json
+from lemniscate.run.hub import is_address
 from lemniscate.stored import Trained, load, path_of
 
 MANIFEST, PARITY, ONNX = "manifest.json", "parity.json", "policy.onnx"
@@ -49,7 +50,7 @@ def export(run: Trained, to: str | Path | None = None, *, trust: bool = False) -
             cannot be made; a directory that is no export, or that cannot be written. Nothing is left half-written.
     """
     policy = load(run, trust=trust)
-    folder = _destination(policy, to)
+    folder = _destination(run, policy, to)
     require_vector(policy.spec)
     program = translate(Deployed(policy).eval(), input_size(policy.spec))
     contents, said = _contents(policy, program)
@@ -62,10 +63,10 @@ def export(run: Trained, to: str | Path | None = None, *, trust: bool = False) -
     return folder
 
 
-def _destination(policy: TrainedPolicy, to: str | Path | None) -> Path:
+def _destination(run: Trained, policy: TrainedPolicy, to: str | Path | None) -> Path:
     """The directory of the export. Raises `UserError` where something else is in its place."""
-    if to is None and policy.path is None:
-        raise UserError("This policy is of no run: name the directory of its export with `to`.")
+    if to is None and (policy.path is None or is_address(run)):
+        raise UserError("This policy is of no run here: name the directory of its export, with --to or `to`.")
     folder = path_of(to) if to is not None else Path(policy.path or "") / "export"
     if folder.is_symlink() or (folder.exists() and not is_export(folder)):
         raise UserError(f"{folder} exists already, and is no export; choose another directory.")

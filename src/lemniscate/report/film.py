@@ -1,6 +1,7 @@
 """Films: frames into an animated picture or a video, at their own speed."""
 
 import math
+import stat
 from collections.abc import Iterable, Iterator
 from itertools import islice
 from pathlib import Path
@@ -12,8 +13,18 @@ from PIL import Image
 from lemniscate.errors import UserError, is_installed, missing_extra
 from lemniscate.run.files import remove
 
+SUFFIXES = (".gif", ".webp", ".mp4")
+"""what a film can be"""
+
 PICTURE_FPS = 50
 """frames a second that an animated picture has at most: browsers show one with shorter delays far too slowly"""
+
+
+def newest_film(run: Path) -> Path | None:
+    """The newest film of a run, if it has any."""
+    files = (file for file in (run / "videos").glob("*") if file.suffix in SUFFIXES)
+    films = [file for file in files if stat.S_ISREG(file.lstat().st_mode)]
+    return max(films, key=lambda file: file.stat().st_mtime, default=None)
 
 
 def save_frames(frames: Iterable[np.ndarray], file: Path, fps: float) -> None:
@@ -48,7 +59,7 @@ def _write(frames: Iterable[np.ndarray], file: Path, fps: float) -> None:
 
 def check_film(file: Path) -> None:
     """Raise `UserError` for a film that could not be written, before anything is played for it."""
-    if file.suffix not in (".gif", ".webp", ".mp4"):
+    if file.suffix not in SUFFIXES:
         raise UserError(f"{file} must end in .gif, .webp or .mp4.")
     if file.suffix == ".mp4" and not is_installed("imageio_ffmpeg"):
         raise missing_extra("imageio_ffmpeg", "video")

@@ -2,7 +2,6 @@
 
 import math
 import platform
-import stat
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
@@ -14,6 +13,7 @@ import numpy as np
 from lemniscate.errors import resume_line
 from lemniscate.report import advice, commands, html
 from lemniscate.report.curves import training_minutes
+from lemniscate.report.film import newest_film
 from lemniscate.report.html import Html, element, section
 from lemniscate.run.directory import read_config
 from lemniscate.run.metrics import read_metrics
@@ -64,8 +64,13 @@ def write(run: Path, pictures: Sequence[Path], scores: Mapping[str, Any] | None)
 
 def figures(pictures: Sequence[Path]) -> list[Html]:
     """Pictures, each with its caption."""
-    captions = {file: text for file in pictures for name, text in CAPTIONS.items() if file.stem.startswith(name)}
-    return [html.picture(file, captions.get(file, file.stem)) for file in pictures]
+    return [html.picture(file, caption(file)) for file in pictures]
+
+
+def caption(picture: Path) -> str:
+    """What is below a picture."""
+    known = [text for name, text in CAPTIONS.items() if picture.stem.startswith(name)]
+    return [picture.stem, *known][-1]
 
 
 def footer() -> Html:
@@ -85,8 +90,17 @@ def evaluation(scores: Mapping[str, Any] | None) -> list[Html]:
     """The scores of an evaluation as a table, and its returns as bars."""
     if not scores or not scores.get("returns"):
         return [element("p", "The final policy has not been evaluated yet.", class_="soft")]
+    returns = scores["returns"]
+    alike = max(returns) - min(returns) < 1e-6 * (1 + abs(returns[0]))
+    same, title = element("p", "Every episode had the same return."), "Returns of the episodes"
+    table = html.table(("measure", "value"), score_rows(scores))
+    return [table, same if alike else html.histogram(returns, title)]
+
+
+def score_rows(scores: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The scores of an evaluation, each with its name in words."""
     returns, lengths = scores["returns"], scores["lengths"]
-    rows = [
+    return [
         ("return, mean ± standard deviation", f"{scores['mean_return']:,.1f} ± {scores['std_return']:,.1f}"),
         ("episodes, from starts that training never saw", f"{len(returns):,}, seed {scores.get('seed', 0)}"),
         ("worst, median, best return", ", ".join(f"{x:,.1f}" for x in np.percentile(returns, [0, 50, 100]))),
@@ -94,9 +108,6 @@ def evaluation(scores: Mapping[str, Any] | None) -> list[Html]:
         ("terminated by the environment's rules", f"{scores['terminated']:,} of {len(returns):,}"),
         *((words(name), number(name, value)) for name, value in measures(scores).items()),
     ]
-    alike = max(returns) - min(returns) < 1e-6 * (1 + abs(returns[0]))
-    same, caption = element("p", "Every episode had the same return."), "Returns of the episodes"
-    return [html.table(("measure", "value"), rows), same if alike else html.histogram(returns, caption)]
 
 
 def measures(scores: Mapping[str, Any]) -> dict[str, float]:
@@ -158,9 +169,8 @@ def _headline(run: Path, scores: Mapping[str, Any] | None) -> list[tuple[str, st
 
 def _films(run: Path, page: Path) -> list[Html]:
     """The newest film of a run, if it has any."""
-    files = (file for file in (run / "videos").glob("*") if file.suffix in (".gif", ".webp", ".mp4"))
-    films = [file for file in files if stat.S_ISREG(file.lstat().st_mode)]
-    return [section("Film", html.film(max(films, key=lambda file: file.stat().st_mtime), page))] if films else []
+    film = newest_film(run)
+    return [section("Film", html.film(film, page))] if film else []
 
 
 def _commands(run: Path, algorithm: str, config: Mapping[str, Any]) -> list[Html]:

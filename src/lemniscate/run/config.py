@@ -176,7 +176,7 @@ class RunConfig:
     video_every_episodes: Natural = 0
     """training episodes between such recordings; 0: none"""
     warm_start: str | None = None
-    """run or checkpoint whose networks this run begins with"""
+    """run, checkpoint or hf://user/name whose networks this run begins with"""
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     """arguments of the environment, as JSON: '{"dynamics": "first_principles"}'"""
     wrappers: tuple[str, ...] = ()

@@ -1,11 +1,9 @@
 """Warm start: networks that another run has trained are the beginning of this one."""
 
-from pathlib import Path
-
 from torch import Tensor, nn
 
 from lemniscate.errors import UserError
-from lemniscate.run import checkpoint
+from lemniscate.run import checkpoint, hub
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import find_checkpoint
 from lemniscate.spec import Spec
@@ -26,9 +24,9 @@ def load_networks(networks: nn.Module, config: RunConfig, spec: Spec) -> str:
         A sentence on what was loaded.
 
     Raises:
-        UserError: no such checkpoint; other spaces; a policy of other shapes.
+        UserError: no such checkpoint, here or on the Hub; other spaces; a policy of other shapes.
     """
-    source = find_checkpoint(Path(str(config.warm_start)))
+    source = find_checkpoint(hub.local_path(str(config.warm_start)))
     name = f"{config.warm_start} at step {source.numbers['step']:,}"
     their_spec = checkpoint.spec_from_json(source.record["spec"])
     if not their_spec.fits(spec):
