@@ -70,7 +70,7 @@ tutorials: setup  ## the notebooks with their outputs, from docs/tutorial/*.py: 
 	$(BIN)/python docs/tutorial/execute.py
 
 lock: setup  ## renew requirements.lock from pyproject.toml
-	$(BIN)/pip-compile --quiet --strip-extras --extra box2d --extra classic-control --extra drone --extra envpool --extra hub --extra mujoco --extra tune --extra docs --extra dev --no-emit-index-url --no-emit-find-links --no-emit-trusted-host --no-header --allow-unsafe --annotation-style=line --constraint constraints.txt --output-file requirements.lock pyproject.toml
+	$(BIN)/pip-compile --quiet --strip-extras --extra box2d --extra classic-control --extra drone --extra envpool --extra export --extra hub --extra mujoco --extra tune --extra docs --extra dev --no-emit-index-url --no-emit-find-links --no-emit-trusted-host --no-header --allow-unsafe --annotation-style=line --constraint constraints.txt --output-file requirements.lock pyproject.toml
 	sed -i 's/+cpu//' requirements.lock
 
 clean:

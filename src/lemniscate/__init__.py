@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from lemniscate.checks import check
     from lemniscate.envs.vector_view import make_vec
     from lemniscate.errors import NonFiniteError, NotStoredError, SweepError, UserError
+    from lemniscate.exporting.export import export
     from lemniscate.plots import plot
     from lemniscate.policy import TrainedPolicy
     from lemniscate.pushed import push
@@ -40,6 +41,7 @@ __all__ = [
     "check",
     "config_for",
     "evaluate",
+    "export",
     "load",
     "make_envs",
     "make_vec",
@@ -70,6 +72,7 @@ MODULES = {
     "check": "checks",
     "config_for": "api",
     "evaluate": "results",
+    "export": "exporting.export",
     "load": "stored",
     "make_envs": "run.environments",
     "make_vec": "envs.vector_view",
@@ -88,8 +91,8 @@ MODULES = {
 """where each public name is defined"""
 
 SUBMODULES = (
-    *("algos", "api", "course", "data", "envs", "errors", "maths", "nn", "optim", "policy", "presets", "report"),
-    *("plots", "pushed", "results", "run", "spec", "stored", "sweep", "testing", "tuning", "types"),
+    *("algos", "api", "course", "data", "envs", "errors", "exporting", "maths", "nn", "optim", "policy", "presets"),
+    *("plots", "pushed", "report", "results", "run", "spec", "stored", "sweep", "testing", "tuning", "types"),
 )
 """what `lemniscate.NAME` imports by itself"""
 

@@ -56,7 +56,9 @@ def substeps_by_hand(env, plan, delay, seed=3):
     sim.data, states = data, []
     for i in range(len(plan) * SUBSTEPS + 1):
         state = sim.data.states
-        states.append(np.concatenate([np.asarray(getattr(state, n))[:, 0] for n in ("pos", "quat", "vel", "ang_vel")], -1))
+        states.append(
+            np.concatenate([np.asarray(getattr(state, n))[:, 0] for n in ("pos", "quat", "vel", "ang_vel")], -1)
+        )
         acting = (i - delay) // SUBSTEPS if i >= delay else -1
         if acting < len(commands):
             sim.attitude_control((commands[acting] if acting >= 0 else level)[:, None])
@@ -139,7 +141,7 @@ def test_actions_that_come_late_act_as_in_a_simulation_by_hand(plain, substeps):
     plan = actions(12)
     obs = fly(make(action_delay=substeps * 0.002) if substeps else plain, plan)
     by_hand = substeps_by_hand(plain, plan, substeps)
-    torch.testing.assert_close(obs[..., :13], by_hand[:: SUBSTEPS], rtol=1e-4, atol=2e-5)
+    torch.testing.assert_close(obs[..., :13], by_hand[::SUBSTEPS], rtol=1e-4, atol=2e-5)
 
 
 @pytest.mark.parametrize("substeps", [4, 10, 23])

@@ -38,6 +38,17 @@ def test_the_layout_is_the_documented_one(env):
     assert env.spec.max_episode_steps == 500
 
 
+def test_every_number_has_a_unit_and_a_frame(env):
+    interface = env.backend.interface
+    assert all(len(interface.parts[part.name]) == part.size for part in env.spec.observation_parts)
+    assert len(interface.action) == env.spec.action.size
+    assert (interface.period, interface.dynamics, interface.vehicle) == (0.02, "so_rpy", "crazyflie")
+    assert interface.reference.points.shape == (500, 3)
+    obs = env.restart(3)
+    seen = interface.reference.points[(499 + interface.reference.offsets) % 500].ravel()
+    assert np.allclose(obs[0, 13:] + obs[0, :3].repeat(10), seen, atol=1e-5)
+
+
 def test_the_first_observation_is_a_start_of_the_task(env):
     obs = env.restart(3)
     assert (obs[:, 0:2].abs() <= 0.1).all()

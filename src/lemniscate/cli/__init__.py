@@ -28,6 +28,7 @@ COMMANDS = {
     "resume": "Continue an interrupted run, sweep or search.",
     "evaluate": "Play whole episodes with the newest policy of a run.",
     "watch": "Show episodes in a window, or record them.",
+    "export": "Write a policy as C for microcontrollers and as ONNX, and measure how far these are from it.",
     "plot": "Draw the curves of a run and its report.html, or compare several, grouped by all but the seed.",
     "push": "Upload the policy of a run to the Hugging Face Hub, with a page about it.",
     "envs": "List the environments, their backends, and the preset that fits.",
@@ -127,13 +128,15 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
 
     subs["resume"].add_argument("run", type=Path, metavar="RUN", help="a run, a sweep or a search")
     _add_endings(subs["resume"])
-    for name in ("resume", "evaluate", "watch", "plot", "push"):
+    for name in ("resume", "evaluate", "watch", "export", "plot", "push"):
         subs[name].add_argument(
             "--trust", action="store_true", help="import a run's own code (module:name) also if the run is not yours"
         )
 
+    for sub in (subs["export"], subs["evaluate"]):
+        sub.add_argument("run", type=Path, metavar="RUN", help="a run, a checkpoint or hf://user/name")
+    subs["export"].add_argument("--to", type=Path, metavar="DIR", help="new directory, or an export [RUN/export]")
     sub = subs["evaluate"]
-    sub.add_argument("run", type=Path, metavar="RUN", help="a run, a checkpoint or hf://user/name")
     sub.add_argument("--episodes", default=100, metavar="INT", help="how many [100]")
     sub.add_argument("--seed", default=0, metavar="INT", help="seed of the starts [0]")
     sub.add_argument("--env-args", metavar="JSON", help="arguments of the environment [as in training]")
@@ -165,7 +168,6 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
     sub.add_argument("--license", metavar="NAME", help="licence on the page, as the Hub abbreviates it: mit [none]")
 
     subs["envs"].add_argument("filter", nargs="?", default="", metavar="FILTER", help="a part of the id")
-
     subs["check"].add_argument("what", metavar="ENV|RUN", help="an id, module:Class of your own, a run or a sweep")
     subs["check"].add_argument("--env-args", metavar="JSON", help="arguments of the environment")
     subs["check"].add_argument("--wrappers", nargs="+", default=[], metavar="NAME", help="wrappers, as in training")

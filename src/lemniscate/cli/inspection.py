@@ -46,6 +46,13 @@ def watch(given: argparse.Namespace) -> None:
     )
 
 
+def export(given: argparse.Namespace) -> None:
+    """Write a policy as C and ONNX, and say how far these are from it."""
+    from lemniscate.exporting.export import export
+
+    say(f"Everything is in {export(given.run, given.to, trust=given.trust)}")
+
+
 def plot(given: argparse.Namespace) -> None:
     """Draw the curves of one run, or compare several, grouped by all but the seed."""
     for file in plots.plot(*given.runs, by=given.by, trust=given.trust):

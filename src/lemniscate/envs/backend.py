@@ -65,6 +65,7 @@ class Backend(Protocol):
     - `summaries`: a tuple of `Summary`;
     - `scene`: a `Scene` or None, which is drawn where a Gymnasium environment would be rendered;
     - `baseline`: a `Baseline` or None, a classical controller beside which policies are shown;
+    - `interface`: an `Interface`, the meaning of the numbers, for policies that are exported;
     - `compiled = True`: a step is a program for one number of environments, so evaluation takes as many as training;
     - `package`: what has to be installed;
     - `in_process`: the name of the backend that evaluates its policies, where it uses other processes itself;

@@ -21,7 +21,9 @@ import torch
 
 from lemniscate.envs.air import CONDITIONS, read_ranges
 from lemniscate.envs.backend import Scene, Summary
+from lemniscate.envs.drone_interface import interface_of
 from lemniscate.envs.drones import Drones, Mixed
+from lemniscate.envs.interface import Interface
 from lemniscate.envs.jax_backend import JaxBackend, Programs, jax_device
 from lemniscate.envs.pd import GAINS, PD
 from lemniscate.envs.spaces import action_kind
@@ -93,8 +95,9 @@ class CrazyflowBackend(JaxBackend):
                 raise
             raise UserError(f"{env} cannot be made with {kwargs}: {error}.") from error
         super().__init__(shared, num_envs, device, stagger=stagger)
-        self._drones = drones = shared.envs.drones[0] if isinstance(shared.envs, Mixed) else shared.envs
-        assert isinstance(drones, Drones)
+        assert isinstance(shared.envs, Drones | Mixed)
+        self._vectors = shared.envs.drones if isinstance(shared.envs, Mixed) else [shared.envs]
+        self._drones = drones = self._vectors[0]
         action = action_kind(drones.env.single_action_space, env)
         assert isinstance(action, Box)
         self.spec = Spec(env, drones.parts, action, max_episode_steps=drones.episode_steps)
@@ -121,6 +124,14 @@ class CrazyflowBackend(JaxBackend):
         if drones.error is None:
             return None
         return Scene(drones.env.sim.mj_model, 1 / drones.env.freq, slice(0, 3), slice(3, 7), drones.error)
+
+    @property
+    def interface(self) -> Interface:
+        """Units, frames and times, for policies that leave Python."""
+        air = self._drones.air
+        late = [air.ranges.get(name, (0.0, 0.0)) for name in ("action_delay", "observation_delay")]
+        delay = (sum(least for least, _ in late), sum(most for _, most in late))
+        return interface_of(self._drones.env, [one.dynamics for one in self._vectors], delay, air.history)
 
 
 def _import() -> None:

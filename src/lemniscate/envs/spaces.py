@@ -103,12 +103,13 @@ def scale_action(action: np.ndarray, box: Box) -> np.ndarray:
     With one infinite bound, −1 is the finite one and the unit stays: low + 1 + a, or high − 1 + a. With two, a is not
     changed.
     """
-    low, high, middle, half = _scale(box)
+    low, high, middle, half = scale_of(box)
     return np.minimum(np.maximum(middle + half * action, low), high)
 
 
 @lru_cache
-def _scale(box: Box) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def scale_of(box: Box) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """low, high, middle and half of the width of each coordinate, [A] each, as `scale_action` takes them."""
     low, high = np.array(box.low, dtype=box.dtype), np.array(box.high, dtype=box.dtype)
     below, above = np.isfinite(low), np.isfinite(high)
     with np.errstate(invalid="ignore"):  # ∞ − ∞, of which nothing is taken
@@ -148,5 +149,5 @@ def normalized_action(action: np.ndarray, kind: Action) -> np.ndarray:
         return flat.astype(np.int64)
     if isinstance(kind, MultiDiscrete):
         return (flat - np.array(kind.start)).astype(np.int64)
-    _, _, middle, half = _scale(kind)
+    _, _, middle, half = scale_of(kind)
     return ((flat - middle) / np.where(half > 0, half, 1)).astype(np.float32)

@@ -1,0 +1,152 @@
+"""`export`: a policy as C99 and as ONNX, with what its numbers mean and how far the copies are from it."""
+
+import json
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from lemniscate.console import say
+from lemniscate.errors import UserError, is_installed
+from lemniscate.exporting.actions import Act, act_with
+from lemniscate.exporting.c_files import c_files
+from lemniscate.exporting.crazyflie import crazyflie_files
+from lemniscate.exporting.deployed import Deployed, input_size, require_vector
+from lemniscate.exporting.flights import Flights, fly, origin, self_tests
+from lemniscate.exporting.host import HostPolicy, host_compiler
+from lemniscate.exporting.manifest import manifest, observed, title
+from lemniscate.exporting.onnx_model import onnx_model
+from lemniscate.exporting.operations import Program
+from lemniscate.exporting.parity import onnx_act, parity, sentences
+from lemniscate.exporting.translation import translate
+from lemniscate.policy import TrainedPolicy
+from lemniscate.run.files import DamagedFileError, make_directory, read_json, remove, replace_file, sync, write_json
+from lemniscate.run.hub import is_address
+from lemniscate.stored import Trained, load, path_of
+
+MANIFEST, PARITY, ONNX = "manifest.json", "parity.json", "policy.onnx"
+CRAZYFLIE = "crazyflie"
+
+
+def export(run: Trained, to: str | Path | None = None, *, trust: bool = False) -> Path:
+    """Write a policy as ONNX and as C99 for microcontrollers, from the raw observation to the action for `env.step`.
+
+    These are `policy.onnx`, `policy.c` and `policy.h`; `manifest.json` says what every number means. The exported C
+    acts in the environment of training, and at what it sees there all copies are compared with the policy:
+    `parity.json`. What is not installed for that (a C compiler, onnxruntime, arm-none-eabi-gcc, QEMU) is said and left
+    out. A policy that flies a Crazyflie also gets an application for its firmware, in `crazyflie/`.
+
+    Args:
+        run: as in `load`.
+        to: the new directory; by default `export` in that of the run. An export that is there is replaced.
+        trust: as in `load`.
+
+    Returns:
+        The directory.
+
+    Raises:
+        UserError: a policy that looks at images; a network of one's own that cannot be translated; an environment that
+            cannot be made; a directory that is no export, or that cannot be written. Nothing is left half-written.
+    """
+    policy = load(run, trust=trust)
+    folder = _destination(run, policy, to)
+    require_vector(policy.spec)
+    program = translate(Deployed(policy).eval(), input_size(policy.spec))
+    contents, said = _contents(policy, program)
+    try:
+        _write(folder, contents)
+    except OSError as error:
+        raise UserError(f"{folder} cannot be written: {error.strerror or error}.") from error
+    for sentence in said:
+        say(sentence)
+    return folder
+
+
+def _destination(run: Trained, policy: TrainedPolicy, to: str | Path | None) -> Path:
+    """The directory of the export. Raises `UserError` where something else is in its place."""
+    if to is None and (policy.path is None or is_address(run)):
+        raise UserError("This policy is of no run here: name the directory of its export, with --to or `to`.")
+    folder = path_of(to) if to is not None else Path(policy.path or "") / "export"
+    if folder.is_symlink() or (folder.exists() and not is_export(folder)):
+        raise UserError(f"{folder} exists already, and is no export; choose another directory.")
+    return folder
+
+
+def is_export(folder: Path) -> bool:
+    """Whether `export` has written what is there; an empty directory may be written into as well."""
+    try:
+        return folder.is_dir() and (not any(folder.iterdir()) or "export" in read_json(folder / MANIFEST))
+    except (DamagedFileError, OSError):
+        return False
+
+
+def _contents(policy: TrainedPolicy, program: Program) -> tuple[dict[str, bytes], list[str]]:
+    """The content of every file by its name, the manifest without its own sha256 last; what a person is to know."""
+    true, action, compiler = act_with(policy), policy.spec.action, host_compiler()
+    facts = {"title": title(policy), "environment": policy.spec.env_id, "step": policy.step}
+    model = onnx_model(program, facts) if is_installed("onnx") else None
+    write = partial(c_files, program, action, title=facts["title"])
+    flights = fly(policy, _actor(policy, program, model, compiler))
+    tests = self_tests(policy, flights.obs)
+    named = {"origin": origin(policy, len(tests)), "period": flights.interface.period}
+    texts = write(tests, true(tests), **named)
+    host = HostPolicy(texts, compiler) if compiler else None
+    record, missing = parity(program, true, flights.obs, texts, model, host, compiler)
+    acting = "policy.c" if compiler else "policy.onnx" if model and is_installed("onnxruntime") else "the policy itself"
+    record = {"environment": policy.spec.env_id, "acting": acting, "reference": "torch", **record}
+    vehicle, left_out = _vehicle_files(policy, flights, texts)
+    contents: dict[str, bytes] = {} if model is None else {ONNX: model}
+    contents |= {name: text.encode() for name, text in {**texts, **vehicle}.items()}
+    contents[PARITY] = (json.dumps(record, indent=1, allow_nan=False) + "\n").encode()
+    contents[MANIFEST] = json.dumps(manifest(policy, program, flights.interface, flights.obs, contents)).encode()
+    return contents, [*sentences(record), *missing, *left_out]
+
+
+def _actor(policy: TrainedPolicy, program: Program, model: bytes | None, compiler: str | None) -> Act:
+    """What flies: the C on this machine, or else ONNX, or else the policy itself."""
+    if compiler:
+        size = input_size(policy.spec)
+        untested = np.zeros((1, size), dtype=np.float32), np.zeros((1, program.action.size), dtype=np.float32)
+        return HostPolicy(c_files(program, policy.spec.action, *untested, title="", origin=""), compiler).act
+    return onnx_act(model)[0] if model and is_installed("onnxruntime") else act_with(policy)
+
+
+def _vehicle_files(
+    policy: TrainedPolicy, flights: Flights, texts: Mapping[str, str]
+) -> tuple[dict[str, str], list[str]]:
+    """The files of the vehicle's firmware, and why there are none for a vehicle that could have some."""
+    if flights.interface.vehicle != CRAZYFLIE:
+        return {}, []
+    quantities = observed(policy.spec, flights.interface)
+    try:
+        found = crazyflie_files(flights.interface, quantities, policy.spec.action, texts, title(policy))
+    except UserError as error:
+        return {}, [f"{CRAZYFLIE}/ is left out: {error}."]
+    return {f"{CRAZYFLIE}/{name}": text for name, text in found.items()}, []
+
+
+def _write(folder: Path, contents: Mapping[str, bytes]) -> None:
+    """Write all files aside, then put the directory in its place. Raises `OSError`, and leaves nothing behind then."""
+    aside, before = (folder.with_name(f"{folder.name}.{end}") for end in ("tmp", "old"))
+    make_directory(folder.parent)
+    remove(aside)
+    try:
+        aside.mkdir()
+        for name, content in contents.items():
+            if name == MANIFEST:
+                write_json(aside / name, json.loads(content))
+                continue
+            (aside / name).parent.mkdir(exist_ok=True)
+            replace_file(aside / name, content)
+        remove(before)
+        if folder.exists():
+            folder.replace(before)
+        aside.replace(folder)
+        sync(folder.parent)
+        remove(before)
+    except BaseException:
+        remove(aside)
+        if before.exists() and not folder.exists():
+            before.replace(folder)
+        raise

@@ -1,0 +1,127 @@
+"""ONNX from a list of operations."""
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from lemniscate.exporting.operations import Operand, Operation, Program, Value, weight_of
+from lemniscate.exporting.provenance import version
+
+OPSET, IR = 18, 10
+"""of 2022 and 2024: runtimes that are some years old can read it"""
+
+
+def onnx_model(program: Program, facts: Mapping[str, Any]) -> bytes:
+    """A model with the input `obs` [batch, O] float32 and the output `action` [batch, …], checked.
+
+    Args:
+        program: the policy.
+        facts: what the model carries as metadata, each as JSON.
+    """
+    import onnx
+    from onnx import helper
+
+    writer = _Writer()
+    for operation in program.operations:
+        writer.add(operation)
+    writer.node("Identity", [program.action.name], "action")
+    batch = {"obs": program.obs, "action": program.action}
+    ends = {
+        name: helper.make_tensor_value_info(name, writer.types[value.kind], ["batch", *value.shape])
+        for name, value in batch.items()
+    }
+    graph = helper.make_graph(writer.nodes, "policy", [ends["obs"]], [ends["action"]], initializer=writer.initializers)
+    opset = helper.make_opsetid("", OPSET)
+    model = helper.make_model(graph, opset_imports=[opset], ir_version=IR, producer_name="lemniscate")
+    model.producer_version = version()
+    helper.set_model_props(model, {name: json.dumps(value) for name, value in facts.items()})
+    onnx.checker.check_model(model, full_check=True)
+    return model.SerializeToString()
+
+
+class _Writer:
+    def __init__(self) -> None:
+        from onnx import TensorProto
+
+        self.types = {"float": TensorProto.FLOAT, "int": TensorProto.INT64, "bool": TensorProto.BOOL}
+        self.bfloat16 = TensorProto.BFLOAT16
+        self.nodes: list[Any] = []
+        self.initializers: list[Any] = []
+
+    def node(self, name: str, inputs: list[str], output: str, **attributes: Any) -> str:
+        """A new node; returns the name of its output."""
+        from onnx import helper
+
+        self.nodes.append(helper.make_node(name, inputs, [output], **attributes))
+        return output
+
+    def constant(self, numbers: np.ndarray) -> str:
+        """A new constant; returns its name."""
+        from onnx import numpy_helper
+
+        name = f"constant_{len(self.initializers)}"
+        self.initializers.append(numpy_helper.from_array(np.ascontiguousarray(numbers), name))
+        return name
+
+    def operand(self, operand: Operand) -> str:
+        """The name of a result or of a new constant."""
+        return operand.name if isinstance(operand, Value) else self.constant(operand)
+
+    def add(self, operation: Operation) -> None:
+        """Translate one operation."""
+        name, output, own = operation.name, operation.output.name, getattr(self, f"_{operation.name.lower()}", None)
+        if own:
+            own(operation)
+        elif name.startswith("Reduce"):
+            axes = self.constant(np.array([-1]))
+            self.node(name, [self.operand(operation.inputs[0]), axes], output, keepdims=1)
+        else:
+            self.node(name, [self.operand(operand) for operand in operation.inputs], output)
+
+    def _linear(self, operation: Operation) -> None:
+        x, output = self.operand(operation.inputs[0]), operation.output.name
+        biases = [self.operand(operand) for operand in operation.inputs[2:]]
+        if len(operation.output.shape) == 1:
+            self.node("Gemm", [x, self.constant(weight_of(operation)), *biases], output, transB=1)
+            return
+        weight = self.constant(weight_of(operation).T)
+        product = self.node("MatMul", [x, weight], f"{output}_product" if biases else output)
+        if biases:
+            self.node("Add", [product, *biases], output)
+
+    def _concat(self, operation: Operation) -> None:
+        rank = len(operation.output.shape) + 1
+        names = [self.operand(operand) for operand in operation.inputs]
+        self.node("Concat", names, operation.output.name, axis=operation.settings["axis"] + 1 - rank)
+
+    def _argmax(self, operation: Operation) -> None:
+        self.node("ArgMax", [self.operand(operation.inputs[0])], operation.output.name, axis=-1, keepdims=0)
+
+    def _cast(self, operation: Operation) -> None:
+        to = self.types[operation.output.kind]
+        self.node("Cast", [self.operand(operation.inputs[0])], operation.output.name, to=to)
+
+    def _roundbfloat16(self, operation: Operation) -> None:
+        output = operation.output.name
+        rounded = self.node("Cast", [self.operand(operation.inputs[0])], f"{output}_bfloat16", to=self.bfloat16)
+        self.node("Cast", [rounded], output, to=self.types["float"])
+
+    def _slice(self, operation: Operation) -> None:
+        axis, start = operation.settings["axis"], operation.settings["start"]
+        ends = (start, start + operation.output.shape[axis], axis + 1)
+        places = [self.constant(np.array([number])) for number in ends]
+        self.node("Slice", [self.operand(operation.inputs[0]), *places], operation.output.name)
+
+    def _reshape(self, operation: Operation) -> None:
+        shape = self.constant(np.array([-1, *operation.output.shape]))
+        self.node("Reshape", [self.operand(operation.inputs[0]), shape], operation.output.name)
+
+    def _expand(self, operation: Operation) -> None:
+        shape = self.constant(np.array([1, *operation.output.shape]))
+        self.node("Expand", [self.operand(operation.inputs[0]), shape], operation.output.name)
+
+    def _transpose(self, operation: Operation) -> None:
+        axes = [0, *(axis + 1 for axis in operation.settings["axes"])]
+        self.node("Transpose", [self.operand(operation.inputs[0])], operation.output.name, perm=axes)

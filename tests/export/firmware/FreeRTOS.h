@@ -1,0 +1,2 @@
+#include <stdint.h>
+#define M2T(X) ((uint32_t)(X))
