@@ -31,6 +31,7 @@ from peers import EXCHANGE, RLLIB, RLLIB_LANDER
 SIZE = {"num_envs": 16, "num_steps": 128, "minibatch_size": 64, "epochs": 10, "learning_rate": 3e-4}
 LARGE = {"minibatch_size": 512}
 STEPS = 100_000
+PAPER, PAIR = (2, 4, 8, 16, 64, 256, 1024), (2, 12_000)
 DELAYS, RANKS, FLOATS = (0.0, 0.0001, 0.0005, 0.002), (2, 4, 8, 16), (16, 12_000, 120_000)
 
 
@@ -148,6 +149,24 @@ def table():
         print(f"| {floats:,} numbers, {1e3 * delay:g} ms a packet | {cells} |")
 
 
+def on_paper():
+    """The share of perfect scaling, by ranks and by gradient steps an update, each rank with 2048 rows of its own.
+
+    An update takes as long as one process takes for Ant-v5, and a gather of 12,000 numbers for each gradient step: in
+    a ring of W ranks W − 1 times that of two ranks.
+    """
+    alone = [row["seconds"]["1"] for row in measured("processes") if row["env"] == "Ant-v5"]
+    update = 1e3 * median(half["collect"] + half["learn"] for half in alone)
+    ring = {row["delay"]: row["milliseconds"] for row in measured("exchange") if (row["ranks"], row["floats"]) == PAIR}
+    print("\n| share of perfect scaling | " + " | ".join(f"{ranks:,} ranks" for ranks in PAPER) + " |")
+    print("|---|" + "--:|" * len(PAPER))
+    for steps in (40, 4):
+        for delay, hop in ring.items():
+            shares = [update / (update + steps * (ranks - 1) * hop) for ranks in PAPER]
+            name = f"{steps} gradient steps, {1e3 * delay:g} ms a packet"
+            print(f"| {name} | " + " | ".join(f"{share:.0%}" for share in shares) + " |")
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("measures", nargs="*", metavar="MEASURE", help=", ".join(MEASURES))
@@ -160,6 +179,7 @@ def main():
     for name in [] if given.table else given.measures or MEASURES:
         MEASURES[name](given.rounds, provenance())
     table()
+    on_paper()
 
 
 if __name__ == "__main__":

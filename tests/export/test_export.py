@@ -220,7 +220,7 @@ def test_drones_have_units_and_frames():
     interface = interface_of(env, ["so_rpy", "first_principles"], (0.0, 0.02), 2)
     assert (interface.period, interface.vehicle, interface.dynamics[1]) == (0.02, "crazyflie", "first_principles")
     assert (interface.delay, interface.history, len(interface.parts["history"])) == ((0.0, 0.02), 2, 2 * 17)
-    assert interface.parts["history"][17].name == "position_x_2_steps_ago"
+    assert interface.parts["history"][17].name == "position_x_2_steps_ago_less_now"
     assert {name: len(part) for name, part in interface.parts.items()}["local_samples"] == 30
     assert interface.parts["local_samples"][5].name == "to_reference_in_0.1s_z"
     assert [quantity.unit for quantity in interface.action] == ["rad", "rad", "rad", "N"]

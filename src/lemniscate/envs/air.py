@@ -250,6 +250,16 @@ class Air:
             air["seen"] = seen
         return air
 
+    def changes(self, air: dict[str, Any]) -> jax.Array:
+        """The history as it is observed, [N, H, 13 + A], the newest first: states less the present one, and actions.
+
+        Differences, since what a small one says of mass and motors would drown in the scale of the states themselves.
+        """
+        import jax.numpy as jnp
+
+        states, actions = air["past"][..., :STATE_SIZE], air["past"][..., STATE_SIZE:]
+        return jnp.concatenate([states - air["seen"][:, None], actions], axis=-1)
+
     def _measure(self, air: dict[str, Any], state: jax.Array) -> tuple[dict[str, Any], jax.Array]:
         """States [N, 13] as they are measured: late, biased and noisy."""
         import jax

@@ -41,7 +41,11 @@ def interface_of(env: Any, dynamics: Sequence[str], delay: tuple[float, float], 
         parts["local_samples"] = tuple(quantity for vector in ahead for quantity in vector)
     seen = [*(quantity for name in STATE_PARTS for quantity in PARTS[name]), *ACTION]
     steps = range(1, history + 1)
-    parts["history"] = tuple(Quantity(f"{q.name}_{ago}_steps_ago", q.unit, q.frame) for ago in steps for q in seen)
+    parts["history"] = tuple(
+        Quantity(f"{q.name}_{ago}_steps_ago{'' if q in ACTION else '_less_now'}", q.unit, q.frame)
+        for ago in steps
+        for q in seen
+    )
     drone = str(env.sim.drone)
     return Interface(
         parts=parts,

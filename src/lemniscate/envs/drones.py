@@ -35,7 +35,8 @@ class Drones:
     Args:
         env: crazyflow's environment of N drones.
         ranges: the conditions that are other than the simulator's.
-        history: the number of steps before this one whose observed state and action are observed too.
+        history: the number of steps before this one that are observed too: the state then less the present one, and
+            the action.
     """
 
     def __init__(self, env: Any, ranges: Ranges, history: int) -> None:
@@ -207,7 +208,7 @@ class Drones:
         parts = env.obs()
         env.sim.data = data
         if self.air.history:
-            parts["history"] = air["past"].reshape(self.num_envs, -1)
+            parts["history"] = self.air.changes(air).reshape(self.num_envs, -1)
         return jnp.concatenate([parts[part.name] for part in self.parts], axis=-1)
 
     def _way(self, obs: jax.Array) -> jax.Array:
