@@ -38,11 +38,16 @@ class PD:
     def __init__(
         self, gains: Sequence[float], mass: float, action: Box, reference: slice, velocity: slice, preview: float
     ) -> None:
+        self._made_of = mass, action, reference, velocity, preview
         kp, kd, kp_z, kd_z = gains
         self.kp, self.kd = torch.tensor((kp, kp, kp_z)), torch.tensor((kd, kd, kd_z))
         self.mass, self.preview = mass, preview
         self.low, self.high = torch.tensor(action.low), torch.tensor(action.high)
         self.reference, self.velocity = reference, velocity
+
+    def with_gains(self, gains: Sequence[float]) -> "PD":
+        """The same controller with other gains."""
+        return PD(gains, *self._made_of)
 
     def __call__(self, obs: Tensor) -> Deterministic:
         """The action [N, 4] at each observation [N, O]."""
