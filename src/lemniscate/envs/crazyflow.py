@@ -22,7 +22,7 @@ import torch
 from lemniscate.envs.air import CONDITIONS, read_ranges
 from lemniscate.envs.backend import Scene, Summary
 from lemniscate.envs.drone_interface import interface_of
-from lemniscate.envs.drones import AHEAD, Drones, Mixed
+from lemniscate.envs.drones import Drones, Mixed
 from lemniscate.envs.interface import Interface
 from lemniscate.envs.jax_backend import JaxBackend, Programs, jax_device
 from lemniscate.envs.pd import GAINS, PD
@@ -33,8 +33,6 @@ from lemniscate.spec import Box, Spec
 IDS = ("DroneFigureEightTrajectory-v0", "DroneLanding-v0", "DroneReachPos-v0", "DroneReachVel-v0")
 DYNAMICS = ("so_rpy", "so_rpy_rotor", "so_rpy_rotor_drag", "first_principles")
 CONTROL_HZ = 50
-OPTIONS = ("history", "ahead")
-"""arguments of our own, besides the conditions"""
 MOST_HISTORY = 50
 
 
@@ -42,13 +40,13 @@ MOST_HISTORY = 50
 def programs(env_id: str, num_envs: int, device: str, kwargs: tuple[tuple[str, Any], ...]) -> Programs:
     """The compiled programs of so many drones, built once a process: all vectors of a size share them."""
     given = dict(kwargs)
-    ranges, own_options = read_ranges(given), {name: given.pop(name) for name in OPTIONS if name in given}
+    ranges, history = read_ranges(given), given.pop("history", 0)
     own = {name: value for name, value in given.items() if name not in CONDITIONS}
     each = [{**own, "dynamics": name} for name in dynamics_of(own)] or [own]
     with _quietly():
         how = {"num_envs": num_envs // len(each), "device": device}
         made = [gym.make_vec(env_id, **how, **{"freq": CONTROL_HZ, **arguments}).unwrapped for arguments in each]
-    drones = [Drones(one, ranges, **own_options) for one in made]
+    drones = [Drones(one, ranges, history) for one in made]
     return Programs(drones[0] if len(drones) == 1 else Mixed(drones))
 
 
@@ -148,7 +146,7 @@ def _import() -> None:
 def _check(env_id: str, num_envs: int, kwargs: Mapping[str, Any]) -> None:
     """Raise `UserError` for an argument that the environment does not have, or a value that it cannot take."""
     entry: Any = gym.spec(env_id).vector_entry_point
-    known = {*inspect.signature(entry).parameters, *CONDITIONS, *OPTIONS} - {"num_envs", "device"}
+    known = {*inspect.signature(entry).parameters, *CONDITIONS, "history"} - {"num_envs", "device"}
     for name, value in kwargs.items():
         if name not in known:
             raise unknown_name(f"argument of {env_id}", name, known)
@@ -158,8 +156,6 @@ def _check(env_id: str, num_envs: int, kwargs: Mapping[str, Any]) -> None:
     history, several = kwargs.get("history", 0), dynamics_of(kwargs)
     if not isinstance(history, int) or isinstance(history, bool) or not 0 <= history <= MOST_HISTORY:
         raise UserError(f"history must be a whole number of steps from 0 to {MOST_HISTORY}, not {history!r}.")
-    if not 0 <= float(kwargs.get("ahead", AHEAD)) <= 1:
-        raise UserError(f"ahead must be a share of episodes from 0 to 1, not {kwargs['ahead']!r}.")
     for name in several:
         if name not in DYNAMICS:
             raise unknown_name("dynamics", str(name), DYNAMICS)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import jax
 
 AHEAD = 0.75
-"""the share of staggered episodes that begin ahead of their beginning, unless another is asked for"""
+"""the share of staggered episodes that begin ahead of their beginning"""
 STATE_PARTS = ("pos", "quat", "vel", "ang_vel")
 REFERENCE = "local_samples"
 """the part of an observation that begins with the way to the reference"""
@@ -37,14 +37,13 @@ class Drones:
         ranges: the conditions that are other than the simulator's.
         history: the number of steps before this one that are observed too: the state then less the present one, and
             the action.
-        ahead: the share of staggered episodes that begin ahead of their beginning.
     """
 
-    def __init__(self, env: Any, ranges: Ranges, history: int = 0, ahead: float = AHEAD) -> None:
+    def __init__(self, env: Any, ranges: Ranges, history: int = 0) -> None:
         import jax
         import jax.numpy as jnp
 
-        self.env, self._ahead = env, ahead
+        self.env = env
         for name, value in vars(env).items():
             if isinstance(value, np.ndarray):  # the reference trajectory: NumPy cannot be indexed by a tracer
                 setattr(env, name, jnp.asarray(value, device=env.device))
@@ -120,7 +119,7 @@ class Drones:
         with self._at(state) as env:
             env._reset(mask=mask)
             key, whether, where, turns = jax.random.split(env.sim.data.core.rng_key, 4)
-            ahead = mask & stagger & jax.random.bernoulli(whether, self._ahead, (self.num_envs,))
+            ahead = mask & stagger & jax.random.bernoulli(whether, AHEAD, (self.num_envs,))
             steps = jax.random.randint(where, (self.num_envs,), 1, self.episode_steps) * ahead
             air = self.air.draw(state[2], mask)
             self._apply_conditions(air, mask)
