@@ -5,6 +5,8 @@ import os
 os.environ.setdefault("SCIPY_ARRAY_API", "1")
 
 import math
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -318,3 +320,11 @@ def test_what_is_no_condition_has_its_sentence(kwargs, sentence):
         make(**kwargs)
     assert sentence in str(error.value)
     assert str(error.value).count("\n") == 0
+
+
+def test_the_page_names_every_condition_with_its_nominal_value():
+    page = (Path(__file__).parents[2] / "docs" / "vehicle.md").read_text()
+    rows = [line.split(" | ") for line in page.splitlines() if line.startswith("| `")]
+    named = {name: row[-1].strip(" |") for row in rows for name in re.findall(r"`(\w+)`", row[0])}
+    for name, condition in CONDITIONS.items():
+        assert float(named[name]) == condition.nominal, name
