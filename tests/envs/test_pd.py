@@ -71,5 +71,5 @@ def test_it_flies_the_figure_eight_and_its_gains_matter():
 
 
 def test_an_environment_without_a_baseline_says_so():
-    with pytest.raises(lem.errors.UserError, match="CartPole-v1 has no baseline to compare with."):
+    with pytest.raises(lem.errors.UserError, match=r"CartPole-v1 has no baseline to compare with\."):
         lem.evaluate(lambda obs: 0, env="CartPole-v1", baseline=True)

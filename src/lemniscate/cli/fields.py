@@ -70,12 +70,21 @@ def field_help(config: type[RunConfig]) -> dict[str, str]:
 def _parse(command: str, algorithm: str, words: list[str]) -> tuple[argparse.Namespace, dict[str, Any]]:
     hints = get_type_hints(find(algorithm).Config, include_extras=True)
     parser = parser_of(algorithm, command)
-    given, rest = parser.parse_known_args(words)
+    given, rest = parser.parse_known_args([_switch(word, hints) for word in words])
     if rest:
         known = [action.dest for action in parser._actions]
         raise unknown_argument(rest, lambda word: _unknown_flag(word, known))
     values = {name: value for name, value in vars(given).items() if name in hints and name != "env"}
     return given, {name: read(name, hints[name], value) for name, value in values.items()}
+
+
+def _switch(word: str, hints: dict[str, Any]) -> str:
+    """The flag or the no-flag that `--field=on` or `--field=off` means, as programs that start others write it."""
+    name, _, value = word.partition("=")
+    if bool not in options_of(hints.get(name.removeprefix("--").replace("-", "_"))):
+        return word
+    no = name.replace("--", "--no-", 1)
+    return {"on": name, "true": name, "off": no, "false": no}.get(value.lower(), word)
 
 
 def _unknown_flag(word: str, known: list[str]) -> UserError:
