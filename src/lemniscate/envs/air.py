@@ -130,7 +130,10 @@ class Air:
         import jax.numpy as jnp
 
         n, actions = self.num_envs, self._hover.size
-        air: dict[str, Any] = {"key": key, "drawn": {name: jnp.zeros(n) for name in self.ranges}} if self.ranges else {}
+        air: dict[str, Any] = {}
+        if self.ranges:
+            ends = jnp.array(list(self.ranges.values()))  # in the state, so that one program serves other ends too
+            air = {"key": key, "ends": ends, "drawn": {name: jnp.zeros(n) for name in self.ranges}}
         if self.is_late:
             longest = self._most("action_delay") * self.frequency + self._most("jitter")
             air["commands"] = jnp.zeros((n, math.ceil(longest - 1e-6) + 1, actions))
@@ -157,7 +160,7 @@ class Air:
             return air
         air, (key, *keys) = dict(air), jax.random.split(air["key"], 4 + len(self.ranges))
         drawn = {}
-        for own, (name, (low, high)) in zip(keys[3:], self.ranges.items(), strict=True):
+        for own, name, (low, high) in zip(keys[3:], self.ranges, air["ends"], strict=True):
             new = jax.random.uniform(own, (self.num_envs,), minval=low, maxval=high)
             drawn[name] = jnp.where(mask, new, air["drawn"][name])
         air |= {"key": key, "drawn": drawn}
