@@ -19,6 +19,7 @@ from typing import Any, NoReturn
 from lemniscate import __version__
 from lemniscate.algos import ALGORITHMS
 from lemniscate.cli.endings import exit_code, sentence
+from lemniscate.cli.preflight_options import add_preflight_options
 from lemniscate.console import say
 from lemniscate.errors import UserError, is_installed, unknown_name
 
@@ -29,6 +30,7 @@ COMMANDS = {
     "evaluate": "Play whole episodes with the newest policy of a run.",
     "watch": "Show episodes in a window, or record them.",
     "export": "Write a policy as C for microcontrollers and as ONNX, and measure how far these are from it.",
+    "preflight": "Measure how much delay, mass, wind and noise a policy bears, one at a time.",
     "plot": "Draw the curves of a run and its report.html, or compare several, grouped by all but the seed.",
     "push": "Upload the policy of a run to the Hugging Face Hub, with a page about it.",
     "envs": "List the environments, their backends, and the preset that fits.",
@@ -128,7 +130,7 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
 
     subs["resume"].add_argument("run", type=Path, metavar="RUN", help="a run, a sweep or a search")
     _add_endings(subs["resume"])
-    for name in ("resume", "evaluate", "watch", "export", "plot", "push"):
+    for name in ("resume", "evaluate", "watch", "export", "preflight", "plot", "push"):
         subs[name].add_argument(
             "--trust", action="store_true", help="import a run's own code (module:name) also if the run is not yours"
         )
@@ -156,6 +158,7 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
     sub.add_argument("--env", metavar="ID", help="environment [that of training]; without RUN, with --random")
     sub.add_argument("--env-args", metavar="JSON", help="arguments of the environment [as in training]")
 
+    add_preflight_options(subs["preflight"])
     subs["plot"].add_argument("runs", type=Path, nargs="+", metavar="RUN", help="runs or sweeps")
     subs["plot"].add_argument(
         "--by", default="step", metavar="AXIS", help="learning curve by step, episode or minute [step]"

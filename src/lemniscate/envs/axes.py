@@ -1,4 +1,4 @@
-"""The axes along which a policy's margins are measured: one thing that may be other than in training, and its values."""
+"""The axes along which margins are measured: one thing that may be other than it is nominally, and its values."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -42,7 +42,7 @@ class Axis:
 
     @property
     def is_factor(self) -> bool:
-        """Whether the values are factors of what is nominal."""
+        """The values are factors of what is nominal."""
         return not self.unit
 
     @property
@@ -117,7 +117,7 @@ class Flown:
 
     Attributes:
         returns: [E].
-        terminated: [E], whether the episode ended by the environment's rules.
+        terminated: [E], the episodes that ended by the environment's rules.
         actions: [T, E, A] in [-1, 1], of episodes that all took the same time and were asked for; else None.
     """
 
@@ -137,7 +137,7 @@ class Sweep(Protocol):
         spec: of the environment.
         axes: along which it can be flown.
         period: seconds between two actions, where they are known.
-        ends_by_failure: whether an episode that terminates has failed.
+        ends_by_failure: an episode that terminates has failed.
     """
 
     spec: Spec

@@ -54,7 +54,7 @@ class DroneSweep:
         self.period = 1 / self._drones.env.freq
 
     def fly(self, act: Act, seed: int) -> tuple[Flown, dict[str, list[Flown]]]:
-        """As `Sweep.fly`; with the actions of the nominal flights."""
+        """All flights, see `Sweep.fly`; those that are nominal with their actions."""
         points = [(axis, value) for axis in self._conditions for value in axis.values if value != axis.nominal]
         batches = math.ceil((1 + len(points)) / max(1, MOST_FLIGHTS // self._starts))
         size = math.ceil((1 + len(points)) / batches)
@@ -148,9 +148,7 @@ def _lowered(drones: Drones, points: int) -> tuple[Any, Any]:
         return state, obs.reshape(-1, obs.shape[-1])
 
     def step(state: Any, action: jax.Array) -> tuple[Any, jax.Array, jax.Array, jax.Array]:
-        state, (obs, reward, crashed, _, _) = jax.vmap(drones.step)(
-            state, action.reshape(points, drones.num_envs, -1)
-        )
+        state, (obs, reward, crashed, _, _) = jax.vmap(drones.step)(state, action.reshape(points, drones.num_envs, -1))
         crashed = crashed | ~jnp.isfinite(obs).all(-1)
         return state, obs.reshape(-1, obs.shape[-1]), reward.ravel(), crashed.ravel()
 
