@@ -1,6 +1,7 @@
 """`preflight`: the margins of a policy, with one thing at a time other than in training."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -140,7 +141,8 @@ def _sweep(policy: TrainedPolicy, episodes: int, given: Mapping[str, Any]) -> Sw
 
 @torch.no_grad()
 def _fly(policy: TrainedPolicy, act: Act, sweep: Sweep, how: dict[str, Any]) -> Preflight:
-    nominal, flown = sweep.fly(act, derive(how["seed"], EVALUATION, 0))
+    with _one_thread():
+        nominal, flown = sweep.fly(act, derive(how["seed"], EVALUATION, 0))
     least = None if sweep.ends_by_failure else worst_accepted(nominal)
     axes = tuple(margins_of(axis, flown[axis.name], least) for axis in sweep.axes)
     known = sweep.period is not None and nominal.actions is not None
@@ -158,6 +160,17 @@ def _fly(policy: TrainedPolicy, act: Act, sweep: Sweep, how: dict[str, Any]) -> 
         sentences=tuple(said),
         **how,
     )
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """One thread of torch's: several wait for each other longer than a small network takes, if simulators run too."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def _smoothness_sentence(smooth: Mapping[str, float]) -> str:

@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -69,15 +70,15 @@ def draw(panels: Sequence[Panel], title: str, file: Path) -> Path:
 
 def _draw(axes: Axes, right: Axes, panel: Panel) -> None:
     """The curves of one panel, the margin as a band that ends in a line where fewer are alive."""
-    style = {"markersize": 3, "linewidth": 1.5}
-    line = {"linestyle": ""} if panel.names else {}
+    style: dict[str, Any] = {"markersize": 3, "linewidth": 1.5}
+    style["linestyle"] = "" if panel.names else "-"
     if panel.margin and not panel.names:
         axes.axvspan(*panel.margin, color=ALIVE, alpha=0.1, linewidth=0, label="within the margin")
         for edge in panel.edges:
             axes.axvline(edge, color=ALIVE, linewidth=1, linestyle="--")
     axes.axvline(panel.nominal, color="0.6", linewidth=0.8, linestyle=":", label="nominal")
-    right.plot(panel.values, panel.returns, "s-", color=RETURN, label="mean return", alpha=0.8, **{**style, **line})
-    axes.plot(panel.values, panel.alive, "o-", color=ALIVE, label="share alive", **{**style, **line})
+    right.plot(panel.values, panel.returns, "s", color=RETURN, label="mean return", alpha=0.8, **style)
+    axes.plot(panel.values, panel.alive, "o", color=ALIVE, label="share alive", **style)
     finish(axes, ticks=4)
     if panel.names:
         axes.set_xticks(panel.values, [name.replace("_", "\n", 1) for name in panel.names], fontsize=6.5)
