@@ -118,7 +118,7 @@ class Air:
     ) -> None:
         self.ranges, self.history, self.num_envs = ranges, history, num_envs
         self.substeps, self.frequency = substeps, frequency
-        self._hover, self._hover_action = hover
+        self.hover, self._hover_action = hover
         self.is_late = bool({"action_delay", "jitter", "lost_actions"} & set(ranges))
         """actions may come late or not at all"""
         self.is_blurred = bool({"observation_delay", "observation_noise", "observation_bias"} & set(ranges))
@@ -129,7 +129,7 @@ class Air:
         """The air before the first episode."""
         import jax.numpy as jnp
 
-        n, actions = self.num_envs, self._hover.size
+        n, actions = self.num_envs, self.hover.size
         air: dict[str, Any] = {}
         if self.ranges:
             ends = jnp.array(list(self.ranges.values()))  # in the state, so that one program serves other ends too
@@ -187,7 +187,7 @@ class Air:
 
         begins, air = mask[:, None, None], dict(air)
         if self.is_late:
-            air["commands"] = jnp.where(begins, self._hover, air["commands"])
+            air["commands"] = jnp.where(begins, self.hover, air["commands"])
         if self.is_blurred:
             air["states"] = jnp.where(begins, state[:, None], air["states"])
         if "seen" in air:

@@ -158,7 +158,7 @@ class CrazyflowBackend(JaxBackend):
         air = self._drones.air
         late = [air.ranges.get(name, (0.0, 0.0)) for name in ("action_delay", "observation_delay")]
         delay = (sum(least for least, _ in late), sum(most for _, most in late))
-        return interface_of(self._drones.env, [one.dynamics for one in self._vectors], delay, air.history)
+        return interface_of(self._drones.env, [one.dynamics for one in self._vectors], delay, air.history, air.hover)
 
 
 def _import() -> None:
