@@ -29,7 +29,9 @@ HOVER = (0.0, 0.0, 0.0, 0.32)
 def interface(curve=True, history=0, **changed):
     sim = SimpleNamespace(drone="cf2x_L250", control="attitude", dynamics="so_rpy")
     curve = {"trajectory": TRAJECTORY, "sample_offsets": np.array([0, 3])} if curve else {}
-    return interface_of(SimpleNamespace(**{"freq": 50, "sim": sim, **curve, **changed}), ["so_rpy"], (0.0, 0.0), history, HOVER)
+    return interface_of(
+        SimpleNamespace(**{"freq": 50, "sim": sim, **curve, **changed}), ["so_rpy"], (0.0, 0.0), history, HOVER
+    )
 
 
 def quantities(meaning, *parts):

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 import torch
 
-from lemniscate.envs import registry
 from lemniscate.envs.axes import CHANNEL_AXES
 from lemniscate.envs.disturbed import Channel, ModelFactors, has_model
 from lemniscate.errors import UserError
@@ -116,7 +115,10 @@ def test_models_of_mujoco_have_masses_and_frictions(env, expected):
 
 def test_factors_change_the_model_and_what_is_derived_from_it():
     pytest.importorskip("mujoco")
-    plain, heavy = gym.make("Hopper-v5").unwrapped, ModelFactors(gym.make("Hopper-v5"), mass=1.3, friction=0.5).unwrapped
+    plain, heavy = (
+        gym.make("Hopper-v5").unwrapped,
+        ModelFactors(gym.make("Hopper-v5"), mass=1.3, friction=0.5).unwrapped,
+    )
     np.testing.assert_allclose(heavy.model.body_mass, 1.3 * plain.model.body_mass)
     np.testing.assert_allclose(heavy.model.body_subtreemass, 1.3 * plain.model.body_subtreemass)
     np.testing.assert_allclose(heavy.model.geom_friction, 0.5 * plain.model.geom_friction)
@@ -142,4 +144,3 @@ def test_an_episode_without_an_end_is_refused(monkeypatch):
     monkeypatch.setattr(vec_env, "PATIENCE", 20)
     with pytest.raises(UserError, match="has not ended after 20 steps"):
         flown()
-    assert registry  # the environments are closed again

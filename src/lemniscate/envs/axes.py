@@ -72,6 +72,7 @@ def _condition(name: str, values: tuple[float, ...], unit: str, title: str, phra
 
 
 _DELAYS = tuple(step / 500 for step in range(31))
+_TIMES = (0.5, 1.0, 2.0, 4.0)
 _PERCENT = ("%", 100.0)
 
 CONDITION_AXES = (
@@ -84,10 +85,10 @@ CONDITION_AXES = (
     _condition("thrust_curve", (-0.1, -0.05, 0.05, 0.1), "1", "thrust curve", "a thrust curve bent by {}", *_PERCENT),
     _condition("wind", (0.05, 0.1, 0.15), "N", "wind", "{} of wind"),
     _condition("gusts", (0.02, 0.05, 0.1), "N", "gusts", "gusts of {}"),
-    _condition("observation_noise", (0.5, 1.0, 2.0, 4.0), "NOISE", "sensor noise", "{} sensor noise", "×", 1),
-    _condition("observation_bias", (0.5, 1.0, 2.0, 4.0), "NOISE", "sensor bias", "{} sensor bias", "×", 1),
+    _condition("observation_noise", _TIMES, "NOISE", "sensor noise", "{} the usual sensor noise", "times", 1),
+    _condition("observation_bias", _TIMES, "NOISE", "sensor bias", "{} the usual sensor bias", "times", 1),
     _condition("lost_actions", (0.01, 0.05, 0.1, 0.2), "1", "lost actions", "{} of the actions lost", *_PERCENT),
-    _condition("jitter", (0.25, 0.5, 1.0), "control periods", "jitter", "{} of jitter", "periods", 1),
+    _condition("jitter", (0.25, 0.5, 1.0), "periods", "jitter", "a jitter of {} of a control period", *_PERCENT),
     _condition("start_spread", (1.25, 1.5, 2.0), "", "start spread", "{} spread of the starts"),
 )
 """of drones; NOISE is that of `lemniscate.envs.air`"""

@@ -10,7 +10,7 @@ def panel(one: AxisMargins, episodes: int) -> Panel:
     """The panel of an axis."""
     axis, inside = one.axis, within(one, episodes)
     places = [_place(axis, value) for value in axis.values]
-    ends = [side.last for side in one.sides.values() if side.last is not None and side.first is not None]
+    ends = [side.last for side in one.sides.values() if side.first is not None]
     return Panel(
         title=axis.title,
         unit=axis.shown_unit,
@@ -18,7 +18,7 @@ def panel(one: AxisMargins, episodes: int) -> Panel:
         names=[str(value) for value in axis.values] if isinstance(axis.nominal, str) else [],
         nominal=_place(axis, axis.nominal),
         margin=(_place(axis, inside[0]), _place(axis, inside[-1])) if inside else None,
-        edges=[_place(axis, value) for value in ends],
+        edges=[_place(axis, value) for value in ends if value is not None],
         margin_text=(span(axis, inside) if one.sides else "") if inside else "none",
         alive=[alive / episodes for alive in one.alive],
         returns=one.mean_returns,

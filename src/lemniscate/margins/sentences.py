@@ -19,7 +19,6 @@ def _row(one: AxisMargins, episodes: int) -> list[str]:
     axis, inside = one.axis, within(one, episodes)
     returns = [one.return_at(value) for value in inside]
     beyond = [side.first for side in one.sides.values() if side.first is not None]
-    beyond = beyond if one.sides else [value for value in axis.values if value not in inside]
     return [
         axis.title,
         span(axis, axis.values),
@@ -42,9 +41,9 @@ def within(one: AxisMargins, episodes: int) -> list[Value]:
 
 
 def span(axis: Axis, values: Sequence[Value]) -> str:
-    """Values in a few letters: from the first to the last, or all where they are words."""
+    """Values in a few letters: from the first to the last; of words their number."""
     if isinstance(axis.nominal, str):
-        return ", ".join(map(str, values))
+        return f"{len(values)} of {len(axis.values)}"
     first, last = _short(axis, values[0]).removesuffix(f" {axis.shown_unit}"), _short(axis, values[-1])
     return f"{first} … {last}"
 

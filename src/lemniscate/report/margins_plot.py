@@ -1,6 +1,7 @@
 """The picture of a policy's margins: a panel for each axis, with the share that is alive and the mean return."""
 
 import math
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,11 +9,12 @@ from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from lemniscate.report.style import COLORS, finish, legend_above, save
 
-COLUMNS = 4
-ALIVE, RETURN = COLORS[0], COLORS[1]
+COLUMNS = 5
+ALIVE, RETURN, BEYOND = COLORS[0], COLORS[1], COLORS[3]
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,7 @@ def draw(panels: Sequence[Panel], title: str, file: Path) -> Path:
     """Draw all panels into a picture."""
     columns = min(COLUMNS, len(panels))
     lines = math.ceil(len(panels) / columns)
-    figure = Figure(figsize=(3.1 * columns + 0.6, 2.05 * lines + 0.9), layout="constrained")
+    figure = Figure(figsize=(2.9 * columns + 0.6, 2.0 * lines + 0.7), layout="constrained")
     figure.get_layout_engine().set(hspace=0.06, wspace=0.03)  # pyright: ignore[reportOptionalMemberAccess]
     everything = [value for panel in panels for value in panel.returns]
     low, high = min(0.0, *everything), max(0.0, *everything)
@@ -59,10 +61,12 @@ def draw(panels: Sequence[Panel], title: str, file: Path) -> Path:
         _draw(axes, right, panel)
         if i % columns:
             axes.set_yticklabels([])
-        if (i + 1) % columns and i + 1 < len(panels):
+        else:
+            axes.set_ylabel("share alive", fontsize=8, color=ALIVE)
+        if (i + 1) % columns:
             right.set_yticklabels([])
-    figure.supylabel("share alive", fontsize=9, color=ALIVE)
-    figure.text(1.0, 0.5, "mean return", rotation=270, va="center", ha="left", fontsize=9, color=RETURN)
+        else:
+            right.set_ylabel("mean return", fontsize=8, color=RETURN)
     legend_above(figure)
     figure.suptitle(title, x=0.99, ha="right", fontsize=9, color="dimgrey")
     return save(figure, file)
@@ -76,12 +80,15 @@ def _draw(axes: Axes, right: Axes, panel: Panel) -> None:
         axes.axvspan(*panel.margin, color=ALIVE, alpha=0.1, linewidth=0, label="within the margin")
         for edge in panel.edges:
             axes.axvline(edge, color=ALIVE, linewidth=1, linestyle="--")
+            end = min(panel.values) if edge < panel.nominal else max(panel.values)
+            axes.axvspan(edge, end, color=BEYOND, alpha=0.06, linewidth=0, label="beyond it")
     axes.axvline(panel.nominal, color="0.6", linewidth=0.8, linestyle=":", label="nominal")
     right.plot(panel.values, panel.returns, "s", color=RETURN, label="mean return", alpha=0.8, **style)
     axes.plot(panel.values, panel.alive, "o", color=ALIVE, label="share alive", **style)
-    finish(axes, ticks=4)
+    finish(axes)
+    axes.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 2.5, 5, 10]))
     if panel.names:
-        axes.set_xticks(panel.values, [name.replace("_", "\n", 1) for name in panel.names], fontsize=6.5)
+        axes.set_xticks(panel.values, [textwrap.fill(name.replace("_", " "), 10) for name in panel.names])
         axes.margins(x=0.12)
     axes.set_ylim(-0.04, 1.08)
     axes.set_yticks([0, 0.5, 1], ["0", "50 %", "100 %"])
