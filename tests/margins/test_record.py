@@ -57,11 +57,11 @@ def test_words_have_no_order_and_so_no_sides():
 @pytest.mark.parametrize(
     ("axis", "alive", "sentence"),
     [
-        (DELAY, (64, 62, 3, 0), "Flies with 10 ms of action delay (and loses 2 of 64 there), 61 of 64 crash at 20 ms."),
+        (DELAY, (64, 62, 3, 0), "Flies with 10 ms of action delay, and loses 2 of 64 there; at 20 ms 61 of 64 crash."),
         (DELAY, (64, 64, 64, 64), "Flies with 30 ms of action delay, the most that was tried."),
         (DELAY, (64, 60, 64, 64), "4 of 64 crash with 10 ms of action delay, the least that was tried."),
         (MASS, (64,) * 5, "Flies with 30 % less to 30 % more mass, the most that was tried."),
-        (MASS, (0, 64, 64, 64, 63), "Flies with 15 % less mass, 64 of 64 crash at 30 % less; flies with 30 % more mass, the most that was tried (and loses 1 of 64 there)."),
+        (MASS, (0, 64, 64, 64, 63), "Flies with 15 % less mass; at 30 % less 64 of 64 crash; flies with 30 % more mass, the most that was tried, and loses 1 of 64 there."),
         (DYNAMICS, (64, 64, 1), "Flies with the dynamics so_rpy and so_rpy_rotor; 63 of 64 crash with first_principles."),
         (DELAY, (60, 64, 64, 64), "4 of 64 crash in the environment as it is, so there are no margins."),
     ],

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
 from lemniscate.envs.air import CONDITIONS, Ranges
-from lemniscate.envs.axes import CONDITION_AXES, Act, Axis, Flown, Tally, Value, dynamics_axis
+from lemniscate.envs.axes import CONDITION_AXES, Act, Axis, Flown, Tally, dynamics_axis
 from lemniscate.envs.drones import Drones
 from lemniscate.envs.jax_backend import compile_side_by_side
 from lemniscate.spec import Spec
@@ -42,42 +43,45 @@ class DroneSweep:
     ends_by_failure = True
 
     def __init__(self, make: Make, dynamics: Sequence[str], given: Ranges, starts: int, spec: Callable) -> None:
-        self._make, self._given, self._starts = make, given, starts
+        self._make, self._given = make, given
         conditions = tuple(_conditions(given))
         ranges = {**given, **{axis.name: (min(axis.values), max(axis.values)) for axis in conditions}}
         self._drones = make(None, ranges)
         nominal, self._ends = self._drones.dynamics, _ends(ranges, given)
-        self._conditions = tuple(a for a in conditions if a.name != "motor_time" or nominal != "so_rpy")
-        self._dynamics = dynamics_axis(nominal, tuple(dynamics))
-        self.axes = (*self._conditions, self._dynamics)
+        ordered = tuple(axis for axis in conditions if axis.name != "motor_time" or nominal != "so_rpy")
+        self.axes = (*ordered, dynamics_axis(nominal, tuple(dynamics)))
         self.spec: Spec = spec(self._drones)
         self.period = 1 / self._drones.env.freq
+        self._points = [(axis.name, value) for axis in ordered for value in axis.values if value != axis.nominal]
+        batches = math.ceil((1 + len(self._points)) / max(1, MOST_FLIGHTS // starts))
+        self._size = math.ceil((1 + len(self._points)) / batches)
+        """the points of a batch"""
+
+    @cached_property
+    def _programs(self) -> dict[str, _Programs]:
+        """The programs of each of the dynamics by its name: those of a batch, first, and those of a point."""
+        axis = self.axes[-1]
+        others = [self._make(str(name), self._given) for name in axis.values if name != axis.nominal]
+        every = [(self._drones, self._size), *((one, 1) for one in others)]
+        return dict(zip((one.dynamics for one, _ in every), _compiled(every), strict=True))
 
     def fly(self, act: Act, seed: int) -> tuple[Flown, dict[str, list[Flown]]]:
         """All flights, see `Sweep.fly`; those that are nominal with their actions."""
-        points = [(axis, value) for axis in self._conditions for value in axis.values if value != axis.nominal]
-        batches = math.ceil((1 + len(points)) / max(1, MOST_FLIGHTS // self._starts))
-        size = math.ceil((1 + len(points)) / batches)
-        others = [name for name in self._dynamics.values if name != self._dynamics.nominal]
-        drones = [self._make(str(name), self._given) for name in others]
-        first, *rest = _programs([(self._drones, size), *((one, 1) for one in drones)])
-        flown = list(self._batches(first, points, size, act, seed))
-        nominal, at = flown[0], {(a.name, value): one for (a, value), one in zip(points, flown[1:], strict=False)}
-        for name, programs in zip(others, rest, strict=True):
-            ends = np.array(list(self._given.values()), np.float32).reshape(1, -1, 2)
-            at["dynamics", name] = programs.fly(act, seed, ends)[0]
+        (_, programs), *others = self._programs.items()
+        nominal, *flown = self._batches(programs, act, seed)
+        at = dict(zip(self._points, flown, strict=False))  # the last batch has more
+        given = np.array(list(self._given.values()), np.float32).reshape(1, -1, 2)
+        at |= {("dynamics", name): one.fly(act, seed, given)[0] for name, one in others}
         return nominal, {a.name: [at.get((a.name, value), nominal) for value in a.values] for a in self.axes}
 
-    def _batches(
-        self, programs: _Programs, points: Sequence[tuple[Axis, Value]], size: int, act: Act, seed: int
-    ) -> Iterator[Flown]:
-        """The nominal flights, then those of each point, in batches of so many; the last is filled up."""
+    def _batches(self, programs: _Programs, act: Act, seed: int) -> Iterator[Flown]:
+        """The nominal flights, then those of each point, batch by batch; the last is filled up with nominal ones."""
         names = list(self._drones.air.ranges)
-        ends = np.tile(self._ends, (math.ceil((1 + len(points)) / size) * size, 1, 1))
-        for row, (axis, value) in enumerate(points, 1):
-            ends[row, names.index(axis.name)] = value
-        for begin in range(0, len(ends), size):
-            yield from programs.fly(act, seed, ends[begin : begin + size], keep_first=begin == 0)
+        ends = np.tile(self._ends, (math.ceil((1 + len(self._points)) / self._size) * self._size, 1, 1))
+        for row, (name, value) in enumerate(self._points, 1):
+            ends[row, names.index(name)] = value
+        for begin in range(0, len(ends), self._size):
+            yield from programs.fly(act, seed, ends[begin : begin + self._size], keep_first=begin == 0)
 
 
 def _conditions(given: Ranges) -> Iterator[Axis]:
@@ -123,7 +127,7 @@ class _Programs:
         return [Flown(*pair, actions if i == 0 else None) for i, pair in enumerate(pairs)]
 
 
-def _programs(drones: Sequence[tuple[Drones, int]]) -> list[_Programs]:
+def _compiled(drones: Sequence[tuple[Drones, int]]) -> list[_Programs]:
     """The programs of several drones, each of so many points: traced one after the other, compiled side by side."""
     lowered = [program for one, points in drones for program in _lowered(one, points)]
     compiled = compile_side_by_side(lowered)

@@ -101,13 +101,13 @@ def _side(one: AxisMargins, side: Side, episodes: int, flies: str, fails: str) -
     lost = f"{episodes - one.alive_at(side.first)} of {episodes} {fails}"
     if side.last == axis.nominal:
         return f"{lost} with {axis.phrase.format(axis.text(side.first))}, the least that was tried"
-    return f"{with_last}{_losses(one, [side.last], episodes)}, {lost} at {axis.text(side.first)}"
+    return f"{with_last}{_losses(one, [side.last], episodes)}; at {axis.text(side.first)} {lost}"
 
 
 def _losses(one: AxisMargins, values: Sequence[Value | None], episodes: int) -> str:
     """The losses within the margins, where there are some."""
     lost = max(episodes - one.alive_at(value) for value in values if value is not None)
-    return f" (and loses {lost} of {episodes} there)" if lost else ""
+    return f", and loses {lost} of {episodes} there" if lost else ""
 
 
 def _choices(one: AxisMargins, episodes: int, flies: str, fails: str) -> list[str]:
