@@ -124,7 +124,7 @@ def test_arguments_that_are_given_are_nominal(monkeypatch):
     mass, dynamics = made.axes
     assert (mass.nominal, dynamics.nominal) == (1.1, "so_rpy_rotor")
     assert mass.values == (0.7, 0.85, 0.95, 1, 1.05, 1.1, 1.15, 1.3)
-    assert made.spec.observation_parts[-1].name == ("history",)
+    assert made.spec.observation_parts[-1].name == "history"
     assert made._ends.tolist() == pytest.approx([[1.1, 1.1], [0, 0.01]])
 
 

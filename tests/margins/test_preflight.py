@@ -80,7 +80,7 @@ def test_the_exported_c_acts_as_the_policy_does(copy, monkeypatch):
     with pytest.raises(lem.UserError, match="is of step 128, the policy of step 256: lemniscate export"):
         preflight(copy, compiled=True)
     (copy / "export" / "policy.c").unlink()
-    with pytest.raises(lem.UserError, match="There is no whole export of .*: lemniscate export "):
+    with pytest.raises(lem.UserError, match=r"There is no whole export of .*: lemniscate export "):
         preflight(copy, compiled=True)
 
 

@@ -124,6 +124,16 @@ def test_factors_change_the_model_and_what_is_derived_from_it():
     np.testing.assert_allclose(heavy.model.geom_friction, 0.5 * plain.model.geom_friction)
 
 
+def test_a_model_is_flown_with_other_masses_and_frictions():
+    """A push of constant size: a heavier cart moves less, and its pole falls later."""
+    pytest.importorskip("mujoco")
+    found, nominal, points = flown(lambda obs: torch.full((len(obs), 1), 0.5), env="InvertedPendulum-v5", starts=4)
+    assert list(found) == ["action_delay", "observation_noise", "lost_actions", "mass", "friction"]
+    falls = [one.returns.mean() for one in points["mass"]]
+    assert falls[0] < nominal.returns.mean() < falls[-1]
+    assert points["mass"][3] is nominal
+
+
 def test_what_cannot_be_disturbed_has_no_axis():
     names = [axis.name for axis in CHANNEL_AXES]
     assert [a.name for a in VectorSweep("CartPole-v1", 4, {}, (), None).axes] == names

@@ -70,7 +70,8 @@ class ModelFactors(gym.Wrapper):
         world.model.body_mass[:] *= mass
         world.model.body_inertia[:] *= mass
         world.model.geom_friction[:] *= friction
-        mujoco.mj_setConst(world.model, world.data)  # what MuJoCo has derived from masses
+        # what MuJoCo has derived from masses
+        mujoco.mj_setConst(world.model, world.data)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def has_model(env: str, kwargs: Mapping[str, Any]) -> bool:

@@ -141,12 +141,12 @@ def _lowered(drones: Drones, points: int) -> tuple[Any, Any]:
     import jax.numpy as jnp
 
     drones.env.sim.device = None  # crazyflow places actions on a device, which jax.vmap cannot
-    every, calm = np.ones(drones.num_envs, dtype=bool), np.bool_(False)
+    every, calm = jnp.ones(drones.num_envs, dtype=bool), jnp.array(False)
 
     def restart(seed: jax.Array, ends: jax.Array) -> tuple[Any, jax.Array]:
         def one(ends: jax.Array) -> tuple[Any, jax.Array]:
             data, arrays, air = drones.init(jax.random.key(seed))
-            return drones.reset((data, arrays, {**air, "ends": ends}), jnp.asarray(every), calm)[:2]
+            return drones.reset((data, arrays, {**air, "ends": ends}), every, calm)[:2]
 
         state, obs = jax.vmap(one)(ends)
         return state, obs.reshape(-1, obs.shape[-1])

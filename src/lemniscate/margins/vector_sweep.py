@@ -28,7 +28,7 @@ class VectorSweep:
     """
 
     ends_by_failure = False
-    period = None
+    period: float | None = None
 
     def __init__(
         self, env: str, starts: int, kwargs: Mapping[str, Any], wrappers: tuple[str, ...], backend: str | None
@@ -65,7 +65,8 @@ class VectorSweep:
     def _at(self, axis: Axis, value: Value, scale: Tensor | None, act: Act, seed: int) -> Flown:
         rng = generator(seed, CPU, 1)
         if axis not in MODEL_AXES:
-            return _fly(self._env, Channel(act, scale=scale, rng=rng, **{axis.name: value}), seed)
+            disturbance: dict[str, Any] = {axis.name: value}
+            return _fly(self._env, Channel(act, scale=scale, rng=rng, **disturbance), seed)
         env = self._make(f"{FACTORS}({axis.name}={value})")
         try:
             return _fly(env, act, seed)

@@ -9,6 +9,7 @@ from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import MaxNLocator
 
 from lemniscate.report.style import COLORS, finish, legend_above, save
@@ -50,8 +51,7 @@ def draw(panels: Sequence[Panel], title: str, file: Path) -> Path:
     """Draw all panels into a picture."""
     columns = min(COLUMNS, len(panels))
     lines = math.ceil(len(panels) / columns)
-    figure = Figure(figsize=(2.9 * columns + 0.6, 2.0 * lines + 0.7), layout="constrained")
-    figure.get_layout_engine().set(hspace=0.06, wspace=0.03)  # pyright: ignore[reportOptionalMemberAccess]
+    figure = Figure(figsize=(2.9 * columns + 0.6, 2.0 * lines + 0.7), layout=ConstrainedLayoutEngine(hspace=0.06))
     everything = [value for panel in panels for value in panel.returns]
     low, high = min(0.0, *everything), max(0.0, *everything)
     for i, panel in enumerate(panels):
