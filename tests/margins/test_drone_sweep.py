@@ -125,7 +125,10 @@ def test_arguments_that_are_given_are_nominal(monkeypatch):
     assert (mass.nominal, dynamics.nominal) == (1.1, "so_rpy_rotor")
     assert mass.values == (0.7, 0.85, 0.95, 1, 1.05, 1.1, 1.15, 1.3)
     assert made.spec.observation_parts[-1].name == "history"
-    assert made._ends.tolist() == pytest.approx([[1.1, 1.1], [0, 0.01]])
+    ends = dict(zip(made._drones.air.ranges, made._ends.tolist(), strict=True))
+    assert ends["mass"] == pytest.approx([1.1, 1.1])
+    assert ends["action_delay"] == pytest.approx([0, 0.01])
+    assert made._drones.air.ranges["mass"] == (0.7, 1.3)
 
 
 def test_every_axis_is_of_a_condition_and_within_its_limits():

@@ -33,7 +33,7 @@ class VectorSweep:
     def __init__(
         self, env: str, starts: int, kwargs: Mapping[str, Any], wrappers: tuple[str, ...], backend: str | None
     ) -> None:
-        own = registry.backend_class("gymnasium").serves(env)
+        own = (backend is None or backend in registry.BACKENDS) and registry.backend_class("gymnasium").serves(env)
         self._arguments: dict[str, Any] = {"env": env, "num_envs": starts, "kwargs": kwargs}
         self._arguments |= {"backend": "gymnasium" if own else backend}
         self._wrappers = wrappers
