@@ -19,7 +19,6 @@ from typing import Any, NoReturn
 from lemniscate import __version__
 from lemniscate.algos import ALGORITHMS
 from lemniscate.cli.endings import exit_code, sentence
-from lemniscate.cli.preflight_options import add_preflight_options
 from lemniscate.console import say
 from lemniscate.errors import UserError, is_installed, unknown_name
 
@@ -135,13 +134,15 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
             "--trust", action="store_true", help="import a run's own code (module:name) also if the run is not yours"
         )
 
-    for sub in (subs["export"], subs["evaluate"]):
-        sub.add_argument("run", type=Path, metavar="RUN", help="a run, a checkpoint or hf://user/name")
+    for name in ("export", "evaluate", "preflight"):
+        known = "a run" if name == "preflight" else "a run, a checkpoint or hf://user/name"
+        subs[name].add_argument("run", type=Path, metavar="RUN", help=known)
     subs["export"].add_argument("--to", type=Path, metavar="DIR", help="new directory, or an export [RUN/export]")
+    for sub, episodes in ((subs["preflight"], 64), (subs["evaluate"], 100)):
+        sub.add_argument("--episodes", default=episodes, metavar="INT", help=f"how many [{episodes}]")
+        sub.add_argument("--seed", default=0, metavar="INT", help="seed of the starts [0]")
+        sub.add_argument("--env-args", metavar="JSON", help="arguments of the environment [as in training]")
     sub = subs["evaluate"]
-    sub.add_argument("--episodes", default=100, metavar="INT", help="how many [100]")
-    sub.add_argument("--seed", default=0, metavar="INT", help="seed of the starts [0]")
-    sub.add_argument("--env-args", metavar="JSON", help="arguments of the environment [as in training]")
     sub.add_argument("--backend", metavar="NAME", help="simulation backend [as in training]")
     sub.add_argument("--baseline", action="store_true", help="play by the environment's classical controller instead")
     sub.add_argument("--video", type=Path, metavar="FILE", help=".gif, .webp or .mp4 to record all episodes into")
@@ -158,7 +159,7 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
     sub.add_argument("--env", metavar="ID", help="environment [that of training]; without RUN, with --random")
     sub.add_argument("--env-args", metavar="JSON", help="arguments of the environment [as in training]")
 
-    add_preflight_options(subs["preflight"])
+    subs["preflight"].add_argument("--compiled", action="store_true", help="let the exported C act, RUN/export")
     subs["plot"].add_argument("runs", type=Path, nargs="+", metavar="RUN", help="runs or sweeps")
     subs["plot"].add_argument(
         "--by", default="step", metavar="AXIS", help="learning curve by step, episode or minute [step]"
