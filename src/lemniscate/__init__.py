@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from lemniscate.envs.vector_view import make_vec
     from lemniscate.errors import NonFiniteError, NotStoredError, SweepError, UserError
     from lemniscate.exporting.export import export
+    from lemniscate.margins.preflight import Preflight, preflight
     from lemniscate.plots import plot
     from lemniscate.policy import TrainedPolicy
     from lemniscate.pushed import push
@@ -31,6 +32,7 @@ __all__ = [
     "Evaluation",
     "NonFiniteError",
     "NotStoredError",
+    "Preflight",
     "Stopped",
     "SweepError",
     "TrainedPolicy",
@@ -46,6 +48,7 @@ __all__ = [
     "make_envs",
     "make_vec",
     "plot",
+    "preflight",
     "push",
     "resume",
     "resume_sweep",
@@ -63,6 +66,7 @@ MODULES = {
     "NonFiniteError": "errors",
     "Stopped": "run.run",
     "NotStoredError": "errors",
+    "Preflight": "margins.preflight",
     "SweepError": "errors",
     "TrainedPolicy": "policy",
     "TrainedRun": "stored",
@@ -77,6 +81,7 @@ MODULES = {
     "make_envs": "run.environments",
     "make_vec": "envs.vector_view",
     "plot": "plots",
+    "preflight": "margins.preflight",
     "push": "pushed",
     "resume": "resumed",
     "resume_sweep": "sweep",
@@ -91,7 +96,21 @@ MODULES = {
 """where each public name is defined"""
 
 SUBMODULES = (
-    *("algos", "api", "course", "data", "envs", "errors", "exporting", "maths", "nn", "optim", "policy", "presets"),
+    *(
+        "algos",
+        "api",
+        "course",
+        "data",
+        "envs",
+        "errors",
+        "exporting",
+        "margins",
+        "maths",
+        "nn",
+        "optim",
+        "policy",
+        "presets",
+    ),
     *("plots", "pushed", "report", "results", "run", "spec", "stored", "sweep", "testing", "tuning", "types"),
 )
 """what `lemniscate.NAME` imports by itself"""

@@ -23,10 +23,15 @@ STATE = [0.5, -0.25, 1.0, 0.0, 0.0, 0.0, 1.0, 0.1, 0.2, 0.3, 90.0, -45.0, 10.0]
 TRAJECTORY = np.stack([np.sin(np.arange(40) / 40 * math.tau), np.zeros(40), np.arange(40) / 40], axis=1)
 
 
-def interface(curve=True, **changed):
+HOVER = (0.0, 0.0, 0.0, 0.32)
+
+
+def interface(curve=True, history=0, **changed):
     sim = SimpleNamespace(drone="cf2x_L250", control="attitude", dynamics="so_rpy")
     curve = {"trajectory": TRAJECTORY, "sample_offsets": np.array([0, 3])} if curve else {}
-    return interface_of(SimpleNamespace(**{"freq": 50, "sim": sim, **curve, **changed}), ["so_rpy"], (0.0, 0.0), 0)
+    return interface_of(
+        SimpleNamespace(**{"freq": 50, "sim": sim, **curve, **changed}), ["so_rpy"], (0.0, 0.0), history, HOVER
+    )
 
 
 def quantities(meaning, *parts):
@@ -136,6 +141,43 @@ def test_goals_are_the_operators_setpoints(tmp_path):
     firmware = Firmware(tmp_path, meaning, seen, copy)
     obs = np.float32([[*STATE[:10], *np.radians(STATE[10:]), *(-np.array(STATE[:3])), *(-np.array(STATE[7:10]))]])
     assert np.allclose(firmware.tick(0)[0], commanded(copy.host(), obs), rtol=1e-4, atol=1e-3)
+
+
+@pytest.mark.parametrize("steps", [1, 3])
+def test_it_keeps_what_it_saw_and_did(steps, tmp_path):
+    def less_now(past, now):
+        changes = np.array(past)
+        changes[:, :13] -= now[0, :13]
+        return np.float32(changes.reshape(1, -1))
+
+    copy = exported(policy_for(ACTION, observations=19 + 17 * steps), rows=20)
+    meaning = interface(history=steps)
+    firmware = Firmware(tmp_path, meaning, quantities(meaning, "local_samples", "history"), copy)
+    host, past = copy.host(), None
+    low, high = np.float32(ACTION.low), np.float32(ACTION.high)
+    states = [[0.5 + 0.01 * i, *STATE[1:]] for i in range(5)]
+    for i, state in enumerate(states):
+        now = seen_at(state, (39 + i) % 40)
+        if past is None:  # level, and with a thrust of the weight
+            past = [np.concatenate([now[0, :13], 2 * (np.float32(HOVER) - low) / (high - low) - 1])] * steps
+        obs = np.concatenate([now, less_now(past, now)], axis=1)
+        followed, fault = firmware.tick(20 * i, state)
+        assert not fault
+        assert np.allclose(followed, commanded(host, obs), rtol=1e-3, atol=2e-2)
+        action = 2 * (host.act(obs)[0] - low) / (high - low) - 1
+        past = [np.concatenate([now[0, :13], action]), *past[:-1]]
+    firmware.tick(100, on=0)
+    begun = seen_at(states[0], 39)
+    level = [np.concatenate([begun[0, :13], 2 * (np.float32(HOVER) - low) / (high - low) - 1])] * steps
+    obs = np.concatenate([begun, less_now(level, begun)], axis=1)
+    assert np.allclose(firmware.tick(120, states[0])[0], commanded(host, obs), rtol=1e-3, atol=2e-2)
+
+
+def test_a_history_in_another_order_is_refused():
+    meaning = interface(history=2)
+    seen = quantities(meaning, "local_samples", "history")
+    with pytest.raises(UserError, match="nothing in the firmware gives position_x_2_steps_ago_less_now"):
+        crazyflie_files(meaning, seen[:19] + seen[36:] + seen[19:36], ACTION, {}, "A policy.")
 
 
 def test_the_folder_says_what_a_pilot_must_know(flying):

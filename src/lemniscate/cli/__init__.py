@@ -29,6 +29,7 @@ COMMANDS = {
     "evaluate": "Play whole episodes with the newest policy of a run.",
     "watch": "Show episodes in a window, or record them.",
     "export": "Write a policy as C for microcontrollers and as ONNX, and measure how far these are from it.",
+    "preflight": "Measure how much delay, mass, wind and noise a policy bears, one at a time.",
     "plot": "Draw the curves of a run and its report.html, or compare several, grouped by all but the seed.",
     "push": "Upload the policy of a run to the Hugging Face Hub, with a page about it.",
     "envs": "List the environments, their backends, and the preset that fits.",
@@ -128,18 +129,20 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
 
     subs["resume"].add_argument("run", type=Path, metavar="RUN", help="a run, a sweep or a search")
     _add_endings(subs["resume"])
-    for name in ("resume", "evaluate", "watch", "export", "plot", "push"):
+    for name in ("resume", "evaluate", "watch", "export", "preflight", "plot", "push"):
         subs[name].add_argument(
             "--trust", action="store_true", help="import a run's own code (module:name) also if the run is not yours"
         )
 
-    for sub in (subs["export"], subs["evaluate"]):
-        sub.add_argument("run", type=Path, metavar="RUN", help="a run, a checkpoint or hf://user/name")
+    for name in ("export", "evaluate", "preflight"):
+        known = "a run" if name == "preflight" else "a run, a checkpoint or hf://user/name"
+        subs[name].add_argument("run", type=Path, metavar="RUN", help=known)
     subs["export"].add_argument("--to", type=Path, metavar="DIR", help="new directory, or an export [RUN/export]")
+    for sub, episodes in ((subs["preflight"], 64), (subs["evaluate"], 100)):
+        sub.add_argument("--episodes", default=episodes, metavar="INT", help=f"how many [{episodes}]")
+        sub.add_argument("--seed", default=0, metavar="INT", help="seed of the starts [0]")
+        sub.add_argument("--env-args", metavar="JSON", help="arguments of the environment [as in training]")
     sub = subs["evaluate"]
-    sub.add_argument("--episodes", default=100, metavar="INT", help="how many [100]")
-    sub.add_argument("--seed", default=0, metavar="INT", help="seed of the starts [0]")
-    sub.add_argument("--env-args", metavar="JSON", help="arguments of the environment [as in training]")
     sub.add_argument("--backend", metavar="NAME", help="simulation backend [as in training]")
     sub.add_argument("--baseline", action="store_true", help="play by the environment's classical controller instead")
     sub.add_argument("--video", type=Path, metavar="FILE", help=".gif, .webp or .mp4 to record all episodes into")
@@ -156,6 +159,7 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
     sub.add_argument("--env", metavar="ID", help="environment [that of training]; without RUN, with --random")
     sub.add_argument("--env-args", metavar="JSON", help="arguments of the environment [as in training]")
 
+    subs["preflight"].add_argument("--compiled", action="store_true", help="let the exported C act, RUN/export")
     subs["plot"].add_argument("runs", type=Path, nargs="+", metavar="RUN", help="runs or sweeps")
     subs["plot"].add_argument(
         "--by", default="step", metavar="AXIS", help="learning curve by step, episode or minute [step]"

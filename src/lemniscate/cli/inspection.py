@@ -53,6 +53,15 @@ def export(given: argparse.Namespace) -> None:
     say(f"Everything is in {export(given.run, given.to, trust=given.trust)}")
 
 
+def preflight(given: argparse.Namespace) -> None:
+    """Measure the margins of a policy, and name the files."""
+    from lemniscate.margins.preflight import preflight
+
+    own = {"episodes": number(given.episodes), "seed": number(given.seed), "env_kwargs": _env_args(given)}
+    preflight(given.run, given.compiled, trust=given.trust, **own)
+    say(f"Everything is in {given.run / 'preflight.json'} and {given.run / 'plots' / 'preflight.png'}")
+
+
 def plot(given: argparse.Namespace) -> None:
     """Draw the curves of one run, or compare several, grouped by all but the seed."""
     for file in plots.plot(*given.runs, by=given.by, trust=given.trust):

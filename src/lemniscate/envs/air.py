@@ -118,7 +118,7 @@ class Air:
     ) -> None:
         self.ranges, self.history, self.num_envs = ranges, history, num_envs
         self.substeps, self.frequency = substeps, frequency
-        self._hover, self._hover_action = hover
+        self.hover, self._hover_action = hover
         self.is_late = bool({"action_delay", "jitter", "lost_actions"} & set(ranges))
         """actions may come late or not at all"""
         self.is_blurred = bool({"observation_delay", "observation_noise", "observation_bias"} & set(ranges))
@@ -129,8 +129,11 @@ class Air:
         """The air before the first episode."""
         import jax.numpy as jnp
 
-        n, actions = self.num_envs, self._hover.size
-        air: dict[str, Any] = {"key": key, "drawn": {name: jnp.zeros(n) for name in self.ranges}} if self.ranges else {}
+        n, actions = self.num_envs, self.hover.size
+        air: dict[str, Any] = {}
+        if self.ranges:
+            ends = jnp.array(list(self.ranges.values()))  # in the state, so that one program serves other ends too
+            air = {"key": key, "ends": ends, "drawn": {name: jnp.zeros(n) for name in self.ranges}}
         if self.is_late:
             longest = self._most("action_delay") * self.frequency + self._most("jitter")
             air["commands"] = jnp.zeros((n, math.ceil(longest - 1e-6) + 1, actions))
@@ -157,7 +160,7 @@ class Air:
             return air
         air, (key, *keys) = dict(air), jax.random.split(air["key"], 4 + len(self.ranges))
         drawn = {}
-        for own, (name, (low, high)) in zip(keys[3:], self.ranges.items(), strict=True):
+        for own, name, (low, high) in zip(keys[3:], self.ranges, air["ends"], strict=True):
             new = jax.random.uniform(own, (self.num_envs,), minval=low, maxval=high)
             drawn[name] = jnp.where(mask, new, air["drawn"][name])
         air |= {"key": key, "drawn": drawn}
@@ -184,7 +187,7 @@ class Air:
 
         begins, air = mask[:, None, None], dict(air)
         if self.is_late:
-            air["commands"] = jnp.where(begins, self._hover, air["commands"])
+            air["commands"] = jnp.where(begins, self.hover, air["commands"])
         if self.is_blurred:
             air["states"] = jnp.where(begins, state[:, None], air["states"])
         if "seen" in air:

@@ -13,15 +13,16 @@ import io
 import os
 import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import gymnasium as gym
 import torch
 
-from lemniscate.envs.air import CONDITIONS, read_ranges
+from lemniscate.envs.air import CONDITIONS, Ranges, read_ranges
 from lemniscate.envs.backend import Scene, Summary
 from lemniscate.envs.drone_interface import interface_of
+from lemniscate.envs.drone_sweep import DroneSweep
 from lemniscate.envs.drones import Drones, Mixed
 from lemniscate.envs.interface import Interface
 from lemniscate.envs.jax_backend import JaxBackend, Programs, jax_device
@@ -40,14 +41,27 @@ MOST_HISTORY = 50
 def programs(env_id: str, num_envs: int, device: str, kwargs: tuple[tuple[str, Any], ...]) -> Programs:
     """The compiled programs of so many drones, built once a process: all vectors of a size share them."""
     given = dict(kwargs)
-    ranges, history = read_ranges(given), given.pop("history", 0)
-    own = {name: value for name, value in given.items() if name not in CONDITIONS}
-    each = [{**own, "dynamics": name} for name in dynamics_of(own)] or [own]
-    with _quietly():
-        how = {"num_envs": num_envs // len(each), "device": device}
-        made = [gym.make_vec(env_id, **how, **{"freq": CONTROL_HZ, **arguments}).unwrapped for arguments in each]
-    drones = [Drones(one, ranges, history) for one in made]
+    ranges, each = read_ranges(given), dynamics_of(given) or (None,)
+    drones = [make_drones(env_id, num_envs // len(each), device, given, dynamics, ranges) for dynamics in each]
     return Programs(drones[0] if len(drones) == 1 else Mixed(drones))
+
+
+def make_drones(
+    env_id: str, num_envs: int, device: str, kwargs: Mapping[str, Any], dynamics: str | None, ranges: Ranges
+) -> Drones:
+    """So many drones in one dynamics, by default crazyflow's, and under conditions that need not be those of kwargs."""
+    own = {name: value for name, value in kwargs.items() if name not in (*CONDITIONS, "history", "dynamics")}
+    own |= {"dynamics": dynamics} if dynamics else {}
+    with _quietly():
+        made = gym.make_vec(env_id, num_envs=num_envs, device=device, **{"freq": CONTROL_HZ, **own}).unwrapped
+    return Drones(made, ranges, kwargs.get("history", 0))
+
+
+def spec_of(env_id: str, drones: Drones) -> Spec:
+    """The Spec of drones."""
+    action = action_kind(drones.env.single_action_space, env_id)
+    assert isinstance(action, Box)
+    return Spec(env_id, drones.parts, action, max_episode_steps=drones.episode_steps)
 
 
 class CrazyflowBackend(JaxBackend):
@@ -88,24 +102,37 @@ class CrazyflowBackend(JaxBackend):
         _import()
         kwargs = dict(kwargs or {})
         _check(env, num_envs, kwargs)
-        try:
+        with _sentence(env, kwargs):
             shared = programs(env, num_envs, jax_device(device), tuple(sorted(_hashable(kwargs).items())))
-        except (TypeError, ValueError, KeyError, AssertionError) as error:
-            if not kwargs:
-                raise
-            raise UserError(f"{env} cannot be made with {kwargs}: {error}.") from error
         super().__init__(shared, num_envs, device, stagger=stagger)
         assert isinstance(shared.envs, Drones | Mixed)
         self._vectors = shared.envs.drones if isinstance(shared.envs, Mixed) else [shared.envs]
         self._drones = drones = self._vectors[0]
-        action = action_kind(drones.env.single_action_space, env)
-        assert isinstance(action, Box)
-        self.spec = Spec(env, drones.parts, action, max_episode_steps=drones.episode_steps)
+        self.spec = spec_of(env, drones)
         if drones.error:
             self.summaries = (
                 Summary("rmse_mm", "tracking_error", "rms", scale=1000),
                 Summary("rmse_after_1s_mm", "tracking_error", "rms", scale=1000, skip=drones.env.freq),
             )
+
+    @classmethod
+    def sweep(cls, env: str, starts: int, trained: Mapping[str, Any], given: Mapping[str, Any]) -> DroneSweep:
+        """Flights along each condition and in all dynamics, on the CPU.
+
+        Conditions that only training has are nominal; so are the first dynamics, of those given or else of training.
+        """
+        _import()
+        own = {name: value for name, value in trained.items() if name not in CONDITIONS}
+        own = {**own, **given}
+        dynamics = (*dynamics_of(own), None)[0]
+        kwargs = {**own, "dynamics": dynamics} if dynamics else own
+        _check(env, starts, kwargs)
+
+        def make(other: str | None, ranges: Ranges) -> Drones:
+            return make_drones(env, starts, "cpu", kwargs, other or dynamics, ranges)
+
+        with _sentence(env, kwargs):
+            return DroneSweep(make, DYNAMICS, read_ranges(kwargs), starts, partial(spec_of, env))
 
     @property
     def baseline(self) -> PD | None:
@@ -131,7 +158,7 @@ class CrazyflowBackend(JaxBackend):
         air = self._drones.air
         late = [air.ranges.get(name, (0.0, 0.0)) for name in ("action_delay", "observation_delay")]
         delay = (sum(least for least, _ in late), sum(most for _, most in late))
-        return interface_of(self._drones.env, [one.dynamics for one in self._vectors], delay, air.history)
+        return interface_of(self._drones.env, [one.dynamics for one in self._vectors], delay, air.history, air.hover)
 
 
 def _import() -> None:
@@ -162,6 +189,17 @@ def _check(env_id: str, num_envs: int, kwargs: Mapping[str, Any]) -> None:
     if several and num_envs % len(several):
         raise UserError(f"{num_envs} drones cannot be divided equally among {len(several)} dynamics.")
     read_ranges(kwargs)
+
+
+@contextlib.contextmanager
+def _sentence(env: str, kwargs: Mapping[str, Any]) -> Iterator[None]:
+    """An error that arguments cause in crazyflow, as a `UserError` that names them."""
+    try:
+        yield
+    except (TypeError, ValueError, KeyError, AssertionError) as error:
+        if not kwargs:
+            raise
+        raise UserError(f"{env} cannot be made with {kwargs}: {error}.") from error
 
 
 def dynamics_of(kwargs: Mapping[str, Any]) -> tuple[str, ...]:

@@ -30,8 +30,16 @@ ACTION = (
 )
 
 
-def interface_of(env: Any, dynamics: Sequence[str], delay: tuple[float, float], history: int) -> Interface:
-    """The interface of a crazyflow environment with attitude control, flown in these dynamics."""
+PAST_ACTION = tuple(Quantity(q.name, "1", "-1 and 1 are the bounds of the action") for q in ACTION)
+
+
+def interface_of(
+    env: Any, dynamics: Sequence[str], delay: tuple[float, float], history: int, hover: Sequence[float] = ()
+) -> Interface:
+    """The interface of a crazyflow environment with attitude control, flown in these dynamics.
+
+    `hover` is the command that is taken to have gone before the first.
+    """
     parts, reference = dict(PARTS), None
     if hasattr(env, "trajectory"):
         offsets = np.asarray(env.sample_offsets)
@@ -39,10 +47,10 @@ def interface_of(env: Any, dynamics: Sequence[str], delay: tuple[float, float], 
         seconds = [f"{offset / env.freq:g}s" for offset in offsets]
         ahead = [_vector(f"to_reference_in_{text}", "m", WORLD) for text in seconds]
         parts["local_samples"] = tuple(quantity for vector in ahead for quantity in vector)
-    seen = [*(quantity for name in STATE_PARTS for quantity in PARTS[name]), *ACTION]
+    seen = [*(quantity for name in STATE_PARTS for quantity in PARTS[name]), *PAST_ACTION]
     steps = range(1, history + 1)
     parts["history"] = tuple(
-        Quantity(f"{q.name}_{ago}_steps_ago{'' if q in ACTION else '_less_now'}", q.unit, q.frame)
+        Quantity(f"{q.name}_{ago}_steps_ago{'' if q in PAST_ACTION else '_less_now'}", q.unit, q.frame)
         for ago in steps
         for q in seen
     )
@@ -53,6 +61,7 @@ def interface_of(env: Any, dynamics: Sequence[str], delay: tuple[float, float], 
         period=1 / env.freq,
         delay=delay,
         history=history,
+        action_before=tuple(map(float, hover)),
         dynamics=tuple(dynamics),
         vehicle="crazyflie" if drone.startswith("cf") else drone,
         reference=reference,

@@ -36,6 +36,7 @@ class Interface:
         period: seconds between two actions.
         delay: seconds from an observation to the action's effect, besides the vehicle's own: the least, the most.
         history: the number of earlier observations and actions that are seen beside the present one.
+        action_before: the action, in its units, that is taken to have gone before the first, where there is a history.
         dynamics: the models of the vehicle.
         vehicle: its name, such as crazyflie.
         reference: the curve that it follows, if it does.
@@ -46,6 +47,7 @@ class Interface:
     period: float | None = None
     delay: tuple[float, float] | None = None
     history: int | None = None
+    action_before: tuple[float, ...] = ()
     dynamics: tuple[str, ...] | None = None
     vehicle: str | None = None
     reference: Reference | None = None

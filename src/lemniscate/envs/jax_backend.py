@@ -7,7 +7,7 @@ is traced once into a single XLA program, so every row is real.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
@@ -83,9 +83,14 @@ class Programs:
         action = jax.device_put(np.zeros((self.envs.num_envs, self.envs.action_size), np.float32), self.envs.device)
         lowered_restart = jax.jit(restart).lower(seed, stagger)
         lowered_step = jax.jit(step).lower(lowered_restart.out_info[0], action, stagger)
-        with ThreadPoolExecutor(2) as pool:
-            programs = list(pool.map(lambda lowered: lowered.compile(), (lowered_restart, lowered_step)))
+        programs = compile_side_by_side([lowered_restart, lowered_step])
         return programs[0], programs[1]
+
+
+def compile_side_by_side(lowered: Sequence[Any]) -> list[Callable]:
+    """The programs of what `jax.jit` has lowered, compiled by two threads."""
+    with ThreadPoolExecutor(2) as pool:
+        return list(pool.map(lambda one: one.compile(), lowered))
 
 
 class JaxBackend:

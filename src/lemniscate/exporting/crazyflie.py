@@ -27,6 +27,7 @@ for _axis in "xyz":
     }
 """the firmware's expression for each quantity, by its name"""
 TO_REFERENCE = re.compile(r"to_reference_in_.*s_[xyz]")
+PAST = re.compile(r"(.+)_(\d+)_steps_ago(_less_now)?")
 
 
 def crazyflie_files(
@@ -50,12 +51,16 @@ def crazyflie_files(
     rate = round(1 / interface.period) if interface.period else 0
     if not rate or LOOP % rate:
         raise UserError(f"its {rate} actions a second do not divide the firmware's {LOOP}")
-    reference = interface.reference
+    reference, names = interface.reference, [quantity.name for quantity in quantities]
+    past = [name for name in names if PAST.fullmatch(name)]
     shared = {"title": comment(title), "version": version(), "rate": rate}
     controller = {
         "reference": _reference(reference) if reference else "",
         "counter": "static uint32_t step; /* the point of the curve */\n" if reference else "",
-        "observe": _observe(quantities, reference),
+        "observe": _observe([name for name in names if name not in past], reference),
+        "history": _history(names, past, action, interface.action_before) if past else "",
+        "recall": "        recall(obs);\n" if past else "",
+        "remember": "        remember(obs, action);\n" if past else "",
         "restart": "        step = acting ? (step + 1) % REFERENCE_STEPS : REFERENCE_STEPS - 1;\n" if reference else "",
     }
     start = reference.points[-1] if reference else ()
@@ -92,9 +97,44 @@ def _reference(reference: Reference) -> str:
     )
 
 
-def _observe(quantities: list[Quantity], reference: Reference | None) -> str:
-    """The body of `observe`."""
-    names = [quantity.name for quantity in quantities]
+def _history(names: list[str], past: list[str], action: Box, before: tuple[float, ...]) -> str:
+    """The functions that keep what was observed and done in earlier steps, the newest first, and give it to the policy.
+
+    Raises:
+        UserError: a history of other quantities, or in another order.
+    """
+    each = [found[1] for name in past if (found := PAST.fullmatch(name)) and found[2] == "1"]
+    steps = len(past) // max(1, len(each))
+    first, known = names.index(past[0]), (*names, *COMMANDS)
+    steps_ago = [(ago, name) for ago in range(1, steps + 1) for name in each]
+    expected = [f"{name}_{ago}_steps_ago{'_less_now' if name in names else ''}" for ago, name in steps_ago]
+    if names[first : first + len(past)] != expected or not set(each) <= set(known) or len(before) != len(COMMANDS):
+        raise UserError(f"nothing in the firmware gives {past[0]}")
+    remembered, recalled = [], []
+    for i, name in enumerate(each):
+        now = f"obs[{names.index(name)}]" if name in names else ""
+        remembered.append(f"    past[0][{i}] = {now or _normalized(COMMANDS.index(name), action)};")
+        recalled.append(f"        then[{i}] = past[i][{i}]{f' - {now}' if now else ''};")
+    lines = {"remembered": "\n".join(remembered), "recalled": "\n".join(recalled)}
+    numbers = {"steps": steps, "size": len(each), "first": first, "before": ", ".join(map(_float, before))}
+    return fill("crazyflie/history.c", {**numbers, **lines})
+
+
+def _normalized(i: int, action: Box) -> str:
+    """The C expression of a coordinate of the action between -1 and 1, the ends of its range."""
+    low, high = action.low[i], action.high[i]
+    return f"(action[{i}] - {_float((low + high) / 2)}) / {_float((high - low) / 2)}"
+
+
+def _float(number: float) -> str:
+    """A number in C; one below zero in brackets."""
+    text = f"{number:.9g}"
+    text = f"{text}f" if any(letter in text for letter in ".e") else f"{text}.0f"
+    return f"({text})" if number < 0 else text
+
+
+def _observe(names: list[str], reference: Reference | None) -> str:
+    """The body of `observe`, of the present quantities."""
     strangers = [name for name in names if name not in SENSED and not (reference and TO_REFERENCE.fullmatch(name))]
     if strangers:
         raise UserError(f"nothing in the firmware gives {strangers[0]}")

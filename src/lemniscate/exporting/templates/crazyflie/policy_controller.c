@@ -40,7 +40,7 @@ static void observe(float *obs, const setpoint_t *setpoint, const sensorData_t *
 {
 $observe
 }
-
+$history
 static void command(setpoint_t *setpoint, const float *action)
 {
     memset(setpoint, 0, sizeof *setpoint); /* no position is held: modeDisable is 0 */
@@ -98,8 +98,8 @@ void controllerOutOfTree(control_t *control, const setpoint_t *setpoint, const s
     bool acts = may_act(state);
     if (acts && (!acting || RATE_DO_EXECUTE(POLICY_RATE, stabilizerStep))) {
 $restart        observe(obs, setpoint, sensors, state);
-        fault = policy_act(obs, action) != 0;
-        acts = !fault;
+$recall        fault = policy_act(obs, action) != 0;
+$remember        acts = !fault;
         command(&commanded, action);
     }
     acting = acts;

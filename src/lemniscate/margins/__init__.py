@@ -1,0 +1,1 @@
+"""The margins of a policy: how much may be other than in training before it fails."""

@@ -1,0 +1,194 @@
+"""`preflight`: the margins of a policy, with one thing at a time other than in training."""
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import torch
+
+from lemniscate.console import say
+from lemniscate.envs import registry
+from lemniscate.envs.axes import Act, Sweep
+from lemniscate.errors import UserError
+from lemniscate.exporting.provenance import commit, version
+from lemniscate.margins.compiled import compiled_policy
+from lemniscate.margins.panels import panel
+from lemniscate.margins.record import AxisMargins, margins_of, worst_accepted
+from lemniscate.margins.sentences import FAILS, FALLS_SHORT, rows, sentences
+from lemniscate.margins.smoothness import smoothness
+from lemniscate.margins.vector_sweep import VectorSweep
+from lemniscate.policy import TrainedPolicy
+from lemniscate.report import margins_plot
+from lemniscate.report.compare import table
+from lemniscate.run.config import Natural, Range, checked
+from lemniscate.run.directory import read_config
+from lemniscate.run.environments import env_arguments
+from lemniscate.run.evaluate import EVALUATION
+from lemniscate.run.files import write_json
+from lemniscate.run.seeding import derive
+from lemniscate.stored import Trained, load, path_of
+
+FORMAT = 1
+Starts = Annotated[int, Range(4, 1000)]
+
+
+@dataclass(frozen=True)
+class Preflight:
+    """The findings of a pre-flight.
+
+    Attributes:
+        env_id: of the environment.
+        step: of the policy.
+        episodes: E, from as many starts, the same at every point.
+        seed: of the starts.
+        compiled: the exported C acted.
+        alive_means: the condition of an episode that counts as alive.
+        nominal_return: mean return in the environment as it is.
+        axes: the margins.
+        smoothness: of the actions in the environment as it is, where the time between them is known: `action_rate`,
+            `fast_share`, `saturated_share`, as `lemniscate.margins.smoothness`.
+        sentences: for people.
+        env_kwargs: arguments that were nominal here, though not in training.
+    """
+
+    env_id: str
+    step: int
+    episodes: int
+    seed: int
+    compiled: bool
+    alive_means: str
+    nominal_return: float
+    axes: tuple[AxisMargins, ...]
+    smoothness: dict[str, float] | None
+    sentences: tuple[str, ...]
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+
+    def to_json(self) -> dict[str, Any]:
+        """One object of JSON; a margin is the deviation from the nominal value, on each side that was tried."""
+        own = {name: value for name, value in vars(self).items() if name not in ("axes", "sentences")}
+        axes = {one.axis.name: one.to_json(self.episodes) for one in self.axes}
+        origin = {"lemniscate": version(), "commit": commit()}
+        return {"preflight": FORMAT, **own, "axes": axes, "sentences": list(self.sentences), **origin}
+
+
+def preflight(
+    run: Trained,
+    compiled: bool = False,
+    episodes: int = 64,
+    seed: int = 0,
+    env_kwargs: Mapping[str, Any] | None = None,
+    trust: bool = False,
+) -> Preflight:
+    """Let a policy act while one thing after the other is other than in training, and find how much it bears.
+
+    Drones are flown with late, lost and irregular actions, with late, noisy and biased observations, with other masses,
+    inertias, motors and dynamics, in wind and from wider starts; conditions that training has drawn are nominal
+    otherwise. Other environments have late and lost actions, noisy observations and, where MuJoCo simulates them, other
+    masses and frictions. A margin ends where fewer than 95 % are alive: have not crashed; in environments that are no
+    drones, have a return that is at most a tenth of the nominal mean below what 95 % of the nominal episodes reach.
+
+    Writes `preflight.json` and `plots/preflight.png` into the run; a table and sentences go to standard error.
+
+    Args:
+        run: the directory of a run, or what `train` returned.
+        compiled: let the exported C act, `policy.c` in the run's `export`.
+        episodes: from as many starts at each point, which are the same at all.
+        seed: of the starts.
+        env_kwargs: arguments of the environment that are to be nominal here; of conditions that are ranges there is no
+            axis.
+        trust: as in `load`.
+
+    Raises:
+        UserError: no run; numbers out of range; an environment that cannot be made, is another now, or has no axis;
+            with `compiled`, no export of this policy or no compiler. Nothing is written then.
+    """
+    episodes, seed = checked("episodes", episodes, Starts), checked("seed", seed, Natural)
+    given = checked("env_kwargs", env_kwargs, dict | None) or {}
+    folder = path_of(run)
+    read_config(folder)
+    policy = load(run, trust=trust)
+    act = compiled_policy(policy, folder) if compiled else _torch(policy)
+    sweep = _sweep(policy, episodes, given)
+    result = _fly(policy, act, sweep, {"episodes": episodes, "seed": seed, "compiled": compiled, "env_kwargs": given})
+    for line in [*table(rows(result.axes, episodes)), *result.sentences]:
+        say(line)
+    _write(result, folder)
+    return result
+
+
+def _torch(policy: TrainedPolicy) -> Act:
+    return lambda obs: policy.module(obs).mode()
+
+
+def _sweep(policy: TrainedPolicy, episodes: int, given: Mapping[str, Any]) -> Sweep:
+    """The environment. Raises `UserError` where it is another than in training, or has no axis."""
+    arguments = env_arguments(policy.config)
+    backend = arguments["backend"] or registry.backend_for(arguments["env"], arguments["wrappers"])
+    own = getattr(registry.backend_class(backend), "sweep", None)
+    if own:
+        sweep: Sweep = own(arguments["env"], episodes, policy.config.env_kwargs, given)
+    else:
+        arguments["kwargs"] |= given
+        sweep = VectorSweep(starts=episodes, **arguments)
+    if not sweep.spec.fits(policy.spec):
+        raise UserError(f"{policy.spec.env_id} has other spaces here than in training.")
+    if not sweep.axes:
+        raise UserError(f"{policy.spec.env_id} has nothing that could be changed: masked choices, and no numbers.")
+    return sweep
+
+
+@torch.no_grad()
+def _fly(policy: TrainedPolicy, act: Act, sweep: Sweep, how: dict[str, Any]) -> Preflight:
+    with _one_thread():
+        nominal, flown = sweep.fly(act, derive(how["seed"], EVALUATION, 0))
+    least = None if sweep.ends_by_failure else worst_accepted(nominal)
+    axes = tuple(margins_of(axis, flown[axis.name], least) for axis in sweep.axes)
+    known = sweep.period is not None and nominal.actions is not None
+    smooth = smoothness(nominal.actions, sweep.period) if known else None  # pyright: ignore[reportArgumentType]
+    said = [*sentences(axes, how["episodes"], FAILS if least is None else FALLS_SHORT)]
+    if smooth:
+        said.append(_smoothness_sentence(smooth))
+    return Preflight(
+        env_id=policy.spec.env_id,
+        step=policy.step,
+        alive_means="no crash" if least is None else f"a return of at least {least:.6g}",
+        nominal_return=float(nominal.returns.mean()),
+        axes=axes,
+        smoothness=smooth,
+        sentences=tuple(said),
+        **how,
+    )
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """One thread of torch's: several wait for each other longer than a small network takes, if simulators run too."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _smoothness_sentence(smooth: Mapping[str, float]) -> str:
+    fast, saturated = (100 * smooth[name] for name in ("fast_share", "saturated_share"))
+    return (
+        f"Actions change by {smooth['action_rate']:.2g} of their half range a second (RMS), {fast:.2g} % of their power"
+        f" is above 10 Hz, and {saturated:.2g} % are at a bound."
+    )
+
+
+def _write(result: Preflight, folder: Path) -> None:
+    """The picture, then the record. Raises `UserError` where the run cannot be written."""
+    acting = "the exported C" if result.compiled else "the policy"
+    acts = f"{result.env_id}: {acting} of step {result.step:,}"
+    title = f"{acts}, {result.episodes} starts a point, alive is {result.alive_means}"
+    panels = [panel(one, result.episodes) for one in result.axes]
+    try:
+        margins_plot.draw(panels, title, folder / "plots" / "preflight.png")
+        write_json(folder / "preflight.json", result.to_json())
+    except OSError as error:
+        raise UserError(f"{folder} cannot be written: {error.strerror or error}.") from error

@@ -1,0 +1,106 @@
+"""Environments of any backend flown along axes: through a disturbed channel, and with other models."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lemniscate.envs import registry
+from lemniscate.envs.axes import CHANNEL_AXES, MODEL_AXES, Act, Axis, Flown, Tally, Value
+from lemniscate.envs.disturbed import Channel, has_model
+from lemniscate.envs.vec_env import VecEnv
+from lemniscate.run.seeding import derive, generator
+from lemniscate.spec import Discrete, Spec
+
+FACTORS = "lemniscate.envs.disturbed:ModelFactors"
+CPU = torch.device("cpu")
+
+
+class VectorSweep:
+    """A sweep in E parallel environments, of which the first episode of each counts; all begin from one seed.
+
+    Environments of Gymnasium's interface are those of the gymnasium backend, others those of the backend named.
+
+    Args:
+        env: as `registry.make` takes it, kwargs and wrappers too.
+        starts: E.
+    """
+
+    ends_by_failure = False
+    period: float | None = None
+
+    def __init__(
+        self, env: str, starts: int, kwargs: Mapping[str, Any], wrappers: tuple[str, ...], backend: str | None
+    ) -> None:
+        own = (backend is None or backend in registry.BACKENDS) and registry.backend_class("gymnasium").serves(env)
+        self._arguments: dict[str, Any] = {"env": env, "num_envs": starts, "kwargs": kwargs}
+        self._arguments |= {"backend": "gymnasium" if own else backend}
+        self._wrappers = wrappers
+        self._env = self._make()
+        self.spec: Spec = self._env.spec
+        single = own and registry.can_wrap("gymnasium", env)
+        self.axes = _axes(self.spec, single and has_model(env, kwargs))
+
+    def fly(self, act: Act, seed: int) -> tuple[Flown, dict[str, list[Flown]]]:
+        """All episodes, see `Sweep.fly`; afterwards the environments are closed."""
+        try:
+            nominal, scale = self._nominal(act, seed)
+            return nominal, {axis.name: self._along(axis, nominal, scale, act, seed) for axis in self.axes}
+        finally:
+            self._env.close()
+
+    def _nominal(self, act: Act, seed: int) -> tuple[Flown, Tensor | None]:
+        """The nominal episodes; the standard deviation [O] of what was seen in them, 0 of what is no number."""
+        numbers, seen = _is_number(self.spec), list[Tensor]()
+        if not numbers.any():
+            return _fly(self._env, act, seed), None
+        flown = _fly(self._env, act, seed, seen)
+        return flown, torch.cat(seen).std(0, correction=0) * numbers
+
+    def _along(self, axis: Axis, nominal: Flown, scale: Tensor | None, act: Act, seed: int) -> list[Flown]:
+        """The episodes at each value of an axis."""
+        return [nominal if v == axis.nominal else self._at(axis, v, scale, act, seed) for v in axis.values]
+
+    def _at(self, axis: Axis, value: Value, scale: Tensor | None, act: Act, seed: int) -> Flown:
+        rng = generator(seed, CPU, 1)
+        if axis not in MODEL_AXES:
+            disturbance: dict[str, Any] = {axis.name: value}
+            return _fly(self._env, Channel(act, scale=scale, rng=rng, **disturbance), seed)
+        env = self._make(f"{FACTORS}({axis.name}={value})")
+        try:
+            return _fly(env, act, seed)
+        finally:
+            env.close()
+
+    def _make(self, *wrappers: str) -> VecEnv:
+        return registry.make(**self._arguments, wrappers=(*self._wrappers, *wrappers))
+
+
+def _axes(spec: Spec, has_model: bool) -> tuple[Axis, ...]:
+    """Those of an environment: a mask forbids to act late, and only numbers can be noisy."""
+    masked = isinstance(spec.action, Discrete) and spec.action.masked
+    noisy = bool(_is_number(spec).any())
+    channel = (axis for axis in CHANNEL_AXES if (noisy if axis.name == "observation_noise" else not masked))
+    return (*channel, *(MODEL_AXES if has_model else ()))
+
+
+def _is_number(spec: Spec) -> Tensor:
+    """[O] bool, of the whole observation: numbers, which are no choices, masks or pixels."""
+    own = [not part.nvec and not spec.image for part in spec.observation_parts for _ in range(part.size)]
+    mask = spec.action.n if isinstance(spec.action, Discrete) and spec.action.masked else 0
+    return torch.tensor([*own, *[False] * mask])
+
+
+def _fly(env: VecEnv, act: Act, seed: int, seen: list[Tensor] | None = None) -> Flown:
+    """The first episode of each environment; with `seen`, the observations of those that had not ended."""
+    tally, age = Tally(env.num_envs), 0
+    env.restart(derive(seed, 0))
+    while tally.going.any():
+        env.require_end(age)
+        if seen is not None:
+            seen.append(env.obs[tally.going].clone())
+        step = env.step(act(env.obs))
+        tally.add(step.reward, step.terminated, step.truncated)
+        age += 1
+    return tally.flown()

@@ -1,0 +1,125 @@
+"""Margins, sentences and the picture, from flights whose answer is known."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from lemniscate.envs.axes import Axis, Flown, Tally, dynamics_axis
+from lemniscate.margins.panels import panel
+from lemniscate.margins.record import margins_of, worst_accepted
+from lemniscate.margins.sentences import FAILS, FALLS_SHORT, rows, sentences, within
+from lemniscate.margins.smoothness import smoothness
+from lemniscate.report import margins_plot
+
+DELAY = Axis("delay", (0.0, 0.01, 0.02, 0.03), 0.0, "s", "action delay", "{} of action delay", ("ms", 1000))
+MASS = Axis("mass", (0.7, 0.85, 1.0, 1.15, 1.3), 1.0, "", "mass", "{} mass")
+DYNAMICS = dynamics_axis("so_rpy", ("so_rpy", "so_rpy_rotor", "first_principles"))
+E = 64
+
+
+def flown(*alive):
+    """Flights of which so many are alive at each value; the mean return is the number that is alive."""
+    lost = [torch.arange(E) >= count for count in alive]
+    return [Flown(torch.where(each, 0.0, float(E)), each) for each in lost]
+
+
+def said(axis, *alive, words=FAILS):
+    return list(sentences([margins_of(axis, flown(*alive), None)], E, words))
+
+
+def test_a_margin_is_the_last_value_up_to_which_95_percent_are_alive():
+    found = margins_of(DELAY, flown(64, 61, 60, 64), None)
+    assert found.alive == (64, 61, 60, 64)
+    assert set(found.sides) == {"above"}
+    assert (found.sides["above"].last, found.sides["above"].first) == (0.01, 0.02)
+    record = found.to_json(E)
+    assert record["margin"] == {"above": 0.01}
+    assert record["alive"] == [1.0, 61 / 64, 60 / 64, 1.0]
+    assert record["mean_return"] == [64.0, 61.0, 60.0, 64.0]
+    assert (record["unit"], record["values"], record["nominal"]) == ("s", [0.0, 0.01, 0.02, 0.03], 0.0)
+
+
+def test_a_margin_has_two_sides_where_there_are_values_on_both():
+    found = margins_of(MASS, flown(0, 64, 64, 64, 64), None)
+    assert found.to_json(E)["margin"] == {"below": 0.15, "above": 0.3}
+    assert within(found, E) == [0.85, 1.0, 1.15, 1.3]
+    assert margins_of(MASS, flown(0, 3, 60, 64, 64), None).to_json(E)["margin"] == {"below": None, "above": None}
+
+
+def test_words_have_no_order_and_so_no_sides():
+    found = margins_of(DYNAMICS, flown(64, 63, 0), None)
+    assert found.to_json(E)["margin"] == ["so_rpy", "so_rpy_rotor"]
+    assert within(found, E) == ["so_rpy", "so_rpy_rotor"]
+
+
+@pytest.mark.parametrize(
+    ("axis", "alive", "sentence"),
+    [
+        (DELAY, (64, 62, 3, 0), "Flies with 10 ms of action delay, and loses 2 of 64 there; at 20 ms 61 of 64 crash."),
+        (DELAY, (64, 64, 64, 64), "Flies with 30 ms of action delay, the most that was tried."),
+        (DELAY, (64, 60, 64, 64), "4 of 64 crash with 10 ms of action delay, the least that was tried."),
+        (MASS, (64,) * 5, "Flies with 30 % less to 30 % more mass, the most that was tried."),
+        (MASS, (0, 64, 64, 64, 63), "Flies with 15 % less mass; at 30 % less 64 of 64 crash; flies with 30 % more mass, the most that was tried, and loses 1 of 64 there."),
+        (DYNAMICS, (64, 64, 1), "Flies with the dynamics so_rpy and so_rpy_rotor; 63 of 64 crash with first_principles."),
+        (DELAY, (60, 64, 64, 64), "4 of 64 crash in the environment as it is, so there are no margins."),
+    ],
+)  # fmt: skip
+def test_each_axis_has_its_sentence(axis, alive, sentence):
+    assert said(axis, *alive) == [sentence]
+
+
+def test_no_word_promises_safety():
+    for words in (FAILS, FALLS_SHORT):
+        for alive in ((64, 62, 3, 0), (64,) * 4, (0,) * 4):
+            assert "safe" not in " ".join(said(DELAY, *alive, words=words)).lower()
+
+
+def test_the_table_has_a_row_for_each_axis():
+    found = [margins_of(DELAY, flown(64, 62, 3, 0), None), margins_of(MASS, flown(*[64] * 5), None)]
+    assert rows(found, E) == [
+        ["", "tried", "within margins", "mean return there", "alive beyond"],
+        ["action delay", "0 … 30 ms", "0 … 10 ms", "62", "3 of 64 at 20 ms"],
+        ["mass", "−30 … +30 %", "−30 … +30 %", "64", "–"],
+    ]
+
+
+def test_alive_is_a_return_that_nominal_episodes_have():
+    """Of returns 1 to 100, 95 % reach 5; a tenth of their mean, 5.05, is forgiven."""
+    nominal = Flown(torch.arange(1.0, 101.0, dtype=torch.float64), torch.zeros(100, dtype=torch.bool))
+    assert worst_accepted(nominal) == pytest.approx(5 - 5.05)
+    assert worst_accepted(Flown(-nominal.returns, nominal.terminated)) == pytest.approx(-96 - 5.05)
+    least = worst_accepted(nominal)
+    assert margins_of(DELAY, [nominal, *[Flown(nominal.returns - 5, nominal.terminated)] * 3], least).alive[1] == 96
+
+
+def test_what_follows_an_end_does_not_count():
+    tally = Tally(3)
+    tally.add(torch.ones(3), torch.tensor([True, False, False]), torch.tensor([False, True, False]))
+    tally.add(torch.ones(3), torch.tensor([False, True, True]))
+    assert tally.flown().returns.tolist() == [1, 1, 2]
+    assert tally.flown().terminated.tolist() == [True, False, True]
+    assert not tally.going.any()
+
+
+def test_smoothness_of_waves_is_known():
+    t = torch.arange(500) / 50
+    slow, fast = 0.6 * torch.sin(2 * math.pi * 2 * t), 0.3 * torch.sin(2 * math.pi * 15 * t)
+    found = smoothness((slow + fast)[:, None, None], 1 / 50)
+    assert found["fast_share"] == pytest.approx(0.3**2 / (0.3**2 + 0.6**2), abs=1e-3)
+    steps = np.sqrt(0.5 * sum((size * 2 * math.sin(math.pi * f / 50)) ** 2 for size, f in ((0.6, 2), (0.3, 15)))) * 50
+    assert found["action_rate"] == pytest.approx(steps, rel=1e-2)
+    assert found["saturated_share"] == 0
+    assert smoothness(torch.tensor([1.0, -1.0, 0.0, 1.0])[:, None, None], 0.02)["saturated_share"] == 0.75
+
+
+def test_the_picture_has_a_panel_for_each_axis(tmp_path):
+    found = [margins_of(DELAY, flown(64, 62, 3, 0), None), margins_of(MASS, flown(*[64] * 5), None)]
+    panels = [panel(one, E) for one in (*found, margins_of(DYNAMICS, flown(64, 64, 1), None))]
+    assert panels[0].margin == (0, 10)
+    assert panels[0].edges == [10]
+    assert panels[1].margin == pytest.approx((-30, 30))
+    assert panels[1].edges == []
+    assert panels[2].names == ["so_rpy", "so_rpy_rotor", "first_principles"]
+    assert margins_plot.draw(panels, "A policy.", tmp_path / "p.png").stat().st_size > 10_000
