@@ -66,7 +66,7 @@ class Program:
             self.state, (obs, reward, _, _, measures) = self.step(self.state, given)
             observed.append(np.asarray(obs))
             told.append(np.stack([np.asarray(reward), np.asarray(measures["tracking_error"])]))
-        return torch.tensor(np.stack(observed)), torch.tensor(np.stack(told))
+        return torch.tensor(np.stack(observed)), torch.tensor(np.array(told))
 
     def hover(self, factor=1.0):
         """The action of level attitude and a thrust of the weight, [N, 4]."""
