@@ -57,7 +57,8 @@ class Axis:
         number, unit = self.number(value), f" {self.shown_unit}" if self.shown_unit else ""
         if self.is_factor:
             return f"{abs(number):.4g} % {'more' if number > 0 else 'less'}" if number else "nominal"
-        return f"{number:.4g}{unit}".replace("-", "−")
+        text = f"{number:.4g}{unit}".replace("-", "−")
+        return "1 step" if text == "1 steps" else text
 
     def around(self, nominal: float) -> "Axis":
         """The same axis about another nominal value."""
