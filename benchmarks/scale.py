@@ -130,17 +130,27 @@ def measured(what):
     return [row for row in of if row["commit"] == of[-1]["commit"]]
 
 
+def ratios(what, env):
+    """For each other way: its name, the median speeds of both, and the median of the ratios within a round."""
+    speeds = [row["steps_per_second"] for row in measured(what) if row["env"] == env]
+    first, *others = speeds[0]
+    for other in others:
+        mine, its = (median(row[way] for row in speeds) for way in (first, other))
+        yield other, mine, its, median(row[other] / row[first] for row in speeds)
+
+
 def table():
-    print("| PPO | steps/s | | | |")
+    print("| PPO | one process | beside it | | ratio |")
     print("|---|--:|---|--:|--:|")
-    for what, name in (("processes", "processes"), ("shards", "shards"), ("rllib", "")):
+    for what in ("processes", "shards"):
         for env in dict.fromkeys(row["env"] for row in measured(what)):
-            speeds = [row["steps_per_second"] for row in measured(what) if row["env"] == env]
-            first, *others = speeds[0]
-            for other in others:
-                ratio = median(row[other] / row[first] for row in speeds)
-                mine, its = (median(row[way] for row in speeds) for way in (first, other))
-                print(f"| {env} | {mine:,.0f} | {other} {name} | {its:,.0f} | {ratio:.2f} × |")
+            for other, mine, its, ratio in ratios(what, env):
+                print(f"| {env} | {mine:,.0f} steps/s | {other} {what} | {its:,.0f} steps/s | {ratio:.2f} × |")
+    print("\n| lemniscate | RLlib 2.60 | | lemniscate is |")
+    print("|--:|---|--:|--:|")
+    for other, mine, its, ratio in ratios("rllib", "HalfCheetah-v5"):
+        runners = other.removeprefix("RLlib, ")
+        print(f"| {mine:,.0f} steps/s | {runners} | {its:,.0f} steps/s | {1 / ratio:.1f} × |")
     print("\n| ms to gather | " + " | ".join(f"{size} ranks" for size in RANKS) + " |")
     print("|---|" + "--:|" * len(RANKS))
     of = {(row["delay"], row["floats"], row["ranks"]): row["milliseconds"] for row in measured("exchange")}
