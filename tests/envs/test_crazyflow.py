@@ -42,7 +42,7 @@ def test_every_number_has_a_unit_and_a_frame(env):
     interface = env.backend.interface
     assert all(len(interface.parts[part.name]) == part.size for part in env.spec.observation_parts)
     assert len(interface.action) == env.spec.action.size
-    assert (interface.period, interface.dynamics, interface.vehicle) == (0.02, "so_rpy", "crazyflie")
+    assert (interface.period, interface.dynamics, interface.vehicle) == (0.02, ("so_rpy",), "crazyflie")
     assert interface.reference.points.shape == (500, 3)
     obs = env.restart(3)
     seen = interface.reference.points[(499 + interface.reference.offsets) % 500].ravel()

@@ -99,7 +99,7 @@ def test_wrappers_choose_the_backend_that_can_wrap():
         ("EnvPool/Pong-v5", {"wrappers": ["m:f"]}, "The envpool backend cannot wrap EnvPool/Pong-v5"),
         ("DroneLanding-v0", {"wrappers": ["m:f"]}, "The crazyflow backend cannot wrap DroneLanding-v0"),
         ("DroneLanding-v0", {"kwargs": {"dynamic": 1}}, "did you mean dynamics"),
-        ("DroneLanding-v0", {"kwargs": {"dynamics": "heavy"}}, "cannot be made with {'dynamics': 'heavy'}"),
+        ("DroneLanding-v0", {"kwargs": {"dynamics": "heavy"}}, "There is no dynamics 'heavy'"),
         ("Countdown-v0", {"wrappers": [times_ten]}, "The gymnasium backend cannot wrap Countdown-v0"),
         (Reach(), {}, "env is an environment that is made already; give its class"),
         (3, {}, "env is 3; give its class"),

@@ -138,7 +138,7 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
         known = "a run" if name == "preflight" else "a run, a checkpoint or hf://user/name"
         subs[name].add_argument("run", type=Path, metavar="RUN", help=known)
     subs["export"].add_argument("--to", type=Path, metavar="DIR", help="new directory, or an export [RUN/export]")
-    for sub, episodes in ((subs["preflight"], 64), (subs["evaluate"], 100)):
+    for sub, episodes in ((subs["preflight"], 64), (subs["evaluate"], 100), (subs["watch"], 1)):
         sub.add_argument("--episodes", default=episodes, metavar="INT", help=f"how many [{episodes}]")
         sub.add_argument("--seed", default=0, metavar="INT", help="seed of the starts [0]")
         sub.add_argument("--env-args", metavar="JSON", help="arguments of the environment [as in training]")
@@ -151,13 +151,10 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
     sub = subs["watch"]
     sub.usage = "lemniscate watch RUN [options]\n       lemniscate watch --random --env ID [options]"
     sub.add_argument("run", type=Path, nargs="?", metavar="RUN", help="a run, a checkpoint or hf://user/name")
-    sub.add_argument("--episodes", default=1, metavar="INT", help="how many [1]")
     sub.add_argument("--sample", action="store_true", help="draw actions from the policy [the most likely ones]")
     sub.add_argument("--random", action="store_true", help="act uniformly at random")
     sub.add_argument("--video", type=Path, metavar="FILE", help=".gif, .webp or .mp4 instead of a window")
-    sub.add_argument("--seed", default=0, metavar="INT", help="seed of the starts [0]")
     sub.add_argument("--env", metavar="ID", help="environment [that of training]; without RUN, with --random")
-    sub.add_argument("--env-args", metavar="JSON", help="arguments of the environment [as in training]")
 
     subs["preflight"].add_argument("--compiled", action="store_true", help="let the exported C act, RUN/export")
     subs["plot"].add_argument("runs", type=Path, nargs="+", metavar="RUN", help="runs or sweeps")
