@@ -232,7 +232,7 @@ class Air:
         gust = keep * air["gust"] + self._of(air, "gusts")[:, None] * noise
         return {**air, "key": key, "gust": gust}, air["wind"] + gust
 
-    def seconds_behind(self, air: dict[str, Any]) -> tuple[jax.Array, jax.Array]:
+    def steps_behind(self, air: dict[str, Any]) -> tuple[jax.Array, jax.Array]:
         """The delay of observations as control steps and substeps, [N] each."""
         import jax.numpy as jnp
 
@@ -240,7 +240,7 @@ class Air:
         return jnp.divmod(jnp.round(behind).astype(jnp.int32), self.substeps)
 
     def observe(self, air: dict[str, Any], state: jax.Array, action: jax.Array) -> dict[str, Any]:
-        """What is observed after a step that ended, some substeps before its end, in `state` [N, 13]."""
+        """The observation after a step, caught in `state` [N, 13] as many substeps before its end as it is late."""
         import jax.numpy as jnp
 
         air = dict(air)
@@ -271,7 +271,7 @@ class Air:
         if not self.is_blurred:
             return air, state
         key, own = jax.random.split(air["key"])
-        age, _ = self.seconds_behind(air)
+        age, _ = self.steps_behind(air)
         state = jnp.take_along_axis(air["states"], age[:, None, None], axis=1)[:, 0]
         noise = self._of(air, "observation_noise")[:, None] * jax.random.normal(own, (self.num_envs, 12))
         return {**air, "key": key}, disturb(state, air["bias"] + noise)

@@ -132,7 +132,7 @@ Act = Callable[[Tensor], Tensor]
 """flat observations [N, O] to actions [N, …] as `VecEnv.step` takes them"""
 
 
-class Sweep(Protocol):
+class Probe(Protocol):
     """An environment that can be flown along axes, from the same E starts at each point.
 
     Attributes:

@@ -73,8 +73,8 @@ class Backend(Protocol):
       environments, so that nothing of a part depends on the others; where it does not, each shard has a backend;
     - `room(env) -> (bytes, files)`, a class method: the memory and the open files that each takes at least;
     - `wraps(env) -> bool`, a class method: whether it can put `wrappers` around;
-    - `sweep(env, starts, trained, given)`, a class method: a `lemniscate.envs.axes.Sweep` from so many starts, with the
-      arguments of training and those that differ from them; other backends are flown as `margins.vector_sweep` does;
+    - `probe(env, starts, trained, given)`, a class method: a `lemniscate.envs.axes.Probe` from so many starts, with the
+      arguments of training and those that differ from them; other backends are flown as `margins.vector_probe` does;
     - `make_rendered(env, mode, kwargs, wrappers)`, a class method: one `gymnasium.Env` that renders itself.
     """
 

@@ -22,7 +22,7 @@ import torch
 from lemniscate.envs.air import CONDITIONS, Ranges, read_ranges
 from lemniscate.envs.backend import Scene, Summary
 from lemniscate.envs.drone_interface import interface_of
-from lemniscate.envs.drone_sweep import DroneSweep
+from lemniscate.envs.drone_probe import DroneProbe
 from lemniscate.envs.drones import Drones, Mixed
 from lemniscate.envs.interface import Interface
 from lemniscate.envs.jax_backend import JaxBackend, Programs, jax_device
@@ -116,7 +116,7 @@ class CrazyflowBackend(JaxBackend):
             )
 
     @classmethod
-    def sweep(cls, env: str, starts: int, trained: Mapping[str, Any], given: Mapping[str, Any]) -> DroneSweep:
+    def probe(cls, env: str, starts: int, trained: Mapping[str, Any], given: Mapping[str, Any]) -> DroneProbe:
         """Flights along each condition and in all dynamics, on the CPU.
 
         Conditions that only training has are nominal; so are the first dynamics, of those given or else of training.
@@ -132,11 +132,11 @@ class CrazyflowBackend(JaxBackend):
             return make_drones(env, starts, "cpu", kwargs, other or dynamics, ranges)
 
         with _sentence(env, kwargs):
-            return DroneSweep(make, DYNAMICS, read_ranges(kwargs), starts, partial(spec_of, env))
+            return DroneProbe(make, DYNAMICS, read_ranges(kwargs), starts, partial(spec_of, env))
 
     @property
     def baseline(self) -> PD | None:
-        """A PD controller with the gains that are best in these dynamics, where there is a reference."""
+        """A PD controller with its gains for these dynamics, where there is a reference."""
         drones, env = self._drones, self._drones.env
         if drones.error is None or not isinstance(self.spec.action, Box):
             return None

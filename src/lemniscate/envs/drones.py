@@ -178,7 +178,7 @@ class Drones:
             env._apply_action(acting(jnp.zeros((), jnp.int32)))
             env.sim.step(count)
             return self._state()
-        before_end = self.air.seconds_behind(air)[1] if is_behind else jnp.zeros(self.num_envs, jnp.int32)
+        before_end = self.air.steps_behind(air)[1] if is_behind else jnp.zeros(self.num_envs, jnp.int32)
 
         def substep(carry: tuple[Any, jax.Array], i: jax.Array) -> tuple[tuple[Any, jax.Array], None]:
             env.sim.data, seen = carry

@@ -10,7 +10,7 @@ import torch
 
 from lemniscate.console import say
 from lemniscate.envs import registry
-from lemniscate.envs.axes import Act, Sweep
+from lemniscate.envs.axes import Act, Probe
 from lemniscate.errors import UserError
 from lemniscate.exporting.provenance import commit, version
 from lemniscate.margins.compiled import compiled_policy
@@ -18,7 +18,7 @@ from lemniscate.margins.panels import panel
 from lemniscate.margins.record import AxisMargins, margins_of, worst_accepted
 from lemniscate.margins.sentences import FAILS, FALLS_SHORT, rows, sentences
 from lemniscate.margins.smoothness import smoothness
-from lemniscate.margins.vector_sweep import VectorSweep
+from lemniscate.margins.vector_probe import VectorProbe
 from lemniscate.policy import TrainedPolicy
 from lemniscate.report import margins_plot
 from lemniscate.report.compare import table
@@ -110,8 +110,8 @@ def preflight(
     read_config(folder)
     policy = load(run, trust=trust)
     act = compiled_policy(policy, folder) if compiled else _torch(policy)
-    sweep = _sweep(policy, episodes, given)
-    result = _fly(policy, act, sweep, {"episodes": episodes, "seed": seed, "compiled": compiled, "env_kwargs": given})
+    probe = _probe(policy, episodes, given)
+    result = _fly(policy, act, probe, {"episodes": episodes, "seed": seed, "compiled": compiled, "env_kwargs": given})
     for line in [*table(rows(result.axes, episodes)), *result.sentences]:
         say(line)
     _write(result, folder)
@@ -122,31 +122,31 @@ def _torch(policy: TrainedPolicy) -> Act:
     return lambda obs: policy.module(obs).mode()
 
 
-def _sweep(policy: TrainedPolicy, episodes: int, given: Mapping[str, Any]) -> Sweep:
+def _probe(policy: TrainedPolicy, episodes: int, given: Mapping[str, Any]) -> Probe:
     """The environment. Raises `UserError` where it is another than in training, or has no axis."""
     arguments = env_arguments(policy.config)
     backend = arguments["backend"] or registry.backend_for(arguments["env"], arguments["wrappers"])
-    own = getattr(registry.backend_class(backend), "sweep", None)
+    own = getattr(registry.backend_class(backend), "probe", None)
     if own:
-        sweep: Sweep = own(arguments["env"], episodes, policy.config.env_kwargs, given)
+        probe: Probe = own(arguments["env"], episodes, policy.config.env_kwargs, given)
     else:
         arguments["kwargs"] |= given
-        sweep = VectorSweep(starts=episodes, **arguments)
-    if not sweep.spec.fits(policy.spec):
+        probe = VectorProbe(starts=episodes, **arguments)
+    if not probe.spec.fits(policy.spec):
         raise UserError(f"{policy.spec.env_id} has other spaces here than in training.")
-    if not sweep.axes:
+    if not probe.axes:
         raise UserError(f"{policy.spec.env_id} has nothing that could be changed: masked choices, and no numbers.")
-    return sweep
+    return probe
 
 
 @torch.no_grad()
-def _fly(policy: TrainedPolicy, act: Act, sweep: Sweep, how: dict[str, Any]) -> Preflight:
+def _fly(policy: TrainedPolicy, act: Act, probe: Probe, how: dict[str, Any]) -> Preflight:
     with _one_thread():
-        nominal, flown = sweep.fly(act, derive(how["seed"], EVALUATION, 0))
-    least = None if sweep.ends_by_failure else worst_accepted(nominal)
-    axes = tuple(margins_of(axis, flown[axis.name], least) for axis in sweep.axes)
-    known = sweep.period is not None and nominal.actions is not None
-    smooth = smoothness(nominal.actions, sweep.period) if known else None  # pyright: ignore[reportArgumentType]
+        nominal, flown = probe.fly(act, derive(how["seed"], EVALUATION, 0))
+    least = None if probe.ends_by_failure else worst_accepted(nominal)
+    axes = tuple(margins_of(axis, flown[axis.name], least) for axis in probe.axes)
+    known = probe.period is not None and nominal.actions is not None
+    smooth = smoothness(nominal.actions, probe.period) if known else None  # pyright: ignore[reportArgumentType]
     said = [*sentences(axes, how["episodes"], FAILS if least is None else FALLS_SHORT)]
     if smooth:
         said.append(_smoothness_sentence(smooth))

@@ -17,8 +17,8 @@ FACTORS = "lemniscate.envs.disturbed:ModelFactors"
 CPU = torch.device("cpu")
 
 
-class VectorSweep:
-    """A sweep in E parallel environments, of which the first episode of each counts; all begin from one seed.
+class VectorProbe:
+    """A probe in E parallel environments, of which the first episode of each counts; all begin from one seed.
 
     Environments of Gymnasium's interface are those of the gymnasium backend, others those of the backend named.
 
@@ -43,7 +43,7 @@ class VectorSweep:
         self.axes = _axes(self.spec, single and has_model(env, kwargs))
 
     def fly(self, act: Act, seed: int) -> tuple[Flown, dict[str, list[Flown]]]:
-        """All episodes, see `Sweep.fly`; afterwards the environments are closed."""
+        """All episodes, see `Probe.fly`; afterwards the environments are closed."""
         try:
             nominal, scale = self._nominal(act, seed)
             return nominal, {axis.name: self._along(axis, nominal, scale, act, seed) for axis in self.axes}

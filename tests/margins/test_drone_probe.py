@@ -11,7 +11,7 @@ import torch
 
 pytest.importorskip("crazyflow")
 
-from lemniscate.envs import drone_sweep, registry
+from lemniscate.envs import drone_probe, registry
 from lemniscate.envs.air import CONDITIONS
 from lemniscate.envs.axes import CONDITION_AXES, Tally
 from lemniscate.envs.crazyflow import CrazyflowBackend
@@ -21,8 +21,8 @@ ENV, STARTS, STEPS = "DroneFigureEightTrajectory-v0", 4, 25
 MASS, DELAY = (next(axis for axis in CONDITION_AXES if axis.name == name) for name in ("mass", "action_delay"))
 
 
-def sweep(trained=None, given=None):
-    return CrazyflowBackend.sweep(ENV, STARTS, {"max_episode_time": STEPS / 50, **(trained or {})}, given or {})
+def probe(trained=None, given=None):
+    return CrazyflowBackend.probe(ENV, STARTS, {"max_episode_time": STEPS / 50, **(trained or {})}, given or {})
 
 
 @pytest.fixture(scope="module")
@@ -30,10 +30,10 @@ def two_axes():
     """Mass and delay in one dynamics, in two batches of five points."""
     with pytest.MonkeyPatch.context() as patch:
         delays = tuple(value for value in DELAY.values if value in (0, 0.004, 0.05))
-        patch.setattr(drone_sweep, "CONDITION_AXES", (MASS, replace(DELAY, values=delays)))
-        patch.setattr(drone_sweep, "MOST_FLIGHTS", 5 * STARTS)
+        patch.setattr(drone_probe, "CONDITION_AXES", (MASS, replace(DELAY, values=delays)))
+        patch.setattr(drone_probe, "MOST_FLIGHTS", 5 * STARTS)
         patch.setattr("lemniscate.envs.crazyflow.DYNAMICS", ("so_rpy",))
-        return sweep(trained={"mass": [0.5, 2.0], "wind": 0.3})
+        return probe(trained={"mass": [0.5, 2.0], "wind": 0.3})
 
 
 def follow(obs):
@@ -117,8 +117,8 @@ def test_a_drone_whose_state_is_not_finite_has_crashed(two_axes):
 
 
 def test_arguments_that_are_given_are_nominal(monkeypatch):
-    monkeypatch.setattr(drone_sweep, "CONDITION_AXES", (MASS, DELAY))
-    made = sweep(
+    monkeypatch.setattr(drone_probe, "CONDITION_AXES", (MASS, DELAY))
+    made = probe(
         trained={"dynamics": ["so_rpy_rotor", "so_rpy"], "history": 1}, given={"mass": 1.1, "action_delay": [0, 0.01]}
     )
     mass, dynamics = made.axes
@@ -149,4 +149,4 @@ def test_every_axis_is_of_a_condition_and_within_its_limits():
 )
 def test_wrong_arguments_have_their_sentences(given, said):
     with pytest.raises(UserError, match=said):
-        sweep(given=given)
+        probe(given=given)

@@ -9,7 +9,7 @@ from lemniscate.envs.axes import CHANNEL_AXES
 from lemniscate.envs.disturbed import Channel, ModelFactors, has_model
 from lemniscate.errors import UserError
 from lemniscate.margins.record import margins_of, worst_accepted
-from lemniscate.margins.vector_sweep import VectorSweep
+from lemniscate.margins.vector_probe import VectorProbe
 
 
 class Follow(gym.Env):
@@ -32,7 +32,7 @@ class Follow(gym.Env):
         return np.float32([self.first + 0.1 * self.t, self.first])
 
 
-gym.register("Follow-v0", entry_point="test_vector_sweep:Follow")
+gym.register("Follow-v0", entry_point="test_vector_probe:Follow")
 
 
 def repeat(obs):
@@ -41,10 +41,10 @@ def repeat(obs):
 
 
 def flown(act=repeat, env="Follow-v0", starts=8, wrappers=(), **kwargs):
-    sweep = VectorSweep(env, starts, kwargs, wrappers, None)
-    nominal, points = sweep.fly(act, 3)
+    probe = VectorProbe(env, starts, kwargs, wrappers, None)
+    nominal, points = probe.fly(act, 3)
     least = worst_accepted(nominal)
-    return {axis.name: margins_of(axis, points[axis.name], least) for axis in sweep.axes}, nominal, points
+    return {axis.name: margins_of(axis, points[axis.name], least) for axis in probe.axes}, nominal, points
 
 
 @pytest.fixture(scope="module")
@@ -136,11 +136,11 @@ def test_a_model_is_flown_with_other_masses_and_frictions():
 
 def test_what_cannot_be_disturbed_has_no_axis():
     names = [axis.name for axis in CHANNEL_AXES]
-    assert [a.name for a in VectorSweep("CartPole-v1", 4, {}, (), None).axes] == names
+    assert [a.name for a in VectorProbe("CartPole-v1", 4, {}, (), None).axes] == names
     import environments  # noqa: F401
 
-    assert [a.name for a in VectorSweep("Copy-discrete-v0", 4, {}, (), None).axes] == ["action_delay", "lost_actions"]
-    assert VectorSweep("Copy-masked-v0", 4, {}, (), None).axes == ()
+    assert [a.name for a in VectorProbe("Copy-discrete-v0", 4, {}, (), None).axes] == ["action_delay", "lost_actions"]
+    assert VectorProbe("Copy-masked-v0", 4, {}, (), None).axes == ()
 
 
 def test_wrappers_of_training_stay():

@@ -26,8 +26,8 @@ Make = Callable[[str | None, Ranges], Drones]
 """the drones of as many flights as there are starts, in dynamics by name, or in those that are nominal"""
 
 
-class DroneSweep:
-    """A sweep of drones: a point is a value of one condition, while the others are as they are nominally.
+class DroneProbe:
+    """A probe of drones: a point is a value of one condition, while the others are as they are nominally.
 
     The points are copies of the same drones, `jax.vmap` over the ends of the conditions' ranges; so at each of them the
     starts, the noise and the direction of the wind are the same. Each of the other dynamics is a program of its own.
@@ -66,7 +66,7 @@ class DroneSweep:
         return dict(zip((one.dynamics for one, _ in every), _compiled(every), strict=True))
 
     def fly(self, act: Act, seed: int) -> tuple[Flown, dict[str, list[Flown]]]:
-        """All flights, see `Sweep.fly`; those that are nominal with their actions."""
+        """All flights, see `Probe.fly`; those that are nominal with their actions."""
         (_, programs), *others = self._programs.items()
         nominal, *flown = self._batches(programs, act, seed)
         at = dict(zip(self._points, flown, strict=False))  # the last batch has more
