@@ -31,12 +31,15 @@ CORNERS = {
     }
     for m, j, k in product((0.85, 1.15), (0.7, 1.3), (0.9, 1.1))
 }  # fmt: skip
+ALONE = {"history": 5, "rotors": [0.0, 1.0]}
 WAYS = {
-    "figure-eight": ("figure-eight", {}),
-    "figure-eight-robust": ("figure-eight-robust", {}),
-    "first principles alone": ("figure-eight-robust", {"dynamics": "first_principles", "history": 5}),
+    "figure-eight": ("figure-eight", {}, {}),
+    "figure-eight-robust": ("figure-eight-robust", {}, {}),
+    "so_rpy_rotor alone": ("figure-eight", {"dynamics": "so_rpy_rotor", **ALONE}, {"total_steps": 2_000_000}),
+    "so_rpy_rotor_drag alone": ("figure-eight", {"dynamics": "so_rpy_rotor_drag", **ALONE}, {"total_steps": 2_000_000}),
+    "first principles alone": ("figure-eight-robust", {"dynamics": "first_principles", "history": 5}, {}),
 }
-"""preset and arguments of the environment"""
+"""preset, arguments of the environment, other fields"""
 
 
 def numbers(scores):
@@ -53,9 +56,9 @@ def one_run(way, seed):
     import lemniscate as lem
     from lemniscate.envs.air import CONDITIONS
 
-    preset, kwargs = WAYS[way]
+    preset, kwargs, fields = WAYS[way]
     with tempfile.TemporaryDirectory() as folder:
-        given = {"env_kwargs": kwargs} if kwargs else {}
+        given = fields | ({"env_kwargs": kwargs} if kwargs else {})
         run = lem.train("ppo", ENV, preset=preset, seed=seed, run=f"{folder}/run", progress=False, **given)
     nominal = {name: CONDITIONS[name].nominal for name in run.policy.config.env_kwargs if name in CONDITIONS}
 
@@ -64,7 +67,7 @@ def one_run(way, seed):
         return numbers(lem.evaluate(run.policy, episodes=STARTS, seed=0, env_kwargs=kwargs, baseline=baseline))
 
     found = {"way": way, "seed": seed, "training_s": run.seconds}
-    for dynamics in DYNAMICS if way != "first principles alone" else DYNAMICS[-1:]:
+    for dynamics in [kwargs["dynamics"]] if "dynamics" in kwargs else DYNAMICS:
         found[dynamics] = {"rest": fly(dynamics), "turning": fly(dynamics, rotors=1)}
         if seed == 1:
             found[dynamics] |= {"pd rest": fly(dynamics, True), "pd turning": fly(dynamics, True, rotors=1)}
@@ -136,7 +139,10 @@ def table():
                 )
                 print(f"| `{dynamics}` | {rotors} | {mine} | {beside} |")
         corners = [
-            (d, name, row[d]["corners"][name]) for row in of for d in DYNAMICS for name in row[d].get("corners", {})
+            (dynamics, name, flown)
+            for row in of
+            for dynamics in DYNAMICS
+            for name, flown in row.get(dynamics, {}).get("corners", {}).items()
         ]
         for dynamics in dict.fromkeys(d for d, _, _ in corners):
             by = {n: [f for d, name, f in corners if (d, name) == (dynamics, n)] for n in CORNERS}
