@@ -20,8 +20,8 @@ GAINS = {
     "so_rpy_rotor_drag": (50.2, 14.4, 66.3, 24.0),
     "first_principles": (17.8, 9.3, 27.9, 11.8),
 }
-"""kp (1/s²) and kd (1/s) of the horizontal axes, then of the vertical one; in each dynamics the best of 60, by the return
-from 192 starts of the figure eight (`benchmarks/air.py --gains`)"""
+"""kp (1/s²) and kd (1/s) of the horizontal axes, then of the vertical one: in each dynamics the best of 60, by the
+return from 192 starts of the figure eight (`benchmarks/air.py --gains`)"""
 
 
 class PD:
