@@ -133,15 +133,3 @@ class Batch(Record):
 
     def __len__(self) -> int:
         return len(self.obs)
-
-
-@dataclass(frozen=True)
-class SoftBatch(Record):
-    """The rows of a rollout with Q(s, a), its target, and the policy's μ and log σ at collection, [B, …]."""
-
-    obs: Tensor
-    action: Tensor
-    value: Tensor
-    target: Tensor
-    mean: Tensor
-    log_std: Tensor

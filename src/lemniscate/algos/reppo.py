@@ -11,19 +11,18 @@ import torch
 from torch import Tensor
 
 from lemniscate.data.rollout import collect, epoch_minibatches, estimates
-from lemniscate.maths import SquashedGaussian, cross_entropy, explained_variance, hl_gauss, means, soft_lambda_return
+from lemniscate.data.soft_batch import SoftBatch
+from lemniscate.maths import Gaussian, cross_entropy, explained_variance, hl_gauss, means, soft_lambda_return
 from lemniscate.nn.activations import Activation
-from lemniscate.nn.actor_q import ActorCategoricalQ
-from lemniscate.nn.networks import Layers
+from lemniscate.nn.actor_categorical_q import ActorCategoricalQ, CategoricalQ, Multipliers
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.nn.policies import Policy
-from lemniscate.nn.q_values import CategoricalQ, Multipliers
 from lemniscate.optim.adam import Adam, linear
-from lemniscate.run.config import Bins, Count, Finite, Fraction, NumEnvs, Positive, Repeats, Width
+from lemniscate.run.config import Count, Finite, Fraction, LogStd, NumEnvs, Positive, Repeats, Width
 from lemniscate.run.on_policy import OnPolicyConfig, OnPolicyState
 from lemniscate.run.run import Run
 from lemniscate.spec import Spec
-from lemniscate.types import Loss, Metrics, Rollout, SoftBatch
+from lemniscate.types import Loss, Metrics, Rollout
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,20 +49,14 @@ class Config(OnPolicyConfig):
     """trace decay λ of the soft return, usually 0.9 to 0.99; 0 is one-step TD, 1 Monte Carlo"""
     max_kl: Positive = 0.2
     """ε, the KL from the policy that collected beyond which a row only brings it back; usually 0.1 to 0.5"""
-    initial_temperature: Positive = 0.01
-    """initial α, the weight of the entropy; it is learned"""
-    initial_kl_weight: Positive = 0.01
-    """initial β, the weight of the KL where it is above max_kl; it is learned"""
     target_entropy: Finite | None = None
     """H̄ in nats, the entropy that the temperature aims at, over actions in [-1, 1]^A; none: −A"""
-    num_bins: Bins = 101
-    """K, the bins of Q's distribution; usually 51 to 151"""
     value_range: Positive = 10.0
-    """the bins cover [-value_range, value_range], in units of scaled rewards; usually 5 to 20"""
-    critic_hidden: tuple[Width, ...] = (128, 128)
-    """widths of the critic's hidden layers"""
+    """the bins of Q's distribution cover [-value_range, value_range], in units of scaled rewards; usually 5 to 20"""
     hidden: tuple[Width, ...] = (128, 128)
-    """widths of the policy's hidden layers"""
+    """widths of the hidden layers of the policy, and of Q"""
+    initial_log_std: LogStd = -1.0
+    """initial log σ of the policy before its tanh; usually -1.5 to -0.5"""
     activation: Activation = "silu"
     """activation function between the layers"""
     network: str = "layer_norm"
@@ -72,18 +65,11 @@ class Config(OnPolicyConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._require_minibatch("minibatch_size")
-        self.critic_layers.check()
-
-    @property
-    def critic_layers(self) -> Layers:
-        """The hidden layers of the critic."""
-        return Layers(self.critic_hidden, self.activation, self.network)
 
     def networks(self, spec: Spec) -> ActorCategoricalQ:
         """New networks for the spaces in `spec`: π, Q, α and β."""
-        bins, start = (self.num_bins, self.value_range), (self.initial_temperature, self.initial_kl_weight)
-        layers, observations = (self.layers, self.critic_layers), self.normalize_observations
-        return ActorCategoricalQ(spec, *layers, observations, self.initial_log_std, bins=bins, multipliers=start)
+        fields = self.normalize_observations, self.initial_log_std, self.value_range
+        return ActorCategoricalQ(spec, self.layers, *fields)
 
     @property
     def gradient_steps(self) -> int:
@@ -120,11 +106,9 @@ def targets(config: Config, state: State, rollout: Rollout) -> SoftBatch:
     noise = state.policy.draw_noise(rollout.reward.shape, state.rng.action)
     value, next_value, next_log_prob, mean, log_std = estimates(state.networks, rollout, noise)
     alpha, _ = state.networks.multipliers()
-    ends = rollout.terminated, rollout.done
-    gamma, lam = config.gamma, config.td_lambda
+    ends, gamma, lam = (rollout.terminated, rollout.done), config.gamma, config.td_lambda
     target = soft_lambda_return(rollout.reward, next_value, -alpha * next_log_prob, *ends, gamma=gamma, lam=lam)
-    batch = SoftBatch(rollout.obs, rollout.action, value, target, mean, log_std)
-    return batch.flatten(rollout.shards)  # [T, N, …] -> [B, …]
+    return SoftBatch(rollout.obs, rollout.action, value, target, mean, log_std).flatten(rollout.shards)  # [B, …]
 
 
 def critic_loss(critic: CategoricalQ, batch: SoftBatch) -> Loss:
@@ -137,7 +121,8 @@ def actor_loss(config: Config, state: State, policy: Policy, batch: SoftBatch, n
     """Row by row α log π(a|s) − Q(s, a), a ~ π(·|s), where KL(π_old ‖ π) < ε; elsewhere β KL. And its metrics."""
     distribution = policy(batch.obs)
     action, log_prob = distribution.sample_with_log_prob(noise)
-    kl = SquashedGaussian(batch.mean, batch.log_std).kl(distribution)
+    old, new = Gaussian(batch.mean, batch.log_std), Gaussian(distribution.mean, distribution.log_std)
+    kl = old.kl(new)  # before the tanh, which moves both alike
     alpha, beta = state.networks.multipliers().detach()
     soft_value = state.networks.critic(batch.obs, action) - alpha * log_prob
     loss = torch.where(kl < config.max_kl, -soft_value, beta * kl).mean()
@@ -150,10 +135,7 @@ def actor_loss(config: Config, state: State, policy: Policy, batch: SoftBatch, n
 
 
 def multiplier_loss(config: Config, multipliers: Multipliers, entropy: Tensor, kl: Tensor, size: int) -> Loss:
-    """α (H − H̄) + β (ε − KL), H and KL of the minibatch, over A = `size` coordinates, and its metrics.
-
-    α grows while the entropy is below its target, β while the KL is above its bound.
-    """
+    """α (H − H̄) + β (ε − KL), H and KL of the minibatch, over A = `size` coordinates, and its metrics."""
     target_entropy = -size if config.target_entropy is None else config.target_entropy
     alpha, beta = multipliers()
     loss = alpha * (entropy - target_entropy) + beta * (config.max_kl - kl)

@@ -3,9 +3,10 @@
 from lemniscate.maths.bounded import Deterministic, SquashedGaussian
 from lemniscate.maths.discrete import Bernoulli, Categorical, MultiCategorical
 from lemniscate.maths.distributions import Distribution, Gaussian, tanh
-from lemniscate.maths.losses import clipped_surrogate, cross_entropy, policy_gradient, surrogate, value_loss
+from lemniscate.maths.losses import clipped_surrogate, policy_gradient, surrogate, value_loss
 from lemniscate.maths.noise import coloured, normal, ornstein_uhlenbeck, uniform
-from lemniscate.maths.returns import episode_return, gae, reward_to_go, soft_lambda_return
+from lemniscate.maths.returns import episode_return, gae, reward_to_go
+from lemniscate.maths.soft_q import cross_entropy, hl_gauss, soft_lambda_return
 from lemniscate.maths.stats import (
     ONE_SHARD,
     Shards,
@@ -18,7 +19,7 @@ from lemniscate.maths.stats import (
     ratio_statistics,
     standardize,
 )
-from lemniscate.maths.targets import hl_gauss, polyak, td_target
+from lemniscate.maths.targets import polyak, td_target
 from lemniscate.maths.trust_region import backtrack, conjugate_gradient, fisher_product, natural_step
 
 __all__ = [

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import softplus
 
-from lemniscate.maths.distributions import LOG_2PI, Gaussian
+from lemniscate.maths.distributions import LOG_2PI
 
 
 @dataclass(frozen=True)
@@ -51,13 +51,6 @@ class SquashedGaussian:
         u = self.mean + self.log_std.exp() * noise
         normal = -0.5 * (noise.square() + LOG_2PI) - self.log_std
         return torch.tanh(u), (normal - _log_slope(u)).sum(-1)
-
-    def kl(self, other: "SquashedGaussian") -> Tensor:
-        """[B]: KL(self ‖ other), which is that of the normals of u, since tanh maps both in the same way.
-
-        Σ_i [ log σ'_i − log σ_i + (σ_i² + (μ_i − μ'_i)²) / 2σ'_i² − ½ ]
-        """
-        return Gaussian(self.mean, self.log_std).kl(Gaussian(other.mean, other.log_std))
 
 
 def _log_slope(u: Tensor) -> Tensor:

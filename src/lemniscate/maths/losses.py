@@ -93,16 +93,3 @@ def value_loss(
         clipped = old_value + (value - old_value).clamp(-clip, clip)
         error = torch.max(error, (clipped - target).square())
     return 0.5 * error.mean()
-
-
-def cross_entropy(logits: Float[Tensor, "B K"], target: Float[Tensor, "B K"]) -> Float[Tensor, ""]:
-    """−E[ Σ_i p_i log q_i ]: the loss of a distribution over K bins, arXiv:2403.03950, section 2.
-
-    Args:
-        logits: of q.
-        target: p, no gradient.
-
-    Returns:
-        A scalar.
-    """
-    return -(target * logits.log_softmax(-1)).sum(-1).mean()

@@ -97,38 +97,3 @@ def episode_return(
         paid = torch.where(done[t], 0.0, paid + weight * reward[t])
         weight = torch.where(done[t], 1.0, gamma * weight)
     return whole
-
-
-def soft_lambda_return(
-    reward: Float[Tensor, "T N"],
-    next_value: Float[Tensor, "T N"],
-    next_bonus: Float[Tensor, "T N"],
-    terminated: Bool[Tensor, "T N"],
-    done: Bool[Tensor, "T N"],
-    *,
-    gamma: float = 0.99,
-    lam: float = 0.95,
-) -> Float[Tensor, "T N"]:
-    """The TD(λ) return of Q(s, a) where entropy is rewarded: Voelcker et al. 2025, arXiv:2507.11019.
-
-        G_t = r_t + γ (b_{t+1} + (1 − λ) Q(s_{t+1}, a') + λ G_{t+1})
-        a' ~ π(·|s_{t+1}),   b_{t+1} = −α log π(a'|s_{t+1})
-
-    r_t alone after a termination. Where the chain ends, at a time-out and in the last row, Q(s_{t+1}, a') stands for
-    G_{t+1}. At λ = 0 it is SAC's target, arXiv:1812.05905, eq. 3.
-
-    Args:
-        reward: r_t.
-        next_value: Q(s_{t+1}, a') at the true successor, before any reset.
-        next_bonus: b_{t+1}, of the same action.
-        terminated: the episode ended by its own rules at row t.
-        done: the episode ended at row t for any reason.
-        gamma: discount γ in [0, 1].
-        lam: trace decay λ in [0, 1].
-    """
-    target = torch.empty_like(reward)
-    follows = next_value[-1]
-    for t in reversed(range(len(reward))):
-        ahead = torch.lerp(next_value[t], follows, lam * (~done[t]).to(follows.dtype))
-        target[t] = follows = reward[t] + gamma * (next_bonus[t] + ahead) * ~terminated[t]
-    return target

@@ -27,21 +27,6 @@ def td_target(
     return reward + gamma * next_value * ~terminated
 
 
-def hl_gauss(target: Float[Tensor, " B"], edges: Float[Tensor, " E"], width: float = 0.75) -> Float[Tensor, "B K"]:
-    """A number as probabilities of K bins: Farebrother et al. 2024, arXiv:2403.03950, "HL-Gauss".
-
-        p_i = (Φ((e_{i+1} − y) / σ) − Φ((e_i − y) / σ)) / (Φ((e_K − y) / σ) − Φ((e_0 − y) / σ))
-
-    Args:
-        target: y, which is clamped to [e_0, e_K].
-        edges: e_0 < … < e_K, at equal distances; E = K + 1.
-        width: σ in units of a bin's width.
-    """
-    sigma = width * (edges[1] - edges[0])
-    below = torch.erf((edges - target.clamp(edges[0], edges[-1])[:, None]) / (sigma * 2**0.5))
-    return below.diff() / (below[:, -1:] - below[:, :1])
-
-
 @torch.no_grad()
 def polyak(target: Iterable[Tensor], online: Iterable[Tensor], tau: float) -> None:
     """Move a target network towards the online one, in place: arXiv:1509.02971, section 3.

@@ -11,7 +11,7 @@ from lemniscate.nn.bounded_policies import DeterministicPolicy, SquashedGaussian
 from lemniscate.nn.networks import Layers
 from lemniscate.nn.normalizer import NoNorm
 from lemniscate.nn.policies import Policy
-from lemniscate.nn.q_values import CategoricalQ, Critics, Multipliers, QValue, Temperature
+from lemniscate.nn.q_values import Critics, QValue, Temperature
 from lemniscate.spec import Spec
 
 Module = TypeVar("Module", bound=nn.Module)
@@ -92,49 +92,3 @@ class SoftActorQ(ActorQ):
         """−α log π(a|s) of an action drawn at each observation [B, O], [B]."""
         _, log_prob = self.policy(obs).sample_with_log_prob(self.policy.draw_noise((len(obs),), (generator,)))
         return -self.temperature() * log_prob
-
-
-class ActorCategoricalQ(nn.Module):
-    """A stochastic policy for bounded continuous actions, Q(s, a) as a distribution, and the multipliers α and β.
-
-    Args:
-        spec: of the environment.
-        actor_layers: of the policy.
-        critic_layers: of the critic.
-        normalize_observations: put a running normalizer in front of both.
-        initial_log_std: log σ of the policy before the tanh, at first.
-        bins: the number of bins, and the end of their range, of the critic.
-        multipliers: α and β at first.
-
-    Raises:
-        UserError: actions that are not continuous, or without bounds.
-    """
-
-    def __init__(
-        self,
-        spec: Spec,
-        actor_layers: Layers,
-        critic_layers: Layers,
-        normalize_observations: bool,
-        initial_log_std: float,
-        *,
-        bins: tuple[int, float],
-        multipliers: tuple[float, float],
-    ) -> None:
-        super().__init__()
-        size = spec.bounded_box().size
-        normalizer = normalizer_of(spec, normalize_observations)
-        self.policy = SquashedGaussianPolicy(normalizer, network_of(spec, actor_layers, 2 * size, last_gain=0.01), size)
-        self.policy.begin_with(initial_log_std)
-        encoder, features = encoder_of(spec)
-        net = critic_layers.network(features + size, bins[0], last_gain=0.01)
-        gain = (features / size) ** 0.5  # of two parts of the input, neither drowns the other
-        self.critic = CategoricalQ(normalizer, encoder, net, *bins, action_gain=gain)
-        self.multipliers = Multipliers(multipliers)
-
-    def estimates(self, obs: Tensor, next_obs: Tensor, action: Tensor, noise: Tensor) -> tuple[Tensor, ...]:
-        """Q(s, a), Q(s', a') and log π(a'|s') of an a' drawn with `noise`, μ and log σ of π(·|s): of rows […, …]."""
-        policy = self.policy(obs)
-        next_action, next_log_prob = self.policy(next_obs).sample_with_log_prob(noise)
-        values = self.critic(obs, action), self.critic(next_obs, next_action)
-        return *values, next_log_prob, policy.mean, policy.log_std

@@ -1,6 +1,5 @@
 """Policies of bounded continuous actions, for the algorithms that learn from a replay buffer."""
 
-import math
 from collections.abc import Sequence
 
 import torch
@@ -38,12 +37,6 @@ class SquashedGaussianPolicy(Policy):
         """[B, O] to μ and log σ, [B, A] each."""
         mean, log_std = self.net(self.normalizer(obs)).chunk(2, dim=-1)
         return SquashedGaussian(mean, -5 + 3.5 * (torch.tanh(log_std) + 1))
-
-    def begin_with(self, log_std: float) -> None:
-        """Set the bias of log σ so that it is `log_std` where the network is zero."""
-        last = self.net.get_submodule(next(reversed(dict(self.net.named_children()))))
-        if isinstance(last, nn.Linear):
-            nn.init.constant_(last.bias[self.size :], math.atanh((log_std + 5) / 3.5 - 1))
 
     def noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
         """Standard normal, [*shape, A]."""

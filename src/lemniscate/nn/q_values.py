@@ -1,7 +1,7 @@
 """Values of actions, Q(s, a), behind the policy's observation normalizer; and the price of entropy."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 import torch
 from torch import Tensor, nn
@@ -50,50 +50,3 @@ class Temperature(nn.Module):
     def forward(self) -> Tensor:
         """α, a scalar."""
         return self.log_alpha.exp()
-
-
-class CategoricalQ(nn.Module):
-    """Q(s, a) as the mean of a distribution over K bins of equal width, behind the policy's observation normalizer.
-
-    Args:
-        normalizer: of observations.
-        encoder: from normalized observations to features.
-        net: from features and action to K logits.
-        bins: K.
-        value_range: the bins cover [-value_range, value_range].
-        action_gain: the factor of actions before `net`.
-    """
-
-    edges: Tensor
-
-    def __init__(
-        self, normalizer: NoNorm, encoder: nn.Module, net: nn.Module, bins: int, value_range: float, action_gain: float
-    ) -> None:
-        super().__init__()
-        self.normalizer = normalizer
-        self.encoder = encoder
-        self.net = net
-        self.action_gain = action_gain
-        self.register_buffer("edges", torch.linspace(-value_range, value_range, bins + 1), persistent=False)
-
-    def logits(self, obs: Tensor, action: Tensor) -> Tensor:
-        """[…, O] and […, A] to […, K]."""
-        features = self.encoder(self.normalizer(obs))
-        return self.net(torch.cat([features, self.action_gain * action], dim=-1))
-
-    def forward(self, obs: Tensor, action: Tensor) -> Tensor:
-        """[…, O] and […, A] to […]."""
-        centres = (self.edges[1:] + self.edges[:-1]) / 2
-        return self.logits(obs, action).softmax(-1) @ centres
-
-
-class Multipliers(nn.Module):
-    """Lagrange multipliers, each above zero; their logs are the parameter."""
-
-    def __init__(self, initial: Sequence[float]) -> None:
-        super().__init__()
-        self.log = nn.Parameter(torch.tensor([math.log(value) for value in initial]))
-
-    def forward(self) -> Tensor:
-        """[number of multipliers]."""
-        return self.log.exp()

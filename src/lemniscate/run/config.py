@@ -49,7 +49,6 @@ Natural = Annotated[int, Range(0)]
 NumEnvs = Annotated[int, Range(1, MOST_ENVS)]
 Episodes = Annotated[int, Range(1, 1_000_000)]  # the return of each is kept
 Repeats = Annotated[int, Range(1, 10_000)]  # within one update
-Bins = Annotated[int, Range(2, 10_000)]
 Width = Annotated[int, Range(1, 1_000_000)]
 Seed = Annotated[int, Range(0, 2**32 - 1)]
 Fraction = Annotated[float, Range(0, 1)]
