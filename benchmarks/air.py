@@ -127,7 +127,8 @@ def table():
             flown = [row[dynamics][rotors] for row in of if dynamics in row]
             if flown:
                 returns, errors = [f["return"] for f in flown], [f["mm"] for f in flown]
-                pd = next((row[dynamics][f"pd {rotors}"] for row in of if f"pd {rotors}" in row[dynamics]), None)
+                flown_by_pd = [row[dynamics] for row in found if f"pd {rotors}" in row.get(dynamics, {})]
+                pd = flown_by_pd[-1][f"pd {rotors}"] if flown_by_pd else None
                 beside = f"{pd['return']:.0f}, {pd['mm']:.0f} mm" if pd else ""
                 crashes = f"{sum(f['crashes'] for f in flown)} of {STARTS * len(flown)}"
                 mine = (

@@ -161,7 +161,7 @@ config = ppo("LunarLander-v3", 2, 16, entropy_coeff=0.01, **fields).debugging(se
 judge = dict(evaluation_num_env_runners=0, evaluation_config=dict(explore=False, num_envs_per_env_runner=16))
 config = config.evaluation(evaluation_interval=3, evaluation_duration=100, **judge)
 algorithm, steps, reached = config.build_algo(), 0, float("-inf")
-while steps < 1_000_000 and reached < 250:
+while steps < 1_000_000 and not reached >= 250:  # RLlib says NaN where no episode of an evaluation has ended
     result = algorithm.train()
     steps += result["env_runners"]["num_env_steps_sampled"]
     if "evaluation" in result:
