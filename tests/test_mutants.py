@@ -594,9 +594,9 @@ MUTANTS = [
     ),
     (
         "REPPO's KL is the other way round",
-        "algos/reppo.py",
-        "old.kl(new)",
-        "new.kl(old)",
+        "data/soft_batch.py",
+        "Gaussian(self.mean, self.log_std).kl(Gaussian(policy.mean, policy.log_std))",
+        "Gaussian(policy.mean, policy.log_std).kl(Gaussian(self.mean, self.log_std))",
         REPPO + "rows_within_the_bound_climb_and_the_others_come_back",
     ),
     (

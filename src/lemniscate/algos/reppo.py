@@ -12,7 +12,7 @@ from torch import Tensor
 
 from lemniscate.data.rollout import collect, epoch_minibatches, estimates
 from lemniscate.data.soft_batch import SoftBatch
-from lemniscate.maths import Gaussian, cross_entropy, explained_variance, hl_gauss, means, soft_lambda_return
+from lemniscate.maths import cross_entropy, explained_variance, hl_gauss, means, soft_lambda_return
 from lemniscate.nn.activations import Activation
 from lemniscate.nn.actor_categorical_q import ActorCategoricalQ, CategoricalQ, Multipliers
 from lemniscate.nn.normalizer import RewardScale
@@ -121,17 +121,12 @@ def actor_loss(config: Config, state: State, policy: Policy, batch: SoftBatch, n
     """Row by row α log π(a|s) − Q(s, a), a ~ π(·|s), where KL(π_old ‖ π) < ε; elsewhere β KL. And its metrics."""
     distribution = policy(batch.obs)
     action, log_prob = distribution.sample_with_log_prob(noise)
-    old, new = Gaussian(batch.mean, batch.log_std), Gaussian(distribution.mean, distribution.log_std)
-    kl = old.kl(new)  # before the tanh, which moves both alike
+    kl = batch.kl_to(distribution)
     alpha, beta = state.networks.multipliers().detach()
     soft_value = state.networks.critic(batch.obs, action) - alpha * log_prob
     loss = torch.where(kl < config.max_kl, -soft_value, beta * kl).mean()
-    return loss, {
-        "losses/actor": loss.detach(),
-        "losses/entropy": -log_prob.detach().mean(),
-        "kl": kl.detach().mean(),
-        "beyond_max_kl": (kl.detach() >= config.max_kl).float().mean(),
-    }
+    metrics = {"losses/actor": loss.detach(), "losses/entropy": -log_prob.detach().mean(), "kl": kl.detach().mean()}
+    return loss, {**metrics, "beyond_max_kl": (kl.detach() >= config.max_kl).float().mean()}
 
 
 def multiplier_loss(config: Config, multipliers: Multipliers, entropy: Tensor, kl: Tensor, size: int) -> Loss:
@@ -157,7 +152,6 @@ def learn(config: Config, state: State, batch: SoftBatch, minibatches: Tensor, n
 
 def update(config: Config, state: State, rollout: Rollout) -> dict[str, Tensor | float]:
     """Some epochs of minibatch steps on one rollout; returns the means of the metrics."""
-    networks = state.networks
     rate = linear(config.learning_rate, config.final_learning_rate, state.step / config.total_steps)
     for optimizer in state.optimizers():
         optimizer.learning_rate = rate
@@ -169,9 +163,9 @@ def update(config: Config, state: State, rollout: Rollout) -> dict[str, Tensor |
     for _ in range(config.epochs):
         size = config.minibatch_size // config.shards
         minibatches = epoch_minibatches(valid_rows, rollout.num_rows, size, state.rng.minibatch)
-        noise = networks.policy.draw_noise(minibatches.shape, state.rng.action)  # [K, M, A]
+        noise = state.policy.draw_noise(minibatches.shape, state.rng.action)  # [K, M, A]
         metrics.append(means(state.learn(config, state, batch, minibatches, noise)))
-    networks.policy.observe(rollout.obs, rollout.valid)  # last: the KL compares policies behind the same normalizer
+    state.policy.observe(rollout.obs, rollout.valid)  # last: the KL compares policies behind the same normalizer
     state.step += config.num_steps * config.num_envs
     explained = explained_variance(batch.value, batch.target, valid_rows, state.shards)
     return {**means(metrics), "explained_variance": explained, "learning_rate": rate}

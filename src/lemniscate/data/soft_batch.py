@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
+from lemniscate.maths import Gaussian, SquashedGaussian
 from lemniscate.types import Record
 
 
@@ -17,3 +18,7 @@ class SoftBatch(Record):
     target: Tensor
     mean: Tensor
     log_std: Tensor
+
+    def kl_to(self, policy: SquashedGaussian) -> Tensor:
+        """KL(π_old ‖ π) of each row, [B]: that of the normals before the tanh, which maps both in the same way."""
+        return Gaussian(self.mean, self.log_std).kl(Gaussian(policy.mean, policy.log_std))
