@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from forks import Forks
-from lemniscate.algos import ppo, reinforce, sac, trpo
+from lemniscate.algos import ppo, reinforce, reppo, sac, trpo
 from lemniscate.data.replay import interact
 from lemniscate.data.rollout import collect
 from lemniscate.envs import toy
@@ -74,7 +74,7 @@ def vectorize(env, num_envs=4, **kwargs):
 def small(algo, env="Countdown-v0", **fields):
     """A Config of an on-policy algorithm that takes an update in a moment."""
     defaults = {"env": env, "num_envs": 4, "num_steps": 8, "total_steps": 100_000, "hidden": (16,)}
-    defaults |= {"minibatch_size": 16} if algo is ppo else {}
+    defaults |= {"minibatch_size": 16} if algo in (ppo, reppo) else {}
     fields = {**defaults, **fields}
     if algo in (trpo, reinforce):  # one minibatch, as far as the rows go
         fields = {"critic_minibatch_size": min(128, fields["num_envs"] * fields["num_steps"]), **fields}

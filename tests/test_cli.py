@@ -23,7 +23,7 @@ TINY = [
     for part in (f"--{name.replace('_', '-')}", value)
 ]
 
-ALGORITHMS = ("reinforce", "a2c", "trpo", "ppo", "ddpg", "td3", "sac")
+ALGORITHMS = ("reinforce", "a2c", "trpo", "ppo", "reppo", "ddpg", "td3", "sac")
 
 
 class Broken(gym.Env):
@@ -286,7 +286,7 @@ def test_an_algorithm_is_named_by_its_module_and_its_own_name_too(tmp_path, monk
         (["evaluat"], "There is no command 'evaluat': did you mean evaluate?"),
         (["--verion"], "The following arguments are required: COMMAND"),
         (["train"], "Which algorithm? lemniscate train ALGORITHM …, with one of reinforce, a2c, trpo, ppo"),
-        (["train", "pp", "--env", "CartPole-v1"], "There is no algorithm 'pp': did you mean ppo?"),
+        (["train", "pp", "--env", "CartPole-v1"], "There is no algorithm 'pp': did you mean ppo or reppo?"),
         (["train", "PPO", "--env", "CartPole-v1"], "There is no algorithm 'PPO': did you mean ppo?"),
         (["train", "ppo,sacc", "--seeds", "1-2"], "There is no algorithm 'sacc': did you mean sac"),
         (["train", "--seed", "3", "ppo"], "The algorithm comes first, then its fields: lemniscate train ppo"),

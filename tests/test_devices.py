@@ -51,6 +51,7 @@ CASES = {
     "ppo box": ("box", {**ON_POLICY, "epochs": 2, "minibatch_size": 8, "clip_value": 0.2}),
     "ppo discrete": ("discrete", {**ON_POLICY, "epochs": 2, "minibatch_size": 8, "desired_kl": None}),
     "ppo image": ("image", {**ON_POLICY, "epochs": 1, "minibatch_size": 18}),
+    "reppo box": ("box", {**ON_POLICY, "epochs": 2, "minibatch_size": 8}),
     "ddpg box": ("box", {**OFF_POLICY, "action_noise": "ou"}),
     "td3 box": ("box", {**OFF_POLICY, "action_noise": "coloured"}),
     "sac box": ("box", OFF_POLICY),

@@ -10,9 +10,9 @@ from forks import Forks
 
 ROOT = Path(__file__).parents[1]
 
-ON, OFF, REINFORCE, PPO, TRPO, DDPG, TD3, SAC = (
+ON, OFF, REINFORCE, PPO, TRPO, REPPO, DDPG, TD3, SAC = (
     f"algos/test_{name}.py::test_"
-    for name in ("on_policy", "off_policy", "reinforce", "ppo", "trpo", "ddpg", "td3", "sac")
+    for name in ("on_policy", "off_policy", "reinforce", "ppo", "trpo", "reppo", "ddpg", "td3", "sac")
 )
 INTERACT, ROLLOUT = (f"data/test_{name}.py::test_" for name in ("interact", "rollout"))
 
@@ -549,6 +549,83 @@ MUTANTS = [
         "(state.networks.temperature().detach() *",
         "(-state.networks.temperature().detach() *",
         SAC + "the_policy_is_rewarded_for_entropy",
+    ),
+    (
+        "a time-out ends the soft return",
+        "maths/soft_q.py",
+        "(next_bonus[t] + ahead) * ~terminated[t]",
+        "(next_bonus[t] + ahead) * ~done[t]",
+        "maths/test_soft_q.py::test_the_soft_return_is_the_mixture_of_n_step_returns",
+    ),
+    (
+        "the soft return runs on into the next episode",
+        "maths/soft_q.py",
+        "lam * (~done[t]).to(follows.dtype)",
+        "lam * (~terminated[t]).to(follows.dtype)",
+        "maths/test_soft_q.py::test_the_soft_return_is_the_mixture_of_n_step_returns",
+    ),
+    (
+        "entropy is paid for after a death",
+        "maths/soft_q.py",
+        "gamma * (next_bonus[t] + ahead) * ~terminated[t]",
+        "gamma * (next_bonus[t] + ahead * ~terminated[t])",
+        "maths/test_soft_q.py::test_the_soft_return_is_the_mixture_of_n_step_returns",
+    ),
+    (
+        "the normal of HL-Gauss is too narrow",
+        "maths/soft_q.py",
+        "(sigma * 2**0.5)",
+        "sigma",
+        "maths/test_soft_q.py::test_hl_gauss_is_the_mass_of_a_normal_in_each_bin",
+    ),
+    (
+        "HL-Gauss loses what lies outside",
+        "maths/soft_q.py",
+        "below.diff() / (below[:, -1:] - below[:, :1])",
+        "below.diff() / 2",
+        "maths/test_soft_q.py::test_hl_gauss_is_the_mass_of_a_normal_in_each_bin",
+    ),
+    (
+        "entropy is a cost in REPPO's target",
+        "algos/reppo.py",
+        "-alpha * next_log_prob",
+        "alpha * next_log_prob",
+        REPPO + "the_target_is_the_soft_return_of_the_policy_that_collected",
+    ),
+    (
+        "REPPO's KL is the other way round",
+        "data/soft_batch.py",
+        "Gaussian(self.mean, self.log_std).kl(Gaussian(policy.mean, policy.log_std))",
+        "Gaussian(policy.mean, policy.log_std).kl(Gaussian(self.mean, self.log_std))",
+        REPPO + "rows_within_the_bound_climb_and_the_others_come_back",
+    ),
+    (
+        "rows beyond the bound climb on",
+        "algos/reppo.py",
+        "torch.where(kl < config.max_kl, -soft_value, beta * kl)",
+        "(beta * kl - soft_value)",
+        REPPO + "rows_within_the_bound_climb_and_the_others_come_back",
+    ),
+    (
+        "the weight of the KL falls while the bound is broken",
+        "algos/reppo.py",
+        "beta * (config.max_kl - kl)",
+        "beta * (kl - config.max_kl)",
+        REPPO + "a_multiplier_grows_while_its_constraint_is_broken",
+    ),
+    (
+        "the policy's loss moves the temperature",
+        "algos/reppo.py",
+        "state.networks.multipliers().detach()",
+        "state.networks.multipliers()",
+        REPPO + "the_policys_loss_moves_neither_q_nor_the_multipliers",
+    ),
+    (
+        "the action hardly matters to Q",
+        "nn/actor_categorical_q.py",
+        "self.action_gain * action",
+        "action",
+        REPPO + "q_is_the_mean_of_its_distribution",
     ),
     (
         "noise runs on into the next episode",

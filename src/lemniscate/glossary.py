@@ -78,6 +78,8 @@ FIELDS = """
 `target_entropy` none | `target_entropy` auto | `autotune` | – (fixed α) | – | –
 `initial_temperature` | `ent_coef` (as auto_1.0) | `alpha` (fixed, unless autotune) | `alpha` (fixed) | – | `init_temperature`
 `max_kl` | `target_kl` | – | `delta` | – | `kl_limit`
+`td_lambda` | – | – | – | – | `lmbda`
+`value_range` | – | – | – | – | `v_max`
 `shrink` | `line_search_shrinking_factor` | – | `backtrack_coeff` | – | –
 `attempts` | `line_search_max_iter` | – | `backtrack_iters` | – | –
 `line_search` off | – | – | the algorithm npg | – | –

@@ -22,6 +22,13 @@ OFF_POLICY = {
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_the_contract_holds(check, algorithm, tmp_path):
     settings = OFF_POLICY if algorithm in ("ddpg", "td3", "sac") else ON_POLICY
-    minibatch = {"ppo": "minibatch_size", "trpo": "critic_minibatch_size", "reinforce": "critic_minibatch_size"}
+    if algorithm == "reppo":
+        settings = settings | {"env": "Pendulum-v1"}
+    minibatch = {
+        "reppo": "minibatch_size",
+        "ppo": "minibatch_size",
+        "trpo": "critic_minibatch_size",
+        "reinforce": "critic_minibatch_size",
+    }
     settings = settings | ({minibatch[algorithm]: 64} if algorithm in minibatch else {})
     check(algorithm, tmp_path, **settings, checkpoint_every=settings["total_steps"] // 4, evaluate_episodes=2)

@@ -21,6 +21,7 @@ KINDS = {
     "reinforce": ("reinforce", "Pendulum-v1", {"critic_minibatch_size": 16}),
     "a2c": ("a2c", "CartPole-v1", {}),
     "trpo": ("trpo", "HalfCheetah-v5", {"critic_minibatch_size": 16, "total_steps": 640}),
+    "reppo": ("reppo", "Pendulum-v1", {"minibatch_size": 16, "epochs": 3}),
     "ddpg": ("ddpg", "Pendulum-v1", OFF_POLICY["ddpg"]),
     "td3": ("td3", "HalfCheetah-v5", OFF_POLICY["td3"]),
     "sac": ("sac", "Pendulum-v1", OFF_POLICY["sac"] | {"evaluate_every": 800}),

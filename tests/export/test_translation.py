@@ -6,7 +6,7 @@ import torch
 from exported import BOX, exported, needs_compiler, observations_for, policy_for
 from torch import nn
 
-from lemniscate.algos import a2c, ddpg, ppo, reinforce, sac, td3, trpo
+from lemniscate.algos import a2c, ddpg, ppo, reinforce, reppo, sac, td3, trpo
 from lemniscate.errors import UserError
 from lemniscate.exporting.deployed import Deployed, safe_action
 from lemniscate.exporting.translation import translate
@@ -66,7 +66,9 @@ def test_every_kind_of_actions(kind):
         assert host.flags == 0
 
 
-@pytest.mark.parametrize("algo", [reinforce, a2c, trpo, ppo, ddpg, td3, sac], ids=lambda algo: algo.__name__[16:])
+@pytest.mark.parametrize(
+    "algo", [reinforce, a2c, trpo, ppo, reppo, ddpg, td3, sac], ids=lambda algo: algo.__name__[16:]
+)
 def test_every_algorithm(algo):
     require_parity(exported(policy_for(algo=algo, normalize_observations=True)))
 

@@ -24,6 +24,7 @@ FIELDS = {
     "a2c": ("a2c", "CartPole-v1", ON_POLICY["a2c"] | {"total_steps": 3_200}),
     "trpo": ("trpo", "CartPole-v1", ON_POLICY["trpo"] | {"total_steps": 640}),
     "trpo-sync": ("trpo", "Pendulum-v1", ON_POLICY["trpo"] | {"backend": "gymnasium", "total_steps": 640}),
+    "reppo": ("reppo", "Pendulum-v1", ON_POLICY["reppo"]),
     "ddpg": ("ddpg", "Pendulum-v1", OFF_POLICY["ddpg"]),
     "ddpg-sync": ("ddpg", "Pendulum-v1", OFF_POLICY["ddpg-pink"] | {"backend": "gymnasium"}),
     "ddpg-compiled": ("ddpg", "Pendulum-v1", OFF_POLICY["ddpg"] | {"compile": "on"}),

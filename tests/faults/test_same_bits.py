@@ -12,7 +12,7 @@ from forks import LEMNISCATE, Forks, command
 from lemniscate.run import checkpoint
 from run.test_run import OFF_POLICY, ON_POLICY, final_hashes, history, words_for
 
-ALGORITHMS = ("reinforce", "a2c", "trpo", "ppo", "ddpg", "td3", "sac")
+ALGORITHMS = ("reinforce", "a2c", "trpo", "ppo", "reppo", "ddpg", "td3", "sac")
 DRAWING = """
 import sys, types
 import matplotlib.pyplot as plt, numpy, random, torch
@@ -43,7 +43,7 @@ BACKENDS = {"gymnasium": list(VARIANTS), "envpool": ["again", "with evaluations"
 def words(algorithm, backend):
     """The command that trains a run of some hundred steps, less its directory."""
     continuous = "Hopper-v5" if backend == "envpool" else "Pendulum-v1"
-    env = continuous if algorithm in OFF_POLICY else "CartPole-v1"
+    env = continuous if algorithm in (*OFF_POLICY, "reppo") else "CartPole-v1"
     chosen = OFF_POLICY.get(algorithm) or ON_POLICY.get(algorithm, {"minibatch_size": 16})
     small = tiny_off_policy(log_every=16) if algorithm in OFF_POLICY else SMALL
     fields = {**small, **chosen, "compile": "off", "total_steps": 640, "checkpoint_every": 320, "backend": backend}

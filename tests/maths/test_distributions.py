@@ -150,3 +150,17 @@ def test_the_kl_of_what_is_masked_in_both_is_finite():
     one, two = (Categorical(torch.tensor([[0.0, x, -1e9]], dtype=torch.float64)) for x in (1.0, -2.0))
     short = [Categorical(x.logits[:, :2]) for x in (one, two)]
     torch.testing.assert_close(one.kl(two), short[0].kl(short[1]))
+
+
+def test_the_kl_of_normals_is_that_of_their_images_under_tanh(rng):
+    """By integration over actions, on a fine grid of u = artanh a."""
+    grid = torch.linspace(-12, 12, 100_001, dtype=torch.float64)
+    actions, slope = torch.tanh(grid), 1 / torch.cosh(grid) ** 2
+    for mean, log_std, other_mean, other_log_std in (
+        torch.randn(6, 4, generator=rng, dtype=torch.float64) / 2
+    ).tolist():
+        pairs = [(mean, log_std), (other_mean, other_log_std)]
+        p, q = (distributions.Normal(m, math.exp(s)).log_prob(grid) - slope.log() for m, s in pairs)  # of actions
+        integral = torch.trapezoid(p.exp() * (p - q), actions)
+        one, other = (Gaussian(torch.tensor([[m]]), torch.tensor([[s]])) for m, s in pairs)
+        torch.testing.assert_close(one.kl(other)[0], integral.float(), rtol=1e-4, atol=1e-5)

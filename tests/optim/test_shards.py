@@ -6,9 +6,10 @@ from functools import partial
 import pytest
 import torch
 
-from helpers import begin, begin_off_policy, numbers, small, small_networks, small_off_policy
-from lemniscate.algos import a2c, ppo, reinforce, sac, trpo
+from helpers import begin, begin_off_policy, numbers, small, small_networks, small_off_policy, spec_of
+from lemniscate.algos import a2c, ppo, reinforce, reppo, sac, trpo
 from lemniscate.data.rollout import collect
+from lemniscate.data.soft_batch import SoftBatch
 from lemniscate.maths import Shards, standardize
 from lemniscate.optim.adam import Adam
 from lemniscate.optim.shards import GradientOverShards
@@ -64,6 +65,18 @@ def test_the_critics_of_sac_too(rng):
     state.networks.double(), state.targets.double()
     noise = torch.randn(48, 1, generator=rng, dtype=torch.float64)
     require_equal(*twins(state.networks.critics), partial(sac.critic_loss, config, state), batch, noise)
+
+
+def test_the_losses_of_reppo_too(rng):
+    config = reppo.Config(num_envs=4, num_steps=12, minibatch_size=24, hidden=(8,), max_kl=0.1)
+    torch.manual_seed(0)
+    state = reppo.init(config, spec_of(), torch.device("cpu"))
+    state.networks.double()
+    obs, action, mean, log_std = (torch.randn(48, n, generator=rng, dtype=torch.float64) for n in (5, 2, 2, 2))
+    noise, value, target = torch.randn(48, 2, generator=rng, dtype=torch.float64), *torch.randn(2, 48, generator=rng)
+    batch = SoftBatch(obs, action.tanh(), value.double(), target.double(), mean, log_std / 3 - 0.5)
+    require_equal(*twins(state.networks.critic), reppo.critic_loss, batch)
+    require_equal(*twins(state.networks.policy), partial(reppo.actor_loss, config, state), batch, noise)
 
 
 FIELDS = {

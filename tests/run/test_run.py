@@ -37,20 +37,20 @@ OFF_POLICY = {
 
 
 ON_POLICY = {
-    # name: algorithm and fields; in CartPole-v1
+    # name: algorithm and fields; in CartPole-v1, REPPO in Pendulum-v1
     "reinforce": {"scale_rewards": True, "critic_minibatch_size": 32},
     "reinforce-episodes": {"episodes": 1, "baseline": "mean", "returns": "episode"},
     "a2c": {"gae_lambda": 0.9},
     "trpo": {"final_critic_learning_rate": 0.1, "critic_minibatch_size": 32},
+    "reppo": {"epochs": 2, "minibatch_size": 16},
 }
 
 
 def train(path, env="Countdown-v0", **fields):
     if env in ON_POLICY:
         small = {"num_envs": 4, "num_steps": 8, "total_steps": 256, "hidden": (16,), "evaluate_episodes": 4}
-        return lem.train(
-            env.split("-")[0], "CartPole-v1", run=path, progress=False, **{**small, **ON_POLICY[env], **fields}
-        )
+        where = "Pendulum-v1" if env == "reppo" else "CartPole-v1"
+        return lem.train(env.split("-")[0], where, run=path, progress=False, **{**small, **ON_POLICY[env], **fields})
     if env in OFF_POLICY:
         fields = tiny_off_policy(**OFF_POLICY[env], **fields)
         return lem.train(env.split("-")[0], "Pendulum-v1", run=path, progress=False, **fields)

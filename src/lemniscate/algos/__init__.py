@@ -9,7 +9,7 @@ from typing import Any
 from lemniscate import named
 from lemniscate.errors import UserError, shown, unknown_name
 
-ALGORITHMS = ("reinforce", "a2c", "trpo", "ppo", "ddpg", "td3", "sac")
+ALGORITHMS = ("reinforce", "a2c", "trpo", "ppo", "reppo", "ddpg", "td3", "sac")
 
 REQUIRED = ("Config", "train")
 """names that a module needs to be an algorithm; `lemniscate.testing` checks the rest"""

@@ -58,7 +58,7 @@ class Config(OnPolicyConfig):
 
 
 @dataclass(kw_only=True)
-class State(OnPolicyState):
+class State(OnPolicyState[ActorCritic]):
     """The training state of A2C."""
 
     optimizer: Adam

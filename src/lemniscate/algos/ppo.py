@@ -80,7 +80,7 @@ class Config(OnPolicyConfig):
 
 
 @dataclass(kw_only=True)
-class State(OnPolicyState):
+class State(OnPolicyState[ActorCritic]):
     """The training state of PPO."""
 
     optimizer: Adam

@@ -81,7 +81,7 @@ class Config(OnPolicyConfig):
 
 
 @dataclass(kw_only=True)
-class State(OnPolicyState):
+class State(OnPolicyState[ActorCritic]):
     """The training state of REINFORCE."""
 
     optimizer: Adam

@@ -68,7 +68,7 @@ class Config(OnPolicyConfig):
 
 
 @dataclass(kw_only=True)
-class State(OnPolicyState):
+class State(OnPolicyState[ActorCritic]):
     """The training state of TRPO."""
 
     critic_optimizer: Adam

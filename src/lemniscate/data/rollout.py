@@ -2,13 +2,13 @@
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError
-from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.policies import Policy
 from lemniscate.spec import Box, Spec
 from lemniscate.types import Rollout, Streams
@@ -36,14 +36,12 @@ def rollout_bytes(spec: Spec, num_steps: int, num_envs: int) -> int:
 
 
 @torch.no_grad()
-def estimates(networks: ActorCritic, rollout: Rollout) -> tuple[Tensor, Tensor, Tensor]:
-    """V(s), V(s') and log π(a|s) of every row, [T, N] each; the networks are called with each shard alone."""
-    parts = (
-        (x.contiguous() for x in r.chunk(rollout.shards, 1)) for r in (rollout.obs, rollout.next_obs, rollout.action)
-    )
+def estimates(networks: Any, rollout: Rollout, *by_row: Tensor) -> tuple[Tensor, ...]:
+    """What `networks.estimates` says of every row, [T, N, …] each; `networks` is called with each shard alone."""
+    rows = (rollout.obs, rollout.next_obs, rollout.action, *by_row)
+    parts = ((x.contiguous() for x in r.chunk(rollout.shards, 1)) for r in rows)
     columns = [networks.estimates(*part) for part in zip(*parts, strict=True)]
-    value, next_value, log_prob = (torch.cat(column, dim=1) for column in zip(*columns, strict=True))
-    return value, next_value, log_prob
+    return tuple(torch.cat(column, dim=1) for column in zip(*columns, strict=True))
 
 
 def one_minibatch(valid_rows: Sequence[Tensor], num_rows: int) -> Tensor:

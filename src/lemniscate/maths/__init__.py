@@ -6,6 +6,7 @@ from lemniscate.maths.distributions import Distribution, Gaussian, tanh
 from lemniscate.maths.losses import clipped_surrogate, policy_gradient, surrogate, value_loss
 from lemniscate.maths.noise import coloured, normal, ornstein_uhlenbeck, uniform
 from lemniscate.maths.returns import episode_return, gae, reward_to_go
+from lemniscate.maths.soft_q import cross_entropy, hl_gauss, soft_lambda_return
 from lemniscate.maths.stats import (
     ONE_SHARD,
     Shards,
@@ -36,10 +37,12 @@ __all__ = [
     "clipped_surrogate",
     "coloured",
     "conjugate_gradient",
+    "cross_entropy",
     "episode_return",
     "explained_variance",
     "fisher_product",
     "gae",
+    "hl_gauss",
     "kl_k1",
     "kl_k3",
     "means",
@@ -51,6 +54,7 @@ __all__ = [
     "polyak",
     "ratio_statistics",
     "reward_to_go",
+    "soft_lambda_return",
     "standardize",
     "surrogate",
     "tanh",

@@ -1,6 +1,7 @@
 """Settings and training state of the algorithms that learn from their newest rollout."""
 
 from dataclasses import dataclass
+from typing import Any
 
 from lemniscate.data.rollout import rollout_bytes
 from lemniscate.errors import UserError
@@ -9,7 +10,7 @@ from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.networks import Layers
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.run.config import Count, Fraction, LogStd, RunConfig, Width
-from lemniscate.run.state import TrainState, rows_of
+from lemniscate.run.state import Networks, TrainState, rows_of
 from lemniscate.spec import Spec
 
 
@@ -38,7 +39,7 @@ class OnPolicyConfig(RunConfig):
         super().__post_init__()
         self.layers.check()
 
-    def networks(self, spec: Spec) -> ActorCritic:
+    def networks(self, spec: Spec) -> Any:
         """New networks for the spaces in `spec`: the policy and V(s)."""
         return ActorCritic(spec, self.layers, self.initial_log_std, self.normalize_observations)
 
@@ -76,13 +77,13 @@ class OnPolicyConfig(RunConfig):
 
 
 @dataclass(kw_only=True)
-class OnPolicyState(TrainState[ActorCritic]):
+class OnPolicyState(TrainState[Networks]):
     """The training state of the algorithms that learn from their newest rollout."""
 
     reward_scale: RewardScale
 
     def per_step_methods(self) -> list[tuple[object, str]]:
-        """Those of every algorithm, and V(s) and log π(a|s) of a rollout."""
+        """Those of every algorithm, and what is estimated of a rollout."""
         return [*super().per_step_methods(), (self.networks, "estimates")]
 
     def hold(self, held: range) -> None:

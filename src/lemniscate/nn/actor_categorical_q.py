@@ -1,0 +1,112 @@
+"""A stochastic policy, a Q(s, a) that is a distribution over bins, and the multipliers of two constraints."""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from lemniscate.nn.actor_critic import encoder_of, network_of, normalizer_of
+from lemniscate.nn.bounded_policies import SquashedGaussianPolicy
+from lemniscate.nn.networks import Layers
+from lemniscate.nn.normalizer import NoNorm
+from lemniscate.spec import Spec
+
+BINS = 101
+"""K, of Q's distribution"""
+INITIAL_MULTIPLIER = 0.01
+"""α and β at first, as in the paper"""
+
+
+class CategoricalQ(nn.Module):
+    """Q(s, a) as the mean of a distribution over K bins of equal width, behind the policy's observation normalizer.
+
+    Args:
+        normalizer: of observations.
+        encoder: from normalized observations to features.
+        net: from features and action to K = `BINS` logits.
+        value_range: the bins cover [-value_range, value_range].
+        action_gain: the factor of actions before `net`.
+    """
+
+    edges: Tensor
+
+    def __init__(
+        self, normalizer: NoNorm, encoder: nn.Module, net: nn.Module, value_range: float, action_gain: float
+    ) -> None:
+        super().__init__()
+        self.normalizer = normalizer
+        self.encoder = encoder
+        self.net = net
+        self.action_gain = action_gain
+        self.register_buffer("edges", torch.linspace(-value_range, value_range, BINS + 1), persistent=False)
+
+    def logits(self, obs: Tensor, action: Tensor) -> Tensor:
+        """[…, O] and […, A] to […, K]."""
+        features = self.encoder(self.normalizer(obs))
+        return self.net(torch.cat([features, self.action_gain * action], dim=-1))
+
+    def forward(self, obs: Tensor, action: Tensor) -> Tensor:
+        """[…, O] and […, A] to […]."""
+        centres = (self.edges[1:] + self.edges[:-1]) / 2
+        return self.logits(obs, action).softmax(-1) @ centres
+
+
+class Multipliers(nn.Module):
+    """Lagrange multipliers, each above zero; their logs are the parameter."""
+
+    def __init__(self, initial: Sequence[float]) -> None:
+        super().__init__()
+        self.log = nn.Parameter(torch.tensor([math.log(value) for value in initial]))
+
+    def forward(self) -> Tensor:
+        """[number of multipliers]."""
+        return self.log.exp()
+
+
+class ActorCategoricalQ(nn.Module):
+    """A stochastic policy for bounded continuous actions, Q(s, a) as a distribution, and the multipliers α and β.
+
+    Args:
+        spec: of the environment.
+        layers: of the policy, and of the critic.
+        normalize_observations: put a running normalizer in front of both.
+        initial_log_std: log σ of the policy before the tanh, at first.
+        value_range: of the critic's bins.
+
+    Raises:
+        UserError: actions that are not continuous, or without bounds.
+    """
+
+    def __init__(
+        self,
+        spec: Spec,
+        layers: Layers,
+        normalize_observations: bool,
+        initial_log_std: float,
+        value_range: float,
+    ) -> None:
+        super().__init__()
+        size = spec.bounded_box().size
+        normalizer = normalizer_of(spec, normalize_observations)
+        self.policy = SquashedGaussianPolicy(normalizer, network_of(spec, layers, 2 * size, last_gain=0.01), size)
+        _begin_with(self.policy, initial_log_std)
+        encoder, features = encoder_of(spec)
+        net = layers.network(features + size, BINS, last_gain=0.01)
+        gain = (features / size) ** 0.5  # of two parts of the input, neither drowns the other
+        self.critic = CategoricalQ(normalizer, encoder, net, value_range, action_gain=gain)
+        self.multipliers = Multipliers([INITIAL_MULTIPLIER] * 2)
+
+    def estimates(self, obs: Tensor, next_obs: Tensor, action: Tensor, noise: Tensor) -> tuple[Tensor, ...]:
+        """Q(s, a), Q(s', a') and log π(a'|s') of an a' drawn with `noise`, μ and log σ of π(·|s): of rows […, …]."""
+        policy = self.policy(obs)
+        next_action, next_log_prob = self.policy(next_obs).sample_with_log_prob(noise)
+        values = self.critic(obs, action), self.critic(next_obs, next_action)
+        return *values, next_log_prob, policy.mean, policy.log_std
+
+
+def _begin_with(policy: SquashedGaussianPolicy, log_std: float) -> None:
+    """Set the last bias so that log σ is this where the network is zero."""
+    last = [module for module in policy.net.modules() if isinstance(module, nn.Linear)][-1:]
+    for layer in last:
+        nn.init.constant_(layer.bias[policy.size :], math.atanh((log_std + 5) / 3.5 - 1))
