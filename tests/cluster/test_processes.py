@@ -9,6 +9,7 @@ import sys
 import time
 from pathlib import Path
 
+import psutil
 import pytest
 from hosts import hosts
 
@@ -121,8 +122,10 @@ def test_a_rank_that_is_gone_is_named_and_all_end(tmp_path, how, sentence):
     flag = tmp_path / "hang"
     waits = "pass" if how == "hang" else "sum(range(10**12))"
     before = f"os.environ['HANG'] = {str(flag)!r}\n" + (HANG.format(waits) if "hang" in how else "")
-    processes = ranks(2, *ENDLESS, tmp_path / "r", before=before, patience=4)
+    in_peace = ("--checkpoint-every", 10**6, "--evaluate-every", 0)  # who saves or evaluates may be silent for 30 s
+    processes = ranks(2, *ENDLESS, tmp_path / "r", *in_peace, before=before, patience=4)
     wait_for(tmp_path / "r" / "metrics.jsonl")
+    time.sleep(1)
     began = time.monotonic()
     if how == "kill":
         processes[1].kill()
@@ -251,7 +254,7 @@ def test_processes_launches_them_and_leaves_none(tmp_path):
     wait_for(tmp_path / "endless" / "metrics.jsonl")
     launcher.kill()
     deadline = time.monotonic() + 2
-    while os.popen(f"pgrep -f 'resume {tmp_path}/endless'").read():
+    while any(str(tmp_path / "endless") in (p.info["cmdline"] or ()) for p in psutil.process_iter(["cmdline"])):
         assert time.monotonic() < deadline
         time.sleep(0.05)
 
