@@ -103,9 +103,10 @@ def train_on_ray(path: Path, algorithm: str, config: RunConfig, cluster: Cluster
         try:
             with watching:
                 result = trainer.fit()
-        except (KeyboardInterrupt, SystemExit):
+        except (KeyboardInterrupt, SystemExit) as asked:  # Ray makes the latter of SIGTERM
+            signum = signal.SIGTERM if isinstance(asked, SystemExit) else signal.SIGINT
             again = f"{resume_line(path)} --cluster ray --workers {workers}"
-            raise Stopped(f"Stopped; the last checkpoint is kept. Go on with: {again}", signal.SIGINT) from None
+            raise Stopped(f"Stopped; the last checkpoint is kept. Go on with: {again}", signum) from None
         except TrainingFailedError as error:
             raise RankError(f"The workers failed {FAILURES} times; the last time: {error}") from None
         _fetch(result.checkpoint, path)
