@@ -105,6 +105,7 @@ def train_on_ray(path: Path, algorithm: str, config: RunConfig, cluster: Cluster
                 result = trainer.fit()
         except (KeyboardInterrupt, SystemExit) as asked:  # Ray makes the latter of SIGTERM
             signum = signal.SIGTERM if isinstance(asked, SystemExit) else signal.SIGINT
+            signal.alarm(0)  # else Ray's handler of SIGTERM aborts this process three seconds after it
             again = f"{resume_line(path)} --cluster ray --workers {workers}"
             raise Stopped(f"Stopped; the last checkpoint is kept. Go on with: {again}", signum) from None
         except TrainingFailedError as error:
