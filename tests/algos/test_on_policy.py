@@ -8,7 +8,7 @@ import torch
 
 import environments
 from helpers import COMPILERS, MODES, CompiledCalls, begin, copy_of, equal, one_rollout, require_in_own_process, small
-from lemniscate.algos import a2c, ppo, reinforce, reppo, trpo
+from lemniscate.algos import a2c, ppo, reinforce, trpo
 from lemniscate.data.rollout import collect
 from lemniscate.errors import UserError
 
@@ -141,7 +141,7 @@ def test_a_single_row_has_no_standard_deviation(algo):
 def compiled_equals_eager(algo, env, programs):
     """Three updates from the same data, through a normalizer that moves."""
     compiled = CompiledCalls()
-    config = small(algo, env, num_steps=16, **({"epochs": 2} if algo is reppo else {}))
+    config = small(algo, env, num_steps=16)
     (one, envs), (two, _) = begin(algo, config), begin(algo, config)
     two.compile()
     for _ in range(3):
@@ -163,7 +163,6 @@ def compiled_equals_eager(algo, env, programs):
         "trpo, 'Pendulum-v1', programs=4",  # act, the estimates, the Fisher product, the value
         "trpo, 'CartPole-v1', programs=4",
         "a2c, 'Pendulum-v1', programs=3",
-        "reppo, 'Pendulum-v1', programs=3",  # act, the estimates, the gradient steps
         "reinforce, 'CartPole-v1', programs=4",  # act, the estimates, the policy, the value
     ],
 )

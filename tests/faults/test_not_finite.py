@@ -70,6 +70,10 @@ def is_off_policy(algorithm):
     return algorithm in ("ddpg", "td3", "sac")
 
 
+def needs_box(algorithm):
+    return is_off_policy(algorithm) or algorithm == "reppo"
+
+
 def content(run):
     return {file: file.read_bytes() for file in sorted((run / "checkpoints").rglob("*")) if file.is_file()}
 
@@ -114,7 +118,7 @@ def injections():
 def test_a_number_that_is_not_finite_is_named_with_its_environment_and_step(tmp_path, algorithm, every):
     counts = Counter()
     for number, (where, name, at) in enumerate(itertools.islice(injections(), 0, None, every)):
-        injected = {"where": where, "value": BAD[name], "at": at, "box": is_off_policy(algorithm)}
+        injected = {"where": where, "value": BAD[name], "at": at, "box": needs_box(algorithm)}
         if not math.isfinite(BAD[name]):  # JSON holds none
             injected["value"] = name
         said = ending(tmp_path / str(number), algorithm, env_kwargs=injected)
@@ -138,7 +142,7 @@ def test_huge_and_constant_numbers_are_learned_from_or_named(tmp_path, algorithm
     cases += [({"where": "measure", "value": name, "at": 5}, {"evaluate_every": 16}) for name in ("nan", "inf")]
     for number, (injected, more) in enumerate(itertools.islice(cases, 0, None, every)):
         own = {"scale_rewards": False} if not off_policy and number % 2 else {}
-        how = ending(tmp_path / str(number), algorithm, env_kwargs={**injected, "box": off_policy}, **own, **more)
+        how = ending(tmp_path / str(number), algorithm, env_kwargs={**injected, "box": needs_box(algorithm)}, **own, **more)
         assert how == "finished" or "step" in how, how
         counts["finished" if how == "finished" else "named"] += 1
     print(f"{algorithm}: {dict(counts)}, 0 non-finite tensors saved")
@@ -160,7 +164,7 @@ def test_parameters_that_overflow_are_neither_acted_with_nor_saved(tmp_path, alg
     for number, fields in enumerate(itertools.islice(rates(algorithm), 0, None, every)):
         if algorithm == "ppo":
             fields["desired_kl"] = None
-        box = {"box": is_off_policy(algorithm) or number % 2 == 0}
+        box = {"box": needs_box(algorithm) or number % 2 == 0}
         how = ending(tmp_path / str(number), algorithm, env_kwargs=box, **fields)
         assert how == "finished" or "step" in how, how
         counts["finished" if how == "finished" else "named"] += 1
