@@ -142,7 +142,9 @@ def test_huge_and_constant_numbers_are_learned_from_or_named(tmp_path, algorithm
     cases += [({"where": "measure", "value": name, "at": 5}, {"evaluate_every": 16}) for name in ("nan", "inf")]
     for number, (injected, more) in enumerate(itertools.islice(cases, 0, None, every)):
         own = {"scale_rewards": False} if not off_policy and number % 2 else {}
-        how = ending(tmp_path / str(number), algorithm, env_kwargs={**injected, "box": needs_box(algorithm)}, **own, **more)
+        how = ending(
+            tmp_path / str(number), algorithm, env_kwargs={**injected, "box": needs_box(algorithm)}, **own, **more
+        )
         assert how == "finished" or "step" in how, how
         counts["finished" if how == "finished" else "named"] += 1
     print(f"{algorithm}: {dict(counts)}, 0 non-finite tensors saved")
