@@ -8,7 +8,7 @@ import torch
 
 import environments
 from helpers import COMPILERS, MODES, CompiledCalls, begin, copy_of, equal, one_rollout, require_in_own_process, small
-from lemniscate.algos import a2c, ppo, reinforce, trpo
+from lemniscate.algos import a2c, ppo, reinforce, reppo, trpo  # noqa: F401  (a case names REPPO)
 from lemniscate.data.rollout import collect
 from lemniscate.errors import UserError
 
@@ -146,7 +146,8 @@ def compiled_equals_eager(algo, env, programs):
     two.compile()
     for _ in range(3):
         rollout = collect(envs, one.policy, config.num_steps, one.rng.action)
-        two.policy.act(rollout.obs[0], two.policy.draw_noise((4,), two.rng.action))
+        noise = two.policy.draw_noise((config.num_steps, config.num_envs), two.rng.action)  # as much as `collect` draws
+        two.policy.act(rollout.obs[0], noise[0])
         a, b = (algo.update(config, state, rollout) for state in (one, two))
         for name in a:
             torch.testing.assert_close(torch.as_tensor(a[name]), torch.as_tensor(b[name]), rtol=1e-3, atol=1e-5)
@@ -163,6 +164,7 @@ def compiled_equals_eager(algo, env, programs):
         "trpo, 'Pendulum-v1', programs=4",  # act, the estimates, the Fisher product, the value
         "trpo, 'CartPole-v1', programs=4",
         "a2c, 'Pendulum-v1', programs=3",
+        "reppo, 'Pendulum-v1', programs=3",  # act, the estimates, the gradient steps
         "reinforce, 'CartPole-v1', programs=4",  # act, the estimates, the policy, the value
     ],
 )

@@ -18,7 +18,7 @@ from lemniscate.nn.actor_categorical_q import ActorCategoricalQ, CategoricalQ, M
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.nn.policies import Policy
 from lemniscate.optim.adam import Adam, linear
-from lemniscate.run.config import Count, Finite, Fraction, LogStd, NumEnvs, Positive, Repeats, Width
+from lemniscate.run.config import Count, Finite, Fraction, NumEnvs, Positive, Repeats, SquashedLogStd, Width
 from lemniscate.run.on_policy import OnPolicyConfig, OnPolicyState
 from lemniscate.run.run import Run
 from lemniscate.spec import Spec
@@ -55,7 +55,7 @@ class Config(OnPolicyConfig):
     """the bins of Q's distribution cover [-value_range, value_range], in units of scaled rewards; usually 5 to 20"""
     hidden: tuple[Width, ...] = (128, 128)
     """widths of the hidden layers of the policy, and of Q"""
-    initial_log_std: LogStd = -1.0
+    initial_log_std: SquashedLogStd = -1.0
     """initial log σ of the policy before its tanh; usually -1.5 to -0.5"""
     activation: Activation = "silu"
     """activation function between the layers"""

@@ -180,12 +180,8 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
 
 def _add_endings(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--track", metavar="LOGGER", help="additional logger: wandb, or module:Class of your own")
-    parser.add_argument(
-        "--callbacks",
-        nargs="+",
-        metavar="FUNCTION",
-        help="sees each update and may stop the run: module:function, or 'module:Class(key=value)'",
-    )
+    functions = "may stop a run: module:function, 'module:Class(key=value)'"
+    parser.add_argument("--callbacks", nargs="+", metavar="FUNCTION", help=functions)
     parser.add_argument("--processes", default=1, metavar="INT", help="processes of this machine for one run [1]")
     add_cluster_options(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress on standard error")

@@ -37,7 +37,7 @@ def rollout_bytes(spec: Spec, num_steps: int, num_envs: int) -> int:
 
 @torch.no_grad()
 def estimates(networks: Any, rollout: Rollout, *by_row: Tensor) -> tuple[Tensor, ...]:
-    """What `networks.estimates` says of every row, [T, N, …] each; `networks` is called with each shard alone."""
+    """The values of `networks.estimates` at every row, [T, N, …] each; it is called with each shard alone."""
     rows = (rollout.obs, rollout.next_obs, rollout.action, *by_row)
     parts = ((x.contiguous() for x in r.chunk(rollout.shards, 1)) for r in rows)
     columns = [networks.estimates(*part) for part in zip(*parts, strict=True)]

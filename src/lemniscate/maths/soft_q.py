@@ -1,4 +1,4 @@
-"""What a soft Q(s, a) that is a distribution over bins should say: Voelcker et al. 2025, arXiv:2507.11019."""
+"""Targets and loss of a soft Q(s, a) that is a distribution over bins: Voelcker et al. 2025, arXiv:2507.11019."""
 
 import torch
 from jaxtyping import Bool, Float

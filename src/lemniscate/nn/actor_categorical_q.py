@@ -89,12 +89,12 @@ class ActorCategoricalQ(nn.Module):
         super().__init__()
         size = spec.bounded_box().size
         normalizer = normalizer_of(spec, normalize_observations)
-        self.policy = SquashedGaussianPolicy(normalizer, network_of(spec, layers, 2 * size, last_gain=0.01), size)
-        _begin_with(self.policy, initial_log_std)
+        net = network_of(spec, layers, 2 * size, last_gain=0.01)
+        self.policy = SquashedGaussianPolicy(normalizer, net, size, initial_log_std)
         encoder, features = encoder_of(spec)
-        net = layers.network(features + size, BINS, last_gain=0.01)
+        critic = layers.network(features + size, BINS, last_gain=0.01)
         gain = (features / size) ** 0.5  # of two parts of the input, neither drowns the other
-        self.critic = CategoricalQ(normalizer, encoder, net, value_range, action_gain=gain)
+        self.critic = CategoricalQ(normalizer, encoder, critic, value_range, action_gain=gain)
         self.multipliers = Multipliers([INITIAL_MULTIPLIER] * 2)
 
     def estimates(self, obs: Tensor, next_obs: Tensor, action: Tensor, noise: Tensor) -> tuple[Tensor, ...]:
@@ -103,10 +103,3 @@ class ActorCategoricalQ(nn.Module):
         next_action, next_log_prob = self.policy(next_obs).sample_with_log_prob(noise)
         values = self.critic(obs, action), self.critic(next_obs, next_action)
         return *values, next_log_prob, policy.mean, policy.log_std
-
-
-def _begin_with(policy: SquashedGaussianPolicy, log_std: float) -> None:
-    """Set the last bias so that log σ is this where the network is zero."""
-    last = [module for module in policy.net.modules() if isinstance(module, nn.Linear)][-1:]
-    for layer in last:
-        nn.init.constant_(layer.bias[policy.size :], math.atanh((log_std + 5) / 3.5 - 1))

@@ -57,6 +57,7 @@ NonNegative = Annotated[float, Range(0)]
 Finite = Annotated[float, Range()]
 Epsilon = Annotated[float, Range(1e-30, 1)]  # a smaller one is a zero in float32
 LogStd = Annotated[float, Range(-10, 5)]
+SquashedLogStd = Annotated[float, Range(-4.9, 1.9)]  # of a `SquashedGaussianPolicy`
 
 
 def options_of(hint: Any) -> tuple[Any, ...]:
