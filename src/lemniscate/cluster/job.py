@@ -18,6 +18,7 @@ from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from shutil import copytree, rmtree
+from types import FrameType
 from typing import Any
 
 from lemniscate import named, processes
@@ -30,7 +31,7 @@ from lemniscate.results import report_on
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import CONFIG, LOCK, create_directory
 from lemniscate.run.launch import require_importable
-from lemniscate.run.run import Stopped
+from lemniscate.run.run import Stopped, stop_signals_to
 from lemniscate.run.sweep_progress import progress_of
 from lemniscate.run.trust import signed
 from lemniscate.stored import TrainedRun, load
@@ -100,14 +101,19 @@ def train_on_ray(path: Path, algorithm: str, config: RunConfig, cluster: Cluster
             ),
         )
         watching = _Progress(Path(storage) / name, config.total_steps) if options["progress"] else nullcontext()
+        asked: list[int] = []  # Ray makes exceptions of its own of what a handler raises
+
+        def stop(signum: int, _frame: FrameType | None) -> None:
+            asked.append(signum)
+            raise KeyboardInterrupt
+
         try:
-            with watching:
+            with stop_signals_to(stop), watching:
                 result = trainer.fit()
-        except (KeyboardInterrupt, SystemExit) as asked:  # Ray makes the latter of SIGTERM
-            signum = signal.SIGTERM if isinstance(asked, SystemExit) else signal.SIGINT
-            signal.alarm(0)  # else Ray's handler of SIGTERM aborts this process three seconds after it
+        except (KeyboardInterrupt, SystemExit):
             again = f"{resume_line(path)} --cluster ray --workers {workers}"
-            raise Stopped(f"Stopped; the last checkpoint is kept. Go on with: {again}", signum) from None
+            sentence = f"Stopped; the last checkpoint is kept. Go on with: {again}"
+            raise Stopped(sentence, asked[0] if asked else signal.SIGINT) from None  # Ray has Ctrl-C for itself
         except TrainingFailedError as error:
             raise RankError(f"The workers failed {FAILURES} times; the last time: {error}") from None
         _fetch(result.checkpoint, path)
