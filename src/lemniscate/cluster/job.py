@@ -163,7 +163,7 @@ def _fetch(checkpoint: Any, path: Path) -> None:
 
 
 def _work(given: dict[str, Any]) -> str | None:
-    """What each worker does. Returns the sentence of what ended the run, if that would end it again."""
+    """The program of each worker. Returns the sentence of what ended the run, if that would end it again."""
     import ray.train
     import torch.distributed as dist
     from ray.train.collective import broadcast_from_rank_zero

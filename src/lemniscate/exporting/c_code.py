@@ -272,7 +272,7 @@ def _plus(pointer: str | None, offset: int) -> str:
 
 
 def _strides(shape: tuple[int, ...]) -> list[int]:
-    """Of an array in C's order."""
+    """The strides of an array in C's order."""
     return [int(np.prod(shape[axis + 1 :])) for axis in range(len(shape))]
 
 

@@ -76,7 +76,7 @@ PPO = [
             hidden=(128, 128),
             checkpoint_every=2_000_000,
         ),
-        "search by hand, 8 settings, on seed 101",
+        "search by hand, 12 settings, on seed 101",
         "2026-11",
     ),
     Preset(
