@@ -10,6 +10,7 @@ from lemniscate.nn.actor_critic import encoder_of, network_of, normalizer_of
 from lemniscate.nn.bounded_policies import SquashedGaussianPolicy
 from lemniscate.nn.networks import Layers
 from lemniscate.nn.normalizer import NoNorm
+from lemniscate.nn.q_values import QValue
 from lemniscate.spec import Spec
 
 BINS = 101
@@ -18,7 +19,7 @@ INITIAL_MULTIPLIER = 0.01
 """α and β at first, as in the paper"""
 
 
-class CategoricalQ(nn.Module):
+class CategoricalQ(QValue):
     """Q(s, a) as the mean of a distribution over K bins of equal width, behind the policy's observation normalizer.
 
     Args:
@@ -34,10 +35,7 @@ class CategoricalQ(nn.Module):
     def __init__(
         self, normalizer: NoNorm, encoder: nn.Module, net: nn.Module, value_range: float, action_gain: float
     ) -> None:
-        super().__init__()
-        self.normalizer = normalizer
-        self.encoder = encoder
-        self.net = net
+        super().__init__(normalizer, encoder, net)
         self.action_gain = action_gain
         self.register_buffer("edges", torch.linspace(-value_range, value_range, BINS + 1), persistent=False)
 
