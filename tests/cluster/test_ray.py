@@ -208,8 +208,12 @@ def test_the_runs_of_a_sweep_are_tasks_that_end_in_the_same_bits(tmp_path, kill)
 
 @pytest.mark.parametrize("verb", [pytest.param(verb, marks=with_ray) for verb in ("train", "tune")])
 def test_a_set_that_is_stopped_saves_itself_and_goes_on_there_or_here(tmp_path, verb):
-    own = ["--seeds", "1-2"] if verb == "train" else ["--search", "gamma=.9:.99", "--trials", "2", "--seeds", "101"]
-    process = start(verb, *words("ppo", **RUN)[1:], *own, "--run", "set", "--cluster", "ray", cwd=tmp_path)
+    if verb == "train":
+        own = [*words("ppo", **RUN)[1:], "--seeds", "1-2"]
+    else:  # which chooses its checkpoints itself
+        own = ["ppo", "--env", "CartPole-v1", "--total-steps", RUN["total_steps"], "--compile", "off"]
+        own += ["--search", "gamma=.9:.99", "--trials", "2", "--seeds", "101"]
+    process = start(verb, *own, "--run", "set", "--cluster", "ray", cwd=tmp_path)
     assert wait_for(process, lambda: [*tmp_path.glob("set/**/step-*")])
     process.send_signal(signal.SIGINT)
     said = process.communicate(timeout=60)[1]
@@ -275,8 +279,10 @@ def test_without_ray_the_extra_is_named(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("address", [pytest.param("127.0.0.1:1", marks=with_ray)])
-def test_an_address_at_which_nobody_answers_has_its_sentence(tmp_path, address):
-    process = start(*words("ppo"), "--cluster", f"ray={address}", "--run", "run", cwd=tmp_path)
+@pytest.mark.parametrize("several", [[], ["--seeds", "1-2"]])
+def test_an_address_at_which_nobody_answers_has_its_sentence(tmp_path, address, several):
+    process = start(*words("ppo"), *several, "--cluster", f"ray={address}", "--run", "run", cwd=tmp_path)
     said = process.communicate(timeout=120)[1]
     assert process.returncode == 2, said
     assert f"No Ray cluster answers at {address}" in said
+    assert not [*tmp_path.iterdir()]

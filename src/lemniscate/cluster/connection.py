@@ -5,12 +5,14 @@
 
 import logging
 import os
+import socket
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 from lemniscate.errors import UserError, is_installed, missing_extra, shown
 
@@ -33,10 +35,10 @@ class Cluster:
 
 
 def find_cluster(cluster: object, workers: object = None, storage: object = None) -> Cluster | None:
-    """What a user names as `ray` or `ray=ADDRESS`; None if nothing is named.
+    """The cluster that a user names as `ray` or `ray=ADDRESS`; None if nothing is named.
 
     Raises:
-        UserError: another name, or a number that is none; Ray is not installed.
+        UserError: another name, or a number that is none; Ray is not installed; nobody listens at the address.
     """
     if cluster is None:
         for name, value in (("workers", workers), ("storage", storage)):
@@ -50,6 +52,7 @@ def find_cluster(cluster: object, workers: object = None, storage: object = None
         raise UserError(f"workers must be a whole number from 1 to {MOST_WORKERS:,}, not {shown(workers)}.")
     if not is_installed("ray"):
         raise missing_extra("ray", "ray")
+    _require_answer(address or os.environ.get("RAY_ADDRESS", ""))
     return Cluster(address or None, workers, None if storage is None else str(storage))
 
 
@@ -76,10 +79,23 @@ def connected(cluster: Cluster) -> Iterator[None]:
         ray.init(cluster.address, **options)
     except (ConnectionError, RuntimeError, ValueError) as error:
         logging.disable(logging.NOTSET)
-        where = cluster.address or os.environ.get("RAY_ADDRESS", "this machine")
-        raise UserError(f"No Ray cluster answers at {where}: {str(error).partition(chr(10))[0]}") from None
+        raise _no_answer(cluster.address or os.environ.get("RAY_ADDRESS", "this machine"), error) from None
     try:
         yield
     finally:
         ray.shutdown()
         logging.disable(logging.NOTSET)
+
+
+def _require_answer(address: str) -> None:
+    """Raise `UserError` at once where Ray would try for minutes: at a HOST:PORT that nobody listens at."""
+    try:
+        place = urlsplit(address if "://" in address else f"//{address}")
+        if place.hostname and place.port:
+            socket.create_connection((place.hostname, place.port), timeout=10).close()
+    except (OSError, ValueError) as error:
+        raise _no_answer(address, error) from None
+
+
+def _no_answer(address: str, error: Exception) -> UserError:
+    return UserError(f"No Ray cluster answers at {address}: {str(error).partition(chr(10))[0]}")

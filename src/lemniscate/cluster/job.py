@@ -70,13 +70,15 @@ def train_on_ray(path: Path, algorithm: str, config: RunConfig, cluster: Cluster
     """
     workers = cluster.workers or 1
     record = {"algorithm": algorithm, "config": config.to_json()}
-    if not (path / CONFIG).exists():
+    new = not (path / CONFIG).exists()
+    if new:
         config = config.replace(shards=max(config.shards, workers))
         record["config"] = config.to_json()
-        create_directory(path, CONFIG, signed(record))
     begun = pack(path) if (path / "checkpoints").exists() else None
     began = time.monotonic()
     with connected(cluster):
+        if new:
+            create_directory(path, CONFIG, signed(record))
         from ray.train import CheckpointConfig, FailureConfig, ScalingConfig
         from ray.train import RunConfig as JobConfig
         from ray.train.torch import TorchConfig, TorchTrainer
