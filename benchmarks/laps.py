@@ -2,10 +2,11 @@
 
     .venv/bin/python benchmarks/laps.py                        5 seeds for each lap time
     .venv/bin/python benchmarks/laps.py --laps 10 5 --seeds 1 2
-    .venv/bin/python benchmarks/laps.py --table                the table of what has been measured
+    .venv/bin/python benchmarks/laps.py --table                the table and the picture of what has been measured
 
-The preset `figure-eight` is trained for each lap time, and flies 64 unseen starts of one lap; the controllers fly the
-same starts in the same dynamics. Each row of `benchmarks/results/laps.jsonl` says how it was made.
+The preset `figure-eight`, a million steps long, is trained for each lap time, and flies 64 unseen starts of one lap;
+the controllers fly the same starts in the same dynamics. Each row of `benchmarks/results/laps.jsonl` says how it was
+made.
 """
 
 import argparse
@@ -16,7 +17,7 @@ from statistics import mean
 os.environ.setdefault("SCIPY_ARRAY_API", "1")
 
 import numpy as np
-from common import append, provenance, rows
+from common import RESULTS, append, provenance, rows
 
 ENV, STARTS, HZ = "DroneFigureEightTrajectory-v0", 64, 50
 LAPS = (10.0, 8.0, 6.0, 5.0, 4.5)
@@ -32,7 +33,13 @@ def learned(lap, seed):
     import lemniscate as lem
 
     with tempfile.TemporaryDirectory() as folder:
-        fields = {"preset": "figure-eight", "seed": seed, "env_kwargs": arguments(lap), "progress": False}
+        fields = {
+            "preset": "figure-eight",
+            "total_steps": 1_000_000,
+            "seed": seed,
+            "env_kwargs": arguments(lap),
+            "progress": False,
+        }
         run = lem.train("ppo", ENV, run=f"{folder}/run", **fields)
         scores = [lem.evaluate(run.policy, episodes=STARTS, seed=0, baseline=pd) for pd in (False, True)]
     mine, pd = ({"mm": s.measures["rmse_after_1s_mm"], "crashes": s.terminated} for s in scores)
@@ -79,6 +86,34 @@ def table():
         print(f"| {lap:g} | {mean(mine):.1f} mm ({max(mine):.1f}) | {crashes} of {STARTS * len(of)} | {others} |")
 
 
+def draw():
+    """Error by lap time, a line for each controller, and the seeds of ours."""
+    from matplotlib.figure import Figure
+
+    found = rows("laps")
+    laps = sorted({row["lap"] for row in found})
+    figure = Figure(figsize=(6, 3.2), layout="constrained")
+    axes = figure.subplots()
+    for name, label, color in (
+        ("learned", "PPO", "#3465a4"),
+        ("pd", "PD", "#888a85"),
+        ("mellinger", "Mellinger", "#c17d11"),
+    ):
+        errors = [[row[name]["mm"] for row in found if row["lap"] == lap] for lap in laps]
+        axes.plot(laps, [mean(of) for of in errors], color=color, marker="o", markersize=4)
+        axes.annotate(label, (laps[-1], mean(errors[-1])), (6, 0), textcoords="offset points", va="center", color=color)
+        if name == "learned":
+            axes.fill_between(
+                laps, [min(of) for of in errors], [max(of) for of in errors], color=color, alpha=0.2, lw=0
+            )
+    axes.set(yscale="log", xlabel="seconds a lap", xlim=(laps[0] - 0.3, laps[-1] + 1.4))
+    axes.set_title("error after the first second, mm", loc="left", fontsize=10)
+    axes.set_yticks([1, 3, 10, 30], ["1", "3", "10", "30"])
+    axes.minorticks_off()
+    axes.spines[["top", "right"]].set_visible(False)
+    figure.savefig(RESULTS / "laps.png", dpi=130)
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--laps", nargs="+", type=float, default=LAPS, help="seconds")
@@ -93,6 +128,7 @@ def main():
             append("laps", {"lap": lap, "seed": seed, "learned": mine, "mellinger": its, "pd": pd} | stamp)
             print(lap, seed, mine, its, pd, flush=True)
     table()
+    draw()
 
 
 if __name__ == "__main__":
