@@ -37,7 +37,11 @@ WAYS = {
     "figure-eight-robust": ("figure-eight-robust", {}, {}),
     "so_rpy_rotor alone": ("figure-eight", {"dynamics": "so_rpy_rotor", **ALONE}, {"total_steps": 2_000_000}),
     "so_rpy_rotor_drag alone": ("figure-eight", {"dynamics": "so_rpy_rotor_drag", **ALONE}, {"total_steps": 2_000_000}),
-    "first principles alone": ("figure-eight-robust", {"dynamics": "first_principles", "history": 5}, {}),
+    "first principles alone": (
+        "figure-eight-robust",
+        {"dynamics": "first_principles", "history": 5},
+        {"total_steps": 8_000_000},
+    ),
 }
 """preset, arguments of the environment, other fields"""
 

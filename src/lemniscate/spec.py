@@ -100,6 +100,8 @@ class Spec:
 
     `observation_parts` are the parts of the flat observation in their order; their sizes sum to O. With `image`, the
     only part is an image of bytes, height × width × channels, and stays bytes. `max_episode_steps` is the time limit.
+    In training, P = `privileged` numbers follow the observation: what a simulator knows and a vehicle does not. Critics
+    see them and policies do not (Pinto et al. 2018, arXiv:1710.06542), so a policy acts without them.
     """
 
     env_id: str
@@ -107,6 +109,7 @@ class Spec:
     action: Action
     max_episode_steps: int | None = None
     image: bool = False
+    privileged: int = 0
 
     def fits(self, other: "Spec") -> bool:
         """Whether a policy for one environment can act in the other."""
@@ -128,5 +131,5 @@ class Spec:
 
     @property
     def observation_size(self) -> int:
-        """O, the length of the flat observation, without the action mask."""
+        """O, the length of the flat observation, without the action mask and without what is privileged."""
         return sum(part.size for part in self.observation_parts)

@@ -18,11 +18,14 @@ import torch
 
 pytest.importorskip("crazyflow")
 
+import lemniscate as lem
 from lemniscate.envs import registry
 from lemniscate.envs.air import CONDITIONS, NOISE, disturb, read_ranges
-from lemniscate.envs.crazyflow import DYNAMICS, make_drones
+from lemniscate.envs.crazyflow import DYNAMICS, CrazyflowBackend, make_drones
 from lemniscate.envs.spaces import scale_action
 from lemniscate.errors import UserError
+from lemniscate.exporting.actions import act_with
+from lemniscate.exporting.flights import fly
 from lemniscate.spec import Box
 
 ENV = "DroneFigureEightTrajectory-v0"
@@ -329,6 +332,77 @@ def test_drones_of_several_dynamics_take_turns(mixed):
     assert at_once.mean() - later.mean() > 0.1
 
 
+def test_what_is_privileged_is_the_truth_about_each_drone_and_changes_no_flight():
+    kwargs = {
+        "dynamics": ["so_rpy", "first_principles"],
+        "mass": [0.5, 2.0],
+        "action_delay": 0.02,
+        "rotors": [0.2, 1.0],
+    }
+    kwargs |= {"wind": [0.0, 0.1], "max_episode_time": 0.2}
+    plain, told = (registry.make(ENV, 64, kwargs=kwargs | {"privileged": privileged}) for privileged in (False, True))
+    assert (plain.spec.privileged, told.spec.privileged) == (0, 4 + 3 + 4 + len(DYNAMICS))
+    assert told.spec.fits(plain.spec)
+    plain.restart(1), told.restart(1)
+    assert told.spec.observation_size == plain.spec.observation_size == plain.obs.shape[1]
+    for _ in range(12):  # beyond the end of episodes
+        size = plain.spec.observation_size
+        assert torch.equal(told.obs[:, :size], plain.obs)
+        for i, state in enumerate(told.backend._state):
+            hidden, (data, _, air) = told.obs[i::2, size:].numpy(), state
+            masses = np.asarray(data.params.mass).ravel() / MASS
+            np.testing.assert_allclose(hidden[:, 0], (masses - 1.25) / 0.75, atol=1e-5)
+            assert (hidden[:, 1] == 0).all()  # a condition that is a number has no place in a range
+            np.testing.assert_allclose(
+                np.linalg.norm(hidden[:, 4:7], axis=1), np.asarray(air["drawn"]["wind"]) / 0.1, atol=1e-5
+            )
+            rotors = np.asarray(data.states.rotor_vel).reshape(32, -1)
+            if i == 0:
+                assert (hidden[:, -8:-4] == 0).all()
+            else:
+                np.testing.assert_allclose(hidden[:, -8:-4], rotors / hovering(data), rtol=1e-4)
+            assert (hidden[:, -4:] == np.eye(4)[3 * i]).all()
+        action = torch.rand(64, 4) * 2 - 1
+        plain.step(action), told.step(action)
+
+
+def hovering(data):
+    """The rotor speed at which four rotors carry the nominal drone, by bisection."""
+    k0, k1, k2 = map(float, np.asarray(data.params.rpm2thrust).reshape(-1, 3)[0])
+    low, high = 0.0, 1e5
+    for _ in range(100):
+        middle = (low + high) / 2
+        low, high = (middle, high) if 4 * (k0 + k1 * middle + k2 * middle**2) < MASS * G else (low, middle)
+    return low
+
+
+@pytest.mark.parametrize("algorithm", ["ppo", "reppo", "sac"])
+def test_critics_are_told_what_policies_are_not(algorithm, tmp_path):
+    kwargs = {"mass": [0.5, 2.0], "privileged": True, "max_episode_time": 0.4}
+    fields = {"num_envs": 8, "total_steps": 64, "hidden": (16,), "compile": "off", "env_kwargs": kwargs}
+    fields |= {"batch_size": 8, "learning_starts": 16} if algorithm == "sac" else {"num_steps": 4, "minibatch_size": 16}
+    run = lem.train(algorithm, ENV, preset="default", run=tmp_path / "run", progress=False, **fields)
+    networks, size = run.policy.networks, run.policy.spec.observation_size
+    known = torch.randn(5, size + run.policy.spec.privileged)
+    other = torch.cat([known[:, :size], torch.randn(5, run.policy.spec.privileged)], dim=1)
+    for obs in (other, known[:, :size]):
+        assert torch.equal(networks.policy(obs).mode(), networks.policy(known).mode())
+    critic = (
+        networks.value if algorithm == "ppo" else networks.critic if algorithm == "reppo" else networks.critics.first
+    )
+    values = [critic(obs) if algorithm == "ppo" else critic(obs, torch.zeros(5, 4)) for obs in (known, other)]
+    assert not (values[0] == values[1]).any()
+    assert lem.evaluate(run.policy, episodes=2).returns == lem.evaluate(lem.load(run.path), episodes=2).returns
+    assert fly(run.policy, act_with(run.policy), rows=20).obs.shape[1] == size
+    flat = run.policy.act(np.zeros(size, np.float32))
+    assert flat.shape == (4,)
+
+
+def test_margins_need_nothing_that_is_privileged():
+    trained = {"mass": [0.5, 2.0], "privileged": True}
+    assert CrazyflowBackend.probe(ENV, 4, trained, {}).spec.privileged == 0
+
+
 @pytest.mark.parametrize(
     ("kwargs", "sentence"),
     [
@@ -345,6 +419,7 @@ def test_drones_of_several_dynamics_take_turns(mixed):
         ({"history": -1}, "history must be a whole number of steps from 0 to 50, not -1."),
         ({"history": 2.5}, "history must be a whole number of steps"),
         ({"winds": 1}, "winds"),
+        ({"privileged": 1}, "privileged must be true or false, not 1."),
     ],
 )
 def test_what_is_no_condition_has_its_sentence(kwargs, sentence):

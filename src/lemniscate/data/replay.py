@@ -127,7 +127,7 @@ def bytes_per_transition(spec: Spec) -> int:
 
 
 def _columns(spec: Spec) -> list[tuple[str, tuple[int, ...], torch.dtype]]:
-    obs = ((spec.observation_size,), torch.uint8 if spec.image else torch.float32)
+    obs = ((spec.observation_size + spec.privileged,), torch.uint8 if spec.image else torch.float32)
     return [
         ("obs", *obs),
         ("action", (spec.bounded_box().size,), torch.float32),

@@ -31,7 +31,7 @@ def collect(env: VecEnv, policy: Policy, num_steps: int, streams: Streams) -> Ro
 def rollout_bytes(spec: Spec, num_steps: int, num_envs: int) -> int:
     """The memory that a rollout takes while its steps [N, …] are stacked to [T, N, …]; of each step 1 kB of its own."""
     action = spec.action.size if isinstance(spec.action, Box) else 2
-    obs = spec.observation_size * (1 if spec.image else 4)
+    obs = (spec.observation_size + spec.privileged) * (1 if spec.image else 4)
     return num_steps * (num_envs * (3 * obs + 2 * (4 * action + 7)) + 1_000)
 
 

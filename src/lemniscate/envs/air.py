@@ -253,6 +253,28 @@ class Air:
             air["seen"] = seen
         return air
 
+    @property
+    def truths(self) -> int:
+        """The number of `truth`'s numbers."""
+        return len(self.ranges) + 3 * self.is_windy
+
+    def truth(self, air: dict[str, Any]) -> jax.Array:
+        """What a vehicle does not know of its air, [N, truths].
+
+        Each condition drawn by its place in its range, from -1 to 1; and the force of the wind and the gust, 1 where
+        it is the most that there is on average.
+        """
+        import jax.numpy as jnp
+
+        if not self.ranges:
+            return jnp.zeros((self.num_envs, 0))
+        low, high = air["ends"].T
+        drawn = jnp.stack([air["drawn"][name] for name in self.ranges], axis=1)
+        parts = [jnp.where(high > low, (2 * drawn - low - high) / jnp.where(high > low, high - low, 1), 0.0)]
+        if self.is_windy:
+            parts.append((air["wind"] + air["gust"]) / (self._most("wind") + self._most("gusts")))
+        return jnp.concatenate(parts, axis=1)
+
     def changes(self, air: dict[str, Any]) -> jax.Array:
         """The history as it is observed, [N, H, 13 + A], the newest first: states less the present one, and actions.
 

@@ -23,7 +23,7 @@ from lemniscate.envs.air import CONDITIONS, Ranges, read_ranges
 from lemniscate.envs.backend import Scene, Summary
 from lemniscate.envs.drone_interface import interface_of
 from lemniscate.envs.drone_probe import DroneProbe
-from lemniscate.envs.drones import Drones, Mixed
+from lemniscate.envs.drones import DYNAMICS, Drones, Mixed
 from lemniscate.envs.interface import Interface
 from lemniscate.envs.jax_backend import JaxBackend, Programs, jax_device
 from lemniscate.envs.pd import GAINS, PD
@@ -32,9 +32,10 @@ from lemniscate.errors import UserError, missing_extra, unknown_name
 from lemniscate.spec import Box, Spec
 
 IDS = ("DroneFigureEightTrajectory-v0", "DroneLanding-v0", "DroneReachPos-v0", "DroneReachVel-v0")
-DYNAMICS = ("so_rpy", "so_rpy_rotor", "so_rpy_rotor_drag", "first_principles")
 CONTROL_HZ = 50
 MOST_HISTORY = 50
+OWN = (*CONDITIONS, "history", "privileged", "dynamics")
+"""the arguments that are ours or read by us; the others are crazyflow's"""
 
 
 @lru_cache(maxsize=4)
@@ -50,18 +51,19 @@ def make_drones(
     env_id: str, num_envs: int, device: str, kwargs: Mapping[str, Any], dynamics: str | None, ranges: Ranges
 ) -> Drones:
     """So many drones in one dynamics, by default crazyflow's, and under conditions that need not be those of kwargs."""
-    own = {name: value for name, value in kwargs.items() if name not in (*CONDITIONS, "history", "dynamics")}
+    own = {name: value for name, value in kwargs.items() if name not in OWN}
     own |= {"dynamics": dynamics} if dynamics else {}
     with _quietly():
         made = gym.make_vec(env_id, num_envs=num_envs, device=device, **{"freq": CONTROL_HZ, **own}).unwrapped
-    return Drones(made, ranges, kwargs.get("history", 0))
+    return Drones(made, ranges, kwargs.get("history", 0), kwargs.get("privileged", False))
 
 
 def spec_of(env_id: str, drones: Drones) -> Spec:
     """The Spec of drones."""
     action = action_kind(drones.env.single_action_space, env_id)
     assert isinstance(action, Box)
-    return Spec(env_id, drones.parts, action, max_episode_steps=drones.episode_steps)
+    time_limit = drones.episode_steps
+    return Spec(env_id, drones.parts, action, max_episode_steps=time_limit, privileged=drones.privileged)
 
 
 class CrazyflowBackend(JaxBackend):
@@ -122,7 +124,7 @@ class CrazyflowBackend(JaxBackend):
         Conditions that only training has are nominal; so are the first dynamics, of those given or else of training.
         """
         _import()
-        own = {name: value for name, value in trained.items() if name not in CONDITIONS}
+        own = {name: value for name, value in trained.items() if name not in (*CONDITIONS, "privileged")}
         own = {**own, **given}
         dynamics = (*dynamics_of(own), None)[0]
         kwargs = {**own, "dynamics": dynamics} if dynamics else own
@@ -173,7 +175,7 @@ def _import() -> None:
 def _check(env_id: str, num_envs: int, kwargs: Mapping[str, Any]) -> None:
     """Raise `UserError` for an argument that the environment does not have, or a value that it cannot take."""
     entry: Any = gym.spec(env_id).vector_entry_point
-    known = {*inspect.signature(entry).parameters, *CONDITIONS, "history"} - {"num_envs", "device"}
+    known = {*inspect.signature(entry).parameters, *OWN} - {"num_envs", "device"}
     for name, value in kwargs.items():
         if name not in known:
             raise unknown_name(f"argument of {env_id}", name, known)
@@ -183,6 +185,8 @@ def _check(env_id: str, num_envs: int, kwargs: Mapping[str, Any]) -> None:
     history, several = kwargs.get("history", 0), dynamics_of(kwargs)
     if not isinstance(history, int) or isinstance(history, bool) or not 0 <= history <= MOST_HISTORY:
         raise UserError(f"history must be a whole number of steps from 0 to {MOST_HISTORY}, not {history!r}.")
+    if not isinstance(kwargs.get("privileged", False), bool):
+        raise UserError(f"privileged must be true or false, not {kwargs['privileged']!r}.")
     for name in several:
         if name not in DYNAMICS:
             raise unknown_name("dynamics", str(name), DYNAMICS)

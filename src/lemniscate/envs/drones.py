@@ -17,6 +17,7 @@ from lemniscate.spec import ObservationPart
 if TYPE_CHECKING:
     import jax
 
+DYNAMICS = ("so_rpy", "so_rpy_rotor", "so_rpy_rotor_drag", "first_principles")
 AHEAD = 0.75
 """the share of staggered episodes that begin ahead of their beginning"""
 STATE_PARTS = ("pos", "quat", "vel", "ang_vel")
@@ -37,9 +38,10 @@ class Drones:
         ranges: the conditions that are other than the simulator's.
         history: the number of steps before this one that are observed too: the state then less the present one, and
             the action.
+        privileged: let what the drone does not know follow its observation: the air, its rotors and its dynamics.
     """
 
-    def __init__(self, env: Any, ranges: Ranges, history: int = 0) -> None:
+    def __init__(self, env: Any, ranges: Ranges, history: int = 0, privileged: bool = False) -> None:
         import jax
         import jax.numpy as jnp
 
@@ -63,6 +65,8 @@ class Drones:
         past = [ObservationPart(("history",), (history, STATE_SIZE + self.action_size))] if history else []
         self.parts = (*(ObservationPart((name,), (sizes[name],)) for name in names), *past)
         """the flat observation: the drone's state first, then the task's own parts, then the history"""
+        self.privileged = self.air.truths + 4 + len(DYNAMICS) if privileged else 0
+        """the number of privileged numbers that follow the flat observation"""
         self.error = slice(STATE_SIZE, STATE_SIZE + 3) if REFERENCE in names else None
         self._own_parameters()
         self._arrays = [name for name, value in vars(env).items() if isinstance(value, jax.Array)]
@@ -198,7 +202,7 @@ class Drones:
         return jnp.concatenate([getattr(states, name)[:, 0] for name in STATE_PARTS], axis=-1)
 
     def _observe(self, air: dict[str, Any]) -> jax.Array:
-        """The flat observation [N, O], of the state as it is measured."""
+        """The flat observation, of the state as it is measured, and what is privileged, [N, O + P]."""
         import jax.numpy as jnp
 
         env, data = self.env, self.env.sim.data
@@ -209,7 +213,17 @@ class Drones:
         env.sim.data = data
         if self.air.history:
             parts["history"] = self.air.changes(air).reshape(self.num_envs, -1)
-        return jnp.concatenate([parts[part.name] for part in self.parts], axis=-1)
+        observed = [parts[part.name] for part in self.parts]
+        return jnp.concatenate([*observed, self._truth(air)] if self.privileged else observed, axis=-1)
+
+    def _truth(self, air: dict[str, Any]) -> jax.Array:
+        """What is privileged, [N, P]: the air, the four rotors' speed (1: hovering), and which dynamics, one-hot."""
+        import jax.numpy as jnp
+
+        rotors = self.env.sim.data.states.rotor_vel[:, 0] / np.where(self._turning > 0, self._turning, 1)
+        dynamics = np.eye(len(DYNAMICS), dtype=np.float32)[DYNAMICS.index(self.dynamics)]
+        each = [jnp.broadcast_to(part, (self.num_envs, part.shape[-1])) for part in (rotors, dynamics)]
+        return jnp.concatenate([self.air.truth(air), *each], axis=-1)
 
     def _way(self, obs: jax.Array) -> jax.Array:
         """The true way to the reference, [N, 3] m."""

@@ -10,12 +10,13 @@ from lemniscate.envs import registry
 from lemniscate.envs.interface import Interface
 from lemniscate.errors import UserError
 from lemniscate.exporting.actions import Act, act_with, for_policy
+from lemniscate.exporting.deployed import input_size
 from lemniscate.maths import Deterministic
 from lemniscate.nn.normalizer import RunningNorm
 from lemniscate.policy import TrainedPolicy
 from lemniscate.run.environments import env_arguments
 from lemniscate.run.evaluate import play_episodes
-from lemniscate.spec import Action, Box
+from lemniscate.spec import Box, Spec
 
 ENVIRONMENTS, ROWS, TESTS = 16, 10_000, 64
 """environments side by side; observations at least; those of them that the self-test has"""
@@ -32,13 +33,17 @@ class Flights:
 
 
 class _Driver:
-    """A function of rows in the place of a policy."""
+    """A function of rows, of what a policy is given, in the place of the policy."""
 
-    def __init__(self, act: Act, kind: Action) -> None:
-        self.act, self.kind = act, kind
+    def __init__(self, act: Act, spec: Spec) -> None:
+        self.act, self.kind, self.size = act, spec.action, input_size(spec)
 
     def __call__(self, obs: Tensor) -> Deterministic:
-        return Deterministic(for_policy(self.act(obs.numpy()), self.kind))
+        return Deterministic(for_policy(self.act(self.given(obs)), self.kind))
+
+    def given(self, obs: Tensor) -> np.ndarray:
+        """Rows of the environment without what is privileged."""
+        return np.ascontiguousarray(obs[:, : self.size].numpy())
 
 
 def fly(policy: TrainedPolicy, act: Act, rows: int = ROWS, seed: int = 0) -> Flights:
@@ -47,13 +52,13 @@ def fly(policy: TrainedPolicy, act: Act, rows: int = ROWS, seed: int = 0) -> Fli
     Raises `UserError` where the environment cannot be made, or is another now.
     """
     env = registry.make(num_envs=ENVIRONMENTS, device="cpu", **env_arguments(policy.config))
-    driver: Any = _Driver(act, policy.spec.action)
+    driver: Any = _Driver(act, policy.spec)
     seen: list[np.ndarray] = []
     try:
         if not env.spec.fits(policy.spec):
             raise UserError(f"{policy.spec.env_id} has other spaces here than in training.")
         for obs, _, _, counts in play_episodes(driver, env, episodes=10**9, seed=seed):
-            seen.append(obs[counts].numpy().copy())
+            seen.append(driver.given(obs[counts]).copy())
             if sum(map(len, seen)) >= rows:
                 break
         return Flights(np.concatenate(seen), getattr(env.backend, "interface", Interface()))

@@ -28,24 +28,30 @@ class CategoricalQ(QValue):
         net: from features and action to K = `BINS` logits.
         value_range: the bins cover [-value_range, value_range].
         action_gain: the factor of actions before `net`.
+        privileged: P, of `QValue`.
     """
 
     edges: Tensor
 
     def __init__(
-        self, normalizer: NoNorm, encoder: nn.Module, net: nn.Module, value_range: float, action_gain: float
+        self,
+        normalizer: NoNorm,
+        encoder: nn.Module,
+        net: nn.Module,
+        value_range: float,
+        action_gain: float,
+        privileged: int = 0,
     ) -> None:
-        super().__init__(normalizer, encoder, net)
+        super().__init__(normalizer, encoder, net, privileged)
         self.action_gain = action_gain
         self.register_buffer("edges", torch.linspace(-value_range, value_range, BINS + 1), persistent=False)
 
     def logits(self, obs: Tensor, action: Tensor) -> Tensor:
-        """[…, O] and […, A] to […, K]."""
-        features = self.encoder(self.normalizer(obs))
-        return self.net(torch.cat([features, self.action_gain * action], dim=-1))
+        """[…, O + P] and […, A] to […, K]."""
+        return self.net(torch.cat([self.features(obs), self.action_gain * action], dim=-1))
 
     def forward(self, obs: Tensor, action: Tensor) -> Tensor:
-        """[…, O] and […, A] to […]."""
+        """[…, O + P] and […, A] to […]."""
         centres = (self.edges[1:] + self.edges[:-1]) / 2
         return self.logits(obs, action).softmax(-1) @ centres
 
@@ -90,9 +96,9 @@ class ActorCategoricalQ(nn.Module):
         net = network_of(spec, layers, 2 * size, last_gain=0.01)
         self.policy = SquashedGaussianPolicy(normalizer, net, size, initial_log_std)
         encoder, features = encoder_of(spec)
-        critic = layers.network(features + size, BINS, last_gain=0.01)
-        gain = (features / size) ** 0.5  # of two parts of the input, neither drowns the other
-        self.critic = CategoricalQ(normalizer, encoder, critic, value_range, action_gain=gain)
+        critic = layers.network(features + spec.privileged + size, BINS, last_gain=0.01)
+        gain = ((features + spec.privileged) / size) ** 0.5  # of two parts of the input, neither drowns the other
+        self.critic = CategoricalQ(normalizer, encoder, critic, value_range, gain, spec.privileged)
         self.multipliers = Multipliers([INITIAL_MULTIPLIER] * 2)
 
     def estimates(self, obs: Tensor, next_obs: Tensor, action: Tensor, noise: Tensor) -> tuple[Tensor, ...]:

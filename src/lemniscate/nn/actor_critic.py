@@ -1,5 +1,6 @@
 """A policy and V(s) for the spaces of an environment: separate networks behind one normalizer."""
 
+import torch
 from torch import Tensor, nn
 
 from lemniscate.nn.images import ImageEncoder
@@ -10,16 +11,17 @@ from lemniscate.spec import Action, Box, Discrete, MultiDiscrete, Spec
 
 
 class Value(nn.Module):
-    """V(s), behind the policy's observation normalizer."""
+    """V(s), behind the policy's observation normalizer; it sees the last `privileged` numbers too, as they are."""
 
-    def __init__(self, normalizer: NoNorm, net: nn.Module) -> None:
+    def __init__(self, normalizer: NoNorm, net: nn.Module, privileged: int = 0) -> None:
         super().__init__()
         self.normalizer = normalizer
         self.net = net
+        self.privileged = privileged
 
     def forward(self, obs: Tensor) -> Tensor:
-        """[…, O] to […]."""
-        return self.net(self.normalizer(obs)).squeeze(-1)
+        """[…, O + P] to […]."""
+        return self.net(with_privileged(self.normalizer(obs), obs, self.privileged)).squeeze(-1)
 
 
 class ActorCritic(nn.Module):
@@ -30,7 +32,8 @@ class ActorCritic(nn.Module):
     ) -> None:
         super().__init__()
         self.policy = _policy(normalizer_of(spec, normalize_observations), spec, layers, initial_log_std)
-        self.value = Value(self.policy.normalizer, network_of(spec, layers, 1, last_gain=1.0))
+        net = network_of(spec, layers, 1, last_gain=1.0, more=spec.privileged)
+        self.value = Value(self.policy.normalizer, net, spec.privileged)
 
     def estimates(self, obs: Tensor, next_obs: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """V(s), V(s') and log π(a|s) of rows […, …], […] each."""
@@ -71,8 +74,13 @@ def encoder_of(spec: Spec) -> tuple[nn.Module, int]:
     return encoder, encoder.size
 
 
-def network_of(spec: Spec, layers: Layers, outputs: int, last_gain: float) -> nn.Module:
-    """A network from normalized observations, with an encoder before it where these are images."""
+def with_privileged(features: Tensor, obs: Tensor, privileged: int) -> Tensor:
+    """Features […, F], and behind them the last P = `privileged` numbers of […, O + P]: […, F + P]."""
+    return torch.cat([features, obs[..., obs.shape[-1] - privileged :]], dim=-1) if privileged else features
+
+
+def network_of(spec: Spec, layers: Layers, outputs: int, last_gain: float, more: int = 0) -> nn.Module:
+    """A network from normalized observations, with an encoder before it where these are images, and `more` inputs."""
     encoder, features = encoder_of(spec)
-    net = layers.network(features, outputs, last_gain)
+    net = layers.network(features + more, outputs, last_gain)
     return nn.Sequential(encoder, net) if spec.image else net

@@ -41,7 +41,8 @@ class ActorQ(nn.Module):
 
         def critic() -> QValue:
             encoder, features = encoder_of(spec)
-            return QValue(normalizer, encoder, critic_layers.network(features + size, 1, last_gain=1.0))
+            net = critic_layers.network(features + spec.privileged + size, 1, last_gain=1.0)
+            return QValue(normalizer, encoder, net, spec.privileged)
 
         self.critics = Critics(critic() for _ in range(critics))
 

@@ -6,22 +6,27 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor, nn
 
+from lemniscate.nn.actor_critic import with_privileged
 from lemniscate.nn.normalizer import NoNorm
 
 
 class QValue(nn.Module):
-    """Q(s, a), behind the policy's observation normalizer."""
+    """Q(s, a), behind the policy's observation normalizer; it sees the last `privileged` numbers too, as they are."""
 
-    def __init__(self, normalizer: NoNorm, encoder: nn.Module, net: nn.Module) -> None:
+    def __init__(self, normalizer: NoNorm, encoder: nn.Module, net: nn.Module, privileged: int = 0) -> None:
         super().__init__()
         self.normalizer = normalizer
         self.encoder = encoder
         self.net = net
+        self.privileged = privileged
+
+    def features(self, obs: Tensor) -> Tensor:
+        """[…, O + P] to […, F + P]."""
+        return with_privileged(self.encoder(self.normalizer(obs)), obs, self.privileged)
 
     def forward(self, obs: Tensor, action: Tensor) -> Tensor:
-        """[…, O] and […, A] to […]."""
-        features = self.encoder(self.normalizer(obs))
-        return self.net(torch.cat([features, action], dim=-1)).squeeze(-1)
+        """[…, O + P] and […, A] to […]."""
+        return self.net(torch.cat([self.features(obs), action], dim=-1)).squeeze(-1)
 
 
 class Critics(nn.Module):
