@@ -47,6 +47,20 @@ MUTANTS = [
         "maths/test_returns.py",
     ),
     (
+        "a critic is not told what is privileged",
+        "nn/actor_critic.py",
+        "obs[..., obs.shape[-1] - privileged :]",
+        "0 * obs[..., obs.shape[-1] - privileged :]",
+        "nn/test_critics.py::test_critics_see_what_is_privileged_and_policies_do_not",
+    ),
+    (
+        "a policy is told what is privileged",
+        "nn/normalizer.py",
+        "obs[..., : self.size]",
+        "obs[..., -self.size :]",
+        "nn/test_critics.py::test_critics_see_what_is_privileged_and_policies_do_not",
+    ),
+    (
         "lambda is forgotten",
         "maths/returns.py",
         "gamma * lam * (",

@@ -1,9 +1,13 @@
 """V(s), the critics Q(s, a), and the temperature."""
 
+from dataclasses import replace
+from functools import partial
+
 import pytest
 import torch
 
 from helpers import spec_of
+from lemniscate.nn.actor_categorical_q import ActorCategoricalQ
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.actor_q import ActorQ
 from lemniscate.nn.networks import Layers
@@ -14,6 +18,25 @@ def test_a_value_is_one_number_for_each_observation():
     value, obs = ActorCritic(spec_of(), Layers()).value, torch.randn(20, 5)
     assert value(obs).shape == (20,)
     assert value(obs.view(4, 5, 5)).shape == (4, 5)
+
+
+@pytest.mark.parametrize("kind", [ActorCritic, ActorQ, ActorCategoricalQ])
+def test_critics_see_what_is_privileged_and_policies_do_not(kind):
+    spec, layers = replace(spec_of(), privileged=3), Layers((8,))
+    if kind is ActorCritic:
+        networks = ActorCritic(spec, layers)
+        critic = networks.value
+    elif kind is ActorQ:
+        networks = ActorQ(spec, layers, layers, False, critics=2)
+        critic = partial(networks.q, action=torch.zeros(20, 2))
+    else:
+        networks = ActorCategoricalQ(spec, layers, False, -1.0, 10.0)
+        critic = partial(networks.critic, action=torch.zeros(20, 2))
+    obs = torch.randn(20, 8)
+    other = torch.cat([obs[:, :5], torch.randn(20, 3)], dim=1)
+    for given in (other, obs[:, :5]):
+        assert torch.equal(networks.policy(given).mode(), networks.policy(obs).mode())
+    assert not torch.isclose(critic(obs), critic(other), rtol=0).any()
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
