@@ -279,9 +279,20 @@ def test_an_algorithm_is_named_by_its_module_and_its_own_name_too(tmp_path, monk
     assert lem.load(run).step == 256
 
 
+@pytest.mark.parametrize("env", [["--env", "CartPole-v1"], ["--env=CartPole-v1"]])
+def test_who_names_no_algorithm_gets_the_recommended_one_and_is_told_why(tmp_path, capsys, env):
+    run = tmp_path / "run"
+    assert main(["train", *env, "--run", str(run), "--total-steps", "64", "--evaluate-every", "0"]) == 0
+    first, second, *_ = capsys.readouterr().err.splitlines()
+    assert first.startswith("No algorithm is named: ppo takes every kind of actions")
+    assert second.startswith("ppo on 8 × CartPole-v1")
+    assert json.loads((run / "config.json").read_text())["algorithm"] == "ppo"
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
+        (["train", "--env-args", "{}"], "Which algorithm? lemniscate train ALGORITHM …"),
         (["trian"], "There is no command 'trian': did you mean train?"),
         (["evaluat"], "There is no command 'evaluat': did you mean evaluate?"),
         (["--verion"], "The following arguments are required: COMMAND"),

@@ -17,7 +17,7 @@ from shutil import get_terminal_size
 from typing import Any, NoReturn
 
 from lemniscate import __version__
-from lemniscate.algos import ALGORITHMS
+from lemniscate.algos import ALGORITHMS, RECOMMENDED
 from lemniscate.cli.endings import exit_code, sentence
 from lemniscate.console import say
 from lemniscate.errors import UserError, is_installed, unknown_name
@@ -124,7 +124,7 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
     parser.add_argument("--version", action="version", version=f"lemniscate {__version__}", help="print the version")
     commands = parser.add_subparsers(dest="command", required=True, title="commands", metavar="COMMAND")
     subs = {name: commands.add_parser(name, help=text, description=text) for name, text in COMMANDS.items()}
-    subs["train"].usage = "lemniscate train ALGORITHM --env ID [--run DIR] [--preset NAME] [--FIELD VALUE …]"
+    subs["train"].usage = "lemniscate train [ALGORITHM] --env ID [--run DIR] [--preset NAME] [--FIELD VALUE …]"
     subs["tune"].usage = "lemniscate tune ALGORITHM --env ID --search RANGES [--trials INT] [--FIELD VALUE …]"
 
     subs["resume"].add_argument("run", type=Path, metavar="RUN", help="a run, a sweep or a search")
@@ -219,13 +219,18 @@ def _parse_algorithm(command: str, parser: Parser, words: list[str]) -> argparse
     misplaced = [word for word in words if word in titles]
     if misplaced and (strangers or not names):
         raise UserError(f"The algorithm comes first, then its fields: {verb} {misplaced[0]} …")
+    chosen = command == "train" and not names and any(re.match("--env(=|$)", word) for word in words)
+    if chosen:
+        names, words = [RECOMMENDED], [RECOMMENDED, *words]
     if not names:
         raise UserError(f"Which algorithm? {verb} ALGORITHM …, with one of {', '.join(titles)}.")
     if strangers:
         raise unknown_name("algorithm", strangers[0], titles)
     from lemniscate.cli.fields import parse_fields  # imports torch
 
-    return parse_fields(command, names, words[1:])
+    given = parse_fields(command, names, words[1:])
+    given.chosen = chosen
+    return given
 
 
 def _is_own(name: str) -> bool:
