@@ -13,7 +13,8 @@ from PIL import Image
 import lemniscate as lem
 from conftest import tiny_fields
 from lemniscate.algos import find
-from lemniscate.cli import algorithms, main, parse
+from lemniscate.cli import main, parse
+from lemniscate.cli.help import algorithms
 from lemniscate.run.texts import read
 
 TINY = [

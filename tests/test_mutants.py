@@ -48,7 +48,7 @@ MUTANTS = [
     ),
     (
         "a critic is not told what is privileged",
-        "nn/actor_critic.py",
+        "nn/normalizer.py",
         "obs[..., obs.shape[-1] - privileged :]",
         "0 * obs[..., obs.shape[-1] - privileged :]",
         "nn/test_critics.py::test_critics_see_what_is_privileged_and_policies_do_not",

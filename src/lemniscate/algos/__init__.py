@@ -12,7 +12,7 @@ from lemniscate.errors import UserError, shown, unknown_name
 ALGORITHMS = ("reinforce", "a2c", "trpo", "ppo", "reppo", "ddpg", "td3", "sac")
 
 RECOMMENDED = "ppo"
-"""for who names none: it takes every kind of actions, and in most rows of docs/results.md it needs the fewest minutes"""
+"""for who names none: it takes every kind of actions, and mostly needs the fewest minutes (docs/results.md)"""
 
 REQUIRED = ("Config", "train")
 """names that a module needs to be an algorithm; `lemniscate.testing` checks the rest"""

@@ -9,7 +9,7 @@ import argparse
 import os
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from importlib import import_module
 from itertools import takewhile
 from pathlib import Path
@@ -18,7 +18,7 @@ from typing import Any, NoReturn
 
 from lemniscate import __version__
 from lemniscate.algos import ALGORITHMS, RECOMMENDED
-from lemniscate.cli.endings import exit_code, sentence
+from lemniscate.cli.endings import exit_code, sentence, unknown_argument
 from lemniscate.console import say
 from lemniscate.errors import UserError, is_installed, unknown_name
 
@@ -75,13 +75,6 @@ def parse(arguments: Sequence[str]) -> argparse.Namespace:
         options = [option for option in commands[given.command]._option_string_actions if option.startswith("--")]
         raise unknown_argument(rest, lambda flag: unknown_name("option", flag, options))
     return given
-
-
-def algorithms() -> dict[str, str]:
-    """The algorithms, and the first line of each file, read from there: to import them is to import torch."""
-    folder = Path(__file__).parents[1] / "algos"
-    lines = {name: (folder / f"{name}.py").read_text().partition("\n")[0] for name in ALGORITHMS}
-    return {name: line.removeprefix('"""') for name, line in lines.items()}
 
 
 def add_train_options(parser: argparse.ArgumentParser) -> None:
@@ -198,34 +191,29 @@ def add_cluster_options(parser: argparse.ArgumentParser) -> None:
 
 def _parse_algorithm(command: str, parser: Parser, words: list[str]) -> argparse.Namespace:
     """The words of `train` and `tune`, which begin with an algorithm."""
-    titles, verb = algorithms(), f"lemniscate {command}"
+    verb = f"lemniscate {command}"
     asks = "-h" in words or "--help" in words
     if asks and (words[0].startswith("-") or "," in words[0]):
-        from lemniscate.cli.tune_options import add_tune_options
+        from lemniscate.cli.help import print_help
 
-        (add_train_options if command == "train" else add_tune_options)(parser)
-        listed = "\n".join(f"  {name:<12}{title}" for name, title in titles.items())
-        several = "several, such as ppo,sac, with --seeds; " if command == "train" else ""
-        parser.epilog = f"algorithms ({several}or a module of your own; ppo --help lists the fields of ppo):\n{listed}"
-        parser.print_help()
-        parser.exit()
-    apart = list(takewhile(titles.__contains__, (word.strip(",") for word in words)))
+        print_help(command, parser)
+    apart = list(takewhile(ALGORITHMS.__contains__, (word.strip(",") for word in words)))
     if len(apart) > 1:
         raise UserError(f"Several algorithms are one word: lemniscate train {','.join(apart)} --seeds 1-5 …")
     names = list(dict.fromkeys(words[0].split(","))) if words and not words[0].startswith("-") else []
     if command == "tune" and len(names) > 1:
         raise UserError(f"A search is for one algorithm: {verb} {names[0]} …")
-    strangers = [name for name in names if name not in titles and not _is_own(name)]
-    misplaced = [word for word in words if word in titles]
+    strangers = [name for name in names if name not in ALGORITHMS and not _is_own(name)]
+    misplaced = [word for word in words if word in ALGORITHMS]
     if misplaced and (strangers or not names):
         raise UserError(f"The algorithm comes first, then its fields: {verb} {misplaced[0]} …")
     chosen = command == "train" and not names and any(re.match("--env(=|$)", word) for word in words)
     if chosen:
         names, words = [RECOMMENDED], [RECOMMENDED, *words]
     if not names:
-        raise UserError(f"Which algorithm? {verb} ALGORITHM …, with one of {', '.join(titles)}.")
+        raise UserError(f"Which algorithm? {verb} ALGORITHM …, with one of {', '.join(ALGORITHMS)}.")
     if strangers:
-        raise unknown_name("algorithm", strangers[0], titles)
+        raise unknown_name("algorithm", strangers[0], ALGORITHMS)
     from lemniscate.cli.fields import parse_fields  # imports torch
 
     given = parse_fields(command, names, words[1:])
@@ -252,11 +240,3 @@ def _normalized(arguments: Sequence[str]) -> list[str]:
         else:
             words.append(word)
     return words
-
-
-def unknown_argument(rest: list[str], sentence_for: Callable[[str], UserError]) -> UserError:
-    """The sentence for the arguments that no parser understood: `sentence_for` the first flag among them."""
-    flags = [word.partition("=")[0] for word in rest if word.startswith("-")]
-    is_switch = rest[0].lower() in ("true", "false", "on", "off", "yes", "no")
-    hint = "a switch has no value: --flag or --no-flag." if is_switch else "--help lists what there is."
-    return sentence_for(flags[0]) if flags else UserError(f"Unknown argument {rest[0]!r}; {hint}")

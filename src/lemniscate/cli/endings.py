@@ -1,5 +1,7 @@
 """What a person reads, and what the shell gets, where a command ends with an error."""
 
+from collections.abc import Callable
+
 from lemniscate.console import talks
 from lemniscate.errors import NonFiniteError, NotStoredError, RankError, SweepError, UserError, WorkerError
 
@@ -30,3 +32,11 @@ def sentence(error: BaseException, command: str | None) -> str:
     if isinstance(error, OSError):  # a disk that is full, a folder that cannot be written
         return f"{error.filename or 'A file could not be written'}: {error.strerror}."
     return str(error)
+
+
+def unknown_argument(rest: list[str], sentence_for: Callable[[str], UserError]) -> UserError:
+    """The sentence for the arguments that no parser understood: `sentence_for` the first flag among them."""
+    flags = [word.partition("=")[0] for word in rest if word.startswith("-")]
+    is_switch = rest[0].lower() in ("true", "false", "on", "off", "yes", "no")
+    hint = "a switch has no value: --flag or --no-flag." if is_switch else "--help lists what there is."
+    return sentence_for(flags[0]) if flags else UserError(f"Unknown argument {rest[0]!r}; {hint}")

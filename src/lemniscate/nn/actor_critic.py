@@ -1,11 +1,10 @@
 """A policy and V(s) for the spaces of an environment: separate networks behind one normalizer."""
 
-import torch
 from torch import Tensor, nn
 
 from lemniscate.nn.images import ImageEncoder
 from lemniscate.nn.networks import Layers
-from lemniscate.nn.normalizer import NoNorm, RunningNorm, ScaleBytes
+from lemniscate.nn.normalizer import NoNorm, RunningNorm, ScaleBytes, with_privileged
 from lemniscate.nn.policies import BernoulliPolicy, CategoricalPolicy, GaussianPolicy, MultiCategoricalPolicy, Policy
 from lemniscate.spec import Action, Box, Discrete, MultiDiscrete, Spec
 
@@ -72,11 +71,6 @@ def encoder_of(spec: Spec) -> tuple[nn.Module, int]:
     height, width, channels = spec.observation_parts[0].shape
     encoder = ImageEncoder((height, width, channels))
     return encoder, encoder.size
-
-
-def with_privileged(features: Tensor, obs: Tensor, privileged: int) -> Tensor:
-    """Features […, F], and behind them the last P = `privileged` numbers of […, O + P]: […, F + P]."""
-    return torch.cat([features, obs[..., obs.shape[-1] - privileged :]], dim=-1) if privileged else features
 
 
 def network_of(spec: Spec, layers: Layers, outputs: int, last_gain: float, more: int = 0) -> nn.Module:

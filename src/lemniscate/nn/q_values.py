@@ -6,8 +6,7 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor, nn
 
-from lemniscate.nn.actor_critic import with_privileged
-from lemniscate.nn.normalizer import NoNorm
+from lemniscate.nn.normalizer import NoNorm, with_privileged
 
 
 class QValue(nn.Module):
