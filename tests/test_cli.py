@@ -173,7 +173,9 @@ def test_version(capsys):
     assert capsys.readouterr().out.startswith("lemniscate 0.")
 
 
-def test_help_of_train_lists_the_algorithms(capsys):
+@pytest.mark.parametrize("columns", [80, 120])
+def test_help_of_train_lists_the_algorithms(columns, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", str(columns))
     assert main(["train", "--help"]) == 0
     out = capsys.readouterr().out
     assert tuple(algorithms()) == ALGORITHMS

@@ -114,7 +114,7 @@ def test_each_run_of_a_trial_ends_in_the_bits_of_a_run_alone(tuned, tmp_path):
 def test_an_interrupted_search_goes_on_with_every_trial_exact(tuned, tmp_path):
     path = tmp_path / "search"
     words = ["tune", "ppo", *FLAGS, *SEARCH, "--seeds", "101", "--trials", "2", "--run", path]
-    first = command(*words)
+    first = command(*words, "--no-prune")  # which of two trials ends early is a matter of speed
     while not list(path.glob("trials/000/*/checkpoints/step-*")) and first.poll() is None:
         time.sleep(0.05)
     first.send_signal(signal.SIGINT)

@@ -172,13 +172,13 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
 
 
 def _add_endings(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--track", metavar="LOGGER", help="additional logger: wandb, or module:Class of your own")
-    functions = "may stop a run: module:function, 'module:Class(key=value)'"
+    parser.add_argument("--track", metavar="LOGGER", help="another logger: wandb, or module:Class of your own")
+    functions = "module:function or 'module:Class(key=value)'"
     parser.add_argument("--callbacks", nargs="+", metavar="FUNCTION", help=functions)
     parser.add_argument("--processes", default=1, metavar="INT", help="processes of this machine for one run [1]")
     add_cluster_options(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress on standard error")
-    parser.add_argument("--report", action="store_true", help="evaluate the final policy, and draw plots and videos")
+    parser.add_argument("--report", action="store_true", help="evaluate the final policy, draw plots and videos")
     parser.add_argument("--score", action="store_true", help="store the final return over 100 episodes")
 
 
