@@ -37,6 +37,8 @@ def test_critics_see_what_is_privileged_and_policies_do_not(kind):
     for given in (other, obs[:, :5]):
         assert torch.equal(networks.policy(given).mode(), networks.policy(obs).mode())
     assert not torch.isclose(critic(obs), critic(other), rtol=0).any()
+    with pytest.raises(RuntimeError):  # without them there is no value, and none is made up
+        critic(obs[:, :5])
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])

@@ -173,8 +173,8 @@ def parsers() -> tuple[Parser, dict[str, Parser]]:
 
 def _add_endings(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--track", metavar="LOGGER", help="another logger: wandb, or module:Class of your own")
-    functions = "module:function or 'module:Class(key=value)'"
-    parser.add_argument("--callbacks", nargs="+", metavar="FUNCTION", help=functions)
+    called = "called after each logged line: module:function"
+    parser.add_argument("--callbacks", nargs="+", metavar="FUNCTION", help=called)
     parser.add_argument("--processes", default=1, metavar="INT", help="processes of this machine for one run [1]")
     add_cluster_options(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress on standard error")
@@ -207,8 +207,8 @@ def _parse_algorithm(command: str, parser: Parser, words: list[str]) -> argparse
     misplaced = [word for word in words if word in ALGORITHMS]
     if misplaced and (strangers or not names):
         raise UserError(f"The algorithm comes first, then its fields: {verb} {misplaced[0]} …")
-    chosen = command == "train" and not names and any(re.match("--env(=|$)", word) for word in words)
-    if chosen:
+    unnamed = command == "train" and not names and any(re.match("--env(=|$)", word) for word in words)
+    if unnamed:
         names, words = [RECOMMENDED], [RECOMMENDED, *words]
     if not names:
         raise UserError(f"Which algorithm? {verb} ALGORITHM …, with one of {', '.join(ALGORITHMS)}.")
@@ -217,7 +217,7 @@ def _parse_algorithm(command: str, parser: Parser, words: list[str]) -> argparse
     from lemniscate.cli.fields import parse_fields  # imports torch
 
     given = parse_fields(command, names, words[1:])
-    given.chosen = chosen
+    given.unnamed = unnamed
     return given
 
 

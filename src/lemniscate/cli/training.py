@@ -4,7 +4,6 @@ import argparse
 from typing import Any
 
 from lemniscate import api, results, resumed, sweep
-from lemniscate.algos import RECOMMENDED
 from lemniscate.console import say, talks
 from lemniscate.envs import registry
 from lemniscate.errors import UserError
@@ -20,8 +19,9 @@ def train(given: argparse.Namespace) -> None:
     """Train one policy, or with --seeds one for each algorithm and seed."""
     shared = {"run": given.run, "preset": given.preset, "track": given.track, "report": given.report, **given.fields}
     shared["progress"] = not given.quiet
-    if given.chosen:
-        tell(f"No algorithm is named: {RECOMMENDED} takes every kind of actions and, mostly, needs the fewest minutes.")
+    if given.unnamed:
+        why = "takes every kind of actions and, mostly, needs the fewest minutes"
+        tell(f"No algorithm is named: {given.algorithm} {why}.")
     if given.seeds is not None or "," in given.algorithm:
         if "seed" in given.fields:
             raise UserError("Several runs have several seeds: --seeds 1-5, not --seed.")

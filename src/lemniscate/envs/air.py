@@ -254,12 +254,12 @@ class Air:
         return air
 
     @property
-    def truths(self) -> int:
-        """The number of `truth`'s numbers."""
+    def truth_size(self) -> int:
+        """The length of `truth`."""
         return len(self.ranges) + 3 * self.is_windy
 
     def truth(self, air: dict[str, Any]) -> jax.Array:
-        """What a vehicle does not know of its air, [N, truths].
+        """The conditions and the force on each drone, of which a vehicle knows nothing, [N, `truth_size`].
 
         Each condition drawn by its place in its range, from -1 to 1; and the force of the wind and the gust, 1 where
         it is the most that there is on average.

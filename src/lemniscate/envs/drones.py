@@ -38,7 +38,7 @@ class Drones:
         ranges: the conditions that are other than the simulator's.
         history: the number of steps before this one that are observed too: the state then less the present one, and
             the action.
-        privileged: let what the drone does not know follow its observation: the air, its rotors and its dynamics.
+        privileged: let privileged numbers follow the observation: the air, the rotors' speed and the dynamics.
     """
 
     def __init__(self, env: Any, ranges: Ranges, history: int = 0, privileged: bool = False) -> None:
@@ -65,7 +65,7 @@ class Drones:
         past = [ObservationPart(("history",), (history, STATE_SIZE + self.action_size))] if history else []
         self.parts = (*(ObservationPart((name,), (sizes[name],)) for name in names), *past)
         """the flat observation: the drone's state first, then the task's own parts, then the history"""
-        self.privileged = self.air.truths + 4 + len(DYNAMICS) if privileged else 0
+        self.privileged = self.air.truth_size + 4 + len(DYNAMICS) if privileged else 0
         """the number of privileged numbers that follow the flat observation"""
         self.error = slice(STATE_SIZE, STATE_SIZE + 3) if REFERENCE in names else None
         self._own_parameters()
@@ -217,7 +217,7 @@ class Drones:
         return jnp.concatenate([*observed, self._truth(air)] if self.privileged else observed, axis=-1)
 
     def _truth(self, air: dict[str, Any]) -> jax.Array:
-        """What is privileged, [N, P]: the air, the four rotors' speed (1: hovering), and which dynamics, one-hot."""
+        """The privileged numbers, [N, P]: the air, the four rotors' speed (1: hovering), the dynamics as one-hot."""
         import jax.numpy as jnp
 
         rotors = self.env.sim.data.states.rotor_vel[:, 0] / np.where(self._turning > 0, self._turning, 1)

@@ -10,7 +10,7 @@ from lemniscate.spec import Action, Box, Discrete, MultiDiscrete, Spec
 
 
 class Value(nn.Module):
-    """V(s), behind the policy's observation normalizer; it sees the last `privileged` numbers too, as they are."""
+    """V(s), behind the policy's observation normalizer; it sees the P = `privileged` numbers too, as they are."""
 
     def __init__(self, normalizer: NoNorm, net: nn.Module, privileged: int = 0) -> None:
         super().__init__()
@@ -20,7 +20,8 @@ class Value(nn.Module):
 
     def forward(self, obs: Tensor) -> Tensor:
         """[…, O + P] to […]."""
-        return self.net(with_privileged(self.normalizer(obs), obs, self.privileged)).squeeze(-1)
+        seen = with_privileged(self.normalizer(obs), obs, self.normalizer.size, self.privileged)
+        return self.net(seen).squeeze(-1)
 
 
 class ActorCritic(nn.Module):

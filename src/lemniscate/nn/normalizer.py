@@ -37,9 +37,9 @@ class ScaleBytes(NoNorm):
         return super().forward(obs).float() / 255 - 0.5
 
 
-def with_privileged(features: Tensor, obs: Tensor, privileged: int) -> Tensor:
-    """Features […, F], and behind them the last P = `privileged` numbers of […, O + P]: […, F + P]."""
-    return torch.cat([features, obs[..., obs.shape[-1] - privileged :]], dim=-1) if privileged else features
+def with_privileged(features: Tensor, obs: Tensor, size: int, privileged: int) -> Tensor:
+    """Features […, F] and, behind them, the P = `privileged` numbers after the first O = `size` of […, O + P]."""
+    return torch.cat([features, obs[..., size : size + privileged]], dim=-1) if privileged else features
 
 
 class WideBuffers(nn.Module):

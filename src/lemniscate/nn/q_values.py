@@ -10,7 +10,7 @@ from lemniscate.nn.normalizer import NoNorm, with_privileged
 
 
 class QValue(nn.Module):
-    """Q(s, a), behind the policy's observation normalizer; it sees the last `privileged` numbers too, as they are."""
+    """Q(s, a), behind the policy's observation normalizer; it sees the P = `privileged` numbers too, as they are."""
 
     def __init__(self, normalizer: NoNorm, encoder: nn.Module, net: nn.Module, privileged: int = 0) -> None:
         super().__init__()
@@ -21,7 +21,7 @@ class QValue(nn.Module):
 
     def features(self, obs: Tensor) -> Tensor:
         """[…, O + P] to […, F + P]."""
-        return with_privileged(self.encoder(self.normalizer(obs)), obs, self.privileged)
+        return with_privileged(self.encoder(self.normalizer(obs)), obs, self.normalizer.size, self.privileged)
 
     def forward(self, obs: Tensor, action: Tensor) -> Tensor:
         """[…, O + P] and […, A] to […]."""
