@@ -92,6 +92,59 @@ model.learn(1_000_000, EvalCallback(judge, stop, n_eval_episodes=100, eval_freq=
 print(model.num_timesteps)
 """
 
+PEER_MINUTES = """
+import importlib, time, torch
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import VecNormalize
+
+SHARED = dict(n_steps=512, policy_kwargs=dict(log_std_init=-2, ortho_init=False, net_arch=[256, 256]))
+PPO = {  # rl-baselines3-zoo, ppo.yml; Ant has the defaults there
+    "HalfCheetah-v5": dict(batch_size=64, gamma=0.98, learning_rate=2.0633e-5, ent_coef=0.000401762, clip_range=0.1,
+        n_epochs=20, gae_lambda=0.92, max_grad_norm=0.8, vf_coef=0.58096, **SHARED),
+    "Hopper-v5": dict(batch_size=32, gamma=0.999, learning_rate=9.80828e-5, ent_coef=0.00229519, clip_range=0.2,
+        n_epochs=5, gae_lambda=0.99, max_grad_norm=0.7, vf_coef=0.835671, **SHARED),
+    "Ant-v5": dict(),
+}
+
+class Clock(BaseCallback):
+    def __init__(self, started, minutes):
+        super().__init__()
+        self.started, self.minutes, self.curve, self.returns = started, minutes, [], []
+
+    def _on_step(self):
+        self.returns += [info["episode"]["r"] for info in self.locals["infos"] if "episode" in info]
+        spent = (time.monotonic() - self.started) / 60
+        if len(self.returns) >= 5 or self.returns and spent >= self.minutes:
+            self.curve.append([spent, self.num_timesteps, float(sum(self.returns) / len(self.returns))])
+            self.returns = []
+        return spent < self.minutes
+
+def train(library, algorithm, env, seed, minutes):
+    torch.set_num_threads(1)
+    started = time.monotonic()
+    package = importlib.import_module({"sb3": "stable_baselines3", "sbx": "sbx"}[library])
+    vector, fields = make_vec_env(env, n_envs=1, seed=seed), dict(learning_starts=10_000)
+    if algorithm == "ppo":
+        vector, fields = VecNormalize(vector), dict(PPO[env])
+        if "policy_kwargs" in fields and library == "sb3":
+            fields["policy_kwargs"] = {**fields["policy_kwargs"], "activation_fn": torch.nn.ReLU}
+        elif "policy_kwargs" in fields:
+            import flax.linen
+            fields["policy_kwargs"] = dict(log_std_init=-2, net_arch=[256, 256], activation_fn=flax.linen.relu)
+    clock = Clock(started, minutes)
+    model = getattr(package, algorithm.upper())("MlpPolicy", vector, seed=seed, **fields)
+    model.learn(10**9, clock)
+    spent = (time.monotonic() - started) / 60
+    judge = make_vec_env(env, n_envs=10, seed=10_000)
+    if algorithm == "ppo":
+        judge = VecNormalize(judge, training=False, norm_reward=False)
+        judge.obs_rms = vector.obs_rms
+    mean, _ = evaluate_policy(model, judge, n_eval_episodes=100)
+    return {"steps": model.num_timesteps, "minutes": spent, "curve": clock.curve, "mean_return": float(mean)}
+"""
+
 PEER_TRPO = """
 import sys, time, torch
 steps, kind, threads, cg_iterations, critic_epochs, max_kl = int(sys.argv[1]), sys.argv[2], *map(float, sys.argv[3:])

@@ -14,9 +14,10 @@ from lemniscate.data.rollout import collect, epoch_minibatches, estimates
 from lemniscate.data.soft_batch import SoftBatch
 from lemniscate.maths import cross_entropy, explained_variance, hl_gauss, means, soft_lambda_return
 from lemniscate.nn.activations import Activation
-from lemniscate.nn.actor_categorical_q import ActorCategoricalQ, CategoricalQ, Multipliers
+from lemniscate.nn.actor_categorical_q import ActorCategoricalQ, Multipliers
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.nn.policies import Policy
+from lemniscate.nn.q_values import CategoricalQ
 from lemniscate.optim.adam import Adam, linear
 from lemniscate.run.config import Count, Finite, Fraction, NumEnvs, Positive, Repeats, SquashedLogStd, Width
 from lemniscate.run.on_policy import OnPolicyConfig, OnPolicyState
@@ -113,7 +114,7 @@ def targets(config: Config, state: State, rollout: Rollout) -> SoftBatch:
 
 def critic_loss(critic: CategoricalQ, batch: SoftBatch) -> Loss:
     """Cross-entropy of the target's probabilities and Q's, over the bins."""
-    loss = cross_entropy(critic.logits(batch.obs, batch.action), hl_gauss(batch.target, critic.edges))
+    loss = cross_entropy(critic.logits(batch.obs, batch.action), hl_gauss(batch.target, critic.bins.edges))
     return loss, {"losses/critic": loss.detach()}
 
 

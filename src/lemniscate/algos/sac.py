@@ -8,19 +8,21 @@ from dataclasses import dataclass
 from functools import partial
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from lemniscate.data.replay import interact
-from lemniscate.maths import means, polyak, td_target, value_loss
+from lemniscate.maths import cross_entropy, hl_gauss, means, polyak, td_target, value_loss
 from lemniscate.nn.actor_q import SoftActorQ
+from lemniscate.nn.normalizer import RewardScale
 from lemniscate.nn.policies import Policy
-from lemniscate.nn.q_values import Critics, Temperature
+from lemniscate.nn.q_values import Bins, CategoricalQ, Critics, Temperature
 from lemniscate.optim.adam import Adam, linear
 from lemniscate.run.config import Finite, Positive
 from lemniscate.run.off_policy import OffPolicyConfig, OffPolicyState
 from lemniscate.run.run import Run
+from lemniscate.run.state import rows_of
 from lemniscate.spec import Spec
-from lemniscate.types import Flags, Loss, Metrics, Transition
+from lemniscate.types import Flags, Loss, Metrics, Step, Transition
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,10 +33,15 @@ class Config(OffPolicyConfig):
     """initial α; it is learned with actor_learning_rate"""
     target_entropy: Finite | None = None
     """H̄ in nats, the entropy that the temperature aims at, over actions in [-1, 1]^A; none: −A"""
+    value_range: Positive | None = None
+    """each Q is a distribution over bins on [-value_range, value_range], in units of the standard deviation of the
+    discounted return; usually 5 to 20; none: each Q is a number"""
 
     def networks(self, spec: Spec) -> SoftActorQ:
         """New networks for the spaces in `spec`: π, Q₁, Q₂ and α."""
-        return SoftActorQ(spec, *self.network_settings, critics=2, initial_temperature=self.initial_temperature)
+        bins = None if self.value_range is None else Bins(self.value_range, stretched=True)
+        own = {"critics": 2, "initial_temperature": self.initial_temperature, "bins": bins}
+        return SoftActorQ(spec, *self.network_settings, **own)
 
 
 @dataclass(kw_only=True)
@@ -44,6 +51,24 @@ class State(OffPolicyState[SoftActorQ]):
     actor_optimizer: Adam
     critic_optimizer: Adam
     temperature_optimizer: Adam
+    reward_scale: RewardScale
+
+    def observe(self, step: Step) -> None:
+        """Stretch the bins of Q, where it has any, to the rewards of one more step of the environments."""
+        if self.networks.bins is not None:
+            rows = step.reward, step.terminated | step.truncated, step.valid
+            self.reward_scale.update(*(row[None] for row in rows))
+            self.networks.bins.stretch(self.reward_scale.std)
+
+    def hold(self, held: range) -> None:
+        """Keep what every off-policy algorithm keeps, and the running returns of these shards."""
+        super().hold(held)
+        self.reward_scale.hold(rows_of(held, self.shards.count, len(self.reward_scale.running)))
+
+    def on_restart(self) -> None:
+        """Begin new sequences of action noise, and forget the running returns."""
+        super().on_restart()
+        self.reward_scale.on_restart()
 
 
 def init(config: Config, spec: Spec, device: torch.device) -> State:
@@ -57,6 +82,7 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
         temperature_optimizer=Adam(networks.temperature, name="temperature"),
         replay=config.make_replay(spec, device),
         action_noise=config.make_action_noise(spec, device),
+        reward_scale=RewardScale(config.num_envs, config.gamma).to(device),
         rng=config.generators(device),
         learn=learn,
     )
@@ -67,9 +93,18 @@ def critic_loss(config: Config, state: State, critics: Critics, batch: Transitio
     next_action, log_prob = state.networks.policy(batch.next_obs).sample_with_log_prob(noise)
     next_value = state.targets(batch.next_obs, next_action).amin(0) - state.networks.temperature() * log_prob
     target = td_target(batch.reward, next_value, batch.terminated, gamma=config.gamma).detach()
-    q = critics(batch.obs, batch.action)  # [2, M]
-    loss = value_loss(q[0], target) + value_loss(q[1], target)
-    return loss, {"losses/critic": loss.detach(), "q": q[0].detach().mean()}
+    (loss_1, q), (loss_2, _) = (distance(critic, batch, target) for critic in critics.members)
+    loss = loss_1 + loss_2
+    return loss, {"losses/critic": loss.detach(), "q": q.detach().mean()}
+
+
+def distance(critic: nn.Module, batch: Transition, target: Tensor) -> tuple[Tensor, Tensor]:
+    """½ (Q(s, a) − y)², or of a distribution its cross-entropy with y's probabilities over the bins; and Q [M]."""
+    if isinstance(critic, CategoricalQ):
+        logits = critic.logits(batch.obs, batch.action)
+        return cross_entropy(logits, hl_gauss(target, critic.bins.edges)), critic.bins.mean(logits)
+    q = critic(batch.obs, batch.action)
+    return value_loss(q, target), q
 
 
 def actor_loss(state: State, policy: Policy, batch: Transition, noise: Tensor) -> Loss:
@@ -122,7 +157,7 @@ def train(config: Config, run: Run) -> State:
         metrics: list[Metrics] = []
         for _ in run.steps(config.log_every):
             policy, random = state.networks.policy, state.step < config.learning_starts
-            interact(env, policy, state.replay, state.action_noise, state.rng.action, random=random)
+            state.observe(interact(env, policy, state.replay, state.action_noise, state.rng.action, random=random))
             state.step += config.num_envs
             if config.updates_at(state.step):
                 metrics.append(update(config, state))

@@ -99,8 +99,8 @@ def interact(
     *,
     noise_std: float = 1.0,
     random: bool = False,
-) -> None:
-    """One step of every parallel environment, added to the replay buffer.
+) -> Step:
+    """One step of every parallel environment, [N, …], added to the replay buffer.
 
     Args:
         env: the environments.
@@ -119,6 +119,7 @@ def interact(
         replay.add(obs, action, step)
         action_noise.on_episode_end(step.terminated | step.truncated | ~step.valid)
         policy.observe(obs, step.valid)
+    return step
 
 
 def bytes_per_transition(spec: Spec) -> int:

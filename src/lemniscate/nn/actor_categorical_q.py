@@ -9,51 +9,11 @@ from torch import Tensor, nn
 from lemniscate.nn.actor_critic import encoder_of, network_of, normalizer_of
 from lemniscate.nn.bounded_policies import SquashedGaussianPolicy
 from lemniscate.nn.networks import Layers
-from lemniscate.nn.normalizer import NoNorm
-from lemniscate.nn.q_values import QValue
+from lemniscate.nn.q_values import BINS, Bins, CategoricalQ
 from lemniscate.spec import Spec
 
-BINS = 101
-"""K, of Q's distribution"""
 INITIAL_MULTIPLIER = 0.01
 """α and β at first, as in the paper"""
-
-
-class CategoricalQ(QValue):
-    """Q(s, a) as the mean of a distribution over K bins of equal width, behind the policy's observation normalizer.
-
-    Args:
-        normalizer: of observations.
-        encoder: from normalized observations to features.
-        net: from features and action to K = `BINS` logits.
-        value_range: the bins cover [-value_range, value_range].
-        action_gain: the factor of actions before `net`.
-        privileged: P, of `QValue`.
-    """
-
-    edges: Tensor
-
-    def __init__(
-        self,
-        normalizer: NoNorm,
-        encoder: nn.Module,
-        net: nn.Module,
-        value_range: float,
-        action_gain: float,
-        privileged: int = 0,
-    ) -> None:
-        super().__init__(normalizer, encoder, net, privileged)
-        self.action_gain = action_gain
-        self.register_buffer("edges", torch.linspace(-value_range, value_range, BINS + 1), persistent=False)
-
-    def logits(self, obs: Tensor, action: Tensor) -> Tensor:
-        """[…, O + P] and […, A] to […, K]."""
-        return self.net(torch.cat([self.features(obs), self.action_gain * action], dim=-1))
-
-    def forward(self, obs: Tensor, action: Tensor) -> Tensor:
-        """[…, O + P] and […, A] to […]."""
-        centres = (self.edges[1:] + self.edges[:-1]) / 2
-        return self.logits(obs, action).softmax(-1) @ centres
 
 
 class Multipliers(nn.Module):
@@ -98,7 +58,7 @@ class ActorCategoricalQ(nn.Module):
         encoder, features = encoder_of(spec)
         critic = layers.network(features + spec.privileged + size, BINS, last_gain=0.01)
         gain = ((features + spec.privileged) / size) ** 0.5  # of two parts of the input, neither drowns the other
-        self.critic = CategoricalQ(normalizer, encoder, critic, value_range, gain, spec.privileged)
+        self.critic = CategoricalQ(normalizer, encoder, critic, Bins(value_range), gain, spec.privileged)
         self.multipliers = Multipliers([INITIAL_MULTIPLIER] * 2)
 
     def estimates(self, obs: Tensor, next_obs: Tensor, action: Tensor, noise: Tensor) -> tuple[Tensor, ...]:

@@ -11,7 +11,7 @@ from lemniscate.nn.bounded_policies import DeterministicPolicy, SquashedGaussian
 from lemniscate.nn.networks import Layers
 from lemniscate.nn.normalizer import NoNorm
 from lemniscate.nn.policies import Policy
-from lemniscate.nn.q_values import Critics, QValue, Temperature
+from lemniscate.nn.q_values import BINS, Bins, CategoricalQ, Critics, QValue, Temperature
 from lemniscate.spec import Spec
 
 Module = TypeVar("Module", bound=nn.Module)
@@ -26,23 +26,35 @@ class ActorQ(nn.Module):
         critic_layers: of each critic.
         normalize_observations: put a running normalizer in front of all of them.
         critics: C.
+        bins: those of a Q that is a distribution; None: Q is a number.
 
     Raises:
         UserError: actions that are not continuous, or without bounds.
     """
 
     def __init__(
-        self, spec: Spec, actor_layers: Layers, critic_layers: Layers, normalize_observations: bool, *, critics: int
+        self,
+        spec: Spec,
+        actor_layers: Layers,
+        critic_layers: Layers,
+        normalize_observations: bool,
+        *,
+        critics: int,
+        bins: Bins | None = None,
     ) -> None:
         super().__init__()
+        self.bins = bins
         size = spec.bounded_box().size
         normalizer = normalizer_of(spec, normalize_observations)
         self.policy: Policy = self._policy(spec, normalizer, actor_layers, size)
 
         def critic() -> QValue:
             encoder, features = encoder_of(spec)
-            net = critic_layers.network(features + spec.privileged + size, 1, last_gain=1.0)
-            return QValue(normalizer, encoder, net, spec.privileged)
+            inputs = features + spec.privileged + size
+            if self.bins is None:
+                return QValue(normalizer, encoder, critic_layers.network(inputs, 1, last_gain=1.0), spec.privileged)
+            net = critic_layers.network(inputs, BINS, last_gain=0.01)
+            return CategoricalQ(normalizer, encoder, net, self.bins, privileged=spec.privileged)
 
         self.critics = Critics(critic() for _ in range(critics))
 
@@ -58,12 +70,12 @@ class ActorQ(nn.Module):
         return torch.zeros(len(obs), device=obs.device)
 
     def target(self) -> nn.Module:
-        """A copy for the target networks: it shares the normalizer, and its parameters need no gradient."""
+        """A copy for the target networks, with the same normalizer and bins; its parameters need no gradient."""
         return self._follower(self)
 
     def _follower(self, networks: Module) -> Module:
-        normalizer = self.policy.normalizer
-        return copy.deepcopy(networks, {id(normalizer): normalizer}).requires_grad_(False)  # the memo keeps it shared
+        shared = {id(module): module for module in (self.policy.normalizer, self.bins)}  # a memo: these are not copied
+        return copy.deepcopy(networks, shared).requires_grad_(False)
 
 
 class SoftActorQ(ActorQ):
@@ -78,8 +90,9 @@ class SoftActorQ(ActorQ):
         *,
         critics: int,
         initial_temperature: float,
+        bins: Bins | None = None,
     ) -> None:
-        super().__init__(spec, actor_layers, critic_layers, normalize_observations, critics=critics)
+        super().__init__(spec, actor_layers, critic_layers, normalize_observations, critics=critics, bins=bins)
         self.temperature = Temperature(initial_temperature)
 
     def _policy(self, spec: Spec, normalizer: NoNorm, layers: Layers, size: int) -> Policy:

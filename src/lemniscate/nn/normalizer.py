@@ -109,7 +109,7 @@ class RewardScale(WideBuffers):
 
     def forward(self, reward: Tensor) -> Tensor:
         """Any shape to the same shape."""
-        return (reward / (self.var + 1e-8).sqrt().to(reward.dtype)).clamp(-self.clip, self.clip)
+        return (reward / self.std.to(reward.dtype)).clamp(-self.clip, self.clip)
 
     def hold(self, rows: slice) -> None:
         """Keep only the running returns of these environments."""
@@ -119,16 +119,24 @@ class RewardScale(WideBuffers):
         """Forget the running episodes: the environments have been restarted."""
         self.running = torch.zeros_like(self.running)
 
+    @property
+    def std(self) -> Tensor:
+        """The standard deviation of the discounted return so far, a scalar; 1 before the first update."""
+        return (self.var + 1e-8).sqrt()
+
     @torch.no_grad()
-    def scale(self, rollout: Rollout) -> Rollout:
-        """The rollout [T, N] with scaled rewards, after its returns Σ γ^k r_{t−k} have joined the statistics."""
+    def update(self, reward: Tensor, done: Tensor, valid: Tensor) -> None:
+        """Merge the returns Σ γ^k r_{t−k} of the `valid` rows [T, N] into the statistics."""
         returns = []
-        counted = rollout.reward.to(self.var.dtype) * rollout.valid
-        for reward, done in zip(counted, rollout.done, strict=True):
-            self.running = self.gamma * self.running + reward
+        for counted, ended in zip(reward.to(self.var.dtype) * valid, done, strict=True):
+            self.running = self.gamma * self.running + counted
             returns.append(self.running)
-            self.running = self.running * ~done
-        parts = (x.chunk(rollout.shards, 1) for x in (torch.stack(returns), rollout.valid))
+            self.running = self.running * ~ended
+        parts = (x.chunk(len(self.shards.held), 1) for x in (torch.stack(returns), valid))
         moments = self.shards.moments([rows[counted] for rows, counted in zip(*parts, strict=True)])
         self.mean, self.var, self.count = merge_moments(self.mean, self.var, self.count, *moments)
+
+    def scale(self, rollout: Rollout) -> Rollout:
+        """The rollout [T, N] with scaled rewards, after its returns have joined the statistics."""
+        self.update(rollout.reward, rollout.done, rollout.valid)
         return replace(rollout, reward=self(rollout.reward))

@@ -8,6 +8,9 @@ from torch import Tensor, nn
 
 from lemniscate.nn.normalizer import NoNorm, with_privileged
 
+BINS = 101
+"""K, the number of bins of a Q that is a distribution"""
+
 
 class QValue(nn.Module):
     """Q(s, a), behind the policy's observation normalizer; it sees the P = `privileged` numbers too, as they are."""
@@ -26,6 +29,67 @@ class QValue(nn.Module):
     def forward(self, obs: Tensor, action: Tensor) -> Tensor:
         """[…, O + P] and […, A] to […]."""
         return self.net(torch.cat([self.features(obs), action], dim=-1)).squeeze(-1)
+
+
+class Bins(nn.Module):
+    """K = `BINS` bins of equal width on [-c x, c x], x = `value_range` and c a scale of the values, 1 at first.
+
+    Args:
+        value_range: x.
+        stretched: c will move with the rewards (`stretch`), and is saved with the networks.
+    """
+
+    edges: Tensor
+    """[K + 1]"""
+
+    def __init__(self, value_range: float, *, stretched: bool = False) -> None:
+        super().__init__()
+        self.value_range = value_range
+        edges = torch.linspace(-value_range, value_range, BINS + 1)
+        self.register_buffer("edges", edges, persistent=stretched)
+
+    def stretch(self, scale: Tensor) -> None:
+        """Move the edges to the scale c, a scalar above zero: what a distribution says moves with them."""
+        self.edges.copy_(torch.linspace(-self.value_range, self.value_range, BINS + 1) * scale)
+
+    def mean(self, logits: Tensor) -> Tensor:
+        """The mean of the distributions with these logits: […, K] to […]."""
+        centres = (self.edges[1:] + self.edges[:-1]) / 2
+        return logits.softmax(-1) @ centres
+
+
+class CategoricalQ(QValue):
+    """Q(s, a) as the mean of a distribution over bins, behind the policy's observation normalizer.
+
+    Args:
+        normalizer: of observations.
+        encoder: from normalized observations to features.
+        net: from features and action to K = `BINS` logits.
+        bins: the K bins; several Q may share them.
+        action_gain: the factor of actions before `net`.
+        privileged: P, of `QValue`.
+    """
+
+    def __init__(
+        self,
+        normalizer: NoNorm,
+        encoder: nn.Module,
+        net: nn.Module,
+        bins: Bins,
+        action_gain: float = 1.0,
+        privileged: int = 0,
+    ) -> None:
+        super().__init__(normalizer, encoder, net, privileged)
+        self.bins = bins
+        self.action_gain = action_gain
+
+    def logits(self, obs: Tensor, action: Tensor) -> Tensor:
+        """[…, O + P] and […, A] to […, K]."""
+        return self.net(torch.cat([self.features(obs), self.action_gain * action], dim=-1))
+
+    def forward(self, obs: Tensor, action: Tensor) -> Tensor:
+        """[…, O + P] and […, A] to […]."""
+        return self.bins.mean(self.logits(obs, action))
 
 
 class Critics(nn.Module):

@@ -8,7 +8,7 @@ from pathlib import Path
 from lemniscate.algos import find
 from lemniscate.errors import unknown_name
 from lemniscate.presets.off_policy import DDPG, SAC, TD3
-from lemniscate.presets.on_policy import A2C, PPO, REINFORCE, TRPO
+from lemniscate.presets.on_policy import A2C, PPO, REINFORCE, REPPO, TRPO
 from lemniscate.presets.preset import Preset
 from lemniscate.presets.stored import read_preset
 from lemniscate.run.config import RunConfig
@@ -18,6 +18,7 @@ PRESETS: dict[str, list[Preset]] = {
     "a2c": A2C,
     "trpo": TRPO,
     "ppo": PPO,
+    "reppo": REPPO,
     "ddpg": DDPG,
     "td3": TD3,
     "sac": SAC,

@@ -22,6 +22,23 @@ QUICK = {
     "network": "layer_norm",
 }
 """small networks, and annealed learning rates"""
+SMALL = sac.Config(
+    total_steps=300_000,
+    num_envs=16,
+    num_updates=4,
+    log_every=100,
+    learning_starts=10_000,
+    actor_learning_rate=1e-3,
+    critic_learning_rate=1e-3,
+    final_learning_rate=0.1,
+    hidden=(128, 128),
+    critic_hidden=(128, 128),
+    network="layer_norm",
+    normalize_observations=True,
+    value_range=10.0,
+)
+"""for a CPU: many steps for each gradient step, small normalized networks, and a Q that is a distribution"""
+SIZED = "search by hand, four settings on HalfCheetah, Walker2d and Ant, on seed 101"
 PENDULUM = {"env": "Pendulum-v1", "total_steps": 20_000, "learning_starts": 1000, **QUICK}
 SWUNG = "search by hand, three settings of each algorithm, on seed 101"
 
@@ -83,7 +100,16 @@ TD3 = [
 ]
 SAC = [
     Preset("pendulum", sac.Config(**PENDULUM), SWUNG, "2026-11"),
-    Preset("half-cheetah", sac.Config(total_steps=300_000, **CHEETAH), "not searched: DDPG's", "2026-11"),
+    *(
+        Preset(name, SMALL.replace(env=env), SIZED, "2026-11")
+        for name, env in {
+            "half-cheetah": "HalfCheetah-v5",
+            "hopper": "Hopper-v5",
+            "walker2d": "Walker2d-v5",
+            "ant": "Ant-v5",
+        }.items()
+    ),
+    Preset("half-cheetah-long", sac.Config(total_steps=300_000, **CHEETAH), "not searched: DDPG's", "2026-11"),
     Preset(
         "lunar-lander-continuous",
         sac.Config(

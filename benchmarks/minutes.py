@@ -1,0 +1,201 @@
+"""Return against minutes: the eight algorithms, Stable-Baselines3 and SBX, on five environments.
+
+    .venv/bin/python benchmarks/minutes.py                              all of ours: 80 minutes on two cores
+    .venv/bin/python benchmarks/minutes.py ppo sac --envs Ant-v5        some of it
+    .venv/bin/python benchmarks/minutes.py sb3 sbx                      the peers; `make .venv/.peers` installs them
+    .venv/bin/python benchmarks/minutes.py --table                      the tables, and a picture for each environment
+
+One core and one thread for each run, as many runs at a time as there are cores. An algorithm has the settings that
+`lemniscate train ALGORITHM --env …` gives it, and about as many steps as take `MINUTES` there (`STEPS`): a learning
+rate that falls has to know where it ends. A peer has the settings of its zoo, and stops when the time is up.
+The clock starts before the environments are made, so that compiling counts. Each row of
+`benchmarks/results/minutes.jsonl` is a run: its curve, and its final policy over 100 episodes, deterministic.
+"""
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from queue import Queue
+
+import numpy as np
+from common import RESULTS, append, provenance, rows
+from peers import PEER_MINUTES
+
+MINUTES = {"Pendulum-v1": 1, "HalfCheetah-v5": 3, "Hopper-v5": 3, "Walker2d-v5": 3, "Ant-v5": 3}
+STEPS = {
+    # algorithm: thousands of steps in so many minutes, in the order of MINUTES
+    "reinforce": (450, 1400, 1000, 900, 500),
+    "a2c": (450, 1500, 1100, 1000, 500),
+    "trpo": (350, 900, 750, 600, 400),
+    "ppo": (350, 2000, 640, 750, 500),
+    "reppo": (250, 1050, 750, 650, 400),
+    "ddpg": (18, 32, 144, 50, 40),
+    "td3": (18, 32, 50, 50, 40),
+    "sac": (18, 170, 170, 170, 130),
+}
+PEERS = {"sb3": ("ppo",), "sbx": ("sac",)}
+PEER_ENVS = ("HalfCheetah-v5", "Hopper-v5", "Ant-v5")
+PEER_SEEDS = (1, 2)
+POINTS = 80
+"""of a stored curve, at most"""
+
+
+def train(algorithm, env, seed):
+    """Train in this process; returns what a row says of it."""
+    import lemniscate as lem
+
+    started, curve = time.monotonic(), []
+
+    def follow(step, metrics, _policy):
+        if "episode/return" in metrics:
+            curve.append([(time.monotonic() - started) / 60, step, metrics["episode/return"]])
+
+    steps = 1000 * STEPS[algorithm][list(MINUTES).index(env)]
+    with tempfile.TemporaryDirectory() as scratch:
+        fields = {"seed": seed, "total_steps": steps, "checkpoint_every": steps, "progress": False}
+        run = lem.train(algorithm, env, run=Path(scratch) / "run", callbacks=[follow], **fields)
+        minutes = (time.monotonic() - started) / 60
+        scores = lem.evaluate(run.policy, episodes=100, seed=0, backend="gymnasium")
+    return {"steps": run.policy.step, "minutes": minutes, "curve": curve, "mean_return": scores.mean_return}
+
+
+def peer(library, algorithm, env, seed):
+    """The same of a peer."""
+    import runpy
+
+    with tempfile.TemporaryDirectory() as scratch:
+        file = Path(scratch) / "peer.py"
+        file.write_text(PEER_MINUTES)
+        return runpy.run_path(str(file))["train"](library, algorithm, env, seed, MINUTES[env])
+
+
+def one(library, algorithm, env, seed, core):
+    """A run in this process, and its row."""
+    os.sched_setaffinity(0, [core])
+    row = train(algorithm, env, seed) if library == "lemniscate" else peer(library, algorithm, env, seed)
+    row["curve"] = [[round(x, 3) for x in point] for point in row["curve"][:: max(1, len(row["curve"]) // POINTS)]]
+    names = {"library": library, "algorithm": algorithm, "env": env, "seed": seed}
+    append("minutes", names | row | provenance())
+    print(
+        f"{library} {algorithm} {env} seed {seed}: {row['mean_return']:.0f} after {row['minutes']:.1f} min", flush=True
+    )
+
+
+def together(runs):
+    """Each run in a process of its own, on a core of its own."""
+    cores = Queue()
+    for core in sorted(os.sched_getaffinity(0)):
+        cores.put(core)
+
+    def start(run):
+        core = cores.get()
+        subprocess.run([sys.executable, __file__, "--one", *map(str, run), str(core)], check=False)
+        cores.put(core)
+
+    with ThreadPoolExecutor(cores.qsize()) as pool:
+        list(pool.map(start, runs))
+
+
+def measured(env):
+    """{(library, algorithm): its rows} of an environment, in the order of STEPS and PEERS."""
+    names = [("lemniscate", name) for name in STEPS] + [(library, name) for library in PEERS for name in PEERS[library]]
+    of = {
+        name: [r for r in rows("minutes") if (r["library"], r["algorithm"]) == name and r["env"] == env]
+        for name in names
+    }
+    return {name: found for name, found in of.items() if found}
+
+
+def label(library, algorithm):
+    named = {"sb3": "Stable-Baselines3", "sbx": "SBX"}
+    return algorithm.upper() if library == "lemniscate" else f"{named[library]}, {algorithm.upper()}"
+
+
+def table():
+    """A row for each algorithm: the final policy, mean over seeds, and its minutes."""
+    print("| |", " | ".join(f"{env}, {minutes} min" for env, minutes in MINUTES.items()), "|")
+    print("|---|" + "--:|" * len(MINUTES))
+    by_env = {env: measured(env) for env in MINUTES}
+    for name in dict.fromkeys(name for found in by_env.values() for name in found):
+        cells = []
+        for env in MINUTES:
+            found = by_env[env].get(name, [])
+            cells.append(f"{np.mean([row['mean_return'] for row in found]):,.0f}" if found else "")
+        print(f"| {label(*name)} | {' | '.join(cells)} |")
+
+
+def smoothed(row, minutes):
+    """The returns of a curve at these minutes, each the mean of a twentieth of the time around it."""
+    times, _, returns = np.array(row["curve"]).T
+    weights = np.abs(times - minutes[:, None]) <= minutes[-1] / 40
+    weights[np.arange(len(minutes)), np.abs(times - minutes[:, None]).argmin(axis=1)] = True
+    values = (weights @ returns) / weights.sum(axis=1)
+    values[(minutes < times[0]) | (minutes > times[-1])] = np.nan
+    return values
+
+
+def draw():
+    """A picture for each environment: the return in training against minutes, a dot where the final policy is."""
+    from matplotlib.figure import Figure
+
+    from lemniscate.report.style import COLORS, finish, save
+
+    colors = {name: COLORS[i] for i, name in enumerate(STEPS)}
+    for env, limit in MINUTES.items():
+        figure = Figure(figsize=(7.2, 4.2), layout="constrained")
+        axes = figure.subplots()
+        for (library, algorithm), found in measured(env).items():
+            style = {"lemniscate": "-", "sb3": ":", "sbx": "--"}[library]
+            grid = np.linspace(0, 1.1 * limit, 150)
+            curves = np.stack([smoothed(row, grid) for row in found])
+            known = ~np.isnan(curves).all(axis=0)
+            look = {"color": colors[algorithm], "linestyle": style, "linewidth": 1.8}
+            axes.plot(grid[known], np.nanmean(curves[:, known], axis=0), label=label(library, algorithm), **look)
+            end = np.mean([row["minutes"] for row in found])
+            axes.plot(end, np.mean([row["mean_return"] for row in found]), "o", color=colors[algorithm], markersize=5)
+        axes.set(xlabel="minutes on one core", ylabel="return in training")
+        axes.set_title(f"{env}; a dot: the final policy, deterministic", loc="left", fontsize=10)
+        axes.set_xlim(0, 1.15 * limit)
+        axes.legend(frameon=False, fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))
+        finish(axes)
+        save(figure, RESULTS / f"minutes-{env}.png")
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join([*STEPS, *PEERS]))
+    parser.add_argument("--envs", nargs="+", choices=MINUTES, default=list(MINUTES))
+    parser.add_argument("--seeds", nargs="+", type=int)
+    parser.add_argument("--table", action="store_true", help="run nothing")
+    parser.add_argument("--one", nargs=5, help=argparse.SUPPRESS)
+    given = parser.parse_args()
+    if given.one:
+        library, algorithm, env, seed, core = given.one
+        return one(library, algorithm, env, int(seed), int(core))
+    if wrong := set(given.names) - {*STEPS, *PEERS}:
+        parser.error(f"there is no {', '.join(sorted(wrong))}; there is {', '.join([*STEPS, *PEERS])}")
+    runs = []
+    for name in [] if given.table else given.names or STEPS:
+        if name in STEPS:
+            runs += [("lemniscate", name, env, seed) for env in given.envs for seed in given.seeds or (1,)]
+        else:
+            envs = [env for env in PEER_ENVS if env in given.envs]
+            chosen = [
+                (algorithm, env, seed)
+                for algorithm in PEERS[name]
+                for env in envs
+                for seed in given.seeds or PEER_SEEDS
+            ]
+            runs += [(name, *run) for run in chosen]
+    together(runs)
+    table()
+    draw()
+
+
+if __name__ == "__main__":
+    main()
