@@ -10,6 +10,7 @@
     startup      from the command to the first update: eager, compiled with a cold cache and with a warm one
     trust        TRPO on 16 × HalfCheetah-v5, 2048 rows, beside sb3-contrib with the same settings
     replay       DDPG on Hopper-v5: batches of 256, 256 × 256, one gradient step for each step, in turns of 500
+    pace         minutes of a million steps of HalfCheetah-v5, each algorithm with its preset
     lander       from process start to a policy of mean return 250 over 100 episodes of LunarLander-v3
 
 Every line of `benchmarks/results/speed.jsonl` carries commit, versions and machine. Rounds are interleaved, and what is
@@ -46,6 +47,8 @@ TRUST = {
 }
 DDPG = {"batch_size": 256, "learning_starts": 500, "buffer_size": 100_000, "log_every": 500, "compile": "on"}
 DDPG |= {"total_steps": 1_000_000, "checkpoint_every": 1_000_000}
+PACE = {"reinforce": 400_000, "a2c": 200_000, "trpo": 200_000, "ppo": 300_000, "reppo": 100_000}
+PACE |= {"ddpg": 14_000, "td3": 14_000, "sac": 40_000}
 WAYS = {
     OURS: {},
     "lemniscate, bfloat16 products": {"matmul": "bfloat16"},
@@ -311,6 +314,32 @@ def replay_summary():
         print(f"| {name} | {median(row[name] for row in speeds):,.0f} | {' | '.join(times)} |")
 
 
+def pace(rounds, stamp):
+    """Minutes of a million steps, without the first lines: those compile, or act at random."""
+    for _ in range(rounds):
+        spent = {}
+        for algorithm, steps in PACE.items():
+            with tempfile.TemporaryDirectory() as scratch:
+                folder = Path(scratch) / "run"
+                train(
+                    folder,
+                    "HalfCheetah-v5",
+                    algorithm=algorithm,
+                    total_steps=steps,
+                    checkpoint_every=steps,
+                    compile="on",
+                )
+                learning = [line for line in lines(folder) if any(name.startswith("losses/") for name in line)][3:]
+                speed = harmonic_mean(line["time/steps_per_second"] for line in learning)
+                spent[algorithm] = 1e6 / speed / 60
+                say(algorithm, f"{spent[algorithm]:.1f} min for a million steps")
+        append("speed", {"what": "pace", "minutes": spent} | stamp)
+    table = [row["minutes"] for row in rows("speed") if row["what"] == "pace" and row["commit"] == stamp["commit"]]
+    print("| " + " | ".join(name.upper() for name in PACE) + " |")
+    print("|" + "--:|" * len(PACE))
+    print("| " + " | ".join(f"{median(row[name] for row in table):.1f} min" for name in PACE) + " |")
+
+
 def lander(rounds, stamp):
     """Seconds to a mean return of 250, both judged every 50,000 steps by 100 episodes, for 1,000,000 steps at most."""
     for seed in range(1, rounds + 1):
@@ -351,6 +380,7 @@ MEASURES = {
     "startup": startup,
     "trust": trust,
     "replay": replay,
+    "pace": pace,
     "lander": lander,
 }
 

@@ -203,7 +203,9 @@ def play(config, state, env):
     """One step of an off-policy algorithm in its environments, without an update."""
     random, noise_std = state.step < config.learning_starts, getattr(config, "noise_std", 1.0)
     policy, noise = state.networks.policy, state.action_noise
-    interact(env, policy, state.replay, noise, state.rng.action, noise_std=noise_std, random=random)
+    step = interact(env, policy, state.replay, noise, state.rng.action, noise_std=noise_std, random=random)
+    if isinstance(state, sac.State):
+        state.observe(step)
     state.step += env.num_envs
 
 

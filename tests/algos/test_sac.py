@@ -3,9 +3,12 @@
 import numpy as np
 import pytest
 import torch
+from torch.nn.functional import cross_entropy
 
-from helpers import begin_off_policy, half_square, q_of, slope, small_off_policy, with_random_targets
+from helpers import begin_off_policy, half_square, play, q_of, slope, small_off_policy, with_random_targets
 from lemniscate.algos import sac
+from lemniscate.maths import hl_gauss
+from lemniscate.nn.networks import Layers, normalize_units
 
 
 def test_the_target_is_the_smaller_of_two_less_the_price_of_the_action(rng):
@@ -18,6 +21,73 @@ def test_the_target_is_the_smaller_of_two_less_the_price_of_the_action(rng):
     values = q_of(state.networks.critics, batch.obs, batch.action)
     torch.testing.assert_close(loss, half_square(values[0], target) + half_square(values[1], target))
     torch.testing.assert_close(metrics["q"], values[0].mean())
+
+
+def logits_of(critics, obs, action):
+    """The logits of each Q(s, a) of `critics`, by its layers: two tensors [B, 101]."""
+    return [q.net(torch.cat([obs, action], dim=-1)) for q in critics.members]
+
+
+def test_a_q_that_is_a_distribution_learns_the_probabilities_of_the_same_target(rng):
+    config, state, batch = with_random_targets(sac, rng, initial_temperature=0.3, value_range=4.0)
+    state.networks.bins.stretch(torch.tensor(2.5))
+    edges = torch.linspace(-10, 10, 102)
+    centres = (edges[1:] + edges[:-1]) / 2
+    noise = torch.randn(50, 1, generator=rng)
+    loss, metrics = sac.critic_loss(config, state, state.networks.critics, batch, noise)
+    next_action, log_prob = state.policy(batch.next_obs).sample_with_log_prob(noise)
+    both = [logits.softmax(1) @ centres for logits in logits_of(state.targets, batch.next_obs, next_action)]
+    target = batch.reward + 0.9 * (torch.min(*both) - 0.3 * log_prob) * (1 - batch.terminated.float())
+    logits = logits_of(state.networks.critics, batch.obs, batch.action)
+    probabilities = hl_gauss(target.detach(), edges)
+    torch.testing.assert_close(loss, sum(cross_entropy(both, probabilities) for both in logits))
+    torch.testing.assert_close(metrics["q"], (logits[0].softmax(1) @ centres).mean())
+    slopes = torch.autograd.grad(loss, list(state.networks.critics.parameters()))
+    assert all(gradient.any() for gradient in slopes)  # both Q learn
+
+
+def test_bins_follow_the_spread_of_the_returns_and_the_targets_share_them():
+    config = small_off_policy(sac, "EndlessLevers-v0", value_range=4.0, gamma=0.5)
+    state, env = begin_off_policy(sac, config, "NEXT_STEP", length=None, horizon=4)
+    assert all(q.bins is state.networks.bins for q in (*state.targets.members, *state.networks.critics.members))
+    state.on_restart()
+    assert not state.reward_scale.running.any()
+    before = float(state.reward_scale.count)
+    play(config, state, env)  # a reset row pays 100, and does not count
+    assert float(state.reward_scale.count) in (before, before + 4)
+    spread = state.reward_scale.std.float()
+    assert 0.05 < spread < 1  # returns from 0 to 2
+    torch.testing.assert_close(state.networks.bins.edges, torch.linspace(-4, 4, 102) * spread)
+
+
+@pytest.mark.parametrize("mode", ["NEXT_STEP", "SAME_STEP", "DISABLED"])
+def test_a_q_that_is_a_distribution_has_the_values_of_the_rewards_themselves(mode):
+    config = small_off_policy(sac, "EndlessLevers-v0", value_range=20.0)
+    state, _ = begin_off_policy(sac, config, mode, length=None, horizon=4)
+    for _ in range(700):
+        sac.update(config, state)
+    assert (state.networks.q(torch.ones(1, 3), torch.zeros(1, 1)) - 10).abs().max() < 0.2
+
+
+def test_the_weights_of_each_unit_of_q_have_length_one_after_an_update():
+    fields = {"value_range": 10.0, "critic_hidden": (8, 8), "network": "layer_norm", "compile": "off"}
+    state, _ = begin_off_policy(sac, config := small_off_policy(sac, unit_weights=True, **fields))
+    sac.update(config, state)
+    lengths = [torch.linalg.vector_norm(p, dim=1) for p in state.networks.critics.parameters() if p.dim() == 2]
+    assert [len(each) for each in lengths] == 2 * [8, 8, 101]
+    for each in lengths:
+        torch.testing.assert_close(each, torch.ones_like(each))
+    theirs = [torch.linalg.vector_norm(p, dim=1) for p in state.policy.parameters() if p.dim() == 2]
+    assert all((each - 1).abs().max() > 0.1 for each in theirs)  # those of the policy are as they were
+
+
+def test_behind_a_layer_normalization_the_length_of_weights_changes_no_value(rng):
+    network, rows = Layers((8, 8), kind="layer_norm").network(5, 3, 1.0), torch.randn(20, 5, generator=rng)
+    before = network[:-1](rows)
+    network[0].weight.data *= 3
+    network[0].bias.data *= 3
+    normalize_units(network[3])
+    torch.testing.assert_close(network[:-1](rows), before, atol=1e-4, rtol=1e-4)
 
 
 def test_the_policy_is_rewarded_for_entropy(rng):

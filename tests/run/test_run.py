@@ -33,6 +33,7 @@ OFF_POLICY = {
     "ddpg-pink": {"action_noise": "coloured", "update_every": 2, "num_updates": 3, "network": "simba"},
     "td3": {"network": "layer_norm"},
     "sac": {"action_noise": "coloured"},
+    "sac-bins": {"value_range": 5.0, "num_envs": 4},
 }
 
 

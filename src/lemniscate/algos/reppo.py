@@ -69,8 +69,7 @@ class Config(OnPolicyConfig):
 
     def networks(self, spec: Spec) -> ActorCategoricalQ:
         """New networks for the spaces in `spec`: π, Q, α and β."""
-        fields = self.normalize_observations, self.initial_log_std, self.value_range
-        return ActorCategoricalQ(spec, self.layers, *fields)
+        return ActorCategoricalQ(spec, self.layers, self.normalize_observations, self.initial_log_std, self.value_range)
 
     @property
     def gradient_steps(self) -> int:

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from lemniscate.data.replay import interact
 from lemniscate.maths import cross_entropy, hl_gauss, means, polyak, td_target, value_loss
 from lemniscate.nn.actor_q import SoftActorQ
+from lemniscate.nn.networks import normalize_units
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.nn.policies import Policy
 from lemniscate.nn.q_values import Bins, CategoricalQ, Critics, Temperature
@@ -36,6 +37,8 @@ class Config(OffPolicyConfig):
     value_range: Positive | None = None
     """each Q is a distribution over bins on [-value_range, value_range], in units of the standard deviation of the
     discounted return; usually 5 to 20; none: each Q is a number"""
+    unit_weights: bool = False
+    """divide the weights of each unit of Q by their length after every update; with layer_norm"""
 
     def networks(self, spec: Spec) -> SoftActorQ:
         """New networks for the spaces in `spec`: π, Q₁, Q₂ and α."""
@@ -147,7 +150,10 @@ def update(config: Config, state: State) -> Metrics:
     noise = state.networks.policy.draw_noise((2, *minibatches.shape), state.rng.action).transpose(0, 1)  # [K, 2, M, A]
     update_actor = tuple((state.updates + k) % config.policy_delay == 0 for k in range(1, config.num_updates + 1))
     state.updates += config.num_updates
-    return means(state.learn(config, state, state.replay.transitions, minibatches, noise, update_actor=update_actor))
+    metrics = state.learn(config, state, state.replay.transitions, minibatches, noise, update_actor=update_actor)
+    if config.unit_weights:
+        normalize_units(state.networks.critics)
+    return means(metrics)
 
 
 def train(config: Config, run: Run) -> State:

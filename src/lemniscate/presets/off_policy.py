@@ -36,6 +36,7 @@ SMALL = sac.Config(
     network="layer_norm",
     normalize_observations=True,
     value_range=10.0,
+    unit_weights=True,
 )
 """for a CPU: many steps for each gradient step, small normalized networks, and a Q that is a distribution"""
 SIZED = "search by hand, four settings on HalfCheetah, Walker2d and Ant, on seed 101"
