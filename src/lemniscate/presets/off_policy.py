@@ -23,14 +23,16 @@ QUICK = {
 }
 """small networks, and annealed learning rates"""
 SMALL = sac.Config(
-    total_steps=300_000,
-    num_envs=16,
+    total_steps=600_000,
+    num_envs=32,
     num_updates=4,
-    log_every=100,
+    log_every=50,
     learning_starts=10_000,
     actor_learning_rate=1e-3,
     critic_learning_rate=1e-3,
     final_learning_rate=0.1,
+    tau=0.01,
+    policy_delay=2,
     hidden=(128, 128),
     critic_hidden=(128, 128),
     network="layer_norm",
@@ -39,7 +41,7 @@ SMALL = sac.Config(
     unit_weights=True,
 )
 """for a CPU: many steps for each gradient step, small normalized networks, and a Q that is a distribution"""
-SIZED = "search by hand, four settings on HalfCheetah, Walker2d and Ant, on seed 101"
+SIZED = "search by hand, seven settings on HalfCheetah, four of them on Ant or Walker2d, on seed 101"
 PENDULUM = {"env": "Pendulum-v1", "total_steps": 20_000, "learning_starts": 1000, **QUICK}
 SWUNG = "search by hand, three settings of each algorithm, on seed 101"
 
