@@ -55,7 +55,7 @@ RUNS = {
     "sac": {
         "Pendulum-v1": ((20_000,), 5),
         "LunarLanderContinuous-v3": ((300_000,), 3),
-        "HalfCheetah-v5": ((300_000,), 2),
+        "HalfCheetah-v5": ((600_000,), 5),
     },
 }
 

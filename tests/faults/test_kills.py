@@ -31,6 +31,7 @@ FIELDS = {
     "td3": ("td3", "Pendulum-v1", OFF_POLICY["td3"]),
     "td3-async": ("td3", "Pendulum-v1", OFF_POLICY["td3"] | {"backend": "gymnasium-async"}),
     "sac": ("sac", "Pendulum-v1", OFF_POLICY["sac"]),
+    "sac-bins": ("sac", "Pendulum-v1", OFF_POLICY["sac-bins"] | {"unit_weights": True}),
     "sac-compiled": ("sac", "Pendulum-v1", OFF_POLICY["sac"] | {"compile": "on"}),
     "drone": ("ppo", "DroneFigureEightTrajectory-v0", {"num_envs": 64, "num_steps": 16, "total_steps": 64 * 16 * 60}),
 }
