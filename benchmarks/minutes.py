@@ -78,7 +78,7 @@ def one(library, algorithm, env, seed, core):
     """A run in this process, and its row."""
     os.sched_setaffinity(0, [core])
     row = train(algorithm, env, seed) if library == "lemniscate" else peer(library, algorithm, env, seed)
-    row["curve"] = [[round(x, 3) for x in point] for point in row["curve"][:: max(1, len(row["curve"]) // POINTS)]]
+    row["curve"] = [[round(x, 3) for x in point] for point in row["curve"][:: -(-len(row["curve"]) // POINTS)]]
     names = {"library": library, "algorithm": algorithm, "env": env, "seed": seed}
     append("minutes", names | row | provenance())
     print(
@@ -94,11 +94,14 @@ def together(runs):
 
     def start(run):
         core = cores.get()
-        subprocess.run([sys.executable, __file__, "--one", *map(str, run), str(core)], check=False)
+        done = subprocess.run([sys.executable, __file__, "--one", *map(str, run), str(core)], check=False)
         cores.put(core)
+        return done.returncode == 0
 
     with ThreadPoolExecutor(cores.qsize()) as pool:
-        list(pool.map(start, runs))
+        failed = [" ".join(map(str, run)) for run, well in zip(runs, pool.map(start, runs), strict=True) if not well]
+    if failed:
+        raise SystemExit(f"These runs failed: {', '.join(failed)}.")
 
 
 def measured(env):

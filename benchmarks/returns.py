@@ -55,9 +55,12 @@ RUNS = {
     "sac": {
         "Pendulum-v1": ((20_000,), 5),
         "LunarLanderContinuous-v3": ((300_000,), 3),
-        "HalfCheetah-v5": ((600_000,), 5),
+        "HalfCheetah-v5": ((300_000,), 2),
     },
 }
+
+PRESETS = {("sac", "HalfCheetah-v5"): "half-cheetah-large"}
+"""where it is not the preset that the environment gets"""
 
 
 def one(algorithm, env, seed, marks, runs):
@@ -69,7 +72,8 @@ def one(algorithm, env, seed, marks, runs):
         if path.exists():
             run = lem.resume(path, progress=False)
         else:
-            run = lem.train(algorithm, env, seed=seed, run=path, progress=False, **fields)
+            preset = PRESETS.get((algorithm, env))
+            run = lem.train(algorithm, env, preset=preset, seed=seed, run=path, progress=False, **fields)
         lines = [json.loads(line) for line in (run.path / "metrics.jsonl").read_text().splitlines()]
         paces = [(line["step"], line["time/steps_per_second"]) for line in lines if "time/steps_per_second" in line]
         curve = [(line["step"], round(line["episode/return"], 1)) for line in lines if "episode/return" in line]

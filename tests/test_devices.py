@@ -55,6 +55,7 @@ CASES = {
     "ddpg box": ("box", {**OFF_POLICY, "action_noise": "ou"}),
     "td3 box": ("box", {**OFF_POLICY, "action_noise": "coloured"}),
     "sac box": ("box", OFF_POLICY),
+    "sac bins": ("box", {**OFF_POLICY, "value_range": 5.0, "network": "layer_norm", "unit_weights": True}),
     "sac simba": ("box", {**OFF_POLICY, "network": "simba", "activation": "relu", "matmul": "bfloat16"}),
 }
 ACTIONS = {

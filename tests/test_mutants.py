@@ -567,8 +567,8 @@ MUTANTS = [
     (
         "the bins do not follow the rewards",
         "algos/sac.py",
-        "bins.stretch(self.reward_scale.std)",
-        "bins.stretch(torch.ones(()))",
+        "self.networks.bins.observe(self.reward_scale)",
+        "pass",
         SAC + "bins_follow_the_spread_of_the_returns_and_the_targets_share_them",
     ),
     (
@@ -589,7 +589,7 @@ MUTANTS = [
         "a distribution is fitted to a target in other units",
         "algos/sac.py",
         "hl_gauss(target, critic.bins.edges)",
-        "hl_gauss(target, critic.bins.edges / critic.bins.edges[-1] * critic.bins.value_range)",
+        "hl_gauss(target, critic.bins.unit)",
         SAC + "a_q_that_is_a_distribution_learns_the_probabilities_of_the_same_target",
     ),
     (

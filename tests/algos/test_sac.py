@@ -5,10 +5,10 @@ import pytest
 import torch
 from torch.nn.functional import cross_entropy
 
-from helpers import begin_off_policy, half_square, play, q_of, slope, small_off_policy, with_random_targets
+from helpers import CPU, begin_off_policy, half_square, play, q_of, slope, small_off_policy, with_random_targets
 from lemniscate.algos import sac
+from lemniscate.errors import UserError
 from lemniscate.maths import hl_gauss
-from lemniscate.nn.networks import Layers, normalize_units
 
 
 def test_the_target_is_the_smaller_of_two_less_the_price_of_the_action(rng):
@@ -30,7 +30,7 @@ def logits_of(critics, obs, action):
 
 def test_a_q_that_is_a_distribution_learns_the_probabilities_of_the_same_target(rng):
     config, state, batch = with_random_targets(sac, rng, initial_temperature=0.3, value_range=4.0)
-    state.networks.bins.stretch(torch.tensor(2.5))
+    state.networks.bins.moments.copy_(torch.tensor([1.0, 6.25, 100.0]))
     edges = torch.linspace(-10, 10, 102)
     centres = (edges[1:] + edges[:-1]) / 2
     noise = torch.randn(50, 1, generator=rng)
@@ -50,14 +50,19 @@ def test_bins_follow_the_spread_of_the_returns_and_the_targets_share_them():
     config = small_off_policy(sac, "EndlessLevers-v0", value_range=4.0, gamma=0.5)
     state, env = begin_off_policy(sac, config, "NEXT_STEP", length=None, horizon=4)
     assert all(q.bins is state.networks.bins for q in (*state.targets.members, *state.networks.critics.members))
-    state.on_restart()
-    assert not state.reward_scale.running.any()
-    before = float(state.reward_scale.count)
-    play(config, state, env)  # a reset row pays 100, and does not count
-    assert float(state.reward_scale.count) in (before, before + 4)
+    counted = []
+    for _ in range(5):  # an episode, and in NEXT_STEP a reset row, which pays 100 and does not count
+        before = float(state.reward_scale.count)
+        play(config, state, env)
+        counted.append(float(state.reward_scale.count) - before)
+    assert sorted(counted) == [0, 4, 4, 4, 4]
     spread = state.reward_scale.std.float()
     assert 0.05 < spread < 1  # returns from 0 to 2
     torch.testing.assert_close(state.networks.bins.edges, torch.linspace(-4, 4, 102) * spread)
+    play(config, state, env)
+    assert state.reward_scale.running.any()
+    state.on_restart()
+    assert not state.reward_scale.running.any()
 
 
 @pytest.mark.parametrize("mode", ["NEXT_STEP", "SAME_STEP", "DISABLED"])
@@ -81,13 +86,27 @@ def test_the_weights_of_each_unit_of_q_have_length_one_after_an_update():
     assert all((each - 1).abs().max() > 0.1 for each in theirs)  # those of the policy are as they were
 
 
-def test_behind_a_layer_normalization_the_length_of_weights_changes_no_value(rng):
-    network, rows = Layers((8, 8), kind="layer_norm").network(5, 3, 1.0), torch.randn(20, 5, generator=rng)
-    before = network[:-1](rows)
-    network[0].weight.data *= 3
-    network[0].bias.data *= 3
-    normalize_units(network[3])
-    torch.testing.assert_close(network[:-1](rows), before, atol=1e-4, rtol=1e-4)
+@pytest.mark.parametrize(
+    "fields", [{"network": "mlp"}, {"value_range": None}, {"critic_hidden": ()}, {"network": "simba"}]
+)
+def test_weights_of_length_one_need_normalized_layers_and_a_distribution(fields):
+    good = {"value_range": 10.0, "network": "layer_norm", "critic_hidden": (8, 8), "hidden": (8, 8)}
+    sac.Config(env="Pendulum-v1", unit_weights=True, **good)
+    with pytest.raises(UserError, match="unit_weights needs a Q that is a distribution behind normalized layers"):
+        sac.Config(env="Pendulum-v1", unit_weights=True, **{**good, **fields})
+
+
+def test_a_warm_start_goes_on_with_the_scale_of_the_loaded_bins():
+    state, env = begin_off_policy(sac, config := small_off_policy(sac, value_range=4.0))
+    fresh = sac.init(config, env.spec, CPU)
+    fresh.networks.load_state_dict(state.networks.state_dict())
+    fresh.on_warm_start()
+    assert state.reward_scale.count > 0
+    for name in ("mean", "var", "count"):
+        assert torch.equal(getattr(fresh.reward_scale, name), getattr(state.reward_scale, name))
+    torch.testing.assert_close(fresh.networks.bins.edges, state.networks.bins.edges)
+    fresh.networks.bins.observe(fresh.reward_scale)
+    torch.testing.assert_close(fresh.networks.bins.edges, state.networks.bins.edges)
 
 
 def test_the_policy_is_rewarded_for_entropy(rng):

@@ -25,6 +25,7 @@ KINDS = {
     "ddpg": ("ddpg", "Pendulum-v1", OFF_POLICY["ddpg"]),
     "td3": ("td3", "HalfCheetah-v5", OFF_POLICY["td3"]),
     "sac": ("sac", "Pendulum-v1", OFF_POLICY["sac"] | {"evaluate_every": 800}),
+    "sac-bins": ("sac", "Pendulum-v1", OFF_POLICY["sac-bins"]),
     "sac-compiled": ("sac", "Pendulum-v1", OFF_POLICY["sac"] | {"compile": "on"}),
     "drone": ("ppo", "DroneFigureEightTrajectory-v0", {"num_envs": 64, "total_steps": 4096, "minibatch_size": 64}),
 }

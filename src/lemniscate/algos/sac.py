@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from lemniscate.data.replay import interact
+from lemniscate.errors import UserError
 from lemniscate.maths import cross_entropy, hl_gauss, means, polyak, td_target, value_loss
 from lemniscate.nn.actor_q import SoftActorQ
 from lemniscate.nn.networks import normalize_units
@@ -21,7 +22,7 @@ from lemniscate.optim.adam import Adam, linear
 from lemniscate.run.config import Finite, Positive
 from lemniscate.run.off_policy import OffPolicyConfig, OffPolicyState
 from lemniscate.run.run import Run
-from lemniscate.run.state import rows_of
+from lemniscate.run.state import ScaledState
 from lemniscate.spec import Spec
 from lemniscate.types import Flags, Loss, Metrics, Step, Transition
 
@@ -38,45 +39,51 @@ class Config(OffPolicyConfig):
     """each Q is a distribution over bins on [-value_range, value_range], in units of the standard deviation of the
     discounted return; usually 5 to 20; none: each Q is a number"""
     unit_weights: bool = False
-    """divide the weights of each unit of Q by their length after every update; with layer_norm"""
+    """divide the weights of each unit of Q by their length after every update; with value_range and layer_norm"""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.unit_weights and not (self.value_range and self.network == "layer_norm" and self.critic_hidden):
+            raise UserError(
+                "unit_weights needs a Q that is a distribution behind normalized layers: value_range 10, network"
+                f" layer_norm and critic_hidden, not {self.value_range}, {self.network} and {self.critic_hidden}."
+            )
 
     def networks(self, spec: Spec) -> SoftActorQ:
         """New networks for the spaces in `spec`: π, Q₁, Q₂ and α."""
-        bins = None if self.value_range is None else Bins(self.value_range, stretched=True)
+        bins = None if self.value_range is None else Bins(self.value_range, scaled=True)
         own = {"critics": 2, "initial_temperature": self.initial_temperature, "bins": bins}
         return SoftActorQ(spec, *self.network_settings, **own)
 
 
 @dataclass(kw_only=True)
-class State(OffPolicyState[SoftActorQ]):
+class State(OffPolicyState[SoftActorQ], ScaledState[SoftActorQ]):
     """The training state of SAC; `targets` are Q'₁ and Q'₂."""
 
     actor_optimizer: Adam
     critic_optimizer: Adam
     temperature_optimizer: Adam
-    reward_scale: RewardScale
 
     def observe(self, step: Step) -> None:
-        """Stretch the bins of Q, where it has any, to the rewards of one more step of the environments."""
+        """Let the bins of Q, where it has any, follow the rewards of one more step of the environments."""
         if self.networks.bins is not None:
             rows = step.reward, step.terminated | step.truncated, step.valid
             self.reward_scale.update(*(row[None] for row in rows))
-            self.networks.bins.stretch(self.reward_scale.std)
+            self.networks.bins.observe(self.reward_scale)
 
-    def hold(self, held: range) -> None:
-        """Keep what every off-policy algorithm keeps, and the running returns of these shards."""
-        super().hold(held)
-        self.reward_scale.hold(rows_of(held, self.shards.count, len(self.reward_scale.running)))
-
-    def on_restart(self) -> None:
-        """Begin new sequences of action noise, and forget the running returns."""
-        super().on_restart()
-        self.reward_scale.on_restart()
+    def on_warm_start(self) -> None:
+        """Copy the loaded networks into the targets, and go on with the scale of their bins."""
+        super().on_warm_start()
+        if self.networks.bins is not None:
+            scale = self.reward_scale
+            scale.mean, scale.var, scale.count = self.networks.bins.moments.clone().unbind()
 
 
 def init(config: Config, spec: Spec, device: torch.device) -> State:
     """A new state with an empty replay buffer, seeded by the run's seed."""
     networks = config.networks(spec).to(device)
+    if config.unit_weights:
+        normalize_units(networks.critics)
     return State(
         networks=networks,
         targets=networks.target(),
@@ -92,16 +99,16 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
 
 
 def critic_loss(config: Config, state: State, critics: Critics, batch: Transition, noise: Tensor) -> Loss:
-    """Σ_i ½ (Q_i(s, a) − y)², y = r + γ (min_i Q'_i(s', a') − α log π(a'|s')), a' ~ π(·|s') (eq. 5 and 3)."""
+    """Σ_i of `q_loss`, y = r + γ (min_i Q'_i(s', a') − α log π(a'|s')), a' ~ π(·|s') (eq. 5 and 3); its metrics."""
     next_action, log_prob = state.networks.policy(batch.next_obs).sample_with_log_prob(noise)
     next_value = state.targets(batch.next_obs, next_action).amin(0) - state.networks.temperature() * log_prob
     target = td_target(batch.reward, next_value, batch.terminated, gamma=config.gamma).detach()
-    (loss_1, q), (loss_2, _) = (distance(critic, batch, target) for critic in critics.members)
+    (loss_1, q), (loss_2, _) = (q_loss(critic, batch, target) for critic in critics.members)
     loss = loss_1 + loss_2
     return loss, {"losses/critic": loss.detach(), "q": q.detach().mean()}
 
 
-def distance(critic: nn.Module, batch: Transition, target: Tensor) -> tuple[Tensor, Tensor]:
+def q_loss(critic: nn.Module, batch: Transition, target: Tensor) -> tuple[Tensor, Tensor]:
     """½ (Q(s, a) − y)², or of a distribution its cross-entropy with y's probabilities over the bins; and Q [M]."""
     if isinstance(critic, CategoricalQ):
         logits = critic.logits(batch.obs, batch.action)

@@ -125,7 +125,7 @@ class Residual(nn.Module):
 def normalize_units(networks: nn.Module) -> None:
     """Divide the weights of each unit of the linear layers by their length, in place.
 
-    Behind a layer normalization the length of a unit's weights changes nothing but how far a gradient step turns them.
+    A constraint on networks with normalized layers: weights that cannot grow are turned as far by each step of Adam.
     """
     for layer in networks.modules():
         if isinstance(layer, nn.Linear):

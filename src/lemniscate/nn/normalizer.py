@@ -96,7 +96,9 @@ class RewardScale(WideBuffers):
 
     local = ("running",)
     running: Tensor
+    mean: Tensor
     var: Tensor
+    count: Tensor
     shards: Shards = ONE_SHARD
 
     def __init__(self, num_envs: int, gamma: float, clip: float = 10.0) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor, nn
 
-from lemniscate.nn.normalizer import NoNorm, with_privileged
+from lemniscate.nn.normalizer import NoNorm, RewardScale, WideBuffers, with_privileged
 
 BINS = 101
 """K, the number of bins of a Q that is a distribution"""
@@ -31,31 +31,37 @@ class QValue(nn.Module):
         return self.net(torch.cat([self.features(obs), action], dim=-1)).squeeze(-1)
 
 
-class Bins(nn.Module):
-    """K = `BINS` bins of equal width on [-c x, c x], x = `value_range` and c a scale of the values, 1 at first.
+class Bins(WideBuffers):
+    """K = `BINS` bins of equal width on [-c x, c x], x = `value_range` and c a scale of the values.
 
     Args:
         value_range: x.
-        stretched: c will move with the rewards (`stretch`), and is saved with the networks.
+        scaled: c is the standard deviation of a return that `observe` follows, saved with the networks; else it is 1.
     """
 
-    edges: Tensor
-    """[K + 1]"""
+    unit: Tensor
+    """edges at c = 1, [K + 1]"""
+    moments: Tensor
+    """mean, variance and number of the returns so far, [3]"""
 
-    def __init__(self, value_range: float, *, stretched: bool = False) -> None:
+    def __init__(self, value_range: float, *, scaled: bool = False) -> None:
         super().__init__()
-        self.value_range = value_range
-        edges = torch.linspace(-value_range, value_range, BINS + 1)
-        self.register_buffer("edges", edges, persistent=stretched)
+        self.register_buffer("unit", torch.linspace(-value_range, value_range, BINS + 1), persistent=False)
+        self.register_buffer("moments", torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64), persistent=scaled)
 
-    def stretch(self, scale: Tensor) -> None:
-        """Move the edges to the scale c, a scalar above zero: what a distribution says moves with them."""
-        self.edges.copy_(torch.linspace(-self.value_range, self.value_range, BINS + 1) * scale)
+    @property
+    def edges(self) -> Tensor:
+        """The ends of the bins, [K + 1]."""
+        return self.unit * (self.moments[1] + 1e-8).sqrt().to(self.unit.dtype)
+
+    def observe(self, scale: RewardScale) -> None:
+        """Follow the returns of which `scale` has the statistics: what a distribution says moves with them."""
+        self.moments.copy_(torch.stack([scale.mean, scale.var, scale.count]))
 
     def mean(self, logits: Tensor) -> Tensor:
         """The mean of the distributions with these logits: […, K] to […]."""
-        centres = (self.edges[1:] + self.edges[:-1]) / 2
-        return logits.softmax(-1) @ centres
+        edges = self.edges
+        return logits.softmax(-1) @ ((edges[1:] + edges[:-1]) / 2)
 
 
 class CategoricalQ(QValue):

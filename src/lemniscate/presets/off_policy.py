@@ -112,7 +112,7 @@ SAC = [
             "ant": "Ant-v5",
         }.items()
     ),
-    Preset("half-cheetah-long", sac.Config(total_steps=300_000, **CHEETAH), "not searched: DDPG's", "2026-11"),
+    Preset("half-cheetah-large", sac.Config(total_steps=300_000, **CHEETAH), "not searched: DDPG's", "2026-11"),
     Preset(
         "lunar-lander-continuous",
         sac.Config(

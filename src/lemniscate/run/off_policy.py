@@ -164,6 +164,7 @@ class OffPolicyState(TrainState[Networks]):
 
     def on_restart(self) -> None:
         """Begin new sequences of action noise."""
+        super().on_restart()
         self.action_noise.on_restart()
 
     def on_warm_start(self) -> None:

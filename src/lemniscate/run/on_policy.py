@@ -8,9 +8,8 @@ from lemniscate.errors import UserError
 from lemniscate.nn.activations import Activation
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.networks import Layers
-from lemniscate.nn.normalizer import RewardScale
 from lemniscate.run.config import Count, Fraction, LogStd, RunConfig, Width
-from lemniscate.run.state import Networks, TrainState, rows_of
+from lemniscate.run.state import Networks, ScaledState
 from lemniscate.spec import Spec
 
 
@@ -77,20 +76,9 @@ class OnPolicyConfig(RunConfig):
 
 
 @dataclass(kw_only=True)
-class OnPolicyState(TrainState[Networks]):
+class OnPolicyState(ScaledState[Networks]):
     """The training state of the algorithms that learn from their newest rollout."""
-
-    reward_scale: RewardScale
 
     def per_step_methods(self) -> list[tuple[object, str]]:
         """Those of every algorithm, and what is estimated of a rollout."""
         return [*super().per_step_methods(), (self.networks, "estimates")]
-
-    def hold(self, held: range) -> None:
-        """Keep the generators and the running returns of these shards."""
-        super().hold(held)
-        self.reward_scale.hold(rows_of(held, self.shards.count, len(self.reward_scale.running)))
-
-    def on_restart(self) -> None:
-        """Forget the running returns."""
-        self.reward_scale.on_restart()

@@ -7,6 +7,7 @@ from typing import Any, Generic, TypeVar
 
 from lemniscate.errors import NonFiniteError
 from lemniscate.maths import ONE_SHARD, Shards
+from lemniscate.nn.normalizer import RewardScale
 from lemniscate.nn.policies import Policy
 from lemniscate.optim.adam import Adam
 from lemniscate.optim.compiled import Compiled
@@ -106,6 +107,23 @@ class TrainState(Generic[Networks]):
         device = next(self.networks.parameters()).device
         for owner, name in self.per_step_methods():
             vars(owner)[name] = Compiled(getattr(owner, name), device)  # over the method of the class
+
+
+@dataclass(kw_only=True)
+class ScaledState(TrainState[Networks]):
+    """A training state with the scale of the rewards."""
+
+    reward_scale: RewardScale
+
+    def hold(self, held: range) -> None:
+        """Keep the running returns of these shards, too."""
+        super().hold(held)
+        self.reward_scale.hold(rows_of(held, self.shards.count, len(self.reward_scale.running)))
+
+    def on_restart(self) -> None:
+        """Forget the running returns."""
+        super().on_restart()
+        self.reward_scale.on_restart()
 
 
 def rows_of(held: range, shards: int, rows: int) -> slice:

@@ -41,7 +41,7 @@ def load_networks(networks: nn.Module, config: RunConfig, spec: Spec) -> str:
     if set(differing) & set(FUNCTION):
         raise UserError(f"warm_start: {name} does not fit: {settings[0]}.")
     found, own = source.tensors_of("networks"), networks.state_dict()
-    if not difference(found, own):
+    if not difference(found, own) and theirs.get("value_range") == mine.get("value_range"):  # else a Q says another
         networks.load_state_dict(found)
         return f"Warm start: all networks of {name}."
     policy, own_policy = _policy(found), _policy(own)

@@ -19,7 +19,7 @@ from lemniscate.run.texts import read
 
 FIXED = ("num_envs", "num_steps", "shards", "threads", "device", "compile", "warm_start", "env_kwargs", "wrappers")
 FIXED += ("hidden", "critic_hidden", "activation", "network", "normalize_observations", "scale_rewards", "buffer_size")
-FIXED += ("initial_log_std", "initial_temperature", "learning_starts")
+FIXED += ("initial_log_std", "initial_temperature", "learning_starts", "value_range", "unit_weights")
 """fields that cannot change, or would change nothing, after a run has begun"""
 NEAR = 0.8, 1.25
 """factors of a number that varies"""
