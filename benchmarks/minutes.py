@@ -149,12 +149,13 @@ def draw():
     from lemniscate.report.style import COLORS, finish, save
 
     colors = {name: COLORS[i] for i, name in enumerate(STEPS)}
-    for env, limit in MINUTES.items():
+    for env in [env for env in MINUTES if measured(env)]:
         figure = Figure(figsize=(7.2, 4.2), layout="constrained")
         axes = figure.subplots()
+        longest = max(row["minutes"] for found in measured(env).values() for row in found)
         for (library, algorithm), found in measured(env).items():
             style = {"lemniscate": "-", "sb3": ":", "sbx": "--"}[library]
-            grid = np.linspace(0, 1.1 * limit, 150)
+            grid = np.linspace(0, longest, 200)
             curves = np.stack([smoothed(row, grid) for row in found])
             known = ~np.isnan(curves).all(axis=0)
             look = {"color": colors[algorithm], "linestyle": style, "linewidth": 1.8}
@@ -163,7 +164,7 @@ def draw():
             axes.plot(end, np.mean([row["mean_return"] for row in found]), "o", color=colors[algorithm], markersize=5)
         axes.set(xlabel="minutes on one core", ylabel="return in training")
         axes.set_title(f"{env}; a dot: the final policy, deterministic", loc="left", fontsize=10)
-        axes.set_xlim(0, 1.15 * limit)
+        axes.set_xlim(0, 1.03 * longest)
         axes.legend(frameon=False, fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))
         finish(axes)
         save(figure, RESULTS / f"minutes-{env}.png")
