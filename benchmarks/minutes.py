@@ -31,12 +31,12 @@ STEPS = {
     # algorithm: thousands of steps in so many minutes, in the order of MINUTES
     "reinforce": (450, 450, 1400, 1000, 500),
     "a2c": (450, 450, 1500, 1100, 500),
-    "trpo": (350, 400, 900, 750, 400),
+    "trpo": (300, 400, 1500, 950, 450),
     "ppo": (350, 400, 2000, 640, 500),
     "reppo": (250, 250, 1050, 750, 400),
-    "ddpg": (18, 15, 32, 144, 40),
-    "td3": (18, 15, 32, 50, 40),
-    "sac": (18, 15, 270, 260, 200),
+    "ddpg": (18, 15, 45, 144, 22),
+    "td3": (18, 10, 36, 25, 19),
+    "sac": (18, 7, 220, 200, 150),
 }
 PEERS = {"sb3": ("ppo",), "sbx": ("sac",)}
 PEER_ENVS = ("HalfCheetah-v5", "Hopper-v5", "Ant-v5")
@@ -128,7 +128,7 @@ def table():
         cells = []
         for env in MINUTES:
             found = by_env[env].get(name, [])
-            cells.append(f"{np.mean([row['mean_return'] for row in found]):,.0f}" if found else "")
+            cells.append(f"{round(np.mean([row['mean_return'] for row in found])):,}" if found else "")
         print(f"| {label(*name)} | {' | '.join(cells)} |")
 
 
