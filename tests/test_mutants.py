@@ -224,8 +224,8 @@ MUTANTS = [
     (
         "ignored rewards are counted",
         "nn/normalizer.py",
-        ".to(self.var.dtype) * rollout.valid",
-        ".to(self.var.dtype)",
+        "reward.to(self.var.dtype) * valid",
+        "reward.to(self.var.dtype)",
         "nn/test_normalizer.py",
     ),
     (
@@ -238,7 +238,7 @@ MUTANTS = [
     (
         "returns run on over the end",
         "nn/normalizer.py",
-        "self.running * ~done",
+        "self.running * ~ended",
         "self.running * 1",
         "nn/test_normalizer.py",
     ),
@@ -580,16 +580,16 @@ MUTANTS = [
     ),
     (
         "units are normalized by column",
-        "nn/networks.py",
+        "nn/categorical_q.py",
         "vector_norm(layer.weight, dim=1, keepdim=True)",
         "vector_norm(layer.weight, dim=0, keepdim=True)",
         SAC + "the_weights_of_each_unit_of_q_have_length_one_after_an_update",
     ),
     (
         "a distribution is fitted to a target in other units",
-        "algos/sac.py",
-        "hl_gauss(target, critic.bins.edges)",
-        "hl_gauss(target, critic.bins.unit)",
+        "nn/categorical_q.py",
+        "hl_gauss(target, self.bins.edges)",
+        "hl_gauss(target, self.bins.unit)",
         SAC + "a_q_that_is_a_distribution_learns_the_probabilities_of_the_same_target",
     ),
     (
@@ -664,7 +664,7 @@ MUTANTS = [
     ),
     (
         "the action hardly matters to Q",
-        "nn/actor_categorical_q.py",
+        "nn/categorical_q.py",
         "self.action_gain * action",
         "action",
         REPPO + "q_is_the_mean_of_its_distribution",
@@ -868,8 +868,8 @@ MUTANTS = [
     (
         "the targets have a normalizer of their own",
         "nn/actor_q.py",
-        "{id(normalizer): normalizer}",
-        "{}",
+        "(self.policy.normalizer, self.bins)}",
+        "(self.bins,)}",
         "nn/test_actor_critic.py",
     ),
     (

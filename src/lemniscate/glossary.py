@@ -80,6 +80,7 @@ FIELDS = """
 `max_kl` | `target_kl` | – | `delta` | – | `kl_limit`
 `td_lambda` | – | – | – | – | `lmbda`
 `value_range` | – | – | – | – | `v_max`
+`unit_weights` | – | – | – | – | –
 `shrink` | `line_search_shrinking_factor` | – | `backtrack_coeff` | – | –
 `attempts` | `line_search_max_iter` | – | `backtrack_iters` | – | –
 `line_search` off | – | – | the algorithm npg | – | –

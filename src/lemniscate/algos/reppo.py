@@ -15,9 +15,9 @@ from lemniscate.data.soft_batch import SoftBatch
 from lemniscate.maths import cross_entropy, explained_variance, hl_gauss, means, soft_lambda_return
 from lemniscate.nn.activations import Activation
 from lemniscate.nn.actor_categorical_q import ActorCategoricalQ, Multipliers
+from lemniscate.nn.categorical_q import CategoricalQ
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.nn.policies import Policy
-from lemniscate.nn.q_values import CategoricalQ
 from lemniscate.optim.adam import Adam, linear
 from lemniscate.run.config import Count, Finite, Fraction, NumEnvs, Positive, Repeats, SquashedLogStd, Width
 from lemniscate.run.on_policy import OnPolicyConfig, OnPolicyState

@@ -8,16 +8,16 @@ from dataclasses import dataclass
 from functools import partial
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from lemniscate.data.replay import interact
 from lemniscate.errors import UserError
-from lemniscate.maths import cross_entropy, hl_gauss, means, polyak, td_target, value_loss
+from lemniscate.maths import means, polyak, td_target
 from lemniscate.nn.actor_q import SoftActorQ
-from lemniscate.nn.networks import normalize_units
+from lemniscate.nn.categorical_q import Bins, normalize_units
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.nn.policies import Policy
-from lemniscate.nn.q_values import Bins, CategoricalQ, Critics, Temperature
+from lemniscate.nn.q_values import Critics, Temperature
 from lemniscate.optim.adam import Adam, linear
 from lemniscate.run.config import Finite, Positive
 from lemniscate.run.off_policy import OffPolicyConfig, OffPolicyState
@@ -36,18 +36,14 @@ class Config(OffPolicyConfig):
     target_entropy: Finite | None = None
     """H̄ in nats, the entropy that the temperature aims at, over actions in [-1, 1]^A; none: −A"""
     value_range: Positive | None = None
-    """each Q is a distribution over bins on [-value_range, value_range], in units of the standard deviation of the
-    discounted return; usually 5 to 20; none: each Q is a number"""
+    """bins of Q reach so many std of the return, usually 5 to 20; none: Q is a number"""
     unit_weights: bool = False
-    """divide the weights of each unit of Q by their length after every update; with value_range and layer_norm"""
+    """keep each unit's weights in Q at length 1"""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.unit_weights and not (self.value_range and self.network == "layer_norm" and self.critic_hidden):
-            raise UserError(
-                "unit_weights needs a Q that is a distribution behind normalized layers: value_range 10, network"
-                f" layer_norm and critic_hidden, not {self.value_range}, {self.network} and {self.critic_hidden}."
-            )
+            raise UserError("unit_weights needs a value_range, network layer_norm and hidden layers of the critics.")
 
     def networks(self, spec: Spec) -> SoftActorQ:
         """New networks for the spaces in `spec`: π, Q₁, Q₂ and α."""
@@ -99,22 +95,13 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
 
 
 def critic_loss(config: Config, state: State, critics: Critics, batch: Transition, noise: Tensor) -> Loss:
-    """Σ_i of `q_loss`, y = r + γ (min_i Q'_i(s', a') − α log π(a'|s')), a' ~ π(·|s') (eq. 5 and 3); its metrics."""
+    """Σ_i ½ (Q_i(s, a) − y)², y = r + γ (min_i Q'_i(s', a') − α log π(a'|s')), a' ~ π(·|s') (eq. 5 and 3)."""
     next_action, log_prob = state.networks.policy(batch.next_obs).sample_with_log_prob(noise)
     next_value = state.targets(batch.next_obs, next_action).amin(0) - state.networks.temperature() * log_prob
     target = td_target(batch.reward, next_value, batch.terminated, gamma=config.gamma).detach()
-    (loss_1, q), (loss_2, _) = (q_loss(critic, batch, target) for critic in critics.members)
+    (loss_1, q), (loss_2, _) = (each.loss(batch.obs, batch.action, target) for each in critics.members)
     loss = loss_1 + loss_2
     return loss, {"losses/critic": loss.detach(), "q": q.detach().mean()}
-
-
-def q_loss(critic: nn.Module, batch: Transition, target: Tensor) -> tuple[Tensor, Tensor]:
-    """½ (Q(s, a) − y)², or of a distribution its cross-entropy with y's probabilities over the bins; and Q [M]."""
-    if isinstance(critic, CategoricalQ):
-        logits = critic.logits(batch.obs, batch.action)
-        return cross_entropy(logits, hl_gauss(target, critic.bins.edges)), critic.bins.mean(logits)
-    q = critic(batch.obs, batch.action)
-    return value_loss(q, target), q
 
 
 def actor_loss(state: State, policy: Policy, batch: Transition, noise: Tensor) -> Loss:

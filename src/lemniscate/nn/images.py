@@ -1,9 +1,18 @@
-"""The encoder of images."""
+"""The normalizer and the encoder of images."""
 
 import torch
 from torch import Tensor, nn
 
 from lemniscate.nn.networks import orthogonal
+from lemniscate.nn.normalizer import NoNorm
+
+
+class ScaleBytes(NoNorm):
+    """Bytes to numbers from -½ to ½."""
+
+    def forward(self, obs: Tensor) -> Tensor:
+        """[…, O or more] uint8 to […, O]."""
+        return super().forward(obs).float() / 255 - 0.5
 
 
 class ImageEncoder(nn.Module):

@@ -121,17 +121,6 @@ class Residual(nn.Module):
         return x + self.layers(x)
 
 
-@torch.no_grad()
-def normalize_units(networks: nn.Module) -> None:
-    """Divide the weights of each unit of the linear layers by their length, in place.
-
-    A constraint on networks with normalized layers: weights that cannot grow are turned as far by each step of Adam.
-    """
-    for layer in networks.modules():
-        if isinstance(layer, nn.Linear):
-            layer.weight.div_(torch.linalg.vector_norm(layer.weight, dim=1, keepdim=True) + 1e-8)
-
-
 def orthogonal(layer: nn.Linear | nn.Conv2d, gain: float) -> nn.Module:
     """The layer with orthogonal weights of this gain, and zero biases."""
     nn.init.orthogonal_(layer.weight, gain)

@@ -29,14 +29,6 @@ class NoNorm(nn.Module):
         """Nothing: there are no statistics."""
 
 
-class ScaleBytes(NoNorm):
-    """Bytes to numbers from -½ to ½."""
-
-    def forward(self, obs: Tensor) -> Tensor:
-        """[…, O or more] uint8 to […, O]."""
-        return super().forward(obs).float() / 255 - 0.5
-
-
 def with_privileged(features: Tensor, obs: Tensor, size: int, privileged: int) -> Tensor:
     """Features […, F] and, behind them, the P = `privileged` numbers after the first O = `size` of […, O + P]."""
     return torch.cat([features, obs[..., size : size + privileged]], dim=-1) if privileged else features
@@ -96,22 +88,19 @@ class RewardScale(WideBuffers):
 
     local = ("running",)
     running: Tensor
-    mean: Tensor
     var: Tensor
-    count: Tensor
     shards: Shards = ONE_SHARD
 
     def __init__(self, num_envs: int, gamma: float, clip: float = 10.0) -> None:
         super().__init__()
         self.gamma, self.clip = gamma, clip
         self.register_buffer("running", torch.zeros(num_envs, dtype=torch.float64))
-        self.register_buffer("mean", torch.zeros((), dtype=torch.float64))
-        self.register_buffer("var", torch.ones((), dtype=torch.float64))
-        self.register_buffer("count", torch.zeros((), dtype=torch.float64))
+        for name, value in (("mean", 0.0), ("var", 1.0), ("count", 0.0)):
+            self.register_buffer(name, torch.tensor(value, dtype=torch.float64))
 
     def forward(self, reward: Tensor) -> Tensor:
         """Any shape to the same shape."""
-        return (reward / self.std.to(reward.dtype)).clamp(-self.clip, self.clip)
+        return (reward / (self.var + 1e-8).sqrt().to(reward.dtype)).clamp(-self.clip, self.clip)
 
     def hold(self, rows: slice) -> None:
         """Keep only the running returns of these environments."""
@@ -120,11 +109,6 @@ class RewardScale(WideBuffers):
     def on_restart(self) -> None:
         """Forget the running episodes: the environments have been restarted."""
         self.running = torch.zeros_like(self.running)
-
-    @property
-    def std(self) -> Tensor:
-        """The standard deviation of the discounted return so far, a scalar; 1 before the first update."""
-        return (self.var + 1e-8).sqrt()
 
     @torch.no_grad()
     def update(self, reward: Tensor, done: Tensor, valid: Tensor) -> None:

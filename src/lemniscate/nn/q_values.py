@@ -1,15 +1,13 @@
 """Values of actions, Q(s, a), behind the policy's observation normalizer; and the price of entropy."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import torch
 from torch import Tensor, nn
 
-from lemniscate.nn.normalizer import NoNorm, RewardScale, WideBuffers, with_privileged
-
-BINS = 101
-"""K, the number of bins of a Q that is a distribution"""
+from lemniscate.maths import value_loss
+from lemniscate.nn.normalizer import NoNorm, with_privileged
 
 
 class QValue(nn.Module):
@@ -30,72 +28,10 @@ class QValue(nn.Module):
         """[…, O + P] and […, A] to […]."""
         return self.net(torch.cat([self.features(obs), action], dim=-1)).squeeze(-1)
 
-
-class Bins(WideBuffers):
-    """K = `BINS` bins of equal width on [-c x, c x], x = `value_range` and c a scale of the values.
-
-    Args:
-        value_range: x.
-        scaled: c is the standard deviation of a return that `observe` follows, saved with the networks; else it is 1.
-    """
-
-    unit: Tensor
-    """edges at c = 1, [K + 1]"""
-    moments: Tensor
-    """mean, variance and number of the returns so far, [3]"""
-
-    def __init__(self, value_range: float, *, scaled: bool = False) -> None:
-        super().__init__()
-        self.register_buffer("unit", torch.linspace(-value_range, value_range, BINS + 1), persistent=False)
-        self.register_buffer("moments", torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64), persistent=scaled)
-
-    @property
-    def edges(self) -> Tensor:
-        """The ends of the bins, [K + 1]."""
-        return self.unit * (self.moments[1] + 1e-8).sqrt().to(self.unit.dtype)
-
-    def observe(self, scale: RewardScale) -> None:
-        """Follow the returns of which `scale` has the statistics: what a distribution says moves with them."""
-        self.moments.copy_(torch.stack([scale.mean, scale.var, scale.count]))
-
-    def mean(self, logits: Tensor) -> Tensor:
-        """The mean of the distributions with these logits: […, K] to […]."""
-        edges = self.edges
-        return logits.softmax(-1) @ ((edges[1:] + edges[:-1]) / 2)
-
-
-class CategoricalQ(QValue):
-    """Q(s, a) as the mean of a distribution over bins, behind the policy's observation normalizer.
-
-    Args:
-        normalizer: of observations.
-        encoder: from normalized observations to features.
-        net: from features and action to K = `BINS` logits.
-        bins: the K bins; several Q may share them.
-        action_gain: the factor of actions before `net`.
-        privileged: P, of `QValue`.
-    """
-
-    def __init__(
-        self,
-        normalizer: NoNorm,
-        encoder: nn.Module,
-        net: nn.Module,
-        bins: Bins,
-        action_gain: float = 1.0,
-        privileged: int = 0,
-    ) -> None:
-        super().__init__(normalizer, encoder, net, privileged)
-        self.bins = bins
-        self.action_gain = action_gain
-
-    def logits(self, obs: Tensor, action: Tensor) -> Tensor:
-        """[…, O + P] and […, A] to […, K]."""
-        return self.net(torch.cat([self.features(obs), self.action_gain * action], dim=-1))
-
-    def forward(self, obs: Tensor, action: Tensor) -> Tensor:
-        """[…, O + P] and […, A] to […]."""
-        return self.bins.mean(self.logits(obs, action))
+    def loss(self, obs: Tensor, action: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+        """½ (Q(s, a) − y)², the mean over M rows, y = `target` [M]; and Q(s, a) [M]."""
+        q = self(obs, action)
+        return value_loss(q, target), q
 
 
 class Critics(nn.Module):
@@ -103,7 +39,7 @@ class Critics(nn.Module):
 
     def __init__(self, members: Iterable[QValue]) -> None:
         super().__init__()
-        self.members = nn.ModuleList(members)
+        self.members: Sequence[QValue] = nn.ModuleList(members)  # pyright: ignore[reportAttributeAccessIssue]
 
     def forward(self, obs: Tensor, action: Tensor) -> Tensor:
         """[…, O] and […, A] to [C, …]."""
