@@ -1,6 +1,6 @@
 """Return against minutes: the eight algorithms, Stable-Baselines3 and SBX, on five environments.
 
-    .venv/bin/python benchmarks/minutes.py                              all of ours: 80 minutes on two cores
+    .venv/bin/python benchmarks/minutes.py                              all of ours: an hour on two cores
     .venv/bin/python benchmarks/minutes.py ppo sac --envs Ant-v5        some of it
     .venv/bin/python benchmarks/minutes.py sb3 sbx                      the peers; `make .venv/.peers` installs them
     .venv/bin/python benchmarks/minutes.py --table                      the tables, and a picture for each environment

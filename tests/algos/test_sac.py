@@ -77,6 +77,8 @@ def test_a_q_that_is_a_distribution_has_the_values_of_the_rewards_themselves(mod
 def test_the_weights_of_each_unit_of_q_have_length_one_after_an_update():
     fields = {"value_range": 10.0, "critic_hidden": (8, 8), "network": "layer_norm", "compile": "off"}
     state, _ = begin_off_policy(sac, config := small_off_policy(sac, unit_weights=True, **fields))
+    for q in state.targets.members:  # copied before the first update, they have the same length
+        assert all((torch.linalg.vector_norm(p, dim=1) - 1).abs().max() < 1e-5 for p in q.parameters() if p.dim() == 2)
     sac.update(config, state)
     lengths = [torch.linalg.vector_norm(p, dim=1) for p in state.networks.critics.parameters() if p.dim() == 2]
     assert [len(each) for each in lengths] == 2 * [8, 8, 101]

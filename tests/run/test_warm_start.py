@@ -70,6 +70,17 @@ def test_of_another_algorithms_networks_the_policy_is_taken_over(tmp_path):
     assert not torch.equal(begun["policy.net.0.weight"], networks_at(tmp_path / "td3")["policy.net.0.weight"])
 
 
+@pytest.mark.parametrize(("value_range", "whole"), [(5.0, True), (10.0, False)])
+def test_a_q_over_other_bins_is_not_taken_over(tmp_path, value_range, whole):
+    """Its shapes are the same, and its values would be others."""
+    train(tmp_path / "source", "sac", "Pendulum-v1", value_range=5.0)
+    fields = {"algorithm": "sac", "env": "Pendulum-v1", "value_range": value_range}
+    begun = first_networks(tmp_path / "r", warm_start=str(tmp_path / "source"), **fields)
+    theirs = networks_at(tmp_path / "source")
+    assert all(torch.equal(begun[name], theirs[name]) for name in begun if name.startswith("policy."))
+    assert same(begun, theirs) == whole
+
+
 def test_a_checkpoint_can_be_named_too(source, tmp_path):
     checkpoints = sorted((source / "checkpoints").iterdir())
     begun = first_networks(tmp_path / "r", normalize_observations=True, warm_start=str(checkpoints[0]))

@@ -95,7 +95,7 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
 
 
 def critic_loss(config: Config, state: State, critics: Critics, batch: Transition, noise: Tensor) -> Loss:
-    """Σ_i ½ (Q_i(s, a) − y)², y = r + γ (min_i Q'_i(s', a') − α log π(a'|s')), a' ~ π(·|s') (eq. 5 and 3)."""
+    """Σ_i of the loss of Q_i(s, a), y = r + γ (min_i Q'_i(s', a') − α log π(a'|s')), a' ~ π(·|s') (eq. 5 and 3)."""
     next_action, log_prob = state.networks.policy(batch.next_obs).sample_with_log_prob(noise)
     next_value = state.targets(batch.next_obs, next_action).amin(0) - state.networks.temperature() * log_prob
     target = td_target(batch.reward, next_value, batch.terminated, gamma=config.gamma).detach()
