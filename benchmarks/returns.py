@@ -27,8 +27,8 @@ RUNS = {
     "ppo": {
         "CartPole-v1": ((50_000,), 5),
         "LunarLander-v3": ((MILLION,), 5),
-        "HalfCheetah-v5": ((MILLION, 3 * MILLION), 5),
-        "Hopper-v5": ((MILLION,), 5),
+        "HalfCheetah-v5": ((MILLION, 3 * MILLION), 10),
+        "Hopper-v5": ((640_000,), 10),
         "Walker2d-v5": ((MILLION,), 5),
         "Ant-v5": ((MILLION, 3 * MILLION), 5),
         "Humanoid-v5": ((MILLION, 3 * MILLION), 3),
@@ -37,8 +37,8 @@ RUNS = {
     "a2c": {"HalfCheetah-v5": ((MILLION,), 5), DRONE: ((MILLION,), 5)},
     "trpo": {
         "HalfCheetah-v5": ((MILLION,), 5),
-        "Hopper-v5": ((MILLION,), 5),
-        "Walker2d-v5": ((MILLION,), 5),
+        "Hopper-v5": ((MILLION,), 10),
+        "Walker2d-v5": ((MILLION, 1_700_000), 10),
         "Swimmer-v5": ((MILLION,), 5),
         DRONE: ((MILLION,), 5),
     },
