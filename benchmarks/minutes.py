@@ -1,8 +1,9 @@
-"""Return against minutes: the eight algorithms, Stable-Baselines3 and SBX, on five environments.
+"""Return against minutes: the eight algorithms, Stable-Baselines3 and SBX, on five environments; the defaults on nine.
 
     .venv/bin/python benchmarks/minutes.py                              all of ours: an hour on two cores
     .venv/bin/python benchmarks/minutes.py ppo sac --envs Ant-v5        some of it
     .venv/bin/python benchmarks/minutes.py sb3 sbx                      the peers; `make .venv/.peers` installs them
+    .venv/bin/python benchmarks/minutes.py --unknown                    PPO, TRPO and REPPO where no preset was searched
     .venv/bin/python benchmarks/minutes.py --table                      the tables, and a picture for each environment
 
 One core and one thread for each run, as many runs at a time as there are cores. An algorithm has the settings that
@@ -19,6 +20,7 @@ import sys
 import tempfile
 import time
 from concurrent.futures import ThreadPoolExecutor
+from itertools import product
 from pathlib import Path
 from queue import Queue
 
@@ -38,11 +40,32 @@ STEPS = {
     "td3": (18, 10, 36, 25, 19),
     "sac": (18, 7, 220, 200, 150),
 }
+UNKNOWN = {
+    # environment without a preset: thousands of steps that take each of DEFAULTS a minute
+    "InvertedPendulum-v5": (650, 350, 400),
+    "HumanoidStandup-v5": (117, 96, 102),
+    "LunarLanderContinuous-v3": (600, 340, 400),
+    "MountainCarContinuous-v0": (400, 400, 250),
+    "EnvPool/WalkerWalk-v1": (420, 280, 250),
+    "EnvPool/FetchReachDense-v4": (96, 84, 81),
+    "EnvPool/MetaWorld/Reach-v3": (370, 250, 220),
+    "EnvPool/myoElbowPose1D6MRandom-v0": (260, 53, 150),
+    "EnvPool/MuJoCoPlayground/PandaPickCube-v1": (330, 250, 220),
+}
+DEFAULTS = ("ppo", "trpo", "reppo")
+"""what a stranger could be given"""
 PEERS = {"sb3": ("ppo",), "sbx": ("sac",)}
 PEER_ENVS = ("HalfCheetah-v5", "Hopper-v5", "Ant-v5")
 PEER_SEEDS = (1, 2)
 POINTS = 80
 """of a stored curve, at most"""
+
+
+def thousands(algorithm, env):
+    """The steps of a run, in thousands."""
+    if env in MINUTES:
+        return STEPS[algorithm][list(MINUTES).index(env)]
+    return UNKNOWN[env][DEFAULTS.index(algorithm)]
 
 
 def train(algorithm, env, seed):
@@ -55,12 +78,12 @@ def train(algorithm, env, seed):
         if "episode/return" in metrics:
             curve.append([(time.monotonic() - started) / 60, step, metrics["episode/return"]])
 
-    steps = 1000 * STEPS[algorithm][list(MINUTES).index(env)]
+    steps, own = 1000 * thousands(algorithm, env), env.startswith("EnvPool/")
     with tempfile.TemporaryDirectory() as scratch:
         fields = {"seed": seed, "total_steps": steps, "checkpoint_every": steps, "progress": False}
         run = lem.train(algorithm, env, run=Path(scratch) / "run", callbacks=[follow], **fields)
         minutes = (time.monotonic() - started) / 60
-        scores = lem.evaluate(run.policy, episodes=100, seed=0, backend="gymnasium")
+        scores = lem.evaluate(run.policy, episodes=100, seed=0, backend=None if own else "gymnasium")
     return {"steps": run.policy.step, "minutes": minutes, "curve": curve, "mean_return": scores.mean_return}
 
 
@@ -119,6 +142,18 @@ def label(library, algorithm):
     return algorithm.upper() if library == "lemniscate" else f"{named[library]}, {algorithm.upper()}"
 
 
+def unknown():
+    """A row for each environment without a preset: the mean of each default over seeds, and its worst seed."""
+    print("| | seeds |", " | ".join(name.upper() for name in DEFAULTS), "|")
+    print("|---|--:|" + "--:|" * len(DEFAULTS))
+    for env in UNKNOWN:
+        of = [[row["mean_return"] for row in measured(env).get(("lemniscate", name), [])] for name in DEFAULTS]
+        if all(of):
+            digits = 1 if abs(np.mean(of[0])) < 200 else 0
+            cells = [f"{np.mean(returns):,.{digits}f} ({min(returns):,.{digits}f})" for returns in of]
+            print(f"| {env} | {len(of[0])} | {' | '.join(cells)} |")
+
+
 def table():
     """A row for each algorithm: the final policy, mean over seeds, and its minutes."""
     print("| |", " | ".join(f"{env}, {minutes} min" for env, minutes in MINUTES.items()), "|")
@@ -175,6 +210,7 @@ def main():
     parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join([*STEPS, *PEERS]))
     parser.add_argument("--envs", nargs="+", choices=MINUTES, default=list(MINUTES))
     parser.add_argument("--seeds", nargs="+", type=int)
+    parser.add_argument("--unknown", action="store_true", help="the defaults where there is no preset; two seeds")
     parser.add_argument("--table", action="store_true", help="run nothing")
     parser.add_argument("--one", nargs=5, help=argparse.SUPPRESS)
     given = parser.parse_args()
@@ -183,8 +219,11 @@ def main():
         return one(library, algorithm, env, int(seed), int(core))
     if wrong := set(given.names) - {*STEPS, *PEERS}:
         parser.error(f"there is no {', '.join(sorted(wrong))}; there is {', '.join([*STEPS, *PEERS])}")
-    runs = []
-    for name in [] if given.table else given.names or STEPS:
+    runs, none = [], given.table or given.unknown
+    if given.unknown:
+        chosen = product(given.names or DEFAULTS, UNKNOWN, given.seeds or (1, 2))
+        runs += [("lemniscate", *run) for run in chosen]
+    for name in [] if none else given.names or STEPS:
         if name in STEPS:
             runs += [("lemniscate", name, env, seed) for env in given.envs for seed in given.seeds or (1,)]
         else:
@@ -198,6 +237,7 @@ def main():
             runs += [(name, *run) for run in chosen]
     together(runs)
     table()
+    unknown()
     draw()
 
 

@@ -42,6 +42,7 @@ RUNS = {
         "Swimmer-v5": ((MILLION,), 5),
         DRONE: ((MILLION,), 5),
     },
+    "reppo": {"HalfCheetah-v5": ((3_400_000,), 5)},
     "ddpg": {
         "MountainCarContinuous-v0": ((30_000,), 10),
         "Pendulum-v1": ((20_000,), 5),
