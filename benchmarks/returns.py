@@ -38,7 +38,7 @@ RUNS = {
     "trpo": {
         "HalfCheetah-v5": ((MILLION,), 5),
         "Hopper-v5": ((MILLION,), 10),
-        "Walker2d-v5": ((MILLION, 1_700_000), 10),
+        "Walker2d-v5": ((MILLION, 3 * MILLION), 10),
         "Swimmer-v5": ((MILLION,), 5),
         DRONE: ((MILLION,), 5),
     },

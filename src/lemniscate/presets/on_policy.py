@@ -225,7 +225,12 @@ A2C = [
 
 TRPO = [
     Preset("half-cheetah", trpo.Config(env="HalfCheetah-v5"), "search by hand, 3 runs, on seed 101", "2026-11"),
-    Preset("walker2d", trpo.Config(env="Walker2d-v5"), "a run on seed 101", "2026-11"),
+    Preset(
+        "walker2d",
+        trpo.Config(env="Walker2d-v5", num_envs=64),
+        "search by hand, 7 runs, on seeds 101 to 104",
+        "2026-11",
+    ),
     Preset(
         "hopper",
         trpo.Config(env="Hopper-v5", num_envs=8, num_steps=256),
