@@ -196,7 +196,7 @@ def parts(rounds, stamp):
         state.optimizer.learning_rate = 3e-4
         networks, noise = state.networks, state.policy.draw_noise((16,), state.rng.action)
         batch = ppo.advantages(config, networks, rollout)
-        minibatches = epoch_minibatches(torch.arange(2048), 2048, 64, state.rng.minibatch)
+        minibatches = epoch_minibatches([torch.arange(2048)], 2048, 64, state.rng.minibatch)
         with torch.no_grad():
             act = milliseconds(lambda: networks.policy.act(obs[0], noise), 500)  # noqa: B023
         epoch = milliseconds(lambda: means(state.learn(config, state, batch, minibatches)), 3 * rounds)  # noqa: B023
