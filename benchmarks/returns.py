@@ -37,7 +37,7 @@ RUNS = {
     "a2c": {"HalfCheetah-v5": ((MILLION,), 5), DRONE: ((MILLION,), 5)},
     "trpo": {
         "HalfCheetah-v5": ((MILLION,), 5),
-        "Hopper-v5": ((MILLION,), 10),
+        "Hopper-v5": ((MILLION, 2 * MILLION), 10),
         "Walker2d-v5": ((MILLION, 3 * MILLION), 10),
         "Swimmer-v5": ((MILLION,), 5),
         DRONE: ((MILLION,), 5),
