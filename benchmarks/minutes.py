@@ -148,10 +148,12 @@ def unknown():
     print("|---|--:|" + "--:|" * len(DEFAULTS))
     for env in UNKNOWN:
         of = [[row["mean_return"] for row in measured(env).get(("lemniscate", name), [])] for name in DEFAULTS]
-        if all(of):
-            digits = 1 if abs(np.mean(of[0])) < 200 else 0
-            cells = [f"{np.mean(returns):,.{digits}f} ({min(returns):,.{digits}f})" for returns in of]
-            print(f"| {env} | {len(of[0])} | {' | '.join(cells)} |")
+        if any(of):
+            digits = 0 if max(abs(x) for returns in of for x in returns) >= 200 else 1
+            cells = [
+                f"{np.mean(returns):,.{digits}f} ({min(returns):,.{digits}f})" if returns else "" for returns in of
+            ]
+            print(f"| {env} | {max(map(len, of))} | {' | '.join(cells)} |")
 
 
 def table():
