@@ -153,7 +153,7 @@ def unknown():
             cells = [
                 f"{np.mean(returns):,.{digits}f} ({min(returns):,.{digits}f})" if returns else "" for returns in of
             ]
-            print(f"| {env} | {max(map(len, of))} | {' | '.join(cells)} |")
+            print(f"| {env} | {max(map(len, of))} | {' | '.join(row)} |")
 
 
 def table():
