@@ -150,9 +150,7 @@ def unknown():
         of = [[row["mean_return"] for row in measured(env).get(("lemniscate", name), [])] for name in DEFAULTS]
         if any(of):
             digits = 0 if max(abs(x) for returns in of for x in returns) >= 200 else 1
-            cells = [
-                f"{np.mean(returns):,.{digits}f} ({min(returns):,.{digits}f})" if returns else "" for returns in of
-            ]
+            row = [f"{np.mean(x):,.{digits}f} ({min(x):,.{digits}f})" if x else "" for x in of]
             print(f"| {env} | {max(map(len, of))} | {' | '.join(row)} |")
 
 
