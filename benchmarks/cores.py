@@ -105,7 +105,7 @@ def threads(rounds):
         torch.set_num_threads(count)
         started = time.perf_counter()
         for _ in range(4):
-            state.learn(config, state, batch, minibatches)
+            state.learn(config, state, batch, minibatches, batch.advantage[minibatches])
         return 1e3 * (time.perf_counter() - started) / (4 * len(minibatches))
 
     for rows in ROWS:
@@ -118,8 +118,8 @@ def threads(rounds):
             state.optimizer.learning_rate = 3e-4
             batch = ppo.advantages(config, state.networks, rollout)
             minibatches = epoch_minibatches([torch.arange(8192)], 8192, rows, state.rng.minibatch)
-            ways[f"{count} threads"] = partial(milliseconds, state, config, batch, minibatches, count)
-            ways[f"{count} threads"]()
+            ways[f"threads: {count}"] = partial(milliseconds, state, config, batch, minibatches, count)
+            ways[f"threads: {count}"]()
         print(f"{rows} rows, milliseconds of a gradient step")
         table(ways, rounds, 3)
 
@@ -127,10 +127,12 @@ def threads(rounds):
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     measures = {"halves": halves, "threads": threads}
-    parser.add_argument("what", nargs="*", choices=measures)
+    parser.add_argument("measures", nargs="*", metavar="MEASURE", help=", ".join(measures))
     parser.add_argument("--rounds", type=int, default=5)
     given = parser.parse_args()
-    for name in given.what or measures:
+    if wrong := set(given.measures) - set(measures):
+        parser.error(f"there is no measure {', '.join(sorted(wrong))}; there is {', '.join(measures)}")
+    for name in given.measures or measures:
         measures[name](given.rounds)
 
 

@@ -199,7 +199,8 @@ def parts(rounds, stamp):
         minibatches = epoch_minibatches([torch.arange(2048)], 2048, 64, state.rng.minibatch)
         with torch.no_grad():
             act = milliseconds(lambda: networks.policy.act(obs[0], noise), 500)  # noqa: B023
-        epoch = milliseconds(lambda: means(state.learn(config, state, batch, minibatches)), 3 * rounds)  # noqa: B023
+        rows = batch, minibatches, batch.advantage[minibatches]
+        epoch = milliseconds(lambda: means(state.learn(config, state, *rows)), 3 * rounds)  # noqa: B023
         row = {
             "what": "parts",
             "how": how,
