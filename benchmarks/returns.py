@@ -28,7 +28,7 @@ RUNS = {
         "CartPole-v1": ((50_000,), 5),
         "LunarLander-v3": ((MILLION,), 5),
         "HalfCheetah-v5": ((MILLION, 3 * MILLION), 10),
-        "Hopper-v5": ((640_000,), 10),
+        "Hopper-v5": ((MILLION,), 10),
         "Walker2d-v5": ((MILLION,), 5),
         "Ant-v5": ((MILLION, 3 * MILLION), 5),
         "Humanoid-v5": ((MILLION, 3 * MILLION), 3),
