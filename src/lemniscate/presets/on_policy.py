@@ -201,8 +201,8 @@ TRIED = "search by hand, some 25 settings on four environments, 300,000 steps, m
 REPPO = [
     Preset("half-cheetah", reppo.Config(env="HalfCheetah-v5", initial_log_std=-0.5), TRIED, "2026-11"),
     Preset("ant", FAR.replace(env="Ant-v5"), TRIED, "2026-11"),
-    Preset("walker2d", FAR.replace(env="Walker2d-v5", gamma=0.995), TRIED, "2026-11"),
-    Preset("hopper", FAR.replace(env="Hopper-v5", gamma=0.995), TRIED, "2026-11"),
+    Preset("walker2d", FAR.replace(env="Walker2d-v5"), TRIED, "2026-11"),
+    Preset("hopper", FAR.replace(env="Hopper-v5"), TRIED, "2026-11"),
 ]
 
 A2C = [
