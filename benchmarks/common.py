@@ -35,6 +35,18 @@ def provenance():
     return {"commit": commit, "versions": versions, "machine": machine, "date": time.strftime("%Y-%m-%d")}
 
 
+def random_rollout(num_envs):
+    """A spec of HalfCheetah's sizes, and a rollout of 128 random steps of it."""
+    import torch
+
+    from lemniscate.spec import Box, ObservationPart, Spec
+    from lemniscate.types import Rollout
+
+    spec = Spec("x", (ObservationPart((), (17,)),), Box((-1.0,) * 6, (1.0,) * 6))
+    no, obs = torch.zeros(128, num_envs, dtype=torch.bool), torch.randn(129, num_envs, 17)
+    return spec, Rollout(obs[:-1], torch.randn(128, num_envs, 6), torch.randn(128, num_envs), obs[1:], no, no, ~no)
+
+
 def append(name, row):
     """One more line of results/name.jsonl."""
     RESULTS.mkdir(exist_ok=True)

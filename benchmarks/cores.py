@@ -16,6 +16,7 @@ from statistics import median
 
 import numpy as np
 import torch
+from common import random_rollout
 
 ENVS = (("HalfCheetah-v5", 16, 1500), ("HalfCheetah-v5", 64, 500), ("Ant-v5", 64, 200), ("Humanoid-v5", 64, 150))
 ROWS = (64, 256, 512, 2048)
@@ -94,12 +95,8 @@ def threads(rounds):
     """Milliseconds of a compiled gradient step of PPO, HalfCheetah's sizes, on one thread and on two."""
     from lemniscate.algos import ppo
     from lemniscate.data.rollout import epoch_minibatches
-    from lemniscate.spec import Box, ObservationPart, Spec
-    from lemniscate.types import Rollout
 
-    spec = Spec("x", (ObservationPart((), (17,)),), Box((-1.0,) * 6, (1.0,) * 6))
-    no, obs = torch.zeros(128, 64, dtype=torch.bool), torch.randn(129, 64, 17)
-    rollout = Rollout(obs[:-1], torch.randn(128, 64, 6), torch.randn(128, 64), obs[1:], no, no, ~no, 1)
+    spec, rollout = random_rollout(64)
 
     def milliseconds(state, config, batch, minibatches, count):
         torch.set_num_threads(count)

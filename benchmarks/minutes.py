@@ -1,4 +1,4 @@
-"""Return against minutes: the eight algorithms, Stable-Baselines3 and SBX, on five environments; the defaults on nine.
+"""Return against minutes: the eight algorithms, Stable-Baselines3 and SBX, on five environments; three on eight more.
 
     .venv/bin/python benchmarks/minutes.py                              all of ours: an hour on two cores
     .venv/bin/python benchmarks/minutes.py ppo sac --envs Ant-v5        some of it
@@ -45,7 +45,6 @@ UNKNOWN = {
     "InvertedPendulum-v5": (650, 350, 400),
     "HumanoidStandup-v5": (117, 96, 102),
     "LunarLanderContinuous-v3": (600, 340, 400),
-    "MountainCarContinuous-v0": (400, 400, 250),
     "EnvPool/WalkerWalk-v1": (420, 280, 250),
     "EnvPool/FetchReachDense-v4": (96, 84, 81),
     "EnvPool/MetaWorld/Reach-v3": (370, 250, 220),
@@ -53,7 +52,7 @@ UNKNOWN = {
     "EnvPool/MuJoCoPlayground/PandaPickCube-v1": (330, 250, 220),
 }
 DEFAULTS = ("ppo", "trpo", "reppo")
-"""what a stranger could be given"""
+"""the candidates for the recommended algorithm"""
 PEERS = {"sb3": ("ppo",), "sbx": ("sac",)}
 PEER_ENVS = ("HalfCheetah-v5", "Hopper-v5", "Ant-v5")
 PEER_SEEDS = (1, 2)
@@ -217,8 +216,9 @@ def main():
     if given.one:
         library, algorithm, env, seed, core = given.one
         return one(library, algorithm, env, int(seed), int(core))
-    if wrong := set(given.names) - {*STEPS, *PEERS}:
-        parser.error(f"there is no {', '.join(sorted(wrong))}; there is {', '.join([*STEPS, *PEERS])}")
+    known = DEFAULTS if given.unknown else [*STEPS, *PEERS]
+    if wrong := set(given.names) - set(known):
+        parser.error(f"there is no {', '.join(sorted(wrong))}; there is {', '.join(known)}")
     runs, none = [], given.table or given.unknown
     if given.unknown:
         chosen = product(given.names or DEFAULTS, UNKNOWN, given.seeds or (1, 2))

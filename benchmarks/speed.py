@@ -31,7 +31,7 @@ from itertools import product
 from pathlib import Path
 from statistics import harmonic_mean, median
 
-from common import RESULTS, append, provenance, rows
+from common import RESULTS, append, provenance, random_rollout, rows
 from peers import BARE, PEER, PEER_LANDER, PEER_REPLAY, PEER_TRPO, REPLAY
 
 NUM_ENVS = {"HalfCheetah-v5": 16, "Ant-v5": 64, "Humanoid-v5": 64, "Hopper-v5": 64}
@@ -173,14 +173,11 @@ def parts(rounds, stamp):
     from lemniscate.algos import ppo
     from lemniscate.data.rollout import epoch_minibatches
     from lemniscate.maths import gae, means
-    from lemniscate.spec import Box, ObservationPart, Spec
-    from lemniscate.types import Rollout
 
     torch.set_num_threads(1)
-    spec = Spec("x", (ObservationPart((), (17,)),), Box((-1.0,) * 6, (1.0,) * 6))
     config, device = ppo.Config(**SHARED), torch.device("cpu")
-    no, obs = torch.zeros(128, 16, dtype=torch.bool), torch.randn(129, 16, 17)
-    rollout = Rollout(obs[:-1], torch.randn(128, 16, 6), torch.randn(128, 16), obs[1:], no, no, ~no)
+    spec, rollout = random_rollout(16)
+    reward, no = rollout.reward, rollout.terminated
 
     def milliseconds(function, times):
         function()
@@ -198,7 +195,7 @@ def parts(rounds, stamp):
         batch = ppo.advantages(config, networks, rollout)
         minibatches = epoch_minibatches([torch.arange(2048)], 2048, 64, state.rng.minibatch)
         with torch.no_grad():
-            act = milliseconds(lambda: networks.policy.act(obs[0], noise), 500)  # noqa: B023
+            act = milliseconds(lambda: networks.policy.act(rollout.obs[0], noise), 500)  # noqa: B023
         rows = batch, minibatches, batch.advantage[minibatches]
         epoch = milliseconds(lambda: means(state.learn(config, state, *rows)), 3 * rounds)  # noqa: B023
         row = {
@@ -209,7 +206,7 @@ def parts(rounds, stamp):
                 lambda: ppo.advantages(config, networks, rollout),  # noqa: B023
                 20,
             ),
-            "of which GAE": milliseconds(lambda: gae(rollout.reward, rollout.reward, rollout.reward, no, no), 20),
+            "of which GAE": milliseconds(lambda: gae(reward, reward, reward, no, no), 20),
             "gradient step, 64 rows": epoch / 32,
         }
         append("speed", row | stamp)

@@ -228,12 +228,12 @@ TRPO = [
     Preset(
         "walker2d",
         trpo.Config(env="Walker2d-v5", num_envs=64),
-        "search by hand, 7 runs, on seeds 101 to 104",
+        "search by hand, 11 runs, on seeds 101 to 104",
         "2026-11",
     ),
     Preset(
         "hopper",
-        trpo.Config(env="Hopper-v5", num_envs=8, num_steps=256, gamma=0.995),  # else a dive pays as much as standing
+        trpo.Config(env="Hopper-v5", num_envs=8, num_steps=256, gamma=0.995),  # else a dive pays nearly as well
         "search by hand, 10 runs, on seeds 101 to 106",
         "2026-11",
     ),
