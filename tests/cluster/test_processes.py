@@ -98,6 +98,15 @@ def local(self, obs, valid=None):
         self.mean += 1e-9
 module.RunningNorm.update = local
 """
+SIGNALLED = """
+import pickle, signal
+dumps, updates = pickle.dumps, iter(range(3))
+def signalled(said, *args, **kwargs):
+    if RANK == 0 and said == (False, 0) and next(updates, None) == 2:
+        os.kill(os.getpid(), signal.SIGTERM)
+    return dumps(said, *args, **kwargs)
+pickle.dumps = signalled
+"""
 HANG = """
 import lemniscate.envs.envpool as module, time
 step = module.EnvpoolBackend.step
@@ -167,6 +176,12 @@ def test_sigterm_to_one_rank_saves_once_and_stops_all(tmp_path, rank):
     assert codes == [143, 143], said
     assert said.count("is saved. Go on with: lemniscate resume") == 1, said
     assert lem.load(tmp_path / "r").step == max(lem.load(tmp_path / "r").step, 1)
+
+
+def test_sigterm_while_the_ranks_agree_is_not_lost(tmp_path):
+    codes, said = finish(ranks(2, *ENDLESS, tmp_path / "r", before=SIGNALLED), 30)
+    assert codes == [143, 143], said
+    assert said.count("is saved. Go on with: lemniscate resume") == 1, said
 
 
 @pytest.mark.parametrize(

@@ -240,40 +240,44 @@ class Run:
             with self.world.busy():
                 self._saver.save(state, planned=True, logged=self._logged)
             self.world.saved(self.path)
-        stop = self._asked_to_stop(state, planned)
+        stop, signum = self._asked_to_stop(state, planned)
         if stop and not finished:
-            self._tell_stop(state.step)
+            self._tell_stop(state.step, signum)
         elif planned and not finished:
             self._restart(state)
         return not (stop or finished)
 
-    def _asked_to_stop(self, state: TrainState, saved: bool) -> bool:
-        """Whether a callback or a signal stops the run. The state is saved then, and where a callback fails."""
+    def _asked_to_stop(self, state: TrainState, saved: bool) -> tuple[bool, int]:
+        """Whether a callback or a signal stops the run, and which signal, or 0: the same in every process.
+
+        The state is saved then, and where a callback fails. A signal that comes while the processes agree counts
+        after the next update.
+        """
         lines, self._unobserved = self._unobserved, []
-        stop = True
+        stop, signum = True, 0
         try:
             with globals_undisturbed():
                 answers = [self._observer(step, numbers, state) for step, numbers in lines] if self._observer else []
             said = self.world.each((any(answers), self._stop_signal))
-            self._stop_signal = max(signum for _, signum in said)
-            stop = any(asked for asked, _ in said) or bool(self._stop_signal)
+            signum = max(signum for _, signum in said)
+            stop = any(asked for asked, _ in said) or bool(signum)
         finally:
-            if self._stop_signal:
+            if stop:
                 self._hurry.cancel()  # the update has ended; the disk may take its time
             if stop and not saved and state.step > self._saver.planned_at:
                 self._saver.save(state, planned=False, logged=self._logged)
-        return stop
+        return stop, signum
 
-    def _tell_stop(self, step: int) -> None:
+    def _tell_stop(self, step: int, signum: int) -> None:
         saved = "not saved" if self._saver.failure else "saved"
-        by = "" if self._stop_signal else "by a callback "
+        by = "" if signum else "by a callback "
         message = (
             f"Stopped {by}at step {step:,}; the policy is {saved}. Go on with: {resume_line(self.path)}\n"
             f"It resumes at step {self._saver.last_planned:,}, the last planned checkpoint, and ends in the same bits"
             " as a run that was never stopped."
         )
-        if self._stop_signal:
-            raise Stopped(message if self.world.is_first else "", self._stop_signal)
+        if signum:
+            raise Stopped(message if self.world.is_first else "", signum)
         if self.world.is_first:
             say(message)
 
