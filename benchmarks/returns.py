@@ -2,12 +2,14 @@
 
     .venv/bin/python benchmarks/returns.py ppo                       every environment of docs/results.md, every seed
     .venv/bin/python benchmarks/returns.py ppo --envs Hopper-v5 --seeds 1 2
+    .venv/bin/python benchmarks/returns.py reppo --envs HalfCheetah-v5 --steps 1_300_000
     .venv/bin/python benchmarks/returns.py ddpg --runs DIR           keep the runs there, and go on with unfinished ones
     .venv/bin/python benchmarks/returns.py ppo trpo --table          the table of what has been run, and the pictures
 
 Each row of `benchmarks/results/returns.jsonl` is one policy: 100 episodes from starts that training never saw; the
-drone's in crazyflow. Where an environment has two numbers of steps, one run serves both: nothing in those presets
+drone's in crazyflow. Where an environment has two numbers of steps in RUNS, one run serves both: nothing in those presets
 depends on how long the run is to be, so the policy at the first is the one that a shorter run would have ended with.
+Where a learning rate falls, a run of another length is another run: `--steps`.
 """
 
 import argparse
@@ -42,7 +44,7 @@ RUNS = {
         "Swimmer-v5": ((MILLION,), 5),
         DRONE: ((MILLION,), 5),
     },
-    "reppo": {"HalfCheetah-v5": ((3_400_000,), 5)},
+    "reppo": {"HalfCheetah-v5": ((6_600_000,), 5)},
     "ddpg": {
         "MountainCarContinuous-v0": ((30_000,), 10),
         "Pendulum-v1": ((20_000,), 5),
@@ -69,7 +71,10 @@ def one(algorithm, env, seed, marks, runs):
     import lemniscate as lem
 
     with tempfile.TemporaryDirectory() if runs is None else nullcontext(runs) as folder:
-        path, fields = Path(folder) / f"{algorithm}-{env}-{seed}", {"total_steps": marks[-1], "keep_checkpoints": 50}
+        path, fields = (
+            Path(folder) / f"{algorithm}-{env}-{marks[-1]}-{seed}",
+            {"total_steps": marks[-1], "keep_checkpoints": 50},
+        )
         if path.exists():
             run = lem.resume(path, progress=False)
         else:
@@ -107,11 +112,10 @@ def summary(algorithm):
     """The rows of docs/results.md of what has been run."""
     from lemniscate.report.seeds import bootstrap_interval, iqm
 
-    for env, (marks, _) in RUNS[algorithm].items():
-        for mark in marks:
+    for env in RUNS[algorithm]:
+        found = [row["steps"] for row in rows("returns") if (row["algorithm"], row["env"]) == (algorithm, env)]
+        for mark in sorted(set(found)):
             of = measured(algorithm, env, mark)
-            if not of:
-                continue
             means = [row["mean_return"] for row in of]
             low, high = bootstrap_interval(means)
             seconds = np.median([row["training_s"] for row in of])
@@ -167,6 +171,7 @@ def main():
     parser.add_argument("algorithms", nargs="+", choices=RUNS)
     parser.add_argument("--envs", nargs="+")
     parser.add_argument("--seeds", nargs="+", type=int)
+    parser.add_argument("--steps", nargs="+", type=int, help="instead of those of RUNS")
     parser.add_argument("--runs", type=Path)
     parser.add_argument("--table", action="store_true", help="run nothing")
     given = parser.parse_args()
@@ -174,7 +179,7 @@ def main():
         for env in given.envs or RUNS[algorithm]:
             marks, seeds = RUNS[algorithm][env]
             for seed in given.seeds or range(1, seeds + 1):
-                one(algorithm, env, seed, marks, given.runs)
+                one(algorithm, env, seed, given.steps or marks, given.runs)
     print("| algorithm | environment | steps | mean ± std over seeds | IQM [95 %] | worst seed | seeds | training |")
     print("|---|---|---|---|---|---|---|---|")
     for algorithm in given.algorithms:

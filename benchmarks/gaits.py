@@ -1,0 +1,68 @@
+"""How HalfCheetah runs early in training: on both legs, or on its front foot alone, its nose down.
+
+    .venv/bin/python benchmarks/gaits.py reppo                                  the preset, seeds 101 to 106
+    .venv/bin/python benchmarks/gaits.py reppo --set gamma=0.98 initial_log_std=-0.5
+    .venv/bin/python benchmarks/gaits.py ppo --steps 500_000 --seeds 101 102
+
+A run as long as its preset says is stopped after `--steps`; its policy, deterministic, runs for 500 steps from three
+starts in Gymnasium. Each line of `benchmarks/results/gaits.jsonl` is a policy: its mean pitch in radians, positive with
+the nose down, and its mean reward for 1,000 steps, both without the first 100 steps.
+"""
+
+import argparse
+import ast
+import tempfile
+
+import numpy as np
+from common import append, provenance
+
+NOSE_DOWN = 0.5
+"""radians of mean pitch; who runs on both legs has about 0.1, on the front foot about 1.1"""
+
+
+def gait(policy):
+    """Mean pitch, and reward for 1,000 steps."""
+    import gymnasium as gym
+
+    pitches, rewards, env = [], [], gym.make("HalfCheetah-v5", max_episode_steps=500)
+    for seed in range(3):
+        obs, _ = env.reset(seed=seed)
+        for step in range(500):
+            obs, reward, *_ = env.step(policy.act(obs))
+            if step >= 100:
+                pitches.append(obs[1])
+                rewards.append(reward)
+    return float(np.mean(pitches)), float(np.mean(rewards) * 1000)
+
+
+def one(algorithm, seed, steps, fields):
+    """Train until `steps`, and look at the policy."""
+    import lemniscate as lem
+
+    with tempfile.TemporaryDirectory() as scratch:
+        given = {"seed": seed, "checkpoint_every": 10**9, "progress": False, **fields}
+        enough = [lambda step, _metrics, _policy: step >= steps]
+        run = lem.train(algorithm, "HalfCheetah-v5", run=f"{scratch}/run", callbacks=enough, **given)
+        pitch, reward = gait(run.policy)
+    row = {"algorithm": algorithm, "seed": seed, "steps": steps, "fields": fields, "pitch": pitch, "reward": reward}
+    append("gaits", row | provenance())
+    return pitch, reward
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("algorithm", help="its name")
+    parser.add_argument("--steps", type=int, default=330_000, help="after so many training stops; default 330_000")
+    parser.add_argument("--seeds", type=int, nargs="*", default=range(101, 107), help="default 101 to 106")
+    parser.add_argument("--set", nargs="*", default=[], metavar="NAME=VALUE", help="fields beside the preset")
+    options = parser.parse_args()
+    fields = {name: ast.literal_eval(value) for name, _, value in (each.partition("=") for each in options.set)}
+    found = [one(options.algorithm, seed, options.steps, fields) for seed in options.seeds]
+    for seed, (pitch, reward) in zip(options.seeds, found, strict=True):
+        print(f"seed {seed}: {'nose down' if pitch > NOSE_DOWN else 'level'}, pitch {pitch:.2f}, {reward:,.0f}")
+    down = sum(pitch > NOSE_DOWN for pitch, _ in found)
+    print(f"{down} of {len(found)} run nose down; mean {np.mean([reward for _, reward in found]):,.0f}")
+
+
+if __name__ == "__main__":
+    main()
