@@ -1,12 +1,13 @@
 """How HalfCheetah runs early in training: on both legs, or on its front foot alone, its nose down.
 
-    .venv/bin/python benchmarks/gaits.py reppo                                  the preset, seeds 101 to 106
-    .venv/bin/python benchmarks/gaits.py reppo --set gamma=0.98 initial_log_std=-0.5
-    .venv/bin/python benchmarks/gaits.py ppo --steps 500_000 --seeds 101 102
+    .venv/bin/python benchmarks/gaits.py reppo --set total_steps=6_600_000
+    .venv/bin/python benchmarks/gaits.py reppo --set total_steps=6_600_000 initial_log_std=-0.5 --seeds 107 108
+    .venv/bin/python benchmarks/gaits.py ppo --steps 500_000
 
-A run as long as its preset says is stopped after `--steps`; its policy, deterministic, runs for 500 steps from three
-starts in Gymnasium. Each line of `benchmarks/results/gaits.jsonl` is a policy: its mean pitch in radians, positive with
-the nose down, and its mean reward for 1,000 steps, both without the first 100 steps.
+A run is stopped after `--steps`, at the learning rate that it has there when it is to last `total_steps`. Its policy,
+deterministic, runs for 500 steps from three starts in Gymnasium. Each line of `benchmarks/results/gaits.jsonl` is a
+policy: its mean pitch in radians, positive with the nose down, and its mean reward for 1,000 steps, both without the
+first 100 steps.
 """
 
 import argparse

@@ -7,9 +7,9 @@
     .venv/bin/python benchmarks/returns.py ppo trpo --table          the table of what has been run, and the pictures
 
 Each row of `benchmarks/results/returns.jsonl` is one policy: 100 episodes from starts that training never saw; the
-drone's in crazyflow. Where an environment has two numbers of steps in RUNS, one run serves both: nothing in those presets
-depends on how long the run is to be, so the policy at the first is the one that a shorter run would have ended with.
-Where a learning rate falls, a run of another length is another run: `--steps`.
+drone's in crazyflow. Where RUNS has two numbers of steps, one run serves both: nothing in those presets depends on
+how long the run is to be, so the policy at the first is the one that a shorter run would have ended with. Where a
+learning rate falls, a run of another length is another run: `--steps`.
 """
 
 import argparse
