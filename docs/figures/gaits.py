@@ -29,19 +29,19 @@ def stills(policy):
         obs, *_ = env.step(policy.act(obs))
         pitch += obs[1] / MOMENTS[-1]
         if step in MOMENTS:
-            seen.append(env.render()[60:])
+            seen.append(env.render()[60:200])
     env.close()
     return seen, pitch
 
 
 def draw(steps=330_000):
     """A row of pictures for each start."""
-    figure = Figure(figsize=(9.6, 4.2), layout="constrained")
+    figure = Figure(figsize=(9.6, 2.9), layout="constrained")
     panels = figure.subplots(len(STARTS), len(MOMENTS))
     for (name, log_std), row in zip(STARTS.items(), panels, strict=True):
         with tempfile.TemporaryDirectory() as folder:
             enough = [lambda step, _metrics, _policy: step >= steps]
-            given = {"seed": 101, "total_steps": 6_600_000, "checkpoint_every": 10**9, "initial_log_std": log_std}
+            given = {"seed": 102, "total_steps": 6_600_000, "checkpoint_every": 10**9, "initial_log_std": log_std}
             run = lem.train("reppo", "HalfCheetah-v5", run=f"{folder}/run", callbacks=enough, progress=False, **given)
         pictures, pitch = stills(run.policy)
         row[0].set_title(f"{name}: mean pitch {pitch:.2f} rad", loc="left", fontsize=10)
