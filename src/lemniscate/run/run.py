@@ -248,17 +248,13 @@ class Run:
         return not (stop or finished)
 
     def _asked_to_stop(self, state: TrainState, saved: bool) -> tuple[bool, int]:
-        """Whether a callback or a signal stops the run, and which signal, or 0: the same in every process.
-
-        The state is saved then, and where a callback fails. A signal that comes while the processes agree counts
-        after the next update.
-        """
+        """Whether the run stops, and by which signal, or 0. The state is saved then, and where a callback fails."""
         lines, self._unobserved = self._unobserved, []
         stop, signum = True, 0
         try:
             with globals_undisturbed():
                 answers = [self._observer(step, numbers, state) for step, numbers in lines] if self._observer else []
-            said = self.world.each((any(answers), self._stop_signal))
+            said = self.world.each((any(answers), self._stop_signal))  # a signal from here on counts at the next update
             signum = max(signum for _, signum in said)
             stop = any(asked for asked, _ in said) or bool(signum)
         finally:
