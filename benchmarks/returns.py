@@ -71,10 +71,8 @@ def one(algorithm, env, seed, marks, runs):
     import lemniscate as lem
 
     with tempfile.TemporaryDirectory() if runs is None else nullcontext(runs) as folder:
-        path, fields = (
-            Path(folder) / f"{algorithm}-{env}-{marks[-1]}-{seed}",
-            {"total_steps": marks[-1], "keep_checkpoints": 50},
-        )
+        path = Path(folder) / f"{algorithm}-{env}-{marks[-1]}-{seed}"
+        fields = {"total_steps": marks[-1], "keep_checkpoints": 50}
         if path.exists():
             run = lem.resume(path, progress=False)
         else:

@@ -41,7 +41,7 @@ def draw(steps=330_000):
     for (name, log_std), row in zip(STARTS.items(), panels, strict=True):
         with tempfile.TemporaryDirectory() as folder:
             enough = [lambda step, _metrics, _policy: step >= steps]
-            given = {"seed": 102, "total_steps": 6_600_000, "checkpoint_every": 10**9, "initial_log_std": log_std}
+            given = {"seed": 102, "total_steps": 6_600_000, "initial_log_std": log_std}
             run = lem.train("reppo", "HalfCheetah-v5", run=f"{folder}/run", callbacks=enough, progress=False, **given)
         pictures, pitch = stills(run.policy)
         row[0].set_title(f"{name}: mean pitch {pitch:.2f} rad", loc="left", fontsize=10)
