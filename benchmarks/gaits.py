@@ -56,9 +56,7 @@ def main():
     parser.add_argument("algorithm", help="its name")
     parser.add_argument("--steps", type=int, default=330_000, help="after so many training stops; default 330_000")
     parser.add_argument("--seeds", type=int, nargs="*", default=range(101, 107), help="default 101 to 106")
-    parser.add_argument(
-        "--set", nargs="*", default=[], metavar="NAME=VALUE", help="fields, as Python literals"
-    )
+    parser.add_argument("--set", nargs="*", default=[], metavar="NAME=VALUE", help="fields, as Python literals")
     options = parser.parse_args()
     fields = {name: ast.literal_eval(value) for name, _, value in (each.partition("=") for each in options.set)}
     found = [one(options.algorithm, seed, options.steps, fields) for seed in options.seeds]
