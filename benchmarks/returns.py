@@ -44,7 +44,11 @@ RUNS = {
         "Swimmer-v5": ((MILLION,), 5),
         DRONE: ((MILLION,), 5),
     },
-    "reppo": {"HalfCheetah-v5": ((6_600_000,), 5)},
+    "reppo": {
+        "HalfCheetah-v5": ((6_600_000,), 5),
+        "Ant-v5": ((3 * MILLION,), 5),
+        "Humanoid-v5": ((3_500_000,), 3),
+    },
     "ddpg": {
         "MountainCarContinuous-v0": ((30_000,), 10),
         "Pendulum-v1": ((20_000,), 5),
