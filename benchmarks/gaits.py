@@ -1,4 +1,4 @@
-"""How HalfCheetah runs early in training: on both legs, or nose down on its front foot, or on its back.
+"""How HalfCheetah runs early in training: on both legs, nose down on its front foot, or on its back; in which strides.
 
     .venv/bin/python benchmarks/gaits.py reppo --set total_steps=6_600_000
     .venv/bin/python benchmarks/gaits.py reppo --set total_steps=6_600_000 initial_log_std=-0.5 --seeds 107 108
@@ -6,8 +6,8 @@
 
 A run is stopped after `--steps`, at the learning rate that it has there when it is to last `total_steps`. Its policy,
 deterministic, runs for 500 steps from three starts in Gymnasium. Each line of `benchmarks/results/gaits.jsonl` is a
-policy: its mean pitch in radians, positive with the nose down, and its mean reward for 1,000 steps, both over the three
-starts and without the first 100 steps.
+policy, without the first 100 steps: its mean pitch in radians, positive with the nose down, its mean reward for 1,000
+steps, and the strongest frequency of its actions in Hz, its strides, of the three starts the middle one.
 """
 
 import argparse
@@ -23,18 +23,23 @@ three ends so"""
 
 
 def gait(policy):
-    """Mean pitch, and reward for 1,000 steps."""
+    """Mean pitch, reward for 1,000 steps, and strides a second."""
     import gymnasium as gym
 
-    pitches, rewards, env = [], [], gym.make("HalfCheetah-v5", max_episode_steps=500)
+    pitches, rewards, strides, env = [], [], [], gym.make("HalfCheetah-v5", max_episode_steps=500)
     for seed in range(3):
         obs, _ = env.reset(seed=seed)
+        actions = []
         for step in range(500):
-            obs, reward, *_ = env.step(policy.act(obs))
+            action = policy.act(obs)
+            obs, reward, *_ = env.step(action)
             if step >= 100:
+                actions.append(action)
                 pitches.append(obs[1])
                 rewards.append(reward)
-    return float(np.mean(pitches)), float(np.mean(rewards) * 1000)
+        spectrum = np.abs(np.fft.rfft(actions - np.mean(actions, axis=0), axis=0)).sum(axis=1)
+        strides.append(np.fft.rfftfreq(len(actions), env.unwrapped.dt)[spectrum.argmax()])
+    return float(np.mean(pitches)), float(np.mean(rewards) * 1000), float(np.median(strides))
 
 
 def one(algorithm, seed, steps, fields):
@@ -45,10 +50,10 @@ def one(algorithm, seed, steps, fields):
         given = {"seed": seed, "checkpoint_every": 10**9, "progress": False, **fields}
         enough = [lambda step, _metrics, _policy: step >= steps]
         run = lem.train(algorithm, "HalfCheetah-v5", run=f"{scratch}/run", callbacks=enough, **given)
-        pitch, reward = gait(run.policy)
-    row = {"algorithm": algorithm, "seed": seed, "steps": steps, "fields": fields, "pitch": pitch, "reward": reward}
-    append("gaits", row | provenance())
-    return pitch, reward
+        pitch, reward, strides = gait(run.policy)
+    row = {"algorithm": algorithm, "seed": seed, "steps": steps, "fields": fields}
+    append("gaits", row | {"pitch": pitch, "reward": reward, "strides": strides} | provenance())
+    return pitch, reward, strides
 
 
 def main():
@@ -60,10 +65,11 @@ def main():
     options = parser.parse_args()
     fields = {name: ast.literal_eval(value) for name, _, value in (each.partition("=") for each in options.set)}
     found = [one(options.algorithm, seed, options.steps, fields) for seed in options.seeds]
-    for seed, (pitch, reward) in zip(options.seeds, found, strict=True):
-        print(f"seed {seed}: {'off its' if pitch > OFF_ITS_LEGS else 'on both'} legs, pitch {pitch:.2f}, {reward:,.0f}")
-    fallen = sum(pitch > OFF_ITS_LEGS for pitch, _ in found)
-    print(f"{fallen} of {len(found)} are off their legs; mean {np.mean([reward for _, reward in found]):,.0f}")
+    for seed, (pitch, reward, strides) in zip(options.seeds, found, strict=True):
+        legs = "off its" if pitch > OFF_ITS_LEGS else "on both"
+        print(f"seed {seed}: {legs} legs, pitch {pitch:.2f}, {strides:.1f} strides a second, {reward:,.0f}")
+    fallen = sum(pitch > OFF_ITS_LEGS for pitch, *_ in found)
+    print(f"{fallen} of {len(found)} are off their legs; mean {np.mean([reward for _, reward, _ in found]):,.0f}")
 
 
 if __name__ == "__main__":
