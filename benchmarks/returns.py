@@ -163,7 +163,7 @@ def draw(algorithm):
     for axes in panels[len(shown) :]:
         axes.set_visible(False)
     title = f"{algorithm.upper()}: mean over seeds, band from lowest to highest; averaged over a tenth of the run"
-    figure.suptitle(fill(title, 42 * columns), x=0.01, ha="left", fontsize=10)
+    figure.suptitle(fill(title, 46 * columns), x=0.01, ha="left", fontsize=10)
     save(figure, RESULTS / f"returns-{algorithm}.png")
 
 
