@@ -1,6 +1,7 @@
 """The drone behind the contract, held against crazyflow's own step."""
 
 import os
+import warnings
 
 os.environ.setdefault("SCIPY_ARRAY_API", "1")
 
@@ -12,7 +13,8 @@ pytest.importorskip("crazyflow")
 
 import gymnasium as gym
 
-from lemniscate.envs import crazyflow, registry
+from lemniscate.envs import registry
+from lemniscate.envs.factory import model_warnings_off
 from lemniscate.envs.spaces import scale_action
 
 FIGURE_EIGHT = "DroneFigureEightTrajectory-v0"
@@ -64,7 +66,7 @@ def test_every_step_is_crazyflows_own_step(env):
 
     env.restart(5)
     backend = env.backend
-    with crazyflow._quietly():
+    with warnings.catch_warnings(action="ignore"), model_warnings_off():
         native = gym.make_vec(FIGURE_EIGHT, num_envs=N, freq=50, device="cpu").unwrapped
         native.reset(seed=0)
     native.sim.data = jax.tree.map(lambda x: x, backend._state[0])

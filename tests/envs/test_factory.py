@@ -193,3 +193,11 @@ def test_images_are_brought_to_one_layout(shape, laid_out):
     if len(shape) == 4:
         expected = np.moveaxis(expected, 1, -2)
     assert torch.equal(obs.view(2, *laid_out), torch.from_numpy(expected.reshape(2, *laid_out)))
+
+
+def test_mujoco_says_nothing_of_gymnasiums_own_models(tmp_path, monkeypatch, capfd):
+    pytest.importorskip("mujoco")
+    monkeypatch.chdir(tmp_path)
+    registry.make("HalfCheetah-v5", 2, backend="gymnasium").close()
+    assert not capfd.readouterr().err
+    assert not list(tmp_path.iterdir())

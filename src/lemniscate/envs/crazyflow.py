@@ -24,6 +24,7 @@ from lemniscate.envs.backend import Scene, Summary
 from lemniscate.envs.drone_interface import interface_of
 from lemniscate.envs.drone_probe import DroneProbe
 from lemniscate.envs.drones import DYNAMICS, Drones, Mixed
+from lemniscate.envs.factory import model_warnings_off
 from lemniscate.envs.interface import Interface
 from lemniscate.envs.jax_backend import JaxBackend, Programs, jax_device
 from lemniscate.envs.pd import GAINS, PD
@@ -53,7 +54,7 @@ def make_drones(
     """So many drones in one dynamics, by default crazyflow's, and under conditions that need not be those of kwargs."""
     own = {name: value for name, value in kwargs.items() if name not in OWN}
     own |= {"dynamics": dynamics} if dynamics else {}
-    with _quietly():
+    with warnings.catch_warnings(action="ignore"), model_warnings_off():
         made = gym.make_vec(env_id, num_envs=num_envs, device=device, **{"freq": CONTROL_HZ, **own}).unwrapped
     return Drones(made, ranges, kwargs.get("history", 0), kwargs.get("privileged", False))
 
@@ -215,17 +216,3 @@ def dynamics_of(kwargs: Mapping[str, Any]) -> tuple[str, ...]:
 def _hashable(kwargs: Mapping[str, Any]) -> dict[str, Any]:
     """The same arguments with tuples for lists."""
     return {name: tuple(value) if isinstance(value, list) else value for name, value in kwargs.items()}
-
-
-@contextlib.contextmanager
-def _quietly() -> Iterator[None]:
-    """MuJoCo warns about a model detail of crazyflow's on standard error and in a file in the working directory."""
-    import mujoco
-
-    mujoco.set_mju_user_warning(lambda _: None)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        mujoco.set_mju_user_warning(None)

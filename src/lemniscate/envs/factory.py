@@ -4,7 +4,7 @@ import inspect
 import multiprocessing
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from typing import Any
 
@@ -51,13 +51,31 @@ def makes_vector(maker: Maker) -> bool:
 
 def make_one(maker: Maker, wrappers: Sequence[Callable[..., Any]] = (), **kwargs: Any) -> gym.Env:
     """One environment, by its maker: a worker process may not know the id."""
-    env = gym.make(maker, **kwargs) if isinstance(maker, EnvSpec) else maker(**kwargs)
+    registered = isinstance(maker, EnvSpec)
+    theirs = registered and str(maker.entry_point).startswith("gymnasium.envs.mujoco")
+    with model_warnings_off() if theirs else nullcontext():
+        env = gym.make(maker, **kwargs) if registered else maker(**kwargs)
     for wrap in wrappers:
         env = wrap(env)
     if not isinstance(env, gym.Env):
         kind = type(env).__name__
         raise TypeError(f"it makes {'an' if kind[0] in 'aeiouAEIOU' else 'a'} {kind}, not a gymnasium.Env")
     return env
+
+
+@contextmanager
+def model_warnings_off() -> Iterator[None]:
+    """No warnings of MuJoCo about models, which it writes on standard error and into a file where the command runs."""
+    try:
+        from mujoco import set_mju_user_warning  # pyright: ignore[reportAttributeAccessIssue]
+    except ImportError:  # Gymnasium says what to install
+        yield
+        return
+    set_mju_user_warning(lambda _: None)
+    try:
+        yield
+    finally:
+        set_mju_user_warning(None)
 
 
 def make_vector(
