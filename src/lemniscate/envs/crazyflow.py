@@ -24,9 +24,9 @@ from lemniscate.envs.backend import Scene, Summary
 from lemniscate.envs.drone_interface import interface_of
 from lemniscate.envs.drone_probe import DroneProbe
 from lemniscate.envs.drones import DYNAMICS, Drones, Mixed
-from lemniscate.envs.factory import model_warnings_off
 from lemniscate.envs.interface import Interface
 from lemniscate.envs.jax_backend import JaxBackend, Programs, jax_device
+from lemniscate.envs.model_warnings import model_warnings_off
 from lemniscate.envs.pd import GAINS, PD
 from lemniscate.envs.spaces import action_kind
 from lemniscate.errors import UserError, missing_extra, unknown_name

@@ -14,6 +14,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
 import lemniscate.envs.toy  # noqa: F401  (registers the toys)
 from lemniscate import named
+from lemniscate.envs.model_warnings import model_warnings_off
 from lemniscate.envs.workers import WatchedVectorEnv, Worker
 from lemniscate.errors import UserError
 
@@ -51,10 +52,9 @@ def makes_vector(maker: Maker) -> bool:
 
 def make_one(maker: Maker, wrappers: Sequence[Callable[..., Any]] = (), **kwargs: Any) -> gym.Env:
     """One environment, by its maker: a worker process may not know the id."""
-    registered = isinstance(maker, EnvSpec)
-    theirs = registered and str(maker.entry_point).startswith("gymnasium.envs.mujoco")
+    theirs = "gymnasium.envs.mujoco" in str(getattr(maker, "entry_point", ""))
     with model_warnings_off() if theirs else nullcontext():
-        env = gym.make(maker, **kwargs) if registered else maker(**kwargs)
+        env = gym.make(maker, **kwargs) if isinstance(maker, EnvSpec) else maker(**kwargs)
     for wrap in wrappers:
         env = wrap(env)
     if not isinstance(env, gym.Env):
@@ -63,42 +63,24 @@ def make_one(maker: Maker, wrappers: Sequence[Callable[..., Any]] = (), **kwargs
     return env
 
 
-@contextmanager
-def model_warnings_off() -> Iterator[None]:
-    """No warnings of MuJoCo about models, which it writes on standard error and into a file where the command runs."""
-    try:
-        from mujoco import set_mju_user_warning  # pyright: ignore[reportAttributeAccessIssue]
-    except ImportError:  # Gymnasium says what to install
-        yield
-        return
-    set_mju_user_warning(lambda _: None)
-    try:
-        yield
-    finally:
-        set_mju_user_warning(None)
-
-
 def make_vector(
     maker: Maker, num_envs: int, kwargs: Mapping[str, Any], wrappers: Sequence[Callable[..., Any]], workers: bool
 ) -> tuple[VectorEnv, int | None]:
     """N environments of a maker, and their time limit in steps; with `workers`, each in a process of its own."""
+    makers = [partial(make_one, maker, wrappers, **kwargs)] * num_envs
     if makes_vector(maker):
         make = partial(gym.make_vec, maker) if isinstance(maker, EnvSpec) else maker
-        envs = make(num_envs=num_envs, **kwargs)
-        return envs, envs.spec.max_episode_steps if envs.spec else None
-    makers = [partial(make_one, maker, wrappers, **kwargs)] * num_envs
-    if not workers:
+        envs = one = make(num_envs=num_envs, **kwargs)
+    elif workers:
+        multiprocessing.get_context("forkserver").set_forkserver_preload([__name__])  # imported once, for all
+        one = makers[0]()
+        one.close()
+        in_workers = [partial(Worker, make, os.getpid()) for make in makers]
+        envs = WatchedVectorEnv(in_workers, context="forkserver", autoreset_mode=AutoresetMode.DISABLED)
+    else:
         envs = SyncVectorEnv(makers, autoreset_mode=AutoresetMode.DISABLED)
-        return envs, _time_limit(envs.envs[0])
-    multiprocessing.get_context("forkserver").set_forkserver_preload([__name__])  # imported once, for all
-    one = makers[0]()
-    one.close()
-    in_workers = [partial(Worker, make, os.getpid()) for make in makers]
-    return WatchedVectorEnv(in_workers, context="forkserver", autoreset_mode=AutoresetMode.DISABLED), _time_limit(one)
-
-
-def _time_limit(env: gym.Env) -> int | None:
-    return env.spec.max_episode_steps if env.spec else None
+        one = envs.envs[0]
+    return envs, one.spec.max_episode_steps if one.spec else None
 
 
 @contextmanager
