@@ -51,5 +51,5 @@ def each_finding(
 
 
 def verdict(what: str, found: list[Finding]) -> str:
-    """What follows from the findings, in a sentence or two."""
+    """The conclusion from the findings, in a sentence or two."""
     return run_check.verdict(Path(what), found) if run_check.is_stored(Path(what)) else env_verdict(what, found)

@@ -1,4 +1,4 @@
-"""What this machine still has: memory, and files to open."""
+"""The free memory of this machine, and the files that may still be opened."""
 
 import os
 import resource

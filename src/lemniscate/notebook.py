@@ -1,4 +1,4 @@
-"""What is shown below the cell of a notebook, so that a saved notebook holds it: progress, pictures, frames, a film."""
+"""Output below the cell of a notebook, kept when it is saved: progress, pictures, frames, a film."""
 
 import io
 import time

@@ -45,7 +45,7 @@ class Processes(World):
         self._memory = self._shared_memory()
 
     def gather(self, mine: Tensor) -> Tensor:
-        """What every shard says, [S, …], from that of the shards held, [held, …]; also [N, …] from rows of shards."""
+        """The values of all shards, [S, …], from those held here, [held, …]; also [N, …] from rows of shards."""
         with self._together():
             if self._memory and self._memory.holds(mine):
                 return self._memory.gather(mine)
@@ -65,7 +65,7 @@ class Processes(World):
         return torch.cat(parts) if self.is_first else mine
 
     def each(self, mine: Any) -> list[Any]:
-        """What every process says, in the order of the ranks: any objects."""
+        """The objects that all processes pass, in the order of their ranks."""
         said: list[Any] = [None] * self.size
         with self._together():
             if self._memory and (data := self._memory.gather_bytes(pickle.dumps(mine))):
@@ -74,7 +74,7 @@ class Processes(World):
         return said
 
     def from_first(self, mine: Any) -> Any:
-        """What rank 0 says."""
+        """The object that rank 0 passes, in every process."""
         said = [mine]
         with self._together():
             dist.broadcast_object_list(said, src=0)
@@ -123,7 +123,7 @@ class Processes(World):
         return error
 
     def _shared_memory(self) -> SharedMemory | None:
-        """What all processes share, if they are on one machine, which has enough of it: ten times as fast as gloo."""
+        """The memory shared by all processes of one machine, ten times as fast as gloo; None if it is too small."""
         folder = self.from_first(SharedMemory.new_folder() if self.is_first else None)
         memory = None
         try:

@@ -64,7 +64,7 @@ class SharedMemory:
         return mine.device.type == "cpu" and mine.nbytes <= CAPACITY
 
     def gather(self, mine: Tensor) -> Tensor:
-        """What all processes say in the order of the ranks, [W · n, …], from [n, …] of each.
+        """The values of all processes in the order of their ranks, [W · n, …], from [n, …] of each.
 
         Raises `ConnectionError` where a process has ended.
         """
@@ -77,7 +77,7 @@ class SharedMemory:
         return places.clone(memory_format=torch.contiguous_format).view(-1).view(mine.dtype).view(-1, *mine.shape[1:])
 
     def gather_bytes(self, mine: bytes) -> list[bytes]:
-        """What all processes say, of different lengths; nothing where one says too much. Raises as `gather`."""
+        """The bytes of all processes, of different lengths; none if those of one are too many. Raises as `gather`."""
         lengths = self.gather(torch.tensor([len(mine)])).tolist()
         if max(lengths) > CAPACITY:
             return []

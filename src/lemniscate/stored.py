@@ -1,4 +1,4 @@
-"""What a run has stored: its directory, its newest policy. `load` and `save`."""
+"""Stored runs and policies: their directories, `load` and `save`."""
 
 import sys
 from collections.abc import Mapping
@@ -128,7 +128,7 @@ def _write(policy: TrainedPolicy, path: Path, identity: Mapping[str, Any]) -> No
 
 
 def _identity(policy: TrainedPolicy) -> dict[str, Any]:
-    """What a signature is of."""
+    """The signed part of a policy."""
     return {"algorithm": algorithm_of(policy), "config": policy.config.to_json()}
 
 

@@ -32,7 +32,7 @@ DEAD = " does not answer any more: it was killed or stopped, or its machine is g
 
 @dataclass
 class Beat:
-    """What another process said last, and since when it has said nothing new, by this machine's clock."""
+    """The last message of another process, and the time since which it is unchanged, by this machine's clock."""
 
     said: dict[str, Any]
     beats_at: float
@@ -150,7 +150,7 @@ class Watch:
             self._store.compare_set("fault", "", json.dumps(fault))
 
     def fault(self) -> dict[str, Any] | None:
-        """What is said of the process at fault; None if there is none, or if nobody can be asked."""
+        """The report on the process at fault; None if there is none, or if the store cannot be reached."""
         with suppress(RuntimeError):
             if self._store.check(["fault"]):
                 return json.loads(self._store.get("fault"))

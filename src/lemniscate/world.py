@@ -39,11 +39,11 @@ class World(Shards):
         self.held = range(rank * shards // size, (rank + 1) * shards // size)
 
     def each(self, mine: Any) -> list[Any]:
-        """What every process says, in the order of the ranks: any objects."""
+        """The objects that all processes pass, in the order of their ranks."""
         return [mine]
 
     def from_first(self, mine: Any) -> Any:
-        """What rank 0 says."""
+        """The object that rank 0 passes, in every process."""
         return mine
 
     def begin(self, steps: Callable[[], int]) -> None:
@@ -54,4 +54,4 @@ class World(Shards):
         return nullcontext()
 
     def saved(self, path: Path) -> None:
-        """What follows a planned checkpoint in a run directory, in every process."""
+        """The hook after a planned checkpoint in a run directory, called in every process."""

@@ -77,7 +77,7 @@ class State(OnPolicyState[ActorCritic]):
         self.parameters = PolicyVector(self.policy)  # θ
 
     def per_step_methods(self) -> list[tuple[object, str]]:
-        """Those of every state, and the Fisher product."""
+        """The methods of every state, and the Fisher product."""
         return [*super().per_step_methods(), (self.parameters, "fisher")]
 
 

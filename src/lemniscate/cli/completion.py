@@ -80,7 +80,7 @@ def _options(parser: argparse.ArgumentParser) -> dict[str, argparse.Action]:
 
 
 def _followers() -> dict[str, Iterable[str]]:
-    """What may follow a command or an option, where that is one of a few words."""
+    """The words that may follow a command or an option, where they are few."""
     ids, presets = registry.known_ids(), {preset: None for name in ALGORITHMS for preset in names(name)}
     found: dict[str, Iterable[str]] = {"train": ALGORITHMS, "completion": SHELLS, "check": ids, "--env": ids}
     found |= {"--preset": presets, "--backend": registry.BACKENDS, "--track": TRACKERS, "--network": NETWORKS}

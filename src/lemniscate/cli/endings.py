@@ -1,4 +1,4 @@
-"""What a person reads, and what the shell gets, where a command ends with an error."""
+"""The message and the exit code of a command that ends with an error."""
 
 from collections.abc import Callable
 
@@ -19,7 +19,7 @@ def exit_code(error: BaseException) -> int | None:
 
 
 def sentence(error: BaseException, command: str | None) -> str:
-    """What a person reads of it; nothing where another process of the run says it."""
+    """The message of an error; empty if another process of the run prints it."""
     if isinstance(error, BrokenPipeError) or (isinstance(error, UserError) and not talks()):
         return ""
     ended = isinstance(error, NonFiniteError | WorkerError | RankError) and command in ("train", "resume")

@@ -89,7 +89,7 @@ def _say_score(run: TrainedRun) -> None:
 
 
 def _places(given: argparse.Namespace) -> dict[str, Any]:
-    """Where the processes of one run are."""
+    """The places of a run's processes and of its storage."""
     return {"processes": number(given.processes), **_cluster(given), "storage": given.storage}
 
 

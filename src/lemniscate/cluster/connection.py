@@ -21,7 +21,7 @@ MOST_WORKERS = 4096
 
 @dataclass(frozen=True)
 class Cluster:
-    """Where the processes are: `ray` is this machine, or what RAY_ADDRESS says; `ray=ADDRESS` a cluster.
+    """The cluster of the processes: `ray` is this machine, or RAY_ADDRESS; `ray=ADDRESS` another.
 
     Args:
         address: None for this machine, or for RAY_ADDRESS.

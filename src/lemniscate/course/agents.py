@@ -1,4 +1,4 @@
-"""What the networks of an agent have to be: shapes, initialization, distributions, bounds."""
+"""Exercises on the networks of an agent: shapes, initialization, distributions, bounds."""
 
 import math
 from collections.abc import Iterator
@@ -18,7 +18,7 @@ LOW, HIGH = np.array([-2, 0, 1], np.float32), np.array([1, 4, 3], np.float32)
 
 
 def spaces_of(num_envs: int, low: np.ndarray, high: np.ndarray) -> Any:
-    """What an agent asks of a vector environment: its spaces, with O observations and A actions between bounds."""
+    """The spaces of a vector environment as an agent sees them, with O observations and A actions between bounds."""
     observation, action = spaces.Box(-np.inf, np.inf, (O,), np.float32), spaces.Box(low, high)
     return SimpleNamespace(
         num_envs=num_envs,

@@ -1,4 +1,4 @@
-"""What an exercise is: a function that is compared with a reference, or something that is judged by what it does."""
+"""The kinds of exercise: a function compared with a reference, and an object judged by its behaviour."""
 
 import inspect
 import sysconfig
@@ -91,7 +91,7 @@ def call_by_name(function: Function, **known: Any) -> Any:
 
 
 def raised(error: Exception) -> str:
-    """What a solution raised, and on which line of the reader's; in a cell of a notebook the line alone."""
+    """The exception of a solution, and the reader's line that raised it; in a cell of a notebook the line alone."""
     own = [frame for frame in traceback.extract_tb(error.__traceback__) if not frame.filename.startswith(LIBRARIES)]
     if not own:
         return f"it raised {type(error).__name__}: {error}"

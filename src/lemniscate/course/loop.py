@@ -24,7 +24,7 @@ CARTPOLE_STEPS, CARTPOLE_RETURN, EPISODES_EACH = 60_000, 400, 3
 
 @dataclass(frozen=True)
 class Move:
-    """What an action in a state causes: a reward, the next state, and how the episode ends there, if it does."""
+    """The effect of an action in a state: a reward, the next state, and the end of the episode, if it is one."""
 
     reward: float
     state: int
@@ -87,7 +87,7 @@ class BoxEnv(gym.Env):
 
 
 def one_hot(world: World, state: int) -> np.ndarray:
-    """How a state looks, [6]."""
+    """The observation of a state, [6]."""
     return np.eye(6, dtype=np.float32)[(world.seen or {}).get(state, state)]
 
 

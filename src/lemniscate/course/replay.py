@@ -1,4 +1,4 @@
-"""What a replay buffer has to keep, and what has to be put into it."""
+"""Exercises on the replay buffer: its contents, and the rows that go into it."""
 
 from collections.abc import Iterator
 from types import SimpleNamespace
@@ -113,7 +113,7 @@ def add_to_replay(function: Function) -> Iterator[str]:
 
 
 def _columns(args: tuple[Any, ...], named: dict[str, Any]) -> dict[str, Any]:
-    """What `rb.add` was called with, by the names of its parameters."""
+    """The arguments of `rb.add`, by the names of its parameters."""
     same = {"actions": "action", "rewards": "reward", "dones": "done", "terminations": "done"}
     by_place = dict(zip(("obs", "next_obs", "action", "reward", "done", "infos"), args, strict=False))
     return by_place | {same.get(name, name): value for name, value in named.items()}

@@ -1,4 +1,4 @@
-"""What a checkpoint of one's own has to hold, and what has to come back from it."""
+"""Exercises on saving: the contents of a checkpoint of one's own, and their return."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path

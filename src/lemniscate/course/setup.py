@@ -1,4 +1,4 @@
-"""What surrounds a training loop: seeds, environments, and the statistics of their observations."""
+"""Exercises on the setup of a training loop: seeds, environments, and the statistics of their observations."""
 
 import random
 from collections.abc import Iterator

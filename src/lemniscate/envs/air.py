@@ -99,7 +99,7 @@ def parameter_factors(dynamics: str, drawn: Mapping[str, jax.Array]) -> dict[str
 
 
 class Air:
-    """What stands between a policy and N drones: late actions, wind, blurred observations, a history of both.
+    """The disturbances between a policy and N drones: late actions, wind, noisy observations, a history of both.
 
     Its state is a dictionary of arrays, of which there are only those that the conditions need; every method returns
     it changed. Where there are no conditions and no history it is empty, and nothing is computed.

@@ -28,7 +28,7 @@ NUM_ENVS, STEPS = 4, 500
 def each_finding(
     env_id: str, backend: str | None, env_kwargs: Mapping[str, Any] | None, wrappers: Sequence[str]
 ) -> Iterator[Finding]:
-    """What was found about an environment, one by one. Raises `UserError` where there is none of that name."""
+    """The findings about an environment, one by one. Raises `UserError` if there is none of that name."""
     served_by = registry.backend_for(env_id, wrappers) if backend is None else registry.require_backend(backend)
     try:
         with warnings.catch_warnings():

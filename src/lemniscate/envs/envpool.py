@@ -80,7 +80,7 @@ class EnvpoolBackend:
 
     @classmethod
     def room(cls, env: str) -> tuple[int, int]:
-        """Those of the smallest, CartPole; no files."""
+        """The memory of the smallest environment, CartPole; no files."""
         return 10_000, 0
 
     @classmethod

@@ -24,7 +24,7 @@ class Episodes:
 
     @classmethod
     def merged(cls, parts: Sequence["Episodes"]) -> "Episodes":
-        """Those of several processes, in the order of their ends."""
+        """The episodes of several processes, in the order of their ends."""
         rows = sorted((end, i, part) for part in parts for i, end in enumerate(part.ends))
         columns = ([getattr(part, name)[i] for _, i, part in rows] for name in ("returns", "lengths", "ends"))
         return cls(*columns)

@@ -1,4 +1,4 @@
-"""What can be seen in random play that makes learning hard: rewards, ends of episodes, sizes of numbers."""
+"""Obstacles to learning that random play shows: in rewards, ends of episodes, sizes of numbers."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

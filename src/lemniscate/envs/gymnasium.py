@@ -64,7 +64,7 @@ class GymnasiumBackend:
 
     @classmethod
     def room(cls, env: str) -> tuple[int, int]:
-        """Those of arrays, or of the objects of a single environment with its wrappers; no files."""
+        """The memory of arrays, or of the objects of a single environment with its wrappers; no files."""
         return 8_000 if cls.wraps(env) else 200, 0
 
     @classmethod

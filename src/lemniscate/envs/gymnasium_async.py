@@ -19,5 +19,5 @@ class AsyncGymnasiumBackend(GymnasiumBackend):
 
     @classmethod
     def room(cls, env: str) -> tuple[int, int]:
-        """Those of a process of Python with NumPy and Gymnasium, and of its pipes."""
+        """The memory and files of a Python process with NumPy and Gymnasium, and of its pipes."""
         return 100_000_000, 5

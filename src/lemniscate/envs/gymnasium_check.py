@@ -53,7 +53,7 @@ def api_findings(make: Callable[[], gym.Env], env_id: str, wrapped: bool) -> Ite
 
 
 def _why_outside(env: gym.Env) -> str:
-    """What differs between the first observation and its space, a Box, in a sentence after that of Gymnasium's."""
+    """The difference between the first observation and its space, a Box, in a sentence that follows Gymnasium's."""
     space, obs = env.observation_space, np.asarray(env.reset(seed=0)[0])
     if not isinstance(space, gym.spaces.Box):
         return ""
@@ -100,7 +100,7 @@ class Careful(gym.Wrapper):
 
     @property
     def spec(self) -> Any:
-        """That of the environment."""
+        """The spec of the environment."""
         return self.env.spec
 
     @property

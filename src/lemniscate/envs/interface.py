@@ -1,4 +1,4 @@
-"""What the numbers of an environment mean outside of it: names, units, frames, times."""
+"""The physical meaning of an environment's numbers: names, units, frames, times."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -26,7 +26,7 @@ class BackendOfShards:
 
     @property
     def counts(self) -> Tensor:
-        """As `Backend.counts`."""
+        """The counts of all parts; see `Backend.counts`."""
         return torch.cat([backend.counts for backend in self._backends])
 
     def restart(self, *seeds: int) -> Tensor:
@@ -34,7 +34,7 @@ class BackendOfShards:
         return torch.cat([backend.restart(seed) for backend, seed in zip(self._backends, seeds, strict=True)])
 
     def step(self, action: Tensor) -> Step:
-        """As `Backend.step`."""
+        """The step of all parts; see `Backend.step`."""
         parts = zip(self._backends, action.chunk(len(self._backends)), strict=True)
         return joined([backend.step(part) for backend, part in parts])
 

@@ -101,7 +101,7 @@ class VectorView(VectorEnv):
         self.env.close()
 
     def _info(self, step: Step) -> dict[str, Any]:
-        """As Gymnasium lays it out: what is of an episode that ended is under `final_info`."""
+        """The `info` of Gymnasium's layout: the entries of an ended episode are under `final_info`."""
         done = (step.terminated | step.truncated).numpy().copy()
         info = self._masks(step.obs)
         measures = {name: values.numpy().copy() for name, values in step.measures.items()}

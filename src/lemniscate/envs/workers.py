@@ -27,11 +27,11 @@ MOST_LETTERS = 500
 
 
 class RaisedInWorkerError(RuntimeError):
-    """What an environment raised, as a sentence: an exception of its own may not come through a pipe."""
+    """An exception of an environment, as a sentence: the exception itself may not pass through a pipe."""
 
 
 class Unmade(gym.Env):
-    """What is in the place of an environment whose constructor raised: raises that when its `metadata` is asked for."""
+    """The place of an environment whose constructor raised; reading its `metadata` raises the same."""
 
     observation_space = action_space = gym.spaces.Discrete(1)
 

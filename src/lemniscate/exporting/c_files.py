@@ -75,7 +75,7 @@ def comment(text: str) -> str:
 
 
 def self_test_bound(program: Program, actions: np.ndarray) -> float:
-    """What the self-test stays below: ten times what another order of sums may change, by the size of the actions."""
+    """The error bound of the self-test: ten times the effect of another order of sums, by the size of the actions."""
     largest = float(np.abs(actions).max())
     return 0.05 * max(1.0, largest) if program.is_rounded else 1e-5 * max(10.0, largest)
 
@@ -120,7 +120,7 @@ def _statements(body: Body) -> str:
 
 
 def _masked(action: Action) -> str:
-    """What the safe action needs where a mask permits some only."""
+    """The lines of the safe action that obey a mask; empty if there is no mask."""
     if not (isinstance(action, Discrete) and action.masked):
         return ""
     return (

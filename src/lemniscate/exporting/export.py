@@ -104,7 +104,7 @@ def _contents(policy: TrainedPolicy, program: Program) -> tuple[dict[str, bytes]
 
 
 def _actor(policy: TrainedPolicy, program: Program, model: bytes | None, compiler: str | None) -> Act:
-    """What flies: the C on this machine, or else ONNX, or else the policy itself."""
+    """The exported policy that flies here: the C code, or else ONNX, or else the policy itself."""
     if compiler:
         size = input_size(policy.spec)
         untested = np.zeros((1, size), dtype=np.float32), np.zeros((1, program.action.size), dtype=np.float32)

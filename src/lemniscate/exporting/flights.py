@@ -26,7 +26,7 @@ EDGES = 8
 
 @dataclass(frozen=True)
 class Flights:
-    """What was seen, [R, O] float32, of which environment, and what its numbers mean."""
+    """Observations [R, O] float32, their environment, and the meaning of its numbers."""
 
     obs: np.ndarray
     interface: Interface
@@ -98,6 +98,6 @@ def _clear(policy: TrainedPolicy, obs: np.ndarray) -> np.ndarray:
 
 
 def origin(policy: TrainedPolicy, tests: int) -> str:
-    """Where the observations of a self-test are from, in words."""
+    """The origin of a self-test's observations, in words."""
     edges = f", and {tests - TESTS} with one number far outside of them" if tests > TESTS else ""
     return f"{TESTS} of episodes of {policy.spec.env_id}{edges}"

@@ -72,7 +72,7 @@ def manifest(
 
 
 def title(policy: TrainedPolicy) -> str:
-    """What it is a policy for, in a line."""
+    """The environment, algorithm, seed and step of a policy, in a line."""
     return f"A policy for {policy.spec.env_id}: {algorithm(policy)}, seed {policy.config.seed}, step {policy.step:,}."
 
 

@@ -65,7 +65,7 @@ class Program:
 
     @property
     def multiplications(self) -> int:
-        """Those in matrix products, for one observation."""
+        """The multiplications in matrix products, for one observation."""
         linear = [operation for operation in self.operations if operation.name == "Linear"]
         return sum(operation.output.size * weight_of(operation).shape[1] for operation in linear)
 

@@ -120,7 +120,7 @@ def on_target(
 
 
 def sentences(record: Mapping[str, Any]) -> list[str]:
-    """What a person reads of it."""
+    """The record as sentences for a person."""
     names = {"onnx": "ONNX", "c_host": "C", "c_cortex_m4f": "C on the simulated Cortex-M4F"}
     compared = {name: record[key] for key, name in names.items() if (record[key] or {}).get("observations")}
     said = [_distance(name, each) for name, each in compared.items()]

@@ -31,7 +31,7 @@ class Sizes:
 
 @dataclass(frozen=True)
 class Simulated:
-    """What the simulated core did: actions [R, A] at R observations, the self-test, the instructions of a call."""
+    """The results of the simulated core: actions [R, A] at R observations, the self-test, instructions per call."""
 
     actions: np.ndarray
     self_test: float

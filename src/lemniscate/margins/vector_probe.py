@@ -78,7 +78,7 @@ class VectorProbe:
 
 
 def _axes(spec: Spec, has_model: bool) -> tuple[Axis, ...]:
-    """Those of an environment: a mask forbids to act late, and only numbers can be noisy."""
+    """The axes of an environment: with a mask no action can be late, and only numbers can be noisy."""
     masked = isinstance(spec.action, Discrete) and spec.action.masked
     noisy = bool(_is_number(spec).any())
     channel = (axis for axis in CHANNEL_AXES if (noisy if axis.name == "observation_noise" else not masked))

@@ -26,7 +26,7 @@ class Shards:
         """the numbers of those that this process holds"""
 
     def gather(self, mine: Tensor) -> Tensor:
-        """What every shard says, [S, …], from that of the shards held, [held, …]."""
+        """The values of all shards, [S, …], from those of the shards held here, [held, …]."""
         return mine
 
     def to_first(self, mine: Tensor) -> Tensor:
@@ -41,7 +41,7 @@ class Shards:
         return torch.tensordot(weights / weights.sum(), self.gather(torch.stack(list(values))), dims=1)
 
     def moments(self, parts: Sequence[Tensor]) -> Moments:
-        """Those of the last dimension of all shards' rows, from the rows [..., B] of each shard held."""
+        """The moments over the last dimension of all shards' rows, from the rows [..., B] of each shard held here."""
         mine = [_moments(part) for part in parts]
         if self.count == 1:
             return mine[0]

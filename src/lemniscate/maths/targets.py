@@ -1,4 +1,4 @@
-"""What Q should say of a transition, and the networks that say it."""
+"""The targets of Q for a transition, and the target networks."""
 
 from collections.abc import Iterable
 

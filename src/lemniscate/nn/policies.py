@@ -36,7 +36,7 @@ class Policy(nn.Module):
         return torch.cat([self.noise(part, stream) for stream in streams], dim=len(part) - 1)
 
     def noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
-        """Those that one generator draws."""
+        """The action noise of one generator, in this shape."""
         raise NotImplementedError
 
     def metrics(self) -> dict[str, Tensor]:

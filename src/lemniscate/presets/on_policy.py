@@ -163,7 +163,7 @@ PPO = [
     Preset(
         "half-cheetah",
         ADAPTIVE.replace(env="HalfCheetah-v5"),
-        "search by hand, 13 settings, mostly on seeds 101 to 106; the two best did not hold on fresh seeds",
+        "search by hand, 13 settings, mostly on seeds 101 to 106; the three best did not hold on fresh seeds",
         "2026-11",
     ),
     Preset("ant", ADAPTIVE.replace(env="Ant-v5"), "search by hand, 5 runs, on seeds 101 and 102", "2026-11"),

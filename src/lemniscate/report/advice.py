@@ -1,4 +1,4 @@
-"""What to try next: sentences derived from what a run has logged, each by a rule with a threshold and its source.
+"""Advice on a run: sentences derived from its metrics, each by a rule with a threshold and its source.
 
 A rule is a function of the `Evidence` that returns a sentence, or None where it has nothing to say. The rules see
 numbers alone: they say what was measured and what usually helps, not what is wrong.
@@ -22,7 +22,7 @@ ONE_SEED = "One seed says nothing about another setting or algorithm: train seve
 
 @dataclass(frozen=True)
 class Evidence:
-    """What the rules look at: the fields of a run's Config, its metrics, and the scores of its final evaluation."""
+    """The input of the rules: the fields of a run's Config, its metrics, and the scores of its final evaluation."""
 
     config: Mapping[str, Any]
     log: Sequence[Mapping[str, Any]]
@@ -49,7 +49,7 @@ class Evidence:
 
 
 def sentences(evidence: Evidence) -> list[str]:
-    """What each rule has to say."""
+    """The sentences of all rules that apply."""
     return [said for rule in RULES if (said := rule(evidence))]
 
 

@@ -88,7 +88,7 @@ def _draw_episodes(axes: Axes, run: Path, by: str, color: object, label: str) ->
 
 
 def _positions(run: Path, steps: np.ndarray, by: str) -> np.ndarray:
-    """Where the episodes that ended at `steps` lie on the horizontal axis."""
+    """The horizontal positions of the episodes that ended at `steps`."""
     if by == "episode":
         return np.arange(1.0, len(steps) + 1)
     return np.interp(steps, *training_minutes(run)) if by == "minute" else steps

@@ -221,7 +221,7 @@ def _rendered(arguments: dict[str, Any], mode: str) -> gym.Env:
 
 
 def _picture(env: gym.Env, name: str) -> np.ndarray:
-    """What an environment renders, [H, W, 3] uint8. Raises `UserError` where that is no picture."""
+    """The rendered frame of an environment, [H, W, 3] uint8. Raises `UserError` if it is not a picture."""
     picture: Any = env.render()
     is_array = isinstance(picture, np.ndarray)
     if is_array and picture.dtype == np.uint8 and picture.ndim == 3 and picture.shape[2] == 3:

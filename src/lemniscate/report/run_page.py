@@ -68,13 +68,13 @@ def figures(pictures: Sequence[Path]) -> list[Html]:
 
 
 def caption(picture: Path) -> str:
-    """What is below a picture."""
+    """The caption of a picture."""
     known = [text for name, text in CAPTIONS.items() if picture.stem.startswith(name)]
     return [picture.stem, *known][-1]
 
 
 def footer() -> Html:
-    """When and with what the page was written."""
+    """The date, and the versions of the packages, for the end of the page."""
     versions = []
     for package in PACKAGES:
         try:
@@ -111,7 +111,7 @@ def score_rows(scores: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def measures(scores: Mapping[str, Any]) -> dict[str, float]:
-    """What the environment measured besides reward."""
+    """The measures of the environment besides reward."""
     numbers = {name: value for name, value in scores.items() if name not in (*NOT_MEASURES, "step", "seed")}
     return {name: value for name, value in numbers.items() if isinstance(value, int | float) and math.isfinite(value)}
 

@@ -1,4 +1,4 @@
-"""What the processes of a run tell each other after every update."""
+"""The messages between the processes of a run after every update."""
 
 from socket import gethostname
 from zlib import crc32

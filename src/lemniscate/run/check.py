@@ -23,7 +23,7 @@ def is_stored(path: Path) -> bool:
 
 
 def each_finding(path: Path) -> Iterator[Finding]:
-    """What was found in the files of a run, or of each run of a sweep, one by one."""
+    """The findings in the files of a run, or of each run of a sweep, one by one."""
     if not is_sweep(path):
         yield from _of_run(path)
         return
@@ -41,7 +41,7 @@ def each_finding(path: Path) -> Iterator[Finding]:
 
 
 def verdict(path: Path, found: list[Finding]) -> str:
-    """What can be done with a run or a sweep, in a sentence or two."""
+    """The verdict on a run or a sweep, and its remedy, in a sentence or two."""
     damaged = sum(finding.grade == BAD for finding in found)
     if not damaged:
         return f"{path} is whole."

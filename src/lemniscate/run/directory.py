@@ -52,7 +52,7 @@ def create_directory(path: Path, name: str, record: dict[str, Any]) -> None:
 
 
 def read_record(path: Path) -> dict[str, Any]:
-    """What a run's `config.json` holds: algorithm, config, signature. If it is damaged, as in the newest checkpoint.
+    """The record of a run's `config.json`: algorithm, config, signature; if damaged, that of the newest checkpoint.
 
     Raises `UserError` if it is not a run.
     """

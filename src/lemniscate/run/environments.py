@@ -41,7 +41,7 @@ def make_envs(config: RunConfig) -> tuple[VecEnv, VecEnv]:
 
 
 def envs_of(config: RunConfig, world: World) -> tuple[VecEnv, VecEnv | None]:
-    """Those of one of several processes: only the first evaluates. Raises as `make_envs`."""
+    """The environments of one of several processes: only the first evaluates. Raises as `make_envs`."""
     device = device_for(config.device)
     eval_env = evaluation_env(config, config.evaluate_episodes, device=str(device)) if world.is_first else None
     return training_env(config, world), eval_env

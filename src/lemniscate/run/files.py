@@ -35,7 +35,7 @@ def write_json(path: Path, record: Mapping[str, Any]) -> None:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """What `write_json` was given.
+    """The object that `write_json` stored.
 
     Raises:
         DamagedFileError: the file is missing, is no regular file, or has another content than was written.

@@ -37,7 +37,7 @@ def read_metrics(path: Path, last_bytes: int | None = None) -> list[dict[str, An
 
 
 def damage(path: Path, logged: int) -> str | None:
-    """What is wrong with a run's metrics, in a sentence. `logged` is the step that they are known to reach."""
+    """The damage of a run's metrics, in a sentence. `logged` is the step that they are known to reach."""
     file, lines = path / METRICS, _lines(path)
     if lines and not lines[-1].endswith(b"\n"):  # cut off by a crash
         lines.pop()

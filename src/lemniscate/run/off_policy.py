@@ -88,7 +88,7 @@ class OffPolicyConfig(RunConfig):
                 )
 
     def memory(self, spec: Spec) -> dict[str, int]:
-        """Those of the replay buffer, the action noise, the minibatches of an update, and the metrics of a line."""
+        """The bytes of the replay buffer, the action noise, an update's minibatches, and the metrics of a line."""
         actions, length = spec.bounded_box().size, spec.max_episode_steps or 1000
         width = max((*self.hidden, *self.critic_hidden), default=0)
         updates = -(-self.log_every // self.update_every)

@@ -43,7 +43,7 @@ class OnPolicyConfig(RunConfig):
         return ActorCritic(spec, self.layers, self.initial_log_std, self.normalize_observations)
 
     def memory(self, spec: Spec) -> dict[str, int]:
-        """Those of a rollout, and of its rows in the widest layer."""
+        """The bytes of a rollout, and of its rows in the widest layer."""
         rows = 4 * self.num_rows * max(self.hidden, default=0)
         return {"num_steps": rows + rollout_bytes(spec, self.num_steps, self.num_envs)}
 
@@ -80,5 +80,5 @@ class OnPolicyState(ScaledState[Networks]):
     """The training state of the algorithms that learn from their newest rollout."""
 
     def per_step_methods(self) -> list[tuple[object, str]]:
-        """Those of every algorithm, and what is estimated of a rollout."""
+        """The methods of every algorithm, and the estimates on a rollout."""
         return [*super().per_step_methods(), (self.networks, "estimates")]

@@ -60,7 +60,7 @@ class Interval:
         return round(inside) if self.whole else float(f"{inside:.6g}")
 
     def key_of(self, value: Any) -> Any:
-        """What Optuna would have suggested for `value`; None if it is outside."""
+        """The suggestion of Optuna that stands for `value`; None if it is outside."""
         return value if isinstance(value, int | float) and self.low <= value <= self.high else None
 
 
@@ -83,7 +83,7 @@ class Choice:
         return value
 
     def key_of(self, value: Any) -> Any:
-        """What Optuna would have suggested for `value`; None if it is none of the choices."""
+        """The suggestion of Optuna that stands for `value`; None if it is none of the choices."""
         return next((key for key, choice in self.values.items() if choice == value), None)
 
 

@@ -56,7 +56,7 @@ class Tuned:
 
 @dataclass(frozen=True)
 class Search:
-    """What is searched, as `tune.json` has it."""
+    """A search, as stored in `tune.json`."""
 
     path: Path
     algorithm: str
@@ -76,7 +76,7 @@ class Search:
 
     @property
     def what(self) -> str:
-        """What is searched, as a user would type it."""
+        """The searched fields and their ranges, as on the command line."""
         return ", ".join(f"{name}={text}" for name, text in self.search.items())
 
     def create(self) -> None:
@@ -164,7 +164,7 @@ def score_at(runs: Iterable[Path], step: int) -> float | None:
 
 
 def _returns(line: Mapping[str, Any], step: int) -> list[float]:
-    """Those of a line of the metrics, unless it was written long after a step, as where a run has gone on before."""
+    """The episode returns of a line of the metrics; none if it was written long after `step`, as in a resumed run."""
     return line.get("episode/returns", []) if line["step"] <= step + step // 2 else []
 
 
