@@ -27,8 +27,8 @@ MILLION, DRONE = 1_000_000, "DroneFigureEightTrajectory-v0"
 RUNS = {
     # algorithm: environment: (numbers of steps, seeds)
     "ppo": {
-        "CartPole-v1": ((50_000,), 5),
-        "LunarLander-v3": ((MILLION,), 5),
+        "CartPole-v1": ((50_000,), 10),
+        "LunarLander-v3": ((MILLION,), 10),
         "HalfCheetah-v5": ((MILLION, 3 * MILLION), 10),
         "Hopper-v5": ((MILLION,), 10),
         "Walker2d-v5": ((MILLION,), 5),
@@ -36,7 +36,7 @@ RUNS = {
         "Humanoid-v5": ((MILLION, 3 * MILLION, 7_500_000), 3),
     },
     "reinforce": {"CartPole-v1": ((200_000,), 5), "InvertedPendulum-v5": ((500_000,), 5)},
-    "a2c": {"HalfCheetah-v5": ((MILLION,), 5), DRONE: ((MILLION,), 5)},
+    "a2c": {"HalfCheetah-v5": ((MILLION,), 10), DRONE: ((MILLION,), 5)},
     "trpo": {
         "HalfCheetah-v5": ((MILLION,), 5),
         "Hopper-v5": ((MILLION, 2 * MILLION), 10),
