@@ -656,6 +656,13 @@ MUTANTS = [
         REPPO + "a_multiplier_grows_while_its_constraint_is_broken",
     ),
     (
+        "the floor of the temperature is a ceiling",
+        "nn/actor_categorical_q.py",
+        "clamp_(min=math.log(least)",
+        "clamp_(max=math.log(least)",
+        REPPO + "the_temperature_stops_at_its_least_and_can_grow_again",
+    ),
+    (
         "the policy's loss moves the temperature",
         "algos/reppo.py",
         "state.networks.multipliers().detach()",

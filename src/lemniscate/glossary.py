@@ -77,6 +77,7 @@ FIELDS = """
 `target_noise_clip` | `target_noise_clip` | `noise_clip` | `noise_clip` | – | –
 `target_entropy` none | `target_entropy` auto | `autotune` | – (fixed α) | – | –
 `initial_temperature` | `ent_coef` (as auto_1.0) | `alpha` (fixed, unless autotune) | `alpha` (fixed) | – | `init_temperature`
+`min_temperature` | – | – | – | – | `alpha_min`, `min_alpha`
 `max_kl` | `target_kl` | – | `delta` | – | `kl_limit`
 `td_lambda` | – | – | – | – | `lmbda`
 `value_range` | – | – | – | – | `v_max`

@@ -128,6 +128,24 @@ def test_a_multiplier_grows_while_its_constraint_is_broken(ready, entropy, alpha
     torch.testing.assert_close(given - loss, torch.tensor(-0.3 * 2.5))
 
 
+@pytest.mark.parametrize("least", [0.0, 0.2])
+def test_the_temperature_stops_at_its_least_and_can_grow_again(ready, rng, least):
+    config, state, batch = ready
+    config = config.replace(min_temperature=least, max_kl=1e6)
+    state.multiplier_optimizer.learning_rate = 0.2
+
+    def multipliers_after(steps, target_entropy):
+        minibatches, noise = torch.arange(50).expand(steps, 50), torch.randn(steps, 50, 2, generator=rng)
+        reppo.learn(config.replace(target_entropy=target_entropy), state, batch, minibatches, noise)
+        return state.networks.multipliers().tolist()
+
+    alpha, beta = multipliers_after(20, -50.0)
+    assert beta < 0.1, "only the temperature has a floor"
+    assert alpha == pytest.approx(0.2) if least else alpha < 0.1
+    alpha, _ = multipliers_after(40, 50.0)
+    assert alpha > 1.5 * least
+
+
 def learned_q(mode="DISABLED", spoil=lambda rollout: rollout, env="EndlessLevers-v0", **kwargs):
     """Q(s, 0) after enough updates with γ = 0.9 and no entropy; the truth of the endless one is 10."""
     plain = {"normalize_observations": False, "scale_rewards": False}

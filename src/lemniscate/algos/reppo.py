@@ -52,6 +52,8 @@ class Config(OnPolicyConfig):
     """ε, the KL from the policy that collected beyond which a row only brings it back; usually 0.1 to 0.5"""
     target_entropy: Finite | None = None
     """H̄ in nats, the entropy that the temperature aims at, over actions in [-1, 1]^A; none: −A"""
+    min_temperature: Fraction = 0.0
+    """the least α, what a nat of entropy is worth even above H̄, in units of scaled rewards; usually 0 to 0.003"""
     value_range: Positive = 10.0
     """the bins of Q's distribution cover [-value_range, value_range], in units of scaled rewards; usually 5 to 20"""
     hidden: tuple[Width, ...] = (128, 128)
@@ -146,6 +148,7 @@ def learn(config: Config, state: State, batch: SoftBatch, minibatches: Tensor, n
         actor = state.actor_optimizer.step(partial(actor_loss, config, state), minibatch, its_noise)
         reached = actor["losses/entropy"], actor["kl"], minibatch.action.shape[-1]
         multipliers = state.multiplier_optimizer.step(partial(multiplier_loss, config), *reached)
+        state.networks.multipliers.raise_first(config.min_temperature)
         metrics.append({**critic, **actor, **multipliers})
     return metrics
 
@@ -157,17 +160,14 @@ def update(config: Config, state: State, rollout: Rollout) -> dict[str, Tensor |
         optimizer.learning_rate = rate
     if config.scale_rewards:
         rollout = state.reward_scale.scale(rollout)
-    batch = targets(config, state, rollout)
-    valid_rows = rollout.valid_rows
-    metrics: list[Metrics] = []
+    batch, size, metrics = targets(config, state, rollout), config.minibatch_size // config.shards, []
     for _ in range(config.epochs):
-        size = config.minibatch_size // config.shards
-        minibatches = epoch_minibatches(valid_rows, rollout.num_rows, size, state.rng.minibatch)
+        minibatches = epoch_minibatches(rollout.valid_rows, rollout.num_rows, size, state.rng.minibatch)
         noise = state.policy.draw_noise(minibatches.shape, state.rng.action)  # [K, M, A]
         metrics.append(means(state.learn(config, state, batch, minibatches, noise)))
     state.policy.observe(rollout.obs, rollout.valid)  # last: the KL compares policies behind the same normalizer
     state.step += config.num_steps * config.num_envs
-    explained = explained_variance(batch.value, batch.target, valid_rows, state.shards)
+    explained = explained_variance(batch.value, batch.target, rollout.valid_rows, state.shards)
     return {**means(metrics), "explained_variance": explained, "learning_rate": rate}
 
 

@@ -27,6 +27,11 @@ class Multipliers(nn.Module):
         """[number of multipliers]."""
         return self.log.exp()
 
+    @torch.no_grad()
+    def raise_first(self, least: float) -> None:
+        """Set the first to `least` where it is below, in place: the projection of projected gradient descent."""
+        self.log[:1].clamp_(min=math.log(least) if least else -math.inf)
+
 
 class ActorCategoricalQ(nn.Module):
     """A stochastic policy for bounded continuous actions, Q(s, a) as a distribution, and the multipliers α and β.
