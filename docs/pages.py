@@ -34,7 +34,7 @@ PICTURES = {"image/png": "png", "image/gif": "gif", "image/webp": "webp", "image
 
 
 def address(file: Path) -> Path:
-    """Where a file of the project is in the site's folder."""
+    """The path of a project's file in the site's folder."""
     name = file.relative_to(ROOT)
     if str(name) in HOME or name.name == "llms.txt":
         return OUT / HOME.get(str(name), name)

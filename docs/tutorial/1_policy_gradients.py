@@ -47,7 +47,7 @@ print(f"exact              {exact.numpy().round(2)}")
 
 # %%
 def reward_to_go(reward, next_value, terminated, done, *, gamma):
-    """What follows each action, [T, N]."""
+    """The return from each action on, [T, N]."""
     go = torch.zeros_like(reward)
     follows = next_value[-1]  # of the row after the last
     for t in reversed(range(len(reward))):

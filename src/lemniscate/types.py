@@ -100,7 +100,7 @@ class Rollout(Record):
 
     @property
     def valid_rows(self) -> list[Tensor]:
-        """Of each shard the indices [B], in the flattened rollout, of the rows whose action was not ignored."""
+        """The indices [B] of each shard's rows whose action was not ignored, in the flattened rollout."""
         parts, size = self.valid.chunk(self.shards, dim=1), self.num_rows // self.shards
         return [number * size + part.flatten().nonzero()[:, 0] for number, part in enumerate(parts)]
 

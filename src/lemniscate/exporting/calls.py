@@ -33,17 +33,17 @@ class Call:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Of the result, for one observation."""
+        """The shape of the result for one observation."""
         return self._own(self.fake)
 
     @property
     def shapes(self) -> list[tuple[int, ...]]:
-        """Of each result, where there are several."""
+        """The shape of each result for one observation, where there are several."""
         return [self._own(fake) for fake in self.fake]
 
     @property
     def kind(self) -> Kind:
-        """Of the result's numbers."""
+        """The kind of the result's numbers. Raises `UntranslatableError` for a type without one."""
         if self.fake.dtype not in KINDS:
             raise UntranslatableError(f"it computes in {str(self.fake.dtype).removeprefix('torch.')}")
         return KINDS[self.fake.dtype]
@@ -82,7 +82,7 @@ class Call:
         return self.add("RoundBfloat16", value, shape=value.shape) if self.is_bfloat16 else value
 
     def axis(self, axis: int, rank: int) -> int:
-        """Of one observation, for an axis of a batch of `rank` axes."""
+        """The axis of one observation that is `axis` of a batch with `rank` axes."""
         axis %= rank
         if axis == 0:
             raise UntranslatableError(f"{self.name} mixes the observations of a batch")
