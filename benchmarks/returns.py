@@ -46,6 +46,8 @@ RUNS = {
     },
     "reppo": {
         "HalfCheetah-v5": ((6_600_000,), 5),
+        "Hopper-v5": ((MILLION,), 10),
+        "Walker2d-v5": ((MILLION,), 10),
         "Ant-v5": ((4_500_000,), 5),
     },
     "ddpg": {

@@ -194,11 +194,12 @@ PPO = [
 
 REINFORCE: list[Preset] = []
 
-FAR = reppo.Config(gamma=0.99, td_lambda=0.8, max_kl=0.5, initial_log_std=-0.5)
-"""larger steps of the policy, and shorter traces: for tasks in which a robot can fall"""
-MANY = FAR.replace(num_envs=256, initial_log_std=-1.0)
+MANY = reppo.Config(num_envs=256, gamma=0.99, td_lambda=0.8, max_kl=0.5)
 """rollouts of 16,384 rows and 512 gradient steps: for bodies with many joints"""
+NOISY = reppo.Config(gamma=0.995, min_temperature=0.003)
+"""a longer horizon, and noise that always pays: for robots that can fall"""
 TRIED = "search by hand, some 25 settings on four environments, 300,000 steps, mostly on seed 101"
+SURE = "search by hand, nine settings, 750,000 steps, on 101 to 105; chosen by the worst seeds"
 
 REPPO = [
     Preset(
@@ -208,8 +209,8 @@ REPPO = [
         "2026-11",
     ),
     Preset("humanoid", MANY.replace(env="Humanoid-v5"), f"{TRIED}; this one after two longer runs on 101", "2026-11"),
-    Preset("walker2d", FAR.replace(env="Walker2d-v5"), TRIED, "2026-11"),
-    Preset("hopper", FAR.replace(env="Hopper-v5"), TRIED, "2026-11"),
+    Preset("walker2d", NOISY.replace(env="Walker2d-v5"), SURE, "2026-11"),
+    Preset("hopper", NOISY.replace(env="Hopper-v5"), SURE, "2026-11"),
 ]
 
 A2C = [
