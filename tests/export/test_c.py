@@ -128,14 +128,21 @@ def test_it_includes_nothing_but_integers_and_memcpy_and_has_no_double():
 
 
 def test_a_header_of_cpp_too(tmp_path):
-    (tmp_path / "policy.h").write_text(exported(policy_for()).files()["policy.h"])
-    (tmp_path / "use.cpp").write_text('#include "policy.h"\nint use(float *x) { return policy_act(x, x); }\n')
+    """C++ finds the functions of the C file: a program of both is linked, and ends well."""
+    copy, compiler = exported(policy_for()), host_compiler()
+    program = (
+        '#include "policy.h"\nint main() { float x[POLICY_OBSERVATIONS] = {}, y[POLICY_ACTIONS]; policy_act(x, y); }\n'
+    )
+    for name, text in {**copy.files(), "use.cpp": program}.items():
+        (tmp_path / name).write_text(text)
+    run_tool([compiler, *FLAGS[:5], "-c", "policy.c", "-o", "policy.o"], tmp_path)
     try:
-        run_tool([host_compiler().replace("cc", "c++"), "-Wall", "-Werror", "-c", "use.cpp"], tmp_path)
+        run_tool([compiler.replace("cc", "c++"), "-Wall", "-Werror", "use.cpp", "policy.o", "-o", "use"], tmp_path)
     except UserError as error:
         if "did not run" in str(error):
             pytest.skip("there is no C++ compiler")
         raise
+    assert subprocess.run([tmp_path / "use"]).returncode == 0
 
 
 def test_a_run_cannot_write_code_into_a_comment():
