@@ -58,7 +58,7 @@ def numbers(scores):
 def one_run(way, seed):
     """Train and fly here; print one JSON object."""
     import lemniscate as lem
-    from lemniscate.envs.air import CONDITIONS
+    from lemniscate.drones.air import CONDITIONS
 
     preset, kwargs, fields = WAYS[way]
     with tempfile.TemporaryDirectory() as folder:
@@ -106,8 +106,8 @@ def bounds():
 
 def gains(trials):
     """Random search, then steps from the best, by the mean return over three seeds of 64 starts each."""
+    from lemniscate.drones.pd import GAINS
     from lemniscate.envs import registry
-    from lemniscate.envs.pd import GAINS
     from lemniscate.run.evaluate import evaluate
 
     for dynamics in DYNAMICS:

@@ -165,7 +165,7 @@ if __name__ == "__main__":
 
 EXCHANGE = """
 import json, statistics, sys, time, torch
-from lemniscate.processes import together
+from lemniscate.system.processes import together
 rounds, sizes, spent = int(sys.argv[1]), map(int, sys.argv[2:]), {}
 with together() as world:
     for size in sizes:

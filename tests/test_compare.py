@@ -12,8 +12,8 @@ from lemniscate.report.curves import training_minutes
 from lemniscate.report.groups import group
 from lemniscate.report.seeds import bootstrap_interval, improvement_interval, iqm
 from lemniscate.run import checkpoint
-from lemniscate.run.files import write_json
 from lemniscate.run.metrics import to_line
+from lemniscate.system.files import write_json
 
 
 @dataclasses.dataclass

@@ -12,7 +12,7 @@ import pytest
 from nbclient import NotebookClient
 
 THREE_UPDATES = """
-from lemniscate.console import ProgressBar
+from lemniscate.system.console import ProgressBar
 bar = ProgressBar(1_000, 0)
 for step in (90, 500, 1_000):
     bar.update(step, 12.34)
@@ -56,7 +56,7 @@ def notebook():
     """The outputs of a real notebook in a real kernel: a run's progress, a sweep's, a check."""
     sweep = """
         import time
-        from lemniscate.run.sweep_progress import SweepProgress
+        from lemniscate.sweeps.sweep_progress import SweepProgress
         progress = SweepProgress({"one": 10, "two": 10}, {"one": 0, "two": 0})
         progress.update("one", 5, 1.0, 3.0)
         progress.update("two", 5, None, 3.0)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import lemniscate as lem
-from lemniscate import results
+from lemniscate.api import results
 from lemniscate.envs.backend import Scene
 from lemniscate.envs.gymnasium import GymnasiumBackend
 from lemniscate.report import flight, playback

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 import lemniscate as lem
-from lemniscate import algos, glossary
+from lemniscate import algos
+from lemniscate.run import glossary
 
 PAGE = (Path(__file__).parents[1] / "docs" / "glossary.md").read_text()
 

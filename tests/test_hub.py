@@ -17,7 +17,7 @@ from conftest import tiny_fields
 from forks import LEMNISCATE, Forks, command
 from lemniscate.cli import main, parse
 from lemniscate.envs import toy
-from lemniscate.run import hub
+from lemniscate.hub import repository as hub
 
 pytestmark = pytest.mark.filterwarnings("ignore:Use 'content=:DeprecationWarning")  # huggingface_hub's own
 

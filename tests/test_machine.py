@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from forks import Forks
-from lemniscate import machine
+from lemniscate.system import machine
 
 CPU = torch.device("cpu")
 

@@ -5,8 +5,8 @@ import sys
 
 import pytest
 
-from lemniscate import named
 from lemniscate.errors import UserError
+from lemniscate.system import named
 
 
 class Mine:

@@ -15,8 +15,8 @@ from nbclient import NotebookClient
 from PIL import Image
 
 import lemniscate as lem
-from lemniscate import notebook as cells
 from lemniscate.report import playback
+from lemniscate.system import notebook as cells
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ from lemniscate.errors import UserError
 from lemniscate.presets.on_policy import FIGURE_EIGHT
 from lemniscate.presets.preset import Preset
 from lemniscate.presets.stored import StoredPreset, read_preset
-from lemniscate.run.files import read_json, write_json
+from lemniscate.system.files import read_json, write_json
 
 
 @pytest.mark.parametrize("algorithm", presets.PRESETS)

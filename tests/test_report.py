@@ -11,12 +11,12 @@ import pytest
 from matplotlib.figure import Figure
 
 import lemniscate as lem
-from lemniscate import plots
+from lemniscate.api import plots
 from lemniscate.cli import parse
 from lemniscate.report import advice, commands, curves, diagnostics, html, run_page, style
 from lemniscate.report.advice import Evidence
-from lemniscate.run.files import read_json, write_json
 from lemniscate.run.metrics import to_line
+from lemniscate.system.files import read_json, write_json
 from test_compare import write_run, write_runs
 
 PAGE = (Path(__file__).parents[1] / "docs" / "glossary.md").read_text()

@@ -14,13 +14,13 @@ from filelock import FileLock
 
 import lemniscate as lem
 from forks import command
-from lemniscate import places, sweep
 from lemniscate.cli import main
-from lemniscate.run import checkpoint
+from lemniscate.run import checkpoint, places
 from lemniscate.run.directory import is_finished
-from lemniscate.run.files import read_json, write_json
 from lemniscate.run.metrics import read_metrics
-from lemniscate.run.sweep_progress import SweepProgress
+from lemniscate.sweeps import sweep
+from lemniscate.sweeps.sweep_progress import SweepProgress
+from lemniscate.system.files import read_json, write_json
 
 SEEDS = ["--seeds", "1-2"]
 ENV = "environments:Copy-box-v0"

@@ -8,8 +8,8 @@ import matplotlib.pyplot as plt
 import nbformat
 import pytest
 
-from lemniscate import results
 from lemniscate.algos import ddpg, ppo, reinforce
+from lemniscate.api import results
 
 TUTORIALS = sorted((Path(__file__).parents[1] / "docs" / "tutorial").glob("[0-9]_*.py"))
 each_tutorial = pytest.mark.parametrize("file", TUTORIALS, ids=lambda file: file.stem)

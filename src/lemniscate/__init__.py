@@ -4,126 +4,77 @@ Names are imported at their first use, so that `import lemniscate` and `lemnisca
 """
 
 from importlib import import_module
+from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 __version__ = "0.2.0"
 
 if TYPE_CHECKING:
-    from lemniscate.api import config_for, train
-    from lemniscate.checks import check
-    from lemniscate.envs.vector_view import make_vec
-    from lemniscate.errors import NonFiniteError, NotStoredError, SweepError, UserError
-    from lemniscate.exporting.export import export
-    from lemniscate.margins.preflight import Preflight, preflight
-    from lemniscate.plots import plot
-    from lemniscate.policy import TrainedPolicy
-    from lemniscate.pushed import push
-    from lemniscate.results import evaluate, watch
-    from lemniscate.resumed import resume
-    from lemniscate.run.environments import make_envs
-    from lemniscate.run.evaluate import Evaluation
-    from lemniscate.run.run import Stopped
-    from lemniscate.run.seeding import set_seeds
-    from lemniscate.stored import TrainedRun, load, save
-    from lemniscate.sweep import TrainedSweep, resume_sweep, train_sweep
-    from lemniscate.tuning.tuner import Tuned, resume_tuning, tune
-
-__all__ = [
-    "Evaluation",
-    "NonFiniteError",
-    "NotStoredError",
-    "Preflight",
-    "Stopped",
-    "SweepError",
-    "TrainedPolicy",
-    "TrainedRun",
-    "TrainedSweep",
-    "Tuned",
-    "UserError",
-    "check",
-    "config_for",
-    "evaluate",
-    "export",
-    "load",
-    "make_envs",
-    "make_vec",
-    "plot",
-    "preflight",
-    "push",
-    "resume",
-    "resume_sweep",
-    "resume_tuning",
-    "save",
-    "set_seeds",
-    "train",
-    "train_sweep",
-    "tune",
-    "watch",
-]
+    from lemniscate.api.checks import check as check
+    from lemniscate.api.plots import plot as plot
+    from lemniscate.api.policy import TrainedPolicy as TrainedPolicy
+    from lemniscate.api.pushed import push as push
+    from lemniscate.api.results import evaluate as evaluate
+    from lemniscate.api.results import watch as watch
+    from lemniscate.api.resumed import resume as resume
+    from lemniscate.api.stored import TrainedRun as TrainedRun
+    from lemniscate.api.stored import load as load
+    from lemniscate.api.stored import save as save
+    from lemniscate.api.training import config_for as config_for
+    from lemniscate.api.training import train as train
+    from lemniscate.envs.vector_view import make_vec as make_vec
+    from lemniscate.errors import NonFiniteError as NonFiniteError
+    from lemniscate.errors import NotStoredError as NotStoredError
+    from lemniscate.errors import SweepError as SweepError
+    from lemniscate.errors import UserError as UserError
+    from lemniscate.exporting.export import export as export
+    from lemniscate.margins.preflight import Preflight as Preflight
+    from lemniscate.margins.preflight import preflight as preflight
+    from lemniscate.run.environments import make_envs as make_envs
+    from lemniscate.run.evaluate import Evaluation as Evaluation
+    from lemniscate.run.run import Stopped as Stopped
+    from lemniscate.run.seeding import set_seeds as set_seeds
+    from lemniscate.sweeps.sweep import TrainedSweep as TrainedSweep
+    from lemniscate.sweeps.sweep import resume_sweep as resume_sweep
+    from lemniscate.sweeps.sweep import train_sweep as train_sweep
+    from lemniscate.sweeps.tuner import Tuned as Tuned
+    from lemniscate.sweeps.tuner import resume_tuning as resume_tuning
+    from lemniscate.sweeps.tuner import tune as tune
 
 MODULES = {
-    "Evaluation": "run.evaluate",
-    "NonFiniteError": "errors",
-    "Stopped": "run.run",
-    "NotStoredError": "errors",
-    "Preflight": "margins.preflight",
-    "SweepError": "errors",
-    "TrainedPolicy": "policy",
-    "TrainedRun": "stored",
-    "TrainedSweep": "sweep",
-    "Tuned": "tuning.tuner",
-    "UserError": "errors",
-    "check": "checks",
-    "config_for": "api",
-    "evaluate": "results",
-    "export": "exporting.export",
-    "load": "stored",
-    "make_envs": "run.environments",
-    "make_vec": "envs.vector_view",
-    "plot": "plots",
-    "preflight": "margins.preflight",
-    "push": "pushed",
-    "resume": "resumed",
-    "resume_sweep": "sweep",
-    "resume_tuning": "tuning.tuner",
-    "save": "stored",
-    "set_seeds": "run.seeding",
-    "train": "api",
-    "train_sweep": "sweep",
-    "tune": "tuning.tuner",
-    "watch": "results",
+    "api.checks": ("check",),
+    "api.plots": ("plot",),
+    "api.policy": ("TrainedPolicy",),
+    "api.pushed": ("push",),
+    "api.results": ("evaluate", "watch"),
+    "api.resumed": ("resume",),
+    "api.stored": ("TrainedRun", "load", "save"),
+    "api.training": ("config_for", "train"),
+    "envs.vector_view": ("make_vec",),
+    "errors": ("NonFiniteError", "NotStoredError", "SweepError", "UserError"),
+    "exporting.export": ("export",),
+    "margins.preflight": ("Preflight", "preflight"),
+    "run.environments": ("make_envs",),
+    "run.evaluate": ("Evaluation",),
+    "run.run": ("Stopped",),
+    "run.seeding": ("set_seeds",),
+    "sweeps.sweep": ("TrainedSweep", "resume_sweep", "train_sweep"),
+    "sweeps.tuner": ("Tuned", "resume_tuning", "tune"),
 }
-"""where each public name is defined"""
+"""the public names by the module that defines each; a room is never named as one of them, or it would hide it"""
 
-SUBMODULES = (
-    *(
-        "algos",
-        "api",
-        "course",
-        "data",
-        "envs",
-        "errors",
-        "exporting",
-        "margins",
-        "maths",
-        "nn",
-        "optim",
-        "policy",
-        "presets",
-    ),
-    *("plots", "pushed", "report", "results", "run", "spec", "stored", "sweep", "testing", "tuning", "types"),
-)
-"""what `lemniscate.NAME` imports by itself"""
+__all__ = sorted(name for names in MODULES.values() for name in names)  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> object:
-    if name in SUBMODULES:
+    for module, names in MODULES.items():
+        if name in names:
+            value = globals()[name] = getattr(import_module(f"lemniscate.{module}"), name)
+            return value
+    if not name.startswith("_") and find_spec(f"lemniscate.{name}"):
         return import_module(f"lemniscate.{name}")
-    if name not in MODULES:
-        raise AttributeError(f"module 'lemniscate' has no attribute {name!r}")
-    value = globals()[name] = getattr(import_module(f"lemniscate.{MODULES[name]}"), name)
-    return value
+    raise AttributeError(f"module 'lemniscate' has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__, *SUBMODULES})
+    return sorted({*globals(), *__all__})

@@ -19,13 +19,14 @@ from typing import Any
 
 import torch
 
-from lemniscate import algos, api, results
-from lemniscate.resumed import resume
+from lemniscate import algos
+from lemniscate.api import results, training
+from lemniscate.api.resumed import resume
+from lemniscate.api.stored import load
 from lemniscate.run import checkpoint
 from lemniscate.run.config import RunConfig
 from lemniscate.run.metrics import read_metrics
 from lemniscate.run.state import TrainState
-from lemniscate.stored import load
 
 SIGNATURES = {"init": ["config", "spec", "device"], "train": ["config", "run"]}
 
@@ -48,7 +49,7 @@ def check_names(algorithm: str | ModuleType, folder: Path, **settings: Any) -> N
 
 def check_training(algorithm: str | ModuleType, folder: Path, **settings: Any) -> None:
     """A run reaches its last step with finite metrics, and its policy can be loaded and evaluated."""
-    run = api.train(algorithm, run=folder / "run", progress=False, **settings)
+    run = training.train(algorithm, run=folder / "run", progress=False, **settings)
     total = run.policy.config.total_steps
     assert run.policy.step >= total, f"The run ended at step {run.policy.step}, before its {total} steps."
     metrics = read_metrics(run.path)
@@ -62,18 +63,18 @@ def check_training(algorithm: str | ModuleType, folder: Path, **settings: Any) -
 def check_seeds(algorithm: str | ModuleType, folder: Path, **settings: Any) -> None:
     """The seed determines the run: the same one gives the same bits, another one others."""
     again = {"seed": 1, **settings}
-    runs = [api.train(algorithm, run=folder / f"run-{i}", progress=False, **again).path for i in range(2)]
+    runs = [training.train(algorithm, run=folder / f"run-{i}", progress=False, **again).path for i in range(2)]
     assert _same(*map(_last_checkpoint, runs)), "Two runs with the same seed end in different bits."
-    other = api.train(algorithm, run=folder / "other", progress=False, **{**again, "seed": again["seed"] + 1}).path
+    other = training.train(algorithm, run=folder / "other", progress=False, **{**again, "seed": again["seed"] + 1}).path
     assert not _same(_last_checkpoint(runs[0]), _last_checkpoint(other)), "Another seed ends in the same bits."
 
 
 def check_resume(algorithm: str | ModuleType, folder: Path, **settings: Any) -> None:
     """A run that was stopped and resumed ends in the bits of one that was not."""
-    whole = api.train(algorithm, run=folder / "whole", progress=False, **settings)
+    whole = training.train(algorithm, run=folder / "whole", progress=False, **settings)
     half = whole.policy.config.total_steps // 2
     stopped = folder / "stopped"
-    api.train(algorithm, run=stopped, progress=False, callbacks=[lambda step, *_: step >= half], **settings)
+    training.train(algorithm, run=stopped, progress=False, callbacks=[lambda step, *_: step >= half], **settings)
     resume(stopped, progress=False)
     difference = _difference(_last_checkpoint(whole.path), _last_checkpoint(stopped))
     assert difference is None, f"{difference} differs after a resume: is it a field of State that is saved?"
@@ -83,7 +84,7 @@ def check_compilation(algorithm: str | ModuleType, folder: Path, **settings: Any
     """A compiled run computes what one without compilation does, to rounding, for its first update."""
     rows = []
     for compile in ("off", "on"):
-        path = api.train(algorithm, run=folder / compile, progress=False, **{**settings, "compile": compile}).path
+        path = training.train(algorithm, run=folder / compile, progress=False, **{**settings, "compile": compile}).path
         rows.append({name: x for name, x in read_metrics(path)[0].items() if name.startswith("losses/")})
     off, on = rows
     for name, value in off.items():

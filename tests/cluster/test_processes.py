@@ -17,7 +17,7 @@ import lemniscate as lem
 from cluster.worlds import KINDS, SHARDS, finish, free_port, outcome, ranks, train, wait_for, words
 from forks import command
 from lemniscate.errors import UserError
-from lemniscate.world import World
+from lemniscate.system.world import World
 
 ALWAYS = ("ppo", "sac")
 """the kinds that are trained in every run of the suite"""

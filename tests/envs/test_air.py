@@ -19,9 +19,9 @@ import torch
 pytest.importorskip("crazyflow")
 
 import lemniscate as lem
+from lemniscate.drones.air import CONDITIONS, NOISE, disturb, read_ranges
+from lemniscate.drones.crazyflow import DYNAMICS, CrazyflowBackend, make_drones
 from lemniscate.envs import registry
-from lemniscate.envs.air import CONDITIONS, NOISE, disturb, read_ranges
-from lemniscate.envs.crazyflow import DYNAMICS, CrazyflowBackend, make_drones
 from lemniscate.envs.spaces import scale_action
 from lemniscate.errors import UserError
 from lemniscate.exporting.actions import act_with

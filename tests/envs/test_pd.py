@@ -9,8 +9,8 @@ import pytest
 import torch
 
 import lemniscate as lem
+from lemniscate.drones.pd import GAINS, GRAVITY, PD
 from lemniscate.envs import registry
-from lemniscate.envs.pd import GAINS, GRAVITY, PD
 from lemniscate.run.evaluate import evaluate
 from lemniscate.spec import Box
 

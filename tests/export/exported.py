@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from lemniscate.algos import ppo
+from lemniscate.api.policy import TrainedPolicy
 from lemniscate.exporting.actions import act_with
 from lemniscate.exporting.c_files import c_files
 from lemniscate.exporting.deployed import Deployed, input_size
@@ -16,7 +17,6 @@ from lemniscate.exporting.onnx_model import onnx_model
 from lemniscate.exporting.operations import Program
 from lemniscate.exporting.parity import onnx_act
 from lemniscate.exporting.translation import translate
-from lemniscate.policy import TrainedPolicy
 from lemniscate.spec import Box, Discrete, ObservationPart, Spec
 
 needs_compiler = pytest.mark.skipif(not host_compiler(), reason="there is no C compiler")

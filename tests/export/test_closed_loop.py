@@ -9,9 +9,9 @@ from exported import needs_compiler
 import environments  # noqa: F401  (registers the environments)
 import lemniscate as lem
 from lemniscate.algos import a2c, ddpg, ppo, reinforce, reppo, sac, td3, trpo
+from lemniscate.api.policy import TrainedPolicy
 from lemniscate.envs import registry
 from lemniscate.exporting import target
-from lemniscate.policy import TrainedPolicy
 
 pytestmark = [pytest.mark.long, needs_compiler]
 

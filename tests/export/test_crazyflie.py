@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from exported import exported, needs_compiler, policy_for
 
-from lemniscate.envs.drone_interface import PARTS, interface_of
+from lemniscate.drones.interface import PARTS, interface_of
 from lemniscate.errors import UserError
 from lemniscate.exporting.crazyflie import crazyflie_files
 from lemniscate.exporting.host import host_compiler, run_tool

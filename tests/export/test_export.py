@@ -14,9 +14,10 @@ import environments  # noqa: F401  (registers the environments)
 import lemniscate as lem
 from conftest import tiny_fields
 from lemniscate.algos import ppo
+from lemniscate.api.policy import TrainedPolicy
 from lemniscate.cli import main
+from lemniscate.drones.interface import interface_of
 from lemniscate.envs import registry
-from lemniscate.envs.drone_interface import interface_of
 from lemniscate.envs.findings import BAD
 from lemniscate.envs.interface import Interface
 from lemniscate.exporting import export as exporting
@@ -28,7 +29,6 @@ from lemniscate.exporting.flights import fly
 from lemniscate.exporting.host import HostPolicy, host_compiler
 from lemniscate.exporting.manifest import acted, observed, ranges
 from lemniscate.exporting.translation import translate
-from lemniscate.policy import TrainedPolicy
 
 
 @pytest.fixture(scope="module")

@@ -200,9 +200,9 @@ def test_the_same_policy_is_written_in_the_same_words():
 
 
 def test_a_dictionary_is_seen_in_the_order_of_its_parts(tmp_path):
+    from lemniscate.api.policy import TrainedPolicy
     from lemniscate.envs import registry
     from lemniscate.exporting.actions import act_with
-    from lemniscate.policy import TrainedPolicy
 
     env = registry.make("environments:Copy", 2, kwargs={"kind": "tuple"})
     config = ppo.Config(env="environments:Copy", env_kwargs={"kind": "tuple"}, hidden=(8,))

@@ -18,8 +18,8 @@ from hypothesis import HealthCheck, Phase, given, seed, settings
 from hypothesis import strategies as st
 
 import lemniscate as lem
-from lemniscate import api
 from lemniscate.algos import ALGORITHMS, find
+from lemniscate.api import training
 from lemniscate.cli import parse
 from lemniscate.envs import registry
 from lemniscate.errors import UserError
@@ -105,7 +105,7 @@ def begin(algorithm, config):
 
 def by_fields(algorithm, **fields):
     """From Python."""
-    begin(algorithm, api.config_for(algorithm, env_of(algorithm), **{**base(algorithm), **fields}))
+    begin(algorithm, training.config_for(algorithm, env_of(algorithm), **{**base(algorithm), **fields}))
 
 
 def by_words(algorithm, *words):

@@ -7,11 +7,11 @@ import pytest
 
 import lemniscate as lem
 from conftest import tiny_fields
+from lemniscate.api.results import _known_scores, final_scores
 from lemniscate.errors import UserError
-from lemniscate.places import LOG, failure_of
-from lemniscate.results import _known_scores, final_scores
 from lemniscate.run.directory import find_checkpoint, read_config
 from lemniscate.run.metrics import damage, read_metrics
+from lemniscate.run.places import LOG, failure_of
 from lemniscate.run.sweep_file import Sweep, read_sweep
 from run.test_run import final_hashes, history
 

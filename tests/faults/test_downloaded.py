@@ -11,11 +11,11 @@ import pytest
 import lemniscate as lem
 from conftest import tiny_fields
 from forks import command
+from lemniscate.api.results import final_scores
 from lemniscate.errors import UserError
-from lemniscate.results import final_scores
 from lemniscate.run.check import each_finding
 from lemniscate.run.directory import read_config
-from lemniscate.run.files import read_json, write_json
+from lemniscate.system.files import read_json, write_json
 
 STEP = "checkpoints/step-256"
 PLACES = ["config.json", "metrics.jsonl", "final.json", ".lock", "plots", "videos", "checkpoints", STEP]

@@ -11,10 +11,11 @@ import torch
 
 pytest.importorskip("crazyflow")
 
-from lemniscate.envs import drone_probe, registry
-from lemniscate.envs.air import CONDITIONS
-from lemniscate.envs.axes import CONDITION_AXES, Tally
-from lemniscate.envs.crazyflow import CrazyflowBackend
+from lemniscate.drones import probe as drone_probe
+from lemniscate.drones.air import CONDITIONS
+from lemniscate.drones.crazyflow import CrazyflowBackend
+from lemniscate.envs import registry
+from lemniscate.envs.probe import CONDITION_AXES, Tally
 from lemniscate.errors import UserError
 
 ENV, STARTS, STEPS = "DroneFigureEightTrajectory-v0", 4, 25
@@ -32,7 +33,7 @@ def two_axes():
         delays = tuple(value for value in DELAY.values if value in (0, 0.004, 0.05))
         patch.setattr(drone_probe, "CONDITION_AXES", (MASS, replace(DELAY, values=delays)))
         patch.setattr(drone_probe, "MOST_FLIGHTS", 5 * STARTS)
-        patch.setattr("lemniscate.envs.crazyflow.DYNAMICS", ("so_rpy",))
+        patch.setattr("lemniscate.drones.crazyflow.DYNAMICS", ("so_rpy",))
         return probe(trained={"mass": [0.5, 2.0], "wind": 0.3})
 
 

@@ -13,7 +13,7 @@ from lemniscate.cli import main
 from lemniscate.exporting.host import host_compiler
 from lemniscate.margins import compiled
 from lemniscate.margins.preflight import preflight
-from lemniscate.run.files import read_json, write_json
+from lemniscate.system.files import read_json, write_json
 
 
 def train(path, env="CartPole-v1"):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from lemniscate.envs.axes import Axis, Flown, Tally, dynamics_axis
+from lemniscate.envs.probe import Axis, Flown, Tally, dynamics_axis
 from lemniscate.margins.panels import panel
 from lemniscate.margins.record import margins_of, worst_accepted
 from lemniscate.margins.sentences import FAILS, FALLS_SHORT, rows, sentences, within

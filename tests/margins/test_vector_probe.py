@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 import torch
 
-from lemniscate.envs.axes import CHANNEL_AXES
-from lemniscate.envs.disturbed import Channel, ModelFactors, has_model
+from lemniscate.envs.probe import CHANNEL_AXES
 from lemniscate.errors import UserError
+from lemniscate.margins.disturbed import Channel, ModelFactors, has_model
 from lemniscate.margins.record import margins_of, worst_accepted
 from lemniscate.margins.vector_probe import VectorProbe
 

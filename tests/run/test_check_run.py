@@ -7,8 +7,8 @@ from filelock import FileLock
 
 import lemniscate as lem
 from conftest import tiny, tiny_fields
+from lemniscate.api.results import final_return
 from lemniscate.cli import main
-from lemniscate.results import final_return
 from lemniscate.run.check import each_finding
 from lemniscate.run.sweep_file import Sweep
 
@@ -95,7 +95,7 @@ def test_what_was_left_and_who_trains_is_noted(run, capsys):
 
 
 def test_code_of_a_run_from_elsewhere_is_noted(run, monkeypatch, tmp_path):
-    from lemniscate.run.files import write_json
+    from lemniscate.system.files import write_json
 
     record = {"algorithm": "ppo", "config": {"env": "evil:Env"}}
     write_json(run / "config.json", record)

@@ -13,9 +13,9 @@ from safetensors.torch import load_file
 from conftest import tiny
 from lemniscate.algos import ppo
 from lemniscate.run import checkpoint
-from lemniscate.run.files import DamagedFileError
 from lemniscate.run.tensors_file import TYPES, write_tensors
 from lemniscate.spec import Box, Discrete, MultiBinary, MultiDiscrete, ObservationPart, Spec
+from lemniscate.system.files import DamagedFileError
 from lemniscate.types import Batch
 
 SPEC = Spec("x", (ObservationPart((), (3,)),), Box((-1.0,), (1.0,)), 500)

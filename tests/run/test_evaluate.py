@@ -7,13 +7,13 @@ import pytest
 import torch
 
 import lemniscate as lem
-from lemniscate import named
 from lemniscate.envs import registry, toy
 from lemniscate.envs.backend import Summary
 from lemniscate.errors import UserError
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.networks import Layers
 from lemniscate.run.evaluate import evaluate
+from lemniscate.system import named
 
 
 class Uneven(toy.Countdown):

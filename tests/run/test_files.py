@@ -8,7 +8,7 @@ import pytest
 import lemniscate as lem
 from conftest import tiny_fields
 from lemniscate.run.directory import read_config
-from lemniscate.run.files import DamagedFileError, make_directory, read_json, replace_file, write_json
+from lemniscate.system.files import DamagedFileError, make_directory, read_json, replace_file, write_json
 
 RECORD = {"algorithm": "ppo", "config": {"env": "CartPole-v1", "gamma": 0.99, "hidden": [64, 64], "preset": None}}
 

@@ -22,10 +22,10 @@ from lemniscate.envs import toy
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.run import checkpoint
 from lemniscate.run.evaluate import EVALUATION
-from lemniscate.run.files import read_json, write_json
 from lemniscate.run.metrics import read_metrics
 from lemniscate.run.run import TRAINING
 from lemniscate.run.seeding import derive
+from lemniscate.system.files import read_json, write_json
 
 OFF_POLICY = {
     # name: algorithm and fields; in Pendulum-v1, whose episodes are longer than the distance of checkpoints

@@ -8,8 +8,8 @@ import pytest
 
 import lemniscate as lem
 from conftest import tiny_fields
-from lemniscate.run.files import read_json, write_json
-from lemniscate.run.trust import is_signed, signed
+from lemniscate.hub.trust import is_signed, signed
+from lemniscate.system.files import read_json, write_json
 
 EVIL = """
 from pathlib import Path

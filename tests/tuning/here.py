@@ -3,11 +3,11 @@
 import contextlib
 
 from lemniscate.cli import main
-from lemniscate.places import LOG
+from lemniscate.run.places import LOG
 
 
 class Here:
-    """The interface of `lemniscate.places.Processes`, without the seconds that a process takes to begin."""
+    """The interface of `lemniscate.run.places.Processes`, without the seconds that a process takes to begin."""
 
     count, free, running = 1, True, ()
 

@@ -13,11 +13,11 @@ from lemniscate.cli import main
 from lemniscate.errors import SweepError
 from lemniscate.presets.stored import read_preset
 from lemniscate.report.seeds import iqm
-from lemniscate.run.files import read_json
 from lemniscate.run.metrics import read_metrics
-from lemniscate.tuning.population import Population
-from lemniscate.tuning.space import read_space, sample, vary
-from lemniscate.tuning.study import TENTHS, Search
+from lemniscate.sweeps.population import Population
+from lemniscate.sweeps.space import read_space, sample, vary
+from lemniscate.sweeps.study import TENTHS, Search
+from lemniscate.system.files import read_json
 from tuning.here import Here
 
 ENV = "environments:Copy-box-v0"
@@ -33,7 +33,7 @@ def trained(tmp_path_factory):
     """A population of four, and its lines on standard error."""
     path = tmp_path_factory.mktemp("populations") / "four"
     with contextlib.redirect_stderr(io.StringIO()) as said, pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lemniscate.tuning.population.places_on", Here)
+        patch.setattr("lemniscate.sweeps.population.places_on", Here)
         code = main([*WORDS, str(path)])
     assert code == 0, said.getvalue()
     return path, said.getvalue()
@@ -118,7 +118,7 @@ def test_interrupted_at_any_point_it_ends_the_same(trained, tmp_path, monkeypatc
             super().start(run, options)
 
     path = tmp_path / "search"
-    monkeypatch.setattr("lemniscate.tuning.population.places_on", Interrupted)
+    monkeypatch.setattr("lemniscate.sweeps.population.places_on", Interrupted)
     assert main([*WORDS, str(path)]) != 0
     while not (path / "preset.json").exists():
         Interrupted.left = 23

@@ -16,9 +16,9 @@ from lemniscate.cli import main, parse
 from lemniscate.presets.stored import read_preset
 from lemniscate.report.seeds import iqm
 from lemniscate.run import checkpoint
-from lemniscate.run.files import read_json, write_json
 from lemniscate.run.metrics import read_metrics
-from lemniscate.tuning.study import read_search
+from lemniscate.sweeps.study import read_search
+from lemniscate.system.files import read_json, write_json
 from tuning.here import Here
 
 ENV = "environments:Copy-box-v0"
@@ -40,7 +40,7 @@ def tuned(tmp_path_factory):
     """A search of four trials, and its lines on standard error."""
     path = tmp_path_factory.mktemp("searches") / "both"
     with contextlib.redirect_stderr(io.StringIO()) as said, pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lemniscate.tuning.tuner.places_on", Here)
+        patch.setattr("lemniscate.sweeps.tuner.places_on", Here)
         code = main(["tune", "ppo", *FLAGS, *SEARCH, "--trials", "4", "--run", str(path)])
     assert code == 0, said.getvalue()
     return path, said.getvalue()
@@ -154,7 +154,7 @@ def test_what_is_proposed_after_an_interruption_is_new(tmp_path):
 
 
 def read_search_of(folder, trials):
-    from lemniscate.tuning.study import Search
+    from lemniscate.sweeps.study import Search
 
     config = lem.api.config_for("ppo", ENV)
     folder.mkdir(exist_ok=True)

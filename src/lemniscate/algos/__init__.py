@@ -6,8 +6,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from lemniscate import named
 from lemniscate.errors import UserError, shown, unknown_name
+from lemniscate.system import named
 
 ALGORITHMS = ("reinforce", "a2c", "trpo", "ppo", "reppo", "ddpg", "td3", "sac")
 

@@ -19,8 +19,8 @@ from typing import Any, NoReturn
 from lemniscate import __version__
 from lemniscate.algos import ALGORITHMS, RECOMMENDED
 from lemniscate.cli.endings import exit_code, sentence, unknown_argument
-from lemniscate.console import say
 from lemniscate.errors import UserError, is_installed, unknown_name
+from lemniscate.system.console import say
 
 COMMANDS = {
     "train": "Train a policy, or one for each of several algorithms and seeds, to compare them.",

@@ -2,8 +2,8 @@
 
 from collections.abc import Callable
 
-from lemniscate.console import talks
 from lemniscate.errors import NonFiniteError, NotStoredError, RankError, SweepError, UserError, WorkerError
+from lemniscate.system.console import talks
 
 
 def exit_code(error: BaseException) -> int | None:

@@ -9,13 +9,13 @@ from textwrap import dedent, fill
 from types import NoneType
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
-from lemniscate import glossary
 from lemniscate.algos import find
 from lemniscate.cli import Parser, add_train_options
 from lemniscate.cli.endings import unknown_argument
 from lemniscate.cli.tune_options import add_tune_options
 from lemniscate.errors import UserError, prefix_errors, unknown_name
 from lemniscate.presets import PRESETS, names
+from lemniscate.run import glossary
 from lemniscate.run.config import RunConfig, flag, options_of
 from lemniscate.run.texts import is_dict, number_type, read
 

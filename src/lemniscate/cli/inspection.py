@@ -5,17 +5,17 @@ import json
 from shutil import get_terminal_size
 from typing import Any
 
-from lemniscate import plots, pushed, results
 from lemniscate.algos import ALGORITHMS
-from lemniscate.checks import each_finding, verdict
+from lemniscate.api import plots, pushed, results
+from lemniscate.api.checks import each_finding, verdict
 from lemniscate.cli.completion import completion as completion
-from lemniscate.console import say
 from lemniscate.envs import registry
 from lemniscate.envs.findings import BAD
 from lemniscate.errors import UserError, unknown_name
 from lemniscate.presets import best
 from lemniscate.report import pictures
 from lemniscate.run.texts import number, read, read_json
+from lemniscate.system.console import say
 
 
 def evaluate(given: argparse.Namespace) -> None:

@@ -3,16 +3,17 @@
 import argparse
 from typing import Any
 
-from lemniscate import api, results, resumed, sweep
-from lemniscate.console import say, talks
+from lemniscate.api import results, resumed, training
+from lemniscate.api.stored import TrainedRun
 from lemniscate.envs import registry
 from lemniscate.errors import UserError
-from lemniscate.owner import end_with_owner
 from lemniscate.presets import choose
 from lemniscate.run.run import is_compiled
 from lemniscate.run.sweep_file import is_search, is_sweep
 from lemniscate.run.texts import number
-from lemniscate.stored import TrainedRun
+from lemniscate.sweeps import sweep
+from lemniscate.system.console import say, talks
+from lemniscate.system.owner import end_with_owner
 
 
 def train(given: argparse.Namespace) -> None:
@@ -31,13 +32,13 @@ def train(given: argparse.Namespace) -> None:
         runs = sweep.train_sweep(given.algorithm, given.env, given.seeds, **shared, **_callbacks(given))
         tell(f"Everything is in {runs.path}")
         return
-    config = api.config_for(given.algorithm, given.env, given.preset, **given.fields)
+    config = training.config_for(given.algorithm, given.env, given.preset, **given.fields)
     if config.backend:
         registry.require_backend(config.backend)
     preset, _ = choose(given.algorithm, config.env, given.preset)
     what = f"{given.algorithm} on {config.num_envs} × {config.env}, backend {config.backend}"
     tell(f"{what}: preset {preset}, seed {config.seed}, {'compiled' if is_compiled(config) else 'not compiled'}")
-    run = api.train(given.algorithm, config.env, **_places(given), **shared, **_callbacks(given))
+    run = training.train(given.algorithm, config.env, **_places(given), **shared, **_callbacks(given))
     if given.score:
         _say_score(run)
     tell(f"Trained in {run.seconds:.1f} s. Everything is in {run.path}")
@@ -45,7 +46,7 @@ def train(given: argparse.Namespace) -> None:
 
 def tune(given: argparse.Namespace) -> None:
     """Search for the best settings."""
-    from lemniscate.tuning.tuner import tune
+    from lemniscate.sweeps.tuner import tune
 
     if given.search is None:
         raise UserError("Search what? Name fields with their ranges: --search 'learning_rate=log:1e-4:1e-2'.")
@@ -62,7 +63,7 @@ def resume(given: argparse.Namespace) -> None:
     options = {"track": given.track, "report": given.report, "trust": given.trust, **_callbacks(given)}
     options["progress"] = not given.quiet
     if is_search(given.run):
-        from lemniscate.tuning.tuner import resume_tuning
+        from lemniscate.sweeps.tuner import resume_tuning
 
         run = resume_tuning(given.run, **_cluster(given), progress=not given.quiet, trust=given.trust)
     elif is_sweep(given.run):

@@ -21,21 +21,21 @@ from shutil import copytree, rmtree
 from types import FrameType
 from typing import Any
 
-from lemniscate import named, processes
+from lemniscate.api.launch import require_importable
+from lemniscate.api.results import report_on
+from lemniscate.api.stored import TrainedRun, load
 from lemniscate.cluster.connection import Cluster, connected
 from lemniscate.cluster.parcel import STORAGE, pack, unpack
-from lemniscate.console import say
 from lemniscate.errors import NonFiniteError, RankError, UserError, WorkerError, resume_line
-from lemniscate.processes import Processes
-from lemniscate.results import report_on
+from lemniscate.hub.trust import signed
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import CONFIG, LOCK, create_directory
-from lemniscate.run.launch import require_importable
 from lemniscate.run.run import Stopped, stop_signals_to
-from lemniscate.run.sweep_progress import progress_of
-from lemniscate.run.trust import signed
-from lemniscate.stored import TrainedRun, load
-from lemniscate.world import CLUSTER, World
+from lemniscate.sweeps.sweep_progress import progress_of
+from lemniscate.system import named, processes
+from lemniscate.system.console import say
+from lemniscate.system.processes import Processes
+from lemniscate.system.world import CLUSTER, World
 
 JOB = "job"
 EVERY = 1.0
@@ -210,7 +210,7 @@ def _begin(path: Path, given: Mapping[str, Any], checkpoint: Any) -> None:
 def _train(path: Path, options: Mapping[str, Any]) -> str | None:
     """Train a run to its end; returns the sentence of what would end it again."""
     try:
-        named.find("lemniscate.resumed:resume")(path, trust=True, **options)
+        named.find("lemniscate.api.resumed:resume")(path, trust=True, **options)
     except RankError as error:
         if error.repeats:
             return error.reason

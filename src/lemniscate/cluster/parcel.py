@@ -7,7 +7,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from lemniscate.run.directory import CONFIG, LOCK
-from lemniscate.run.files import make_directory, remove
+from lemniscate.system.files import make_directory, remove
 
 STORAGE = "ray"
 """the folder of a run directory that has Ray's storage, where no other is named"""

@@ -18,10 +18,10 @@ from typing import Any
 
 from lemniscate.cluster.connection import Cluster, connected
 from lemniscate.cluster.parcel import pack, unpack
-from lemniscate.places import LOG, Processes
 from lemniscate.run.checkpoint import list_steps
-from lemniscate.run.files import replace_file
 from lemniscate.run.metrics import METRICS
+from lemniscate.run.places import LOG, Processes
+from lemniscate.system.files import replace_file
 
 EVERY = 1.0
 """seconds between two looks at a run"""
@@ -69,7 +69,7 @@ class _Running:
 
 
 class RayTasks:
-    """Places on a cluster: as many runs at a time as its cores serve. See `lemniscate.places.Processes`.
+    """Places on a cluster: as many runs at a time as its cores serve. See `lemniscate.run.places.Processes`.
 
     Args:
         cluster: with at most so many `workers` at a time, if it says how many.

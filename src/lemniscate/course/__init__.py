@@ -20,12 +20,12 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from lemniscate.console import say
 from lemniscate.course.exercise import Case, Exercise, Function, Inspection, Note, raised
 from lemniscate.course.exercises import EXERCISES
 from lemniscate.course.skeletons import skeleton
 from lemniscate.errors import UserError, shown, unknown_name
 from lemniscate.run.seeding import globals_undisturbed, seed_globals
+from lemniscate.system.console import say
 
 __all__ = ["EXERCISES", "Finding", "check", "skeleton"]
 

@@ -14,9 +14,9 @@ import gymnasium as gym
 import numpy as np
 import torch
 
-from lemniscate.console import say
 from lemniscate.course.exercise import Function, raised
 from lemniscate.envs.vector_view import VectorView, make_vec
+from lemniscate.system.console import say
 
 STEPS, NUM_ENVS = 2_048, 8
 CARTPOLE_STEPS, CARTPOLE_RETURN, EPISODES_EACH = 60_000, 400, 3

@@ -73,8 +73,8 @@ class Backend(Protocol):
       environments, so that nothing of a part depends on the others; where it does not, each shard has a backend;
     - `room(env) -> (bytes, files)`, a class method: the memory and the open files that each takes at least;
     - `wraps(env) -> bool`, a class method: whether it can put `wrappers` around;
-    - `probe(env, starts, trained, given)`, a class method: a `lemniscate.envs.axes.Probe` from so many starts, with the
-      arguments of training and those that differ from them; other backends are flown as `margins.vector_probe` does;
+    - `probe(env, starts, trained, given)`, a class method: a `lemniscate.envs.probe.Probe` from so many starts, with
+      the arguments of training and those that differ from them; others are flown as `margins.vector_probe` does;
     - `make_rendered(env, mode, kwargs, wrappers)`, a class method: one `gymnasium.Env` that renders itself.
     """
 
@@ -101,12 +101,12 @@ class Backend(Protocol):
         """Make N environments.
 
         Args:
-            env: an id, or the name of an object: `lemniscate.named.find` returns it.
+            env: an id, or the name of an object: `lemniscate.system.named.find` returns it.
             num_envs: N.
             device: where tensors are to be.
             stagger: spread the first episodes, so that parallel environments do not end in the same step.
             kwargs: arguments of the environment itself.
-            wrappers: around each single environment, the first one innermost: `lemniscate.named.find_callable`.
+            wrappers: around each single environment, the first one innermost: `lemniscate.system.named.find_callable`.
 
         Raises:
             UserError: an environment, argument or wrapper that this backend cannot serve; spaces that no policy can

@@ -18,8 +18,8 @@ from lemniscate.envs.gymnasium_check import api_findings, one_line
 from lemniscate.envs.random_action import random_action
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import NonFiniteError, UserError
-from lemniscate.named import find_callable
 from lemniscate.spec import Action, Box, Discrete, MultiDiscrete, Spec
+from lemniscate.system.named import find_callable
 from lemniscate.types import Rollout
 
 NUM_ENVS, STEPS = 4, 500

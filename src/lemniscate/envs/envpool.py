@@ -21,8 +21,8 @@ from lemniscate.envs.spaces import (
     row_of,
 )
 from lemniscate.errors import UserError, is_installed, missing_extra, unknown_name
-from lemniscate.machine import cores
 from lemniscate.spec import Spec
+from lemniscate.system.machine import cores
 from lemniscate.types import Step
 
 PREFIX = "EnvPool/"

@@ -13,10 +13,10 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
 import lemniscate.envs.toy  # noqa: F401  (registers the toys)
-from lemniscate import named
 from lemniscate.envs.model_warnings import model_warnings_off
 from lemniscate.envs.workers import WatchedVectorEnv, Worker
 from lemniscate.errors import UserError
+from lemniscate.system import named
 
 Maker = EnvSpec | Callable[..., Any]
 """an entry of Gymnasium's registry, or a function (or class) that makes an environment"""

@@ -25,8 +25,8 @@ from lemniscate.envs.spaces import (
     row_of,
 )
 from lemniscate.errors import UserError
-from lemniscate.named import find_callable
 from lemniscate.spec import Discrete, Spec
+from lemniscate.system.named import find_callable
 from lemniscate.types import Step
 
 

@@ -5,8 +5,8 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from lemniscate import named
 from lemniscate.errors import UserError, is_installed, shown, unknown_name
+from lemniscate.system import named
 
 if TYPE_CHECKING:
     from lemniscate.envs.backend import Backend
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from lemniscate.maths import Shards
 
 BACKENDS = {
-    "crazyflow": "lemniscate.envs.crazyflow:CrazyflowBackend",
+    "crazyflow": "lemniscate.drones.crazyflow:CrazyflowBackend",
     "envpool": "lemniscate.envs.envpool:EnvpoolBackend",
     "gymnasium": "lemniscate.envs.gymnasium:GymnasiumBackend",
     "gymnasium-async": "lemniscate.envs.gymnasium_async:AsyncGymnasiumBackend",
@@ -123,7 +123,7 @@ def _checked_count(num_envs: Any) -> int:
 
 def require_room(env: str, num_envs: int, backend: str) -> None:
     """Raise `UserError` where N environments of a backend need more memory than is free, or more open files."""
-    from lemniscate.machine import free_memory, most_open_files
+    from lemniscate.system.machine import free_memory, most_open_files
 
     found: Any = backend_class(backend)
     each, files = found.room(env) if hasattr(found, "room") else (0, 0)

@@ -5,8 +5,8 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
+from lemniscate.api.policy import TrainedPolicy
 from lemniscate.envs.spaces import normalized_action, physical_action
-from lemniscate.policy import TrainedPolicy
 from lemniscate.spec import Action, Box, Discrete
 
 Act = Callable[[np.ndarray], np.ndarray]

@@ -4,9 +4,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from lemniscate.api.policy import TrainedPolicy
 from lemniscate.envs.spaces import scale_of
 from lemniscate.errors import UserError
-from lemniscate.policy import TrainedPolicy
 from lemniscate.spec import Action, Box, Discrete, MultiDiscrete, Spec
 
 

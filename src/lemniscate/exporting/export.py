@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lemniscate.console import say
+from lemniscate.api.policy import TrainedPolicy
+from lemniscate.api.stored import Trained, load, path_of
 from lemniscate.errors import UserError, is_installed
 from lemniscate.exporting.actions import Act, act_with
 from lemniscate.exporting.c_files import c_files
@@ -20,10 +21,9 @@ from lemniscate.exporting.onnx_model import onnx_model
 from lemniscate.exporting.operations import Program
 from lemniscate.exporting.parity import onnx_act, parity, sentences
 from lemniscate.exporting.translation import translate
-from lemniscate.policy import TrainedPolicy
-from lemniscate.run.files import DamagedFileError, make_directory, read_json, remove, replace_file, sync, write_json
-from lemniscate.run.hub import is_address
-from lemniscate.stored import Trained, load, path_of
+from lemniscate.hub.repository import is_address
+from lemniscate.system.console import say
+from lemniscate.system.files import DamagedFileError, make_directory, read_json, remove, replace_file, sync, write_json
 
 MANIFEST, PARITY, ONNX = "manifest.json", "parity.json", "policy.onnx"
 CRAZYFLIE = "crazyflie"

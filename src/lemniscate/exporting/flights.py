@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
+from lemniscate.api.policy import TrainedPolicy
 from lemniscate.envs import registry
 from lemniscate.envs.interface import Interface
 from lemniscate.errors import UserError
@@ -13,7 +14,6 @@ from lemniscate.exporting.actions import Act, act_with, for_policy
 from lemniscate.exporting.deployed import input_size
 from lemniscate.maths import Deterministic
 from lemniscate.nn.normalizer import RunningNorm
-from lemniscate.policy import TrainedPolicy
 from lemniscate.run.environments import env_arguments
 from lemniscate.run.evaluate import play_episodes
 from lemniscate.spec import Box, Spec

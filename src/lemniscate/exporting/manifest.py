@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from lemniscate import algos
+from lemniscate.api.policy import TrainedPolicy
 from lemniscate.envs.interface import Interface, Quantity
 from lemniscate.exporting.c_files import safe_sentence
 from lemniscate.exporting.deployed import safe_action
 from lemniscate.exporting.operations import Program
 from lemniscate.exporting.provenance import commit, version
-from lemniscate.policy import TrainedPolicy
 from lemniscate.spec import Action, Box, Discrete, MultiDiscrete, ObservationPart, Spec
 
 FORMAT = 1

@@ -4,13 +4,13 @@ from pathlib import Path
 
 from torch import Tensor
 
-from lemniscate.envs.axes import Act
+from lemniscate.api.policy import TrainedPolicy
+from lemniscate.envs.probe import Act
 from lemniscate.errors import UserError
 from lemniscate.exporting.actions import for_policy
 from lemniscate.exporting.export import MANIFEST
 from lemniscate.exporting.host import HostPolicy, host_compiler
-from lemniscate.policy import TrainedPolicy
-from lemniscate.run.files import DamagedFileError, read_json
+from lemniscate.system.files import DamagedFileError, read_json
 
 
 def compiled_policy(policy: TrainedPolicy, run: Path) -> Act:

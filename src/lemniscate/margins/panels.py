@@ -1,6 +1,6 @@
 """The panels of the picture of margins."""
 
-from lemniscate.envs.axes import Axis, Value
+from lemniscate.envs.probe import Axis, Value
 from lemniscate.margins.record import AxisMargins
 from lemniscate.margins.sentences import span, within
 from lemniscate.report.margins_plot import Panel

@@ -8,9 +8,10 @@ from typing import Annotated, Any
 
 import torch
 
-from lemniscate.console import say
+from lemniscate.api.policy import TrainedPolicy
+from lemniscate.api.stored import Trained, load, path_of
 from lemniscate.envs import registry
-from lemniscate.envs.axes import Act, Probe
+from lemniscate.envs.probe import Act, Probe
 from lemniscate.errors import UserError
 from lemniscate.exporting.provenance import commit, version
 from lemniscate.margins.compiled import compiled_policy
@@ -19,16 +20,15 @@ from lemniscate.margins.record import AxisMargins, margins_of, worst_accepted
 from lemniscate.margins.sentences import FAILS, FALLS_SHORT, rows, sentences
 from lemniscate.margins.smoothness import smoothness
 from lemniscate.margins.vector_probe import VectorProbe
-from lemniscate.policy import TrainedPolicy
 from lemniscate.report import margins_plot
 from lemniscate.report.compare import table
 from lemniscate.run.config import Natural, Range, checked
 from lemniscate.run.directory import read_config
 from lemniscate.run.environments import env_arguments
 from lemniscate.run.evaluate import EVALUATION
-from lemniscate.run.files import write_json
 from lemniscate.run.seeding import derive
-from lemniscate.stored import Trained, load, path_of
+from lemniscate.system.console import say
+from lemniscate.system.files import write_json
 
 FORMAT = 1
 Starts = Annotated[int, Range(4, 1000)]

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from lemniscate.envs.axes import Axis, Flown, Value
+from lemniscate.envs.probe import Axis, Flown, Value
 
 ALIVE = 0.95
 """the share of the episodes that are alive within a margin"""

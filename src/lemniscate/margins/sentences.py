@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 
-from lemniscate.envs.axes import Axis, Value
+from lemniscate.envs.probe import Axis, Value
 from lemniscate.margins.record import AxisMargins, Side
 
 FAILS, FALLS_SHORT = ("Flies", "crash"), ("Holds", "fall short")

@@ -7,13 +7,13 @@ import torch
 from torch import Tensor
 
 from lemniscate.envs import registry
-from lemniscate.envs.axes import CHANNEL_AXES, MODEL_AXES, Act, Axis, Flown, Tally, Value
-from lemniscate.envs.disturbed import Channel, has_model
+from lemniscate.envs.probe import CHANNEL_AXES, MODEL_AXES, Act, Axis, Flown, Tally, Value
 from lemniscate.envs.vec_env import VecEnv
+from lemniscate.margins.disturbed import Channel, has_model
 from lemniscate.run.seeding import derive, generator
 from lemniscate.spec import Discrete, Spec
 
-FACTORS = "lemniscate.envs.disturbed:ModelFactors"
+FACTORS = "lemniscate.margins.disturbed:ModelFactors"
 CPU = torch.device("cpu")
 
 

@@ -11,7 +11,7 @@ Moments = tuple[Tensor, Tensor, Tensor]
 
 
 class Shards:
-    """The S shards that a batch is divided into. `lemniscate.world.World` has those of several processes.
+    """The S shards that a batch is divided into. `lemniscate.system.world.World` has those of several processes.
 
     Whatever is computed of a shard has the same shapes wherever it is computed, and what the shards say is merged in
     their order. So no result depends on which process holds which shard.

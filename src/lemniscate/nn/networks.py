@@ -9,8 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from lemniscate.errors import UserError, unknown_name
-from lemniscate.named import find_callable
 from lemniscate.nn.activations import ACTIVATIONS, Activation
+from lemniscate.system.named import find_callable
 
 Matmul = Literal["float32", "bfloat16"]
 """of products between hidden layers; the first and the last are always in float32"""

@@ -6,9 +6,9 @@ from textwrap import wrap
 
 from lemniscate.algos import find
 from lemniscate.errors import UserError
+from lemniscate.hub.trust import is_signed, own_code, signed
 from lemniscate.run.config import RunConfig
-from lemniscate.run.files import DamagedFileError, parsing, read_json, write_json
-from lemniscate.run.trust import is_signed, own_code, signed
+from lemniscate.system.files import DamagedFileError, parsing, read_json, write_json
 
 SIGNED = ("algorithm", "fields")
 

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 
-from lemniscate.console import say
 from lemniscate.envs.registry import file_name
 from lemniscate.report import comparison_page
 from lemniscate.report.comparison_plot import draw
@@ -19,6 +18,7 @@ from lemniscate.report.html import Html
 from lemniscate.report.seeds import bootstrap_interval, improvement_interval, iqm, probability_of_improvement
 from lemniscate.report.style import COLORS
 from lemniscate.run.directory import is_finished
+from lemniscate.system.console import say
 
 ONE_SEED = "One seed says nothing about which is better: train more with --seeds 1-5."
 FEW_SEEDS = "Below five seeds of each, intervals are too narrow to be believed: train more with --seeds 1-5."

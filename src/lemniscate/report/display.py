@@ -5,8 +5,8 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from lemniscate.console import in_notebook
 from lemniscate.errors import UserError
+from lemniscate.system.console import in_notebook
 
 
 def require_display() -> None:

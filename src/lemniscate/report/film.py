@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 
 from lemniscate.errors import UserError, is_installed, missing_extra
-from lemniscate.run.files import remove
+from lemniscate.system.files import remove
 
 SUFFIXES = (".gif", ".webp", ".mp4")
 """what a film can be"""

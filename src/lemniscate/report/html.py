@@ -13,7 +13,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from lemniscate.run.files import replace_file
+from lemniscate.system.files import replace_file
 
 MOST_BYTES = 5_000_000
 """the largest film that is embedded; a larger one is linked"""

@@ -7,9 +7,9 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from lemniscate.console import in_notebook
-from lemniscate.notebook import Place
 from lemniscate.report.style import finish
+from lemniscate.system.console import in_notebook
+from lemniscate.system.notebook import Place
 
 
 class LiveCurve:

@@ -6,9 +6,9 @@ from typing import Any
 from urllib.parse import quote
 
 from lemniscate.algos import ALGORITHMS
+from lemniscate.hub.trust import own_code
 from lemniscate.report import commands, run_page
 from lemniscate.run.config import RunConfig
-from lemniscate.run.trust import own_code
 
 CARD = "README.md"
 TASK = "reinforcement-learning"

@@ -8,8 +8,8 @@ from lemniscate.envs.vec_env import VecEnv
 from lemniscate.nn.policies import Policy
 from lemniscate.report import curves, flight, run_page
 from lemniscate.report.playback import show_flights
-from lemniscate.run.files import make_directory
 from lemniscate.run.q_bias import QBias
+from lemniscate.system.files import make_directory
 
 
 def sentence(scores: Mapping[str, Any]) -> str:

@@ -11,16 +11,13 @@ import gymnasium as gym
 import numpy as np
 import torch
 
-from lemniscate.console import in_notebook, say
 from lemniscate.envs import registry
 from lemniscate.envs.factory import make_one, maker_of, sentences
 from lemniscate.envs.measures import SUMMARIES, measures_of
 from lemniscate.envs.rendered import make_rendered
 from lemniscate.envs.vec_env import VecEnv, require_end
 from lemniscate.errors import UserError, shown
-from lemniscate.named import find_callable
 from lemniscate.nn.policies import Policy
-from lemniscate.notebook import send_frames
 from lemniscate.report import flight
 from lemniscate.report.display import quiet_sdl
 from lemniscate.report.film import save_frames
@@ -28,6 +25,9 @@ from lemniscate.run.config import RunConfig
 from lemniscate.run.environments import env_arguments
 from lemniscate.run.evaluate import EVALUATION, EpisodeTable, Evaluation
 from lemniscate.run.seeding import derive
+from lemniscate.system.console import in_notebook, say
+from lemniscate.system.named import find_callable
+from lemniscate.system.notebook import send_frames
 from lemniscate.types import Step
 
 Act = Callable[..., np.ndarray]

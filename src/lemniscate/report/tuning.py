@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from lemniscate.report.style import COLORS, finish, save
-from lemniscate.run.files import make_directory
+from lemniscate.system.files import make_directory
 
 FEW = 4
 """complete trials below which an importance would be a guess"""

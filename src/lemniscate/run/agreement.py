@@ -8,7 +8,7 @@ import torch
 from lemniscate.envs.episodes import Episodes
 from lemniscate.errors import RankError
 from lemniscate.run.state import TrainState
-from lemniscate.world import World
+from lemniscate.system.world import World
 
 
 def episodes_of_all(world: World, state: TrainState, episodes: Episodes) -> Episodes:

@@ -7,12 +7,12 @@ from filelock import FileLock, Timeout
 
 from lemniscate.envs.findings import BAD, GOOD, NOTE, Finding
 from lemniscate.errors import UserError, resume_line
+from lemniscate.hub.trust import is_signed, own_code
 from lemniscate.run import checkpoint
 from lemniscate.run.directory import CONFIG, LOCK
-from lemniscate.run.files import DamagedFileError, parsing, read_json
 from lemniscate.run.metrics import METRICS, damage, read_metrics
 from lemniscate.run.sweep_file import SWEEP, is_sweep, read_sweep
-from lemniscate.run.trust import is_signed, own_code
+from lemniscate.system.files import DamagedFileError, parsing, read_json
 
 FINAL = "final.json"
 

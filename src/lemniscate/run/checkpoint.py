@@ -20,7 +20,10 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from lemniscate.errors import NonFiniteError, UserError
-from lemniscate.run.files import (
+from lemniscate.run.state import TrainState
+from lemniscate.run.tensors_file import write_tensors
+from lemniscate.spec import Action, ObservationPart, Spec
+from lemniscate.system.files import (
     DamagedFileError,
     make_directory,
     open_regular,
@@ -30,9 +33,6 @@ from lemniscate.run.files import (
     sync,
     write_json,
 )
-from lemniscate.run.state import TrainState
-from lemniscate.run.tensors_file import write_tensors
-from lemniscate.spec import Action, ObservationPart, Spec
 
 FORMAT = 3
 TENSORS, STATE, MANIFEST = "tensors.safetensors", "state.json", "manifest.json"

@@ -16,7 +16,7 @@ import torch
 
 from lemniscate.envs.registry import MOST_ENVS
 from lemniscate.errors import UserError, shown
-from lemniscate.glossary import unknown_field
+from lemniscate.run.glossary import unknown_field
 from lemniscate.run.seeding import Generators
 from lemniscate.spec import Spec
 

@@ -6,11 +6,15 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from lemniscate.console import say
 from lemniscate.errors import UserError, resume_line
+from lemniscate.hub.trust import signed
 from lemniscate.run import checkpoint
 from lemniscate.run.config import RunConfig
-from lemniscate.run.files import (
+from lemniscate.run.metrics import METRICS, damage
+from lemniscate.run.state import TrainState
+from lemniscate.spec import Spec
+from lemniscate.system.console import say
+from lemniscate.system.files import (
     DamagedFileError,
     make_directory,
     parsing,
@@ -20,11 +24,7 @@ from lemniscate.run.files import (
     sync,
     write_json,
 )
-from lemniscate.run.metrics import METRICS, damage
-from lemniscate.run.state import TrainState
-from lemniscate.run.trust import signed
-from lemniscate.spec import Spec
-from lemniscate.world import World
+from lemniscate.system.world import World
 
 CONFIG, LOCK = "config.json", ".lock"
 SWEEP = "sweep.json"

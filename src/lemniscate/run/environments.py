@@ -8,12 +8,12 @@ import torch
 from lemniscate.envs import registry
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError, shown
-from lemniscate.machine import free_memory
 from lemniscate.maths import Shards
 from lemniscate.nn.networks import NETWORKS
 from lemniscate.run.config import RunConfig
 from lemniscate.spec import Spec
-from lemniscate.world import World
+from lemniscate.system.machine import free_memory
+from lemniscate.system.world import World
 
 BYTES_PER_PARAMETER = 16
 """of a parameter, its gradient, and the two moments of its optimizer"""

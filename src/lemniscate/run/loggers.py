@@ -9,10 +9,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
 
-from lemniscate.console import say
 from lemniscate.envs.episodes import Episodes
-from lemniscate.run.files import replace_file
 from lemniscate.run.metrics import METRICS, read_metrics, to_line
+from lemniscate.system.console import say
+from lemniscate.system.files import replace_file
 
 Metrics = Mapping[str, float]
 NO_EPISODES = Episodes([], [])

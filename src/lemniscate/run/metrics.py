@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 from zlib import crc32
 
-from lemniscate.console import say
-from lemniscate.run.files import DamagedFileError, open_regular
+from lemniscate.system.console import say
+from lemniscate.system.files import DamagedFileError, open_regular
 
 METRICS = "metrics.jsonl"
 MARK = b', "crc32": "'

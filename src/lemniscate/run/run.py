@@ -21,7 +21,6 @@ from typing import TypeVar
 
 import torch
 
-from lemniscate.console import ProgressBar, say
 from lemniscate.envs.episodes import Episodes
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import NonFiniteError, NotStoredError, UserError, resume_line
@@ -36,7 +35,8 @@ from lemniscate.run.q_bias import critic_of
 from lemniscate.run.seeding import derive, globals_undisturbed, seed_globals
 from lemniscate.run.state import TrainState
 from lemniscate.run.warm_start import load_networks
-from lemniscate.world import World
+from lemniscate.system.console import ProgressBar, say
+from lemniscate.system.world import World
 
 WORTH_COMPILING = 15_000
 """gradient steps from which on a run ends sooner if they are compiled"""

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from lemniscate.errors import UserError
+from lemniscate.hub.trust import is_signed, signed
 from lemniscate.run.directory import CONFIG, SWEEP, TUNE, create_directory
-from lemniscate.run.files import DamagedFileError, parsing, read_json
-from lemniscate.run.trust import is_signed, signed
+from lemniscate.system.files import DamagedFileError, parsing, read_json
 
 
 @dataclass(frozen=True)

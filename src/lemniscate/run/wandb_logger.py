@@ -6,10 +6,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from lemniscate.console import say
 from lemniscate.envs.episodes import Episodes
-from lemniscate.run.files import open_regular, replace_file
 from lemniscate.run.loggers import NO_EPISODES, Metrics
+from lemniscate.system.console import say
+from lemniscate.system.files import open_regular, replace_file
 
 
 class WeightsAndBiases:

@@ -3,7 +3,8 @@
 from torch import Tensor, nn
 
 from lemniscate.errors import UserError
-from lemniscate.run import checkpoint, hub
+from lemniscate.hub import repository as hub
+from lemniscate.run import checkpoint
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import find_checkpoint
 from lemniscate.spec import Spec

@@ -1,0 +1,1 @@
+"""The verbs of the library: train, resume, load, evaluate, watch, plot, check, push."""

@@ -1,0 +1,84 @@
+"""The verb for the curves of runs: plot."""
+
+from pathlib import Path
+
+from lemniscate.api.policy import TrainedPolicy
+from lemniscate.api.results import draw_run, final_return
+from lemniscate.api.stored import TrainedRun, path_of
+from lemniscate.errors import UserError
+from lemniscate.report import compare, curves
+from lemniscate.report.groups import group
+from lemniscate.run.directory import is_finished, read_config
+from lemniscate.run.metrics import damage, read_metrics
+from lemniscate.run.sweep_file import is_sweep, read_sweep
+from lemniscate.system.console import in_notebook, say
+from lemniscate.system.files import make_directory
+from lemniscate.system.notebook import show_pictures
+
+Plotted = str | Path | TrainedRun | TrainedPolicy
+"""what names a run: its directory, what `train` returned, or a policy that came from there"""
+
+
+def plot(*runs: Plotted | list[Plotted], by: str = "step", trust: bool = False) -> list[Path]:
+    """Draw the curves of a run into its `plots/`, or compare several, or a list of them, grouped by all but the seed.
+
+    Beside the pictures stands `report.html`, a page with all of them, the final evaluation, the settings, the commands
+    that do it again, and what to try next. In a notebook the pictures are also shown below the cell.
+
+    Where the environment has a scene, flights are drawn too; where there is a Q, its predictions beside the returns.
+
+    A sweep stands for its runs, and has a `plots/` of its own; other comparisons are drawn into `plots/` here, with a
+    table on standard error. The newest policy of one run is evaluated, of several the final policy of each that is
+    finished: over 100 episodes, kept in `final.json`.
+
+    Args:
+        *runs: run directories, or those of sweeps; what `train` returned; policies from `train` or `load`.
+        by: the horizontal axis of the learning curve: "step", "episode" or "minute". By episode the curve is the moving
+            average of 20 episodes.
+        trust: import the code that a run names as `module:name` also if the run is not of this user and machine.
+
+    Returns:
+        The files, the page last.
+
+    Raises:
+        UserError: no runs, or without metrics; another axis.
+    """
+    curves.require_by(by)
+    given = [run for one in runs for run in (one if isinstance(one, list | tuple) else [one])]
+    paths = [path_of(run) for run in given]
+    if not paths:
+        raise UserError("There is nothing to plot: name one run or several, such as plot('runs/lander').")
+    found = [run for path in paths for run in _members(path)]
+    if len(paths) == 1:
+        make_directory(paths[0] / "plots")
+    if found == paths[:1]:
+        files = draw_run(paths[0], by, trust=trust)
+    else:
+        folder = paths[0] / "plots" if len(paths) == 1 else Path("plots")
+        files = compare.report(group(found), _final_returns(found, trust), folder, by)
+    if in_notebook():
+        show_pictures(file for file in files if file.suffix == ".png")
+    return files
+
+
+def _final_returns(runs: list[Path], trust: bool) -> dict[Path, float]:
+    """The final returns of the finished runs; a line names each run that cannot be evaluated here."""
+    returns: dict[Path, float] = {}
+    for run in filter(is_finished, runs):
+        try:
+            returns[run] = final_return(run, trust=trust)
+        except UserError as error:
+            say(f"{run} has no final return: {error}")
+    return returns
+
+
+def _members(path: Path) -> list[Path]:
+    """A run itself, or those of a sweep that have something to show."""
+    if not is_sweep(path):
+        read_config(path)
+    runs = [run for run in (read_sweep(path).runs if is_sweep(path) else [path]) if read_metrics(run)]
+    if not runs:
+        raise UserError(f"{path} has no metrics to plot yet.")
+    for sentence in filter(None, (damage(run, logged=0) for run in runs)):
+        say(sentence)
+    return runs

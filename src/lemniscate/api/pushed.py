@@ -1,0 +1,106 @@
+"""The verb that uploads a policy to the Hugging Face Hub: push."""
+
+import shutil
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from lemniscate.api.policy import TrainedPolicy
+from lemniscate.api.results import FINAL_EPISODES, evaluate, final_scores
+from lemniscate.api.stored import Trained, algorithm_of, load, write_unsigned
+from lemniscate.errors import UserError
+from lemniscate.hub import repository as hub
+from lemniscate.report import model_card
+from lemniscate.report.film import newest_film
+from lemniscate.run.directory import CONFIG
+from lemniscate.system.console import say
+from lemniscate.system.files import write_json
+
+
+def push(run: Trained, name: str, *, private: bool = False, license: str | None = None, trust: bool = False) -> str:
+    """Upload the policy of a run to the Hugging Face Hub, as the model repository `name`, in one commit.
+
+    The files are those of `save`, without its signature: raw tensors and JSON, each with its sha256. Beside them are a
+    model card with the scores, the command that trains it again and the lines that load it; the final scores of the
+    run, its figures (`plots/`), its newest film, or one that is made now if the environment can be rendered; and what
+    `lemniscate export` wrote (`export/`), if it did. `load("hf://user/name")` loads the policy.
+
+    Args:
+        run: its directory or a checkpoint's, what `train` returned, or a policy.
+        name: "user/name". A new repository is created, and a policy that is there is replaced.
+        private: make a new repository private.
+        license: as the Hub abbreviates it, such as "mit"; without, the card names none.
+        trust: import the code that the run names as `module:name` also if the run is not of this user and machine.
+
+    Returns:
+        The address of the repository's page.
+
+    Raises:
+        UserError: `huggingface_hub` is not installed; no name of a repository; no token; no policy to upload; a Hub
+            that refuses or cannot be reached; a repository that holds something else, or is public in spite of
+            `private`.
+    """
+    hub.require_uploads(name)
+    policy = load(run, trust=trust)
+    with TemporaryDirectory() as temporary:
+        folder = Path(temporary) / "policy"
+        write_unsigned(policy, folder)
+        _write_repository(folder, policy, name, license, trust)
+        return hub.upload(folder, name, private)
+
+
+def _write_repository(folder: Path, policy: TrainedPolicy, name: str, license: str | None, trust: bool) -> None:
+    """Write beside a stored policy what its run has to show, and the card."""
+    run = policy.path if policy.path and (policy.path / CONFIG).is_file() else None
+    if run:
+        _copy_shown(run, folder)
+    if not (run and _copy_film(run, folder)):
+        _make_film(policy, folder)
+    scores = _scores(policy, run, trust)
+    if scores:
+        write_json(folder / "final.json", scores)
+    of_policy = {"step": policy.step, "scores": scores, "license": license}
+    model_card.write(folder, name, algorithm_of(policy), policy.config, **of_policy)
+
+
+def _copy_shown(run: Path, folder: Path) -> None:
+    """Copy the figures of a run, and its export where there is a whole one; no links."""
+    shown = [*(run / "plots").glob("*.png")]
+    if (run / "export" / "policy.onnx").is_file():
+        shown += (run / "export").rglob("*")
+    for file in shown:
+        if file.is_file() and file.resolve() == run.resolve() / file.relative_to(run):
+            copy = folder / file.relative_to(run)
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(file, copy)
+
+
+def _copy_film(run: Path, folder: Path) -> bool:
+    """Copy the newest film of a run, if there is one: a video by the name that the Hub plays, else into `videos/`."""
+    film = newest_film(run)
+    if film:
+        copy = folder / ("replay.mp4" if film.suffix == ".mp4" else f"videos/{film.name}")
+        copy.parent.mkdir(exist_ok=True)
+        shutil.copyfile(film, copy)
+    return film is not None
+
+
+def _make_film(policy: TrainedPolicy, folder: Path) -> None:
+    """Record an episode, where the environment can be rendered; a line says why where it cannot."""
+    try:
+        evaluate(policy, episodes=1, video=folder / "videos" / "episode.gif")
+    except Exception as error:  # whatever a renderer raises: a policy without a film is a policy
+        say(f"No film: {error}")
+
+
+def _scores(policy: TrainedPolicy, run: Path | None, trust: bool) -> dict[str, Any] | None:
+    """The final scores of a run, or those of a policy without one; none where it cannot be evaluated here."""
+    try:
+        if run:
+            return final_scores(run, trust=trust)
+        say(f"Evaluating the policy: {FINAL_EPISODES} episodes.")
+        found = evaluate(policy, episodes=FINAL_EPISODES, seed=0)
+        return {"step": policy.step, "seed": 0, **found.to_json()}
+    except UserError as error:
+        say(f"No scores: {error}")
+        return None

@@ -1,0 +1,1 @@
+"""Drones on crazyflow: the vehicle, the air around it, its classical controller."""

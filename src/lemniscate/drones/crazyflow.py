@@ -1,0 +1,218 @@
+# pyright: reportAttributeAccessIssue=false
+"""crazyflow's drones, as pure functions of their state.
+
+crazyflow's environments are NEXT_STEP: they simulate, then reset what ended one step earlier, then compute a reward at
+the reset state. Here the same methods are called in another order, that of `jax_backend`, so that every row is real.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import inspect
+import io
+import os
+import warnings
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from functools import lru_cache, partial
+from typing import Any
+
+import gymnasium as gym
+import torch
+
+from lemniscate.drones.air import CONDITIONS, Ranges, read_ranges
+from lemniscate.drones.drones import DYNAMICS, Drones, Mixed
+from lemniscate.drones.interface import interface_of
+from lemniscate.drones.pd import GAINS, PD
+from lemniscate.drones.probe import DroneProbe
+from lemniscate.envs.backend import Scene, Summary
+from lemniscate.envs.interface import Interface
+from lemniscate.envs.jax_backend import JaxBackend, Programs, jax_device
+from lemniscate.envs.model_warnings import model_warnings_off
+from lemniscate.envs.spaces import action_kind
+from lemniscate.errors import UserError, missing_extra, unknown_name
+from lemniscate.spec import Box, Spec
+
+IDS = ("DroneFigureEightTrajectory-v0", "DroneLanding-v0", "DroneReachPos-v0", "DroneReachVel-v0")
+CONTROL_HZ = 50
+MOST_HISTORY = 50
+OWN = (*CONDITIONS, "history", "privileged", "dynamics")
+"""the arguments that are ours or read by us; the others are crazyflow's"""
+
+
+@lru_cache(maxsize=4)
+def programs(env_id: str, num_envs: int, device: str, kwargs: tuple[tuple[str, Any], ...]) -> Programs:
+    """The compiled programs of so many drones, built once a process: all vectors of a size share them."""
+    given = dict(kwargs)
+    ranges, each = read_ranges(given), dynamics_of(given) or (None,)
+    drones = [make_drones(env_id, num_envs // len(each), device, given, dynamics, ranges) for dynamics in each]
+    return Programs(drones[0] if len(drones) == 1 else Mixed(drones))
+
+
+def make_drones(
+    env_id: str, num_envs: int, device: str, kwargs: Mapping[str, Any], dynamics: str | None, ranges: Ranges
+) -> Drones:
+    """So many drones in one dynamics, by default crazyflow's, and under conditions that need not be those of kwargs."""
+    own = {name: value for name, value in kwargs.items() if name not in OWN}
+    own |= {"dynamics": dynamics} if dynamics else {}
+    with warnings.catch_warnings(action="ignore"), model_warnings_off():
+        made = gym.make_vec(env_id, num_envs=num_envs, device=device, **{"freq": CONTROL_HZ, **own}).unwrapped
+    return Drones(made, ranges, kwargs.get("history", 0), kwargs.get("privileged", False))
+
+
+def spec_of(env_id: str, drones: Drones) -> Spec:
+    """The Spec of drones."""
+    action = action_kind(drones.env.single_action_space, env_id)
+    assert isinstance(action, Box)
+    time_limit = drones.episode_steps
+    return Spec(env_id, drones.parts, action, max_episode_steps=time_limit, privileged=drones.privileged)
+
+
+class CrazyflowBackend(JaxBackend):
+    """N drones flown at 50 Hz by normalized [roll, pitch, yaw, thrust] commands, all on one device.
+
+    The flat observation is position 3 (m), quaternion 4 (xyzw), velocity 3 (m/s), angular velocity 3 (rad/s), then the
+    task's own part: for the figure eight, `local_samples` 30, the next ten points of the curve, 0.1 s apart, as seen
+    from the drone (m). The length of its first three numbers is the measure `tracking_error`, in metres.
+
+    With `stagger`, three of four episodes begin at a random time of theirs, on the reference curve where there is one:
+    as if the drone had been flying before. All of the course is flown from the first step on, and the drones never fly
+    in step. Their returns are not counted, since they are fragments.
+
+    `kwargs` are crazyflow's: `dynamics`, `drone`, `max_episode_time` (s), `freq` (Hz), and those of the task.
+    """
+
+    @classmethod
+    def ids(cls) -> Collection[str]:
+        """Crazyflow's four tasks."""
+        return IDS
+
+    @classmethod
+    def serves(cls, env: str) -> bool:
+        """Whether it is one of them."""
+        return env in IDS
+
+    def __init__(
+        self,
+        env: str,
+        num_envs: int,
+        device: torch.device,
+        *,
+        stagger: bool = False,
+        kwargs: Mapping[str, Any] | None = None,
+        wrappers: Sequence[str] = (),
+    ) -> None:
+        assert not wrappers, "drones cannot be wrapped"
+        _import()
+        kwargs = dict(kwargs or {})
+        _check(env, num_envs, kwargs)
+        with _sentence(env, kwargs):
+            shared = programs(env, num_envs, jax_device(device), tuple(sorted(_hashable(kwargs).items())))
+        super().__init__(shared, num_envs, device, stagger=stagger)
+        assert isinstance(shared.envs, Drones | Mixed)
+        self._vectors = shared.envs.drones if isinstance(shared.envs, Mixed) else [shared.envs]
+        self._drones = drones = self._vectors[0]
+        self.spec = spec_of(env, drones)
+        if drones.error:
+            self.summaries = (
+                Summary("rmse_mm", "tracking_error", "rms", scale=1000),
+                Summary("rmse_after_1s_mm", "tracking_error", "rms", scale=1000, skip=drones.env.freq),
+            )
+
+    @classmethod
+    def probe(cls, env: str, starts: int, trained: Mapping[str, Any], given: Mapping[str, Any]) -> DroneProbe:
+        """Flights along each condition and in all dynamics, on the CPU.
+
+        Conditions that only training has are nominal; so are the first dynamics, of those given or else of training.
+        """
+        _import()
+        own = {name: value for name, value in trained.items() if name not in (*CONDITIONS, "privileged")}
+        own = {**own, **given}
+        dynamics = (*dynamics_of(own), None)[0]
+        kwargs = {**own, "dynamics": dynamics} if dynamics else own
+        _check(env, starts, kwargs)
+
+        def make(other: str | None, ranges: Ranges) -> Drones:
+            return make_drones(env, starts, "cpu", kwargs, other or dynamics, ranges)
+
+        with _sentence(env, kwargs):
+            return DroneProbe(make, DYNAMICS, read_ranges(kwargs), starts, partial(spec_of, env))
+
+    @property
+    def baseline(self) -> PD | None:
+        """A PD controller with its gains for these dynamics, where there is a reference."""
+        drones, env = self._drones, self._drones.env
+        if drones.error is None or not isinstance(self.spec.action, Box):
+            return None
+        reference = slice(drones.error.start, drones.error.start + 3 * env.n_samples)
+        where = {"reference": reference, "velocity": slice(7, 10), "preview": env.samples_dt}
+        return PD(GAINS[drones.dynamics], drones.mass, self.spec.action, **where)
+
+    @property
+    def scene(self) -> Scene | None:
+        """The drone and its reference, where it has one."""
+        drones = self._drones
+        if drones.error is None:
+            return None
+        return Scene(drones.env.sim.mj_model, 1 / drones.env.freq, slice(0, 3), slice(3, 7), drones.error)
+
+    @property
+    def interface(self) -> Interface:
+        """Units, frames and times, for policies that leave Python."""
+        air = self._drones.air
+        late = [air.ranges.get(name, (0.0, 0.0)) for name in ("action_delay", "observation_delay")]
+        delay = (sum(least for least, _ in late), sum(most for _, most in late))
+        return interface_of(self._drones.env, [one.dynamics for one in self._vectors], delay, air.history, air.hover)
+
+
+def _import() -> None:
+    os.environ.setdefault("SCIPY_ARRAY_API", "1")  # crazyflow insists, and before SciPy is first imported
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):  # MJX announces optional packages that it does not find
+            import crazyflow  # noqa: F401  (registers the environments)
+    except ModuleNotFoundError as error:
+        raise missing_extra("crazyflow", "drone") from error
+
+
+def _check(env_id: str, num_envs: int, kwargs: Mapping[str, Any]) -> None:
+    """Raise `UserError` for an argument that the environment does not have, or a value that it cannot take."""
+    entry: Any = gym.spec(env_id).vector_entry_point
+    known = {*inspect.signature(entry).parameters, *OWN} - {"num_envs", "device"}
+    for name, value in kwargs.items():
+        if name not in known:
+            raise unknown_name(f"argument of {env_id}", name, known)
+        several = name == "dynamics" and isinstance(value, list | tuple)
+        if not (name in CONDITIONS or several or isinstance(value, int | float | str | None) or callable(value)):
+            raise UserError(f"{name} of {env_id} must be a number or a word, not {value!r}.")
+    history, several = kwargs.get("history", 0), dynamics_of(kwargs)
+    if not isinstance(history, int) or isinstance(history, bool) or not 0 <= history <= MOST_HISTORY:
+        raise UserError(f"history must be a whole number of steps from 0 to {MOST_HISTORY}, not {history!r}.")
+    if not isinstance(kwargs.get("privileged", False), bool):
+        raise UserError(f"privileged must be true or false, not {kwargs['privileged']!r}.")
+    for name in several:
+        if name not in DYNAMICS:
+            raise unknown_name("dynamics", str(name), DYNAMICS)
+    if several and num_envs % len(several):
+        raise UserError(f"{num_envs} drones cannot be divided equally among {len(several)} dynamics.")
+    read_ranges(kwargs)
+
+
+@contextlib.contextmanager
+def _sentence(env: str, kwargs: Mapping[str, Any]) -> Iterator[None]:
+    """An error that arguments cause in crazyflow, as a `UserError` that names them."""
+    try:
+        yield
+    except (TypeError, ValueError, KeyError, AssertionError) as error:
+        if not kwargs:
+            raise
+        raise UserError(f"{env} cannot be made with {kwargs}: {error}.") from error
+
+
+def dynamics_of(kwargs: Mapping[str, Any]) -> tuple[str, ...]:
+    """The names of the dynamics among the arguments; none where crazyflow is to choose."""
+    given = kwargs.get("dynamics")
+    return () if given is None else (given,) if isinstance(given, str) else tuple(given)
+
+
+def _hashable(kwargs: Mapping[str, Any]) -> dict[str, Any]:
+    """The same arguments with tuples for lists."""
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in kwargs.items()}

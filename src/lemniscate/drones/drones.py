@@ -1,0 +1,286 @@
+# pyright: reportAttributeAccessIssue=false
+"""crazyflow's drones as pure functions of their state, fit to be traced: `JaxEnvs` in other words."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from lemniscate.drones.air import STATE_SIZE, Acting, Air, Ranges, parameter_factors
+from lemniscate.envs.jax_backend import Outcome, State
+from lemniscate.spec import ObservationPart
+
+if TYPE_CHECKING:
+    import jax
+
+DYNAMICS = ("so_rpy", "so_rpy_rotor", "so_rpy_rotor_drag", "first_principles")
+AHEAD = 0.75
+"""the share of staggered episodes that begin ahead of their beginning"""
+STATE_PARTS = ("pos", "quat", "vel", "ang_vel")
+REFERENCE = "local_samples"
+"""the part of an observation that begins with the way to the reference"""
+START = np.array((0.0, 0.0, 1.2), np.float32)
+"""the middle of the box in which crazyflow's flights of the figure eight begin"""
+
+
+class Drones:
+    """A crazyflow environment with its state apart: SimData, the arrays that the object keeps beside it, and the air.
+
+    The environment's own methods are traced with its state put in and taken out again, so whatever it computes
+    (rewards, ends, goals, starts) is computed by crazyflow's code.
+
+    Args:
+        env: crazyflow's environment of N drones.
+        ranges: the conditions that are other than the simulator's.
+        history: the number of steps before this one that are observed too: the state then less the present one, and
+            the action.
+        privileged: let privileged numbers follow the observation: the air, the rotors' speed and the dynamics.
+    """
+
+    def __init__(self, env: Any, ranges: Ranges, history: int = 0, privileged: bool = False) -> None:
+        import jax
+        import jax.numpy as jnp
+
+        self.env = env
+        for name, value in vars(env).items():
+            if isinstance(value, np.ndarray):  # the reference trajectory: NumPy cannot be indexed by a tracer
+                setattr(env, name, jnp.asarray(value, device=env.device))
+        self.num_envs, self.device = env.num_envs, env.device
+        self.low, self.high = env.single_action_space.low, env.single_action_space.high
+        self.action_size = self.low.size
+        self.episode_steps = round(env.max_episode_time * env.freq)
+        """the time limit, in control steps"""
+        self.dynamics, params = str(env.sim.dynamics), env.sim.data.params
+        self.mass = float(params.mass.ravel()[0])
+        command = np.array((0, 0, 0, self.mass * -float(params.gravity_vec[2])), np.float32)
+        self._turning = np.full(4, hovering_rotors(self.dynamics, params), np.float32)
+        hover = command, 2 * (command - self.low) / (self.high - self.low) - 1
+        self.air = Air(ranges, history, self.num_envs, env.n_substeps, env.freq, hover)
+        sizes = {name: space.shape[-1] for name, space in env.single_observation_space.spaces.items()}
+        names = (*STATE_PARTS, *(name for name in sizes if name not in STATE_PARTS))
+        past = [ObservationPart(("history",), (history, STATE_SIZE + self.action_size))] if history else []
+        self.parts = (*(ObservationPart((name,), (sizes[name],)) for name in names), *past)
+        """the flat observation: the drone's state first, then the task's own parts, then the history"""
+        self.privileged = self.air.truth_size + 4 + len(DYNAMICS) if privileged else 0
+        """the number of privileged numbers that follow the flat observation"""
+        self.error = slice(STATE_SIZE, STATE_SIZE + 3) if REFERENCE in names else None
+        self._own_parameters()
+        self._arrays = [name for name, value in vars(env).items() if isinstance(value, jax.Array)]
+        self._initial = self._take()
+
+    def _own_parameters(self) -> None:
+        """Give each drone parameters of its own, where conditions change them."""
+        import jax.numpy as jnp
+
+        sim = self.env.sim
+        names = parameter_factors(self.dynamics, dict.fromkeys(self.air.ranges, jnp.ones(1)))
+        each = {name: getattr(sim.data.params, name) for name in names}
+        each = {name: jnp.tile(value, (self.num_envs, 1, *[1] * value.ndim)) for name, value in each.items()}
+        params = sim.data.params.replace(**each)
+        sim.data, sim.default_data = sim.data.replace(params=params), sim.default_data.replace(params=params)
+
+    def _take(self) -> tuple[Any, dict[str, Any]]:
+        return self.env.sim.data, {name: getattr(self.env, name) for name in self._arrays}
+
+    @contextlib.contextmanager
+    def _at(self, state: State) -> Iterator[Any]:
+        """The environment in a state; afterwards no placeholder of a tracer stays behind in it."""
+        try:
+            self._put(state)
+            yield self.env
+        finally:
+            self._put(self._initial)
+
+    def _put(self, state: State) -> None:
+        self.env.sim.data = state[0]
+        for name, value in state[1].items():
+            setattr(self.env, name, value)
+
+    def init(self, key: jax.Array) -> State:
+        """The state of drones that have not begun. Goals get keys of their own, which crazyflow never seeds."""
+        import jax
+
+        data, arrays = self._initial
+        arrays = {
+            name: jax.random.fold_in(key, i) if jax.numpy.issubdtype(value.dtype, jax.dtypes.prng_key) else value
+            for i, (name, value) in enumerate(arrays.items(), start=1)
+        }
+        air = self.air.empty(jax.random.fold_in(key, len(arrays) + 1))
+        return data.replace(core=data.core.replace(rng_key=key)), arrays, air
+
+    def reset(self, state: State, mask: jax.Array, stagger: jax.Array) -> tuple[State, jax.Array, jax.Array]:
+        """Reset the masked drones; those that begin ahead of the beginning are fragments.
+
+        Ahead means at a random step of the episode, on the reference curve at that point of it, with turning rotors.
+        """
+        import jax
+        import jax.numpy as jnp
+
+        with self._at(state) as env:
+            env._reset(mask=mask)
+            key, whether, where, turns = jax.random.split(env.sim.data.core.rng_key, 4)
+            ahead = mask & stagger & jax.random.bernoulli(whether, AHEAD, (self.num_envs,))
+            steps = jax.random.randint(where, (self.num_envs,), 1, self.episode_steps) * ahead
+            air = self.air.draw(state[2], mask)
+            self._apply_conditions(air, mask)
+            data = env.sim.data
+            pos = data.states.pos
+            if hasattr(env, "trajectory"):
+                pos = pos + (env.trajectory[steps - 1] - env.trajectory[-1])[:, None]
+            speed = jax.random.uniform(turns, (self.num_envs, 1, 1)) * self._turning
+            rotors = jnp.where(ahead[:, None, None], speed, data.states.rotor_vel)
+            core = data.core.replace(rng_key=key, steps=data.core.steps + steps[:, None] * env.n_substeps)
+            env.sim.data = data.replace(states=data.states.replace(pos=pos, rotor_vel=rotors), core=core)
+            air = self.air.begin(air, mask, self._state())
+            return (*self._take(), air), self._observe(air), ahead
+
+    def step(self, state: State, action: jax.Array) -> tuple[State, Outcome]:
+        """One control step of every drone."""
+        import jax.numpy as jnp
+
+        with self._at(state) as env:
+            action = jnp.clip(action, -1, 1)
+            command = self.low + 0.5 * (action + 1) * (self.high - self.low)
+            air, acting = self.air.send(state[2], command, (self.low, self.high))
+            if self.air.is_windy:
+                air, force = self.air.force(air)
+                data = env.sim.data
+                env.sim.data = data.replace(states=data.states.replace(force=force[:, None]))
+            air = self.air.observe(air, self._simulate(air, acting), action)
+            obs = self._observe(air)
+            measures = {} if self.error is None else {"tracking_error": jnp.linalg.norm(self._way(obs), axis=-1)}
+            return (*self._take(), air), (obs, env.reward(), env.terminated(), env.truncated(), measures)
+
+    def _apply_conditions(self, air: dict[str, Any], mask: jax.Array) -> None:
+        """The conditions drawn for the masked drones, in their parameters and states."""
+        import jax.numpy as jnp
+
+        drawn, data, begins = air.get("drawn", {}), self.env.sim.data, mask[:, None, None]
+        params, states = {}, data.states
+        for name, factor in parameter_factors(self.dynamics, drawn).items():
+            value = getattr(data.params, name)
+            params[name] = value * jnp.where(mask, factor, 1.0).reshape(-1, *[1] * (value.ndim - 1))
+        if "start_spread" in drawn:
+            spread = jnp.where(begins, drawn["start_spread"][:, None, None], 1.0)
+            states = states.replace(pos=START + spread * (states.pos - START), vel=spread * states.vel)
+        if "rotors" in drawn:
+            turning = drawn["rotors"][:, None, None] * self._turning
+            states = states.replace(rotor_vel=jnp.where(begins, turning, states.rotor_vel))
+        self.env.sim.data = data.replace(params=data.params.replace(**params), states=states)
+
+    def _simulate(self, air: dict[str, Any], acting: Acting) -> jax.Array:
+        """Simulate a control step; returns the state [N, 13] as long before its end as observations are late."""
+        import jax
+        import jax.numpy as jnp
+
+        env, count, is_behind = self.env, self.air.substeps, "observation_delay" in self.air.ranges
+        if not (self.air.is_late or is_behind):
+            env._apply_action(acting(jnp.zeros((), jnp.int32)))
+            env.sim.step(count)
+            return self._state()
+        before_end = self.air.steps_behind(air)[1] if is_behind else jnp.zeros(self.num_envs, jnp.int32)
+
+        def substep(carry: tuple[Any, jax.Array], i: jax.Array) -> tuple[tuple[Any, jax.Array], None]:
+            env.sim.data, seen = carry
+            env._apply_action(acting(i))
+            env.sim.step(1)
+            seen = jnp.where((i == count - 1 - before_end)[:, None], self._state(), seen)
+            return (env.sim.data, seen), None
+
+        (env.sim.data, seen), _ = jax.lax.scan(substep, (env.sim.data, self._state()), jnp.arange(count))
+        return seen
+
+    def _state(self) -> jax.Array:
+        """The true state of the drones, [N, 13]."""
+        import jax.numpy as jnp
+
+        states = self.env.sim.data.states
+        return jnp.concatenate([getattr(states, name)[:, 0] for name in STATE_PARTS], axis=-1)
+
+    def _observe(self, air: dict[str, Any]) -> jax.Array:
+        """The flat observation, of the state as it is measured, and what is privileged, [N, O + P]."""
+        import jax.numpy as jnp
+
+        env, data = self.env, self.env.sim.data
+        if self.air.is_blurred:
+            seen = jnp.split(air["seen"][:, None], (3, 7, 10), axis=-1)
+            env.sim.data = data.replace(states=data.states.replace(**dict(zip(STATE_PARTS, seen, strict=True))))
+        parts = env.obs()
+        env.sim.data = data
+        if self.air.history:
+            parts["history"] = self.air.changes(air).reshape(self.num_envs, -1)
+        observed = [parts[part.name] for part in self.parts]
+        return jnp.concatenate([*observed, self._truth(air)] if self.privileged else observed, axis=-1)
+
+    def _truth(self, air: dict[str, Any]) -> jax.Array:
+        """The privileged numbers, [N, P]: the air, the four rotors' speed (1: hovering), the dynamics as one-hot."""
+        import jax.numpy as jnp
+
+        rotors = self.env.sim.data.states.rotor_vel[:, 0] / np.where(self._turning > 0, self._turning, 1)
+        dynamics = np.eye(len(DYNAMICS), dtype=np.float32)[DYNAMICS.index(self.dynamics)]
+        each = [jnp.broadcast_to(part, (self.num_envs, part.shape[-1])) for part in (rotors, dynamics)]
+        return jnp.concatenate([self.air.truth(air), *each], axis=-1)
+
+    def _way(self, obs: jax.Array) -> jax.Array:
+        """The true way to the reference, [N, 3] m."""
+        return self.env.obs()[REFERENCE][:, :3] if self.air.is_blurred else obs[:, self.error]
+
+
+class Mixed:
+    """Drones of several dynamics in one vector, by turns: drone i has dynamics i mod k.
+
+    Args:
+        drones: the k vectors, of N / k drones each.
+    """
+
+    def __init__(self, drones: Sequence[Drones]) -> None:
+        self.drones = drones
+        self.num_envs = sum(one.num_envs for one in drones)
+        self.device, self.action_size = drones[0].device, drones[0].action_size
+
+    def init(self, key: jax.Array) -> State:
+        """The state of each vector, with a key of its own."""
+        import jax
+
+        keys = jax.random.split(key, len(self.drones))
+        return [one.init(its) for one, its in zip(self.drones, keys, strict=True)]
+
+    def reset(self, state: State, mask: jax.Array, stagger: jax.Array) -> tuple[State, jax.Array, jax.Array]:
+        """Reset the masked drones, as `Drones.reset`."""
+        every = [one.reset(its, mask[i :: len(self.drones)], stagger) for i, (one, its) in self._each(state)]
+        states, obs, fragment = zip(*every, strict=True)
+        return list(states), _by_turns(*obs), _by_turns(*fragment)
+
+    def step(self, state: State, action: jax.Array) -> tuple[State, Outcome]:
+        """One control step of every drone, as `Drones.step`."""
+        import jax
+
+        every = [one.step(its, action[i :: len(self.drones)]) for i, (one, its) in self._each(state)]
+        states, outcomes = zip(*every, strict=True)
+        return list(states), jax.tree.map(_by_turns, *outcomes)
+
+    def _each(self, state: State) -> Iterator[tuple[int, tuple[Drones, State]]]:
+        return enumerate(zip(self.drones, state, strict=True))
+
+
+def _by_turns(*parts: jax.Array) -> jax.Array:
+    """The k arrays [N / k, …] as one [N, …], of which row i is from the array i mod k."""
+    import jax.numpy as jnp
+
+    stacked = jnp.stack(parts, axis=1)
+    return stacked.reshape(-1, *stacked.shape[2:])
+
+
+def hovering_rotors(dynamics: str, params: Any) -> float:
+    """The state of each rotor of a drone that hovers: RPM in first principles, newtons of all in other dynamics."""
+    if dynamics == "so_rpy":
+        return 0.0
+    weight = float(params.mass.ravel()[0]) * -float(params.gravity_vec[2])
+    if dynamics == "first_principles":
+        k0, k1, k2 = map(float, params.rpm2thrust.reshape(-1, 3)[0])
+        return (-k1 + math.sqrt(k1**2 - 4 * k2 * (k0 - weight / 4))) / (2 * k2)
+    return (weight - float(params.acc_coef.ravel()[0])) / float(params.cmd_f_coef.ravel()[0])

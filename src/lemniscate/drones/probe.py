@@ -1,0 +1,162 @@
+"""Drones flown along the conditions of their flight: all points of all axes side by side, in one program."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from lemniscate.drones.air import CONDITIONS, Ranges
+from lemniscate.drones.drones import Drones
+from lemniscate.envs.jax_backend import compile_side_by_side
+from lemniscate.envs.probe import CONDITION_AXES, Act, Axis, Flown, Tally, dynamics_axis
+from lemniscate.spec import Spec
+
+if TYPE_CHECKING:
+    import jax
+
+MOST_FLIGHTS = 1024
+"""flights side by side: as many as a cache holds, and few enough that batches of crashed drones end early"""
+
+Make = Callable[[str | None, Ranges], Drones]
+"""the drones of as many flights as there are starts, in dynamics by name, or in those that are nominal"""
+
+
+class DroneProbe:
+    """A probe of drones: a point is a value of one condition, while the others are as they are nominally.
+
+    The points are copies of the same drones, `jax.vmap` over the ends of the conditions' ranges; so at each of them the
+    starts, the noise and the direction of the wind are the same. Each of the other dynamics is a program of its own.
+
+    Args:
+        make: the drones.
+        dynamics: all that there are.
+        given: conditions that are nominal here, though not in the simulator as it is.
+        starts: E.
+        spec: of the environment with these drones.
+    """
+
+    ends_by_failure = True
+
+    def __init__(self, make: Make, dynamics: Sequence[str], given: Ranges, starts: int, spec: Callable) -> None:
+        self._make, self._given = make, given
+        conditions = tuple(_conditions(given))
+        ranges = {**given, **{axis.name: (min(axis.values), max(axis.values)) for axis in conditions}}
+        self._drones = make(None, ranges)
+        nominal, self._ends = self._drones.dynamics, _ends(ranges, given)
+        ordered = tuple(axis for axis in conditions if axis.name != "motor_time" or nominal != "so_rpy")
+        self.axes = (*ordered, dynamics_axis(nominal, tuple(dynamics)))
+        self.spec: Spec = spec(self._drones)
+        self.period = 1 / self._drones.env.freq
+        self._points = [(axis.name, value) for axis in ordered for value in axis.values if value != axis.nominal]
+        batches = math.ceil((1 + len(self._points)) / max(1, MOST_FLIGHTS // starts))
+        self._size = math.ceil((1 + len(self._points)) / batches)
+        """the points of a batch"""
+
+    @cached_property
+    def _programs(self) -> dict[str, _Programs]:
+        """The programs of each of the dynamics by its name: those of a batch, first, and those of a point."""
+        axis = self.axes[-1]
+        others = [self._make(str(name), self._given) for name in axis.values if name != axis.nominal]
+        every = [(self._drones, self._size), *((one, 1) for one in others)]
+        return dict(zip((one.dynamics for one, _ in every), _compiled(every), strict=True))
+
+    def fly(self, act: Act, seed: int) -> tuple[Flown, dict[str, list[Flown]]]:
+        """All flights, see `Probe.fly`; those that are nominal with their actions."""
+        (_, programs), *others = self._programs.items()
+        nominal, *flown = self._batches(programs, act, seed)
+        at = dict(zip(self._points, flown, strict=False))  # the last batch has more
+        given = np.array(list(self._given.values()), np.float32).reshape(1, -1, 2)
+        at |= {("dynamics", name): one.fly(act, seed, given)[0] for name, one in others}
+        return nominal, {a.name: [at.get((a.name, value), nominal) for value in a.values] for a in self.axes}
+
+    def _batches(self, programs: _Programs, act: Act, seed: int) -> Iterator[Flown]:
+        """The nominal flights, then those of each point, batch by batch; the last is filled up with nominal ones."""
+        names = list(self._drones.air.ranges)
+        ends = np.tile(self._ends, (math.ceil((1 + len(self._points)) / self._size) * self._size, 1, 1))
+        for row, (name, value) in enumerate(self._points, 1):
+            ends[row, names.index(name)] = value
+        for begin in range(0, len(ends), self._size):
+            yield from programs.fly(act, seed, ends[begin : begin + self._size], keep_first=begin == 0)
+
+
+def _conditions(given: Ranges) -> Iterator[Axis]:
+    """The axes of conditions about their nominal values; none of a condition that is drawn from a range."""
+    for axis in CONDITION_AXES:
+        low, high = given.get(axis.name, (CONDITIONS[axis.name].nominal,) * 2)
+        if low == high:
+            yield axis.around(low)
+
+
+def _ends(ranges: Ranges, given: Ranges) -> np.ndarray:
+    """The ends [K, 2] of the nominal ranges."""
+    nominal = [given.get(name, (CONDITIONS[name].nominal,) * 2) for name in ranges]
+    return np.array(nominal, dtype=np.float32).reshape(-1, 2)
+
+
+class _Programs:
+    """The compiled programs of P copies of E drones: no flight is reset, so what follows a crash means nothing."""
+
+    def __init__(self, drones: Drones, points: int, restart: Callable, step: Callable) -> None:
+        self._drones, self._points, self._restart, self._step = drones, points, restart, step
+
+    def fly(self, act: Act, seed: int, ends: np.ndarray, keep_first: bool = False) -> list[Flown]:
+        """The flights of each copy, with the ends [P, K, 2] of its ranges; `keep_first` the actions of the first.
+
+        A drone whose state is not finite has crashed.
+        """
+        from jax.dlpack import from_dlpack
+
+        starts, kept = self._drones.num_envs, list[torch.Tensor]()
+        tally = Tally(self._points * starts)
+        state, obs = self._restart(np.uint32(seed), ends)
+        for _ in range(self._drones.episode_steps):
+            action = act(torch.nan_to_num(torch.from_dlpack(obs))).clamp(-1, 1)
+            if keep_first:
+                kept.append(action[:starts].clone())
+            state, obs, reward, crashed = self._step(state, from_dlpack(action.contiguous()))
+            tally.add(torch.nan_to_num(torch.from_dlpack(reward)), torch.from_dlpack(crashed))
+            if not tally.going.any():
+                break
+        pairs = zip(tally.returns.split(starts), tally.terminated.split(starts), strict=True)
+        actions = torch.stack(kept) if kept else None
+        return [Flown(*pair, actions if i == 0 else None) for i, pair in enumerate(pairs)]
+
+
+def _compiled(drones: Sequence[tuple[Drones, int]]) -> list[_Programs]:
+    """The programs of several drones, each of so many points: traced one after the other, compiled side by side."""
+    lowered = [program for one, points in drones for program in _lowered(one, points)]
+    compiled = compile_side_by_side(lowered)
+    pairs = zip(compiled[::2], compiled[1::2], strict=True)
+    return [_Programs(one, points, *pair) for (one, points), pair in zip(drones, pairs, strict=True)]
+
+
+def _lowered(drones: Drones, points: int) -> tuple[Any, Any]:
+    """`restart(seed, ends) -> state, obs` and `step(state, action) -> state, obs, reward, crashed`, traced."""
+    import jax
+    import jax.numpy as jnp
+
+    drones.env.sim.device = None  # crazyflow places actions on a device, which jax.vmap cannot
+    every, calm = jnp.ones(drones.num_envs, dtype=bool), jnp.array(False)
+
+    def restart(seed: jax.Array, ends: jax.Array) -> tuple[Any, jax.Array]:
+        def one(ends: jax.Array) -> tuple[Any, jax.Array]:
+            data, arrays, air = drones.init(jax.random.key(seed))
+            return drones.reset((data, arrays, {**air, "ends": ends}), every, calm)[:2]
+
+        state, obs = jax.vmap(one)(ends)
+        return state, obs.reshape(-1, obs.shape[-1])
+
+    def step(state: Any, action: jax.Array) -> tuple[Any, jax.Array, jax.Array, jax.Array]:
+        state, (obs, reward, crashed, _, _) = jax.vmap(drones.step)(state, action.reshape(points, drones.num_envs, -1))
+        crashed = crashed | ~jnp.isfinite(obs).all(-1)
+        return state, obs.reshape(-1, obs.shape[-1]), reward.ravel(), crashed.ravel()
+
+    ends = np.zeros((points, len(drones.air.ranges), 2), np.float32)
+    action = np.zeros((points * drones.num_envs, drones.action_size), np.float32)
+    begun = jax.jit(restart).lower(np.uint32(0), ends)
+    return begun, jax.jit(step).lower(begun.out_info[0], action)

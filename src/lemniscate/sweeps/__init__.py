@@ -1,0 +1,1 @@
+"""Several runs: sweeps over algorithms and seeds, and the search for settings."""

@@ -1,0 +1,176 @@
+"""The settings that a search may choose, and their ranges.
+
+    learning_rate=log:1e-4:1e-2, gamma=.9:.999, hidden=64 64|256 256
+
+is a range whose orders of magnitude are equally likely, a range whose numbers are, and a choice of two.
+"""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, get_origin, get_type_hints
+
+import numpy as np
+
+from lemniscate.errors import UserError, shown
+from lemniscate.run.config import RunConfig, options_of
+from lemniscate.run.glossary import unknown_field
+from lemniscate.run.texts import read
+
+FIXED = ("num_envs", "num_steps", "shards", "threads", "device", "compile", "warm_start", "env_kwargs", "wrappers")
+FIXED += ("hidden", "critic_hidden", "activation", "network", "normalize_observations", "scale_rewards", "buffer_size")
+FIXED += ("initial_log_std", "initial_temperature", "learning_starts", "value_range", "unit_weights")
+"""fields that cannot change, or would change nothing, after a run has begun"""
+NEAR = 0.8, 1.25
+"""factors of a number that varies"""
+ANEW = 0.25
+"""probability that a setting is drawn anew instead"""
+NOT_SEARCHED = ("env", "backend", "seed", "total_steps", "checkpoint_every", "evaluate_every", "evaluate_episodes")
+"""fields that are the same in all trials, or set by the search itself"""
+
+
+@dataclass(frozen=True)
+class Interval:
+    """The numbers from `low` to `high`; with `log` uniform in their logarithm, with `whole` whole ones."""
+
+    low: float
+    high: float
+    log: bool
+    whole: bool
+
+    def draw(self, trial: Any, name: str) -> Any:
+        """The number that Optuna suggests; of one with a fraction, six digits, which a preset can say."""
+        if self.whole:
+            return trial.suggest_int(name, self.low, self.high, log=self.log)
+        value = float(f"{trial.suggest_float(name, self.low, self.high, log=self.log):.6g}")
+        return min(max(value, self.low), self.high)
+
+    def sample(self, rng: np.random.Generator) -> Any:
+        """A number from anywhere in the range."""
+        low, high = (np.log(self.low), np.log(self.high)) if self.log else (self.low, self.high)
+        value = rng.uniform(low, high)
+        return self._nearest(np.exp(value) if self.log else value)
+
+    def vary(self, value: Any, rng: np.random.Generator) -> Any:
+        """A number near to another one."""
+        return self._nearest(value * rng.choice(NEAR))
+
+    def _nearest(self, value: float) -> Any:
+        inside = min(max(float(value), self.low), self.high)
+        return round(inside) if self.whole else float(f"{inside:.6g}")
+
+    def key_of(self, value: Any) -> Any:
+        """The suggestion of Optuna that stands for `value`; None if it is outside."""
+        return value if isinstance(value, int | float) and self.low <= value <= self.high else None
+
+
+@dataclass(frozen=True)
+class Choice:
+    """One of several values, as they were typed."""
+
+    values: Mapping[str, Any]
+
+    def draw(self, trial: Any, name: str) -> Any:
+        """The value that Optuna suggests."""
+        return self.values[trial.suggest_categorical(name, list(self.values))]
+
+    def sample(self, rng: np.random.Generator) -> Any:
+        """Any of the values."""
+        return list(self.values.values())[rng.integers(len(self.values))]
+
+    def vary(self, value: Any, rng: np.random.Generator) -> Any:
+        """The same value."""
+        return value
+
+    def key_of(self, value: Any) -> Any:
+        """The suggestion of Optuna that stands for `value`; None if it is none of the choices."""
+        return next((key for key, choice in self.values.items() if choice == value), None)
+
+
+Space = dict[str, Interval | Choice]
+
+
+def read_texts(search: object) -> dict[str, str]:
+    """The text of each range by its field, in "learning_rate=log:1e-4:1e-2, gamma=.9:.999" or a dictionary of them."""
+    if isinstance(search, Mapping):
+        pairs = [(str(name), str(text)) for name, text in search.items()]
+    elif isinstance(search, str):
+        pairs = [_pair(field) for field in re.split(r",\s*(?=[\w-]+\s*=)", search.strip(" ,")) if field]
+    else:
+        raise UserError(f"search must be a text such as 'gamma=.9:.999', or a dictionary, not {shown(search)}.")
+    if not pairs:
+        raise UserError("Search what? Name fields with their ranges, such as learning_rate=log:1e-4:1e-2.")
+    return {name.strip().lstrip("-").replace("-", "_"): text.strip() for name, text in pairs}
+
+
+def read_space(texts: Mapping[str, str], config: RunConfig, *, while_training: bool = False) -> Space:
+    """The ranges that the texts stand for; `while_training`, of settings that can change then.
+
+    Raises:
+        UserError: a field that the Config does not have or a search cannot change, or a range that it has no room for.
+    """
+    hints, space = get_type_hints(type(config), include_extras=True), Space()
+    for name, text in texts.items():
+        if name not in hints:
+            raise unknown_field(name, config.names())
+        if name in NOT_SEARCHED:
+            raise UserError(f"{name} is the same in all trials: give it as a field, not in the search.")
+        if while_training and name in FIXED:
+            raise UserError(f"{name} cannot change while a run is trained, as settings of a population do.")
+        if while_training and name == "learning_rate" and getattr(config, "desired_kl", None) is not None:
+            raise UserError("learning_rate follows desired_kl here: search desired_kl, or give --desired-kl none.")
+        space[name] = _range(name, text, hints[name], config)
+    return space
+
+
+def draw(space: Space, trial: Any) -> dict[str, Any]:
+    """The fields of a new trial, by name."""
+    return {name: values.draw(trial, name) for name, values in space.items()}
+
+
+def sample(space: Space, rng: np.random.Generator) -> dict[str, Any]:
+    """Settings from anywhere in the ranges, by name."""
+    return {name: values.sample(rng) for name, values in space.items()}
+
+
+def vary(space: Space, settings: Mapping[str, Any], rng: np.random.Generator) -> dict[str, Any]:
+    """Settings near to others; each is drawn anew with a probability of a quarter."""
+    return {
+        name: values.sample(rng) if rng.random() < ANEW else values.vary(settings[name], rng)
+        for name, values in space.items()
+    }
+
+
+def _pair(field: str) -> tuple[str, str]:
+    name, equals, text = field.partition("=")
+    if not (name.strip() and equals and text.strip()):
+        raise UserError(
+            f"A search is written as field=low:high, field=log:low:high or field=a|b, not {field.strip()!r}."
+        )
+    return name, text
+
+
+def _range(name: str, text: str, hint: Any, config: RunConfig) -> Interval | Choice:
+    """The range that a text stands for; every end of it is a value that the Config has room for."""
+    ends = re.fullmatch(r"(log:)?([^:|]+):([^:|]+)", text)
+    if not ends:
+        values = {part.strip(): _read(name, hint, part) for part in text.split("|")}
+        checked = {key: getattr(config.replace(**{name: value}), name) for key, value in values.items()}
+        if len(checked) < 2:
+            raise UserError(f"{name}={text} is no range: write {name}=low:high, {name}=log:low:high or {name}=a|b.")
+        return Choice(checked)
+    low, high = (getattr(config.replace(**{name: _read(name, hint, end)}), name) for end in ends.groups()[1:])
+    log = ends[1] is not None
+    if not all(isinstance(end, int | float) and not isinstance(end, bool) for end in (low, high)):
+        raise UserError(f"{name} is no number: give its values as {name}=a|b.")
+    if not low < high or (log and low <= 0):
+        above = " above 0" if log else ""
+        raise UserError(f"{name}={text} is no range: its first number must be{above} below its second one.")
+    return Interval(low, high, log, isinstance(low, int) and isinstance(high, int))
+
+
+def _read(name: str, hint: Any, text: str) -> Any:
+    options = options_of(hint)
+    if bool in options:
+        return {"on": True, "off": False}.get(text.strip(), text.strip())
+    return read(name, hint, text.split() if any(get_origin(option) is tuple for option in options) else text.strip())

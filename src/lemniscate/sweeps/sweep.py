@@ -1,0 +1,275 @@
+"""Sweeps: every algorithm with every seed, each in a process of its own, one process per CPU core at a time.
+
+A process resumes one run directory, whether its run has begun or not. So an interrupted sweep goes on as it began, and
+each of its runs ends in the same bits as if it had been trained alone.
+"""
+
+import re
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import islice
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Any
+
+from filelock import FileLock, Timeout
+
+from lemniscate.algos import ALGORITHMS, name_of
+from lemniscate.api import plots, training
+from lemniscate.api.results import final_return
+from lemniscate.api.stored import own_code_of, path_of
+from lemniscate.cluster.connection import Cluster, find_cluster
+from lemniscate.envs import registry
+from lemniscate.errors import SweepError, UserError, prefix_errors, resume_line, shown
+from lemniscate.hub.trust import require_trusted
+from lemniscate.run.config import RunConfig
+from lemniscate.run.directory import is_finished
+from lemniscate.run.environments import device_for, require_memory
+from lemniscate.run.places import LOG, Processes, failure_of
+from lemniscate.run.run import Stopped, stop_signals_to
+from lemniscate.run.sweep_file import Sweep, read_sweep
+from lemniscate.run.warm_start import load_networks
+from lemniscate.sweeps.sweep_progress import SweepProgress, progress_of
+from lemniscate.system import named
+from lemniscate.system.console import say
+
+if TYPE_CHECKING:
+    from lemniscate.cluster.tasks import RayTasks
+
+MOST_SEEDS = 1_000
+"""of a sweep, each of which is a directory and a process"""
+
+POLL_SECONDS = 0.3
+"""seconds between two looks at the processes"""
+
+
+@dataclass(frozen=True)
+class TrainedSweep:
+    """The result of `train_sweep` and `resume_sweep`: the sweep's directory, and the run directories in it."""
+
+    path: Path
+    runs: list[Path]
+
+
+def train_sweep(
+    algorithms: str | Iterable[str],
+    env: str | None,
+    seeds: str | int | Iterable[int],
+    *,
+    run: str | Path | None = None,
+    preset: str | None = None,
+    track: str | None = None,
+    callbacks: str | Sequence[str] = (),
+    report: bool = False,
+    progress: bool = True,
+    cluster: str | None = None,
+    workers: int | None = None,
+    **fields: object,
+) -> TrainedSweep:
+    """Train every algorithm with every seed, and compare them: a table on standard error, pictures in `plots/`.
+
+    Args:
+        algorithms: "ppo,sac", or names in a list.
+        env: the environment's id, one for all; None if the preset has one of its own.
+        seeds: "1-5", "1,3,7", a number, or numbers in a list.
+        run: the sweep's directory; by default a new one under `runs/`.
+        preset: by name, for every algorithm; the best known for the environment unless given.
+        track: as in `train`, for every run.
+        callbacks: names of functions, as `module:function`: every run calls them in its own process.
+        report: as in `train`, for every run.
+        progress: the live lines on standard error.
+        cluster: "ray" or "ray=ADDRESS": train the runs as Ray tasks, wherever there is room.
+        workers: the most runs at a time there; by default as many as the cores serve.
+        **fields: any fields that the Configs of all the algorithms have.
+
+    Raises:
+        UserError: before anything starts, what an algorithm cannot be trained with.
+        Stopped: Ctrl-C or SIGTERM, when every run has saved itself; go on with `resume_sweep`.
+        SweepError: some runs failed; the others are trained and compared.
+    """
+    if "seed" in fields:
+        raise UserError("Several runs have several seeds: they are given as seeds, not as seed.")
+    names, numbers = algorithms_of(algorithms), seeds_of(seeds)
+    configs: dict[str, RunConfig] = {}
+    for name in names:
+        with prefix_errors(name):
+            configs[name] = training.config_for(name, env, preset, **fields)
+    if len({config.env for config in configs.values()}) > 1:
+        raise UserError("These presets are for different environments; name the one of the whole sweep with env.")
+    there, options = find_cluster(cluster, workers), _options(track, callbacks, report)
+    require_trainable(configs, numbers)
+    stem = f"{'-'.join(names)}-{len(numbers)}-seeds"
+    path = path_of(run) if run is not None else training.fresh_directory(next(iter(configs.values())).env, stem)
+    records = {name: config.to_json() for name, config in configs.items()}
+    but_seed = {name: {k: v for k, v in record.items() if k != "seed"} for name, record in records.items()}
+    runs = Sweep(path, numbers, but_seed)
+    runs.create()
+    return _train(runs, [*options, "--trust"], progress, there)  # code that was named here and now
+
+
+def resume_sweep(
+    path: str | Path | TrainedSweep,
+    *,
+    track: str | None = None,
+    callbacks: str | Sequence[str] = (),
+    report: bool = False,
+    progress: bool = True,
+    cluster: str | None = None,
+    workers: int | None = None,
+    trust: bool = False,
+) -> TrainedSweep:
+    """Resume an interrupted sweep: train the runs that are not finished or have not begun. See `resume`."""
+    runs, there, options = read_sweep(path_of(path)), find_cluster(cluster, workers), _options(track, callbacks, report)
+    for record in runs.runs.values():
+        require_trusted(runs.path, own_code_of(record), trusted=trust or runs.trusted)
+    return _train(replace(runs, trusted=trust or runs.trusted), [*options, *["--trust"] * trust], progress, there)
+
+
+def _options(track: str | None, callbacks: str | Sequence[str], report: bool) -> list[str]:
+    """The options of each run's process. Raises `UserError` for a tracker or a callback that it could not find."""
+    names: list[Any] = list(callbacks) if isinstance(callbacks, list | tuple) else [callbacks]
+    for name in (track, *names):
+        if not isinstance(name, str | None):
+            raise UserError(f"Each run of a sweep has a process of its own: name {shown(name)} as 'module:name'.")
+    training.loggers_with(track)
+    for name in names:
+        named.find(name)
+    options = ["--track", track] if track else []
+    return options + (["--callbacks", *names] if names else []) + (["--report"] if report else [])
+
+
+def _train(runs: Sweep, options: list[str], progress: bool, cluster: Cluster | None) -> TrainedSweep:
+    try:
+        with FileLock(runs.path / ".lock", timeout=0):
+            runs.create_runs()
+            failed = _Training(runs, options, progress, cluster).train()
+    except Timeout:
+        raise UserError(f"{runs.path} is being trained by another process.") from None
+    if any(map(is_finished, runs.runs)):
+        for picture in plots.plot(runs.path):
+            say(picture)
+    if failed:
+        sentences = "".join(f"\n{name}: {sentence}" for name, sentence in failed.items())
+        raise SweepError(
+            f"{len(failed)} of {len(runs.runs)} runs could not go on; {LOG} in each says more.{sentences}\n"
+            f"Try them again with: {resume_line(runs.path)}"
+        )
+    return TrainedSweep(runs.path, list(runs.runs))
+
+
+def places_on(cluster: Cluster | None, configs: Iterable[Mapping[str, Any]]) -> "Processes | RayTasks":
+    """The places of a cluster, or of this machine, for runs of such Configs."""
+    threads = max(config["threads"] for config in configs)
+    if cluster is None:
+        return Processes(threads)
+    from lemniscate.cluster.tasks import RayTasks
+
+    return RayTasks(cluster, threads, gpu=any(config["device"].startswith("cuda") for config in configs))
+
+
+class _Training:
+    """The runs of a sweep that are to be trained, and the sentences of those that failed."""
+
+    def __init__(self, runs: Sweep, options: list[str], progress: bool, cluster: Cluster | None) -> None:
+        self._runs, self._options = runs, ["--score", *options]
+        self._places = places_on(cluster, runs.configs.values())
+        self._waiting = [run for run in runs.runs if not is_finished(run)]
+        self._failed: dict[str, str] = {}
+        self._stop_signal = 0
+        totals = {run.name: record["config"]["total_steps"] for run, record in runs.runs.items()}
+        steps = {run.name: progress_of(run)[0] for run in runs.runs}
+        self._bars = SweepProgress(totals, steps, progress)
+
+    def train(self) -> dict[str, str]:
+        """Train every run to its end; returns the sentences of those that failed. Raises `Stopped` after a signal."""
+        path, count, told = self._runs.path, len(self._waiting), False
+        try:
+            self._bars.say(f"{path}: {count} of {len(self._runs.runs)} runs to train, {self._places.count} at a time")
+            with stop_signals_to(self._stop):
+                while self._places.running or (self._waiting and not self._stop_signal):
+                    while self._waiting and self._places.free and not self._stop_signal:
+                        self._start(self._waiting.pop(0))
+                    if self._stop_signal and not told:
+                        told = True
+                        self._bars.say("Stopping: each run ends its update and saves itself.")
+                    self._look()
+                    time.sleep(POLL_SECONDS)
+        finally:
+            self._places.close()
+            self._bars.close()
+        if self._stop_signal and not all(map(is_finished, self._runs.runs)):
+            said = f"Stopped; the runs that had begun are saved. Go on with: {resume_line(path)}"
+            raise Stopped(said, self._stop_signal)
+        return self._failed
+
+    def _start(self, run: Path) -> None:
+        self._places.start(run, self._options)
+        if self._stop_signal:  # the signal came while the process was started
+            self._places.stop([run])
+
+    def _look(self) -> None:
+        """Show the progress of each run, and how those ended that have."""
+        for run in self._places.running:
+            self._bars.update(run.name, *progress_of(run))
+        for run, code in self._places.ended().items():
+            step = progress_of(run)[0]
+            if code == 0:
+                sentence = f"done, final return {final_return(run):.1f}"
+            elif self._stop_signal:
+                sentence = f"stopped at step {step:,}"
+            else:
+                sentence = self._failed[run.name] = failure_of(run, code)
+            self._bars.end(run.name, sentence)
+
+    def _stop(self, signum: int = 0, _frame: FrameType | None = None) -> None:
+        """Ask every process to save and stop; asked twice, it does not wait for the end of its update."""
+        self._stop_signal = self._stop_signal or signum
+        self._places.stop()
+
+
+def algorithms_of(names: str | Iterable[str]) -> list[str]:
+    """The names in "ppo,sac" or in a list, each once. Raises `UserError` for one that is unknown."""
+    several = names.split(",") if isinstance(names, str) else names if isinstance(names, Iterable) else [names]
+    split = [name_of(name.strip() if isinstance(name, str) else name) for name in several]
+    if not split:
+        raise UserError(f"Name at least one algorithm: {', '.join(ALGORITHMS)}.")
+    return list(dict.fromkeys(split))
+
+
+def seeds_of(seeds: str | int | Iterable[int]) -> list[int]:
+    """The seeds in "1-5,8", a number or a list, each once."""
+    if not isinstance(seeds, str):
+        seeds = getattr(seeds, "tolist", lambda: seeds)()  # of NumPy's and torch's arrays
+        given = islice(seeds, MOST_SEEDS + 1) if isinstance(seeds, Iterable) else [seeds]
+        seeds = ",".join(seed if isinstance(seed, str) else shown(seed) for seed in given)
+    numbers: dict[int, None] = {}
+    for part in seeds.split(","):
+        ends = re.fullmatch(r"([0-9]{1,20})(?:-([0-9]{1,20}))?", part.strip())
+        between = range(int(ends[1]), int(ends[2] or ends[1]) + 1) if ends else range(0)
+        if not between:
+            raise UserError(f"seeds must be numbers such as 1-5 or 1,3,7, not {shown(seeds)}.")
+        numbers |= dict.fromkeys(between[: MOST_SEEDS + 1])
+        if len(numbers) > MOST_SEEDS:
+            raise UserError(f"A sweep takes at most {MOST_SEEDS:,} seeds, and there are more in {shown(seeds)}.")
+    return list(numbers)
+
+
+def require_trainable(configs: dict[str, RunConfig], seeds: list[int]) -> None:
+    """Raise `UserError` where a run could not begin: one sentence now, instead of one from each run."""
+    for name, config in configs.items():
+        for thing in (config.env, *config.wrappers, getattr(config, "network", "")):
+            if "<" in thing or thing.startswith("__main__:"):
+                said = f"Each run of a sweep has a process of its own: put {thing} into a module, to import it."
+                raise UserError(said)
+        device = device_for(config.device)
+        for seed in seeds:
+            config.replace(seed=seed)
+        own = {"kwargs": config.env_kwargs, "wrappers": config.wrappers, "backend": config.backend}
+        with prefix_errors(name):
+            env = registry.make(config.env, 1, **own)
+            env.close()
+            require_memory(config, env.spec, device)
+            networks = config.networks(env.spec)
+            if config.warm_start:
+                load_networks(networks, config, env.spec)

@@ -1,0 +1,316 @@
+"""The verbs of a search: Optuna proposes settings, several seeds try each of them, and the worse ones end early.
+
+The settings are proposed by a tree-structured Parzen estimator (Bergstra et al. 2011), and trials end by asynchronous
+successive halving (Li et al. 2020, arXiv:1810.05934): at a ninth and at a third of a run, a trial goes on if it is
+among the best third of all that have come so far. The score of a trial is the interquartile mean over its seeds.
+"""
+
+import time
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING
+
+from filelock import FileLock, Timeout
+
+from lemniscate.algos import name_of
+from lemniscate.api import training
+from lemniscate.api.stored import path_of
+from lemniscate.cluster.connection import Cluster, find_cluster
+from lemniscate.errors import SweepError, UserError, resume_line, shown
+from lemniscate.presets.stored import StoredPreset
+from lemniscate.report import tuning as pictures
+from lemniscate.run.places import LOG, failure_of
+from lemniscate.run.run import Stopped, stop_signals_to
+from lemniscate.run.sweep_file import Sweep, is_sweep
+from lemniscate.sweeps.population import Population
+from lemniscate.sweeps.space import draw, read_space, read_texts
+from lemniscate.sweeps.study import (
+    NINTHS,
+    PRESET,
+    RUNGS,
+    TENTHS,
+    Search,
+    Tuned,
+    as_text,
+    final_score,
+    has_come,
+    import_optuna,
+    read_search,
+    score_at,
+)
+from lemniscate.sweeps.sweep import POLL_SECONDS, places_on, require_trainable, seeds_of
+from lemniscate.system.console import say
+
+if TYPE_CHECKING:
+    import optuna
+
+MOST_TRIALS = 10_000
+FEWEST_MEMBERS = 4
+SEEDS = "101-103"
+"""of a search, none of which any result of this project was evaluated with"""
+EPISODES = 50
+"""that the final policy of each seed plays"""
+
+
+def tune(
+    algorithm: str,
+    env: str | None = None,
+    *,
+    search: str | Mapping[str, str],
+    trials: int = 40,
+    seeds: str | int | Iterable[int] = SEEDS,
+    prune: bool = True,
+    population: bool = False,
+    run: str | Path | None = None,
+    preset: str | None = None,
+    progress: bool = True,
+    cluster: str | None = None,
+    workers: int | None = None,
+    **fields: object,
+) -> Tuned:
+    """Search for the settings with which an algorithm learns an environment best.
+
+    The first trial has the settings of the preset as they are. The result is a preset in `preset.json`, with its
+    provenance: `train(algorithm, preset="…/preset.json")`.
+
+    Args:
+        algorithm: a name.
+        env: an id; None if the preset has one of its own.
+        search: "learning_rate=log:1e-4:1e-2, gamma=.9:.999, hidden=64 64|256 256", or a dictionary of such texts.
+        trials: number of settings that are tried.
+        seeds: of every trial; its score is the interquartile mean over them. Evaluate the result with other ones.
+        prune: end a trial after a ninth or a third of its steps if it is not among the best third.
+        population: train all trials together instead, and change settings of the worse ones on the way, into those of
+            better ones and others near to them (population-based training); it has no `prune`.
+        run: the search's directory; by default a new one under `runs/`.
+        preset: the settings that are not searched; the best known for the environment unless given.
+        progress: a line on standard error for each trial.
+        cluster: "ray" or "ray=ADDRESS": train the trials' runs as Ray tasks, wherever there is room.
+        workers: the most runs at a time there; by default as many as the cores serve.
+        **fields: any other fields of the algorithm's Config, the same for all trials.
+
+    Raises:
+        UserError: what cannot be searched or trained; Optuna is not installed.
+        Stopped: Ctrl-C or SIGTERM, when every run has saved itself; go on with `resume_tuning`.
+        SweepError: no trial has come to its end.
+    """
+    if not population:
+        import_optuna()
+    if "seed" in fields:
+        raise UserError("A search has several seeds: they are given as seeds, not as seed.")
+    for name in sorted({"checkpoint_every", "evaluate_every"} & set(fields)):
+        raise UserError(f"{name} follows from the search: at the end of each part of a run trials are compared.")
+    algorithm = name_of(algorithm)
+    config = training.config_for(algorithm, env, preset, **fields)
+    if not isinstance(trials, int) or isinstance(trials, bool) or not 1 <= trials <= MOST_TRIALS:
+        raise UserError(f"trials must be a whole number from 1 to {MOST_TRIALS:,}, not {shown(trials)}.")
+    if population and trials < FEWEST_MEMBERS:
+        raise UserError(f"A population has {FEWEST_MEMBERS} members or more: trials must not be {trials}.")
+    config = config.replace(
+        checkpoint_every=-(-config.total_steps // (TENTHS if population else NINTHS)),
+        evaluate_every=config.total_steps,
+        evaluate_episodes=fields.get("evaluate_episodes") or EPISODES,
+    )
+    there, texts, numbers = find_cluster(cluster, workers), read_texts(search), seeds_of(seeds)
+    read_space(texts, config, while_training=population)
+    require_trainable({algorithm: config}, numbers)
+    path = path_of(run) if run is not None else training.fresh_directory(config.env, f"{algorithm}-tune")
+    what = Search(path, algorithm, config, texts, numbers, trials, prune, population)
+    what.create()
+    return _tune(what, progress, there)
+
+
+def resume_tuning(
+    path: str | Path | Tuned,
+    *,
+    progress: bool = True,
+    cluster: str | None = None,
+    workers: int | None = None,
+    trust: bool = False,
+) -> Tuned:
+    """Go on with an interrupted search. Each run of each trial ends in the same bits as if it had not been stopped."""
+    return _tune(read_search(path_of(path), trust=trust), progress, find_cluster(cluster, workers))
+
+
+def _tune(search: Search, progress: bool, cluster: Cluster | None) -> Tuned:
+    try:
+        with FileLock(search.path / ".lock", timeout=0):
+            if search.population:
+                return Population(search, progress, cluster).train()
+            return _Tuner(search, progress, cluster).tune()
+    except Timeout:
+        raise UserError(f"{search.path} is being searched by another process.") from None
+
+
+@dataclass
+class _Trial:
+    """A trial that has not ended: its sweep, and which of its runs are to go on to the next rung."""
+
+    asked: "optuna.Trial"
+    sweep: Sweep
+    rung: int = 0
+    """how many it has passed"""
+    waiting: list[Path] = field(default_factory=list)
+    training: set[Path] = field(default_factory=set)
+    failure: str = ""
+
+
+class _Tuner:
+    """The trials of a search, and the processes that train their runs."""
+
+    def __init__(self, search: Search, progress: bool, cluster: Cluster | None) -> None:
+        self._search, self._progress = search, progress
+        self._space, self._rungs, self._study = search.space, search.rungs(), search.study()
+        self._places = places_on(cluster, [search.config.to_json()])
+        self._trials: list[_Trial] = []
+        self._stop_signal = 0
+
+    def tune(self) -> Tuned:
+        """Try everything that is left to try. Raises `Stopped` after a signal."""
+        self._begin()
+        try:
+            with stop_signals_to(self._stop):
+                while not self._stop_signal and (self._trials or self._missing):
+                    for trial in [trial for trial in self._trials if not (trial.waiting or trial.training)]:
+                        self._compare(trial)
+                    self._fill()
+                    time.sleep(POLL_SECONDS)
+                    self._look()
+                while self._places.running:
+                    self._places.ended()
+                    time.sleep(POLL_SECONDS)
+        finally:
+            self._places.close()
+        if self._stop_signal:
+            again = resume_line(self._search.path)
+            raise Stopped(f"Stopped; the runs that had begun are saved. Go on with: {again}", self._stop_signal)
+        return self._result()
+
+    @property
+    def _missing(self) -> int:
+        """The number of trials that have not begun."""
+        return self._search.trials - sum(trial.state.name != "WAITING" for trial in self._study.trials)
+
+    def _begin(self) -> None:
+        """Take up what was interrupted; of a new search, the first trial has the settings as they are."""
+        optuna, known = import_optuna(), self._study.trials
+        if not known:
+            values = {name: getattr(self._search.config, name) for name in self._space}
+            keys = {name: self._space[name].key_of(value) for name, value in values.items()}
+            self._study.enqueue_trial({name: key for name, key in keys.items() if key is not None})
+        for frozen in known:
+            if frozen.state.name == "RUNNING":
+                trial = self._trial(optuna.trial.Trial(self._study, frozen._trial_id))
+                trial.rung = len(frozen.intermediate_values)
+                self._queue(trial)
+        self._say(
+            f"{self._search.path}: {len(self._trials) + self._missing} of {self._search.trials} trials to run, with"
+            f" {len(self._search.seeds)} seeds each, {self._places.count} runs at a time: {self._search.what}"
+        )
+
+    def _trial(self, asked: "optuna.Trial") -> _Trial:
+        trial = _Trial(asked, self._search.sweep(f"{asked.number:03d}", draw(self._space, asked)))
+        if not is_sweep(trial.sweep.path):
+            trial.sweep.create()
+        trial.sweep.create_runs()
+        self._trials.append(trial)
+        return trial
+
+    def _queue(self, trial: _Trial) -> None:
+        """Let the runs of a trial wait for a place, in which they go on to its next rung, or to their end."""
+        until = self._until(trial)
+        trial.waiting = [run for run in trial.sweep.runs if not has_come(run, until)]
+
+    def _until(self, trial: _Trial) -> int | None:
+        """The step to which the runs of a trial go on; None for their end."""
+        return [*self._rungs, None][trial.rung]
+
+    def _fill(self) -> None:
+        """Start runs where there are places: those of the trials that have come furthest first, then new trials."""
+        while self._places.free:
+            trial = max((t for t in self._trials if t.waiting), key=lambda t: (t.rung, -t.asked.number), default=None)
+            if trial is None:
+                if not self._missing:
+                    return
+                trial = self._trial(self._search.ask(self._study))
+                self._queue(trial)
+            run = trial.waiting.pop(0)
+            until = self._until(trial)
+            options = ["--callbacks", f"lemniscate.api.callbacks:StopAt(steps={until})"] if until else []
+            self._places.start(run, [*options, *["--trust"] * self._search.trusted])
+            trial.training.add(run)
+
+    def _look(self) -> None:
+        """Take note of the runs that have ended."""
+        for run, code in self._places.ended().items():
+            trial = next(trial for trial in self._trials if run in trial.training)
+            trial.training.remove(run)
+            if code and not trial.failure and not self._stop_signal:
+                trial.failure = f"{run.name}: {failure_of(run, code)} ({run / LOG} says more)"
+                trial.waiting.clear()
+                self._places.stop(list(trial.training))
+
+    def _compare(self, trial: _Trial) -> None:
+        """Decide whether a trial whose runs have all come to a rung goes on, or take its score at its end."""
+        number, asked = trial.asked.number, trial.asked
+        if trial.failure:
+            self._study.tell(asked, state=import_optuna().trial.TrialState.FAIL)
+            return self._end(trial, f"failed, {trial.failure}")
+        if trial.rung == len(self._rungs):
+            score = final_score(trial.sweep.runs)
+            self._study.tell(asked, score)
+            self._end(trial, f"score {score:,.1f}")
+            if self._study.best_trial.number == number:
+                self._preset().write(self._search.path / PRESET)
+            return None
+        score, ninths = score_at(trial.sweep.runs, self._rungs[trial.rung]), RUNGS[trial.rung]
+        trial.rung += 1
+        if score is not None:
+            asked.report(score, ninths)
+            if asked.should_prune():
+                self._study.tell(asked, state=import_optuna().trial.TrialState.PRUNED)
+                return self._end(trial, f"ended after {ninths} of {NINTHS} parts, where its return was {score:,.1f}")
+        self._queue(trial)
+        return None
+
+    def _end(self, trial: _Trial, sentence: str) -> None:
+        self._trials.remove(trial)
+        settings = draw(self._space, import_optuna().trial.FixedTrial(trial.asked.params))
+        self._say(f"trial {trial.asked.number}: {sentence}; {as_text(settings)}")
+
+    def _result(self) -> Tuned:
+        """The best trial, and pictures of all."""
+        complete = [trial for trial in self._study.trials if trial.state.name == "COMPLETE"]
+        if not complete:
+            raise SweepError(f"None of the {self._search.trials} trials has come to its end; their logs say why.")
+        preset, best = self._preset(), self._study.best_trial
+        preset.write(self._search.path / PRESET)
+        assert best.value is not None
+        self._say(f"Best of {len(self._study.trials)} trials: number {best.number}, score {best.value:,.1f}.")
+        self._say(preset.to_python())
+        for picture in pictures.draw(self._study, list(self._space), self._search.path / "plots"):
+            self._say(str(picture))
+        self._say(
+            f"Evaluate it with seeds that the search has not seen: lemniscate train {self._search.algorithm} --preset"
+            f" {self._search.path / PRESET} --seeds 1-10"
+        )
+        trials = [{"number": t.number, "state": t.state.name, "score": t.value, **t.params} for t in self._study.trials]
+        return Tuned(self._search.path, preset, best.value, trials)
+
+    def _preset(self) -> StoredPreset:
+        """The settings of the best trial, with their provenance."""
+        best = self._study.best_trial
+        assert best.value is not None
+        settings = draw(self._space, import_optuna().trial.FixedTrial(best.params))
+        return self._search.preset(f"trial {best.number} of {self._search.trials}", settings, best.value)
+
+    def _stop(self, signum: int = 0, _frame: FrameType | None = None) -> None:
+        """Ask every process to save and stop; asked twice, it does not wait for the end of its update."""
+        self._stop_signal = self._stop_signal or signum
+        self._places.stop()
+
+    def _say(self, text: str) -> None:
+        if self._progress:
+            say(text)

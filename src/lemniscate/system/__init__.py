@@ -1,0 +1,1 @@
+"""What touches the machine: processes, shared memory, files, the terminal, objects by name."""

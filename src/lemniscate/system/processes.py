@@ -1,0 +1,150 @@
+"""Several processes of one run, as `torchrun` starts them: what they send each other, by `torch.distributed`."""
+
+import os
+import pickle
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
+from datetime import timedelta
+from typing import Any
+
+import torch
+import torch.distributed as dist
+from torch import Tensor
+from torch.distributed import PrefixStore, TCPStore  # pyright: ignore[reportPrivateImportUsage]
+
+from lemniscate.errors import RankError
+from lemniscate.system.shared_memory import SharedMemory
+from lemniscate.system.watchdog import Watch
+from lemniscate.system.world import World
+
+LONGEST = timedelta(hours=2)
+"""that processes wait for one that evaluates, saves or compiles; one that hangs is found by the `Watch` long before"""
+
+
+class Processes(World):
+    """This process's part of a world of several: made once all of them are there.
+
+    Tensors on the CPU are sent by gloo, those on a GPU by NCCL; each process of a machine takes the next GPU.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(int(os.environ["WORLD_SIZE"]), int(os.environ["RANK"]), int(os.environ["WORLD_SIZE"]))
+        has_gpus = torch.cuda.is_available() and dist.is_nccl_available()
+        if has_gpus:
+            torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", 0)) % torch.cuda.device_count())
+        backend = "cpu:gloo,cuda:nccl" if has_gpus else "gloo"
+        host, port = os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"])
+        hosts_store = self.rank == 0 and os.environ.get("TORCHELASTIC_USE_AGENT_STORE") != "True"
+        name = f"lemniscate-{os.environ.get('TORCHELASTIC_RESTART_COUNT', 0)}"
+        store = PrefixStore(name, TCPStore(host, port, self.size, hosts_store, LONGEST))
+        dist.init_process_group(backend, store=store, rank=self.rank, world_size=self.size, timeout=LONGEST)
+        self._watch = Watch(PrefixStore(name, TCPStore(host, port, is_master=False)), self.rank, self.size)
+        self._begun, self._memory = False, None
+        self._memory = self._shared_memory()
+
+    def gather(self, mine: Tensor) -> Tensor:
+        """The values of all shards, [S, …], from those held here, [held, …]; also [N, …] from rows of shards."""
+        with self._together():
+            if self._memory and self._memory.holds(mine):
+                return self._memory.gather(mine)
+            parts = [torch.empty_like(mine, memory_format=torch.contiguous_format) for _ in range(self.size)]
+            dist.all_gather(parts, mine.contiguous())
+            return torch.cat(parts)
+
+    def to_first(self, mine: Tensor) -> Tensor:
+        """The same for rank 0; the others get their own. Zeros fill up second dimensions that are shorter."""
+        lengths = self.each(mine.shape[1]) if mine.ndim > 1 else [0]
+        if mine.ndim > 1 and mine.shape[1] < max(lengths):
+            missing = mine.new_zeros(len(mine), max(lengths) - mine.shape[1], *mine.shape[2:])
+            mine = torch.cat([mine, missing], dim=1)
+        parts = [torch.empty_like(mine, memory_format=torch.contiguous_format) for _ in range(self.size)]
+        with self._together():
+            dist.gather(mine.contiguous(), parts if self.is_first else None)
+        return torch.cat(parts) if self.is_first else mine
+
+    def each(self, mine: Any) -> list[Any]:
+        """The objects that all processes pass, in the order of their ranks."""
+        said: list[Any] = [None] * self.size
+        with self._together():
+            if self._memory and (data := self._memory.gather_bytes(pickle.dumps(mine))):
+                return [pickle.loads(each) for each in data]
+            dist.all_gather_object(said, mine)
+        return said
+
+    def from_first(self, mine: Any) -> Any:
+        """The object that rank 0 passes, in every process."""
+        said = [mine]
+        with self._together():
+            dist.broadcast_object_list(said, src=0)
+        return said[0]
+
+    def busy(self) -> AbstractContextManager[None]:
+        """A context in which this process may take as long as it likes."""
+        return self._watch.state("busy")
+
+    def begin(self, steps: Callable[[], int]) -> None:
+        """From here on every process is to come further every few seconds, by these steps or by what it sends."""
+        self._begun = True
+        self._watch.begin(steps)
+
+    def fail(self, error: Exception) -> Exception:
+        """Tell the other processes why this one ends, so that they end too; returns what it is to raise."""
+        if isinstance(error, RankError):
+            return error
+        if not self._begun and self.rank:
+            time.sleep(1.0)  # most likely it is everyone's mistake, and the first says so
+        sentence = self._watch.fail(str(error) or type(error).__name__)
+        return error if sentence and self.rank == 0 else self._error(sentence)
+
+    def close(self) -> None:
+        """Leave the other processes."""
+        self._watch.close()
+        if self._memory:
+            self._memory.close()
+        with suppress(RuntimeError):
+            dist.destroy_process_group()
+
+    @contextmanager
+    def _together(self) -> Iterator[None]:
+        """Wait for the others. Raises `RankError` where one of them has gone."""
+        self._watch.steps += 1
+        try:
+            with self._watch.state("waiting"):
+                yield
+        except (RuntimeError, OSError) as error:
+            raise self._error(self._watch.why()) from error
+
+    def _error(self, sentence: str) -> RankError:
+        error, fault = RankError(sentence), self._watch.fault()
+        if fault:
+            error.reason, error.repeats = fault["sentence"], fault["by"] == fault["rank"]
+        return error
+
+    def _shared_memory(self) -> SharedMemory | None:
+        """The memory shared by all processes of one machine, ten times as fast as gloo; None if it is too small."""
+        folder = self.from_first(SharedMemory.new_folder() if self.is_first else None)
+        memory = None
+        try:
+            with suppress(OSError, AttributeError):  # macOS cannot reserve a file's memory
+                memory = SharedMemory(folder, self.rank, self.size)
+            listening = all(self.each(memory is not None))
+            with suppress(OSError):
+                memory = memory.connect(folder) if memory and listening else None
+            return memory if all(self.each(memory is not None)) else None
+        finally:
+            if self.is_first:
+                shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextmanager
+def together(kind: type[Processes] = Processes) -> Iterator[World]:
+    """The world that the environment variables of `torchrun` describe; what ends one process ends them all."""
+    world = kind()
+    try:
+        yield world
+    except Exception as error:
+        raise world.fail(error) from error
+    finally:
+        world.close()

@@ -1,0 +1,57 @@
+"""The world of a run: its processes, and the shards that each of them holds. In an ordinary run there is one process.
+
+Networks and statistics are the same in every process, a *rank*; environments, random generators and replay buffers
+belong to shards. Rank 0 writes.
+"""
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
+from typing import Any
+
+from lemniscate.errors import UserError
+from lemniscate.maths import Shards
+
+CLUSTER = "LEMNISCATE_CLUSTER"
+"""in the environment of a worker of a cluster: its kind"""
+
+
+class World(Shards):
+    """One process with all shards: nothing is sent. `lemniscate.system.processes.Processes` is a world of several.
+
+    Args:
+        shards: S.
+        rank: of this process, 0 … W − 1.
+        size: W, which divides S.
+    """
+
+    def __init__(self, shards: int = 1, rank: int = 0, size: int = 1) -> None:
+        self.rank, self.size, self.is_first = rank, size, rank == 0
+        self.divide(shards)
+
+    def divide(self, shards: int) -> None:
+        """Divide every batch into so many shards. Raises `UserError` where W does not divide S."""
+        size, rank = self.size, self.rank
+        if shards % size:
+            fits = ", ".join(str(n) for n in range(1, shards + 1) if shards % n == 0)
+            raise UserError(f"{size} processes cannot share {shards} shards equally: {shards} can be shared by {fits}.")
+        super().__init__(shards)
+        self.held = range(rank * shards // size, (rank + 1) * shards // size)
+
+    def each(self, mine: Any) -> list[Any]:
+        """The objects that all processes pass, in the order of their ranks."""
+        return [mine]
+
+    def from_first(self, mine: Any) -> Any:
+        """The object that rank 0 passes, in every process."""
+        return mine
+
+    def begin(self, steps: Callable[[], int]) -> None:
+        """From here on every process is to come further every few seconds, by these steps or by what it sends."""
+
+    def busy(self) -> AbstractContextManager[None]:
+        """A context in which this process may take as long as it likes."""
+        return nullcontext()
+
+    def saved(self, path: Path) -> None:
+        """The hook after a planned checkpoint in a run directory, called in every process."""
