@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from lemniscate.envs.episodes import Episodes
+from lemniscate.envs.vec_env import Episodes
 
 
 class Csv:

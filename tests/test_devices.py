@@ -77,7 +77,7 @@ class Noise:
         self.num_envs, self.device = num_envs, device
         self.counts = torch.ones(num_envs, dtype=torch.bool, device=device)
 
-    def restart(self, seed):
+    def restart(self, seed, first=0):
         self.generator = torch.Generator(self.device).manual_seed(seed)
         return self._observe()
 
@@ -108,7 +108,7 @@ def train_twice(case, device, directory):
     env.restart(1)
     rows = [_update(module, config, env, state) for _ in range(2)]
     record = {"spec": checkpoint.spec_to_json(env.spec)}
-    path = checkpoint.write(directory, state.whole(), state.step, record, keep=1)
+    path = checkpoint.write(directory, state.saved(), state.step, record, keep=1)
     for _ in range(2):
         env.restart(2)
         state.on_restart()
@@ -123,7 +123,7 @@ def train_twice(case, device, directory):
         for key, tensor in value.state_dict().items()
         if key != "written"
     }
-    streams = {name: stream for name, (stream,) in vars(state.rng).items()}
+    streams = {name: stream for name, stream in vars(state.rng).items()}
     found = {name: value.device for name, value in [*tensors.items(), *streams.items()]}
     assert found == dict.fromkeys(found, whole(device))
     return rows
@@ -184,10 +184,10 @@ def test_a_whole_run_on_the_second_gpu_resumes_and_its_policy_is_evaluated_anywh
 MUTANTS = [
     # what goes wrong, file, the right text, the wrong text, the case that must notice
     ("noise is drawn on the CPU", "nn/policies.py", ", generator=generator, device=generator.device", "", "ppo box"),
-    ("positions on the CPU by a mask on the GPU", "data/action_noise.py", "[done.cpu()]", "[done]", "ddpg box"),
+    ("positions on the CPU by a mask on the GPU", "data/replay.py", "[done.cpu()]", "[done]", "ddpg box"),
     ("the replay buffer stays on the CPU", "data/replay.py", "dtype=kind, device=device)", "dtype=kind)", "td3 box"),
-    ("rows are drawn by the CPU's generator", "run/seeding.py", "self._streams(seed, device, shards, 3)", 'self._streams(seed, torch.device("cpu"), shards, 3)', "ppo box"),
-    ("rows are drawn with no generator's device", "data/replay.py", "generator=stream, device=stream.device)", "generator=stream)", "sac box"),
+    ("rows are drawn by the CPU's generator", "run/seeding.py", "generator(seed, device, 3)", 'generator(seed, torch.device("cpu"), 3)', "ppo box"),
+    ("rows are drawn with no generator's device", "data/replay.py", "(minibatches, size), generator=generator, device=generator.device)", "(minibatches, size), generator=generator)", "sac box"),
     ("the reward scale stays on the CPU", "algos/a2c.py", "RewardScale(config.num_envs, config.gamma).to(device)", "RewardScale(config.num_envs, config.gamma)", "a2c box"),
     ("the networks stay on the CPU", "algos/trpo.py", "config.networks(spec).to(device)", "config.networks(spec)", "trpo box"),
     ("Adam's scalars stay on the CPU", "optim/adam.py", ".log().to(device, wide_float(device))", ".log()", "a2c box"),

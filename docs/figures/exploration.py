@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-from lemniscate.data.action_noise import ActionNoise
+from lemniscate.data.replay import ActionNoise
 from lemniscate.envs import registry
 
 IMAGE = Path(__file__).parents[1] / "images" / "exploration.png"

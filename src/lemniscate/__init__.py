@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from lemniscate.margins.preflight import preflight as preflight
     from lemniscate.run.environments import make_envs as make_envs
     from lemniscate.run.evaluate import Evaluation as Evaluation
-    from lemniscate.run.run import Stopped as Stopped
     from lemniscate.run.seeding import set_seeds as set_seeds
+    from lemniscate.run.stopping import Stopped as Stopped
     from lemniscate.sweeps.sweep import TrainedSweep as TrainedSweep
     from lemniscate.sweeps.sweep import resume_sweep as resume_sweep
     from lemniscate.sweeps.sweep import train_sweep as train_sweep
@@ -56,7 +56,7 @@ MODULES = {
     "margins.preflight": ("Preflight", "preflight"),
     "run.environments": ("make_envs",),
     "run.evaluate": ("Evaluation",),
-    "run.run": ("Stopped",),
+    "run.stopping": ("Stopped",),
     "run.seeding": ("set_seeds",),
     "sweeps.sweep": ("TrainedSweep", "resume_sweep", "train_sweep"),
     "sweeps.tuner": ("Tuned", "resume_tuning", "tune"),

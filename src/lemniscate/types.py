@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, fields
 from typing import Self
 
 import torch
-from torch import Generator, Tensor
+from torch import Tensor
 
 Metrics = dict[str, Tensor]
 """scalars by name"""
@@ -13,8 +13,6 @@ Loss = tuple[Tensor, Metrics]
 """a scalar to minimize, and its metrics"""
 Flags = tuple[bool, ...]
 """a constant for each gradient step, [K]"""
-Streams = tuple[Generator, ...]
-"""random generators, one for each shard held: its equal part of the rows is drawn from it"""
 
 
 def wide_float(device: torch.device) -> torch.dtype:
@@ -31,21 +29,19 @@ class Record:
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Self:
         """The record of what `function` makes of each tensor."""
-        values = {f.name: getattr(self, f.name) for f in fields(self)}
-        return type(self)(**{name: function(x) if isinstance(x, Tensor) else x for name, x in values.items()})
+        return type(self)(**{name: function(x) for name, x in vars(self).items()})
 
     def __getitem__(self, rows: Tensor | slice) -> Self:
         return self.map(lambda x: x[rows])
 
-    def flatten(self, shards: int = 1) -> Self:
-        """[T, N, …] to [T · N, …], the rows of each shard together: an equal part of the N environments."""
-        return self.map(lambda x: x.unflatten(1, (shards, -1)).movedim(1, 0).flatten(0, 2))
+    def flatten(self) -> Self:
+        """[T, N, …] to [T · N, …]."""
+        return self.map(lambda x: x.flatten(0, 1))
 
     @classmethod
     def stack(cls, rows: list[Self]) -> Self:
         """Stack records along a new first dimension: T records [N, …] become one [T, N, …]."""
-        columns = {f.name: [getattr(row, f.name) for row in rows] for f in fields(cls)}
-        return cls(**{name: torch.stack(x) if isinstance(x[0], Tensor) else x[0] for name, x in columns.items()})
+        return cls(**{f.name: torch.stack([getattr(row, f.name) for row in rows]) for f in fields(cls)})
 
 
 @dataclass(frozen=True)
@@ -85,8 +81,6 @@ class Rollout(Record):
     terminated: Tensor
     truncated: Tensor
     valid: Tensor
-    shards: int = 1
-    """those held, each an equal part of the N environments"""
 
     @property
     def num_rows(self) -> int:
@@ -99,10 +93,9 @@ class Rollout(Record):
         return self.terminated | self.truncated
 
     @property
-    def valid_rows(self) -> list[Tensor]:
-        """The indices [B] of each shard's rows whose action was not ignored, in the flattened rollout."""
-        parts, size = self.valid.chunk(self.shards, dim=1), self.num_rows // self.shards
-        return [number * size + part.flatten().nonzero()[:, 0] for number, part in enumerate(parts)]
+    def valid_rows(self) -> Tensor:
+        """The indices [B] of the rows whose action was not ignored, in the flattened rollout."""
+        return self.valid.flatten().nonzero()[:, 0]
 
 
 @dataclass(frozen=True)

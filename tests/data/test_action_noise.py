@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from lemniscate.data.action_noise import ActionNoise
+from lemniscate.data.replay import ActionNoise
 
 CPU = torch.device("cpu")
 KINDS = ["white", "ou", "coloured"]
@@ -14,7 +14,7 @@ def noise(kind, shape=(3, 2), length=8):
 
 
 def drawn(action_noise, steps, rng):
-    return torch.stack([action_noise((rng,)) for _ in range(steps)])  # [T, N, A]
+    return torch.stack([action_noise(rng) for _ in range(steps)])  # [T, N, A]
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -43,7 +43,7 @@ def test_the_end_of_an_episode_begins_a_new_sequence_there_and_nowhere_else(kind
     action_noise, x = noise(kind, (2000, 1), 100), []
     odd = torch.arange(2000) % 2 == 1
     for t in range(12):
-        x.append(action_noise((rng,))[:, 0])
+        x.append(action_noise(rng)[:, 0])
         if t % 2 == 1:
             action_noise.on_episode_end(odd)
     x = torch.stack(x)
@@ -68,6 +68,6 @@ def test_a_checkpoint_restores_it_bit_for_bit(kind):
 
 def test_a_restart_begins_new_sequences_everywhere(rng):
     action_noise = noise("ou", (4000, 1), 100)
-    before = action_noise((rng,))
+    before = action_noise(rng)
     action_noise.on_restart()
-    assert (before * action_noise((rng,))).mean().abs() < 0.05
+    assert (before * action_noise(rng)).mean().abs() < 0.05

@@ -1,14 +1,12 @@
 """Rollouts of whole episodes, and the minibatches of a rollout."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 import torch
 
 from helpers import CPU, MODES, vectorize
 from lemniscate.algos import reinforce
-from lemniscate.data.rollout import collect, epoch_minibatches, estimates, one_minibatch
+from lemniscate.data.rollout import collect, epoch_minibatches, one_minibatch
 from lemniscate.data.whole_episodes import collect_episodes
 from lemniscate.errors import UserError
 from lemniscate.types import Rollout
@@ -24,9 +22,9 @@ def test_whole_episodes_are_whole_and_as_many_from_each_environment(mode, rng):
     lengths = np.array([3, 5, 8])
     env = vectorize("Countdown-v0", 3, mode=mode, length=lengths)
     policy = policy_in(env)
-    collect(env, policy, 2, (rng,))  # now every environment is within an episode
+    collect(env, policy, 2, rng)  # now every environment is within an episode
     for _ in range(2):
-        rollout = collect_episodes(env, policy, 2, (rng,))
+        rollout = collect_episodes(env, policy, 2, rng)
         rows = rollout.obs[rollout.valid].int()
         for n in range(3):
             own = rows[rows[:, 0] == n, 1:]
@@ -37,7 +35,7 @@ def test_whole_episodes_are_whole_and_as_many_from_each_environment(mode, rng):
 class Still:
     """A policy that takes action 0."""
 
-    def draw_noise(self, shape, streams):
+    def draw_noise(self, shape, generator):
         return torch.zeros(*shape)
 
     def act(self, obs, noise):
@@ -47,16 +45,16 @@ class Still:
 def test_an_episode_that_never_ends_is_an_error(rng):
     env = vectorize("Countdown-v0", 1, mode="DISABLED", length=None)
     with pytest.raises(UserError, match=r"Countdown-v0 has not ended after 20,000 steps"):
-        collect_episodes(env, Still(), 1, (rng,))
+        collect_episodes(env, Still(), 1, rng)
 
 
 def test_a_rollout_without_valid_rows_is_an_error(rng):
     with pytest.raises(UserError, match="No valid transition in the whole rollout; increase num_steps"):
-        epoch_minibatches([torch.arange(0)], 4, 2, (rng,))
+        epoch_minibatches(torch.arange(0), 4, 2, rng)
 
 
 def test_minibatches_have_every_row_once_an_epoch(rng):
-    first, second = (epoch_minibatches([torch.arange(24)], 24, 6, (rng,)) for _ in range(2))
+    first, second = (epoch_minibatches(torch.arange(24), 24, 6, rng) for _ in range(2))
     for minibatches in (first, second):
         assert minibatches.shape == (4, 6)
         assert minibatches.flatten().sort().values.tolist() == list(range(24))
@@ -68,7 +66,7 @@ def test_minibatches_have_every_row_once_an_epoch(rng):
 )
 def test_minibatches_have_one_shape_whatever_the_number_of_valid_rows(rng, valid, collected, size, shape):
     rows = torch.arange(valid) * 7
-    minibatches = epoch_minibatches([rows], collected, size, (rng,))
+    minibatches = epoch_minibatches(rows, collected, size, rng)
     assert minibatches.shape == shape
     times = torch.bincount(minibatches.flatten(), minlength=valid * 7)[rows]
     assert times.sum() == minibatches.numel()
@@ -76,38 +74,16 @@ def test_minibatches_have_one_shape_whatever_the_number_of_valid_rows(rng, valid
     assert times.max() - times.min() <= 1
 
 
-def test_each_minibatch_has_as_many_rows_of_every_shard(rng):
-    streams = tuple(torch.Generator().manual_seed(seed) for seed in range(4))
-    minibatches = epoch_minibatches(list(torch.arange(48).chunk(4)), 48, 3, streams)
-    assert minibatches.shape == (4, 12)
-    assert (minibatches // 12).tolist() == [[shard for shard in range(4) for _ in range(3)]] * 4
-    assert minibatches.flatten().sort().values.tolist() == list(range(48))
-
-
-def test_the_rows_of_a_shard_are_together_in_a_flat_rollout(rng):
-    """Environment n's step t has the number 10 n + t; two shards of two environments."""
-    numbers = torch.arange(3)[:, None] + 10 * torch.arange(4)
-    valid = numbers != 21
-    flags = torch.zeros(3, 4, dtype=torch.bool)
-    rollout = Rollout(numbers, numbers, numbers.float(), numbers, flags, flags, valid, shards=2)
-    flat = rollout.flatten(2).obs
-    assert flat.tolist() == [0, 10, 1, 11, 2, 12, 20, 30, 21, 31, 22, 32]
-    assert [flat[rows].tolist() for rows in rollout.valid_rows] == [[0, 10, 1, 11, 2, 12], [20, 30, 31, 22, 32]]
-    assert torch.equal(rollout.flatten().obs, numbers.flatten())
-
-
-def test_the_networks_say_the_same_of_each_shard_alone(rng):
-    env = vectorize("Pendulum-v1", 8)
-    networks = reinforce.Config(num_envs=8, hidden=(16,)).networks(env.spec)
-    rollout = collect(env, networks.policy, 5, (rng,))
-    with torch.no_grad():
-        whole = (networks.value(rollout.obs), networks.value(rollout.next_obs), None)
-    for shards in (1, 4):
-        value, next_value, log_prob = estimates(networks, dataclasses.replace(rollout, shards=shards))
-        torch.testing.assert_close((value, next_value), whole[:2])
-        assert log_prob.shape == (5, 8)
+def test_the_rows_of_a_flat_rollout_are_in_the_order_of_time(rng):
+    """Environment n's step t has the number 10 n + t."""
+    numbers = torch.arange(3)[:, None] + 10 * torch.arange(2)
+    flags = torch.zeros(3, 2, dtype=torch.bool)
+    rollout = Rollout(numbers, numbers, numbers.float(), numbers, flags, flags, numbers != 11)
+    flat = rollout.flatten().obs
+    assert flat.tolist() == [0, 10, 1, 11, 2, 12]
+    assert flat[rollout.valid_rows].tolist() == [0, 10, 1, 2, 12]
 
 
 def test_one_minibatch_has_all_rows_in_their_order():
-    assert one_minibatch([torch.tensor([2, 3, 7])], 3).tolist() == [[2, 3, 7]]
-    assert one_minibatch([torch.tensor([2, 3, 7])], 5).tolist() == [[2, 3, 7, 2, 3]]
+    assert one_minibatch(torch.tensor([2, 3, 7]), 3).tolist() == [[2, 3, 7]]
+    assert one_minibatch(torch.tensor([2, 3, 7]), 5).tolist() == [[2, 3, 7, 2, 3]]

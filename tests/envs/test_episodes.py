@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from lemniscate.envs.episodes import LOG_ROWS, EpisodeStatistics, episode_sums
+from lemniscate.envs.vec_env import LOG_ROWS, EpisodeStatistics, episode_sums
 from lemniscate.types import Step
 
 

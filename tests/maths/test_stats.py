@@ -3,13 +3,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lemniscate.maths import (
-    ONE_SHARD,
-    Shards,
     clip_fraction,
     explained_variance,
     kl_k1,
     kl_k3,
     merge_moments,
+    moments,
     standardize,
 )
 
@@ -23,33 +22,20 @@ def test_standardize():
 
 
 def test_explained_variance():
-    target, rows = torch.tensor([1.0, 2.0, 4.0]), [torch.arange(3)]
-    assert explained_variance(target, target, rows, ONE_SHARD) == 1
-    assert explained_variance(target.mean().expand(3), target, rows, ONE_SHARD).abs() < 1e-6
-    assert explained_variance(-target, target, rows, ONE_SHARD) < 0
-    assert not explained_variance(target, torch.ones(3), rows, ONE_SHARD).isfinite()
+    target = torch.tensor([1.0, 2.0, 4.0])
+    assert explained_variance(target, target) == 1
+    assert explained_variance(target.mean().expand(3), target).abs() < 1e-6
+    assert explained_variance(-target, target) < 0
+    assert not explained_variance(target, torch.ones(3)).isfinite()
 
 
-@given(st.lists(st.integers(0, 6), min_size=2, max_size=5), st.integers(0, 1000))
-def test_the_moments_of_shards_of_any_sizes_are_those_of_all_their_rows(sizes, seed):
-    sizes[0] += 2
-    x = 3 + torch.randn(2, sum(sizes), generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-    mean, var, count = Shards(len(sizes)).moments(x.split(sizes, dim=-1))
-    torch.testing.assert_close(mean, x.mean(-1), rtol=1e-12, atol=1e-12)
-    torch.testing.assert_close(var, x.var(-1, correction=0), rtol=1e-12, atol=1e-12)
-    assert (count == sum(sizes)).all()
-
-
-def test_what_is_computed_over_shards_is_that_of_all_rows(rng):
-    shards, x = Shards(4), torch.randn(2, 24, generator=rng, dtype=torch.float64)
-    torch.testing.assert_close(standardize(x, shards), standardize(x), rtol=1e-12, atol=1e-12)
-    rows = list(torch.arange(24).chunk(4))
-    prediction, target = x
-    over_all = explained_variance(prediction, target, [torch.arange(24)], ONE_SHARD)
-    torch.testing.assert_close(explained_variance(prediction, target, rows, shards), over_all, rtol=1e-12, atol=1e-12)
-    parts = x[0].split([3, 9, 2, 10])
-    mean = shards.mean([part.mean() for part in parts], [len(part) for part in parts])
-    torch.testing.assert_close(mean, x[0].mean(), rtol=1e-12, atol=1e-12)
+def test_moments(rng):
+    x = 3 + torch.randn(2, 24, generator=rng, dtype=torch.float64)
+    mean, var, count = moments(x)
+    torch.testing.assert_close(mean, torch.stack([row.sum() / 24 for row in x]), rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(var, torch.stack([((row - row.mean()) ** 2).sum() / 24 for row in x]))
+    assert count == 24
+    assert [m.tolist() for m in moments(x[:, :0])] == [[0, 0], [0, 0], 0]
 
 
 def test_both_kl_estimates_agree_with_the_exact_divergence():

@@ -37,7 +37,7 @@ def test_every_kind_of_action_has_its_distribution(action, kind, noise, shape, r
     policy = policy_for(action)
     obs = torch.randn(20, 5)
     assert isinstance(policy(obs), kind)
-    drawn = policy.draw_noise((20,), (rng,))
+    drawn = policy.draw_noise((20,), rng)
     assert drawn.shape == (20, *noise)
     assert 0 <= drawn.min() <= drawn.max() < 1
     assert policy.act(obs, drawn).shape == (20, *shape)
@@ -48,7 +48,7 @@ def test_masked_actions_have_no_probability(rng):
     policy = policy_for(Discrete(3, masked=True))
     mask = torch.tensor([[1.0, 0.0, 1.0], [0.0, 1.0, 0.0]]).repeat(50, 1)
     obs = torch.cat([torch.randn(100, 5), mask], dim=-1)
-    action = policy.act(obs, policy.draw_noise((100,), (rng,)))
+    action = policy.act(obs, policy.draw_noise((100,), rng))
     assert mask.gather(1, action[:, None]).all()
     assert len(set(action.tolist())) == 3
 
@@ -57,7 +57,7 @@ def test_policies_of_bounded_actions_act_between_their_bounds(rng):
     obs = 100 * torch.randn(200, 5)
     for kind, extra in ((ActorQ, {}), (SoftActorQ, {"initial_temperature": 1.0})):
         policy = kind(spec_of(), Layers((8,)), Layers((8,)), False, critics=1, **extra).policy
-        noise = policy.draw_noise((200,), (rng,))
+        noise = policy.draw_noise((200,), rng)
         assert noise.shape == (200, 2)
         assert noise.any() == (kind is SoftActorQ)
         assert policy.act(obs, noise).abs().max() <= 1

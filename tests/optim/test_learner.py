@@ -11,8 +11,7 @@ from helpers import COMPILERS, CPU, CompiledCalls, numbers, require_in_own_proce
 from lemniscate.algos import ppo
 from lemniscate.maths import means, standardize
 from lemniscate.optim.adam import Adam
-from lemniscate.optim.compiled import Compiled
-from lemniscate.optim.learner import Learner
+from lemniscate.optim.compiled import Compiled, Learner
 
 
 @dataclass

@@ -10,16 +10,18 @@ from helpers import begin, begin_off_policy, numbers, small, small_networks, sma
 from lemniscate.algos import a2c, ppo, reinforce, reppo, sac, trpo
 from lemniscate.data.rollout import collect
 from lemniscate.data.soft_batch import SoftBatch
-from lemniscate.maths import Shards, standardize
+from lemniscate.maths import standardize
 from lemniscate.optim.adam import Adam
-from lemniscate.optim.shards import GradientOverShards
+from lemniscate.optim.shards import EstimatesOverShards, GradientOverShards
+from lemniscate.system.world import World
 from lemniscate.types import Batch, Transition
+from threads import in_world
 
 
 def twins(networks, **fields):
     """Two optimizers of equal networks, the second one over four shards."""
     one, two = (Adam(copy.deepcopy(networks), **fields) for _ in range(2))
-    two.over_shards = GradientOverShards(two, Shards(4))
+    two.over_shards = GradientOverShards(two, World(4), None)
     for optimizer in (one, two):
         optimizer.learning_rate = 0.01
     return one, two
@@ -38,7 +40,7 @@ def require_equal(one, two, loss, *args):
 def test_a_step_over_four_shards_is_one_over_all_rows(actions):
     networks, config = small_networks(actions, entropy_coef=0.1)
     batch = numbers(actions)
-    batch = Batch(**{**vars(batch), "advantage": standardize(batch.advantage, Shards(4))})
+    batch = Batch(**{**vars(batch), "advantage": standardize(batch.advantage)})
     require_equal(*twins(networks, max_grad_norm=0.1), partial(ppo.loss, config), batch)
 
 
@@ -79,6 +81,34 @@ def test_the_losses_of_reppo_too(rng):
     require_equal(*twins(state.networks.policy), partial(reppo.actor_loss, config, state), batch, noise)
 
 
+@pytest.mark.parametrize("size", [2, 4])
+def test_any_number_of_processes_has_the_same_gradient_to_the_last_bit(size):
+    networks, config = small_networks(entropy_coef=0.1)
+    batch = numbers()
+
+    def step(world):
+        optimizer = Adam(copy.deepcopy(networks))
+        optimizer.learning_rate = 0.01
+        optimizer.over_shards = GradientOverShards(optimizer, world, None)
+        return optimizer.step(partial(ppo.loss, config), batch), optimizer.vector
+
+    ((metrics, vector),) = in_world(4, 1, step)
+    for theirs, other in in_world(4, size, step):
+        assert torch.equal(vector, other)
+        assert {name: x.item() for name, x in theirs.items()} == {name: x.item() for name, x in metrics.items()}
+
+
+@pytest.mark.parametrize("size", [1, 2, 4])
+def test_estimates_are_those_of_all_rows_in_every_process(size, rng):
+    def function(x, y):
+        return x.sum(-1), (x * y[..., None]).sum(-1)
+
+    rows = torch.randn(3, 8, 5, generator=rng), torch.randn(3, 8, generator=rng)
+    expected = function(*rows)
+    for found in in_world(4, size, lambda world: EstimatesOverShards(function, world)(*rows)):
+        assert all(map(torch.equal, found, expected))
+
+
 FIELDS = {
     ppo: {"minibatch_size": 64, "epochs": 2, "normalize_observations": True, "desired_kl": 0.01},
     a2c: {"scale_rewards": True},
@@ -97,7 +127,7 @@ def test_updates_over_four_shards_are_those_over_all_rows(algo, dtype, rtol):
     for state in states:
         state.networks.to(dtype)
     states[0], states[1] = (rebuilt(algo, config, state, dtype) for state in states)
-    states[1].join(Shards(4))
+    states[1].prepare(World(4), None)
     for _ in range(3):
         rollout = collect(
             env,
@@ -106,8 +136,8 @@ def test_updates_over_four_shards_are_those_over_all_rows(algo, dtype, rtol):
             states[0].rng.action,
         )
         wide = rollout.map(lambda x: x.to(dtype) if x.is_floating_point() else x)
-        for state, shards in zip(states, (1, 4), strict=True):
-            algo.update(config.replace(shards=shards), state, type(wide)(**{**vars(wide), "shards": shards}))
+        for state in states:
+            algo.update(config, state, wide)
         one, two = (torch.cat([p.flatten() for p in state.networks.parameters()]) for state in states)
         torch.testing.assert_close(one, two, rtol=rtol, atol=10 * rtol)
         norms = [state.policy.normalizer.state_dict() for state in states]

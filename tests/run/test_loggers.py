@@ -7,7 +7,7 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 
-from lemniscate.envs.episodes import Episodes
+from lemniscate.envs.vec_env import Episodes
 from lemniscate.report.curves import episode_returns
 from lemniscate.run.loggers import JsonLines, TensorBoard
 from lemniscate.run.metrics import damage, read_metrics, to_line

@@ -61,7 +61,7 @@ def test_entropy_counts_from_the_second_step_on(monkeypatch, rng, timed_out):
     monkeypatch.undo()
     obs = torch.randn(20_000, 3, generator=rng)
     policy = nets.policy(obs)
-    noise = nets.policy.draw_noise((20_000,), (torch.Generator().manual_seed(5),))
+    noise = nets.policy.draw_noise((20_000,), torch.Generator().manual_seed(5))
     mine = -2 * policy.sample_with_log_prob(noise)[1].mean()
     assert nets.entropy_bonus(obs, torch.Generator().manual_seed(5)).mean().item() == pytest.approx(
         mine.item(), abs=1e-4

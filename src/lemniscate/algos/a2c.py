@@ -10,7 +10,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from lemniscate.data.rollout import collect, estimates, one_minibatch
+from lemniscate.data.rollout import collect, one_minibatch
 from lemniscate.maths import explained_variance, gae, means, policy_gradient, standardize, value_loss
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.normalizer import RewardScale
@@ -79,11 +79,11 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
 @torch.no_grad()
 def advantages(config: Config, networks: ActorCritic, rollout: Rollout) -> Batch:
     """The rows of a rollout with V(s), advantage and value target (section 4; with λ: arXiv:1506.02438, eq. 16)."""
-    value, next_value, log_prob = estimates(networks, rollout)
+    value, next_value, log_prob = networks.estimates(rollout.obs, rollout.next_obs, rollout.action)
     gamma, lam = config.gamma, config.gae_lambda
     advantage, target = gae(rollout.reward, value, next_value, rollout.terminated, rollout.done, gamma=gamma, lam=lam)
     batch = Batch(rollout.obs, rollout.action, log_prob, value, advantage, target)
-    return batch.flatten(rollout.shards)  # [T, N, …] -> [B, …]
+    return batch.flatten()  # [T, N, …] -> [B, …]
 
 
 def loss(config: Config, networks: ActorCritic, batch: Batch) -> Loss:
@@ -118,11 +118,11 @@ def update(config: Config, state: State, rollout: Rollout) -> dict[str, Tensor |
     rows = one_minibatch(valid_rows, rollout.num_rows)
     advantage = batch.advantage[rows]
     if config.normalize_advantage:
-        advantage = standardize(advantage, state.shards)
+        advantage = standardize(advantage)
     metrics = means(state.learn(config, state, batch, rows, advantage))
     networks.policy.observe(rollout.obs, rollout.valid)  # last: the actions were drawn through the normalizer before
     state.step += config.num_steps * config.num_envs
-    explained = explained_variance(batch.value, batch.target, valid_rows, state.shards)
+    explained = explained_variance(batch.value[valid_rows], batch.target[valid_rows])
     return {**metrics, **networks.policy.metrics(), "explained_variance": explained, "learning_rate": rate}
 
 

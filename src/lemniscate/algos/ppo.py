@@ -11,7 +11,7 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from lemniscate.data.rollout import collect, epoch_minibatches, estimates
+from lemniscate.data.rollout import collect, epoch_minibatches
 from lemniscate.maths import (
     clipped_surrogate,
     explained_variance,
@@ -104,11 +104,11 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
 @torch.no_grad()
 def advantages(config: Config, networks: ActorCritic, rollout: Rollout) -> Batch:
     """The rows of a rollout with log π_old(a|s), V(s), advantage (eq. 11) and value target, [B, …]."""
-    value, next_value, log_prob = estimates(networks, rollout)
+    value, next_value, log_prob = networks.estimates(rollout.obs, rollout.next_obs, rollout.action)
     gamma, lam = config.gamma, config.gae_lambda
     advantage, target = gae(rollout.reward, value, next_value, rollout.terminated, rollout.done, gamma=gamma, lam=lam)
     batch = Batch(rollout.obs, rollout.action, log_prob, value, advantage, target)
-    return batch.flatten(rollout.shards)  # [T, N, …] -> [B, …]
+    return batch.flatten()  # [T, N, …] -> [B, …]
 
 
 def loss(config: Config, networks: ActorCritic, batch: Batch) -> Loss:
@@ -146,11 +146,10 @@ def update(config: Config, state: State, rollout: Rollout) -> dict[str, Tensor |
     for epoch in range(config.epochs):
         if config.recompute_advantages and epoch > 0:
             batch = replace(advantages(config, networks, rollout), log_prob=collected.log_prob)
-        size = config.minibatch_size // config.shards
-        minibatches = epoch_minibatches(valid_rows, rollout.num_rows, size, state.rng.minibatch)
+        minibatches = epoch_minibatches(valid_rows, rollout.num_rows, config.minibatch_size, state.rng.minibatch)
         advantage = batch.advantage[minibatches]
         if config.normalize_advantage:
-            advantage = standardize(advantage, state.shards)
+            advantage = standardize(advantage)
         state.optimizer.learning_rate = state.learning_rate
         metrics.append(means(state.learn(config, state, batch, minibatches, advantage)))
         kl = metrics[-1]["approx_kl"].item()
@@ -164,7 +163,7 @@ def update(config: Config, state: State, rollout: Rollout) -> dict[str, Tensor |
         **means(metrics),
         **networks.policy.metrics(),
         "learning_rate": state.learning_rate,
-        "explained_variance": explained_variance(collected.value, collected.target, valid_rows, state.shards),
+        "explained_variance": explained_variance(collected.value[valid_rows], collected.target[valid_rows]),
     }
 
 

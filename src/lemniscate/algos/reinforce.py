@@ -11,10 +11,19 @@ from typing import Annotated, Literal
 import torch
 from torch import Tensor
 
-from lemniscate.data.rollout import collect, epoch_minibatches, estimates, one_minibatch
+from lemniscate.data.rollout import collect, epoch_minibatches, one_minibatch
 from lemniscate.data.whole_episodes import collect_episodes
 from lemniscate.errors import UserError
-from lemniscate.maths import episode_return, explained_variance, kl_k3, means, policy_gradient, reward_to_go, value_loss
+from lemniscate.maths import (
+    episode_return,
+    explained_variance,
+    kl_k3,
+    means,
+    policy_gradient,
+    reward_to_go,
+    standardize,
+    value_loss,
+)
 from lemniscate.nn.actor_critic import ActorCritic, Value
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.nn.policies import Policy
@@ -104,7 +113,7 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
 @torch.no_grad()
 def weights(config: Config, networks: ActorCritic, rollout: Rollout) -> Batch:
     """The rows of a rollout with log π(a|s), V(s), weight (return minus baseline) and value target, [B, …]."""
-    value, next_value, log_prob = estimates(networks, rollout)
+    value, next_value, log_prob = networks.estimates(rollout.obs, rollout.next_obs, rollout.action)
     if config.baseline != "value":
         value, next_value = torch.zeros_like(value), torch.zeros_like(value)
     to_go = reward_to_go(rollout.reward, next_value, rollout.terminated, rollout.done, gamma=config.gamma)
@@ -112,7 +121,7 @@ def weights(config: Config, networks: ActorCritic, rollout: Rollout) -> Batch:
     if config.returns == "episode":
         weight = episode_return(to_go, rollout.reward, rollout.done | ~rollout.valid, gamma=config.gamma)
     baseline = weight[rollout.valid].mean() if config.baseline == "mean" else value
-    return Batch(rollout.obs, rollout.action, log_prob, value, weight - baseline, to_go).flatten(rollout.shards)
+    return Batch(rollout.obs, rollout.action, log_prob, value, weight - baseline, to_go).flatten()
 
 
 def policy_loss(config: Config, policy: Policy, batch: Batch) -> Loss:
@@ -145,22 +154,20 @@ def update(config: Config, state: State, rollout: Rollout) -> dict[str, Tensor |
         rollout = state.reward_scale.scale(rollout)
     batch = weights(config, state.networks, rollout)
     valid_rows = rollout.valid_rows
-    size = len(valid_rows[0]) if config.episodes else rollout.num_rows
+    size = len(valid_rows) if config.episodes else rollout.num_rows
     learned = batch[one_minibatch(valid_rows, size)[0]]
     if config.standardize:
-        advantage = state.shards.standardize(learned.advantage.chunk(rollout.shards))
-        learned = replace(learned, advantage=torch.cat(advantage))
+        learned = replace(learned, advantage=standardize(learned.advantage))
     all_rows = torch.arange(size, device=batch.obs.device)[None]
     metrics: dict[str, Tensor | float] = {"learning_rate": rate}
     metrics |= means(state.learn(config, state, learned, all_rows, update_policy=True))
-    moved = [policy(batch.obs[r]).log_prob(batch.action[r]).detach() - batch.log_prob[r] for r in valid_rows]
-    metrics["approx_kl"] = state.shards.mean([kl_k3(x) for x in moved], [len(x) for x in moved])
+    valid = batch[valid_rows]
+    metrics["approx_kl"] = kl_k3(policy(valid.obs).log_prob(valid.action).detach() - valid.log_prob)
     if config.baseline == "value":
-        part = config.critic_minibatch_size // config.shards
         for _ in range(config.critic_epochs):
-            minibatches = epoch_minibatches(valid_rows, size, part, state.rng.minibatch)
+            minibatches = epoch_minibatches(valid_rows, size, config.critic_minibatch_size, state.rng.minibatch)
             metrics |= means(state.learn(config, state, batch, minibatches, update_policy=False))
-        metrics["explained_variance"] = explained_variance(batch.value, batch.target, valid_rows, state.shards)
+        metrics["explained_variance"] = explained_variance(valid.value, valid.target)
     policy.observe(rollout.obs, rollout.valid)  # last: the actions were drawn through the normalizer before
     state.step += len(rollout.reward) * config.num_envs
     return {**metrics, **policy.metrics()}

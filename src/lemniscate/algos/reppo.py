@@ -10,7 +10,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from lemniscate.data.rollout import collect, epoch_minibatches, estimates
+from lemniscate.data.rollout import collect, epoch_minibatches
 from lemniscate.data.soft_batch import SoftBatch
 from lemniscate.maths import cross_entropy, explained_variance, hl_gauss, means, soft_lambda_return
 from lemniscate.nn.activations import Activation
@@ -106,11 +106,12 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
 def targets(config: Config, state: State, rollout: Rollout) -> SoftBatch:
     """The rows of a rollout with Q(s, a), the soft λ-return that it should say, and π_old(·|s), [B, …]."""
     noise = state.policy.draw_noise(rollout.reward.shape, state.rng.action)
-    value, next_value, next_log_prob, mean, log_std = estimates(state.networks, rollout, noise)
+    rows = rollout.obs, rollout.next_obs, rollout.action, noise
+    value, next_value, next_log_prob, mean, log_std = state.networks.estimates(*rows)
     alpha, _ = state.networks.multipliers()
     ends, gamma, lam = (rollout.terminated, rollout.done), config.gamma, config.td_lambda
     target = soft_lambda_return(rollout.reward, next_value, -alpha * next_log_prob, *ends, gamma=gamma, lam=lam)
-    return SoftBatch(rollout.obs, rollout.action, value, target, mean, log_std).flatten(rollout.shards)  # [B, …]
+    return SoftBatch(rollout.obs, rollout.action, value, target, mean, log_std).flatten()  # [B, …]
 
 
 def critic_loss(critic: CategoricalQ, batch: SoftBatch) -> Loss:
@@ -160,14 +161,14 @@ def update(config: Config, state: State, rollout: Rollout) -> dict[str, Tensor |
         optimizer.learning_rate = rate
     if config.scale_rewards:
         rollout = state.reward_scale.scale(rollout)
-    batch, size, metrics = targets(config, state, rollout), config.minibatch_size // config.shards, []
+    batch, rows, metrics = targets(config, state, rollout), rollout.valid_rows, []
     for _ in range(config.epochs):
-        minibatches = epoch_minibatches(rollout.valid_rows, rollout.num_rows, size, state.rng.minibatch)
+        minibatches = epoch_minibatches(rows, rollout.num_rows, config.minibatch_size, state.rng.minibatch)
         noise = state.policy.draw_noise(minibatches.shape, state.rng.action)  # [K, M, A]
         metrics.append(means(state.learn(config, state, batch, minibatches, noise)))
     state.policy.observe(rollout.obs, rollout.valid)  # last: the KL compares policies behind the same normalizer
     state.step += config.num_steps * config.num_envs
-    explained = explained_variance(batch.value, batch.target, rollout.valid_rows, state.shards)
+    explained = explained_variance(batch.value[rows], batch.target[rows])
     return {**means(metrics), "explained_variance": explained, "learning_rate": rate}
 
 

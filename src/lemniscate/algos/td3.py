@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from lemniscate.data.replay import interact
-from lemniscate.maths import means, normal, polyak, td_target, value_loss
+from lemniscate.maths import means, polyak, td_target, value_loss
 from lemniscate.nn.actor_q import ActorQ
 from lemniscate.nn.policies import Policy
 from lemniscate.nn.q_values import Critics
@@ -102,7 +102,8 @@ def update(config: Config, state: State) -> Metrics:
     state.actor_optimizer.learning_rate = linear(config.actor_learning_rate, config.final_learning_rate, progress)
     minibatches = state.replay.sample_indices(config.num_updates, config.batch_size, state.rng.minibatch)
     replay = state.replay.transitions
-    noise = normal((*minibatches.shape, replay.action.shape[-1]), state.rng.action)
+    generator = state.rng.action
+    noise = torch.randn(*minibatches.shape, replay.action.shape[-1], generator=generator, device=generator.device)
     update_actor = tuple((state.updates + k) % config.policy_delay == 0 for k in range(1, config.num_updates + 1))
     state.updates += config.num_updates
     return means(state.learn(config, state, replay, minibatches, noise, update_actor=update_actor))

@@ -5,15 +5,14 @@ Departures from the paper, and why: docs/notes/trpo.md.
 """
 
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Annotated
 
 import torch
 from torch import Tensor
 from torch.func import grad
 
-from lemniscate.data.rollout import collect, epoch_minibatches, estimates, one_minibatch
-from lemniscate.maths import backtrack, explained_variance, gae, means, natural_step, surrogate, value_loss
+from lemniscate.data.rollout import collect, epoch_minibatches, one_minibatch
+from lemniscate.maths import backtrack, explained_variance, gae, means, natural_step, standardize, surrogate, value_loss
 from lemniscate.nn.actor_critic import ActorCritic, Value
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.optim.adam import Adam, linear
@@ -96,11 +95,11 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
 @torch.no_grad()
 def advantages(config: Config, networks: ActorCritic, rollout: Rollout) -> Batch:
     """The rows of a rollout with log π_old(a|s), V(s), advantage and value target (arXiv:1506.02438, eq. 16)."""
-    value, next_value, log_prob = estimates(networks, rollout)
+    value, next_value, log_prob = networks.estimates(rollout.obs, rollout.next_obs, rollout.action)
     gamma, lam = config.gamma, config.gae_lambda
     advantage, target = gae(rollout.reward, value, next_value, rollout.terminated, rollout.done, gamma=gamma, lam=lam)
     batch = Batch(rollout.obs, rollout.action, log_prob, value, advantage, target)
-    return batch.flatten(rollout.shards)  # [T, N, …] -> [B, …]
+    return batch.flatten()  # [T, N, …] -> [B, …]
 
 
 def critic_loss(value: Value, batch: Batch) -> Loss:
@@ -109,30 +108,25 @@ def critic_loss(value: Value, batch: Batch) -> Loss:
     return loss, {"losses/value": loss.detach()}
 
 
-def improve(config: Config, state: State, parts: list[Batch], fisher_obs: list[Tensor]) -> dict[str, Tensor | float]:
+def improve(config: Config, state: State, batch: Batch, fisher_obs: Tensor) -> dict[str, Tensor | float]:
     """Maximize L(θ) subject to KL(θ_old ‖ θ) ≤ δ, to first and to second order (eq. 14, appendix C).
 
-    L and the KL are means over the rows of `parts`, the Fisher matrix over `fisher_obs`; each is of the shards held.
+    L and the KL are means over the rows of `batch`, the Fisher matrix over `fisher_obs`.
     """
     here, pi = state.parameters.vector.clone(), state.parameters.at
     if config.normalize_advantage:
-        advantages = state.shards.standardize([part.advantage for part in parts])
-        parts = [replace(part, advantage=a) for part, a in zip(parts, advantages, strict=True)]
-    mean = partial(state.shards.mean, rows=[len(part) for part in parts])
-
-    def loss_of(part: Batch, theta: Tensor) -> Tensor:
-        return surrogate(pi(theta, part.obs).log_prob(part.action) - part.log_prob, part.advantage)
+        batch = replace(batch, advantage=standardize(batch.advantage))
 
     def loss(theta: Tensor) -> Tensor:
-        return mean([loss_of(part, theta) for part in parts])
+        return surrogate(pi(theta, batch.obs).log_prob(batch.action) - batch.log_prob, batch.advantage)
 
     def kl(theta: Tensor) -> Tensor:
-        return mean([pi(here, part.obs).kl(pi(theta, part.obs)).mean() for part in parts])
+        return pi(here, batch.obs).kl(pi(theta, batch.obs)).mean()
 
     def fisher(vector: Tensor) -> Tensor:
-        return mean([state.parameters.fisher(vector, obs) for obs in fisher_obs]) + config.damping * vector
+        return state.parameters.fisher(vector, fisher_obs) + config.damping * vector
 
-    gradient = mean([grad(partial(loss_of, part))(here) for part in parts])
+    gradient = grad(loss)(here)
     with torch.no_grad():
         step = natural_step(fisher, gradient, config.max_kl, iterations=config.cg_iterations)
         limits = {"max_kl": config.max_kl, "shrink": config.shrink, "attempts": config.attempts}
@@ -140,8 +134,7 @@ def improve(config: Config, state: State, parts: list[Batch], fisher_obs: list[T
         if config.line_search:
             there, fraction = backtrack(lambda theta: (loss(theta), kl(theta)), here, step, **limits)
         metrics: dict[str, Tensor | float] = {"losses/policy": loss(there), "kl": kl(there), "step_fraction": fraction}
-        entropy = mean([pi(here, part.obs).entropy().mean() for part in parts])
-        metrics |= {"losses/entropy": entropy, "gradient_norm": gradient.norm()}
+        metrics |= {"losses/entropy": pi(here, batch.obs).entropy().mean(), "gradient_norm": gradient.norm()}
         state.parameters.vector.copy_(there)
     return metrics
 
@@ -158,15 +151,15 @@ def update(config: Config, state: State, rollout: Rollout) -> dict[str, Tensor |
     if config.scale_rewards:
         rollout = state.reward_scale.scale(rollout)
     batch, valid_rows = advantages(config, state.networks, rollout), rollout.valid_rows
-    same_size = one_minibatch(valid_rows, rollout.num_rows)[0].chunk(rollout.shards)  # in every update
-    metrics = improve(config, state, [batch[rows] for rows in valid_rows], [batch.obs[rows] for rows in same_size])
-    size = config.critic_minibatch_size // config.shards
+    same_size = one_minibatch(valid_rows, rollout.num_rows)[0]  # in every update, since the product is compiled
+    metrics = improve(config, state, batch[valid_rows], batch.obs[same_size])
+    size = config.critic_minibatch_size
     for _ in range(config.critic_epochs):
         minibatches = epoch_minibatches(valid_rows, rollout.num_rows, size, state.rng.minibatch)
         metrics |= means(state.learn(config, state, batch, minibatches))
     state.networks.policy.observe(rollout.obs, rollout.valid)  # last: old and new probabilities share a normalizer
     state.step += config.num_steps * config.num_envs
-    explained = explained_variance(batch.value, batch.target, valid_rows, state.shards)
+    explained = explained_variance(batch.value[valid_rows], batch.target[valid_rows])
     return {**metrics, **state.networks.policy.metrics(), "explained_variance": explained, "learning_rate": rate}
 
 

@@ -13,7 +13,7 @@ from lemniscate.errors import RankError, UserError, shown
 from lemniscate.hub.trust import signed
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import CONFIG, create_directory
-from lemniscate.run.run import Stopped
+from lemniscate.run.stopping import Stopped
 from lemniscate.system.owner import OWNED
 from lemniscate.system.world import World
 

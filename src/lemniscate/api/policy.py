@@ -64,6 +64,6 @@ class TrainedPolicy:
         if deterministic:
             action = distribution.mode()
         else:
-            action = distribution.sample(self.module.draw_noise((len(flat),), (self._noise,)))
+            action = distribution.sample(self.module.draw_noise((len(flat),), self._noise))
         physical = physical_action(action.numpy(), self.spec.action)
         return physical if batched else physical[0]

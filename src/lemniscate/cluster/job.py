@@ -30,7 +30,7 @@ from lemniscate.errors import NonFiniteError, RankError, UserError, WorkerError,
 from lemniscate.hub.trust import signed
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import CONFIG, LOCK, create_directory
-from lemniscate.run.run import Stopped, stop_signals_to
+from lemniscate.run.stopping import Stopped, stop_signals_to
 from lemniscate.sweeps.sweep_progress import progress_of
 from lemniscate.system import named, processes
 from lemniscate.system.console import say

@@ -1,92 +1,127 @@
-"""Replay (Lin 1992; Mnih et al. 2015): a ring buffer of transitions, and the steps that fill it."""
+"""Replay (Lin 1992; Mnih et al. 2015): a ring buffer of transitions, the steps that fill it, and their noise."""
 
 import math
+from typing import Literal
 
 import torch
-from torch import Tensor
+from torch import Generator, Tensor
 
-from lemniscate.data.action_noise import ActionNoise
 from lemniscate.envs.vec_env import VecEnv
-from lemniscate.maths import uniform
+from lemniscate.maths import coloured, ornstein_uhlenbeck, uniform
 from lemniscate.nn.policies import Policy
 from lemniscate.spec import Spec
-from lemniscate.types import Step, Streams, Transition
+from lemniscate.types import Step, Transition
+
+Kind = Literal["white", "ou", "coloured"]
 
 
 class ReplayBuffer:
-    """The last `capacity` transitions of all parallel environments, preallocated on `device`.
+    """The last `capacity` transitions of all parallel environments, preallocated on `device`."""
 
-    Each shard has an equal part of the capacity, a ring of its own: rows [c·s, c·(s + 1)) of `transitions`.
-    """
-
-    local = ("obs", "action", "reward", "next_obs", "terminated", "written")
-
-    def __init__(self, spec: Spec, capacity: int, device: torch.device, shards: int = 1) -> None:
+    def __init__(self, spec: Spec, capacity: int, device: torch.device) -> None:
         columns = {
             name: torch.zeros(capacity, *shape, dtype=kind, device=device) for name, shape, kind in _columns(spec)
         }
         self.transitions = Transition(**columns)
         self.capacity = capacity
-        self._shards, self._written = shards, [0] * shards
-        """rows ever added, of each shard"""
+        self._written = 0
+        """rows ever added"""
 
     def __len__(self) -> int:
-        return sum(min(written, self._room) for written in self._written)
-
-    @property
-    def _room(self) -> int:
-        """The rows of each shard's ring."""
-        return self.capacity // len(self._written)
+        return min(self._written, self.capacity)
 
     def add(self, obs: Tensor, action: Tensor, step: Step) -> None:
         """Add the transitions of one step of N environments; rows whose action was ignored are left out."""
-        rows, shards = Transition(obs, action, step.reward, step.next_obs, step.terminated), len(self._written)
-        for shard in range(shards):
-            mine = slice(shard * len(obs) // shards, (shard + 1) * len(obs) // shards)
-            part, valid = (rows, step.valid) if shards == 1 else (rows[mine], step.valid[mine])
-            self.extend(part if valid.all() else part[valid], shard)
+        rows = Transition(obs, action, step.reward, step.next_obs, step.terminated)
+        self.extend(rows if step.valid.all() else rows[step.valid])
 
-    def extend(self, rows: Transition, shard: int = 0) -> None:
-        """Add `rows` [B, …] to a shard's ring, in place of the oldest."""
-        first, start, count = shard * self._room, self._written[shard] % self._room, len(rows.reward)
-        room = min(count, self._room - start)
+    def extend(self, rows: Transition) -> None:
+        """Add `rows` [B, …] in the place of the oldest."""
+        start, count = self._written % self.capacity, len(rows.reward)
+        room = min(count, self.capacity - start)
         for name, ring in vars(self.transitions).items():
             new = getattr(rows, name)
-            ring[first + start : first + start + room] = new[:room]
+            ring[start : start + room] = new[:room]
             if count > room:
-                ring[first : first + count - room] = new[room:]
-        self._written[shard] += count
+                ring[: count - room] = new[room:]
+        self._written += count
 
-    def sample_indices(self, minibatches: int, size: int, streams: Streams) -> Tensor:
-        """Rows of `transitions`, of each shard an equal part of `size`, drawn uniformly with replacement.
-
-        Returns [minibatches, M] int64, M = `size` where all shards are held.
-        """
-        parts = []
-        for shard, stream in enumerate(streams):
-            filled = min(self._written[shard], self._room)
-            drawn = torch.randint(filled, (minibatches, size // self._shards), generator=stream, device=stream.device)
-            parts.append(shard * self._room + drawn)
-        return torch.cat(parts, dim=1)
-
-    def hold(self, held: range) -> None:
-        """Keep only these shards."""
-        rows = slice(held.start * self._room, held.stop * self._room)
-        self.transitions = self.transitions[rows].map(torch.clone)
-        self._written, self.capacity = self._written[held.start : held.stop], len(held) * self._room
+    def sample_indices(self, minibatches: int, size: int, generator: Generator) -> Tensor:
+        """Rows of `transitions`, drawn uniformly with replacement: [minibatches, size] int64."""
+        return torch.randint(len(self), (minibatches, size), generator=generator, device=generator.device)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """The rows up to the largest that is filled, not copied, [S, B, …]; and the number ever written of each [S]."""
-        shards, filled = len(self._written), min(self._room, max(self._written))
-        rows = {name: ring.unflatten(0, (shards, -1))[:, :filled] for name, ring in vars(self.transitions).items()}
+        """The rows that are filled, not copied, [B, …]; and the number ever written."""
+        rows = {name: ring[: len(self)] for name, ring in vars(self.transitions).items()}
         return {**rows, "written": torch.tensor(self._written)}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
         """Restore what `state_dict` returned."""
-        shards = len(self._written)
         for name, ring in vars(self.transitions).items():
-            ring.unflatten(0, (shards, -1))[:, : state[name].shape[1]] = state[name]
-        self._written = state["written"].tolist()
+            ring[: len(state[name])] = state[name]
+        self._written = int(state["written"])
+
+
+class ActionNoise:
+    """Noise of variance 1 for N parallel environments and A coordinates, each a sequence of its own.
+
+    A sequence is as long as an episode may be, and every episode begins a new one. (Where episodes have no time limit,
+    a sequence may end first; then the next one follows.)
+
+    Args:
+        kind: white; Ornstein–Uhlenbeck; or coloured, of power f^(−β).
+        shape: (N, A).
+        length: steps of a sequence, L.
+        device: of the sequences.
+        time: steps in which an Ornstein–Uhlenbeck correlation falls to 1/e.
+        exponent: β.
+    """
+
+    def __init__(
+        self, kind: Kind, shape: tuple[int, int], length: int, device: torch.device, *, time: float, exponent: float
+    ) -> None:
+        self._kind, self._time, self._exponent = kind, time, exponent
+        self._length = length + length % 2  # `coloured` is for even lengths
+        self._sequences = torch.zeros(*shape, self._length, device=device)
+        self._position = torch.full((shape[0],), self._length)
+        self._rows = torch.arange(shape[0])
+
+    def __call__(self, generator: Generator) -> Tensor:
+        """The noise of the next step, [N, A]."""
+        due = self._position == self._length
+        if due.any():
+            self._sequences[due] = self._new_sequences(int(due.sum()), generator)
+            self._position[due] = 0
+        noise = self._sequences[self._rows, :, self._position]
+        self._position += 1
+        return noise
+
+    def on_episode_end(self, done: Tensor) -> None:
+        """Begin new sequences in the environments `done` [N] bool, whose episodes ended."""
+        self._position[done.cpu()] = self._length
+
+    def on_restart(self) -> None:
+        """Begin new sequences everywhere: the environments have been restarted."""
+        self._position.fill_(self._length)
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """The sequences, and the position in each."""
+        return {"sequences": self._sequences, "position": self._position}
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Restore what `state_dict` returned."""
+        self._sequences.copy_(state["sequences"])
+        self._position.copy_(state["position"])
+
+    def _new_sequences(self, count: int, generator: Generator) -> Tensor:
+        """[count, A, L]."""
+        shape = (count, *self._sequences.shape[1:])
+        normal = torch.randn(shape, generator=generator, device=generator.device)
+        if self._kind == "white":
+            return normal
+        if self._kind == "ou":
+            return ornstein_uhlenbeck(normal, self._time)
+        return coloured(normal, self._exponent)
 
 
 @torch.no_grad()
@@ -95,7 +130,7 @@ def interact(
     policy: Policy,
     replay: ReplayBuffer,
     action_noise: ActionNoise,
-    streams: Streams,
+    generator: Generator,
     *,
     noise_std: float = 1.0,
     random: bool = False,
@@ -107,14 +142,14 @@ def interact(
         policy: acts with `noise_std` times the noise of the next step.
         replay: the buffer.
         action_noise: standard normal noise [N, A], correlated in time or not.
-        streams: of the noise.
+        generator: of the noise.
         noise_std: standard deviation of the noise of a deterministic policy, in units of half the action range; 1 for a
             stochastic policy, which takes standard normal numbers.
         random: act uniformly in [-1, 1]^A instead.
     """
     with env.collecting:
-        obs, noise = env.obs, action_noise(streams)
-        action = uniform(noise) if random else env.act(policy.act, noise_std * noise)
+        obs, noise = env.obs, action_noise(generator)
+        action = uniform(noise) if random else policy.act(obs, noise_std * noise)
         step = env.step(action)
         replay.add(obs, action, step)
         action_noise.on_episode_end(step.terminated | step.truncated | ~step.valid)

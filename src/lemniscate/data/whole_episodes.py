@@ -3,14 +3,15 @@
 from functools import partial
 
 import torch
+from torch import Generator
 
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.nn.policies import Policy
-from lemniscate.types import Rollout, Streams
+from lemniscate.types import Rollout
 
 
 @torch.no_grad()
-def collect_episodes(env: VecEnv, policy: Policy, episodes: int, streams: Streams) -> Rollout:
+def collect_episodes(env: VecEnv, policy: Policy, episodes: int, generator: Generator) -> Rollout:
     """Act until every environment has completed `episodes` whole episodes, from where it stands.
 
     Returns:
@@ -20,14 +21,14 @@ def collect_episodes(env: VecEnv, policy: Policy, episodes: int, streams: Stream
     Raises:
         UserError: an episode of an environment without a time limit takes more than 20,000 steps.
     """
-    rows, noise = [], partial(policy.draw_noise, (env.num_envs,), streams)
+    rows, noise = [], partial(policy.draw_noise, (env.num_envs,), generator)
     ended = torch.zeros(env.num_envs, dtype=torch.int64, device=env.device)
     age = torch.zeros_like(ended)
     with env.collecting:
         while (ended <= episodes).any():
             env.require_end(int(age.max()))
             obs = env.obs
-            action = env.act(policy.act, noise())
+            action = policy.act(obs, noise())
             step = env.step(action)
             whole = step.valid & (ended >= 1) & (ended <= episodes)
             rows.append(Rollout(obs, action, step.reward, step.next_obs, step.terminated, step.truncated, whole))

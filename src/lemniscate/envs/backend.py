@@ -69,8 +69,8 @@ class Backend(Protocol):
     - `compiled = True`: a step is a program for one number of environments, so evaluation takes as many as training;
     - `package`: what has to be installed;
     - `in_process`: the name of the backend that evaluates its policies, where it uses other processes itself;
-    - `divides(env) -> bool`, a class method: whether `restart` takes several seeds, each for an equal part of the
-      environments, so that nothing of a part depends on the others; where it does not, each shard has a backend;
+    - `divides(env) -> bool`, a class method: whether each environment has a seed of its own, so that nothing of one
+      depends on the others beside it; where it has not, each shard of a run has a backend;
     - `room(env) -> (bytes, files)`, a class method: the memory and the open files that each takes at least;
     - `wraps(env) -> bool`, a class method: whether it can put `wrappers` around;
     - `probe(env, starts, trained, given)`, a class method: a `lemniscate.envs.probe.Probe` from so many starts, with
@@ -127,8 +127,14 @@ class Backend(Protocol):
         """
         ...
 
-    def restart(self, seed: int) -> Tensor:
-        """Begin again, as if just built from `seed`: nothing of the past remains. Returns obs [N, O]."""
+    def restart(self, seed: int, first: int = 0) -> Tensor:
+        """Begin again, as if just built: nothing of the past remains. Returns obs [N, O].
+
+        Args:
+            seed: of all environments of the run.
+            first: the number of the first of these among them. What is random in environment i follows from `seed` and
+                `first + i`, where each has a seed of its own; else from `seed + first`.
+        """
         ...
 
     def step(self, action: Tensor) -> Step:

@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lemniscate.envs.episodes import Stagger
 from lemniscate.envs.measures import STANDARD, SUMMARIES, measured
 from lemniscate.envs.spaces import (
     action_kind,
@@ -20,6 +19,7 @@ from lemniscate.envs.spaces import (
     physical_action,
     row_of,
 )
+from lemniscate.envs.vec_env import Stagger
 from lemniscate.errors import UserError, is_installed, missing_extra, unknown_name
 from lemniscate.spec import Spec
 from lemniscate.system.machine import cores
@@ -107,7 +107,7 @@ class EnvpoolBackend:
         task, threads = env.removeprefix(PREFIX), min(num_envs, num_threads or cores())
         options = _checked(task, dict(kwargs or {})) | {"num_envs": num_envs, "num_threads": threads}
         self._build = partial(make_pool, task, options)
-        self._pool = self._build((0,))
+        self._pool = self._build(0)
         limit = int(self._pool.config["max_episode_steps"])
         self._limit = limit if limit < NO_LIMIT else None
         self._stagger_up_to = self._limit if stagger else None
@@ -120,11 +120,11 @@ class EnvpoolBackend:
         """Yes: each environment has a seed of its own."""
         return True
 
-    def restart(self, *seeds: int) -> Tensor:
+    def restart(self, seed: int, first: int = 0) -> Tensor:
         """Build the pool again: nothing of the past remains."""
         self._pool.close()
-        self._pool = self._build(seeds)
-        self._stagger = Stagger(self.num_envs, self._stagger_up_to, *seeds)
+        self._pool = self._build(seed + first)
+        self._stagger = Stagger(self.num_envs, self._stagger_up_to, seed, first)
         self.counts = self._tensor(self._stagger.counts)
         obs, _ = self._pool.reset()
         return self._tensor(self._flatten(obs))
@@ -170,14 +170,14 @@ class SingleEnv(gym.Env):
 
     def __init__(self, task: str, mode: str, kwargs: Mapping[str, Any]) -> None:
         self._make = partial(make_pool, task, {**_checked(task, dict(kwargs)), "num_envs": 1, "render_mode": mode})
-        self._pool = self._make((0,))
+        self._pool = self._make(0)
         self.render_mode = mode
         self.observation_space, self.action_space = self._pool.observation_space, self._pool.action_space
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Build it again from `seed`: EnvPool seeds at no other time."""
         self._pool.close()
-        self._pool = self._make((seed or 0,))
+        self._pool = self._make(seed or 0)
         return row_of(self._pool.reset()[0], 0), {}
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -195,14 +195,12 @@ class SingleEnv(gym.Env):
         self._pool.close()
 
 
-def make_pool(task: str, options: Mapping[str, Any], seeds: Sequence[int]) -> Any:
-    """A pool of EnvPool's; of several seeds, each is for an equal part. Raises `UserError` where it cannot be made."""
+def make_pool(task: str, options: Mapping[str, Any], seed: int) -> Any:
+    """A pool of EnvPool's, whose environments count up from `seed`. Raises `UserError` where it cannot be made."""
     import envpool
 
-    each = options["num_envs"] // len(seeds)
-    seed = [(seed + i) % 2**31 for seed in seeds for i in range(each)] if len(seeds) > 1 else seeds[0] % 2**31
     try:
-        pool = envpool.make(task, env_type="gymnasium", seed=seed, **options)
+        pool = envpool.make(task, env_type="gymnasium", seed=seed % 2**31, **options)
     except (ImportError, TypeError, ValueError, RuntimeError, AssertionError) as error:
         first_line = str(error).partition("\n")[0]
         raise UserError(f"EnvPool cannot make {task}: {first_line}") from error

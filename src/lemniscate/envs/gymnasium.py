@@ -12,7 +12,6 @@ from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
 from lemniscate.envs.backend import Summary
-from lemniscate.envs.episodes import Stagger
 from lemniscate.envs.factory import make_one, make_vector, maker_of, makes_vector, sentences
 from lemniscate.envs.masks import ActionMasks
 from lemniscate.envs.measures import SUMMARIES, measured, measures_of
@@ -24,6 +23,7 @@ from lemniscate.envs.spaces import (
     physical_action,
     row_of,
 )
+from lemniscate.envs.vec_env import Stagger
 from lemniscate.errors import UserError
 from lemniscate.spec import Discrete, Spec
 from lemniscate.system.named import find_callable
@@ -108,20 +108,23 @@ class GymnasiumBackend:
         """Whether it is made of single environments, each of which has a seed of its own."""
         return cls.wraps(env)
 
-    def restart(self, *seeds: int) -> Tensor:
-        """Close the environments and build them again: some (Box2D) carry more over a reset than they tell."""
+    def restart(self, seed: int, first: int = 0) -> Tensor:
+        """Close the environments and build them again: some (Box2D) carry more over a reset than they tell.
+
+        Environment i of these has the seed `seed + first + i`: Gymnasium counts up.
+        """
         if self._used:
             self._envs.close()
             self._envs, _ = self._build()
         self._used = True
         self._resetting = np.zeros(self.num_envs, dtype=bool)
-        self._stagger = Stagger(self.num_envs, self._stagger_up_to, *seeds)
+        self._stagger = Stagger(self.num_envs, self._stagger_up_to, seed, first)
         self.counts = self._tensor(self._stagger.counts)
         kind = self.spec.action
         self._masks = None
         if isinstance(kind, Discrete) and kind.masked:
             self._masks = ActionMasks(self.spec.env_id, self.num_envs, kind.n)
-        return self._tensor(self._observe(*self._envs.reset(seed=self._env_seeds(seeds))))
+        return self._tensor(self._observe(*self._envs.reset(seed=seed + first)))
 
     def step(self, action: Tensor) -> Step:
         """Step, then find the true successor of each row and where to act next, as the mode demands."""
@@ -155,11 +158,6 @@ class GymnasiumBackend:
     def close(self) -> None:
         """Close the environments and their workers."""
         self._envs.close()
-
-    def _env_seeds(self, seeds: Sequence[int]) -> Any:
-        """One seed, from which Gymnasium counts up; several, each counted up for an equal part of the environments."""
-        each = self.num_envs // len(seeds)
-        return seeds[0] if len(seeds) == 1 else [seed + i for seed in seeds for i in range(each)]
 
     def _with_final(self, obs: np.ndarray, info: dict, done: np.ndarray) -> np.ndarray:
         if not done.any():

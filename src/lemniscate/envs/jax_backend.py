@@ -108,9 +108,9 @@ class JaxBackend:
         self._stagger = self._put(np.bool_(stagger))
         self._valid = torch.ones(num_envs, dtype=torch.bool, device=device)
 
-    def restart(self, seed: int) -> Tensor:
-        """Begin again from `seed`."""
-        self._state, obs, fragment = self._programs.restart(self._put(np.uint32(seed)), self._stagger)
+    def restart(self, seed: int, first: int = 0) -> Tensor:
+        """Begin again from `seed + first`, the seed of this vector."""
+        self._state, obs, fragment = self._programs.restart(self._put(np.uint32(seed + first)), self._stagger)
         self.counts = ~torch.from_dlpack(fragment)
         return torch.from_dlpack(obs)
 

@@ -11,7 +11,7 @@ from lemniscate.system import named
 if TYPE_CHECKING:
     from lemniscate.envs.backend import Backend
     from lemniscate.envs.vec_env import VecEnv
-    from lemniscate.maths import Shards
+    from lemniscate.system.world import World
 
 BACKENDS = {
     "crazyflow": "lemniscate.drones.crazyflow:CrazyflowBackend",
@@ -69,7 +69,7 @@ def can_wrap(backend: str, env: str) -> bool:
 
 
 def can_divide(backend: str, env: str) -> bool:
-    """Whether a backend takes a seed for each of several shards, and nothing of one depends on the others."""
+    """Whether each environment of a backend has a seed of its own, and nothing of one depends on the others."""
     divides = getattr(backend_class(backend), "divides", None)
     return divides is not None and divides(env)
 
@@ -154,7 +154,7 @@ def make(
     device: str = "cpu",
     stagger: bool = False,
     backend: str | None = None,
-    shards: "Shards | None" = None,
+    world: "World | None" = None,
 ) -> "VecEnv":
     """N parallel environments on `device`; `restart` them before the first step.
 
@@ -168,7 +168,7 @@ def make(
         device: of the tensors: cpu, cuda, …
         stagger: spread the first episodes over time.
         backend: a name of `BACKENDS`, or `module:Class`; by default the first that serves `env`.
-        shards: those of a run; `num_envs` is the number in the shards held.
+        world: the processes that share the environments; by default this one has all.
 
     Raises:
         UserError: an unknown environment or backend, arguments that it does not take, spaces nobody can act in, a
@@ -176,9 +176,9 @@ def make(
     """
     import torch
 
-    from lemniscate.envs.shards import BackendOfShards
+    from lemniscate.envs.joined import Joined
     from lemniscate.envs.vec_env import VecEnv
-    from lemniscate.maths import ONE_SHARD
+    from lemniscate.system.world import ALONE
 
     name, wraps, num_envs = name_of(env), names_of(wrappers), _checked_count(num_envs)
     if kwargs is not None and not isinstance(kwargs, Mapping):
@@ -190,11 +190,11 @@ def make(
         raise UserError(
             f"The {chosen} backend cannot wrap {name}; wrappers go around single environments of the gymnasium backend."
         )
-    require_room(name, num_envs, chosen)
-    shards, cls = shards or ONE_SHARD, backend_class(chosen)
-    together = len(shards.held) == 1 or can_divide(chosen, name)
-    sizes = [num_envs] if together else [num_envs // len(shards.held)] * len(shards.held)
+    world, cls = world or ALONE, backend_class(chosen)
+    mine = num_envs // world.size
+    require_room(name, mine, chosen)
+    vectors = 1 if can_divide(chosen, name) else len(world.held)
     options = {"stagger": stagger, "kwargs": kwargs, "wrappers": wraps}
-    made = [cls(name, size, torch.device(device), **options) for size in sizes]
-    backend_of_all: Any = made[0] if len(made) == 1 else BackendOfShards(made)
-    return VecEnv(backend_of_all, shards)
+    made = [cls(name, mine // vectors, torch.device(device), **options) for _ in range(vectors)]
+    backend_of_all: Any = made[0] if vectors == 1 else Joined(made)
+    return VecEnv(backend_of_all, world)

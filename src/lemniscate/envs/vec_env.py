@@ -1,57 +1,41 @@
-"""Parallel environments, as the floors above see them."""
+"""Parallel environments as the floors above see them, and the episodes that run in them."""
 
 import math
 import time
-from collections.abc import Callable
+from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from lemniscate.envs.backend import Backend, Baseline, Scene, Summary
-from lemniscate.envs.episodes import Episodes, EpisodeStatistics
-from lemniscate.envs.shards import act_over_shards
 from lemniscate.errors import NonFiniteError, UserError, wrong_action
-from lemniscate.maths import ONE_SHARD, Shards
 from lemniscate.spec import Box, Discrete, MultiBinary, Spec
-from lemniscate.types import Step
+from lemniscate.system.world import ALONE, World
+from lemniscate.types import Step, wide_float
 
 PATIENCE = 20_000
 """steps that an episode may take in an environment without a time limit, where whole ones are wanted"""
 
-
-class Stopwatch:
-    """Seconds spent inside its `with` blocks."""
-
-    def __init__(self) -> None:
-        self._began, self._seconds = 0.0, 0.0
-
-    def __enter__(self) -> None:
-        self._began = time.perf_counter()
-
-    def __exit__(self, *_: object) -> None:
-        self._seconds += time.perf_counter() - self._began
-
-    def take(self) -> float:
-        """The seconds since the last call."""
-        seconds, self._seconds = self._seconds, 0.0
-        return seconds
+LOG_ROWS = 1024
+"""steps after which the logged ones are summed up"""
 
 
 class VecEnv:
-    """A backend with its current observation and the statistics of its episodes.
+    """N parallel environments with their current observation and the statistics of their episodes.
+
+    Where several processes share them, each steps its own and all learn what came of every one.
 
     Args:
-        backend: N environments, those of the shards held.
-        shards: of the run.
+        backend: the environments that this process steps, N / W of them.
+        world: the processes that share the environments.
     """
 
-    def __init__(self, backend: Backend, shards: Shards = ONE_SHARD) -> None:
-        self.backend = backend
+    def __init__(self, backend: Backend, world: World = ALONE) -> None:
+        self.backend, self._world = backend, world
         self.spec = backend.spec
-        self.num_envs = backend.num_envs
-        self.shards = shards
-        size = backend.num_envs // len(shards.held)
-        self._first, self._total = shards.held[0] * size, shards.count * size
+        self.num_envs = world.size * backend.num_envs
+        self._first = world.rank * backend.num_envs
         self.device = backend.device
         self.summaries: tuple[Summary, ...] = getattr(backend, "summaries", ())
         self.scene: Scene | None = getattr(backend, "scene", None)
@@ -60,21 +44,18 @@ class VecEnv:
         self.collecting = Stopwatch()
         """seconds that the functions of `data` spend acting and stepping"""
         self.steps = 0
-        self._statistics = EpisodeStatistics(self.num_envs, self.device, self._first, self._total)
+        self._statistics = EpisodeStatistics(self.num_envs, self.device)
         self._actions: tuple[torch.Size, torch.dtype] | None = None  # before it is restarted, none is right
 
-    def restart(self, *seeds: int, steps: int = 0) -> Tensor:
-        """Begin again, each shard from its seed; also stored as `obs`, [N, O]. `steps` is what the run has taken."""
+    def restart(self, seed: int, steps: int = 0) -> Tensor:
+        """Begin again from a seed; also stored as `obs`, [N, O]. `steps` is what the run has taken."""
         self.steps = steps
-        self._statistics = EpisodeStatistics(self.num_envs, self.device, self._first, self._total)
-        self.obs = self.backend.restart(*seeds)
+        self._statistics = EpisodeStatistics(self.num_envs, self.device)
+        mine = self.backend.restart(seed, self._first)
         self._actions = _action_layout(self.spec, self.num_envs)
-        self._require_finite(observation=self.obs)
+        self._require_finite(observation=mine)
+        self.obs = self._world.gather(mine)
         return self.obs
-
-    def act(self, act: Callable[[Tensor, Tensor], Tensor], noise: Tensor) -> Tensor:
-        """`act(obs, noise)` for every environment, [N, …], the same bits for any number of processes."""
-        return act(self.obs, noise) if self.shards.count == 1 else act_over_shards(act, self.shards, self.obs, noise)
 
     def step(self, action: Tensor) -> Step:
         """Act in every environment and move `obs` on; actions as in `Backend.step`.
@@ -87,15 +68,24 @@ class VecEnv:
             raise wrong_action(f"{self.num_envs} × {self.spec.env_id}", action, self._actions)
         if action.is_floating_point():
             self._require_finite(action=action)
+        mine = action if self._world.size == 1 else action[self._first : self._first + self.backend.num_envs]
         counts = self.backend.counts
-        step = self.backend.step(action)
+        step = self.backend.step(mine)
         self._require_finite(observation=step.next_obs, reward=step.reward)
         if step.obs is not step.next_obs:
             self._require_finite(observation=step.obs)
+        if self._world.size > 1:
+            step, counts = self._of_all(step, counts)
         self.obs = step.obs
-        self.steps += self._total
+        self.steps += self.num_envs
         self._statistics.log(step, counts)
         return step
+
+    def _of_all(self, step: Step, counts: Tensor) -> tuple[Step, Tensor]:
+        """The step of the environments of all processes, and its counts; without measures, which nobody reads here."""
+        names = ("obs", "next_obs", "reward", "terminated", "truncated", "valid")
+        *columns, counts = self._world.gather_columns([*(getattr(step, name) for name in names), counts])
+        return replace(step, **dict(zip(names, columns, strict=True)), measures={}), counts
 
     def _require_finite(self, **quantities: Tensor) -> None:
         for name, values in quantities.items():
@@ -110,7 +100,7 @@ class VecEnv:
         """Raise `UserError` where an episode of `age` steps has had its chance to end, and there is no time limit."""
         require_end(self.spec.env_id, age, self.spec.max_episode_steps)
 
-    def take_episodes(self) -> Episodes:
+    def take_episodes(self) -> "Episodes":
         """The whole episodes that ended since the last call."""
         return self._statistics.take()
 
@@ -135,3 +125,113 @@ def _action_layout(spec: Spec, num_envs: int) -> tuple[torch.Size, torch.dtype]:
     if isinstance(action, Box):
         return torch.Size((num_envs, action.size)), torch.float32
     return torch.Size((num_envs, action.n if isinstance(action, MultiBinary) else len(action.nvec))), torch.int64
+
+
+class Stopwatch:
+    """Seconds spent inside its `with` blocks."""
+
+    def __init__(self) -> None:
+        self._began, self._seconds = 0.0, 0.0
+
+    def __enter__(self) -> None:
+        self._began = time.perf_counter()
+
+    def __exit__(self, *_: object) -> None:
+        self._seconds += time.perf_counter() - self._began
+
+    def take(self) -> float:
+        """The seconds since the last call."""
+        seconds, self._seconds = self._seconds, 0.0
+        return seconds
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """Whole episodes that ended, in the order of their ends."""
+
+    returns: list[float]
+    lengths: list[int]
+
+
+class EpisodeStatistics:
+    """Returns and lengths, summed up over many logged steps at once, since [T, N] costs hardly more than [N].
+
+    Fragments (episodes that staggering began late or cut early) and ignored actions (`valid` False) are not counted.
+    """
+
+    def __init__(self, num_envs: int, device: torch.device) -> None:
+        self._log: list[tuple[Tensor, ...]] = []
+        self._running = torch.zeros(2, num_envs, dtype=wide_float(device), device=device)
+        self._ended: list[Tensor] = []
+
+    def log(self, step: Step, counts: Tensor) -> None:
+        """One step of every environment; `counts` [N] is False where the episode is a fragment."""
+        self._log.append((step.reward, step.terminated, step.truncated, step.valid, counts))
+        if len(self._log) == LOG_ROWS:
+            self._sum_up()
+
+    def take(self) -> Episodes:
+        """The whole episodes that ended since the last call."""
+        if self._log:
+            self._sum_up()
+        returns, lengths = torch.cat([self._running.new_zeros(2, 0), *self._ended], dim=1)
+        self._ended = []
+        return Episodes(returns.tolist(), lengths.int().tolist())
+
+    def _sum_up(self) -> None:
+        reward, terminated, truncated, valid, counts = (torch.stack(column) for column in zip(*self._log, strict=True))
+        done = (terminated | truncated) & valid
+        running = episode_sums(torch.stack([reward * valid, valid]).to(self._running.dtype), done, self._running)
+        self._ended.append(running[:, done & counts])  # by time, then by environment
+        self._running = running[:, -1] * ~done[-1]
+        self._log = []
+
+
+def episode_sums(rows: Tensor, done: Tensor, carried: Tensor) -> Tensor:
+    """The running sums of each episode, at each row.
+
+    Args:
+        rows: quantities to sum, [K, T, N].
+        done: the episode ends with this row, [T, N] bool.
+        carried: sums of the episodes that were under way before the first row, [K, N].
+
+    Returns:
+        [K, T, N]
+    """
+    sums = torch.cat([torch.zeros_like(carried)[:, None], carried[:, None] + rows.cumsum(1)], dim=1)  # [K, T + 1, N]
+    next_row = torch.arange(1, len(done) + 1, device=done.device)[:, None]
+    after_end = torch.where(done, next_row, 0).cummax(0).values
+    first_row = torch.cat([torch.zeros_like(after_end[:1]), after_end[:-1]])  # of the episode at hand, or 0
+    return sums[:, 1:] - sums.gather(1, first_row.expand(len(rows), -1, -1))
+
+
+class Stagger:
+    """The first episode of each environment is cut after a random number of steps, uniform up to the time limit.
+
+    A cut counts as a truncation. Without a limit there are no cuts, and every episode is whole.
+
+    Args:
+        num_envs: number of environments.
+        limit: the time limit in steps; None for no cuts.
+        seed: of the run's environments.
+        first: the number of the first of these in the run: all are drawn for, so that each is cut alike in any process.
+    """
+
+    def __init__(self, num_envs: int, limit: int | None, seed: int, first: int = 0) -> None:
+        self._steps_left = np.full(num_envs, -1)
+        if limit is not None:
+            drawn = np.random.default_rng(seed).integers(1, limit, first + num_envs, endpoint=True)
+            self._steps_left = drawn[first:]
+        self.counts = np.full(num_envs, limit is None)
+        """[N] bool: the environment's present episode began at its beginning and is not to be cut"""
+
+    def apply(self, terminated: np.ndarray, truncated: np.ndarray) -> np.ndarray:
+        """After one more step in every environment: `truncated` [N], with the cuts that are due."""
+        if self.counts.all():
+            return truncated
+        self._steps_left -= 1
+        truncated = truncated | ((self._steps_left == 0) & ~terminated)
+        done = terminated | truncated
+        self._steps_left[done] = -1
+        self.counts = self.counts | done
+        return truncated

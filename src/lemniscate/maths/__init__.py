@@ -4,18 +4,17 @@ from lemniscate.maths.bounded import Deterministic, SquashedGaussian
 from lemniscate.maths.discrete import Bernoulli, Categorical, MultiCategorical
 from lemniscate.maths.distributions import Distribution, Gaussian, tanh
 from lemniscate.maths.losses import clipped_surrogate, policy_gradient, surrogate, value_loss
-from lemniscate.maths.noise import coloured, normal, ornstein_uhlenbeck, uniform
+from lemniscate.maths.noise import coloured, ornstein_uhlenbeck, uniform
 from lemniscate.maths.returns import episode_return, gae, reward_to_go
 from lemniscate.maths.soft_q import cross_entropy, hl_gauss, soft_lambda_return
 from lemniscate.maths.stats import (
-    ONE_SHARD,
-    Shards,
     clip_fraction,
     explained_variance,
     kl_k1,
     kl_k3,
     means,
     merge_moments,
+    moments,
     ratio_statistics,
     standardize,
 )
@@ -23,14 +22,12 @@ from lemniscate.maths.targets import polyak, td_target
 from lemniscate.maths.trust_region import backtrack, conjugate_gradient, fisher_product, natural_step
 
 __all__ = [
-    "ONE_SHARD",
     "Bernoulli",
     "Categorical",
     "Deterministic",
     "Distribution",
     "Gaussian",
     "MultiCategorical",
-    "Shards",
     "SquashedGaussian",
     "backtrack",
     "clip_fraction",
@@ -47,8 +44,8 @@ __all__ = [
     "kl_k3",
     "means",
     "merge_moments",
+    "moments",
     "natural_step",
-    "normal",
     "ornstein_uhlenbeck",
     "policy_gradient",
     "polyak",

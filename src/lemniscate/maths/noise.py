@@ -1,11 +1,10 @@
 """Noise correlated in time: pure functions of standard normal numbers."""
 
 import math
-from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float
-from torch import Generator, Tensor
+from torch import Tensor
 
 
 def ornstein_uhlenbeck(normal: Float[Tensor, "*S L"], time: float) -> Float[Tensor, "*S L"]:
@@ -61,10 +60,3 @@ def coloured(normal: Float[Tensor, "*S L"], exponent: float) -> Float[Tensor, "*
 def uniform(normal: Float[Tensor, "*S"]) -> Float[Tensor, "*S"]:
     """2 Φ(x) − 1: standard normal numbers become uniform ones in [-1, 1], and those that went together still do."""
     return torch.erf(normal / math.sqrt(2))
-
-
-def normal(shape: Sequence[int], streams: Sequence[Generator]) -> Tensor:
-    """Standard normal numbers [..., B, A], an equal part of the B rows from each stream."""
-    *leading, rows, size = shape
-    part = (*leading, rows // len(streams), size)
-    return torch.cat([torch.randn(part, generator=stream, device=stream.device) for stream in streams], dim=-2)

@@ -105,5 +105,5 @@ class SoftActorQ(ActorQ):
 
     def entropy_bonus(self, obs: Tensor, generator: Generator) -> Tensor:
         """−α log π(a|s) of an action drawn at each observation [B, O], [B]."""
-        _, log_prob = self.policy(obs).sample_with_log_prob(self.policy.draw_noise((len(obs),), (generator,)))
+        _, log_prob = self.policy(obs).sample_with_log_prob(self.policy.draw_noise((len(obs),), generator))
         return -self.temperature() * log_prob

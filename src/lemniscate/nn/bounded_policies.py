@@ -22,7 +22,7 @@ class DeterministicPolicy(Policy):
         """[B, O] to [B, A]."""
         return Deterministic(torch.tanh(self.net(self.normalizer(obs))))
 
-    def noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
+    def draw_noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
         """Zeros, [*shape, A]: the policy has no randomness of its own."""
         return torch.zeros(*shape, self.size, device=generator.device)
 
@@ -47,6 +47,6 @@ class SquashedGaussianPolicy(Policy):
         mean, log_std = self.net(self.normalizer(obs)).chunk(2, dim=-1)
         return SquashedGaussian(mean, -5 + 3.5 * (torch.tanh(log_std + self._offset) + 1))
 
-    def noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
+    def draw_noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
         """Standard normal, [*shape, A]."""
         return torch.randn(*shape, self.size, generator=generator, device=generator.device)

@@ -10,7 +10,7 @@ from typing import Self
 import torch
 from torch import Tensor, nn
 
-from lemniscate.maths import ONE_SHARD, Shards, merge_moments
+from lemniscate.maths import merge_moments, moments
 from lemniscate.types import Rollout, wide_float
 
 
@@ -53,7 +53,6 @@ class RunningNorm(WideBuffers, NoNorm):
     mean: Tensor
     var: Tensor
     count: Tensor
-    shards: Shards = ONE_SHARD
 
     def __init__(self, size: int, clip: float = 10.0) -> None:
         super().__init__(size)
@@ -71,12 +70,9 @@ class RunningNorm(WideBuffers, NoNorm):
     def update(self, obs: Tensor, valid: Tensor | None = None) -> None:
         """Merge finite observations [..., N, O or more], those of `valid` [..., N], into the statistics."""
         wide = super().forward(obs).to(self.mean.dtype)
-        mask = torch.ones(obs.shape[:-1], dtype=torch.bool, device=obs.device) if valid is None else valid
-        held = len(self.shards.held)
-        parts = zip(wide.chunk(held, -2), mask.chunk(held, -1), strict=True)
-        mean, var, count = self.shards.moments([rows[counted].T for rows, counted in parts])
-        moments = merge_moments(self.mean, self.var, self.count, mean, var, count.max())
-        for buffer, new in zip((self.mean, self.var, self.count), moments, strict=True):
+        rows = wide.flatten(0, -2) if valid is None else wide[valid]
+        merged = merge_moments(self.mean, self.var, self.count, *moments(rows.T))
+        for buffer, new in zip((self.mean, self.var, self.count), merged, strict=True):
             buffer.copy_(new)
 
 
@@ -86,10 +82,8 @@ class RewardScale(WideBuffers):
     The mean is not subtracted, which would reward surviving or dying. Before the first update rewards are unscaled.
     """
 
-    local = ("running",)
     running: Tensor
     var: Tensor
-    shards: Shards = ONE_SHARD
 
     def __init__(self, num_envs: int, gamma: float, clip: float = 10.0) -> None:
         super().__init__()
@@ -101,10 +95,6 @@ class RewardScale(WideBuffers):
     def forward(self, reward: Tensor) -> Tensor:
         """Any shape to the same shape."""
         return (reward / (self.var + 1e-8).sqrt().to(reward.dtype)).clamp(-self.clip, self.clip)
-
-    def hold(self, rows: slice) -> None:
-        """Keep only the running returns of these environments."""
-        self.running = self.running[rows].clone()
 
     def on_restart(self) -> None:
         """Forget the running episodes: the environments have been restarted."""
@@ -118,9 +108,8 @@ class RewardScale(WideBuffers):
             self.running = self.gamma * self.running + counted
             returns.append(self.running)
             self.running = self.running * ~ended
-        parts = (x.chunk(len(self.shards.held), 1) for x in (torch.stack(returns), valid))
-        moments = self.shards.moments([rows[counted] for rows, counted in zip(*parts, strict=True)])
-        self.mean, self.var, self.count = merge_moments(self.mean, self.var, self.count, *moments)
+        new = moments(torch.stack(returns)[valid])
+        self.mean, self.var, self.count = merge_moments(self.mean, self.var, self.count, *new)
 
     def scale(self, rollout: Rollout) -> Rollout:
         """The rollout [T, N] with scaled rewards, after its returns have joined the statistics."""

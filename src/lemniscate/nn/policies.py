@@ -8,7 +8,6 @@ from torch import Generator, Tensor, nn
 from lemniscate.maths import Bernoulli, Categorical, Distribution, Gaussian, MultiCategorical
 from lemniscate.nn.normalizer import NoNorm
 from lemniscate.spec import Box, Discrete, MultiDiscrete
-from lemniscate.types import Streams
 
 
 class Policy(nn.Module):
@@ -27,16 +26,8 @@ class Policy(nn.Module):
         """The distribution over actions at each observation, [B, O]."""
         raise NotImplementedError
 
-    def draw_noise(self, shape: Sequence[int], streams: Streams) -> Tensor:
-        """The random numbers that `Distribution.sample` needs for actions at observations [*shape, O].
-
-        An equal part of the last dimension of `shape` is drawn from each stream.
-        """
-        part = (*shape[:-1], shape[-1] // len(streams))
-        return torch.cat([self.noise(part, stream) for stream in streams], dim=len(part) - 1)
-
-    def noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
-        """The action noise of one generator, in this shape."""
+    def draw_noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
+        """The random numbers that `Distribution.sample` needs for actions at observations [*shape, O]."""
         raise NotImplementedError
 
     def metrics(self) -> dict[str, Tensor]:
@@ -62,7 +53,7 @@ class GaussianPolicy(Policy):
         """[B, O] to N(μ [B, A], σ [A])."""
         return Gaussian(self.net(self.normalizer(obs)), self.log_std)
 
-    def noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
+    def draw_noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
         """Standard normal, [*shape, A]."""
         return torch.randn(*shape, *self.log_std.shape, generator=generator, device=generator.device)
 
@@ -85,7 +76,7 @@ class CategoricalPolicy(Policy):
             logits = logits.masked_fill(obs[..., -self.action.n :] == 0, -1e9)
         return Categorical(logits)
 
-    def noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
+    def draw_noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
         """Uniform in [0, 1), [*shape]."""
         return torch.rand(*shape, generator=generator, device=generator.device)
 
@@ -102,7 +93,7 @@ class MultiCategoricalPolicy(Policy):
         logits = self.net(self.normalizer(obs)).split(self.action.nvec, dim=-1)
         return MultiCategorical(tuple(Categorical(part) for part in logits))
 
-    def noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
+    def draw_noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
         """Uniform in [0, 1), [*shape, K]."""
         return torch.rand(*shape, len(self.action.nvec), generator=generator, device=generator.device)
 
@@ -118,6 +109,6 @@ class BernoulliPolicy(Policy):
         """[B, O] to logits [B, n]."""
         return Bernoulli(self.net(self.normalizer(obs)))
 
-    def noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
+    def draw_noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
         """Uniform in [0, 1), [*shape, n]."""
         return torch.rand(*shape, self.n, generator=generator, device=generator.device)

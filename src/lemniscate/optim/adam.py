@@ -90,8 +90,8 @@ class Adam:
         self._rates, self._powers = self._log_betas.new_ones(2), self._log_betas.new_tensor([-1, -0.5])
         self._count = self._log_betas.new_zeros(1)
         self._norm_name = f"gradient_norm/{name}" if name else "gradient_norm"
-        self.over_shards: Any = None
-        """the gradient where there are several shards"""
+        self.over_shards: Callable[..., tuple[Tensor, Metrics]] | None = None
+        """takes the place of `gradient` where there are several shards: `optim.shards`"""
         self._inputs = list(self.module.parameters())
         for parameter, gradient in zip(self._inputs, self._parameters.views(self._gradient).values(), strict=True):
             parameter.grad = gradient
@@ -113,19 +113,16 @@ class Adam:
     def step(self, loss: LossFunction, *args: Any) -> Metrics:
         """One step down `loss(networks, *args)`; returns the metrics of the loss, and the gradient's norm.
 
-        Of several shards, each has an equal part of the rows in `args`, records and tensors [M, …]; see `optim.shards`.
+        Of several shards, each has an equal part of the rows in `args`, records and tensors [M, …].
         """
         gradient, metrics = (self.over_shards or self.gradient)(loss, *args)
         return {**metrics, self._norm_name: self.descend(gradient)}
 
-    def gradient(self, loss: LossFunction, *args: Any, vector: Tensor | None = None) -> tuple[Tensor, Metrics]:
-        """The gradient [P] of `loss(networks, *args)`, valid until the next call, and the metrics of the loss.
-
-        In a compiled call it may be that at another `vector`.
-        """
+    def gradient(self, loss: LossFunction, *args: Any) -> tuple[Tensor, Metrics]:
+        """The gradient [P] of `loss(networks, *args)`, valid until the next call, and the metrics of the loss."""
         if torch.compiler.is_compiling():
             differentiate = grad_and_value(partial(functional_call, self.module, args=(loss, *args)), has_aux=True)
-            gradients, (_, metrics) = differentiate(self.views(vector))
+            gradients, (_, metrics) = differentiate(self.views())
             return self._parameters.join(gradients), metrics
         total, metrics = self.module(loss, *args)
         self._gradient.zero_()
@@ -140,9 +137,9 @@ class Adam:
             scales = (self._rates * bias**self._powers).to(gradient)
             return self._adam(self.vector, gradient, self._mean, self._square, scales)
 
-    def views(self, vector: Tensor | None = None) -> dict[str, Tensor]:
-        """The parameters of `module` by name, views of the vector as it is now, or of another one."""
-        return self._parameters.views(self.vector if vector is None else vector)
+    def views(self) -> dict[str, Tensor]:
+        """The parameters of `module` by name, views of the vector as it is now."""
+        return self._parameters.views(self.vector)
 
     def state_dict(self) -> dict[str, Tensor]:
         """Adam's two moments and its count; the parameters belong to the networks."""

@@ -1,41 +1,57 @@
-"""Methods of tensors, each compiled into one call."""
+"""Compiled calls: methods of tensors, and the gradient steps of an algorithm's `learn`."""
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from threading import Event
 from types import FunctionType, MethodType
 from typing import Any, Generic, ParamSpec, TypeVar
 
 import torch
+from torch import Tensor, nn
+from torch.func import functional_call
+
+from lemniscate.maths import means
+from lemniscate.optim.adam import Adam
+from lemniscate.types import Metrics
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
 
-stopping = Event()
-"""set while a run that was asked to stop ends its update: nothing more is compiled, and a compiler that Ctrl-C has
-reached, too, has not failed"""
+class Compiler:
+    """What a run and its compiled programs tell each other.
 
+    Args:
+        busy: entered while a program is compiled, so that the other processes of a run know.
+    """
 
-around: Callable[[], AbstractContextManager[None]] = nullcontext
-"""entered while a program is compiled; several processes of a run let each other know"""
+    def __init__(self, busy: Callable[[], AbstractContextManager[None]] = nullcontext) -> None:
+        self.busy, self.stopping = busy, Event()
+        """set while a run that was asked to stop ends its update: nothing more is compiled, and a compiler that Ctrl-C
+        has reached, too, has not failed"""
 
 
 class Compiled(Generic[P, R]):
     """A method, compiled at its first call; every later call must have arguments of the same shapes.
 
     Nothing is checked at a call: for small networks the checks would cost as much as the work. Where `torch.compile`
-    fails, a sentence says so (unless the run is `stopping`) and `fallback` is called instead.
+    fails, a sentence says so (unless the run is stopping) and `fallback` is called instead.
     """
 
-    def __init__(self, method: Callable[P, R], device: torch.device, fallback: Callable[P, R] | None = None) -> None:
+    def __init__(
+        self,
+        method: Callable[P, R],
+        device: torch.device,
+        compiler: Compiler,
+        fallback: Callable[P, R] | None = None,
+    ) -> None:
         options: dict[str, Any] = {"guard_filter_fn": torch.compiler.skip_all_guards_unsafe}
         options["deterministic"] = torch.are_deterministic_algorithms_enabled()
         if device.type == "cpu":
             options["cpp_wrapper"] = True
         self._compiled = torch.compile(_with_own_code(method), fullgraph=True, dynamic=False, options=options)
-        self._fallback = fallback or method
+        self._compiler, self._fallback = compiler, fallback or method
         self._chosen: Callable[P, R] | None = None
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
@@ -43,13 +59,13 @@ class Compiled(Generic[P, R]):
         return self._chosen(*args, **kwargs) if self._chosen else self._first_call(*args, **kwargs)
 
     def _first_call(self, *args: P.args, **kwargs: P.kwargs) -> R:
-        if not stopping.is_set():
+        if not self._compiler.stopping.is_set():
             self._chosen = self._compiled
             try:
-                with around():
+                with self._compiler.busy():
                     return self._compiled(*args, **kwargs)
             except RuntimeError as error:
-                if not stopping.is_set():
+                if not self._compiler.stopping.is_set():
                     reason = str(error).strip().partition("\n")[0]
                     print(f"torch.compile failed ({reason}); continuing without compilation.", file=sys.stderr)
         self._chosen = self._fallback
@@ -68,3 +84,68 @@ def _with_own_code(method: Callable[P, R]) -> Callable[P, R]:
     copied = FunctionType(code, names, function.__name__, function.__defaults__, function.__closure__)
     copied.__kwdefaults__ = function.__kwdefaults__
     return MethodType(copied, method.__self__)
+
+
+Learn = Callable[..., list[Metrics]]
+"""learn(config, state, data, *by_step, **flags) -> the metrics of each gradient step
+
+data: a record of tensors [B, …]; by_step: tensors [K, …], row k of which is for gradient step k; flags: constants, of
+which a tuple has a value for each step.
+"""
+
+STEPS_PER_CALL = 4
+"""gradient steps in one compiled call, where K is divisible by it; more are hardly faster, and compile longer"""
+
+
+class Learner:
+    """`learn` as compiled calls of up to four gradient steps each.
+
+    Between the steps of one call, `learn` may gather rows and move target networks as well. Every call must have the
+    same shapes. Each combination of flags is a program of its own.
+
+    Args:
+        learn: the function to compile. It may change the tensors of `state`, and nothing else of it.
+        optimizers: all optimizers that it steps.
+        compiler: of the run.
+    """
+
+    def __init__(self, learn: Learn, optimizers: Sequence[Adam], compiler: Compiler) -> None:
+        self._learn, self._optimizers, self._compiler = learn, optimizers, compiler
+        self._module = _LearnModule(learn, [optimizer.module for optimizer in optimizers])
+        self._programs: dict[Any, Compiled[..., Metrics]] = {}
+
+    def __call__(self, config: Any, state: Any, data: Any, *by_step: Tensor, **flags: Any) -> list[Metrics]:
+        """The metrics of `learn`, averaged over the gradient steps of each compiled call."""
+        size = next(n for n in range(STEPS_PER_CALL, 0, -1) if len(by_step[0]) % n == 0)
+        metrics = []
+        for i, chunk in enumerate(zip(*(tensor.split(size) for tensor in by_step), strict=True)):
+            part = slice(size * i, size * (i + 1))
+            here = {name: flag[part] if isinstance(flag, tuple) else flag for name, flag in flags.items()}
+            key = tuple(here.values())
+            if key not in self._programs:
+                device = self._optimizers[0].vector.device
+                self._programs[key] = Compiled(self._functional, device, self._compiler, fallback=self._eager)
+            metrics.append(self._programs[key](config, state, data, *chunk, **here))
+        return metrics
+
+    def _eager(self, *args: Any, **flags: Any) -> Metrics:
+        return means(self._learn(*args, **flags))
+
+    def _functional(self, *args: Any, **flags: Any) -> Metrics:
+        """`learn`, while every network that an optimizer moves is made of views of that optimizer's vector."""
+        owned = enumerate(optimizer.views() for optimizer in self._optimizers)
+        views = {f"modules_of.{i}.{name}": view for i, parameters in owned for name, view in parameters.items()}
+        with torch.no_grad():  # of networks that only take part in a loss; `grad_and_value` differentiates all the same
+            return means(functional_call(self._module, views, args, flags))
+
+
+class _LearnModule(nn.Module):
+    """`learn` as a module, so that `functional_call` can replace the parameters of all networks at once."""
+
+    def __init__(self, learn: Learn, modules: list[nn.Module]) -> None:
+        super().__init__()
+        self.modules_of = nn.ModuleList(modules)
+        self._learn = learn
+
+    def forward(self, *args: Any, **flags: Any) -> list[Metrics]:
+        return self._learn(*args, **flags)

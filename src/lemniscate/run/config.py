@@ -161,7 +161,7 @@ class RunConfig:
     threads: Annotated[int, Range(1, 256)] = 1
     """CPU threads for torch; results differ in rounding between thread counts"""
     shards: Annotated[int, Range(1, 4096)] = 1
-    """equal parts of the environments and of minibatches, S, which processes share"""
+    """equal parts of the environments and of minibatches, S, whose work processes share"""
     compile: Literal["auto", "on", "off"] = "auto"
     """compile the gradient steps and the policy; auto compiles long runs, where it saves time"""
     checkpoint_every: Natural = 0
@@ -205,7 +205,7 @@ class RunConfig:
 
     def generators(self, device: torch.device) -> Generators:
         """New random generators, seeded by the run's seed."""
-        return Generators(self.seed, device, self.shards)
+        return Generators(self.seed, device)
 
     def networks(self, spec: Spec) -> Any:
         """New networks for the spaces in `spec`, a module with a `policy`. Raises `UserError` if they do not fit."""

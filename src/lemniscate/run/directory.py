@@ -193,7 +193,7 @@ class Saver:
         # An unplanned checkpoint is kept beside the planned ones, never in the place of one.
         keep = self._config.keep_checkpoints + (not planned)
         self.failure = None
-        fields = state.whole()
+        fields = state.saved()
         if planned:
             self.planned_at = state.step
         if not self._world.is_first:

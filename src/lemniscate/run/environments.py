@@ -8,7 +8,6 @@ import torch
 from lemniscate.envs import registry
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError, shown
-from lemniscate.maths import Shards
 from lemniscate.nn.networks import NETWORKS
 from lemniscate.run.config import RunConfig
 from lemniscate.spec import Spec
@@ -34,7 +33,7 @@ def make_envs(config: RunConfig) -> tuple[VecEnv, VecEnv]:
     eval_env = evaluation_env(config, config.evaluate_episodes, device=str(device))  # the few, before the many
     try:
         require_memory(config, eval_env.spec, device)
-        return training_env(config, Shards(config.shards)), eval_env
+        return training_env(config, World(config.shards)), eval_env
     except BaseException:
         eval_env.close()
         raise
@@ -47,12 +46,11 @@ def envs_of(config: RunConfig, world: World) -> tuple[VecEnv, VecEnv | None]:
     return training_env(config, world), eval_env
 
 
-def training_env(config: RunConfig, shards: Shards) -> VecEnv:
-    """The environments of the shards held, staggered."""
-    num_envs = config.num_envs * len(shards.held) // shards.count
+def training_env(config: RunConfig, world: World) -> VecEnv:
+    """The environments of training, staggered, shared by the processes of a world."""
     own = {"kwargs": config.env_kwargs, "wrappers": config.wrappers, "backend": config.backend}
     device = str(device_for(config.device))
-    return registry.make(config.env, num_envs, device=device, stagger=True, shards=shards, **own)
+    return registry.make(config.env, config.num_envs, device=device, stagger=True, world=world, **own)
 
 
 def evaluation_env(

@@ -97,7 +97,7 @@ def _act(policy: Policy | Baseline | None, deterministic: bool, env: VecEnv, rng
     distribution = policy(env.obs)
     if deterministic or not isinstance(policy, Policy):
         return distribution.mode()
-    return distribution.sample(policy.draw_noise((env.num_envs,), (rng,)))
+    return distribution.sample(policy.draw_noise((env.num_envs,), rng))
 
 
 def evaluate(

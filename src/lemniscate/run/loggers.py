@@ -9,7 +9,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
 
-from lemniscate.envs.episodes import Episodes
+from lemniscate.envs.vec_env import Episodes
 from lemniscate.run.metrics import METRICS, read_metrics, to_line
 from lemniscate.system.console import say
 from lemniscate.system.files import replace_file

@@ -5,13 +5,12 @@ from typing import Any
 
 import torch
 
-from lemniscate.data.action_noise import ActionNoise, Kind
-from lemniscate.data.replay import ReplayBuffer, bytes_per_transition
+from lemniscate.data.replay import ActionNoise, Kind, ReplayBuffer, bytes_per_transition
 from lemniscate.errors import UserError
 from lemniscate.nn.activations import Activation
 from lemniscate.nn.networks import Layers, Matmul
 from lemniscate.run.config import Count, Fraction, Natural, NonNegative, NumEnvs, Positive, RunConfig, Width
-from lemniscate.run.state import Networks, TrainState, rows_of
+from lemniscate.run.state import Networks, TrainState
 from lemniscate.spec import Spec
 
 
@@ -116,9 +115,8 @@ class OffPolicyConfig(RunConfig):
 
     @property
     def capacity(self) -> int:
-        """The rows of the replay buffer: no more than the run can fill, and as many for each shard."""
-        rows = min(self.buffer_size, self.num_envs * self.steps_per_env)
-        return rows // self.shards * self.shards
+        """The rows of the replay buffer: no more than the run can fill."""
+        return min(self.buffer_size, self.num_envs * self.steps_per_env)
 
     @property
     def steps_per_env(self) -> int:
@@ -132,8 +130,8 @@ class OffPolicyConfig(RunConfig):
         return self.num_updates * (updates - self.learning_starts // self.num_envs // self.update_every)
 
     def make_replay(self, spec: Spec, device: torch.device) -> ReplayBuffer:
-        """An empty replay buffer, with an equal part for each shard."""
-        return ReplayBuffer(spec, self.capacity, device, self.shards)
+        """An empty replay buffer."""
+        return ReplayBuffer(spec, self.capacity, device)
 
     def make_action_noise(self, spec: Spec, device: torch.device) -> ActionNoise:
         """Action noise for the environments of a run; a sequence is as long as an episode may be."""
@@ -155,12 +153,6 @@ class OffPolicyState(TrainState[Networks]):
     action_noise: ActionNoise
     updates: int = 0
     """gradient steps of the critics taken"""
-
-    def hold(self, held: range) -> None:
-        """Keep the generators, the replay buffers and the action noise of these shards."""
-        super().hold(held)
-        self.replay.hold(held)
-        self.action_noise.hold(rows_of(held, self.shards.count, self.action_noise.num_envs))
 
     def on_restart(self) -> None:
         """Begin new sequences of action noise."""

@@ -9,23 +9,19 @@ At a planned checkpoint the environments restart from a seed derived from (run s
 one that is resumed. So both end in the same bits, whatever the simulator.
 """
 
-import os
-import signal
-import threading
+import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType
-from typing import TypeVar
+from socket import gethostname
+from typing import Any, TypeVar
+from zlib import crc32
 
 import torch
 
-from lemniscate.envs.episodes import Episodes
-from lemniscate.envs.vec_env import VecEnv
-from lemniscate.errors import NonFiniteError, NotStoredError, UserError, resume_line
-from lemniscate.optim import compiled
-from lemniscate.run.agreement import episodes_of_all
+from lemniscate.envs.vec_env import Episodes, VecEnv
+from lemniscate.errors import NonFiniteError, NotStoredError, RankError, UserError, resume_line
+from lemniscate.optim.compiled import Compiler
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import Saver
 from lemniscate.run.evaluate import evaluate
@@ -34,18 +30,13 @@ from lemniscate.run.metrics import read_metrics
 from lemniscate.run.q_bias import critic_of
 from lemniscate.run.seeding import derive, globals_undisturbed, seed_globals
 from lemniscate.run.state import TrainState
+from lemniscate.run.stopping import Stopped, StopRequest
 from lemniscate.run.warm_start import load_networks
 from lemniscate.system.console import ProgressBar, say
 from lemniscate.system.world import World
 
 WORTH_COMPILING = 15_000
 """gradient steps from which on a run ends sooner if they are compiled"""
-
-PATIENCE = 1.0
-"""seconds that an update has to end by itself after a signal, then to be interrupted"""
-
-PATIENCE_OF_SEVERAL = 6.0
-"""the same where several processes have to agree first"""
 
 AGREED_EVERY = 16
 """steps of the environments after which several processes ask each other whether one is to stop"""
@@ -56,14 +47,6 @@ TRAINING = 0
 S = TypeVar("S", bound=TrainState)
 Observer = Callable[[int, Mapping[str, float], TrainState], bool]
 """(step, metrics, state) of a logged line, to whether the run is to stop; it leaves the state as it is"""
-
-
-class Stopped(KeyboardInterrupt):
-    """The run was asked to stop (Ctrl-C, SIGTERM), and has saved itself."""
-
-    def __init__(self, message: str, signum: int) -> None:
-        super().__init__(message)
-        self.signum = signum
 
 
 class Run:
@@ -92,6 +75,8 @@ class Run:
         self._logger_classes, self._loggers = loggers if world.is_first else (), list[Logger]()
         self._visible, self._film, self._observer = progress, film, observer
         self._bar = ProgressBar(config.total_steps, 0, visible=False)
+        self._compiler = Compiler(world.busy)
+        self._stop = StopRequest(world.size > 1, self._how_to_go_on, self._compiler.stopping)
         self._recent_returns: list[float] = []
         self._unobserved: list[tuple[int, dict[str, float]]] = []
         """logged lines that callbacks have not seen"""
@@ -99,13 +84,8 @@ class Run:
         """whole training episodes so far"""
         self._logged = 0
         """the step of the last line of metrics"""
-        self._stop_signal, self._asked_at = 0, 0.0
         self._cut_short = False
         """whether the body of the loop took fewer steps than it was to: its state is nobody's to resume from"""
-        self._patience = PATIENCE if world.size == 1 else PATIENCE_OF_SEVERAL
-        self._hurry, self._ended = threading.Timer(self._patience, self._ask_again), threading.Event()
-        self._hurry.daemon = True
-        """asks again to stop; whether the loop has ended"""
         self._line_time, self._line_step = 0.0, 0
         """when the last line was logged, and at which step"""
         self._body_time, self._body_began = 0.0, 0.0
@@ -126,12 +106,10 @@ class Run:
             if saver.exists:
                 self._begin_warm(state)
             saver.save(state, planned=True, logged=0)
-        state.join(self.world)
-        if is_compiled(self.config):
-            if self._visible:
-                say("Compiling: up to a minute the first time, 5 to 10 s from then on.")
-            compiled.around = self.world.busy
-            state.compile()
+        compiled = is_compiled(self.config)
+        if compiled and self._visible:
+            say("Compiling: up to a minute the first time, 5 to 10 s from then on.")
+        state.prepare(self.world, self._compiler if compiled else None)
         record = {"algorithm": self.algorithm, **self.config.to_json()}
         self._loggers += [make(self.path, record, state.step) for make in self._logger_classes]
         lines = read_metrics(self.path) if self.world.is_first else []
@@ -149,7 +127,7 @@ class Run:
         started = time.monotonic()
         self._line_time, self._line_step = started, state.step
         try:
-            with stop_signals_to(self._stop):
+            with self._stop.heard():
                 self.world.begin(lambda: self.env.steps)
                 if state.step == 0 and (self.config.video_every or self.config.video_every_episodes):
                     self._record(state)
@@ -162,17 +140,13 @@ class Run:
                     self._body_time += time.monotonic() - self._body_began
                     going_on = self._between(state, before, episodes_before, total_steps)
         finally:
-            self._ended.set()
-            self._hurry.cancel()
-            compiled.stopping.clear()
             self.seconds = time.monotonic() - started
             self._bar.close()
 
     def steps(self, count: int) -> Iterator[int]:
         """The numbers below `count`, for a body of the loop that takes many steps; asked to stop, it takes fewer."""
         for number in range(count):
-            if number % AGREED_EVERY == 0 or self.world.size == 1:
-                self._cut_short = any(self.world.each(bool(self._stop_signal)))
+            self._cut_short = self._cut_short or self._is_asked_to_stop(number)
             if self._cut_short:
                 return
             yield number
@@ -184,12 +158,9 @@ class Run:
             NonFiniteError: a loss, the gradient or a parameter is NaN or infinite; the last checkpoint is untouched.
         """
         numbers = {name: float(value) for name, value in metrics.items()}
-        for name, value in numbers.items():
-            if name.startswith(("losses/", "gradient")) and not -float("inf") < value < float("inf"):
-                raise NonFiniteError(f"{name} is {value} in the update that ends at step {state.step:,}.")
-        state.require_finite()
+        require_finite(state, numbers)
         if self.world.size > 1:
-            episodes = episodes_of_all(self.world, state, episodes)
+            require_agreement(self.world, state)
         if episodes.returns:
             self._episodes += len(episodes.returns)
             self._recent_returns = (self._recent_returns + episodes.returns)[-100:]
@@ -209,7 +180,7 @@ class Run:
 
     def close(self, pictures: list[Path] | None = None) -> None:
         """Close the loggers and the environments, and unlock the directory."""
-        self._ended.set()
+        self._stop.end()
         for logger in self._loggers:
             logger.close(pictures or [])
         for env in (self.env, self.eval_env):
@@ -228,60 +199,83 @@ class Run:
 
     def _between(self, state: TrainState, before: int, episodes_before: int, total_steps: int) -> bool:
         """Do what is due after an update; returns whether the run goes on."""
-        whole = not self._cut_short  # else it evaluates, films and plans what the next process will do
-        if whole and _passed(self.config.evaluate_every, before, state.step):
+        if self._cut_short:  # evaluations, films and the planned checkpoint are left to the process that goes on
+            return not self._stopped(state, planned=False, finished=False)
+        config = self.config
+        if _passed(config.evaluate_every, before, state.step):
             self._evaluate(state)
-        by_episodes = _passed(self.config.video_every_episodes, episodes_before, self._episodes)
-        if whole and (by_episodes or _passed(self.config.video_every, before, state.step)):
+        by_episodes = _passed(config.video_every_episodes, episodes_before, self._episodes)
+        if by_episodes or _passed(config.video_every, before, state.step):
             self._record(state)
-        finished = whole and state.step >= total_steps
-        planned = finished or (whole and _passed(self._checkpoint_interval(), before, state.step))
+        finished = state.step >= total_steps
+        planned = finished or _passed(self._checkpoint_interval(), before, state.step)
         if planned:
             with self.world.busy():
                 self._saver.save(state, planned=True, logged=self._logged)
             self.world.saved(self.path)
-        stop, signum = self._asked_to_stop(state, planned)
-        if stop and not finished:
-            self._tell_stop(state.step, signum)
-        elif planned and not finished:
+        if self._stopped(state, planned, finished) or finished:
+            return False
+        if planned:
             self._restart(state)
-        return not (stop or finished)
+        return True
 
-    def _asked_to_stop(self, state: TrainState, saved: bool) -> tuple[bool, int]:
-        """Whether the run stops, and by which signal, or 0. The state is saved then, and where a callback fails."""
-        lines, self._unobserved = self._unobserved, []
+    def _stopped(self, state: TrainState, planned: bool, finished: bool) -> bool:
+        """Whether a callback or a signal stops the run here. The state is saved then, and where a callback fails.
+
+        Raises:
+            Stopped: by a signal.
+        """
         stop, signum = True, 0
         try:
-            with globals_undisturbed():
-                answers = [self._observer(step, numbers, state) for step, numbers in lines] if self._observer else []
-            said = self.world.each((any(answers), self._stop_signal))  # a signal from here on counts at the next update
+            asked = self._ask_callbacks(state)
+            said = self._everyone((asked, self._stop.signum))  # a signal from here on counts at the next update
             signum = max(signum for _, signum in said)
             stop = any(asked for asked, _ in said) or bool(signum)
         finally:
             if stop:
-                self._hurry.cancel()  # the update has ended; the disk may take its time
-            if stop and not saved and state.step > self._saver.planned_at:
+                self._stop.settle()
+            if stop and not planned and state.step > self._saver.planned_at:
                 self._saver.save(state, planned=False, logged=self._logged)
-        return stop, signum
+        if stop and not finished:
+            self._tell_stop(state.step, signum)
+        return stop
+
+    def _ask_callbacks(self, state: TrainState) -> bool:
+        """Show the callbacks the lines that they have not seen; returns whether one of them stops the run."""
+        lines, self._unobserved = self._unobserved, []
+        if not self._observer:
+            return False
+        with globals_undisturbed():
+            return any([self._observer(step, numbers, state) for step, numbers in lines])
+
+    def _everyone(self, mine: Any) -> list[Any]:
+        """What each process says, in the order of their ranks."""
+        return [mine] if self.world.size == 1 else self.world.each(mine)
+
+    def _is_asked_to_stop(self, number: int) -> bool:
+        """Whether a signal has come; several processes agree on that now and then."""
+        if self.world.size == 1:
+            return self._stop.signum > 0
+        return number % AGREED_EVERY == 0 and any(self.world.each(self._stop.signum > 0))
 
     def _tell_stop(self, step: int, signum: int) -> None:
         saved = "not saved" if self._saver.failure else "saved"
         by = "" if signum else "by a callback "
-        message = (
-            f"Stopped {by}at step {step:,}; the policy is {saved}. Go on with: {resume_line(self.path)}\n"
-            f"It resumes at step {self._saver.last_planned:,}, the last planned checkpoint, and ends in the same bits"
-            " as a run that was never stopped."
-        )
+        here = f"Stopped {by}at step {step:,}; the policy is {saved}."
+        message = f"{here} {self._how_to_go_on()[:-1]}, and ends in the same bits as a run that was never stopped."
         if signum:
             raise Stopped(message if self.world.is_first else "", signum)
         if self.world.is_first:
             say(message)
 
+    def _how_to_go_on(self) -> str:
+        planned = f"It resumes at step {self._saver.last_planned:,}, the last planned checkpoint."
+        return f"Go on with: {resume_line(self.path)}\n{planned}"
+
     def _restart(self, state: TrainState) -> None:
-        seed, shards = derive(self.config.seed, TRAINING, state.step), state.shards
+        seed = derive(self.config.seed, TRAINING, state.step)
         seed_globals(seed)  # nothing here draws from them, but a user's environment may
-        seeds = [derive(seed, shard) for shard in shards.held] if shards.count > 1 else [seed]
-        self.env.restart(*seeds, steps=state.step)
+        self.env.restart(seed, state.step)
         state.on_restart()
 
     def _begin_warm(self, state: TrainState) -> None:
@@ -327,27 +321,37 @@ class Run:
         self._logged = step
         self._unobserved.append((step, numbers))
 
-    def _stop(self, signum: int, _frame: FrameType | None) -> None:
-        """Stop after the current update; asked again, or if that takes longer than `PATIENCE`, at once."""
-        if self._stop_signal and self.world.size > 1 and time.monotonic() - self._asked_at < self._patience - 1:
-            return  # a launcher sends on what each process has been sent
-        if self._stop_signal:
-            self._hurry.cancel()
-            raise Stopped(
-                f"Stopped in the middle of an update, which is not saved. Go on with: {resume_line(self.path)}\n"
-                f"It resumes at step {self._saver.last_planned:,}, the last planned checkpoint.",
-                self._stop_signal,
-            )
-        self._stop_signal, self._asked_at = signum, time.monotonic()
-        compiled.stopping.set()
-        self._hurry.start()
 
-    def _ask_again(self) -> None:
-        """In a thread: send the signal again; where even that is not heard, end the process."""
-        signal.pthread_kill(threading.main_thread().ident or 0, self._stop_signal)
-        if not self._ended.wait(self._patience):
-            say(f"Stopped; the update did not let itself be interrupted. Go on with: {resume_line(self.path)}")
-            os._exit(128 + self._stop_signal)
+def require_finite(state: TrainState, numbers: Mapping[str, float]) -> None:
+    """Raise `NonFiniteError` where a loss, the gradient or a parameter is NaN or infinite."""
+    for name, value in numbers.items():
+        if name.startswith(("losses/", "gradient")) and not math.isfinite(value):
+            raise NonFiniteError(f"{name} is {value} in the update that ends at step {state.step:,}.")
+    vectors = [value.vector for value in vars(state).values() if hasattr(value, "vector")]
+    if math.isfinite(sum(vector.sum().item() for vector in vectors)):  # a NaN shows in the sum
+        return
+    for name, values in state.networks.named_parameters():
+        bad = values[~values.isfinite()]
+        if len(bad):
+            said = f"The parameter {name} is {bad[0].item()} after the update"
+            raise NonFiniteError(f"{said} that ends at step {state.step:,}.")
+
+
+def require_agreement(world: World, state: TrainState) -> None:
+    """Raise `RankError` where the networks of a process are not those of the first."""
+    said = world.each((fingerprint(state), gethostname()))
+    for rank, (theirs, host) in enumerate(said):
+        if theirs != said[0][0]:
+            sentence = f"The networks of rank {rank} on {host} differ from those of rank 0 on {said[0][1]}"
+            raise RankError(f"{sentence} after the update that ends at step {state.step:,}." if world.is_first else "")
+
+
+def fingerprint(state: TrainState) -> int:
+    """A checksum of the networks, the same in every process of a run."""
+    checksum = 0
+    for values in state.networks.state_dict().values():
+        checksum = crc32(values.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy(), checksum)
+    return checksum
 
 
 def is_compiled(config: RunConfig) -> bool:
@@ -358,21 +362,3 @@ def is_compiled(config: RunConfig) -> bool:
 def _passed(every: int, before: int, after: int) -> bool:
     """Whether a multiple of `every` lies after `before` and not after `after`; 0 stands for never."""
     return every > 0 and after // every > before // every
-
-
-@contextmanager
-def stop_signals_to(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
-    """Inside, `handler` receives Ctrl-C, SIGTERM, and the end of the terminal unless nohup has it ignored.
-
-    Off the main thread, where no handler can be, they are left alone.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    hang_up = [signal.SIGHUP] if signal.getsignal(signal.SIGHUP) is signal.SIG_DFL else []
-    previous = {signum: signal.signal(signum, handler) for signum in (signal.SIGINT, signal.SIGTERM, *hang_up)}
-    try:
-        yield
-    finally:
-        for signum, handler_before in previous.items():
-            signal.signal(signum, handler_before)

@@ -10,7 +10,6 @@ import torch
 import torch.utils.deterministic as deterministic_mode
 
 from lemniscate.errors import UserError, shown
-from lemniscate.types import Streams
 
 
 def set_seeds(seed: int, deterministic: bool = True) -> None:
@@ -75,31 +74,19 @@ def generator(seed: int, device: torch.device, *path: int) -> torch.Generator:
 
 
 class Generators:
-    """The random generators of a run, each with its own stream of the run's seed, for each shard."""
+    """The random generators of a run, each with a stream of its own of the run's seed; the same in every process."""
 
-    local = ("action", "minibatch")
-
-    def __init__(self, seed: int, device: torch.device, shards: int = 1) -> None:
-        self.action = self._streams(seed, device, shards, 2)
+    def __init__(self, seed: int, device: torch.device) -> None:
+        self.action = generator(seed, device, 2)
         """of the policy's actions, and of the noise in losses"""
-        self.minibatch = self._streams(seed, device, shards, 3)
+        self.minibatch = generator(seed, device, 3)
         """of the rows of minibatches"""
 
-    def _streams(self, seed: int, device: torch.device, shards: int, number: int) -> Streams:
-        paths = [(number,)] if shards == 1 else [(number, shard) for shard in range(shards)]
-        return tuple(generator(seed, device, *path) for path in paths)
-
-    def hold(self, held: range) -> None:
-        """Keep only those of these shards."""
-        for name, streams in vars(self).items():
-            setattr(self, name, streams[held.start : held.stop])
-
     def state_dict(self) -> dict[str, torch.Tensor]:
-        """The states of each generator, a row for each shard."""
-        return {name: torch.stack([stream.get_state() for stream in streams]) for name, streams in vars(self).items()}
+        """The state of each generator."""
+        return {name: stream.get_state() for name, stream in vars(self).items()}
 
     def load_state_dict(self, states: Mapping[str, torch.Tensor]) -> None:
         """Restore what `state_dict` returned."""
-        for name, streams in vars(self).items():
-            for stream, state in zip(streams, states[name], strict=True):
-                stream.set_state(state.clone())  # it takes no part of a larger tensor
+        for name, stream in vars(self).items():
+            stream.set_state(states[name])

@@ -6,7 +6,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from lemniscate.envs.episodes import Episodes
+from lemniscate.envs.vec_env import Episodes
 from lemniscate.run.loggers import NO_EPISODES, Metrics
 from lemniscate.system.console import say
 from lemniscate.system.files import open_regular, replace_file

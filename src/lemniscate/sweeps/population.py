@@ -21,8 +21,8 @@ from lemniscate.errors import SweepError, resume_line
 from lemniscate.report import tuning as pictures
 from lemniscate.run.directory import CONFIG, LOCK
 from lemniscate.run.places import LOG, failure_of
-from lemniscate.run.run import Stopped, stop_signals_to
 from lemniscate.run.seeding import derive
+from lemniscate.run.stopping import Stopped, stop_signals_to
 from lemniscate.run.sweep_file import Sweep, is_sweep
 from lemniscate.sweeps.space import sample, vary
 from lemniscate.sweeps.study import PRESET, TENTHS, Search, Tuned, as_text, final_score, has_come, score_at

@@ -27,7 +27,7 @@ from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import is_finished
 from lemniscate.run.environments import device_for, require_memory
 from lemniscate.run.places import LOG, Processes, failure_of
-from lemniscate.run.run import Stopped, stop_signals_to
+from lemniscate.run.stopping import Stopped, stop_signals_to
 from lemniscate.run.sweep_file import Sweep, read_sweep
 from lemniscate.run.warm_start import load_networks
 from lemniscate.sweeps.sweep_progress import SweepProgress, progress_of

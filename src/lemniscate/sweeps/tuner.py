@@ -22,7 +22,7 @@ from lemniscate.errors import SweepError, UserError, resume_line, shown
 from lemniscate.presets.stored import StoredPreset
 from lemniscate.report import tuning as pictures
 from lemniscate.run.places import LOG, failure_of
-from lemniscate.run.run import Stopped, stop_signals_to
+from lemniscate.run.stopping import Stopped, stop_signals_to
 from lemniscate.run.sweep_file import Sweep, is_sweep
 from lemniscate.sweeps.population import Population
 from lemniscate.sweeps.space import draw, read_space, read_texts

@@ -4,7 +4,7 @@ import os
 import pickle
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from datetime import timedelta
 from typing import Any
@@ -45,7 +45,7 @@ class Processes(World):
         self._memory = self._shared_memory()
 
     def gather(self, mine: Tensor) -> Tensor:
-        """The values of all shards, [S, …], from those held here, [held, …]; also [N, …] from rows of shards."""
+        """The rows of all processes in the order of their ranks, [W · n, …], from [n, …] of each."""
         with self._together():
             if self._memory and self._memory.holds(mine):
                 return self._memory.gather(mine)
@@ -53,16 +53,12 @@ class Processes(World):
             dist.all_gather(parts, mine.contiguous())
             return torch.cat(parts)
 
-    def to_first(self, mine: Tensor) -> Tensor:
-        """The same for rank 0; the others get their own. Zeros fill up second dimensions that are shorter."""
-        lengths = self.each(mine.shape[1]) if mine.ndim > 1 else [0]
-        if mine.ndim > 1 and mine.shape[1] < max(lengths):
-            missing = mine.new_zeros(len(mine), max(lengths) - mine.shape[1], *mine.shape[2:])
-            mine = torch.cat([mine, missing], dim=1)
-        parts = [torch.empty_like(mine, memory_format=torch.contiguous_format) for _ in range(self.size)]
-        with self._together():
-            dist.gather(mine.contiguous(), parts if self.is_first else None)
-        return torch.cat(parts) if self.is_first else mine
+    def gather_columns(self, columns: Sequence[Tensor]) -> list[Tensor]:
+        """`gather` for several tensors [n, …] of any types, in one message: they are sent as bytes, side by side."""
+        rows = [column.contiguous().view(len(column), -1).view(torch.uint8) for column in columns]
+        widths = [row.shape[1] for row in rows]
+        parts = zip(self.gather(torch.cat(rows, dim=1)).split(widths, dim=1), columns, strict=True)
+        return [part.contiguous().view(c.dtype).view(-1, *c.shape[1:]) for part, c in parts]
 
     def each(self, mine: Any) -> list[Any]:
         """The objects that all processes pass, in the order of their ranks."""

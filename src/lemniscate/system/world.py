@@ -1,22 +1,24 @@
-"""The world of a run: its processes, and the shards that each of them holds. In an ordinary run there is one process.
+"""The world of a run: its processes, and the shards whose work each of them does. In an ordinary run there is one.
 
-Networks and statistics are the same in every process, a *rank*; environments, random generators and replay buffers
-belong to shards. Rank 0 writes.
+Everything that a run knows is the same in every process, a *rank*: networks, statistics, random generators, rollouts
+and replay. Only work is divided: the steps of the environments (`envs.vec_env`), estimates and gradients
+(`optim.shards`). Rank 0 writes.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
+from torch import Tensor
+
 from lemniscate.errors import UserError
-from lemniscate.maths import Shards
 
 CLUSTER = "LEMNISCATE_CLUSTER"
 """in the environment of a worker of a cluster: its kind"""
 
 
-class World(Shards):
+class World:
     """One process with all shards: nothing is sent. `lemniscate.system.processes.Processes` is a world of several.
 
     Args:
@@ -30,13 +32,22 @@ class World(Shards):
         self.divide(shards)
 
     def divide(self, shards: int) -> None:
-        """Divide every batch into so many shards. Raises `UserError` where W does not divide S."""
+        """Divide the work into so many shards. Raises `UserError` where W does not divide S."""
         size, rank = self.size, self.rank
         if shards % size:
             fits = ", ".join(str(n) for n in range(1, shards + 1) if shards % n == 0)
             raise UserError(f"{size} processes cannot share {shards} shards equally: {shards} can be shared by {fits}.")
-        super().__init__(shards)
+        self.shards = shards
         self.held = range(rank * shards // size, (rank + 1) * shards // size)
+        """the numbers of the shards that this process computes"""
+
+    def gather(self, mine: Tensor) -> Tensor:
+        """The rows of all processes in the order of their ranks, [W · n, …], from [n, …] of each."""
+        return mine
+
+    def gather_columns(self, columns: Sequence[Tensor]) -> list[Tensor]:
+        """`gather` for several tensors [n, …] of any types, in one message."""
+        return list(columns)
 
     def each(self, mine: Any) -> list[Any]:
         """The objects that all processes pass, in the order of their ranks."""
@@ -55,3 +66,7 @@ class World(Shards):
 
     def saved(self, path: Path) -> None:
         """The hook after a planned checkpoint in a run directory, called in every process."""
+
+
+ALONE = World()
+"""one process that does all of the work, undivided"""

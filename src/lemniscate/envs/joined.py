@@ -1,19 +1,15 @@
-"""Environments of several shards: a backend for each where one cannot hold several, and their actions."""
+"""Several vectors of the same environment as one: where one vector cannot be divided, each shard has its own."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from lemniscate.envs.backend import Backend, Baseline, Scene, Summary
-from lemniscate.maths import Shards
 from lemniscate.types import Step
 
-MOST_TOGETHER = 512
-"""parallel environments of all shards up to which their actions are computed in one call"""
 
-
-class BackendOfShards:
+class Joined:
     """Several backends of the same environment, stepped one after the other as if they were one."""
 
     def __init__(self, backends: Sequence[Backend]) -> None:
@@ -29,9 +25,10 @@ class BackendOfShards:
         """The counts of all parts; see `Backend.counts`."""
         return torch.cat([backend.counts for backend in self._backends])
 
-    def restart(self, *seeds: int) -> Tensor:
-        """Begin again, each backend from its seed."""
-        return torch.cat([backend.restart(seed) for backend, seed in zip(self._backends, seeds, strict=True)])
+    def restart(self, seed: int, first: int = 0) -> Tensor:
+        """Begin again; see `Backend.restart`."""
+        size = self._backends[0].num_envs
+        return torch.cat([backend.restart(seed, first + i * size) for i, backend in enumerate(self._backends)])
 
     def step(self, action: Tensor) -> Step:
         """The step of all parts; see `Backend.step`."""
@@ -54,19 +51,3 @@ def joined(steps: Sequence[Step]) -> Step:
     }
     columns = ("obs", "next_obs", "reward", "terminated", "truncated", "valid")
     return Step(**{name: torch.cat([getattr(step, name) for step in steps]) for name in columns}, measures=measures)
-
-
-def act_over_shards(act: Callable[[Tensor, Tensor], Tensor], shards: Shards, obs: Tensor, noise: Tensor) -> Tensor:
-    """`act(obs, noise)` for the rows [N, …] of the shards held, in calls of the same shapes for all processes.
-
-    All shards together are one call, in which the rows of shards that are not held are zero. Large ones are one each.
-    """
-    held, size = shards.held, len(obs) // len(shards.held)
-    if shards.count * size > MOST_TOGETHER:
-        parts = zip(obs.chunk(len(held)), noise.chunk(len(held)), strict=True)
-        return torch.cat([act(*part) for part in parts])
-    here = slice(held.start * size, held.stop * size)
-    padded = [x.new_zeros(shards.count * size, *x.shape[1:]) for x in (obs, noise)]
-    for whole, mine in zip(padded, (obs, noise), strict=True):
-        whole[here] = mine
-    return act(*padded)[here]
