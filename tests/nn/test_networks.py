@@ -5,9 +5,7 @@ import math
 import pytest
 import torch
 
-from lemniscate.nn.activations import Tanh
-from lemniscate.nn.images import ImageEncoder
-from lemniscate.nn.networks import Bfloat16Linear, Layers
+from lemniscate.nn.networks import Bfloat16Linear, ImageEncoder, Layers, Tanh
 
 
 def test_layers_are_orthogonal_with_their_gains():

@@ -2,9 +2,8 @@
 
 from torch import Tensor, nn
 
-from lemniscate.nn.images import ImageEncoder, ScaleBytes
-from lemniscate.nn.networks import Layers
-from lemniscate.nn.normalizer import NoNorm, RunningNorm, with_privileged
+from lemniscate.nn.networks import ImageEncoder, Layers
+from lemniscate.nn.normalizer import NoNorm, RunningNorm, ScaleBytes, with_privileged
 from lemniscate.nn.policies import BernoulliPolicy, CategoricalPolicy, GaussianPolicy, MultiCategoricalPolicy, Policy
 from lemniscate.spec import Action, Box, Discrete, MultiDiscrete, Spec
 

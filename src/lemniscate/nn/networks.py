@@ -1,4 +1,4 @@
-"""Hidden layers: perceptrons, residual blocks, and modules of one's own."""
+"""Networks: perceptrons, residual blocks, modules of one's own; and the encoder of images."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,8 +9,19 @@ import torch
 from torch import Tensor, nn
 
 from lemniscate.errors import UserError, unknown_name
-from lemniscate.nn.activations import ACTIVATIONS, Activation
+from lemniscate.maths import tanh
 from lemniscate.system.named import find_callable
+
+Activation = Literal["tanh", "relu", "elu", "silu"]
+
+
+class Tanh(nn.Module):
+    """`lemniscate.maths.tanh`, any shape to the same shape."""
+
+    forward = staticmethod(tanh)
+
+
+ACTIVATIONS = {"tanh": Tanh, "relu": nn.ReLU, "elu": nn.ELU, "silu": nn.SiLU}
 
 Matmul = Literal["float32", "bfloat16"]
 """of products between hidden layers; the first and the last are always in float32"""
@@ -127,3 +138,32 @@ def orthogonal(layer: nn.Linear | nn.Conv2d, gain: float) -> nn.Module:
     assert layer.bias is not None
     nn.init.zeros_(layer.bias)
     return layer
+
+
+class ImageEncoder(nn.Module):
+    """Two convolutions with ReLU, 16 and 32 channels, and layer normalization.
+
+    8 × 8 pixels in steps of 4, then 4 × 4 in steps of 2 (Mnih et al. 2013, arXiv:1312.5602, section 4.1); in images
+    with a side below 36 pixels, such as a grid world's, 3 × 3 in steps of 1, then of 2. Without the normalization a
+    policy's encoder, which learns from the advantage alone, may end with the same output for every image.
+    """
+
+    def __init__(self, shape: tuple[int, int, int]) -> None:
+        super().__init__()
+        self.shape = height, width, channels = shape
+        if min(height, width) < 36:
+            first = nn.Conv2d(channels, 16, kernel_size=3, padding=1)
+            second = nn.Conv2d(16, 32, kernel_size=3, stride=2, padding=1)
+        else:
+            first = nn.Conv2d(channels, 16, kernel_size=8, stride=4)
+            second = nn.Conv2d(16, 32, kernel_size=4, stride=2)
+        convolutions = [orthogonal(first, 2**0.5), nn.ReLU(), orthogonal(second, 2**0.5), nn.ReLU(), nn.Flatten()]
+        with torch.no_grad():
+            self.size = nn.Sequential(*convolutions)(torch.zeros(1, channels, height, width)).shape[-1]
+        """length of what comes out"""
+        self.layers = nn.Sequential(*convolutions, nn.LayerNorm(self.size))
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        """[…, H · W · C] in [-½, ½] to […, `size`]."""
+        images = pixels.reshape(-1, *self.shape).movedim(-1, 1)
+        return self.layers(images).reshape(*pixels.shape[:-1], self.size)

@@ -29,6 +29,14 @@ class NoNorm(nn.Module):
         """Nothing: there are no statistics."""
 
 
+class ScaleBytes(NoNorm):
+    """Bytes to numbers from -½ to ½."""
+
+    def forward(self, obs: Tensor) -> Tensor:
+        """[…, O or more] uint8 to […, O]."""
+        return super().forward(obs).float() / 255 - 0.5
+
+
 def with_privileged(features: Tensor, obs: Tensor, size: int, privileged: int) -> Tensor:
     """Features […, F] and, behind them, the P = `privileged` numbers after the first O = `size` of […, O + P]."""
     return torch.cat([features, obs[..., size : size + privileged]], dim=-1) if privileged else features

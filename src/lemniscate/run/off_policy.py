@@ -7,8 +7,7 @@ import torch
 
 from lemniscate.data.replay import ActionNoise, Kind, ReplayBuffer, bytes_per_transition
 from lemniscate.errors import UserError
-from lemniscate.nn.activations import Activation
-from lemniscate.nn.networks import Layers, Matmul
+from lemniscate.nn.networks import Activation, Layers, Matmul
 from lemniscate.run.config import Count, Fraction, Natural, NonNegative, NumEnvs, Positive, RunConfig, Width
 from lemniscate.run.state import Networks, TrainState
 from lemniscate.spec import Spec

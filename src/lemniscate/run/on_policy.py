@@ -5,9 +5,8 @@ from typing import Any
 
 from lemniscate.data.rollout import rollout_bytes
 from lemniscate.errors import UserError
-from lemniscate.nn.activations import Activation
 from lemniscate.nn.actor_critic import ActorCritic
-from lemniscate.nn.networks import Layers
+from lemniscate.nn.networks import Activation, Layers
 from lemniscate.run.config import Count, Fraction, LogStd, RunConfig, Width
 from lemniscate.run.state import Networks, ScaledState
 from lemniscate.spec import Spec

@@ -12,14 +12,15 @@ one that is resumed. So both end in the same bits, whatever the simulator.
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from socket import gethostname
-from typing import Any, TypeVar
+from typing import TypeVar
 from zlib import crc32
 
 import torch
 
-from lemniscate.envs.vec_env import Episodes, VecEnv
+from lemniscate.envs.vec_env import Episodes, Stopwatch, VecEnv
 from lemniscate.errors import NonFiniteError, NotStoredError, RankError, UserError, resume_line
 from lemniscate.optim.compiled import Compiler
 from lemniscate.run.config import RunConfig
@@ -80,16 +81,15 @@ class Run:
         self._recent_returns: list[float] = []
         self._unobserved: list[tuple[int, dict[str, float]]] = []
         """logged lines that callbacks have not seen"""
-        self._episodes = 0
-        """whole training episodes so far"""
+        self._episodes, self._episodes_before = 0, 0
+        """whole training episodes so far, and before the present body of the loop"""
         self._logged = 0
         """the step of the last line of metrics"""
         self._cut_short = False
         """whether the body of the loop took fewer steps than it was to: its state is nobody's to resume from"""
         self._line_time, self._line_step = 0.0, 0
         """when the last line was logged, and at which step"""
-        self._body_time, self._body_began = 0.0, 0.0
-        """seconds spent in bodies of the loop since the last line, and when the present body began"""
+        self._between_bodies = Stopwatch()
 
     def restore(self, state: S) -> S:
         """Restore `state` from the newest planned checkpoint, if there is one; then open the loggers.
@@ -134,11 +134,10 @@ class Run:
                 self._restart(state)
                 going_on = True
                 while going_on and state.step < total_steps:
-                    before, episodes_before = state.step, self._episodes
-                    self._body_began = time.monotonic()
+                    before, self._episodes_before = state.step, self._episodes
                     yield self.env
-                    self._body_time += time.monotonic() - self._body_began
-                    going_on = self._between(state, before, episodes_before, total_steps)
+                    with self._between_bodies:
+                        going_on = self._between(state, before, total_steps)
         finally:
             self.seconds = time.monotonic() - started
             self._bar.close()
@@ -190,25 +189,25 @@ class Run:
 
     def _times(self, step: int) -> dict[str, float]:
         """The speed since the last line, everything included, and the seconds of the loop's bodies by their use."""
-        now = time.monotonic()
-        collect, body = self.env.collecting.take(), self._body_time + now - self._body_began
-        speed = (step - self._line_step) / max(now - self._line_time, 1e-9)
+        now, collect = time.monotonic(), self.env.collecting.take()
+        seconds, steps = max(now - self._line_time, 1e-9), step - self._line_step
         self._line_time, self._line_step = now, step
-        self._body_time, self._body_began = 0.0, now
-        return {"time/steps_per_second": speed, "time/collect": collect, "time/learn": body - collect}
+        learn = seconds - self._between_bodies.take() - collect
+        return {"time/steps_per_second": steps / seconds, "time/collect": collect, "time/learn": learn}
 
-    def _between(self, state: TrainState, before: int, episodes_before: int, total_steps: int) -> bool:
-        """Do what is due after an update; returns whether the run goes on."""
-        if self._cut_short:  # evaluations, films and the planned checkpoint are left to the process that goes on
-            return not self._stopped(state, planned=False, finished=False)
-        config = self.config
-        if _passed(config.evaluate_every, before, state.step):
+    def _between(self, state: TrainState, before: int, total_steps: int) -> bool:
+        """Do what is due after an update; returns whether the run goes on.
+
+        What a body that was cut short would have had done, the process does that goes on from the checkpoint before.
+        """
+        config, step, whole = self.config, state.step, not self._cut_short
+        if whole and _passed(config.evaluate_every, before, step):
             self._evaluate(state)
-        by_episodes = _passed(config.video_every_episodes, episodes_before, self._episodes)
-        if by_episodes or _passed(config.video_every, before, state.step):
+        by_episodes = _passed(config.video_every_episodes, self._episodes_before, self._episodes)
+        if whole and (by_episodes or _passed(config.video_every, before, step)):
             self._record(state)
-        finished = state.step >= total_steps
-        planned = finished or _passed(self._checkpoint_interval(), before, state.step)
+        finished = whole and step >= total_steps
+        planned = finished or (whole and _passed(self._checkpoint_every, before, step))
         if planned:
             with self.world.busy():
                 self._saver.save(state, planned=True, logged=self._logged)
@@ -227,30 +226,33 @@ class Run:
         """
         stop, signum = True, 0
         try:
-            asked = self._ask_callbacks(state)
-            said = self._everyone((asked, self._stop.signum))  # a signal from here on counts at the next update
-            signum = max(signum for _, signum in said)
-            stop = any(asked for asked, _ in said) or bool(signum)
+            stop = self._ask_callbacks(state)
+            signum = self._stop.signum  # one that comes from here on counts at the next update
+            if self.world.size > 1:
+                said = self.world.each((stop, signum))
+                stop, signum = any(asked for asked, _ in said), max(each for _, each in said)
+            stop = stop or signum > 0
         finally:
             if stop:
                 self._stop.settle()
-            if stop and not planned and state.step > self._saver.planned_at:
-                self._saver.save(state, planned=False, logged=self._logged)
+                self._save_unplanned(state, planned)
         if stop and not finished:
             self._tell_stop(state.step, signum)
         return stop
 
+    def _save_unplanned(self, state: TrainState, planned: bool) -> None:
+        """Save a run that stops where no checkpoint is planned."""
+        if not planned and state.step > self._saver.planned_at:
+            self._saver.save(state, planned=False, logged=self._logged)
+
     def _ask_callbacks(self, state: TrainState) -> bool:
         """Show the callbacks the lines that they have not seen; returns whether one of them stops the run."""
-        lines, self._unobserved = self._unobserved, []
-        if not self._observer:
-            return False
-        with globals_undisturbed():
-            return any([self._observer(step, numbers, state) for step, numbers in lines])
-
-    def _everyone(self, mine: Any) -> list[Any]:
-        """What each process says, in the order of their ranks."""
-        return [mine] if self.world.size == 1 else self.world.each(mine)
+        lines, self._unobserved, stop = self._unobserved, [], False
+        if self._observer:
+            with globals_undisturbed():
+                for step, numbers in lines:
+                    stop |= self._observer(step, numbers, state)
+        return stop
 
     def _is_asked_to_stop(self, number: int) -> bool:
         """Whether a signal has come; several processes agree on that now and then."""
@@ -284,7 +286,8 @@ class Run:
         if self._visible:
             say(sentence)
 
-    def _checkpoint_interval(self) -> int:
+    @cached_property
+    def _checkpoint_every(self) -> int:
         """The configured interval; else a fifth of the run, or three episodes of each environment if that is longer.
 
         Where a limit is above 1,000 steps, as the 27,000 of Atari's, episodes hardly ever last so long.
@@ -327,8 +330,9 @@ def require_finite(state: TrainState, numbers: Mapping[str, float]) -> None:
     for name, value in numbers.items():
         if name.startswith(("losses/", "gradient")) and not math.isfinite(value):
             raise NonFiniteError(f"{name} is {value} in the update that ends at step {state.step:,}.")
-    vectors = [value.vector for value in vars(state).values() if hasattr(value, "vector")]
-    if math.isfinite(sum(vector.sum().item() for vector in vectors)):  # a NaN shows in the sum
+    with torch.no_grad():
+        total = sum(map(torch.sum, state.networks.parameters()))
+    if math.isfinite(total):  # a NaN shows in the sum, and so does a mere overflow
         return
     for name, values in state.networks.named_parameters():
         bad = values[~values.isfinite()]
