@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 import lemniscate as lem
-from lemniscate.report import compare, comparison_plot
+from lemniscate.report import compare
 from lemniscate.report.curves import training_minutes
-from lemniscate.report.groups import group
-from lemniscate.report.seeds import bootstrap_interval, improvement_interval, iqm
+from lemniscate.report.seeds import bootstrap_interval, group, improvement_interval, iqm
 from lemniscate.run import checkpoint
 from lemniscate.run.metrics import to_line
 from lemniscate.system.files import write_json
@@ -137,10 +136,8 @@ def test_it_is_said_which_is_better_and_how_certain_that_is(tmp_path, ppo, sac, 
 def drawn(monkeypatch, *runs):
     """The figure of the comparison that `lem.plot` draws."""
     figures = {}
-    save = comparison_plot.save
-    monkeypatch.setattr(
-        comparison_plot, "save", lambda figure, file: figures.update({file.name: figure}) or save(figure, file)
-    )
+    save = compare.save
+    monkeypatch.setattr(compare, "save", lambda figure, file: figures.update({file.name: figure}) or save(figure, file))
     lem.plot(*runs)
     return figures
 

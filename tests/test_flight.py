@@ -60,7 +60,7 @@ def run(tmp_path_factory):
 def drawn(monkeypatch):
     """The flights that are drawn into films; nothing is rendered."""
     flights = []
-    monkeypatch.setattr(playback, "_draw", lambda track, env: (flights.append(track) or [], "Drawn."))
+    monkeypatch.setattr(flight, "_frames", lambda tracks, model: (flights.append(tracks) or [], "Drawn."))
     monkeypatch.setattr(playback, "save_frames", lambda frames, file, fps: None)
     return flights
 
@@ -69,9 +69,9 @@ def test_more_flights_than_environments_are_evaluated_as_without_a_film(run, dra
     filmed, plain = lem.evaluate(run, episodes=5, video="film.gif"), lem.evaluate(run, episodes=5)
     assert filmed.returns == plain.returns
     assert filmed.episodes == 5
-    (track,) = drawn
-    assert track.position.shape == (5, 2, 3)  # one flight of each environment, to its end
-    assert not np.isnan(track.position).any()
+    (tracks,) = drawn
+    assert [track.position.shape for track in tracks] == [(5, 1, 3)] * 2  # one of each environment, to its end
+    assert not any(np.isnan(track.position).any() for track in tracks)
     assert "2 of the 5 flights are shown" in capsys.readouterr().err
 
 

@@ -169,7 +169,7 @@ def test_a_picture_keeps_the_time_with_delays_that_a_browser_shows(fps, kind, tm
 
 
 def test_without_ffmpeg_the_extra_is_named_with_a_line_that_works(tmp_path, monkeypatch):
-    monkeypatch.setattr("lemniscate.report.film.is_installed", lambda package: False)
+    monkeypatch.setattr("lemniscate.report.playback.is_installed", lambda package: False)
     with pytest.raises(lem.UserError, match=r"imageio_ffmpeg is not installed; .* pip install '\.\[video\]'"):
         playback.save_frames([], tmp_path / "film.mp4", 30)
 

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 import lemniscate as lem
 from lemniscate.api import plots
 from lemniscate.cli import parse
-from lemniscate.report import advice, commands, curves, diagnostics, html, run_page, style
+from lemniscate.report import advice, curves, pages, style
 from lemniscate.report.advice import Evidence
 from lemniscate.run.metrics import to_line
 from lemniscate.system.files import read_json, write_json
@@ -125,7 +125,7 @@ def test_diagnostics_have_plain_titles_and_the_units_of_the_glossary(tmp_path, m
         {"step": s, "approx_kl": 0.01, "old_approx_kl": 0.01, "losses/mine": 1.0, "time/x": 1.0} for s in (1, 2, 3)
     ]
     run = with_lines(write_run(tmp_path / "r"), lines)
-    figure = drawn(monkeypatch, diagnostics, lambda: diagnostics.diagnostics([run], Path("x.png")))
+    figure = drawn(monkeypatch, curves, lambda: curves.diagnostics([run], Path("x.png")))
     shown = [axes for axes in figure.axes if axes.get_visible()]
     assert [axes.get_title("left") for axes in shown] == ["Approximate KL divergence", "losses/mine"]
     assert [axes.get_ylabel() for axes in shown] == ["nats", ""]
@@ -133,7 +133,7 @@ def test_diagnostics_have_plain_titles_and_the_units_of_the_glossary(tmp_path, m
 
 
 def test_every_metric_with_a_title_is_in_the_glossary():
-    for name in diagnostics.TITLES:
+    for name in curves.TITLES:
         word = name.replace("gradient_norm", "") if "/" in name and name.startswith("gradient") else name
         assert f"{word}`" in PAGE, name
 
@@ -149,7 +149,7 @@ class Page(HTMLParser):
 
     def handle_starttag(self, tag, attrs):
         self.seen.append((tag, dict(attrs)))
-        self.open += [tag] if tag not in html.WITHOUT_END else []
+        self.open += [tag] if tag not in ("img", "meta") else []
 
     def handle_endtag(self, tag):
         assert self.open.pop() == tag
@@ -159,7 +159,7 @@ class Page(HTMLParser):
 
 
 def page_of(run, scores=SCORES, pictures=()):
-    return run_page.write(run, pictures, scores).read_text()
+    return pages.write_run(run, pictures, scores).read_text()
 
 
 def test_the_page_of_a_run_is_one_file(tmp_path):
@@ -208,7 +208,7 @@ def test_a_small_film_is_in_the_page_and_a_large_one_is_linked(tmp_path, monkeyp
     (run / "videos").mkdir()
     (run / "videos" / "step 1.mp4").write_bytes(b"film")
     assert 'video src="data:video/mp4;base64,ZmlsbQ=="' in page_of(run)
-    monkeypatch.setattr(html, "MOST_BYTES", 3)
+    monkeypatch.setattr(pages, "MOST_BYTES", 3)
     assert 'href="../videos/step%201.mp4"' in page_of(run)
 
 
@@ -229,7 +229,7 @@ def test_a_run_without_anything_has_a_page(tmp_path):
 def test_the_command_of_the_page_trains_the_same_run(tmp_path, algorithm, fields):
     run = write_run(tmp_path / "r", algorithm, **{"env": "CartPole-v1", **fields}, seed=7)
     record = read_json(run / "config.json")
-    _, *words = shlex.split(commands.train(algorithm, record["config"]))
+    _, *words = shlex.split(pages.train_command(algorithm, record["config"]))
     given = parse(words)
     again = lem.config_for(given.algorithm, given.env, given.preset, **given.fields)
     assert again.to_json() == record["config"]

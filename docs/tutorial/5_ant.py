@@ -19,7 +19,7 @@ from lemniscate import course
 from lemniscate.algos import ppo
 from lemniscate.data.rollout import collect, epoch_minibatches
 from lemniscate.maths import clip_fraction, kl_k3, standardize
-from lemniscate.report.live import LiveCurve
+from lemniscate.report.curves import LiveCurve
 from lemniscate.run.loggers import read_metrics
 from lemniscate.system.notebook import show_film
 

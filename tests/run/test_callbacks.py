@@ -13,7 +13,7 @@ from test_run import final_hashes, history
 import lemniscate as lem
 from conftest import tiny_fields, tiny_off_policy
 from lemniscate.envs import toy
-from lemniscate.report import live
+from lemniscate.report import curves
 from lemniscate.run import checkpoint
 from lemniscate.run.metrics import read_metrics
 
@@ -191,10 +191,10 @@ def test_the_live_curve_is_drawn_at_most_once_a_second_and_at_the_end(monkeypatc
         def update(self, picture):
             shown.append(picture.data)
 
-    monkeypatch.setattr(live, "in_notebook", lambda: True)
+    monkeypatch.setattr(curves, "in_notebook", lambda: True)
     monkeypatch.setattr("IPython.display.display", lambda picture, display_id: shown.append(picture.data) or Place())
-    monkeypatch.setattr(live.time, "monotonic", lambda: now[0])
-    curve = live.LiveCurve()
+    monkeypatch.setattr(curves.time, "monotonic", lambda: now[0])
+    curve = curves.LiveCurve()
     curve(10, {"losses/policy": 1.0}, _Policy)
     assert not shown  # no episode has ended
     for step in range(100, 1000, 100):
@@ -209,7 +209,7 @@ def test_the_live_curve_is_drawn_at_most_once_a_second_and_at_the_end(monkeypatc
 
 def test_outside_a_notebook_no_live_curve_is_drawn(tmp_path, monkeypatch):
     monkeypatch.setattr("IPython.display.display", None)
-    train(tmp_path / "r", callbacks=[live.LiveCurve(seconds=0)])
+    train(tmp_path / "r", callbacks=[curves.LiveCurve(seconds=0)])
 
 
 def test_the_live_curve_grows_in_one_place_below_the_cell(tmp_path):
@@ -217,7 +217,7 @@ def test_the_live_curve_grows_in_one_place_below_the_cell(tmp_path):
     cell = textwrap.dedent(
         f"""
         import lemniscate as lem
-        from lemniscate.report.live import LiveCurve
+        from lemniscate.report.curves import LiveCurve
         lem.train("ppo", "CartPole-v1", run={str(tmp_path / "run")!r}, progress=False, total_steps=8192,
                   callbacks=[LiveCurve(seconds=0)])
         """

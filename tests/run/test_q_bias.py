@@ -13,7 +13,7 @@ from lemniscate.envs import registry
 from lemniscate.nn.actor_q import ActorQ, SoftActorQ
 from lemniscate.nn.networks import Layers
 from lemniscate.report import curves
-from lemniscate.report.pictures import sentence
+from lemniscate.report.pages import sentence
 from lemniscate.run.evaluate import evaluate
 from lemniscate.run.metrics import read_metrics
 from lemniscate.run.q_bias import QBias

@@ -7,7 +7,7 @@ from lemniscate.api.results import draw_run, final_return
 from lemniscate.api.stored import TrainedRun, path_of
 from lemniscate.errors import UserError
 from lemniscate.report import compare, curves
-from lemniscate.report.groups import group
+from lemniscate.report.seeds import group
 from lemniscate.run.directory import is_finished, read_config
 from lemniscate.run.metrics import damage, read_metrics
 from lemniscate.run.sweep_file import is_sweep, read_sweep

@@ -10,8 +10,7 @@ from lemniscate.api.results import FINAL_EPISODES, evaluate, final_scores
 from lemniscate.api.stored import Trained, algorithm_of, load, write_unsigned
 from lemniscate.errors import UserError
 from lemniscate.hub import repository as hub
-from lemniscate.report import model_card
-from lemniscate.report.film import newest_film
+from lemniscate.report import pages
 from lemniscate.run.directory import CONFIG
 from lemniscate.system.console import say
 from lemniscate.system.files import write_json
@@ -60,7 +59,7 @@ def _write_repository(folder: Path, policy: TrainedPolicy, name: str, license: s
     if scores:
         write_json(folder / "final.json", scores)
     of_policy = {"step": policy.step, "scores": scores, "license": license}
-    model_card.write(folder, name, algorithm_of(policy), policy.config, **of_policy)
+    pages.write_card(folder, name, algorithm_of(policy), policy.config, **of_policy)
 
 
 def _copy_shown(run: Path, folder: Path) -> None:
@@ -77,7 +76,7 @@ def _copy_shown(run: Path, folder: Path) -> None:
 
 def _copy_film(run: Path, folder: Path) -> bool:
     """Copy the newest film of a run, if there is one: a video by the name that the Hub plays, else into `videos/`."""
-    film = newest_film(run)
+    film = pages.newest_film(run)
     if film:
         copy = folder / ("replay.mp4" if film.suffix == ".mp4" else f"videos/{film.name}")
         copy.parent.mkdir(exist_ok=True)

@@ -13,10 +13,7 @@ from lemniscate.envs import registry
 from lemniscate.envs.backend import Baseline
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError, shown
-from lemniscate.report import pictures as pictures_of
-from lemniscate.report import playback
-from lemniscate.report.display import require_display
-from lemniscate.report.film import check_film
+from lemniscate.report import flight, pages, playback
 from lemniscate.run import checkpoint
 from lemniscate.run.config import Episodes, Natural, RunConfig, checked
 from lemniscate.run.environments import env_arguments, evaluation_env
@@ -129,7 +126,7 @@ def watch(
     elsewhere: dict[str, Any] = {"env": env, "env_kwargs": _kwargs(env_kwargs)}
     arguments = env_arguments(_config_of(agent, env), **elsewhere)
     if file is None:
-        require_display()
+        playback.require_display()
     vec = _env_for(agent, episodes, **elsewhere)
     try:
         if vec.scene and episodes > vec.num_envs:
@@ -140,7 +137,7 @@ def watch(
     finally:
         vec.close()
     if episodes > 1 or scores.measures:
-        say(pictures_of.sentence(scores.to_json()))
+        say(pages.sentence(scores.to_json()))
     if file:
         say(f"Recorded in {file}.")
     return scores
@@ -198,11 +195,11 @@ def draw_run(run: str | Path | TrainedRun, by: str = "step", *, film: bool = Fal
     if checkpoint.list_steps(path / "checkpoints"):
         try:
             scores = final_scores(run, trust=trust)
-            say(pictures_of.sentence(scores))
+            say(pages.sentence(scores))
             flights = _draw_flights(load(run, trust=trust), path, film)
         except UserError as error:
             say(f"{path} is drawn without an evaluation: {error}")
-    return pictures_of.draw_run(path, scores, flights, by)
+    return pages.draw_run(path, scores, flights, by)
 
 
 def _draw_flights(policy: TrainedPolicy, path: Path, film: bool) -> list[Path]:
@@ -210,7 +207,7 @@ def _draw_flights(policy: TrainedPolicy, path: Path, film: bool) -> list[Path]:
     episodes = policy.config.evaluate_episodes
     env = evaluation_env(policy.config, episodes)
     try:
-        return pictures_of.draw_flights(policy.module, env, path, episodes, film) if env.scene else []
+        return flight.draw_flights(policy.module, env, path, episodes, film) if env.scene else []
     finally:
         env.close()
 
@@ -220,7 +217,7 @@ def _film(video: str | Path | None) -> Path | None:
     if not isinstance(video, str | PathLike | None):
         raise UserError(f"video must be a path, such as 'film.gif', not {shown(video)}.")
     if video is not None:
-        check_film(Path(video))
+        playback.check_film(Path(video))
     return None if video is None else Path(video)
 
 
@@ -263,10 +260,10 @@ def _show(
     """Play flights where `vec` has a scene, else episodes in a rendered environment; at random without an agent."""
     if isinstance(agent, TrainedPolicy):
         if vec.scene:
-            return playback.show_flights(agent.module, vec, deterministic=deterministic, **how)
+            return flight.show_flights(agent.module, vec, deterministic=deterministic, **how)
         drawn = TrainedPolicy(agent.networks, agent.spec, agent.config.replace(seed=how["seed"]), agent.step)
         act = partial(drawn.act, deterministic=deterministic)
         return playback.show_episodes(act if drawn.is_masked else playback.act_by(act), arguments, **how)
     if vec.scene and agent is None:
-        return playback.show_flights(None, vec, **how)
+        return flight.show_flights(None, vec, **how)
     return playback.show_episodes(playback.act_by(agent) if agent else None, arguments, **how)

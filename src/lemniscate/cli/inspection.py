@@ -13,7 +13,7 @@ from lemniscate.envs import registry
 from lemniscate.envs.findings import BAD
 from lemniscate.errors import UserError, unknown_name
 from lemniscate.presets import best
-from lemniscate.report import pictures
+from lemniscate.report import pages
 from lemniscate.run.texts import number, read, read_json
 from lemniscate.system.console import say
 
@@ -26,7 +26,7 @@ def evaluate(given: argparse.Namespace) -> None:
     if given.json:
         print(json.dumps(scores.to_json(), allow_nan=False))
     else:
-        say(pictures.sentence(scores.to_json()))
+        say(pages.sentence(scores.to_json()))
 
 
 def watch(given: argparse.Namespace) -> None:

@@ -1,18 +1,24 @@
-"""Learning curves, of one run or of several side by side."""
+"""What a run has logged, drawn: learning curves, metrics of the updates, the bias of Q, a curve while it trains."""
 
-from collections.abc import Sequence
+import io
+import math
+import time
+from collections.abc import Mapping, Sequence
+from itertools import zip_longest
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from lemniscate.errors import unknown_name
-from lemniscate.report.diagnostics import diagnostics, draw_metric
-from lemniscate.report.style import COLORS, finish, legend_above, run_styles, save
+from lemniscate.report.style import COLORS, finish, legend_above, limit_axis, run_styles, save
 from lemniscate.run.directory import read_config
 from lemniscate.run.metrics import read_metrics
 from lemniscate.run.q_bias import QBias
+from lemniscate.system.console import in_notebook
+from lemniscate.system.notebook import Place
 
 BY = {"step": "environment steps", "episode": "episode", "minute": "minutes of training"}
 """what a learning curve can be drawn against, and the label of that axis"""
@@ -22,6 +28,34 @@ WINDOW = 20
 
 POINTS = 3000
 """the most episodes of a run that are drawn, evenly chosen"""
+
+TITLES = {
+    "losses/policy": ("Policy loss", ""),
+    "losses/value": ("Value loss", "return²"),
+    "losses/actor": ("Actor loss", "return"),
+    "losses/critic": ("Critic loss", "return²"),
+    "q": ("Q", "return"),
+    "explained_variance": ("Explained variance", "share"),
+    "approx_kl": ("Approximate KL divergence", "nats"),
+    "kl": ("KL divergence", "nats"),
+    "step_fraction": ("Step fraction", "share of the full step"),
+    "clip_fraction": ("Clip fraction", "share of ratios"),
+    "losses/entropy": ("Entropy of the policy", "nats"),
+    "policy_std": ("Standard deviation of the policy", "half the action range"),
+    "temperature": ("Temperature", "return per nat"),
+    "gradient_norm": ("Gradient norm", "before the clip"),
+    "gradient_norm/critic": ("Gradient norm of the critic", "before the clip"),
+    "gradient_norm/actor": ("Gradient norm of the actor", "before the clip"),
+    "gradient_norm/value": ("Gradient norm of the value", "before the clip"),
+    "learning_rate": ("Learning rate", ""),
+}
+"""metric: (title, unit), in the order of the panels; the names and units of the glossary"""
+
+APART = ("step", "old_approx_kl", "gradient_norm/temperature")
+"""metrics without a panel, beside those in `ELSEWHERE`"""
+
+ELSEWHERE = ("episode/", "evaluation/", "time/")
+"""beginnings of the names that are not of an update"""
 
 
 def plot_runs(
@@ -94,6 +128,42 @@ def _positions(run: Path, steps: np.ndarray, by: str) -> np.ndarray:
     return np.interp(steps, *training_minutes(run)) if by == "minute" else steps
 
 
+def diagnostics(runs: list[Path], file: Path, labels: Sequence[str] | None = None) -> Path:
+    """Draw a panel for each metric of the updates, three in a row; one of a user's own algorithm under its name.
+
+    A few outliers do not flatten a panel: its y axis ends where they begin, and triangles mark them.
+    """
+    logs = {run: read_metrics(run) for run in runs}
+    logged = {name: None for lines in logs.values() for line in lines for name in line}
+    own = [name for name in logged if name not in (*TITLES, *APART) and not name.startswith(ELSEWHERE)]
+    names = [name for name in TITLES if name in logged] + own
+    rows = max(1, math.ceil(len(names) / 3))
+    figure = Figure(figsize=(10, 2.4 * rows + 0.4), layout="constrained")
+    for i, (axes, name) in enumerate(zip_longest(figure.subplots(rows, 3, squeeze=False).flat, names)):
+        if name is None:
+            axes.set_visible(False)
+            continue
+        for run, color, label in run_styles(runs, labels):
+            draw_metric(axes, logs[run], name, color, label, width=1.5 if len(runs) <= 5 else 0.7)
+        title, unit = TITLES.get(name, (name, ""))
+        axes.set_title(title, loc="left", fontsize=10)
+        axes.set_ylabel(unit, fontsize=8)
+        axes.set_xlabel("environment steps" if i >= len(names) - 3 else "", fontsize=9)
+        axes.set_xlim(left=0)
+        finish(axes, ticks=3)  # a panel is narrow
+        limit_axis(axes)
+    if len(runs) > 1:
+        legend_above(figure)
+    return save(figure, file)
+
+
+def draw_metric(axes: Axes, log: list[dict[str, Any]], name: str, color: object, label: str, width: float) -> None:
+    """Draw one metric of a run against steps, if it has any."""
+    rows = [(line["step"], line[name]) for line in log if name in line]
+    if rows:
+        axes.plot(*np.array(rows).T, color=color, linewidth=width, label=label)
+
+
 def draw_q_bias(q_bias: QBias, run: Path, file: Path) -> Path:
     """Q(s₀, a₀) of each episode against the discounted return that followed; on the line there is no bias.
 
@@ -116,6 +186,48 @@ def draw_q_bias(q_bias: QBias, run: Path, file: Path) -> Path:
         finish(panel)
         panel.legend(frameon=False)
     return save(figure, file)
+
+
+class LiveCurve:
+    """A callback that draws the returns of training episodes, and of evaluations where the run has them.
+
+        lem.train("ppo", "CartPole-v1", callbacks=[LiveCurve()])
+
+    The picture is replaced at most once in `seconds`, and at the end of the run. Outside a notebook nothing is drawn.
+    """
+
+    def __init__(self, seconds: float = 1.0) -> None:
+        self.seconds = seconds
+        self._drawn = -float("inf")
+        self._place = Place()
+        self._curves: dict[str, list[tuple[int, float]]] = {"episode/return": [], "evaluation/return": []}
+
+    def __call__(self, step: int, metrics: Mapping[str, float], policy: Any) -> None:
+        """Take the returns of one line, and draw if it is time."""
+        for name, points in self._curves.items():
+            if name in metrics:
+                points.append((step, metrics[name]))
+        due = time.monotonic() - self._drawn >= self.seconds or step >= policy.config.total_steps
+        if due and any(self._curves.values()) and in_notebook():
+            from IPython.display import Image
+
+            self._place.show(Image(self.draw(policy.config), format="png"))
+            self._drawn = time.monotonic()
+
+    def draw(self, config: Any) -> bytes:
+        """The curves so far as a PNG; `config` has the title and the length of the run."""
+        figure = Figure(figsize=(7, 3), layout="constrained")
+        axes = figure.subplots()
+        for points, style, label in zip(self._curves.values(), ("-", "o-"), ("training", "evaluation"), strict=True):
+            if points:
+                axes.plot(*zip(*points, strict=True), style, label=label, linewidth=1.5, markersize=4)
+        axes.set(xlabel="environment steps", ylabel="return of an episode", xlim=(0, config.total_steps))
+        axes.set_title(f"{config.env}, seed {config.seed}", loc="left")
+        axes.legend(frameon=False)
+        finish(axes)
+        png = io.BytesIO()
+        figure.savefig(png, format="png", dpi=90)
+        return png.getvalue()
 
 
 def episode_returns(run: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -1,7 +1,10 @@
-"""The flight of a body along its reference: the path, the error, an animation."""
+"""The flight of a body along its reference: the path, the error, a film."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,10 +15,16 @@ from lemniscate.envs.backend import Baseline
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError
 from lemniscate.nn.policies import Policy
+from lemniscate.report.playback import Tell, give, sentence
 from lemniscate.report.style import finish, save
-from lemniscate.run.evaluate import EpisodeTable, play_episodes
+from lemniscate.run.evaluate import EpisodeTable, Evaluation, play_episodes
+from lemniscate.system.console import in_notebook, say
+from lemniscate.system.files import make_directory
 
 BLUE, ORANGE, GREY = "#1f5fa8", "#e07b1a", "#9aa0a6"
+
+STRIDE = 5
+"""a film has a frame for every so many-th step"""
 
 
 @dataclass(frozen=True)
@@ -75,6 +84,52 @@ def record(
     return Flight(position, position + track[..., scene.error], track[..., scene.attitude], scene.time_step)
 
 
+def show_flights(
+    policy: Policy | None,
+    env: VecEnv,
+    episodes: int,
+    seed: int,
+    deterministic: bool = True,
+    video: Path | None = None,
+    tell: Tell = say,
+) -> Evaluation:
+    """What `playback.show_episodes` does, for environments that have a scene.
+
+    The flights are those of `evaluate`, and played together. Of more flights than there are environments, the first of
+    each is shown.
+    """
+    table = EpisodeTable(env.num_envs, env.device)
+    track = record(policy, env, episodes, seed, deterministic, table)
+    scores = table.evaluation(env.spec.env_id, env.summaries)
+    if episodes > env.num_envs:
+        say(f"{env.num_envs} of the {episodes} flights are shown, the first of each environment.")
+    for number, of_episode in enumerate(zip(scores.returns, scores.lengths, strict=True), start=1):
+        tell(sentence(number, *of_episode))
+    flights = [track.one(number) for number in range(track.position.shape[1])]
+    model = env.scene.model if env.scene else None
+    if video is None and not in_notebook():
+        from lemniscate.report import scene
+
+        scene.show(flights, model)
+    else:
+        frames, how = _frames(flights, model)
+        give(frames, 1 / (STRIDE * track.time_step), video)
+        tell(how)
+    return scores
+
+
+def draw_flights(policy: Policy, env: VecEnv, run: Path, flights: int, film: bool) -> list[Path]:
+    """Path and error of some flights in a scene, into the `plots/` of a run; with `film` one of them into `videos/`."""
+    track = record(policy, env, flights, seed=0)
+    beside = record(env.baseline, env, flights, seed=0) if env.baseline else None
+    folder, video = run / "plots", run / "videos" / "flight.gif"
+    if film:
+        make_directory(video.parent)
+        show_flights(policy, env, 1, seed=0, video=video, tell=lambda text: None)
+    drawn = [draw_path(track, folder / "flight.png"), draw_error(track, folder / "error.png", beside)]
+    return [*drawn, video] if film else drawn
+
+
 def draw_path(flight: Flight, file: Path) -> Path:
     """The first flight over the reference, seen from the side (x, z); the others' first second faintly."""
     figure = Figure(figsize=(7, 4.4), layout="constrained")
@@ -117,6 +172,21 @@ def draw_error(flight: Flight, file: Path, baseline: Flight | None = None) -> Pa
     return save(figure, file)
 
 
+def _frames(flights: list[Flight], model: Any) -> tuple[Iterable[np.ndarray], str]:
+    """Frames of flights, one after the other, and how they are drawn."""
+    from lemniscate.report import scene
+
+    first = scene.render(flights[0], model, STRIDE)
+    if first is not None:
+        more = (scene.render(one, model, STRIDE) for one in flights[1:])
+        return chain(first, chain.from_iterable(frames for frames in more if frames is not None)), "Rendered by MuJoCo."
+    how = (
+        "Drawn with matplotlib, since there is no off-screen OpenGL; for a MuJoCo rendering install EGL or OSMesa"
+        " (Debian: libegl1 and libgl1-mesa-dri, or libosmesa6)."
+    )
+    return chain.from_iterable(animate(one, STRIDE) for one in flights), how
+
+
 def animate(flight: Flight, every: int) -> list[np.ndarray]:
     """Frames of the first flight drawn with matplotlib, one each `every` steps: [H, W, 3] uint8."""
     figure = Figure(figsize=(6, 3.6), dpi=90, layout="constrained")
@@ -124,18 +194,23 @@ def animate(flight: Flight, every: int) -> list[np.ndarray]:
     axes = figure.subplots()
     path, reference = flight.position[:, 0, [0, 2]], flight.reference[:, 0, [0, 2]]
     axes.plot(*reference.T, color=ORANGE, linewidth=4, alpha=0.3)
-    (left, low), (right, high) = _limits(np.concatenate([path, reference]))
-    axes.set(xlabel="x / m", ylabel="z / m", aspect="equal", xlim=(left, right), ylim=(low, high))
+    both = np.concatenate([path, reference])
+    low, high = np.nanmin(both, axis=0), np.nanmax(both, axis=0)
+    margin = 0.1 + 0.1 * np.max(high - low)  # metres; the body itself is 0.14 wide
+    axes.set_xlim(low[0] - margin, high[0] + margin)
+    axes.set_ylim(low[1] - margin, high[1] + margin)
+    axes.set(xlabel="x / m", ylabel="z / m", aspect="equal")
     axes.spines[["top", "right"]].set_visible(False)
     canvas.draw()
-    background = canvas.copy_from_bbox(figure.bbox)
+    background = canvas.copy_from_bbox(figure.bbox)  # the axes are drawn once: text and ticks would take most time
     (trail,) = axes.plot([], [], color=BLUE, linewidth=1.5)
     (arms,) = axes.plot([], [], color="black", linewidth=3, solid_capstyle="round")
     (goal,) = axes.plot([], [], "o", color=ORANGE, markersize=5)
     clock = axes.text(0.01, 0.95, "", transform=axes.transAxes)
     frames = []
     for t in range(0, len(path), every):
-        body_x = _rotate_x_axis(flight.attitude[t, 0])[[0, 2]]
+        x, y, z, w = flight.attitude[t, 0]
+        body_x = np.array([1 - 2 * (y * y + z * z), 2 * (x * z - y * w)])  # of the body's x axis, in the world's x, z
         arms.set_data(*np.stack([path[t] - 0.07 * body_x, path[t] + 0.07 * body_x]).T)
         trail.set_data(*path[max(0, t - 100) : t + 1].T)
         goal.set_data(*reference[[t]].T)
@@ -145,19 +220,6 @@ def animate(flight: Flight, every: int) -> list[np.ndarray]:
             axes.draw_artist(artist)
         frames.append(np.asarray(canvas.buffer_rgba())[..., :3].copy())
     return frames
-
-
-def _limits(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The lower and the upper ends of axes that show `points` [B, 2] with a margin for the body itself."""
-    low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
-    margin = 0.1 + 0.1 * np.max(high - low)
-    return low - margin, high + margin
-
-
-def _rotate_x_axis(quaternion: np.ndarray) -> np.ndarray:
-    """The direction of the body's x axis in the world, from quaternions xyzw."""
-    x, y, z, w = quaternion
-    return np.array([1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)])
 
 
 def _rms(error: np.ndarray) -> float:

@@ -1,31 +1,33 @@
-"""Playing episodes for a person: in a window, in a notebook, or into a film."""
+"""Episodes played for a person: in a window, in a notebook, or into a film."""
 
+import math
+import os
+import sys
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from itertools import chain
+from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import torch
+from PIL import Image
 
 from lemniscate.envs import registry
 from lemniscate.envs.factory import make_one, maker_of, sentences
 from lemniscate.envs.measures import SUMMARIES, measures_of
 from lemniscate.envs.rendered import make_rendered
 from lemniscate.envs.vec_env import VecEnv, require_end
-from lemniscate.errors import UserError, shown
-from lemniscate.nn.policies import Policy
-from lemniscate.report import flight
-from lemniscate.report.display import quiet_sdl
-from lemniscate.report.film import save_frames
+from lemniscate.errors import UserError, is_installed, missing_extra, shown
 from lemniscate.run.config import RunConfig
 from lemniscate.run.environments import env_arguments
 from lemniscate.run.evaluate import EVALUATION, EpisodeTable, Evaluation
 from lemniscate.run.seeding import derive
 from lemniscate.system.console import in_notebook, say
+from lemniscate.system.files import remove
 from lemniscate.system.named import find_callable
 from lemniscate.system.notebook import send_frames
 from lemniscate.types import Step
@@ -36,8 +38,11 @@ Tell = Callable[[str], object]
 
 ONE = torch.ones(1, dtype=torch.bool)
 
-FLIGHT_STRIDE = 5
-"""a flight is drawn at every so many-th step"""
+FILMS = (".gif", ".webp", ".mp4")
+"""the endings of a film's file"""
+
+PICTURE_FPS = 50
+"""frames a second that an animated picture has at most: browsers show one with shorter delays far too slowly"""
 
 
 def show_episodes(
@@ -53,18 +58,18 @@ def show_episodes(
         UserError: an environment that cannot be made or renders no pictures; an episode without an end.
     """
     in_window = video is None and not in_notebook()
-    table = EpisodeTable(1, torch.device("cpu"))
-    with quiet_sdl(in_window):
+    table, name = EpisodeTable(1, torch.device("cpu")), arguments["env"]
+    with _quiet_sdl(in_window):
         env = _rendered(arguments, "human" if in_window else "rgb_array")
-        played = _play(env, act or _random(env, seed), arguments["env"], episodes, seed, table, tell)
+        played = _play(env, act or _random(env, seed), name, episodes, seed, table, tell)
         try:
             if in_window:
                 deque(played, maxlen=0)  # Gymnasium draws at each step
             else:
-                _give((_picture(env, arguments["env"]) for _ in played), _fps(env), video)
+                give((_picture(env, name) for _ in played), float(env.metadata.get("render_fps", 30)), video)
         finally:
             env.close()
-    return table.evaluation(arguments["env"], SUMMARIES)
+    return table.evaluation(name, SUMMARIES)
 
 
 def play_single(act: Act, arguments: dict[str, Any], episodes: int, seed: int, tell: Tell = say) -> Evaluation:
@@ -91,43 +96,25 @@ def act_by(function: Callable[[Any], Any]) -> Act:
     return lambda obs, action_mask=None: function(obs)
 
 
-def show_flights(
-    policy: Policy | None,
-    env: VecEnv,
-    episodes: int,
-    seed: int,
-    deterministic: bool = True,
-    video: Path | None = None,
-    tell: Tell = say,
-) -> Evaluation:
-    """Play flights in a scene: the same, for environments that have one.
-
-    They are those of `evaluate`, and played together. Of more flights than there are environments, the first of each
-    is shown.
-    """
-    table = EpisodeTable(env.num_envs, env.device)
-    track = flight.record(policy, env, episodes, seed, deterministic, table)
-    scores = table.evaluation(env.spec.env_id, env.summaries)
-    if episodes > env.num_envs:
-        say(f"{env.num_envs} of the {episodes} flights are shown, the first of each environment.")
-    for number, of_episode in enumerate(zip(scores.returns, scores.lengths, strict=True), start=1):
-        tell(_sentence(number, *of_episode))
-    if video is None and not in_notebook():
-        from lemniscate.report import scene
-
-        scene.show((track.one(number) for number in range(track.position.shape[1])), _model(env))
-    else:
-        frames, how = _draw(track, env)
-        _give(frames, 1 / (FLIGHT_STRIDE * track.time_step), video)
-        tell(how)
-    return scores
-
-
 def require_pictures(config: RunConfig, env: VecEnv) -> None:
     """Raise `UserError` where an environment cannot be recorded; one with a scene always can."""
     if not env.scene:
-        with quiet_sdl(in_window=False):
+        with _quiet_sdl(in_window=False):
             _rendered(env_arguments(config), "rgb_array").close()
+
+
+def require_display() -> None:
+    """Raise `UserError` where there is neither a notebook nor a display for a window."""
+    displays = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
+    if sys.platform == "linux" and not in_notebook() and not any(map(os.environ.get, displays)):
+        raise UserError(
+            'There is no display for a window; record a film instead: --video film.gif, in Python video="film.gif".'
+        )
+
+
+def sentence(number: int, episode_return: float, length: int) -> str:
+    """The line that is said after an episode."""
+    return f"Episode {number}: return {episode_return:.1f}, length {length}"
 
 
 def _play(
@@ -153,7 +140,7 @@ def _play(
             done = terminated or truncated
             table.add(_step(reward, terminated, truncated, {name: info[name] for name in names if name in info}), ONE)
             yield
-        tell(_sentence(number + 1, total, length))
+        tell(sentence(number + 1, total, length))
 
 
 def _require_in(space: gym.Space, action: Any, name: str) -> None:
@@ -182,22 +169,6 @@ def _random(env: gym.Env, seed: int) -> Act:
     return lambda obs, action_mask=None: env.action_space.sample(
         None if action_mask is None else np.asarray(action_mask, dtype=np.int8)
     )
-
-
-def _sentence(number: int, episode_return: float, length: int) -> str:
-    return f"Episode {number}: return {episode_return:.1f}, length {length}"
-
-
-def _give(frames: Iterable[np.ndarray], fps: float, video: Path | None) -> None:
-    """Record the frames, or show them below the cell."""
-    if video is None:
-        send_frames(frames, fps)
-    else:
-        save_frames(frames, video, fps)
-
-
-def _fps(env: gym.Env) -> float:
-    return float(env.metadata.get("render_fps", 30))
 
 
 def _rendered(arguments: dict[str, Any], mode: str) -> gym.Env:
@@ -230,21 +201,67 @@ def _picture(env: gym.Env, name: str) -> np.ndarray:
     raise UserError(f"{name} renders no pictures: render() returns {what}; a picture is (height, width, 3) of uint8.")
 
 
-def _draw(track: flight.Flight, env: VecEnv) -> tuple[Iterable[np.ndarray], str]:
-    """Frames of all flights, one after the other, and how they are drawn."""
-    from lemniscate.report import scene
-
-    flights = [track.one(number) for number in range(track.position.shape[1])]
-    first = scene.render(flights[0], _model(env), FLIGHT_STRIDE)
-    if first is not None:
-        more = (scene.render(one, _model(env), FLIGHT_STRIDE) for one in flights[1:])
-        return chain(first, chain.from_iterable(frames for frames in more if frames is not None)), "Rendered by MuJoCo."
-    how = (
-        "Drawn with matplotlib, since there is no off-screen OpenGL; for a MuJoCo rendering install EGL or OSMesa"
-        " (Debian: libegl1 and libgl1-mesa-dri, or libosmesa6)."
-    )
-    return chain.from_iterable(flight.animate(one, FLIGHT_STRIDE) for one in flights), how
+@contextmanager
+def _quiet_sdl(in_window: bool) -> Iterator[None]:
+    """Keeps pygame's SDL from writing on standard error; without a window also from looking for a display."""
+    settings = {"PYGAME_HIDE_SUPPORT_PROMPT": "1", "SDL_AUDIODRIVER": "dummy"}
+    settings |= {} if in_window else {"SDL_VIDEODRIVER": "dummy"}
+    before = {name: os.environ.get(name) for name in settings}
+    os.environ.update(settings)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name) if value is None else os.environ.update({name: value})
 
 
-def _model(env: VecEnv) -> Any:
-    return env.scene.model if env.scene else None
+def give(frames: Iterable[np.ndarray], fps: float, video: Path | None) -> None:
+    """Record frames [H, W, 3] uint8 into a film, or show them below the cell."""
+    if video is None:
+        send_frames(frames, fps)
+    else:
+        save_frames(frames, video, fps)
+
+
+def check_film(file: Path) -> None:
+    """Raise `UserError` for a film that could not be written, before anything is played for it."""
+    if file.suffix not in FILMS:
+        raise UserError(f"{file} must end in .gif, .webp or .mp4.")
+    if file.suffix == ".mp4" and not is_installed("imageio_ffmpeg"):
+        raise missing_extra("imageio_ffmpeg", "video")
+
+
+def save_frames(frames: Iterable[np.ndarray], file: Path, fps: float) -> None:
+    """Write frames [H, W, 3] uint8 as an animated picture (.gif, .webp) or a video (.mp4, extra `video`)."""
+    check_film(file)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    remove(file)  # writing would follow a link
+    try:
+        _write(frames, file, fps)
+    except BaseException:  # what draws the frames may fail: no half of a film is left
+        file.unlink(missing_ok=True)
+        raise
+
+
+def _write(frames: Iterable[np.ndarray], file: Path, fps: float) -> None:
+    if file.suffix == ".mp4":
+        from imageio import v2 as imageio
+
+        film: Any = imageio.get_writer(file, fps=fps, macro_block_size=2)
+        with film:
+            for frame in frames:
+                film.append_data(frame)
+        return
+    stride = max(1, math.ceil(fps / PICTURE_FPS))
+    images = _timed(islice(frames, 0, None, stride), fps / stride)
+    # A GIF takes the delay of each image, whole hundredths of a second; a WebP has one delay for all.
+    delay: dict[str, Any] = {} if file.suffix == ".gif" else {"duration": 1000 * stride / fps}
+    next(images).save(file, save_all=True, append_images=images, loop=0, **delay)
+
+
+def _timed(frames: Iterable[np.ndarray], fps: float) -> Iterator[Image.Image]:
+    """Images, each with a delay in whole hundredths of a second, as a GIF has them; their sum keeps the time."""
+    for i, frame in enumerate(frames):
+        image = Image.fromarray(frame)
+        image.info["duration"] = 10 * (round(100 * (i + 1) / fps) - round(100 * i / fps))
+        yield image

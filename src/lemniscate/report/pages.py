@@ -1,0 +1,424 @@
+"""What is written about a run: its page, the page of a comparison, its card on the Hub, and its scores in a sentence.
+
+A page is one file, `plots/report.html`: no script, nothing from a network, for light and dark, wide and narrow. The
+templates stand in `templates/`; Jinja escapes whatever is put into a page, so nothing in a run's files becomes markup.
+"""
+
+import base64
+import json
+import math
+import os
+import platform
+import shlex
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
+
+import numpy as np
+
+from lemniscate import algos
+from lemniscate.errors import UserError, resume_line
+from lemniscate.report import advice, curves
+from lemniscate.report.playback import FILMS
+from lemniscate.report.seeds import Group, Scores
+from lemniscate.run.config import RunConfig, flag
+from lemniscate.run.directory import is_finished, read_config
+from lemniscate.run.metrics import read_metrics
+from lemniscate.run.q_bias import QBias
+from lemniscate.system import named
+from lemniscate.system.files import replace_file
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+
+MOST_BYTES = 5_000_000
+"""the largest film that is embedded; a larger one is linked"""
+
+KINDS = {".png": "image/png", ".gif": "image/gif", ".webp": "image/webp", ".mp4": "video/mp4"}
+
+CAPTIONS = {
+    "learning_curve": "Return of each whole training episode, from a policy that explores",
+    "diagnostics": "Metrics of the updates; triangles mark values beyond an axis",
+    "q": "What Q predicts at the beginning of each episode, and the discounted return that followed",
+    "flight": "The first flight of the evaluation over its reference",
+    "error": "Distance to the reference over time",
+    "comparison": "Returns in training, final returns, and probabilities of improvement",
+}
+"""what is below a picture, by the beginning of its name"""
+
+NOT_MEASURES = ("env_id", "episodes", "mean_return", "std_return", "returns", "lengths", "terminated", "q_bias")
+"""names in the JSON of an `Evaluation` that are not measures of the environment"""
+
+PACKAGES = ("lemniscate", "torch", "numpy", "gymnasium")
+
+TASK = "reinforcement-learning"
+"""the name of the field on the Hub"""
+
+
+def draw_run(run: Path, scores: Mapping[str, Any] | None, flights: Sequence[Path], by: str) -> list[Path]:
+    """Draw the curves of a run and write its page; returns the files, the page last.
+
+    Args:
+        run: the run directory.
+        scores: of its newest policy, those of `results.final_scores`, if there are any.
+        flights: what `flight.draw_flights` returned.
+        by: "step", "episode" or "minute", the horizontal axis of the learning curve.
+    """
+    pictures = curves.plot_runs([run], run / "plots", by=by)
+    if scores and "q_bias" in scores:
+        pictures.append(curves.draw_q_bias(_q_bias(scores), run, run / "plots" / "q.png"))
+    pictures += [file for file in flights if file.suffix == ".png"]
+    films = [file for file in flights if file not in pictures]
+    return [*pictures, *films, write_run(run, pictures, scores)]
+
+
+def write_run(run: Path, pictures: Sequence[Path], scores: Mapping[str, Any] | None) -> Path:
+    """Write the page of a run: curves, film, evaluation, settings, commands, what to try next.
+
+    Args:
+        run: the run directory.
+        pictures: of the run; they are embedded.
+        scores: of its newest policy, those of `Evaluation.to_json` and the `seed` of the starts, if there are any.
+    """
+    algorithm, config = read_config(run)
+    log, file, film = read_metrics(run), run / "plots" / "report.html", newest_film(run)
+    taken, total = (log[-1]["step"] if log else 0), config.get("total_steps", 0)
+    progress = f"{taken:,} steps" if taken >= total else f"{taken:,} of {total:,} steps"
+    evaluated = scores if scores and scores.get("returns") else None
+    defaults, changed = default_fields(algorithm), changed_fields(algorithm, config)
+    return _write_page(
+        file,
+        "run.html.j2",
+        title=f"{algorithm.upper()} on {config.get('env')}",
+        subtitle=f"{run} · seed {config.get('seed')} · {progress}",
+        headline=_headline(run, scores),
+        advice=[*advice.sentences(advice.Evidence(config, log, scores or {})), advice.ONE_SEED],
+        pictures=pictures,
+        film=_film(film, file) if film else None,
+        scores=score_rows(evaluated) if evaluated else [],
+        histogram=_histogram(evaluated["returns"]) if evaluated else None,
+        changed=[(name, _shown(value), _shown(defaults.get(name))) for name, value in changed.items()],
+        unchanged=[(name, _shown(value)) for name, value in config.items() if name not in changed],
+        commands={
+            "Train it again; with the same versions on the same kind of machine the result is the same": train_command(
+                algorithm, config
+            ),
+            "Continue it where it was interrupted": resume_line(run),
+            "Evaluate its newest policy from other starts": shlex.join(
+                ["lemniscate", "evaluate", str(run), "--episodes", "100", "--seed", "1"]
+            ),
+        },
+    )
+
+
+def _headline(run: Path, scores: Mapping[str, Any] | None) -> list[tuple[str, str]]:
+    """(name, number) of the few numbers at the top."""
+    spent = ("minutes of training", f"{curves.training_minutes(run)[1][-1]:,.1f}")
+    if not scores or "mean_return" not in scores:
+        return [spent]
+    means = ("final return, mean ± std", f"{scores['mean_return']:,.1f} ± {scores['std_return']:,.1f}")
+    worst = ("worst episode", f"{min(scores['returns']):,.1f}")
+    return [means, worst, *(row for row in _measures(scores) if row[1].endswith(" mm")), spent]
+
+
+def newest_film(run: Path) -> Path | None:
+    """The newest film of a run, if it has any."""
+    films = [file for file in (run / "videos").glob("*") if file.suffix in FILMS]
+    # Not a link, which could lead to any file of this machine, and what is found is embedded and uploaded.
+    own = [file for file in films if file.is_file() and not file.is_symlink()]
+    return max(own, key=lambda file: file.stat().st_mtime, default=None)
+
+
+def _film(film: Path, page: Path) -> dict[str, Any]:
+    """A film, linked from its page if it is large."""
+    size = film.stat().st_size
+    return {"file": film, "linked": size > MOST_BYTES, "megabytes": size / 1e6, "href": _link(film, page.parent)}
+
+
+def _histogram(returns: Sequence[float]) -> dict[str, Any] | None:
+    """Bars of how many returns lie where, the highest 40; None if all are alike."""
+    if max(returns) - min(returns) < 1e-6 * (1 + abs(returns[0])):
+        return None
+    counts, edges = np.histogram(returns, bins=min(24, max(6, len(returns) // 4)))
+    return {"heights": 40 * counts / max(counts), "least": edges[0], "greatest": edges[-1]}
+
+
+def write_comparison(page: Path, parts: Sequence[Mapping[str, Any]]) -> Path:
+    """Write the page of a comparison from what `comparison_part` returned for each environment."""
+    title = f"Comparison on {', '.join(part['env'] for part in parts)}"
+    return _write_page(page, "comparison.html.j2", title=title, subtitle=str(page), parts=parts)
+
+
+def comparison_part(
+    page: Path,
+    groups: Sequence[Group],
+    scores: Scores,
+    rows: Sequence[Sequence[str]],
+    remarks: Sequence[str],
+    pictures: Sequence[Path],
+) -> dict[str, Any]:
+    """The part of one environment: the table, remarks, pictures, settings that differ, runs, commands.
+
+    Args:
+        page: that the part is for.
+        groups: in that environment.
+        scores: final returns of the finished runs.
+        rows: the table of final returns, its heading first.
+        remarks: sentences on what cannot be compared.
+        pictures: of the comparison, embedded.
+    """
+    spread = [(one.label, advice.seeds_differ(one.finals(scores))) for one in groups]
+    return {
+        "env": groups[0].env,
+        "labels": [one.label for one in groups],
+        "rows": rows,
+        "remarks": [*remarks, *(f"{label}: {sentence}" for label, sentence in spread if sentence)],
+        "pictures": pictures,
+        "differences": _differences(groups),
+        "runs": [_run_row(run, scores, page) for one in groups for run in one.runs],
+        "commands": [
+            (one.label, train_command(one.algorithm, one.config, seeds=",".join(map(_seed_of, one.runs))))
+            for one in groups
+        ],
+    }
+
+
+def _differences(groups: Sequence[Group]) -> list[list[str]]:
+    """The fields that are not the same in all groups, each with its value in every group."""
+    kinds = [{"algorithm": one.algorithm, **one.config} for one in groups]
+    names = [name for name in dict.fromkeys(name for kind in kinds for name in kind) if name != "seed"]
+    differ = [name for name in names if any(kind.get(name) != kinds[0].get(name) for kind in kinds)]
+    return [[name, *(_shown(kind[name]) if name in kind else "–" for kind in kinds)] for name in differ]
+
+
+def _run_row(run: Path, scores: Scores, page: Path) -> dict[str, Any]:
+    """The row of a run, with a link to its own page, if there is one."""
+    own = run / "plots" / "report.html"
+    return {
+        "path": str(run),
+        "href": _link(own, page.parent) if own.exists() else None,
+        "seed": _seed_of(run),
+        "final": f"{scores[run]:,.1f}" if run in scores else "–",
+        "state": "finished" if is_finished(run) else "not finished",
+    }
+
+
+def _seed_of(run: Path) -> str:
+    return str(read_config(run)[1].get("seed"))
+
+
+def write_card(
+    folder: Path,
+    name: str,
+    algorithm: str,
+    config: RunConfig,
+    *,
+    step: int,
+    scores: Mapping[str, Any] | None,
+    license: str | None,
+) -> None:
+    """Write the card of a repository on the Hugging Face Hub beside its files; it shows those that are there.
+
+    Args:
+        folder: the repository's files.
+        name: user/name of the repository.
+        algorithm: by name.
+        config: of the run.
+        step: of the policy.
+        scores: those of `Evaluation.to_json` and the `seed` of the starts, if there are any.
+        license: as the Hub abbreviates it, such as "mit"; none is named without.
+    """
+    stored = config.to_json()
+    places = [str(stored.get(part)) for part in ("env", "network")] + list(stored.get("wrappers") or ())
+    code = [place for place in places if ":" in place and not named.is_passed(place)]
+    text = (
+        _templates()
+        .get_template("card.md.j2")
+        .render(
+            metadata=_metadata(name, algorithm, config, scores, license),
+            name=name,
+            algorithm=algorithm,
+            config=config,
+            step=step,
+            films=[_link(file, folder) for file in sorted((folder / "videos").glob("*"))],
+            replay=(folder / "replay.mp4").exists(),
+            scores=score_rows(scores) if scores else [],
+            code=code if algorithm in algos.ALGORITHMS else [algorithm, *code],
+            command=train_command(algorithm, stored),
+            pictures=[(caption(file), _link(file, folder)) for file in sorted((folder / "plots").glob("*.png"))],
+            exported=[
+                (file.name, _link(file, folder)) for file in sorted((folder / "export").rglob("*")) if file.is_file()
+            ],
+        )
+    )
+    (folder / "README.md").write_text(text, encoding="utf-8")
+
+
+def _metadata(
+    name: str, algorithm: str, config: RunConfig, scores: Mapping[str, Any] | None, license: str | None
+) -> str:
+    """The front matter in YAML, by which the Hub lists a policy: library, tags, and the scores as a `model-index`.
+
+    In the words of the Hub the return of an episode is its reward.
+    """
+    from huggingface_hub import EvalResult, ModelCardData
+
+    results = []
+    if scores:
+        seeds = {"seed": scores["seed"], "training_seeds": [config.seed]}
+        result = EvalResult(
+            task_type=TASK,
+            task_name=TASK,
+            dataset_type=config.env,
+            dataset_name=config.env,
+            metric_type="mean_reward",
+            metric_name="mean_reward",
+            metric_value=f"{scores['mean_return']:.2f} +/- {scores['std_return']:.2f}",
+            metric_args={"episodes": scores["episodes"], **seeds},
+        )
+        results.append(result)
+    data = ModelCardData(
+        library_name="lemniscate",
+        pipeline_tag=TASK,
+        license=license,
+        tags=[TASK, "lemniscate", config.env, algorithm],
+        model_name=name,
+        eval_results=results or None,
+    )
+    return data.to_yaml()
+
+
+def sentence(scores: Mapping[str, Any]) -> str:
+    """The scores of an evaluation, as `Evaluation.to_json` has them, in one sentence, or two."""
+    mean, std = scores["mean_return"], scores["std_return"]
+    said = f"{mean:.1f} ± {std:.1f} return over {scores['episodes']} episodes of {scores['env_id']}"
+    if measures := _measures(scores):
+        said += f", {scores['terminated']} of them terminated; {', '.join(map(' '.join, measures))}"
+    return f"{said}.\n{_q_bias(scores)}." if "q_bias" in scores else f"{said}."
+
+
+def score_rows(scores: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The scores of an evaluation, each with its name in words."""
+    returns, lengths = scores["returns"], scores["lengths"]
+    return [
+        ("return, mean ± standard deviation", f"{scores['mean_return']:,.1f} ± {scores['std_return']:,.1f}"),
+        ("episodes, from starts that training never saw", f"{len(returns):,}, seed {scores.get('seed', 0)}"),
+        ("worst, median, best return", ", ".join(f"{x:,.1f}" for x in np.percentile(returns, [0, 50, 100]))),
+        ("length, mean", f"{np.mean(lengths):,.1f} steps"),
+        ("terminated by the environment's rules", f"{scores['terminated']:,} of {len(returns):,}"),
+        *_measures(scores),
+    ]
+
+
+def _measures(scores: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """(name in words, value) of what the environment measures besides reward; the ending `_mm` is a unit."""
+    numbers = {name: value for name, value in scores.items() if name not in (*NOT_MEASURES, "step", "seed")}
+    return [
+        (name.removesuffix("_mm").replace("_", " "), f"{value:.4g}{' mm' * name.endswith('_mm')}")
+        for name, value in numbers.items()
+        if isinstance(value, int | float) and math.isfinite(value)
+    ]
+
+
+def _q_bias(scores: Mapping[str, Any]) -> QBias:
+    return QBias(scores["q_bias"]["predicted"], scores["q_bias"]["realised"])
+
+
+def default_fields(algorithm: str) -> dict[str, Any]:
+    """The default of each field of an algorithm, as `config.json` would hold it; empty if there is no such module."""
+    try:
+        return algos.find(algorithm).Config().to_json()
+    except UserError:
+        return {}
+
+
+def changed_fields(algorithm: str, config: Mapping[str, Any]) -> dict[str, Any]:
+    """The fields of a run that are not at their defaults; all, if these are not known."""
+    defaults = default_fields(algorithm)
+    return {name: value for name, value in config.items() if name not in defaults or defaults[name] != value}
+
+
+def train_command(algorithm: str, config: Mapping[str, Any], *, seeds: str | None = None) -> str:
+    """The command line that trains a run of this Config; with `seeds`, such as "1,2,3", a sweep of it."""
+    # The preset is named because the one that fits the environment best may change between versions.
+    words = ["lemniscate", "train", algorithm, "--preset", "default", "--env", str(config.get("env"))]
+    changed = {name: value for name, value in changed_fields(algorithm, config).items() if name not in ("env", "seed")}
+    words += ["--seeds", seeds] if seeds else ["--seed", str(config.get("seed"))]
+    for name, value in {"total_steps": config.get("total_steps"), **changed}.items():
+        words += _option(name, value)
+    return shlex.join(words)
+
+
+def _option(name: str, value: Any) -> list[str]:
+    """The words of one field on the command line."""
+    if isinstance(value, bool):
+        return [flag(name) if value else flag(name).replace("--", "--no-", 1)]
+    if isinstance(value, list):
+        return [flag(name), *map(str, value or ["none"])]
+    if isinstance(value, dict):
+        return [flag(name), json.dumps(value)]
+    return [flag(name), "none" if value is None else str(value)]
+
+
+def _shown(value: Any) -> str:
+    """The value of a field, as a person would write it."""
+    if isinstance(value, list):
+        return " ".join(map(_shown, value)) or "none"
+    if isinstance(value, bool):
+        return "on" if value else "off"
+    if isinstance(value, int):
+        return f"{value:,}"
+    return "none" if value in (None, "", {}) else str(value)
+
+
+def caption(picture: Path) -> str:
+    """The caption of a picture."""
+    known = [text for name, text in CAPTIONS.items() if picture.stem.startswith(name)]
+    return [picture.stem, *known][-1]
+
+
+def _link(file: Path, folder: Path) -> str:
+    """A link to a file from a page in `folder`, which holds as long as both are moved together."""
+    return quote(os.path.relpath(file, folder).replace(os.sep, "/"))
+
+
+def _embedded(file: Path) -> str:
+    return f"data:{KINDS[file.suffix]};base64,{base64.b64encode(file.read_bytes()).decode()}"
+
+
+def _write_page(file: Path, template: str, **context: Any) -> Path:
+    """Fill a template, and say at its end by which versions that was done."""
+    versions = []
+    for package in PACKAGES:
+        try:
+            versions.append(f"{package} {version(package)}")
+        except PackageNotFoundError:
+            continue
+    machine = f"Python {platform.python_version()} on {platform.system()} {platform.machine()}"
+    date = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
+    written = f"Written on {date} by {', '.join(versions)}, {machine}."
+    page = _templates().get_template(template).render(written=written, **context)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    replace_file(file, page.encode("utf-8", errors="xmlcharrefreplace"))
+    return file
+
+
+@cache
+def _templates() -> "Environment":
+    """The templates beside this module; what is put into HTML is escaped, into Markdown not."""
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined  # a training without a report needs none
+
+    templates = Environment(
+        loader=FileSystemLoader(Path(__file__).parent / "templates"),
+        autoescape=lambda name: name is not None and ".html" in name,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    templates.filters |= {"embedded": _embedded, "caption": caption}
+    return templates
