@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import lemniscate as lem
-from lemniscate.report import compare
+from lemniscate.report import compare, curves
 from lemniscate.report.curves import training_minutes
 from lemniscate.report.seeds import bootstrap_interval, group, improvement_interval, iqm
 from lemniscate.run import checkpoint
@@ -133,13 +133,26 @@ def test_it_is_said_which_is_better_and_how_certain_that_is(tmp_path, ppo, sac, 
     assert (compare.FEW_SEEDS in said) == (len(ppo) < 5)
 
 
-def drawn(monkeypatch, *runs):
-    """The figure of the comparison that `lem.plot` draws."""
+def without_layout(monkeypatch):
+    """The figures that are saved from here on, by file name; files are written, but nothing is laid out: it is slow."""
     figures = {}
-    save = compare.save
-    monkeypatch.setattr(compare, "save", lambda figure, file: figures.update({file.name: figure}) or save(figure, file))
-    lem.plot(*runs)
+
+    def keep(figure, file):
+        file.parent.mkdir(exist_ok=True)
+        file.write_bytes(b"a picture")
+        figures[file.name] = figure
+        return file
+
+    for module in (compare, curves):
+        monkeypatch.setattr(module, "save", keep)
     return figures
+
+
+def drawn(monkeypatch, *runs):
+    """The figures of the comparison that `lem.plot` draws."""
+    figures = without_layout(monkeypatch)
+    lem.plot(*runs)
+    return {name: figure for name, figure in figures.items() if name.startswith("comparison")}
 
 
 def test_one_seed_ranks_nothing_and_that_is_said(tmp_path, monkeypatch, capsys):

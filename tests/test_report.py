@@ -17,7 +17,7 @@ from lemniscate.report import advice, curves, pages, style
 from lemniscate.report.advice import Evidence
 from lemniscate.run.metrics import to_line
 from lemniscate.system.files import read_json, write_json
-from test_compare import write_run, write_runs
+from test_compare import without_layout, write_run, write_runs
 
 PAGE = (Path(__file__).parents[1] / "docs" / "glossary.md").read_text()
 SCORES = {
@@ -248,7 +248,8 @@ def test_the_page_of_a_comparison(tmp_path, monkeypatch):
     assert "gamma0.90.8" in page.text  # the row of what differs
 
 
-def test_plot_of_a_run_returns_its_page_last(tmp_path):
+def test_plot_of_a_run_returns_its_page_last(tmp_path, monkeypatch):
+    without_layout(monkeypatch)
     run = without_policy(write_run(tmp_path / "r"))
     assert lem.plot(run)[-1] == run / "plots" / "report.html"
 
@@ -256,6 +257,7 @@ def test_plot_of_a_run_returns_its_page_last(tmp_path):
 @pytest.mark.parametrize("count", [1, 2])
 def test_a_notebook_shows_the_pictures_of_every_plot(tmp_path, monkeypatch, count):
     shown = []
+    without_layout(monkeypatch)
     monkeypatch.setattr("IPython.display.display", lambda image: shown.append(image.filename))
     monkeypatch.setattr(plots, "in_notebook", lambda: True)
     files = lem.plot(*map(without_policy, write_runs(tmp_path / "a")[:count]))

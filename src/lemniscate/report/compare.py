@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 from lemniscate.envs.registry import file_name
 from lemniscate.report import pages
-from lemniscate.report.curves import episode_returns, plot_runs, smooth, training_minutes
+from lemniscate.report.curves import episode_returns, moving_average, plot_runs, training_minutes, window_of
 from lemniscate.report.seeds import (
     Group,
     Scores,
@@ -196,7 +196,7 @@ def _draw_training(figure: Figure, by_step: Axes, by_minute: Axes, groups: list[
 def _curve(run: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The step and the minute at which each episode of a run ended, and the mean return of the last ones there."""
     steps, returns = episode_returns(run)
-    return steps, np.interp(steps, *training_minutes(run)), smooth(returns)
+    return steps, np.interp(steps, *training_minutes(run)), moving_average(returns, window_of(returns))
 
 
 def _band(axes: Axes, curves: list[tuple[np.ndarray, np.ndarray]], color: object) -> None:

@@ -272,11 +272,6 @@ def window_of(returns: np.ndarray) -> int:
     return max(WINDOW, len(returns) // 50)
 
 
-def smooth(returns: np.ndarray) -> np.ndarray:
-    """The mean of the last episodes at each of them, as many as `window_of` says."""
-    return moving_average(returns, window_of(returns))
-
-
 def moving_average(values: np.ndarray, window: int) -> np.ndarray:
     """The mean of the last `window` values at each place, of fewer at the beginning."""
     total = np.cumsum(np.insert(values, 0, 0.0))

@@ -12,10 +12,9 @@ import platform
 import shlex
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
-from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import quote
 
 import numpy as np
@@ -31,9 +30,6 @@ from lemniscate.run.metrics import read_metrics
 from lemniscate.run.q_bias import QBias
 from lemniscate.system import named
 from lemniscate.system.files import replace_file
-
-if TYPE_CHECKING:
-    from jinja2 import Environment
 
 MOST_BYTES = 5_000_000
 """the largest film that is embedded; a larger one is linked"""
@@ -98,7 +94,9 @@ def write_run(run: Path, pictures: Sequence[Path], scores: Mapping[str, Any] | N
         headline=_headline(run, scores),
         advice=[*advice.sentences(advice.Evidence(config, log, scores or {})), advice.ONE_SEED],
         pictures=pictures,
-        film=_film(film, file) if film else None,
+        film=film,
+        film_link=_link(film, file.parent) if film else "",
+        embedded_bytes=MOST_BYTES,
         scores=score_rows(evaluated) if evaluated else [],
         histogram=_histogram(evaluated["returns"]) if evaluated else None,
         changed=[(name, _shown(value), _shown(defaults.get(name))) for name, value in changed.items()],
@@ -131,12 +129,6 @@ def newest_film(run: Path) -> Path | None:
     # Not a link, which could lead to any file of this machine, and what is found is embedded and uploaded.
     own = [file for file in films if file.is_file() and not file.is_symlink()]
     return max(own, key=lambda file: file.stat().st_mtime, default=None)
-
-
-def _film(film: Path, page: Path) -> dict[str, Any]:
-    """A film, linked from its page if it is large."""
-    size = film.stat().st_size
-    return {"file": film, "linked": size > MOST_BYTES, "megabytes": size / 1e6, "href": _link(film, page.parent)}
 
 
 def _histogram(returns: Sequence[float]) -> dict[str, Any] | None:
@@ -172,43 +164,35 @@ def comparison_part(
         pictures: of the comparison, embedded.
     """
     spread = [(one.label, advice.seeds_differ(one.finals(scores))) for one in groups]
+    kinds = [{"algorithm": one.algorithm, **one.config} for one in groups]
+    names = [name for name in dict.fromkeys(name for kind in kinds for name in kind) if name != "seed"]
+    differ = [name for name in names if any(kind.get(name) != kinds[0].get(name) for kind in kinds)]
+    seeds = {run: str(read_config(run)[1].get("seed")) for one in groups for run in one.runs}
+    commands = {one.label: (one, ",".join(seeds[run] for run in one.runs)) for one in groups}
     return {
         "env": groups[0].env,
         "labels": [one.label for one in groups],
         "rows": rows,
         "remarks": [*remarks, *(f"{label}: {sentence}" for label, sentence in spread if sentence)],
         "pictures": pictures,
-        "differences": _differences(groups),
-        "runs": [_run_row(run, scores, page) for one in groups for run in one.runs],
-        "commands": [
-            (one.label, train_command(one.algorithm, one.config, seeds=",".join(map(_seed_of, one.runs))))
-            for one in groups
-        ],
+        "differences": [[name, *(_shown(kind[name]) if name in kind else "–" for kind in kinds)] for name in differ],
+        "runs": [_run_row(run, seed, scores, page) for run, seed in seeds.items()],
+        "commands": {
+            label: train_command(one.algorithm, one.config, seeds=seeds) for label, (one, seeds) in commands.items()
+        },
     }
 
 
-def _differences(groups: Sequence[Group]) -> list[list[str]]:
-    """The fields that are not the same in all groups, each with its value in every group."""
-    kinds = [{"algorithm": one.algorithm, **one.config} for one in groups]
-    names = [name for name in dict.fromkeys(name for kind in kinds for name in kind) if name != "seed"]
-    differ = [name for name in names if any(kind.get(name) != kinds[0].get(name) for kind in kinds)]
-    return [[name, *(_shown(kind[name]) if name in kind else "–" for kind in kinds)] for name in differ]
-
-
-def _run_row(run: Path, scores: Scores, page: Path) -> dict[str, Any]:
+def _run_row(run: Path, seed: str, scores: Scores, page: Path) -> dict[str, str]:
     """The row of a run, with a link to its own page, if there is one."""
     own = run / "plots" / "report.html"
     return {
         "path": str(run),
-        "href": _link(own, page.parent) if own.exists() else None,
-        "seed": _seed_of(run),
+        "page": _link(own, page.parent) if own.exists() else "",
+        "seed": seed,
         "final": f"{scores[run]:,.1f}" if run in scores else "–",
         "state": "finished" if is_finished(run) else "not finished",
     }
-
-
-def _seed_of(run: Path) -> str:
-    return str(read_config(run)[1].get("seed"))
 
 
 def write_card(
@@ -233,27 +217,22 @@ def write_card(
         license: as the Hub abbreviates it, such as "mit"; none is named without.
     """
     stored = config.to_json()
-    places = [str(stored.get(part)) for part in ("env", "network")] + list(stored.get("wrappers") or ())
-    code = [place for place in places if ":" in place and not named.is_passed(place)]
-    text = (
-        _templates()
-        .get_template("card.md.j2")
-        .render(
-            metadata=_metadata(name, algorithm, config, scores, license),
-            name=name,
-            algorithm=algorithm,
-            config=config,
-            step=step,
-            films=[_link(file, folder) for file in sorted((folder / "videos").glob("*"))],
-            replay=(folder / "replay.mp4").exists(),
-            scores=score_rows(scores) if scores else [],
-            code=code if algorithm in algos.ALGORITHMS else [algorithm, *code],
-            command=train_command(algorithm, stored),
-            pictures=[(caption(file), _link(file, folder)) for file in sorted((folder / "plots").glob("*.png"))],
-            exported=[
-                (file.name, _link(file, folder)) for file in sorted((folder / "export").rglob("*")) if file.is_file()
-            ],
-        )
+    places = [stored.get("env"), stored.get("network"), *(stored.get("wrappers") or ())]
+    code = [place for place in map(str, places) if ":" in place and not named.is_passed(place)]
+    shown = {"videos": "videos/*", "plots": "plots/*.png", "export": "export/**/*"}
+    found = {kind: sorted(filter(Path.is_file, folder.glob(pattern))) for kind, pattern in shown.items()}
+    text = _filled(
+        "card.md.j2",
+        metadata=_metadata(name, algorithm, config, scores, license),
+        name=name,
+        algorithm=algorithm,
+        config=config,
+        step=step,
+        replay=(folder / "replay.mp4").exists(),
+        scores=score_rows(scores) if scores else [],
+        code=code if algorithm in algos.ALGORITHMS else [algorithm, *code],
+        command=train_command(algorithm, stored),
+        files={kind: [(file, _link(file, folder)) for file in files] for kind, files in found.items()},
     )
     (folder / "README.md").write_text(text, encoding="utf-8")
 
@@ -401,24 +380,23 @@ def _write_page(file: Path, template: str, **context: Any) -> Path:
     machine = f"Python {platform.python_version()} on {platform.system()} {platform.machine()}"
     date = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
     written = f"Written on {date} by {', '.join(versions)}, {machine}."
-    page = _templates().get_template(template).render(written=written, **context)
+    page = _filled(template, written=written, **context)
     file.parent.mkdir(parents=True, exist_ok=True)
     replace_file(file, page.encode("utf-8", errors="xmlcharrefreplace"))
     return file
 
 
-@cache
-def _templates() -> "Environment":
-    """The templates beside this module; what is put into HTML is escaped, into Markdown not."""
+def _filled(template: str, **context: Any) -> str:
+    """The text of a template beside this module; what is put into HTML is escaped, into Markdown not."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined  # a training without a report needs none
 
     templates = Environment(
         loader=FileSystemLoader(Path(__file__).parent / "templates"),
-        autoescape=lambda name: name is not None and ".html" in name,
+        autoescape=".html" in template,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
     templates.filters |= {"embedded": _embedded, "caption": caption}
-    return templates
+    return templates.get_template(template).render(context)

@@ -59,8 +59,7 @@ def show(flights: Iterable[Flight], model: mujoco.MjModel) -> None:
                     return
                 _place(model, data, flight.position[t, 0], flight.attitude[t, 0])
                 window.user_scn.ngeom = 0
-                _line(window.user_scn, flight.reference[::5, 0], REFERENCE, width=3)
-                _line(window.user_scn, flight.position[max(0, t - 100) : t + 1 : 2, 0], TRAIL, width=4)
+                _draw_lines(window.user_scn, flight.reference[:, 0], flight.position[: t + 1, 0])
                 window.sync()
                 time.sleep(flight.time_step)
 
@@ -85,18 +84,19 @@ def _render_here(folder: Path) -> None:
         for t in range(0, len(path), int(flight["every"])):
             _place(model, data, path[t], attitude[t])
             renderer.update_scene(data, camera)
-            _line(renderer.scene, reference[::5], REFERENCE, width=3)
-            _line(renderer.scene, path[max(0, t - 100) : t + 1 : 2], TRAIL, width=4)
+            _draw_lines(renderer.scene, reference, path[: t + 1])
             frames.append(renderer.render())
     np.save(folder / "frames.npy", np.stack(frames))
 
 
-def _line(scene: mujoco.MjvScene, points: np.ndarray, color: np.ndarray, width: float) -> None:
-    for start, end in pairwise(points):
-        geom = scene.geoms[scene.ngeom]
-        mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_LINE, np.zeros(3), np.zeros(3), np.zeros(9), color)
-        mujoco.mjv_connector(geom, mujoco.mjtGeom.mjGEOM_LINE, width, start, end)
-        scene.ngeom += 1
+def _draw_lines(scene: mujoco.MjvScene, reference: np.ndarray, flown: np.ndarray) -> None:
+    """Add the reference and the last hundred steps that were flown."""
+    for points, color, width in ((reference[::5], REFERENCE, 3), (flown[-101::2], TRAIL, 4)):
+        for start, end in pairwise(points):
+            geom = scene.geoms[scene.ngeom]
+            mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_LINE, np.zeros(3), np.zeros(3), np.zeros(9), color)
+            mujoco.mjv_connector(geom, mujoco.mjtGeom.mjGEOM_LINE, width, start, end)
+            scene.ngeom += 1
 
 
 if __name__ == "__main__":
