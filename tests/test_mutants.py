@@ -965,7 +965,7 @@ MUTANTS = [
     ),
     (
         "the clips are not tested",
-        "exporting/flights.py",
+        "exporting/parity.py",
         "return np.concatenate([real, edges]).astype(np.float32)",
         "return real",
         "export/test_self_test.py::test_a_wrong_export_fails_its_self_test",

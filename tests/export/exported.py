@@ -9,13 +9,11 @@ import torch
 
 from lemniscate.algos import ppo
 from lemniscate.api.policy import TrainedPolicy
-from lemniscate.exporting.actions import act_with
-from lemniscate.exporting.c_files import c_files
-from lemniscate.exporting.deployed import Deployed, input_size
-from lemniscate.exporting.host import HostPolicy, host_compiler
-from lemniscate.exporting.onnx_model import onnx_model
+from lemniscate.exporting.c_code import c_files
+from lemniscate.exporting.compiled import HostPolicy, host_compiler
+from lemniscate.exporting.deployed import Deployed, act_with, input_size
+from lemniscate.exporting.onnx_model import onnx_act, onnx_model
 from lemniscate.exporting.operations import Program
-from lemniscate.exporting.parity import onnx_act
 from lemniscate.exporting.translation import translate
 from lemniscate.spec import Box, Discrete, ObservationPart, Spec
 

@@ -9,8 +9,8 @@ import pytest
 from exported import BOX, exported, needs_compiler, policy_for
 
 from lemniscate.errors import UserError
-from lemniscate.exporting.c_files import c_files, functions
-from lemniscate.exporting.host import FLAGS, HostPolicy, host_compiler, run_tool
+from lemniscate.exporting.c_code import c_files, functions
+from lemniscate.exporting.compiled import FLAGS, HostPolicy, host_compiler, run_tool
 
 pytestmark = needs_compiler
 

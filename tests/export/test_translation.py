@@ -8,7 +8,7 @@ from torch import nn
 
 from lemniscate.algos import a2c, ddpg, ppo, reinforce, reppo, sac, td3, trpo
 from lemniscate.errors import UserError
-from lemniscate.exporting.deployed import Deployed, safe_action
+from lemniscate.exporting.deployed import Deployed, act_with, safe_action
 from lemniscate.exporting.translation import translate
 from lemniscate.spec import Box, Discrete, MultiBinary, MultiDiscrete
 
@@ -202,7 +202,6 @@ def test_the_same_policy_is_written_in_the_same_words():
 def test_a_dictionary_is_seen_in_the_order_of_its_parts(tmp_path):
     from lemniscate.api.policy import TrainedPolicy
     from lemniscate.envs import registry
-    from lemniscate.exporting.actions import act_with
 
     env = registry.make("environments:Copy", 2, kwargs={"kind": "tuple"})
     config = ppo.Config(env="environments:Copy", env_kwargs={"kind": "tuple"}, hidden=(8,))

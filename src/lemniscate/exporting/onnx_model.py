@@ -1,4 +1,4 @@
-"""ONNX from a list of operations."""
+"""ONNX from a list of operations, and onnxruntime, which acts with it."""
 
 import json
 from collections.abc import Mapping
@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from lemniscate.exporting.operations import Operand, Operation, Program, Value, weight_of
-from lemniscate.exporting.provenance import version
+from lemniscate.exporting.deployed import Act, as_rows
+from lemniscate.exporting.manifest import version
+from lemniscate.exporting.operations import Operand, Operation, Program, Value
 
 OPSET, IR = 18, 10
-"""of 2022 and 2024: runtimes that are some years old can read it"""
+"""of 2022 and 2024, so that runtimes that are some years old can read the model"""
 
 
 def onnx_model(program: Program, facts: Mapping[str, Any]) -> bytes:
@@ -18,7 +19,7 @@ def onnx_model(program: Program, facts: Mapping[str, Any]) -> bytes:
 
     Args:
         program: the policy.
-        facts: what the model carries as metadata, each as JSON.
+        facts: the model's metadata, each value as JSON.
     """
     import onnx
     from onnx import helper
@@ -39,6 +40,17 @@ def onnx_model(program: Program, facts: Mapping[str, Any]) -> bytes:
     helper.set_model_props(model, {name: json.dumps(value) for name, value in facts.items()})
     onnx.checker.check_model(model, full_check=True)
     return model.SerializeToString()
+
+
+def onnx_act(model: bytes) -> tuple[Act, str]:
+    """The policy in onnxruntime, on one thread, and the version of onnxruntime."""
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    options.log_severity_level = 3
+    session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+    return lambda obs: as_rows(np.asarray(session.run(None, {"obs": obs})[0])), onnxruntime.__version__
 
 
 class _Writer:
@@ -83,10 +95,10 @@ class _Writer:
     def _linear(self, operation: Operation) -> None:
         x, output = self.operand(operation.inputs[0]), operation.output.name
         biases = [self.operand(operand) for operand in operation.inputs[2:]]
-        if len(operation.output.shape) == 1:
-            self.node("Gemm", [x, self.constant(weight_of(operation)), *biases], output, transB=1)
+        if len(operation.output.shape) == 1:  # Gemm takes matrices only, MatMul any number of axes
+            self.node("Gemm", [x, self.constant(operation.weight), *biases], output, transB=1)
             return
-        weight = self.constant(weight_of(operation).T)
+        weight = self.constant(operation.weight.T)
         product = self.node("MatMul", [x, weight], f"{output}_product" if biases else output)
         if biases:
             self.node("Add", [product, *biases], output)

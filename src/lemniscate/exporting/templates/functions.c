@@ -146,9 +146,9 @@ static float policy_erf(float x)
     return x < 0.0F ? -y : y;
 }
 
-// bfloat16
+// roundbfloat16
 /* The nearest number with 8 bits of mantissa; of two, the even one. */
-static float policy_bfloat16(float x)
+static float policy_roundbfloat16(float x)
 {
     uint32_t bits;
     memcpy(&bits, &x, sizeof bits);
