@@ -128,6 +128,7 @@ class Odd(nn.Module):
         )
         e = torch.stack([a[:, 0], b.sum(-1), b.argmax(-1).float()], dim=1) * 0.1
         e = torch.cat([e, ((a[:, :3] >= 0) & ~(b[:, :3] == 0)).float()], dim=-1)
+        e = torch.cat([e[:, :3], x.new_full((x.shape[0], 1), 0.5), e[:, 3:5]], dim=-1)
         return self.last(torch.cat([c, d, e, nn.functional.elu(a)], dim=-1).tanh())
 
 

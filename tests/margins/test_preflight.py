@@ -10,8 +10,8 @@ import environments  # noqa: F401  (registers the environments)
 import lemniscate as lem
 from conftest import tiny_fields
 from lemniscate.cli import main
-from lemniscate.exporting.host import host_compiler
-from lemniscate.margins import compiled
+from lemniscate.exporting.compiled import host_compiler
+from lemniscate.margins import preflight as preflights
 from lemniscate.margins.preflight import preflight
 from lemniscate.system.files import read_json, write_json
 
@@ -69,8 +69,8 @@ def test_in_python_it_is_the_same_again(copy):
 def test_the_exported_c_acts_as_the_policy_does(copy, monkeypatch):
     lem.export(copy)
     acted = []
-    original = compiled.for_policy
-    monkeypatch.setattr(compiled, "for_policy", lambda rows, kind: acted.append(1) or original(rows, kind))
+    original = preflights.for_policy
+    monkeypatch.setattr(preflights, "for_policy", lambda rows, kind: acted.append(1) or original(rows, kind))
     plain, exported = (preflight(copy, compiled=c, episodes=4) for c in (False, True))
     assert acted
     assert exported.compiled
@@ -105,7 +105,7 @@ def test_a_mistake_is_one_sentence_and_nothing_is_written(copy, capsys, argument
 
 
 def test_a_missing_compiler_has_its_sentence(copy, monkeypatch):
-    monkeypatch.setattr(compiled, "host_compiler", lambda: None)
+    monkeypatch.setattr(preflights, "host_compiler", lambda: None)
     with pytest.raises(lem.UserError, match="There is no C compiler here"):
         preflight(copy, compiled=True)
 

@@ -65,14 +65,15 @@ def c_files(
         "origin": comment(origin),
     }
     masked = isinstance(action, Discrete) and action.masked
+    statements = "\n".join(f"    {statement.text}" for statement in body.statements)
     source = {
         "constants": "\n\n".join(body.constants),
         "safe": braces(safe_action(action)),
         "scratch": max(scratch, 1),
-        "functions": "".join(f"{text}\n" for text in functions(body.functions)),
+        "functions": functions(statements),
         "arrays": "\n".join(f"    float *const {name} = scratch + {places[name]};" for name in body.sizes),
         "masked": fill("masked.c", vars(action)) if masked else "",
-        "statements": "\n".join(f"    {statement.text}" for statement in body.statements),
+        "statements": statements,
         "test_observations": _rows(observations),
         "test_actions": _rows(actions),
     }
@@ -95,27 +96,17 @@ def self_test_bound(program: Program, actions: np.ndarray) -> float:
     return 0.05 * max(1.0, largest) if program.is_rounded else 1e-5 * max(10.0, largest)
 
 
-def functions(names: set[str]) -> list[str]:
-    """The texts of C functions and of those that they call, in the order of their file."""
-    blocks = _function_blocks()
-    wanted, todo = set[str](), list(names)
-    while todo:
-        name = todo.pop()
-        wanted.add(name)
-        todo += [other for other in blocks[name][0] if other not in wanted]
-    return [text for name, (_, text) in blocks.items() if name in wanted]
+def functions(text: str) -> str:
+    """The functions in functions.c that `text` calls, and those that they call, in the order of their file.
 
-
-def _function_blocks() -> dict[str, tuple[list[str], str]]:
-    """(names of the functions that it calls, text) of each function in functions.c, by its name.
-
-    A block begins with the line `// name: names of the functions that it calls`.
+    A block of that file begins with a line `// name`.
     """
-    found: dict[str, tuple[list[str], str]] = {}
-    for block in f"\n{(TEMPLATES / 'functions.c').read_text()}".split("\n// ")[1:]:
-        head, _, text = block.partition("\n")
-        name, _, called = head.partition(":")
-        found[name] = (called.split(), f"{text.strip()}\n")
+    blocks = f"\n{(TEMPLATES / 'functions.c').read_text()}".split("\n// ")[1:]
+    found = ""
+    for block in reversed(blocks):  # C defines a function before it is called, so one pass finds all of them
+        name, _, block_text = block.partition("\n")
+        if f"policy_{name}(" in text + found:
+            found = f"{block_text.strip()}\n\n{found}"
     return found
 
 
@@ -151,14 +142,12 @@ class Body:
         constants: the definitions of constant arrays.
         statements: in their order.
         sizes: of the arrays in the scratch memory, by name.
-        functions: the names of the functions that the statements call.
     """
 
     def __init__(self, program: Program) -> None:
         self.constants: list[str] = []
         self.statements: list[Statement] = []
         self.sizes: dict[str, int] = {}
-        self.functions: set[str] = set()
         self._results = {program.obs: Numbers(lambda index: f"obs[{index}]", frozenset(), "obs")}
         self._uses = Counter(x for operation in program.operations for x in operation.inputs if isinstance(x, Value))
         for operation in program.operations:
@@ -242,8 +231,6 @@ class Body:
                 self._array(operand)  # computed once for all numbers that need it, not in the loop
         inputs = [self._broadcast(operand, output.shape) for operand in operation.inputs]
         kinds = [operand.kind if isinstance(operand, Value) else "float" for operand in operation.inputs]
-        if operation.name not in OPERATORS and operation.name != "Cast":
-            self.functions.add(operation.name.lower())
 
         def at(index: str) -> str:
             return _expression(operation, [x.at(index) for x in inputs], kinds)
@@ -268,7 +255,6 @@ class Body:
     def _linear(self, operation: Operation) -> None:
         x, _, *biases = operation.inputs
         assert isinstance(x, Value)
-        self.functions.add("linear")
         source, target = self._array(x), self._new(operation.output)
         weight = self._constant(operation.weight, "weight")
         bias = self._constant(np.asarray(biases[0]), "bias") if biases else "0"
@@ -282,20 +268,19 @@ class Body:
         axis, output = operation.settings["axis"], operation.output
         target, places, start = self._new(output), _places(output.shape), 0
         for part in operation.inputs:
-            numbers, size = self._numbers(part), part.shape[axis]
+            assert isinstance(part, Value)
+            numbers, size = self._results[part], part.shape[axis]
             place = _place("i", _part(places, axis, start, size))
-            value = part if isinstance(part, Value) else Value("", part.shape)
-            text = f"{output.name}[{place}] = {_bare(_float(numbers.at('i'), value))};"
-            self._say(_loop(text, value.size), numbers.arrays, output.name)
+            text = f"{output.name}[{place}] = {_bare(_float(numbers.at('i'), part))};"
+            self._say(_loop(text, part.size), numbers.arrays, output.name)
             start += size
         self._results[output] = target
 
     def _reduce(self, operation: Operation) -> None:
-        (x,), output, function = operation.inputs, operation.output, operation.name.lower()
+        (x,), output = operation.inputs, operation.output
         assert isinstance(x, Value)
-        self.functions.add(function)
         source, target, size = self._array(x), self._new(output), x.shape[-1]
-        call = f"policy_{function}({source.whole} + i * {size}, {size})"
+        call = f"policy_{operation.name.lower()}({source.whole} + i * {size}, {size})"
         self._say(_loop(f"{target.whole}[i] = {call};", output.size), source.arrays, output.name)
         self._results[output] = target
 

@@ -83,14 +83,38 @@ class _Writer:
 
     def add(self, operation: Operation) -> None:
         """Translate one operation."""
-        name, output, own = operation.name, operation.output.name, getattr(self, f"_{operation.name.lower()}", None)
-        if own:
-            own(operation)
-        elif name.startswith("Reduce"):
-            axes = self.constant(np.array([-1]))
-            self.node(name, [self.operand(operation.inputs[0]), axes], output, keepdims=1)
-        else:
-            self.node(name, [self.operand(operand) for operand in operation.inputs], output)
+        name, output = operation.name, operation.output.name
+        if name == "Linear":
+            self._linear(operation)
+            return
+        inputs = [self.operand(operand) for operand in operation.inputs]
+        if name == "RoundBfloat16":
+            rounded = self.node("Cast", inputs, f"{output}_bfloat16", to=self.bfloat16)
+            self.node("Cast", [rounded], output, to=self.types["float"])
+            return
+        places, attributes = self._settings(operation)
+        self.node(name, [*inputs, *(self.constant(np.array(numbers)) for numbers in places)], output, **attributes)
+
+    def _settings(self, operation: Operation) -> tuple[list[list[int]], dict[str, Any]]:
+        """Further inputs of whole numbers, and attributes; here axes and shapes count the batch."""
+        shape, settings = operation.output.shape, operation.settings
+        match operation.name:
+            case "Slice":
+                start, end = settings["start"], settings["start"] + shape[settings["axis"]]
+                return [[start], [end], [settings["axis"] + 1]], {}
+            case "Reshape":
+                return [[-1, *shape]], {}
+            case "Expand":
+                return [[1, *shape]], {}
+            case "Transpose":
+                return [], {"perm": [0, *(axis + 1 for axis in settings["axes"])]}
+            case "Concat":
+                return [], {"axis": settings["axis"] + 1}
+            case "Cast":
+                return [], {"to": self.types[operation.output.kind]}
+            case "ArgMax":
+                return [], {"axis": -1, "keepdims": 0}
+        return ([[-1]], {"keepdims": 1}) if operation.name.startswith("Reduce") else ([], {})
 
     def _linear(self, operation: Operation) -> None:
         x, output = self.operand(operation.inputs[0]), operation.output.name
@@ -102,38 +126,3 @@ class _Writer:
         product = self.node("MatMul", [x, weight], f"{output}_product" if biases else output)
         if biases:
             self.node("Add", [product, *biases], output)
-
-    def _concat(self, operation: Operation) -> None:
-        rank = len(operation.output.shape) + 1
-        names = [self.operand(operand) for operand in operation.inputs]
-        self.node("Concat", names, operation.output.name, axis=operation.settings["axis"] + 1 - rank)
-
-    def _argmax(self, operation: Operation) -> None:
-        self.node("ArgMax", [self.operand(operation.inputs[0])], operation.output.name, axis=-1, keepdims=0)
-
-    def _cast(self, operation: Operation) -> None:
-        to = self.types[operation.output.kind]
-        self.node("Cast", [self.operand(operation.inputs[0])], operation.output.name, to=to)
-
-    def _roundbfloat16(self, operation: Operation) -> None:
-        output = operation.output.name
-        rounded = self.node("Cast", [self.operand(operation.inputs[0])], f"{output}_bfloat16", to=self.bfloat16)
-        self.node("Cast", [rounded], output, to=self.types["float"])
-
-    def _slice(self, operation: Operation) -> None:
-        axis, start = operation.settings["axis"], operation.settings["start"]
-        ends = (start, start + operation.output.shape[axis], axis + 1)
-        places = [self.constant(np.array([number])) for number in ends]
-        self.node("Slice", [self.operand(operation.inputs[0]), *places], operation.output.name)
-
-    def _reshape(self, operation: Operation) -> None:
-        shape = self.constant(np.array([-1, *operation.output.shape]))
-        self.node("Reshape", [self.operand(operation.inputs[0]), shape], operation.output.name)
-
-    def _expand(self, operation: Operation) -> None:
-        shape = self.constant(np.array([1, *operation.output.shape]))
-        self.node("Expand", [self.operand(operation.inputs[0]), shape], operation.output.name)
-
-    def _transpose(self, operation: Operation) -> None:
-        axes = [0, *(axis + 1 for axis in operation.settings["axes"])]
-        self.node("Transpose", [self.operand(operation.inputs[0])], operation.output.name, perm=axes)

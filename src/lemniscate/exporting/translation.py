@@ -15,21 +15,11 @@ import torch
 from torch import Tensor, nn
 from torch._decomp import get_decompositions
 from torch.export.graph_signature import InputKind
-from torch.fx.node import Node, map_arg
+from torch.fx import GraphModule, Interpreter, Node
 from torch.utils import _pytree as pytree
 
 from lemniscate.errors import UserError
-from lemniscate.exporting.operations import (
-    BATCH,
-    Call,
-    Kind,
-    Operation,
-    Program,
-    UntranslatableError,
-    Value,
-    array,
-    constant,
-)
+from lemniscate.exporting.operations import BATCH, Call, Kind, Operation, Program, UntranslatableError, Value, array
 
 Translation = Callable[..., Any]
 
@@ -187,15 +177,17 @@ def _permute(call: Call, x: Value, axes: list[int]) -> Value:
 
 
 def _cat(call: Call, parts: list[Any], axis: int = 0) -> Value:
-    shape, own = call.shape, call.axis(axis, len(call.shape))
-    wide = []
-    for part in parts:
-        if isinstance(part, Tensor):
-            row = constant(part, len(shape))
-            assert isinstance(row, np.ndarray)
-            part = np.broadcast_to(row, (*shape[:own], row.shape[own], *shape[own + 1 :]))
-        wide.append(call.as_kind(part, call.kind))
-    return call.add("Concat", *wide, kind=call.kind, axis=own)
+    own = call.axis(axis, len(call.shape))
+    first = next(part for part in parts if isinstance(part, Value))
+    rows = [part if isinstance(part, Value) else _in_batch(call, array(part), first, own) for part in parts]
+    return call.add("Concat", *(call.as_kind(row, call.kind) for row in rows), kind=call.kind, axis=own)
+
+
+def _in_batch(call: Call, numbers: np.ndarray, x: Value, own: int) -> Value:
+    """Constants as a result: ONNX joins nothing that has no batch axis to something that has one."""
+    shape = (*call.shape[:own], numbers.shape[own - len(call.shape)], *call.shape[own + 1 :])
+    one = call.as_kind(_part(call, x, own, 0, 1), "float")
+    return call.add("Add", call.add("Sub", one, one, shape=one.shape), numbers, shape=shape)
 
 
 def _full(call: Call, _size: Any, number: float = 0.0, **_: Any) -> Tensor:
@@ -269,9 +261,22 @@ def translate(module: nn.Module, inputs: int) -> Program:
         UserError: an operation that has no translation, or a result that depends on more than one row.
     """
     try:
-        return _Translator(_exported(module, inputs)).program()
+        return _program(_exported(module, inputs))
     except UntranslatableError as error:
         raise UserError(f"This network cannot be exported: {error}.") from None
+
+
+def _program(exported: torch.export.ExportedProgram) -> Program:
+    signature, constants = exported.graph_signature, {**exported.state_dict, **exported.constants}
+    (given,) = (node for node in exported.graph.nodes if node.name in signature.user_inputs)
+    batch, *shape = given.meta["val"].shape
+    obs, translator = Value("obs", tuple(shape)), _Translator(exported.graph_module, str(batch))
+    specs = signature.input_specs
+    inputs = [obs if spec.kind is InputKind.USER_INPUT else constants.get(spec.target or "") for spec in specs]
+    (action,) = translator.run(*inputs, enable_io_processing=False)
+    if not isinstance(action, Value):
+        raise UntranslatableError("its actions do not depend on the observation")
+    return Program(obs, _needed(translator.operations, action), action)
 
 
 def _exported(module: nn.Module, inputs: int) -> torch.export.ExportedProgram:
@@ -315,47 +320,27 @@ def _needed(operations: list[Operation], action: Value) -> tuple[Operation, ...]
     return tuple(reversed(kept))
 
 
-class _Translator:
-    """A walk through a graph, node by node."""
+class _Translator(Interpreter):
+    """A walk through a graph, node by node, that collects operations."""
 
-    def __init__(self, exported: torch.export.ExportedProgram) -> None:
-        self.exported = exported
+    def __init__(self, graph: GraphModule, batch: str) -> None:
+        super().__init__(graph)
+        self.extra_traceback = False  # torch would put the node in front of an error's message
         self.operations: list[Operation] = []
-        self.results: dict[Node, Any] = {}
-        self.obs, self.batch = Value("obs", ()), ""
+        self.batch = batch
 
-    def program(self) -> Program:
-        """The operations of the whole graph."""
-        specs = {spec.arg.name: spec for spec in self.exported.graph_signature.input_specs}
-        for node in self.exported.graph.nodes:
-            if node.op == "placeholder":
-                self.results[node] = self._placeholder(node, specs[node.name])
-            elif node.op == "call_function":
-                self.results[node] = self._call(node)
-        (node,) = [node for node in self.exported.graph.nodes if node.op == "output"]
-        action = self.results[node.args[0][0]]
-        if not isinstance(action, Value):
-            raise UntranslatableError("its actions do not depend on the observation")
-        return Program(self.obs, _needed(self.operations, action), action)
-
-    def _placeholder(self, node: Node, spec: Any) -> Any:
-        if spec.kind is InputKind.USER_INPUT:
-            batch, *shape = node.meta["val"].shape
-            self.obs, self.batch = Value("obs", tuple(shape)), str(batch)
-            return self.obs
-        return {**self.exported.state_dict, **self.exported.constants}.get(spec.target)
-
-    def _call(self, node: Node) -> Any:
-        name = _name_of(node)
+    def run_node(self, n: Node) -> Any:
+        """The result of a node: a `Value`, `BATCH`, or a constant."""
+        if n.op != "call_function":
+            return super().run_node(n)
+        name, (args, kwargs) = _name_of(n), self.fetch_args_kwargs_from_env(n)
         if name in CHECKS:
             return None
-        args, kwargs = map_arg((node.args, node.kwargs), self.results.__getitem__)
         given = pytree.tree_leaves((args, kwargs))
         if not any(isinstance(leaf, Value) or leaf is BATCH for leaf in given):
-            assert callable(node.target)
-            return node.target(*args, **kwargs)
-        if getattr(node.target, "__module__", "") == "_operator" and BATCH in given:  # on its way into a shape
+            return super().run_node(n)
+        if getattr(n.target, "__module__", "") == "_operator" and BATCH in given:  # on its way into a shape
             return BATCH
         if name not in TRANSLATIONS:
             raise UntranslatableError(f"{name} has no translation")
-        return TRANSLATIONS[name](Call(self.operations, node.meta["val"], name, self.batch), *args, **kwargs)
+        return TRANSLATIONS[name](Call(self.operations, n.meta["val"], name, self.batch), *args, **kwargs)

@@ -48,14 +48,14 @@ static float policy_exp(float x)
     return y * power;
 }
 
-// sigmoid: exp
+// sigmoid
 /* 1 / (1 + e^-x), with an error below 2e-7. */
 static float policy_sigmoid(float x)
 {
     return 1.0F / (1.0F + policy_exp(-x));
 }
 
-// tanh: sigmoid
+// tanh
 /* 2 sigmoid(2x) - 1, with an error below 3e-7. */
 static float policy_tanh(float x)
 {
@@ -130,13 +130,13 @@ static float policy_sin(float x)
     return policy_sine(x, 0);
 }
 
-// cos: sin
+// cos
 static float policy_cos(float x)
 {
     return policy_sine(x, 1);
 }
 
-// erf: exp abs
+// erf
 /* The error function, with an error below 7e-7 (Abramowitz and Stegun 1964, 7.1.26). */
 static float policy_erf(float x)
 {
@@ -200,7 +200,7 @@ static float policy_reducesum(const float *x, int size)
     return sum;
 }
 
-// reducemean: reducesum
+// reducemean
 static float policy_reducemean(const float *x, int size)
 {
     return policy_reducesum(x, size) / (float)size;
