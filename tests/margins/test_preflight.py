@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from functools import partial
 
 import pytest
 import torch
@@ -10,6 +11,7 @@ import environments  # noqa: F401  (registers the environments)
 import lemniscate as lem
 from conftest import tiny_fields
 from lemniscate.cli import main
+from lemniscate.exporting import export as exporting
 from lemniscate.exporting.compiled import host_compiler
 from lemniscate.margins import preflight as preflights
 from lemniscate.margins.preflight import preflight
@@ -57,8 +59,10 @@ def test_it_leaves_a_record_a_picture_a_table_and_sentences(copy, capsys):
     assert "safe" not in said.lower()
 
 
-def test_in_python_it_is_the_same_again(copy):
+def test_in_python_it_is_the_same_again_and_the_threads_of_torch_are_as_before(copy):
+    torch.set_num_threads(2)
     first, second = (lem.preflight(copy, episodes=4, seed=2) for _ in range(2))
+    assert torch.get_num_threads() == 2
     assert isinstance(first, lem.Preflight)
     assert first == second
     assert first.to_json() == second.to_json()
@@ -67,6 +71,7 @@ def test_in_python_it_is_the_same_again(copy):
 
 @pytest.mark.skipif(not host_compiler(), reason="there is no C compiler")
 def test_the_exported_c_acts_as_the_policy_does(copy, monkeypatch):
+    monkeypatch.setattr(exporting, "fly", partial(exporting.fly, rows=200))
     lem.export(copy)
     acted = []
     original = preflights.for_policy
@@ -133,16 +138,6 @@ def test_a_folder_that_cannot_be_written_is_a_sentence(copy):
     with pytest.raises(lem.UserError, match="cannot be written"):
         preflight(copy, episodes=4)
     assert is_untouched(copy)
-
-
-def test_the_threads_of_torch_are_as_before(copy):
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    try:
-        preflight(copy, episodes=4)
-        assert torch.get_num_threads() == 2
-    finally:
-        torch.set_num_threads(before)
 
 
 @pytest.mark.long

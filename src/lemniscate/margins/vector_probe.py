@@ -121,23 +121,17 @@ class VectorProbe:
 
     def fly(self, act: Act, seed: int) -> tuple[Flown, dict[str, list[Flown]]]:
         """All episodes, see `Probe.fly`; afterwards the environments are closed."""
+        numbers, seen = _is_number(self.spec), list[Tensor]()
         try:
-            nominal, scale = self._nominal(act, seed)
-            return nominal, {axis.name: self._along(axis, nominal, scale, act, seed) for axis in self.axes}
+            nominal = _fly(self._env, act, seed, seen if numbers.any() else None)
+            scale = torch.cat(seen).std(0, correction=0) * numbers if seen else None
+            points: dict[str, list[Flown]] = {}
+            for axis in self.axes:
+                flown = (nominal if v == axis.nominal else self._at(axis, v, scale, act, seed) for v in axis.values)
+                points[axis.name] = list(flown)
+            return nominal, points
         finally:
             self._env.close()
-
-    def _nominal(self, act: Act, seed: int) -> tuple[Flown, Tensor | None]:
-        """The nominal episodes; the standard deviation [O] of what was seen in them, 0 of what is no number."""
-        numbers, seen = _is_number(self.spec), list[Tensor]()
-        if not numbers.any():
-            return _fly(self._env, act, seed), None
-        flown = _fly(self._env, act, seed, seen)
-        return flown, torch.cat(seen).std(0, correction=0) * numbers
-
-    def _along(self, axis: Axis, nominal: Flown, scale: Tensor | None, act: Act, seed: int) -> list[Flown]:
-        """The episodes at each value of an axis."""
-        return [nominal if v == axis.nominal else self._at(axis, v, scale, act, seed) for v in axis.values]
 
     def _at(self, axis: Axis, value: Value, scale: Tensor | None, act: Act, seed: int) -> Flown:
         rng = generator(seed, CPU, 1)
