@@ -102,6 +102,9 @@ def test_ends_of_functions_are_finite(library):
 def test_only_functions_that_are_called_are_written():
     assert re.findall(r"float policy_(\w+)\(", functions("y = policy_tanh(x);")) == ["exp", "sigmoid", "tanh"]
     assert functions("") == ""
+    for name in NAMES:
+        text = functions(f"policy_{name}(")
+        assert set(re.findall(r"policy_(\w+)\(", text)) == set(re.findall(r"static \w+ policy_(\w+)\(", text)), name
 
 
 MAIN = """

@@ -103,7 +103,7 @@ static float policy_sqrt(float x)
     return 0.5F * (y + x / y);
 }
 
-// sin
+// sine
 /* The sine of x + quarters pi / 2, with an error below 4e-7 for |x| < 1000; 0 from |x| = 1e6 on. */
 static float policy_sine(float x, int32_t quarters)
 {
@@ -125,6 +125,7 @@ static float policy_sine(float x, int32_t quarters)
     return quarters & 2 ? -y : y;
 }
 
+// sin
 static float policy_sin(float x)
 {
     return policy_sine(x, 0);
