@@ -945,8 +945,8 @@ MUTANTS = [
     (
         "an expression is in an array that is written twice",
         "exporting/c_code.py",
-        "if self.uses[output] > 1:",
-        "if self.uses[output] < 0:",
+        "if self._uses[output] > 1:",
+        "if self._uses[output] < 0:",
         "export/test_translation.py::test_what_is_used_twice_is_computed_once",
     ),
     (
@@ -965,7 +965,7 @@ MUTANTS = [
     ),
     (
         "the clips are not tested",
-        "exporting/flights.py",
+        "exporting/parity.py",
         "return np.concatenate([real, edges]).astype(np.float32)",
         "return real",
         "export/test_self_test.py::test_a_wrong_export_fails_its_self_test",

@@ -1,6 +1,7 @@
 """Policies without training, and their exports."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -9,13 +10,11 @@ import torch
 
 from lemniscate.algos import ppo
 from lemniscate.api.policy import TrainedPolicy
-from lemniscate.exporting.actions import act_with
-from lemniscate.exporting.c_files import c_files
-from lemniscate.exporting.deployed import Deployed, input_size
-from lemniscate.exporting.host import HostPolicy, host_compiler
-from lemniscate.exporting.onnx_model import onnx_model
+from lemniscate.exporting.c_code import c_files
+from lemniscate.exporting.compiled import HostPolicy, host_compiler
+from lemniscate.exporting.deployed import Deployed, act_with, input_size
+from lemniscate.exporting.onnx_model import onnx_act, onnx_model
 from lemniscate.exporting.operations import Program
-from lemniscate.exporting.parity import onnx_act
 from lemniscate.exporting.translation import translate
 from lemniscate.spec import Box, Discrete, ObservationPart, Spec
 
@@ -31,13 +30,18 @@ class Exported:
     program: Program
     obs: np.ndarray
     true: np.ndarray
+    hosts: dict[Any, HostPolicy] = field(default_factory=dict)
 
     def files(self, tests=16):
         obs, true = self.obs[:tests], self.true[:tests]
         return c_files(self.program, self.policy.spec.action, obs, true, title="A policy.", origin="random ones")
 
     def host(self, *flags):
-        return HostPolicy(self.files(), host_compiler(), flags or ("-O0",))
+        """Compiled once for each choice of flags."""
+        flags = flags or ("-O0",)
+        if flags not in self.hosts:
+            self.hosts[flags] = HostPolicy(self.files(), host_compiler(), flags)
+        return self.hosts[flags]
 
     def onnx(self, obs):
         return onnx_act(onnx_model(self.program, {"a": 1}))[0](obs)
@@ -72,3 +76,9 @@ def exported(policy, **how):
     obs = observations_for(policy, **how)
     program = translate(Deployed(policy).eval(), obs.shape[1])
     return Exported(policy, program, obs, act_with(policy)(obs))
+
+
+@cache
+def plain():
+    """The export of a policy without anything special, for tests that look at its text."""
+    return exported(policy_for())

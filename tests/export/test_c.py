@@ -6,21 +6,17 @@ import subprocess
 
 import numpy as np
 import pytest
-from exported import BOX, exported, needs_compiler, policy_for
+from exported import BOX, exported, needs_compiler, plain, policy_for
 
 from lemniscate.errors import UserError
-from lemniscate.exporting.c_files import c_files, functions
-from lemniscate.exporting.host import FLAGS, HostPolicy, host_compiler, run_tool
+from lemniscate.exporting.c_code import c_files, functions
+from lemniscate.exporting.compiled import FLAGS, HostPolicy, host_compiler, run_tool
 
 pytestmark = needs_compiler
 
 HARNESS = """
-#include <math.h>
-#include <stdint.h>
-#include <string.h>
-FUNCTIONS
-double worst(int relative, double low, double high, uint32_t step);
-double worst(int relative, double low, double high, uint32_t step)
+double worst_NUMBER(int relative, double low, double high, uint32_t step);
+double worst_NUMBER(int relative, double low, double high, uint32_t step)
 {
     double largest = 0.0;
     uint32_t bits = 0;
@@ -54,38 +50,61 @@ BOUNDS = [
 ]
 
 
-def worst(folder, function, truth, relative, low, high, step):
-    text = HARNESS.replace("FUNCTIONS", "\n".join(functions({function}))).replace("TRUTH", truth)
-    (folder / "worst.c").write_text(text.replace("CALL", f"policy_{function}"))
-    library = folder / f"{function}.so"
-    run_tool([host_compiler(), "-std=c99", "-O2", "-fPIC", "-shared", "-o", str(library), "worst.c", "-lm"], folder)
-    call = ctypes.CDLL(str(library)).worst
+ENDS = "float f_NAME(float x);\nfloat f_NAME(float x) { return policy_NAME(x); }\n"
+NAMES = sorted({bound[0] for bound in BOUNDS})
+
+
+@pytest.fixture(scope="module")
+def library(tmp_path_factory):
+    """All functions, `worst_N` of each line of the table, and `f_NAME`, which has a number from ctypes."""
+    folder = tmp_path_factory.mktemp("functions")
+    texts = ["#include <math.h>\n#include <stdint.h>\n#include <string.h>"]
+    texts.append(functions("".join(f"policy_{name}(" for name in NAMES)))
+    for number, (name, truth, *_) in enumerate(BOUNDS):
+        text = HARNESS.replace("NUMBER", str(number)).replace("TRUTH", truth)
+        texts.append(text.replace("CALL", f"policy_{name}"))
+    texts += [ENDS.replace("NAME", name) for name in NAMES]
+    (folder / "functions.c").write_text("\n".join(texts))
+    command = [host_compiler(), "-std=c99", "-O2", "-fPIC", "-shared", "-o", "functions.so", "functions.c", "-lm"]
+    run_tool(command, folder)
+    return ctypes.CDLL(str(folder / "functions.so"))
+
+
+def worst(library, number, step):
+    _, _, relative, low, high, _ = BOUNDS[number]
+    call = library[f"worst_{number}"]
     call.restype, call.argtypes = ctypes.c_double, (ctypes.c_int, ctypes.c_double, ctypes.c_double, ctypes.c_uint32)
     return call(relative, low, high, step)
 
 
-@pytest.mark.parametrize(("function", "truth", "relative", "low", "high", "bound"), BOUNDS)
-def test_functions_are_as_exact_as_their_comments_say(tmp_path, function, truth, relative, low, high, bound):
-    assert worst(tmp_path, function, truth, relative, low, high, step=1009) <= bound  # four million numbers
+every_bound = pytest.mark.parametrize("number", range(len(BOUNDS)), ids=[f"{bound[0]}-{bound[3]}" for bound in BOUNDS])
+
+
+@every_bound
+def test_functions_are_as_exact_as_their_comments_say(library, number):
+    assert worst(library, number, step=1009) <= BOUNDS[number][-1]  # four million numbers
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("function", "truth", "relative", "low", "high", "bound"), BOUNDS)
-def test_functions_are_as_exact_at_every_float32(tmp_path, function, truth, relative, low, high, bound):
-    assert worst(tmp_path, function, truth, relative, low, high, step=1) <= bound
+@every_bound
+def test_functions_are_as_exact_at_every_float32(library, number):
+    assert worst(library, number, step=1) <= BOUNDS[number][-1]
 
 
-def test_ends_of_functions_are_finite(tmp_path):
+def test_ends_of_functions_are_finite(library):
     """No NaN and no infinity is made of finite numbers, so that a policy's answer is one."""
-    for function in ("exp", "sigmoid", "tanh", "log", "sqrt", "sin", "cos", "erf"):
-        text = "#include <stdint.h>\n#include <string.h>\n" + "\n".join(functions({function}))
-        (tmp_path / "f.c").write_text(
-            f"{text}\nfloat f(float x);\nfloat f(float x) {{ return policy_{function}(x); }}\n"
-        )
-        run_tool([host_compiler(), "-std=c99", "-fPIC", "-shared", "-o", f"{function}.so", "f.c"], tmp_path)
-        f = ctypes.CDLL(str(tmp_path / f"{function}.so")).f
+    for name in NAMES:
+        f = library[f"f_{name}"]
         f.restype, f.argtypes = ctypes.c_float, (ctypes.c_float,)
-        assert np.isfinite([f(x) for x in (0, -0.0, 1e-45, -1e-45, 3.4e38, -3.4e38, 88.1, -87.1, 1e6)]).all(), function
+        assert np.isfinite([f(x) for x in (0, -0.0, 1e-45, -1e-45, 3.4e38, -3.4e38, 88.1, -87.1, 1e6)]).all(), name
+
+
+def test_only_functions_that_are_called_are_written():
+    assert re.findall(r"float policy_(\w+)\(", functions("y = policy_tanh(x);")) == ["exp", "sigmoid", "tanh"]
+    assert functions("") == ""
+    for name in NAMES:
+        text = functions(f"policy_{name}(")
+        assert set(re.findall(r"policy_(\w+)\(", text)) == set(re.findall(r"static \w+ policy_(\w+)\(", text)), name
 
 
 MAIN = """
@@ -129,7 +148,7 @@ def test_it_includes_nothing_but_integers_and_memcpy_and_has_no_double():
 
 def test_a_header_of_cpp_too(tmp_path):
     """C++ finds the functions of the C file: a program of both is linked, and ends well."""
-    copy, compiler = exported(policy_for()), host_compiler()
+    copy, compiler = plain(), host_compiler()
     program = (
         '#include "policy.h"\nint main() { float x[POLICY_OBSERVATIONS] = {}, y[POLICY_ACTIONS]; policy_act(x, y); }\n'
     )
@@ -146,7 +165,7 @@ def test_a_header_of_cpp_too(tmp_path):
 
 
 def test_a_run_cannot_write_code_into_a_comment():
-    copy = exported(policy_for())
+    copy = plain()
     evil = "*/ int main(void) { return 1; }\n#error evil\\\n/*"
     for name, text in c_files(copy.program, BOX, copy.obs[:2], copy.true[:2], title=evil, origin=evil).items():
         assert text.count("#error") == text.count("* / int main(void)"), name
@@ -155,13 +174,13 @@ def test_a_run_cannot_write_code_into_a_comment():
 
 @pytest.mark.parametrize(("scale", "bound"), [(1, "1e-04F"), (1e6, "1e+01F")])
 def test_the_bound_of_the_self_test_grows_with_the_actions(scale, bound):
-    copy = exported(policy_for())
+    copy = plain()
     header = c_files(copy.program, BOX, copy.obs[:1], np.full((1, 3), scale), title="", origin="")["policy.h"]
     assert f"#define POLICY_SELF_TEST_BOUND {bound}\n" in header
 
 
 def test_a_compiler_that_refuses_is_quoted():
-    files = exported(policy_for()).files()
+    files = plain().files()
     files["policy.c"] = files["policy.c"].replace("int i;", "")
     with pytest.raises(UserError, match=r"failed: policy.c:\d+.*error"):
         HostPolicy(files, host_compiler())

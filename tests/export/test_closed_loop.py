@@ -11,7 +11,7 @@ import lemniscate as lem
 from lemniscate.algos import a2c, ddpg, ppo, reinforce, reppo, sac, td3, trpo
 from lemniscate.api.policy import TrainedPolicy
 from lemniscate.envs import registry
-from lemniscate.exporting import target
+from lemniscate.exporting.compiled import missing_target_tools
 
 pytestmark = [pytest.mark.long, needs_compiler]
 
@@ -27,12 +27,12 @@ def test_the_figure_eight_fits_and_flies_on_the_target(tmp_path):
     assert (manifest["control_period_s"], manifest["delay_s"], manifest["dynamics"]) == (0.02, [0.0, 0.0], ["so_rpy"])
     low, high = manifest["observations"][2]["range"]
     assert 0.3 < low < high < 1.7  # it flew the curve, which is half a metre up and down from one metre
-    copies = ["c_host"] if target.missing_tools() else ["c_host", "c_cortex_m4f"]
+    copies = ["c_host"] if missing_target_tools() else ["c_host", "c_cortex_m4f"]
     for name in copies:
         assert record[name]["observations"] >= 10_000
         assert record[name]["max_abs_difference"] <= 1e-5
         assert record[name]["self_test"] <= 1e-5
-    if not target.missing_tools():
+    if not missing_target_tools():
         assert record["c_cortex_m4f"]["flash_bytes"] <= 32 * 1024
         assert record["c_cortex_m4f"]["ram_bytes"] <= 1024
 
@@ -54,7 +54,7 @@ def test_all_copies_act_alike_in_closed_loop(algo, env, tmp_path):
             parameter += 0.1 * torch.randn_like(parameter)
     record = json.loads((lem.export(policy, tmp_path / "e") / "parity.json").read_text())
     assert record["acting"] == "policy.c"
-    for name in ("onnx", "c_host") if target.missing_tools() else ("onnx", "c_host", "c_cortex_m4f"):
+    for name in ("onnx", "c_host") if missing_target_tools() else ("onnx", "c_host", "c_cortex_m4f"):
         assert record[name]["observations"] >= 10_000
         assert record[name]["max_abs_difference"] <= 1e-5, name
     print(

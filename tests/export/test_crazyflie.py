@@ -12,8 +12,8 @@ from exported import exported, needs_compiler, policy_for
 
 from lemniscate.drones.interface import PARTS, interface_of
 from lemniscate.errors import UserError
+from lemniscate.exporting.compiled import CORE, TARGET_COMPILER, host_compiler, run_tool
 from lemniscate.exporting.crazyflie import crazyflie_files
-from lemniscate.exporting.host import host_compiler, run_tool
 from lemniscate.spec import Box
 
 pytestmark = needs_compiler
@@ -217,11 +217,9 @@ def test_what_the_firmware_cannot_do_is_refused(changed, parts, said, monkeypatc
 
 @pytest.mark.skipif(not shutil.which("arm-none-eabi-gcc"), reason="arm-none-eabi-gcc is not installed")
 def test_it_compiles_for_the_crazyflies_processor(built, folder):
-    from lemniscate.exporting.target import COMPILER, CORE
-
     options = ["-std=gnu11", "-Wall", "-Wextra", "-Werror", "-Wdouble-promotion", f"-I{FIRMWARE}", "-I."]
     for source in ("policy.c", "policy_controller.c"):
-        run_tool([COMPILER, *CORE, *options, "-c", source, "-o", "x.o"], folder)
+        run_tool([TARGET_COMPILER, *CORE, *options, "-c", source, "-o", "x.o"], folder)
 
 
 def test_parts_have_their_sizes():

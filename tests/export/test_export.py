@@ -20,14 +20,13 @@ from lemniscate.drones.interface import interface_of
 from lemniscate.envs import registry
 from lemniscate.envs.findings import BAD
 from lemniscate.envs.interface import Interface
+from lemniscate.exporting import compiled, parity
 from lemniscate.exporting import export as exporting
-from lemniscate.exporting import parity, target
-from lemniscate.exporting.actions import act_with
-from lemniscate.exporting.c_files import c_files
-from lemniscate.exporting.deployed import Deployed, input_size
-from lemniscate.exporting.flights import fly
-from lemniscate.exporting.host import HostPolicy, host_compiler
+from lemniscate.exporting.c_code import c_files
+from lemniscate.exporting.compiled import HostPolicy, host_compiler
+from lemniscate.exporting.deployed import Deployed, act_with, input_size
 from lemniscate.exporting.manifest import acted, observed, ranges
+from lemniscate.exporting.parity import fly
 from lemniscate.exporting.translation import translate
 
 
@@ -50,8 +49,7 @@ def few(monkeypatch):
 def same(run, monkeypatch):
     """Exports that all have the same content, which is there at once."""
     contents = {name: name.encode() for name in ("policy.c", "policy.h", "parity.json")}
-    contents["manifest.json"] = b'{"export": 1}'
-    monkeypatch.setattr(exporting, "_contents", lambda policy, program: (contents, []))
+    monkeypatch.setattr(exporting, "_contents", lambda policy, program: (contents, {"export": 1}, []))
 
 
 @needs_compiler
@@ -69,7 +67,11 @@ def test_an_export_is_whole_and_acts_as_the_policy_does(run, tmp_path, capsys):
     assert manifest["actions"] == [{"index": 0, "name": "action", "unit": None, "frame": None, "range": [0, 1]}]
     assert record["acting"] == "policy.c"
     assert record["observations"] >= 10_000
-    compared = [record["onnx"], record["c_host"], *([] if target.missing_tools() else [record["c_cortex_m4f"]])]
+    compared = [
+        record["onnx"],
+        record["c_host"],
+        *([] if compiled.missing_target_tools() else [record["c_cortex_m4f"]]),
+    ]
     assert all(each["max_abs_difference"] <= 1e-5 for each in compared)
     assert record["c_host"]["self_test"] <= 1e-5
     assert record["ns_per_action"]["c"] < record["ns_per_action"]["torch"]
@@ -128,7 +130,7 @@ def test_what_is_not_installed_is_said_and_left_out(run, tmp_path, few, monkeypa
     monkeypatch.setattr(exporting, "host_compiler", lambda: None)
     for module in (exporting, parity):
         monkeypatch.setattr(module, "is_installed", lambda package: False)
-    monkeypatch.setattr(target, "missing_tools", lambda: [target.COMPILER, target.EMULATOR])
+    monkeypatch.setattr(compiled, "missing_target_tools", lambda: [compiled.TARGET_COMPILER, compiled.EMULATOR])
     folder = lem.export(run, tmp_path / "e")
     record = json.loads((folder / "parity.json").read_text())
     assert record["onnx"] is record["c_host"] is record["c_cortex_m4f"] is None
@@ -193,11 +195,11 @@ def test_in_closed_loop_the_c_does_what_the_policy_does(kind):
     program = translate(Deployed(policy).eval(), input_size(env.spec))
     zero = np.zeros((1, program.obs.size)), np.zeros((1, program.action.size))
     host = HostPolicy(c_files(program, env.spec.action, *zero, title="", origin=""), host_compiler(), ("-O0",))
-    flown, true = fly(policy, host.act, rows=300), fly(policy, act_with(policy), rows=300)
-    assert len(flown.obs) >= 300
-    assert np.allclose(flown.obs, true.obs, atol=1e-4)
-    assert np.abs(host.act(flown.obs) - act_with(policy)(flown.obs)).max() <= 1e-5
-    assert len(observed(env.spec, flown.interface)) == flown.obs.shape[1]
+    (flown, interface), (true, _) = (fly(policy, act, rows=300) for act in (host.act, act_with(policy)))
+    assert len(flown) >= 300
+    assert np.allclose(flown, true, atol=1e-4)
+    assert np.abs(host.act(flown) - act_with(policy)(flown)).max() <= 1e-5
+    assert len(observed(env.spec, interface)) == flown.shape[1]
     assert len(acted(env.spec.action, Interface())) == len(ranges(env.spec.action)) == program.action.size
 
 

@@ -7,11 +7,10 @@ from exported import BOX, needs_compiler, policy_for
 from torch import nn
 
 from lemniscate.algos import ppo, sac
-from lemniscate.exporting.actions import act_with
-from lemniscate.exporting.c_files import c_files
-from lemniscate.exporting.deployed import Deployed
-from lemniscate.exporting.flights import EDGES, TESTS, self_tests
-from lemniscate.exporting.host import HostPolicy, host_compiler
+from lemniscate.exporting.c_code import c_files
+from lemniscate.exporting.compiled import HostPolicy, host_compiler
+from lemniscate.exporting.deployed import Deployed, act_with
+from lemniscate.exporting.parity import EDGES, TESTS, self_tests
 from lemniscate.exporting.translation import translate
 from lemniscate.spec import Discrete
 

@@ -8,7 +8,7 @@ from torch import nn
 
 from lemniscate.algos import a2c, ddpg, ppo, reinforce, reppo, sac, td3, trpo
 from lemniscate.errors import UserError
-from lemniscate.exporting.deployed import Deployed, safe_action
+from lemniscate.exporting.deployed import Deployed, act_with, safe_action
 from lemniscate.exporting.translation import translate
 from lemniscate.spec import Box, Discrete, MultiBinary, MultiDiscrete
 
@@ -128,6 +128,7 @@ class Odd(nn.Module):
         )
         e = torch.stack([a[:, 0], b.sum(-1), b.argmax(-1).float()], dim=1) * 0.1
         e = torch.cat([e, ((a[:, :3] >= 0) & ~(b[:, :3] == 0)).float()], dim=-1)
+        e = torch.cat([e[:, :3], x.new_full((x.shape[0], 1), 0.5), e[:, 3:5]], dim=-1)
         return self.last(torch.cat([c, d, e, nn.functional.elu(a)], dim=-1).tanh())
 
 
@@ -202,7 +203,6 @@ def test_the_same_policy_is_written_in_the_same_words():
 def test_a_dictionary_is_seen_in_the_order_of_its_parts(tmp_path):
     from lemniscate.api.policy import TrainedPolicy
     from lemniscate.envs import registry
-    from lemniscate.exporting.actions import act_with
 
     env = registry.make("environments:Copy", 2, kwargs={"kind": "tuple"})
     config = ppo.Config(env="environments:Copy", env_kwargs={"kind": "tuple"}, hidden=(8,))

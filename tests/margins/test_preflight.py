@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from functools import partial
 
 import pytest
 import torch
@@ -10,8 +11,9 @@ import environments  # noqa: F401  (registers the environments)
 import lemniscate as lem
 from conftest import tiny_fields
 from lemniscate.cli import main
-from lemniscate.exporting.host import host_compiler
-from lemniscate.margins import compiled
+from lemniscate.exporting import export as exporting
+from lemniscate.exporting.compiled import host_compiler
+from lemniscate.margins import preflight as preflights
 from lemniscate.margins.preflight import preflight
 from lemniscate.system.files import read_json, write_json
 
@@ -57,8 +59,10 @@ def test_it_leaves_a_record_a_picture_a_table_and_sentences(copy, capsys):
     assert "safe" not in said.lower()
 
 
-def test_in_python_it_is_the_same_again(copy):
+def test_in_python_it_is_the_same_again_and_the_threads_of_torch_are_as_before(copy):
+    torch.set_num_threads(2)
     first, second = (lem.preflight(copy, episodes=4, seed=2) for _ in range(2))
+    assert torch.get_num_threads() == 2
     assert isinstance(first, lem.Preflight)
     assert first == second
     assert first.to_json() == second.to_json()
@@ -67,10 +71,11 @@ def test_in_python_it_is_the_same_again(copy):
 
 @pytest.mark.skipif(not host_compiler(), reason="there is no C compiler")
 def test_the_exported_c_acts_as_the_policy_does(copy, monkeypatch):
+    monkeypatch.setattr(exporting, "fly", partial(exporting.fly, rows=200))
     lem.export(copy)
     acted = []
-    original = compiled.for_policy
-    monkeypatch.setattr(compiled, "for_policy", lambda rows, kind: acted.append(1) or original(rows, kind))
+    original = preflights.for_policy
+    monkeypatch.setattr(preflights, "for_policy", lambda rows, kind: acted.append(1) or original(rows, kind))
     plain, exported = (preflight(copy, compiled=c, episodes=4) for c in (False, True))
     assert acted
     assert exported.compiled
@@ -105,7 +110,7 @@ def test_a_mistake_is_one_sentence_and_nothing_is_written(copy, capsys, argument
 
 
 def test_a_missing_compiler_has_its_sentence(copy, monkeypatch):
-    monkeypatch.setattr(compiled, "host_compiler", lambda: None)
+    monkeypatch.setattr(preflights, "host_compiler", lambda: None)
     with pytest.raises(lem.UserError, match="There is no C compiler here"):
         preflight(copy, compiled=True)
 
@@ -133,16 +138,6 @@ def test_a_folder_that_cannot_be_written_is_a_sentence(copy):
     with pytest.raises(lem.UserError, match="cannot be written"):
         preflight(copy, episodes=4)
     assert is_untouched(copy)
-
-
-def test_the_threads_of_torch_are_as_before(copy):
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    try:
-        preflight(copy, episodes=4)
-        assert torch.get_num_threads() == 2
-    finally:
-        torch.set_num_threads(before)
 
 
 @pytest.mark.long

@@ -7,10 +7,8 @@ import pytest
 import torch
 
 from lemniscate.envs.probe import Axis, Flown, Tally, dynamics_axis
-from lemniscate.margins.panels import panel
-from lemniscate.margins.record import margins_of, worst_accepted
-from lemniscate.margins.sentences import FAILS, FALLS_SHORT, rows, sentences, within
-from lemniscate.margins.smoothness import smoothness
+from lemniscate.margins.record import margins_of, smoothness, worst_accepted
+from lemniscate.margins.sentences import FAILS, FALLS_SHORT, panel, rows, sentences
 from lemniscate.report import margins_plot
 
 DELAY = Axis("delay", (0.0, 0.01, 0.02, 0.03), 0.0, "s", "action delay", "{} of action delay", ("ms", 1000))
@@ -26,7 +24,7 @@ def flown(*alive):
 
 
 def said(axis, *alive, words=FAILS):
-    return list(sentences([margins_of(axis, flown(*alive), None)], E, words))
+    return list(sentences([margins_of(axis, flown(*alive), None)], words))
 
 
 def test_a_margin_is_the_last_value_up_to_which_95_percent_are_alive():
@@ -34,7 +32,7 @@ def test_a_margin_is_the_last_value_up_to_which_95_percent_are_alive():
     assert found.alive == (64, 61, 60, 64)
     assert set(found.sides) == {"above"}
     assert (found.sides["above"].last, found.sides["above"].first) == (0.01, 0.02)
-    record = found.to_json(E)
+    record = found.to_json()
     assert record["margin"] == {"above": 0.01}
     assert record["alive"] == [1.0, 61 / 64, 60 / 64, 1.0]
     assert record["mean_return"] == [64.0, 61.0, 60.0, 64.0]
@@ -43,15 +41,15 @@ def test_a_margin_is_the_last_value_up_to_which_95_percent_are_alive():
 
 def test_a_margin_has_two_sides_where_there_are_values_on_both():
     found = margins_of(MASS, flown(0, 64, 64, 64, 64), None)
-    assert found.to_json(E)["margin"] == {"below": 0.15, "above": 0.3}
-    assert within(found, E) == [0.85, 1.0, 1.15, 1.3]
-    assert margins_of(MASS, flown(0, 3, 60, 64, 64), None).to_json(E)["margin"] == {"below": None, "above": None}
+    assert found.to_json()["margin"] == {"below": 0.15, "above": 0.3}
+    assert found.within() == [0.85, 1.0, 1.15, 1.3]
+    assert margins_of(MASS, flown(0, 3, 60, 64, 64), None).to_json()["margin"] == {"below": None, "above": None}
 
 
 def test_words_have_no_order_and_so_no_sides():
     found = margins_of(DYNAMICS, flown(64, 63, 0), None)
-    assert found.to_json(E)["margin"] == ["so_rpy", "so_rpy_rotor"]
-    assert within(found, E) == ["so_rpy", "so_rpy_rotor"]
+    assert found.to_json()["margin"] == ["so_rpy", "so_rpy_rotor"]
+    assert found.within() == ["so_rpy", "so_rpy_rotor"]
 
 
 @pytest.mark.parametrize(
@@ -78,7 +76,7 @@ def test_no_word_promises_safety():
 
 def test_the_table_has_a_row_for_each_axis():
     found = [margins_of(DELAY, flown(64, 62, 3, 0), None), margins_of(MASS, flown(*[64] * 5), None)]
-    assert rows(found, E) == [
+    assert rows(found) == [
         ["", "tried", "within margins", "mean return there", "alive beyond"],
         ["action delay", "0 … 30 ms", "0 … 10 ms", "62", "3 of 64 at 20 ms"],
         ["mass", "−30 … +30 %", "−30 … +30 %", "64", "–"],
@@ -116,7 +114,7 @@ def test_smoothness_of_waves_is_known():
 
 def test_the_picture_has_a_panel_for_each_axis(tmp_path):
     found = [margins_of(DELAY, flown(64, 62, 3, 0), None), margins_of(MASS, flown(*[64] * 5), None)]
-    panels = [panel(one, E) for one in (*found, margins_of(DYNAMICS, flown(64, 64, 1), None))]
+    panels = [panel(one) for one in (*found, margins_of(DYNAMICS, flown(64, 64, 1), None))]
     assert panels[0].margin == (0, 10)
     assert panels[0].edges == [10]
     assert panels[1].margin == pytest.approx((-30, 30))

@@ -7,9 +7,8 @@ import torch
 
 from lemniscate.envs.probe import CHANNEL_AXES
 from lemniscate.errors import UserError
-from lemniscate.margins.disturbed import Channel, ModelFactors, has_model
 from lemniscate.margins.record import margins_of, worst_accepted
-from lemniscate.margins.vector_probe import VectorProbe
+from lemniscate.margins.vector_probe import Channel, ModelFactors, VectorProbe, has_model
 
 
 class Follow(gym.Env):

@@ -1,30 +1,124 @@
-"""C99 from a list of operations.
+"""`policy.c` and `policy.h`: C99 from a list of operations.
 
 Results that are computed number by number are expressions of an index `i`, and are written into an array only where
 something needs them whole or twice. Arrays share one static scratch memory: each has its place there as long as
 something still reads it.
 """
 
+import math
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
+from string import Template
 
 import numpy as np
 
-from lemniscate.exporting.operations import ELEMENTWISE, VIEWS, Operand, Operation, Program, Value, weight_of
+from lemniscate.exporting.deployed import safe_action, safe_sentence
+from lemniscate.exporting.manifest import version
+from lemniscate.exporting.operations import ELEMENTWISE, VIEWS, Operand, Operation, Program, Value
+from lemniscate.spec import Action, Discrete
 
+TEMPLATES = Path(__file__).parent / "templates"
 LARGEST = "3.402823466e+38F"
-"""float32's, in the place of infinity, which has no name in C99 without math.h"""
+"""float32's largest number, in the place of infinity, which has no name in C99 without math.h"""
 
-INFIX = {"Add": "+", "Sub": "-", "Mul": "*", "Div": "/", "And": "&&", "Or": "||"}
-INFIX |= {"Greater": ">", "GreaterOrEqual": ">=", "Less": "<", "LessOrEqual": "<=", "Equal": "=="}
+OPERATORS = {"Add": "({} + {})", "Sub": "({} - {})", "Mul": "({} * {})", "Div": "({} / {})", "Neg": "(-{})"}
+OPERATORS |= {"Greater": "({} > {})", "GreaterOrEqual": "({} >= {})", "Less": "({} < {})", "LessOrEqual": "({} <= {})"}
+OPERATORS |= {"Equal": "({} == {})", "And": "({} && {})", "Or": "({} || {})", "Not": "(!{})", "Where": "({} ? {} : {})"}
+"""the operations that C has operators for; others are functions of templates/functions.c, with the operation's name"""
+
+
+def c_files(
+    program: Program,
+    action: Action,
+    observations: np.ndarray,
+    actions: np.ndarray,
+    *,
+    title: str,
+    origin: str,
+    period: float | None = None,
+) -> dict[str, str]:
+    """The texts of `policy.c` and `policy.h`.
+
+    Args:
+        program: the policy.
+        action: its kind of actions.
+        observations: of the self-test, [S, O].
+        actions: the true actions at these observations, [S, A].
+        title: what the policy is for.
+        origin: where the observations are from.
+        period: seconds between two actions, where known.
+    """
+    body = Body(program)
+    places, scratch = body.places()
+    shared = {"title": comment(title), "version": version()}
+    header = {
+        "observations": program.obs.size,
+        "actions": program.action.size,
+        "tests": len(observations),
+        "bound": f"{self_test_bound(program, actions):.0e}F",
+        "period": ""
+        if period is None
+        else f"#define POLICY_PERIOD {np.float32(period)!s}F /* seconds between two actions */\n",
+        "safe": safe_sentence(action),
+        "origin": comment(origin),
+    }
+    masked = isinstance(action, Discrete) and action.masked
+    statements = "\n".join(f"    {statement.text}" for statement in body.statements)
+    source = {
+        "constants": "\n\n".join(body.constants),
+        "safe": braces(safe_action(action)),
+        "scratch": max(scratch, 1),
+        "functions": functions(statements),
+        "arrays": "\n".join(f"    float *const {name} = scratch + {places[name]};" for name in body.sizes),
+        "masked": fill("masked.c", vars(action)) if masked else "",
+        "statements": statements,
+        "test_observations": _rows(observations),
+        "test_actions": _rows(actions),
+    }
+    return {"policy.c": fill("policy.c", {**shared, **source}), "policy.h": fill("policy.h", {**shared, **header})}
+
+
+def fill(template: str, values: Mapping[str, object]) -> str:
+    """The text of a template with its values."""
+    return Template((TEMPLATES / template).read_text()).substitute(values)
+
+
+def comment(text: str) -> str:
+    """Text that cannot end the comment in C in which it stands; anyone may have written the run that it comes from."""
+    return " ".join(text.replace("*/", "* /").replace("\\", "/").split())
+
+
+def self_test_bound(program: Program, actions: np.ndarray) -> float:
+    """The error bound of the self-test: ten times the effect of another order of sums, by the size of the actions."""
+    largest = float(np.abs(actions).max())
+    return 0.05 * max(1.0, largest) if program.is_rounded else 1e-5 * max(10.0, largest)
+
+
+def functions(text: str) -> str:
+    """The functions in functions.c that `text` calls, and those that they call, in the order of their file.
+
+    A block of that file begins with a line `// name`.
+    """
+    blocks = f"\n{(TEMPLATES / 'functions.c').read_text()}".split("\n// ")[1:]
+    found = ""
+    for block in reversed(blocks):  # C defines a function before it is called, so one pass finds all of them
+        name, _, block_text = block.partition("\n")
+        if f"policy_{name}(" in text + found:
+            found = f"{block_text.strip()}\n\n{found}"
+    return found
+
+
+def _rows(rows: np.ndarray) -> str:
+    return "\n".join(f"    {braces(row)}," for row in rows.astype(np.float32))
 
 
 @dataclass(frozen=True)
 class Numbers:
     """A result as C: `at(index)` is the expression of one number of it, which reads `arrays`.
 
-    `whole` is a pointer to all of it, where these stand in a row in memory.
+    `whole` is a pointer to all of them, where they stand in a row in memory.
     """
 
     at: Callable[[str], str]
@@ -41,21 +135,33 @@ class Statement:
     writes: str
 
 
-@dataclass
 class Body:
-    """The parts of `policy_act`: constant arrays, statements, sizes of arrays, names of the functions that it calls."""
+    """The parts of `policy_act` that depend on the policy.
 
-    constants: list[str]
-    statements: list[Statement]
-    sizes: dict[str, int]
-    functions: set[str]
+    Attributes:
+        constants: the definitions of constant arrays.
+        statements: in their order.
+        sizes: of the arrays in the scratch memory, by name.
+    """
+
+    def __init__(self, program: Program) -> None:
+        self.constants: list[str] = []
+        self.statements: list[Statement] = []
+        self.sizes: dict[str, int] = {}
+        self._results = {program.obs: Numbers(lambda index: f"obs[{index}]", frozenset(), "obs")}
+        self._uses = Counter(x for operation in program.operations for x in operation.inputs if isinstance(x, Value))
+        for operation in program.operations:
+            self._add(operation)
+        self._write(program.action, "action")
 
     def places(self) -> tuple[dict[str, int], int]:
-        """The place of each array in the scratch memory, and its size.
+        """The place of each array in the scratch memory, and the size of that.
 
-        First fit, the largest first, over the statements from the first that writes an array to the last that reads it.
+        First fit, the largest first; an array lives from the first statement that writes it to the last that reads it.
         """
-        lives = {name: (self._first(name), self._last(name)) for name in self.sizes}
+        named = [{statement.writes, *statement.reads} for statement in self.statements]
+        at = {name: [i for i, names in enumerate(named) if name in names] for name in self.sizes}
+        lives = {name: (numbers[0], numbers[-1]) for name, numbers in at.items()}
         places: dict[str, int] = {}
         for name, (born, dead) in sorted(lives.items(), key=lambda life: (-self.sizes[life[0]], life[1])):
             others = [other for other in places if lives[other][0] <= dead and born <= lives[other][1]]
@@ -68,89 +174,63 @@ class Body:
             places[name] = place
         return places, max((places[name] + size for name, size in self.sizes.items()), default=0)
 
-    def _first(self, name: str) -> int:
-        return min(i for i, statement in enumerate(self.statements) if statement.writes == name)
-
-    def _last(self, name: str) -> int:
-        return max(i for i, statement in enumerate(self.statements) if name in {statement.writes, *statement.reads})
-
-
-def body_of(program: Program) -> Body:
-    """The statements that a program is in C."""
-    writer = _Writer(program)
-    for operation in program.operations:
-        writer.add(operation)
-    writer.write(program.action, "action")
-    return writer.body
-
-
-class _Writer:
-    def __init__(self, program: Program) -> None:
-        self.body = Body([], [], {}, set())
-        self.results = {program.obs: Numbers(lambda index: f"obs[{index}]", frozenset(), "obs")}
-        self.uses = Counter(x for operation in program.operations for x in operation.inputs if isinstance(x, Value))
-
-    def add(self, operation: Operation) -> None:
+    def _add(self, operation: Operation) -> None:
         """Translate one operation."""
         output = operation.output
         if operation.name in VIEWS:
-            self.results[output] = self._view(operation)
+            self._results[output] = self._view(operation)
         elif operation.name in ELEMENTWISE:
-            self.results[output] = self._elementwise(operation)
-            if self.uses[output] > 1:
-                self.results[output] = self._array(output)
+            self._results[output] = self._elementwise(operation)
+            if self._uses[output] > 1:
+                self._results[output] = self._array(output)
         else:
             {"Linear": self._linear, "Concat": self._concat}.get(operation.name, self._reduce)(operation)
 
-    def write(self, value: Value, array: str) -> None:
+    def _write(self, value: Value, array: str) -> None:
         """A loop that writes a result into an array."""
-        numbers, number = self.results[value], "0" if value.size == 1 else "i"
-        expression = numbers.at(number)
-        text = f"{array}[{number}] = {_bare(_float(expression, value))};"
-        self._say(_loop(text, value.size), numbers.arrays, array)
+        numbers, number = self._results[value], "0" if value.size == 1 else "i"
+        text = f"{array}[{number}] = {_bare(_float(numbers.at(number), value))};"
+        self._say(text if value.size == 1 else _loop(text, value.size), numbers.arrays, array)
 
     def _say(self, text: str, reads: Iterable[str], writes: str) -> None:
-        self.body.statements.append(Statement(text, frozenset(reads), writes))
+        self.statements.append(Statement(text, frozenset(reads), writes))
 
     def _new(self, value: Value) -> Numbers:
         """A new array for a result."""
         name = value.name
-        self.body.sizes[name] = value.size
-        test = " != 0.0F" if value.kind == "bool" else ""
-        return Numbers(
-            lambda index: f"({name}[{index}]{test})" if test else f"{name}[{index}]", frozenset({name}), name
-        )
+        self.sizes[name] = value.size
+        number = f"({name}[{{}}] != 0.0F)" if value.kind == "bool" else f"{name}[{{}}]"
+        return Numbers(number.format, frozenset({name}), name)
 
     def _array(self, value: Value) -> Numbers:
-        """The result in an array: where it is already, or a new one."""
-        if self.results[value].whole:
-            return self.results[value]
-        new = self._new(value)
-        self.write(value, value.name)
-        self.results[value] = new
-        return new
+        """The result in an array: the one where it is already, or a new one."""
+        if not self._results[value].whole:
+            new = self._new(value)
+            self._write(value, value.name)
+            self._results[value] = new
+        return self._results[value]
 
     def _numbers(self, operand: Operand) -> Numbers:
         if isinstance(operand, Value):
-            return self.results[operand]
+            return self._results[operand]
         if operand.size == 1:
-            return Numbers(lambda _: _literal(operand.reshape(-1)[0]), frozenset())
+            return Numbers(lambda _: literal(operand.item()), frozenset())
         name = self._constant(operand)
         return Numbers(lambda index: f"{name}[{index}]", frozenset(), name)
 
     def _constant(self, numbers: np.ndarray, kind: str = "constant") -> str:
-        name = f"{kind}_{len(self.body.constants)}"
-        self.body.constants.append(f"static const float {name}[{numbers.size}] = {braces(numbers)};")
+        """The name of a new constant array."""
+        name = f"{kind}_{len(self.constants)}"
+        self.constants.append(f"static const float {name}[{numbers.size}] = {braces(numbers)};")
         return name
 
     def _elementwise(self, operation: Operation) -> Numbers:
         output = operation.output
         for operand in operation.inputs:
             if isinstance(operand, Value) and operand.size < output.size:
-                self._array(operand)  # once for all numbers that need it
+                self._array(operand)  # computed once for all numbers that need it, not in the loop
         inputs = [self._broadcast(operand, output.shape) for operand in operation.inputs]
         kinds = [operand.kind if isinstance(operand, Value) else "float" for operand in operation.inputs]
-        self.body.functions |= _functions(operation.name)
 
         def at(index: str) -> str:
             return _expression(operation, [x.at(index) for x in inputs], kinds)
@@ -158,85 +238,60 @@ class _Writer:
         return Numbers(at, frozenset().union(*(x.arrays for x in inputs)))
 
     def _broadcast(self, operand: Operand, shape: tuple[int, ...]) -> Numbers:
-        strides = _strides(operand.shape)
-        strides = [0] * (len(shape) - len(strides)) + [
-            0 if size == 1 else stride for size, stride in zip(operand.shape, strides, strict=True)
-        ]
-        return _strided(self._numbers(operand), shape, strides)
+        return _seen(self._numbers(operand), np.broadcast_to(_places(operand.shape), shape))
 
     def _view(self, operation: Operation) -> Numbers:
         (x,), settings, shape = operation.inputs, operation.settings, operation.output.shape
-        numbers = self._numbers(x)
         if operation.name == "Reshape":
-            return numbers
+            return self._numbers(x)
         if operation.name == "Expand":
             return self._broadcast(x, shape)
-        strides = _strides(x.shape)
+        places = _places(x.shape)
         if operation.name == "Transpose":
-            return _strided(numbers, shape, [strides[axis] for axis in settings["axes"]])
-        return _strided(numbers, shape, strides, settings["start"] * strides[settings["axis"]])
+            return _seen(self._numbers(x), places.transpose(settings["axes"]))
+        axis, start = settings["axis"], settings["start"]
+        return _seen(self._numbers(x), _part(places, axis, start, shape[axis]))
 
     def _linear(self, operation: Operation) -> None:
-        x, *parameters = operation.inputs
+        x, _, *biases = operation.inputs
         assert isinstance(x, Value)
-        self.body.functions.add("linear")
         source, target = self._array(x), self._new(operation.output)
-        weight, bias = self._constant(weight_of(operation), "weight"), "0"
-        if len(parameters) == 2:
-            assert isinstance(parameters[1], np.ndarray)
-            bias = self._constant(parameters[1], "bias")
-        outputs, inputs = weight_of(operation).shape
+        weight = self._constant(operation.weight, "weight")
+        bias = self._constant(np.asarray(biases[0]), "bias") if biases else "0"
+        outputs, inputs = operation.weight.shape
         for row in range(x.size // inputs):
-            sizes = f"{inputs}, {outputs}"
-            arrays = f"{_plus(source.whole, row * inputs)}, {sizes}, {_plus(target.whole, row * outputs)}"
-            self._say(f"policy_linear({weight}, {bias}, {arrays});", source.arrays, operation.output.name)
-        self.results[operation.output] = target
+            ends = f"{_plus(source.whole, row * inputs)}, {inputs}, {outputs}, {_plus(target.whole, row * outputs)}"
+            self._say(f"policy_linear({weight}, {bias}, {ends});", source.arrays, operation.output.name)
+        self._results[operation.output] = target
 
     def _concat(self, operation: Operation) -> None:
         axis, output = operation.settings["axis"], operation.output
-        target, strides, start = self._new(output), _strides(output.shape), 0
+        target, places, start = self._new(output), _places(output.shape), 0
         for part in operation.inputs:
-            numbers, size = self._numbers(part), int(np.prod(part.shape))
-            place = _place("i", part.shape, strides, start * strides[axis])
-            value = part if isinstance(part, Value) else Value("", part.shape)
-            text = f"{output.name}[{place}] = {_bare(_float(numbers.at('i'), value))};"
-            self._say(_loop(text, size, always=True), numbers.arrays, output.name)
-            start += part.shape[axis]
-        self.results[output] = target
+            assert isinstance(part, Value)
+            numbers, size = self._results[part], part.shape[axis]
+            place = _place("i", _part(places, axis, start, size))
+            text = f"{output.name}[{place}] = {_bare(_float(numbers.at('i'), part))};"
+            self._say(_loop(text, part.size), numbers.arrays, output.name)
+            start += size
+        self._results[output] = target
 
     def _reduce(self, operation: Operation) -> None:
-        (x,) = operation.inputs
+        (x,), output = operation.inputs, operation.output
         assert isinstance(x, Value)
-        self.body.functions |= _functions(operation.name)
-        source, target, size = self._array(x), self._new(operation.output), x.shape[-1]
+        source, target, size = self._array(x), self._new(output), x.shape[-1]
         call = f"policy_{operation.name.lower()}({source.whole} + i * {size}, {size})"
-        text = _loop(f"{target.whole}[i] = {call};", operation.output.size, always=True)
-        self._say(text, source.arrays, operation.output.name)
-        self.results[operation.output] = target
-
-
-def _functions(name: str) -> set[str]:
-    known = {"RoundBfloat16": "bfloat16", **{n: n.lower() for n in ("Abs", "Exp", "Log", "Sqrt", "Sin", "Cos", "Tanh")}}
-    known |= {name: name.lower() for name in ("Sigmoid", "Erf", "Floor", "Max", "Min", "ArgMax")}
-    known |= {name: name.lower() for name in ("ReduceSum", "ReduceMean", "ReduceMax", "ReduceMin")}
-    return {known[name]} if name in known else set()
+        self._say(_loop(f"{target.whole}[i] = {call};", output.size), source.arrays, output.name)
+        self._results[output] = target
 
 
 def _expression(operation: Operation, inputs: list[str], kinds: list[str]) -> str:
     """One number of an elementwise operation."""
-    name = operation.name
-    if name in INFIX:
-        return f"({inputs[0]} {INFIX[name]} {inputs[1]})"
-    if name == "Neg":
-        return f"(-{inputs[0]})"
-    if name == "Not":
-        return f"(!{inputs[0]})"
-    if name == "Where":
-        return f"({inputs[0]} ? {inputs[1]} : {inputs[2]})"
-    if name == "Cast":
+    if operation.name == "Cast":
         return _cast(inputs[0], kinds[0], operation.output.kind)
-    (function,) = _functions(name)
-    return f"policy_{function}({', '.join(map(_bare, inputs))})"
+    if operation.name in OPERATORS:
+        return OPERATORS[operation.name].format(*inputs)
+    return f"policy_{operation.name.lower()}({', '.join(map(_bare, inputs))})"
 
 
 def _bare(expression: str) -> str:
@@ -261,9 +316,7 @@ def _float(expression: str, value: Value) -> str:
     return f"({expression} ? 1.0F : 0.0F)" if value.kind == "bool" else expression
 
 
-def _loop(text: str, size: int, *, always: bool = False) -> str:
-    if size == 1 and not always:
-        return text
+def _loop(text: str, size: int) -> str:
     return f"for (i = 0; i < {size}; ++i) {{\n        {text}\n    }}"
 
 
@@ -271,46 +324,47 @@ def _plus(pointer: str | None, offset: int) -> str:
     return f"{pointer} + {offset}" if offset else str(pointer)
 
 
-def _strides(shape: tuple[int, ...]) -> list[int]:
-    """The strides of an array in C's order."""
-    return [int(np.prod(shape[axis + 1 :])) for axis in range(len(shape))]
+def _places(shape: tuple[int, ...]) -> np.ndarray:
+    """The places 0, 1, 2, … of the numbers of an array in memory; NumPy's views of it have the strides for C."""
+    return np.arange(math.prod(shape)).reshape(shape)
 
 
-def _strided(numbers: Numbers, shape: tuple[int, ...], strides: list[int], offset: int = 0) -> Numbers:
-    """The numbers at other places: those that `strides` and `offset` lead to."""
-    in_a_row = _in_a_row(shape, strides)
-    whole = _plus(numbers.whole, offset) if numbers.whole and in_a_row else None
-    return Numbers(lambda index: numbers.at(_place(index, shape, strides, offset)), numbers.arrays, whole)
+def _part(places: np.ndarray, axis: int, start: int, size: int) -> np.ndarray:
+    """A view of `size` rows along an axis; `np.take` would copy, and forget the strides."""
+    return places[(slice(None),) * axis + (slice(start, start + size),)]
 
 
-def _in_a_row(shape: tuple[int, ...], strides: list[int]) -> bool:
-    expected = _strides(shape)
-    return all(size == 1 or mine == its for size, mine, its in zip(shape, strides, expected, strict=True))
+def _seen(numbers: Numbers, view: np.ndarray) -> Numbers:
+    """The numbers in another order: those at the places in `view`."""
+    whole = _place(numbers.whole, view) if numbers.whole and view.flags.c_contiguous else None
+    return Numbers(lambda index: numbers.at(_place(index, view)), numbers.arrays, whole)
 
 
-def _place(index: str, shape: tuple[int, ...], strides: list[int], offset: int = 0) -> str:
-    """The expression of the place at which number `index` of an array of this shape is."""
-    if _in_a_row(shape, strides):
-        return f"{index} + {offset}" if offset else index
+def _place(index: str, view: np.ndarray) -> str:
+    """The expression of the place of number `index` of a view."""
+    offset = int(view.flat[0]) if view.size else 0
+    if view.flags.c_contiguous:
+        return _plus(index, offset)
     terms = []
-    for axis, (size, stride, inner) in enumerate(zip(shape, strides, _strides(shape), strict=True)):
-        if size > 1 and stride:
+    for axis, (size, stride) in enumerate(zip(view.shape, view.strides, strict=True)):
+        step, inner = stride // view.itemsize, math.prod(view.shape[axis + 1 :])
+        if size > 1 and step:
             coordinate = index if inner == 1 else f"({index}) / {inner}"
-            coordinate = coordinate if not any(n > 1 for n in shape[:axis]) else f"({coordinate}) % {size}"
-            terms.append(coordinate if stride == 1 else f"({coordinate}) * {stride}")
+            coordinate = coordinate if not any(n > 1 for n in view.shape[:axis]) else f"({coordinate}) % {size}"
+            terms.append(coordinate if step == 1 else f"({coordinate}) * {step}")
     terms += [str(offset)] if offset or not terms else []
     return " + ".join(terms)
 
 
-def braces(numbers: np.ndarray, indent: str = "    ") -> str:
+def braces(numbers: np.ndarray) -> str:
     """An array's initializer."""
-    literals = [_literal(number).strip("()") for number in np.ravel(numbers)]
+    literals = [literal(number).strip("()") for number in np.ravel(numbers)]
     rows = [", ".join(literals[i : i + 8]) for i in range(0, len(literals), 8)]
-    return "{\n" + "".join(f"{indent}{row},\n" for row in rows) + "}"
+    return "{\n" + "".join(f"    {row},\n" for row in rows) + "}"
 
 
-def _literal(number: np.generic | float) -> str:
-    """A number in C, as short as float32 allows."""
+def literal(number: np.generic | float) -> str:
+    """A number in C, as short as float32 allows; one below zero in brackets."""
     value = np.float32(number)
     if not np.isfinite(value):
         return LARGEST if value > 0 else f"(-{LARGEST})"

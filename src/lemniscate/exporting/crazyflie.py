@@ -7,14 +7,13 @@ import numpy as np
 
 from lemniscate.envs.interface import Interface, Quantity, Reference
 from lemniscate.errors import UserError
-from lemniscate.exporting.c_code import braces
-from lemniscate.exporting.c_files import TEMPLATES, comment, fill
-from lemniscate.exporting.provenance import version
+from lemniscate.exporting.c_code import TEMPLATES, comment, fill, literal
+from lemniscate.exporting.manifest import version
 from lemniscate.spec import Action, Box
 
 COMMANDS = ("roll", "pitch", "yaw", "thrust")
 LOOP = 1000
-"""Hz, of the firmware's stabilizer, which a controller's rate divides"""
+"""Hz, the rate of the firmware's stabilizer, which the policy's rate has to divide"""
 
 SENSED = {f"attitude_{axis}": f"state->attitudeQuaternion.{axis}" for axis in "xyzw"}
 for _axis in "xyz":
@@ -40,10 +39,10 @@ def crazyflie_files(
         quantities: of the whole observation, in its order.
         action: the kind of actions.
         c_files: the texts of `policy.c` and `policy.h`.
-        title: what it is a policy for.
+        title: what the policy is for.
 
     Raises:
-        UserError: actions that are no attitude and thrust; quantities that the firmware does not have; a rate that does
+        UserError: actions other than attitude and thrust; quantities that the firmware does not have; a rate that does
             not divide the firmware's.
     """
     if tuple(quantity.name for quantity in interface.action) != COMMANDS or not isinstance(action, Box):
@@ -81,24 +80,13 @@ def crazyflie_files(
 
 def _reference(reference: Reference) -> str:
     """The curve as constants."""
-    points = (
-        "".join(f"    {braces(point)},\n" for point in reference.points).replace("{\n    ", "{").replace(",\n}", "}")
-    )
-    offsets = ", ".join(map(str, reference.offsets))
-    return (
-        (
-            f"\n#define REFERENCE_STEPS {len(reference.points)}\n"
-            f"#define REFERENCE_SAMPLES {len(reference.offsets)}\n\n"
-            f"static const float reference[REFERENCE_STEPS][3] = {{ /* m, in the world */\n{points}}};\n\n"
-            f"static const uint32_t ahead[REFERENCE_SAMPLES] = {{{offsets}}}; /* steps */\n"
-        )
-        .replace("F,", "f,")
-        .replace("F}", "f}")
-    )
+    points = ",\n".join(f"    {{{', '.join(map(literal, point))}}}" for point in reference.points)
+    sizes = {"steps": len(reference.points), "samples": len(reference.offsets)}
+    return fill("crazyflie/reference.c", {**sizes, "points": points, "offsets": ", ".join(map(str, reference.offsets))})
 
 
 def _history(names: list[str], past: list[str], action: Box, before: tuple[float, ...]) -> str:
-    """The functions that keep what was observed and done in earlier steps, the newest first, and give it to the policy.
+    """The functions that keep observations and actions of earlier steps, the newest first, and give them to the policy.
 
     Raises:
         UserError: a history of other quantities, or in another order.
@@ -116,25 +104,18 @@ def _history(names: list[str], past: list[str], action: Box, before: tuple[float
         remembered.append(f"    past[0][{i}] = {now or _normalized(COMMANDS.index(name), action)};")
         recalled.append(f"        then[{i}] = past[i][{i}]{f' - {now}' if now else ''};")
     lines = {"remembered": "\n".join(remembered), "recalled": "\n".join(recalled)}
-    numbers = {"steps": steps, "size": len(each), "first": first, "before": ", ".join(map(_float, before))}
+    numbers = {"steps": steps, "size": len(each), "first": first, "before": ", ".join(map(literal, before))}
     return fill("crazyflie/history.c", {**numbers, **lines})
 
 
 def _normalized(i: int, action: Box) -> str:
     """The C expression of a coordinate of the action between -1 and 1, the ends of its range."""
     low, high = action.low[i], action.high[i]
-    return f"(action[{i}] - {_float((low + high) / 2)}) / {_float((high - low) / 2)}"
-
-
-def _float(number: float) -> str:
-    """A number in C; one below zero in brackets."""
-    text = f"{number:.9g}"
-    text = f"{text}f" if any(letter in text for letter in ".e") else f"{text}.0f"
-    return f"({text})" if number < 0 else text
+    return f"(action[{i}] - {literal((low + high) / 2)}) / {literal((high - low) / 2)}"
 
 
 def _observe(names: list[str], reference: Reference | None) -> str:
-    """The body of `observe`, of the present quantities."""
+    """The body of `observe`, for the quantities of this step."""
     strangers = [name for name in names if name not in SENSED and not (reference and TO_REFERENCE.fullmatch(name))]
     if strangers:
         raise UserError(f"nothing in the firmware gives {strangers[0]}")

@@ -1,19 +1,27 @@
-"""A policy from the raw observation to the action for `env.step`, as one module."""
+"""A policy from the raw observation to the action for `env.step`: as a module, and as a function of rows of numbers.
+
+Exported policies take and give rows: observations [R, O] and actions [R, A], float32, where A counts the numbers of an
+action of any shape. These actions are in the environment's units, unlike those of `VecEnv.step`.
+"""
+
+from collections.abc import Callable
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from lemniscate.api.policy import TrainedPolicy
-from lemniscate.envs.spaces import scale_of
-from lemniscate.errors import UserError
+from lemniscate.envs.spaces import normalized_action, physical_action, scale_of
 from lemniscate.spec import Action, Box, Discrete, MultiDiscrete, Spec
+
+Act = Callable[[np.ndarray], np.ndarray]
+"""raw observations [R, O] float32 to actions for `env.step`, [R, A] float32"""
 
 
 class Deployed(nn.Module):
     """The most probable action in the environment's own units: [B, O] raw observations to [B, …] actions.
 
-    Normalizer, clip, network, squash and the scale to the bounds are inside; an action mask, where there is one, is the
+    Normalizer, clip, network, squash and the scale to the bounds are inside. An action mask, where there is one, is the
     end of the observation.
     """
 
@@ -34,7 +42,7 @@ class Deployed(nn.Module):
             self.register_buffer("start", torch.tensor(self.kind.start))
 
     def forward(self, obs: Tensor) -> Tensor:
-        """[B, O] to [B, A] or the environment's own shape; [B] for Discrete."""
+        """[B, O] to [B, A], or to [B, …] in the environment's own shape; [B] for Discrete."""
         action = self.policy(obs).mode()
         if isinstance(self.kind, Box):
             action = torch.minimum(torch.maximum(self.middle + self.half_width * action, self.low), self.high)
@@ -45,20 +53,13 @@ class Deployed(nn.Module):
         return action if self.kind.shape is None else action.reshape(-1, *self.kind.shape)
 
 
-def require_vector(spec: Spec) -> None:
-    """Raise `UserError` where a policy looks at images."""
-    if spec.image:
-        raise UserError(f"A policy for {spec.env_id} looks at images; what can be exported looks at vectors.")
-
-
 def input_size(spec: Spec) -> int:
-    """The length of what a policy is given: the flat observation, and the action mask where there is one."""
-    masked = isinstance(spec.action, Discrete) and spec.action.masked
-    return spec.observation_size + (spec.action.n if masked and isinstance(spec.action, Discrete) else 0)
+    """The length of a policy's input: the flat observation, and the action mask where there is one."""
+    return spec.observation_size + (spec.action.n if isinstance(spec.action, Discrete) and spec.action.masked else 0)
 
 
 def safe_action(action: Action) -> np.ndarray:
-    """The action [A] where an observation is not finite.
+    """The action [A] for an observation that is not finite.
 
     The middle of each range of a Box; where one bound is infinite, 1 from the other, and 0 where both are. The first
     choice of Discrete and MultiDiscrete, 0 of MultiBinary.
@@ -69,3 +70,34 @@ def safe_action(action: Action) -> np.ndarray:
     if isinstance(action, Discrete):
         return np.array([action.start], dtype=np.float32)
     return np.array(action.start if isinstance(action, MultiDiscrete) else [0] * action.n, dtype=np.float32)
+
+
+def safe_sentence(action: Action) -> str:
+    """The safe action in words."""
+    if isinstance(action, Box):
+        return "the middle of each coordinate's range (1 from its bound where it has only one, 0 where it has none)"
+    if isinstance(action, Discrete) and action.masked:
+        return "the first that the mask permits"
+    return "the first choice of each"
+
+
+def act_with(policy: TrainedPolicy) -> Act:
+    """The policy itself as a function of rows; every export is compared with it."""
+
+    @torch.no_grad()
+    def act(obs: np.ndarray) -> np.ndarray:
+        action = policy.module(torch.from_numpy(obs)).mode().numpy()
+        return as_rows(physical_action(action, policy.spec.action))
+
+    return act
+
+
+def as_rows(action: np.ndarray) -> np.ndarray:
+    """Actions [R, …] of any type as rows [R, A] float32."""
+    return action.reshape(len(action), -1).astype(np.float32)
+
+
+def for_policy(rows: np.ndarray, kind: Action) -> torch.Tensor:
+    """Actions for `VecEnv.step`, in a policy's units, from rows [R, A] in the environment's units."""
+    own = rows if isinstance(kind, Box) else np.rint(rows).astype(np.int64)
+    return torch.from_numpy(normalized_action(own[:, 0] if isinstance(kind, Discrete) else own, kind))

@@ -2,24 +2,23 @@
 
 import json
 from collections.abc import Mapping
-from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from lemniscate.api.policy import TrainedPolicy
 from lemniscate.api.stored import Trained, load, path_of
+from lemniscate.envs.interface import Interface
 from lemniscate.errors import UserError, is_installed
-from lemniscate.exporting.actions import Act, act_with
-from lemniscate.exporting.c_files import c_files
+from lemniscate.exporting.c_code import c_files
+from lemniscate.exporting.compiled import HostPolicy, host_compiler
 from lemniscate.exporting.crazyflie import crazyflie_files
-from lemniscate.exporting.deployed import Deployed, input_size, require_vector
-from lemniscate.exporting.flights import Flights, fly, origin, self_tests
-from lemniscate.exporting.host import HostPolicy, host_compiler
+from lemniscate.exporting.deployed import Act, Deployed, act_with, input_size
 from lemniscate.exporting.manifest import manifest, observed, title
-from lemniscate.exporting.onnx_model import onnx_model
+from lemniscate.exporting.onnx_model import onnx_act, onnx_model
 from lemniscate.exporting.operations import Program
-from lemniscate.exporting.parity import onnx_act, parity, sentences
+from lemniscate.exporting.parity import fly, origin, parity, self_tests, sentences
 from lemniscate.exporting.translation import translate
 from lemniscate.hub.repository import is_address
 from lemniscate.system.console import say
@@ -33,9 +32,9 @@ def export(run: Trained, to: str | Path | None = None, *, trust: bool = False) -
     """Write a policy as ONNX and as C99 for microcontrollers, from the raw observation to the action for `env.step`.
 
     These are `policy.onnx`, `policy.c` and `policy.h`; `manifest.json` says what every number means. The exported C
-    acts in the environment of training, and at what it sees there all copies are compared with the policy:
-    `parity.json`. What is not installed for that (a C compiler, onnxruntime, arm-none-eabi-gcc, QEMU) is said and left
-    out. A policy that flies a Crazyflie also gets an application for its firmware, in `crazyflie/`.
+    acts in the environment of training, and at the observations there all copies are compared with the policy:
+    `parity.json`. Tools that are not installed for that (a C compiler, onnxruntime, arm-none-eabi-gcc, QEMU) are named,
+    and their part is left out. A policy that flies a Crazyflie also gets an application for its firmware, `crazyflie/`.
 
     Args:
         run: as in `load`.
@@ -46,16 +45,17 @@ def export(run: Trained, to: str | Path | None = None, *, trust: bool = False) -
         The directory.
 
     Raises:
-        UserError: a policy that looks at images; a network of one's own that cannot be translated; an environment that
-            cannot be made; a directory that is no export, or that cannot be written. Nothing is left half-written.
+        UserError: a policy that looks at images; a network that cannot be translated; an environment that cannot be
+            made; a directory that is no export, or that cannot be written. Nothing is left half-written.
     """
     policy = load(run, trust=trust)
     folder = _destination(run, policy, to)
-    require_vector(policy.spec)
+    if policy.spec.image:
+        raise UserError(f"A policy for {policy.spec.env_id} looks at images; what can be exported looks at vectors.")
     program = translate(Deployed(policy).eval(), input_size(policy.spec))
-    contents, said = _contents(policy, program)
+    contents, record, said = _contents(policy, program)
     try:
-        _write(folder, contents)
+        _write(folder, contents, record)
     except OSError as error:
         raise UserError(f"{folder} cannot be written: {error.strerror or error}.") from error
     for sentence in said:
@@ -74,59 +74,59 @@ def _destination(run: Trained, policy: TrainedPolicy, to: str | Path | None) -> 
 
 
 def is_export(folder: Path) -> bool:
-    """Whether `export` has written what is there; an empty directory may be written into as well."""
+    """Whether a directory is an export, or empty, and may be replaced by one."""
     try:
         return folder.is_dir() and (not any(folder.iterdir()) or "export" in read_json(folder / MANIFEST))
     except (DamagedFileError, OSError):
         return False
 
 
-def _contents(policy: TrainedPolicy, program: Program) -> tuple[dict[str, bytes], list[str]]:
-    """The content of every file by its name, the manifest without its own sha256 last; what a person is to know."""
+def _contents(policy: TrainedPolicy, program: Program) -> tuple[dict[str, bytes], dict[str, Any], list[str]]:
+    """The content of every file but the manifest by its name, the manifest, and sentences for a person."""
     true, action, compiler = act_with(policy), policy.spec.action, host_compiler()
     facts = {"title": title(policy), "environment": policy.spec.env_id, "step": policy.step}
     model = onnx_model(program, facts) if is_installed("onnx") else None
-    write = partial(c_files, program, action, title=facts["title"])
-    flights = fly(policy, _actor(policy, program, model, compiler))
-    tests = self_tests(policy, flights.obs)
-    named = {"origin": origin(policy, len(tests)), "period": flights.interface.period}
-    texts = write(tests, true(tests), **named)
-    host = HostPolicy(texts, compiler) if compiler else None
-    record, missing = parity(program, true, flights.obs, texts, model, host, compiler)
-    acting = "policy.c" if compiler else "policy.onnx" if model and is_installed("onnxruntime") else "the policy itself"
-    record = {"environment": policy.spec.env_id, "acting": acting, "reference": "torch", **record}
-    vehicle, left_out = _vehicle_files(policy, flights, texts)
+    acting, act = _actor(policy, program, model, compiler)
+    obs, interface = fly(policy, act)
+    tests = self_tests(policy, obs)
+    named = {"title": facts["title"], "origin": origin(policy, len(tests)), "period": interface.period}
+    texts = c_files(program, action, tests, true(tests), **named)
+    found = parity(program, true, obs, texts, model, HostPolicy(texts, compiler) if compiler else None)
+    record = {"environment": policy.spec.env_id, "acting": acting, "reference": "torch", **found}
+    vehicle, left_out = _vehicle_files(policy, interface, texts)
     contents: dict[str, bytes] = {} if model is None else {ONNX: model}
     contents |= {name: text.encode() for name, text in {**texts, **vehicle}.items()}
     contents[PARITY] = (json.dumps(record, indent=1, allow_nan=False) + "\n").encode()
-    contents[MANIFEST] = json.dumps(manifest(policy, program, flights.interface, flights.obs, contents)).encode()
-    return contents, [*sentences(record), *missing, *left_out]
+    return contents, manifest(policy, program, interface, obs, contents), [*sentences(record), *left_out]
 
 
-def _actor(policy: TrainedPolicy, program: Program, model: bytes | None, compiler: str | None) -> Act:
-    """The exported policy that flies here: the C code, or else ONNX, or else the policy itself."""
+def _actor(policy: TrainedPolicy, program: Program, model: bytes | None, compiler: str | None) -> tuple[str, Act]:
+    """The copy that acts here, by its name: the C code, or else ONNX, or else the policy itself."""
     if compiler:
-        size = input_size(policy.spec)
-        untested = np.zeros((1, size), dtype=np.float32), np.zeros((1, program.action.size), dtype=np.float32)
-        return HostPolicy(c_files(program, policy.spec.action, *untested, title="", origin=""), compiler).act
-    return onnx_act(model)[0] if model and is_installed("onnxruntime") else act_with(policy)
+        # what the self-test stores is seen on this flight, so the C that flies has an empty one
+        untested = np.zeros((1, program.obs.size)), np.zeros((1, program.action.size))
+        files = c_files(program, policy.spec.action, *untested, title="", origin="")
+        return "policy.c", HostPolicy(files, compiler).act
+    if model and is_installed("onnxruntime"):
+        return ONNX, onnx_act(model)[0]
+    return "the policy itself", act_with(policy)
 
 
 def _vehicle_files(
-    policy: TrainedPolicy, flights: Flights, texts: Mapping[str, str]
+    policy: TrainedPolicy, interface: Interface, texts: Mapping[str, str]
 ) -> tuple[dict[str, str], list[str]]:
-    """The files of the vehicle's firmware, and why there are none for a vehicle that could have some."""
-    if flights.interface.vehicle != CRAZYFLIE:
+    """The files for the vehicle's firmware, and why there are none for a vehicle that could have some."""
+    if interface.vehicle != CRAZYFLIE:
         return {}, []
-    quantities = observed(policy.spec, flights.interface)
+    quantities = observed(policy.spec, interface)
     try:
-        found = crazyflie_files(flights.interface, quantities, policy.spec.action, texts, title(policy))
+        found = crazyflie_files(interface, quantities, policy.spec.action, texts, title(policy))
     except UserError as error:
         return {}, [f"{CRAZYFLIE}/ is left out: {error}."]
     return {f"{CRAZYFLIE}/{name}": text for name, text in found.items()}, []
 
 
-def _write(folder: Path, contents: Mapping[str, bytes]) -> None:
+def _write(folder: Path, contents: Mapping[str, bytes], record: Mapping[str, Any]) -> None:
     """Write all files aside, then put the directory in its place. Raises `OSError`, and leaves nothing behind then."""
     aside, before = (folder.with_name(f"{folder.name}.{end}") for end in ("tmp", "old"))
     make_directory(folder.parent)
@@ -134,11 +134,9 @@ def _write(folder: Path, contents: Mapping[str, bytes]) -> None:
     try:
         aside.mkdir()
         for name, content in contents.items():
-            if name == MANIFEST:
-                write_json(aside / name, json.loads(content))
-                continue
             (aside / name).parent.mkdir(exist_ok=True)
             replace_file(aside / name, content)
+        write_json(aside / MANIFEST, record)
         remove(before)
         if folder.exists():
             folder.replace(before)

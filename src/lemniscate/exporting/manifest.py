@@ -1,9 +1,13 @@
 """`manifest.json`: what every number of an exported policy means, and where it is from."""
 
 import hashlib
+import importlib.metadata
 import math
+import subprocess
 import sys
 from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,10 +15,8 @@ import numpy as np
 from lemniscate import algos
 from lemniscate.api.policy import TrainedPolicy
 from lemniscate.envs.interface import Interface, Quantity
-from lemniscate.exporting.c_files import safe_sentence
-from lemniscate.exporting.deployed import safe_action
+from lemniscate.exporting.deployed import safe_action, safe_sentence
 from lemniscate.exporting.operations import Program
-from lemniscate.exporting.provenance import commit, version
 from lemniscate.spec import Action, Box, Discrete, MultiDiscrete, ObservationPart, Spec
 
 FORMAT = 1
@@ -30,15 +32,14 @@ def manifest(
     """The record of an export.
 
     Args:
-        policy: that was exported.
+        policy: the exported policy.
         program: its translation.
         interface: of its environment.
-        obs: seen by it, [R, O]: their range is that of each observation's entry.
-        files: the content of the others, for their sha256.
+        obs: observations of its episodes, [R, O]; their range is that of each observation's entry.
+        files: the content of the other files, for their sha256.
     """
     action = policy.spec.action
     seen = zip(obs.min(0).tolist(), obs.max(0).tolist(), strict=True)
-    rounded = "bfloat16 between hidden layers, as in training" if program.is_rounded else "float32"
     return {
         "export": FORMAT,
         "title": title(policy),
@@ -54,7 +55,7 @@ def manifest(
         "history": interface.history,
         "dynamics": interface.dynamics,
         "vehicle": interface.vehicle,
-        "products": rounded,
+        "products": "bfloat16 between hidden layers, as in training" if program.is_rounded else "float32",
         "deterministic": True,
         "observations": [
             {"index": i, **vars(quantity), "range": list(ends)}
@@ -71,13 +72,34 @@ def manifest(
     }
 
 
+def version() -> str:
+    """The version of lemniscate that is installed; "unknown" where its source runs without being installed."""
+    try:
+        return importlib.metadata.version("lemniscate")
+    except importlib.metadata.PackageNotFoundError:
+        return "unknown"
+
+
+@cache
+def commit() -> str | None:
+    """The commit of lemniscate's source, where it runs from its repository."""
+    folder = Path(__file__).parent
+    try:
+        # the first command fails where lemniscate is installed into the directory of another repository
+        for command in (["ls-files", "--error-unmatch", "__init__.py"], ["rev-parse", "HEAD"]):
+            done = subprocess.run(["git", *command], cwd=folder, capture_output=True, text=True, timeout=10, check=True)
+        return done.stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return None
+
+
 def title(policy: TrainedPolicy) -> str:
     """The environment, algorithm, seed and step of a policy, in a line."""
     return f"A policy for {policy.spec.env_id}: {algorithm(policy)}, seed {policy.config.seed}, step {policy.step:,}."
 
 
 def algorithm(policy: TrainedPolicy) -> str:
-    """The name of the algorithm that trained it."""
+    """The name of the algorithm that trained a policy."""
     return algos.name_of(sys.modules[type(policy.config).__module__])
 
 

@@ -1,4 +1,4 @@
-"""ONNX from a list of operations."""
+"""ONNX from a list of operations, and onnxruntime, which acts with it."""
 
 import json
 from collections.abc import Mapping
@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from lemniscate.exporting.operations import Operand, Operation, Program, Value, weight_of
-from lemniscate.exporting.provenance import version
+from lemniscate.exporting.deployed import Act, as_rows
+from lemniscate.exporting.manifest import version
+from lemniscate.exporting.operations import Operand, Operation, Program, Value
 
 OPSET, IR = 18, 10
-"""of 2022 and 2024: runtimes that are some years old can read it"""
+"""of 2022 and 2024, so that runtimes that are some years old can read the model"""
 
 
 def onnx_model(program: Program, facts: Mapping[str, Any]) -> bytes:
@@ -18,7 +19,7 @@ def onnx_model(program: Program, facts: Mapping[str, Any]) -> bytes:
 
     Args:
         program: the policy.
-        facts: what the model carries as metadata, each as JSON.
+        facts: the model's metadata, each value as JSON.
     """
     import onnx
     from onnx import helper
@@ -39,6 +40,17 @@ def onnx_model(program: Program, facts: Mapping[str, Any]) -> bytes:
     helper.set_model_props(model, {name: json.dumps(value) for name, value in facts.items()})
     onnx.checker.check_model(model, full_check=True)
     return model.SerializeToString()
+
+
+def onnx_act(model: bytes) -> tuple[Act, str]:
+    """The policy in onnxruntime, on one thread, and the version of onnxruntime."""
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    options.log_severity_level = 3
+    session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+    return lambda obs: as_rows(np.asarray(session.run(None, {"obs": obs})[0])), onnxruntime.__version__
 
 
 class _Writer:
@@ -71,57 +83,46 @@ class _Writer:
 
     def add(self, operation: Operation) -> None:
         """Translate one operation."""
-        name, output, own = operation.name, operation.output.name, getattr(self, f"_{operation.name.lower()}", None)
-        if own:
-            own(operation)
-        elif name.startswith("Reduce"):
-            axes = self.constant(np.array([-1]))
-            self.node(name, [self.operand(operation.inputs[0]), axes], output, keepdims=1)
-        else:
-            self.node(name, [self.operand(operand) for operand in operation.inputs], output)
+        name, output = operation.name, operation.output.name
+        if name == "Linear":
+            self._linear(operation)
+            return
+        inputs = [self.operand(operand) for operand in operation.inputs]
+        if name == "RoundBfloat16":
+            rounded = self.node("Cast", inputs, f"{output}_bfloat16", to=self.bfloat16)
+            self.node("Cast", [rounded], output, to=self.types["float"])
+            return
+        places, attributes = self._settings(operation)
+        self.node(name, [*inputs, *(self.constant(np.array(numbers)) for numbers in places)], output, **attributes)
+
+    def _settings(self, operation: Operation) -> tuple[list[list[int]], dict[str, Any]]:
+        """Further inputs of whole numbers, and attributes; here axes and shapes count the batch."""
+        shape, settings = operation.output.shape, operation.settings
+        match operation.name:
+            case "Slice":
+                start, end = settings["start"], settings["start"] + shape[settings["axis"]]
+                return [[start], [end], [settings["axis"] + 1]], {}
+            case "Reshape":
+                return [[-1, *shape]], {}
+            case "Expand":
+                return [[1, *shape]], {}
+            case "Transpose":
+                return [], {"perm": [0, *(axis + 1 for axis in settings["axes"])]}
+            case "Concat":
+                return [], {"axis": settings["axis"] + 1}
+            case "Cast":
+                return [], {"to": self.types[operation.output.kind]}
+            case "ArgMax":
+                return [], {"axis": -1, "keepdims": 0}
+        return ([[-1]], {"keepdims": 1}) if operation.name.startswith("Reduce") else ([], {})
 
     def _linear(self, operation: Operation) -> None:
         x, output = self.operand(operation.inputs[0]), operation.output.name
         biases = [self.operand(operand) for operand in operation.inputs[2:]]
-        if len(operation.output.shape) == 1:
-            self.node("Gemm", [x, self.constant(weight_of(operation)), *biases], output, transB=1)
+        if len(operation.output.shape) == 1:  # Gemm takes matrices only, MatMul any number of axes
+            self.node("Gemm", [x, self.constant(operation.weight), *biases], output, transB=1)
             return
-        weight = self.constant(weight_of(operation).T)
+        weight = self.constant(operation.weight.T)
         product = self.node("MatMul", [x, weight], f"{output}_product" if biases else output)
         if biases:
             self.node("Add", [product, *biases], output)
-
-    def _concat(self, operation: Operation) -> None:
-        rank = len(operation.output.shape) + 1
-        names = [self.operand(operand) for operand in operation.inputs]
-        self.node("Concat", names, operation.output.name, axis=operation.settings["axis"] + 1 - rank)
-
-    def _argmax(self, operation: Operation) -> None:
-        self.node("ArgMax", [self.operand(operation.inputs[0])], operation.output.name, axis=-1, keepdims=0)
-
-    def _cast(self, operation: Operation) -> None:
-        to = self.types[operation.output.kind]
-        self.node("Cast", [self.operand(operation.inputs[0])], operation.output.name, to=to)
-
-    def _roundbfloat16(self, operation: Operation) -> None:
-        output = operation.output.name
-        rounded = self.node("Cast", [self.operand(operation.inputs[0])], f"{output}_bfloat16", to=self.bfloat16)
-        self.node("Cast", [rounded], output, to=self.types["float"])
-
-    def _slice(self, operation: Operation) -> None:
-        axis, start = operation.settings["axis"], operation.settings["start"]
-        ends = (start, start + operation.output.shape[axis], axis + 1)
-        places = [self.constant(np.array([number])) for number in ends]
-        self.node("Slice", [self.operand(operation.inputs[0]), *places], operation.output.name)
-
-    def _reshape(self, operation: Operation) -> None:
-        shape = self.constant(np.array([-1, *operation.output.shape]))
-        self.node("Reshape", [self.operand(operation.inputs[0]), shape], operation.output.name)
-
-    def _expand(self, operation: Operation) -> None:
-        shape = self.constant(np.array([1, *operation.output.shape]))
-        self.node("Expand", [self.operand(operation.inputs[0]), shape], operation.output.name)
-
-    def _transpose(self, operation: Operation) -> None:
-        axes = [0, *(axis + 1 for axis in operation.settings["axes"])]
-        self.node("Transpose", [self.operand(operation.inputs[0])], operation.output.name, perm=axes)

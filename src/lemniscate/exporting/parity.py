@@ -1,38 +1,141 @@
-"""`parity.json`: how far the exported policies are from the policy itself, and what they cost."""
+"""`parity.json`: how far the exported policies are from the policy itself, where they act, and what they cost."""
 
 import platform
-from collections.abc import Mapping
-from pathlib import Path
+import timeit
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
+from torch import Tensor
 
+from lemniscate.api.policy import TrainedPolicy
+from lemniscate.envs import registry
+from lemniscate.envs.interface import Interface
 from lemniscate.errors import UserError, is_installed, missing_extra
-from lemniscate.exporting import target
-from lemniscate.exporting.actions import Act, as_rows
-from lemniscate.exporting.host import HostPolicy, nanoseconds
+from lemniscate.exporting import compiled
+from lemniscate.exporting.compiled import HostPolicy
+from lemniscate.exporting.deployed import Act, act_with, for_policy, input_size
+from lemniscate.exporting.onnx_model import onnx_act
 from lemniscate.exporting.operations import Program
+from lemniscate.maths import Deterministic
+from lemniscate.nn.normalizer import RunningNorm
+from lemniscate.run.environments import env_arguments
+from lemniscate.run.evaluate import play_episodes
+from lemniscate.spec import Box
 
-TOLERANCE = 1e-5
-"""of an action; that of bfloat16 is one in its last place, where another order of sums rounds it the other way"""
-BFLOAT16_TOLERANCE = 0.05
+ENVIRONMENTS, ROWS, TESTS = 16, 10_000, 64
+"""environments side by side; observations at least; the number of them that the self-test has"""
+EDGES = 8
+"""further observations of the self-test, for the clips"""
+TOLERANCE, BFLOAT16_TOLERANCE = 1e-5, 0.05
+"""of an action; with bfloat16 a sum in another order is sometimes rounded the other way, to the next number"""
+INSTRUCTIONS = 10**9
+"""of a simulation of the target, at most: it takes some ten seconds"""
 
 
-def onnx_act(model: bytes) -> tuple[Act, str]:
-    """The policy in onnxruntime, on one thread, and its version."""
-    import onnxruntime
+def fly(policy: TrainedPolicy, act: Act, rows: int = ROWS, seed: int = 0) -> tuple[np.ndarray, Interface]:
+    """Let `act` act in the environment of a policy's training until it has seen `rows` observations.
 
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = 1
-    options.log_severity_level = 3
-    session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
-    return lambda obs: as_rows(np.asarray(session.run(None, {"obs": obs})[0])), onnxruntime.__version__
+    Returns:
+        The observations [R, O] float32, and the meaning of the environment's numbers.
+
+    Raises:
+        UserError: the environment cannot be made, or has other spaces now.
+    """
+    env = registry.make(num_envs=ENVIRONMENTS, device="cpu", **env_arguments(policy.config))
+    size, seen = input_size(policy.spec), list[np.ndarray]()
+
+    def driver(obs: Tensor) -> Deterministic:
+        given = np.ascontiguousarray(obs[:, :size].numpy())  # without what is privileged
+        return Deterministic(for_policy(act(given), policy.spec.action))
+
+    try:
+        if not env.spec.fits(policy.spec):
+            raise UserError(f"{policy.spec.env_id} has other spaces here than in training.")
+        for obs, _, _, counts in play_episodes(driver, env, episodes=10**9, seed=seed):
+            seen.append(obs[counts][:, :size].numpy().copy())
+            if sum(map(len, seen)) >= rows:
+                break
+        return np.concatenate(seen), getattr(env.backend, "interface", Interface())
+    finally:
+        env.close()
 
 
-def missing_onnx() -> list[str]:
-    """The sentences for what ONNX needs and is not installed."""
+def self_tests(policy: TrainedPolicy, obs: np.ndarray) -> np.ndarray:
+    """The observations of the self-test, [S, O]: `TESTS` from all over the flights, then `EDGES` for the clips.
+
+    Each of the latter is a real one with one number far outside of what was seen, so that a forgotten clip shows. There
+    are none where nothing is clipped. With discrete actions, observations at which rounding could decide are left out.
+    """
+    obs = obs if isinstance(policy.spec.action, Box) else obs[_clear(policy, obs)]
+    real = obs[np.linspace(0, len(obs) - 1, TESTS).round().astype(int)]
+    normalizer, action = policy.module.normalizer, policy.spec.action
+    size = policy.spec.observation_size
+    if isinstance(normalizer, RunningNorm):
+        mean, std = normalizer.mean.numpy(), normalizer.var.numpy() ** 0.5
+        far = 3 * normalizer.clip * (std + 1e-4)
+    elif isinstance(action, Box) and np.isfinite([*action.low, *action.high]).all():
+        mean, far = obs[:, :size].mean(0), 10 * np.abs(obs[:, :size]).max(0) + 1
+    else:
+        return real
+    edges = real[:: TESTS // EDGES].copy()
+    for row, column in enumerate(np.linspace(0, size - 1, EDGES).round().astype(int)):
+        edges[row, column] = (mean + (-1) ** row * far)[column]
+    return np.concatenate([real, edges]).astype(np.float32)
+
+
+def _clear(policy: TrainedPolicy, obs: np.ndarray) -> np.ndarray:
+    """[R], whether a slightly different observation has the same action; all where that holds for none."""
+    act = act_with(policy)
+    same = [(act(obs * np.float32(factor)) == act(obs)).all(1) for factor in (0.99999, 1.00001)]
+    clear = np.logical_and(*same)
+    return clear if clear.any() else ~clear
+
+
+def origin(policy: TrainedPolicy, tests: int) -> str:
+    """The origin of a self-test's observations, in words."""
+    edges = f", and {tests - TESTS} with one number far outside of them" if tests > TESTS else ""
+    return f"{TESTS} of episodes of {policy.spec.env_id}{edges}"
+
+
+def parity(
+    program: Program, act: Act, obs: np.ndarray, files: Mapping[str, str], model: bytes | None, host: HostPolicy | None
+) -> dict[str, Any]:
+    """The record; `missing` has a sentence for everything that could not be compared.
+
+    Args:
+        program: the policy.
+        act: the policy itself, in torch.
+        obs: the observations at which all are compared, [R, O].
+        files: the texts of `policy.c` and `policy.h`.
+        model: `policy.onnx`.
+        host: `policy.c` on this machine.
+    """
+    true, tolerance = act(obs), BFLOAT16_TOLERANCE if program.is_rounded else TOLERANCE
+    costs: dict[str, float | None] = {"c": None, "onnxruntime": None, "torch": nanoseconds(lambda: act(obs[:1]))}
+    record: dict[str, Any] = {"observations": len(obs), "tolerance": tolerance, "onnx": None, "c_host": None}
     left_out = {"onnx": "policy.onnx is left out", "onnxruntime": "policy.onnx is not compared"}
-    return [f"{missing_extra(name, 'export')}; {what}." for name, what in left_out.items() if not is_installed(name)]
+    missing = [f"{missing_extra(name, 'export')}; {what}." for name, what in left_out.items() if not is_installed(name)]
+    if model is not None and is_installed("onnxruntime"):
+        run, version = onnx_act(model)
+        record["onnx"] = {**compare(run(obs), true, tolerance), "onnxruntime": version}
+        costs["onnxruntime"] = nanoseconds(lambda: run(obs[:1]))
+    if host is None:
+        missing.append("There is no C compiler here (cc, gcc, clang or CC): policy.c is not compared on this machine.")
+    else:
+        compared = compare(host.act(obs), true, tolerance)
+        record["c_host"] = {**compared, "self_test": host.self_test(), "compiler": host.compiler}
+        costs["c"] = nanoseconds(lambda: host.act(obs)) / len(obs)
+    record["c_cortex_m4f"], said = _on_target(program, files, obs, true, tolerance)
+    record["multiplications"] = program.multiplications
+    record["ns_per_action"] = {name: cost and round(cost) for name, cost in costs.items()}
+    record["ns_are"] = "C in a loop in C, the others called from Python with one observation, all on one core"
+    return {**record, "machine": platform.machine(), "missing": missing + said}
+
+
+def nanoseconds(call: Callable[[], object], calls: int = 20) -> float:
+    """The time of a call: the least of several, since anything else on the machine only adds to it."""
+    return 1e9 * min(timeit.repeat(call, number=1, repeat=calls))
 
 
 def compare(actions: np.ndarray, true: np.ndarray, tolerance: float) -> dict[str, Any]:
@@ -47,76 +150,26 @@ def compare(actions: np.ndarray, true: np.ndarray, tolerance: float) -> dict[str
     }
 
 
-def parity(
-    program: Program,
-    act: Act,
-    obs: np.ndarray,
-    files: Mapping[str, str],
-    model: bytes | None,
-    host: HostPolicy | None,
-    compiler: str | None,
-) -> tuple[dict[str, Any], list[str]]:
-    """The record, and a sentence for everything that could not be compared.
-
-    Args:
-        program: the policy.
-        act: the policy itself, in torch.
-        obs: at which all are compared, [R, O].
-        files: the texts of `policy.c` and `policy.h`.
-        model: `policy.onnx`.
-        host: `policy.c` on this machine.
-        compiler: that of this machine.
-    """
-    true, tolerance = act(obs), BFLOAT16_TOLERANCE if program.is_rounded else TOLERANCE
-    costs: dict[str, float | None] = {"c": None, "onnxruntime": None, "torch": nanoseconds(lambda: act(obs[:1]))}
-    record: dict[str, Any] = {"observations": len(obs), "tolerance": tolerance, "onnx": None, "c_host": None}
-    missing = missing_onnx()
-    if model is not None and is_installed("onnxruntime"):
-        run, version = onnx_act(model)
-        record["onnx"] = {**compare(run(obs), true, tolerance), "onnxruntime": version}
-        costs["onnxruntime"] = nanoseconds(lambda: run(obs[:1]))
-    if host is None:
-        missing.append("There is no C compiler here (cc, gcc, clang or CC): policy.c is not compared on this machine.")
-    else:
-        compared = compare(host.act(obs), true, tolerance)
-        record["c_host"] = {**compared, "self_test": host.self_test(), "compiler": Path(compiler or "").name}
-        costs["c"] = nanoseconds(lambda: host.act(obs)) / len(obs)
-    record["c_cortex_m4f"], said = on_target(program, files, obs, true, tolerance)
-    record["multiplications"] = program.multiplications
-    record["ns_per_action"] = {name: cost and round(cost) for name, cost in costs.items()}
-    record["ns_are"] = "C in a loop in C, the others called from Python with one observation, all on one core"
-    return {**record, "machine": platform.machine(), "missing": missing + said}, missing + said
-
-
-def on_target(
+def _on_target(
     program: Program, files: Mapping[str, str], obs: np.ndarray, true: np.ndarray, tolerance: float
 ) -> tuple[dict[str, Any] | None, list[str]]:
-    """The figures of a Cortex-M4F, and a sentence for what is not there."""
-    absent = target.missing_tools()
-    if target.COMPILER in absent:
-        return None, [
-            f"{target.COMPILER} is not installed: nothing is known of the target (Debian: gcc-arm-none-eabi)."
-        ]
-    sizes = target.sizes(files)
-    record: dict[str, Any] = {
-        "flash_bytes": sizes.flash,
-        "flash_bytes_with_self_test": sizes.flash + sizes.self_test,
-        "ram_bytes": sizes.static + sizes.stack,
-        "static_bytes": sizes.static,
-        "stack_bytes": sizes.stack,
-        "compiled_with": " ".join((target.COMPILER, *target.CORE)),
-    }
+    """The figures of a Cortex-M4F, and a sentence for what is not installed."""
+    absent = compiled.missing_target_tools()
+    if compiled.TARGET_COMPILER in absent:
+        name = compiled.TARGET_COMPILER
+        return None, [f"{name} is not installed: nothing is known of the target (Debian: gcc-arm-none-eabi)."]
+    command = " ".join((compiled.TARGET_COMPILER, *compiled.CORE))
+    record: dict[str, Any] = {**compiled.target_sizes(files), "compiled_with": command}
     if absent:
-        return record, [
-            f"{target.EMULATOR} is not installed: policy.c is not run on the target (Debian: qemu-system-arm)."
-        ]
-    rows = min(len(obs), max(64, target.INSTRUCTIONS // (8 * program.multiplications + 10_000)))
+        name = compiled.EMULATOR
+        return record, [f"{name} is not installed: policy.c is not run on the target (Debian: qemu-system-arm)."]
+    rows = min(len(obs), max(64, INSTRUCTIONS // (8 * program.multiplications + 10_000)))
     try:
-        done = target.simulate(files, obs[:rows], true.shape[1])
+        actions, self_test, instructions = compiled.simulate(files, obs[:rows], true.shape[1])
     except UserError as error:
         return record, [f"policy.c is not run on the target: {error}"]
-    compared = compare(done.actions, true[: len(done.actions)], tolerance)
-    return {**record, **compared, "self_test": done.self_test, "instructions_per_call": done.instructions}, []
+    record |= compare(actions, true[: len(actions)], tolerance)
+    return {**record, "self_test": self_test, "instructions_per_call": instructions}, []
 
 
 def sentences(record: Mapping[str, Any]) -> list[str]:
@@ -125,15 +178,15 @@ def sentences(record: Mapping[str, Any]) -> list[str]:
     compared = {name: record[key] for key, name in names.items() if (record[key] or {}).get("observations")}
     said = [_distance(name, each) for name, each in compared.items()]
     if sizes := record["c_cortex_m4f"]:
-        counted = sizes.get("instructions_per_call")
+        instructions = sizes.get("instructions_per_call")
         said.append(
             f"On a Cortex-M4F: {sizes['flash_bytes']:,} bytes of flash, {sizes['ram_bytes']:,} of RAM"
-            + (f", {counted:,} instructions a call." if counted else ".")
+            + (f", {instructions:,} instructions a call." if instructions else ".")
         )
     for name, each in compared.items():
         if each["above_tolerance"]:
             said.append(f"{name} is beyond {record['tolerance']:g} at {each['above_tolerance']:,} of them.")
-    return said
+    return [*said, *record["missing"]]
 
 
 def _distance(name: str, compared: Mapping[str, Any]) -> str:

@@ -7,18 +7,19 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import torch
+from torch import Tensor
 
 from lemniscate.api.policy import TrainedPolicy
 from lemniscate.api.stored import Trained, load, path_of
 from lemniscate.envs import registry
 from lemniscate.envs.probe import Act, Probe
 from lemniscate.errors import UserError
-from lemniscate.exporting.provenance import commit, version
-from lemniscate.margins.compiled import compiled_policy
-from lemniscate.margins.panels import panel
-from lemniscate.margins.record import AxisMargins, margins_of, worst_accepted
-from lemniscate.margins.sentences import FAILS, FALLS_SHORT, rows, sentences
-from lemniscate.margins.smoothness import smoothness
+from lemniscate.exporting.compiled import HostPolicy, host_compiler
+from lemniscate.exporting.deployed import for_policy
+from lemniscate.exporting.export import MANIFEST
+from lemniscate.exporting.manifest import commit, version
+from lemniscate.margins.record import AxisMargins, margins_of, smoothness, worst_accepted
+from lemniscate.margins.sentences import FAILS, FALLS_SHORT, panel, rows, sentences, smoothness_sentence
 from lemniscate.margins.vector_probe import VectorProbe
 from lemniscate.report import margins_plot
 from lemniscate.report.compare import table
@@ -28,7 +29,7 @@ from lemniscate.run.environments import env_arguments
 from lemniscate.run.evaluate import EVALUATION
 from lemniscate.run.seeding import derive
 from lemniscate.system.console import say
-from lemniscate.system.files import write_json
+from lemniscate.system.files import DamagedFileError, read_json, write_json
 
 FORMAT = 1
 Starts = Annotated[int, Range(4, 1000)]
@@ -48,7 +49,7 @@ class Preflight:
         nominal_return: mean return in the environment as it is.
         axes: the margins.
         smoothness: of the actions in the environment as it is, where the time between them is known: `action_rate`,
-            `fast_share`, `saturated_share`, as `lemniscate.margins.smoothness`.
+            `fast_share`, `saturated_share`, as `lemniscate.margins.record.smoothness` measures them.
         sentences: for people.
         env_kwargs: arguments that were nominal here, though not in training.
     """
@@ -68,7 +69,7 @@ class Preflight:
     def to_json(self) -> dict[str, Any]:
         """One object of JSON; a margin is the deviation from the nominal value, on each side that was tried."""
         own = {name: value for name, value in vars(self).items() if name not in ("axes", "sentences")}
-        axes = {one.axis.name: one.to_json(self.episodes) for one in self.axes}
+        axes = {one.axis.name: one.to_json() for one in self.axes}
         origin = {"lemniscate": version(), "commit": commit()}
         return {"preflight": FORMAT, **own, "axes": axes, "sentences": list(self.sentences), **origin}
 
@@ -81,7 +82,7 @@ def preflight(
     env_kwargs: Mapping[str, Any] | None = None,
     trust: bool = False,
 ) -> Preflight:
-    """Let a policy act while one thing after the other is other than in training, and find how much it bears.
+    """Let a policy act while one thing after the other differs from training, and find how much it bears.
 
     Drones are flown with late, lost and irregular actions, with late, noisy and biased observations, with other masses,
     inertias, motors and dynamics, in wind and from wider starts; conditions that training has drawn are nominal
@@ -109,17 +110,37 @@ def preflight(
     folder = path_of(run)
     read_config(folder)
     policy = load(run, trust=trust)
-    act = compiled_policy(policy, folder) if compiled else _torch(policy)
+    act = _compiled(policy, folder) if compiled else lambda obs: policy.module(obs).mode()
     probe = _probe(policy, episodes, given)
     result = _fly(policy, act, probe, {"episodes": episodes, "seed": seed, "compiled": compiled, "env_kwargs": given})
-    for line in [*table(rows(result.axes, episodes)), *result.sentences]:
+    for line in [*table(rows(result.axes)), *result.sentences]:
         say(line)
     _write(result, folder)
     return result
 
 
-def _torch(policy: TrainedPolicy) -> Act:
-    return lambda obs: policy.module(obs).mode()
+def _compiled(policy: TrainedPolicy, run: Path) -> Act:
+    """The C of a run's `export`, compiled on this machine.
+
+    Raises:
+        UserError: no export, a damaged one, or one of another step; no compiler, or one that refuses.
+    """
+    compiler, folder = host_compiler(), run / "export"
+    if compiler is None:
+        raise UserError("There is no C compiler here (cc, gcc, clang or CC), which --compiled needs.")
+    try:
+        step = read_json(folder / MANIFEST)["step"]
+        files = {name: (folder / name).read_text() for name in ("policy.c", "policy.h")}
+    except (DamagedFileError, OSError, KeyError):
+        raise UserError(f"There is no whole export of {run}: lemniscate export {run}") from None
+    if step != policy.step:
+        raise UserError(f"{folder} is of step {step:,}, the policy of step {policy.step:,}: lemniscate export {run}")
+    host, kind = HostPolicy(files, compiler), policy.spec.action
+
+    def act(obs: Tensor) -> Tensor:
+        return for_policy(host.act(obs.numpy()), kind)
+
+    return act
 
 
 def _probe(policy: TrainedPolicy, episodes: int, given: Mapping[str, Any]) -> Probe:
@@ -147,9 +168,9 @@ def _fly(policy: TrainedPolicy, act: Act, probe: Probe, how: dict[str, Any]) -> 
     axes = tuple(margins_of(axis, flown[axis.name], least) for axis in probe.axes)
     known = probe.period is not None and nominal.actions is not None
     smooth = smoothness(nominal.actions, probe.period) if known else None  # pyright: ignore[reportArgumentType]
-    said = [*sentences(axes, how["episodes"], FAILS if least is None else FALLS_SHORT)]
+    said = [*sentences(axes, FAILS if least is None else FALLS_SHORT)]
     if smooth:
-        said.append(_smoothness_sentence(smooth))
+        said.append(smoothness_sentence(smooth))
     return Preflight(
         env_id=policy.spec.env_id,
         step=policy.step,
@@ -173,22 +194,13 @@ def _one_thread() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-def _smoothness_sentence(smooth: Mapping[str, float]) -> str:
-    fast, saturated = (100 * smooth[name] for name in ("fast_share", "saturated_share"))
-    return (
-        f"Actions change by {smooth['action_rate']:.2g} of their half range a second (RMS), {fast:.2g} % of their power"
-        f" is above 10 Hz, and {saturated:.2g} % are at a bound."
-    )
-
-
 def _write(result: Preflight, folder: Path) -> None:
     """The picture, then the record. Raises `UserError` where the run cannot be written."""
     acting = "the exported C" if result.compiled else "the policy"
     acts = f"{result.env_id}: {acting} of step {result.step:,}"
     title = f"{acts}, {result.episodes} starts a point, alive is {result.alive_means}"
-    panels = [panel(one, result.episodes) for one in result.axes]
     try:
-        margins_plot.draw(panels, title, folder / "plots" / "preflight.png")
+        margins_plot.draw([panel(one) for one in result.axes], title, folder / "plots" / "preflight.png")
         write_json(folder / "preflight.json", result.to_json())
     except OSError as error:
         raise UserError(f"{folder} cannot be written: {error.strerror or error}.") from error

@@ -1,16 +1,21 @@
-"""The findings of a pre-flight: the share that is alive at each point, margins, and the record for programs."""
+"""The findings of a pre-flight as numbers: shares that are alive, margins, and the smoothness of actions."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from lemniscate.envs.probe import Axis, Flown, Value
 
 ALIVE = 0.95
 """the share of the episodes that are alive within a margin"""
-SIDES = ("below", "above")
+FAST = 10.0
+"""Hz; motors and servos cannot follow faster changes of an action, and a flight does not need them"""
+EDGE = 0.999
+"""the size of an action from which on it counts as saturated"""
 
 
 @dataclass(frozen=True)
@@ -32,30 +37,39 @@ class AxisMargins:
 
     Attributes:
         axis: with its values [V].
-        alive: of E episodes at each value, [V].
+        episodes: E, at each value.
+        alive: the number of episodes that are alive at each value, [V].
         mean_returns: [V].
-        sides: by their names; of an axis without an order there are none.
+        sides: "below" and "above", where values were tried there; an axis without an order has none.
     """
 
     axis: Axis
+    episodes: int
     alive: tuple[int, ...]
     mean_returns: tuple[float, ...]
     sides: dict[str, Side]
 
-    def alive_at(self, value: Value) -> int:
-        """The number of episodes that are alive at a value."""
-        return self.alive[self.axis.values.index(value)]
+    def lost_at(self, value: Value) -> int:
+        """The number of episodes that are not alive at a value."""
+        return self.episodes - self.alive[self.axis.values.index(value)]
 
     def return_at(self, value: Value) -> float:
         """The mean return at a value."""
         return self.mean_returns[self.axis.values.index(value)]
 
-    def survived(self, episodes: int) -> list[Value]:
-        """The values at which at least `ALIVE` are alive."""
-        pairs = zip(self.axis.values, self.alive, strict=True)
-        return [value for value, alive in pairs if alive >= ALIVE * episodes]
+    def within(self) -> list[Value]:
+        """The values within the margins; of an axis without an order those at which at least `ALIVE` are alive."""
+        values = self.axis.values
+        if not self.sides:
+            pairs = zip(values, self.alive, strict=True)
+            return [value for value, alive in pairs if alive >= ALIVE * self.episodes]
+        places = [values.index(side.last) for side in self.sides.values() if side.last is not None]
+        if not places:
+            return []
+        places.append(values.index(self.axis.nominal))
+        return list(values[min(places) : max(places) + 1])
 
-    def to_json(self, episodes: int) -> dict[str, Any]:
+    def to_json(self) -> dict[str, Any]:
         """The axis as an object of JSON."""
         axis = self.axis
         margin = {name: _deviation(axis, side.last) for name, side in self.sides.items()}
@@ -63,9 +77,9 @@ class AxisMargins:
             "unit": axis.unit or "factor",
             "nominal": axis.nominal,
             "values": list(axis.values),
-            "alive": [alive / episodes for alive in self.alive],
+            "alive": [alive / self.episodes for alive in self.alive],
             "mean_return": list(self.mean_returns),
-            "margin": margin if self.sides else self.survived(episodes),
+            "margin": margin if self.sides else self.within(),
         }
 
 
@@ -88,22 +102,42 @@ def worst_accepted(nominal: Flown) -> float:
 
 
 def margins_of(axis: Axis, flown: Sequence[Flown], least: float | None) -> AxisMargins:
-    """Margins of an axis. Alive are episodes with the `least` return; if it is None, those that did not terminate."""
+    """The margins of an axis. Alive are episodes with the `least` return; without it, those that did not terminate."""
     alive = [one.terminated.logical_not() if least is None else one.returns >= least for one in flown]
-    counts = tuple(int(each.sum()) for each in alive)
-    episodes = len(alive[0])
+    counts, episodes = tuple(int(each.sum()) for each in alive), len(alive[0])
     returns = tuple(float(one.returns.mean()) for one in flown)
-    return AxisMargins(axis, counts, returns, dict(_sides(axis, counts, episodes)))
+    return AxisMargins(axis, episodes, counts, returns, dict(_sides(axis, counts, episodes)))
 
 
-def _sides(axis: Axis, alive: Sequence[int], episodes: int) -> Iterable[tuple[str, Side]]:
+def _sides(axis: Axis, alive: Sequence[int], episodes: int) -> Iterator[tuple[str, Side]]:
     if isinstance(axis.nominal, str):
         return
     middle = axis.values.index(axis.nominal)
-    for name, step in zip(SIDES, (-1, 1), strict=True):
-        places = range(middle, -1 if step < 0 else len(axis.values), step)
+    for name, places in (("below", range(middle, -1, -1)), ("above", range(middle, len(axis.values)))):
         if len(places) > 1:
             flies = [alive[place] >= ALIVE * episodes for place in places]
             count = flies.index(False) if False in flies else len(flies)
             outward = [axis.values[place] for place in places]
             yield name, Side(outward[count - 1] if count else None, outward[count] if count < len(flies) else None)
+
+
+def smoothness(actions: Tensor, period: float) -> dict[str, float]:
+    """The smoothness of a policy's actions.
+
+    Args:
+        actions: [T, E, A] in [-1, 1], one every `period`.
+        period: in seconds.
+
+    Returns:
+        `action_rate`, the root mean square of the change of an action in a second, where from one bound to the other is
+        2; `fast_share`, the share of the power of the actions, without their means, at frequencies above 10 Hz;
+        `saturated_share`, the share of the actions at a bound.
+    """
+    rate = actions.diff(dim=0).square().mean().sqrt() / period
+    power = torch.fft.rfft(actions - actions.mean(0), dim=0).abs().square().sum((1, 2))
+    fast = torch.fft.rfftfreq(len(actions), period) > FAST
+    return {
+        "action_rate": rate.item(),
+        "fast_share": (power[fast].sum() / power.sum().clamp(min=1e-12)).item(),
+        "saturated_share": (actions.abs() >= EDGE).float().mean().item(),
+    }

@@ -1,20 +1,97 @@
-"""Environments of any backend flown along axes: through a disturbed channel, and with other models."""
+"""Environments of any backend flown along axes, though they know nothing of disturbances.
+
+A channel between policy and environment delays actions, loses actions and blurs observations; factors change the models
+of MuJoCo.
+"""
 
 from collections.abc import Mapping
 from typing import Any
 
+import gymnasium as gym
 import torch
 from torch import Tensor
 
 from lemniscate.envs import registry
+from lemniscate.envs.factory import make_one, maker_of
 from lemniscate.envs.probe import CHANNEL_AXES, MODEL_AXES, Act, Axis, Flown, Tally, Value
 from lemniscate.envs.vec_env import VecEnv
-from lemniscate.margins.disturbed import Channel, has_model
 from lemniscate.run.seeding import derive, generator
 from lemniscate.spec import Discrete, Spec
 
-FACTORS = "lemniscate.margins.disturbed:ModelFactors"
+FACTORS = "lemniscate.margins.vector_probe:ModelFactors"
 CPU = torch.device("cpu")
+
+
+class Channel:
+    """The way between a policy and N environments: late and lost actions, blurred observations.
+
+    Before the first action has arrived it acts already; a lost one is replaced by the one that acted before it.
+
+    Args:
+        act: the policy.
+        action_delay: in steps.
+        observation_noise: standard deviation of each number of an observation, in multiples of `scale`.
+        lost_actions: probability that an action is lost.
+        scale: [O].
+        rng: of noise and losses.
+    """
+
+    def __init__(
+        self,
+        act: Act,
+        *,
+        action_delay: int = 0,
+        observation_noise: float = 0.0,
+        lost_actions: float = 0.0,
+        scale: Tensor | None = None,
+        rng: torch.Generator,
+    ) -> None:
+        self._act, self._delay, self._lost, self._rng = act, int(action_delay), lost_actions, rng
+        self._noise = observation_noise * scale if scale is not None and observation_noise else None
+        self._sent: list[Tensor] = []
+        self._acting: Tensor | None = None
+
+    def __call__(self, obs: Tensor) -> Tensor:
+        """The actions [N, …] that act now, after the observations [N, O]."""
+        if self._noise is not None:
+            obs = obs + self._noise * torch.randn(obs.shape, generator=self._rng)
+        self._sent.append(self._act(obs))
+        arrived = self._sent.pop(0) if len(self._sent) > self._delay else self._sent[0]
+        if self._lost and self._acting is not None:
+            lost = torch.rand(len(obs), generator=self._rng) < self._lost
+            arrived = torch.where(lost.reshape(-1, *[1] * (arrived.ndim - 1)), self._acting, arrived)
+        self._acting = arrived
+        return arrived
+
+
+class ModelFactors(gym.Wrapper):
+    """A MuJoCo environment whose bodies are heavier and whose surfaces are rougher by a factor.
+
+    Args:
+        env: the environment.
+        mass: of all masses, and with them of the moments of inertia.
+        friction: of all coefficients of friction.
+    """
+
+    def __init__(self, env: gym.Env, mass: float = 1.0, friction: float = 1.0) -> None:
+        super().__init__(env)
+        import mujoco
+
+        world: Any = env.unwrapped
+        world.model.body_mass[:] *= mass
+        world.model.body_inertia[:] *= mass
+        world.model.geom_friction[:] *= friction
+        # what MuJoCo has derived from masses
+        mujoco.mj_setConst(world.model, world.data)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def has_model(env: str, kwargs: Mapping[str, Any]) -> bool:
+    """MuJoCo simulates the environment of Gymnasium's with this name."""
+    made: Any = make_one(maker_of(env), **kwargs)
+    try:
+        return hasattr(getattr(made.unwrapped, "model", None), "geom_friction")
+    finally:
+        made.close()
 
 
 class VectorProbe:
@@ -44,23 +121,17 @@ class VectorProbe:
 
     def fly(self, act: Act, seed: int) -> tuple[Flown, dict[str, list[Flown]]]:
         """All episodes, see `Probe.fly`; afterwards the environments are closed."""
+        numbers, seen = _is_number(self.spec), list[Tensor]()
         try:
-            nominal, scale = self._nominal(act, seed)
-            return nominal, {axis.name: self._along(axis, nominal, scale, act, seed) for axis in self.axes}
+            nominal = _fly(self._env, act, seed, seen if numbers.any() else None)
+            scale = torch.cat(seen).std(0, correction=0) * numbers if seen else None
+            points: dict[str, list[Flown]] = {}
+            for axis in self.axes:
+                flown = (nominal if v == axis.nominal else self._at(axis, v, scale, act, seed) for v in axis.values)
+                points[axis.name] = list(flown)
+            return nominal, points
         finally:
             self._env.close()
-
-    def _nominal(self, act: Act, seed: int) -> tuple[Flown, Tensor | None]:
-        """The nominal episodes; the standard deviation [O] of what was seen in them, 0 of what is no number."""
-        numbers, seen = _is_number(self.spec), list[Tensor]()
-        if not numbers.any():
-            return _fly(self._env, act, seed), None
-        flown = _fly(self._env, act, seed, seen)
-        return flown, torch.cat(seen).std(0, correction=0) * numbers
-
-    def _along(self, axis: Axis, nominal: Flown, scale: Tensor | None, act: Act, seed: int) -> list[Flown]:
-        """The episodes at each value of an axis."""
-        return [nominal if v == axis.nominal else self._at(axis, v, scale, act, seed) for v in axis.values]
 
     def _at(self, axis: Axis, value: Value, scale: Tensor | None, act: Act, seed: int) -> Flown:
         rng = generator(seed, CPU, 1)

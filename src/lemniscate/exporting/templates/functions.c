@@ -48,14 +48,14 @@ static float policy_exp(float x)
     return y * power;
 }
 
-// sigmoid: exp
+// sigmoid
 /* 1 / (1 + e^-x), with an error below 2e-7. */
 static float policy_sigmoid(float x)
 {
     return 1.0F / (1.0F + policy_exp(-x));
 }
 
-// tanh: sigmoid
+// tanh
 /* 2 sigmoid(2x) - 1, with an error below 3e-7. */
 static float policy_tanh(float x)
 {
@@ -103,7 +103,7 @@ static float policy_sqrt(float x)
     return 0.5F * (y + x / y);
 }
 
-// sin
+// sine
 /* The sine of x + quarters pi / 2, with an error below 4e-7 for |x| < 1000; 0 from |x| = 1e6 on. */
 static float policy_sine(float x, int32_t quarters)
 {
@@ -125,18 +125,19 @@ static float policy_sine(float x, int32_t quarters)
     return quarters & 2 ? -y : y;
 }
 
+// sin
 static float policy_sin(float x)
 {
     return policy_sine(x, 0);
 }
 
-// cos: sin
+// cos
 static float policy_cos(float x)
 {
     return policy_sine(x, 1);
 }
 
-// erf: exp abs
+// erf
 /* The error function, with an error below 7e-7 (Abramowitz and Stegun 1964, 7.1.26). */
 static float policy_erf(float x)
 {
@@ -146,9 +147,9 @@ static float policy_erf(float x)
     return x < 0.0F ? -y : y;
 }
 
-// bfloat16
+// roundbfloat16
 /* The nearest number with 8 bits of mantissa; of two, the even one. */
-static float policy_bfloat16(float x)
+static float policy_roundbfloat16(float x)
 {
     uint32_t bits;
     memcpy(&bits, &x, sizeof bits);
@@ -200,7 +201,7 @@ static float policy_reducesum(const float *x, int size)
     return sum;
 }
 
-// reducemean: reducesum
+// reducemean
 static float policy_reducemean(const float *x, int size)
 {
     return policy_reducesum(x, size) / (float)size;
