@@ -19,7 +19,6 @@ from lemniscate.run import checkpoint, places
 from lemniscate.run.directory import is_finished
 from lemniscate.run.metrics import read_metrics
 from lemniscate.sweeps import sweep
-from lemniscate.sweeps.sweep_progress import SweepProgress
 from lemniscate.system.files import read_json, write_json
 
 SEEDS = ["--seeds", "1-2"]
@@ -96,7 +95,7 @@ def test_at_the_end_there_is_one_table_and_one_picture(trained):
 
 def test_the_sweep_is_plotted_again_without_playing(trained, monkeypatch):
     path, _ = trained
-    monkeypatch.setattr(lem.results, "evaluate", None)
+    monkeypatch.setattr(lem.api.results, "evaluate", None)
     assert {picture.parent for picture in lem.plot(path)} == {path / "plots"}
 
 
@@ -157,12 +156,12 @@ def test_two_processes_do_not_train_one_sweep(trained):
 def test_the_policy_is_played_anew_when_there_is_a_newer_checkpoint(trained, tmp_path, capsys):
     run = shutil.copytree(trained[0] / "ppo-1", tmp_path / "run")
     known = read_json(run / "final.json")
-    assert lem.results.final_return(run) == known["mean_return"]
+    assert lem.api.results.final_return(run) == known["mean_return"]
     assert capsys.readouterr().err == ""
     newest = run / "checkpoints" / f"step-{known['step']}"
     newest.rename(newest.with_name(f"step-{known['step'] + 1}"))
     write_json(run / "final.json", known | {"mean_return": 7.0})
-    assert lem.results.final_return(run) == known["mean_return"]
+    assert lem.api.results.final_return(run) == known["mean_return"]
     assert "Evaluating" in capsys.readouterr().err
 
 
@@ -286,20 +285,3 @@ def test_seeds_are_given_as_ranges_and_lists():
 def test_as_many_runs_at_once_as_cores_serve(monkeypatch, cores, threads, runs):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)))
     assert places.at_once(threads) == runs
-
-
-def test_without_a_terminal_progress_is_a_line_now_and_then(capsys):
-    bars = SweepProgress({"a": 1_000, "b": 1_000}, {"a": 0, "b": 500})
-    bars.update("a", 0, None, None)
-    bars.update("a", 100, 7.0, 50.0)
-    bars.update("a", 150, 7.0, 50.0)
-    bars.update("a", 1_030, 9.0, 50.0)
-    bars.end("a", "done")
-    bars.close()
-    assert capsys.readouterr().err.splitlines() == [
-        "30 % of all steps",
-        "  a: 100 steps  50/s  return 7.0  0:00:18 left",
-        "70 % of all steps",
-        "  a: 1,030 steps  50/s  return 9.0  being evaluated",
-        "a: done",
-    ]

@@ -7,7 +7,7 @@ from lemniscate.run.places import LOG
 
 
 class Here:
-    """The interface of `lemniscate.run.places.Processes`, without the seconds that a process takes to begin."""
+    """The interface of `lemniscate.run.places.Places`, without the seconds that a process takes to begin."""
 
     count, free, running = 1, True, ()
 

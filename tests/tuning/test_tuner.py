@@ -40,7 +40,7 @@ def tuned(tmp_path_factory):
     """A search of four trials, and its lines on standard error."""
     path = tmp_path_factory.mktemp("searches") / "both"
     with contextlib.redirect_stderr(io.StringIO()) as said, pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lemniscate.sweeps.tuner.places_on", Here)
+        patch.setattr("lemniscate.sweeps.runs.places_on", Here)
         code = main(["tune", "ppo", *FLAGS, *SEARCH, "--trials", "4", "--run", str(path)])
     assert code == 0, said.getvalue()
     return path, said.getvalue()
