@@ -1,4 +1,7 @@
-"""Sweeps: real processes, each run ends in the same bits as alone, whatever happens to the others."""
+"""Sweeps: each run ends in the same bits as alone, whatever happens to the others.
+
+Where processes are stopped, killed or counted they are real ones; else the runs are trained in this one.
+"""
 
 import contextlib
 import io
@@ -20,12 +23,12 @@ from lemniscate.run.directory import is_finished
 from lemniscate.run.metrics import read_metrics
 from lemniscate.sweeps import sweep
 from lemniscate.system.files import read_json, write_json
+from tuning.here import in_this_process
 
 SEEDS = ["--seeds", "1-2"]
 ENV = "environments:Copy-box-v0"
-SHARED = {"num_envs": 4, "total_steps": 5_200, "hidden": (16,)}
-FLAGS = ["--num-envs", "4", "--total-steps", "5_200", "--hidden", "16"]
-FEW = {"num_envs": 4, "num_steps": 8, "total_steps": 256, "hidden": (16,), "minibatch_size": 16}
+SHARED = {"num_envs": 4, "total_steps": 5_200, "hidden": (16,), "compile": "off"}
+FLAGS = ["--num-envs", "4", "--total-steps", "5_200", "--hidden", "16", "--compile", "off"]
 SMALL = [
     "--num-envs",
     "4",
@@ -51,7 +54,7 @@ def final_hash(run):
 def trained(tmp_path_factory):
     """A sweep of PPO and DDPG with a callback, and its lines on standard error."""
     path = tmp_path_factory.mktemp("sweeps") / "both"
-    with contextlib.redirect_stderr(io.StringIO()) as said:
+    with contextlib.redirect_stderr(io.StringIO()) as said, in_this_process():
         options = ["--env", ENV, "--seeds", "1-2", "--run", str(path), "--callbacks", "environments:tell"]
         code = main(["train", "ppo,ddpg", *options, *FLAGS])
     assert code == 0, said.getvalue()
@@ -116,7 +119,8 @@ def test_resuming_a_sweep_goes_on_begins_and_leaves_alone(trained, tmp_path, cap
     for step in checkpoint.list_steps(copy / "ppo-2" / "checkpoints")[-2:]:
         shutil.rmtree(copy / "ppo-2" / "checkpoints" / f"step-{step}")
     untouched = {file: file.stat().st_mtime_ns for name in ("ppo-1", "ddpg-1") for file in (copy / name).rglob("*")}
-    assert main(["resume", str(copy)]) == 0
+    with in_this_process():
+        assert main(["resume", str(copy)]) == 0
     assert "2 of 4 runs to train" in capsys.readouterr().err
     for name in ("ppo-2", "ddpg-2"):
         assert final_hash(copy / name) == final_hash(path / name)
@@ -136,15 +140,6 @@ def test_a_run_whose_last_checkpoint_is_damaged_is_not_finished(trained, tmp_pat
     state = run / "checkpoints" / f"step-{checkpoint.list_steps(run / 'checkpoints')[-1]}" / "state.json"
     state.write_bytes(state.read_bytes()[:-1])
     assert not is_finished(run)
-
-
-def test_runs_are_trained_side_by_side_where_there_are_cores(tmp_path, monkeypatch):
-    monkeypatch.setattr(places, "at_once", lambda threads: 2)
-    most = []
-    ended = places.Processes.ended
-    monkeypatch.setattr(places.Processes, "ended", lambda here: most.append(len(here.running)) or ended(here))
-    lem.train_sweep("ppo", "Countdown-v0", "1-3", run=tmp_path / "set", progress=False, **FEW)
-    assert max(most) == 2
 
 
 def test_two_processes_do_not_train_one_sweep(trained):
@@ -223,9 +218,14 @@ def test_ctrl_c_stops_every_run_and_the_sweep_goes_on_to_the_same_bits(tmp_path)
         assert final_hash(path / f"ppo-{seed}") == final_hash(alone.path)
 
 
-def test_runs_that_fail_are_named_and_the_others_are_not_touched(tmp_path, capsys):
+def test_runs_that_fail_are_named_and_the_others_are_trained_side_by_side(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(places, "at_once", lambda threads: 2)
+    most = []
+    ended = places.Processes.ended
+    monkeypatch.setattr(places.Processes, "ended", lambda here: most.append(len(here.running)) or ended(here))
     with pytest.raises(lem.SweepError) as told:
         lem.train_sweep(["ppo"], "environments:Fragile", range(1, 4), run=tmp_path / "s", num_envs=2, total_steps=2_000)
+    assert max(most) == 2
     first, nan, killed, again = str(told.value).splitlines()
     assert first == "2 of 3 runs could not go on; log.txt in each says more."
     assert nan.startswith("ppo-2: The reward of environment 0 is nan in the step after 0. Training stopped;")
