@@ -50,6 +50,14 @@ def final_hash(run):
     return json.loads((last / "manifest.json").read_text())["sha256"]
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _few_episodes():
+    """A final return takes seconds over 100 episodes."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("lemniscate.api.results.FINAL_EPISODES", 10)
+        yield
+
+
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     """A sweep of PPO and DDPG with a callback, and its lines on standard error."""
