@@ -1,4 +1,7 @@
-"""Sweeps: real processes, each run ends in the same bits as alone, whatever happens to the others."""
+"""Sweeps: each run ends in the same bits as alone, whatever happens to the others.
+
+Where processes are stopped, killed or counted they are real ones; else the runs are trained in this one.
+"""
 
 import contextlib
 import io
@@ -19,14 +22,13 @@ from lemniscate.run import checkpoint, places
 from lemniscate.run.directory import is_finished
 from lemniscate.run.metrics import read_metrics
 from lemniscate.sweeps import sweep
-from lemniscate.sweeps.sweep_progress import SweepProgress
 from lemniscate.system.files import read_json, write_json
+from tuning.here import in_this_process
 
 SEEDS = ["--seeds", "1-2"]
 ENV = "environments:Copy-box-v0"
-SHARED = {"num_envs": 4, "total_steps": 5_200, "hidden": (16,)}
-FLAGS = ["--num-envs", "4", "--total-steps", "5_200", "--hidden", "16"]
-FEW = {"num_envs": 4, "num_steps": 8, "total_steps": 256, "hidden": (16,), "minibatch_size": 16}
+SHARED = {"num_envs": 4, "total_steps": 5_200, "hidden": (16,), "compile": "off"}
+FLAGS = ["--num-envs", "4", "--total-steps", "5_200", "--hidden", "16", "--compile", "off"]
 SMALL = [
     "--num-envs",
     "4",
@@ -48,11 +50,19 @@ def final_hash(run):
     return json.loads((last / "manifest.json").read_text())["sha256"]
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _few_episodes():
+    """A final return takes seconds over 100 episodes."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("lemniscate.api.results.FINAL_EPISODES", 10)
+        yield
+
+
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     """A sweep of PPO and DDPG with a callback, and its lines on standard error."""
     path = tmp_path_factory.mktemp("sweeps") / "both"
-    with contextlib.redirect_stderr(io.StringIO()) as said:
+    with contextlib.redirect_stderr(io.StringIO()) as said, in_this_process():
         options = ["--env", ENV, "--seeds", "1-2", "--run", str(path), "--callbacks", "environments:tell"]
         code = main(["train", "ppo,ddpg", *options, *FLAGS])
     assert code == 0, said.getvalue()
@@ -96,7 +106,7 @@ def test_at_the_end_there_is_one_table_and_one_picture(trained):
 
 def test_the_sweep_is_plotted_again_without_playing(trained, monkeypatch):
     path, _ = trained
-    monkeypatch.setattr(lem.results, "evaluate", None)
+    monkeypatch.setattr(lem.api.results, "evaluate", None)
     assert {picture.parent for picture in lem.plot(path)} == {path / "plots"}
 
 
@@ -117,7 +127,8 @@ def test_resuming_a_sweep_goes_on_begins_and_leaves_alone(trained, tmp_path, cap
     for step in checkpoint.list_steps(copy / "ppo-2" / "checkpoints")[-2:]:
         shutil.rmtree(copy / "ppo-2" / "checkpoints" / f"step-{step}")
     untouched = {file: file.stat().st_mtime_ns for name in ("ppo-1", "ddpg-1") for file in (copy / name).rglob("*")}
-    assert main(["resume", str(copy)]) == 0
+    with in_this_process():
+        assert main(["resume", str(copy)]) == 0
     assert "2 of 4 runs to train" in capsys.readouterr().err
     for name in ("ppo-2", "ddpg-2"):
         assert final_hash(copy / name) == final_hash(path / name)
@@ -139,15 +150,6 @@ def test_a_run_whose_last_checkpoint_is_damaged_is_not_finished(trained, tmp_pat
     assert not is_finished(run)
 
 
-def test_runs_are_trained_side_by_side_where_there_are_cores(tmp_path, monkeypatch):
-    monkeypatch.setattr(places, "at_once", lambda threads: 2)
-    most = []
-    ended = places.Processes.ended
-    monkeypatch.setattr(places.Processes, "ended", lambda here: most.append(len(here.running)) or ended(here))
-    lem.train_sweep("ppo", "Countdown-v0", "1-3", run=tmp_path / "set", progress=False, **FEW)
-    assert max(most) == 2
-
-
 def test_two_processes_do_not_train_one_sweep(trained):
     path, _ = trained
     with FileLock(path / ".lock"), pytest.raises(lem.UserError, match="being trained by another process"):
@@ -157,12 +159,12 @@ def test_two_processes_do_not_train_one_sweep(trained):
 def test_the_policy_is_played_anew_when_there_is_a_newer_checkpoint(trained, tmp_path, capsys):
     run = shutil.copytree(trained[0] / "ppo-1", tmp_path / "run")
     known = read_json(run / "final.json")
-    assert lem.results.final_return(run) == known["mean_return"]
+    assert lem.api.results.final_return(run) == known["mean_return"]
     assert capsys.readouterr().err == ""
     newest = run / "checkpoints" / f"step-{known['step']}"
     newest.rename(newest.with_name(f"step-{known['step'] + 1}"))
     write_json(run / "final.json", known | {"mean_return": 7.0})
-    assert lem.results.final_return(run) == known["mean_return"]
+    assert lem.api.results.final_return(run) == known["mean_return"]
     assert "Evaluating" in capsys.readouterr().err
 
 
@@ -224,9 +226,14 @@ def test_ctrl_c_stops_every_run_and_the_sweep_goes_on_to_the_same_bits(tmp_path)
         assert final_hash(path / f"ppo-{seed}") == final_hash(alone.path)
 
 
-def test_runs_that_fail_are_named_and_the_others_are_not_touched(tmp_path, capsys):
+def test_runs_that_fail_are_named_and_the_others_are_trained_side_by_side(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(places, "at_once", lambda threads: 2)
+    most = []
+    ended = places.Processes.ended
+    monkeypatch.setattr(places.Processes, "ended", lambda here: most.append(len(here.running)) or ended(here))
     with pytest.raises(lem.SweepError) as told:
         lem.train_sweep(["ppo"], "environments:Fragile", range(1, 4), run=tmp_path / "s", num_envs=2, total_steps=2_000)
+    assert max(most) == 2
     first, nan, killed, again = str(told.value).splitlines()
     assert first == "2 of 3 runs could not go on; log.txt in each says more."
     assert nan.startswith("ppo-2: The reward of environment 0 is nan in the step after 0. Training stopped;")
@@ -286,20 +293,3 @@ def test_seeds_are_given_as_ranges_and_lists():
 def test_as_many_runs_at_once_as_cores_serve(monkeypatch, cores, threads, runs):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)))
     assert places.at_once(threads) == runs
-
-
-def test_without_a_terminal_progress_is_a_line_now_and_then(capsys):
-    bars = SweepProgress({"a": 1_000, "b": 1_000}, {"a": 0, "b": 500})
-    bars.update("a", 0, None, None)
-    bars.update("a", 100, 7.0, 50.0)
-    bars.update("a", 150, 7.0, 50.0)
-    bars.update("a", 1_030, 9.0, 50.0)
-    bars.end("a", "done")
-    bars.close()
-    assert capsys.readouterr().err.splitlines() == [
-        "30 % of all steps",
-        "  a: 100 steps  50/s  return 7.0  0:00:18 left",
-        "70 % of all steps",
-        "  a: 1,030 steps  50/s  return 9.0  being evaluated",
-        "a: done",
-    ]

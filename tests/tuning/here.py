@@ -2,17 +2,23 @@
 
 import contextlib
 
+import pytest
+
 from lemniscate.cli import main
 from lemniscate.run.places import LOG
 
 
 class Here:
-    """The interface of `lemniscate.run.places.Processes`, without the seconds that a process takes to begin."""
+    """The interface of `lemniscate.run.places.Places`, without the seconds that a process takes to begin."""
 
-    count, free, running = 1, True, ()
+    count, free = 1, True
 
     def __init__(self, *_):
         self._codes = {}
+
+    @property
+    def running(self):
+        return list(self._codes)
 
     def start(self, run, options):
         with (run / LOG).open("a") as log, contextlib.redirect_stderr(log), contextlib.redirect_stdout(log):
@@ -27,3 +33,12 @@ class Here:
 
     def close(self):
         pass
+
+
+@contextlib.contextmanager
+def in_this_process(places=Here):
+    """Sweeps and searches train their runs here meanwhile."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("lemniscate.sweeps.runs.places_on", places)
+        patch.setattr("lemniscate.sweeps.runs.POLL_SECONDS", 0.0)
+        yield

@@ -12,6 +12,7 @@ import pytest
 
 import lemniscate as lem
 from forks import command
+from lemniscate.api.training import config_for
 from lemniscate.cli import main, parse
 from lemniscate.presets.stored import read_preset
 from lemniscate.report.seeds import iqm
@@ -19,10 +20,12 @@ from lemniscate.run import checkpoint
 from lemniscate.run.metrics import read_metrics
 from lemniscate.sweeps.study import read_search
 from lemniscate.system.files import read_json, write_json
-from tuning.here import Here
+from tuning.here import in_this_process
 
 ENV = "environments:Copy-box-v0"
-FLAGS = ["--env", ENV, "--num-envs", "4", "--num-steps", "16", "--total-steps", "5_184", "--minibatch-size", "32"]
+STEPS = 2_304
+FLAGS = ["--env", ENV, "--num-envs", "4", "--num-steps", "16", "--total-steps", str(STEPS), "--minibatch-size", "32"]
+FLAGS += ["--epochs", "2", "--evaluate-episodes", "5", "--compile", "off"]
 SEARCH = ["--search", "learning_rate=log:1e-4:1e-2, hidden=16|32", "--seeds", "101-102"]
 
 
@@ -39,8 +42,7 @@ def trials_of(path):
 def tuned(tmp_path_factory):
     """A search of four trials, and its lines on standard error."""
     path = tmp_path_factory.mktemp("searches") / "both"
-    with contextlib.redirect_stderr(io.StringIO()) as said, pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lemniscate.sweeps.tuner.places_on", Here)
+    with contextlib.redirect_stderr(io.StringIO()) as said, in_this_process():
         code = main(["tune", "ppo", *FLAGS, *SEARCH, "--trials", "4", "--run", str(path)])
     assert code == 0, said.getvalue()
     return path, said.getvalue()
@@ -66,9 +68,9 @@ def test_the_worse_trials_end_early(tuned):
     for number, state in states.items():
         for run in (tuned[0] / "trials" / f"{number:03d}").glob("ppo-*"):
             steps = checkpoint.list_steps(run / "checkpoints")[-1]
-            assert (steps < 5_184) == (state == "PRUNED")
+            assert (steps < STEPS) == (state == "PRUNED")
             if state == "PRUNED":
-                assert steps in (576, 3 * 576)
+                assert steps in (STEPS // 9, STEPS // 3)
 
 
 def test_the_best_trial_is_the_preset_with_its_provenance(tuned):
@@ -156,7 +158,7 @@ def test_what_is_proposed_after_an_interruption_is_new(tmp_path):
 def read_search_of(folder, trials):
     from lemniscate.sweeps.study import Search
 
-    config = lem.api.config_for("ppo", ENV)
+    config = config_for("ppo", ENV)
     folder.mkdir(exist_ok=True)
     search = Search(folder / "search", "ppo", config, {"learning_rate": "log:1e-4:1e-2"}, [101], trials, True)
     search.create()
@@ -166,7 +168,8 @@ def read_search_of(folder, trials):
 def test_a_trial_that_fails_is_told_and_the_search_goes_on(tmp_path, capsys):
     path = tmp_path / "search"
     words = ["--search", "learning_rate=1e-3|1e30", "--trials", "3", "--seeds", "101", "--no-prune", "--run", str(path)]
-    assert main(["tune", "ppo", *FLAGS, *words, "--env", "Pendulum-v1"]) in (0, 1)
+    with in_this_process():
+        assert main(["tune", "ppo", *FLAGS, *words, "--env", "Pendulum-v1", "--total-steps", "1_152"]) in (0, 1)
     states = [trial.state.name for trial in trials_of(path).values()]
     said = capsys.readouterr().err
     assert set(states) <= {"COMPLETE", "FAIL"}
@@ -196,6 +199,10 @@ def test_a_search_from_elsewhere_that_names_code_is_not_resumed_unasked(tuned, t
         (["--search", "gamma=.9:.99", "--seed", "3"], "several seeds"),
         (["--search", "gamma=.9:.99", "--seeds", "x"], "seeds"),
         (["--search", "gama=.9:.99"], "did you mean gamma"),
+        (
+            ["--search", "gamma=.9:.99", "--population"],
+            "Population-based training has gone: `lemniscate tune` ends the",
+        ),
         ([], "Search what?"),
         (["--search", "minibatch_size=64|100_000"], "minibatch_size 100,000 is above"),
     ],

@@ -1,4 +1,4 @@
-"""Several processes of one run on this machine, by torch's elastic launcher, as `torchrun` starts them."""
+"""One run in several processes: those of this machine, started by torch's elastic launcher, or those of a cluster."""
 
 import logging
 import os
@@ -9,6 +9,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from lemniscate.api.results import report_on
+from lemniscate.api.stored import TrainedRun, load
+from lemniscate.cluster.connection import Cluster
 from lemniscate.errors import RankError, UserError, shown
 from lemniscate.hub.trust import signed
 from lemniscate.run.config import RunConfig
@@ -38,14 +41,48 @@ def launch_run(
     if (path / CONFIG).exists() or config.shards > 1:
         World(config.shards, size=processes).divide(config.shards)
     names = require_importable(config, track, callbacks)
-    if not (path / CONFIG).exists():
-        config = config.replace(shards=max(config.shards, processes))
-        create_directory(path, CONFIG, signed({"algorithm": algorithm, "config": config.to_json()}))
+    _begin(path, algorithm, config, processes)
     options = [*(["--track", str(track)] if track else []), *(["--callbacks", *names] if names else [])]
     options += ["--report"] * report + ["--trust"] + ["--quiet"] * (not progress)
     began = time.monotonic()
     launch(["resume", str(path), *options], processes)
     return time.monotonic() - began
+
+
+def train_there(
+    path: Path,
+    algorithm: str,
+    config: RunConfig,
+    cluster: Cluster,
+    track: object,
+    callbacks: Any,
+    report: bool,
+    progress: bool,
+) -> TrainedRun:
+    """Train on a cluster, or go on there; the run is evaluated and drawn here. Raises as `launch_run`."""
+    from lemniscate.cluster.connection import connected
+    from lemniscate.cluster.job import train_on_ray
+
+    options = {"track": track, "callbacks": require_importable(config, track, callbacks), "progress": progress}
+    options["trust"] = True  # its code was named here, or vouched for
+    began = time.monotonic()
+    with connected(cluster):  # before the directory is made: a cluster that does not answer leaves nothing
+        workers = cluster.workers or 1
+        config = _begin(path, algorithm, config, workers)
+        train_on_ray(path, algorithm, config, workers, cluster.storage, "lemniscate.api.resumed:resume", options)
+    seconds = time.monotonic() - began
+    trained = TrainedRun(path, load(path, trust=True), seconds)
+    if report or track is not None:
+        report_on(trained)
+    return trained
+
+
+def _begin(path: Path, algorithm: str, config: RunConfig, processes: int) -> RunConfig:
+    """Create the directory of a new run, with a shard for each process; returns the Config of the run."""
+    if not (path / CONFIG).exists():
+        config = config.replace(shards=max(config.shards, processes))
+        create_directory(path, CONFIG, signed({"algorithm": algorithm, "config": config.to_json()}))
+    return config
 
 
 def require_importable(config: RunConfig, track: object, callbacks: Any) -> list[str]:

@@ -6,7 +6,7 @@ from typing import Any
 
 from lemniscate import algos
 from lemniscate.api.callbacks import Callback, find_callbacks
-from lemniscate.api.launch import launch_run
+from lemniscate.api.launch import launch_run, train_there
 from lemniscate.api.policy import TrainedPolicy
 from lemniscate.api.results import report_on
 from lemniscate.api.stored import TrainedRun, load, own_code_of, path_of
@@ -77,8 +77,6 @@ def resume(
         if world.from_first(world.is_first and is_finished(path)):
             return _finished(path, report and world.is_first, progress and world.is_first, trust)
         if there is not None:
-            from lemniscate.cluster.job import train_there
-
             return train_there(path, algorithm, config, there, track, callbacks, report, progress)
         if processes > 1 and world.size == 1:
             launched = launch_run(path, algorithm, config, processes, track, callbacks, report, progress)

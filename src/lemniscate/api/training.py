@@ -13,7 +13,7 @@ import torch
 
 from lemniscate import algos, presets
 from lemniscate.api.callbacks import Callback, call_callbacks, find_callbacks
-from lemniscate.api.launch import launch_run
+from lemniscate.api.launch import launch_run, train_there
 from lemniscate.api.policy import TrainedPolicy
 from lemniscate.api.results import evaluate, report_on
 from lemniscate.api.stored import TrainedRun, load, path_of
@@ -122,8 +122,6 @@ def train(
         if world.is_first:
             require_absent(path)
         if there is not None:
-            from lemniscate.cluster.job import train_there
-
             return train_there(path, name, config, there, track, callbacks, report, progress)
         if processes > 1:
             launched = launch_run(path, name, config, processes, track, callbacks, report, progress)

@@ -52,7 +52,6 @@ def tune(given: argparse.Namespace) -> None:
         raise UserError("Search what? Name fields with their ranges: --search 'learning_rate=log:1e-4:1e-2'.")
     fields = {"run": given.run, "preset": given.preset, "seeds": given.seeds, "prune": given.prune, **given.fields}
     fields |= {**_cluster(given), "trials": number(given.trials), "progress": not given.quiet}
-    fields["population"] = given.population
     tuned = tune(given.algorithm, given.env, search=given.search, **fields)
     tell(f"Everything is in {tuned.path}")
 

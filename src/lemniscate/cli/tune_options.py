@@ -22,8 +22,5 @@ def add_tune_options(parser: argparse.ArgumentParser) -> None:
         default=True,
         help="end a trial after 1/9 or 1/3 of its steps if it is not among the best third [on]",
     )
-    parser.add_argument(
-        "--population", action="store_true", help="train all together; worse trials go on as copies of better ones"
-    )
     add_cluster_options(parser)
     parser.add_argument("--quiet", action="store_true", help="no progress on standard error")

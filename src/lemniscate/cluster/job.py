@@ -12,28 +12,22 @@ import signal
 import socket
 import tempfile
 import threading
-import time
 import traceback
-from collections.abc import Mapping
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from shutil import copytree, rmtree
 from types import FrameType
 from typing import Any
 
-from lemniscate.api.launch import require_importable
-from lemniscate.api.results import report_on
-from lemniscate.api.stored import TrainedRun, load
-from lemniscate.cluster.connection import Cluster, connected
 from lemniscate.cluster.parcel import STORAGE, pack, unpack
 from lemniscate.errors import NonFiniteError, RankError, UserError, WorkerError, resume_line
-from lemniscate.hub.trust import signed
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import CONFIG, LOCK, create_directory
+from lemniscate.run.metrics import progress_of
 from lemniscate.run.stopping import Stopped, stop_signals_to
-from lemniscate.sweeps.sweep_progress import progress_of
 from lemniscate.system import named, processes
-from lemniscate.system.console import say
+from lemniscate.system.console import ProgressBar
 from lemniscate.system.processes import Processes
 from lemniscate.system.world import CLUSTER, World
 
@@ -44,110 +38,104 @@ FAILURES = 100
 """workers that may be lost before the job gives up"""
 
 
-def train_there(
+def train_on_ray(
     path: Path,
     algorithm: str,
     config: RunConfig,
-    cluster: Cluster,
-    track: object,
-    callbacks: Any,
-    report: bool,
-    progress: bool,
-) -> TrainedRun:
-    """Train on a cluster, or go on there; the run is evaluated and drawn here."""
-    options = {"track": track, "callbacks": require_importable(config, track, callbacks), "progress": progress}
-    seconds = train_on_ray(path, algorithm, config, cluster, options)
-    trained = TrainedRun(path, load(path, trust=True), seconds)
-    if report or track is not None:
-        report_on(trained)
-    return trained
+    workers: int,
+    storage: str | None,
+    resume: str,
+    options: Mapping[str, Any],
+) -> None:
+    """Train a run to its end on the cluster that is connected; its directory here is then as far as it has come.
 
+    Args:
+        path: the run directory.
+        algorithm: its name.
+        config: of the run.
+        workers: the number of processes.
+        storage: as in `Cluster`.
+        resume: the name, as `module:function`, of what each worker calls with its run directory and the options.
+        options: of `resume`, in the worker; with `progress`, it is shown here too.
 
-def train_on_ray(path: Path, algorithm: str, config: RunConfig, cluster: Cluster, options: Mapping[str, Any]) -> float:
-    """Train a run to its end on a cluster; its directory is here when it has ended, as far as it has come.
-
-    Returns the seconds that it took. Raises what ended the run, as one `RankError` if it ended in a worker.
+    Raises:
+        Stopped: after a signal; the last checkpoint is kept.
+        RankError: what ended the run in a worker.
     """
-    workers = cluster.workers or 1
-    record = {"algorithm": algorithm, "config": config.to_json()}
-    new = not (path / CONFIG).exists()
-    if new:
-        config = config.replace(shards=max(config.shards, workers))
-        record["config"] = config.to_json()
-    begun = pack(path) if (path / "checkpoints").exists() else None
-    began = time.monotonic()
-    with connected(cluster):
-        if new:
-            create_directory(path, CONFIG, signed(record))
-        from ray.train import CheckpointConfig, FailureConfig, ScalingConfig
-        from ray.train import RunConfig as JobConfig
-        from ray.train.torch import TorchConfig, TorchTrainer
-        from ray.train.v2.api.exceptions import TrainingFailedError
+    from ray.train import CheckpointConfig, FailureConfig, ScalingConfig
+    from ray.train import RunConfig as JobConfig
+    from ray.train.torch import TorchConfig, TorchTrainer
+    from ray.train.v2.api.exceptions import TrainingFailedError
 
-        storage = cluster.storage or str((path / STORAGE).absolute())
-        name = JOB if cluster.storage is None else path.name
-        trainer = TorchTrainer(
-            _work,
-            train_loop_config={"record": record, "begun": begun, "options": dict(options), "name": path.name},
-            torch_config=TorchConfig(backend="gloo"),
-            scaling_config=ScalingConfig(
-                num_workers=(1, workers) if workers > 1 else 1,
-                use_gpu=config.device.startswith("cuda"),
-                resources_per_worker={"CPU": config.threads},
-            ),
-            run_config=JobConfig(
-                name=name,
-                storage_path=storage,
-                checkpoint_config=CheckpointConfig(num_to_keep=2),
-                failure_config=FailureConfig(max_failures=FAILURES),
-            ),
-        )
-        watching = _Progress(Path(storage) / name, config.total_steps) if options["progress"] else nullcontext()
-        asked: list[int] = []  # Ray makes exceptions of its own of what a handler raises
+    name = path.name if storage else JOB
+    storage = storage or str((path / STORAGE).absolute())
+    given = {
+        "name": path.name,
+        "record": {"algorithm": algorithm, "config": config.to_json()},
+        "begun": pack(path) if (path / "checkpoints").exists() else None,
+        "resume": resume,
+        "options": dict(options),
+    }
+    trainer = TorchTrainer(
+        _work,
+        train_loop_config=given,
+        torch_config=TorchConfig(backend="gloo"),
+        scaling_config=ScalingConfig(
+            num_workers=(1, workers) if workers > 1 else 1,
+            use_gpu=config.device.startswith("cuda"),
+            resources_per_worker={"CPU": config.threads},
+        ),
+        run_config=JobConfig(
+            name=name,
+            storage_path=storage,
+            checkpoint_config=CheckpointConfig(num_to_keep=2),
+            failure_config=FailureConfig(max_failures=FAILURES),
+        ),
+    )
+    shown = _shown_progress(Path(storage) / name, config.total_steps) if options["progress"] else nullcontext()
+    asked: list[int] = []  # Ray makes exceptions of its own of what a handler raises
 
-        def stop(signum: int, _frame: FrameType | None) -> None:
-            asked.append(signum)
-            raise KeyboardInterrupt
+    def stop(signum: int, _frame: FrameType | None) -> None:
+        asked.append(signum)
+        raise KeyboardInterrupt
 
-        try:
-            with stop_signals_to(stop), watching:
-                result = trainer.fit()
-        except (KeyboardInterrupt, SystemExit):
-            again = f"{resume_line(path)} --cluster ray --workers {workers}"
-            sentence = f"Stopped; the last checkpoint is kept. Go on with: {again}"
-            raise Stopped(sentence, asked[0] if asked else signal.SIGINT) from None  # Ray has Ctrl-C for itself
-        except TrainingFailedError as error:
-            raise RankError(f"The workers failed {FAILURES} times; the last time: {error}") from None
-        _fetch(result.checkpoint, path)
+    try:
+        with stop_signals_to(stop), shown:
+            result = trainer.fit()
+    except (KeyboardInterrupt, SystemExit):
+        again = f"{resume_line(path)} --cluster ray --workers {workers}"
+        sentence = f"Stopped; the last checkpoint is kept. Go on with: {again}"
+        raise Stopped(sentence, asked[0] if asked else signal.SIGINT) from None  # Ray has Ctrl-C for itself
+    except TrainingFailedError as error:
+        raise RankError(f"The workers failed {FAILURES} times; the last time: {error}") from None
+    _fetch(result.checkpoint, path)
     if result.return_value:
         raise RankError(result.return_value)
     rmtree(path / STORAGE, ignore_errors=True)
-    return time.monotonic() - began
 
 
-class _Progress:
-    """A line on standard error for each checkpoint that comes into a storage on this machine's disk."""
+@contextmanager
+def _shown_progress(storage: Path, total_steps: int) -> Iterator[None]:
+    """Show meanwhile how far the checkpoints have come that a storage on this machine's disk receives."""
+    ended = threading.Event()
 
-    def __init__(self, storage: Path, total_steps: int) -> None:
-        self._storage, self._total, self._ended = storage, total_steps, threading.Event()
-        self._thread = threading.Thread(target=self._watch, daemon=True)
-
-    def __enter__(self) -> None:
-        self._thread.start()
-
-    def __exit__(self, *_: object) -> None:
-        self._ended.set()
-        self._thread.join()
-
-    def _watch(self) -> None:
-        told = 0
-        while not self._ended.wait(EVERY):
-            newest = max(self._storage.glob("checkpoint_*"), default=None)
+    def watch() -> None:
+        told, bar = 0, ProgressBar(total_steps, 0)
+        while not ended.wait(EVERY):
+            newest = max(storage.glob("checkpoint_*"), default=None)
             step, episode_return, _ = progress_of(newest) if newest else (0, None, None)
             if step > told:
                 told = step
-                so_far = "" if episode_return is None else f", return {episode_return:.1f}"
-                say(f"{step:,} of {self._total:,} steps{so_far}")
+                bar.update(step, episode_return)
+        bar.close()
+
+    thread = threading.Thread(target=watch, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
 
 
 def _usable(shards: int, workers: int) -> int:
@@ -189,7 +177,7 @@ def _work(given: dict[str, Any]) -> str | None:
         path = Path(folder) / given["name"]
         if rank == 0:
             _begin(path, given, ray.train.get_checkpoint())
-        sentence = _train(path, given["options"])
+        sentence = _train(path, given["resume"], given["options"])
         if sentence is None:
             _keep(path, rank == 0)
         broadcast_from_rank_zero(False)
@@ -207,10 +195,10 @@ def _begin(path: Path, given: Mapping[str, Any], checkpoint: Any) -> None:
         create_directory(path, CONFIG, given["record"])
 
 
-def _train(path: Path, options: Mapping[str, Any]) -> str | None:
+def _train(path: Path, resume: str, options: Mapping[str, Any]) -> str | None:
     """Train a run to its end; returns the sentence of what would end it again."""
     try:
-        named.find("lemniscate.api.resumed:resume")(path, trust=True, **options)
+        named.find(resume)(path, **options)
     except RankError as error:
         if error.repeats:
             return error.reason

@@ -20,7 +20,7 @@ from lemniscate.cluster.connection import Cluster, connected
 from lemniscate.cluster.parcel import pack, unpack
 from lemniscate.run.checkpoint import list_steps
 from lemniscate.run.metrics import METRICS
-from lemniscate.run.places import LOG, Processes
+from lemniscate.run.places import LOG, Places, Processes
 from lemniscate.system.files import replace_file
 
 EVERY = 1.0
@@ -68,8 +68,8 @@ class _Running:
     begun: bool = False
 
 
-class RayTasks:
-    """Places on a cluster: as many runs at a time as its cores serve. See `lemniscate.run.places.Processes`.
+class RayTasks(Places):
+    """Places on a cluster: as many runs at a time as its cores serve.
 
     Args:
         cluster: with at most so many `workers` at a time, if it says how many.
@@ -80,28 +80,18 @@ class RayTasks:
     def __init__(self, cluster: Cluster, threads: int, gpu: bool = False) -> None:
         import ray
 
+        super().__init__()
         self._ray, self._connection = ray, ExitStack()
         self._connection.enter_context(connected(cluster))
         self._most, self._threads = cluster.workers, threads
         needs: dict[str, Any] = {"num_cpus": threads, "num_gpus": int(gpu), "max_concurrency": 2}
         self._task: Any = ray.remote(**needs)(Task)
-        self._running: dict[Path, _Running] = {}
 
     @property
     def count(self) -> int:
         """The number of runs at a time: it changes with the machines of the cluster."""
         cores = int(self._ray.cluster_resources().get("CPU", 1))
         return min(self._most or cores, max(1, cores // self._threads))
-
-    @property
-    def running(self) -> list[Path]:
-        """The runs that are being trained."""
-        return list(self._running)
-
-    @property
-    def free(self) -> bool:
-        """Whether another run fits."""
-        return len(self._running) < self.count
 
     def start(self, run: Path, options: Sequence[str]) -> None:
         """Send a run to a machine that has room, or will have."""

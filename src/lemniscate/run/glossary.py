@@ -96,6 +96,11 @@ FIELDS = """
 """
 """A row for each field: ours, then that of each library. What stands in backticks is looked up."""
 
+GONE = {
+    "population": "Population-based training has gone: `lemniscate tune` ends the worse trials early instead (--prune).",
+}
+"""names that earlier versions had, and what takes their place"""
+
 
 def rows() -> list[tuple[str, ...]]:
     """The cells of each row: our field, and the other libraries' words for it."""
@@ -143,6 +148,8 @@ def unknown_field(name: str, known: Iterable[str], spell: Callable[[str], str] =
         known: the Config's fields.
         spell: how a name is written in the sentence, such as a flag.
     """
+    if name in GONE:
+        return UserError(GONE[name])
     known = list(known)
     found = ours(name, known)
     if not found:

@@ -11,6 +11,8 @@ from lemniscate.system.files import DamagedFileError, open_regular
 
 METRICS = "metrics.jsonl"
 MARK = b', "crc32": "'
+PROGRESS_BYTES = 2**17
+"""bytes at the end of a run's metrics that its progress is read from"""
 
 
 def to_line(record: Mapping[str, Any]) -> bytes:
@@ -34,6 +36,15 @@ def read_metrics(path: Path, last_bytes: int | None = None) -> list[dict[str, An
     """
     lines = _lines(path, last_bytes)
     return [record for record in map(from_line, lines) if record is not None]
+
+
+def progress_of(run: Path) -> tuple[int, float | None, float | None]:
+    """(step, mean return of the last 100 episodes, steps per second) in the last lines of a run's metrics."""
+    lines = read_metrics(run, PROGRESS_BYTES)
+    returns = [ret for line in lines for ret in line.get("episode/returns", [])][-100:]
+    rates = [line["time/steps_per_second"] for line in lines if "time/steps_per_second" in line]
+    mean = sum(returns) / len(returns) if returns else None
+    return (lines[-1]["step"] if lines else 0), mean, (rates[-1] if rates else None)
 
 
 def damage(path: Path, logged: int) -> str | None:

@@ -1,14 +1,17 @@
 """The places at which the runs of a set are trained: processes of this machine, one for each run.
 
 Each process resumes one run directory, whether its run has begun or not, and ends with the process that started it.
+The tasks of a cluster are places too: see `lemniscate.cluster.tasks`.
 """
 
 import os
 import signal
 import subprocess
 import sys
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from lemniscate.system.files import open_log, open_regular
 from lemniscate.system.owner import OWNED
@@ -23,16 +26,17 @@ def at_once(threads: int) -> int:
     return max(1, cores // threads)
 
 
-class Processes:
-    """Processes of this machine, as many at a time as have cores.
+class Places(ABC):
+    """Places at which runs are trained, `count` at a time."""
 
-    Args:
-        threads: of each run.
-    """
+    def __init__(self) -> None:
+        self._running: dict[Path, Any] = {}
+        """what trains each of the runs"""
 
-    def __init__(self, threads: int) -> None:
-        self.count = at_once(threads)
-        self._running: dict[Path, subprocess.Popen] = {}
+    @property
+    @abstractmethod
+    def count(self) -> int:
+        """The number of runs at a time."""
 
     @property
     def running(self) -> list[Path]:
@@ -43,6 +47,39 @@ class Processes:
     def free(self) -> bool:
         """Whether another run fits."""
         return len(self._running) < self.count
+
+    @abstractmethod
+    def start(self, run: Path, options: Sequence[str]) -> None:
+        """Begin to train a run: `lemniscate resume` with these options."""
+
+    @abstractmethod
+    def ended(self) -> dict[Path, int]:
+        """The exit codes of the runs that have ended since the last look."""
+
+    @abstractmethod
+    def stop(self, runs: Sequence[Path] | None = None) -> None:
+        """Ask these runs, or all, to save and stop; asked twice, they do not wait for the end of their update."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Stop all runs, and wait for them."""
+
+
+class Processes(Places):
+    """Processes of this machine, as many at a time as have cores.
+
+    Args:
+        threads: of each run.
+    """
+
+    def __init__(self, threads: int) -> None:
+        super().__init__()
+        self._threads = threads
+
+    @property
+    def count(self) -> int:
+        """The number of runs that the cores of this machine serve."""
+        return at_once(self._threads)
 
     def start(self, run: Path, options: Sequence[str]) -> None:
         """Start a process in a session of its own, so that Ctrl-C at the terminal reaches only this process.

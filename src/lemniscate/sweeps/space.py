@@ -10,21 +10,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, get_origin, get_type_hints
 
-import numpy as np
-
 from lemniscate.errors import UserError, shown
 from lemniscate.run.config import RunConfig, options_of
 from lemniscate.run.glossary import unknown_field
 from lemniscate.run.texts import read
 
-FIXED = ("num_envs", "num_steps", "shards", "threads", "device", "compile", "warm_start", "env_kwargs", "wrappers")
-FIXED += ("hidden", "critic_hidden", "activation", "network", "normalize_observations", "scale_rewards", "buffer_size")
-FIXED += ("initial_log_std", "initial_temperature", "learning_starts", "value_range", "unit_weights")
-"""fields that cannot change, or would change nothing, after a run has begun"""
-NEAR = 0.8, 1.25
-"""factors of a number that varies"""
-ANEW = 0.25
-"""probability that a setting is drawn anew instead"""
 NOT_SEARCHED = ("env", "backend", "seed", "total_steps", "checkpoint_every", "evaluate_every", "evaluate_episodes")
 """fields that are the same in all trials, or set by the search itself"""
 
@@ -45,20 +35,6 @@ class Interval:
         value = float(f"{trial.suggest_float(name, self.low, self.high, log=self.log):.6g}")
         return min(max(value, self.low), self.high)
 
-    def sample(self, rng: np.random.Generator) -> Any:
-        """A number from anywhere in the range."""
-        low, high = (np.log(self.low), np.log(self.high)) if self.log else (self.low, self.high)
-        value = rng.uniform(low, high)
-        return self._nearest(np.exp(value) if self.log else value)
-
-    def vary(self, value: Any, rng: np.random.Generator) -> Any:
-        """A number near to another one."""
-        return self._nearest(value * rng.choice(NEAR))
-
-    def _nearest(self, value: float) -> Any:
-        inside = min(max(float(value), self.low), self.high)
-        return round(inside) if self.whole else float(f"{inside:.6g}")
-
     def key_of(self, value: Any) -> Any:
         """The suggestion of Optuna that stands for `value`; None if it is outside."""
         return value if isinstance(value, int | float) and self.low <= value <= self.high else None
@@ -73,14 +49,6 @@ class Choice:
     def draw(self, trial: Any, name: str) -> Any:
         """The value that Optuna suggests."""
         return self.values[trial.suggest_categorical(name, list(self.values))]
-
-    def sample(self, rng: np.random.Generator) -> Any:
-        """Any of the values."""
-        return list(self.values.values())[rng.integers(len(self.values))]
-
-    def vary(self, value: Any, rng: np.random.Generator) -> Any:
-        """The same value."""
-        return value
 
     def key_of(self, value: Any) -> Any:
         """The suggestion of Optuna that stands for `value`; None if it is none of the choices."""
@@ -103,8 +71,8 @@ def read_texts(search: object) -> dict[str, str]:
     return {name.strip().lstrip("-").replace("-", "_"): text.strip() for name, text in pairs}
 
 
-def read_space(texts: Mapping[str, str], config: RunConfig, *, while_training: bool = False) -> Space:
-    """The ranges that the texts stand for; `while_training`, of settings that can change then.
+def read_space(texts: Mapping[str, str], config: RunConfig) -> Space:
+    """The ranges that the texts stand for.
 
     Raises:
         UserError: a field that the Config does not have or a search cannot change, or a range that it has no room for.
@@ -115,10 +83,6 @@ def read_space(texts: Mapping[str, str], config: RunConfig, *, while_training: b
             raise unknown_field(name, config.names())
         if name in NOT_SEARCHED:
             raise UserError(f"{name} is the same in all trials: give it as a field, not in the search.")
-        if while_training and name in FIXED:
-            raise UserError(f"{name} cannot change while a run is trained, as settings of a population do.")
-        if while_training and name == "learning_rate" and getattr(config, "desired_kl", None) is not None:
-            raise UserError("learning_rate follows desired_kl here: search desired_kl, or give --desired-kl none.")
         space[name] = _range(name, text, hints[name], config)
     return space
 
@@ -126,19 +90,6 @@ def read_space(texts: Mapping[str, str], config: RunConfig, *, while_training: b
 def draw(space: Space, trial: Any) -> dict[str, Any]:
     """The fields of a new trial, by name."""
     return {name: values.draw(trial, name) for name, values in space.items()}
-
-
-def sample(space: Space, rng: np.random.Generator) -> dict[str, Any]:
-    """Settings from anywhere in the ranges, by name."""
-    return {name: values.sample(rng) for name, values in space.items()}
-
-
-def vary(space: Space, settings: Mapping[str, Any], rng: np.random.Generator) -> dict[str, Any]:
-    """Settings near to others; each is drawn anew with a probability of a quarter."""
-    return {
-        name: values.sample(rng) if rng.random() < ANEW else values.vary(settings[name], rng)
-        for name, values in space.items()
-    }
 
 
 def _pair(field: str) -> tuple[str, str]:

@@ -1,7 +1,7 @@
 """The directory of a search: what is searched, Optuna's journal of the trials, and a sweep for each trial.
 
 tune.json        algorithm, Config, search, seeds, number of trials
-study.journal    what Optuna knows of the trials; of a population, population.json
+study.journal    what Optuna knows of the trials
 trials/000/…     a sweep of one algorithm with all seeds
 preset.json      the settings of the best trial so far
 """
@@ -31,9 +31,7 @@ if TYPE_CHECKING:
     import optuna
 
 JOURNAL, PRESET, TRIALS = "study.journal", "preset.json", "trials"
-SIGNED = ("algorithm", "config", "search", "seeds", "trials", "prune", "population")
-TENTHS = 10
-"""parts of the runs of a population, between which settings change"""
+SIGNED = ("algorithm", "config", "search", "seeds", "trials", "prune")
 RETURNS = 100
 """newest training episodes that a trial is compared by before its end"""
 
@@ -66,13 +64,12 @@ class Search:
     seeds: list[int]
     trials: int
     prune: bool
-    population: bool = False
     trusted: bool = True
 
     @property
     def space(self) -> Space:
         """The ranges of what is searched."""
-        return read_space(self.search, self.config, while_training=self.population)
+        return read_space(self.search, self.config)
 
     @property
     def what(self) -> str:
@@ -145,8 +142,7 @@ def read_search(path: Path, *, trust: bool = False) -> Search:
         config = algos.find(algorithm).Config.from_json(record["config"])
         seeds = [int(seed) for seed in record["seeds"]]
         search = {str(name): str(text) for name, text in record["search"].items()}
-        flags = bool(record["prune"]), bool(record["population"])
-        return Search(path, algorithm, config, search, seeds, int(record["trials"]), *flags, trusted)
+        return Search(path, algorithm, config, search, seeds, int(record["trials"]), bool(record["prune"]), trusted)
 
 
 def has_come(run: Path, step: int | None) -> bool:
@@ -173,12 +169,7 @@ def final_score(runs: Iterable[Path]) -> float:
     return float(iqm([read_metrics(run)[-1]["evaluation/return"] for run in runs]))
 
 
-def as_text(settings: Mapping[str, Any]) -> str:
-    """Settings as a line says them."""
-    return ", ".join(f"{name} {_shown(value)}" for name, value in settings.items())
-
-
-def _shown(value: object) -> str:
-    if isinstance(value, tuple):
-        return " ".join(map(str, value))
-    return f"{value:.3g}" if isinstance(value, float) else str(value)
+def as_text(params: Mapping[str, Any]) -> str:
+    """Optuna's values of a trial as a line says them."""
+    shown = {name: f"{value:.3g}" if isinstance(value, float) else value for name, value in params.items()}
+    return ", ".join(f"{name} {value}" for name, value in shown.items())

@@ -5,15 +5,11 @@ each of its runs ends in the same bits as if it had been trained alone.
 """
 
 import re
-import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
-from types import FrameType
-from typing import TYPE_CHECKING, Any
-
-from filelock import FileLock, Timeout
+from typing import Any
 
 from lemniscate.algos import ALGORITHMS, name_of
 from lemniscate.api import plots, training
@@ -26,22 +22,16 @@ from lemniscate.hub.trust import require_trusted
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import is_finished
 from lemniscate.run.environments import device_for, require_memory
-from lemniscate.run.places import LOG, Processes, failure_of
-from lemniscate.run.stopping import Stopped, stop_signals_to
+from lemniscate.run.metrics import progress_of
+from lemniscate.run.places import LOG, failure_of
 from lemniscate.run.sweep_file import Sweep, read_sweep
 from lemniscate.run.warm_start import load_networks
-from lemniscate.sweeps.sweep_progress import SweepProgress, progress_of
+from lemniscate.sweeps.runs import SetOfRuns, locked
 from lemniscate.system import named
-from lemniscate.system.console import say
-
-if TYPE_CHECKING:
-    from lemniscate.cluster.tasks import RayTasks
+from lemniscate.system.console import Line, ProgressBar, pace, say
 
 MOST_SEEDS = 1_000
 """of a sweep, each of which is a directory and a process"""
-
-POLL_SECONDS = 0.3
-"""seconds between two looks at the processes"""
 
 
 @dataclass(frozen=True)
@@ -140,12 +130,9 @@ def _options(track: str | None, callbacks: str | Sequence[str], report: bool) ->
 
 
 def _train(runs: Sweep, options: list[str], progress: bool, cluster: Cluster | None) -> TrainedSweep:
-    try:
-        with FileLock(runs.path / ".lock", timeout=0):
-            runs.create_runs()
-            failed = _Training(runs, options, progress, cluster).train()
-    except Timeout:
-        raise UserError(f"{runs.path} is being trained by another process.") from None
+    with locked(runs.path):
+        runs.create_runs()
+        failed = _Training(runs, options, progress, cluster).train()
     if any(map(is_finished, runs.runs)):
         for picture in plots.plot(runs.path):
             say(picture)
@@ -158,74 +145,66 @@ def _train(runs: Sweep, options: list[str], progress: bool, cluster: Cluster | N
     return TrainedSweep(runs.path, list(runs.runs))
 
 
-def places_on(cluster: Cluster | None, configs: Iterable[Mapping[str, Any]]) -> "Processes | RayTasks":
-    """The places of a cluster, or of this machine, for runs of such Configs."""
-    threads = max(config["threads"] for config in configs)
-    if cluster is None:
-        return Processes(threads)
-    from lemniscate.cluster.tasks import RayTasks
-
-    return RayTasks(cluster, threads, gpu=any(config["device"].startswith("cuda") for config in configs))
-
-
-class _Training:
+class _Training(SetOfRuns):
     """The runs of a sweep that are to be trained, and the sentences of those that failed."""
 
     def __init__(self, runs: Sweep, options: list[str], progress: bool, cluster: Cluster | None) -> None:
-        self._runs, self._options = runs, ["--score", *options]
-        self._places = places_on(cluster, runs.configs.values())
+        super().__init__(runs.path, runs.configs.values(), cluster)
+        self._options = ["--score", *options]
         self._waiting = [run for run in runs.runs if not is_finished(run)]
         self._failed: dict[str, str] = {}
-        self._stop_signal = 0
-        totals = {run.name: record["config"]["total_steps"] for run, record in runs.runs.items()}
-        steps = {run.name: progress_of(run)[0] for run in runs.runs}
-        self._bars = SweepProgress(totals, steps, progress)
+        self._totals = {run: record["config"]["total_steps"] for run, record in runs.runs.items()}
+        self._steps = {run: min(progress_of(run)[0], total) for run, total in self._totals.items()}
+        self._ended = len(self._totals) - len(self._waiting)
+        self._bar = ProgressBar(sum(self._totals.values()), sum(self._steps.values()), progress)
 
     def train(self) -> dict[str, str]:
         """Train every run to its end; returns the sentences of those that failed. Raises `Stopped` after a signal."""
-        path, count, told = self._runs.path, len(self._waiting), False
+        count, at_a_time = len(self._waiting), self._places.count
+        self._say(f"{self.path}: {count} of {len(self._totals)} runs to train, {at_a_time} at a time")
         try:
-            self._bars.say(f"{path}: {count} of {len(self._runs.runs)} runs to train, {self._places.count} at a time")
-            with stop_signals_to(self._stop):
-                while self._places.running or (self._waiting and not self._stop_signal):
-                    while self._waiting and self._places.free and not self._stop_signal:
-                        self._start(self._waiting.pop(0))
-                    if self._stop_signal and not told:
-                        told = True
-                        self._bars.say("Stopping: each run ends its update and saves itself.")
-                    self._look()
-                    time.sleep(POLL_SECONDS)
+            self._train_all()
         finally:
-            self._places.close()
-            self._bars.close()
-        if self._stop_signal and not all(map(is_finished, self._runs.runs)):
-            said = f"Stopped; the runs that had begun are saved. Go on with: {resume_line(path)}"
-            raise Stopped(said, self._stop_signal)
+            self._bar.close()
         return self._failed
 
-    def _start(self, run: Path) -> None:
-        self._places.start(run, self._options)
-        if self._stop_signal:  # the signal came while the process was started
-            self._places.stop([run])
+    def _begin_runs(self) -> bool:
+        while self._waiting and self._has_room:
+            self._start(self._waiting.pop(0), self._options)
+        return bool(self._waiting)
+
+    def _is_finished(self) -> bool:
+        return all(map(is_finished, self._totals))
 
     def _look(self) -> None:
-        """Show the progress of each run, and how those ended that have."""
-        for run in self._places.running:
-            self._bars.update(run.name, *progress_of(run))
-        for run, code in self._places.ended().items():
-            step = progress_of(run)[0]
-            if code == 0:
-                sentence = f"done, final return {final_return(run):.1f}"
-            elif self._stop_signal:
-                sentence = f"stopped at step {step:,}"
-            else:
-                sentence = self._failed[run.name] = failure_of(run, code)
-            self._bars.end(run.name, sentence)
+        super()._look()
+        lines = [self._line(run) for run in self._places.running]
+        steps, total = sum(self._steps.values()), sum(self._totals.values())
+        runs = f"{self._ended} of {len(self._totals)} runs ended"
+        self._bar.show(Line(runs, steps, total, f"{steps:,} of {total:,} steps"), lines)
 
-    def _stop(self, signum: int = 0, _frame: FrameType | None = None) -> None:
-        """Ask every process to save and stop; asked twice, it does not wait for the end of its update."""
-        self._stop_signal = self._stop_signal or signum
-        self._places.stop()
+    def _line(self, run: Path) -> Line:
+        """How far a run has come that is under way."""
+        step, episode_return, rate = progress_of(run)
+        total = self._totals[run]
+        self._steps[run] = min(step, total)
+        speed = pace(rate, episode_return, total - step, "being evaluated") if rate else "starting"
+        return Line(run.name, step, total, f"{step:,} steps  {speed}")
+
+    def _run_ended(self, run: Path, code: int) -> None:
+        step = progress_of(run)[0]
+        self._steps[run] = min(step, self._totals[run])
+        self._ended += 1
+        if code == 0:
+            sentence = f"done, final return {final_return(run):.1f}"
+        elif self._stop_signal:
+            sentence = f"stopped at step {step:,}"
+        else:
+            sentence = self._failed[run.name] = failure_of(run, code)
+        self._say(f"{run.name}: {sentence}")
+
+    def _say(self, text: str) -> None:
+        self._bar.say(text)
 
 
 def algorithms_of(names: str | Iterable[str]) -> list[str]:

@@ -5,32 +5,26 @@ successive halving (Li et al. 2020, arXiv:1810.05934): at a ninth and at a third
 among the best third of all that have come so far. The score of a trial is the interquartile mean over its seeds.
 """
 
-import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING
-
-from filelock import FileLock, Timeout
 
 from lemniscate.algos import name_of
 from lemniscate.api import training
 from lemniscate.api.stored import path_of
 from lemniscate.cluster.connection import Cluster, find_cluster
-from lemniscate.errors import SweepError, UserError, resume_line, shown
+from lemniscate.errors import SweepError, UserError, shown
 from lemniscate.presets.stored import StoredPreset
 from lemniscate.report import tuning as pictures
 from lemniscate.run.places import LOG, failure_of
-from lemniscate.run.stopping import Stopped, stop_signals_to
 from lemniscate.run.sweep_file import Sweep, is_sweep
-from lemniscate.sweeps.population import Population
+from lemniscate.sweeps.runs import SetOfRuns, locked
 from lemniscate.sweeps.space import draw, read_space, read_texts
 from lemniscate.sweeps.study import (
     NINTHS,
     PRESET,
     RUNGS,
-    TENTHS,
     Search,
     Tuned,
     as_text,
@@ -40,14 +34,13 @@ from lemniscate.sweeps.study import (
     read_search,
     score_at,
 )
-from lemniscate.sweeps.sweep import POLL_SECONDS, places_on, require_trainable, seeds_of
+from lemniscate.sweeps.sweep import require_trainable, seeds_of
 from lemniscate.system.console import say
 
 if TYPE_CHECKING:
     import optuna
 
 MOST_TRIALS = 10_000
-FEWEST_MEMBERS = 4
 SEEDS = "101-103"
 """of a search, none of which any result of this project was evaluated with"""
 EPISODES = 50
@@ -62,7 +55,6 @@ def tune(
     trials: int = 40,
     seeds: str | int | Iterable[int] = SEEDS,
     prune: bool = True,
-    population: bool = False,
     run: str | Path | None = None,
     preset: str | None = None,
     progress: bool = True,
@@ -82,8 +74,6 @@ def tune(
         trials: number of settings that are tried.
         seeds: of every trial; its score is the interquartile mean over them. Evaluate the result with other ones.
         prune: end a trial after a ninth or a third of its steps if it is not among the best third.
-        population: train all trials together instead, and change settings of the worse ones on the way, into those of
-            better ones and others near to them (population-based training); it has no `prune`.
         run: the search's directory; by default a new one under `runs/`.
         preset: the settings that are not searched; the best known for the environment unless given.
         progress: a line on standard error for each trial.
@@ -96,8 +86,7 @@ def tune(
         Stopped: Ctrl-C or SIGTERM, when every run has saved itself; go on with `resume_tuning`.
         SweepError: no trial has come to its end.
     """
-    if not population:
-        import_optuna()
+    import_optuna()
     if "seed" in fields:
         raise UserError("A search has several seeds: they are given as seeds, not as seed.")
     for name in sorted({"checkpoint_every", "evaluate_every"} & set(fields)):
@@ -106,18 +95,16 @@ def tune(
     config = training.config_for(algorithm, env, preset, **fields)
     if not isinstance(trials, int) or isinstance(trials, bool) or not 1 <= trials <= MOST_TRIALS:
         raise UserError(f"trials must be a whole number from 1 to {MOST_TRIALS:,}, not {shown(trials)}.")
-    if population and trials < FEWEST_MEMBERS:
-        raise UserError(f"A population has {FEWEST_MEMBERS} members or more: trials must not be {trials}.")
     config = config.replace(
-        checkpoint_every=-(-config.total_steps // (TENTHS if population else NINTHS)),
+        checkpoint_every=-(-config.total_steps // NINTHS),
         evaluate_every=config.total_steps,
         evaluate_episodes=fields.get("evaluate_episodes") or EPISODES,
     )
     there, texts, numbers = find_cluster(cluster, workers), read_texts(search), seeds_of(seeds)
-    read_space(texts, config, while_training=population)
+    read_space(texts, config)
     require_trainable({algorithm: config}, numbers)
     path = path_of(run) if run is not None else training.fresh_directory(config.env, f"{algorithm}-tune")
-    what = Search(path, algorithm, config, texts, numbers, trials, prune, population)
+    what = Search(path, algorithm, config, texts, numbers, trials, prune)
     what.create()
     return _tune(what, progress, there)
 
@@ -135,13 +122,8 @@ def resume_tuning(
 
 
 def _tune(search: Search, progress: bool, cluster: Cluster | None) -> Tuned:
-    try:
-        with FileLock(search.path / ".lock", timeout=0):
-            if search.population:
-                return Population(search, progress, cluster).train()
-            return _Tuner(search, progress, cluster).tune()
-    except Timeout:
-        raise UserError(f"{search.path} is being searched by another process.") from None
+    with locked(search.path):
+        return _Tuner(search, progress, cluster).tune()
 
 
 @dataclass
@@ -157,35 +139,19 @@ class _Trial:
     failure: str = ""
 
 
-class _Tuner:
-    """The trials of a search, and the processes that train their runs."""
+class _Tuner(SetOfRuns):
+    """The trials of a search, and the places at which their runs are trained."""
 
     def __init__(self, search: Search, progress: bool, cluster: Cluster | None) -> None:
+        super().__init__(search.path, [search.config.to_json()], cluster)
         self._search, self._progress = search, progress
         self._space, self._rungs, self._study = search.space, search.rungs(), search.study()
-        self._places = places_on(cluster, [search.config.to_json()])
         self._trials: list[_Trial] = []
-        self._stop_signal = 0
 
     def tune(self) -> Tuned:
         """Try everything that is left to try. Raises `Stopped` after a signal."""
         self._begin()
-        try:
-            with stop_signals_to(self._stop):
-                while not self._stop_signal and (self._trials or self._missing):
-                    for trial in [trial for trial in self._trials if not (trial.waiting or trial.training)]:
-                        self._compare(trial)
-                    self._fill()
-                    time.sleep(POLL_SECONDS)
-                    self._look()
-                while self._places.running:
-                    self._places.ended()
-                    time.sleep(POLL_SECONDS)
-        finally:
-            self._places.close()
-        if self._stop_signal:
-            again = resume_line(self._search.path)
-            raise Stopped(f"Stopped; the runs that had begun are saved. Go on with: {again}", self._stop_signal)
+        self._train_all()
         return self._result()
 
     @property
@@ -227,30 +193,34 @@ class _Tuner:
         """The step to which the runs of a trial go on; None for their end."""
         return [*self._rungs, None][trial.rung]
 
-    def _fill(self) -> None:
-        """Start runs where there are places: those of the trials that have come furthest first, then new trials."""
-        while self._places.free:
+    def _begin_runs(self) -> bool:
+        """Compare the trials that have come to a rung, then start runs: those of the trials that are furthest first."""
+        for trial in [trial for trial in self._trials if not (trial.waiting or trial.training)]:
+            self._compare(trial)
+        while self._has_room:
             trial = max((t for t in self._trials if t.waiting), key=lambda t: (t.rung, -t.asked.number), default=None)
             if trial is None:
                 if not self._missing:
-                    return
+                    break
                 trial = self._trial(self._search.ask(self._study))
                 self._queue(trial)
-            run = trial.waiting.pop(0)
             until = self._until(trial)
             options = ["--callbacks", f"lemniscate.api.callbacks:StopAt(steps={until})"] if until else []
-            self._places.start(run, [*options, *["--trust"] * self._search.trusted])
+            run = trial.waiting.pop(0)
             trial.training.add(run)
+            self._start(run, [*options, *["--trust"] * self._search.trusted])
+        return not self._is_finished()
 
-    def _look(self) -> None:
-        """Take note of the runs that have ended."""
-        for run, code in self._places.ended().items():
-            trial = next(trial for trial in self._trials if run in trial.training)
-            trial.training.remove(run)
-            if code and not trial.failure and not self._stop_signal:
-                trial.failure = f"{run.name}: {failure_of(run, code)} ({run / LOG} says more)"
-                trial.waiting.clear()
-                self._places.stop(list(trial.training))
+    def _is_finished(self) -> bool:
+        return not (self._trials or self._missing)
+
+    def _run_ended(self, run: Path, code: int) -> None:
+        trial = next(trial for trial in self._trials if run in trial.training)
+        trial.training.remove(run)
+        if code and not trial.failure and not self._stop_signal:
+            trial.failure = f"{run.name}: {failure_of(run, code)} ({run / LOG} says more)"
+            trial.waiting.clear()
+            self._places.stop(list(trial.training))
 
     def _compare(self, trial: _Trial) -> None:
         """Decide whether a trial whose runs have all come to a rung goes on, or take its score at its end."""
@@ -277,8 +247,7 @@ class _Tuner:
 
     def _end(self, trial: _Trial, sentence: str) -> None:
         self._trials.remove(trial)
-        settings = draw(self._space, import_optuna().trial.FixedTrial(trial.asked.params))
-        self._say(f"trial {trial.asked.number}: {sentence}; {as_text(settings)}")
+        self._say(f"trial {trial.asked.number}: {sentence}; {as_text(trial.asked.params)}")
 
     def _result(self) -> Tuned:
         """The best trial, and pictures of all."""
@@ -305,11 +274,6 @@ class _Tuner:
         assert best.value is not None
         settings = draw(self._space, import_optuna().trial.FixedTrial(best.params))
         return self._search.preset(f"trial {best.number} of {self._search.trials}", settings, best.value)
-
-    def _stop(self, signum: int = 0, _frame: FrameType | None = None) -> None:
-        """Ask every process to save and stop; asked twice, it does not wait for the end of its update."""
-        self._stop_signal = self._stop_signal or signum
-        self._places.stop()
 
     def _say(self, text: str) -> None:
         if self._progress:

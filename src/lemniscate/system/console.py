@@ -1,4 +1,4 @@
-"""Text for people: lines and a progress bar, on standard error or below the cell of a notebook.
+"""Text for people: lines and progress, on standard error or below the cell of a notebook.
 
 Standard output is left to programs; in a notebook nothing reads it, and standard error looks like a failure there.
 """
@@ -7,8 +7,10 @@ import os
 import select
 import sys
 import time
+from collections.abc import Sequence
 from contextlib import suppress
-from typing import Any, TextIO
+from datetime import timedelta
+from typing import Any, NamedTuple, TextIO
 
 from lemniscate.system.notebook import CellText, drawn_bar
 
@@ -46,50 +48,102 @@ def _takes_a_line(stream: TextIO, seconds: float = 1.0) -> bool:
         return True
 
 
+def pace(rate: float, episode_return: float | None, steps_left: int, at_the_end: str) -> str:
+    """The speed of a run in steps per second, its return, and the time that is left, or else what is at the end."""
+    ret = "–" if episode_return is None else f"{episode_return:.1f}"
+    left = f"{_clock(steps_left / rate)} left" if rate and steps_left > 0 else at_the_end
+    return f"{rate:,.0f} steps/s  return {ret}  {left}"
+
+
+def _clock(seconds: float) -> str:
+    """Hours, minutes and seconds: 0:00:18."""
+    return str(timedelta(seconds=round(seconds)))
+
+
+class Line(NamedTuple):
+    """A line of a progress display: `done` of `total` steps, with a short text before the bar and one after it."""
+
+    name: str
+    done: int
+    total: int
+    text: str
+
+
 class ProgressBar:
-    """Steps, steps per second, return and time left: a live bar in a terminal, a live line in a notebook, else ten."""
+    """The progress of one run, or of several: live bars in a terminal, live lines in a notebook, else ten lines.
+
+    Args:
+        total: steps to take, of all runs together.
+        done: those that were taken before.
+        visible: whether anything is shown.
+    """
 
     def __init__(self, total: int, done: int, visible: bool = True) -> None:
         self._cell = CellText() if visible and in_notebook() else None
-        self._bar: Any = _live_bar(total, done) if visible and not self._cell else None
-        self._lines = visible and not self._cell and not self._bar
-        self._total, self._tenth = total, 10 * done // total
+        self._bars: Any = _live_bars() if visible and not self._cell else None
+        self._tasks: dict[str, Any] = {}
+        """rich's number of each live bar"""
+        self._visible, self._total, self._tenth = visible, total, 10 * done // total
         self._started, self._done_before = time.monotonic(), done
 
     def update(self, step: int, episode_return: float | None) -> None:
-        """Show that `step` is reached, and the mean return of the last episodes."""
+        """Show that a single run has reached `step`, and the mean return of its last episodes."""
         seconds = time.monotonic() - self._started + 1e-9
         rate = (step - self._done_before) / seconds
-        ret = "–" if episode_return is None else f"{episode_return:.1f}"
-        steps, speed = f"{step:,} of {self._total:,} steps", f"{rate:,.0f} steps/s"
-        left = f"{(self._total - step) / rate:.0f} s left" if step < self._total else f"{seconds:.0f} s"
-        if self._bar:
-            self._bar.update(self._bar.task_ids[0], completed=step, steps=steps, speed=speed, ret=ret)
-        elif self._cell:
-            self._cell.show(f"{drawn_bar(step / self._total)} {steps}  {speed}  return {ret}  {left}")
-        elif self._lines and 10 * step // self._total > self._tenth:
-            self._tenth = 10 * step // self._total
-            say(f"{steps}  {speed}  return {ret}  {left}")
+        text = pace(rate, episode_return, self._total - step, f"{_clock(seconds)} in all")
+        self.show(Line(f"{step:,} of {self._total:,} steps", step, self._total, text))
+
+    def show(self, whole: Line, runs: Sequence[Line] = ()) -> None:
+        """Show how far all have come together, and each of the runs that are under way."""
+        tenth = 10 * whole.done // self._total
+        if self._bars:
+            self._show_bars(whole, runs)
+        elif self._cell or (self._visible and tenth > self._tenth):
+            lines = "".join(f"\n  {run.name}: {run.text}" for run in runs)
+            text = f"{whole.name}  {whole.text}{lines}"
+            if self._cell:
+                self._cell.show(f"{drawn_bar(whole.done / self._total)} {text}")
+            else:
+                self._tenth = tenth
+                say(text)
+
+    def say(self, text: str) -> None:
+        """Print a line above the bars."""
+        if self._bars:
+            with suppress(OSError):  # the terminal may be gone
+                self._bars.console.print(text, highlight=False, markup=False, soft_wrap=True)
+        elif self._visible:
+            say(text)
 
     def close(self) -> None:
         """Leave the terminal as it was, or the last line below the cell."""
-        if self._bar:
-            with suppress(OSError):  # the terminal may be gone
-                self._bar.stop()
+        if self._bars:
+            with suppress(OSError):
+                self._bars.stop()
         if self._cell:
             self._cell.flush()
 
+    def _show_bars(self, whole: Line, runs: Sequence[Line]) -> None:
+        lines = {"": whole, **{run.name: run for run in runs}}  # the name of the whole changes
+        for name in self._tasks.keys() - lines.keys():
+            self._bars.remove_task(self._tasks.pop(name))
+        for name, line in lines.items():
+            shown = {"description": line.name, "completed": line.done, "total": line.total, "text": line.text}
+            if name in self._tasks:
+                self._bars.update(self._tasks[name], **shown)
+            else:
+                self._tasks[name] = self._bars.add_task(**shown)
 
-def _live_bar(total: int, done: int) -> Any:
-    """A started bar with one task; None where standard error is no terminal."""
+
+def _live_bars() -> Any:
+    """Rich's display of several bars, started; None where standard error is no terminal."""
     from rich.console import Console  # here, because commands that train nothing need not wait for it
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, Progress, TextColumn
 
     console = Console(stderr=True)
     if not console.is_terminal:
         return None
-    numbers = TextColumn("{task.percentage:>3.0f}%  {task.fields[speed]}  return {task.fields[ret]}  left")
-    bar = Progress(TextColumn("{task.fields[steps]}"), BarColumn(), numbers, TimeRemainingColumn(), console=console)
-    bar.add_task("", total=total, completed=done, steps="", speed="", ret="–")
-    bar.start()
-    return bar
+    after = TextColumn("{task.percentage:>3.0f}%  {task.fields[text]}")
+    bars = Progress(TextColumn("{task.description}"), BarColumn(bar_width=20), after, console=console)
+    bars.start()
+    return bars
