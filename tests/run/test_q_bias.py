@@ -14,9 +14,8 @@ from lemniscate.nn.actor_q import ActorQ, SoftActorQ
 from lemniscate.nn.networks import Layers
 from lemniscate.report import curves
 from lemniscate.report.pages import sentence
-from lemniscate.run.evaluate import evaluate
+from lemniscate.run.evaluate import QBias, evaluate
 from lemniscate.run.metrics import read_metrics
-from lemniscate.run.q_bias import QBias
 from lemniscate.spec import Box, ObservationPart, Spec
 
 

@@ -16,6 +16,7 @@ from lemniscate.spec import Spec
 from lemniscate.system.console import say
 from lemniscate.system.files import (
     DamagedFileError,
+    is_whole,
     make_directory,
     parsing,
     read_json,
@@ -147,7 +148,7 @@ class Saver:
             raise UserError(f"{self.path} cannot be written: {error.strerror or error}.") from error
         if not self.exists:
             create_directory(self.path, CONFIG, self._identity)
-        elif not _is_whole(self.path / CONFIG):
+        elif not is_whole(self.path / CONFIG):
             write_json(self.path / CONFIG, self._identity)
 
     def restore(self, state: TrainState) -> bool:
@@ -211,10 +212,3 @@ class Saver:
     def close(self) -> None:
         """Unlock the directory."""
         self._lock.release()
-
-
-def _is_whole(path: Path) -> bool:
-    try:
-        return bool(read_json(path))
-    except DamagedFileError:
-        return False

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from lemniscate.system.files import open_log, open_regular
-from lemniscate.system.owner import OWNED
+from lemniscate.system.watchdog import OWNED
 
 LOG = "log.txt"
 """standard output and error of a run, in its directory"""
