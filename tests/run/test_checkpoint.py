@@ -37,7 +37,7 @@ def state_with_history(seed=0):
     learn(state)
     state.policy.observe(torch.randn(7, 3))
     state.reward_scale.var = torch.rand((), dtype=torch.float64)
-    torch.rand(5, generator=state.rng.action[0])
+    torch.rand(5, generator=state.rng.action)
     state.step = 123
     return state
 

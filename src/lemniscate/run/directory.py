@@ -191,7 +191,8 @@ class Saver:
 
         Raises `NonFiniteError` where the state has a NaN or an infinity; the checkpoints before are untouched.
         """
-        # An unplanned checkpoint is kept beside the planned ones, never in the place of one.
+        # An unplanned checkpoint is kept beside the planned ones, never in the place of one: a run goes on from a planned
+        # one only, since the environments restart there, and would otherwise have none to go on from.
         keep = self._config.keep_checkpoints + (not planned)
         self.failure = None
         fields = state.saved()
@@ -201,7 +202,7 @@ class Saver:
             return
         try:
             if (self.path / METRICS).exists():
-                sync(self.path / METRICS)
+                sync(self.path / METRICS)  # before the checkpoint, which says up to which step they are whole
             record = {**self._record, "planned": planned, "logged": logged}
             checkpoint.write(self._checkpoints, fields, state.step, record, keep)
             self.last_planned = state.step if planned else self.last_planned

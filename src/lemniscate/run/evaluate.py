@@ -1,4 +1,7 @@
-"""Playing episodes without learning. Nothing here is shared with training: not environments, nor random numbers."""
+"""Episodes played without learning: returns, lengths, measures, and the bias of Q beside the return that followed.
+
+Nothing here is shared with training: neither environments nor random numbers.
+"""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -204,7 +207,7 @@ class EpisodeTable:
     def returns_and_lengths(self) -> Tensor:
         """[2, episodes]: ordered by environment, then by time."""
         table = torch.cat(self._ended, dim=1)
-        return table[:2, table[2].argsort(stable=True)]  # they stand by time, which a stable order keeps
+        return table[:2, table[2].argsort(stable=True)]  # the columns are in the order of time; a stable sort keeps it
 
     def measures(self, summaries: Sequence[Summary]) -> dict[str, float]:
         """The mean of every measure over all rows; then the summaries of those that there are."""

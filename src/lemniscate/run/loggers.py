@@ -53,7 +53,7 @@ class JsonLines:
         Metrics that are NaN or infinite are left out: JSON has no such numbers.
         """
         line: dict[str, Any] = {"step": step} | {name: x for name, x in metrics.items() if math.isfinite(x)}
-        if episodes.returns:
+        if episodes.returns:  # six digits: the lists are most of the file
             line |= {"episode/returns": [float(f"{r:.6g}") for r in episodes.returns]}
             line |= {"episode/lengths": episodes.lengths}
         self._unwritten += to_line(line)
