@@ -191,8 +191,8 @@ class Saver:
 
         Raises `NonFiniteError` where the state has a NaN or an infinity; the checkpoints before are untouched.
         """
-        # An unplanned checkpoint is kept beside the planned ones, never in the place of one: a run goes on from a planned
-        # one only, since the environments restart there, and would otherwise have none to go on from.
+        # An unplanned checkpoint is kept beside the planned ones, never in the place of one: a run goes on only from a
+        # planned one, at which its environments restart.
         keep = self._config.keep_checkpoints + (not planned)
         self.failure = None
         fields = state.saved()
