@@ -26,7 +26,7 @@ test: setup  ## the whole suite but the long ones
 test-long: setup  ## the tests that train for minutes
 	$(BIN)/python -m pytest -m long
 
-test-faults: setup  ## every way to break a run, many times: half an hour
+test-faults: setup  ## every way to break a run, many times: half an hour; FAULTS_SHARE=1 for more than an hour
 	$(BIN)/python -m pytest -n auto --dist load -m faults -rP
 
 test-cluster: .venv/.ray  ## runs of several processes and of Ray (240 MB): the same bits for any number, kills, hangs; half an hour

@@ -125,8 +125,8 @@ def forks():
     return Forks()
 
 
-def command(*arguments, before="", cwd=".", server=None):
-    """Start a command of lemniscate, after the statements `before`."""
+def command(*arguments, before="", cwd=".", server=None, **environment):
+    """Start a command of lemniscate, after the statements `before`, with more variables in its environment."""
     words = list(map(str, arguments))
     code = f"import sys\nsys.argv = {['lemniscate', *words]!r}\n{before}\nimport lemniscate.cli\n"
-    return (server or forks()).start(f"{code}sys.exit(lemniscate.cli.main())", cwd)
+    return (server or forks()).start(f"{code}sys.exit(lemniscate.cli.main())", cwd, **environment)

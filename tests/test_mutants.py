@@ -699,7 +699,7 @@ MUTANTS = [
     ),
     (
         "a time-out ends the entropy",
-        "run/q_bias.py",
+        "run/evaluate.py",
         " + networks.entropy_bonus(last, self._generator)",
         "",
         "run/test_q_bias.py::test_entropy_counts_from_the_second_step_on",
@@ -727,7 +727,7 @@ MUTANTS = [
     ),
     (
         "a time-out is worth nothing",
-        "run/q_bias.py",
+        "run/evaluate.py",
         "realised + self._gamma**age * value * ~step.terminated",
         "realised",
         "run/test_q_bias.py::test_what_followed_is_the_discounted_return_and_after_a_time_out_what_q_expects",

@@ -108,6 +108,7 @@ class Disk:
     def apply(self, event):
         """Do what the event did."""
         if event.kind == "sync":
+            self._see_rename(event.path)
             node = self._find(event.path)
             if node.entries is None:
                 node.synced = bytes(node.content)
@@ -130,6 +131,13 @@ class Disk:
                 folder.entries.pop(event.path.name, None)
             elif event.kind == "rename":
                 self._find(event.second.parent).entries[event.second.name] = folder.entries.pop(event.path.name)
+
+    def _see_rename(self, path):
+        """Give a file its name: safetensors renames by a system call that is not the C library's, then it is synced."""
+        entries = {} if path == self.root else self._find(path.parent).entries
+        unnamed = [name for name in entries if name.startswith(".tmp")]
+        if unnamed and path.name not in entries:
+            entries[path.name] = entries.pop(unnamed[0])
 
     def write_state(self, folder, rng, how):
         """Write a state after a power cut into the empty directory `folder`.

@@ -1,4 +1,6 @@
-"""A small run, and the processes that train it on a disk that is watched."""
+"""A small run, the processes that train it on a disk that is watched, and how often things are broken."""
+
+import os
 
 import pytest
 
@@ -11,6 +13,15 @@ FIELDS = {**tiny_fields(), "total_steps": 24 * 32, "checkpoint_every": 6 * 32, "
 WORDS = [word for name, value in FIELDS.items() if name in CHOSEN for word in words_for(name, value)]
 TRAIN = ["train", "ppo", "--env", "Countdown-v0", *WORDS, "--run"]
 """24 updates, a checkpoint at each sixth, 3 kept"""
+
+
+SHARE = float(os.environ.get("FAULTS_SHARE", 0.4))
+"""of the tries in docs/guarantees.md, those that `make test-faults` makes, in half an hour on two cores; 1 makes all"""
+
+
+def often(times):
+    """How many of so many tries are made."""
+    return max(1, round(SHARE * times))
 
 
 @pytest.fixture(scope="session")

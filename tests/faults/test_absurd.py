@@ -9,11 +9,12 @@ import pytest
 
 import lemniscate as lem
 from faults.absurd import by_fields, by_words, env_of, numeric_fields, systematic, verbs
+from faults.runs import often
 from forks import Forks
 from lemniscate.algos import ALGORITHMS, find
 from lemniscate.errors import UserError
 
-TOTAL, PER_PROCESS = 20_000, 1_000
+TOTAL, PER_PROCESS = often(20_000), 1_000
 
 
 @pytest.fixture(scope="module")

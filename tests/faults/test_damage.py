@@ -7,6 +7,7 @@ import pytest
 
 import lemniscate as lem
 from conftest import tiny_fields
+from faults.runs import SHARE, often
 from lemniscate.api.results import _known_scores, final_scores
 from lemniscate.errors import UserError
 from lemniscate.run.directory import find_checkpoint, read_config
@@ -104,14 +105,18 @@ def copy_of(run, folder):
     return folder / "r"
 
 
-@pytest.mark.parametrize("every", [pytest.param(1, marks=pytest.mark.faults), 397])
+EVERY = pytest.param(1 if SHARE == 1 else 3, marks=pytest.mark.faults)
+"""bits from one damage to the next: three is odd, so that each bit of a byte is flipped in some byte"""
+
+
+@pytest.mark.parametrize("every", [EVERY, 397])
 @pytest.mark.parametrize("name", RUN)
 def test_damage_of_a_run_is_named_or_changes_nothing(run, tmp_path, capsys, name, every):
     count = check_damage(copy_of(run, tmp_path), name, every, capsys)
     print(f"{name}: {count:,} damages, 0 silent, 0 tracebacks")
 
 
-@pytest.mark.parametrize("every", [pytest.param(1, marks=pytest.mark.faults), 97])
+@pytest.mark.parametrize("every", [EVERY, 97])
 @pytest.mark.parametrize("name", ["sweep.json", f"ppo-1/{LOG}"])
 def test_damage_of_a_sweep_is_named_or_changes_nothing(sweep, capsys, name, every):
     path = sweep / "ppo-1" if name.endswith(LOG) else sweep
@@ -119,7 +124,7 @@ def test_damage_of_a_sweep_is_named_or_changes_nothing(sweep, capsys, name, ever
     print(f"{name}: {count:,} damages, 0 silent, 0 tracebacks")
 
 
-@pytest.mark.parametrize("times", [pytest.param(500, marks=pytest.mark.faults), 10])
+@pytest.mark.parametrize("times", [pytest.param(often(500), marks=pytest.mark.faults), 4])
 def test_a_damaged_run_goes_on_to_the_same_bits(run, tmp_path, capsys, times):
     """Damage anywhere, its pictures and TensorBoard's events included; then it is resumed."""
     seed = random.SystemRandom().randrange(10**6)

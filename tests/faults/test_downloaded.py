@@ -10,6 +10,7 @@ import pytest
 
 import lemniscate as lem
 from conftest import tiny_fields
+from faults.runs import often
 from forks import command
 from lemniscate.api.results import final_scores
 from lemniscate.errors import UserError
@@ -57,7 +58,7 @@ CASES = [(place, kind, verb) for place in PLACES for kind in KINDS for verb in V
 whole = [pytest.param(first, 3, marks=pytest.mark.faults) for first in range(3)]
 
 
-@pytest.mark.parametrize(("first", "every"), [*whole, (0, 31)])
+@pytest.mark.parametrize(("first", "every"), [*whole, (0, 61)])
 def test_what_a_run_links_to_is_not_touched_and_no_pipe_is_waited_for(run, tmp_path, first, every):
     outside = tmp_path / "outside"
     for number, (place, kind, verb) in enumerate(CASES[first::every]):
@@ -104,7 +105,7 @@ def checked(path):
     assert all(finding.sentence.endswith(".") for finding in each_finding(path))
 
 
-@pytest.mark.parametrize("times", [pytest.param(1500, marks=pytest.mark.faults), 40])
+@pytest.mark.parametrize("times", [pytest.param(often(1500), marks=pytest.mark.faults), 20])
 def test_records_of_odd_content_and_right_hashes_are_a_sentence(run, tmp_path, capsys, times):
     names = ["config.json", "final.json", f"{STEP}/state.json", f"{STEP}/manifest.json"]
     refused = 0

@@ -7,7 +7,7 @@ import pytest
 
 import lemniscate as lem
 from faults.disk import fresh
-from faults.runs import TRAIN, trials
+from faults.runs import TRAIN, often, trials
 from forks import command
 from lemniscate.errors import UserError
 from lemniscate.run import checkpoint
@@ -15,7 +15,7 @@ from lemniscate.run.metrics import read_metrics
 from run.test_run import final_hashes, long_run, wait_for
 
 
-@pytest.mark.parametrize("times", [pytest.param(2000, marks=pytest.mark.faults), 30])
+@pytest.mark.parametrize("times", [pytest.param(often(2000), marks=pytest.mark.faults), 30])
 def test_a_run_can_be_read_at_any_time_while_it_is_trained(tmp_path, capsys, times):
     """Each checkpoint replaces the one before, after each update."""
     path = tmp_path / "r"
@@ -42,7 +42,7 @@ def test_a_run_can_be_read_at_any_time_while_it_is_trained(tmp_path, capsys, tim
     assert len(said) <= times / 1000
 
 
-@pytest.mark.parametrize("times", [pytest.param(20, marks=pytest.mark.faults), 1])
+@pytest.mark.parametrize("times", [pytest.param(often(20), marks=pytest.mark.faults), 1])
 def test_a_directory_that_is_deleted_in_training_ends_in_a_sentence(tmp_path, times):
     for number in range(times):
         path = tmp_path / str(number)

@@ -5,7 +5,7 @@ from importlib.util import find_spec
 import pytest
 
 from faults.runs import TRAIN
-from forks import LEMNISCATE, Forks, command
+from forks import command
 
 CANARY = "canary-5d41402abc4b2a76b9719d911017c592"
 NAMES = ("WANDB_API_KEY", "HF_TOKEN", "AWS_SECRET_ACCESS_KEY", "OPENAI_API_KEY", "GITHUB_TOKEN", "MY_PASSWORD")
@@ -31,27 +31,22 @@ CASES = {
 }  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def with_keys():
-    """Processes whose environment has keys, one of them in the address of a proxy."""
-    keys = dict.fromkeys(NAMES, CANARY) | {"WANDB_MODE": "offline", "HTTPS_PROXY": f"http://me:{CANARY}@localhost:9"}
-    forks = Forks(LEMNISCATE, **keys)
-    yield forks
-    forks.close()
+KEYS = dict.fromkeys(NAMES, CANARY) | {"WANDB_MODE": "offline", "HTTPS_PROXY": f"http://me:{CANARY}@localhost:9"}
+"""what the environment of a run has, one of the keys in the address of a proxy"""
 
 
-SHORT = ("exception", "worker", "misuse")
+SHORT = ("exception", "misuse")
 
 
 @pytest.mark.parametrize(
     "case", [case if case in SHORT else pytest.param(case, marks=pytest.mark.faults) for case in CASES]
 )
-def test_no_key_of_the_environment_is_written_or_said(tmp_path, with_keys, case):
+def test_no_key_of_the_environment_is_written_or_said(tmp_path, case):
     words, expected = CASES[case]
     if "wandb" in words and find_spec("wandb") is None:
         pytest.skip("without wandb")
     (tmp_path / "broken.py").write_text(BROKEN)
-    process = command(*words, cwd=tmp_path, server=with_keys)
+    process = command(*words, cwd=tmp_path, **KEYS)
     said = "".join(process.communicate())
     assert process.returncode == expected, said
     files = [file for file in tmp_path.rglob("*") if file.is_file()]
@@ -61,7 +56,7 @@ def test_no_key_of_the_environment_is_written_or_said(tmp_path, with_keys, case)
     print(f"{case}: {len(files)} files, and what it said: 0 of {len(NAMES) + 1} keys")
 
 
-def test_a_key_that_is_written_is_found(tmp_path, with_keys):
+def test_a_key_that_is_written_is_found(tmp_path):
     leak = "import os, pathlib; pathlib.Path('leak').write_text(str(dict(os.environ)))"
-    command("--version", before=leak, cwd=tmp_path, server=with_keys).wait()
+    command("--version", before=leak, cwd=tmp_path, **KEYS).wait()
     assert (tmp_path / "leak").read_text().count(CANARY) == len(NAMES) + 1

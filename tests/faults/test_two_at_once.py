@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from faults.runs import TRAIN
+from faults.runs import TRAIN, often
 from forks import command
 from lemniscate.run import checkpoint
 from lemniscate.run.directory import read_config
@@ -16,7 +16,7 @@ from run.test_run import final_hashes, history
 
 SWEEP = [*TRAIN[:2], "--seeds", "1", *TRAIN[2:]]
 REFUSED = ("exists already", "is being trained by another process")
-each_number = pytest.mark.parametrize("times", [pytest.param(50, marks=pytest.mark.faults), 2])
+each_number = pytest.mark.parametrize("times", [pytest.param(often(50), marks=pytest.mark.faults), 1])
 
 
 def outcome(path):
@@ -71,7 +71,7 @@ def test_of_two_that_resume_a_run_one_is_refused_or_finds_nothing_to_do(whole, t
     print(f"{times} runs resumed twice at once, 0 differ")
 
 
-@pytest.mark.parametrize("times", [pytest.param(10, marks=pytest.mark.faults), 1])
+@pytest.mark.parametrize("times", [pytest.param(often(10), marks=pytest.mark.faults), 1])
 def test_of_two_sweeps_in_a_new_directory_one_is_refused(whole, tmp_path, times):
     rng = random.Random(3)
     for number in range(times):

@@ -1,19 +1,20 @@
 """Checkpoints: whole or absent, every damaged byte seen, nothing executed."""
 
+import errno
 import json
 import os
 import pickle
 import random
+import resource
 import shutil
+import signal
 
 import pytest
 import torch
-from safetensors.torch import load_file
 
 from conftest import tiny
 from lemniscate.algos import ppo
 from lemniscate.run import checkpoint
-from lemniscate.run.tensors_file import TYPES, write_tensors
 from lemniscate.spec import Box, Discrete, MultiBinary, MultiDiscrete, ObservationPart, Spec
 from lemniscate.system.files import DamagedFileError
 from lemniscate.types import Batch
@@ -36,7 +37,7 @@ def state_with_history(seed=0):
     learn(state)
     state.policy.observe(torch.randn(7, 3))
     state.reward_scale.var = torch.rand((), dtype=torch.float64)
-    torch.rand(5, generator=state.rng.action[0])
+    torch.rand(5, generator=state.rng.action)
     state.step = 123
     return state
 
@@ -152,11 +153,37 @@ def test_a_full_disk_leaves_the_checkpoint_before(tmp_path, monkeypatch):
     assert not list(tmp_path.glob("*.tmp"))
 
 
-def test_tensors_of_every_type_and_shape_are_read_by_the_library(tmp_path):
+TYPES = (torch.float64, torch.float32, torch.float16, torch.bfloat16, torch.bool)
+TYPES += (torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8)
+
+
+def test_tensors_of_every_type_and_shape_come_back(tmp_path):
     vector = torch.arange(10.0)
     tensors = {"part": vector[:5], "rest": vector[5:], "number": torch.tensor(3), "none": torch.zeros(0, 4)}
     tensors |= {str(dtype): torch.ones(3, 1).to(dtype) for dtype in TYPES} | {"turned": torch.arange(6.0).view(2, 3).T}
-    write_tensors(tmp_path / "file", tensors)
-    found = load_file(tmp_path / "file")
+    tensors |= {"again": tensors["part"], "whole": vector, "gradient": vector.clone().requires_grad_()}
+    checkpoint.write_fields(tmp_path / "step-1", {"x": tensors}, {})
+    found = checkpoint.read(tmp_path / "step-1").tensors_of("x")
     assert found.keys() == tensors.keys()
     assert all(torch.equal(found[name], tensors[name]) and found[name].dtype == tensors[name].dtype for name in tensors)
+
+
+def test_all_files_of_a_checkpoint_have_the_permissions_of_new_files(tmp_path):
+    path = write(tmp_path, state_with_history())
+    (tmp_path / "new").touch()
+    assert {file.stat().st_mode for file in path.iterdir()} == {(tmp_path / "new").stat().st_mode}
+
+
+def test_the_error_of_a_full_disk_is_that_of_the_system(tmp_path):
+    """Beyond the limit on the size of files, the library's write fails as on a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (3000, before[1]))
+        with pytest.raises(OSError, match="File too large") as raised:
+            checkpoint.write(tmp_path, {"x": {"tensor": torch.zeros(1000)}}, 1, {}, 3)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, ignored)
+    assert raised.value.errno == errno.EFBIG
+    assert list(tmp_path.iterdir()) == []

@@ -7,23 +7,25 @@ import pytest
 
 import lemniscate as lem
 from conftest import tiny_fields
+from lemniscate.api.results import final_scores
 from lemniscate.run.directory import read_config
 from lemniscate.system.files import DamagedFileError, make_directory, read_json, replace_file, write_json
 
 RECORD = {"algorithm": "ppo", "config": {"env": "CartPole-v1", "gamma": 0.99, "hidden": [64, 64], "preset": None}}
 
 
-def test_every_flipped_bit_is_found_or_changes_nothing(tmp_path):
+def test_a_flipped_bit_is_found_or_changes_nothing(tmp_path):
     write_json(tmp_path / "x.json", RECORD)
     content, unchanged = (tmp_path / "x.json").read_bytes(), 0
-    for position in range(8 * len(content)):
+    tried = range(0, 8 * len(content), 5)  # each bit of a byte, in some byte; `make test-faults` tries all
+    for position in tried:
         damaged = bytearray(content)
         damaged[position // 8] ^= 1 << position % 8
         (tmp_path / "x.json").write_bytes(damaged)
         with suppress(DamagedFileError):
             assert read_json(tmp_path / "x.json") == RECORD
             unchanged += 1
-    assert unchanged < 0.02 * 8 * len(content)  # white space
+    assert unchanged < 0.02 * len(tried)  # white space
 
 
 def test_every_truncation_is_found(tmp_path):
@@ -101,7 +103,7 @@ def test_damaged_metrics_are_kept_aside_and_damaged_scores_found_again(tmp_path,
         f"line 2 is damaged, and left out. It is kept as {run / 'metrics.damaged-1.jsonl'}." in capsys.readouterr().err
     )
     assert (run / "metrics.damaged-1.jsonl").read_bytes() == damaged
-    scores = lem.results.final_scores(run)
+    scores = final_scores(run)
     (run / "final.json").write_text('{"mean_return": 1000000.0}')
-    assert lem.results.final_scores(run) == scores
+    assert final_scores(run) == scores
     assert "final.json has no sha256" in capsys.readouterr().err

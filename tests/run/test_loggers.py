@@ -9,9 +9,8 @@ import pytest
 
 from lemniscate.envs.vec_env import Episodes
 from lemniscate.report.curves import episode_returns
-from lemniscate.run.loggers import JsonLines, TensorBoard
+from lemniscate.run.loggers import JsonLines, TensorBoard, WeightsAndBiases
 from lemniscate.run.metrics import damage, read_metrics, to_line
-from lemniscate.run.wandb_logger import WeightsAndBiases
 
 
 def test_a_resumed_log_drops_what_it_will_write_again(tmp_path):
@@ -204,7 +203,7 @@ def test_seconds_spent_collecting_and_learning_are_logged(tmp_path, monkeypatch)
         assert 0.08 <= line["time/collect"] < 0.2  # 8 steps of all environments
         assert 0 < line["time/learn"] < 0.2
         seconds = 32 / line["time/steps_per_second"]
-        assert line["time/collect"] + line["time/learn"] <= seconds
+        assert line["time/collect"] + line["time/learn"] <= seconds + 1e-6
 
 
 def points(folder):

@@ -14,9 +14,8 @@ from lemniscate.nn.actor_q import ActorQ, SoftActorQ
 from lemniscate.nn.networks import Layers
 from lemniscate.report import curves
 from lemniscate.report.pages import sentence
-from lemniscate.run.evaluate import evaluate
-from lemniscate.run.metrics import read_metrics
-from lemniscate.run.q_bias import QBias
+from lemniscate.run.evaluate import QBias, evaluate
+from lemniscate.run.metrics import METRICS, read_metrics, to_line
 from lemniscate.spec import Box, ObservationPart, Spec
 
 
@@ -98,36 +97,40 @@ def test_of_two_critics_the_lower_is_asked(rng):
     assert torch.equal(nets.q(obs, action), torch.min(one, two))
 
 
-def test_it_is_said_written_and_drawn(tmp_path, capsys):
-    run = lem.train("td3", "Pendulum-v1", run=tmp_path / "r", progress=False, **tiny_off_policy(evaluate_every=128))
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A run with two evaluations."""
+    path = tmp_path_factory.mktemp("runs") / "r"
+    return lem.train("td3", "Pendulum-v1", run=path, progress=False, **tiny_off_policy(evaluate_every=128))
+
+
+def test_it_is_said_written_and_drawn(run, capsys):
     scores = lem.evaluate(run.policy, episodes=3)
     assert len(scores.q_bias.predicted) == 3
     assert sentence(scores.to_json()).count("\n") == 1
     assert json.loads(json.dumps(scores.to_json()))["q_bias"]["bias"] == scores.q_bias.bias
-    lines = [json.loads(line) for line in (tmp_path / "r" / "metrics.jsonl").read_text().splitlines()]
-    assert sum("evaluation/q_bias" in line for line in lines) == 2
-    assert tmp_path / "r" / "plots" / "q.png" in lem.plot(tmp_path / "r")
+    assert sum("evaluation/q_bias" in line for line in read_metrics(run.path)) == 2
+    assert run.path / "plots" / "q.png" in lem.plot(run.path)
 
 
-@pytest.mark.parametrize("every", [None, 128])
-def test_the_picture_has_what_the_evaluations_said_beside_what_is(tmp_path, monkeypatch, every):
-    fields = tiny_off_policy(evaluate_every=every) if every else tiny_off_policy()
-    run = lem.train("td3", "Pendulum-v1", run=tmp_path / "r", progress=False, **fields)
+@pytest.mark.parametrize("evaluated", [False, True])
+def test_the_picture_has_what_the_evaluations_said_beside_what_is(run, tmp_path, monkeypatch, evaluated):
+    lines = [line for line in read_metrics(run.path) if evaluated or "evaluation/q" not in line]
+    (tmp_path / METRICS).write_bytes(b"".join(map(to_line, lines)))
     drawn = []
     monkeypatch.setattr(curves, "save", lambda figure, file: drawn.append(figure) or file)
-    curves.draw_q_bias(QBias([1.0, 2.0], [3.0, 4.0]), run.path, tmp_path / "q.png")
+    curves.draw_q_bias(QBias([1.0, 2.0], [3.0, 4.0]), tmp_path, tmp_path / "q.png")
     now, *history = drawn[0].axes
     assert now.lines[1].get_xydata().tolist() == [[3, 1], [4, 2]]
-    logged = [line for line in read_metrics(run.path) if "evaluation/q" in line]
-    assert len(history) == bool(every)
+    logged = [line for line in lines if "evaluation/q" in line]
+    assert len(history) == evaluated
     for axes in history:
         promised, realised = axes.lines
         assert promised.get_xydata().tolist() == [[line["step"], line["evaluation/q"]] for line in logged]
         assert realised.get_ydata().tolist() == [line["evaluation/q_realised"] for line in logged]
 
 
-def test_the_dictionary_of_the_course(tmp_path):
-    run = lem.train("ddpg", "Pendulum-v1", run=tmp_path / "r", progress=False, **tiny_off_policy())
+def test_the_dictionary_of_the_course(run):
     scores = lem.evaluate(run.policy, episodes=3)
     handed_in = scores.to_course()
     assert handed_in.pop("eval_datetime")[:2] == "20"

@@ -17,7 +17,7 @@ from lemniscate.hub.trust import signed
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import CONFIG, create_directory
 from lemniscate.run.stopping import Stopped
-from lemniscate.system.owner import OWNED
+from lemniscate.system.watchdog import OWNED
 from lemniscate.system.world import World
 
 SECONDS_TO_END = 10

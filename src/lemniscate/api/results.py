@@ -17,9 +17,8 @@ from lemniscate.report import flight, pages, playback
 from lemniscate.run import checkpoint
 from lemniscate.run.config import Episodes, Natural, RunConfig, checked
 from lemniscate.run.environments import env_arguments, evaluation_env
-from lemniscate.run.evaluate import Evaluation
+from lemniscate.run.evaluate import Evaluation, critic_of
 from lemniscate.run.evaluate import evaluate as evaluate_policy
-from lemniscate.run.q_bias import critic_of
 from lemniscate.system.console import say
 from lemniscate.system.files import DamagedFileError, make_directory, read_json, write_json
 from lemniscate.system.named import takes

@@ -13,7 +13,7 @@ from lemniscate.run.sweep_file import is_search, is_sweep
 from lemniscate.run.texts import number
 from lemniscate.sweeps import sweep
 from lemniscate.system.console import say, talks
-from lemniscate.system.owner import end_with_owner
+from lemniscate.system.watchdog import end_with_owner
 
 
 def train(given: argparse.Namespace) -> None:

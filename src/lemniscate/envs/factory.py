@@ -36,7 +36,7 @@ def maker_of(env: str) -> Maker:
             return gym.spec(name)
     found = named.find(env)
     if isinstance(found, type) and issubclass(found, gym.Env):
-        return EnvSpec(name.rpartition(".")[2], entry_point=found)
+        return EnvSpec(found.__name__, entry_point=found)
     if (isinstance(found, type) and issubclass(found, VectorEnv)) or (callable(found) and not isinstance(found, type)):
         return found
     raise UserError(f"{env} cannot be made: {name} is neither an environment class, nor a function, nor an id.")

@@ -123,21 +123,13 @@ def _checked_count(num_envs: Any) -> int:
 
 def require_room(env: str, num_envs: int, backend: str) -> None:
     """Raise `UserError` where N environments of a backend need more memory than is free, or more open files."""
-    from lemniscate.system.machine import free_memory, most_open_files
+    from lemniscate.system.machine import require_files, require_free
 
     found: Any = backend_class(backend)
     each, files = found.room(env) if hasattr(found, "room") else (0, 0)
-    free = free_memory()
-    if num_envs * each > free:
-        raise UserError(
-            f"{num_envs:,} × {env} in the {backend} backend take at least {num_envs * each // 10**6:,} MB, and"
-            f" {free // 10**6:,} MB are free: choose num_envs at most {max(1, free // each):,}."
-        )
-    if num_envs * files > most_open_files():
-        raise UserError(
-            f"{num_envs:,} × {env} in the {backend} backend need {num_envs * files:,} open files, and this process may"
-            f" have {most_open_files():,} (`ulimit -n`): choose num_envs at most {most_open_files() // files:,}."
-        )
+    what = f"{num_envs:,} × {env} in the {backend} backend"
+    require_free(f"{what} take", {"num_envs": num_envs * each}, {"num_envs": num_envs}, None)
+    require_files(what, num_envs, files)
 
 
 def file_name(env: str) -> str:

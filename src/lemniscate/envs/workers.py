@@ -16,7 +16,7 @@ from gymnasium.vector import AsyncVectorEnv
 from gymnasium.vector.async_vector_env import AsyncState
 
 from lemniscate.errors import WorkerError
-from lemniscate.system.owner import end_when_closed
+from lemniscate.system.watchdog import end_when_closed
 
 CLOSING_SECONDS = 2.0
 """how long workers may take to close their environments before they are killed"""

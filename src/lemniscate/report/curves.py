@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 from lemniscate.errors import unknown_name
 from lemniscate.report.style import COLORS, finish, legend_above, limit_axis, run_styles, save
 from lemniscate.run.directory import read_config
+from lemniscate.run.evaluate import QBias
 from lemniscate.run.metrics import read_metrics
-from lemniscate.run.q_bias import QBias
 from lemniscate.system.console import in_notebook
 from lemniscate.system.notebook import Place
 

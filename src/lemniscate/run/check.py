@@ -12,7 +12,7 @@ from lemniscate.run import checkpoint
 from lemniscate.run.directory import CONFIG, LOCK
 from lemniscate.run.metrics import METRICS, damage, read_metrics
 from lemniscate.run.sweep_file import SWEEP, is_sweep, read_sweep
-from lemniscate.system.files import DamagedFileError, parsing, read_json
+from lemniscate.system.files import DamagedFileError, is_whole, parsing, read_json
 
 FINAL = "final.json"
 
@@ -46,7 +46,7 @@ def verdict(path: Path, found: list[Finding]) -> str:
     if not damaged:
         return f"{path} is whole."
     repairable = (
-        _can_be_read(path / SWEEP)
+        is_whole(path / SWEEP)
         if is_sweep(path)
         else any(found.record.get("planned") for found in _checkpoints(path)[0])
     )
@@ -64,7 +64,7 @@ def _of_run(path: Path) -> Iterator[Finding]:
     yield _going_on(path, whole)
     yield from _metrics(path, whole)
     if (path / FINAL).exists():
-        if _can_be_read(path / FINAL):
+        if is_whole(path / FINAL):
             yield Finding(GOOD, f"{FINAL}: the scores of the final policy.")
         else:
             yield Finding(BAD, f"{path / FINAL} is damaged; its scores are computed again where they are asked for.")
@@ -123,13 +123,6 @@ def _metrics(path: Path, whole: list[checkpoint.Checkpoint]) -> Iterator[Finding
         yield Finding(BAD, f"{sentence} The other lines serve; resume keeps the damaged file beside the new one.")
     elif lines := read_metrics(path):
         yield Finding(GOOD, f"{METRICS}: {len(lines):,} lines up to step {lines[-1]['step']:,}.")
-
-
-def _can_be_read(file: Path) -> bool:
-    try:
-        return bool(read_json(file))
-    except DamagedFileError:
-        return False
 
 
 def _is_locked(file: Path) -> bool:

@@ -10,18 +10,19 @@ find damage, not malice; but nothing in these files can be executed.
 
 import dataclasses
 import hashlib
+import os
+import re
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, get_args
 
 from safetensors import SafetensorError
-from safetensors.torch import load_file
+from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from lemniscate.errors import NonFiniteError, UserError
 from lemniscate.run.state import TrainState
-from lemniscate.run.tensors_file import write_tensors
 from lemniscate.spec import Action, ObservationPart, Spec
 from lemniscate.system.files import (
     DamagedFileError,
@@ -98,13 +99,13 @@ def write_fields(final: Path, fields: Mapping[str, Any], record: dict[str, Any])
     remove(temporary)
     try:
         temporary.mkdir()
-        write_tensors(temporary / TENSORS, tensors)
         write_json(temporary / STATE, {"numbers": numbers, "record": record})
-        write_json(
-            temporary / MANIFEST, {"format": FORMAT, "files": {name: _sha256(temporary / name) for name in FILES}}
-        )
+        _write_tensors(temporary / TENSORS, tensors, mode=(temporary / STATE).stat().st_mode)
+        hashes = {name: _sha256(temporary / name) for name in FILES}
+        write_json(temporary / MANIFEST, {"format": FORMAT, "files": hashes})
+        # The names inside are synced before the directory has its own name: else a power cut leaves it without them.
         sync(temporary)
-        if final.exists():
+        if final.exists():  # a directory that is not empty cannot be renamed over
             remove(replaced)
             final.rename(replaced)
         temporary.rename(final)
@@ -115,6 +116,26 @@ def write_fields(final: Path, fields: Mapping[str, Any], record: dict[str, Any])
                 replaced.rename(final)
             remove(temporary)
             remove(replaced)
+
+
+def _write_tensors(path: Path, tensors: Mapping[str, Tensor], mode: int) -> None:
+    """Write tensors into a new file with the permissions `mode`, and have the disk store it. Raises `OSError`."""
+    distinct: dict[str, Tensor] = {}
+    taken = set[int]()
+    for name, tensor in tensors.items():
+        values = tensor.detach().contiguous()
+        # The library refuses names of one memory, such as a normalizer that policy and value share.
+        distinct[name] = values.clone() if values.data_ptr() in taken else values
+        taken.add(values.data_ptr())
+    try:
+        save_file(distinct, path)  # to the disk without a copy in memory: a replay buffer may be all that fits
+    except SafetensorError as error:  # the library's name for the system's error, whose number is in its text
+        number = re.search(r"os error (\d+)", str(error))
+        if number is None:
+            raise
+        raise OSError(int(number[1]), os.strerror(int(number[1])), str(path)) from error
+    path.chmod(mode)  # the library makes files that only their owner can read
+    sync(path)
 
 
 def read(path: Path) -> Checkpoint:

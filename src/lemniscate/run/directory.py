@@ -16,6 +16,7 @@ from lemniscate.spec import Spec
 from lemniscate.system.console import say
 from lemniscate.system.files import (
     DamagedFileError,
+    is_whole,
     make_directory,
     parsing,
     read_json,
@@ -147,7 +148,7 @@ class Saver:
             raise UserError(f"{self.path} cannot be written: {error.strerror or error}.") from error
         if not self.exists:
             create_directory(self.path, CONFIG, self._identity)
-        elif not _is_whole(self.path / CONFIG):
+        elif not is_whole(self.path / CONFIG):
             write_json(self.path / CONFIG, self._identity)
 
     def restore(self, state: TrainState) -> bool:
@@ -190,7 +191,8 @@ class Saver:
 
         Raises `NonFiniteError` where the state has a NaN or an infinity; the checkpoints before are untouched.
         """
-        # An unplanned checkpoint is kept beside the planned ones, never in the place of one.
+        # An unplanned checkpoint is kept beside the planned ones, never in the place of one: a run goes on only from a
+        # planned one, at which its environments restart.
         keep = self._config.keep_checkpoints + (not planned)
         self.failure = None
         fields = state.saved()
@@ -200,7 +202,7 @@ class Saver:
             return
         try:
             if (self.path / METRICS).exists():
-                sync(self.path / METRICS)
+                sync(self.path / METRICS)  # before the checkpoint, which says up to which step they are whole
             record = {**self._record, "planned": planned, "logged": logged}
             checkpoint.write(self._checkpoints, fields, state.step, record, keep)
             self.last_planned = state.step if planned else self.last_planned
@@ -211,10 +213,3 @@ class Saver:
     def close(self) -> None:
         """Unlock the directory."""
         self._lock.release()
-
-
-def _is_whole(path: Path) -> bool:
-    try:
-        return bool(read_json(path))
-    except DamagedFileError:
-        return False

@@ -11,7 +11,7 @@ from lemniscate.errors import UserError, shown
 from lemniscate.nn.networks import NETWORKS
 from lemniscate.run.config import RunConfig
 from lemniscate.spec import Spec
-from lemniscate.system.machine import free_memory
+from lemniscate.system.machine import require_free
 from lemniscate.system.world import World
 
 BYTES_PER_PARAMETER = 16
@@ -105,13 +105,7 @@ def device_for(name: str) -> torch.device:
 def require_memory(config: RunConfig, spec: Spec, device: torch.device) -> None:
     """Raise `UserError` where a run takes more memory than is free, with the field that takes most, and its limit."""
     parts = {"hidden": _network_bytes(config, spec), **config.memory(spec)}
-    total, free, most = sum(parts.values()), free_memory(device), max(parts, key=lambda name: parts[name])
-    if total > free:
-        value, left = getattr(config, most), f"{free // 10**6:,} MB"
-        taken = f"{total // 10**6:,} MB, of which {parts[most] // 10**6:,} MB"
-        limit = (free - total + parts[most]) * value // parts[most] if isinstance(value, int) else 0
-        advice = f"choose {most} at most {limit:,}" if limit > 0 else f"choose a smaller {most}"
-        raise UserError(f"This run takes at least {taken} are for {most} {value}; {left} are free: {advice}.")
+    require_free("This run takes", parts, vars(config), device)
 
 
 def _network_bytes(config: RunConfig, spec: Spec) -> int:

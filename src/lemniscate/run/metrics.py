@@ -23,7 +23,7 @@ def to_line(record: Mapping[str, Any]) -> bytes:
 
 def from_line(line: bytes) -> dict[str, Any] | None:
     """The record of a line; None if the line is not whole."""
-    body, _, rest = line.rpartition(MARK)
+    body, _, rest = line.rpartition(MARK)  # the last one, since a name in the record may hold the mark as well
     return json.loads(body + b"}") if rest == f'{crc32(body):08x}"}}\n'.encode() else None
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from lemniscate.system.files import open_log, open_regular
-from lemniscate.system.owner import OWNED
+from lemniscate.system.watchdog import OWNED
 
 LOG = "log.txt"
 """standard output and error of a run, in its directory"""

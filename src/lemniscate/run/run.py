@@ -25,10 +25,9 @@ from lemniscate.errors import NonFiniteError, NotStoredError, RankError, UserErr
 from lemniscate.optim.compiled import Compiler
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import Saver
-from lemniscate.run.evaluate import evaluate
+from lemniscate.run.evaluate import critic_of, evaluate
 from lemniscate.run.loggers import NO_EPISODES, JsonLines, Logger, LoggerClass, TensorBoard
 from lemniscate.run.metrics import read_metrics
-from lemniscate.run.q_bias import critic_of
 from lemniscate.run.seeding import derive, globals_undisturbed, seed_globals
 from lemniscate.run.state import TrainState
 from lemniscate.run.stopping import Stopped, StopRequest

@@ -62,13 +62,23 @@ def replace_file(path: Path, content: bytes) -> None:
         with temporary.open("xb") as file:  # "x" does not follow a link
             file.write(content)
             file.flush()
+            # In this order: renamed before it is synced, a power cut could leave the name with an empty file.
             os.fsync(file.fileno())
         temporary.replace(path)
-        sync(path.parent)
+        sync(path.parent)  # only now is the new name itself on the disk
     except BaseException:
         with suppress(OSError):
             remove(temporary)
         raise
+
+
+def is_whole(path: Path) -> bool:
+    """Whether a file is there and has the JSON that `write_json` stored."""
+    try:
+        read_json(path)
+    except DamagedFileError:
+        return False
+    return True
 
 
 def open_regular(path: Path) -> BufferedReader:
@@ -82,8 +92,11 @@ def open_log(path: Path) -> FileIO:
 
 
 def _open(path: Path, flags: int) -> int:
+    # A run from elsewhere may hold a link to a file of this user (O_NOFOLLOW), or a pipe that nobody writes to, for
+    # which an ordinary open waits for ever (O_NONBLOCK). Windows knows neither.
+    flags |= getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
     try:
-        handle = os.open(path, flags | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0), 0o666)
+        handle = os.open(path, flags, 0o666)
     except FileNotFoundError:
         raise DamagedFileError(f"{path} is missing.") from None
     except OSError as error:
@@ -128,7 +141,10 @@ def make_directory(path: Path) -> None:
 
 def sync(path: Path) -> None:
     """Have the disk store a file, or the names in a directory, before anything that follows. Raises `OSError`."""
-    handle = os.open(path, os.O_RDONLY)
+    is_windows = os.name == "nt"
+    if is_windows and path.is_dir():  # it opens no directory; the names are in the journal of its file system
+        return
+    handle = os.open(path, os.O_RDWR if is_windows else os.O_RDONLY)  # Windows syncs only what it could write to
     try:
         os.fsync(handle)
     finally:

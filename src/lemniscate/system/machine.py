@@ -1,37 +1,70 @@
-"""The free memory of this machine, and the files that may still be opened."""
+"""The free memory of this machine, its processors, and the files that may still be opened."""
 
 import os
-import resource
 import sys
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
-import psutil
 import torch
 
+from lemniscate.errors import UserError
+
 CGROUPS = Path("/sys/fs/cgroup")
+
+
+def require_free(what: str, parts: Mapping[str, int], fields: Mapping[str, Any], device: torch.device | None) -> None:
+    """Raise `UserError` where something takes more memory than is free, with the field that takes most, and its limit.
+
+    Args:
+        what: subject and verb of the sentence, such as "This run takes".
+        parts: the bytes that grow with each field.
+        fields: their values.
+        device: whose memory it takes; of this process if it is None.
+    """
+    total, free, most = sum(parts.values()), free_memory(device), max(parts, key=lambda name: parts[name])
+    if total <= free:
+        return
+    value = fields[most]
+    limit = (free - total + parts[most]) * value // parts[most] if isinstance(value, int) else 0
+    of_which = f", of which {parts[most] // 10**6:,} MB are for {most} {value}" if len(parts) > 1 else ""
+    advice = f"choose {most} at most {limit:,}" if limit > 0 else f"choose a smaller {most}"
+    raise UserError(f"{what} at least {total // 10**6:,} MB{of_which}; {free // 10**6:,} MB are free: {advice}.")
+
+
+def require_files(what: str, count: int, each: int) -> None:
+    """Raise `UserError` where `count` environments need more open files, `each` so many, than the process may have."""
+    most = _limit("RLIMIT_NOFILE")
+    if count * each > most:
+        needed = f"need {count * each:,} open files, and this process may have {most:,} (`ulimit -n`)"
+        raise UserError(f"{what} {needed}: choose num_envs at most {most // each:,}.")
 
 
 def free_memory(device: torch.device | None = None) -> int:
     """Bytes that this process can still take: of the GPU; else of the machine, its container and its own limit."""
     if device and device.type == "cuda":
         return torch.cuda.mem_get_info(device)[0]
-    own = _limit(resource.RLIMIT_AS) - psutil.Process().memory_info().vms
+    try:
+        import psutil
+    except ImportError:  # it needs modules of the platform; where they are missing, no memory is known to be short
+        return sys.maxsize
+    own = _limit("RLIMIT_AS") - psutil.Process().memory_info().vms
     return max(0, min(psutil.virtual_memory().available, own, *_left_in_cgroups()))
 
 
 def cores() -> int:
-    """The processors that this process may use; those of one run on this machine share them."""
-    return max(1, len(os.sched_getaffinity(0)) // int(os.environ.get("LOCAL_WORLD_SIZE", 1)))
+    """The processors that this process may use; the processes of one run on this machine share them."""
+    there = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return max(1, there // int(os.environ.get("LOCAL_WORLD_SIZE", 1)))
 
 
-def most_open_files() -> int:
-    """The open files that this process may have."""
-    return _limit(resource.RLIMIT_NOFILE)
-
-
-def _limit(kind: int) -> int:
+def _limit(name: str) -> int:
     """The most of a resource that this process may have (`ulimit`)."""
-    most, _ = resource.getrlimit(kind)
+    try:
+        import resource
+    except ImportError:  # Windows has no such limits
+        return sys.maxsize
+    most, _ = resource.getrlimit(getattr(resource, name))
     return sys.maxsize if most == resource.RLIM_INFINITY else most
 
 
@@ -43,6 +76,7 @@ def _left_in_cgroups() -> list[int]:
             try:
                 most = int((group / limit).read_text())
                 cached = dict(line.split() for line in (group / "memory.stat").read_text().splitlines())
+                # Files that are cached but not in use count as used there, and are dropped where memory is asked for.
                 left.append(most - int((group / used).read_text()) + int(cached.get("inactive_file", 0)))
             except (OSError, ValueError):  # there is no such group, or it has no limit
                 continue

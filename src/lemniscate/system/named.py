@@ -17,13 +17,29 @@ WHERE = "here; run in its folder, or add that folder to PYTHONPATH"
 """ends the sentence on a module that cannot be found"""
 
 _PASSED: dict[str, Any] = {}
-"""every object that was passed in this process, by its name"""
+"""every object that was passed in this process, by its name; of two of one name, the later"""
+
+
+class PassedName(str):
+    """The name of an object that was passed in this process, which keeps the object itself.
+
+    A Config that holds it goes on meaning that object where another one gets the same name, as a class does whose cell
+    in a notebook is run again. Written to a file or sent to another process, it is text like any other.
+    """
+
+    thing: Any
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "PassedName":
+        return self
+
+    def __reduce__(self) -> tuple[type[str], tuple[str]]:
+        return str, (str(self),)
 
 
 def name_of(thing: object) -> str:
     """The name by which `find` returns an object: `module:qualname`. A string is taken to be a name already.
 
-    A lambda or a local class gets a name too, which is of use in this process only.
+    A lambda or a local class gets a name too, with a number where another has it; it is of use in this process only.
     """
     if isinstance(thing, str):
         return thing
@@ -34,12 +50,14 @@ def name_of(thing: object) -> str:
         number += 1
         name = f"{module}:{qualname}#{number}"
     _PASSED[name] = thing
-    return name
+    passed = PassedName(name)
+    passed.thing = thing
+    return passed
 
 
 def is_passed(name: str) -> bool:
     """Whether an object of this name was passed in this process."""
-    return name in _PASSED
+    return isinstance(name, PassedName) or name in _PASSED
 
 
 def find(name: str) -> Any:
@@ -48,6 +66,8 @@ def find(name: str) -> Any:
     Raises:
         UserError: no such module or object; an object that only the process that was given it can know.
     """
+    if isinstance(name, PassedName):
+        return name.thing
     if name in _PASSED:
         return _PASSED[name]
     found: Any = module_of(name)
@@ -117,7 +137,7 @@ def find_callable(text: str) -> Callable[..., Any]:
         UserError: as `find`; arguments that are no literals; an object that cannot be called.
     """
     name, opening, rest = (text, "", "") if is_passed(text) else text.partition("(")
-    found = find(name.strip())
+    found = find(name if is_passed(text) else name.strip())
     if not callable(found):
         raise UserError(f"{name} is neither a function nor a class.")
     if not opening:

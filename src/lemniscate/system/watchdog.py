@@ -1,11 +1,14 @@
-"""The watch that the processes of a run keep over each other: one that dies, hangs or fails is named to all.
+"""Processes that end together: the watch of a run's processes over each other, and of one over its owner.
 
-A thread of every process says in the common store twice a second what its process does, and looks what the others say.
+In a run of several processes, one that dies, hangs or fails is named to all: a thread of every process writes to the
+common store twice a second what its process does, and reads what the others write. A process that works for another,
+such as the worker of an environment, ends with it, however that ends.
 """
 
 import faulthandler
 import json
 import os
+import select
 import signal
 import socket
 import threading
@@ -25,8 +28,8 @@ BUSY = 30.0
 """seconds that a busy process may be silent: a compiler, or a simulator that is being made, may let no thread run"""
 GRACE = 1.0
 """seconds that a process has to end by itself once one of them has failed"""
-
-
+OWNED = "LEMNISCATE_OWNED"
+"""in the environment of a process that works for another: the file of the pipe from there"""
 DEAD = " does not answer any more: it was killed or stopped, or its machine is gone."
 
 
@@ -165,3 +168,24 @@ class Watch:
             if fault["by"] == self._rank and fault["rank"] != self._rank:
                 say(f"{fault['sentence']} All processes of the run end.")
             os._exit(1)
+
+
+def end_with_owner() -> bool:
+    """End this process with its owner, if it was started with `OWNED`; returns whether it was."""
+    pipe = os.environ.pop(OWNED, None)
+    if pipe:
+        end_when_closed(os.open(pipe, os.O_RDONLY | os.O_NONBLOCK))
+    return bool(pipe)
+
+
+def end_when_closed(pipe: int) -> None:
+    """Have the system end this process once nobody holds the writing end of `pipe`, whose reading end this is.
+
+    The signal comes from the kernel, so it also ends a process that is caught in a loop. No data may come.
+    """
+    import fcntl  # here, since Windows has none
+
+    fcntl.fcntl(pipe, fcntl.F_SETOWN, os.getpid())
+    fcntl.fcntl(pipe, fcntl.F_SETFL, fcntl.fcntl(pipe, fcntl.F_GETFL) | os.O_ASYNC)  # sends SIGIO, which terminates
+    if select.select([pipe], [], [], 0)[0]:  # closed before
+        os._exit(1)
