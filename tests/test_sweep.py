@@ -96,7 +96,7 @@ def test_at_the_end_there_is_one_table_and_one_picture(trained):
 
 def test_the_sweep_is_plotted_again_without_playing(trained, monkeypatch):
     path, _ = trained
-    monkeypatch.setattr(lem.results, "evaluate", None)
+    monkeypatch.setattr(lem.api.results, "evaluate", None)
     assert {picture.parent for picture in lem.plot(path)} == {path / "plots"}
 
 
@@ -157,12 +157,12 @@ def test_two_processes_do_not_train_one_sweep(trained):
 def test_the_policy_is_played_anew_when_there_is_a_newer_checkpoint(trained, tmp_path, capsys):
     run = shutil.copytree(trained[0] / "ppo-1", tmp_path / "run")
     known = read_json(run / "final.json")
-    assert lem.results.final_return(run) == known["mean_return"]
+    assert lem.api.results.final_return(run) == known["mean_return"]
     assert capsys.readouterr().err == ""
     newest = run / "checkpoints" / f"step-{known['step']}"
     newest.rename(newest.with_name(f"step-{known['step'] + 1}"))
     write_json(run / "final.json", known | {"mean_return": 7.0})
-    assert lem.results.final_return(run) == known["mean_return"]
+    assert lem.api.results.final_return(run) == known["mean_return"]
     assert "Evaluating" in capsys.readouterr().err
 
 

@@ -101,7 +101,7 @@ def test_damaged_metrics_are_kept_aside_and_damaged_scores_found_again(tmp_path,
         f"line 2 is damaged, and left out. It is kept as {run / 'metrics.damaged-1.jsonl'}." in capsys.readouterr().err
     )
     assert (run / "metrics.damaged-1.jsonl").read_bytes() == damaged
-    scores = lem.results.final_scores(run)
+    scores = lem.api.results.final_scores(run)
     (run / "final.json").write_text('{"mean_return": 1000000.0}')
-    assert lem.results.final_scores(run) == scores
+    assert lem.api.results.final_scores(run) == scores
     assert "final.json has no sha256" in capsys.readouterr().err

@@ -11,7 +11,7 @@ import pytest
 import lemniscate as lem
 from lemniscate.cli import main
 from lemniscate.errors import SweepError
-from lemniscate.presets.stored import read_preset
+from lemniscate.presets.preset import read_preset
 from lemniscate.report.seeds import iqm
 from lemniscate.run.metrics import read_metrics
 from lemniscate.sweeps.population import Population

@@ -7,10 +7,8 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-from lemniscate.errors import RankError, UserError, shown
-from lemniscate.hub.trust import signed
+from lemniscate.errors import RankError
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import CONFIG, create_directory
 from lemniscate.run.stopping import Stopped
@@ -21,40 +19,26 @@ SECONDS_TO_END = 10
 """that the processes have to end by themselves, once one has ended or the launcher was asked to stop"""
 
 
-def launch_run(
-    path: Path,
-    algorithm: str,
-    config: RunConfig,
-    processes: int,
-    track: object,
-    callbacks: Any,
-    report: bool,
-    progress: bool,
-) -> float:
+def launch_run(path: Path, algorithm: str, config: RunConfig, processes: int, words: Sequence[str]) -> float:
     """Train in several processes of this machine: each resumes the run, which begins here if it is new.
 
-    Returns the seconds that it took. Raises as `launch`, and `UserError` for what another process could not import.
+    Args:
+        path: the run directory.
+        algorithm: by name.
+        config: of the run; a new one has a shard for each process, unless more are asked for.
+        processes: how many.
+        words: options of `lemniscate resume`.
+
+    Returns the seconds that it took. Raises as `launch`.
     """
     if (path / CONFIG).exists() or config.shards > 1:
         World(config.shards, size=processes).divide(config.shards)
-    names = require_importable(config, track, callbacks)
     if not (path / CONFIG).exists():
         config = config.replace(shards=max(config.shards, processes))
-        create_directory(path, CONFIG, signed({"algorithm": algorithm, "config": config.to_json()}))
-    options = [*(["--track", str(track)] if track else []), *(["--callbacks", *names] if names else [])]
-    options += ["--report"] * report + ["--trust"] + ["--quiet"] * (not progress)
+        create_directory(path, CONFIG, {"algorithm": algorithm, "config": config.to_json()})
     began = time.monotonic()
-    launch(["resume", str(path), *options], processes)
+    launch(["resume", str(path), *words], processes)
     return time.monotonic() - began
-
-
-def require_importable(config: RunConfig, track: object, callbacks: Any) -> list[str]:
-    """The names of the callbacks. Raises `UserError` for what another process could not import."""
-    names = list(callbacks) if isinstance(callbacks, list | tuple) else [callbacks] if callbacks else []
-    for name in (config.env, *config.wrappers, getattr(config, "network", ""), track or "", *names):
-        if not isinstance(name, str) or "<" in name or name.startswith("__main__:"):
-            raise UserError(f"Each process has to import it: put {shown(name)} into a module, and name it.")
-    return names
 
 
 def launch(words: Sequence[str], processes: int) -> None:

@@ -21,13 +21,9 @@ from shutil import copytree, rmtree
 from types import FrameType
 from typing import Any
 
-from lemniscate.api.launch import require_importable
-from lemniscate.api.results import report_on
-from lemniscate.api.stored import TrainedRun, load
 from lemniscate.cluster.connection import Cluster, connected
 from lemniscate.cluster.parcel import STORAGE, pack, unpack
 from lemniscate.errors import NonFiniteError, RankError, UserError, WorkerError, resume_line
-from lemniscate.hub.trust import signed
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import CONFIG, LOCK, create_directory
 from lemniscate.run.stopping import Stopped, stop_signals_to
@@ -42,25 +38,6 @@ EVERY = 1.0
 """seconds between two looks at the storage"""
 FAILURES = 100
 """workers that may be lost before the job gives up"""
-
-
-def train_there(
-    path: Path,
-    algorithm: str,
-    config: RunConfig,
-    cluster: Cluster,
-    track: object,
-    callbacks: Any,
-    report: bool,
-    progress: bool,
-) -> TrainedRun:
-    """Train on a cluster, or go on there; the run is evaluated and drawn here."""
-    options = {"track": track, "callbacks": require_importable(config, track, callbacks), "progress": progress}
-    seconds = train_on_ray(path, algorithm, config, cluster, options)
-    trained = TrainedRun(path, load(path, trust=True), seconds)
-    if report or track is not None:
-        report_on(trained)
-    return trained
 
 
 def train_on_ray(path: Path, algorithm: str, config: RunConfig, cluster: Cluster, options: Mapping[str, Any]) -> float:
@@ -78,7 +55,7 @@ def train_on_ray(path: Path, algorithm: str, config: RunConfig, cluster: Cluster
     began = time.monotonic()
     with connected(cluster):
         if new:
-            create_directory(path, CONFIG, signed(record))
+            create_directory(path, CONFIG, record)
         from ray.train import CheckpointConfig, FailureConfig, ScalingConfig
         from ray.train import RunConfig as JobConfig
         from ray.train.torch import TorchConfig, TorchTrainer
@@ -210,7 +187,7 @@ def _begin(path: Path, given: Mapping[str, Any], checkpoint: Any) -> None:
 def _train(path: Path, options: Mapping[str, Any]) -> str | None:
     """Train a run to its end; returns the sentence of what would end it again."""
     try:
-        named.find("lemniscate.api.resumed:resume")(path, trust=True, **options)
+        named.find("lemniscate.api.training:resume")(path, **options)
     except RankError as error:
         if error.repeats:
             return error.reason

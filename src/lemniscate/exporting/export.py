@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lemniscate.api.policy import TrainedPolicy
-from lemniscate.api.stored import Trained, load, path_of
+from lemniscate.api.policy import Trained, TrainedPolicy, load, path_of
 from lemniscate.errors import UserError, is_installed
 from lemniscate.exporting.actions import Act, act_with
 from lemniscate.exporting.c_files import c_files

@@ -6,7 +6,7 @@ from typing import Any
 from urllib.parse import quote
 
 from lemniscate.algos import ALGORITHMS
-from lemniscate.hub.trust import own_code
+from lemniscate.hub.repository import own_code
 from lemniscate.report import commands, run_page
 from lemniscate.run.config import RunConfig
 

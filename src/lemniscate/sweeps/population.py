@@ -110,8 +110,7 @@ class Population:
             self._make(member, sweep)
         last = tenth == TENTHS
         until = None if last else tenth * self._search.config.checkpoint_every
-        options = [] if last else ["--callbacks", f"lemniscate.api.callbacks:StopAt(steps={until})"]
-        options += ["--trust"] * self._search.trusted
+        options = [] if last else ["--callbacks", f"lemniscate.api.options:StopAt(steps={until})"]
         waiting = [run for sweep in sweeps for run in sweep.runs if not has_come(run, until)]
         failed = set()
         while self._places.running or (waiting and not self._stop_signal):

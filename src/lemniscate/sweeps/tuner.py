@@ -16,10 +16,10 @@ from filelock import FileLock, Timeout
 
 from lemniscate.algos import name_of
 from lemniscate.api import training
-from lemniscate.api.stored import path_of
+from lemniscate.api.policy import path_of
 from lemniscate.cluster.connection import Cluster, find_cluster
 from lemniscate.errors import SweepError, UserError, resume_line, shown
-from lemniscate.presets.stored import StoredPreset
+from lemniscate.presets.preset import StoredPreset
 from lemniscate.report import tuning as pictures
 from lemniscate.run.places import LOG, failure_of
 from lemniscate.run.stopping import Stopped, stop_signals_to
@@ -128,10 +128,9 @@ def resume_tuning(
     progress: bool = True,
     cluster: str | None = None,
     workers: int | None = None,
-    trust: bool = False,
 ) -> Tuned:
     """Go on with an interrupted search. Each run of each trial ends in the same bits as if it had not been stopped."""
-    return _tune(read_search(path_of(path), trust=trust), progress, find_cluster(cluster, workers))
+    return _tune(read_search(path_of(path)), progress, find_cluster(cluster, workers))
 
 
 def _tune(search: Search, progress: bool, cluster: Cluster | None) -> Tuned:
@@ -238,8 +237,8 @@ class _Tuner:
                 self._queue(trial)
             run = trial.waiting.pop(0)
             until = self._until(trial)
-            options = ["--callbacks", f"lemniscate.api.callbacks:StopAt(steps={until})"] if until else []
-            self._places.start(run, [*options, *["--trust"] * self._search.trusted])
+            options = ["--callbacks", f"lemniscate.api.options:StopAt(steps={until})"] if until else []
+            self._places.start(run, options)
             trial.training.add(run)
 
     def _look(self) -> None:
