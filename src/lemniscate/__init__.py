@@ -5,7 +5,6 @@ Names are imported at their first use, so that `import lemniscate` and `lemnisca
 
 from importlib import import_module
 from importlib.util import find_spec
-from pkgutil import iter_modules
 from typing import TYPE_CHECKING
 
 __version__ = "0.2.0"
@@ -75,4 +74,6 @@ def __getattr__(name: str) -> object:
 
 
 def __dir__() -> list[str]:
+    from pkgutil import iter_modules
+
     return sorted({*globals(), *__all__, *(room.name for room in iter_modules(__path__))})

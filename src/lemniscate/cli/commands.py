@@ -9,7 +9,6 @@ from lemniscate.algos import ALGORITHMS
 from lemniscate.api import training
 from lemniscate.api.options import RunOptions
 from lemniscate.api.policy import TrainedRun
-from lemniscate.cli.completion import completion as completion
 from lemniscate.envs import registry
 from lemniscate.errors import UserError, unknown_name
 from lemniscate.run.directory import SWEEP, TUNE
@@ -162,6 +161,13 @@ def check(given: argparse.Namespace) -> None:
     if any(finding.grade == BAD for finding in found):
         raise UserError(verdict(given.what, found))
     say(verdict(given.what, found))
+
+
+def completion(given: argparse.Namespace) -> None:
+    """Print the script with which a shell completes."""
+    from lemniscate.cli.completion import script
+
+    print(script(given.shell), end="")
 
 
 def tell(text: str) -> None:

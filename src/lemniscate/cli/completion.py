@@ -1,6 +1,5 @@
 """Completion in bash, zsh and fish: a script with all that may follow a word, so that pressing TAB starts nothing."""
 
-import argparse
 from collections.abc import Iterable
 from shlex import quote
 from typing import Literal, get_args, get_origin, get_type_hints
@@ -39,12 +38,12 @@ autoload -Uz bashcompinit && bashcompinit
 """
 
 
-def completion(given: argparse.Namespace) -> None:
-    """Print the script with which a shell, one of `SHELLS`, completes."""
-    if given.shell not in SHELLS:
-        raise unknown_name("shell", given.shell, SHELLS)
-    print(f"# Write it once, and again after an upgrade: lemniscate completion {given.shell} > {FILES[given.shell]}")
-    print(_fish() if given.shell == "fish" else (ZSH if given.shell == "zsh" else "") + _bash(), end="")
+def script(shell: str) -> str:
+    """The script with which a shell completes, with a comment on where to write it. Raises `UserError`."""
+    if shell not in SHELLS:
+        raise unknown_name("shell", shell, SHELLS)
+    written = _fish() if shell == "fish" else (ZSH if shell == "zsh" else "") + _bash()
+    return f"# Write it once, and again after an upgrade: lemniscate completion {shell} > {FILES[shell]}\n{written}"
 
 
 def _bash() -> str:
