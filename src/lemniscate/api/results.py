@@ -9,7 +9,6 @@ from typing import Any
 
 from lemniscate.api.policy import Trained, TrainedPolicy, TrainedRun, load, path_of
 from lemniscate.envs import registry
-from lemniscate.envs.backend import Baseline
 from lemniscate.envs.findings import Finding
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError, shown
@@ -73,13 +72,16 @@ def evaluate(
     """
     agent = policy if callable(policy) else load(policy, trust=trust)
     episodes, seed, file = checked("episodes", episodes, Episodes), checked("seed", seed, Natural), _film(video)
-    elsewhere: dict[str, Any] = {"env": env, "env_kwargs": _kwargs(env_kwargs), "backend": backend}
+    kwargs = checked("env_kwargs", env_kwargs, dict | None)
+    elsewhere: dict[str, Any] = {"env": env, "env_kwargs": kwargs, "backend": backend}
     how: dict[str, Any] = {"episodes": episodes, "seed": seed, "tell": lambda text: None}
     arguments = env_arguments(_config_of(agent, env), **elsewhere)
     vec = _env_for(agent, episodes, **elsewhere)
     try:
-        if baseline:
-            return evaluate_policy(_baseline_of(vec), vec, episodes, seed)
+        if baseline and vec.baseline is None:
+            raise UserError(f"{vec.spec.env_id} has no baseline to compare with.")
+        if baseline and vec.baseline:
+            return evaluate_policy(vec.baseline, vec, episodes, seed)
         if file:
             return _show(agent, vec, arguments, deterministic=deterministic, video=file, **how)
         if not isinstance(agent, TrainedPolicy):
@@ -126,7 +128,7 @@ def watch(
     episodes, seed, file = checked("episodes", episodes, Episodes), checked("seed", seed, Natural), _film(video)
     if agent is None and env is None:
         raise UserError("Watch what? Name a run, or an environment to act in at random.")
-    elsewhere: dict[str, Any] = {"env": env, "env_kwargs": _kwargs(env_kwargs)}
+    elsewhere: dict[str, Any] = {"env": env, "env_kwargs": checked("env_kwargs", env_kwargs, dict | None)}
     arguments = env_arguments(_config_of(agent, env), **elsewhere)
     if file is None:
         require_display()
@@ -237,10 +239,6 @@ def _film(video: str | Path | None) -> Path | None:
     return None if video is None else Path(video)
 
 
-def _kwargs(env_kwargs: Mapping[str, Any] | None) -> dict[str, Any] | None:
-    return checked("env_kwargs", env_kwargs, dict | None)
-
-
 def _config_of(agent: TrainedPolicy | Agent | None, env: str | Callable[..., Any] | None) -> RunConfig:
     """The Config of a policy; without one, that of `env` alone. Raises `UserError` for a function without `env`."""
     if isinstance(agent, TrainedPolicy):
@@ -261,13 +259,6 @@ def _env_for(agent: TrainedPolicy | Agent | None, episodes: int, **elsewhere: An
             f"A policy for {agent.spec.env_id} cannot act in {vec.spec.env_id}: observation or action spaces differ."
         )
     return vec
-
-
-def _baseline_of(vec: VecEnv) -> Baseline:
-    """The baseline of an environment. Raises `UserError` where there is none."""
-    if vec.baseline is None:
-        raise UserError(f"{vec.spec.env_id} has no baseline to compare with.")
-    return vec.baseline
 
 
 def _show(
