@@ -24,12 +24,6 @@ def rng():
     return torch.Generator().manual_seed(0)
 
 
-@pytest.fixture(scope="session", autouse=True)
-def state_home(tmp_path_factory):
-    """A directory for the key of this user that signs runs, in the place of the user's own."""
-    os.environ["XDG_STATE_HOME"] = str(tmp_path_factory.mktemp("state"))
-
-
 def tiny(env="Countdown-v0", **fields):
     """A Config that trains in a moment."""
     from lemniscate.algos.ppo import Config

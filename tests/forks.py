@@ -12,7 +12,7 @@ from pathlib import Path
 from tempfile import mkdtemp
 
 TESTS = Path(__file__).parent
-LEMNISCATE = "import sys, envpool, torch, torch.utils.tensorboard, lemniscate.cli.training, lemniscate.cli.inspection; torch.set_num_threads(1)"
+LEMNISCATE = "import sys, envpool, torch, torch.utils.tensorboard, lemniscate.cli.commands, lemniscate.api.plots; torch.set_num_threads(1)"
 
 SERVER = """
 import gc, json, os, signal, sys
@@ -69,8 +69,7 @@ class Forks:
         for name in ("out", "err"):  # it may be killed before it opens them
             (folder / name).touch()
         job = {"code": code, "cwd": str(Path(cwd).resolve()), "folder": str(folder)}
-        state = {name: value for name, value in os.environ.items() if name == "XDG_STATE_HOME"}
-        job["environment"] = {**self._environment, **state, **environment}
+        job["environment"] = {**self._environment, **environment}
         print(json.dumps(job), file=self._server.stdin, flush=True)
         return Forked(int(self._server.stdout.readline()), folder)
 

@@ -2,6 +2,7 @@
 
 import json
 import re
+import sys
 from urllib.parse import unquote
 
 import numpy as np
@@ -18,6 +19,7 @@ from forks import LEMNISCATE, Forks, command
 from lemniscate.cli import main, parse
 from lemniscate.envs import toy
 from lemniscate.hub import repository as hub
+from lemniscate.run import checkpoint
 
 pytestmark = pytest.mark.filterwarnings("ignore:Use 'content=:DeprecationWarning")  # huggingface_hub's own
 
@@ -276,17 +278,40 @@ def test_a_repository_can_be_private_and_have_a_license(run, server):
     assert "\nlicense: mit\n" in server.files("anna/secret")["README.md"].decode()
 
 
-def test_code_of_a_downloaded_policy_is_imported_only_with_trust(server, tmp_path, capsys):
+def test_code_of_a_downloaded_policy_is_imported_only_with_trust(server, tmp_path, monkeypatch, capsys):
     """And a policy without pictures, film or figures is uploaded, with a line on why."""
-    lem.push(train(tmp_path / "run", "test_hub:Own"), "eve/own")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "theirs.py").write_text("from test_hub import Own\n")
+    lem.push(train(tmp_path / "run", "theirs:Own"), "eve/own")
+    del sys.modules["theirs"]
     assert "No film: " in capsys.readouterr().err
     files = server.files("eve/own")
     assert set(files) == {".gitattributes", "README.md", "final.json", *hub.CHECKPOINT}
-    assert "loaded with `trust=True`: test_hub:Own." in files["README.md"].decode()
-    assert b"signature" not in files["state.json"]
-    with pytest.raises(lem.UserError, match="would execute code of its own: test_hub:Own"):
-        lem.load("hf://eve/own")
+    assert "loaded with `trust=True`: theirs:Own." in files["README.md"].decode()
+    for verb in (lem.load, lem.evaluate, lem.watch, lem.export):
+        with pytest.raises(
+            lem.UserError, match=r"hf://eve/own: The policy would execute code of its own: theirs:Own\."
+        ):
+            verb("hf://eve/own")
+    assert main(["evaluate", "hf://eve/own"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.endswith("If you know that code, add --trust (in Python trust=True).")
+    assert "theirs" not in sys.modules
     assert lem.load("hf://eve/own", trust=True).step == 256
+    assert main(["evaluate", "hf://eve/own", "--episodes", "2", "--trust"]) == 0
+
+
+@pytest.mark.parametrize("field", ["env", "network", "wrappers", "algorithm"])
+def test_every_name_of_code_in_a_downloaded_record_is_asked_for(run, server, tmp_path, field):
+    found = checkpoint.read(lem.save(run, tmp_path / "policy"))
+    name = "nowhere.evil" if field == "algorithm" else "nowhere:evil"
+    at = found.record if field == "algorithm" else found.record["config"]
+    at[field] = [name] if field == "wrappers" else name
+    checkpoint.write_fields(found.path, {"networks": run.policy.networks, "step": 256}, found.record)
+    store(server, "eve/policy", {file.name: file.read_bytes() for file in found.path.iterdir()})
+    with pytest.raises(lem.UserError, match=f"would execute code of its own: {name}"):
+        lem.load("hf://eve/policy")
 
 
 def test_a_policy_without_a_run_is_filmed_and_evaluated_now(run, server, capsys):

@@ -74,7 +74,7 @@ def test_a_path_a_run_and_a_policy_are_evaluated_alike(run):
 def test_runs_are_plotted_one_by_one_or_in_a_list(run):
     pictures = lem.plot(run.policy)
     assert pictures == lem.plot([str(run.path)])
-    assert {lem.stored.path_of(which) for which in (run, run.policy, lem.load(run.path))} == {run.path}
+    assert {lem.api.policy.path_of(which) for which in (run, run.policy, lem.load(run.path))} == {run.path}
     assert {picture.parent for picture in pictures} == {run.path / "plots"}
 
 
@@ -100,14 +100,14 @@ def test_runs_are_plotted_one_by_one_or_in_a_list(run):
         (lambda run: lem.train(lem.run.config.RunConfig()), "lemniscate.run.config is not an algorithm"),
         (lambda run: lem.train("ppo", "CartPole-v1", track=3), "track must be a logger's name or class, not 3"),
         (lambda run: lem.train("ppo", Sized), "required positional argument: 'size'; it is given in env_kwargs"),
-        (lambda run: lem.train_sweep("ppo", "CartPole-v1", 1, callbacks=[print]), "has a process of its own: name"),
+        (lambda run: lem.train_sweep("ppo", "CartPole-v1", 1, callbacks=[print]), "Each process has to import it: put"),
         (lambda run: lem.train_sweep("ppo", "CartPole-v1", 1, callbacks=["math:cosy"]), "math has no cosy"),
         (lambda run: lem.train_sweep("ppo", "CartPole-v1", 1, seed=3), "given as seeds, not as seed"),
-        (lambda run: lem.train_sweep("ppo", lambda: gym.make("CartPole-v1"), 1), "into a module, to import it"),
+        (lambda run: lem.train_sweep("ppo", lambda: gym.make("CartPole-v1"), 1), "into a module, and name it"),
         (lambda run: lem.train_sweep(None, "CartPole-v1", 1), "None is not an algorithm"),
         (lambda run: lem.train_sweep("ppo", Sized, 1, env_kwargs={"size": 1}, run=run.path), "exists already"),
         (lambda run: lem.train_sweep("ppo", Sized, 1, env_kwargs={"size": 1}, run=run.path, wrappers=[Missing]), "is lost"),
-        (lambda run: lem.train_sweep("ppo", "CartPole-v1", 1, callbacks=print), "has a process of its own: name"),
+        (lambda run: lem.train_sweep("ppo", "CartPole-v1", 1, callbacks=print), "Each process has to import it: put"),
         (lambda run: lem.train("ppo", "CartPole-v1", preset=3), "There is no preset 3"),
         (lambda run: lem.train("ppo", "CartPole-v1", callbacks=3), "A callback must be a function of"),
         (lambda run: lem.train("ppo", "CartPole-v1", callbacks=lambda step: None), "A callback must be a function of"),

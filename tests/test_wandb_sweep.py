@@ -45,7 +45,7 @@ def test_the_agent_starts_what_is_understood(page, which):
 def test_an_agent_on_a_machine_without_a_network_logs_the_metric_that_runs_are_judged_by(tmp_path, monkeypatch):
     fake = FakeWandb(has_key=False, reachable=False)
     monkeypatch.setitem(sys.modules, "wandb", fake)
-    monkeypatch.setattr("lemniscate.api.training.is_installed", lambda package: True)
+    monkeypatch.setattr("lemniscate.api.options.is_installed", lambda package: True)
     for name in ("WANDB_API_KEY", "WANDB_MODE"):
         monkeypatch.delenv(name, raising=False)
     sweep = sweep_of("scale.md")

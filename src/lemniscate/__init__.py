@@ -10,17 +10,17 @@ from typing import TYPE_CHECKING
 __version__ = "0.2.0"
 
 if TYPE_CHECKING:
-    from lemniscate.api.checks import check as check
     from lemniscate.api.plots import plot as plot
     from lemniscate.api.policy import TrainedPolicy as TrainedPolicy
+    from lemniscate.api.policy import TrainedRun as TrainedRun
+    from lemniscate.api.policy import load as load
+    from lemniscate.api.policy import save as save
     from lemniscate.api.pushed import push as push
+    from lemniscate.api.results import check as check
     from lemniscate.api.results import evaluate as evaluate
     from lemniscate.api.results import watch as watch
-    from lemniscate.api.resumed import resume as resume
-    from lemniscate.api.stored import TrainedRun as TrainedRun
-    from lemniscate.api.stored import load as load
-    from lemniscate.api.stored import save as save
     from lemniscate.api.training import config_for as config_for
+    from lemniscate.api.training import resume as resume
     from lemniscate.api.training import train as train
     from lemniscate.envs.vector_view import make_vec as make_vec
     from lemniscate.errors import NonFiniteError as NonFiniteError
@@ -42,14 +42,11 @@ if TYPE_CHECKING:
     from lemniscate.sweeps.tuner import tune as tune
 
 MODULES = {
-    "api.checks": ("check",),
     "api.plots": ("plot",),
-    "api.policy": ("TrainedPolicy",),
+    "api.policy": ("TrainedPolicy", "TrainedRun", "load", "save"),
     "api.pushed": ("push",),
-    "api.results": ("evaluate", "watch"),
-    "api.resumed": ("resume",),
-    "api.stored": ("TrainedRun", "load", "save"),
-    "api.training": ("config_for", "train"),
+    "api.results": ("check", "evaluate", "watch"),
+    "api.training": ("config_for", "resume", "train"),
     "envs.vector_view": ("make_vec",),
     "errors": ("NonFiniteError", "NotStoredError", "SweepError", "UserError"),
     "exporting.export": ("export",),
@@ -77,4 +74,6 @@ def __getattr__(name: str) -> object:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    from pkgutil import iter_modules
+
+    return sorted({*globals(), *__all__, *(room.name for room in iter_modules(__path__))})

@@ -21,8 +21,7 @@ import torch
 
 from lemniscate import algos
 from lemniscate.api import results, training
-from lemniscate.api.resumed import resume
-from lemniscate.api.stored import load
+from lemniscate.api.policy import load
 from lemniscate.run import checkpoint
 from lemniscate.run.config import RunConfig
 from lemniscate.run.metrics import read_metrics
@@ -75,7 +74,7 @@ def check_resume(algorithm: str | ModuleType, folder: Path, **settings: Any) -> 
     half = whole.policy.config.total_steps // 2
     stopped = folder / "stopped"
     training.train(algorithm, run=stopped, progress=False, callbacks=[lambda step, *_: step >= half], **settings)
-    resume(stopped, progress=False)
+    training.resume(stopped, progress=False)
     difference = _difference(_last_checkpoint(whole.path), _last_checkpoint(stopped))
     assert difference is None, f"{difference} differs after a resume: is it a field of State that is saved?"
 

@@ -6,7 +6,7 @@ import pytest
 
 import environments  # noqa: F401  (registers the copies)
 import lemniscate as lem
-from lemniscate.api.checks import check
+from lemniscate.api.results import check
 from lemniscate.errors import UserError
 
 

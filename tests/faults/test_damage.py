@@ -55,7 +55,7 @@ READERS = {
     "manifest.json": found_in,
     "state.json": found_in,
     "tensors.safetensors": found_in,
-    "sweep.json": lambda path: (read_sweep(path).seeds, read_sweep(path).configs, read_sweep(path).trusted),
+    "sweep.json": lambda path: (read_sweep(path).seeds, read_sweep(path).configs),
     LOG: lambda path: bool(failure_of(path, 1)),
 }
 

@@ -14,12 +14,11 @@ import lemniscate as lem
 from forks import command
 from lemniscate.api.training import config_for
 from lemniscate.cli import main, parse
-from lemniscate.presets.stored import read_preset
+from lemniscate.presets.preset import read_preset
 from lemniscate.report.seeds import iqm
 from lemniscate.run import checkpoint
 from lemniscate.run.metrics import read_metrics
 from lemniscate.sweeps.study import read_search
-from lemniscate.system.files import read_json, write_json
 from tuning.here import in_this_process
 
 ENV = "environments:Copy-box-v0"
@@ -179,16 +178,6 @@ def test_a_trial_that_fails_is_told_and_the_search_goes_on(tmp_path, capsys):
 
 def test_the_pictures_show_history_importance_and_settings(tuned):
     assert (tuned[0] / "plots" / "history.png").stat().st_size > 10_000
-
-
-def test_a_search_from_elsewhere_that_names_code_is_not_resumed_unasked(tuned, tmp_path, capsys):
-    record = read_json(tuned[0] / "tune.json")
-    record["config"]["env"] = "elsewhere:Env"
-    folder = tmp_path / "search"
-    folder.mkdir()
-    write_json(folder / "tune.json", {name: value for name, value in record.items() if name != "signature"})
-    assert main(["resume", str(folder)]) == 2
-    assert "elsewhere:Env" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

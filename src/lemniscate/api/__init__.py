@@ -1,1 +1,1 @@
-"""The verbs of the library: train, resume, load, evaluate, watch, plot, check, push."""
+"""The verbs of the library: train, resume, load, save, evaluate, watch, plot, check, push."""

@@ -1,4 +1,4 @@
-"""One run in several processes: those of this machine, started by torch's elastic launcher, or those of a cluster."""
+"""Several processes of one run on this machine, by torch's elastic launcher, as `torchrun` starts them."""
 
 import logging
 import os
@@ -7,13 +7,8 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-from lemniscate.api.results import report_on
-from lemniscate.api.stored import TrainedRun, load
-from lemniscate.cluster.connection import Cluster
-from lemniscate.errors import RankError, UserError, shown
-from lemniscate.hub.trust import signed
+from lemniscate.errors import RankError
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import CONFIG, create_directory
 from lemniscate.run.stopping import Stopped
@@ -24,74 +19,26 @@ SECONDS_TO_END = 10
 """that the processes have to end by themselves, once one has ended or the launcher was asked to stop"""
 
 
-def launch_run(
-    path: Path,
-    algorithm: str,
-    config: RunConfig,
-    processes: int,
-    track: object,
-    callbacks: Any,
-    report: bool,
-    progress: bool,
-) -> float:
+def launch_run(path: Path, algorithm: str, config: RunConfig, processes: int, words: Sequence[str]) -> float:
     """Train in several processes of this machine: each resumes the run, which begins here if it is new.
 
-    Returns the seconds that it took. Raises as `launch`, and `UserError` for what another process could not import.
+    Args:
+        path: the run directory.
+        algorithm: by name.
+        config: of the run; a new one has a shard for each process, unless more are asked for.
+        processes: how many.
+        words: options of `lemniscate resume`.
+
+    Returns the seconds that it took. Raises as `launch`.
     """
     if (path / CONFIG).exists() or config.shards > 1:
         World(config.shards, size=processes).divide(config.shards)
-    names = require_importable(config, track, callbacks)
-    _begin(path, algorithm, config, processes)
-    options = [*(["--track", str(track)] if track else []), *(["--callbacks", *names] if names else [])]
-    options += ["--report"] * report + ["--trust"] + ["--quiet"] * (not progress)
-    began = time.monotonic()
-    launch(["resume", str(path), *options], processes)
-    return time.monotonic() - began
-
-
-def train_there(
-    path: Path,
-    algorithm: str,
-    config: RunConfig,
-    cluster: Cluster,
-    track: object,
-    callbacks: Any,
-    report: bool,
-    progress: bool,
-) -> TrainedRun:
-    """Train on a cluster, or go on there; the run is evaluated and drawn here. Raises as `launch_run`."""
-    from lemniscate.cluster.connection import connected
-    from lemniscate.cluster.job import train_on_ray
-
-    options = {"track": track, "callbacks": require_importable(config, track, callbacks), "progress": progress}
-    options["trust"] = True  # its code was named here, or vouched for
-    began = time.monotonic()
-    with connected(cluster):  # before the directory is made: a cluster that does not answer leaves nothing
-        workers = cluster.workers or 1
-        config = _begin(path, algorithm, config, workers)
-        train_on_ray(path, algorithm, config, workers, cluster.storage, "lemniscate.api.resumed:resume", options)
-    seconds = time.monotonic() - began
-    trained = TrainedRun(path, load(path, trust=True), seconds)
-    if report or track is not None:
-        report_on(trained)
-    return trained
-
-
-def _begin(path: Path, algorithm: str, config: RunConfig, processes: int) -> RunConfig:
-    """Create the directory of a new run, with a shard for each process; returns the Config of the run."""
     if not (path / CONFIG).exists():
         config = config.replace(shards=max(config.shards, processes))
-        create_directory(path, CONFIG, signed({"algorithm": algorithm, "config": config.to_json()}))
-    return config
-
-
-def require_importable(config: RunConfig, track: object, callbacks: Any) -> list[str]:
-    """The names of the callbacks. Raises `UserError` for what another process could not import."""
-    names = list(callbacks) if isinstance(callbacks, list | tuple) else [callbacks] if callbacks else []
-    for name in (config.env, *config.wrappers, getattr(config, "network", ""), track or "", *names):
-        if not isinstance(name, str) or "<" in name or name.startswith("__main__:"):
-            raise UserError(f"Each process has to import it: put {shown(name)} into a module, and name it.")
-    return names
+        create_directory(path, CONFIG, {"algorithm": algorithm, "config": config.to_json()})
+    began = time.monotonic()
+    launch(["resume", str(path), *words], processes)
+    return time.monotonic() - began
 
 
 def launch(words: Sequence[str], processes: int) -> None:

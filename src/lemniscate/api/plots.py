@@ -1,14 +1,15 @@
-"""The verb for the curves of runs: plot."""
+"""The verb for the curves of runs, plot; and the pictures and the page of one run."""
 
 from pathlib import Path
 
-from lemniscate.api.policy import TrainedPolicy
-from lemniscate.api.results import draw_run, final_return
-from lemniscate.api.stored import TrainedRun, path_of
+from lemniscate.api.policy import TrainedPolicy, TrainedRun, load, path_of
+from lemniscate.api.results import final_return, final_scores
 from lemniscate.errors import UserError
-from lemniscate.report import compare, curves
+from lemniscate.report import compare, curves, flight, pages
 from lemniscate.report.seeds import group
+from lemniscate.run import checkpoint
 from lemniscate.run.directory import is_finished, read_config
+from lemniscate.run.environments import evaluation_env
 from lemniscate.run.metrics import damage, read_metrics
 from lemniscate.run.sweep_file import is_sweep, read_sweep
 from lemniscate.system.console import in_notebook, say
@@ -19,7 +20,7 @@ Plotted = str | Path | TrainedRun | TrainedPolicy
 """what names a run: its directory, what `train` returned, or a policy that came from there"""
 
 
-def plot(*runs: Plotted | list[Plotted], by: str = "step", trust: bool = False) -> list[Path]:
+def plot(*runs: Plotted | list[Plotted], by: str = "step") -> list[Path]:
     """Draw the curves of a run into its `plots/`, or compare several, or a list of them, grouped by all but the seed.
 
     Beside the pictures stands `report.html`, a page with all of them, the final evaluation, the settings, the commands
@@ -52,21 +53,57 @@ def plot(*runs: Plotted | list[Plotted], by: str = "step", trust: bool = False) 
     if len(paths) == 1:
         make_directory(paths[0] / "plots")
     if found == paths[:1]:
-        files = draw_run(paths[0], by, trust=trust)
+        files = draw_run(paths[0], by)
     else:
         folder = paths[0] / "plots" if len(paths) == 1 else Path("plots")
-        files = compare.report(group(found), _final_returns(found, trust), folder, by)
+        files = compare.report(group(found), _final_returns(found), folder, by)
     if in_notebook():
         show_pictures(file for file in files if file.suffix == ".png")
     return files
 
 
-def _final_returns(runs: list[Path], trust: bool) -> dict[Path, float]:
+def report_on(run: TrainedRun) -> list[Path]:
+    """Evaluate a run's final policy, draw it, and name the files; returns the pages."""
+    files = draw_run(run, film=True)
+    for file in files:
+        say(file)
+    return [file for file in files if file.suffix == ".png"]
+
+
+def draw_run(run: str | Path | TrainedRun, by: str = "step", *, film: bool = False) -> list[Path]:
+    """Draw a run and its final scores into its `plots/`, and write its page; returns the files, the page last.
+
+    What cannot be evaluated here is left out, and a line says so. With `film` a flight is recorded too, where there is
+    a scene.
+    """
+    path, scores, flights = path_of(run), None, list[Path]()
+    make_directory(path / "plots")
+    if checkpoint.list_steps(path / "checkpoints"):
+        try:
+            scores = final_scores(run)
+            say(pages.sentence(scores))
+            flights = _draw_flights(load(run), path, film)
+        except UserError as error:
+            say(f"{path} is drawn without an evaluation: {error}")
+    return pages.draw_run(path, scores, flights, by)
+
+
+def _draw_flights(policy: TrainedPolicy, path: Path, film: bool) -> list[Path]:
+    """The pictures of a policy's flights, into the `plots/` of a run; none where there is no scene."""
+    episodes = policy.config.evaluate_episodes
+    env = evaluation_env(policy.config, episodes)
+    try:
+        return flight.draw_flights(policy.module, env, path, episodes, film) if env.scene else []
+    finally:
+        env.close()
+
+
+def _final_returns(runs: list[Path]) -> dict[Path, float]:
     """The final returns of the finished runs; a line names each run that cannot be evaluated here."""
     returns: dict[Path, float] = {}
     for run in filter(is_finished, runs):
         try:
-            returns[run] = final_return(run, trust=trust)
+            returns[run] = final_return(run)
         except UserError as error:
             say(f"{run} has no final return: {error}")
     return returns

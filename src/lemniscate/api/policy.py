@@ -1,19 +1,29 @@
-"""A trained policy, for those who have NumPy and an environment of their own."""
+"""Trained policies, for those who have NumPy and an environment of their own; `load` and `save`."""
 
+import sys
+from contextlib import nullcontext
+from dataclasses import dataclass
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
+from lemniscate import algos
 from lemniscate.envs.masks import read_mask
 from lemniscate.envs.observations import read_observation
 from lemniscate.envs.spaces import physical_action
-from lemniscate.errors import UserError
+from lemniscate.errors import UserError, prefix_errors, shown
+from lemniscate.hub import repository as hub
 from lemniscate.nn.policies import Policy
+from lemniscate.run import checkpoint
 from lemniscate.run.config import RunConfig
+from lemniscate.run.directory import find_checkpoint
 from lemniscate.run.seeding import generator
+from lemniscate.run.warm_start import difference
 from lemniscate.spec import Discrete, Spec
+from lemniscate.system.files import parsing
 
 
 class TrainedPolicy:
@@ -67,3 +77,119 @@ class TrainedPolicy:
             action = distribution.sample(self.module.draw_noise((len(flat),), self._noise))
         physical = physical_action(action.numpy(), self.spec.action)
         return physical if batched else physical[0]
+
+
+@dataclass(frozen=True)
+class TrainedRun:
+    """The result of `train` and `resume`: the run directory, the final policy, the seconds of the training loop."""
+
+    path: Path
+    policy: TrainedPolicy
+    seconds: float
+
+
+Trained = str | Path | TrainedRun | TrainedPolicy
+"""what has a policy: the path of a run or a checkpoint, or an address on the Hub; what `train` returned; the policy"""
+
+
+def path_of(run: object) -> Path:
+    """The directory of a run: of its path, of what `train` returned, or of a policy from `train` or `load`.
+
+    Raises:
+        UserError: anything else; a policy on the Hub.
+    """
+    path = getattr(run, "path", run)
+    if not isinstance(path, str | PathLike):
+        raise UserError(f"A run is a directory, such as 'runs/lander', or what train returned, not {shown(run)}.")
+    if Path(path).parts[:1] == (hub.SCHEME,):
+        address = hub.read_address(path)
+        raise UserError(f"{address} is on the Hub, and no run directory: it can be loaded, evaluated and watched.")
+    return Path(path)
+
+
+def load(run: Trained, *, trust: bool = False) -> TrainedPolicy:
+    """The policy of a run (its newest whole checkpoint), of one checkpoint or on the Hub. No file is executed.
+
+    What `train` returned has its policy already, and a policy is returned as it is.
+
+    Args:
+        run: its directory or a checkpoint's; `hf://user/name` or `hf://user/name@revision`, which is downloaded; what
+            `train` returned; a policy.
+        trust: import the code that a downloaded policy names as `module:name`.
+
+    Raises:
+        UserError: neither a run nor a checkpoint, or a run without a whole checkpoint; a damaged checkpoint; networks
+            of the user's own that have other parameters now; an address without a policy, a Hub that refuses or cannot
+            be reached; a downloaded policy that names code of its own, without `trust`.
+    """
+    if isinstance(run, TrainedRun | TrainedPolicy):
+        return run.policy if isinstance(run, TrainedRun) else run
+    if not hub.is_address(run):
+        return _read(find_checkpoint(path_of(run)), path_of(run))
+    address = hub.read_address(run)
+    path = hub.download(address)
+    with prefix_errors(str(address)):
+        found = find_checkpoint(path)
+        with parsing(found.path):
+            hub.require_trusted(_own_code(found), trust=trust)
+        return _read(found, path)
+
+
+def _read(found: checkpoint.Checkpoint, path: Path) -> TrainedPolicy:
+    """The policy of a checkpoint, which was named by `path`; raises as `load`."""
+    with parsing(found.path):
+        name, fields, step = found.record["algorithm"], found.record["config"], found.numbers["step"]
+        spec = checkpoint.spec_from_json(found.record["spec"])
+        has_own_code = bool(_own_code(found))
+    config = algos.find(name).Config.from_json(fields)
+    with nullcontext() if has_own_code else parsing(found.path):  # what the user's own code raises is not damage
+        networks = config.networks(spec)
+    tensors = found.tensors_of("networks")
+    if differs := difference(tensors, networks.state_dict()):
+        raise UserError(f"{path} does not fit its networks: {differs}.")
+    networks.load_state_dict(tensors)
+    return TrainedPolicy(networks, spec, config, step, path)
+
+
+def _own_code(found: checkpoint.Checkpoint) -> list[str]:
+    """The names of the code that a checkpoint needs and that is not lemniscate's: algorithm, environment, networks."""
+    name = found.record["algorithm"]
+    return [*([] if name in algos.ALGORITHMS else [str(name)]), *hub.own_code(found.record["config"])]
+
+
+def save(policy: Any, path: str | Path) -> Path:
+    """Store a policy for `load`: weights, normalizer, Config and Spec, as a checkpoint without pickle.
+
+    Args:
+        policy: from `load`, or what `train` returned. It may begin another run (`warm_start=path`), but not resume
+            its own: a run's checkpoints also hold optimizers and random generators.
+        path: a new directory, or a policy stored before, which is replaced.
+
+    Raises:
+        UserError: something else is at `path`, or it cannot be written.
+    """
+    path, policy = path_of(path), getattr(policy, "policy", policy)
+    if not isinstance(policy, TrainedPolicy):
+        raise UserError(f"What can be stored is a policy, from load or train, not a {type(policy).__name__}.")
+    if path.exists() and not _is_stored(path):
+        raise UserError(f"{path} exists already, and is not a stored policy; choose another path.")
+    record = {"algorithm": algorithm_of(policy), "config": policy.config.to_json()}
+    record |= {"spec": checkpoint.spec_to_json(policy.spec), "planned": False, "stored": True}
+    try:
+        checkpoint.write_fields(path, {"networks": policy.networks, "step": policy.step}, record)
+    except OSError as error:
+        raise UserError(f"{path} cannot be written: {error}.") from error
+    return path
+
+
+def _is_stored(path: Path) -> bool:
+    """Whether `save` has written what is at `path`: a checkpoint of a run is not to be replaced."""
+    try:
+        return bool(checkpoint.read(path).record.get("stored"))
+    except UserError:
+        return False
+
+
+def algorithm_of(policy: TrainedPolicy) -> str:
+    """The name of the algorithm that trained a policy."""
+    return algos.name_of(sys.modules[type(policy.config).__module__])

@@ -5,9 +5,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from lemniscate.api.policy import TrainedPolicy
+from lemniscate.api.policy import Trained, TrainedPolicy, algorithm_of, load, save
 from lemniscate.api.results import FINAL_EPISODES, evaluate, final_scores
-from lemniscate.api.stored import Trained, algorithm_of, load, write_unsigned
 from lemniscate.errors import UserError
 from lemniscate.hub import repository as hub
 from lemniscate.report import pages
@@ -19,7 +18,7 @@ from lemniscate.system.files import write_json
 def push(run: Trained, name: str, *, private: bool = False, license: str | None = None, trust: bool = False) -> str:
     """Upload the policy of a run to the Hugging Face Hub, as the model repository `name`, in one commit.
 
-    The files are those of `save`, without its signature: raw tensors and JSON, each with its sha256. Beside them are a
+    The files are those of `save`: raw tensors and JSON, each with its sha256. Beside them are a
     model card with the scores, the command that trains it again and the lines that load it; the final scores of the
     run, its figures (`plots/`), its newest film, or one that is made now if the environment can be rendered; and what
     `lemniscate export` wrote (`export/`), if it did. `load("hf://user/name")` loads the policy.
@@ -29,7 +28,7 @@ def push(run: Trained, name: str, *, private: bool = False, license: str | None 
         name: "user/name". A new repository is created, and a policy that is there is replaced.
         private: make a new repository private.
         license: as the Hub abbreviates it, such as "mit"; without, the card names none.
-        trust: import the code that the run names as `module:name` also if the run is not of this user and machine.
+        trust: as in `load`.
 
     Returns:
         The address of the repository's page.
@@ -43,19 +42,19 @@ def push(run: Trained, name: str, *, private: bool = False, license: str | None 
     policy = load(run, trust=trust)
     with TemporaryDirectory() as temporary:
         folder = Path(temporary) / "policy"
-        write_unsigned(policy, folder)
-        _write_repository(folder, policy, name, license, trust)
+        save(policy, folder)
+        _write_repository(folder, policy, name, license)
         return hub.upload(folder, name, private)
 
 
-def _write_repository(folder: Path, policy: TrainedPolicy, name: str, license: str | None, trust: bool) -> None:
+def _write_repository(folder: Path, policy: TrainedPolicy, name: str, license: str | None) -> None:
     """Write beside a stored policy what its run has to show, and the card."""
     run = policy.path if policy.path and (policy.path / CONFIG).is_file() else None
     if run:
         _copy_shown(run, folder)
     if not (run and _copy_film(run, folder)):
         _make_film(policy, folder)
-    scores = _scores(policy, run, trust)
+    scores = _scores(policy, run)
     if scores:
         write_json(folder / "final.json", scores)
     of_policy = {"step": policy.step, "scores": scores, "license": license}
@@ -92,11 +91,11 @@ def _make_film(policy: TrainedPolicy, folder: Path) -> None:
         say(f"No film: {error}")
 
 
-def _scores(policy: TrainedPolicy, run: Path | None, trust: bool) -> dict[str, Any] | None:
+def _scores(policy: TrainedPolicy, run: Path | None) -> dict[str, Any] | None:
     """The final scores of a run, or those of a policy without one; none where it cannot be evaluated here."""
     try:
         if run:
-            return final_scores(run, trust=trust)
+            return final_scores(run)
         say(f"Evaluating the policy: {FINAL_EPISODES} episodes.")
         found = evaluate(policy, episodes=FINAL_EPISODES, seed=0)
         return {"step": policy.step, "seed": 0, **found.to_json()}

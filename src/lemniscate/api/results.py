@@ -1,16 +1,15 @@
-"""The verbs for what a run has left: evaluate, watch; the final scores that runs are compared by; a run's pictures."""
+"""The verbs that look: evaluate, watch, check; and the final scores by which runs are compared."""
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
-from lemniscate.api.policy import TrainedPolicy
-from lemniscate.api.stored import Trained, TrainedRun, load, path_of
+from lemniscate.api.policy import Trained, TrainedPolicy, TrainedRun, load, path_of
 from lemniscate.envs import registry
-from lemniscate.envs.backend import Baseline
+from lemniscate.envs.findings import Finding
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError, shown
 from lemniscate.report import flight, pages, playback
@@ -20,7 +19,7 @@ from lemniscate.run.environments import env_arguments, evaluation_env
 from lemniscate.run.evaluate import Evaluation, critic_of
 from lemniscate.run.evaluate import evaluate as evaluate_policy
 from lemniscate.system.console import say
-from lemniscate.system.files import DamagedFileError, make_directory, read_json, write_json
+from lemniscate.system.files import DamagedFileError, read_json, write_json
 from lemniscate.system.named import takes
 
 Agent = Callable[[Any], Any]
@@ -60,7 +59,7 @@ def evaluate(
             rendered environment, without a measurement of the Q bias. The first 16 starts are the same; from the 17th
             on, and in other backends than gymnasium, returns may differ from those without a film. Of flights in a
             scene, which are those without a film, the first of each parallel environment is recorded.
-        trust: import the code that the run names as `module:name` also if the run is not of this user and machine.
+        trust: as in `load`.
 
     Raises:
         UserError: numbers out of range; an environment that cannot be made, or whose spaces differ; one without a
@@ -69,13 +68,16 @@ def evaluate(
     """
     agent = policy if callable(policy) else load(policy, trust=trust)
     episodes, seed, file = checked("episodes", episodes, Episodes), checked("seed", seed, Natural), _film(video)
-    elsewhere: dict[str, Any] = {"env": env, "env_kwargs": _kwargs(env_kwargs), "backend": backend}
+    kwargs = checked("env_kwargs", env_kwargs, dict | None)
+    elsewhere: dict[str, Any] = {"env": env, "env_kwargs": kwargs, "backend": backend}
     how: dict[str, Any] = {"episodes": episodes, "seed": seed, "tell": lambda text: None}
     arguments = env_arguments(_config_of(agent, env), **elsewhere)
     vec = _env_for(agent, episodes, **elsewhere)
     try:
-        if baseline:
-            return evaluate_policy(_baseline_of(vec), vec, episodes, seed)
+        if baseline and vec.baseline is None:
+            raise UserError(f"{vec.spec.env_id} has no baseline to compare with.")
+        if baseline and vec.baseline:
+            return evaluate_policy(vec.baseline, vec, episodes, seed)
         if file:
             return _show(agent, vec, arguments, deterministic=deterministic, video=file, **how)
         if not isinstance(agent, TrainedPolicy):
@@ -111,7 +113,7 @@ def watch(
         random: act uniformly at random, in the environment of the policy.
         video: a .gif, .webp or .mp4 to record all episodes into.
         env_kwargs: as in `evaluate`.
-        trust: import the code that the run names as `module:name` also if the run is not of this user and machine.
+        trust: as in `load`.
 
     Raises:
         UserError: nothing to show it on; numbers out of range; an environment that cannot be made, renders no pictures,
@@ -122,7 +124,7 @@ def watch(
     episodes, seed, file = checked("episodes", episodes, Episodes), checked("seed", seed, Natural), _film(video)
     if agent is None and env is None:
         raise UserError("Watch what? Name a run, or an environment to act in at random.")
-    elsewhere: dict[str, Any] = {"env": env, "env_kwargs": _kwargs(env_kwargs)}
+    elsewhere: dict[str, Any] = {"env": env, "env_kwargs": checked("env_kwargs", env_kwargs, dict | None)}
     arguments = env_arguments(_config_of(agent, env), **elsewhere)
     if file is None:
         playback.require_display()
@@ -142,12 +144,61 @@ def watch(
     return scores
 
 
-def final_return(run: str | Path | TrainedRun, *, trust: bool = False) -> float:
+def check(
+    what: "str | Path | TrainedRun | Callable[..., Any]",
+    backend: str | None = None,
+    env_kwargs: Mapping[str, Any] | None = None,
+    wrappers: Sequence[str | Callable[..., Any]] = (),
+) -> list[Finding]:
+    """Check that an environment is suitable for training, or that the files of a run are whole.
+
+    An environment is looked at with Gymnasium's own checker and by random play; of a run or a sweep every file is read,
+    and nothing is changed.
+
+    Args:
+        what: an environment: an id, `module:Class`, a class, or a function that makes one. Or the directory of a run or
+            of a sweep, or what `train` returned.
+        backend: of an environment, a simulation backend; by default the first that serves it.
+        env_kwargs: arguments of the environment.
+        wrappers: around each single environment, the first innermost.
+
+    Returns:
+        Everything found, each a sentence with a grade; what keeps an environment from being made is the last.
+
+    Raises:
+        UserError: no such environment, backend or wrapper.
+    """
+    what = what.path if isinstance(what, TrainedRun) else what
+    name = str(what) if isinstance(what, Path) else registry.name_of(what)
+    return list(each_finding(name, backend, env_kwargs, registry.names_of(wrappers)))
+
+
+def each_finding(
+    what: str, backend: str | None, env_kwargs: Mapping[str, Any] | None, wrappers: Sequence[str]
+) -> Iterator[Finding]:
+    """The findings of `check`, one by one."""
+    from lemniscate.envs import check as env_check
+    from lemniscate.run import check as run_check
+
+    if run_check.is_stored(Path(what)):
+        return run_check.each_finding(Path(what))
+    return env_check.each_finding(what, backend, env_kwargs, wrappers)
+
+
+def verdict(what: str, found: list[Finding]) -> str:
+    """The conclusion from the findings, in a sentence or two."""
+    from lemniscate.envs import findings
+    from lemniscate.run import check as run_check
+
+    return run_check.verdict(Path(what), found) if run_check.is_stored(Path(what)) else findings.verdict(what, found)
+
+
+def final_return(run: str | Path | TrainedRun) -> float:
     """Mean return of a run's newest policy over 100 episodes, from `final_scores`."""
-    return final_scores(run, trust=trust)["mean_return"]
+    return final_scores(run)["mean_return"]
 
 
-def final_scores(run: str | Path | TrainedRun, *, trust: bool = False) -> dict[str, Any]:
+def final_scores(run: str | Path | TrainedRun) -> dict[str, Any]:
     """Scores of a run's newest policy over 100 episodes; kept in `final.json` until there is a newer policy.
 
     They are those of `Evaluation.to_json`, with the `step` of the policy and the `seed` of the starts.
@@ -156,7 +207,7 @@ def final_scores(run: str | Path | TrainedRun, *, trust: bool = False) -> dict[s
     file = path / "final.json"
     known = _known_scores(file)
     if known.get("step") not in checkpoint.list_steps(path / "checkpoints")[-1:]:
-        policy = load(run, trust=trust)
+        policy = load(run)
         say(f"Evaluating {path}: {FINAL_EPISODES} episodes.")
         scores = evaluate(policy, episodes=FINAL_EPISODES, seed=0)
         known = {"step": policy.step, "seed": 0, **scores.to_json()}
@@ -175,42 +226,6 @@ def _known_scores(file: Path) -> dict[str, Any]:
         return {}
 
 
-def report_on(run: TrainedRun) -> list[Path]:
-    """Evaluate a run's final policy, draw it, and name the files; returns the pictures."""
-    files = draw_run(run, film=True)
-    for file in files:
-        say(file)
-    return [file for file in files if file.suffix == ".png"]
-
-
-def draw_run(run: str | Path | TrainedRun, by: str = "step", *, film: bool = False, trust: bool = False) -> list[Path]:
-    """Draw a run and its final scores into its `plots/`, and write its page; returns the files, the page last.
-
-    What cannot be evaluated here is left out, and a line says so. With `film` a flight is recorded too, where there is
-    a scene.
-    """
-    path, scores, flights = path_of(run), None, list[Path]()
-    make_directory(path / "plots")
-    if checkpoint.list_steps(path / "checkpoints"):
-        try:
-            scores = final_scores(run, trust=trust)
-            say(pages.sentence(scores))
-            flights = _draw_flights(load(run, trust=trust), path, film)
-        except UserError as error:
-            say(f"{path} is drawn without an evaluation: {error}")
-    return pages.draw_run(path, scores, flights, by)
-
-
-def _draw_flights(policy: TrainedPolicy, path: Path, film: bool) -> list[Path]:
-    """The pictures of a policy's flights, into the `plots/` of a run; none where there is no scene."""
-    episodes = policy.config.evaluate_episodes
-    env = evaluation_env(policy.config, episodes)
-    try:
-        return flight.draw_flights(policy.module, env, path, episodes, film) if env.scene else []
-    finally:
-        env.close()
-
-
 def _film(video: str | Path | None) -> Path | None:
     """The file of a film. Raises `UserError` for one that could not be written."""
     if not isinstance(video, str | PathLike | None):
@@ -218,10 +233,6 @@ def _film(video: str | Path | None) -> Path | None:
     if video is not None:
         playback.check_film(Path(video))
     return None if video is None else Path(video)
-
-
-def _kwargs(env_kwargs: Mapping[str, Any] | None) -> dict[str, Any] | None:
-    return checked("env_kwargs", env_kwargs, dict | None)
 
 
 def _config_of(agent: TrainedPolicy | Agent | None, env: str | Callable[..., Any] | None) -> RunConfig:
@@ -244,13 +255,6 @@ def _env_for(agent: TrainedPolicy | Agent | None, episodes: int, **elsewhere: An
             f"A policy for {agent.spec.env_id} cannot act in {vec.spec.env_id}: observation or action spaces differ."
         )
     return vec
-
-
-def _baseline_of(vec: VecEnv) -> Baseline:
-    """The baseline of an environment. Raises `UserError` where there is none."""
-    if vec.baseline is None:
-        raise UserError(f"{vec.spec.env_id} has no baseline to compare with.")
-    return vec.baseline
 
 
 def _show(

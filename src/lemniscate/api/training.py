@@ -1,37 +1,36 @@
-"""The verb that begins a run, and the Config of one."""
+"""The verbs that train: `train` begins a run, `resume` goes on with one."""
 
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from itertools import count
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 
 from lemniscate import algos, presets
-from lemniscate.api.callbacks import Callback, call_callbacks, find_callbacks
-from lemniscate.api.launch import launch_run, train_there
-from lemniscate.api.policy import TrainedPolicy
-from lemniscate.api.results import evaluate, report_on
-from lemniscate.api.stored import TrainedRun, load, path_of
-from lemniscate.cluster.connection import find_cluster
+from lemniscate.api.options import Callback, RunOptions, call_callbacks, require_importable
+from lemniscate.api.policy import TrainedPolicy, TrainedRun, load, path_of
 from lemniscate.envs import registry
-from lemniscate.errors import NotStoredError, UserError, is_installed, missing_extra, shown, unknown_name
-from lemniscate.report import playback
+from lemniscate.errors import NotStoredError, UserError, is_installed
+from lemniscate.hub.repository import local_path
 from lemniscate.run.config import RunConfig
-from lemniscate.run.directory import require_absent
+from lemniscate.run.directory import is_finished, read_record, require_absent
 from lemniscate.run.environments import envs_of, make_envs
-from lemniscate.run.loggers import TRACKERS, JsonLines, LoggerClass, TensorBoard
+from lemniscate.run.loggers import LoggerClass
 from lemniscate.run.run import Run
 from lemniscate.run.seeding import set_seeds
 from lemniscate.run.state import TrainState
 from lemniscate.system import named
 from lemniscate.system.console import say
-from lemniscate.system.files import make_directory
+from lemniscate.system.files import make_directory, parsing
 from lemniscate.system.world import CLUSTER, World
+
+if TYPE_CHECKING:
+    from lemniscate.cluster.connection import Cluster
 
 
 def config_for(
@@ -45,19 +44,33 @@ def config_for(
     Raises:
         UserError: an unknown algorithm, environment, preset or field, or a value out of range.
     """
+    return choose_config(algorithm, env, preset, fields)[2]
+
+
+def choose_config(
+    algorithm: str | ModuleType | RunConfig,
+    env: str | Callable[..., Any] | None,
+    preset: str | None,
+    fields: Mapping[str, object],
+) -> tuple[str, str, RunConfig]:
+    """The algorithm's name, the preset's and the Config of `config_for`; raises as that."""
     if isinstance(env, RunConfig) or "config" in fields:
         raise UserError("A Config knows its algorithm and takes its place: lem.train(config).")
     env = None if env is None else registry.name_of(env)
     if isinstance(algorithm, RunConfig):
         if preset is not None:
             raise UserError("A Config has a value for every field: it does not go with a preset.")
-        name, config = "given", algorithm if env is None else algorithm.replace(env=env, backend=None)
+        name = algos.name_of(sys.modules[type(algorithm).__module__])
+        chosen, config = "given", algorithm if env is None else algorithm.replace(env=env, backend=None)
     else:
-        name, config = presets.choose(algos.name_of(algorithm), env, preset)
+        name = algos.name_of(algorithm)
+        chosen, config = presets.choose(name, env, preset)
     config = config.replace(**{name: name_in_config(value) for name, value in fields.items()})
-    if name == "default" and env is None:
+    if chosen == "default" and env is None:
         raise UserError("Which environment? Name one with env; `lemniscate envs` lists them.")
-    return config if config.backend else config.replace(backend=registry.backend_for(config.env, config.wrappers))
+    if not config.backend:
+        config = config.replace(backend=registry.backend_for(config.env, config.wrappers))
+    return name, chosen, config
 
 
 def name_in_config(value: object) -> object:
@@ -113,24 +126,98 @@ def train(
         WorkerError: the process of an environment died.
         Stopped: Ctrl-C or SIGTERM, when the run has saved itself; go on with `resume`.
     """
-    there = find_cluster(cluster, workers, storage) if cluster or workers or storage else None
+    options = RunOptions(track, callbacks, report, progress, processes, cluster, workers, storage)
+    name, _, config = choose_config(algorithm, env, preset, fields)
+    return begin(name, config, run, options)
+
+
+def begin(algorithm: str, config: RunConfig, run: str | Path | None, options: RunOptions) -> TrainedRun:
+    """Train by a Config that is chosen: in this process, in several, or on a cluster. Raises as `train`."""
+    there = options.find_cluster()
     with together() as world:
-        config = config_for(algorithm, env, preset, **fields)
-        name = algos.name_of(sys.modules[type(config).__module__] if isinstance(algorithm, RunConfig) else algorithm)
-        path = path_of(run) if run is not None else fresh_directory(config.env, f"{name}-{config.seed}")
-        loggers, functions = loggers_with(track), find_callbacks(callbacks) if callbacks else []
+        path = path_of(run) if run is not None else fresh_directory(config.env, f"{algorithm}-{config.seed}")
+        loggers, callbacks = options.loggers(), options.functions()
         if world.is_first:
             require_absent(path)
-        if there is not None:
-            return train_there(path, name, config, there, track, callbacks, report, progress)
-        if processes > 1:
-            launched = launch_run(path, name, config, processes, track, callbacks, report, progress)
-            return TrainedRun(path, load(path, trust=True), launched)
+        if there is not None or options.processes > 1:
+            return _train_elsewhere(path, algorithm, config, options, there)
         if config.shards == 1:  # each process has one, unless more are asked for
             config = config.replace(shards=world.size)
         world.divide(config.shards)
         path = world.from_first(path)
-        return train_here(world, path, name, config, loggers, functions, report or track is not None, progress)
+        return _train_here(world, path, algorithm, config, loggers, callbacks, options)
+
+
+def resume(
+    run: str | Path | TrainedRun | TrainedPolicy,
+    *,
+    env: str | Callable[..., Any] | None = None,
+    wrappers: Sequence[str | Callable[..., Any]] | None = None,
+    network: str | Callable[..., Any] | None = None,
+    track: str | LoggerClass | None = None,
+    callbacks: Callback | str | Sequence[Callback | str] = (),
+    report: bool = False,
+    progress: bool = True,
+    processes: int = 1,
+    cluster: str | None = None,
+    workers: int | None = None,
+    storage: str | None = None,
+) -> TrainedRun:
+    """Resume an interrupted run from its newest whole planned checkpoint, and train it to its end.
+
+    A run that is finished stays as it is; with `report` it is evaluated and drawn again.
+
+    Args:
+        run: its directory, or what `train` returned.
+        env: only of a run that began with an object that no file holds, such as a lambda: the same object again.
+        wrappers: the same.
+        network: the same.
+        track: as in `train`, and the following; none of them is saved with the run.
+        callbacks: functions that see each logged line.
+        report: evaluate the final policy, and draw it.
+        progress: the live line on standard error.
+        processes: of this machine; any number that divides the run's `shards`, whatever it began with.
+        cluster: as in `train`: go on there, from what its storage has, or else this directory.
+        workers: as many as divide the run's `shards`; others stand by.
+        storage: the same as when the run began there.
+
+    Raises:
+        UserError: no run directory, or one that another process trains in or another version wrote; an object that no
+            file holds and that was not passed again; a tracker or a callback that is not there.
+        NonFiniteError: an observation, a reward or a loss is NaN or infinite; the last checkpoint is as it was.
+        WorkerError: the process of an environment died.
+        Stopped: Ctrl-C or SIGTERM, when the run has saved itself.
+    """
+    options = RunOptions(track, callbacks, report, progress, processes, cluster, workers, storage)
+    again = {"env": env, "wrappers": wrappers, "network": network}
+    return go_on(path_of(run), options, {name: name_in_config(x) for name, x in again.items() if x is not None})
+
+
+def go_on(path: Path, options: RunOptions, changes: Mapping[str, object]) -> TrainedRun:
+    """Go on with the run in a directory; `changes` are fields whose objects were passed again. Raises as `resume`."""
+    there = options.find_cluster()
+    with together() as world:
+        record = world.from_first(read_record(path) if world.is_first else {})
+        with parsing(path):
+            algorithm, fields = record["algorithm"], record["config"]
+        config = algos.find(algorithm).Config.from_json(fields).replace(**changes)
+        world.divide(config.shards)
+        loggers, callbacks = options.loggers(), options.functions()
+        if world.from_first(world.is_first and is_finished(path)):
+            return _leave(path, options, world)
+        if there is not None or (options.processes > 1 and world.size == 1):
+            return _train_elsewhere(path, algorithm, config, options, there)
+        return _train_here(world, path, algorithm, config, loggers, callbacks, options)
+
+
+def _leave(path: Path, options: RunOptions, world: World) -> TrainedRun:
+    """A run that has taken all its steps, as it is; with `report` it is evaluated and drawn again."""
+    run = TrainedRun(path, load(path), 0.0)
+    if options.progress and world.is_first:
+        say(f"{path} is finished, at step {run.policy.step:,}: there is nothing to resume.")
+    if options.report and world.is_first:
+        _report_on(run)
+    return run
 
 
 def together() -> AbstractContextManager[World]:
@@ -144,18 +231,37 @@ def together() -> AbstractContextManager[World]:
     return together()
 
 
-def train_here(
+def _train_elsewhere(
+    path: Path, algorithm: str, config: RunConfig, options: RunOptions, there: "Cluster | None"
+) -> TrainedRun:
+    """Train in other processes, of this machine or of a cluster; each resumes the run, which begins if it is new."""
+    require_importable(config)
+    if there is None:
+        from lemniscate.api.launch import launch_run
+
+        seconds = launch_run(path, algorithm, config, options.processes, options.words())
+        return TrainedRun(path, load(path), seconds)
+    from lemniscate.cluster.job import train_on_ray
+
+    shared = {"track": options.track, "callbacks": options.names(), "progress": options.progress}
+    seconds = train_on_ray(path, algorithm, config, there, f"{__name__}:resume", shared)
+    trained = TrainedRun(path, load(path), seconds)
+    if options.reports:
+        _report_on(trained)
+    return trained
+
+
+def _train_here(
     world: World,
     path: Path,
     algorithm: str,
     config: RunConfig,
-    loggers: tuple[LoggerClass, ...],
+    loggers: Sequence[LoggerClass],
     callbacks: Sequence[Callback],
-    report: bool,
-    progress: bool,
+    options: RunOptions,
 ) -> TrainedRun:
     """Train in this process; of several, the first alone writes, reports and talks."""
-    progress, report = progress and world.is_first, report and world.is_first
+    progress = options.progress and world.is_first
     set_seeds(config.seed)  # before JAX starts, which reads its flags then
     torch.set_num_threads(config.threads)
     envs = make_envs(config) if world.size == 1 else envs_of(config, world)
@@ -167,24 +273,23 @@ def train_here(
         return networks
 
     def film(state: TrainState) -> None:
-        kind = "mp4" if is_installed("imageio_ffmpeg") else "gif"
-        policy = TrainedPolicy(copy_networks(state), spec, config, state.step)
-        make_directory(path / "videos")
-        evaluate(policy, episodes=1, video=path / "videos" / f"step-{state.step}.{kind}")
+        _film(TrainedPolicy(copy_networks(state), spec, config, state.step), path)
 
     observer = call_callbacks(callbacks, copy_networks, spec, config) if callbacks and world.is_first else None
     surroundings = {"loggers": loggers, "progress": progress, "film": film, "observer": observer}
-    run = Run(path, algorithm, config, envs, world=world, **surroundings)
+    run = Run(path, algorithm, config, envs, world=world, locate=local_path, **surroundings)
     pictures: list[Path] = []
     try:
         if world.is_first and (config.video_every or config.video_every_episodes) and not path.exists():
-            playback.require_pictures(config, envs[0])
+            from lemniscate.report.playback import require_pictures
+
+            require_pictures(config, envs[0])
         for notice in config.notices(spec, envs[0].device) if progress else ():
             say(notice)
         state = algos.find(algorithm).train(config, run)
         trained = TrainedRun(path, TrainedPolicy(state.networks.cpu(), spec, config, state.step, path), run.seconds)
-        if report:
-            pictures = report_on(trained)
+        if options.reports and world.is_first:
+            pictures = _report_on(trained)
     finally:
         run.close(pictures)
     try:
@@ -195,19 +300,20 @@ def train_here(
     return trained
 
 
-def loggers_with(track: str | LoggerClass | None) -> tuple[LoggerClass, ...]:
-    """The local loggers, and the tracker asked for. Raises `UserError` if it does not exist or is not installed."""
-    if track is None:
-        return JsonLines, TensorBoard
-    if isinstance(track, str) and ":" not in track:
-        if track not in TRACKERS:
-            raise unknown_name("tracker", track, TRACKERS)
-        extra, track = TRACKERS[track]
-        if not is_installed(extra):
-            raise missing_extra(extra, extra)
-    if not (isinstance(track, str) or callable(track)):
-        raise UserError(f"track must be a logger's name or class, not {shown(track)}.")
-    return JsonLines, TensorBoard, named.find(track) if isinstance(track, str) else track
+def _film(policy: TrainedPolicy, path: Path) -> None:
+    """Record an episode into the `videos/` of a run."""
+    from lemniscate.api.results import evaluate
+
+    kind = "mp4" if is_installed("imageio_ffmpeg") else "gif"
+    make_directory(path / "videos")
+    evaluate(policy, episodes=1, video=path / "videos" / f"step-{policy.step}.{kind}")
+
+
+def _report_on(run: TrainedRun) -> list[Path]:
+    """Evaluate a run's final policy and draw it; returns the pictures."""
+    from lemniscate.api.plots import report_on  # what most runs do not need: matplotlib's pages
+
+    return report_on(run)
 
 
 def fresh_directory(env_id: str, name: str) -> Path:

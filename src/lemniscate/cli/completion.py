@@ -1,17 +1,17 @@
 """Completion in bash, zsh and fish: a script with all that may follow a word, so that pressing TAB starts nothing."""
 
-import argparse
 from collections.abc import Iterable
 from shlex import quote
 from typing import Literal, get_args, get_origin, get_type_hints
 
 from lemniscate.algos import ALGORITHMS, find
-from lemniscate.cli import COMMANDS, SHELLS, Parser, parsers
-from lemniscate.cli.fields import flag, parser_of
+from lemniscate.cli.fields import algorithm_parser, explain
+from lemniscate.cli.parsers import COMMANDS, SHELLS, Parser, flags_of, parser_of
 from lemniscate.envs import registry
+from lemniscate.errors import unknown_name
 from lemniscate.nn.networks import NETWORKS
 from lemniscate.presets import names
-from lemniscate.run.config import options_of
+from lemniscate.run.config import flag, options_of
 from lemniscate.run.loggers import TRACKERS
 
 FILES = {
@@ -38,15 +38,17 @@ autoload -Uz bashcompinit && bashcompinit
 """
 
 
-def completion(given: argparse.Namespace) -> None:
-    """Print the script with which a shell, one of `SHELLS`, completes."""
-    print(f"# Write it once, and again after an upgrade: lemniscate completion {given.shell} > {FILES[given.shell]}")
-    print(_fish() if given.shell == "fish" else (ZSH if given.shell == "zsh" else "") + _bash(), end="")
+def script(shell: str) -> str:
+    """The script with which a shell completes, with a comment on where to write it. Raises `UserError`."""
+    if shell not in SHELLS:
+        raise unknown_name("shell", shell, SHELLS)
+    written = _fish() if shell == "fish" else (ZSH if shell == "zsh" else "") + _bash()
+    return f"# Write it once, and again after an upgrade: lemniscate completion {shell} > {FILES[shell]}\n{written}"
 
 
 def _bash() -> str:
     cases = [("1 *", COMMANDS), *((f"* * {word} *", words) for word, words in _followers().items())]
-    cases += [(f"* {name} * -*", _options(parser)) for name, parser in _parsers().items()]
+    cases += [(f"* {name} * -*", flags_of(parser)) for name, parser in _parsers().items()]
     lines = (f"    {pattern.replace(' ', chr(92) + ' ')}) known='{' '.join(words)}' ;;" for pattern, words in cases)
     return BASH.replace("CASES", "\n".join(lines))
 
@@ -61,7 +63,7 @@ def _fish() -> str:
         after = f"test (count (commandline -opc)) = 2; and __fish_seen_subcommand_from {word}"
         lines.append(f"{begin} '{after}' -f -a '${variables[word]}'")
     for name, parser in _parsers().items():
-        for option, action in _options(parser).items():
+        for option, action in flags_of(parser).items():
             known = f"-x -a '${variables[option]}'" if option in followers else "-r" if action.nargs != 0 else ""
             text = quote((action.help or "").replace("%%", "%"))
             lines.append(f"{begin} '__fish_seen_subcommand_from {name}' -l {option[2:]} {known} -d {text}")
@@ -70,13 +72,11 @@ def _fish() -> str:
 
 def _parsers() -> dict[str, Parser]:
     """The parser of each command, and in the place of `train` that of each algorithm."""
-    return {name: parser for name, parser in parsers()[1].items() if name != "train"} | {
-        name: parser_of(name) for name in ALGORITHMS
-    }
-
-
-def _options(parser: argparse.ArgumentParser) -> dict[str, argparse.Action]:
-    return {name: action for name, action in parser._option_string_actions.items() if name.startswith("--")}
+    parsers = {name: parser_of(name) for name in COMMANDS if name != "train"}
+    for name in ALGORITHMS:
+        parsers[name] = algorithm_parser("train", name)
+        explain(parsers[name], name)
+    return parsers
 
 
 def _followers() -> dict[str, Iterable[str]]:

@@ -10,13 +10,11 @@ from types import NoneType
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from lemniscate.algos import find
-from lemniscate.cli import Parser, add_train_options
-from lemniscate.cli.endings import unknown_argument
-from lemniscate.cli.tune_options import add_tune_options
+from lemniscate.cli.parsers import Parser, parser_of, unknown_argument
 from lemniscate.errors import UserError, prefix_errors, unknown_name
 from lemniscate.presets import PRESETS, names
-from lemniscate.run import glossary
 from lemniscate.run.config import RunConfig, flag, options_of
+from lemniscate.run.glossary import unknown_field
 from lemniscate.run.texts import is_dict, number_type, read
 
 GROUPS: dict[str, tuple[str, ...]] = {
@@ -53,6 +51,63 @@ def parse_fields(command: str, algorithms: list[str], words: list[str]) -> argpa
     return given
 
 
+def _parse(command: str, algorithm: str, words: list[str]) -> tuple[argparse.Namespace, dict[str, Any]]:
+    hints = get_type_hints(find(algorithm).Config, include_extras=True)
+    parser = algorithm_parser(command, algorithm)
+    if {"-h", "--help"} & set(words):
+        explain(parser, algorithm)
+    given, rest = parser.parse_known_args([_switch(word, hints) for word in words])
+    if rest:
+        known = [action.dest for action in parser._actions]
+        raise unknown_argument(rest, lambda word: _unknown_flag(word, known))
+    values = {name: value for name, value in vars(given).items() if name in hints and name != "env"}
+    return given, {name: read(name, hints[name], value) for name, value in values.items()}
+
+
+def algorithm_parser(command: str, algorithm: str) -> Parser:
+    """The parser of `train ALGORITHM` or `tune ALGORITHM`, with an option for each field; `explain` adds their help."""
+    config, parser = find(algorithm).Config, parser_of(command)
+    parser.prog = f"lemniscate {command} {algorithm}"
+    parser.description = None  # the help of an algorithm is to fit on two pages
+    parser.usage = f"{parser.prog} --env ID [--run DIR] [--preset NAME] [--FIELD VALUE …]"
+    hints = get_type_hints(config, include_extras=True)
+    grouped = {name for members in GROUPS.values() for name in members} | {"env"}
+    for title, members in GROUPS.items():
+        group = parser.add_argument_group(title)
+        own = [name for name in config.names() if name not in grouped] if title == "algorithm" else members
+        for name in own:
+            if name in hints:
+                flags = dict.fromkeys([flag(name), f"--{name.replace('_', '-')}"])
+                group.add_argument(*flags, dest=name, default=argparse.SUPPRESS, **_kind(options_of(hints[name])))
+    return parser
+
+
+def _kind(options: tuple[Any, ...]) -> dict[str, Any]:
+    """How argparse reads a field of these types: a switch, several words or one; `read` knows the rest."""
+    if bool in options:
+        return {"action": argparse.BooleanOptionalAction}
+    return {"nargs": "+"} if any(get_origin(option) is tuple for option in options) else {}
+
+
+def explain(parser: Parser, algorithm: str) -> None:
+    """Give each field in a parser its help: its docstring, the values that it may have, and its default."""
+    config = find(algorithm).Config
+    texts, defaults, hints = field_help(config), config(), get_type_hints(config, include_extras=True)
+    for action in parser._actions:
+        if action.dest in hints and action.dest != "env":
+            options, text = options_of(hints[action.dest]), texts.get(action.dest, "")
+            literals = [get_args(option) for option in options if get_origin(option) is Literal]
+            if literals:
+                text += f" {{{', '.join(map(str, literals[0]))}}}"
+            default = getattr(defaults, action.dest)
+            if default not in ((), {}) and "(default" not in text:
+                text += f" [{_shown(default)}]"
+            action.help, action.metavar = text.replace("%", "%%"), _metavar(options)
+    known = ", ".join(names(algorithm) if algorithm in PRESETS else ["default"])
+    bracket = "[…] is the default, where neither --preset nor the environment's own preset says otherwise."
+    parser.epilog = fill(f"presets: {known}", 110) + f"\n{bracket}"
+
+
 def field_help(config: type[RunConfig]) -> dict[str, str]:
     """The docstring below each field, read from the source of the Config and of those it inherits from."""
     found: dict[str, str] = {}
@@ -68,17 +123,6 @@ def field_help(config: type[RunConfig]) -> dict[str, str]:
     return found
 
 
-def _parse(command: str, algorithm: str, words: list[str]) -> tuple[argparse.Namespace, dict[str, Any]]:
-    hints = get_type_hints(find(algorithm).Config, include_extras=True)
-    parser = parser_of(algorithm, command)
-    given, rest = parser.parse_known_args([_switch(word, hints) for word in words])
-    if rest:
-        known = [action.dest for action in parser._actions]
-        raise unknown_argument(rest, lambda word: _unknown_flag(word, known))
-    values = {name: value for name, value in vars(given).items() if name in hints and name != "env"}
-    return given, {name: read(name, hints[name], value) for name, value in values.items()}
-
-
 def _switch(word: str, hints: dict[str, Any]) -> str:
     """The flag or the no-flag that `--field=on` or `--field=off` means, as programs that start others write it."""
     name, _, value = word.partition("=")
@@ -92,51 +136,7 @@ def _unknown_flag(word: str, known: list[str]) -> UserError:
     name = word.lstrip("-").replace("-", "_")
     if name in known:  # it was written with one dash
         return unknown_name("field", word, [flag(name)])
-    return glossary.unknown_field(name, known, flag)
-
-
-def parser_of(algorithm: str, command: str = "train") -> Parser:
-    """The parser of `lemniscate train ALGORITHM` or `tune ALGORITHM`, with an option for each field."""
-    config = find(algorithm).Config
-    hints = get_type_hints(config, include_extras=True)
-    parser = Parser(
-        prog=f"lemniscate {command} {algorithm}",
-        usage=f"lemniscate {command} {algorithm} --env ID [--run DIR] [--preset NAME] [--FIELD VALUE …]",
-        epilog=_presets(algorithm),
-    )
-    (add_train_options if command == "train" else add_tune_options)(parser)
-    texts, defaults = field_help(config), config()
-    grouped = {name for members in GROUPS.values() for name in members} | {"env"}
-    for title, members in GROUPS.items():
-        own = [name for name in config.names() if name not in grouped] if title == "algorithm" else members
-        group = parser.add_argument_group(title)
-        for name in own:
-            if name in hints:
-                _add(group, name, hints[name], texts.get(name, ""), getattr(defaults, name))
-    return parser
-
-
-def _presets(algorithm: str) -> str:
-    """The presets of an algorithm, and what the brackets of its help mean."""
-    listed = fill(f"presets: {', '.join(names(algorithm) if algorithm in PRESETS else ['default'])}", 110)
-    return f"{listed}\n[…] is the default, where neither --preset nor the environment's own preset says otherwise."
-
-
-def _add(group: argparse._ArgumentGroup, name: str, hint: Any, text: str, default: Any) -> None:
-    flags = list(dict.fromkeys([flag(name), f"--{name.replace('_', '-')}"]))
-    options = options_of(hint)
-    choices = [str(choice) for option in options if get_origin(option) is Literal for choice in get_args(option)]
-    if choices:
-        text += f" {{{', '.join(choices)}}}"
-    if default not in ((), {}) and "(default" not in text:
-        text += f" [{_shown(default)}]"
-    shared: dict[str, Any] = {"dest": name, "default": argparse.SUPPRESS, "help": text.replace("%", "%%")}
-    if bool in options:
-        group.add_argument(*flags, action=argparse.BooleanOptionalAction, **shared)
-    elif any(get_origin(option) is tuple for option in options):
-        group.add_argument(*flags, nargs="+", metavar=_metavar(options), **shared)
-    else:
-        group.add_argument(*flags, metavar=_metavar(options), **shared)
+    return unknown_field(name, known, flag)
 
 
 def _metavar(options: tuple[Any, ...]) -> str:

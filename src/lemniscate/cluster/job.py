@@ -12,6 +12,7 @@ import signal
 import socket
 import tempfile
 import threading
+import time
 import traceback
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -20,6 +21,7 @@ from shutil import copytree, rmtree
 from types import FrameType
 from typing import Any
 
+from lemniscate.cluster.connection import Cluster, connected
 from lemniscate.cluster.parcel import STORAGE, pack, unpack
 from lemniscate.errors import NonFiniteError, RankError, UserError, WorkerError, resume_line
 from lemniscate.run.config import RunConfig
@@ -39,6 +41,34 @@ FAILURES = 100
 
 
 def train_on_ray(
+    path: Path, algorithm: str, config: RunConfig, cluster: Cluster, resume: str, options: Mapping[str, Any]
+) -> float:
+    """Train a run to its end on a cluster; its directory here is then as far as it has come.
+
+    Args:
+        path: the run directory.
+        algorithm: its name.
+        config: of the run; a new one has a shard for each worker, unless more are asked for.
+        cluster: where.
+        resume: the name, as `module:function`, of what each worker calls with its run directory and the options.
+        options: of `resume`, in the worker; with `progress`, it is shown here too.
+
+    Returns the seconds that it took.
+
+    Raises:
+        Stopped: after a signal; the last checkpoint is kept.
+        RankError: what ended the run in a worker.
+    """
+    workers, began = cluster.workers or 1, time.monotonic()
+    with connected(cluster):  # before the directory is made: a cluster that does not answer leaves nothing
+        if not (path / CONFIG).exists():
+            config = config.replace(shards=max(config.shards, workers))
+            create_directory(path, CONFIG, {"algorithm": algorithm, "config": config.to_json()})
+        _train_on_ray(path, algorithm, config, workers, cluster.storage, resume, options)
+    return time.monotonic() - began
+
+
+def _train_on_ray(
     path: Path,
     algorithm: str,
     config: RunConfig,
@@ -47,21 +77,7 @@ def train_on_ray(
     resume: str,
     options: Mapping[str, Any],
 ) -> None:
-    """Train a run to its end on the cluster that is connected; its directory here is then as far as it has come.
-
-    Args:
-        path: the run directory.
-        algorithm: its name.
-        config: of the run.
-        workers: the number of processes.
-        storage: as in `Cluster`.
-        resume: the name, as `module:function`, of what each worker calls with its run directory and the options.
-        options: of `resume`, in the worker; with `progress`, it is shown here too.
-
-    Raises:
-        Stopped: after a signal; the last checkpoint is kept.
-        RankError: what ended the run in a worker.
-    """
+    """Train on the cluster that is connected."""
     from ray.train import CheckpointConfig, FailureConfig, ScalingConfig
     from ray.train import RunConfig as JobConfig
     from ray.train.torch import TorchConfig, TorchTrainer

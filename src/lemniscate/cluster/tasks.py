@@ -95,7 +95,7 @@ class RayTasks(Places):
 
     def start(self, run: Path, options: Sequence[str]) -> None:
         """Send a run to a machine that has room, or will have."""
-        self._begin(run, ["--trust", *options], lost=0)
+        self._begin(run, options, lost=0)
 
     def ended(self) -> dict[Path, int]:
         """The exit codes of the runs that have ended since the last look; what the others have sent is stored."""

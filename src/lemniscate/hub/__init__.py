@@ -1,1 +1,1 @@
-"""The Hugging Face Hub, and whose code may be imported."""
+"""The Hugging Face Hub: download, upload, and whose code may be imported."""

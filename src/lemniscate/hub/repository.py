@@ -1,17 +1,20 @@
 """Policies on the Hugging Face Hub: their addresses, download and upload.
 
 A policy there is a model repository whose root is a checkpoint. The files of a checkpoint, raw tensors and JSON, are
-all that is ever downloaded; their hashes are checked where they are read.
+all that is ever downloaded; their hashes are checked where they are read. What they name as `module:name` is imported
+from this computer, and only if the user trusts it: see `require_trusted`.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 from lemniscate.errors import UserError, is_installed, missing_extra, prefix_errors
 from lemniscate.run.checkpoint import FILES, MANIFEST
+from lemniscate.system import named
 
 SCHEME = "hf:"
 """the first part of an address as a path"""
@@ -61,6 +64,19 @@ def read_address(place: str | PathLike[str]) -> Address:
 def local_path(place: str | PathLike[str]) -> Path:
     """The path of a run or a checkpoint; for an address, of its downloaded checkpoint. Raises as `download`."""
     return download(read_address(place)) if is_address(place) else Path(place)
+
+
+def own_code(config: Mapping[str, Any]) -> list[str]:
+    """The names of the code in a run's config that is not lemniscate's, nor was passed in this process."""
+    names = [config.get("env"), config.get("network"), *(config.get("wrappers") or ())]
+    return [str(name) for name in names if ":" in str(name) and not named.is_passed(str(name))]
+
+
+def require_trusted(code: Sequence[str], *, trust: bool) -> None:
+    """Raise `UserError` where a downloaded policy names `code` of its own, and the user has not said to trust it."""
+    if code and not trust:
+        known = "If you know that code, add --trust (in Python trust=True)."
+        raise UserError(f"The policy would execute code of its own: {', '.join(code)}. {known}")
 
 
 def download(address: Address) -> Path:

@@ -9,8 +9,7 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor
 
-from lemniscate.api.policy import TrainedPolicy
-from lemniscate.api.stored import Trained, load, path_of
+from lemniscate.api.policy import Trained, TrainedPolicy, load, path_of
 from lemniscate.envs import registry
 from lemniscate.envs.probe import Act, Probe
 from lemniscate.errors import UserError

@@ -9,8 +9,7 @@ from lemniscate.algos import find
 from lemniscate.errors import unknown_name
 from lemniscate.presets.off_policy import DDPG, SAC, TD3
 from lemniscate.presets.on_policy import A2C, PPO, REINFORCE, REPPO, TRPO
-from lemniscate.presets.preset import Preset
-from lemniscate.presets.stored import read_preset
+from lemniscate.presets.preset import Preset, read_preset
 from lemniscate.run.config import RunConfig
 
 PRESETS: dict[str, list[Preset]] = {

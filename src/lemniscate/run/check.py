@@ -7,7 +7,6 @@ from filelock import FileLock, Timeout
 
 from lemniscate.envs.findings import BAD, GOOD, NOTE, Finding
 from lemniscate.errors import UserError, resume_line
-from lemniscate.hub.trust import is_signed, own_code
 from lemniscate.run import checkpoint
 from lemniscate.run.directory import CONFIG, LOCK
 from lemniscate.run.metrics import METRICS, damage, read_metrics
@@ -86,16 +85,14 @@ def _checkpoints(path: Path) -> tuple[list[checkpoint.Checkpoint], list[Finding]
 
 
 def _config(path: Path, whole: list[checkpoint.Checkpoint]) -> Finding:
-    """Whether the config is whole, or can be taken from a checkpoint, and whether it names code that is not trusted."""
+    """Whether the config is whole, or can be taken from a checkpoint."""
     try:
         record = read_json(path / CONFIG)
         with parsing(path / CONFIG):
-            code, what = own_code(record["config"]), f"{record['algorithm']} on {record['config']['env']}"
+            what = f"{record['algorithm']} on {record['config']['env']}"
     except DamagedFileError as error:
         copy = f"{whole[-1].path} has a copy, which is taken." if whole else "No checkpoint has a copy."
         return Finding(BAD, f"{error} {copy}")
-    if code and not is_signed(record):
-        return Finding(NOTE, f"It is from elsewhere and names code of its own, {', '.join(code)}: see --trust.")
     return Finding(GOOD, f"{CONFIG}: {what}.")
 
 

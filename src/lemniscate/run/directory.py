@@ -7,7 +7,6 @@ from typing import Any
 from filelock import FileLock, Timeout
 
 from lemniscate.errors import UserError, resume_line
-from lemniscate.hub.trust import signed
 from lemniscate.run import checkpoint
 from lemniscate.run.config import RunConfig
 from lemniscate.run.metrics import METRICS, damage
@@ -53,7 +52,7 @@ def create_directory(path: Path, name: str, record: dict[str, Any]) -> None:
 
 
 def read_record(path: Path) -> dict[str, Any]:
-    """The record of a run's `config.json`: algorithm, config, signature; if damaged, that of the newest checkpoint.
+    """The record of a run's `config.json`: algorithm and config; if damaged, that of the newest checkpoint.
 
     Raises `UserError` if it is not a run.
     """
@@ -125,7 +124,7 @@ class Saver:
         self.exists: bool = world.from_first(there)
         """whether the run directory was there before this process"""
         self._config, self._checkpoints = config, path / "checkpoints"
-        self._identity = signed({"algorithm": algorithm, "config": config.to_json()})
+        self._identity = {"algorithm": algorithm, "config": config.to_json()}
         self._record = {**self._identity, "spec": checkpoint.spec_to_json(spec)}
         self._lock = FileLock(path / LOCK, timeout=0)
         self.last_planned = 0

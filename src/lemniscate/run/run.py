@@ -64,6 +64,7 @@ class Run:
         progress: bool = True,
         film: Callable[[TrainState], None] | None = None,
         observer: Observer | None = None,
+        locate: Callable[[str], Path] = Path,
     ) -> None:
         self.path, self.algorithm, self.config = path, algorithm, config
         self.world = world = world or World(config.shards)
@@ -73,7 +74,7 @@ class Run:
         """how long the training loop took"""
         self._saver = Saver(path, algorithm, config, self.spec, world)
         self._logger_classes, self._loggers = loggers if world.is_first else (), list[Logger]()
-        self._visible, self._film, self._observer = progress, film, observer
+        self._visible, self._film, self._observer, self._locate = progress, film, observer, locate
         self._bar = ProgressBar(config.total_steps, 0, visible=False)
         self._compiler = Compiler(world.busy)
         self._stop = StopRequest(world.size > 1, self._how_to_go_on, self._compiler.stopping)
@@ -280,7 +281,7 @@ class Run:
         state.on_restart()
 
     def _begin_warm(self, state: TrainState) -> None:
-        sentence = load_networks(state.networks, self.config, self.spec)
+        sentence = load_networks(state.networks, self.config, self.spec, self._locate)
         state.on_warm_start()
         if self._visible:
             say(sentence)

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 from lemniscate.errors import UserError
-from lemniscate.hub.trust import is_signed, signed
 from lemniscate.run.directory import CONFIG, SWEEP, TUNE, create_directory
 from lemniscate.system.files import DamagedFileError, parsing, read_json
 
@@ -24,8 +23,6 @@ class Sweep:
     path: Path
     seeds: list[int]
     configs: dict[str, dict[str, Any]]
-    trusted: bool = True
-    """whether this user made it, on this machine, or vouches for it"""
 
     @property
     def runs(self) -> dict[Path, dict[str, Any]]:
@@ -38,13 +35,13 @@ class Sweep:
 
     def create(self) -> None:
         """Write `sweep.json` into a new directory. Raises `UserError` if the directory exists already."""
-        create_directory(self.path, SWEEP, signed({"seeds": self.seeds, "configs": self.configs}))
+        create_directory(self.path, SWEEP, {"seeds": self.seeds, "configs": self.configs})
 
     def create_runs(self) -> None:
         """Create the run directories that do not exist yet."""
         for path, record in self.runs.items():
             if not (path / CONFIG).exists():
-                create_directory(path, CONFIG, signed(record) if self.trusted else record)
+                create_directory(path, CONFIG, record)
 
 
 def is_sweep(path: Path) -> bool:
@@ -65,8 +62,7 @@ def read_sweep(path: Path) -> Sweep:
         reason = f": {error}" if (path / SWEEP).exists() else f": it holds no {SWEEP} that can be read."
         raise UserError(f"{path} is not a sweep{reason}") from None
     with parsing(path / SWEEP):
-        seeds, trusted = [int(seed) for seed in record["seeds"]], is_signed(record, ("seeds", "configs"))
-        sweep = Sweep(path, seeds, dict(record["configs"]), trusted)
+        sweep = Sweep(path, [int(seed) for seed in record["seeds"]], dict(record["configs"]))
         if unsafe := [name for name in sweep.configs if not re.fullmatch(r"[\w.:-]*\w", name) or ".." in name]:
             raise ValueError(f"{unsafe[0]!r} is no name of an algorithm")
         return sweep

@@ -1,9 +1,11 @@
 """Warm start: networks that another run has trained are the beginning of this one."""
 
+from collections.abc import Callable
+from pathlib import Path
+
 from torch import Tensor, nn
 
 from lemniscate.errors import UserError
-from lemniscate.hub import repository as hub
 from lemniscate.run import checkpoint
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import find_checkpoint
@@ -16,18 +18,19 @@ SHAPE = ("hidden", "normalize_observations")
 """fields of a Config that a policy of other shapes may come from"""
 
 
-def load_networks(networks: nn.Module, config: RunConfig, spec: Spec) -> str:
+def load_networks(networks: nn.Module, config: RunConfig, spec: Spec, locate: Callable[[str], Path] = Path) -> str:
     """Load the networks of the run or checkpoint `config.warm_start` into `networks`, as many as fit.
 
-    All of them if they have the same names and shapes; else the policy, with its normalizer, if it has.
+    All of them if they have the same names and shapes; else the policy, with its normalizer, if it has. `locate` finds
+    the directory that `config.warm_start` names: a run knows no address but a path.
 
     Returns:
         A sentence on what was loaded.
 
     Raises:
-        UserError: no such checkpoint, here or on the Hub; other spaces; a policy of other shapes.
+        UserError: no such checkpoint; other spaces; a policy of other shapes.
     """
-    source = find_checkpoint(hub.local_path(str(config.warm_start)))
+    source = find_checkpoint(locate(str(config.warm_start)))
     name = f"{config.warm_start} at step {source.numbers['step']:,}"
     their_spec = checkpoint.spec_from_json(source.record["spec"])
     if not their_spec.fits(spec):

@@ -16,8 +16,7 @@ import numpy as np
 
 from lemniscate import algos
 from lemniscate.errors import UserError, is_installed, missing_extra
-from lemniscate.hub.trust import is_signed, own_code, require_trusted, signed
-from lemniscate.presets.stored import StoredPreset
+from lemniscate.presets.preset import StoredPreset
 from lemniscate.report.seeds import iqm
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import TUNE, create_directory, is_finished
@@ -31,7 +30,7 @@ if TYPE_CHECKING:
     import optuna
 
 JOURNAL, PRESET, TRIALS = "study.journal", "preset.json", "trials"
-SIGNED = ("algorithm", "config", "search", "seeds", "trials", "prune")
+FIELDS = ("algorithm", "config", "search", "seeds", "trials", "prune")
 RETURNS = 100
 """newest training episodes that a trial is compared by before its end"""
 
@@ -64,7 +63,6 @@ class Search:
     seeds: list[int]
     trials: int
     prune: bool
-    trusted: bool = True
 
     @property
     def space(self) -> Space:
@@ -78,14 +76,14 @@ class Search:
 
     def create(self) -> None:
         """Write `tune.json` into a new directory. Raises `UserError` if the directory exists already."""
-        record = {name: getattr(self, name) for name in SIGNED} | {"config": self.config.to_json()}
-        create_directory(self.path, TUNE, signed(record))
+        record = {name: getattr(self, name) for name in FIELDS} | {"config": self.config.to_json()}
+        create_directory(self.path, TUNE, record)
 
     def sweep(self, name: str, fields: Mapping[str, Any]) -> Sweep:
         """The sweep of one trial."""
         config = self.config.replace(**fields).to_json()
         but_seed = {name: value for name, value in config.items() if name != "seed"}
-        return Sweep(self.path / TRIALS / name, self.seeds, {self.algorithm: but_seed}, self.trusted)
+        return Sweep(self.path / TRIALS / name, self.seeds, {self.algorithm: but_seed})
 
     def preset(self, which: str, settings: Mapping[str, Any], score: float) -> StoredPreset:
         """The best settings, with their provenance."""
@@ -128,21 +126,18 @@ def import_optuna() -> Any:
     return optuna
 
 
-def read_search(path: Path, *, trust: bool = False) -> Search:
-    """The search in a directory. Raises `UserError` if there is none, or one from elsewhere that names code."""
+def read_search(path: Path) -> Search:
+    """The search in a directory. Raises `UserError` if there is none."""
     try:
         record = read_json(path / TUNE)
     except DamagedFileError as error:
         raise UserError(f"{path} is not a search: {error}") from None
     with parsing(path / TUNE):
-        trusted = trust or is_signed(record, SIGNED)
         algorithm = str(record["algorithm"])
-        code = own_code(record["config"]) + ([algorithm] if algorithm not in algos.ALGORITHMS else [])
-        require_trusted(path, code, trusted=trusted)
         config = algos.find(algorithm).Config.from_json(record["config"])
         seeds = [int(seed) for seed in record["seeds"]]
         search = {str(name): str(text) for name, text in record["search"].items()}
-        return Search(path, algorithm, config, search, seeds, int(record["trials"]), bool(record["prune"]), trusted)
+        return Search(path, algorithm, config, search, seeds, int(record["trials"]), bool(record["prune"]))
 
 
 def has_come(run: Path, step: int | None) -> bool:

@@ -6,19 +6,19 @@ each of its runs ends in the same bits as if it had been trained alone.
 
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
 from lemniscate.algos import ALGORITHMS, name_of
 from lemniscate.api import plots, training
+from lemniscate.api.options import RunOptions, require_importable
+from lemniscate.api.policy import path_of
 from lemniscate.api.results import final_return
-from lemniscate.api.stored import own_code_of, path_of
-from lemniscate.cluster.connection import Cluster, find_cluster
+from lemniscate.cluster.connection import Cluster
 from lemniscate.envs import registry
 from lemniscate.errors import SweepError, UserError, prefix_errors, resume_line, shown
-from lemniscate.hub.trust import require_trusted
+from lemniscate.hub.repository import local_path
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import is_finished
 from lemniscate.run.environments import device_for, require_memory
@@ -27,7 +27,6 @@ from lemniscate.run.places import LOG, failure_of
 from lemniscate.run.sweep_file import Sweep, read_sweep
 from lemniscate.run.warm_start import load_networks
 from lemniscate.sweeps.runs import SetOfRuns, locked
-from lemniscate.system import named
 from lemniscate.system.console import Line, ProgressBar, pace, say
 
 MOST_SEEDS = 1_000
@@ -87,7 +86,8 @@ def train_sweep(
             configs[name] = training.config_for(name, env, preset, **fields)
     if len({config.env for config in configs.values()}) > 1:
         raise UserError("These presets are for different environments; name the one of the whole sweep with env.")
-    there, options = find_cluster(cluster, workers), _options(track, callbacks, report)
+    options = RunOptions(track, callbacks, report, progress, cluster=cluster, workers=workers)
+    there, words = options.find_cluster(), _words(options)
     require_trainable(configs, numbers)
     stem = f"{'-'.join(names)}-{len(numbers)}-seeds"
     path = path_of(run) if run is not None else training.fresh_directory(next(iter(configs.values())).env, stem)
@@ -95,7 +95,7 @@ def train_sweep(
     but_seed = {name: {k: v for k, v in record.items() if k != "seed"} for name, record in records.items()}
     runs = Sweep(path, numbers, but_seed)
     runs.create()
-    return _train(runs, [*options, "--trust"], progress, there)  # code that was named here and now
+    return _train(runs, words, progress, there)
 
 
 def resume_sweep(
@@ -107,26 +107,17 @@ def resume_sweep(
     progress: bool = True,
     cluster: str | None = None,
     workers: int | None = None,
-    trust: bool = False,
 ) -> TrainedSweep:
     """Resume an interrupted sweep: train the runs that are not finished or have not begun. See `resume`."""
-    runs, there, options = read_sweep(path_of(path)), find_cluster(cluster, workers), _options(track, callbacks, report)
-    for record in runs.runs.values():
-        require_trusted(runs.path, own_code_of(record), trusted=trust or runs.trusted)
-    return _train(replace(runs, trusted=trust or runs.trusted), [*options, *["--trust"] * trust], progress, there)
+    options = RunOptions(track, callbacks, report, progress, cluster=cluster, workers=workers)
+    return _train(read_sweep(path_of(path)), _words(options), progress, options.find_cluster())
 
 
-def _options(track: str | None, callbacks: str | Sequence[str], report: bool) -> list[str]:
+def _words(options: RunOptions) -> list[str]:
     """The options of each run's process. Raises `UserError` for a tracker or a callback that it could not find."""
-    names: list[Any] = list(callbacks) if isinstance(callbacks, list | tuple) else [callbacks]
-    for name in (track, *names):
-        if not isinstance(name, str | None):
-            raise UserError(f"Each run of a sweep has a process of its own: name {shown(name)} as 'module:name'.")
-    training.loggers_with(track)
-    for name in names:
-        named.find(name)
-    options = ["--track", track] if track else []
-    return options + (["--callbacks", *names] if names else []) + (["--report"] if report else [])
+    options.loggers()
+    options.functions()
+    return options.words()
 
 
 def _train(runs: Sweep, options: list[str], progress: bool, cluster: Cluster | None) -> TrainedSweep:
@@ -237,10 +228,7 @@ def seeds_of(seeds: str | int | Iterable[int]) -> list[int]:
 def require_trainable(configs: dict[str, RunConfig], seeds: list[int]) -> None:
     """Raise `UserError` where a run could not begin: one sentence now, instead of one from each run."""
     for name, config in configs.items():
-        for thing in (config.env, *config.wrappers, getattr(config, "network", "")):
-            if "<" in thing or thing.startswith("__main__:"):
-                said = f"Each run of a sweep has a process of its own: put {thing} into a module, to import it."
-                raise UserError(said)
+        require_importable(config)
         device = device_for(config.device)
         for seed in seeds:
             config.replace(seed=seed)
@@ -251,4 +239,4 @@ def require_trainable(configs: dict[str, RunConfig], seeds: list[int]) -> None:
             require_memory(config, env.spec, device)
             networks = config.networks(env.spec)
             if config.warm_start:
-                load_networks(networks, config, env.spec)
+                load_networks(networks, config, env.spec, local_path)

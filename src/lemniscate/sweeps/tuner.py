@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING
 
 from lemniscate.algos import name_of
 from lemniscate.api import training
-from lemniscate.api.stored import path_of
+from lemniscate.api.policy import path_of
 from lemniscate.cluster.connection import Cluster, find_cluster
 from lemniscate.errors import SweepError, UserError, shown
-from lemniscate.presets.stored import StoredPreset
+from lemniscate.presets.preset import StoredPreset
 from lemniscate.report import tuning as pictures
 from lemniscate.run.places import LOG, failure_of
 from lemniscate.run.sweep_file import Sweep, is_sweep
@@ -115,10 +115,9 @@ def resume_tuning(
     progress: bool = True,
     cluster: str | None = None,
     workers: int | None = None,
-    trust: bool = False,
 ) -> Tuned:
     """Go on with an interrupted search. Each run of each trial ends in the same bits as if it had not been stopped."""
-    return _tune(read_search(path_of(path), trust=trust), progress, find_cluster(cluster, workers))
+    return _tune(read_search(path_of(path)), progress, find_cluster(cluster, workers))
 
 
 def _tune(search: Search, progress: bool, cluster: Cluster | None) -> Tuned:
@@ -205,10 +204,10 @@ class _Tuner(SetOfRuns):
                 trial = self._trial(self._search.ask(self._study))
                 self._queue(trial)
             until = self._until(trial)
-            options = ["--callbacks", f"lemniscate.api.callbacks:StopAt(steps={until})"] if until else []
+            options = ["--callbacks", f"lemniscate.api.options:StopAt(steps={until})"] if until else []
             run = trial.waiting.pop(0)
             trial.training.add(run)
-            self._start(run, [*options, *["--trust"] * self._search.trusted])
+            self._start(run, options)
         return not self._is_finished()
 
     def _is_finished(self) -> bool:

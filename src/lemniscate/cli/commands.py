@@ -1,0 +1,208 @@
+"""The work of each command: each takes what `parse` understood, and imports what it alone needs."""
+
+import argparse
+import json
+from shutil import get_terminal_size
+from typing import Any
+
+from lemniscate.algos import ALGORITHMS
+from lemniscate.api import training
+from lemniscate.api.options import RunOptions
+from lemniscate.api.policy import TrainedRun
+from lemniscate.envs import registry
+from lemniscate.errors import UserError, unknown_name
+from lemniscate.run.directory import SWEEP, TUNE
+from lemniscate.run.run import is_compiled
+from lemniscate.run.texts import number, read, read_json
+from lemniscate.system.console import say, talks
+from lemniscate.system.watchdog import end_with_owner
+
+
+def train(given: argparse.Namespace) -> None:
+    """Train one policy, or with --seeds one for each algorithm and seed."""
+    if given.unnamed:
+        why = "takes every kind of actions and, mostly, needs the fewest minutes"
+        tell(f"No algorithm is named: {given.algorithm} {why}.")
+    if given.seeds is not None or "," in given.algorithm:
+        train_sweep(given)
+        return
+    name, preset, config = training.choose_config(given.algorithm, given.env, given.preset, given.fields)
+    registry.require_backend(str(config.backend))
+    what = f"{name} on {config.num_envs} × {config.env}, backend {config.backend}"
+    tell(f"{what}: preset {preset}, seed {config.seed}, {'compiled' if is_compiled(config) else 'not compiled'}")
+    run = training.begin(name, config, given.run, _options(given))
+    if given.score:
+        _say_score(run)
+    tell(f"Trained in {run.seconds:.1f} s. Everything is in {run.path}")
+
+
+def train_sweep(given: argparse.Namespace) -> None:
+    """Train one policy for each algorithm and seed, and compare them."""
+    from lemniscate.sweeps.sweep import train_sweep
+
+    if "seed" in given.fields:
+        raise UserError("Several runs have several seeds: --seeds 1-5, not --seed.")
+    if given.seeds is None:
+        raise UserError("Algorithms are compared over several seeds: add --seeds 1-5.")
+    shared = {"run": given.run, "preset": given.preset, **given.fields, **_of_several(given)}
+    runs = train_sweep(given.algorithm, given.env, given.seeds, **shared)
+    tell(f"Everything is in {runs.path}")
+
+
+def tune(given: argparse.Namespace) -> None:
+    """Search for the best settings."""
+    from lemniscate.sweeps.tuner import tune
+
+    if given.search is None:
+        raise UserError("Search what? Name fields with their ranges: --search 'learning_rate=log:1e-4:1e-2'.")
+    fields = {"run": given.run, "preset": given.preset, "seeds": given.seeds, "prune": given.prune, **given.fields}
+    fields |= {**_cluster(given), "trials": number(given.trials), "progress": not given.quiet}
+    tuned = tune(given.algorithm, given.env, search=given.search, **fields)
+    tell(f"Everything is in {tuned.path}")
+
+
+def resume(given: argparse.Namespace) -> None:
+    """Continue an interrupted run, sweep or search. The runs of the latter two are begun by this command, too."""
+    owned = end_with_owner()
+    if (given.run / TUNE).exists():
+        from lemniscate.sweeps.tuner import resume_tuning
+
+        run = resume_tuning(given.run, **_cluster(given), progress=not given.quiet)
+    elif (given.run / SWEEP).exists():
+        from lemniscate.sweeps.sweep import resume_sweep
+
+        run = resume_sweep(given.run, **_of_several(given))
+    else:
+        run = training.go_on(training.path_of(given.run), _options(given), {})
+        if given.score:
+            _say_score(run)
+        if not run.seconds:  # it was finished, which has been said
+            return
+    if not owned:
+        tell(f"Done. Everything is in {run.path}")
+
+
+def evaluate(given: argparse.Namespace) -> None:
+    """Play whole episodes: scores as JSON on standard output, or as a sentence."""
+    from lemniscate.api import results
+    from lemniscate.report import pages
+
+    own = {"backend": given.backend, "baseline": given.baseline, "video": given.video, "trust": given.trust}
+    scores = results.evaluate(given.run, **_episodes(given), **own)
+    if given.json:
+        print(json.dumps(scores.to_json(), allow_nan=False))
+    else:
+        say(pages.sentence(scores.to_json()))
+
+
+def watch(given: argparse.Namespace) -> None:
+    """Show episodes in a window, or record them."""
+    from lemniscate.api import results
+
+    if not given.run and not (given.random and given.env):
+        raise UserError("Watch what? lemniscate watch RUN; before training, lemniscate watch --random --env ID.")
+    own = {"random": given.random, "video": given.video, "trust": given.trust}
+    results.watch(given.run, given.env, deterministic=not given.sample, **_episodes(given), **own)
+
+
+def export(given: argparse.Namespace) -> None:
+    """Write a policy as C and ONNX, and say how far these are from it."""
+    from lemniscate.exporting.export import export
+
+    say(f"Everything is in {export(given.run, given.to, trust=given.trust)}")
+
+
+def preflight(given: argparse.Namespace) -> None:
+    """Measure the margins of a policy, and name the files."""
+    from lemniscate.margins.preflight import preflight
+
+    preflight(given.run, given.compiled, **_episodes(given))
+    say(f"Everything is in {given.run / 'preflight.json'} and {given.run / 'plots' / 'preflight.png'}")
+
+
+def plot(given: argparse.Namespace) -> None:
+    """Draw the curves of one run, or compare several, grouped by all but the seed."""
+    from lemniscate.api.plots import plot
+
+    for file in plot(*given.runs, by=given.by):
+        say(file)
+
+
+def push(given: argparse.Namespace) -> None:
+    """Upload the policy of a run to the Hub."""
+    from lemniscate.api.pushed import push
+
+    page = push(given.run, given.name, private=given.private, license=given.license)
+    say(f"Uploaded: {page}. It is loaded from hf://{given.name}.")
+
+
+def envs(given: argparse.Namespace) -> None:
+    """List the environments, the backend of each, and the presets that fit."""
+    from lemniscate.presets import best
+
+    found = [env_id for env_id in registry.known_ids() if given.filter.lower() in env_id.lower()]
+    if not found:
+        raise unknown_name("environment", given.filter, registry.known_ids())
+    for env_id in found:
+        presets = ((algorithm, best(algorithm, env_id)) for algorithm in ALGORITHMS)
+        fitting = ", ".join(f"{algorithm}: {preset}" for algorithm, preset in presets if preset != "default")
+        say(f"{env_id:<40} {registry.backend_for(env_id):<12} {fitting or 'default'}")
+
+
+def check(given: argparse.Namespace) -> None:
+    """Say what was found about an environment or the files of a run, as a list; what is bad there is an error."""
+    from lemniscate.api.results import each_finding, verdict
+    from lemniscate.envs.findings import BAD
+
+    found, wrappers = [], read("wrappers", tuple[str, ...], given.wrappers)
+    for finding in each_finding(given.what, given.backend, _env_args(given), wrappers):
+        found.append(finding)
+        say(finding.listed(min(get_terminal_size((112, 24)).columns, 120)))
+    if any(finding.grade == BAD for finding in found):
+        raise UserError(verdict(given.what, found))
+    say(verdict(given.what, found))
+
+
+def completion(given: argparse.Namespace) -> None:
+    """Print the script with which a shell completes."""
+    from lemniscate.cli.completion import script
+
+    print(script(given.shell), end="")
+
+
+def tell(text: str) -> None:
+    """Say it, where this process is the one that talks."""
+    if talks():
+        say(text)
+
+
+def _say_score(run: TrainedRun) -> None:
+    from lemniscate.api.results import FINAL_EPISODES, final_return
+
+    if talks():
+        say(f"Final return {final_return(run):.1f} over {FINAL_EPISODES} episodes.")
+
+
+def _options(given: argparse.Namespace) -> RunOptions:
+    return RunOptions(processes=number(given.processes), storage=given.storage, **_of_several(given))
+
+
+def _of_several(given: argparse.Namespace) -> dict[str, Any]:
+    """The options that the runs of a sweep have too."""
+    callbacks = [name for word in given.callbacks or () for name in word.split(",")]
+    shared = {"track": given.track, "callbacks": callbacks, "report": given.report, "progress": not given.quiet}
+    return {**shared, **_cluster(given)}
+
+
+def _cluster(given: argparse.Namespace) -> dict[str, Any]:
+    return {"cluster": given.cluster, "workers": given.workers and number(given.workers)}
+
+
+def _episodes(given: argparse.Namespace) -> dict[str, Any]:
+    """The episodes that are to be played."""
+    numbers = {"episodes": number(given.episodes), "seed": number(given.seed)}
+    return {**numbers, "env_kwargs": _env_args(given)}
+
+
+def _env_args(given: argparse.Namespace) -> dict[str, Any] | None:
+    return None if given.env_args is None else read_json("--env-args", given.env_args)
