@@ -12,7 +12,7 @@ import torch
 import lemniscate as lem
 from lemniscate import course
 from lemniscate.cli import parse
-from lemniscate.course import setup, skeletons
+from lemniscate.course import loop, setup
 
 PAGE = (Path(__file__).parents[1] / "docs" / "courses.md").read_text()
 
@@ -35,7 +35,7 @@ def test_the_python_of_the_page_runs(tmp_path, monkeypatch):
     assert (tmp_path / "models" / "pendulum" / "manifest.json").exists()
     assert (tmp_path / "mine.webp").exists()
     assert scope["path"].read_text().count("NotImplementedError(") == 5
-    (tmp_path / "my_ppo.py").write_text((Path(skeletons.__file__).parent / skeletons.SKELETONS["ppo"]).read_text())
+    (tmp_path / "my_ppo.py").write_text(loop.solution("ppo"))
     exec(compile(filled_in + after, "courses.md", "exec"), scope)
     assert scope["agent"].act(np.zeros((16, 105), np.float32)).shape == (16, 8)
 
