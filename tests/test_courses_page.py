@@ -11,6 +11,7 @@ import torch
 
 import lemniscate as lem
 from lemniscate import course
+from lemniscate.api import results
 from lemniscate.cli import parse
 from lemniscate.course import loop, setup
 
@@ -21,6 +22,7 @@ def test_the_python_of_the_page_runs(tmp_path, monkeypatch):
     """To its end, once the skeleton is filled in."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(results, "FINAL_EPISODES", 4)
     code = "\n".join(re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL))
     scope = {"__name__": "courses"}
     shorter = "total_steps=64, learning_starts=32, hidden=(8,), critic_hidden=(8,), progress=False"
