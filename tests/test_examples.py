@@ -1,6 +1,5 @@
 """The examples run: as programs, and by their names on the command line."""
 
-import re
 from pathlib import Path
 
 import pytest

@@ -12,7 +12,12 @@ from lemniscate.algos import ddpg, ppo, reinforce
 from lemniscate.api import results
 
 TUTORIALS = sorted((Path(__file__).parents[1] / "docs" / "tutorial").glob("[0-9]_*.py"))
-SMALLER = {r"^STEPS = [\d_]+$": "STEPS = 3_000", r"\bepisodes=\d+": "episodes=2", "epochs=20": "epochs=2", r"range\(200\)": "range(4)"}
+SMALLER = {
+    r"^STEPS = [\d_]+$": "STEPS = 3_000",
+    r"\bepisodes=\d+": "episodes=2",
+    "epochs=20": "epochs=2",
+    r"range\(200\)": "range(4)",
+}
 """sizes of which no assertion depends: steps of training, episodes of an evaluation, epochs on one rollout, frames"""
 each_tutorial = pytest.mark.parametrize("file", TUTORIALS, ids=lambda file: file.stem)
 
