@@ -17,7 +17,7 @@ MISTAKES = [(name, words) for name, exercise in COMPARED.items() for words in ex
 
 @pytest.mark.parametrize("name", COMPARED)
 def test_the_library_passes(name, capsys):
-    finding = course.check(getattr(maths, name, COMPARED[name].right))
+    finding = course.check(getattr(maths, name, COMPARED[name].right), name)
     assert finding
     assert str(finding).startswith(f"✓ {name}: right")
     assert capsys.readouterr().err.strip() == str(finding)

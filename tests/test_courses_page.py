@@ -11,8 +11,9 @@ import torch
 
 import lemniscate as lem
 from lemniscate import course
+from lemniscate.api import results
 from lemniscate.cli import parse
-from lemniscate.course import setup, skeletons
+from lemniscate.course import loop, setup
 
 PAGE = (Path(__file__).parents[1] / "docs" / "courses.md").read_text()
 
@@ -21,6 +22,7 @@ def test_the_python_of_the_page_runs(tmp_path, monkeypatch):
     """To its end, once the skeleton is filled in."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(results, "FINAL_EPISODES", 4)
     code = "\n".join(re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL))
     scope = {"__name__": "courses"}
     shorter = "total_steps=64, learning_starts=32, hidden=(8,), critic_hidden=(8,), progress=False"
@@ -35,7 +37,7 @@ def test_the_python_of_the_page_runs(tmp_path, monkeypatch):
     assert (tmp_path / "models" / "pendulum" / "manifest.json").exists()
     assert (tmp_path / "mine.webp").exists()
     assert scope["path"].read_text().count("NotImplementedError(") == 5
-    (tmp_path / "my_ppo.py").write_text((Path(skeletons.__file__).parent / skeletons.SKELETONS["ppo"]).read_text())
+    (tmp_path / "my_ppo.py").write_text(loop.solution("ppo"))
     exec(compile(filled_in + after, "courses.md", "exec"), scope)
     assert scope["agent"].act(np.zeros((16, 105), np.float32)).shape == (16, 8)
 

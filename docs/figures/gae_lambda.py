@@ -27,7 +27,9 @@ def walk(walks):
     outside = (after <= 0) | (after >= END)
     times_outside = outside.cumsum(0)
     ended = outside & (times_outside == 1)
-    return after - moves, after, (ended & (after == END)).double(), ended, ended | (times_outside == 0)
+    valid = ended | (times_outside == 0)
+    columns = (after - moves, after, (ended & (after == END)).double(), ended, valid)
+    return tuple(column[: valid.sum(0).max()] for column in columns)
 
 
 def critic(position):

@@ -1,13 +1,15 @@
-"""The judgement of a whole training loop: by what it learns in small worlds that each punish one mistake.
+"""A whole training loop: a skeleton to fill in, and the judgement of a loop by what it learns.
 
-In every world the better of two actions is known, and one mistake makes the other one look better; one more world has
-Box actions. A loop that passes them all is trained on CartPole-v1.
+In each small world the better of two actions is known, and one mistake makes the other one look better; one more world
+has Box actions. A loop that passes them all is trained on CartPole-v1.
 """
 
 import inspect
+import re
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -16,18 +18,52 @@ import torch
 
 from lemniscate.course.exercise import Function, raised
 from lemniscate.envs.vector_view import VectorView, make_vec
+from lemniscate.errors import UserError, unknown_name
 from lemniscate.system.console import say
+
+SKELETONS = {"ppo": "ppo_from_scratch.py"}
+SOLUTION = re.compile(r"^( *)# <solution>\n.*?# </solution>\n", re.DOTALL | re.MULTILINE)
+"""the lines of a program that its skeleton leaves out"""
 
 STEPS, NUM_ENVS = 2_048, 8
 CARTPOLE_STEPS, CARTPOLE_RETURN, EPISODES_EACH = 60_000, 400, 3
 
 
+def skeleton(name: str = "ppo", path: str | Path | None = None) -> Path:
+    """Write a training loop to fill in, as one file that runs by itself and checks itself.
+
+    Args:
+        name: ppo.
+        path: the new file; by default `ppo.py` here.
+
+    Raises:
+        UserError: an unknown name; a file that exists, or cannot be written.
+    """
+    if name not in SKELETONS:
+        raise unknown_name("skeleton", name, SKELETONS)
+    path = Path(path or f"{name}.py")
+    if path.exists():
+        raise UserError(f"{path} exists already; name another file with path.")
+    with_gaps = SOLUTION.sub(r'\1raise NotImplementedError("to be written")\n', solution(name))
+    try:
+        path.write_text(with_gaps.replace(f"python {name}.py", f"python {path.name}"))
+    except OSError as error:
+        raise UserError(f"{path} cannot be written: {error.strerror}.") from error
+    return path
+
+
+def solution(name: str) -> str:
+    """The program of a skeleton without gaps."""
+    return Path(__file__).with_name(SKELETONS[name]).read_text()
+
+
 @dataclass(frozen=True)
 class Move:
-    """The effect of an action in a state: a reward, the next state, and the end of the episode, if it is one."""
+    """The effect of an action in a state."""
 
     reward: float
     state: int
+    """the next one"""
     ends: str = ""
     """death, time-out, or nothing"""
     next_bonus: float = 0.0
@@ -36,59 +72,54 @@ class Move:
 
 @dataclass(frozen=True)
 class World:
-    """A small world: its moves, where episodes begin, the better action in state 0, and what the other one reveals."""
+    """A small world in which action 0 is better than action 1 in state 0."""
 
     moves: Mapping[int, tuple[Move, Move]]
+    """by state: the effect of each of its two actions"""
     starts: Mapping[int, float]
-    """state: probability"""
+    """by state: the probability that an episode begins there"""
     mistake: str
-    better: int = 0
+    """a sentence on what action 1 in state 0 reveals"""
     seen: Mapping[int, int] | None = None
     """by state: the state that it looks like"""
 
+    def obs(self, state: int) -> np.ndarray:
+        """The observation of a state: a one-hot vector [6]."""
+        return np.eye(6, dtype=np.float32)[(self.seen or {}).get(state, state)]
+
 
 class WorldEnv(gym.Env):
-    """A world as an environment; a state is seen as a one-hot vector."""
+    """A world as an environment."""
 
     def __init__(self, world: int) -> None:
         self.world = WORLDS[world]
         self.observation_space = gym.spaces.Box(0, 1, (6,), np.float32)
-        self.action_space = gym.spaces.Discrete(2)
+        self.action_space: gym.Space = gym.spaces.Discrete(2)
         self._bonus = 0.0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
         """A state to begin in."""
         super().reset(seed=seed)
         self._state = int(self.np_random.choice(list(self.world.starts), p=list(self.world.starts.values())))
-        return one_hot(self.world, self._state), {}
+        return self.world.obs(self._state), {}
 
-    def step(self, action: int) -> tuple[np.ndarray, float, bool, bool, dict]:
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict]:
         """The move of that action."""
         move = self.world.moves[self._state][int(action)]
         reward, self._bonus, self._state = move.reward + self._bonus, move.next_bonus, move.state
-        return one_hot(self.world, self._state), reward, move.ends == "death", move.ends == "time-out", {}
+        return self.world.obs(self._state), reward, move.ends == "death", move.ends == "time-out", {}
 
 
-class BoxEnv(gym.Env):
+class BoxEnv(WorldEnv):
     """World 0 with a Box of two actions: the reward is the first minus the second."""
 
     def __init__(self) -> None:
-        self.observation_space = gym.spaces.Box(0, 1, (6,), np.float32)
+        super().__init__(0)
         self.action_space = gym.spaces.Box(-1, 1, (2,), np.float32)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
-        """The only state."""
-        super().reset(seed=seed)
-        return one_hot(WORLDS[0], 0), {}
-
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict]:
         """A death after one action."""
-        return one_hot(WORLDS[0], 0), float(action[0] - action[1]), True, False, {}
-
-
-def one_hot(world: World, state: int) -> np.ndarray:
-    """The observation of a state, [6]."""
-    return np.eye(6, dtype=np.float32)[(world.seen or {}).get(state, state)]
+        return self.world.obs(0), float(action[0] - action[1]), True, False, {}
 
 
 def _both(*move: Any, **more: Any) -> tuple[Move, Move]:
@@ -152,9 +183,8 @@ def train(function: Function) -> Iterator[str]:
     for number in range(len(WORLDS)):
         yield from in_world(function, number)
     yield from with_box_actions(function)
-    envs = make_vec("CartPole-v1", NUM_ENVS, backend="gymnasium")
-    act = _trained(function, envs, CARTPOLE_STEPS, close=False)
-    mean = _mean_return(act, envs)
+    with closing(make_vec("CartPole-v1", NUM_ENVS, backend="gymnasium")) as envs:
+        mean = _mean_return(_trained(function, envs, CARTPOLE_STEPS), envs)
     if mean < CARTPOLE_RETURN:
         yield (
             f"all small worlds are right, but on CartPole-v1 the mean return after {CARTPOLE_STEPS:,} steps is"
@@ -166,20 +196,30 @@ def train(function: Function) -> Iterator[str]:
 def in_world(function: Function, number: int) -> Iterator[str]:
     """Train in one small world, and look at the action in its state 0."""
     world = WORLDS[number]
-    with _ratios_of(function) as ratios:
-        act = _trained(function, make_vec(WorldEnv, NUM_ENVS, env_kwargs={"world": number}), STEPS)
-    choice = int(np.asarray(act(np.stack([one_hot(world, 0)])))[0])
-    if choice != world.better:
+    envs = make_vec(WorldEnv, NUM_ENVS, env_kwargs={"world": number})
+    with closing(envs), _ratios_of(function) as ratios:
+        act = _trained(function, envs, STEPS)
+    if int(np.asarray(act(world.obs(0)[None]))[0]) != 0:
         yield f"small world {number + 1} of {len(WORLDS) + 1}: {world.mistake}."
-    yield from _clipping(ratios)
+    if ratios and max(ratios) < 1e-6:
+        yield (
+            "the ratio is 1 in every gradient step, so the clip never acts. Likely: the old log-probabilities are"
+            " computed again in each epoch; they belong before the epochs."
+        )
+    if ratios and ratios[0] > 1e-3:
+        yield (
+            "the ratio is not 1 in the first gradient step. Likely: the old log-probabilities are of other actions,"
+            " or of other rows (the minibatch chooses rows of each column)."
+        )
 
 
 def with_box_actions(function: Function) -> Iterator[str]:
     """Train in the small world with Box actions, and look at the actions [1, 2] in its only state."""
     try:
-        act = _trained(function, make_vec(BoxEnv, NUM_ENVS), STEPS)
-        first, second = np.asarray(act(np.stack([one_hot(WORLDS[0], 0)])))[0]
-    except Exception as error:  # whatever it raises is a finding; this one is not of Discrete actions
+        with closing(make_vec(BoxEnv, NUM_ENVS)) as envs:
+            act = _trained(function, envs, STEPS)
+        first, second = np.asarray(act(WORLDS[0].obs(0)[None]))[0]
+    except Exception as error:  # what it raises is a finding, which has to say that it is not of Discrete actions
         yield f"in the small world with Box actions {raised(error)}"
         return
     if first - second < 0.5:
@@ -189,10 +229,8 @@ def with_box_actions(function: Function) -> Iterator[str]:
         )
 
 
-def _trained(function: Function, envs: VectorView, steps: int, close: bool = True) -> Callable[[np.ndarray], Any]:
+def _trained(function: Function, envs: VectorView, steps: int) -> Callable[[np.ndarray], Any]:
     made = function(envs, total_steps=steps, seed=1)
-    if close:
-        envs.close()
     return getattr(made, "act", made)
 
 
@@ -206,7 +244,7 @@ def _mean_return(act: Callable[[np.ndarray], Any], envs: VectorView) -> float:
         for i in np.flatnonzero(terminated | truncated):
             returns[i].append(running[i])
             running[i] = 0.0
-    envs.close()
+    # The first ones of each alone: of all that ended, short episodes would be more than their share.
     return float(np.mean([episode for row in returns for episode in row[:EPISODES_EACH]]))
 
 
@@ -228,16 +266,3 @@ def _ratios_of(function: Function) -> Iterator[list[float]]:
         yield found
     finally:
         names["clipped_surrogate"] = own
-
-
-def _clipping(ratios: list[float]) -> Iterator[str]:
-    if ratios and max(ratios) < 1e-6:
-        yield (
-            "the ratio is 1 in every gradient step, so the clip never acts. Likely: the old log-probabilities are"
-            " computed again in each epoch; they belong before the epochs."
-        )
-    elif ratios and ratios[0] > 1e-3:
-        yield (
-            "the ratio is not 1 in the first gradient step. Likely: the old log-probabilities are of other actions,"
-            " or of other rows (the minibatch chooses rows of each column)."
-        )
