@@ -7,8 +7,7 @@ from typing import Any
 from lemniscate.api.stored import TrainedRun
 from lemniscate.envs import check as env_check
 from lemniscate.envs import registry
-from lemniscate.envs.findings import Finding
-from lemniscate.envs.findings import verdict as env_verdict
+from lemniscate.envs.check import Finding
 from lemniscate.run import check as run_check
 
 
@@ -52,4 +51,4 @@ def each_finding(
 
 def verdict(what: str, found: list[Finding]) -> str:
     """The conclusion from the findings, in a sentence or two."""
-    return run_check.verdict(Path(what), found) if run_check.is_stored(Path(what)) else env_verdict(what, found)
+    return run_check.verdict(Path(what), found) if run_check.is_stored(Path(what)) else env_check.verdict(what, found)

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from lemniscate.envs.masks import read_mask
+from lemniscate.envs.info import read_mask
 from lemniscate.envs.observations import read_observation
 from lemniscate.envs.spaces import physical_action
 from lemniscate.errors import UserError

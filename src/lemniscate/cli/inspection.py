@@ -10,7 +10,7 @@ from lemniscate.api import plots, pushed, results
 from lemniscate.api.checks import each_finding, verdict
 from lemniscate.cli.completion import completion as completion
 from lemniscate.envs import registry
-from lemniscate.envs.findings import BAD
+from lemniscate.envs.check import BAD
 from lemniscate.errors import UserError, unknown_name
 from lemniscate.presets import best
 from lemniscate.report import pages

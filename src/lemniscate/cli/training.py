@@ -34,7 +34,7 @@ def train(given: argparse.Namespace) -> None:
         return
     config = training.config_for(given.algorithm, given.env, given.preset, **given.fields)
     if config.backend:
-        registry.require_backend(config.backend)
+        registry.backend_class(config.backend)  # refuses one that is not there
     preset, _ = choose(given.algorithm, config.env, given.preset)
     what = f"{given.algorithm} on {config.num_envs} × {config.env}, backend {config.backend}"
     tell(f"{what}: preset {preset}, seed {config.seed}, {'compiled' if is_compiled(config) else 'not compiled'}")

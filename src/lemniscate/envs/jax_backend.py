@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lemniscate.envs.backend import Backend
 from lemniscate.errors import UserError
 from lemniscate.types import Step
 
@@ -93,7 +94,7 @@ def compile_side_by_side(lowered: Sequence[Any]) -> list[Callable]:
         return list(pool.map(lambda one: one.compile(), lowered))
 
 
-class JaxBackend:
+class JaxBackend(Backend):
     """N environments that are stepped by compiled programs; what a subclass adds is their making, and the Spec."""
 
     compiled = True

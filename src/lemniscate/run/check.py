@@ -5,7 +5,7 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from lemniscate.envs.findings import BAD, GOOD, NOTE, Finding
+from lemniscate.envs.check import BAD, GOOD, NOTE, Finding
 from lemniscate.errors import UserError, resume_line
 from lemniscate.hub.trust import is_signed, own_code
 from lemniscate.run import checkpoint
