@@ -84,7 +84,7 @@ def make_vector(
 
 @contextmanager
 def model_warnings_off() -> Iterator[None]:
-    """No warnings of MuJoCo about the models of others, which it writes on standard error and into a file where the command runs."""
+    """No warnings of MuJoCo about models, which it writes on standard error and into a file where the command runs."""
     try:
         from mujoco import set_mju_user_warning  # pyright: ignore[reportAttributeAccessIssue]
     except ImportError:  # Gymnasium says what to install
