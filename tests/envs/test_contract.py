@@ -43,7 +43,7 @@ def play(env, num_steps, seed=0):
     """A rollout of a fresh policy, from a restart."""
     policy = ActorCritic(env.spec, Layers((8,))).policy
     env.restart(seed)
-    return collect(env, policy, num_steps, (torch.Generator().manual_seed(seed),))
+    return collect(env, policy, num_steps, torch.Generator().manual_seed(seed))
 
 
 @pytest.mark.parametrize(("env_id", "backend"), EVERY)
