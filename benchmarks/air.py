@@ -58,7 +58,7 @@ def numbers(scores):
 def one_run(way, seed):
     """Train and fly here; print one JSON object."""
     import lemniscate as lem
-    from lemniscate.drones.air import CONDITIONS
+    from lemniscate.drones.vehicle import CONDITIONS
 
     preset, kwargs, fields = WAYS[way]
     with tempfile.TemporaryDirectory() as folder:

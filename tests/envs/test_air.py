@@ -19,8 +19,9 @@ import torch
 pytest.importorskip("crazyflow")
 
 import lemniscate as lem
-from lemniscate.drones.air import CONDITIONS, NOISE, disturb, read_ranges
-from lemniscate.drones.crazyflow import DYNAMICS, CrazyflowBackend, make_drones
+from lemniscate.drones.air import disturb
+from lemniscate.drones.crazyflow import CrazyflowBackend, make_drones
+from lemniscate.drones.vehicle import CONDITIONS, DYNAMICS, NOISE, read_ranges
 from lemniscate.envs import registry
 from lemniscate.envs.spaces import scale_action
 from lemniscate.errors import UserError

@@ -8,6 +8,8 @@ from gymnasium.vector import AutoresetMode
 import environments
 from lemniscate.data.rollout import collect
 from lemniscate.envs import registry, toy
+from lemniscate.envs.backend import Backend
+from lemniscate.envs.gymnasium import GymnasiumBackend
 from lemniscate.errors import NonFiniteError, UserError
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.networks import Layers
@@ -41,7 +43,7 @@ def play(env, num_steps, seed=0):
     """A rollout of a fresh policy, from a restart."""
     policy = ActorCritic(env.spec, Layers((8,))).policy
     env.restart(seed)
-    return collect(env, policy, num_steps, (torch.Generator().manual_seed(seed),))
+    return collect(env, policy, num_steps, torch.Generator().manual_seed(seed))
 
 
 @pytest.mark.parametrize(("env_id", "backend"), EVERY)
@@ -107,6 +109,31 @@ def test_episodes_are_counted_without_the_reset_rows(mode):
     assert set(episodes.returns) == {5.0}
     assert set(episodes.lengths) == {5}
     assert env.take_episodes().returns == []
+
+
+class Half(GymnasiumBackend):
+    """Only the methods of a step are there."""
+
+    restart = step = Backend.restart
+
+
+class Alone:
+    """A backend by the names of its methods, without the defaults."""
+
+    restart = step = close = serves = None
+
+
+@pytest.mark.parametrize(
+    ("name", "sentence"),
+    [
+        ("Half", "test_contract:Half lacks restart, step: a backend is derived from lemniscate.envs.backend.Backend"),
+        ("Alone", "test_contract:Alone lacks baseline, compiled, divides, ids,"),
+        ("play", "test_contract:play is not a class"),
+    ],
+)
+def test_what_a_backend_of_ones_own_lacks_is_said(name, sentence):
+    with pytest.raises(UserError, match=sentence):
+        registry.make("CartPole-v1", 2, backend=f"envs.test_contract:{name}")
 
 
 class HidesFinalObs(toy.Countdown):

@@ -14,7 +14,7 @@ pytest.importorskip("crazyflow")
 import gymnasium as gym
 
 from lemniscate.envs import registry
-from lemniscate.envs.model_warnings import model_warnings_off
+from lemniscate.envs.factory import model_warnings_off
 from lemniscate.envs.spaces import scale_action
 
 FIGURE_EIGHT = "DroneFigureEightTrajectory-v0"

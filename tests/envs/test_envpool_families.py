@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from lemniscate.envs import registry
-from lemniscate.envs.random_action import random_action
-from lemniscate.envs.rendered import make_rendered
+from lemniscate.envs.registry import make_rendered
+from lemniscate.envs.spaces import random_action
 from lemniscate.errors import UserError
 
 envpool = pytest.importorskip("envpool")

@@ -7,7 +7,7 @@ jax = pytest.importorskip("jax")
 import jax.numpy as jnp
 
 from lemniscate.envs import registry
-from lemniscate.envs.jax_backend import JaxBackend, Programs, Vectorized
+from lemniscate.envs.jax_backend import JaxBackend, Programs
 from lemniscate.spec import Box, ObservationPart, Spec
 
 N, LIMIT = 4, 20
@@ -24,6 +24,53 @@ def step(state, action):
     x, t = state["x"] + action[0], state["t"] + 1
     obs = jnp.stack([x, t.astype(jnp.float32)])
     return {"x": x, "t": t}, obs, -jnp.abs(x), jnp.abs(x) > 2, {"distance": jnp.abs(x)}
+
+
+class Vectorized:
+    """`JaxEnvs` from the two functions of a single environment, with a time limit.
+
+    `reset(key) -> (state, obs [O])` and `step(state, action [A]) -> (state, obs [O], reward, terminated, measures)` are
+    pure functions of one environment. With staggering, the first episode of each is cut after a random number of
+    steps, uniform up to the time limit.
+    """
+
+    def __init__(self, reset, step, num_envs, action_size, max_steps, device):
+        self.num_envs, self.action_size, self.device = num_envs, action_size, device
+        self._reset, self._step, self._max_steps = reset, step, max_steps
+
+    def init(self, key):
+        """Keys, and environments that have not begun."""
+        key, begin = jax.random.split(key)
+        states, obs = jax.vmap(self._reset)(jax.random.split(begin, self.num_envs))
+        nothing = jnp.zeros(self.num_envs, dtype=int)
+        return {"key": key, "env": states, "obs": obs, "age": nothing, "limit": nothing}
+
+    def reset(self, state, mask, stagger):
+        """Fresh states where `mask`; a limit of 0 is that of an environment before its first episode."""
+        key, begin, where = jax.random.split(state["key"], 3)
+        fresh, fresh_obs = jax.vmap(self._reset)(jax.random.split(begin, self.num_envs))
+
+        def choose(new, old):
+            return jnp.where(mask.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+
+        fragment = mask & stagger & (state["limit"] == 0)
+        cut = jax.random.randint(where, (self.num_envs,), 1, self._max_steps + 1)
+        limit = jnp.where(fragment, cut, self._max_steps)
+        obs = choose(fresh_obs, state["obs"])
+        state = {
+            "key": key,
+            "env": jax.tree.map(choose, fresh, state["env"]),
+            "obs": obs,
+            "age": choose(jnp.zeros_like(state["age"]), state["age"]),
+            "limit": choose(limit, state["limit"]),
+        }
+        return state, obs, fragment
+
+    def step(self, state, action):
+        """Every environment one step on."""
+        env, obs, reward, terminated, measures = jax.vmap(self._step)(state["env"], action)
+        age = state["age"] + 1
+        return {**state, "env": env, "obs": obs, "age": age}, (obs, reward, terminated, age >= state["limit"], measures)
 
 
 class PointBackend(JaxBackend):

@@ -7,10 +7,10 @@ from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lemniscate.envs.images import is_image
 from lemniscate.envs.spaces import (
     action_kind,
     flatten_observation,
+    is_image,
     observation_parts,
     physical_action,
     scale_action,

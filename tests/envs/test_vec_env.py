@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from lemniscate.envs import registry
-from lemniscate.envs.random_action import random_action
+from lemniscate.envs.spaces import random_action
 from threads import in_world
 
 ENVS = {"Pendulum-v1": "gymnasium", "CartPole-v1": "envpool", "Countdown-v0": "gymnasium"}

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from exported import exported, needs_compiler, policy_for
 
-from lemniscate.drones.interface import PARTS, interface_of
+from lemniscate.drones.vehicle import PARTS, interface_of
 from lemniscate.errors import UserError
 from lemniscate.exporting.compiled import CORE, TARGET_COMPILER, host_compiler, run_tool
 from lemniscate.exporting.crazyflie import crazyflie_files

@@ -16,9 +16,9 @@ from conftest import tiny_fields
 from lemniscate.algos import ppo
 from lemniscate.api.policy import TrainedPolicy
 from lemniscate.cli import main
-from lemniscate.drones.interface import interface_of
+from lemniscate.drones.vehicle import interface_of
 from lemniscate.envs import registry
-from lemniscate.envs.findings import BAD
+from lemniscate.envs.check import BAD
 from lemniscate.envs.interface import Interface
 from lemniscate.exporting import compiled, parity
 from lemniscate.exporting import export as exporting

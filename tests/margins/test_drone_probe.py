@@ -12,10 +12,11 @@ import torch
 pytest.importorskip("crazyflow")
 
 from lemniscate.drones import probe as drone_probe
-from lemniscate.drones.air import CONDITIONS
 from lemniscate.drones.crazyflow import CrazyflowBackend
+from lemniscate.drones.probe import CONDITION_AXES
+from lemniscate.drones.vehicle import CONDITIONS
 from lemniscate.envs import registry
-from lemniscate.envs.probe import CONDITION_AXES, Tally
+from lemniscate.envs.probe import Tally
 from lemniscate.errors import UserError
 
 ENV, STARTS, STEPS = "DroneFigureEightTrajectory-v0", 4, 25

@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 import torch
 
-from lemniscate.envs.probe import Axis, Flown, Tally, dynamics_axis
+from lemniscate.envs.probe import Axis, Flown, Tally
 from lemniscate.margins.record import margins_of, smoothness, worst_accepted
 from lemniscate.margins.sentences import FAILS, FALLS_SHORT, panel, rows, sentences
 from lemniscate.report import margins_plot
 
 DELAY = Axis("delay", (0.0, 0.01, 0.02, 0.03), 0.0, "s", "action delay", "{} of action delay", ("ms", 1000))
 MASS = Axis("mass", (0.7, 0.85, 1.0, 1.15, 1.3), 1.0, "", "mass", "{} mass")
-DYNAMICS = dynamics_axis("so_rpy", ("so_rpy", "so_rpy_rotor", "first_principles"))
+ALL = ("so_rpy", "so_rpy_rotor", "first_principles")
+DYNAMICS = Axis("dynamics", ALL, "so_rpy", "name", "dynamics", "the dynamics {}")
 E = 64
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from lemniscate import algos
-from lemniscate.envs.masks import read_mask
+from lemniscate.envs.info import read_mask
 from lemniscate.envs.observations import read_observation
 from lemniscate.envs.spaces import physical_action
 from lemniscate.errors import UserError, prefix_errors, shown

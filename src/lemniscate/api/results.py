@@ -9,7 +9,7 @@ from typing import Any
 
 from lemniscate.api.policy import Trained, TrainedPolicy, TrainedRun, load, path_of
 from lemniscate.envs import registry
-from lemniscate.envs.findings import Finding
+from lemniscate.envs.check import Finding
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError, shown
 from lemniscate.report import flight, pages, playback
@@ -187,10 +187,10 @@ def each_finding(
 
 def verdict(what: str, found: list[Finding]) -> str:
     """The conclusion from the findings, in a sentence or two."""
-    from lemniscate.envs import findings
+    from lemniscate.envs import check as env_check
     from lemniscate.run import check as run_check
 
-    return run_check.verdict(Path(what), found) if run_check.is_stored(Path(what)) else findings.verdict(what, found)
+    return run_check.verdict(Path(what), found) if run_check.is_stored(Path(what)) else env_check.verdict(what, found)
 
 
 def final_return(run: str | Path | TrainedRun) -> float:

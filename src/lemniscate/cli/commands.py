@@ -27,7 +27,7 @@ def train(given: argparse.Namespace) -> None:
         train_sweep(given)
         return
     name, preset, config = training.choose_config(given.algorithm, given.env, given.preset, given.fields)
-    registry.require_backend(str(config.backend))
+    registry.backend_class(str(config.backend))  # refuses one that is not there
     what = f"{name} on {config.num_envs} × {config.env}, backend {config.backend}"
     tell(f"{what}: preset {preset}, seed {config.seed}, {'compiled' if is_compiled(config) else 'not compiled'}")
     run = training.begin(name, config, given.run, _options(given))
@@ -152,7 +152,7 @@ def envs(given: argparse.Namespace) -> None:
 def check(given: argparse.Namespace) -> None:
     """Say what was found about an environment or the files of a run, as a list; what is bad there is an error."""
     from lemniscate.api.results import each_finding, verdict
-    from lemniscate.envs.findings import BAD
+    from lemniscate.envs.check import BAD
 
     found, wrappers = [], read("wrappers", tuple[str, ...], given.wrappers)
     for finding in each_finding(given.what, given.backend, _env_args(given), wrappers):

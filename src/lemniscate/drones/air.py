@@ -1,83 +1,19 @@
-"""The conditions of a drone's flight: how the vehicle and the air differ from the simulator's own.
-
-A condition is a number, or a range [low, high] from which one is drawn for every episode of every drone. All of them
-together are what is called domain randomization (Tobin et al. 2017, arXiv:1703.06907).
-"""
-
-from __future__ import annotations
+"""The air between a policy and drones: late actions, wind, noisy observations, by the conditions of `vehicle`."""
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from lemniscate.errors import UserError, shown
+import jax
+import jax.numpy as jnp
 
-if TYPE_CHECKING:
-    import jax
+from lemniscate.drones.vehicle import CONDITIONS, NOISE, STATE_SIZE, Ranges
 
-STATE_SIZE = 13
-"""position 3 (m), quaternion 4 (xyzw), velocity 3 (m/s), angular velocity 3 (rad/s)"""
-NOISE = {"pos": 0.002, "attitude": math.radians(0.5), "vel": 0.03, "ang_vel": 0.05}
-"""standard deviations: of a motion-capture system (m, rad), of velocities estimated from it (m/s), of a gyroscope
-(rad/s)"""
 GUST_SECONDS = 0.5
 """time constant of gusts"""
 
-
-@dataclass(frozen=True)
-class Condition:
-    """The value of a condition in the simulator as it is, the limits of what can be asked for, and its meaning."""
-
-    nominal: float
-    low: float
-    high: float
-    meaning: str
-
-
-CONDITIONS = {
-    "mass": Condition(1, 0.2, 3, "factor of the mass"),
-    "inertia": Condition(1, 0.1, 10, "factor of the moments of inertia: angular accelerations are divided by it"),
-    "motor_gain": Condition(1, 0.2, 3, "factor of the thrust that a command gives"),
-    "motor_time": Condition(1, 0.05, 20, "factor of the time in which rotors follow; so_rpy has no such time"),
-    "thrust_curve": Condition(0, -0.2, 0.2, "what half of the thrust range gives more, as a share of the range"),
-    "action_delay": Condition(0, 0, 0.2, "seconds until an action reaches the drone, in steps of 2 ms"),
-    "observation_delay": Condition(0, 0, 0.2, "seconds since an observation was true, in steps of 2 ms"),
-    "jitter": Condition(0, 0, 1, "most of a further delay of each action by itself, in control periods"),
-    "lost_actions": Condition(0, 0, 0.9, "probability that an action is lost, and the one before it goes on"),
-    "observation_noise": Condition(0, 0, 20, "normal noise of each observation, in multiples of NOISE"),
-    "observation_bias": Condition(0, 0, 20, "the same, but drawn once an episode"),
-    "wind": Condition(0, 0, 1, "newtons of a constant force from any horizontal direction"),
-    "gusts": Condition(0, 0, 1, "standard deviation of a force that changes within half a second, newtons an axis"),
-    "start_spread": Condition(1, 0, 3, "factor of how far from its middle, and how fast, a flight begins"),
-    "rotors": Condition(0, 0, 1, "rotor speed at the beginning, as a share of that of hovering; so_rpy has no rotors"),
-}
-
-Ranges = Mapping[str, tuple[float, float]]
-
-
-def read_ranges(kwargs: Mapping[str, Any]) -> dict[str, tuple[float, float]]:
-    """The ranges of the conditions among the arguments of an environment, without those that change nothing.
-
-    Raises:
-        UserError: a value that is neither a number nor a range, or outside what a drone could fly with.
-    """
-    ranges = {name: _range(name, kwargs[name]) for name in CONDITIONS if name in kwargs}
-    return {name: ends for name, ends in ranges.items() if ends != (CONDITIONS[name].nominal,) * 2}
-
-
-def _range(name: str, value: Any) -> tuple[float, float]:
-    ends = list(value) if isinstance(value, list | tuple) else [value, value]
-    numbers = all(isinstance(end, int | float) and not isinstance(end, bool) for end in ends)
-    if len(ends) != 2 or not numbers:
-        raise UserError(f"{name} must be a number or a range [low, high], not {shown(value)}.")
-    condition, (low, high) = CONDITIONS[name], map(float, ends)
-    if low > high:
-        raise UserError(f"{name} is a range upside down: {low:g} is above {high:g}.")
-    if not condition.low <= low <= high <= condition.high:
-        limits = f"from {condition.low:g} to {condition.high:g}"
-        raise UserError(f"{name} must be {limits} ({condition.meaning}), not {shown(value)}.")
-    return low, high
+Acting = Callable[[Any], Any]
+"""a function of the substep to the commands [N, 4] that act in it"""
 
 
 def parameter_factors(dynamics: str, drawn: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
@@ -125,10 +61,14 @@ class Air:
         """what is observed is not the state"""
         self.is_windy = bool({"wind", "gusts"} & set(ranges))
 
+    @property
+    def delay(self) -> tuple[float, float]:
+        """Seconds from an observation to its action's effect, the least and the most."""
+        late = [self.ranges.get(name, (0.0, 0.0)) for name in ("action_delay", "observation_delay")]
+        return sum(least for least, _ in late), sum(most for _, most in late)
+
     def empty(self, key: jax.Array) -> dict[str, Any]:
         """The air before the first episode."""
-        import jax.numpy as jnp
-
         n, actions = self.num_envs, self.hover.size
         air: dict[str, Any] = {}
         if self.ranges:
@@ -153,9 +93,6 @@ class Air:
 
     def draw(self, air: dict[str, Any], mask: jax.Array) -> dict[str, Any]:
         """The conditions of the episodes that begin, `mask` [N]."""
-        import jax
-        import jax.numpy as jnp
-
         if not self.ranges:
             return air
         air, (key, *keys) = dict(air), jax.random.split(air["key"], 4 + len(self.ranges))
@@ -177,14 +114,10 @@ class Air:
 
     def _of(self, air: dict[str, Any], name: str) -> jax.Array:
         """The value of a condition, [N]."""
-        import jax.numpy as jnp
-
         return air["drawn"][name] if name in self.ranges else jnp.full(self.num_envs, CONDITIONS[name].nominal)
 
     def begin(self, air: dict[str, Any], mask: jax.Array, state: jax.Array) -> dict[str, Any]:
         """Buffers of the episodes that begin in these states [N, 13], as if the drone had hovered there before."""
-        import jax.numpy as jnp
-
         begins, air = mask[:, None, None], dict(air)
         if self.is_late:
             air["commands"] = jnp.where(begins, self.hover, air["commands"])
@@ -201,9 +134,6 @@ class Air:
 
     def send(self, air: dict[str, Any], command: jax.Array, bounds: tuple[Any, Any]) -> tuple[dict[str, Any], Any]:
         """Take up commands [N, 4]; returns a function of the substep, from 0, to those that act in it."""
-        import jax
-        import jax.numpy as jnp
-
         if "thrust_curve" in self.ranges:
             command = _through_curve(command, air["drawn"]["thrust_curve"], *bounds)
         if not self.is_late:
@@ -224,8 +154,6 @@ class Air:
 
     def force(self, air: dict[str, Any]) -> tuple[dict[str, Any], jax.Array]:
         """The force of wind and gusts in a control step, [N, 3] newtons; a gust is an Ornstein-Uhlenbeck process."""
-        import jax
-
         key, own = jax.random.split(air["key"])
         keep = math.exp(-1 / (self.frequency * GUST_SECONDS))
         noise = math.sqrt(1 - keep**2) * jax.random.normal(own, (self.num_envs, 3))
@@ -234,15 +162,11 @@ class Air:
 
     def steps_behind(self, air: dict[str, Any]) -> tuple[jax.Array, jax.Array]:
         """The delay of observations as control steps and substeps, [N] each."""
-        import jax.numpy as jnp
-
         behind = self._of(air, "observation_delay") * self.frequency * self.substeps
         return jnp.divmod(jnp.round(behind).astype(jnp.int32), self.substeps)
 
     def observe(self, air: dict[str, Any], state: jax.Array, action: jax.Array) -> dict[str, Any]:
         """The observation after a step, caught in `state` [N, 13] as many substeps before its end as it is late."""
-        import jax.numpy as jnp
-
         air = dict(air)
         if self.is_blurred:
             air["states"] = _push(air["states"], state)
@@ -264,8 +188,6 @@ class Air:
         Each condition drawn by its place in its range, from -1 to 1; and the force of the wind and the gust, 1 where
         it is the most that there is on average.
         """
-        import jax.numpy as jnp
-
         if not self.ranges:
             return jnp.zeros((self.num_envs, 0))
         low, high = air["ends"].T
@@ -280,16 +202,11 @@ class Air:
 
         Differences, since what a small one says of mass and motors would drown in the scale of the states themselves.
         """
-        import jax.numpy as jnp
-
         states, actions = air["past"][..., :STATE_SIZE], air["past"][..., STATE_SIZE:]
         return jnp.concatenate([states - air["seen"][:, None], actions], axis=-1)
 
     def _measure(self, air: dict[str, Any], state: jax.Array) -> tuple[dict[str, Any], jax.Array]:
         """States [N, 13] as they are measured: late, biased and noisy."""
-        import jax
-        import jax.numpy as jnp
-
         if not self.is_blurred:
             return air, state
         key, own = jax.random.split(air["key"])
@@ -301,8 +218,6 @@ class Air:
 
 def disturb(state: jax.Array, noise: jax.Array) -> jax.Array:
     """States [N, 13] with noise [N, 12] added, in multiples of `NOISE`; that of the attitude is a small rotation."""
-    import jax.numpy as jnp
-
     pos, quat, vel, ang_vel = jnp.split(state, (3, 7, 10), axis=-1)
     dpos, angle, dvel, dang_vel = jnp.split(noise, 4, axis=-1)
     half = 0.5 * NOISE["attitude"] * angle
@@ -322,10 +237,4 @@ def _through_curve(command: jax.Array, bend: jax.Array, low: Any, high: Any) -> 
 
 def _push(buffer: jax.Array, newest: jax.Array) -> jax.Array:
     """A buffer [N, L, …] with one more entry [N, …] in front, and without its last."""
-    import jax.numpy as jnp
-
     return jnp.concatenate([newest[:, None], buffer[:, :-1]], axis=1)
-
-
-Acting = Callable[[Any], Any]
-"""a function of the substep to the commands [N, 4] that act in it"""

@@ -1,5 +1,5 @@
 # pyright: reportAttributeAccessIssue=false
-"""crazyflow's drones, as pure functions of their state.
+"""crazyflow's drones behind the contract of environments.
 
 crazyflow's environments are NEXT_STEP: they simulate, then reset what ended one step earlier, then compute a reward at
 the reset state. Here the same methods are called in another order, that of `jax_backend`, so that every row is real.
@@ -14,23 +14,23 @@ import os
 import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import lru_cache, partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import torch
 
-from lemniscate.drones.air import CONDITIONS, Ranges, read_ranges
-from lemniscate.drones.drones import DYNAMICS, Drones, Mixed
-from lemniscate.drones.interface import interface_of
 from lemniscate.drones.pd import GAINS, PD
-from lemniscate.drones.probe import DroneProbe
+from lemniscate.drones.vehicle import CONDITIONS, DYNAMICS, Ranges, interface_of, read_ranges
 from lemniscate.envs.backend import Scene, Summary
-from lemniscate.envs.interface import Interface
+from lemniscate.envs.factory import model_warnings_off
 from lemniscate.envs.jax_backend import JaxBackend, Programs, jax_device
-from lemniscate.envs.model_warnings import model_warnings_off
 from lemniscate.envs.spaces import action_kind
 from lemniscate.errors import UserError, missing_extra, unknown_name
-from lemniscate.spec import Box, Spec
+from lemniscate.spec import Action, Box, Spec
+
+if TYPE_CHECKING:
+    from lemniscate.drones.drones import Drones
+    from lemniscate.drones.probe import DroneProbe
 
 IDS = ("DroneFigureEightTrajectory-v0", "DroneLanding-v0", "DroneReachPos-v0", "DroneReachVel-v0")
 CONTROL_HZ = 50
@@ -40,18 +40,28 @@ OWN = (*CONDITIONS, "history", "privileged", "dynamics")
 
 
 @lru_cache(maxsize=4)
-def programs(env_id: str, num_envs: int, device: str, kwargs: tuple[tuple[str, Any], ...]) -> Programs:
-    """The compiled programs of so many drones, built once a process: all vectors of a size share them."""
+def programs(
+    env_id: str, num_envs: int, device: str, kwargs: tuple[tuple[str, Any], ...]
+) -> tuple[Programs, list[Drones]]:
+    """The compiled programs of so many drones, built once a process, since all vectors of a size share them.
+
+    Also the drones that they fly: one vector of them for each of the dynamics.
+    """
+    # JAX takes a second to import, and this module is imported wherever a backend is looked for.
+    from lemniscate.drones.drones import Mixed
+
     given = dict(kwargs)
     ranges, each = read_ranges(given), dynamics_of(given) or (None,)
     drones = [make_drones(env_id, num_envs // len(each), device, given, dynamics, ranges) for dynamics in each]
-    return Programs(drones[0] if len(drones) == 1 else Mixed(drones))
+    return Programs(drones[0] if len(drones) == 1 else Mixed(drones)), drones
 
 
 def make_drones(
     env_id: str, num_envs: int, device: str, kwargs: Mapping[str, Any], dynamics: str | None, ranges: Ranges
 ) -> Drones:
     """So many drones in one dynamics, by default crazyflow's, and under conditions that need not be those of kwargs."""
+    from lemniscate.drones.drones import Drones
+
     own = {name: value for name, value in kwargs.items() if name not in OWN}
     own |= {"dynamics": dynamics} if dynamics else {}
     with warnings.catch_warnings(action="ignore"), model_warnings_off():
@@ -106,17 +116,18 @@ class CrazyflowBackend(JaxBackend):
         kwargs = dict(kwargs or {})
         _check(env, num_envs, kwargs)
         with _sentence(env, kwargs):
-            shared = programs(env, num_envs, jax_device(device), tuple(sorted(_hashable(kwargs).items())))
+            shared, vectors = programs(env, num_envs, jax_device(device), tuple(sorted(_hashable(kwargs).items())))
         super().__init__(shared, num_envs, device, stagger=stagger)
-        assert isinstance(shared.envs, Drones | Mixed)
-        self._vectors = shared.envs.drones if isinstance(shared.envs, Mixed) else [shared.envs]
-        self._drones = drones = self._vectors[0]
+        drones, flown = vectors[0], [one.dynamics for one in vectors]
         self.spec = spec_of(env, drones)
+        self.interface = interface_of(drones.env, flown, drones.air.delay, drones.air.history, drones.air.hover)
         if drones.error:
             self.summaries = (
                 Summary("rmse_mm", "tracking_error", "rms", scale=1000),
                 Summary("rmse_after_1s_mm", "tracking_error", "rms", scale=1000, skip=drones.env.freq),
             )
+            self.scene = Scene(drones.env.sim.mj_model, 1 / drones.env.freq, slice(0, 3), slice(3, 7), drones.error)
+            self.baseline = _pd_of(drones, self.spec.action, drones.error.start)
 
     @classmethod
     def probe(cls, env: str, starts: int, trained: Mapping[str, Any], given: Mapping[str, Any]) -> DroneProbe:
@@ -125,6 +136,8 @@ class CrazyflowBackend(JaxBackend):
         Conditions that only training has are nominal; so are the first dynamics, of those given or else of training.
         """
         _import()
+        from lemniscate.drones.probe import DroneProbe
+
         own = {name: value for name, value in trained.items() if name not in (*CONDITIONS, "privileged")}
         own = {**own, **given}
         dynamics = (*dynamics_of(own), None)[0]
@@ -137,31 +150,12 @@ class CrazyflowBackend(JaxBackend):
         with _sentence(env, kwargs):
             return DroneProbe(make, DYNAMICS, read_ranges(kwargs), starts, partial(spec_of, env))
 
-    @property
-    def baseline(self) -> PD | None:
-        """A PD controller with its gains for these dynamics, where there is a reference."""
-        drones, env = self._drones, self._drones.env
-        if drones.error is None or not isinstance(self.spec.action, Box):
-            return None
-        reference = slice(drones.error.start, drones.error.start + 3 * env.n_samples)
-        where = {"reference": reference, "velocity": slice(7, 10), "preview": env.samples_dt}
-        return PD(GAINS[drones.dynamics], drones.mass, self.spec.action, **where)
 
-    @property
-    def scene(self) -> Scene | None:
-        """The drone and its reference, where it has one."""
-        drones = self._drones
-        if drones.error is None:
-            return None
-        return Scene(drones.env.sim.mj_model, 1 / drones.env.freq, slice(0, 3), slice(3, 7), drones.error)
-
-    @property
-    def interface(self) -> Interface:
-        """Units, frames and times, for policies that leave Python."""
-        air = self._drones.air
-        late = [air.ranges.get(name, (0.0, 0.0)) for name in ("action_delay", "observation_delay")]
-        delay = (sum(least for least, _ in late), sum(most for _, most in late))
-        return interface_of(self._drones.env, [one.dynamics for one in self._vectors], delay, air.history, air.hover)
+def _pd_of(drones: Drones, action: Action, first: int) -> PD:
+    """A PD controller with its gains for these dynamics, for drones whose observation has the reference at `first`."""
+    assert isinstance(action, Box)
+    where = {"reference": slice(first, first + 3 * drones.env.n_samples), "velocity": slice(7, 10)}
+    return PD(GAINS[drones.dynamics], drones.mass, action, **where, preview=drones.env.samples_dt)
 
 
 def _import() -> None:

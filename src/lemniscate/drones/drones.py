@@ -1,26 +1,22 @@
 # pyright: reportAttributeAccessIssue=false
 """crazyflow's drones as pure functions of their state, fit to be traced: `JaxEnvs` in other words."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
-from lemniscate.drones.air import STATE_SIZE, Acting, Air, Ranges, parameter_factors
+from lemniscate.drones.air import Acting, Air, parameter_factors
+from lemniscate.drones.vehicle import DYNAMICS, STATE_PARTS, STATE_SIZE, Ranges
 from lemniscate.envs.jax_backend import Outcome, State
 from lemniscate.spec import ObservationPart
 
-if TYPE_CHECKING:
-    import jax
-
-DYNAMICS = ("so_rpy", "so_rpy_rotor", "so_rpy_rotor_drag", "first_principles")
 AHEAD = 0.75
 """the share of staggered episodes that begin ahead of their beginning"""
-STATE_PARTS = ("pos", "quat", "vel", "ang_vel")
 REFERENCE = "local_samples"
 """the part of an observation that begins with the way to the reference"""
 START = np.array((0.0, 0.0, 1.2), np.float32)
@@ -42,9 +38,6 @@ class Drones:
     """
 
     def __init__(self, env: Any, ranges: Ranges, history: int = 0, privileged: bool = False) -> None:
-        import jax
-        import jax.numpy as jnp
-
         self.env = env
         for name, value in vars(env).items():
             if isinstance(value, np.ndarray):  # the reference trajectory: NumPy cannot be indexed by a tracer
@@ -74,8 +67,6 @@ class Drones:
 
     def _own_parameters(self) -> None:
         """Give each drone parameters of its own, where conditions change them."""
-        import jax.numpy as jnp
-
         sim = self.env.sim
         names = parameter_factors(self.dynamics, dict.fromkeys(self.air.ranges, jnp.ones(1)))
         each = {name: getattr(sim.data.params, name) for name in names}
@@ -102,11 +93,9 @@ class Drones:
 
     def init(self, key: jax.Array) -> State:
         """The state of drones that have not begun. Goals get keys of their own, which crazyflow never seeds."""
-        import jax
-
         data, arrays = self._initial
         arrays = {
-            name: jax.random.fold_in(key, i) if jax.numpy.issubdtype(value.dtype, jax.dtypes.prng_key) else value
+            name: jax.random.fold_in(key, i) if jnp.issubdtype(value.dtype, jax.dtypes.prng_key) else value
             for i, (name, value) in enumerate(arrays.items(), start=1)
         }
         air = self.air.empty(jax.random.fold_in(key, len(arrays) + 1))
@@ -117,9 +106,6 @@ class Drones:
 
         Ahead means at a random step of the episode, on the reference curve at that point of it, with turning rotors.
         """
-        import jax
-        import jax.numpy as jnp
-
         with self._at(state) as env:
             env._reset(mask=mask)
             key, whether, where, turns = jax.random.split(env.sim.data.core.rng_key, 4)
@@ -140,8 +126,6 @@ class Drones:
 
     def step(self, state: State, action: jax.Array) -> tuple[State, Outcome]:
         """One control step of every drone."""
-        import jax.numpy as jnp
-
         with self._at(state) as env:
             action = jnp.clip(action, -1, 1)
             command = self.low + 0.5 * (action + 1) * (self.high - self.low)
@@ -157,8 +141,6 @@ class Drones:
 
     def _apply_conditions(self, air: dict[str, Any], mask: jax.Array) -> None:
         """The conditions drawn for the masked drones, in their parameters and states."""
-        import jax.numpy as jnp
-
         drawn, data, begins = air.get("drawn", {}), self.env.sim.data, mask[:, None, None]
         params, states = {}, data.states
         for name, factor in parameter_factors(self.dynamics, drawn).items():
@@ -174,9 +156,6 @@ class Drones:
 
     def _simulate(self, air: dict[str, Any], acting: Acting) -> jax.Array:
         """Simulate a control step; returns the state [N, 13] as long before its end as observations are late."""
-        import jax
-        import jax.numpy as jnp
-
         env, count, is_behind = self.env, self.air.substeps, "observation_delay" in self.air.ranges
         if not (self.air.is_late or is_behind):
             env._apply_action(acting(jnp.zeros((), jnp.int32)))
@@ -196,15 +175,11 @@ class Drones:
 
     def _state(self) -> jax.Array:
         """The true state of the drones, [N, 13]."""
-        import jax.numpy as jnp
-
         states = self.env.sim.data.states
         return jnp.concatenate([getattr(states, name)[:, 0] for name in STATE_PARTS], axis=-1)
 
     def _observe(self, air: dict[str, Any]) -> jax.Array:
         """The flat observation, of the state as it is measured, and what is privileged, [N, O + P]."""
-        import jax.numpy as jnp
-
         env, data = self.env, self.env.sim.data
         if self.air.is_blurred:
             seen = jnp.split(air["seen"][:, None], (3, 7, 10), axis=-1)
@@ -218,8 +193,6 @@ class Drones:
 
     def _truth(self, air: dict[str, Any]) -> jax.Array:
         """The privileged numbers, [N, P]: the air, the four rotors' speed (1: hovering), the dynamics as one-hot."""
-        import jax.numpy as jnp
-
         rotors = self.env.sim.data.states.rotor_vel[:, 0] / np.where(self._turning > 0, self._turning, 1)
         dynamics = np.eye(len(DYNAMICS), dtype=np.float32)[DYNAMICS.index(self.dynamics)]
         each = [jnp.broadcast_to(part, (self.num_envs, part.shape[-1])) for part in (rotors, dynamics)]
@@ -244,8 +217,6 @@ class Mixed:
 
     def init(self, key: jax.Array) -> State:
         """The state of each vector, with a key of its own."""
-        import jax
-
         keys = jax.random.split(key, len(self.drones))
         return [one.init(its) for one, its in zip(self.drones, keys, strict=True)]
 
@@ -257,8 +228,6 @@ class Mixed:
 
     def step(self, state: State, action: jax.Array) -> tuple[State, Outcome]:
         """One control step of every drone, as `Drones.step`."""
-        import jax
-
         every = [one.step(its, action[i :: len(self.drones)]) for i, (one, its) in self._each(state)]
         states, outcomes = zip(*every, strict=True)
         return list(states), jax.tree.map(_by_turns, *outcomes)
@@ -269,8 +238,6 @@ class Mixed:
 
 def _by_turns(*parts: jax.Array) -> jax.Array:
     """The k arrays [N / k, …] as one [N, …], of which row i is from the array i mod k."""
-    import jax.numpy as jnp
-
     stacked = jnp.stack(parts, axis=1)
     return stacked.reshape(-1, *stacked.shape[2:])
 

@@ -5,22 +5,50 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import torch
 
-from lemniscate.drones.air import CONDITIONS, Ranges
 from lemniscate.drones.drones import Drones
+from lemniscate.drones.vehicle import CONDITIONS, Ranges
 from lemniscate.envs.jax_backend import compile_side_by_side
-from lemniscate.envs.probe import CONDITION_AXES, Act, Axis, Flown, Tally, dynamics_axis
+from lemniscate.envs.probe import PERCENT, Act, Axis, Flown, Tally
 from lemniscate.spec import Spec
-
-if TYPE_CHECKING:
-    import jax
 
 MOST_FLIGHTS = 1024
 """flights side by side: as many as a cache holds, and few enough that batches of crashed drones end early"""
+
+
+def _condition(name: str, values: tuple[float, ...], unit: str, title: str, phrase: str, *shown: str | float) -> Axis:
+    """The axis of a condition in `air.CONDITIONS`."""
+    nominal = CONDITIONS[name].nominal
+    own = (str(shown[0]), float(shown[1])) if shown else (unit, 1.0)
+    return Axis(name, tuple(sorted({*values, nominal})), nominal, unit, title, phrase, own)
+
+
+_DELAYS = tuple(step / 500 for step in range(31))
+_TIMES = (0.5, 1.0, 2.0, 4.0)
+
+CONDITION_AXES = (
+    _condition("action_delay", _DELAYS, "s", "action delay", "{} of action delay", "ms", 1000),
+    _condition("observation_delay", _DELAYS, "s", "observation delay", "{} of observation delay", "ms", 1000),
+    _condition("mass", (0.7, 0.85, 0.95, 1.05, 1.15, 1.3), "", "mass", "{} mass"),
+    _condition("inertia", (0.5, 0.7, 0.9, 1.1, 1.3, 1.5), "", "inertia", "{} inertia"),
+    _condition("motor_gain", (0.8, 0.85, 0.9, 0.95, 1.05, 1.1), "", "motor gain", "{} motor gain"),
+    _condition("motor_time", (0.5, 0.75, 1.25, 1.5, 2.0), "", "motor time constant", "{} motor time constant"),
+    _condition("thrust_curve", (-0.1, -0.05, 0.05, 0.1), "1", "thrust curve", "a thrust curve bent by {}", *PERCENT),
+    _condition("wind", (0.05, 0.1, 0.15), "N", "wind", "{} of wind"),
+    _condition("gusts", (0.02, 0.05, 0.1), "N", "gusts", "gusts of {}"),
+    _condition("observation_noise", _TIMES, "NOISE", "sensor noise", "{} the usual sensor noise", "times", 1),
+    _condition("observation_bias", _TIMES, "NOISE", "sensor bias", "{} the usual sensor bias", "times", 1),
+    _condition("lost_actions", (0.01, 0.05, 0.1, 0.2), "1", "lost actions", "{} of the actions lost", *PERCENT),
+    _condition("jitter", (0.25, 0.5, 1.0), "periods", "jitter", "a jitter of {} of a control period", *PERCENT),
+    _condition("start_spread", (1.25, 1.5, 2.0), "", "start spread", "{} spread of the starts"),
+)
+"""NOISE is that of `lemniscate.drones.air`"""
 
 Make = Callable[[str | None, Ranges], Drones]
 """the drones of as many flights as there are starts, in dynamics by name, or in those that are nominal"""
@@ -49,7 +77,8 @@ class DroneProbe:
         self._drones = make(None, ranges)
         nominal, self._ends = self._drones.dynamics, _ends(ranges, given)
         ordered = tuple(axis for axis in conditions if axis.name != "motor_time" or nominal != "so_rpy")
-        self.axes = (*ordered, dynamics_axis(nominal, tuple(dynamics)))
+        every = Axis("dynamics", tuple(dynamics), nominal, "name", "dynamics", "the dynamics {}")
+        self.axes = (*ordered, every)
         self.spec: Spec = spec(self._drones)
         self.period = 1 / self._drones.env.freq
         self._points = [(axis.name, value) for axis in ordered for value in axis.values if value != axis.nominal]
@@ -109,8 +138,6 @@ class _Programs:
 
         A drone whose state is not finite has crashed.
         """
-        from jax.dlpack import from_dlpack
-
         starts, kept = self._drones.num_envs, list[torch.Tensor]()
         tally = Tally(self._points * starts)
         state, obs = self._restart(np.uint32(seed), ends)
@@ -118,7 +145,7 @@ class _Programs:
             action = act(torch.nan_to_num(torch.from_dlpack(obs))).clamp(-1, 1)
             if keep_first:
                 kept.append(action[:starts].clone())
-            state, obs, reward, crashed = self._step(state, from_dlpack(action.contiguous()))
+            state, obs, reward, crashed = self._step(state, jax.dlpack.from_dlpack(action.contiguous()))
             tally.add(torch.nan_to_num(torch.from_dlpack(reward)), torch.from_dlpack(crashed))
             if not tally.going.any():
                 break
@@ -137,9 +164,6 @@ def _compiled(drones: Sequence[tuple[Drones, int]]) -> list[_Programs]:
 
 def _lowered(drones: Drones, points: int) -> tuple[Any, Any]:
     """`restart(seed, ends) -> state, obs` and `step(state, action) -> state, obs, reward, crashed`, traced."""
-    import jax
-    import jax.numpy as jnp
-
     drones.env.sim.device = None  # crazyflow places actions on a device, which jax.vmap cannot
     every, calm = jnp.ones(drones.num_envs, dtype=bool), jnp.array(False)
 

@@ -1,12 +1,17 @@
 """The contract of the environment floor: what a backend provides."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
+import gymnasium as gym
 import torch
+from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
+from lemniscate.envs.interface import Interface
+from lemniscate.envs.probe import Probe
 from lemniscate.maths import Distribution
 from lemniscate.spec import Spec
 from lemniscate.types import Step
@@ -54,40 +59,44 @@ class Baseline(Protocol):
         ...
 
 
-class Backend(Protocol):
+class Backend(ABC):
     """N parallel environments that are stepped together. Tensors go in and come out, all on one device.
 
-    A backend is a class in a file of its own and a line in `registry.BACKENDS`; a user's own is named `module:Class`.
+    A backend is a subclass in a file of its own and a line in `registry.BACKENDS`; a user's own is named
+    `module:Class`. Its own are the abstract methods; what else is here has a default.
     `tests/envs/test_contract.py` holds each to this contract.
 
-    A backend may have more, each of which is asked for by its name:
-
-    - `summaries`: a tuple of `Summary`;
-    - `scene`: a `Scene` or None, which is drawn where a Gymnasium environment would be rendered;
-    - `baseline`: a `Baseline` or None, a classical controller beside which policies are shown;
-    - `interface`: an `Interface`, the meaning of the numbers, for policies that are exported;
-    - `compiled = True`: a step is a program for one number of environments, so evaluation takes as many as training;
-    - `package`: what has to be installed;
-    - `in_process`: the name of the backend that evaluates its policies, where it uses other processes itself;
-    - `divides(env) -> bool`, a class method: whether each environment has a seed of its own, so that nothing of one
-      depends on the others beside it; where it has not, each shard of a run has a backend;
-    - `room(env) -> (bytes, files)`, a class method: the memory and the open files that each takes at least;
-    - `wraps(env) -> bool`, a class method: whether it can put `wrappers` around;
-    - `probe(env, starts, trained, given)`, a class method: a `lemniscate.envs.probe.Probe` from so many starts, with
-      the arguments of training and those that differ from them; others are flown as `margins.vector_probe` does;
-    - `make_rendered(env, mode, kwargs, wrappers)`, a class method: one `gymnasium.Env` that renders itself.
+    Attributes:
+        spec: observations, actions and the time limit in steps.
+        num_envs: N.
+        device: of every tensor; actions are expected there too.
+        counts: [N] bool, the episode under way counts in the statistics. False where staggering made it a fragment, by
+            beginning it late or by cutting it early. Read before a step, it speaks of the episodes that the step may
+            end.
+        mode: what an environment does after an end, in Gymnasium's words. DISABLED is reset here, in the same step.
+        summaries: the numbers that evaluation makes of the measures besides their means.
+        scene: what is drawn where a Gymnasium environment would be rendered.
+        baseline: a classical controller beside which policies are shown.
+        interface: the meaning of the numbers, for policies that are exported.
+        compiled: a step is a program for one number of environments, so evaluation takes as many as training.
+        package: what has to be installed, if anything.
+        in_process: the name of the backend that evaluates the policies of one that uses other processes.
     """
 
     spec: Spec
-    """observations, actions and the time limit in steps"""
     num_envs: int
-    """N"""
     device: torch.device
-    """of every tensor; actions are expected there too"""
     counts: Tensor
-    """[N] bool: the episode under way counts in the statistics. False where staggering made it a fragment, by beginning
-    it late or by cutting it early. Read before a step, it speaks of the episodes that the step may end."""
+    mode: AutoresetMode = AutoresetMode.DISABLED
+    summaries: tuple[Summary, ...] = ()
+    scene: Scene | None = None
+    baseline: Baseline | None = None
+    interface: Interface = Interface()
+    compiled: bool = False
+    package: str | None = None
+    in_process: str | None = None
 
+    @abstractmethod
     def __init__(
         self,
         env: str,
@@ -112,21 +121,8 @@ class Backend(Protocol):
             UserError: an environment, argument or wrapper that this backend cannot serve; spaces that no policy can
                 act in; an environment that hides its final observations.
         """
-        ...
 
-    @classmethod
-    def ids(cls) -> Collection[str]:
-        """The ids that it serves where no backend is named, for lists; may import heavy packages."""
-        ...
-
-    @classmethod
-    def serves(cls, env: str) -> bool:
-        """Whether it can run `env`; of several backends that can, the first in the table does.
-
-        Asked at every start, so it imports nothing heavy.
-        """
-        ...
-
+    @abstractmethod
     def restart(self, seed: int, first: int = 0) -> Tensor:
         """Begin again, as if just built: nothing of the past remains. Returns obs [N, O].
 
@@ -135,8 +131,8 @@ class Backend(Protocol):
             first: the number of the first of these among them. What is random in environment i follows from `seed` and
                 `first + i`, where each has a seed of its own; else from `seed + first`.
         """
-        ...
 
+    @abstractmethod
     def step(self, action: Tensor) -> Step:
         """Act in every environment; what has ended is reset by itself, now or in the next step (`valid` False).
 
@@ -144,8 +140,98 @@ class Backend(Protocol):
             action: Box float [N, A] in [-1, 1], where more is clipped; Discrete int64 [N]; MultiDiscrete int64 [N, K];
                 MultiBinary [N, n]. The backend converts them to the environment's own units, dtype and shape.
         """
-        ...
 
+    @abstractmethod
     def close(self) -> None:
         """Give back processes and windows."""
-        ...
+
+    @classmethod
+    def ids(cls) -> Collection[str]:
+        """The ids that it serves where no backend is named, for lists; may import heavy packages."""
+        return ()
+
+    @classmethod
+    def serves(cls, env: str) -> bool:
+        """Whether it can run `env`; of several backends that can, the first in the table does.
+
+        Asked at every start, so it imports nothing heavy.
+        """
+        return env in cls.ids()
+
+    @classmethod
+    def room(cls, env: str) -> tuple[int, int]:
+        """The memory in bytes and the open files that each environment takes at least."""
+        return 0, 0
+
+    @classmethod
+    def wraps(cls, env: str) -> bool:
+        """Whether it makes `env` of single environments of Gymnasium's interface, which can be wrapped."""
+        return False
+
+    @classmethod
+    def divides(cls, env: str) -> bool:
+        """Whether each environment has a seed of its own, and nothing of one depends on the others beside it.
+
+        Where it has not, each shard of a run has a backend.
+        """
+        return False
+
+    @classmethod
+    def probe(cls, env: str, starts: int, trained: Mapping[str, Any], given: Mapping[str, Any]) -> Probe | None:
+        """The flights of preflight from so many starts; None flies them as `margins.vector_probe` does.
+
+        `trained` are the arguments of training, `given` those that differ from them.
+        """
+        return None
+
+    @classmethod
+    def make_rendered(cls, env: str, mode: str, kwargs: Mapping[str, Any], wrappers: Sequence[str]) -> gym.Env | None:
+        """One environment that renders itself in `mode`, "rgb_array" or "human"; None where it can make none."""
+        return None
+
+
+class Joined(Backend):
+    """Several backends of the same environment, stepped one after the other as if they were one.
+
+    Where one vector cannot be divided among processes, each shard of a run has its own.
+    """
+
+    def __init__(self, backends: Sequence[Backend]) -> None:
+        self._backends = backends
+        self.spec, self.device = backends[0].spec, backends[0].device
+        self.num_envs = sum(backend.num_envs for backend in backends)
+        self.summaries, self.scene, self.baseline = backends[0].summaries, backends[0].scene, backends[0].baseline
+
+    def restart(self, seed: int, first: int = 0) -> Tensor:
+        """Begin again; see `Backend.restart`."""
+        size = self._backends[0].num_envs
+        obs = torch.cat([backend.restart(seed, first + i * size) for i, backend in enumerate(self._backends)])
+        self._count()
+        return obs
+
+    def step(self, action: Tensor) -> Step:
+        """The step of all parts; see `Backend.step`."""
+        parts = zip(self._backends, action.chunk(len(self._backends)), strict=True)
+        steps = [backend.step(part) for backend, part in parts]
+        self._count()
+        return joined(steps)
+
+    def close(self) -> None:
+        """Close them all."""
+        for backend in self._backends:
+            backend.close()
+
+    def _count(self) -> None:
+        self.counts = torch.cat([backend.counts for backend in self._backends])
+
+
+def joined(steps: Sequence[Step]) -> Step:
+    """The steps of several vectors of environments as one; a measure that some lack is NaN there."""
+    names = dict.fromkeys(name for step in steps for name in step.measures)
+    missing = [torch.full_like(step.reward, torch.nan) for step in steps]
+    measures = {
+        name: torch.cat([step.measures.get(name, nan) for step, nan in zip(steps, missing, strict=True)])
+        for name in names
+    }
+    columns = ("obs", "next_obs", "reward", "terminated", "truncated", "valid")
+    return Step(**{name: torch.cat([getattr(step, name) for step in steps]) for name in columns}, measures=measures)

@@ -1,59 +1,108 @@
-"""Whether an environment is suitable for training: Gymnasium's own checker, and what it does not look at."""
+"""Whether an environment is suitable for training: Gymnasium's own checker, and what random play shows."""
 
 import time
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from copy import deepcopy
+from dataclasses import dataclass
 from functools import partial
+from textwrap import wrap
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import torch
 from gymnasium.envs.registration import EnvSpec
+from gymnasium.utils.env_checker import check_env, data_equivalence
 from gymnasium.vector import AutoresetMode
+from torch import Tensor
 
 from lemniscate.envs import registry
 from lemniscate.envs.factory import make_one, maker_of
-from lemniscate.envs.findings import BAD, GOOD, NOTE, Finding, learnable
-from lemniscate.envs.gymnasium_check import api_findings, one_line
-from lemniscate.envs.random_action import random_action
+from lemniscate.envs.spaces import follow, is_image, observation_parts, random_action
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import NonFiniteError, UserError
 from lemniscate.spec import Action, Box, Discrete, MultiDiscrete, Spec
 from lemniscate.system.named import find_callable
 from lemniscate.types import Rollout
 
+GOOD, NOTE, BAD = "good", "note", "bad"
+MARKS = {GOOD: "✓", NOTE: "!", BAD: "✗"}
 NUM_ENVS, STEPS = 4, 500
+LARGE_RATIO = 1e4
+"""a ratio of sizes of observations from which on a network does not see the small ones"""
+LARGE_REWARD = 100
+"""a reward from which on the errors of the value network are too large for its learning rate"""
+BESIDE_THE_POINT = ("infinity. This is probably", "we recommend using a symmetric and normalized space")
+"""Gymnasium's warnings about spaces that do not matter here, where observations are normalized and actions scaled"""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One sentence about what is checked. `grade` is "good", "note" (works, but look at it) or "bad"."""
+
+    grade: str
+    sentence: str
+
+    def __str__(self) -> str:
+        return self.listed(112)
+
+    def listed(self, width: int) -> str:
+        """The sentence as an item of a list, wrapped at `width` columns."""
+        lines = wrap(self.sentence, width - 2, break_long_words=False, break_on_hyphens=False)
+        return f"{MARKS[self.grade]} " + "\n  ".join(lines)
+
+
+def verdict(env_id: str, findings: Sequence[Finding]) -> str:
+    """Whether an environment is suitable for training, in one sentence."""
+    bad, notes = (sum(finding.grade == grade for finding in findings) for grade in (BAD, NOTE))
+    if bad:
+        return f"{env_id} is not suitable for training: {bad} finding{'s' * (bad > 1)} above, marked {MARKS[BAD]}."
+    look = f"; look at the {notes} note{'s' * (notes > 1)} above, marked {MARKS[NOTE]}" if notes else ""
+    return f"{env_id} is suitable for training{look}."
 
 
 def each_finding(
     env_id: str, backend: str | None, env_kwargs: Mapping[str, Any] | None, wrappers: Sequence[str]
 ) -> Iterator[Finding]:
     """The findings about an environment, one by one. Raises `UserError` if there is none of that name."""
-    served_by = registry.backend_for(env_id, wrappers) if backend is None else registry.require_backend(backend)
+    served_by = backend or registry.backend_for(env_id, wrappers)
+    registry.backend_class(served_by)  # an unknown backend is an error of the question, not a finding
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with warnings.catch_warnings(action="ignore"):
             env = registry.make(env_id, NUM_ENVS, kwargs=env_kwargs, wrappers=wrappers, backend=backend)
-    except UserError as error:
-        yield Finding(BAD, str(error))
-        return
     except Exception as error:  # the environment's own code, here and below: whatever it raises is the finding
-        yield Finding(BAD, f"It cannot be made: {_told(error)}.")
+        yield _raised(error, "It cannot be made")
         return
     try:
         yield from _spaces(env, served_by)
         if registry.can_wrap(served_by, env_id):
             maker = maker_of(env_id)
             make = partial(make_one, maker, tuple(map(find_callable, wrappers)), **(env_kwargs or {}))
-            yield from api_findings(make, env_id, wrapped=bool(wrappers) or not isinstance(maker, EnvSpec))
-        yield from _behaviour(env)
+            yield from _gymnasium(make, env_id, wrapped=bool(wrappers) or not isinstance(maker, EnvSpec))
+        yield from _random_play(env)
     finally:
         env.close()
 
 
+def _raised(error: Exception, what: str) -> Finding:
+    if isinstance(error, NonFiniteError):
+        return Finding(BAD, f"{error} Learning would stop there.")
+    if isinstance(error, UserError):
+        return Finding(BAD, str(error))
+    return Finding(BAD, f"{what}: {type(error).__name__}: {_one_line(error).rstrip('.')}.")
+
+
+def _one_line(message: object) -> str:
+    """A message of Gymnasium's or of an exception, without colours and line breaks."""
+    text = str(message).replace("\x1b[33m", "").replace("\x1b[0m", "").removeprefix("WARN: ")
+    return " ".join(text.split())
+
+
 def _spaces(env: VecEnv, served_by: str) -> Iterator[Finding]:
-    spec = env.spec
-    yield Finding(GOOD, f"Served by {served_by}; observes {_seen(spec)}; acts by {_describe(spec.action)}.")
+    """What is observed and done, and what happens at an episode's end."""
+    spec, mode = env.spec, env.backend.mode
+    yield Finding(GOOD, f"Served by {served_by}; observes {_seen(spec)}; acts by {_acts(spec.action)}.")
     flat = [part for part in spec.observation_parts if len(part.shape) > 1 and min(sorted(part.shape)[-2:]) > 16]
     if flat and not spec.image:
         part = flat[0]
@@ -62,7 +111,12 @@ def _spaces(env: VecEnv, served_by: str) -> Iterator[Finding]:
             f"The array {part.name} {part.shape} becomes {part.size:,} numbers without their places; if it is an image,"
             " return uint8 of height × width × channels, or with the channels first, for a convolutional network.",
         )
-    yield from _autoreset(env)
+    if mode is AutoresetMode.SAME_STEP:
+        yield Finding(GOOD, "Resets in the step that ends an episode, and gives the final observation in its info.")
+    elif mode is AutoresetMode.NEXT_STEP:
+        yield Finding(GOOD, "Resets in the step after an end; the action of that step is ignored and not learned from.")
+    else:
+        yield Finding(GOOD, "Is reset here, right after an episode's end; the final observation is kept.")
     if isinstance(spec.action, Box) and not np.isfinite([*spec.action.low, *spec.action.high]).all():
         yield Finding(
             NOTE, "Some actions have no bound: a policy begins around zero, or around one unit from the only bound."
@@ -79,17 +133,7 @@ def _seen(spec: Spec) -> str:
     return f"{how}, from arrays {part.own_shape}" if part.own_shape else how
 
 
-def _autoreset(env: VecEnv) -> Iterator[Finding]:
-    mode = getattr(env.backend, "mode", None)
-    if mode is AutoresetMode.SAME_STEP:
-        yield Finding(GOOD, "Resets in the step that ends an episode, and gives the final observation in its info.")
-    elif mode is AutoresetMode.NEXT_STEP:
-        yield Finding(GOOD, "Resets in the step after an end; the action of that step is ignored and not learned from.")
-    else:
-        yield Finding(GOOD, "Is reset here, right after an episode's end; the final observation is kept.")
-
-
-def _describe(action: Action) -> str:
+def _acts(action: Action) -> str:
     if isinstance(action, Box):
         return f"{action.size} continuous numbers"
     if isinstance(action, Discrete):
@@ -99,21 +143,16 @@ def _describe(action: Action) -> str:
     return f"{action.n} binary choices"
 
 
-def _behaviour(env: VecEnv) -> Iterator[Finding]:
+def _random_play(env: VecEnv) -> Iterator[Finding]:
+    """Finite numbers, seeds, effects of actions, rows, ends, and whatever else random play shows."""
     try:
         started = time.perf_counter()
         first = _play(env, seed=0)
         speed = NUM_ENVS * STEPS / (time.perf_counter() - started)
         repeated = _same(first, _play(env, seed=0))
         other, acted = _play(env, seed=1), _play(env, seed=0, actions=8, steps=STEPS // 2)
-    except NonFiniteError as error:
-        yield Finding(BAD, f"{error} Learning would stop there.")
-        return
-    except UserError as error:
-        yield Finding(BAD, str(error))
-        return
     except Exception as error:
-        yield Finding(BAD, f"It cannot be played with random actions: {_told(error)}.")
+        yield _raised(error, "It cannot be played with random actions")
         return
     yield Finding(GOOD, f"{STEPS} random steps: every observation and reward is finite.")
     if not repeated:
@@ -128,35 +167,25 @@ def _behaviour(env: VecEnv) -> Iterator[Finding]:
             "Other actions from the same seed had the same outcome in every step: nothing can be learned where actions"
             " are ignored; look whether step() uses its argument.",
         )
-    yield from _rows(first)
-    yield from learnable([first, other], env.spec)
-    yield Finding(GOOD, f"{speed:,.0f} steps a second ({NUM_ENVS} parallel environments, random actions).")
-
-
-def _same(one: Rollout, other: Rollout) -> bool:
-    """Whether two rollouts had the same outcome."""
-    outcome = ("obs", "next_obs", "reward", "terminated", "truncated")
-    return all(torch.equal(getattr(one, name), getattr(other, name)) for name in outcome)
-
-
-def _rows(rollout: Rollout) -> Iterator[Finding]:
-    inside = (rollout.valid & ~rollout.done)[:-1]
-    if not torch.equal(rollout.next_obs[:-1][inside], rollout.obs[1:][inside]):
+    inside = (first.valid & ~first.done)[:-1]
+    if not torch.equal(first.next_obs[:-1][inside], first.obs[1:][inside]):
         yield Finding(BAD, "Within an episode, an observation is not the one that the step before ended in.")
-    ended, timed_out = int(rollout.terminated.sum()), int(rollout.truncated.sum())
-    ignored = int((~rollout.valid).sum())
+    ended, timed_out, ignored = (int(x.sum()) for x in (first.terminated, first.truncated, ~first.valid))
     resets = f", and {ignored} steps in which it ignored its action to reset itself, which are not learned from"
     yield Finding(
         GOOD, f"{ended} episodes ended by its rules and {timed_out} by the time limit{resets if ignored else ''}."
     )
+    yield from _ends_and_rewards([first, other], env.spec)
+    if not env.spec.image:
+        yield from _sizes(torch.cat([rollout.obs[rollout.valid] for rollout in (first, other)]), env.spec)
+    yield Finding(GOOD, f"{speed:,.0f} steps a second ({NUM_ENVS} parallel environments, random actions).")
 
 
 def _play(env: VecEnv, seed: int, actions: int = 7, steps: int = STEPS) -> Rollout:
-    """Random actions, the same for the same `actions`, a seed (up to masks)."""
+    """Random play from a seed; its actions, up to masks, follow from the number `actions`."""
     rng = torch.Generator().manual_seed(actions)
     rows = []
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # Gymnasium's, of which we have told already
+    with warnings.catch_warnings(action="ignore"):  # Gymnasium's, of which we have told already
         env.restart(seed)
         for _ in range(steps):
             obs, action = env.obs, random_action(env.spec, env.obs, rng)
@@ -165,5 +194,172 @@ def _play(env: VecEnv, seed: int, actions: int = 7, steps: int = STEPS) -> Rollo
     return Rollout.stack(rows)
 
 
-def _told(error: Exception) -> str:
-    return f"{type(error).__name__}: {one_line(error).rstrip('.')}"
+def _same(one: Rollout, other: Rollout) -> bool:
+    """Whether two rollouts had the same outcome."""
+    outcome = ("obs", "next_obs", "reward", "terminated", "truncated")
+    return all(torch.equal(getattr(one, name), getattr(other, name)) for name in outcome)
+
+
+def _ends_and_rewards(rollouts: Sequence[Rollout], spec: Spec) -> Iterator[Finding]:
+    """Obstacles to learning in the ends of episodes and in the rewards, each with what to do."""
+    rewards = torch.cat([rollout.reward[rollout.valid] for rollout in rollouts])
+    lengths = torch.cat([_episode_lengths(rollout) for rollout in rollouts])
+    terminated = any(rollout.terminated.any() for rollout in rollouts)
+    truncated = any(rollout.truncated.any() for rollout in rollouts)
+    alike = len(lengths) > 2 and bool((lengths == lengths[0]).all())
+    if spec.max_episode_steps is None and not truncated:
+        yield Finding(
+            NOTE,
+            "It has no time limit: an episode that a policy does not end cannot be evaluated; register it with"
+            " max_episode_steps, or add --wrappers 'gymnasium.wrappers:TimeLimit(max_episode_steps=1000)'.",
+        )
+    if alike and terminated and not truncated and lengths[0] > 1:
+        yield Finding(
+            NOTE,
+            f"Each of {len(lengths)} episodes terminated after exactly {int(lengths[0])} steps: if that is a time"
+            " limit, report it as truncated, or learning takes the value there to be 0.",
+        )
+    if (rewards == rewards[0]).all() and (rewards[0] == 0 or alike or not len(lengths)):
+        yield Finding(
+            NOTE,
+            f"Every reward was {rewards[0]:g}, whatever was done: nothing is learned until random actions meet another;"
+            " if rewards are meant to be rare, reward the way there too.",
+        )
+    if rewards.abs().max() > LARGE_REWARD:
+        yield Finding(
+            NOTE,
+            f"Rewards reach {rewards.abs().max():.3g}, which makes the first value errors too large; train with"
+            " --scale-rewards (on-policy), or pay less.",
+        )
+
+
+def _episode_lengths(rollout: Rollout) -> Tensor:
+    """The lengths of the whole episodes of a rollout, in steps that were not ignored."""
+    lengths: list[Tensor] = []
+    running = torch.zeros(rollout.reward.shape[1])
+    for done, valid in zip(rollout.done, rollout.valid, strict=True):
+        running = running + valid
+        lengths.append(running[done & valid])
+        running = running * ~(done & valid)
+    return torch.cat(lengths)
+
+
+def _sizes(obs: Tensor, spec: Spec) -> Iterator[Finding]:
+    """A note on observations of very different sizes."""
+    largest = obs[:, : spec.observation_size].abs().amax(dim=0)
+    sizes = torch.where(largest > 0, largest, torch.nan)
+    if sizes.isnan().all():
+        return
+    high, low = sizes.nan_to_num(0).argmax(), sizes.nan_to_num(torch.inf).argmin()
+    if sizes[high] >= LARGE_RATIO * sizes[low]:
+        names = [f"{part.name}[{i}]" for part in spec.observation_parts for i in range(part.size)]
+        yield Finding(
+            NOTE,
+            f"Observations reach {sizes[high]:.1g} in {names[high]} and {sizes[low]:.1g} in {names[low]}: the network"
+            " does not see the small ones; train with --normalize-observations, or bring them to about 1.",
+        )
+
+
+def _gymnasium(make: Callable[[], gym.Env], env_id: str, wrapped: bool) -> Iterator[Finding]:
+    """The result of Gymnasium's checker without its false alarms, and whether observations are copies.
+
+    `wrapped` checks the environment as `make` returns it, with the user's own wrappers; otherwise what is inside of
+    Gymnasium's.
+    """
+    found: list[Finding] = []
+    env = make()
+    careful = Careful(env if wrapped else env.unwrapped)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            check_env(careful, skip_render_check=True, skip_close_check=wrapped)
+        except Exception as error:
+            why = _why_outside(careful) if "not within the observation space" in str(error) else ""
+            found.append(Finding(BAD, f"Gymnasium's checker: {_one_line(error)}{why}"))
+    told = {_one_line(warning.message) for warning in caught if warning.category is UserWarning}
+    minded = sorted(sentence for sentence in told if not any(part in sentence for part in BESIDE_THE_POINT))
+    notes = [Finding(NOTE, f"Gymnasium's checker: {sentence}") for sentence in minded]
+    yield from found + notes or [Finding(GOOD, "Gymnasium's checker finds nothing.")]
+    if careful.reuses:
+        yield Finding(
+            NOTE,
+            "It writes each observation into the array that it returned before, which changes what others kept of it;"
+            " return a copy, obs.copy(). (lemniscate copies every observation.)",
+        )
+    if not found:
+        yield _dtypes(env, env_id)
+    env.close()
+
+
+def _why_outside(env: gym.Env) -> str:
+    """The difference between the first observation and its space, a Box, in a sentence that follows Gymnasium's."""
+    space, obs = env.observation_space, np.asarray(env.reset(seed=0)[0])
+    if not isinstance(space, gym.spaces.Box):
+        return ""
+    if not np.can_cast(obs.dtype, space.dtype):
+        return f" It is {obs.dtype}, the space {space.dtype}: return obs.astype(np.{space.dtype})."
+    if obs.shape != space.shape:
+        return f" Its shape is {obs.shape}, that of the space {space.shape}."
+    outside = np.argwhere((obs < space.low) | (obs > space.high))
+    if not len(outside):
+        return ""
+    place = tuple(outside[0])
+    bounds = f"[{space.low[place]:g}, {space.high[place]:g}]"
+    return f" Its number {', '.join(map(str, place))} is {obs[place]:g}, outside of {bounds}."
+
+
+def _dtypes(env: gym.Env, env_id: str) -> Finding:
+    obs, space = env.reset(seed=0)[0], env.observation_space
+    kinds = {np.asarray(follow(part.path, obs)).dtype.name for part in observation_parts(space, env_id)}
+    as_what = "stay bytes" if kinds == {"uint8"} and is_image(space) else "reach the policy as float32"
+    return Finding(GOOD, f"Its observations are {', '.join(sorted(kinds))}, and {as_what}.")
+
+
+class Careful(gym.Wrapper):
+    """An environment as learning uses it: only legal actions, and of every observation a copy.
+
+    `reuses` is whether an observation changed after it had been returned.
+    """
+
+    def __init__(self, env: gym.Env) -> None:
+        super().__init__(env)
+        self.reuses = False
+        self._mask: Any = None
+        self._returned: Any = None
+        self._copy: Any = None
+
+    @property
+    def unwrapped(self) -> gym.Env:
+        """Itself, since Gymnasium's checker warns of an environment with a wrapper."""
+        return self
+
+    @property
+    def spec(self) -> Any:
+        """The spec of the environment; `gym.Wrapper` would look for the arguments of this wrapper."""
+        return self.env.spec
+
+    @property
+    def _np_random(self) -> np.random.Generator | None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return self.env.unwrapped._np_random
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        """Reset."""
+        return self._copied(*self.env.reset(seed=seed, options=options))
+
+    def step(self, action: Any) -> Any:
+        """Take the action, or the first legal one."""
+        if self._mask is not None and isinstance(self.action_space, gym.spaces.Discrete):
+            start = self.action_space.start
+            action = action if self._mask[action - start] else start + np.argmax(self._mask)
+        obs, reward, terminated, truncated, info = self.env.step(action)
+        obs, info = self._copied(obs, info)
+        return obs, reward, terminated, truncated, info
+
+    def _copied(self, obs: Any, info: Any) -> tuple[Any, Any]:
+        """Copies of both. Notes whether the observation before has changed since it was copied, and the new mask."""
+        comparable = self._copy is not None and data_equivalence(self._copy, self._copy, exact=True)  # not with a NaN
+        self.reuses |= comparable and not data_equivalence(self._returned, self._copy, exact=True)
+        self._returned, self._copy = obs, deepcopy(obs)
+        if isinstance(info, dict):
+            self._mask = info.get("action_mask", self._mask)
+        return deepcopy(obs), deepcopy(info)

@@ -10,7 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lemniscate.envs.measures import STANDARD, SUMMARIES, measured
+from lemniscate.envs.backend import Backend
+from lemniscate.envs.info import SUCCESS, SUMMARIES, measured
 from lemniscate.envs.spaces import (
     action_kind,
     flatten_observation,
@@ -52,7 +53,7 @@ RESERVED = ("num_envs", "batch_size", "num_threads", "seed", "env_seed", "base_p
 """options of EnvPool that are not the environment's"""
 
 
-class EnvpoolBackend:
+class EnvpoolBackend(Backend):
     """N parallel environments of one of the ids that EnvPool serves.
 
     EnvPool by itself resets in the step after an end and ignores the action of that step. Here an environment that has
@@ -151,7 +152,7 @@ class EnvpoolBackend:
             terminated=self._tensor(terminated),
             truncated=self._tensor(truncated),
             valid=self._valid,
-            measures=measured(info, STANDARD, self.num_envs, self.device),
+            measures=measured(info, SUCCESS, self.num_envs, self.device),
         )
 
     def close(self) -> None:

@@ -13,7 +13,6 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
 import lemniscate.envs.toy  # noqa: F401  (registers the toys)
-from lemniscate.envs.model_warnings import model_warnings_off
 from lemniscate.envs.workers import WatchedVectorEnv, Worker
 from lemniscate.errors import UserError
 from lemniscate.system import named
@@ -81,6 +80,21 @@ def make_vector(
         envs = SyncVectorEnv(makers, autoreset_mode=AutoresetMode.DISABLED)
         one = envs.envs[0]
     return envs, one.spec.max_episode_steps if one.spec else None
+
+
+@contextmanager
+def model_warnings_off() -> Iterator[None]:
+    """No warnings of MuJoCo about models, which it writes on standard error and into a file where the command runs."""
+    try:
+        from mujoco import set_mju_user_warning  # pyright: ignore[reportAttributeAccessIssue]
+    except ImportError:  # Gymnasium says what to install
+        yield
+        return
+    set_mju_user_warning(lambda _: None)
+    try:
+        yield
+    finally:
+        set_mju_user_warning(None)
 
 
 @contextmanager

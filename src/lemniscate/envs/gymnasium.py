@@ -11,10 +11,9 @@ import torch
 from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
-from lemniscate.envs.backend import Summary
+from lemniscate.envs.backend import Backend
 from lemniscate.envs.factory import make_one, make_vector, maker_of, makes_vector, sentences
-from lemniscate.envs.masks import ActionMasks
-from lemniscate.envs.measures import SUMMARIES, measured, measures_of
+from lemniscate.envs.info import SUMMARIES, ActionMasks, measured, measures_of
 from lemniscate.envs.spaces import (
     action_kind,
     flatten_observation,
@@ -30,7 +29,7 @@ from lemniscate.system.named import find_callable
 from lemniscate.types import Step
 
 
-class GymnasiumBackend:
+class GymnasiumBackend(Backend):
     """Any environment of Gymnasium's interface, stepped one after the other in this process.
 
     Single environments are vectorized here, with autoreset DISABLED: this class resets what has ended, so every row is
@@ -45,7 +44,7 @@ class GymnasiumBackend:
     """
 
     workers = False
-    summaries: tuple[Summary, ...] = SUMMARIES
+    summaries = SUMMARIES
 
     @classmethod
     def ids(cls) -> Collection[str]:
@@ -90,9 +89,10 @@ class GymnasiumBackend:
         self._build = partial(make_vector, maker, num_envs, dict(kwargs or {}), wraps, self.workers)
         with sentences(env, kwargs, wrappers):
             self._envs, limit = self._build()
-        self.mode = self._envs.metadata.get("autoreset_mode")
-        if not isinstance(self.mode, AutoresetMode):
+        mode = self._envs.metadata.get("autoreset_mode")
+        if not isinstance(mode, AutoresetMode):
             raise UserError(f"{env} does not say when it resets: its metadata needs an autoreset_mode.")
+        self.mode = mode
         space, action = self._envs.single_observation_space, action_kind(self._envs.single_action_space, env)
         parts = observation_parts(space, env)
         self._reuses = makes_vector(maker)  # it may write over its own observations
@@ -182,3 +182,20 @@ class GymnasiumBackend:
 
     def _tensor(self, array: np.ndarray) -> Tensor:
         return torch.from_numpy(array).to(self.device)
+
+
+class AsyncGymnasiumBackend(GymnasiumBackend):
+    """The same, with a process for each environment. No id is served so unless it is asked for."""
+
+    workers = True
+    in_process = "gymnasium"
+
+    @classmethod
+    def ids(cls) -> Collection[str]:
+        """None."""
+        return ()
+
+    @classmethod
+    def room(cls, env: str) -> tuple[int, int]:
+        """The memory and files of a Python process with NumPy and Gymnasium, and of its pipes."""
+        return 100_000_000, 5

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from lemniscate.envs.backend import Backend
 from lemniscate.errors import UserError
 from lemniscate.types import Step
 
@@ -93,7 +94,7 @@ def compile_side_by_side(lowered: Sequence[Any]) -> list[Callable]:
         return list(pool.map(lambda one: one.compile(), lowered))
 
 
-class JaxBackend:
+class JaxBackend(Backend):
     """N environments that are stepped by compiled programs; what a subclass adds is their making, and the Spec."""
 
     compiled = True
@@ -137,59 +138,3 @@ def jax_device(device: torch.device) -> str:
     if device.type == "cuda" and not any(d.platform == "gpu" for d in jax.devices()):
         raise UserError("JAX sees no GPU, so this cannot run on cuda; it comes with: pip install 'jax[cuda12]'")
     return "gpu" if device.type == "cuda" else "cpu"
-
-
-class Vectorized:
-    """`JaxEnvs` from the two functions of a single environment, with a time limit.
-
-    `reset(key) -> (state, obs [O])` and `step(state, action [A]) -> (state, obs [O], reward, terminated, measures)` are
-    pure functions of one environment. With staggering, the first episode of each is cut after a random number of
-    steps, uniform up to the time limit.
-    """
-
-    def __init__(
-        self, reset: Callable, step: Callable, num_envs: int, action_size: int, max_steps: int, device: Any
-    ) -> None:
-        self.num_envs, self.action_size, self.device = num_envs, action_size, device
-        self._reset, self._step, self._max_steps = reset, step, max_steps
-
-    def init(self, key: jax.Array) -> State:
-        """Keys, and environments that have not begun."""
-        import jax
-
-        key, begin = jax.random.split(key)
-        states, obs = jax.vmap(self._reset)(jax.random.split(begin, self.num_envs))
-        nothing = jax.numpy.zeros(self.num_envs, dtype=int)
-        return {"key": key, "env": states, "obs": obs, "age": nothing, "limit": nothing}
-
-    def reset(self, state: State, mask: jax.Array, stagger: jax.Array) -> tuple[State, jax.Array, jax.Array]:
-        """Fresh states where `mask`; a limit of 0 is that of an environment before its first episode."""
-        import jax
-
-        jnp = jax.numpy
-        key, begin, where = jax.random.split(state["key"], 3)
-        fresh, fresh_obs = jax.vmap(self._reset)(jax.random.split(begin, self.num_envs))
-
-        def choose(new: jax.Array, old: jax.Array) -> jax.Array:
-            return jnp.where(mask.reshape(-1, *[1] * (new.ndim - 1)), new, old)
-
-        fragment = mask & stagger & (state["limit"] == 0)
-        cut = jax.random.randint(where, (self.num_envs,), 1, self._max_steps + 1)
-        limit = jnp.where(fragment, cut, self._max_steps)
-        obs = choose(fresh_obs, state["obs"])
-        state = {
-            "key": key,
-            "env": jax.tree.map(choose, fresh, state["env"]),
-            "obs": obs,
-            "age": choose(jnp.zeros_like(state["age"]), state["age"]),
-            "limit": choose(limit, state["limit"]),
-        }
-        return state, obs, fragment
-
-    def step(self, state: State, action: jax.Array) -> tuple[State, Outcome]:
-        """Every environment one step on."""
-        import jax
-
-        env, obs, reward, terminated, measures = jax.vmap(self._step)(state["env"], action)
-        age = state["age"] + 1
-        return {**state, "env": env, "obs": obs, "age": age}, (obs, reward, terminated, age >= state["limit"], measures)

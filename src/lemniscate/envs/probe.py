@@ -7,7 +7,6 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from lemniscate.drones.air import CONDITIONS
 from lemniscate.spec import Spec
 
 Value = float | str
@@ -65,39 +64,13 @@ class Axis:
         return replace(self, values=tuple(sorted({*self.values, nominal})), nominal=nominal)
 
 
-def _condition(name: str, values: tuple[float, ...], unit: str, title: str, phrase: str, *shown: str | float) -> Axis:
-    """The axis of a condition in `air.CONDITIONS`."""
-    nominal = CONDITIONS[name].nominal
-    own = (str(shown[0]), float(shown[1])) if shown else (unit, 1.0)
-    return Axis(name, tuple(sorted({*values, nominal})), nominal, unit, title, phrase, own)
-
-
-_DELAYS = tuple(step / 500 for step in range(31))
-_TIMES = (0.5, 1.0, 2.0, 4.0)
-_PERCENT = ("%", 100.0)
-
-CONDITION_AXES = (
-    _condition("action_delay", _DELAYS, "s", "action delay", "{} of action delay", "ms", 1000),
-    _condition("observation_delay", _DELAYS, "s", "observation delay", "{} of observation delay", "ms", 1000),
-    _condition("mass", (0.7, 0.85, 0.95, 1.05, 1.15, 1.3), "", "mass", "{} mass"),
-    _condition("inertia", (0.5, 0.7, 0.9, 1.1, 1.3, 1.5), "", "inertia", "{} inertia"),
-    _condition("motor_gain", (0.8, 0.85, 0.9, 0.95, 1.05, 1.1), "", "motor gain", "{} motor gain"),
-    _condition("motor_time", (0.5, 0.75, 1.25, 1.5, 2.0), "", "motor time constant", "{} motor time constant"),
-    _condition("thrust_curve", (-0.1, -0.05, 0.05, 0.1), "1", "thrust curve", "a thrust curve bent by {}", *_PERCENT),
-    _condition("wind", (0.05, 0.1, 0.15), "N", "wind", "{} of wind"),
-    _condition("gusts", (0.02, 0.05, 0.1), "N", "gusts", "gusts of {}"),
-    _condition("observation_noise", _TIMES, "NOISE", "sensor noise", "{} the usual sensor noise", "times", 1),
-    _condition("observation_bias", _TIMES, "NOISE", "sensor bias", "{} the usual sensor bias", "times", 1),
-    _condition("lost_actions", (0.01, 0.05, 0.1, 0.2), "1", "lost actions", "{} of the actions lost", *_PERCENT),
-    _condition("jitter", (0.25, 0.5, 1.0), "periods", "jitter", "a jitter of {} of a control period", *_PERCENT),
-    _condition("start_spread", (1.25, 1.5, 2.0), "", "start spread", "{} spread of the starts"),
-)
-"""of drones; NOISE is that of `lemniscate.drones.air`"""
+PERCENT = ("%", 100.0)
+"""how shares are shown"""
 
 CHANNEL_AXES = (
     Axis("action_delay", (0, 1, 2, 3, 4, 6, 8), 0, "steps", "action delay", "{} of action delay", ("steps", 1)),
     Axis("observation_noise", (0, 0.05, 0.1, 0.2, 0.5, 1), 0, "std", "observation noise", "{} of noise", ("std", 1)),
-    Axis("lost_actions", (0, 0.01, 0.05, 0.1, 0.2, 0.5), 0, "1", "lost actions", "{} of the actions lost", _PERCENT),
+    Axis("lost_actions", (0, 0.01, 0.05, 0.1, 0.2, 0.5), 0, "1", "lost actions", "{} of the actions lost", PERCENT),
 )
 """of every environment; std is the standard deviation of each number of the observations in nominal episodes"""
 
@@ -106,11 +79,6 @@ MODEL_AXES = (
     Axis("friction", (0.5, 0.7, 0.9, 1, 1.1, 1.3, 1.5), 1, "", "friction", "{} friction"),
 )
 """of MuJoCo's models"""
-
-
-def dynamics_axis(nominal: str, known: tuple[str, ...]) -> Axis:
-    """The axis of a drone's dynamics."""
-    return Axis("dynamics", known, nominal, "name", "dynamics", "the dynamics {}")
 
 
 @dataclass(frozen=True)

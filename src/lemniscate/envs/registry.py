@@ -9,6 +9,8 @@ from lemniscate.errors import UserError, is_installed, shown, unknown_name
 from lemniscate.system import named
 
 if TYPE_CHECKING:
+    import gymnasium as gym
+
     from lemniscate.envs.backend import Backend
     from lemniscate.envs.vec_env import VecEnv
     from lemniscate.system.world import World
@@ -17,7 +19,7 @@ BACKENDS = {
     "crazyflow": "lemniscate.drones.crazyflow:CrazyflowBackend",
     "envpool": "lemniscate.envs.envpool:EnvpoolBackend",
     "gymnasium": "lemniscate.envs.gymnasium:GymnasiumBackend",
-    "gymnasium-async": "lemniscate.envs.gymnasium_async:AsyncGymnasiumBackend",
+    "gymnasium-async": "lemniscate.envs.gymnasium:AsyncGymnasiumBackend",
 }
 """each is imported when it is used; the first that serves an id runs it"""
 
@@ -44,39 +46,31 @@ def backend_for(env: str, wrappers: Sequence[str] = ()) -> str:
 def backend_class(backend: str) -> type["Backend"]:
     """The class of a backend by its name in the table, or by `module:Class`.
 
-    Raises `UserError` with the nearest names for one that is not known.
+    Raises `UserError` with the nearest names for one that is not known, or with what a user's own lacks.
     """
-    if not isinstance(backend, str):
+    if not isinstance(backend, str) or (backend not in BACKENDS and ":" not in backend):
         raise unknown_name("backend", backend, BACKENDS)
     if backend in BACKENDS:
         module, _, name = BACKENDS[backend].partition(":")
         return getattr(importlib.import_module(module), name)
-    if ":" not in backend:
-        raise unknown_name("backend", backend, BACKENDS)
-    return named.find(backend)
+    return _require_backend(named.find(backend), backend)
 
 
-def require_backend(backend: str) -> str:
-    """The name itself. Raises `UserError` with the nearest names for one that is not known."""
-    backend_class(backend)
-    return backend
+def _require_backend(found: Any, name: str) -> type["Backend"]:
+    """The class itself. Raises `UserError` for a user's own that lacks a part of the contract."""
+    from lemniscate.envs.backend import Backend
+
+    members = [member for member in vars(Backend) if not member.startswith("_")]
+    lacking = getattr(found, "__abstractmethods__", ()) or [part for part in members if not hasattr(found, part)]
+    if not isinstance(found, type) or lacking:
+        what = f"lacks {', '.join(sorted(lacking))}" if isinstance(found, type) else "is not a class"
+        raise UserError(f"{name} {what}: a backend is derived from lemniscate.envs.backend.Backend.")
+    return found
 
 
 def can_wrap(backend: str, env: str) -> bool:
     """Whether a backend makes `env` of single environments of Gymnasium's interface, which can be wrapped."""
-    wraps = getattr(backend_class(backend), "wraps", None)
-    return wraps is not None and wraps(env)
-
-
-def can_divide(backend: str, env: str) -> bool:
-    """Whether each environment of a backend has a seed of its own, and nothing of one depends on the others."""
-    divides = getattr(backend_class(backend), "divides", None)
-    return divides is not None and divides(env)
-
-
-def has_fixed_num_envs(backend: str) -> bool:
-    """Whether a backend's step is a program for one number of environments, which others of that number share."""
-    return getattr(backend_class(backend), "compiled", False)
+    return backend_class(backend).wraps(env)
 
 
 def for_evaluation(backend: str | None) -> str | None:
@@ -84,10 +78,9 @@ def for_evaluation(backend: str | None) -> str | None:
     if backend is None:
         return None
     found = backend_class(backend)
-    package = getattr(found, "package", None)
-    if package and not is_installed(package):
+    if found.package and not is_installed(found.package):
         return None
-    return getattr(found, "in_process", backend)
+    return found.in_process or backend
 
 
 def name_of(env: object) -> str:
@@ -125,11 +118,26 @@ def require_room(env: str, num_envs: int, backend: str) -> None:
     """Raise `UserError` where N environments of a backend need more memory than is free, or more open files."""
     from lemniscate.system.machine import require_files, require_free
 
-    found: Any = backend_class(backend)
-    each, files = found.room(env) if hasattr(found, "room") else (0, 0)
+    each, files = backend_class(backend).room(env)
     what = f"{num_envs:,} × {env} in the {backend} backend"
     require_free(f"{what} take", {"num_envs": num_envs * each}, {"num_envs": num_envs}, None)
     require_files(what, num_envs, files)
+
+
+def make_rendered(
+    env: str, mode: str, kwargs: Mapping[str, Any], wrappers: Sequence[str], backend: str | None
+) -> "gym.Env":
+    """One environment of Gymnasium's interface that renders itself in `mode`, "rgb_array" or "human".
+
+    Where `backend` cannot render, as crazyflow cannot, the first backend that serves the environment and can does it.
+    Raises `UserError` if none can.
+    """
+    chosen = backend or backend_for(env, wrappers)
+    for found in map(backend_class, (chosen, *BACKENDS)):
+        made = found.make_rendered(env, mode, kwargs, wrappers) if found.serves(env) else None
+        if made is not None:
+            return made
+    raise UserError(f"the {chosen} backend renders no single environment.")
 
 
 def file_name(env: str) -> str:
@@ -168,7 +176,7 @@ def make(
     """
     import torch
 
-    from lemniscate.envs.joined import Joined
+    from lemniscate.envs.backend import Joined
     from lemniscate.envs.vec_env import VecEnv
     from lemniscate.system.world import ALONE
 
@@ -176,17 +184,17 @@ def make(
     if kwargs is not None and not isinstance(kwargs, Mapping):
         raise UserError(f"The arguments of an environment are a dictionary, such as {{'x': 1}}, not {kwargs!r}.")
     chosen = backend_for(name, wraps) if backend is None else backend
-    if not backend_class(chosen).serves(name):
+    cls = backend_class(chosen)
+    if not cls.serves(name):
         raise UserError(f"{name} cannot be served by the {chosen} backend; {backend_for(name, wraps)} serves it.")
-    if wraps and not can_wrap(chosen, name):
+    if wraps and not cls.wraps(name):
         raise UserError(
             f"The {chosen} backend cannot wrap {name}; wrappers go around single environments of the gymnasium backend."
         )
-    world, cls = world or ALONE, backend_class(chosen)
+    world = world or ALONE
     mine = num_envs // world.size
     require_room(name, mine, chosen)
-    vectors = 1 if can_divide(chosen, name) else len(world.held)
+    vectors = 1 if cls.divides(name) else len(world.held)
     options = {"stagger": stagger, "kwargs": kwargs, "wrappers": wraps}
     made = [cls(name, mine // vectors, torch.device(device), **options) for _ in range(vectors)]
-    backend_of_all: Any = made[0] if vectors == 1 else Joined(made)
-    return VecEnv(backend_of_all, world)
+    return VecEnv(made[0] if vectors == 1 else Joined(made), world)

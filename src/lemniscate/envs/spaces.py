@@ -1,15 +1,20 @@
-"""Gymnasium spaces, read once into records; observations flattened, actions scaled."""
+"""Gymnasium's spaces as records: observations flattened, images recognized, actions scaled and drawn at random."""
 
+import math
 from functools import lru_cache
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import torch
 from gymnasium import spaces
+from torch import Generator, Tensor
 
-from lemniscate.envs.images import image_part, is_image
 from lemniscate.errors import UserError
-from lemniscate.spec import Action, Box, Discrete, MultiBinary, MultiDiscrete, ObservationPart
+from lemniscate.spec import Action, Box, Discrete, MultiBinary, MultiDiscrete, ObservationPart, Spec
+
+IMAGE_CHANNELS = 16
+"""an image has at most so many channels, and a stack of images at most so many images"""
 
 
 def observation_parts(space: gym.Space, env_id: str, path: tuple[str | int, ...] = ()) -> tuple[ObservationPart, ...]:
@@ -72,6 +77,29 @@ def _flatten(part: ObservationPart, obs: Any, image: bool) -> np.ndarray:
     if part.axes:
         numbers = numbers.reshape(-1, *part.own_shape).transpose(0, *(axis + 1 for axis in part.axes))
     return numbers.reshape(-1, part.size)
+
+
+def is_image(space: gym.Space) -> bool:
+    """Whether observations are images of bytes, or stacks of images: they stay bytes, for a convolutional network."""
+    return isinstance(space, spaces.Box) and space.dtype == np.uint8 and bool(_image_axes(space.shape))
+
+
+def _image_axes(shape: tuple[int, ...]) -> tuple[int, ...]:
+    """The order of an image's axes that puts height and width first, then the stack if there is one, then channels."""
+    if len(shape) == 4 and shape[0] <= IMAGE_CHANNELS:
+        inner = tuple(axis + 1 for axis in _image_axes(shape[1:]))
+        return (*inner[:2], 0, *inner[2:]) if inner else ()
+    if len(shape) != 3 or min(shape[0], shape[2]) > IMAGE_CHANNELS:
+        return ()
+    return (0, 1, 2) if shape[2] <= shape[0] else (1, 2, 0)
+
+
+def image_part(own: tuple[int, ...]) -> ObservationPart:
+    """The part of an observation that is an image of the shape `own`, laid out height × width × channels."""
+    axes = _image_axes(own)
+    height, width, *channels = (own[axis] for axis in axes)
+    shape = (height, width, math.prod(channels))
+    return ObservationPart((), shape) if own == shape else ObservationPart((), shape, own_shape=own, axes=axes)
 
 
 def action_kind(space: gym.Space, env_id: str) -> Action:
@@ -151,3 +179,21 @@ def normalized_action(action: np.ndarray, kind: Action) -> np.ndarray:
         return (flat - np.array(kind.start)).astype(np.int64)
     _, _, middle, half = scale_of(kind)
     return ((flat - middle) / np.where(half > 0, half, 1)).astype(np.float32)
+
+
+def random_action(spec: Spec, obs: Tensor, generator: Generator) -> Tensor:
+    """One action for each of the observations [N, O + n], as `VecEnv.step` takes them.
+
+    Uniform in [-1, 1]^A for a Box, over the n choices of a Discrete (those that the mask in `obs` allows), and over the
+    choices of each component of a MultiDiscrete or MultiBinary.
+    """
+    action, drawn = spec.action, {"generator": generator, "device": obs.device}
+    num_envs = len(obs)
+    if isinstance(action, Box):
+        return 2 * torch.rand(num_envs, action.size, **drawn) - 1
+    if isinstance(action, MultiBinary):
+        return torch.randint(2, (num_envs, action.n), **drawn)
+    if isinstance(action, Discrete):
+        allowed = obs[:, -action.n :] if action.masked else torch.ones(num_envs, action.n, device=obs.device)
+        return torch.multinomial(allowed.float(), 1, generator=generator)[:, 0]
+    return torch.stack([torch.randint(n, (num_envs,), **drawn) for n in action.nvec], dim=1)

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lemniscate.envs.backend import Backend, Baseline, Scene, Summary
+from lemniscate.envs.backend import Backend
 from lemniscate.errors import NonFiniteError, UserError, wrong_action
 from lemniscate.spec import Box, Discrete, MultiBinary, Spec
 from lemniscate.system.world import ALONE, World
@@ -37,9 +37,7 @@ class VecEnv:
         self.num_envs = world.size * backend.num_envs
         self._first = world.rank * backend.num_envs
         self.device = backend.device
-        self.summaries: tuple[Summary, ...] = getattr(backend, "summaries", ())
-        self.scene: Scene | None = getattr(backend, "scene", None)
-        self.baseline: Baseline | None = getattr(backend, "baseline", None)
+        self.summaries, self.scene, self.baseline = backend.summaries, backend.scene, backend.baseline
         self.obs = torch.empty(0)
         self.collecting = Stopwatch()
         """seconds that the functions of `data` spend acting and stepping"""

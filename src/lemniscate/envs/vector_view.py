@@ -56,7 +56,7 @@ class VectorView(VectorEnv):
 
     def __init__(self, env: VecEnv) -> None:
         self.env, self.num_envs = env, env.num_envs
-        self._next_step = getattr(env.backend, "mode", None) is AutoresetMode.NEXT_STEP
+        self._next_step = env.backend.mode is AutoresetMode.NEXT_STEP
         mode = AutoresetMode.NEXT_STEP if self._next_step else AutoresetMode.SAME_STEP
         self.metadata = {"autoreset_mode": mode}
         self.single_observation_space = observation_space(env.spec)

@@ -56,7 +56,7 @@ def fly(policy: TrainedPolicy, act: Act, rows: int = ROWS, seed: int = 0) -> tup
             seen.append(obs[counts][:, :size].numpy().copy())
             if sum(map(len, seen)) >= rows:
                 break
-        return np.concatenate(seen), getattr(env.backend, "interface", Interface())
+        return np.concatenate(seen), env.backend.interface
     finally:
         env.close()
 

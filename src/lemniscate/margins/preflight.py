@@ -146,10 +146,9 @@ def _probe(policy: TrainedPolicy, episodes: int, given: Mapping[str, Any]) -> Pr
     """The environment. Raises `UserError` where it is another than in training, or has no axis."""
     arguments = env_arguments(policy.config)
     backend = arguments["backend"] or registry.backend_for(arguments["env"], arguments["wrappers"])
-    own = getattr(registry.backend_class(backend), "probe", None)
-    if own:
-        probe: Probe = own(arguments["env"], episodes, policy.config.env_kwargs, given)
-    else:
+    own = registry.backend_class(backend)
+    probe: Probe | None = own.probe(arguments["env"], episodes, policy.config.env_kwargs, given)
+    if probe is None:
         arguments["kwargs"] |= given
         probe = VectorProbe(starts=episodes, **arguments)
     if not probe.spec.fits(policy.spec):

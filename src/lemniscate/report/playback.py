@@ -18,8 +18,8 @@ from PIL import Image
 
 from lemniscate.envs import registry
 from lemniscate.envs.factory import make_one, maker_of, sentences
-from lemniscate.envs.measures import SUMMARIES, measures_of
-from lemniscate.envs.rendered import make_rendered
+from lemniscate.envs.info import SUMMARIES, measures_of
+from lemniscate.envs.registry import make_rendered
 from lemniscate.envs.vec_env import VecEnv, require_end
 from lemniscate.errors import UserError, is_installed, missing_extra, shown
 from lemniscate.run.config import RunConfig

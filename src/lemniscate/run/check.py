@@ -5,7 +5,7 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
-from lemniscate.envs.findings import BAD, GOOD, NOTE, Finding
+from lemniscate.envs.check import BAD, GOOD, NOTE, Finding
 from lemniscate.errors import UserError, resume_line
 from lemniscate.run import checkpoint
 from lemniscate.run.directory import CONFIG, LOCK

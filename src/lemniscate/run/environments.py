@@ -68,7 +68,7 @@ def evaluation_env(
     """
     arguments = env_arguments(config, env, env_kwargs, backend)
     served_by = arguments["backend"] or registry.backend_for(arguments["env"], config.wrappers)
-    num_envs = config.num_envs if registry.has_fixed_num_envs(served_by) else min(episodes, 16)
+    num_envs = config.num_envs if registry.backend_class(served_by).compiled else min(episodes, 16)
     return registry.make(num_envs=num_envs, device=device, **arguments)
 
 

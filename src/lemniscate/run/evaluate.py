@@ -12,7 +12,7 @@ import torch
 from torch import Generator, Tensor, nn
 
 from lemniscate.envs.backend import Baseline, Summary
-from lemniscate.envs.random_action import random_action
+from lemniscate.envs.spaces import random_action
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.nn.actor_q import ActorQ
 from lemniscate.nn.policies import Policy

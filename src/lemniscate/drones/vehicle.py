@@ -1,0 +1,138 @@
+# pyright: reportAttributeAccessIssue=false
+"""The meaning of a drone's numbers: units and frames of what crazyflow observes, and the conditions of a flight.
+
+A condition is a number, or a range [low, high] from which one is drawn for every episode of every drone. All of them
+together are what is called domain randomization (Tobin et al. 2017, arXiv:1703.06907).
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lemniscate.envs.interface import Interface, Quantity, Reference
+from lemniscate.errors import UserError, shown
+
+DYNAMICS = ("so_rpy", "so_rpy_rotor", "so_rpy_rotor_drag", "first_principles")
+STATE_PARTS = ("pos", "quat", "vel", "ang_vel")
+STATE_SIZE = 13
+"""position 3 (m), quaternion 4 (xyzw), velocity 3 (m/s), angular velocity 3 (rad/s)"""
+NOISE = {"pos": 0.002, "attitude": math.radians(0.5), "vel": 0.03, "ang_vel": 0.05}
+"""standard deviations: of a motion-capture system (m, rad), of velocities estimated from it (m/s), of a gyroscope
+(rad/s)"""
+
+
+@dataclass(frozen=True)
+class Condition:
+    """The value of a condition in the simulator as it is, the limits of what can be asked for, and its meaning."""
+
+    nominal: float
+    low: float
+    high: float
+    meaning: str
+
+
+CONDITIONS = {
+    "mass": Condition(1, 0.2, 3, "factor of the mass"),
+    "inertia": Condition(1, 0.1, 10, "factor of the moments of inertia: angular accelerations are divided by it"),
+    "motor_gain": Condition(1, 0.2, 3, "factor of the thrust that a command gives"),
+    "motor_time": Condition(1, 0.05, 20, "factor of the time in which rotors follow; so_rpy has no such time"),
+    "thrust_curve": Condition(0, -0.2, 0.2, "what half of the thrust range gives more, as a share of the range"),
+    "action_delay": Condition(0, 0, 0.2, "seconds until an action reaches the drone, in steps of 2 ms"),
+    "observation_delay": Condition(0, 0, 0.2, "seconds since an observation was true, in steps of 2 ms"),
+    "jitter": Condition(0, 0, 1, "most of a further delay of each action by itself, in control periods"),
+    "lost_actions": Condition(0, 0, 0.9, "probability that an action is lost, and the one before it goes on"),
+    "observation_noise": Condition(0, 0, 20, "normal noise of each observation, in multiples of NOISE"),
+    "observation_bias": Condition(0, 0, 20, "the same, but drawn once an episode"),
+    "wind": Condition(0, 0, 1, "newtons of a constant force from any horizontal direction"),
+    "gusts": Condition(0, 0, 1, "standard deviation of a force that changes within half a second, newtons an axis"),
+    "start_spread": Condition(1, 0, 3, "factor of how far from its middle, and how fast, a flight begins"),
+    "rotors": Condition(0, 0, 1, "rotor speed at the beginning, as a share of that of hovering; so_rpy has no rotors"),
+}
+
+Ranges = Mapping[str, tuple[float, float]]
+
+
+def read_ranges(kwargs: Mapping[str, Any]) -> dict[str, tuple[float, float]]:
+    """The ranges of the conditions among the arguments of an environment, without those that change nothing.
+
+    Raises:
+        UserError: a value that is neither a number nor a range, or outside what a drone could fly with.
+    """
+    ranges = {name: _range(name, kwargs[name]) for name in CONDITIONS if name in kwargs}
+    return {name: ends for name, ends in ranges.items() if ends != (CONDITIONS[name].nominal,) * 2}
+
+
+def _range(name: str, value: Any) -> tuple[float, float]:
+    ends = list(value) if isinstance(value, list | tuple) else [value, value]
+    numbers = all(isinstance(end, int | float) and not isinstance(end, bool) for end in ends)
+    if len(ends) != 2 or not numbers:
+        raise UserError(f"{name} must be a number or a range [low, high], not {shown(value)}.")
+    condition, (low, high) = CONDITIONS[name], map(float, ends)
+    if low > high:
+        raise UserError(f"{name} is a range upside down: {low:g} is above {high:g}.")
+    if not condition.low <= low <= high <= condition.high:
+        limits = f"from {condition.low:g} to {condition.high:g}"
+        raise UserError(f"{name} must be {limits} ({condition.meaning}), not {shown(value)}.")
+    return low, high
+
+
+WORLD, BODY = "world: x, y, z, z is up", "body: x is ahead, y to the left, z up"
+
+
+def _vector(name: str, unit: str, frame: str) -> tuple[Quantity, ...]:
+    return tuple(Quantity(f"{name}_{axis}", unit, frame) for axis in "xyz")
+
+
+PARTS = {
+    "pos": _vector("position", "m", WORLD),
+    "quat": tuple(Quantity(f"attitude_{axis}", "1", "unit quaternion, body to world") for axis in "xyzw"),
+    "vel": _vector("velocity", "m/s", WORLD),
+    "ang_vel": _vector("angular_velocity", "rad/s", BODY),
+    "difference_to_goal": _vector("to_goal", "m", WORLD),
+    "difference_to_target_vel": _vector("to_goal_velocity", "m/s", WORLD),
+}
+ACTION = (
+    *(Quantity(name, "rad", "Euler angles x-y-z, body to world") for name in ("roll", "pitch", "yaw")),
+    Quantity("thrust", "N", "body: along z, all rotors together"),
+)
+
+
+PAST_ACTION = tuple(Quantity(q.name, "1", "-1 and 1 are the bounds of the action") for q in ACTION)
+
+
+def interface_of(
+    env: Any, dynamics: Sequence[str], delay: tuple[float, float], history: int, hover: Sequence[float] = ()
+) -> Interface:
+    """The interface of a crazyflow environment with attitude control, flown in these dynamics.
+
+    `hover` is the command that is taken to have gone before the first.
+    """
+    parts, reference = dict(PARTS), None
+    if hasattr(env, "trajectory"):
+        offsets = np.asarray(env.sample_offsets)
+        reference = Reference(np.asarray(env.trajectory, dtype=np.float32), offsets)
+        seconds = [f"{offset / env.freq:g}s" for offset in offsets]
+        ahead = [_vector(f"to_reference_in_{text}", "m", WORLD) for text in seconds]
+        parts["local_samples"] = tuple(quantity for vector in ahead for quantity in vector)
+    seen = [*(quantity for name in STATE_PARTS for quantity in PARTS[name]), *PAST_ACTION]
+    steps = range(1, history + 1)
+    parts["history"] = tuple(
+        Quantity(f"{q.name}_{ago}_steps_ago{'' if q in PAST_ACTION else '_less_now'}", q.unit, q.frame)
+        for ago in steps
+        for q in seen
+    )
+    drone = str(env.sim.drone)
+    return Interface(
+        parts=parts,
+        action=ACTION if str(env.sim.control) == "attitude" else (),
+        period=1 / env.freq,
+        delay=delay,
+        history=history,
+        action_before=tuple(map(float, hover)),
+        dynamics=tuple(dynamics),
+        vehicle="crazyflie" if drone.startswith("cf") else drone,
+        reference=reference,
+    )
