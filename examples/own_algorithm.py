@@ -100,9 +100,8 @@ def update(config: Config, state: State, rollout: Rollout) -> Metrics:
     batch, valid_rows = advantages(config, state.networks, rollout), rollout.valid_rows
     metrics: list[Metrics] = []
     for _ in range(config.epochs):
-        size = config.minibatch_size // config.shards
-        minibatches = epoch_minibatches(valid_rows, rollout.num_rows, size, state.rng.minibatch)
-        advantage = standardize(batch.advantage[minibatches], state.shards)
+        minibatches = epoch_minibatches(valid_rows, rollout.num_rows, config.minibatch_size, state.rng.minibatch)
+        advantage = standardize(batch.advantage[minibatches])
         metrics.append(means(state.learn(config, state, batch, minibatches, advantage)))
     state.networks.policy.observe(rollout.obs, rollout.valid)
     state.step += config.num_rows

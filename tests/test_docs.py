@@ -198,7 +198,7 @@ def test_the_python_of_the_lander_runs(tmp_path, monkeypatch):
 
 def test_lambda_is_drawn_and_the_formulas_lie_on_its_lines(tmp_path):
     """At λ = 0 and 1 the lines of `gae` go through the dots that were added up by hand."""
-    figure = runpy.run_path(str(ROOT / "docs" / "figures" / "gae_lambda.py"))["draw"](walks=3_000)
+    figure = runpy.run_path(str(ROOT / "docs" / "figures" / "gae_lambda.py"))["draw"](walks=6_000)
     lines = {line.get_label(): line.get_ydata() for line in figure.axes[0].lines}
     assert lines["gae, λ = 0"] == pytest.approx(lines["r + V(s′) − V(s)"])
     assert lines["gae, λ = 1"] == pytest.approx(lines["return to come − V(s)"])
