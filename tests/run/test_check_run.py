@@ -9,7 +9,6 @@ import lemniscate as lem
 from conftest import tiny, tiny_fields
 from lemniscate.api.results import final_return
 from lemniscate.cli import main
-from lemniscate.run.check import each_finding
 from lemniscate.run.sweep_file import Sweep
 
 
@@ -92,16 +91,6 @@ def test_what_was_left_and_who_trains_is_noted(run, capsys):
     assert code in (0, None)
     assert "! Left by a write that was interrupted, and harmless: checkpoints/step-300.tmp." in said
     assert "! It is being trained by another process" in said
-
-
-def test_code_of_a_run_from_elsewhere_is_noted(run, monkeypatch, tmp_path):
-    from lemniscate.system.files import write_json
-
-    record = {"algorithm": "ppo", "config": {"env": "evil:Env"}}
-    write_json(run / "config.json", record)
-    assert any(
-        "from elsewhere and names code of its own, evil:Env" in str(finding.sentence) for finding in each_finding(run)
-    )
 
 
 def test_a_sweep_is_checked_run_by_run(tmp_path, capsys):

@@ -36,7 +36,6 @@ def plot(*runs: Plotted | list[Plotted], by: str = "step") -> list[Path]:
         *runs: run directories, or those of sweeps; what `train` returned; policies from `train` or `load`.
         by: the horizontal axis of the learning curve: "step", "episode" or "minute". By episode the curve is the moving
             average of 20 episodes.
-        trust: import the code that a run names as `module:name` also if the run is not of this user and machine.
 
     Returns:
         The files, the page last.
