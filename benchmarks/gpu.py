@@ -103,6 +103,7 @@ def resume(device: torch.device, quick: bool) -> Iterator[dict[str, Any]]:
             command = ["train", algorithm, "--env", "Pendulum-v1", "--device", str(device), "--compile", "off"]
             command += ["--total-steps", str(total), "--checkpoint-every", str(total // 4), "--num-envs", "4"]
             command += ["--learning-starts", "100"] if algorithm == "sac" else ["--num-steps", "64"]
+            command += ["--hidden", "8"] if quick else []
             lemniscate(*command, "--run", str(whole)).wait()
             begun = lemniscate(*command, "--run", str(killed))
             while begun.poll() is None and not list(killed.glob("checkpoints/step-*/*.safetensors")):

@@ -9,7 +9,15 @@ import torch
 CPU = torch.device("cpu")
 
 
-@pytest.mark.parametrize("name", ["agreement", "resume", "speed", "graphs"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "agreement",
+        "speed",
+        pytest.param("resume", marks=pytest.mark.long),
+        pytest.param("graphs", marks=pytest.mark.long),
+    ],
+)
 def test_a_part_runs_in_miniature(name):
     rows = list(gpu.PARTS[name][0](CPU, True))
     assert len(rows) == {"agreement": 3, "resume": 2, "speed": 2, "graphs": 2}[name]
