@@ -1,7 +1,7 @@
 # lemniscate on the CPU:
 #   docker build --tag lemniscate .
 #   docker run --rm --user "$(id -u)" --volume "$PWD/runs:/work/runs" lemniscate train ppo --env CartPole-v1 --run runs/cartpole
-FROM python:3.12-slim
+FROM python:3.12-slim-bookworm
 
 # g++ is what torch.compile calls in long runs, swig what Box2D is built with; OSMesa draws MuJoCo without a screen.
 RUN apt-get update \

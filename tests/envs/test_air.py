@@ -23,7 +23,7 @@ from lemniscate.drones.air import disturb
 from lemniscate.drones.crazyflow import CrazyflowBackend, make_drones
 from lemniscate.drones.vehicle import CONDITIONS, DYNAMICS, NOISE, read_ranges
 from lemniscate.envs import registry
-from lemniscate.envs.spaces import scale_action
+from lemniscate.envs.conversion import scale_action
 from lemniscate.errors import UserError
 from lemniscate.exporting.deployed import act_with
 from lemniscate.exporting.parity import fly

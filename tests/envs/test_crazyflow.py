@@ -14,8 +14,8 @@ pytest.importorskip("crazyflow")
 import gymnasium as gym
 
 from lemniscate.envs import registry
+from lemniscate.envs.conversion import scale_action
 from lemniscate.envs.factory import model_warnings_off
-from lemniscate.envs.spaces import scale_action
 
 FIGURE_EIGHT = "DroneFigureEightTrajectory-v0"
 N = 8

@@ -1,7 +1,8 @@
+import numpy as np
 import pytest
 import torch
 
-from lemniscate.envs.vec_env import LOG_ROWS, EpisodeStatistics, episode_sums
+from lemniscate.envs.vec_env import LOG_ROWS, EpisodeStatistics, Stagger, episode_sums
 from lemniscate.types import Step
 
 
@@ -43,3 +44,13 @@ def test_sums_begin_anew_after_each_end():
     rows = torch.tensor([[[1.0], [2.0], [3.0], [4.0]]])
     done = torch.tensor([[False], [True], [False], [True]])
     assert episode_sums(rows, done, torch.tensor([[10.0]])).flatten().tolist() == [11.0, 13.0, 3.0, 7.0]
+
+
+def test_first_episodes_are_cut_at_all_steps_up_to_the_limit_and_later_ones_are_not():
+    num_envs, limit = 200, 10
+    stagger, no = Stagger(num_envs, limit, seed=3), np.zeros(num_envs, dtype=bool)
+    assert not stagger.counts.any()
+    cuts = np.stack([stagger.apply(no, no) for _ in range(3 * limit)])
+    assert (cuts.sum(0) == 1).all()
+    assert set(cuts.argmax(0)) == set(range(limit))
+    assert stagger.counts.all()

@@ -7,14 +7,9 @@ from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lemniscate.envs.spaces import (
-    action_kind,
-    flatten_observation,
-    is_image,
-    observation_parts,
-    physical_action,
-    scale_action,
-)
+from lemniscate.envs.conversion import flatten_observation, physical_action, scale_action
+from lemniscate.envs.info import ActionMasks
+from lemniscate.envs.spaces import action_kind, is_image, observation_parts
 from lemniscate.errors import UserError
 from lemniscate.spec import Box, Discrete
 
@@ -145,3 +140,12 @@ def test_other_spaces_get_a_sentence():
         action_kind(spaces.Dict({"a": spaces.Discrete(2)}), "myenv")
     with pytest.raises(UserError, match="a Box of floating-point numbers"):
         action_kind(gym.spaces.Box(0, 9, (2,), np.int64), "myenv")
+
+
+def test_a_mask_that_is_given_for_some_environments_is_theirs_alone():
+    masks = ActionMasks("Env-v0", 3, 2)
+    info = {"action_mask": np.array([[0, 1], [1, 0], [0, 1]]), "_action_mask": np.array([False, True, True])}
+    assert masks.append_to(np.zeros((3, 1)), info).tolist() == [[0, 1, 1], [0, 1, 0], [0, 0, 1]]
+    assert masks.append_to(np.zeros((3, 1)), {}).tolist() == [[0, 1, 1], [0, 1, 0], [0, 0, 1]], "until another is given"
+    with pytest.raises(UserError, match="rules out every action of environment 2"):
+        masks.append_to(np.zeros((3, 1)), {"action_mask": np.array([[1, 1], [1, 1], [0, 0]])})

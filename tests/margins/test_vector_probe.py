@@ -119,6 +119,7 @@ def test_factors_change_the_model_and_what_is_derived_from_it():
         ModelFactors(gym.make("Hopper-v5"), mass=1.3, friction=0.5).unwrapped,
     )
     np.testing.assert_allclose(heavy.model.body_mass, 1.3 * plain.model.body_mass)
+    np.testing.assert_allclose(heavy.model.body_inertia, 1.3 * plain.model.body_inertia)
     np.testing.assert_allclose(heavy.model.body_subtreemass, 1.3 * plain.model.body_subtreemass)
     np.testing.assert_allclose(heavy.model.geom_friction, 0.5 * plain.model.geom_friction)
 

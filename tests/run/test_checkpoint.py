@@ -14,9 +14,10 @@ import torch
 
 from conftest import tiny
 from lemniscate.algos import ppo
+from lemniscate.errors import NonFiniteError, UserError
 from lemniscate.run import checkpoint
 from lemniscate.spec import Box, Discrete, MultiBinary, MultiDiscrete, ObservationPart, Spec
-from lemniscate.system.files import DamagedFileError
+from lemniscate.system.files import DamagedFileError, read_json, write_json
 from lemniscate.types import Batch
 
 SPEC = Spec("x", (ObservationPart((), (3,)),), Box((-1.0,), (1.0,)), 500)
@@ -92,6 +93,30 @@ def test_only_the_newest_are_kept(tmp_path):
     for step in range(5):
         write(tmp_path, state, step, keep=2)
     assert checkpoint.list_steps(tmp_path) == [3, 4]
+
+
+def test_steps_are_numbers_not_words(tmp_path):
+    state = state_with_history()
+    for step in (9, 100, 20):
+        write(tmp_path, state, step)
+    assert checkpoint.list_steps(tmp_path) == [9, 20, 100]
+
+
+def test_another_format_is_refused(tmp_path):
+    path = write(tmp_path, state_with_history())
+    manifest = read_json(path / checkpoint.MANIFEST)
+    write_json(path / checkpoint.MANIFEST, manifest | {"format": checkpoint.FORMAT - 1})
+    with pytest.raises(UserError, match=f"this version of lemniscate reads {checkpoint.FORMAT}"):
+        checkpoint.read(path)
+
+
+def test_what_is_not_finite_is_not_written_and_leaves_the_checkpoint_before(tmp_path):
+    state = state_with_history()
+    write(tmp_path, state, 1)
+    state.optimizer.vector[0] = torch.nan
+    with pytest.raises(NonFiniteError, match="is not written"):
+        write(tmp_path, state, 2)
+    assert checkpoint.list_steps(tmp_path) == [1]
 
 
 def test_every_flipped_bit_is_seen(tmp_path):

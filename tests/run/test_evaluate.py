@@ -12,8 +12,11 @@ from lemniscate.envs.backend import Summary
 from lemniscate.errors import UserError
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.networks import Layers
-from lemniscate.run.evaluate import evaluate
+from lemniscate.run.evaluate import EVALUATION, EpisodeTable, evaluate
+from lemniscate.run.run import TRAINING
+from lemniscate.run.seeding import derive
 from lemniscate.system import named
+from lemniscate.types import Step
 
 
 class Uneven(toy.Countdown):
@@ -143,3 +146,24 @@ def test_an_environment_that_no_file_can_keep_is_asked_for_again(tmp_path):
     named._PASSED.clear()  # as another process would have it
     with pytest.raises(UserError, match="pass the object again"):
         lem.evaluate(policy, episodes=2)
+
+
+def test_starts_of_an_evaluation_are_never_those_of_training():
+    """Training restarts from `derive(seed, TRAINING, step)`, whatever the step."""
+    env = registry.make("Countdown-v0", 2)
+    seeds, restart = [], env.restart
+    env.restart = lambda seed, **options: seeds.append(seed) or restart(seed, **options)
+    evaluate(ActorCritic(env.spec, Layers((4,))).policy, env, 2, seed=7)
+    assert seeds == [derive(7, EVALUATION, 0)]
+    assert EVALUATION != TRAINING
+
+
+def test_returns_are_ordered_by_environment_then_by_time():
+    def step(reward, terminated):
+        obs, no = torch.zeros(2, 1), torch.zeros(2, dtype=torch.bool)
+        return Step(obs, obs, torch.tensor(reward), torch.tensor(terminated), no, ~no)
+
+    table = EpisodeTable(2, torch.device("cpu"))
+    for rewards, ends in (([5.0, 1.0], [True, True]), ([3.0, 9.0], [True, False]), ([4.0, 2.0], [True, True])):
+        table.add(step(rewards, ends), torch.ones(2, dtype=torch.bool))
+    assert table.returns_and_lengths().tolist() == [[5, 3, 4, 1, 11], [1, 1, 1, 1, 2]]

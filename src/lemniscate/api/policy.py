@@ -3,6 +3,7 @@
 import sys
 from contextlib import nullcontext
 from dataclasses import dataclass
+from functools import cached_property
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -11,9 +12,9 @@ import numpy as np
 import torch
 
 from lemniscate import algos
+from lemniscate.envs.conversion import physical_action
 from lemniscate.envs.info import read_mask
 from lemniscate.envs.observations import read_observation
-from lemniscate.envs.spaces import physical_action
 from lemniscate.errors import UserError, prefix_errors, shown
 from lemniscate.hub import repository as hub
 from lemniscate.nn.policies import Policy
@@ -35,7 +36,11 @@ class TrainedPolicy:
     def __init__(self, networks: Any, spec: Spec, config: RunConfig, step: int, path: Path | None = None) -> None:
         self.networks = networks.eval()
         self.spec, self.config, self.step, self.path = spec, config, step, path
-        self._noise = generator(config.seed, torch.device("cpu"), 4)
+
+    @cached_property
+    def _noise(self) -> torch.Generator:
+        """Of the actions that are drawn."""
+        return generator(self.config.seed, torch.device("cpu"), 4)
 
     @property
     def module(self) -> Policy:

@@ -13,7 +13,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from lemniscate.run.seeding import globals_undisturbed, seed_globals
+from lemniscate.run.run import globals_undisturbed
+from lemniscate.run.seeding import seed_globals
 
 Function = Callable[..., Any]
 

@@ -18,8 +18,9 @@ from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
 from lemniscate.envs import registry
+from lemniscate.envs.conversion import follow
 from lemniscate.envs.factory import make_one, maker_of
-from lemniscate.envs.spaces import follow, is_image, observation_parts, random_action
+from lemniscate.envs.spaces import is_image, observation_parts, random_action
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import NonFiniteError, UserError
 from lemniscate.spec import Action, Box, Discrete, MultiDiscrete, Spec

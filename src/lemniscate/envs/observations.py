@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from lemniscate.envs.spaces import flatten_observation, follow
+from lemniscate.envs.conversion import flatten_observation, follow
 from lemniscate.errors import UserError
 from lemniscate.spec import Spec
 

@@ -12,7 +12,7 @@ from gymnasium.wrappers import vector as wrappers_of_vectors
 from gymnasium.wrappers.utils import RunningMeanStd
 
 from lemniscate.envs import registry
-from lemniscate.envs.spaces import normalized_action
+from lemniscate.envs.conversion import normalized_action
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError
 from lemniscate.spec import Action, Box, Discrete, MultiDiscrete, Spec

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from lemniscate.api.policy import TrainedPolicy
-from lemniscate.envs.spaces import normalized_action, physical_action, scale_of
+from lemniscate.envs.conversion import normalized_action, physical_action, scale_of
 from lemniscate.spec import Action, Box, Discrete, MultiDiscrete, Spec
 
 Act = Callable[[np.ndarray], np.ndarray]

@@ -10,14 +10,17 @@ one that is resumed. So both end in the same bits, whatever the simulator.
 """
 
 import math
+import random
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
 from socket import gethostname
 from typing import TypeVar
 from zlib import crc32
 
+import numpy as np
 import torch
 
 from lemniscate.envs.vec_env import Episodes, Stopwatch, VecEnv
@@ -28,7 +31,7 @@ from lemniscate.run.directory import Saver
 from lemniscate.run.evaluate import critic_of, evaluate
 from lemniscate.run.loggers import NO_EPISODES, JsonLines, Logger, LoggerClass, TensorBoard
 from lemniscate.run.metrics import read_metrics
-from lemniscate.run.seeding import derive, globals_undisturbed, seed_globals
+from lemniscate.run.seeding import derive, seed_globals
 from lemniscate.run.state import TrainState
 from lemniscate.run.stopping import Stopped, StopRequest
 from lemniscate.run.warm_start import load_networks
@@ -323,6 +326,21 @@ class Run:
             logger.write(step, numbers, episodes)
         self._logged = step
         self._unobserved.append((step, numbers))
+
+
+@contextmanager
+def globals_undisturbed() -> Iterator[None]:
+    """Restore the global generators afterwards: Python's, NumPy's legacy one, torch's on the CPU and on every GPU."""
+    states = random.getstate(), np.random.get_state(), torch.get_rng_state()  # noqa: NPY002
+    gpus = torch.cuda.get_rng_state_all() if torch.cuda.is_initialized() else []
+    try:
+        yield
+    finally:
+        random.setstate(states[0])
+        np.random.set_state(states[1])  # noqa: NPY002
+        torch.set_rng_state(states[2])
+        if gpus:
+            torch.cuda.set_rng_state_all(gpus)
 
 
 def require_finite(state: TrainState, numbers: Mapping[str, float]) -> None:

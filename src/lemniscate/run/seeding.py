@@ -2,8 +2,7 @@
 
 import os
 import random
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 
 import numpy as np
 import torch
@@ -46,21 +45,6 @@ def seed_globals(seed: int) -> None:
     np.random.seed(seed)  # noqa: NPY002  (users' environments may draw from it)
     torch.manual_seed(seed)
     torch.cuda.manual_seed_all(seed)
-
-
-@contextmanager
-def globals_undisturbed() -> Iterator[None]:
-    """Restore the global generators afterwards: Python's, NumPy's legacy one, torch's on the CPU and on every GPU."""
-    states = random.getstate(), np.random.get_state(), torch.get_rng_state()  # noqa: NPY002
-    gpus = torch.cuda.get_rng_state_all() if torch.cuda.is_initialized() else []
-    try:
-        yield
-    finally:
-        random.setstate(states[0])
-        np.random.set_state(states[1])  # noqa: NPY002
-        torch.set_rng_state(states[2])
-        if gpus:
-            torch.cuda.set_rng_state_all(gpus)
 
 
 def derive(seed: int, *path: int) -> int:

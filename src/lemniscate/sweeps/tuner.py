@@ -204,7 +204,7 @@ class _Tuner(SetOfRuns):
                 trial = self._trial(self._search.ask(self._study))
                 self._queue(trial)
             until = self._until(trial)
-            options = ["--callbacks", f"lemniscate.api.options:StopAt(steps={until})"] if until else []
+            options = ["--callbacks", f"lemniscate.api.callbacks:StopAt(steps={until})"] if until else []
             run = trial.waiting.pop(0)
             trial.training.add(run)
             self._start(run, options)
