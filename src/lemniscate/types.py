@@ -1,7 +1,7 @@
 """Data records of tensors. Shapes: T time, N environments, B batch, O observation, A action."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Self
 
 import torch
@@ -29,7 +29,7 @@ class Record:
 
     def map(self, function: Callable[[Tensor], Tensor]) -> Self:
         """The record of what `function` makes of each tensor."""
-        return type(self)(**{name: function(x) for name, x in vars(self).items()})
+        return type(self)(*map(function, vars(self).values()))
 
     def __getitem__(self, rows: Tensor | slice) -> Self:
         return self.map(lambda x: x[rows])
@@ -41,7 +41,7 @@ class Record:
     @classmethod
     def stack(cls, rows: list[Self]) -> Self:
         """Stack records along a new first dimension: T records [N, …] become one [T, N, …]."""
-        return cls(**{f.name: torch.stack([getattr(row, f.name) for row in rows]) for f in fields(cls)})
+        return cls(*map(torch.stack, zip(*(vars(row).values() for row in rows), strict=True)))
 
 
 @dataclass(frozen=True)

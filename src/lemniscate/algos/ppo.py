@@ -129,8 +129,11 @@ def loss(config: Config, networks: ActorCritic, batch: Batch) -> Loss:
 
 def learn(config: Config, state: State, batch: Batch, minibatches: Tensor, advantage: Tensor) -> list[Metrics]:
     """A clipped gradient step on each minibatch, rows [K, M] of the batch, with its advantages [K, M]."""
-    steps = (replace(batch[rows], advantage=a) for rows, a in zip(minibatches, advantage, strict=True))
-    return [state.optimizer.step(partial(loss, config), minibatch) for minibatch in steps]
+    metrics = []
+    for rows, its_advantage in zip(minibatches, advantage, strict=True):
+        minibatch = replace(batch[rows], advantage=its_advantage)
+        metrics.append(state.optimizer.step(partial(loss, config), minibatch))
+    return metrics
 
 
 def update(config: Config, state: State, rollout: Rollout) -> dict[str, Tensor | float]:

@@ -84,9 +84,8 @@ class Config(OnPolicyConfig):
     @property
     def gradient_steps(self) -> int:
         """The number of gradient steps of the whole run; 0 where batches differ in size and cannot be compiled for."""
-        if self.episodes:
-            return 0
-        return self.num_rollouts * (1 + self.critic_epochs * -(-self.num_rows // self.critic_minibatch_size))
+        critic_steps = self.critic_epochs * -(-self.num_rows // self.critic_minibatch_size)
+        return 0 if self.episodes else self.num_rollouts * (1 + critic_steps)
 
 
 @dataclass(kw_only=True)
@@ -147,7 +146,6 @@ def learn(config: Config, state: State, batch: Batch, minibatches: Tensor, *, up
 
 def update(config: Config, state: State, rollout: Rollout) -> dict[str, Tensor | float]:
     """One step of the policy on one rollout, some epochs of the baseline; returns the metrics."""
-    policy = state.networks.policy
     rate = linear(config.learning_rate, config.final_learning_rate, state.step / config.total_steps)
     state.optimizer.learning_rate, state.critic_optimizer.learning_rate = rate, config.critic_learning_rate
     if config.scale_rewards:
@@ -159,18 +157,17 @@ def update(config: Config, state: State, rollout: Rollout) -> dict[str, Tensor |
     if config.standardize:
         learned = replace(learned, advantage=standardize(learned.advantage))
     all_rows = torch.arange(size, device=batch.obs.device)[None]
-    metrics: dict[str, Tensor | float] = {"learning_rate": rate}
-    metrics |= means(state.learn(config, state, learned, all_rows, update_policy=True))
+    metrics = means(state.learn(config, state, learned, all_rows, update_policy=True))
     valid = batch[valid_rows]
-    metrics["approx_kl"] = kl_k3(policy(valid.obs).log_prob(valid.action).detach() - valid.log_prob)
+    metrics["approx_kl"] = kl_k3(state.policy(valid.obs).log_prob(valid.action).detach() - valid.log_prob)
     if config.baseline == "value":
         for _ in range(config.critic_epochs):
             minibatches = epoch_minibatches(valid_rows, size, config.critic_minibatch_size, state.rng.minibatch)
             metrics |= means(state.learn(config, state, batch, minibatches, update_policy=False))
         metrics["explained_variance"] = explained_variance(valid.value, valid.target)
-    policy.observe(rollout.obs, rollout.valid)  # last: the actions were drawn through the normalizer before
+    state.policy.observe(rollout.obs, rollout.valid)  # last: the actions were drawn through the normalizer before
     state.step += len(rollout.reward) * config.num_envs
-    return {**metrics, **policy.metrics()}
+    return {**metrics, **state.policy.metrics(), "learning_rate": rate}
 
 
 def train(config: Config, run: Run) -> State:

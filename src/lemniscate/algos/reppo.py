@@ -106,12 +106,11 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
 def targets(config: Config, state: State, rollout: Rollout) -> SoftBatch:
     """The rows of a rollout with Q(s, a), the soft λ-return that it should say, and π_old(·|s), [B, …]."""
     noise = state.policy.draw_noise(rollout.reward.shape, state.rng.action)
-    rows = rollout.obs, rollout.next_obs, rollout.action, noise
-    value, next_value, next_log_prob, mean, log_std = state.networks.estimates(*rows)
-    alpha, _ = state.networks.multipliers()
+    q, next_q, next_log_prob, *old = state.networks.estimates(rollout.obs, rollout.next_obs, rollout.action, noise)
+    bonus = -state.networks.multipliers()[0] * next_log_prob
     ends, gamma, lam = (rollout.terminated, rollout.done), config.gamma, config.td_lambda
-    target = soft_lambda_return(rollout.reward, next_value, -alpha * next_log_prob, *ends, gamma=gamma, lam=lam)
-    return SoftBatch(rollout.obs, rollout.action, value, target, mean, log_std).flatten()  # [B, …]
+    target = soft_lambda_return(rollout.reward, next_q, bonus, *ends, gamma=gamma, lam=lam)
+    return SoftBatch(rollout.obs, rollout.action, q, target, *old).flatten()  # [B, …]
 
 
 def critic_loss(critic: CategoricalQ, batch: SoftBatch) -> Loss:

@@ -139,15 +139,10 @@ class GymnasiumBackend(Backend):
                 obs = self._observe(*self._envs.reset(options={"reset_mask": done.copy()}))
         self.counts = self._tensor(self._stagger.counts)
         there = self._tensor(next_obs)
-        return Step(
-            obs=there if obs is next_obs else self._tensor(obs),
-            next_obs=there,
-            reward=self._tensor(reward.astype(np.float32)),
-            terminated=self._tensor(terminated),
-            truncated=self._tensor(truncated),
-            valid=self._tensor(valid),
-            measures=measured(info, self._measures, self.num_envs, self.device) if info else {},
-        )
+        here = there if obs is next_obs else self._tensor(obs)
+        columns = map(self._tensor, (reward.astype(np.float32), terminated, truncated, valid))
+        measures = measured(info, self._measures, self.num_envs, self.device) if info else {}
+        return Step(here, there, *columns, measures)
 
     def close(self) -> None:
         """Close the environments and their workers."""

@@ -20,9 +20,11 @@ def moments(rows: Tensor) -> Moments:
 
 def means(rows: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
     """The mean of each quantity over the rows in which it is."""
-    names = dict.fromkeys(name for row in rows for name in row)
-    columns = {name: [row[name] for row in rows if name in row] for name in names}
-    return {name: torch.stack(column).mean() if len(column) > 1 else column[0] for name, column in columns.items()}
+    columns: dict[str, list[Tensor]] = {}
+    for row in rows:
+        for name, value in row.items():
+            columns.setdefault(name, []).append(value)
+    return {name: torch.stack(column).mean() for name, column in columns.items()}
 
 
 def standardize(x: Float[Tensor, "*K B"]) -> Float[Tensor, "*K B"]:
