@@ -44,7 +44,7 @@ def gradients(batches=60, updates=10, num_envs=4):
         rollout = collect_episodes(env, state.policy, 1, state.rng.action)
         for way, (returns, baseline) in WAYS.items():
             weighting = config.replace(episodes=1, returns=returns, baseline=baseline)
-            batch = reinforce.weights(weighting, state.networks, rollout)[rollout.valid_rows[0]]
+            batch = reinforce.weights(weighting, state.networks, rollout)[rollout.valid_rows]
             loss = policy_gradient(state.policy(batch.obs).log_prob(batch.action), batch.advantage)
             gradient = torch.autograd.grad(loss, list(state.policy.parameters()))
             of[way].append(torch.cat([part.flatten() for part in gradient]))

@@ -120,7 +120,7 @@ def require_room(env: str, num_envs: int, backend: str) -> None:
 
     each, files = backend_class(backend).room(env)
     what = f"{num_envs:,} × {env} in the {backend} backend"
-    require_free(f"{what} take", {"num_envs": num_envs * each}, {"num_envs": num_envs}, None)
+    require_free(f"{what} take at least", {"num_envs": num_envs * each}, {"num_envs": num_envs}, None)
     require_files(what, num_envs, files)
 
 

@@ -105,7 +105,7 @@ def device_for(name: str) -> torch.device:
 def require_memory(config: RunConfig, spec: Spec, device: torch.device) -> None:
     """Raise `UserError` where a run takes more memory than is free, with the field that takes most, and its limit."""
     parts = {"hidden": _network_bytes(config, spec), **config.memory(spec)}
-    require_free("This run takes", parts, vars(config), device)
+    require_free("This run takes at least", parts, vars(config), device)
 
 
 def _network_bytes(config: RunConfig, spec: Spec) -> int:

@@ -17,7 +17,7 @@ def require_free(what: str, parts: Mapping[str, int], fields: Mapping[str, Any],
     """Raise `UserError` where something takes more memory than is free, with the field that takes most, and its limit.
 
     Args:
-        what: subject and verb of the sentence, such as "This run takes".
+        what: subject and verb of the sentence, such as "This run takes at least".
         parts: the bytes that grow with each field.
         fields: their values.
         device: whose memory it takes; of this process if it is None.
@@ -29,7 +29,7 @@ def require_free(what: str, parts: Mapping[str, int], fields: Mapping[str, Any],
     limit = (free - total + parts[most]) * value // parts[most] if isinstance(value, int) else 0
     of_which = f", of which {parts[most] // 10**6:,} MB are for {most} {value}" if len(parts) > 1 else ""
     advice = f"choose {most} at most {limit:,}" if limit > 0 else f"choose a smaller {most}"
-    raise UserError(f"{what} at least {total // 10**6:,} MB{of_which}; {free // 10**6:,} MB are free: {advice}.")
+    raise UserError(f"{what} {total // 10**6:,} MB{of_which}; {free // 10**6:,} MB are free: {advice}.")
 
 
 def require_files(what: str, count: int, each: int) -> None:
