@@ -69,6 +69,8 @@ ACTIONS = {
 class Noise:
     """A backend whose observations and rewards are noise, with ends of both kinds and with ignored actions."""
 
+    summaries, scene, baseline = (), None, None
+
     def __init__(self, actions, num_envs, device):
         image, masked = actions == "image", actions == "discrete"
         layout = (ObservationPart((), (6, 6, 1) if image else (4,)),)

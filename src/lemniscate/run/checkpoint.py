@@ -35,7 +35,7 @@ from lemniscate.system.files import (
     write_json,
 )
 
-FORMAT = 3
+FORMAT = 4
 TENSORS, STATE, MANIFEST = "tensors.safetensors", "state.json", "manifest.json"
 FILES = (TENSORS, STATE)
 
