@@ -15,6 +15,7 @@ from lemniscate import algos
 from lemniscate.data.replay import interact
 from lemniscate.data.rollout import collect
 from lemniscate.data.whole_episodes import collect_episodes
+from lemniscate.envs.backend import Backend
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError
 from lemniscate.run import checkpoint
@@ -66,7 +67,7 @@ ACTIONS = {
 }
 
 
-class Noise:
+class Noise(Backend):
     """A backend whose observations and rewards are noise, with ends of both kinds and with ignored actions."""
 
     summaries, scene, baseline = (), None, None
