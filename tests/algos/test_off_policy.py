@@ -27,7 +27,9 @@ from helpers import (
 from lemniscate.algos import ddpg, sac, td3
 from lemniscate.errors import UserError
 from lemniscate.maths import uniform
+from lemniscate.optim.compiled import Compiler
 from lemniscate.run import checkpoint
+from lemniscate.system.world import ALONE
 from lemniscate.types import Transition
 
 ALGORITHMS = {"ddpg": ddpg, "td3": td3, "sac": sac}
@@ -203,7 +205,7 @@ def compiled_equals_eager(algo, delay=1, updates=1, matmul="float32"):
     fields = {"policy_delay": delay, "num_updates": updates, "tau": 0.3, "critic_learning_rate": 1e-3}
     config = small_off_policy(algo, **fields, **layers)
     states = [filled(algo, config), filled(algo, config)]
-    states[1].compile()
+    states[1].prepare(ALONE, Compiler())
     require_same_updates(2 * delay, algo, config, states, **close)
     _, *programs = compiled.calls  # the first one is `act`, which no update calls
     assert len(programs) == delay // updates
@@ -233,7 +235,7 @@ def test_many_steps_are_compiled_in_calls_of_one_size_with_the_flags_of_their_st
     monkeypatch.setattr(torch, "compile", lambda *_, **__: fails)
     config = small_off_policy(algo, num_updates=6, policy_delay=4, tau=0.3)
     states = [filled(algo, config), filled(algo, config)]
-    states[1].compile()
+    states[1].prepare(ALONE, Compiler())
     require_same_updates(2, algo, config, states)
     assert flags == [(i == 0, i == 1, i == 2) for i in (3, 0, 1, 2)]
     assert capsys.readouterr().err.count("torch.compile failed (no compiler)") == 4

@@ -143,7 +143,7 @@ def compiled_equals_eager(algo, env, programs):
     compiled = CompiledCalls()
     config = small(algo, env, num_steps=16)
     (one, envs), (two, _) = begin(algo, config), begin(algo, config)
-    two.compile()
+    two.prepare(ALONE, Compiler())
     for _ in range(3):
         rollout = collect(envs, one.policy, config.num_steps, one.rng.action)
         noise = two.policy.draw_noise((config.num_steps, config.num_envs), two.rng.action)  # as much as `collect` draws

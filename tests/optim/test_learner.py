@@ -11,7 +11,7 @@ from helpers import COMPILERS, CPU, CompiledCalls, numbers, require_in_own_proce
 from lemniscate.algos import ppo
 from lemniscate.maths import means, standardize
 from lemniscate.optim.adam import Adam
-from lemniscate.optim.compiled import Compiled, Learner
+from lemniscate.optim.compiled import Compiled, Compiler, Learner
 
 
 @dataclass
@@ -33,7 +33,7 @@ def compiled_equals_eager(actions):
     compiled = CompiledCalls()
     config, one = new_state(actions, max_grad_norm=0.1)
     _, two = new_state(actions, max_grad_norm=0.1)
-    learner = Learner(ppo.learn, [two.optimizer])
+    learner = Learner(ppo.learn, [two.optimizer], Compiler())
     batch, minibatches = numbers(actions), torch.randint(24, (6, 8), generator=torch.Generator().manual_seed(1))
     given = config, batch, minibatches, standardize(batch.advantage[minibatches])
     for _ in range(2):
@@ -51,8 +51,8 @@ def programs_are_not_mixed_up():
     for clip, size in ((0.2, 8), (1e-3, 8), (0.2, 4)):
         config, one = new_state(clip=clip)
         _, two = new_state(clip=clip)
-        learner = Learner(ppo.learn, [two.optimizer])
-        act = Compiled(two.networks.policy.act, CPU)
+        learner = Learner(ppo.learn, [two.optimizer], Compiler())
+        act = Compiled(two.networks.policy.act, CPU, Compiler())
         minibatches = torch.arange(24).view(-1, size)
         for _ in range(2):
             data = numbers(), minibatches, numbers().advantage[minibatches]
@@ -93,7 +93,7 @@ def test_each_combination_of_flags_is_a_program_of_its_own(monkeypatch):
         return program
 
     monkeypatch.setattr(torch, "compile", compile_once)
-    learner = Learner(count, [Adam(small_networks()[0])])
+    learner = Learner(count, [Adam(small_networks()[0])], Compiler())
     rows = torch.arange(12.0).view(6, 2)
     update = (True, False, False, True, False, True)
     for weight in (1.0, 2.0):
@@ -111,7 +111,7 @@ def test_each_combination_of_flags_is_a_program_of_its_own(monkeypatch):
 @pytest.mark.parametrize(("steps", "calls"), [(1, 1), (4, 1), (5, 5), (6, 2), (7, 7), (8, 2), (10, 5), (12, 3)])
 def test_calls_are_of_one_size_and_of_at_most_four_steps(monkeypatch, steps, calls):
     monkeypatch.setattr(torch, "compile", lambda *_, **__: lambda *args, **flags: means(count(*args, **flags)))
-    learner = Learner(count, [Adam(small_networks()[0])])
+    learner = Learner(count, [Adam(small_networks()[0])], Compiler())
     rows = torch.arange(2.0 * steps).view(steps, 2)
     metrics = learner(None, None, None, rows, weight=1.0, update=(True,) * steps)
     assert len(metrics) == calls
@@ -125,7 +125,7 @@ def test_without_a_compiler_it_prints_so_and_continues(monkeypatch, capsys):
     monkeypatch.setattr(torch, "compile", lambda *_, **__: fails)
     config, one = new_state()
     _, two = new_state()
-    learner = Learner(ppo.learn, [two.optimizer])
+    learner = Learner(ppo.learn, [two.optimizer], Compiler())
     eager = partial(ppo.learn, config, one)
     for _ in range(2):
         minibatches: Tensor = torch.arange(24).view(3, 8)

@@ -128,7 +128,7 @@ def test_evaluation_changes_no_bit_of_training(tmp_path, env):
 
 @pytest.mark.parametrize("env", ["CartPole-v1", "sac"])
 def test_recordings_change_no_bit_of_training_and_survive_a_resume(tmp_path, env, monkeypatch):
-    monkeypatch.setattr(lem.api, "is_installed", lambda name: name != "imageio_ffmpeg")
+    monkeypatch.setattr(lem.api.training, "is_installed", lambda name: name != "imageio_ffmpeg")
     train(tmp_path / "without", env, checkpoint_every=64)
     path = tmp_path / "with"
     train(path, env, checkpoint_every=64, video_every=96)
@@ -144,7 +144,7 @@ def test_recordings_change_no_bit_of_training_and_survive_a_resume(tmp_path, env
 
 
 def test_films_by_the_number_of_training_episodes(tmp_path, monkeypatch):
-    monkeypatch.setattr(lem.api, "is_installed", lambda name: name != "imageio_ffmpeg")
+    monkeypatch.setattr(lem.api.training, "is_installed", lambda name: name != "imageio_ffmpeg")
     path = tmp_path / "r"
     train(path, "CartPole-v1", video_every_episodes=3)
     lines = read_metrics(path)
