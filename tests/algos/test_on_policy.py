@@ -11,6 +11,8 @@ from helpers import COMPILERS, MODES, CompiledCalls, begin, copy_of, equal, one_
 from lemniscate.algos import a2c, ppo, reinforce, reppo, trpo  # noqa: F401  (a case names REPPO)
 from lemniscate.data.rollout import collect
 from lemniscate.errors import UserError
+from lemniscate.optim.compiled import Compiler
+from lemniscate.system.world import ALONE
 
 ALGORITHMS = {"reinforce": reinforce, "a2c": a2c, "trpo": trpo, "ppo": ppo}
 EACH = pytest.mark.parametrize("algo", ALGORITHMS.values(), ids=ALGORITHMS)

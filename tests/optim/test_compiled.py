@@ -60,18 +60,15 @@ def test_where_the_compiler_fails_it_prints_one_sentence_and_calls_the_fallback(
 
 
 def test_a_compiler_that_ctrl_c_has_stopped_is_no_failure_to_report(monkeypatch, capsys):
-    called = []
+    called, compiler = [], Compiler()
 
     def interrupted(*_):
         called.append(True)
-        stopping.set()
+        compiler.stopping.set()
         raise RuntimeError("the compiler got the signal, too")
 
     monkeypatch.setattr(torch, "compile", lambda *_, **__: interrupted)
-    try:
-        for _ in range(2):  # and the next method is not compiled any more
-            assert Compiled(Scale(3).twice, CPU, compiler)(torch.tensor(1.0)) == 6
-    finally:
-        stopping.clear()
+    for _ in range(2):  # and the next method is not compiled any more
+        assert Compiled(Scale(3).twice, CPU, compiler)(torch.tensor(1.0)) == 6
     assert len(called) == 1
     assert capsys.readouterr().err == ""
