@@ -22,7 +22,7 @@ from lemniscate.maths import kl_k3, means, standardize, surrogate, value_loss
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.optim.adam import Adam
-from lemniscate.presets.preset import Preset
+from lemniscate.presets import Preset
 from lemniscate.run.config import Count, Fraction, NonNegative, Positive
 from lemniscate.run.on_policy import OnPolicyConfig, OnPolicyState
 from lemniscate.run.run import Run

@@ -1,17 +1,21 @@
 """Presets are chosen by environment and by name."""
 
+import subprocess
+import sys
+
 import pytest
 
 from lemniscate import presets
 from lemniscate.algos import ALGORITHMS, find, ppo
 from lemniscate.errors import UserError
-from lemniscate.presets.on_policy import FIGURE_EIGHT
-from lemniscate.presets.preset import Preset, StoredPreset, read_preset
+from lemniscate.presets import Preset, read_preset, read_toml
+
+FIGURE_EIGHT = "DroneFigureEightTrajectory-v0"
 
 
-@pytest.mark.parametrize("algorithm", presets.PRESETS)
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_each_environment_gets_its_own_unless_another_is_named(algorithm):
-    for preset in presets.PRESETS[algorithm]:
+    for preset in presets.of(algorithm):
         name, config = presets.choose(algorithm, preset.config.env, None)
         assert config.env == preset.config.env
         assert name != "default"
@@ -61,17 +65,26 @@ def test_an_unknown_name_is_an_error_with_the_nearest_one():
 
 def test_a_stored_preset_is_ready_to_be_pasted_whatever_its_provenance(tmp_path):
     config = ppo.Config(env="CartPole-v1", hidden=(16,), gamma=0.98, network="layer_norm", desired_kl=None)
-    stored = StoredPreset("mine", "ppo", config, "lemniscate tune: " + ", ".join(["gamma=.9:.999"] * 40), "2026-11")
-    stored.write(tmp_path / "preset.json")
-    text = read_preset(tmp_path / "preset.json", "ppo").to_python()
-    assert max(map(len, text.splitlines())) <= 116  # in a list, four more
-    assert eval(text, {"Preset": Preset, "ppo": ppo}) == Preset("mine", config, stored.source, "2026-11")
+    config = config.replace(env_kwargs={"gravity": None, "name": 'the "second"'}, wrappers=("module:name(key=1)",))
+    stored = Preset("mine", config, "lemniscate tune: " + ", ".join(["gamma=.9:.999"] * 40), "2026-11")
+    stored.write(tmp_path / "preset.json", "ppo")
+    text = read_preset(tmp_path / "preset.json", "ppo").to_toml()
+    assert read_toml("ppo", f"{text}\n{text}") == [stored, stored]
+
+
+def test_only_the_presets_of_the_algorithm_that_is_chosen_are_read():
+    program = (
+        "import sys; from lemniscate import presets; presets.choose('ppo', 'Ant-v5', None);"
+        "print(sorted(name for name in sys.modules if name.startswith('lemniscate.algos.')))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout == "['lemniscate.algos.ppo']\n"
 
 
 def test_a_stored_preset_is_chosen_by_its_file(tmp_path):
     config = ppo.Config(env="CartPole-v1", gamma=0.98)
     file = tmp_path / "preset.json"
-    StoredPreset("mine", "ppo", config, "by hand", "2026-11").write(file)
+    Preset("mine", config, "by hand", "2026-11").write(file, "ppo")
     assert presets.choose("ppo", None, str(file))[1] == config
     assert presets.choose("ppo", "Acrobot-v1", str(file))[1] == config.replace(env="Acrobot-v1")
     with pytest.raises(UserError, match="is a preset of ppo, not of sac"):

@@ -14,7 +14,7 @@ import lemniscate as lem
 from forks import command
 from lemniscate.api.training import config_for
 from lemniscate.cli import main, parse
-from lemniscate.presets.preset import read_preset
+from lemniscate.presets import read_preset, read_toml
 from lemniscate.report.seeds import iqm
 from lemniscate.run import checkpoint
 from lemniscate.run.metrics import read_metrics
@@ -94,13 +94,8 @@ def test_the_preset_trains(tuned, tmp_path):
 
 
 def test_the_preset_is_ready_to_be_pasted(tuned):
-    from lemniscate.algos import ppo
-    from lemniscate.presets.preset import Preset
-
     preset = read_preset(tuned[0] / "preset.json", "ppo")
-    text = preset.to_python()
-    assert max(map(len, text.splitlines())) <= 116  # and the four spaces of a list around it
-    assert eval(text, {"Preset": Preset, "ppo": ppo}).config == preset.config
+    assert read_toml("ppo", preset.to_toml()) == [preset]
 
 
 def test_each_run_of_a_trial_ends_in_the_bits_of_a_run_alone(tuned, tmp_path):

@@ -12,7 +12,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 from lemniscate.algos import find
 from lemniscate.cli.parsers import Parser, parser_of, unknown_argument
 from lemniscate.errors import UserError, prefix_errors, unknown_name
-from lemniscate.presets import PRESETS, names
+from lemniscate.presets import names
 from lemniscate.run.config import RunConfig, flag, options_of
 from lemniscate.run.glossary import unknown_field
 from lemniscate.run.texts import is_dict, number_type, read
@@ -103,9 +103,8 @@ def explain(parser: Parser, algorithm: str) -> None:
             if default not in ((), {}) and "(default" not in text:
                 text += f" [{_shown(default)}]"
             action.help, action.metavar = text.replace("%", "%%"), _metavar(options)
-    known = ", ".join(names(algorithm) if algorithm in PRESETS else ["default"])
     bracket = "[…] is the default, where neither --preset nor the environment's own preset says otherwise."
-    parser.epilog = fill(f"presets: {known}", 110) + f"\n{bracket}"
+    parser.epilog = fill(f"presets: {', '.join(names(algorithm))}", 110) + f"\n{bracket}"
 
 
 def field_help(config: type[RunConfig]) -> dict[str, str]:

@@ -16,7 +16,7 @@ import numpy as np
 
 from lemniscate import algos
 from lemniscate.errors import UserError, is_installed, missing_extra
-from lemniscate.presets.preset import StoredPreset
+from lemniscate.presets import Preset
 from lemniscate.report.seeds import iqm
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import TUNE, create_directory, is_finished
@@ -46,7 +46,7 @@ class Tuned:
     """The result of `tune`: the search's directory, the best settings and their score, and every trial's."""
 
     path: Path
-    preset: StoredPreset
+    preset: Preset
     score: float
     trials: list[dict[str, Any]]
 
@@ -85,12 +85,12 @@ class Search:
         but_seed = {name: value for name, value in config.items() if name != "seed"}
         return Sweep(self.path / TRIALS / name, self.seeds, {self.algorithm: but_seed})
 
-    def preset(self, which: str, settings: Mapping[str, Any], score: float) -> StoredPreset:
+    def preset(self, which: str, settings: Mapping[str, Any], score: float) -> Preset:
         """The best settings, with their provenance."""
         seeds = ", ".join(map(str, self.seeds))
         source = f"lemniscate tune: {which}, {self.what}, seeds {seeds}, score {score:,.1f}"
         config = self.config.replace(**settings, evaluate_every=0, evaluate_episodes=20)
-        return StoredPreset(self.path.name, self.algorithm, config, source, f"{date.today():%Y-%m}")
+        return Preset(self.path.name, config, source, f"{date.today():%Y-%m}")
 
     def rungs(self) -> list[int]:
         """The steps after which a trial may end, planned checkpoints all of them."""

@@ -15,7 +15,7 @@ from lemniscate.api import training
 from lemniscate.api.policy import path_of
 from lemniscate.cluster.connection import Cluster, find_cluster
 from lemniscate.errors import SweepError, UserError, shown
-from lemniscate.presets.preset import StoredPreset
+from lemniscate.presets import Preset
 from lemniscate.report import tuning as pictures
 from lemniscate.run.places import LOG, failure_of
 from lemniscate.run.sweep_file import Sweep, is_sweep
@@ -232,7 +232,7 @@ class _Tuner(SetOfRuns):
             self._study.tell(asked, score)
             self._end(trial, f"score {score:,.1f}")
             if self._study.best_trial.number == number:
-                self._preset().write(self._search.path / PRESET)
+                self._preset().write(self._search.path / PRESET, self._search.algorithm)
             return None
         score, ninths = score_at(trial.sweep.runs, self._rungs[trial.rung]), RUNGS[trial.rung]
         trial.rung += 1
@@ -254,10 +254,10 @@ class _Tuner(SetOfRuns):
         if not complete:
             raise SweepError(f"None of the {self._search.trials} trials has come to its end; their logs say why.")
         preset, best = self._preset(), self._study.best_trial
-        preset.write(self._search.path / PRESET)
+        preset.write(self._search.path / PRESET, self._search.algorithm)
         assert best.value is not None
         self._say(f"Best of {len(self._study.trials)} trials: number {best.number}, score {best.value:,.1f}.")
-        self._say(preset.to_python())
+        self._say(preset.to_toml())
         for picture in pictures.draw(self._study, list(self._space), self._search.path / "plots"):
             self._say(str(picture))
         self._say(
@@ -267,7 +267,7 @@ class _Tuner(SetOfRuns):
         trials = [{"number": t.number, "state": t.state.name, "score": t.value, **t.params} for t in self._study.trials]
         return Tuned(self._search.path, preset, best.value, trials)
 
-    def _preset(self) -> StoredPreset:
+    def _preset(self) -> Preset:
         """The settings of the best trial, with their provenance."""
         best = self._study.best_trial
         assert best.value is not None
