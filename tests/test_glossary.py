@@ -18,7 +18,7 @@ def configs():
 
 
 def test_the_table_of_the_page_is_that_of_the_code():
-    assert glossary.table() in PAGE
+    assert glossary.TABLE.read_text() in PAGE
 
 
 def test_the_words_of_one_library_are_beside_ours():
@@ -29,11 +29,11 @@ def test_the_words_of_one_library_are_beside_ours():
 
 
 def test_every_row_has_a_cell_for_each_library():
-    assert {len(row) for row in glossary.rows()} == {1 + len(glossary.LIBRARIES)}
+    assert len({len(row) for row in glossary.rows()}) == 1
 
 
 def test_every_field_has_a_row_and_every_row_a_field():
-    listed = {glossary.names_in(field)[0] for field, *_ in glossary.rows()}
+    listed = {glossary.names_in(field)[0] for field, *_ in glossary.rows()[1:]}
     fields = {name for config in configs() for name in config.names()}
     assert fields - listed == set()
     assert listed - fields <= {
