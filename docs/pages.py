@@ -6,7 +6,7 @@ README.md is the home page, the notebooks are pages with their outputs, and a li
 along: a program becomes a page with its text. Two comments in a page are filled in:
 
     <!-- file: examples/callback.py -->    the text of the file
-    <!-- words: CleanRL -->                the table of a library's words beside ours, from lemniscate.run.glossary
+    <!-- words: CleanRL -->                the table of a library's words beside ours, from lemniscate.run.fields
 """
 
 import base64
@@ -19,7 +19,7 @@ from pathlib import Path
 
 from latex2mathml.converter import convert
 
-from lemniscate.run import glossary
+from lemniscate.run import fields as glossary
 
 ROOT = Path(__file__).parents[1]
 OUT = ROOT / "build" / "docs"

@@ -15,7 +15,7 @@ from conftest import tiny_fields
 from lemniscate.algos import find
 from lemniscate.cli import main, parse
 from lemniscate.cli.parsers import algorithms
-from lemniscate.run.texts import read
+from lemniscate.run.fields import read
 
 TINY = [
     str(part)

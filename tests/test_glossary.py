@@ -8,7 +8,7 @@ import pytest
 
 import lemniscate as lem
 from lemniscate import algos
-from lemniscate.run import glossary
+from lemniscate.run import fields as glossary
 
 PAGE = (Path(__file__).parents[1] / "docs" / "glossary.md").read_text()
 

@@ -23,9 +23,9 @@ from lemniscate.api import training
 from lemniscate.cli import parse
 from lemniscate.envs import registry
 from lemniscate.errors import UserError
-from lemniscate.run.config import _hints_of, options_of
+from lemniscate.run.config import _hints_of
 from lemniscate.run.environments import device_for, evaluation_env, make_envs, require_memory
-from lemniscate.run.texts import number_type
+from lemniscate.run.fields import kinds_of
 
 MEMORY, SECONDS = 2 * 10**9, 5
 """bytes that the cases of one process may take, and processor time of one case"""
@@ -65,10 +65,11 @@ def numeric_fields(algorithm):
     """The names of the fields that hold a number, or several."""
     hints = _hints_of(find(algorithm).Config)
 
-    def is_numeric(option):
-        return number_type(option) is not None or any(number_type(part) for part in getattr(option, "__args__", ()))
+    def is_numeric(hint):
+        kinds = kinds_of(hint)
+        return bool({int, float} & kinds.keys()) or (tuple in kinds and is_numeric(kinds[tuple][0]))
 
-    return [name for name, hint in hints.items() if any(map(is_numeric, options_of(hint)))]
+    return [name for name, hint in hints.items() if is_numeric(hint)]
 
 
 def base(algorithm):

@@ -12,8 +12,8 @@ from lemniscate.api.policy import TrainedRun
 from lemniscate.envs import registry
 from lemniscate.errors import UserError, unknown_name
 from lemniscate.run.directory import SWEEP, TUNE
+from lemniscate.run.fields import number, read, read_json
 from lemniscate.run.run import is_compiled
-from lemniscate.run.texts import number, read, read_json
 from lemniscate.system.console import say, talks
 from lemniscate.system.watchdog import end_with_owner
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 from shlex import quote
-from typing import Literal, get_args, get_origin, get_type_hints
+from typing import Literal, get_type_hints
 
 from lemniscate.algos import ALGORITHMS, find
 from lemniscate.cli.fields import algorithm_parser, explain
@@ -11,7 +11,7 @@ from lemniscate.envs import registry
 from lemniscate.errors import unknown_name
 from lemniscate.nn.networks import NETWORKS
 from lemniscate.presets import names
-from lemniscate.run.config import flag, options_of
+from lemniscate.run.fields import flag, kinds_of
 from lemniscate.run.loggers import TRACKERS
 
 FILES = {
@@ -86,7 +86,6 @@ def _followers() -> dict[str, Iterable[str]]:
     found |= {"--preset": presets, "--backend": registry.BACKENDS, "--track": TRACKERS, "--network": NETWORKS}
     for name in ALGORITHMS:
         for field, hint in get_type_hints(find(name).Config).items():
-            for option in options_of(hint):
-                if get_origin(option) is Literal:
-                    found[flag(field)] = get_args(option)
+            if choices := kinds_of(hint).get(Literal):
+                found[flag(field)] = choices
     return found

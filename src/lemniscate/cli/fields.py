@@ -7,15 +7,14 @@ from contextlib import nullcontext
 from itertools import pairwise
 from textwrap import dedent, fill
 from types import NoneType
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any, Literal, get_type_hints
 
 from lemniscate.algos import find
 from lemniscate.cli.parsers import Parser, parser_of, unknown_argument
 from lemniscate.errors import UserError, prefix_errors, unknown_name
 from lemniscate.presets import names
-from lemniscate.run.config import RunConfig, flag, options_of
-from lemniscate.run.glossary import unknown_field
-from lemniscate.run.texts import is_dict, number_type, read
+from lemniscate.run.config import RunConfig
+from lemniscate.run.fields import flag, kinds_of, read, unknown_field
 
 GROUPS: dict[str, tuple[str, ...]] = {
     "run": ("seed", "total_steps", "device", "threads", "shards", "compile", "matmul", "warm_start"),
@@ -78,15 +77,15 @@ def algorithm_parser(command: str, algorithm: str) -> Parser:
         for name in own:
             if name in hints:
                 flags = dict.fromkeys([flag(name), f"--{name.replace('_', '-')}"])
-                group.add_argument(*flags, dest=name, default=argparse.SUPPRESS, **_kind(options_of(hints[name])))
+                group.add_argument(*flags, dest=name, default=argparse.SUPPRESS, **_kind(hints[name]))
     return parser
 
 
-def _kind(options: tuple[Any, ...]) -> dict[str, Any]:
-    """How argparse reads a field of these types: a switch, several words or one; `read` knows the rest."""
-    if bool in options:
+def _kind(hint: Any) -> dict[str, Any]:
+    """How argparse reads a field of this type: a switch, several words or one; `read` knows the rest."""
+    if bool in kinds_of(hint):
         return {"action": argparse.BooleanOptionalAction}
-    return {"nargs": "+"} if any(get_origin(option) is tuple for option in options) else {}
+    return {"nargs": "+"} if tuple in kinds_of(hint) else {}
 
 
 def explain(parser: Parser, algorithm: str) -> None:
@@ -95,14 +94,13 @@ def explain(parser: Parser, algorithm: str) -> None:
     texts, defaults, hints = field_help(config), config(), get_type_hints(config, include_extras=True)
     for action in parser._actions:
         if action.dest in hints and action.dest != "env":
-            options, text = options_of(hints[action.dest]), texts.get(action.dest, "")
-            literals = [get_args(option) for option in options if get_origin(option) is Literal]
-            if literals:
-                text += f" {{{', '.join(map(str, literals[0]))}}}"
+            hint, text = hints[action.dest], texts.get(action.dest, "")
+            if choices := kinds_of(hint).get(Literal):
+                text += f" {{{', '.join(map(str, choices))}}}"
             default = getattr(defaults, action.dest)
             if default not in ((), {}) and "(default" not in text:
                 text += f" [{_shown(default)}]"
-            action.help, action.metavar = text.replace("%", "%%"), _metavar(options)
+            action.help, action.metavar = text.replace("%", "%%"), _metavar(hint)
     bracket = "[…] is the default, where neither --preset nor the environment's own preset says otherwise."
     parser.epilog = fill(f"presets: {', '.join(names(algorithm))}", 110) + f"\n{bracket}"
 
@@ -125,7 +123,7 @@ def field_help(config: type[RunConfig]) -> dict[str, str]:
 def _switch(word: str, hints: dict[str, Any]) -> str:
     """The flag or the no-flag that `--field=on` or `--field=off` means, as programs that start others write it."""
     name, _, value = word.partition("=")
-    if bool not in options_of(hints.get(name.removeprefix("--").replace("-", "_"))):
+    if bool not in kinds_of(hints.get(name.removeprefix("--").replace("-", "_"))):
         return word
     no = name.replace("--", "--no-", 1)
     return {"on": name, "true": name, "off": no, "false": no}.get(value.lower(), word)
@@ -138,16 +136,11 @@ def _unknown_flag(word: str, known: list[str]) -> UserError:
     return unknown_field(name, known, flag)
 
 
-def _metavar(options: tuple[Any, ...]) -> str:
+def _metavar(hint: Any) -> str:
     """INT, FLOAT, NAME or JSON; `|none` where nothing is a value too."""
-    kinds: list[str] = []
-    for option in options:
-        if get_origin(option) is tuple:
-            kinds.append(_metavar(options_of(get_args(option)[0])))
-        elif option is not NoneType:
-            number = number_type(option)
-            kinds.append("INT" if number is int else "FLOAT" if number else "JSON" if is_dict(option) else "NAME")
-    return "|".join([*dict.fromkeys(kinds), *(["none"] if NoneType in options else [])])
+    words = {int: "INT", float: "FLOAT", dict: "JSON", NoneType: "none"}
+    kinds = kinds_of(hint).items()
+    return "|".join(dict.fromkeys(_metavar(of[0]) if kind is tuple else words.get(kind, "NAME") for kind, of in kinds))
 
 
 def _shown(value: Any) -> str:

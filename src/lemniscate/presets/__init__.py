@@ -18,7 +18,7 @@ from typing import Any, get_type_hints
 from lemniscate.algos import ALGORITHMS, find
 from lemniscate.errors import UserError, unknown_name
 from lemniscate.run.config import RunConfig
-from lemniscate.run.texts import read
+from lemniscate.run.fields import read
 from lemniscate.system.files import DamagedFileError, parsing, read_json, write_json
 
 

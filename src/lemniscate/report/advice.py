@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from lemniscate.report.curves import moving_average, window_of
-from lemniscate.run.config import flag
+from lemniscate.run.fields import flag
 
 SMALLER_STEPS = (("lower", "learning_rate"), ("lower", "actor_learning_rate"), ("lower", "max_kl"))
 """cures of a policy that changes too fast, by the field that its algorithm has"""

@@ -24,9 +24,10 @@ from lemniscate.errors import UserError, resume_line
 from lemniscate.report import advice, curves
 from lemniscate.report.playback import FILMS
 from lemniscate.report.seeds import Group, Scores
-from lemniscate.run.config import RunConfig, flag
+from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import is_finished, read_config
 from lemniscate.run.evaluate import QBias
+from lemniscate.run.fields import flag
 from lemniscate.run.metrics import read_metrics
 from lemniscate.system import named
 from lemniscate.system.files import replace_file

@@ -9,14 +9,14 @@ from dataclasses import dataclass, field
 from functools import cache
 from itertools import islice
 from pathlib import PurePath
-from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, Self, Union, get_args, get_origin, get_type_hints
+from types import NoneType
+from typing import Annotated, Any, Literal, Self, get_args, get_origin, get_type_hints
 
 import torch
 
 from lemniscate.envs.registry import MOST_ENVS
 from lemniscate.errors import UserError, shown
-from lemniscate.run.glossary import unknown_field
+from lemniscate.run.fields import options_of, unknown_field
 from lemniscate.run.seeding import Generators
 from lemniscate.spec import Spec
 
@@ -58,11 +58,6 @@ Finite = Annotated[float, Range()]
 Epsilon = Annotated[float, Range(1e-30, 1)]  # a smaller one is a zero in float32
 LogStd = Annotated[float, Range(-10, 5)]
 SquashedLogStd = Annotated[float, Range(-4.9, 1.9)]  # of a `SquashedGaussianPolicy`
-
-
-def options_of(hint: Any) -> tuple[Any, ...]:
-    """The types that a field may have: those of a union, or the one."""
-    return get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
 
 
 def checked(name: str, value: Any, hint: Any) -> Any:
@@ -128,11 +123,6 @@ def _number(value: Any, kind: type, limits: Range = Range()) -> int | float:
         if value in limits and (kind is float or isinstance(value, int) or value.is_integer()):
             return kind(value)
     raise ValueError(wanted)
-
-
-def flag(name: str) -> str:
-    """The flag of a field on the command line."""
-    return "--env-args" if name == "env_kwargs" else f"--{name.replace('_', '-')}"
 
 
 @cache

@@ -8,12 +8,11 @@ is a range whose orders of magnitude are equally likely, a range whose numbers a
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, get_origin, get_type_hints
+from typing import Any, get_type_hints
 
 from lemniscate.errors import UserError, shown
-from lemniscate.run.config import RunConfig, options_of
-from lemniscate.run.glossary import unknown_field
-from lemniscate.run.texts import read
+from lemniscate.run.config import RunConfig
+from lemniscate.run.fields import kinds_of, read, unknown_field
 
 NOT_SEARCHED = ("env", "backend", "seed", "total_steps", "checkpoint_every", "evaluate_every", "evaluate_episodes")
 """fields that are the same in all trials, or set by the search itself"""
@@ -121,7 +120,7 @@ def _range(name: str, text: str, hint: Any, config: RunConfig) -> Interval | Cho
 
 
 def _read(name: str, hint: Any, text: str) -> Any:
-    options = options_of(hint)
-    if bool in options:
-        return {"on": True, "off": False}.get(text.strip(), text.strip())
-    return read(name, hint, text.split() if any(get_origin(option) is tuple for option in options) else text.strip())
+    kinds, text = kinds_of(hint), text.strip()
+    if bool in kinds:
+        return {"on": True, "off": False}.get(text, text)
+    return read(name, hint, text.split() if tuple in kinds else text)
