@@ -1168,14 +1168,14 @@ MUTANTS = [
     ),
     (
         "a sent run loses its config",
-        "cluster/parcel.py",
+        "cluster/connection.py",
         "if file.is_file() and not (file.name == CONFIG",
         "if file.is_file() and (file.name == CONFIG",
         "cluster/test_parcel.py",
     ),
     (
         "deleted checkpoints come back",
-        "cluster/parcel.py",
+        "cluster/connection.py",
         "if checkpoint.name not in sent:",
         "if False:",
         "cluster/test_parcel.py",

@@ -1,6 +1,6 @@
 """A run directory as bytes: what is sent, and what stays where it is."""
 
-from lemniscate.cluster.parcel import pack, unpack
+from lemniscate.cluster.connection import pack, unpack
 
 
 def run(path, config, *steps):

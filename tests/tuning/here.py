@@ -39,6 +39,6 @@ class Here:
 def in_this_process(places=Here):
     """Sweeps and searches train their runs here meanwhile."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lemniscate.sweeps.runs.places_on", places)
-        patch.setattr("lemniscate.sweeps.runs.POLL_SECONDS", 0.0)
+        patch.setattr("lemniscate.sweeps.sweep.places_on", places)
+        patch.setattr("lemniscate.sweeps.sweep.POLL_SECONDS", 0.0)
         yield

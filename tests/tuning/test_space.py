@@ -7,7 +7,7 @@ import pytest
 
 from conftest import tiny
 from lemniscate.errors import UserError
-from lemniscate.sweeps.space import Choice, Interval, draw, read_space, read_texts
+from lemniscate.sweeps.search import Choice, Interval, draw, read_space, read_texts
 
 
 def space_of(search, **fields):

@@ -18,7 +18,7 @@ from lemniscate.presets import read_preset, read_toml
 from lemniscate.report.seeds import iqm
 from lemniscate.run import checkpoint
 from lemniscate.run.metrics import read_metrics
-from lemniscate.sweeps.study import read_search
+from lemniscate.sweeps.search import read_search
 from tuning.here import in_this_process
 
 ENV = "environments:Copy-box-v0"
@@ -150,7 +150,7 @@ def test_what_is_proposed_after_an_interruption_is_new(tmp_path):
 
 
 def read_search_of(folder, trials):
-    from lemniscate.sweeps.study import Search
+    from lemniscate.sweeps.search import Search
 
     config = config_for("ppo", ENV)
     folder.mkdir(exist_ok=True)

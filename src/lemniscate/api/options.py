@@ -1,18 +1,31 @@
 """How a run is trained besides its Config: loggers, callbacks, and the processes that share the work."""
 
+import logging
+import os
+import signal
+import sys
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from lemniscate.api.callbacks import Callback
-from lemniscate.errors import UserError, is_installed, missing_extra, shown, unknown_name
+from lemniscate.errors import RankError, UserError, is_installed, missing_extra, shown, unknown_name
 from lemniscate.run.config import RunConfig
+from lemniscate.run.directory import CONFIG, create_directory
 from lemniscate.run.loggers import TRACKERS, JsonLines, LoggerClass, TensorBoard
+from lemniscate.run.stopping import Stopped
 from lemniscate.system import named
+from lemniscate.system.watchdog import OWNED
+from lemniscate.system.world import World
 
 if TYPE_CHECKING:
     from lemniscate.cluster.connection import Cluster
+
+SECONDS_TO_END = 10
+"""that the processes have to end by themselves, once one has ended or the launcher was asked to stop"""
 
 
 @dataclass(frozen=True)
@@ -103,3 +116,61 @@ def _by_name(name: str) -> Any:
         return found()
     except TypeError as error:
         raise UserError(f"{name} cannot be made; give its arguments as module:Class(key=value, …): {error}.") from error
+
+
+def train_in_processes(path: Path, algorithm: str, config: RunConfig, options: RunOptions) -> None:
+    """Train in several processes of this machine: each resumes the run, which begins here if it is new.
+
+    A new run has a shard for each process, unless its Config has more. Raises as `launch`.
+    """
+    if (path / CONFIG).exists() or config.shards > 1:
+        World(config.shards, size=options.processes).divide(config.shards)
+    words = options.words()
+    if not (path / CONFIG).exists():
+        config = config.replace(shards=max(config.shards, options.processes))
+        create_directory(path, CONFIG, {"algorithm": algorithm, "config": config.to_json()})
+    launch(["resume", str(path), *words], options.processes)
+
+
+def launch(words: Sequence[str], processes: int) -> None:
+    """Run `lemniscate WORDS` in so many processes, and wait for all of them; they say themselves what there is to say.
+
+    Raises:
+        Stopped: they were asked to stop, and have saved the run.
+        RankError: one of them failed; empty unless all were killed.
+    """
+    from torch.distributed.elastic.multiprocessing import SignalException
+    from torch.distributed.elastic.multiprocessing.errors import ChildFailedError
+    from torch.distributed.launcher.api import LaunchConfig, elastic_launch
+
+    logging.disable(logging.ERROR)
+    config = LaunchConfig(
+        min_nodes=1,
+        max_nodes=1,
+        nproc_per_node=processes,
+        run_id=f"lemniscate-{os.getpid()}-{time.time_ns()}",
+        rdzv_backend="c10d",
+        rdzv_endpoint="localhost:0",
+        local_addr="localhost",
+        max_restarts=0,
+        shutdown_timeout=SECONDS_TO_END,
+    )
+    reading, writing = os.pipe()  # closed when this process ends, however it ends; then they end, too
+    os.environ[OWNED] = f"/proc/{os.getpid()}/fd/{reading}"
+    os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))
+    try:
+        elastic_launch(config, sys.executable)("-m", "lemniscate", *words)
+    except SignalException as stopped:
+        raise Stopped("", stopped.sigval) from None
+    except ChildFailedError as failed:
+        codes = {rank: failure.exitcode for rank, failure in failed.failures.items()}
+        for signum in (signal.SIGINT, signal.SIGTERM):
+            if 128 + signum in codes.values():
+                raise Stopped("", signum) from None
+        killed = len(codes) == processes and all(code == -signal.SIGKILL for code in codes.values())
+        raise RankError("All processes of the run were killed." if killed else "") from None
+    finally:
+        logging.disable(logging.NOTSET)
+        del os.environ[OWNED]
+        os.close(writing)
+        os.close(reading)

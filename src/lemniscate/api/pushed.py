@@ -6,7 +6,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from lemniscate.api.policy import Trained, TrainedPolicy, algorithm_of, load, save
-from lemniscate.api.results import FINAL_EPISODES, evaluate, final_scores
+from lemniscate.api.results import FINAL_EPISODES, evaluate, final_scores, scores_of
 from lemniscate.errors import UserError
 from lemniscate.hub import repository as hub
 from lemniscate.report import pages
@@ -97,8 +97,7 @@ def _scores(policy: TrainedPolicy, run: Path | None) -> dict[str, Any] | None:
         if run:
             return final_scores(run)
         say(f"Evaluating the policy: {FINAL_EPISODES} episodes.")
-        found = evaluate(policy, episodes=FINAL_EPISODES, seed=0)
-        return {"step": policy.step, "seed": 0, **found.to_json()}
+        return scores_of(policy)
     except UserError as error:
         say(f"No scores: {error}")
         return None

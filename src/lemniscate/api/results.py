@@ -2,17 +2,20 @@
 
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
 from lemniscate.api.policy import Trained, TrainedPolicy, TrainedRun, load, path_of
+from lemniscate.envs import check as env_check
 from lemniscate.envs import registry
 from lemniscate.envs.check import Finding
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError, shown
 from lemniscate.report import flight, pages, playback
+from lemniscate.run import check as run_check
 from lemniscate.run import checkpoint
 from lemniscate.run.config import Episodes, Natural, RunConfig, checked
 from lemniscate.run.environments import env_arguments, evaluation_env
@@ -69,11 +72,8 @@ def evaluate(
     agent = policy if callable(policy) else load(policy, trust=trust)
     episodes, seed, file = checked("episodes", episodes, Episodes), checked("seed", seed, Natural), _film(video)
     kwargs = checked("env_kwargs", env_kwargs, dict | None)
-    elsewhere: dict[str, Any] = {"env": env, "env_kwargs": kwargs, "backend": backend}
     how: dict[str, Any] = {"episodes": episodes, "seed": seed, "tell": lambda text: None}
-    arguments = env_arguments(_config_of(agent, env), **elsewhere)
-    vec = _env_for(agent, episodes, **elsewhere)
-    try:
+    with _environments(agent, episodes, env, env_kwargs=kwargs, backend=backend) as (vec, arguments):
         if baseline and vec.baseline is None:
             raise UserError(f"{vec.spec.env_id} has no baseline to compare with.")
         if baseline and vec.baseline:
@@ -84,8 +84,6 @@ def evaluate(
             return playback.play_single(playback.act_by(agent), arguments, **how)
         critic = critic_of(agent.networks, agent.config)
         return evaluate_policy(agent.module, vec, episodes, seed, deterministic, critic)
-    finally:
-        vec.close()
 
 
 def watch(
@@ -124,19 +122,14 @@ def watch(
     episodes, seed, file = checked("episodes", episodes, Episodes), checked("seed", seed, Natural), _film(video)
     if agent is None and env is None:
         raise UserError("Watch what? Name a run, or an environment to act in at random.")
-    elsewhere: dict[str, Any] = {"env": env, "env_kwargs": checked("env_kwargs", env_kwargs, dict | None)}
-    arguments = env_arguments(_config_of(agent, env), **elsewhere)
-    if file is None:
-        playback.require_display()
-    vec = _env_for(agent, episodes, **elsewhere)
-    try:
+    kwargs = checked("env_kwargs", env_kwargs, dict | None)
+    with _environments(agent, episodes, env, env_kwargs=kwargs) as (vec, arguments):
+        if file is None:
+            playback.require_display()
         if vec.scene and episodes > vec.num_envs:
             raise UserError(f"At most {vec.num_envs} flights of this run can be shown, not {episodes}.")
-        shown_by = None if random else agent
         how = {"episodes": episodes, "seed": seed, "deterministic": deterministic, "video": file}
-        scores = _show(shown_by, vec, arguments, **how)
-    finally:
-        vec.close()
+        scores = _show(None if random else agent, vec, arguments, **how)
     if episodes > 1 or scores.measures:
         say(pages.sentence(scores.to_json()))
     if file:
@@ -177,9 +170,6 @@ def each_finding(
     what: str, backend: str | None, env_kwargs: Mapping[str, Any] | None, wrappers: Sequence[str]
 ) -> Iterator[Finding]:
     """The findings of `check`, one by one."""
-    from lemniscate.envs import check as env_check
-    from lemniscate.run import check as run_check
-
     if run_check.is_stored(Path(what)):
         return run_check.each_finding(Path(what))
     return env_check.each_finding(what, backend, env_kwargs, wrappers)
@@ -187,10 +177,13 @@ def each_finding(
 
 def verdict(what: str, found: list[Finding]) -> str:
     """The conclusion from the findings, in a sentence or two."""
-    from lemniscate.envs import check as env_check
-    from lemniscate.run import check as run_check
-
     return run_check.verdict(Path(what), found) if run_check.is_stored(Path(what)) else env_check.verdict(what, found)
+
+
+def scores_of(policy: TrainedPolicy) -> dict[str, Any]:
+    """Scores of a policy over 100 episodes: `Evaluation.to_json`, with its `step` and the `seed` of the starts."""
+    scores = evaluate(policy, episodes=FINAL_EPISODES, seed=0)
+    return {"step": policy.step, "seed": 0, **scores.to_json()}
 
 
 def final_return(run: str | Path | TrainedRun) -> float:
@@ -199,18 +192,13 @@ def final_return(run: str | Path | TrainedRun) -> float:
 
 
 def final_scores(run: str | Path | TrainedRun) -> dict[str, Any]:
-    """Scores of a run's newest policy over 100 episodes; kept in `final.json` until there is a newer policy.
-
-    They are those of `Evaluation.to_json`, with the `step` of the policy and the `seed` of the starts.
-    """
+    """The `scores_of` a run's newest policy; kept in `final.json` until there is a newer policy."""
     path = path_of(run)
     file = path / "final.json"
     known = _known_scores(file)
     if known.get("step") not in checkpoint.list_steps(path / "checkpoints")[-1:]:
-        policy = load(run)
         say(f"Evaluating {path}: {FINAL_EPISODES} episodes.")
-        scores = evaluate(policy, episodes=FINAL_EPISODES, seed=0)
-        known = {"step": policy.step, "seed": 0, **scores.to_json()}
+        known = scores_of(load(run))
         write_json(file, known)
     return known
 
@@ -246,15 +234,21 @@ def _config_of(agent: TrainedPolicy | Agent | None, env: str | Callable[..., Any
     return RunConfig(env=registry.name_of(env))
 
 
-def _env_for(agent: TrainedPolicy | Agent | None, episodes: int, **elsewhere: Any) -> VecEnv:
-    """The environments of an evaluation. Raises `UserError` where the policy cannot act."""
-    vec = evaluation_env(_config_of(agent, elsewhere["env"]), episodes, **elsewhere)
-    if isinstance(agent, TrainedPolicy) and not vec.spec.fits(agent.spec):
+@contextmanager
+def _environments(
+    agent: TrainedPolicy | Agent | None, episodes: int, env: str | Callable[..., Any] | None, **elsewhere: Any
+) -> Iterator[tuple[VecEnv, dict[str, Any]]]:
+    """The environments of an evaluation, and the arguments of a single one. Raises `UserError` for other spaces."""
+    config = _config_of(agent, env)
+    arguments = env_arguments(config, env=env, **elsewhere)
+    vec = evaluation_env(config, episodes, env=env, **elsewhere)
+    try:
+        if isinstance(agent, TrainedPolicy) and not vec.spec.fits(agent.spec):
+            ours, theirs = agent.spec.env_id, vec.spec.env_id
+            raise UserError(f"A policy for {ours} cannot act in {theirs}: observation or action spaces differ.")
+        yield vec, arguments
+    finally:
         vec.close()
-        raise UserError(
-            f"A policy for {agent.spec.env_id} cannot act in {vec.spec.env_id}: observation or action spaces differ."
-        )
-    return vec
 
 
 def _show(

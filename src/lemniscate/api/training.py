@@ -2,6 +2,7 @@
 
 import os
 import sys
+import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from itertools import count
@@ -13,7 +14,7 @@ import torch
 
 from lemniscate import algos, presets
 from lemniscate.api.callbacks import Callback, call_callbacks
-from lemniscate.api.options import RunOptions, require_importable
+from lemniscate.api.options import RunOptions, require_importable, train_in_processes
 from lemniscate.api.policy import TrainedPolicy, TrainedRun, load, path_of
 from lemniscate.envs import registry
 from lemniscate.errors import NotStoredError, UserError, is_installed
@@ -171,12 +172,8 @@ def resume(
     Args:
         run: its directory, or what `train` returned.
         env: only of a run that began with an object that no file holds, such as a lambda: the same object again.
-        wrappers: the same.
-        network: the same.
-        track: as in `train`, and the following; none of them is saved with the run.
-        callbacks: functions that see each logged line.
-        report: evaluate the final policy, and draw it.
-        progress: the live line on standard error.
+        wrappers: the same; and so `network`.
+        track: as in `train`, like `callbacks`, `report` and `progress`; none of them is saved with the run.
         processes: of this machine; any number that divides the run's `shards`, whatever it began with.
         cluster: as in `train`: go on there, from what its storage has, or else this directory.
         workers: as many as divide the run's `shards`; others stand by.
@@ -237,17 +234,16 @@ def _train_elsewhere(
 ) -> TrainedRun:
     """Train in other processes, of this machine or of a cluster; each resumes the run, which begins if it is new."""
     require_importable(config)
+    began = time.monotonic()
     if there is None:
-        from lemniscate.api.launch import launch_run
+        train_in_processes(path, algorithm, config, options)
+    else:
+        from lemniscate.cluster.job import train_on_ray
 
-        seconds = launch_run(path, algorithm, config, options.processes, options.words())
-        return TrainedRun(path, load(path), seconds)
-    from lemniscate.cluster.job import train_on_ray
-
-    shared = {"track": options.track, "callbacks": options.names(), "progress": options.progress}
-    seconds = train_on_ray(path, algorithm, config, there, f"{__name__}:resume", shared)
-    trained = TrainedRun(path, load(path), seconds)
-    if options.reports:
+        shared = {"track": options.track, "callbacks": options.names(), "progress": options.progress}
+        train_on_ray(path, algorithm, config, there, f"{__name__}:resume", shared)
+    trained = TrainedRun(path, load(path), time.monotonic() - began)
+    if there is not None and options.reports:  # processes of this machine get --report, and do it themselves
         _report_on(trained)
     return trained
 

@@ -12,7 +12,6 @@ import signal
 import socket
 import tempfile
 import threading
-import time
 import traceback
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -21,8 +20,7 @@ from shutil import copytree, rmtree
 from types import FrameType
 from typing import Any
 
-from lemniscate.cluster.connection import Cluster, connected
-from lemniscate.cluster.parcel import STORAGE, pack, unpack
+from lemniscate.cluster.connection import STORAGE, Cluster, connected, pack, unpack
 from lemniscate.errors import NonFiniteError, RankError, UserError, WorkerError, resume_line
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import CONFIG, LOCK, create_directory
@@ -42,7 +40,7 @@ FAILURES = 100
 
 def train_on_ray(
     path: Path, algorithm: str, config: RunConfig, cluster: Cluster, resume: str, options: Mapping[str, Any]
-) -> float:
+) -> None:
     """Train a run to its end on a cluster; its directory here is then as far as it has come.
 
     Args:
@@ -53,19 +51,16 @@ def train_on_ray(
         resume: the name, as `module:function`, of what each worker calls with its run directory and the options.
         options: of `resume`, in the worker; with `progress`, it is shown here too.
 
-    Returns the seconds that it took.
-
     Raises:
         Stopped: after a signal; the last checkpoint is kept.
         RankError: what ended the run in a worker.
     """
-    workers, began = cluster.workers or 1, time.monotonic()
+    workers = cluster.workers or 1
     with connected(cluster):  # before the directory is made: a cluster that does not answer leaves nothing
         if not (path / CONFIG).exists():
             config = config.replace(shards=max(config.shards, workers))
             create_directory(path, CONFIG, {"algorithm": algorithm, "config": config.to_json()})
         _train_on_ray(path, algorithm, config, workers, cluster.storage, resume, options)
-    return time.monotonic() - began
 
 
 def _train_on_ray(

@@ -16,8 +16,7 @@ from signal import SIGTERM
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from lemniscate.cluster.connection import Cluster, connected
-from lemniscate.cluster.parcel import pack, unpack
+from lemniscate.cluster.connection import Cluster, connected, pack, unpack
 from lemniscate.run.checkpoint import list_steps
 from lemniscate.run.metrics import METRICS
 from lemniscate.run.places import LOG, Places, Processes

@@ -1,14 +1,22 @@
 """Sweeps: every algorithm with every seed, each in a process of its own, one process per CPU core at a time.
 
 A process resumes one run directory, whether its run has begun or not. So an interrupted sweep goes on as it began, and
-each of its runs ends in the same bits as if it had been trained alone.
+each of its runs ends in the same bits as if it had been trained alone. A search (`tuner`) trains its runs by the same
+`SetOfRuns`.
 """
 
 import re
-from collections.abc import Iterable, Sequence
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from filelock import FileLock, Timeout
 
 from lemniscate.algos import ALGORITHMS, name_of
 from lemniscate.api import plots, training
@@ -20,17 +28,19 @@ from lemniscate.envs import registry
 from lemniscate.errors import SweepError, UserError, prefix_errors, resume_line, shown
 from lemniscate.hub.repository import local_path
 from lemniscate.run.config import RunConfig
-from lemniscate.run.directory import is_finished
+from lemniscate.run.directory import LOCK, is_finished
 from lemniscate.run.environments import device_for, require_memory
 from lemniscate.run.metrics import progress_of
-from lemniscate.run.places import LOG, failure_of
+from lemniscate.run.places import LOG, Places, Processes, failure_of
+from lemniscate.run.stopping import Stopped, stop_signals_to
 from lemniscate.run.sweep_file import Sweep, read_sweep
 from lemniscate.run.warm_start import load_networks
-from lemniscate.sweeps.runs import SetOfRuns, locked
 from lemniscate.system.console import Line, ProgressBar, pace, say
 
 MOST_SEEDS = 1_000
 """of a sweep, each of which is a directory and a process"""
+POLL_SECONDS = 0.3
+"""seconds between two looks at the processes"""
 
 
 @dataclass(frozen=True)
@@ -64,10 +74,8 @@ def train_sweep(
         seeds: "1-5", "1,3,7", a number, or numbers in a list.
         run: the sweep's directory; by default a new one under `runs/`.
         preset: by name, for every algorithm; the best known for the environment unless given.
-        track: as in `train`, for every run.
+        track: as in `train`, for every run; and so `report` and `progress`.
         callbacks: names of functions, as `module:function`: every run calls them in its own process.
-        report: as in `train`, for every run.
-        progress: the live lines on standard error.
         cluster: "ray" or "ray=ADDRESS": train the runs as Ray tasks, wherever there is room.
         workers: the most runs at a time there; by default as many as the cores serve.
         **fields: any fields that the Configs of all the algorithms have.
@@ -134,6 +142,95 @@ def _train(runs: Sweep, options: list[str], progress: bool, cluster: Cluster | N
             f"Try them again with: {resume_line(runs.path)}"
         )
     return TrainedSweep(runs.path, list(runs.runs))
+
+
+@contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """The directory of a set, for this process alone. Raises `UserError` if another one trains its runs."""
+    try:
+        with FileLock(path / LOCK, timeout=0):
+            yield
+    except Timeout:
+        raise UserError(f"{path} is being trained by another process.") from None
+
+
+def places_on(cluster: Cluster | None, configs: Iterable[Mapping[str, Any]]) -> Places:
+    """The places of a cluster, or of this machine, for runs of such Configs."""
+    configs = list(configs)
+    threads = max(config["threads"] for config in configs)
+    if cluster is None:
+        return Processes(threads)
+    from lemniscate.cluster.tasks import RayTasks
+
+    return RayTasks(cluster, threads, gpu=any(config["device"].startswith("cuda") for config in configs))
+
+
+class SetOfRuns(ABC):
+    """Runs that are trained at the places of a machine or of a cluster; asked to stop, all of them save themselves.
+
+    Args:
+        path: the directory of the set.
+        configs: of its runs.
+        cluster: where they are trained; None for this machine.
+    """
+
+    def __init__(self, path: Path, configs: Iterable[Mapping[str, Any]], cluster: Cluster | None) -> None:
+        self.path = path
+        self._places = places_on(cluster, configs)
+        self._stop_signal, self._told = 0, False
+        """the signal that asked to stop, if one has; whether this was said"""
+
+    @abstractmethod
+    def _begin_runs(self) -> bool:
+        """Start runs while there is room; returns whether anything is left that has not ended or not begun."""
+
+    @abstractmethod
+    def _run_ended(self, run: Path, code: int) -> None:
+        """Take note of the end of a run."""
+
+    @abstractmethod
+    def _is_finished(self) -> bool:
+        """Whether nothing is left to be done."""
+
+    @abstractmethod
+    def _say(self, text: str) -> None:
+        """Say a line, if progress is shown."""
+
+    def _train_all(self) -> None:
+        """Train the runs to their ends. Raises `Stopped` after a signal."""
+        try:
+            with stop_signals_to(self._stop):
+                while (not self._stop_signal and self._begin_runs()) or self._places.running:
+                    time.sleep(POLL_SECONDS)
+                    self._look()
+        finally:
+            self._places.close()
+        if self._stop_signal and not self._is_finished():
+            again = resume_line(self.path)
+            raise Stopped(f"Stopped; the runs that had begun are saved. Go on with: {again}", self._stop_signal)
+
+    @property
+    def _has_room(self) -> bool:
+        """Whether another run may be started now."""
+        return self._places.free and not self._stop_signal
+
+    def _start(self, run: Path, options: Sequence[str]) -> None:
+        self._places.start(run, options)
+        if self._stop_signal:  # the signal came while the process was started, before it was among those to be stopped
+            self._places.stop([run])
+
+    def _look(self) -> None:
+        """Take note of the runs that have ended since the last look."""
+        if self._stop_signal and not self._told:  # said here: a handler may interrupt another line
+            self._told = True
+            self._say("Stopping: each run ends its update and saves itself.")
+        for run, code in self._places.ended().items():
+            self._run_ended(run, code)
+
+    def _stop(self, signum: int = 0, _frame: FrameType | None = None) -> None:
+        """Ask every process to save and stop; asked twice, it does not wait for the end of its update."""
+        self._stop_signal = self._stop_signal or signum
+        self._places.stop()
 
 
 class _Training(SetOfRuns):

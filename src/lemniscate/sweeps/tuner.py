@@ -19,22 +19,23 @@ from lemniscate.presets import Preset
 from lemniscate.report import tuning as pictures
 from lemniscate.run.places import LOG, failure_of
 from lemniscate.run.sweep_file import Sweep, is_sweep
-from lemniscate.sweeps.runs import SetOfRuns, locked
-from lemniscate.sweeps.space import draw, read_space, read_texts
-from lemniscate.sweeps.study import (
+from lemniscate.sweeps.search import (
     NINTHS,
     PRESET,
     RUNGS,
     Search,
     Tuned,
     as_text,
+    draw,
     final_score,
     has_come,
     import_optuna,
     read_search,
+    read_space,
+    read_texts,
     score_at,
 )
-from lemniscate.sweeps.sweep import require_trainable, seeds_of
+from lemniscate.sweeps.sweep import SetOfRuns, locked, require_trainable, seeds_of
 from lemniscate.system.console import say
 
 if TYPE_CHECKING:
