@@ -14,14 +14,15 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Annotated, Any
 from urllib.parse import urlsplit
 
 from lemniscate.errors import UserError, is_installed, missing_extra, shown
+from lemniscate.run.config import Range, checked
 from lemniscate.run.directory import CONFIG, LOCK
 from lemniscate.system.files import make_directory, remove
 
-MOST_WORKERS = 4096
+Workers = Annotated[int, Range(1, 4096)]
 STORAGE = "ray"
 """the folder of a run directory that has Ray's storage, where no other is named"""
 LEFT = (LOCK, STORAGE, "plots", "videos")
@@ -57,8 +58,8 @@ def find_cluster(cluster: object, workers: object = None, storage: object = None
     kind, _, address = cluster.partition("=") if isinstance(cluster, str) else ("", "", "")
     if kind != "ray":
         raise UserError(f"cluster must be ray or ray=ADDRESS, not {shown(cluster)}.")
-    if workers is not None and not (type(workers) is int and 1 <= workers <= MOST_WORKERS):
-        raise UserError(f"workers must be a whole number from 1 to {MOST_WORKERS:,}, not {shown(workers)}.")
+    if workers is not None:
+        workers = checked("workers", workers, Workers)
     if not is_installed("ray"):
         raise missing_extra("ray", "ray")
     _require_answer(address or os.environ.get("RAY_ADDRESS", ""))

@@ -8,15 +8,16 @@ among the best third of all that have come so far. The score of a trial is the i
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 from lemniscate.algos import name_of
 from lemniscate.api import training
 from lemniscate.api.policy import path_of
 from lemniscate.cluster.connection import Cluster, find_cluster
-from lemniscate.errors import SweepError, UserError, shown
+from lemniscate.errors import SweepError, UserError
 from lemniscate.presets import Preset
 from lemniscate.report import tuning as pictures
+from lemniscate.run.config import Range, checked
 from lemniscate.run.places import LOG, failure_of
 from lemniscate.run.sweep_file import Sweep, is_sweep
 from lemniscate.sweeps.search import (
@@ -41,7 +42,7 @@ from lemniscate.system.console import say
 if TYPE_CHECKING:
     import optuna
 
-MOST_TRIALS = 10_000
+Trials = Annotated[int, Range(1, 10_000)]
 SEEDS = "101-103"
 """of a search, none of which any result of this project was evaluated with"""
 EPISODES = 50
@@ -94,8 +95,7 @@ def tune(
         raise UserError(f"{name} follows from the search: at the end of each part of a run trials are compared.")
     algorithm = name_of(algorithm)
     config = training.config_for(algorithm, env, preset, **fields)
-    if not isinstance(trials, int) or isinstance(trials, bool) or not 1 <= trials <= MOST_TRIALS:
-        raise UserError(f"trials must be a whole number from 1 to {MOST_TRIALS:,}, not {shown(trials)}.")
+    trials = checked("trials", trials, Trials)
     config = config.replace(
         checkpoint_every=-(-config.total_steps // NINTHS),
         evaluate_every=config.total_steps,
