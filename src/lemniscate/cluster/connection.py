@@ -58,12 +58,11 @@ def find_cluster(cluster: object, workers: object = None, storage: object = None
     kind, _, address = cluster.partition("=") if isinstance(cluster, str) else ("", "", "")
     if kind != "ray":
         raise UserError(f"cluster must be ray or ray=ADDRESS, not {shown(cluster)}.")
-    if workers is not None:
-        workers = checked("workers", workers, Workers)
+    most = None if workers is None else checked("workers", workers, Workers)
     if not is_installed("ray"):
         raise missing_extra("ray", "ray")
     _require_answer(address or os.environ.get("RAY_ADDRESS", ""))
-    return Cluster(address or None, workers, None if storage is None else str(storage))
+    return Cluster(address or None, most, None if storage is None else str(storage))
 
 
 @contextmanager
