@@ -21,7 +21,7 @@ from lemniscate.envs.vector_view import VectorView, make_vec
 from lemniscate.errors import UserError, unknown_name
 from lemniscate.system.console import say
 
-SKELETONS = {"ppo": "ppo_from_scratch.py"}
+SKELETONS = ("ppo",)
 SOLUTION = re.compile(r"^( *)# <solution>\n.*?# </solution>\n", re.DOTALL | re.MULTILINE)
 """the lines of a program that its skeleton leaves out"""
 
@@ -54,7 +54,8 @@ def skeleton(name: str = "ppo", path: str | Path | None = None) -> Path:
 
 def solution(name: str) -> str:
     """The program of a skeleton without gaps."""
-    return Path(__file__).with_name(SKELETONS[name]).read_text()
+    # Not a module: it is a text for the reader's own file, and nothing here may come to import it.
+    return (Path(__file__).parent / "templates" / f"{name}.py.txt").read_text()
 
 
 @dataclass(frozen=True)
