@@ -17,10 +17,9 @@ from lemniscate.exporting.compiled import HostPolicy, host_compiler
 from lemniscate.exporting.deployed import for_policy
 from lemniscate.exporting.export import MANIFEST
 from lemniscate.exporting.manifest import commit, version
+from lemniscate.margins.presentation import FAILS, FALLS_SHORT, draw, rows, sentences, smoothness_sentence
 from lemniscate.margins.record import AxisMargins, margins_of, smoothness, worst_accepted
-from lemniscate.margins.sentences import FAILS, FALLS_SHORT, panel, rows, sentences, smoothness_sentence
 from lemniscate.margins.vector_probe import VectorProbe
-from lemniscate.report import margins_plot
 from lemniscate.report.compare import table
 from lemniscate.run.config import Natural, Range, checked
 from lemniscate.run.directory import read_config
@@ -198,7 +197,7 @@ def _write(result: Preflight, folder: Path) -> None:
     acts = f"{result.env_id}: {acting} of step {result.step:,}"
     title = f"{acts}, {result.episodes} starts a point, alive is {result.alive_means}"
     try:
-        margins_plot.draw([panel(one) for one in result.axes], title, folder / "plots" / "preflight.png")
+        draw(result.axes, title, folder / "plots" / "preflight.png")
         write_json(folder / "preflight.json", result.to_json())
     except OSError as error:
         raise UserError(f"{folder} cannot be written: {error.strerror or error}.") from error
