@@ -1,7 +1,6 @@
 """`manifest.json`: what every number of an exported policy means, and where it is from."""
 
 import hashlib
-import importlib.metadata
 import math
 import subprocess
 import sys
@@ -12,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from lemniscate import algos
+from lemniscate import __version__, algos
 from lemniscate.api.policy import TrainedPolicy
 from lemniscate.envs.interface import Interface, Quantity
 from lemniscate.exporting.deployed import safe_action, safe_sentence
@@ -48,7 +47,7 @@ def manifest(
         "algorithm": algorithm(policy),
         "step": policy.step,
         "seed": policy.config.seed,
-        "lemniscate": version(),
+        "lemniscate": __version__,
         "commit": commit(),
         "control_period_s": interface.period,
         "delay_s": interface.delay,
@@ -70,14 +69,6 @@ def manifest(
         "licence": LICENCE,
         "files": {name: hashlib.sha256(content).hexdigest() for name, content in files.items()},
     }
-
-
-def version() -> str:
-    """The version of lemniscate that is installed; "unknown" where its source runs without being installed."""
-    try:
-        return importlib.metadata.version("lemniscate")
-    except importlib.metadata.PackageNotFoundError:
-        return "unknown"
 
 
 @cache

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor
 
+from lemniscate import __version__
 from lemniscate.api.policy import Trained, TrainedPolicy, load, path_of
 from lemniscate.envs import registry
 from lemniscate.envs.probe import Act, Probe
@@ -16,7 +17,7 @@ from lemniscate.errors import UserError
 from lemniscate.exporting.compiled import HostPolicy, host_compiler
 from lemniscate.exporting.deployed import for_policy
 from lemniscate.exporting.export import MANIFEST
-from lemniscate.exporting.manifest import commit, version
+from lemniscate.exporting.manifest import commit
 from lemniscate.margins.presentation import FAILS, FALLS_SHORT, draw, rows, sentences, smoothness_sentence
 from lemniscate.margins.record import AxisMargins, margins_of, smoothness, worst_accepted
 from lemniscate.margins.vector_probe import VectorProbe
@@ -68,7 +69,7 @@ class Preflight:
         """One object of JSON; a margin is the deviation from the nominal value, on each side that was tried."""
         own = {name: value for name, value in vars(self).items() if name not in ("axes", "sentences")}
         axes = {one.axis.name: one.to_json() for one in self.axes}
-        origin = {"lemniscate": version(), "commit": commit()}
+        origin = {"lemniscate": __version__, "commit": commit()}
         return {"preflight": FORMAT, **own, "axes": axes, "sentences": list(self.sentences), **origin}
 
 
