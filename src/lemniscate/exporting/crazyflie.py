@@ -53,6 +53,10 @@ def crazyflie_files(
     names = [quantity.name for quantity in quantities]
     is_reference = [bool(interface.reference and TO_REFERENCE.fullmatch(name)) for name in names]
     past = [name for name in names if PAST.fullmatch(name)]
+    seen = zip(names, is_reference, strict=True)
+    strangers = [name for name, is_point in seen if not is_point and name not in (*SENSED, *past)]
+    if strangers:
+        raise UserError(f"nothing in the firmware gives {strangers[0]}")
     sensed = {i: SENSED[name] for i, name in enumerate(names) if name in SENSED}
     context = {
         "title": title,
@@ -65,12 +69,10 @@ def crazyflie_files(
         "sensed": sensed,
         "history": _history(names, past, action, interface.action_before) if past else None,
     }
-    strangers = [name for i, name in enumerate(names) if i not in sensed and name not in past and not is_reference[i]]
-    if strangers:
-        raise UserError(f"nothing in the firmware gives {strangers[0]}")
     folder, filters = TEMPLATES / "crazyflie", {"literal": literal, "comment": comment}
     texts = {name: filled(folder / name, filters, **context) for name in ("policy_controller.c", "README.md")}
-    return {**c_files, **texts, **{name: (folder / name).read_text() for name in ("Makefile", "Kbuild", "app-config")}}
+    copied = {name: (folder / name).read_text() for name in ("Makefile", "Kbuild", "app-config")}
+    return {**c_files, **texts, **copied}
 
 
 def _history(names: list[str], past: list[str], action: Box, before: tuple[float, ...]) -> dict[str, Any]:
@@ -88,7 +90,8 @@ def _history(names: list[str], past: list[str], action: Box, before: tuple[float
     expected = [f"{name}_{ago}_steps_ago{'_less_now' if name in names else ''}" for ago, name in steps_ago]
     if names[first : first + len(past)] != expected or not set(each) <= set(known) or len(before) != len(COMMANDS):
         raise UserError(f"nothing in the firmware gives {past[0]}")
-    kept = [(f"obs[{names.index(name)}]", "") if name in names else ("", _normalized(name, action)) for name in each]
+    now = {name: f"obs[{i}]" for i, name in enumerate(names)}
+    kept = [(now.get(name, ""), "" if name in now else _normalized(name, action)) for name in each]
     return {"steps": steps, "first": first, "before": before, "kept": kept}
 
 

@@ -16,8 +16,7 @@ from lemniscate.envs.probe import Act, Probe
 from lemniscate.errors import UserError
 from lemniscate.exporting.compiled import HostPolicy, host_compiler
 from lemniscate.exporting.deployed import for_policy
-from lemniscate.exporting.export import MANIFEST
-from lemniscate.exporting.manifest import commit
+from lemniscate.exporting.export import MANIFEST, commit
 from lemniscate.margins.presentation import FAILS, FALLS_SHORT, draw, rows, sentences, smoothness_sentence
 from lemniscate.margins.record import AxisMargins, margins_of, smoothness, worst_accepted
 from lemniscate.margins.vector_probe import VectorProbe

@@ -86,7 +86,7 @@ def write_run(run: Path, pictures: Sequence[Path], scores: Mapping[str, Any] | N
     taken, total = (log[-1]["step"] if log else 0), config.get("total_steps", 0)
     progress = f"{taken:,} steps" if taken >= total else f"{taken:,} of {total:,} steps"
     evaluated = scores if scores and scores.get("returns") else None
-    defaults, changed = default_fields(algorithm), changed_fields(algorithm, config)
+    changed = changed_fields(algorithm, config)
     evaluate = shlex.join(["lemniscate", "evaluate", str(run), "--episodes", "100", "--seed", "1"])
     return _write_page(
         file,
@@ -101,7 +101,7 @@ def write_run(run: Path, pictures: Sequence[Path], scores: Mapping[str, Any] | N
         embedded_bytes=MOST_BYTES,
         scores=score_rows(evaluated) if evaluated else [],
         histogram=_histogram(evaluated["returns"]) if evaluated else None,
-        changed=[(name, _shown(value), _shown(defaults.get(name))) for name, value in changed.items()],
+        changed=[(name, *map(_shown, values)) for name, values in changed.items()],
         unchanged=[(name, _shown(value)) for name, value in config.items() if name not in changed],
         commands=(train_command(algorithm, config), resume_line(run), evaluate),
     )
@@ -302,28 +302,27 @@ def _q_bias(scores: Mapping[str, Any]) -> QBias:
     return QBias(scores["q_bias"]["predicted"], scores["q_bias"]["realised"])
 
 
-def default_fields(algorithm: str) -> dict[str, Any]:
-    """The default of each field of an algorithm, as `config.json` would hold it; empty if there is no such module."""
+def changed_fields(algorithm: str, config: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
+    """The fields of a run that are not at their defaults: (value, default); all, if there is no such algorithm."""
     try:
-        return algos.find(algorithm).Config().to_json()
+        defaults = algos.find(algorithm).Config().to_json()
     except UserError:
-        return {}
-
-
-def changed_fields(algorithm: str, config: Mapping[str, Any]) -> dict[str, Any]:
-    """The fields of a run that are not at their defaults; all, if these are not known."""
-    defaults = default_fields(algorithm)
-    return {name: value for name, value in config.items() if name not in defaults or defaults[name] != value}
+        defaults = {}
+    return {
+        name: (value, defaults.get(name))
+        for name, value in config.items()
+        if name not in defaults or defaults[name] != value
+    }
 
 
 def train_command(algorithm: str, config: Mapping[str, Any], *, seeds: str | None = None) -> str:
     """The command line that trains a run of this Config; with `seeds`, such as "1,2,3", a sweep of it."""
     # The preset is named because the one that fits the environment best may change between versions.
     words = ["lemniscate", "train", algorithm, "--preset", "default", "--env", str(config.get("env"))]
-    changed = {name: value for name, value in changed_fields(algorithm, config).items() if name not in ("env", "seed")}
+    changed = [name for name in changed_fields(algorithm, config) if name not in ("env", "seed")]
     words += ["--seeds", seeds] if seeds else ["--seed", str(config.get("seed"))]
-    for name, value in {"total_steps": config.get("total_steps"), **changed}.items():
-        words += _option(name, value)
+    for name in dict.fromkeys(["total_steps", *changed]):
+        words += _option(name, config.get(name))
     return shlex.join(words)
 
 

@@ -60,7 +60,7 @@ static void observe(float *obs, const setpoint_t *setpoint, const sensorData_t *
 {% for i, expression in sensed.items() %}
     obs[{{ i }}] = {{ expression }};
 {% endfor %}
-{% if reference %}
+{% if to_reference is not none %}
     for (int i = 0; i < REFERENCE_SAMPLES; ++i) {
         const float *const point = reference[(step + ahead[i]) % REFERENCE_STEPS];
 {% for axis in "xyz" %}
