@@ -25,7 +25,7 @@ from lemniscate.exporting import export as exporting
 from lemniscate.exporting.c_code import c_files
 from lemniscate.exporting.compiled import HostPolicy, host_compiler
 from lemniscate.exporting.deployed import Deployed, act_with, input_size
-from lemniscate.exporting.manifest import acted, observed, ranges
+from lemniscate.exporting.export import acted, observed, ranges
 from lemniscate.exporting.parity import fly
 from lemniscate.exporting.translation import translate
 

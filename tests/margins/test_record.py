@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from lemniscate.envs.probe import Axis, Flown, Tally
+from lemniscate.margins import presentation
+from lemniscate.margins.presentation import FAILS, FALLS_SHORT, rows, sentences
 from lemniscate.margins.record import margins_of, smoothness, worst_accepted
-from lemniscate.margins.sentences import FAILS, FALLS_SHORT, panel, rows, sentences
-from lemniscate.report import margins_plot
 
 DELAY = Axis("delay", (0.0, 0.01, 0.02, 0.03), 0.0, "s", "action delay", "{} of action delay", ("ms", 1000))
 MASS = Axis("mass", (0.7, 0.85, 1.0, 1.15, 1.3), 1.0, "", "mass", "{} mass")
@@ -113,12 +113,24 @@ def test_smoothness_of_waves_is_known():
     assert smoothness(torch.tensor([1.0, -1.0, 0.0, 1.0])[:, None, None], 0.02)["saturated_share"] == 0.75
 
 
-def test_the_picture_has_a_panel_for_each_axis(tmp_path):
+def test_the_picture_has_a_panel_for_each_axis(tmp_path, monkeypatch):
+    figures = []
+    save = presentation.save
+    monkeypatch.setattr(presentation, "save", lambda figure, file: figures.append(figure) or save(figure, file))
     found = [margins_of(DELAY, flown(64, 62, 3, 0), None), margins_of(MASS, flown(*[64] * 5), None)]
-    panels = [panel(one) for one in (*found, margins_of(DYNAMICS, flown(64, 64, 1), None))]
-    assert panels[0].margin == (0, 10)
-    assert panels[0].edges == [10]
-    assert panels[1].margin == pytest.approx((-30, 30))
-    assert panels[1].edges == []
-    assert panels[2].names == ["so_rpy", "so_rpy_rotor", "first_principles"]
-    assert margins_plot.draw(panels, "A policy.", tmp_path / "p.png").stat().st_size > 10_000
+    found.append(margins_of(DYNAMICS, flown(64, 64, 1), None))
+    assert presentation.draw(found, "A policy.", tmp_path / "p.png").stat().st_size > 10_000
+    delay, mass, dynamics = figures[0].axes[::2]  # beside each, the axes of its returns
+    assert bands(delay) == {"within the margin": pytest.approx((0, 10)), "beyond it": pytest.approx((10, 30))}
+    assert bands(mass) == {"within the margin": pytest.approx((-30, 30))}
+    assert bands(dynamics) == {}
+    assert [label.get_text() for label in dynamics.get_xticklabels()] == [
+        "so rpy",
+        "so rpy\nrotor",
+        "first\nprinciples",
+    ]
+
+
+def bands(axes):
+    """The ends of each band by its label."""
+    return {band.get_label(): (band.get_x(), band.get_x() + band.get_width()) for band in axes.patches}

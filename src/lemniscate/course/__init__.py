@@ -11,7 +11,7 @@ compared with those of well-known mistakes, and the mistake that agrees is named
 is judged by what it does; a whole training loop (`skeleton`) by what it learns.
 """
 
-from lemniscate.course import functions, loop, networks, replay, setup
+from lemniscate.course import functions, loop, parts, setup
 from lemniscate.course.exercise import Exercise, Finding, Function, Inspection
 from lemniscate.course.loop import skeleton
 from lemniscate.errors import UserError, shown, unknown_name
@@ -21,17 +21,17 @@ __all__ = ["EXERCISES", "Finding", "check", "skeleton"]
 
 EXERCISES: dict[str, Exercise | Inspection] = {
     **functions.EXERCISES,
-    "sample_categorical": Inspection(networks.sample_categorical),
-    "Agent": Inspection(networks.agent),
-    "Actor": Inspection(networks.actor),
-    "QNetwork": Inspection(networks.q_network),
+    "sample_categorical": Inspection(parts.sample_categorical),
+    "Agent": Inspection(parts.agent),
+    "Actor": Inspection(parts.actor),
+    "QNetwork": Inspection(parts.q_network),
     "set_seeds": Inspection(setup.set_seeds),
     "make_envs": Inspection(setup.make_envs),
     "save_model": Inspection(setup.save_model),
     "load_model": Inspection(setup.load_model),
     "sync_envs": Inspection(setup.sync_envs),
-    "ReplayBuffer": Inspection(replay.replay_buffer),
-    "add_to_replay": Inspection(replay.add_to_replay),
+    "ReplayBuffer": Inspection(parts.replay_buffer),
+    "add_to_replay": Inspection(parts.add_to_replay),
     "train": Inspection(loop.train),
 }
 """each exercise by the name of the function or class to write"""

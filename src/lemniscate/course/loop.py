@@ -6,7 +6,8 @@ has Box actions. A loop that passes them all is trained on CartPole-v1.
 
 import inspect
 import re
-from collections.abc import Callable, Iterator, Mapping
+import tomllib
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +22,8 @@ from lemniscate.envs.vector_view import VectorView, make_vec
 from lemniscate.errors import UserError, unknown_name
 from lemniscate.system.console import say
 
-SKELETONS = {"ppo": "ppo_from_scratch.py"}
+TEMPLATES = Path(__file__).parent / "templates"
+SKELETONS = ("ppo",)
 SOLUTION = re.compile(r"^( *)# <solution>\n.*?# </solution>\n", re.DOTALL | re.MULTILINE)
 """the lines of a program that its skeleton leaves out"""
 
@@ -54,7 +56,8 @@ def skeleton(name: str = "ppo", path: str | Path | None = None) -> Path:
 
 def solution(name: str) -> str:
     """The program of a skeleton without gaps."""
-    return Path(__file__).with_name(SKELETONS[name]).read_text()
+    # Not a module: it is a text for the reader's own file, and nothing here may come to import it.
+    return (TEMPLATES / f"{name}.py.txt").read_text()
 
 
 @dataclass(frozen=True)
@@ -74,18 +77,18 @@ class Move:
 class World:
     """A small world in which action 0 is better than action 1 in state 0."""
 
-    moves: Mapping[int, tuple[Move, Move]]
-    """by state: the effect of each of its two actions"""
-    starts: Mapping[int, float]
+    moves: list[list[list[Any]]]
+    """by state and action: the arguments of a `Move`"""
+    starts: list[float]
     """by state: the probability that an episode begins there"""
     mistake: str
     """a sentence on what action 1 in state 0 reveals"""
-    seen: Mapping[int, int] | None = None
+    seen: Sequence[int] = range(6)
     """by state: the state that it looks like"""
 
     def obs(self, state: int) -> np.ndarray:
         """The observation of a state: a one-hot vector [6]."""
-        return np.eye(6, dtype=np.float32)[(self.seen or {}).get(state, state)]
+        return np.eye(6, dtype=np.float32)[self.seen[state]]
 
 
 class WorldEnv(gym.Env):
@@ -100,12 +103,12 @@ class WorldEnv(gym.Env):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
         """A state to begin in."""
         super().reset(seed=seed)
-        self._state = int(self.np_random.choice(list(self.world.starts), p=list(self.world.starts.values())))
+        self._state = int(self.np_random.choice(len(self.world.starts), p=self.world.starts))
         return self.world.obs(self._state), {}
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict]:
         """The move of that action."""
-        move = self.world.moves[self._state][int(action)]
+        move = Move(*self.world.moves[self._state][int(action)])
         reward, self._bonus, self._state = move.reward + self._bonus, move.next_bonus, move.state
         return self.world.obs(self._state), reward, move.ends == "death", move.ends == "time-out", {}
 
@@ -122,59 +125,7 @@ class BoxEnv(WorldEnv):
         return self.world.obs(0), float(action[0] - action[1]), True, False, {}
 
 
-def _both(*move: Any, **more: Any) -> tuple[Move, Move]:
-    return Move(*move, **more), Move(*move, **more)
-
-
-WORLDS = (
-    World(  # 0: the reward comes at once
-        {0: (Move(1, 0, "death"), Move(0, 0, "death"))},
-        {0: 1.0},
-        "it takes the action without the reward. Likely: the sign of the policy's loss is turned, or its gradient does"
-        " not reach the policy",
-    ),
-    World(  # 1: a small reward now, or a large one two steps later, and nothing to be seen of it until then
-        {
-            0: (Move(0, 1), Move(0.1, 2)),
-            1: _both(0, 3),
-            2: _both(0, 4),
-            3: _both(1, 0, "death"),
-            4: _both(0, 0, "death"),
-        },
-        {0: 1.0},
-        "it takes a small reward now, not the large one two steps later. Likely: there is no chain in the advantage,"
-        " or it does not go backwards",
-        seen={2: 1, 4: 3},
-    ),
-    World(  # 2: a death that looks like a good state, or a reward
-        {0: (Move(0.5, 3, "death"), Move(0, 2, "death")), 2: _both(2, 3, "death"), 3: _both(0, 3, "death")},
-        {0: 0.5, 2: 0.25, 3: 0.25},
-        "it prefers a death that looks like a good state to a reward. Likely: a value follows a death (~terminated is"
-        " missing)",
-    ),
-    World(  # 3: the next episode pays for this one's second action
-        {0: (Move(0.3, 0, "death"), Move(0, 0, "death", next_bonus=1))},
-        {0: 1.0},
-        "it takes the action that pays in the next episode only. Likely: the chain is not cut where an episode ends",
-    ),
-    World(  # 4: the same, at a time-out
-        {0: (Move(0.3, 1, "time-out"), Move(0, 1, "time-out", next_bonus=1)), 1: _both(0, 1, "death")},
-        {0: 0.8, 1: 0.2},
-        "it takes the action that pays in the episode after the time-out. Likely: the chain is cut at deaths alone;"
-        " done is terminated | truncated",
-    ),
-    World(  # 5: a time-out in a good state, or a small reward and death
-        {0: (Move(0, 1, "time-out"), Move(0.5, 0, "death")), 1: _both(1, 0, "death")},
-        {0: 0.5, 1: 0.5},
-        "it avoids a time-out in a good state. Likely: a time-out is taken for a death, or V is not trained",
-    ),
-    World(  # 6: a time-out in a bad state, while most episodes begin well
-        {0: (Move(0, 2, "death"), Move(0, 2, "time-out")), 1: _both(1, 0, "death"), 2: _both(-1, 0, "death")},
-        {0: 0.4, 1: 0.45, 2: 0.15},
-        "it goes to a time-out in a bad state. Likely: V(s') is that of the next episode's first observation;"
-        ' infos["final_obs"] is not used, or V is taken from the next row',
-    ),
-)
+WORLDS = [World(**world) for world in tomllib.loads((TEMPLATES / "worlds.toml").read_text())["world"]]
 
 
 def train(function: Function) -> Iterator[str]:

@@ -7,17 +7,17 @@ something still reads it.
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from string import Template
 
 import numpy as np
 
+from lemniscate import __version__
 from lemniscate.exporting.deployed import safe_action, safe_sentence
-from lemniscate.exporting.manifest import version
 from lemniscate.exporting.operations import ELEMENTWISE, VIEWS, Operand, Operation, Program, Value
 from lemniscate.spec import Action, Discrete
+from lemniscate.system.templates import filled
 
 TEMPLATES = Path(__file__).parent / "templates"
 LARGEST = "3.402823466e+38F"
@@ -52,37 +52,26 @@ def c_files(
     """
     body = Body(program)
     places, scratch = body.places()
-    shared = {"title": comment(title), "version": version()}
-    header = {
-        "observations": program.obs.size,
-        "actions": program.action.size,
-        "tests": len(observations),
+    context = {
+        "title": title,
+        "origin": origin,
+        "version": __version__,
+        "period": None if period is None else np.float32(period),
+        "program": program,
+        "action": action,
+        "masked": isinstance(action, Discrete) and action.masked,
+        "safe": safe_action(action),
+        "safe_sentence": safe_sentence(action),
+        "observations": observations,
+        "actions": actions,
         "bound": f"{self_test_bound(program, actions):.0e}F",
-        "period": ""
-        if period is None
-        else f"#define POLICY_PERIOD {np.float32(period)!s}F /* seconds between two actions */\n",
-        "safe": safe_sentence(action),
-        "origin": comment(origin),
-    }
-    masked = isinstance(action, Discrete) and action.masked
-    statements = "\n".join(f"    {statement.text}" for statement in body.statements)
-    source = {
-        "constants": "\n\n".join(body.constants),
-        "safe": braces(safe_action(action)),
+        "constants": body.constants,
         "scratch": max(scratch, 1),
-        "functions": functions(statements),
-        "arrays": "\n".join(f"    float *const {name} = scratch + {places[name]};" for name in body.sizes),
-        "masked": fill("masked.c", vars(action)) if masked else "",
-        "statements": statements,
-        "test_observations": _rows(observations),
-        "test_actions": _rows(actions),
+        "places": {name: places[name] for name in body.sizes},
+        "statements": [statement.text for statement in body.statements],
     }
-    return {"policy.c": fill("policy.c", {**shared, **source}), "policy.h": fill("policy.h", {**shared, **header})}
-
-
-def fill(template: str, values: Mapping[str, object]) -> str:
-    """The text of a template with its values."""
-    return Template((TEMPLATES / template).read_text()).substitute(values)
+    filters = {"braces": braces, "comment": comment, "functions": functions}
+    return {name: filled(TEMPLATES / name, filters, **context) for name in ("policy.c", "policy.h")}
 
 
 def comment(text: str) -> str:
@@ -108,10 +97,6 @@ def functions(text: str) -> str:
         if f"policy_{name}(" in text + found:
             found = f"{block_text.strip()}\n\n{found}"
     return found
-
-
-def _rows(rows: np.ndarray) -> str:
-    return "\n".join(f"    {braces(row)}," for row in rows.astype(np.float32))
 
 
 @dataclass(frozen=True)

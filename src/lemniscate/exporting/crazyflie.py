@@ -2,14 +2,14 @@
 
 import re
 from collections.abc import Mapping
+from typing import Any
 
-import numpy as np
-
-from lemniscate.envs.interface import Interface, Quantity, Reference
+from lemniscate import __version__
+from lemniscate.envs.interface import Interface, Quantity
 from lemniscate.errors import UserError
-from lemniscate.exporting.c_code import TEMPLATES, comment, fill, literal
-from lemniscate.exporting.manifest import version
+from lemniscate.exporting.c_code import TEMPLATES, comment, literal
 from lemniscate.spec import Action, Box
+from lemniscate.system.templates import filled
 
 COMMANDS = ("roll", "pitch", "yaw", "thrust")
 LOOP = 1000
@@ -50,43 +50,35 @@ def crazyflie_files(
     rate = round(1 / interface.period) if interface.period else 0
     if not rate or LOOP % rate:
         raise UserError(f"its {rate} actions a second do not divide the firmware's {LOOP}")
-    reference, names = interface.reference, [quantity.name for quantity in quantities]
+    names = [quantity.name for quantity in quantities]
+    is_reference = [bool(interface.reference and TO_REFERENCE.fullmatch(name)) for name in names]
     past = [name for name in names if PAST.fullmatch(name)]
-    shared = {"title": comment(title), "version": version(), "rate": rate}
-    controller = {
-        "reference": _reference(reference) if reference else "",
-        "counter": "static uint32_t step; /* the point of the curve */\n" if reference else "",
-        "observe": _observe([name for name in names if name not in past], reference),
-        "history": _history(names, past, action, interface.action_before) if past else "",
-        "recall": "        recall(obs);\n" if past else "",
-        "remember": "        remember(obs, action);\n" if past else "",
-        "restart": "        step = acting ? (step + 1) % REFERENCE_STEPS : REFERENCE_STEPS - 1;\n" if reference else "",
+    seen = zip(names, is_reference, strict=True)
+    strangers = [name for name, is_point in seen if not is_point and name not in (*SENSED, *past)]
+    if strangers:
+        raise UserError(f"nothing in the firmware gives {strangers[0]}")
+    sensed = {i: SENSED[name] for i, name in enumerate(names) if name in SENSED}
+    context = {
+        "title": title,
+        "version": __version__,
+        "rate": rate,
+        "action": action,
+        "interface": interface,
+        "reference": interface.reference,
+        "to_reference": is_reference.index(True) if any(is_reference) else None,
+        "sensed": sensed,
+        "history": _history(names, past, action, interface.action_before) if past else None,
     }
-    start = reference.points[-1] if reference else ()
-    readme = {
-        "thrust": f"{action.low[3]:.3f} to {action.high[3]:.3f}",
-        "start": f", near ({', '.join(f'{x:.1f}' for x in start)})" if reference else "",
-        "goal": "" if reference else " The policy flies to the setpoint.",
-        "dynamics": ", ".join(interface.dynamics or ()),
-    }
-    folder = "crazyflie"
-    return {
-        **c_files,
-        "policy_controller.c": fill(f"{folder}/policy_controller.c", {**shared, **controller}),
-        "README.md": fill(f"{folder}/README.md", {**shared, **readme}),
-        **{name: (TEMPLATES / folder / name).read_text() for name in ("Makefile", "Kbuild", "app-config")},
-    }
+    folder, filters = TEMPLATES / "crazyflie", {"literal": literal, "comment": comment}
+    texts = {name: filled(folder / name, filters, **context) for name in ("policy_controller.c", "README.md")}
+    copied = {name: (folder / name).read_text() for name in ("Makefile", "Kbuild", "app-config")}
+    return {**c_files, **texts, **copied}
 
 
-def _reference(reference: Reference) -> str:
-    """The curve as constants."""
-    points = ",\n".join(f"    {{{', '.join(map(literal, point))}}}" for point in reference.points)
-    sizes = {"steps": len(reference.points), "samples": len(reference.offsets)}
-    return fill("crazyflie/reference.c", {**sizes, "points": points, "offsets": ", ".join(map(str, reference.offsets))})
+def _history(names: list[str], past: list[str], action: Box, before: tuple[float, ...]) -> dict[str, Any]:
+    """What is kept of earlier steps and given to the policy, the newest first.
 
-
-def _history(names: list[str], past: list[str], action: Box, before: tuple[float, ...]) -> str:
-    """The functions that keep observations and actions of earlier steps, the newest first, and give them to the policy.
+    `kept` has the expressions of a quantity: among the observations, where it is one, and among the actions.
 
     Raises:
         UserError: a history of other quantities, or in another order.
@@ -98,35 +90,13 @@ def _history(names: list[str], past: list[str], action: Box, before: tuple[float
     expected = [f"{name}_{ago}_steps_ago{'_less_now' if name in names else ''}" for ago, name in steps_ago]
     if names[first : first + len(past)] != expected or not set(each) <= set(known) or len(before) != len(COMMANDS):
         raise UserError(f"nothing in the firmware gives {past[0]}")
-    remembered, recalled = [], []
-    for i, name in enumerate(each):
-        now = f"obs[{names.index(name)}]" if name in names else ""
-        remembered.append(f"    past[0][{i}] = {now or _normalized(COMMANDS.index(name), action)};")
-        recalled.append(f"        then[{i}] = past[i][{i}]{f' - {now}' if now else ''};")
-    lines = {"remembered": "\n".join(remembered), "recalled": "\n".join(recalled)}
-    numbers = {"steps": steps, "size": len(each), "first": first, "before": ", ".join(map(literal, before))}
-    return fill("crazyflie/history.c", {**numbers, **lines})
+    now = {name: f"obs[{i}]" for i, name in enumerate(names)}
+    kept = [(now.get(name, ""), "" if name in now else _normalized(name, action)) for name in each]
+    return {"steps": steps, "first": first, "before": before, "kept": kept}
 
 
-def _normalized(i: int, action: Box) -> str:
+def _normalized(command: str, action: Box) -> str:
     """The C expression of a coordinate of the action between -1 and 1, the ends of its range."""
+    i = COMMANDS.index(command)
     low, high = action.low[i], action.high[i]
     return f"(action[{i}] - {literal((low + high) / 2)}) / {literal((high - low) / 2)}"
-
-
-def _observe(names: list[str], reference: Reference | None) -> str:
-    """The body of `observe`, for the quantities of this step."""
-    strangers = [name for name in names if name not in SENSED and not (reference and TO_REFERENCE.fullmatch(name))]
-    if strangers:
-        raise UserError(f"nothing in the firmware gives {strangers[0]}")
-    unused = [] if any("setpoint" in SENSED.get(name, "") for name in names) else ["    (void)setpoint;"]
-    unused += [] if any("sensors" in SENSED.get(name, "") for name in names) else ["    (void)sensors;"]
-    lines = [f"    obs[{i}] = {SENSED[name]};" for i, name in enumerate(names) if name in SENSED]
-    if reference:
-        first = int(np.argmax([bool(TO_REFERENCE.fullmatch(name)) for name in names]))
-        axes = [
-            f"        obs[{first + i} + 3 * i] = point[{i}] - state->position.{axis};" for i, axis in enumerate("xyz")
-        ]
-        point = "        const float *const point = reference[(step + ahead[i]) % REFERENCE_STEPS];"
-        lines += ["    for (int i = 0; i < REFERENCE_SAMPLES; ++i) {", point, *axes, "    }"]
-    return "\n".join([*unused, *lines])

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from lemniscate import __version__
 from lemniscate.exporting.deployed import Act, as_rows
-from lemniscate.exporting.manifest import version
 from lemniscate.exporting.operations import Operand, Operation, Program, Value
 
 OPSET, IR = 18, 10
@@ -36,7 +36,7 @@ def onnx_model(program: Program, facts: Mapping[str, Any]) -> bytes:
     graph = helper.make_graph(writer.nodes, "policy", [ends["obs"]], [ends["action"]], initializer=writer.initializers)
     opset = helper.make_opsetid("", OPSET)
     model = helper.make_model(graph, opset_imports=[opset], ir_version=IR, producer_name="lemniscate")
-    model.producer_version = version()
+    model.producer_version = __version__
     helper.set_model_props(model, {name: json.dumps(value) for name, value in facts.items()})
     onnx.checker.check_model(model, full_check=True)
     return model.SerializeToString()

@@ -78,10 +78,6 @@ def _where(call: Call, condition: Any, a: Any, b: Any) -> Value:
     return call.add("Where", *chosen, kind=call.kind)
 
 
-def _cast(call: Call, x: Value, *_: Any, **__: Any) -> Value:
-    return call.rounded(call.as_kind(x, call.kind))
-
-
 def _linear(call: Call, x: Value, weight: Any, bias: Any = None) -> Value:
     if not isinstance(x, Value) or isinstance(weight, Value) or isinstance(bias, Value) or weight.ndim != 2:
         raise UntranslatableError("a product of two results has no translation")
@@ -161,12 +157,8 @@ def _split(call: Call, x: Value, _sizes: Any, axis: int = 0) -> list[Value]:
     return [_part(call, x, own, sum(sizes[:i]), size) for i, size in enumerate(sizes)]
 
 
-def _reshape(call: Call, x: Value, *_: Any) -> Value:
-    return x if x.shape == call.shape else call.add("Reshape", x, kind=x.kind)
-
-
-def _expand(call: Call, x: Value, *_: Any, **__: Any) -> Value:
-    return x if x.shape == call.shape else call.add("Expand", x, kind=x.kind)
+def _shaped(name: str) -> Translation:
+    return lambda call, x, *_, **__: x if x.shape == call.shape else call.add(name, x, kind=x.kind)
 
 
 def _permute(call: Call, x: Value, axes: list[int]) -> Value:
@@ -206,20 +198,14 @@ TRANSLATIONS: dict[str, Translation] = {
     "le": _comparison("LessOrEqual"),
     "eq": _comparison("Equal"),
     "ne": lambda call, a, b: call.add("Not", _comparison("Equal")(call, a, b), kind="bool"),
-    "logical_and": _comparison("And", "bool"),
-    "logical_or": _comparison("Or", "bool"),
-    "bitwise_and": _comparison("And", "bool"),
-    "bitwise_or": _comparison("Or", "bool"),
-    "logical_not": _unary("Not"),
-    "bitwise_not": _unary("Not"),
+    **dict.fromkeys(("logical_and", "bitwise_and"), _comparison("And", "bool")),
+    **dict.fromkeys(("logical_or", "bitwise_or"), _comparison("Or", "bool")),
+    **dict.fromkeys(("logical_not", "bitwise_not"), _unary("Not")),
     "where": _where,
-    "_to_copy": _cast,
-    "to": _cast,
+    **dict.fromkeys(("_to_copy", "to"), lambda call, x, *_, **__: call.rounded(call.as_kind(x, call.kind))),
     "relu": lambda call, x: call.add("Max", x, np.float32(0)),
     "silu": lambda call, x: call.add("Mul", x, call.add("Sigmoid", x)),
-    "clamp": _clamp,
-    "hardtanh": _clamp,
-    "clamp_min": _clamp,
+    **dict.fromkeys(("clamp", "hardtanh", "clamp_min"), _clamp),
     "pow": _power,
     "square": lambda call, x: _power(call, x, 2),
     "reciprocal": lambda call, x: _power(call, x, -1),
@@ -238,17 +224,13 @@ TRANSLATIONS: dict[str, Translation] = {
     "slice": _slice,
     "select": _select,
     "index": _index,
-    "split": _split,
-    "chunk": _split,
-    "split_with_sizes": _split,
+    **dict.fromkeys(("split", "chunk", "split_with_sizes"), _split),
     "permute": _permute,
-    **{name: _reshape for name in ("view", "_unsafe_view", "reshape", "unsqueeze", "squeeze")},
-    "expand": _expand,
-    "full": _full,
-    "full_like": _full,
-    "zeros": _full,
+    **dict.fromkeys(("view", "_unsafe_view", "reshape", "unsqueeze", "squeeze"), _shaped("Reshape")),
+    "expand": _shaped("Expand"),
+    **dict.fromkeys(("full", "full_like", "zeros"), _full),
     "sym_size": lambda call, *_: BATCH,
-    **{name: lambda call, x, *_, **__: x for name in ("alias", "clone", "detach", "contiguous")},
+    **dict.fromkeys(("alias", "clone", "detach", "contiguous"), lambda call, x, *_, **__: x),
     "getitem": lambda call, parts, index: parts[index],
 }
 """by the name of torch's operation; what is not here has no translation"""

@@ -9,18 +9,17 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor
 
+from lemniscate import __version__
 from lemniscate.api.policy import Trained, TrainedPolicy, load, path_of
 from lemniscate.envs import registry
 from lemniscate.envs.probe import Act, Probe
 from lemniscate.errors import UserError
 from lemniscate.exporting.compiled import HostPolicy, host_compiler
 from lemniscate.exporting.deployed import for_policy
-from lemniscate.exporting.export import MANIFEST
-from lemniscate.exporting.manifest import commit, version
+from lemniscate.exporting.export import MANIFEST, commit
+from lemniscate.margins.presentation import FAILS, FALLS_SHORT, draw, rows, sentences, smoothness_sentence
 from lemniscate.margins.record import AxisMargins, margins_of, smoothness, worst_accepted
-from lemniscate.margins.sentences import FAILS, FALLS_SHORT, panel, rows, sentences, smoothness_sentence
 from lemniscate.margins.vector_probe import VectorProbe
-from lemniscate.report import margins_plot
 from lemniscate.report.compare import table
 from lemniscate.run.config import Natural, Range, checked
 from lemniscate.run.directory import read_config
@@ -69,7 +68,7 @@ class Preflight:
         """One object of JSON; a margin is the deviation from the nominal value, on each side that was tried."""
         own = {name: value for name, value in vars(self).items() if name not in ("axes", "sentences")}
         axes = {one.axis.name: one.to_json() for one in self.axes}
-        origin = {"lemniscate": version(), "commit": commit()}
+        origin = {"lemniscate": __version__, "commit": commit()}
         return {"preflight": FORMAT, **own, "axes": axes, "sentences": list(self.sentences), **origin}
 
 
@@ -198,7 +197,7 @@ def _write(result: Preflight, folder: Path) -> None:
     acts = f"{result.env_id}: {acting} of step {result.step:,}"
     title = f"{acts}, {result.episodes} starts a point, alive is {result.alive_means}"
     try:
-        margins_plot.draw([panel(one) for one in result.axes], title, folder / "plots" / "preflight.png")
+        draw(result.axes, title, folder / "plots" / "preflight.png")
         write_json(folder / "preflight.json", result.to_json())
     except OSError as error:
         raise UserError(f"{folder} cannot be written: {error.strerror or error}.") from error

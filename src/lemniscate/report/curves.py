@@ -3,6 +3,7 @@
 import io
 import math
 import time
+import tomllib
 from collections.abc import Mapping, Sequence
 from itertools import zip_longest
 from pathlib import Path
@@ -29,27 +30,8 @@ WINDOW = 20
 POINTS = 3000
 """the most episodes of a run that are drawn, evenly chosen"""
 
-TITLES = {
-    "losses/policy": ("Policy loss", ""),
-    "losses/value": ("Value loss", "return²"),
-    "losses/actor": ("Actor loss", "return"),
-    "losses/critic": ("Critic loss", "return²"),
-    "q": ("Q", "return"),
-    "explained_variance": ("Explained variance", "share"),
-    "approx_kl": ("Approximate KL divergence", "nats"),
-    "kl": ("KL divergence", "nats"),
-    "step_fraction": ("Step fraction", "share of the full step"),
-    "clip_fraction": ("Clip fraction", "share of ratios"),
-    "losses/entropy": ("Entropy of the policy", "nats"),
-    "policy_std": ("Standard deviation of the policy", "half the action range"),
-    "temperature": ("Temperature", "return per nat"),
-    "gradient_norm": ("Gradient norm", "before the clip"),
-    "gradient_norm/critic": ("Gradient norm of the critic", "before the clip"),
-    "gradient_norm/actor": ("Gradient norm of the actor", "before the clip"),
-    "gradient_norm/value": ("Gradient norm of the value", "before the clip"),
-    "learning_rate": ("Learning rate", ""),
-}
-"""metric: (title, unit), in the order of the panels; the names and units of the glossary"""
+TITLES = tomllib.loads((Path(__file__).parent / "templates" / "metrics.toml").read_text(encoding="utf-8"))
+"""metric: (title, unit), in the order of the panels"""
 
 APART = ("step", "old_approx_kl", "gradient_norm/temperature")
 """metrics without a panel, beside those in `ELSEWHERE`"""

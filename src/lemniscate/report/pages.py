@@ -12,14 +12,14 @@ import platform
 import shlex
 from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
 import numpy as np
 
-from lemniscate import algos
+from lemniscate import __version__, algos
 from lemniscate.errors import UserError, resume_line
 from lemniscate.report import advice, curves
 from lemniscate.report.playback import FILMS
@@ -31,6 +31,7 @@ from lemniscate.run.fields import flag
 from lemniscate.run.metrics import read_metrics
 from lemniscate.system import named
 from lemniscate.system.files import replace_file
+from lemniscate.system.templates import filled
 
 MOST_BYTES = 5_000_000
 """the largest film that is embedded; a larger one is linked"""
@@ -50,7 +51,7 @@ CAPTIONS = {
 NOT_MEASURES = ("env_id", "episodes", "mean_return", "std_return", "returns", "lengths", "terminated", "q_bias")
 """names in the JSON of an `Evaluation` that are not measures of the environment"""
 
-PACKAGES = ("lemniscate", "torch", "numpy", "gymnasium")
+TEMPLATES = Path(__file__).parent / "templates"
 
 TASK = "reinforcement-learning"
 """the name of the field on the Hub"""
@@ -86,7 +87,8 @@ def write_run(run: Path, pictures: Sequence[Path], scores: Mapping[str, Any] | N
     taken, total = (log[-1]["step"] if log else 0), config.get("total_steps", 0)
     progress = f"{taken:,} steps" if taken >= total else f"{taken:,} of {total:,} steps"
     evaluated = scores if scores and scores.get("returns") else None
-    defaults, changed = default_fields(algorithm), changed_fields(algorithm, config)
+    changed = changed_fields(algorithm, config)
+    evaluate = shlex.join(["lemniscate", "evaluate", str(run), "--episodes", "100", "--seed", "1"])
     return _write_page(
         file,
         "run.html.j2",
@@ -100,17 +102,9 @@ def write_run(run: Path, pictures: Sequence[Path], scores: Mapping[str, Any] | N
         embedded_bytes=MOST_BYTES,
         scores=score_rows(evaluated) if evaluated else [],
         histogram=_histogram(evaluated["returns"]) if evaluated else None,
-        changed=[(name, _shown(value), _shown(defaults.get(name))) for name, value in changed.items()],
+        changed=[(name, *map(_shown, values)) for name, values in changed.items()],
         unchanged=[(name, _shown(value)) for name, value in config.items() if name not in changed],
-        commands={
-            "Train it again; with the same versions on the same kind of machine the result is the same": train_command(
-                algorithm, config
-            ),
-            "Continue it where it was interrupted": resume_line(run),
-            "Evaluate its newest policy from other starts": shlex.join(
-                ["lemniscate", "evaluate", str(run), "--episodes", "100", "--seed", "1"]
-            ),
-        },
+        commands=(train_command(algorithm, config), resume_line(run), evaluate),
     )
 
 
@@ -222,8 +216,9 @@ def write_card(
     code = [place for place in map(str, places) if ":" in place and not named.is_passed(place)]
     shown = {"videos": "videos/*", "plots": "plots/*.png", "export": "export/**/*"}
     found = {kind: sorted(filter(Path.is_file, folder.glob(pattern))) for kind, pattern in shown.items()}
-    text = _filled(
-        "card.md.j2",
+    text = filled(
+        TEMPLATES / "card.md.j2",
+        FILTERS,
         metadata=_metadata(name, algorithm, config, scores, license),
         name=name,
         algorithm=algorithm,
@@ -308,28 +303,27 @@ def _q_bias(scores: Mapping[str, Any]) -> QBias:
     return QBias(scores["q_bias"]["predicted"], scores["q_bias"]["realised"])
 
 
-def default_fields(algorithm: str) -> dict[str, Any]:
-    """The default of each field of an algorithm, as `config.json` would hold it; empty if there is no such module."""
+def changed_fields(algorithm: str, config: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
+    """The fields of a run that are not at their defaults: (value, default); all, if there is no such algorithm."""
     try:
-        return algos.find(algorithm).Config().to_json()
+        defaults = algos.find(algorithm).Config().to_json()
     except UserError:
-        return {}
-
-
-def changed_fields(algorithm: str, config: Mapping[str, Any]) -> dict[str, Any]:
-    """The fields of a run that are not at their defaults; all, if these are not known."""
-    defaults = default_fields(algorithm)
-    return {name: value for name, value in config.items() if name not in defaults or defaults[name] != value}
+        defaults = {}
+    return {
+        name: (value, defaults.get(name))
+        for name, value in config.items()
+        if name not in defaults or defaults[name] != value
+    }
 
 
 def train_command(algorithm: str, config: Mapping[str, Any], *, seeds: str | None = None) -> str:
     """The command line that trains a run of this Config; with `seeds`, such as "1,2,3", a sweep of it."""
     # The preset is named because the one that fits the environment best may change between versions.
     words = ["lemniscate", "train", algorithm, "--preset", "default", "--env", str(config.get("env"))]
-    changed = {name: value for name, value in changed_fields(algorithm, config).items() if name not in ("env", "seed")}
+    changed = [name for name in changed_fields(algorithm, config) if name not in ("env", "seed")]
     words += ["--seeds", seeds] if seeds else ["--seed", str(config.get("seed"))]
-    for name, value in {"total_steps": config.get("total_steps"), **changed}.items():
-        words += _option(name, value)
+    for name in dict.fromkeys(["total_steps", *changed]):
+        words += _option(name, config.get(name))
     return shlex.join(words)
 
 
@@ -372,32 +366,15 @@ def _embedded(file: Path) -> str:
 
 def _write_page(file: Path, template: str, **context: Any) -> Path:
     """Fill a template, and say at its end by which versions that was done."""
-    versions = []
-    for package in PACKAGES:
-        try:
-            versions.append(f"{package} {version(package)}")
-        except PackageNotFoundError:
-            continue
+    versions = [f"{package} {version(package)}" for package in ("torch", "numpy", "gymnasium")]
     machine = f"Python {platform.python_version()} on {platform.system()} {platform.machine()}"
     date = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
-    written = f"Written on {date} by {', '.join(versions)}, {machine}."
-    page = _filled(template, written=written, **context)
+    written = f"Written on {date} by lemniscate {__version__}, {', '.join(versions)}, {machine}."
+    page = filled(TEMPLATES / template, FILTERS, written=written, **context)
     file.parent.mkdir(parents=True, exist_ok=True)
     replace_file(file, page.encode("utf-8", errors="xmlcharrefreplace"))
     return file
 
 
-def _filled(template: str, **context: Any) -> str:
-    """The text of a template beside this module; what is put into HTML is escaped, into Markdown not."""
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined  # a training without a report needs none
-
-    templates = Environment(
-        loader=FileSystemLoader(Path(__file__).parent / "templates"),
-        autoescape=".html" in template,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        keep_trailing_newline=True,
-    )
-    templates.filters |= {"embedded": _embedded, "caption": caption}
-    return templates.get_template(template).render(context)
+FILTERS = {"embedded": _embedded, "caption": caption}
+"""the functions that templates call"""

@@ -1,19 +1,19 @@
-/* $title
+/* {{ title | comment }}
  *
- * Written by lemniscate $version; MIT licence. C99; no memory is allocated, and no number is a double.
+ * Written by lemniscate {{ version }}; MIT licence. C99; no memory is allocated, and no number is a double.
  */
 #include "policy.h"
 
 #include <stdint.h>
 #include <string.h>
 
-$constants
+{{ constants | join("\n\n") }}
 
-static const float safe_action[POLICY_ACTIONS] = $safe;
+static const float safe_action[POLICY_ACTIONS] = {{ safe | braces }};
 
-static float scratch[$scratch];
+static float scratch[{{ scratch }}];
 
-$functions
+{{ statements | join("\n") | functions }}
 static int is_finite(float x)
 {
     uint32_t bits;
@@ -24,23 +24,40 @@ static int is_finite(float x)
 int policy_act(const float obs[POLICY_OBSERVATIONS], float action[POLICY_ACTIONS])
 {
     int i;
-$arrays
+{% for name, place in places.items() %}
+    float *const {{ name }} = scratch + {{ place }};
+{% endfor %}
     for (i = 0; i < POLICY_OBSERVATIONS; ++i) {
         if (!is_finite(obs[i])) {
             memcpy(action, safe_action, sizeof safe_action);
-$masked            return 1;
+{% if masked %}
+            for (i = 0; i < {{ action.n }}; ++i) {
+                const float permitted = obs[POLICY_OBSERVATIONS - {{ action.n }} + i];
+                if (is_finite(permitted) && permitted != 0.0F) {
+                    action[0] = (float)(i + {{ action.start }});
+                    break;
+                }
+            }
+{% endif %}
+            return 1;
         }
     }
-$statements
+{% for statement in statements %}
+    {{ statement }}
+{% endfor %}
     return 0;
 }
 
 static const float self_test_observations[POLICY_SELF_TESTS][POLICY_OBSERVATIONS] = {
-$test_observations
+{% for row in observations %}
+    {{ row | braces }},
+{% endfor %}
 };
 
 static const float self_test_actions[POLICY_SELF_TESTS][POLICY_ACTIONS] = {
-$test_actions
+{% for row in actions %}
+    {{ row | braces }},
+{% endfor %}
 };
 
 float policy_self_test(void)

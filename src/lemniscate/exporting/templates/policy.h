@@ -1,6 +1,6 @@
-/* $title
+/* {{ title | comment }}
  *
- * Written by lemniscate $version; MIT licence. manifest.json says what each number means.
+ * Written by lemniscate {{ version }}; MIT licence. manifest.json says what each number means.
  */
 #ifndef POLICY_H
 #define POLICY_H
@@ -9,19 +9,22 @@
 extern "C" {
 #endif
 
-#define POLICY_OBSERVATIONS $observations
-#define POLICY_ACTIONS $actions
-$period#define POLICY_SELF_TESTS $tests
-#define POLICY_SELF_TEST_BOUND $bound
+#define POLICY_OBSERVATIONS {{ program.obs.size }}
+#define POLICY_ACTIONS {{ program.action.size }}
+{% if period %}
+#define POLICY_PERIOD {{ period }}F /* seconds between two actions */
+{% endif %}
+#define POLICY_SELF_TESTS {{ observations | length }}
+#define POLICY_SELF_TEST_BOUND {{ bound }}
 
 /* Acts at one raw observation, in the manifest's order; `action` is in the units of the environment. Returns 0, or 1
  * where an observation is NaN or infinite: the action is then the safe one,
- * $safe.
+ * {{ safe_sentence }}.
  * Takes the same time at every finite observation. Not reentrant: it has one static array of scratch. */
 int policy_act(const float obs[POLICY_OBSERVATIONS], float action[POLICY_ACTIONS]);
 
 /* The largest difference from the actions of training's own policy, at POLICY_SELF_TESTS observations that are stored
- * beside the weights: $origin.
+ * beside the weights: {{ origin | comment }}.
  * It is below POLICY_SELF_TEST_BOUND where compiler and memory do as they should. A program that does not call it does
  * not carry them, if it is linked with -ffunction-sections -fdata-sections -Wl,--gc-sections. */
 float policy_self_test(void);

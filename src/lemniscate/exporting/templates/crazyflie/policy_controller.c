@@ -1,12 +1,12 @@
 /* SPDX-License-Identifier: GPL-3.0-only
  *
- * $title
+ * {{ title | comment }}
  *
- * An out-of-tree controller for the Crazyflie's firmware, written by lemniscate $version. This file alone is under the
+ * An out-of-tree controller for the Crazyflie's firmware, written by lemniscate {{ version }}. This file alone is under the
  * GNU General Public License, version 3, since it is linked with the firmware's own functions; policy.c and policy.h
  * are not.
  *
- * The policy commands attitude and thrust $rate times a second; the firmware's Mellinger controller holds them. It acts
+ * The policy commands attitude and thrust {{ rate }} times a second; the firmware's Mellinger controller holds them. It acts
  * only while all of these are so, and else the Mellinger controller follows the setpoints as ever:
  *   - the parameter policy.on is 1;
  *   - a setpoint has come within the last DEAD_MAN_MS milliseconds: who lets go of the sender stops the policy;
@@ -28,19 +28,80 @@
 #include "task.h"
 
 #define DEAD_MAN_MS 200
-#define POLICY_RATE $rate
+#define POLICY_RATE {{ rate }}
 #define DEGREES (180.0f / 3.14159265f)
 #define RADIANS (3.14159265f / 180.0f)
-$reference
+{% if reference %}
+
+#define REFERENCE_STEPS {{ reference.points | length }}
+#define REFERENCE_SAMPLES {{ reference.offsets | length }}
+
+static const float reference[REFERENCE_STEPS][3] = { /* m, in the world */
+{% for point in reference.points %}
+    { {{- point.tolist() | map("literal") | join(", ") -}} }{{ "," if not loop.last }}
+{% endfor %}
+};
+
+static const uint32_t ahead[REFERENCE_SAMPLES] = { {{- reference.offsets | join(", ") -}} }; /* steps */
+{% endif %}
+
 static uint8_t on;
 static uint8_t fault;
 static bool acting;
-$counter
+{% if reference %}
+static uint32_t step; /* the point of the curve */
+{% endif %}
+
 static void observe(float *obs, const setpoint_t *setpoint, const sensorData_t *sensors, const state_t *state)
 {
-$observe
+{% for unread in ("setpoint", "sensors") if unread not in sensed.values() | join %}
+    (void){{ unread }};
+{% endfor %}
+{% for i, expression in sensed.items() %}
+    obs[{{ i }}] = {{ expression }};
+{% endfor %}
+{% if to_reference is not none %}
+    for (int i = 0; i < REFERENCE_SAMPLES; ++i) {
+        const float *const point = reference[(step + ahead[i]) % REFERENCE_STEPS];
+{% for axis in "xyz" %}
+        obs[{{ to_reference + loop.index0 }} + 3 * i] = point[{{ loop.index0 }}] - state->position.{{ axis }};
+{% endfor %}
+    }
+{% endif %}
 }
-$history
+{% if history %}
+
+#define HISTORY {{ history.steps }} /* steps before this one that are observed too */
+
+static float past[HISTORY][{{ history.kept | length }}]; /* what was observed and done then, the newest first */
+
+static void remember(const float *obs, const float *action)
+{
+    for (int i = HISTORY - 1; i > 0; --i) {
+        memcpy(past[i], past[i - 1], sizeof past[0]);
+    }
+{% for now, coordinate in history.kept %}
+    past[0][{{ loop.index0 }}] = {{ now or coordinate }};
+{% endfor %}
+}
+
+static void recall(float *obs)
+{
+    static const float before[POLICY_ACTIONS] = { {{- history.before | map("literal") | join(", ") -}} }; /* as if it had hovered here */
+    if (!acting) {
+        for (int i = 0; i < HISTORY; ++i) {
+            remember(obs, before);
+        }
+    }
+    for (int i = 0; i < HISTORY; ++i) {
+        float *const then = obs + {{ history.first }} + {{ history.kept | length }} * i;
+{% for now, _ in history.kept %}
+        then[{{ loop.index0 }}] = past[i][{{ loop.index0 }}]{{ " - " ~ now if now }};
+{% endfor %}
+    }
+}
+{% endif %}
+
 static void command(setpoint_t *setpoint, const float *action)
 {
     memset(setpoint, 0, sizeof *setpoint); /* no position is held: modeDisable is 0 */
@@ -97,9 +158,18 @@ void controllerOutOfTree(control_t *control, const setpoint_t *setpoint, const s
     static setpoint_t commanded;
     bool acts = may_act(state);
     if (acts && (!acting || RATE_DO_EXECUTE(POLICY_RATE, stabilizerStep))) {
-$restart        observe(obs, setpoint, sensors, state);
-$recall        fault = policy_act(obs, action) != 0;
-$remember        acts = !fault;
+{% if reference %}
+        step = acting ? (step + 1) % REFERENCE_STEPS : REFERENCE_STEPS - 1;
+{% endif %}
+        observe(obs, setpoint, sensors, state);
+{% if history %}
+        recall(obs);
+{% endif %}
+        fault = policy_act(obs, action) != 0;
+{% if history %}
+        remember(obs, action);
+{% endif %}
+        acts = !fault;
         command(&commanded, action);
     }
     acting = acts;

@@ -1,14 +1,27 @@
-"""The findings of a pre-flight for people: a table, a sentence for each axis, and the panels of a picture."""
+"""The findings of a pre-flight for people: a table, a sentence for each axis, and a picture."""
 
+import math
+import textwrap
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.ticker import MaxNLocator
 
 from lemniscate.envs.probe import Axis, Value
 from lemniscate.margins.record import AxisMargins, Side
-from lemniscate.report.margins_plot import Panel
+from lemniscate.report.style import COLORS, finish, legend_above, save
 
 Words = tuple[str, str]
 FAILS, FALLS_SHORT = ("flies", "crash"), ("holds", "fall short")
 """the verbs for episodes that are alive, and for the others"""
+
+COLUMNS = 5
+ALIVE, RETURN, BEYOND = COLORS[0], COLORS[1], COLORS[3]
+"""colours of the picture"""
 
 
 def rows(found: Sequence[AxisMargins]) -> list[list[str]]:
@@ -109,22 +122,66 @@ def smoothness_sentence(smooth: Mapping[str, float]) -> str:
     )
 
 
-def panel(one: AxisMargins) -> Panel:
-    """The panel of an axis in the picture."""
-    axis, inside = one.axis, one.within()
-    ends = [side.last for side in one.sides.values() if side.first is not None]
-    return Panel(
-        title=axis.title,
-        unit=axis.shown_unit,
-        values=[_place(axis, value) for value in axis.values],
-        names=[str(value) for value in axis.values] if isinstance(axis.nominal, str) else [],
-        nominal=_place(axis, axis.nominal),
-        margin=(_place(axis, inside[0]), _place(axis, inside[-1])) if inside else None,
-        edges=[_place(axis, value) for value in ends if value is not None],
-        margin_text=(_span(axis, inside) if one.sides else "") if inside else "none",
-        alive=[alive / one.episodes for alive in one.alive],
-        returns=one.mean_returns,
-    )
+def draw(found: Sequence[AxisMargins], title: str, file: Path) -> Path:
+    """Draw a panel for each axis: the share of the episodes that is alive, and the mean return."""
+    columns = min(COLUMNS, len(found))
+    lines = math.ceil(len(found) / columns)
+    figure = Figure(figsize=(2.9 * columns + 0.6, 2.0 * lines + 0.7), layout=ConstrainedLayoutEngine(hspace=0.06))
+    everything = [value for one in found for value in one.mean_returns]
+    low, high = min(0.0, *everything), max(0.0, *everything)
+    for i, one in enumerate(found):
+        axes = figure.add_subplot(lines, columns, i + 1)
+        right = axes.twinx()
+        right.set_ylim(low - 0.04 * (high - low), high + 0.08 * (high - low))
+        _draw(axes, right, one)
+        if i % columns:
+            axes.set_yticklabels([])
+        else:
+            axes.set_ylabel("share alive", fontsize=8, color=ALIVE)
+        if (i + 1) % columns:
+            right.set_yticklabels([])
+        else:
+            right.set_ylabel("mean return", fontsize=8, color=RETURN)
+    legend_above(figure)
+    figure.suptitle(title, x=0.99, ha="right", fontsize=9, color="dimgrey")
+    return save(figure, file)
+
+
+def _draw(axes: Axes, right: Axes, one: AxisMargins) -> None:
+    """The curves of one panel, the margin as a band that ends in a line where fewer are alive."""
+    axis, inside, is_named = one.axis, one.within(), isinstance(one.axis.nominal, str)
+    values, nominal = [_place(axis, value) for value in axis.values], _place(axis, axis.nominal)
+    style: dict[str, Any] = {"markersize": 3, "linewidth": 1.5, "linestyle": "" if is_named else "-"}
+    if inside and not is_named:
+        ends = _place(axis, inside[0]), _place(axis, inside[-1])
+        axes.axvspan(*ends, color=ALIVE, alpha=0.1, linewidth=0, label="within the margin")
+        for side in one.sides.values():
+            if side.first is not None and side.last is not None:
+                edge = _place(axis, side.last)
+                axes.axvline(edge, color=ALIVE, linewidth=1, linestyle="--")
+                end = min(values) if edge < nominal else max(values)
+                axes.axvspan(edge, end, color=BEYOND, alpha=0.06, linewidth=0, label="beyond it")
+    axes.axvline(nominal, color="0.6", linewidth=0.8, linestyle=":", label="nominal")
+    right.plot(values, one.mean_returns, "s", color=RETURN, label="mean return", alpha=0.8, **style)
+    shares = [alive / one.episodes for alive in one.alive]
+    axes.plot(values, shares, "o", color=ALIVE, label="share alive", **style)
+    finish(axes)
+    axes.xaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 2.5, 5, 10]))
+    if is_named:
+        axes.set_xticks(values, [textwrap.fill(str(value).replace("_", " "), 10) for value in axis.values])
+        axes.margins(x=0.12)
+    axes.set_ylim(-0.04, 1.08)
+    axes.set_yticks([0, 0.5, 1], ["0", "50 %", "100 %"])
+    axes.tick_params(labelsize=7.5)
+    right.tick_params(labelsize=7.5, length=0)
+    right.spines[:].set_visible(False)
+    # The second axes of a twin are drawn above the first, but alive is what the picture is about.
+    axes.set_zorder(right.get_zorder() + 1)
+    axes.patch.set_visible(False)
+    unit = f" ({axis.shown_unit})" if axis.shown_unit else ""
+    axes.set_title(f"{axis.title}{unit}", loc="left", fontsize=9)
+    margin = (_span(axis, inside) if one.sides else "") if inside else "none"
+    axes.set_title(margin, loc="right", fontsize=8, color=ALIVE)
 
 
 def _place(axis: Axis, value: Value) -> float:
