@@ -8,10 +8,9 @@ from lemniscate.errors import UserError
 from lemniscate.report import compare, curves, flight, pages
 from lemniscate.report.seeds import group
 from lemniscate.run import checkpoint
-from lemniscate.run.directory import is_finished, read_config
+from lemniscate.run.directory import is_finished, is_sweep, read_config, read_sweep
 from lemniscate.run.environments import evaluation_env
 from lemniscate.run.metrics import damage, read_metrics
-from lemniscate.run.sweep_file import is_sweep, read_sweep
 from lemniscate.system.console import in_notebook, say
 from lemniscate.system.files import make_directory
 from lemniscate.system.notebook import show_pictures

@@ -13,8 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from lemniscate.run.directory import read_config
-from lemniscate.run.sweep_file import is_sweep
+from lemniscate.run.directory import is_sweep, read_config
 
 RESAMPLES = 10_000
 

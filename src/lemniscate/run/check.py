@@ -8,9 +8,8 @@ from filelock import FileLock, Timeout
 from lemniscate.envs.check import BAD, GOOD, NOTE, Finding
 from lemniscate.errors import UserError, resume_line
 from lemniscate.run import checkpoint
-from lemniscate.run.directory import CONFIG, LOCK
+from lemniscate.run.directory import CONFIG, LOCK, SWEEP, is_sweep, read_sweep
 from lemniscate.run.metrics import METRICS, damage, read_metrics
-from lemniscate.run.sweep_file import SWEEP, is_sweep, read_sweep
 from lemniscate.system.files import DamagedFileError, is_whole, parsing, read_json
 
 FINAL = "final.json"
