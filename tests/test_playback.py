@@ -16,7 +16,7 @@ from PIL import Image
 
 import lemniscate as lem
 from lemniscate.report import playback
-from lemniscate.system import notebook as cells
+from lemniscate.system import console as cells
 
 
 @pytest.fixture(scope="module")

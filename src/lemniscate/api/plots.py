@@ -11,9 +11,8 @@ from lemniscate.run import checkpoint
 from lemniscate.run.directory import is_finished, is_sweep, read_config, read_sweep
 from lemniscate.run.environments import evaluation_env
 from lemniscate.run.metrics import damage, read_metrics
-from lemniscate.system.console import in_notebook, say
+from lemniscate.system.console import in_notebook, say, show_pictures
 from lemniscate.system.files import make_directory
-from lemniscate.system.notebook import show_pictures
 
 Plotted = str | Path | TrainedRun | TrainedPolicy
 """what names a run: its directory, what `train` returned, or a policy that came from there"""

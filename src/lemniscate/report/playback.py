@@ -26,10 +26,9 @@ from lemniscate.run.config import RunConfig
 from lemniscate.run.environments import env_arguments
 from lemniscate.run.evaluate import EVALUATION, EpisodeTable, Evaluation
 from lemniscate.run.seeding import derive
-from lemniscate.system.console import in_notebook, say
+from lemniscate.system.console import in_notebook, say, send_frames
 from lemniscate.system.files import remove
 from lemniscate.system.named import find_callable
-from lemniscate.system.notebook import send_frames
 from lemniscate.types import Step
 
 Act = Callable[..., np.ndarray]

@@ -1,18 +1,22 @@
-"""Text for people: lines and progress, on standard error or below the cell of a notebook.
+"""Output for people: lines and progress on standard error; below the cell of a notebook also pictures and films.
 
 Standard output is left to programs; in a notebook nothing reads it, and standard error looks like a failure there.
 """
 
+import io
 import os
 import select
 import sys
 import time
-from collections.abc import Sequence
+from base64 import b64encode
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from datetime import timedelta
+from pathlib import Path
 from typing import Any, NamedTuple, TextIO
 
-from lemniscate.system.notebook import CellText, drawn_bar
+NOTEBOOK_FPS = 25
+"""more frames a second than a browser is sent; the others are left out"""
 
 
 def in_notebook() -> bool:
@@ -69,6 +73,22 @@ class Line(NamedTuple):
     text: str
 
 
+class Place:
+    """A place below the cell for one object, which the next one replaces; a saved notebook holds the last."""
+
+    def __init__(self) -> None:
+        self._handle: Any = None
+
+    def show(self, shown: Any, **how: Any) -> None:
+        """Show an object in the place of the one before; `how` is for IPython's `display`."""
+        from IPython.display import display
+
+        if self._handle is None:
+            self._handle = display(shown, display_id=True, **how)
+        else:
+            self._handle.update(shown, **how)
+
+
 class ProgressBar:
     """The progress of one run, or of several: live bars in a terminal, live lines in a notebook, else ten lines.
 
@@ -79,7 +99,9 @@ class ProgressBar:
     """
 
     def __init__(self, total: int, done: int, visible: bool = True) -> None:
-        self._cell = CellText() if visible and in_notebook() else None
+        self._cell = Place() if visible and in_notebook() else None
+        self._text, self._shown_at = "", -float("inf")
+        """the newest text below the cell, and when one was shown there"""
         self._bars: Any = _live_bars() if visible and not self._cell else None
         self._tasks: dict[str, Any] = {}
         """rich's number of each live bar"""
@@ -102,7 +124,10 @@ class ProgressBar:
             lines = "".join(f"\n  {run.name}: {run.text}" for run in runs)
             text = f"{whole.name}  {whole.text}{lines}"
             if self._cell:
-                self._cell.show(f"{drawn_bar(whole.done / self._total)} {text}")
+                filled = round(20 * min(1.0, whole.done / self._total))
+                self._text = f"{'━' * filled}{'╌' * (20 - filled)} {text}"
+                if time.monotonic() - self._shown_at >= 0.2:
+                    self._show_text(self._cell)
             else:
                 self._tenth = tenth
                 say(text)
@@ -120,8 +145,12 @@ class ProgressBar:
         if self._bars:
             with suppress(OSError):
                 self._bars.stop()
-        if self._cell:
-            self._cell.flush()
+        if self._cell and self._text:
+            self._show_text(self._cell)
+
+    def _show_text(self, cell: Place) -> None:
+        cell.show({"text/plain": self._text}, raw=True)  # no widget, which a saved notebook cannot show
+        self._shown_at = time.monotonic()
 
     def _show_bars(self, whole: Line, runs: Sequence[Line]) -> None:
         lines = {"": whole, **{run.name: run for run in runs}}  # the name of the whole changes
@@ -147,3 +176,36 @@ def _live_bars() -> Any:
     bars = Progress(TextColumn("{task.description}"), BarColumn(bar_width=20), after, console=console)
     bars.start()
     return bars
+
+
+def show_pictures(files: Iterable[Path]) -> None:
+    """Show pictures below the cell."""
+    from IPython.display import Image, display
+
+    for file in files:
+        display(Image(filename=str(file)))
+
+
+def send_frames(frames: Iterable[Any], fps: float) -> None:
+    """Show frames, arrays [H, W, 3] of uint8, one after the other below the cell, at their own speed."""
+    import PIL.Image
+    from IPython.display import Image
+
+    stride = max(1, round(fps / NOTEBOOK_FPS))
+    place, started = Place(), time.monotonic()
+    for i, frame in enumerate(frames):
+        if i % stride:
+            continue
+        jpeg = io.BytesIO()
+        PIL.Image.fromarray(frame).save(jpeg, format="JPEG", quality=85)
+        place.show(Image(jpeg.getvalue(), format="jpeg"))
+        time.sleep(max(0.0, started + i / fps - time.monotonic()))
+
+
+def show_film(file: str | Path) -> None:
+    """Show an animated picture (.gif, .webp) below the cell; the notebook then holds it without the file."""
+    from IPython.display import HTML, display
+
+    path = Path(file)
+    data = b64encode(path.read_bytes()).decode()
+    display(HTML(f'<img src="data:image/{path.suffix[1:]};base64,{data}">'))  # few viewers know image/webp as an output
