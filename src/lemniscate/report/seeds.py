@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from lemniscate.run.directory import is_sweep, read_config
+from lemniscate.run.directory import read_config
+from lemniscate.run.places import is_sweep
 
 RESAMPLES = 10_000
 

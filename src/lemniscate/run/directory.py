@@ -1,11 +1,5 @@
-"""The directories of runs and sweeps: their creation, their configs, their locks, and the checkpoints in them.
+"""The run directory: its creation, its config, its lock, and the checkpoints in it."""
 
-sweep.json        of a sweep: the seeds, and the Config of each algorithm
-ppo-1/, sac-1/…   its runs; one that has not begun has only a `config.json`, and is resumed from step 0
-"""
-
-import re
-from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -119,53 +113,6 @@ def _newest(path: Path, planned_only: bool) -> checkpoint.Checkpoint | None:
             if folder.exists():
                 say(f"{error} Taking the one before.")
     return None if steps == checkpoint.list_steps(path / "checkpoints") else _newest(path, planned_only)
-
-
-@dataclass(frozen=True)
-class Sweep:
-    """A sweep of several algorithms times several seeds; the Config of each algorithm is without its seed."""
-
-    path: Path
-    seeds: list[int]
-    configs: dict[str, dict[str, Any]]
-
-    @property
-    def runs(self) -> dict[Path, dict[str, Any]]:
-        """The run directories and the content of their `config.json`, ordered by seed, then by algorithm."""
-        return {
-            self.path / f"{algorithm}-{seed}": {"algorithm": algorithm, "config": {**config, "seed": seed}}
-            for seed in self.seeds
-            for algorithm, config in self.configs.items()
-        }
-
-    def create(self) -> None:
-        """Write `sweep.json` into a new directory. Raises `UserError` if the directory exists already."""
-        create_directory(self.path, SWEEP, {"seeds": self.seeds, "configs": self.configs})
-
-    def create_runs(self) -> None:
-        """Create the run directories that do not exist yet."""
-        for path, record in self.runs.items():
-            if not (path / CONFIG).exists():
-                create_directory(path, CONFIG, record)
-
-
-def is_sweep(path: Path) -> bool:
-    """Whether a directory is that of a sweep."""
-    return (path / SWEEP).exists()
-
-
-def read_sweep(path: Path) -> Sweep:
-    """The sweep in a directory. Raises `UserError` if there is none."""
-    try:
-        record = read_json(path / SWEEP)
-    except DamagedFileError as error:
-        reason = f": {error}" if (path / SWEEP).exists() else f": it holds no {SWEEP} that can be read."
-        raise UserError(f"{path} is not a sweep{reason}") from None
-    with parsing(path / SWEEP):
-        sweep = Sweep(path, [int(seed) for seed in record["seeds"]], dict(record["configs"]))
-        if unsafe := [name for name in sweep.configs if not re.fullmatch(r"[\w.:-]*\w", name) or ".." in name]:
-            raise ValueError(f"{unsafe[0]!r} is no name of an algorithm")
-        return sweep
 
 
 class Saver:

@@ -19,8 +19,9 @@ from lemniscate.errors import UserError, is_installed, missing_extra
 from lemniscate.presets.preset import StoredPreset
 from lemniscate.report.seeds import iqm
 from lemniscate.run.config import RunConfig
-from lemniscate.run.directory import TUNE, Sweep, create_directory, is_finished
+from lemniscate.run.directory import TUNE, create_directory, is_finished
 from lemniscate.run.metrics import read_metrics
+from lemniscate.run.places import Sweep
 from lemniscate.run.seeding import derive
 from lemniscate.sweeps.space import Space, read_space
 from lemniscate.system.files import DamagedFileError, parsing, read_json

@@ -20,10 +20,10 @@ from lemniscate.envs import registry
 from lemniscate.errors import SweepError, UserError, prefix_errors, resume_line, shown
 from lemniscate.hub.repository import local_path
 from lemniscate.run.config import RunConfig
-from lemniscate.run.directory import Sweep, is_finished, read_sweep
+from lemniscate.run.directory import is_finished
 from lemniscate.run.environments import device_for, require_memory
 from lemniscate.run.metrics import progress_of
-from lemniscate.run.places import LOG, failure_of
+from lemniscate.run.places import LOG, Sweep, failure_of, read_sweep
 from lemniscate.run.warm_start import load_networks
 from lemniscate.sweeps.runs import SetOfRuns, locked
 from lemniscate.system.console import Line, ProgressBar, pace, say

@@ -17,8 +17,7 @@ from lemniscate.cluster.connection import Cluster, find_cluster
 from lemniscate.errors import SweepError, UserError, shown
 from lemniscate.presets.preset import StoredPreset
 from lemniscate.report import tuning as pictures
-from lemniscate.run.directory import Sweep, is_sweep
-from lemniscate.run.places import LOG, failure_of
+from lemniscate.run.places import LOG, Sweep, failure_of, is_sweep
 from lemniscate.sweeps.runs import SetOfRuns, locked
 from lemniscate.sweeps.space import draw, read_space, read_texts
 from lemniscate.sweeps.study import (

@@ -1,22 +1,16 @@
-"""Output for people: lines and progress on standard error; below the cell of a notebook also pictures and films.
+"""Text for people: lines and progress, on standard error or below the cell of a notebook.
 
 Standard output is left to programs; in a notebook nothing reads it, and standard error looks like a failure there.
 """
 
-import io
 import os
 import select
 import sys
 import time
-from base64 import b64encode
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from datetime import timedelta
-from pathlib import Path
 from typing import Any, NamedTuple, TextIO
-
-NOTEBOOK_FPS = 25
-"""more frames a second than a browser is sent; the others are left out"""
 
 
 def in_notebook() -> bool:
@@ -176,36 +170,3 @@ def _live_bars() -> Any:
     bars = Progress(TextColumn("{task.description}"), BarColumn(bar_width=20), after, console=console)
     bars.start()
     return bars
-
-
-def show_pictures(files: Iterable[Path]) -> None:
-    """Show pictures below the cell."""
-    from IPython.display import Image, display
-
-    for file in files:
-        display(Image(filename=str(file)))
-
-
-def send_frames(frames: Iterable[Any], fps: float) -> None:
-    """Show frames, arrays [H, W, 3] of uint8, one after the other below the cell, at their own speed."""
-    import PIL.Image
-    from IPython.display import Image
-
-    stride = max(1, round(fps / NOTEBOOK_FPS))
-    place, started = Place(), time.monotonic()
-    for i, frame in enumerate(frames):
-        if i % stride:
-            continue
-        jpeg = io.BytesIO()
-        PIL.Image.fromarray(frame).save(jpeg, format="JPEG", quality=85)
-        place.show(Image(jpeg.getvalue(), format="jpeg"))
-        time.sleep(max(0.0, started + i / fps - time.monotonic()))
-
-
-def show_film(file: str | Path) -> None:
-    """Show an animated picture (.gif, .webp) below the cell; the notebook then holds it without the file."""
-    from IPython.display import HTML, display
-
-    path = Path(file)
-    data = b64encode(path.read_bytes()).decode()
-    display(HTML(f'<img src="data:image/{path.suffix[1:]};base64,{data}">'))  # few viewers know image/webp as an output
