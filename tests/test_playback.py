@@ -16,7 +16,6 @@ from PIL import Image
 
 import lemniscate as lem
 from lemniscate.report import playback
-from lemniscate.system import notebook as cells
 
 
 @pytest.fixture(scope="module")
@@ -63,10 +62,10 @@ def test_frames_are_sent_at_their_own_speed_but_no_faster_than_a_browser_takes(m
 
     sent, now = [], [0.0]
     monkeypatch.setattr("IPython.display.display", display)
-    monkeypatch.setattr(cells.time, "monotonic", lambda: now[0])
-    monkeypatch.setattr(cells.time, "sleep", lambda seconds: now.__setitem__(0, now[0] + seconds))
+    monkeypatch.setattr(playback.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(playback.time, "sleep", lambda seconds: now.__setitem__(0, now[0] + seconds))
     frames = [np.full((8, 8, 3), shade, dtype=np.uint8) for shade in range(0, 200, 2)]
-    cells.send_frames(frames, fps=50)
+    playback.send_frames(frames, fps=50)
     shades = [int(np.asarray(Image.open(io.BytesIO(jpeg)))[0, 0, 0]) for jpeg in sent]
     assert shades == pytest.approx(range(0, 200, 4), abs=2)
     assert now[0] == pytest.approx(2.0, abs=0.05)

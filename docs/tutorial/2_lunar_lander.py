@@ -10,7 +10,7 @@ import torch
 import lemniscate as lem
 from lemniscate import course
 from lemniscate.algos import ppo
-from lemniscate.system.notebook import show_film
+from lemniscate.report.playback import show_film
 
 STEPS = 300_000
 

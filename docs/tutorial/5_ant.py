@@ -20,8 +20,8 @@ from lemniscate.algos import ppo
 from lemniscate.data.rollout import collect, epoch_minibatches
 from lemniscate.maths import clip_fraction, kl_k3, standardize
 from lemniscate.report.curves import LiveCurve
+from lemniscate.report.playback import show_film
 from lemniscate.run.loggers import read_metrics
-from lemniscate.system.notebook import show_film
 
 STEPS = 150_000
 torch.set_num_threads(1)  # networks this small are quickest so

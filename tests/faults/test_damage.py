@@ -12,8 +12,7 @@ from lemniscate.api.results import _known_scores, final_scores
 from lemniscate.errors import UserError
 from lemniscate.run.directory import find_checkpoint, read_config
 from lemniscate.run.metrics import damage, read_metrics
-from lemniscate.run.places import LOG, failure_of
-from lemniscate.run.sweep_file import Sweep, read_sweep
+from lemniscate.run.places import LOG, Sweep, failure_of, read_sweep
 from run.test_run import final_hashes, history
 
 FIELDS = {**tiny_fields(hidden=(2,)), "checkpoint_every": 128, "keep_checkpoints": 2}

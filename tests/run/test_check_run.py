@@ -9,7 +9,7 @@ import lemniscate as lem
 from conftest import tiny, tiny_fields
 from lemniscate.api.results import final_return
 from lemniscate.cli import main
-from lemniscate.run.sweep_file import Sweep
+from lemniscate.run.places import Sweep
 
 
 @pytest.fixture(scope="module")

@@ -11,10 +11,9 @@ from lemniscate.run import checkpoint
 from lemniscate.run.directory import is_finished, read_config
 from lemniscate.run.environments import evaluation_env
 from lemniscate.run.metrics import damage, read_metrics
-from lemniscate.run.sweep_file import is_sweep, read_sweep
+from lemniscate.run.places import is_sweep, read_sweep
 from lemniscate.system.console import in_notebook, say
 from lemniscate.system.files import make_directory
-from lemniscate.system.notebook import show_pictures
 
 Plotted = str | Path | TrainedRun | TrainedPolicy
 """what names a run: its directory, what `train` returned, or a policy that came from there"""
@@ -57,7 +56,11 @@ def plot(*runs: Plotted | list[Plotted], by: str = "step") -> list[Path]:
         folder = paths[0] / "plots" if len(paths) == 1 else Path("plots")
         files = compare.report(group(found), _final_returns(found), folder, by)
     if in_notebook():
-        show_pictures(file for file in files if file.suffix == ".png")
+        from IPython.display import Image, display
+
+        for file in files:
+            if file.suffix == ".png":
+                display(Image(filename=str(file)))
     return files
 
 

@@ -96,41 +96,28 @@ class RayTasks(Places):
         """Send a run to a machine that has room, or will have."""
         self._begin(run, options, lost=0)
 
-    def ended(self) -> dict[Path, int]:
-        """The exit codes of the runs that have ended since the last look; what the others have sent is stored."""
-        codes: dict[Path, int] = {}
-        for run in list(self._running):
-            code = self._hear(run)
-            if code is not None:
-                self._ray.kill(self._running.pop(run).task)
-                codes[run] = code
-        return codes
-
-    def stop(self, runs: Sequence[Path] | None = None) -> None:
-        """Ask these runs, or all, to save and stop. One that has not begun stops at once."""
-        for run, running in self._running.items():
-            if runs is None or run in runs:
-                if running.begun:
-                    running.task.stop.remote()
-                else:
-                    running.said = None
-
     def close(self) -> None:
-        """Stop all, wait for them, and leave the cluster."""
+        """Stop all runs, wait for them, and leave the cluster."""
         try:
-            self.stop()
-            while self._running:
-                self.ended()
-                time.sleep(EVERY / 4)
+            super().close()
         finally:
             self._connection.close()
+
+    def _ask_to_stop(self, trainer: _Running) -> None:
+        if trainer.begun:
+            trainer.task.stop.remote()
+        else:  # it waits for room: nothing is lost
+            trainer.said = None
+
+    def _release(self, trainer: _Running) -> None:
+        self._ray.kill(trainer.task)
 
     def _begin(self, run: Path, options: Sequence[str], lost: int) -> None:
         task = self._task.remote()
         said = task.train.options(num_returns="streaming").remote(run.name, pack(run), options)
         self._running[run] = _Running(task, said, options, lost)
 
-    def _hear(self, run: Path) -> int | None:
+    def _code_of(self, run: Path) -> int | None:
         """Store what a task has sent; its exit code if it has ended. A task that is lost begins again."""
         running = self._running[run]
         if running.said is None:

@@ -27,7 +27,7 @@ from lemniscate.exporting.translation import translate
 from lemniscate.hub.repository import is_address
 from lemniscate.spec import Action, Box, Discrete, MultiDiscrete, ObservationPart, Spec
 from lemniscate.system.console import say
-from lemniscate.system.files import DamagedFileError, make_directory, read_json, remove, replace_file, sync, write_json
+from lemniscate.system.files import DamagedFileError, read_json, replace_directory, replace_file, write_json
 
 MANIFEST, PARITY, ONNX = "manifest.json", "parity.json", "policy.onnx"
 CRAZYFLIE = "crazyflie"
@@ -139,26 +139,11 @@ def _vehicle_files(
 
 def _write(folder: Path, contents: Mapping[str, bytes], record: Mapping[str, Any]) -> None:
     """Write all files aside, then put the directory in its place. Raises `OSError`, and leaves nothing behind then."""
-    aside, before = (folder.with_name(f"{folder.name}.{end}") for end in ("tmp", "old"))
-    make_directory(folder.parent)
-    remove(aside)
-    try:
-        aside.mkdir()
+    with replace_directory(folder) as aside:
         for name, content in contents.items():
             (aside / name).parent.mkdir(exist_ok=True)
             replace_file(aside / name, content)
         write_json(aside / MANIFEST, record)
-        remove(before)
-        if folder.exists():
-            folder.replace(before)
-        aside.replace(folder)
-        sync(folder.parent)
-        remove(before)
-    except BaseException:
-        remove(aside)
-        if before.exists() and not folder.exists():
-            before.replace(folder)
-        raise
 
 
 def manifest(

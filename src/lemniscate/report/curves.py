@@ -18,8 +18,7 @@ from lemniscate.report.style import COLORS, finish, legend_above, limit_axis, ru
 from lemniscate.run.directory import read_config
 from lemniscate.run.evaluate import QBias
 from lemniscate.run.metrics import read_metrics
-from lemniscate.system.console import in_notebook
-from lemniscate.system.notebook import Place
+from lemniscate.system.console import Place, in_notebook
 
 BY = {"step": "environment steps", "episode": "episode", "minute": "minutes of training"}
 """what a learning curve can be drawn against, and the label of that axis"""

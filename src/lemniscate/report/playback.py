@@ -1,9 +1,12 @@
 """Episodes played for a person: in a window, in a notebook, or into a film."""
 
+import io
 import math
 import os
 import sys
+import time
 import warnings
+from base64 import b64encode
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -26,10 +29,9 @@ from lemniscate.run.config import RunConfig
 from lemniscate.run.environments import env_arguments
 from lemniscate.run.evaluate import EVALUATION, EpisodeTable, Evaluation
 from lemniscate.run.seeding import derive
-from lemniscate.system.console import in_notebook, say
+from lemniscate.system.console import Place, in_notebook, say
 from lemniscate.system.files import remove
 from lemniscate.system.named import find_callable
-from lemniscate.system.notebook import send_frames
 from lemniscate.types import Step
 
 Act = Callable[..., np.ndarray]
@@ -43,6 +45,8 @@ FILMS = (".gif", ".webp", ".mp4")
 
 PICTURE_FPS = 50
 """frames a second that an animated picture has at most: browsers show one with shorter delays far too slowly"""
+NOTEBOOK_FPS = 25
+"""more frames a second than a browser is sent; the others are left out"""
 
 
 def show_episodes(
@@ -265,3 +269,27 @@ def _timed(frames: Iterable[np.ndarray], fps: float) -> Iterator[Image.Image]:
         image = Image.fromarray(frame)
         image.info["duration"] = 10 * (round(100 * (i + 1) / fps) - round(100 * i / fps))
         yield image
+
+
+def send_frames(frames: Iterable[Any], fps: float) -> None:
+    """Show frames, arrays [H, W, 3] of uint8, one after the other below the cell, at their own speed."""
+    from IPython import display
+
+    stride = max(1, round(fps / NOTEBOOK_FPS))
+    place, started = Place(), time.monotonic()
+    for i, frame in enumerate(frames):
+        if i % stride:
+            continue
+        jpeg = io.BytesIO()
+        Image.fromarray(frame).save(jpeg, format="JPEG", quality=85)
+        place.show(display.Image(jpeg.getvalue(), format="jpeg"))
+        time.sleep(max(0.0, started + i / fps - time.monotonic()))
+
+
+def show_film(file: str | Path) -> None:
+    """Show an animated picture (.gif, .webp) below the cell; the notebook then holds it without the file."""
+    from IPython.display import HTML, display
+
+    path = Path(file)
+    data = b64encode(path.read_bytes()).decode()
+    display(HTML(f'<img src="data:image/{path.suffix[1:]};base64,{data}">'))  # few viewers know image/webp as an output

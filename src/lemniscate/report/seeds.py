@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from lemniscate.run.directory import read_config
-from lemniscate.run.sweep_file import is_sweep
+from lemniscate.run.places import is_sweep
 
 RESAMPLES = 10_000
 

@@ -8,9 +8,9 @@ from filelock import FileLock, Timeout
 from lemniscate.envs.check import BAD, GOOD, NOTE, Finding
 from lemniscate.errors import UserError, resume_line
 from lemniscate.run import checkpoint
-from lemniscate.run.directory import CONFIG, LOCK
+from lemniscate.run.directory import CONFIG, LOCK, SWEEP
 from lemniscate.run.metrics import METRICS, damage, read_metrics
-from lemniscate.run.sweep_file import SWEEP, is_sweep, read_sweep
+from lemniscate.run.places import is_sweep, read_sweep
 from lemniscate.system.files import DamagedFileError, is_whole, parsing, read_json
 
 FINAL = "final.json"
@@ -123,12 +123,10 @@ def _metrics(path: Path, whole: list[checkpoint.Checkpoint]) -> Iterator[Finding
 
 
 def _is_locked(file: Path) -> bool:
-    lock = FileLock(file, timeout=0)
     try:
-        lock.acquire()
+        with FileLock(file, timeout=0):
+            return False
     except Timeout:
         return True
     except OSError:  # read-only: nobody can train there
         return False
-    lock.release()
-    return False

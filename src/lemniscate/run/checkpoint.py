@@ -26,11 +26,11 @@ from lemniscate.run.state import TrainState
 from lemniscate.spec import Action, ObservationPart, Spec
 from lemniscate.system.files import (
     DamagedFileError,
-    make_directory,
     open_regular,
     parsing,
     read_json,
     remove,
+    replace_directory,
     sync,
     write_json,
 )
@@ -94,28 +94,11 @@ def write_fields(final: Path, fields: Mapping[str, Any], record: dict[str, Any])
             numbers[name] = value
     if name := _not_finite(tensors):
         raise NonFiniteError(f"{name} has a value that is not finite; {final} is not written.")
-    temporary, replaced = final.with_name(f"{final.name}.tmp"), final.with_name(f"{final.name}.old.tmp")
-    make_directory(final.parent)
-    remove(temporary)
-    try:
-        temporary.mkdir()
-        write_json(temporary / STATE, {"numbers": numbers, "record": record})
-        _write_tensors(temporary / TENSORS, tensors, mode=(temporary / STATE).stat().st_mode)
-        hashes = {name: _sha256(temporary / name) for name in FILES}
-        write_json(temporary / MANIFEST, {"format": FORMAT, "files": hashes})
-        # The names inside are synced before the directory has its own name: else a power cut leaves it without them.
-        sync(temporary)
-        if final.exists():  # a directory that is not empty cannot be renamed over
-            remove(replaced)
-            final.rename(replaced)
-        temporary.rename(final)
-        sync(final.parent)
-    finally:
-        with suppress(OSError):
-            if replaced.exists() and not final.exists():
-                replaced.rename(final)
-            remove(temporary)
-            remove(replaced)
+    with replace_directory(final) as folder:
+        write_json(folder / STATE, {"numbers": numbers, "record": record})
+        _write_tensors(folder / TENSORS, tensors, mode=(folder / STATE).stat().st_mode)
+        hashes = {name: _sha256(folder / name) for name in FILES}
+        write_json(folder / MANIFEST, {"format": FORMAT, "files": hashes})
 
 
 def _write_tensors(path: Path, tensors: Mapping[str, Tensor], mode: int) -> None:

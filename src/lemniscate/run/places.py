@@ -1,29 +1,84 @@
-"""The places at which the runs of a set are trained: processes of this machine, one for each run.
+"""The places of a set of runs: the directory of a sweep, and the processes of this machine that train its runs.
+
+    sweep.json        of a sweep: the seeds, and the Config of each algorithm
+    ppo-1/, sac-1/…   its runs; one that has not begun has only a `config.json`, and is resumed from step 0
 
 Each process resumes one run directory, whether its run has begun or not, and ends with the process that started it.
 The tasks of a cluster are places too: see `lemniscate.cluster.tasks`.
 """
 
 import os
+import re
 import signal
 import subprocess
 import sys
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from lemniscate.system.files import open_log, open_regular
+from lemniscate.errors import UserError
+from lemniscate.run.directory import CONFIG, SWEEP, create_directory
+from lemniscate.system.files import DamagedFileError, open_log, open_regular, parsing, read_json
+from lemniscate.system.machine import cores
 from lemniscate.system.watchdog import OWNED
 
 LOG = "log.txt"
 """standard output and error of a run, in its directory"""
 
 
+@dataclass(frozen=True)
+class Sweep:
+    """A sweep of several algorithms times several seeds; the Config of each algorithm is without its seed."""
+
+    path: Path
+    seeds: list[int]
+    configs: dict[str, dict[str, Any]]
+
+    @property
+    def runs(self) -> dict[Path, dict[str, Any]]:
+        """The run directories and the content of their `config.json`, ordered by seed, then by algorithm."""
+        return {
+            self.path / f"{algorithm}-{seed}": {"algorithm": algorithm, "config": {**config, "seed": seed}}
+            for seed in self.seeds
+            for algorithm, config in self.configs.items()
+        }
+
+    def create(self) -> None:
+        """Write `sweep.json` into a new directory. Raises `UserError` if the directory exists already."""
+        create_directory(self.path, SWEEP, {"seeds": self.seeds, "configs": self.configs})
+
+    def create_runs(self) -> None:
+        """Create the run directories that do not exist yet."""
+        for path, record in self.runs.items():
+            if not (path / CONFIG).exists():
+                create_directory(path, CONFIG, record)
+
+
+def is_sweep(path: Path) -> bool:
+    """Whether a directory is that of a sweep."""
+    return (path / SWEEP).exists()
+
+
+def read_sweep(path: Path) -> Sweep:
+    """The sweep in a directory. Raises `UserError` if there is none."""
+    try:
+        record = read_json(path / SWEEP)
+    except DamagedFileError as error:
+        reason = f": {error}" if (path / SWEEP).exists() else f": it holds no {SWEEP} that can be read."
+        raise UserError(f"{path} is not a sweep{reason}") from None
+    with parsing(path / SWEEP):
+        sweep = Sweep(path, [int(seed) for seed in record["seeds"]], dict(record["configs"]))
+        if unsafe := [name for name in sweep.configs if not re.fullmatch(r"[\w.:-]*\w", name) or ".." in name]:
+            raise ValueError(f"{unsafe[0]!r} is no name of an algorithm")
+        return sweep
+
+
 def at_once(threads: int) -> int:
     """The number of runs, each of so many threads, that fit on the cores that this process may use; at least one."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return max(1, cores // threads)
+    return max(1, cores() // threads)
 
 
 class Places(ABC):
@@ -52,17 +107,35 @@ class Places(ABC):
     def start(self, run: Path, options: Sequence[str]) -> None:
         """Begin to train a run: `lemniscate resume` with these options."""
 
-    @abstractmethod
     def ended(self) -> dict[Path, int]:
         """The exit codes of the runs that have ended since the last look."""
+        codes = {run: code for run in list(self._running) if (code := self._code_of(run)) is not None}
+        for run in codes:
+            self._release(self._running.pop(run))
+        return codes
 
-    @abstractmethod
     def stop(self, runs: Sequence[Path] | None = None) -> None:
         """Ask these runs, or all, to save and stop; asked twice, they do not wait for the end of their update."""
+        for run, trainer in self._running.items():
+            if runs is None or run in runs:
+                self._ask_to_stop(trainer)
 
-    @abstractmethod
     def close(self) -> None:
         """Stop all runs, and wait for them."""
+        self.stop()
+        while self._running:
+            self.ended()
+            time.sleep(0.1)
+
+    @abstractmethod
+    def _code_of(self, run: Path) -> int | None:
+        """The exit code of a run; None if it goes on."""
+
+    @abstractmethod
+    def _ask_to_stop(self, trainer: Any) -> None: ...
+
+    @abstractmethod
+    def _release(self, trainer: Any) -> None: ...
 
 
 class Processes(Places):
@@ -94,30 +167,15 @@ class Processes(Places):
                 command, stdin=subprocess.PIPE, stdout=log, stderr=log, env=environment, start_new_session=True
             )
 
-    def ended(self) -> dict[Path, int]:
-        """The exit codes of the processes that have ended since the last look."""
-        codes = {run: code for run, process in self._running.items() if (code := process.poll()) is not None}
-        for run in codes:
-            _close_input(self._running.pop(run))
-        return codes
+    def _code_of(self, run: Path) -> int | None:
+        return self._running[run].poll()
 
-    def stop(self, runs: Sequence[Path] | None = None) -> None:
-        """Ask these processes, or all, to save and stop; asked twice, they do not wait for the end of their update."""
-        for run, process in self._running.items():
-            if runs is None or run in runs:
-                process.terminate()
+    def _ask_to_stop(self, trainer: subprocess.Popen) -> None:
+        trainer.terminate()
 
-    def close(self) -> None:
-        """Stop all, and wait for them."""
-        self.stop()
-        for process in self._running.values():
-            process.wait()
-            _close_input(process)
-
-
-def _close_input(process: subprocess.Popen) -> None:
-    if process.stdin:
-        process.stdin.close()
+    def _release(self, trainer: subprocess.Popen) -> None:
+        if trainer.stdin:
+            trainer.stdin.close()
 
 
 def failure_of(run: Path, code: int) -> str:

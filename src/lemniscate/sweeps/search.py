@@ -29,8 +29,8 @@ from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import TUNE, create_directory, is_finished
 from lemniscate.run.fields import kinds_of, read, unknown_field
 from lemniscate.run.metrics import read_metrics
+from lemniscate.run.places import Sweep
 from lemniscate.run.seeding import derive
-from lemniscate.run.sweep_file import Sweep
 from lemniscate.system.files import DamagedFileError, parsing, read_json
 
 if TYPE_CHECKING:

@@ -31,9 +31,8 @@ from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import LOCK, is_finished
 from lemniscate.run.environments import device_for, require_memory
 from lemniscate.run.metrics import progress_of
-from lemniscate.run.places import LOG, Places, Processes, failure_of
+from lemniscate.run.places import LOG, Places, Processes, Sweep, failure_of, read_sweep
 from lemniscate.run.stopping import Stopped, stop_signals_to
-from lemniscate.run.sweep_file import Sweep, read_sweep
 from lemniscate.run.warm_start import load_networks
 from lemniscate.system.console import Line, ProgressBar, pace, say
 

@@ -18,8 +18,7 @@ from lemniscate.errors import SweepError, UserError
 from lemniscate.presets import Preset
 from lemniscate.report import tuning as pictures
 from lemniscate.run.config import Range, checked
-from lemniscate.run.places import LOG, failure_of
-from lemniscate.run.sweep_file import Sweep, is_sweep
+from lemniscate.run.places import LOG, Sweep, failure_of, is_sweep
 from lemniscate.sweeps.search import (
     NINTHS,
     PRESET,

@@ -12,8 +12,6 @@ from contextlib import suppress
 from datetime import timedelta
 from typing import Any, NamedTuple, TextIO
 
-from lemniscate.system.notebook import CellText, drawn_bar
-
 
 def in_notebook() -> bool:
     """Whether this is a cell of a notebook, which can show pictures, and not a terminal."""
@@ -69,6 +67,22 @@ class Line(NamedTuple):
     text: str
 
 
+class Place:
+    """A place below the cell for one object, which the next one replaces; a saved notebook holds the last."""
+
+    def __init__(self) -> None:
+        self._handle: Any = None
+
+    def show(self, shown: Any, **how: Any) -> None:
+        """Show an object in the place of the one before; `how` is for IPython's `display`."""
+        from IPython.display import display
+
+        if self._handle is None:
+            self._handle = display(shown, display_id=True, **how)
+        else:
+            self._handle.update(shown, **how)
+
+
 class ProgressBar:
     """The progress of one run, or of several: live bars in a terminal, live lines in a notebook, else ten lines.
 
@@ -79,7 +93,9 @@ class ProgressBar:
     """
 
     def __init__(self, total: int, done: int, visible: bool = True) -> None:
-        self._cell = CellText() if visible and in_notebook() else None
+        self._cell = Place() if visible and in_notebook() else None
+        self._text, self._shown_at = "", -float("inf")
+        """the newest text below the cell, and when one was shown there"""
         self._bars: Any = _live_bars() if visible and not self._cell else None
         self._tasks: dict[str, Any] = {}
         """rich's number of each live bar"""
@@ -102,7 +118,10 @@ class ProgressBar:
             lines = "".join(f"\n  {run.name}: {run.text}" for run in runs)
             text = f"{whole.name}  {whole.text}{lines}"
             if self._cell:
-                self._cell.show(f"{drawn_bar(whole.done / self._total)} {text}")
+                filled = round(20 * min(1.0, whole.done / self._total))
+                self._text = f"{'━' * filled}{'╌' * (20 - filled)} {text}"
+                if time.monotonic() - self._shown_at >= 0.2:
+                    self._show_text(self._cell)
             else:
                 self._tenth = tenth
                 say(text)
@@ -120,8 +139,12 @@ class ProgressBar:
         if self._bars:
             with suppress(OSError):
                 self._bars.stop()
-        if self._cell:
-            self._cell.flush()
+        if self._cell and self._text:
+            self._show_text(self._cell)
+
+    def _show_text(self, cell: Place) -> None:
+        cell.show({"text/plain": self._text}, raw=True)  # no widget, which a saved notebook cannot show
+        self._shown_at = time.monotonic()
 
     def _show_bars(self, whole: Line, runs: Sequence[Line]) -> None:
         lines = {"": whole, **{run.name: run for run in runs}}  # the name of the whole changes

@@ -72,6 +72,30 @@ def replace_file(path: Path, content: bytes) -> None:
         raise
 
 
+@contextmanager
+def replace_directory(final: Path) -> Iterator[Path]:
+    """A new directory to write into, which then takes the place of `final`: whole, or not at all. Raises `OSError`."""
+    aside, before = (final.with_name(f"{final.name}.{end}") for end in ("tmp", "old.tmp"))
+    make_directory(final.parent)
+    remove(aside)
+    try:
+        aside.mkdir()
+        yield aside
+        # The names inside are synced before the directory has its own name: else a power cut leaves it without them.
+        sync(aside)
+        if final.exists():  # a directory that is not empty cannot be renamed over
+            remove(before)
+            final.rename(before)
+        aside.rename(final)
+        sync(final.parent)
+    finally:
+        with suppress(OSError):
+            if before.exists() and not final.exists():
+                before.rename(final)
+            remove(aside)
+            remove(before)
+
+
 def is_whole(path: Path) -> bool:
     """Whether a file is there and has the JSON that `write_json` stored."""
     try:

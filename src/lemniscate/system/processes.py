@@ -1,13 +1,20 @@
-"""Several processes of one run, as `torchrun` starts them: what they send each other, by `torch.distributed`."""
+"""Several processes of one run, as `torchrun` starts them: what they send each other.
 
+Between machines, and between GPUs, by `torch.distributed`; on one machine through memory that all of them share.
+"""
+
+import mmap
 import os
 import pickle
 import shutil
+import socket
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from datetime import timedelta
-from typing import Any
+from pathlib import Path
+from typing import Any, Self
 
 import torch
 import torch.distributed as dist
@@ -15,12 +22,92 @@ from torch import Tensor
 from torch.distributed import PrefixStore, TCPStore  # pyright: ignore[reportPrivateImportUsage]
 
 from lemniscate.errors import RankError
-from lemniscate.system.shared_memory import SharedMemory
 from lemniscate.system.watchdog import Watch
 from lemniscate.system.world import World
 
 LONGEST = timedelta(hours=2)
 """that processes wait for one that evaluates, saves or compiles; one that hangs is found by the `Watch` long before"""
+CAPACITY = 2**22
+"""bytes that a process may send at once through shared memory"""
+TRIES = 50
+"""looks for the word of another process before this one sleeps: some 25 µs, and to wake takes as long"""
+
+
+class SharedMemory:
+    """One process's part of shared memory: two places for each process, and a socket to each other one.
+
+    A gather takes 17 to 34 µs, where gloo takes some 300.
+
+    A process writes into its place and tells the others so; when all have told it, it reads all places. What they say
+    next goes into the other places, so nobody overwrites what somebody still reads.
+
+    Args:
+        folder: on this machine, of all processes; whoever made it may remove it once all are connected.
+        rank: of this process.
+        size: number of processes.
+
+    Raises:
+        OSError: a process of another machine, or too little memory.
+    """
+
+    def __init__(self, folder: Path, rank: int, size: int) -> None:
+        self._rank, self._turn = rank, 0
+        with (folder / "memory").open("a+b") as file:
+            os.posix_fallocate(file.fileno(), 0, 2 * size * CAPACITY)
+            memory = mmap.mmap(file.fileno(), 2 * size * CAPACITY)
+        self._places = torch.frombuffer(memory, dtype=torch.uint8).view(2, size, CAPACITY)
+        self._others: list[socket.socket] = []
+        self._listener = socket.socket(socket.AF_UNIX)
+        self._listener.bind(str(folder / str(rank)))
+        self._listener.listen(size)
+
+    @staticmethod
+    def new_folder() -> Path:
+        """A new folder, in memory where the system has one there."""
+        return Path(tempfile.mkdtemp(prefix="lemniscate-", dir="/dev/shm" if Path("/dev/shm").is_dir() else None))
+
+    def connect(self, folder: Path) -> Self:
+        """Connect to the other processes, once all listen: those of lower rank are called, the others call."""
+        size = self._places.shape[1]
+        with self._listener:
+            for rank in range(self._rank):
+                connection = socket.socket(socket.AF_UNIX)
+                connection.connect(str(folder / str(rank)))
+                self._others.append(connection)
+            self._others += [self._listener.accept()[0] for _ in range(self._rank + 1, size)]
+        return self
+
+    def holds(self, mine: Tensor) -> bool:
+        """Whether a tensor can be sent so."""
+        return mine.device.type == "cpu" and mine.nbytes <= CAPACITY
+
+    def gather(self, mine: Tensor) -> Tensor:
+        """The values of all processes in the order of their ranks, [W · n, …], from [n, …] of each.
+
+        Raises `ConnectionError` where a process has ended.
+        """
+        places, self._turn = self._places[self._turn, :, : mine.nbytes], 1 - self._turn
+        places[self._rank] = mine.detach().contiguous().view(-1).view(torch.uint8)
+        for other in self._others:
+            other.send(b".")
+        for other in self._others:
+            _hear(other)
+        return places.clone(memory_format=torch.contiguous_format).view(-1).view(mine.dtype).view(-1, *mine.shape[1:])
+
+    def close(self) -> None:
+        """Leave the others."""
+        for other in self._others:
+            other.close()
+
+
+def _hear(other: socket.socket) -> None:
+    for _ in range(TRIES):
+        with suppress(BlockingIOError):
+            if other.recv(1, socket.MSG_DONTWAIT):
+                return
+            break
+    if not other.recv(1):
+        raise ConnectionError("A process has ended.")
 
 
 class Processes(World):
@@ -62,12 +149,11 @@ class Processes(World):
 
     def each(self, mine: Any) -> list[Any]:
         """The objects that all processes pass, in the order of their ranks."""
-        said: list[Any] = [None] * self.size
-        with self._together():
-            if self._memory and (data := self._memory.gather_bytes(pickle.dumps(mine))):
-                return [pickle.loads(each) for each in data]
-            dist.all_gather_object(said, mine)
-        return said
+        data = pickle.dumps(mine)
+        longest = int(self.gather(torch.tensor([len(data)])).max())
+        padded = torch.frombuffer(bytearray(data.ljust(longest)), dtype=torch.uint8)
+        # A pickle says itself where it ends, so what pads it is not read.
+        return [pickle.loads(bytes(row.numpy())) for row in self.gather(padded).view(self.size, -1)]
 
     def from_first(self, mine: Any) -> Any:
         """The object that rank 0 passes, in every process."""
@@ -119,7 +205,7 @@ class Processes(World):
         return error
 
     def _shared_memory(self) -> SharedMemory | None:
-        """The memory shared by all processes of one machine, ten times as fast as gloo; None if it is too small."""
+        """The memory shared by all processes of one machine; None if it is too small, or a process is elsewhere."""
         folder = self.from_first(SharedMemory.new_folder() if self.is_first else None)
         memory = None
         try:

@@ -129,20 +129,16 @@ class Watch:
         for rank in set(range(self._size)) - {self._rank}:
             if not self._store.check([f"beat-{rank}"]):
                 continue
-            said = json.loads(self._store.get(f"beat-{rank}"))
-            last = self._others.get(rank)
+            said, last = json.loads(self._store.get(f"beat-{rank}")), self._others.get(rank)
+            silence = max(BUSY, self._patience) if said["doing"] == "busy" else self._patience
             if last is None or said["count"] != last.said["count"]:
                 moved = last is None or said["steps"] != last.said["steps"] or said["doing"] != "steps"
                 self._others[rank] = Beat(said, now, now if last is None or moved else last.steps_at)
-            elif said["doing"] != "left" and now - last.beats_at > self._silence(said["doing"]):
+            elif said["doing"] != "left" and now - last.beats_at > silence:
                 self._accuse(rank, DEAD)
             if said["doing"] == "steps" and now - self._others[rank].steps_at > self._patience:
                 slow = f"where steps may take longer, set {PATIENCE}"
                 self._accuse(rank, f" has made no step for {self._patience:g} s; {slow}.")
-
-    def _silence(self, doing: str) -> float:
-        """The seconds that a process may say nothing."""
-        return max(BUSY, self._patience) if doing == "busy" else self._patience
 
     def _accuse(self, rank: int, reason: str) -> None:
         """Name the process at fault in the store, unless one is named already."""
