@@ -14,7 +14,7 @@ from torch import Tensor
 from lemniscate.envs.backend import Backend
 from lemniscate.envs.conversion import flatten_observation, physical_action, row_of
 from lemniscate.envs.factory import make_one, make_vector, maker_of, makes_vector, sentences
-from lemniscate.envs.info import SUMMARIES, ActionMasks, measured, measures_of
+from lemniscate.envs.observations import SUMMARIES, ActionMasks, measured, measures_of
 from lemniscate.envs.spaces import action_kind, is_image, observation_parts
 from lemniscate.envs.vec_env import Stagger
 from lemniscate.errors import UserError

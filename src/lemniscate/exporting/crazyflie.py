@@ -5,7 +5,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from lemniscate.envs.interface import Interface, Quantity, Reference
+from lemniscate.envs.backend import Interface, Quantity, Reference
 from lemniscate.errors import UserError
 from lemniscate.exporting.c_code import TEMPLATES, comment, fill, literal
 from lemniscate.exporting.manifest import version

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from lemniscate.api.policy import Trained, TrainedPolicy, load, path_of
-from lemniscate.envs.interface import Interface
+from lemniscate.envs.backend import Interface
 from lemniscate.errors import UserError, is_installed
 from lemniscate.exporting.c_code import c_files
 from lemniscate.exporting.compiled import HostPolicy, host_compiler

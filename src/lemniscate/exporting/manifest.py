@@ -14,7 +14,7 @@ import numpy as np
 
 from lemniscate import algos
 from lemniscate.api.policy import TrainedPolicy
-from lemniscate.envs.interface import Interface, Quantity
+from lemniscate.envs.backend import Interface, Quantity
 from lemniscate.exporting.deployed import safe_action, safe_sentence
 from lemniscate.exporting.operations import Program
 from lemniscate.spec import Action, Box, Discrete, MultiDiscrete, ObservationPart, Spec
