@@ -36,7 +36,8 @@ class Condition:
     meaning: str
 
 
-TABLES: Mapping[str, Any] = tomllib.loads(files(__package__).joinpath("conditions.toml").read_text(encoding="utf-8"))
+_FILE = files("lemniscate.drones").joinpath("conditions.toml")
+TABLES: Mapping[str, Any] = tomllib.loads(_FILE.read_text(encoding="utf-8"))
 CONDITIONS = {name: Condition(**row) for name, row in TABLES["conditions"].items()}
 
 Ranges = Mapping[str, tuple[float, float]]
