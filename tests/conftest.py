@@ -16,6 +16,8 @@ import pytest
 import torch
 from hypothesis import settings
 
+import toy  # noqa: F401  (registers Countdown-v0 and Matching-v0)
+
 settings.register_profile("lemniscate", deadline=None, report_multiple_bugs=False)  # no test waits for a clock
 settings.load_profile("lemniscate")
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from tempfile import mkdtemp
 
 TESTS = Path(__file__).parent
-LEMNISCATE = "import sys, envpool, torch, torch.utils.tensorboard, lemniscate.cli.commands, lemniscate.api.plots; torch.set_num_threads(1)"
+LEMNISCATE = "import sys, envpool, torch, torch.utils.tensorboard, lemniscate.cli.commands, lemniscate.api.plots, toy; torch.set_num_threads(1)"
 
 SERVER = """
 import gc, json, os, signal, sys

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 
+import toy
 from forks import Forks
 from lemniscate.algos import ppo, reinforce, reppo, sac, trpo
 from lemniscate.data.replay import interact
 from lemniscate.data.rollout import collect
-from lemniscate.envs import toy
 from lemniscate.envs.gymnasium import GymnasiumBackend
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.spec import Box, Discrete, ObservationPart, Spec

@@ -14,10 +14,10 @@ from huggingface_hub.utils import _cache_assets
 
 import hub_server
 import lemniscate as lem
+import toy
 from conftest import tiny_fields
 from forks import LEMNISCATE, Forks, command
 from lemniscate.cli import main, parse
-from lemniscate.envs import toy
 from lemniscate.hub import repository as hub
 from lemniscate.run import checkpoint
 

@@ -68,7 +68,7 @@ import os, signal, sys
 without_unix()
 import lemniscate as lem
 small = dict(total_steps=64, num_envs=2, num_steps=16, minibatch_size=16, backend="gymnasium", progress=False)
-run = lem.train("ppo", "Countdown-v0", run="r", **small)
+run = lem.train("ppo", "CartPole-v1", run="r", **small)
 print(len(lem.evaluate(run.policy, episodes=2).returns), lem.load("r").step)
 """
 

@@ -178,7 +178,7 @@ def test_runs_end_with_the_sweep_that_is_killed_and_it_goes_on(tmp_path):
         "train",
         "ppo",
         "--env",
-        "Countdown-v0",
+        "toy:Countdown-v0",
         "--seeds",
         "1",
         "--run",
@@ -202,7 +202,7 @@ def test_ctrl_c_stops_every_run_and_the_sweep_goes_on_to_the_same_bits(tmp_path)
     path = tmp_path / "stopped"
     fields = [*SMALL, "--total-steps", "3_200", "--checkpoint-every", "512"]
     process = command(
-        "train", "ppo", "--env", "Countdown-v0", "--seeds", "1,2", "--run", path, *fields, before=ONE_CORE
+        "train", "ppo", "--env", "toy:Countdown-v0", "--seeds", "1,2", "--run", path, *fields, before=ONE_CORE
     )
     while len(read_metrics(path / "ppo-1")) < 20:
         assert process.poll() is None, process.communicate()

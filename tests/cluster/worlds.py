@@ -12,7 +12,7 @@ SHARDS = 4
 SMALL = {"num_envs": 8, "num_steps": 8, "hidden": (32,), "evaluate_episodes": 2, "compile": "off", "shards": SHARDS}
 KINDS = {
     # kind of run: algorithm, environment, fields; without "total_steps" it takes 1,600
-    "ppo-toy": ("ppo", "Matching-v0", {"minibatch_size": 16, "evaluate_every": 512}),
+    "ppo-toy": ("ppo", "toy:Matching-v0", {"minibatch_size": 16, "evaluate_every": 512}),
     "ppo": ("ppo", "CartPole-v1", {"epochs": 3, "minibatch_size": 16, "evaluate_every": 512}),
     "ppo-sync": ("ppo", "CartPole-v1", {"backend": "gymnasium", "minibatch_size": 16}),
     "ppo-async": ("ppo", "CartPole-v1", {"backend": "gymnasium-async", "minibatch_size": 16}),

@@ -6,8 +6,9 @@ import torch
 from gymnasium.vector import AutoresetMode
 
 import environments
+import toy
 from lemniscate.data.rollout import collect
-from lemniscate.envs import registry, toy
+from lemniscate.envs import registry
 from lemniscate.envs.backend import Backend
 from lemniscate.envs.gymnasium import GymnasiumBackend
 from lemniscate.errors import NonFiniteError, UserError

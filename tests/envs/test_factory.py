@@ -6,7 +6,8 @@ import pytest
 import torch
 
 import environments
-from lemniscate.envs import registry, toy
+import toy
+from lemniscate.envs import registry
 from lemniscate.errors import UserError
 
 

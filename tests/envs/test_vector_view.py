@@ -8,7 +8,7 @@ from gymnasium.wrappers import vector as wrappers
 
 import environments
 import lemniscate as lem
-from lemniscate.envs import toy
+import toy
 from lemniscate.envs.vector_view import NormalizeObservation
 
 

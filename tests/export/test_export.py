@@ -18,8 +18,8 @@ from lemniscate.api.policy import TrainedPolicy
 from lemniscate.cli import main
 from lemniscate.drones.vehicle import interface_of
 from lemniscate.envs import registry
+from lemniscate.envs.backend import Interface
 from lemniscate.envs.check import BAD
-from lemniscate.envs.interface import Interface
 from lemniscate.exporting import compiled, parity
 from lemniscate.exporting import export as exporting
 from lemniscate.exporting.c_code import c_files

@@ -11,7 +11,7 @@ from run.test_run import words_for
 CHOSEN = ("num_envs", "num_steps", "epochs", "minibatch_size", "hidden", "total_steps", "checkpoint_every", "compile")
 FIELDS = {**tiny_fields(), "total_steps": 24 * 32, "checkpoint_every": 6 * 32, "compile": "off", "hidden": (8,)}
 WORDS = [word for name, value in FIELDS.items() if name in CHOSEN for word in words_for(name, value)]
-TRAIN = ["train", "ppo", "--env", "Countdown-v0", *WORDS, "--run"]
+TRAIN = ["train", "ppo", "--env", "toy:Countdown-v0", *WORDS, "--run"]
 """24 updates, a checkpoint at each sixth, 3 kept"""
 
 

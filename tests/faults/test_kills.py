@@ -44,7 +44,7 @@ def words(kind, **changes):
     """The command that trains a run of this kind, with some fields changed, less its directory."""
     if kind == "sweep":
         fields = {"num_envs": 8, "num_steps": 32, "total_steps": 6_400, "checkpoint_every": 512, "hidden": (16,)}
-        given = ["train", "a2c,ppo", "--env", "Countdown-v0", "--seeds", "1", "--compile", "off"]
+        given = ["train", "a2c,ppo", "--env", "toy:Countdown-v0", "--seeds", "1", "--compile", "off"]
     else:
         algorithm, env, chosen = FIELDS[kind]
         small = tiny_off_policy(compile="off", log_every=16) if algorithm in OFF_POLICY else SMALL

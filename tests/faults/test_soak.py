@@ -24,7 +24,7 @@ KINDS = {
     "envpool-compiled": ("ddpg", "Pendulum-v1", {**OFF_POLICY, "compile": "on"}),
     "crazyflow": ("ppo", "DroneFigureEightTrajectory-v0", {**ON_POLICY, "num_envs": 64, "minibatch_size": 512}),
     "filmed": ("a2c", "CartPole-v1", {**ON_POLICY, "num_steps": 8, "video_every": 50_000, "keep_checkpoints": 1}),
-    "sweep": ("a2c,ppo", "Countdown-v0", {**ON_POLICY, "total_steps": 20_000}),
+    "sweep": ("a2c,ppo", "toy:Countdown-v0", {**ON_POLICY, "total_steps": 20_000}),
 }
 WARM_UP = 0.4
 """part of the time after which memory is to stand still"""
@@ -35,8 +35,9 @@ def start(kind, folder):
     words = [word for name, value in fields.items() for word in words_for(name, value)]
     seeds = ["--seeds", "1-500"] if kind == "sweep" else []
     command = [sys.executable, "-m", "lemniscate", "train", algorithm, "--env", env, *seeds, *words, "--run"]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}  # the tests' toy is on it
     with (folder / f"{kind}.txt").open("w") as said:
-        return subprocess.Popen([*command, str(folder / kind)], stdout=said, stderr=said)
+        return subprocess.Popen([*command, str(folder / kind)], stdout=said, stderr=said, env=environment)
 
 
 def sample(kind, process):

@@ -11,8 +11,8 @@ from nbclient import NotebookClient
 from test_run import final_hashes, history
 
 import lemniscate as lem
+import toy
 from conftest import tiny_fields, tiny_off_policy
-from lemniscate.envs import toy
 from lemniscate.report import curves
 from lemniscate.run import checkpoint
 from lemniscate.run.metrics import read_metrics

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 import lemniscate as lem
-from lemniscate.envs import registry, toy
+import toy
+from lemniscate.envs import registry
 from lemniscate.envs.backend import Summary
 from lemniscate.errors import UserError
 from lemniscate.nn.actor_critic import ActorCritic

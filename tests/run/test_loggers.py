@@ -189,8 +189,8 @@ def test_a_logger_of_ones_own_is_named_as_module_and_class(tmp_path, monkeypatch
 def test_seconds_spent_collecting_and_learning_are_logged(tmp_path, monkeypatch):
     """An environment that takes its time makes collecting slow; the rest of an update is learning."""
     import lemniscate as lem
+    import toy
     from conftest import tiny_fields
-    from lemniscate.envs import toy
 
     class Slow(toy.Countdown):
         def step(self, actions):

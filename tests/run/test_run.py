@@ -16,9 +16,9 @@ import pytest
 import torch
 
 import lemniscate as lem
+import toy
 from conftest import tiny_fields, tiny_off_policy
 from forks import command
-from lemniscate.envs import toy
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.run import checkpoint
 from lemniscate.run.evaluate import EVALUATION

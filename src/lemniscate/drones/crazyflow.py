@@ -12,7 +12,7 @@ import inspect
 import io
 import os
 import warnings
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +22,7 @@ import torch
 from lemniscate.drones.pd import GAINS, PD
 from lemniscate.drones.vehicle import CONDITIONS, DYNAMICS, Ranges, interface_of, read_ranges
 from lemniscate.envs.backend import Scene, Summary
-from lemniscate.envs.factory import model_warnings_off
+from lemniscate.envs.factory import model_warnings_off, sentences
 from lemniscate.envs.jax_backend import JaxBackend, Programs, jax_device
 from lemniscate.envs.spaces import action_kind
 from lemniscate.errors import UserError, missing_extra, unknown_name
@@ -115,8 +115,9 @@ class CrazyflowBackend(JaxBackend):
         _import()
         kwargs = dict(kwargs or {})
         _check(env, num_envs, kwargs)
-        with _sentence(env, kwargs):
-            shared, vectors = programs(env, num_envs, jax_device(device), tuple(sorted(_hashable(kwargs).items())))
+        with sentences(env, kwargs):
+            hashable = {name: tuple(value) if isinstance(value, list) else value for name, value in kwargs.items()}
+            shared, vectors = programs(env, num_envs, jax_device(device), tuple(sorted(hashable.items())))
         super().__init__(shared, num_envs, device, stagger=stagger)
         drones, flown = vectors[0], [one.dynamics for one in vectors]
         self.spec = spec_of(env, drones)
@@ -147,7 +148,7 @@ class CrazyflowBackend(JaxBackend):
         def make(other: str | None, ranges: Ranges) -> Drones:
             return make_drones(env, starts, "cpu", kwargs, other or dynamics, ranges)
 
-        with _sentence(env, kwargs):
+        with sentences(env, kwargs):
             return DroneProbe(make, DYNAMICS, read_ranges(kwargs), starts, partial(spec_of, env))
 
 
@@ -190,23 +191,7 @@ def _check(env_id: str, num_envs: int, kwargs: Mapping[str, Any]) -> None:
     read_ranges(kwargs)
 
 
-@contextlib.contextmanager
-def _sentence(env: str, kwargs: Mapping[str, Any]) -> Iterator[None]:
-    """An error that arguments cause in crazyflow, as a `UserError` that names them."""
-    try:
-        yield
-    except (TypeError, ValueError, KeyError, AssertionError) as error:
-        if not kwargs:
-            raise
-        raise UserError(f"{env} cannot be made with {kwargs}: {error}.") from error
-
-
 def dynamics_of(kwargs: Mapping[str, Any]) -> tuple[str, ...]:
     """The names of the dynamics among the arguments; none where crazyflow is to choose."""
     given = kwargs.get("dynamics")
     return () if given is None else (given,) if isinstance(given, str) else tuple(given)
-
-
-def _hashable(kwargs: Mapping[str, Any]) -> dict[str, Any]:
-    """The same arguments with tuples for lists."""
-    return {name: tuple(value) if isinstance(value, list) else value for name, value in kwargs.items()}

@@ -13,42 +13,22 @@ import numpy as np
 import torch
 
 from lemniscate.drones.drones import Drones
-from lemniscate.drones.vehicle import CONDITIONS, Ranges
+from lemniscate.drones.vehicle import CONDITIONS, TABLES, Ranges
 from lemniscate.envs.jax_backend import compile_side_by_side
-from lemniscate.envs.probe import PERCENT, Act, Axis, Flown, Tally
+from lemniscate.envs.probe import Act, Axis, Flown, Tally
 from lemniscate.spec import Spec
 
 MOST_FLIGHTS = 1024
 """flights side by side: as many as a cache holds, and few enough that batches of crashed drones end early"""
 
 
-def _condition(name: str, values: tuple[float, ...], unit: str, title: str, phrase: str, *shown: str | float) -> Axis:
-    """The axis of a condition in `air.CONDITIONS`."""
+def _axis(name: str, values: Sequence[float], shown: tuple[str, float] = ("", 1.0), **words: str) -> Axis:
+    """The axis of a condition in `conditions.toml`."""
     nominal = CONDITIONS[name].nominal
-    own = (str(shown[0]), float(shown[1])) if shown else (unit, 1.0)
-    return Axis(name, tuple(sorted({*values, nominal})), nominal, unit, title, phrase, own)
+    return Axis(name, tuple(sorted({*values, nominal})), nominal, shown=(shown[0], float(shown[1])), **words)
 
 
-_DELAYS = tuple(step / 500 for step in range(31))
-_TIMES = (0.5, 1.0, 2.0, 4.0)
-
-CONDITION_AXES = (
-    _condition("action_delay", _DELAYS, "s", "action delay", "{} of action delay", "ms", 1000),
-    _condition("observation_delay", _DELAYS, "s", "observation delay", "{} of observation delay", "ms", 1000),
-    _condition("mass", (0.7, 0.85, 0.95, 1.05, 1.15, 1.3), "", "mass", "{} mass"),
-    _condition("inertia", (0.5, 0.7, 0.9, 1.1, 1.3, 1.5), "", "inertia", "{} inertia"),
-    _condition("motor_gain", (0.8, 0.85, 0.9, 0.95, 1.05, 1.1), "", "motor gain", "{} motor gain"),
-    _condition("motor_time", (0.5, 0.75, 1.25, 1.5, 2.0), "", "motor time constant", "{} motor time constant"),
-    _condition("thrust_curve", (-0.1, -0.05, 0.05, 0.1), "1", "thrust curve", "a thrust curve bent by {}", *PERCENT),
-    _condition("wind", (0.05, 0.1, 0.15), "N", "wind", "{} of wind"),
-    _condition("gusts", (0.02, 0.05, 0.1), "N", "gusts", "gusts of {}"),
-    _condition("observation_noise", _TIMES, "NOISE", "sensor noise", "{} the usual sensor noise", "times", 1),
-    _condition("observation_bias", _TIMES, "NOISE", "sensor bias", "{} the usual sensor bias", "times", 1),
-    _condition("lost_actions", (0.01, 0.05, 0.1, 0.2), "1", "lost actions", "{} of the actions lost", *PERCENT),
-    _condition("jitter", (0.25, 0.5, 1.0), "periods", "jitter", "a jitter of {} of a control period", *PERCENT),
-    _condition("start_spread", (1.25, 1.5, 2.0), "", "start spread", "{} spread of the starts"),
-)
-"""NOISE is that of `lemniscate.drones.air`"""
+CONDITION_AXES = tuple(_axis(name, **row) for name, row in TABLES["axes"].items())
 
 Make = Callable[[str | None, Ranges], Drones]
 """the drones of as many flights as there are starts, in dynamics by name, or in those that are nominal"""
@@ -88,11 +68,16 @@ class DroneProbe:
 
     @cached_property
     def _programs(self) -> dict[str, _Programs]:
-        """The programs of each of the dynamics by its name: those of a batch, first, and those of a point."""
+        """The programs of each of the dynamics by its name: those of a batch, first, and those of a point.
+
+        Traced one after the other, since tracing may use one object, but compiled side by side.
+        """
         axis = self.axes[-1]
         others = [self._make(str(name), self._given) for name in axis.values if name != axis.nominal]
         every = [(self._drones, self._size), *((one, 1) for one in others)]
-        return dict(zip((one.dynamics for one, _ in every), _compiled(every), strict=True))
+        compiled = compile_side_by_side([program for one, points in every for program in _lowered(one, points)])
+        pairs = zip(every, compiled[::2], compiled[1::2], strict=True)
+        return {one.dynamics: _Programs(one, points, restart, step) for (one, points), restart, step in pairs}
 
     def fly(self, act: Act, seed: int) -> tuple[Flown, dict[str, list[Flown]]]:
         """All flights, see `Probe.fly`; those that are nominal with their actions."""
@@ -152,14 +137,6 @@ class _Programs:
         pairs = zip(tally.returns.split(starts), tally.terminated.split(starts), strict=True)
         actions = torch.stack(kept) if kept else None
         return [Flown(*pair, actions if i == 0 else None) for i, pair in enumerate(pairs)]
-
-
-def _compiled(drones: Sequence[tuple[Drones, int]]) -> list[_Programs]:
-    """The programs of several drones, each of so many points: traced one after the other, compiled side by side."""
-    lowered = [program for one, points in drones for program in _lowered(one, points)]
-    compiled = compile_side_by_side(lowered)
-    pairs = zip(compiled[::2], compiled[1::2], strict=True)
-    return [_Programs(one, points, *pair) for (one, points), pair in zip(drones, pairs, strict=True)]
 
 
 def _lowered(drones: Drones, points: int) -> tuple[Any, Any]:

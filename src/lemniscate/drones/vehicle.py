@@ -6,13 +6,15 @@ together are what is called domain randomization (Tobin et al. 2017, arXiv:1703.
 """
 
 import math
+import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib.resources import files
 from typing import Any
 
 import numpy as np
 
-from lemniscate.envs.interface import Interface, Quantity, Reference
+from lemniscate.envs.backend import Interface, Quantity, Reference
 from lemniscate.errors import UserError, shown
 
 DYNAMICS = ("so_rpy", "so_rpy_rotor", "so_rpy_rotor_drag", "first_principles")
@@ -34,23 +36,9 @@ class Condition:
     meaning: str
 
 
-CONDITIONS = {
-    "mass": Condition(1, 0.2, 3, "factor of the mass"),
-    "inertia": Condition(1, 0.1, 10, "factor of the moments of inertia: angular accelerations are divided by it"),
-    "motor_gain": Condition(1, 0.2, 3, "factor of the thrust that a command gives"),
-    "motor_time": Condition(1, 0.05, 20, "factor of the time in which rotors follow; so_rpy has no such time"),
-    "thrust_curve": Condition(0, -0.2, 0.2, "what half of the thrust range gives more, as a share of the range"),
-    "action_delay": Condition(0, 0, 0.2, "seconds until an action reaches the drone, in steps of 2 ms"),
-    "observation_delay": Condition(0, 0, 0.2, "seconds since an observation was true, in steps of 2 ms"),
-    "jitter": Condition(0, 0, 1, "most of a further delay of each action by itself, in control periods"),
-    "lost_actions": Condition(0, 0, 0.9, "probability that an action is lost, and the one before it goes on"),
-    "observation_noise": Condition(0, 0, 20, "normal noise of each observation, in multiples of NOISE"),
-    "observation_bias": Condition(0, 0, 20, "the same, but drawn once an episode"),
-    "wind": Condition(0, 0, 1, "newtons of a constant force from any horizontal direction"),
-    "gusts": Condition(0, 0, 1, "standard deviation of a force that changes within half a second, newtons an axis"),
-    "start_spread": Condition(1, 0, 3, "factor of how far from its middle, and how fast, a flight begins"),
-    "rotors": Condition(0, 0, 1, "rotor speed at the beginning, as a share of that of hovering; so_rpy has no rotors"),
-}
+_FILE = files("lemniscate.drones").joinpath("conditions.toml")
+TABLES: Mapping[str, Any] = tomllib.loads(_FILE.read_text(encoding="utf-8"))
+CONDITIONS = {name: Condition(**row) for name, row in TABLES["conditions"].items()}
 
 Ranges = Mapping[str, tuple[float, float]]
 

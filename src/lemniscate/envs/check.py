@@ -68,7 +68,7 @@ def each_finding(
 ) -> Iterator[Finding]:
     """The findings about an environment, one by one. Raises `UserError` if there is none of that name."""
     served_by = backend or registry.backend_for(env_id, wrappers)
-    registry.backend_class(served_by)  # an unknown backend is an error of the question, not a finding
+    cls = registry.backend_class(served_by)  # an unknown backend is an error of the question, not a finding
     try:
         with warnings.catch_warnings(action="ignore"):
             env = registry.make(env_id, NUM_ENVS, kwargs=env_kwargs, wrappers=wrappers, backend=backend)
@@ -77,7 +77,7 @@ def each_finding(
         return
     try:
         yield from _spaces(env, served_by)
-        if registry.can_wrap(served_by, env_id):
+        if cls.wraps(env_id):
             maker = maker_of(env_id)
             make = partial(make_one, maker, tuple(map(find_callable, wrappers)), **(env_kwargs or {}))
             yield from _gymnasium(make, env_id, wrapped=bool(wrappers) or not isinstance(maker, EnvSpec))
@@ -148,10 +148,11 @@ def _random_play(env: VecEnv) -> Iterator[Finding]:
     """Finite numbers, seeds, effects of actions, rows, ends, and whatever else random play shows."""
     try:
         started = time.perf_counter()
-        first = _play(env, seed=0)
+        first, lengths = _play(env, seed=0)
         speed = NUM_ENVS * STEPS / (time.perf_counter() - started)
-        repeated = _same(first, _play(env, seed=0))
-        other, acted = _play(env, seed=1), _play(env, seed=0, actions=8, steps=STEPS // 2)
+        repeated = _same(first, _play(env, seed=0)[0])
+        other, more_lengths = _play(env, seed=1)
+        acted, _ = _play(env, seed=0, actions=8, steps=STEPS // 2)
     except Exception as error:
         yield _raised(error, "It cannot be played with random actions")
         return
@@ -176,14 +177,14 @@ def _random_play(env: VecEnv) -> Iterator[Finding]:
     yield Finding(
         GOOD, f"{ended} episodes ended by its rules and {timed_out} by the time limit{resets if ignored else ''}."
     )
-    yield from _ends_and_rewards([first, other], env.spec)
+    yield from _ends_and_rewards([first, other], lengths + more_lengths, env.spec)
     if not env.spec.image:
         yield from _sizes(torch.cat([rollout.obs[rollout.valid] for rollout in (first, other)]), env.spec)
     yield Finding(GOOD, f"{speed:,.0f} steps a second ({NUM_ENVS} parallel environments, random actions).")
 
 
-def _play(env: VecEnv, seed: int, actions: int = 7, steps: int = STEPS) -> Rollout:
-    """Random play from a seed; its actions, up to masks, follow from the number `actions`."""
+def _play(env: VecEnv, seed: int, actions: int = 7, steps: int = STEPS) -> tuple[Rollout, list[int]]:
+    """Random play from a seed, and the lengths of its episodes; `actions` is the seed of the actions, up to masks."""
     rng = torch.Generator().manual_seed(actions)
     rows = []
     with warnings.catch_warnings(action="ignore"):  # Gymnasium's, of which we have told already
@@ -192,7 +193,7 @@ def _play(env: VecEnv, seed: int, actions: int = 7, steps: int = STEPS) -> Rollo
             obs, action = env.obs, random_action(env.spec, env.obs, rng)
             step = env.step(action)
             rows.append(Rollout(obs, action, step.reward, step.next_obs, step.terminated, step.truncated, step.valid))
-    return Rollout.stack(rows)
+    return Rollout.stack(rows), env.take_episodes().lengths
 
 
 def _same(one: Rollout, other: Rollout) -> bool:
@@ -201,13 +202,12 @@ def _same(one: Rollout, other: Rollout) -> bool:
     return all(torch.equal(getattr(one, name), getattr(other, name)) for name in outcome)
 
 
-def _ends_and_rewards(rollouts: Sequence[Rollout], spec: Spec) -> Iterator[Finding]:
+def _ends_and_rewards(rollouts: Sequence[Rollout], lengths: Sequence[int], spec: Spec) -> Iterator[Finding]:
     """Obstacles to learning in the ends of episodes and in the rewards, each with what to do."""
     rewards = torch.cat([rollout.reward[rollout.valid] for rollout in rollouts])
-    lengths = torch.cat([_episode_lengths(rollout) for rollout in rollouts])
     terminated = any(rollout.terminated.any() for rollout in rollouts)
     truncated = any(rollout.truncated.any() for rollout in rollouts)
-    alike = len(lengths) > 2 and bool((lengths == lengths[0]).all())
+    alike = len(lengths) > 2 and len(set(lengths)) == 1
     if spec.max_episode_steps is None and not truncated:
         yield Finding(
             NOTE,
@@ -217,7 +217,7 @@ def _ends_and_rewards(rollouts: Sequence[Rollout], spec: Spec) -> Iterator[Findi
     if alike and terminated and not truncated and lengths[0] > 1:
         yield Finding(
             NOTE,
-            f"Each of {len(lengths)} episodes terminated after exactly {int(lengths[0])} steps: if that is a time"
+            f"Each of {len(lengths)} episodes terminated after exactly {lengths[0]} steps: if that is a time"
             " limit, report it as truncated, or learning takes the value there to be 0.",
         )
     if (rewards == rewards[0]).all() and (rewards[0] == 0 or alike or not len(lengths)):
@@ -232,17 +232,6 @@ def _ends_and_rewards(rollouts: Sequence[Rollout], spec: Spec) -> Iterator[Findi
             f"Rewards reach {rewards.abs().max():.3g}, which makes the first value errors too large; train with"
             " --scale-rewards (on-policy), or pay less.",
         )
-
-
-def _episode_lengths(rollout: Rollout) -> Tensor:
-    """The lengths of the whole episodes of a rollout, in steps that were not ignored."""
-    lengths: list[Tensor] = []
-    running = torch.zeros(rollout.reward.shape[1])
-    for done, valid in zip(rollout.done, rollout.valid, strict=True):
-        running = running + valid
-        lengths.append(running[done & valid])
-        running = running * ~(done & valid)
-    return torch.cat(lengths)
 
 
 def _sizes(obs: Tensor, spec: Spec) -> Iterator[Finding]:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from lemniscate.envs.backend import Backend
 from lemniscate.envs.conversion import flatten_observation, physical_action, row_of
-from lemniscate.envs.info import SUCCESS, SUMMARIES, measured
+from lemniscate.envs.observations import SUCCESS, SUMMARIES, measured
 from lemniscate.envs.spaces import action_kind, is_image, observation_parts
 from lemniscate.envs.vec_env import Stagger
 from lemniscate.errors import UserError, is_installed, missing_extra, unknown_name
@@ -139,15 +139,9 @@ class EnvpoolBackend(Backend):
             obs = next_obs.copy()
             obs[reset_info["env_id"]] = self._flatten(fresh)
             here, self.counts = self._tensor(obs), self._tensor(self._stagger.counts)
-        return Step(
-            obs=here,
-            next_obs=there,
-            reward=self._tensor(reward.astype(np.float32)),
-            terminated=self._tensor(terminated),
-            truncated=self._tensor(truncated),
-            valid=self._valid,
-            measures=measured(info, SUCCESS, self.num_envs, self.device),
-        )
+        reward, ended, cut = map(self._tensor, (reward.astype(np.float32), terminated, truncated))
+        measures = measured(info, SUCCESS, self.num_envs, self.device)
+        return Step(here, there, reward, ended, cut, self._valid, measures)
 
     def close(self) -> None:
         """Let the pool's threads end."""

@@ -12,7 +12,6 @@ import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
-import lemniscate.envs.toy  # noqa: F401  (registers the toys)
 from lemniscate.envs.workers import WatchedVectorEnv, Worker
 from lemniscate.errors import UserError
 from lemniscate.system import named
@@ -98,11 +97,11 @@ def model_warnings_off() -> Iterator[None]:
 
 
 @contextmanager
-def sentences(env: str, kwargs: Mapping[str, Any] | None, wrappers: Sequence[str]) -> Iterator[None]:
+def sentences(env: str, kwargs: Mapping[str, Any] | None, wrappers: Sequence[str] = ()) -> Iterator[None]:
     """An error that the making of an environment raises, as a `UserError` that names the arguments and wrappers."""
     try:
         yield
-    except (gym.error.Error, ImportError, TypeError, ValueError, AssertionError) as error:
+    except (gym.error.Error, ImportError, TypeError, ValueError, KeyError, AssertionError) as error:
         given = [f"{name}={value!r}" for name, value in (kwargs or {}).items()] + list(wrappers)
         with_these = f" with {', '.join(given)}" if given else ""
         said = str(error).partition(" was raised from the environment creator")[0]

@@ -14,7 +14,7 @@ from torch import Tensor
 from lemniscate.envs.backend import Backend
 from lemniscate.envs.conversion import flatten_observation, physical_action, row_of
 from lemniscate.envs.factory import make_one, make_vector, maker_of, makes_vector, sentences
-from lemniscate.envs.info import SUMMARIES, ActionMasks, measured, measures_of
+from lemniscate.envs.observations import SUMMARIES, ActionMasks, measured, measures_of
 from lemniscate.envs.spaces import action_kind, is_image, observation_parts
 from lemniscate.envs.vec_env import Stagger
 from lemniscate.errors import UserError
@@ -140,9 +140,9 @@ class GymnasiumBackend(Backend):
         self.counts = self._tensor(self._stagger.counts)
         there = self._tensor(next_obs)
         here = there if obs is next_obs else self._tensor(obs)
-        columns = map(self._tensor, (reward.astype(np.float32), terminated, truncated, valid))
+        rewards, *flags = map(self._tensor, (reward.astype(np.float32), terminated, truncated, valid))
         measures = measured(info, self._measures, self.num_envs, self.device) if info else {}
-        return Step(here, there, *columns, measures)
+        return Step(here, there, rewards, *flags, measures=measures)
 
     def close(self) -> None:
         """Close the environments and their workers."""

@@ -1,8 +1,8 @@
 """The table of backends, and which of them runs an environment."""
 
-import importlib
 import re
 from collections.abc import Callable, Mapping, Sequence
+from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
 
 from lemniscate.errors import UserError, is_installed, shown, unknown_name
@@ -40,7 +40,7 @@ def backend_for(env: str, wrappers: Sequence[str] = ()) -> str:
     serving = [name for name in BACKENDS if backend_class(name).serves(env)]
     if not serving:
         raise unknown_name("environment", env, known_ids(), "one of your own is named as module:Class.")
-    return next((name for name in serving if not wrappers or can_wrap(name, env)), serving[0])
+    return next((name for name in serving if not wrappers or backend_class(name).wraps(env)), serving[0])
 
 
 def backend_class(backend: str) -> type["Backend"]:
@@ -51,8 +51,7 @@ def backend_class(backend: str) -> type["Backend"]:
     if not isinstance(backend, str) or (backend not in BACKENDS and ":" not in backend):
         raise unknown_name("backend", backend, BACKENDS)
     if backend in BACKENDS:
-        module, _, name = BACKENDS[backend].partition(":")
-        return getattr(importlib.import_module(module), name)
+        return resolve_name(BACKENDS[backend])
     return _require_backend(named.find(backend), backend)
 
 
@@ -66,11 +65,6 @@ def _require_backend(found: Any, name: str) -> type["Backend"]:
         what = f"lacks {', '.join(sorted(lacking))}" if isinstance(found, type) else "is not a class"
         raise UserError(f"{name} {what}: a backend is derived from lemniscate.envs.backend.Backend.")
     return found
-
-
-def can_wrap(backend: str, env: str) -> bool:
-    """Whether a backend makes `env` of single environments of Gymnasium's interface, which can be wrapped."""
-    return backend_class(backend).wraps(env)
 
 
 def for_evaluation(backend: str | None) -> str | None:

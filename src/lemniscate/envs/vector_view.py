@@ -109,19 +109,13 @@ class VectorView(VectorEnv):
         running = ~done if not self._next_step else np.ones_like(done)
         for name, values in measures.items():
             info |= {name: values, f"_{name}": given[name] & running}
-        if self._next_step or not done.any():
+        if self._next_step:
             return info
-        final_obs, last = np.full(self.num_envs, None, dtype=object), self._shaped(step.next_obs)
+        last = self._shaped(step.next_obs)
         for row in np.flatnonzero(done):
-            final_obs[row] = last[row]
-        final_info = measures | {f"_{name}": rows & done for name, rows in given.items()}
-        return {
-            **info,
-            "final_obs": final_obs,
-            "_final_obs": done,
-            "final_info": final_info,
-            "_final_info": done.copy(),
-        }
+            final = {name: values[row] for name, values in measures.items() if given[name][row]}
+            info = self._add_info(info, {"final_obs": last[row], "final_info": final}, int(row))
+        return info
 
     def _shaped(self, obs: torch.Tensor) -> np.ndarray:
         """A copy [N, …] in the shape of the space, without the action mask."""

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from lemniscate import __version__
-from lemniscate.envs.interface import Interface, Quantity
+from lemniscate.envs.backend import Interface, Quantity
 from lemniscate.errors import UserError
 from lemniscate.exporting.c_code import TEMPLATES, comment, literal
 from lemniscate.spec import Action, Box

@@ -14,7 +14,7 @@ import numpy as np
 
 from lemniscate import __version__, algos
 from lemniscate.api.policy import Trained, TrainedPolicy, load, path_of
-from lemniscate.envs.interface import Interface, Quantity
+from lemniscate.envs.backend import Interface, Quantity
 from lemniscate.errors import UserError, is_installed
 from lemniscate.exporting.c_code import c_files
 from lemniscate.exporting.compiled import HostPolicy, host_compiler

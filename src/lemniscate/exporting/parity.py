@@ -10,7 +10,7 @@ from torch import Tensor
 
 from lemniscate.api.policy import TrainedPolicy
 from lemniscate.envs import registry
-from lemniscate.envs.interface import Interface
+from lemniscate.envs.backend import Interface
 from lemniscate.errors import UserError, is_installed, missing_extra
 from lemniscate.exporting import compiled
 from lemniscate.exporting.compiled import HostPolicy

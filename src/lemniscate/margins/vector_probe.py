@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from lemniscate.envs import registry
-from lemniscate.envs.factory import make_one, maker_of
+from lemniscate.envs.factory import make_one, maker_of, makes_vector
 from lemniscate.envs.probe import CHANNEL_AXES, MODEL_AXES, Act, Axis, Flown, Tally, Value
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.run.seeding import derive, generator
@@ -116,7 +116,7 @@ class VectorProbe:
         self._wrappers = wrappers
         self._env = self._make()
         self.spec: Spec = self._env.spec
-        single = own and registry.can_wrap("gymnasium", env)
+        single = own and not makes_vector(maker_of(env))
         self.axes = _axes(self.spec, single and has_model(env, kwargs))
 
     def fly(self, act: Act, seed: int) -> tuple[Flown, dict[str, list[Flown]]]:

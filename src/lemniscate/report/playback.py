@@ -19,9 +19,8 @@ import numpy as np
 import torch
 from PIL import Image
 
-from lemniscate.envs import registry
-from lemniscate.envs.factory import make_one, maker_of, sentences
-from lemniscate.envs.info import SUMMARIES, measures_of
+from lemniscate.envs.factory import make_one, maker_of, makes_vector, sentences
+from lemniscate.envs.observations import SUMMARIES, measures_of
 from lemniscate.envs.registry import make_rendered
 from lemniscate.envs.vec_env import VecEnv, require_end
 from lemniscate.errors import UserError, is_installed, missing_extra, shown
@@ -85,7 +84,7 @@ def play_single(act: Act, arguments: dict[str, Any], episodes: int, seed: int, t
     name, kwargs, wrappers = (arguments[part] for part in ("env", "kwargs", "wrappers"))
     table = EpisodeTable(1, torch.device("cpu"))
     with sentences(name, kwargs, wrappers):
-        if not registry.can_wrap("gymnasium", name):
+        if makes_vector(maker_of(name)):
             raise UserError(f"{name} makes several environments at once, and a function acts in a single one.")
         env = make_one(maker_of(name), tuple(map(find_callable, wrappers)), **kwargs)
     try:

@@ -112,5 +112,5 @@ class Matching(ToyEnv):
         return (actions == self.secret).astype(float)
 
 
-gym.register("Countdown-v0", vector_entry_point="lemniscate.envs.toy:Countdown")
-gym.register("Matching-v0", vector_entry_point="lemniscate.envs.toy:Matching")
+gym.register("Countdown-v0", vector_entry_point="toy:Countdown")
+gym.register("Matching-v0", vector_entry_point="toy:Matching")
