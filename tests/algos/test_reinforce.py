@@ -20,7 +20,7 @@ def weighted(mode="DISABLED", **fields):
     config = small(reinforce, num_envs=3, episodes=2, gamma=0.9, **fields)
     state, env = begin(reinforce, config, mode, length=5)
     rollout = collect_episodes(env, state.policy, 2, state.rng.action)
-    batch = reinforce.weights(config, state.networks, rollout)[rollout.valid_rows[0]]
+    batch = reinforce.weights(config, state.networks, rollout)[rollout.valid_rows]
     return batch.obs[:, 2].long(), batch.advantage, state, batch
 
 
@@ -53,7 +53,7 @@ def test_a_baseline_keeps_the_mean_of_the_gradient_and_lowers_its_variance():
     for _ in range(100):
         rollout = draw()
         for kind, config in configs.items():
-            batch = reinforce.weights(config, state.networks, rollout)[rollout.valid_rows[0]]
+            batch = reinforce.weights(config, state.networks, rollout)[rollout.valid_rows]
             gradients[kind].append(slope(reinforce.policy_loss(config, state.policy, batch)[0], state.policy))
     none, *others = (torch.stack(gradient) for gradient in gradients.values())
     assert (none.mean(0).abs() > 4 * none.std(0) / 100**0.5).any()

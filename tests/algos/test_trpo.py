@@ -35,7 +35,7 @@ def test_the_kl_stays_within_its_bound_at_every_update(env, max_kl):
 def test_an_update_lowers_the_surrogate_loss():
     config, state, rollout = one_rollout(trpo, num_steps=32)
     batch = trpo.advantages(config, state.networks, rollout)
-    metrics = trpo.improve(config, state, [batch], [batch.obs])
+    metrics = trpo.improve(config, state, batch, batch.obs)
     assert metrics["step_fraction"] > 0
     assert metrics["losses/policy"] < 0  # it is 0 at the start: standardized advantages
 
@@ -43,7 +43,7 @@ def test_an_update_lowers_the_surrogate_loss():
 def stepped(config, state, batch, start, fisher_obs=None):
     """The parameters of the policy after one step from `start`."""
     state.parameters.vector.copy_(start)
-    trpo.improve(config, state, [batch], [batch.obs if fisher_obs is None else fisher_obs])
+    trpo.improve(config, state, batch, batch.obs if fisher_obs is None else fisher_obs)
     return state.parameters.vector.clone()
 
 
@@ -67,14 +67,14 @@ def test_a_step_that_is_too_long_is_shortened_until_the_kl_is_within_its_bound(a
     first = next(j for j in range(20) if kl[j] <= 1e-4)
     assert 2 < first < 10
     state.parameters.vector.copy_(start)
-    fraction = trpo.improve(config, state, [batch], [fisher_obs])["step_fraction"]
+    fraction = trpo.improve(config, state, batch, fisher_obs)["step_fraction"]
     assert fraction == (0.5**first if first < attempts else 0)
 
 
 def test_a_step_that_is_not_taken_leaves_the_policy_bit_for_bit():
     config, state, batch, fisher_obs = too_long(attempts=1)
     before = copy_of(state.policy.parameters())
-    assert trpo.improve(config, state, [batch], [fisher_obs])["step_fraction"] == 0
+    assert trpo.improve(config, state, batch, fisher_obs)["step_fraction"] == 0
     assert all(equal(before, state.policy.parameters()))
 
 
@@ -83,7 +83,7 @@ def test_without_the_line_search_it_is_the_natural_policy_gradient():
     fields = {"line_search": False, "damping": 1e-3, "cg_iterations": 30, "max_kl": 1e-4, "hidden": (4,)}
     config, state, rollout = one_rollout(trpo, num_steps=64, **fields)
     batch, before = trpo.advantages(config, state.networks, rollout), state.parameters.vector.clone()
-    metrics = trpo.improve(config, state, [batch], [batch.obs])
+    metrics = trpo.improve(config, state, batch, batch.obs)
     assert metrics["step_fraction"] == 1
     assert metrics["kl"].item() == pytest.approx(1e-4, rel=0.2)
     uphill = dataclasses.replace(batch, advantage=-batch.advantage)
@@ -104,7 +104,7 @@ def test_the_steps_of_policy_and_value_leave_each_other_alone():
     assert len(state.parameters.vector) == sum(p.numel() for p in state.policy.parameters())
     batch = trpo.advantages(config, state.networks, rollout)
     value = copy_of(state.networks.value.parameters())
-    trpo.improve(config, state, [batch], [batch.obs])
+    trpo.improve(config, state, batch, batch.obs)
     assert all(equal(value, state.networks.value.parameters()))
     policy = copy_of(state.policy.parameters())
     state.critic_optimizer.learning_rate = 0.1

@@ -34,7 +34,7 @@ def test_each_step_is_the_same(env_id):
     own = gym.make(env_id).unwrapped
     own.reset(seed=0)
     hidden, nq, nv = MUJOCO[env_id], own.model.nq, own.model.nv
-    raw = EnvpoolBackend(env_id, 1, CPU)._build((3,))
+    raw = EnvpoolBackend(env_id, 1, CPU)._build(3)
     obs, _ = raw.reset()
     rng = np.random.default_rng(0)
     differences, ends = [], 0
@@ -59,7 +59,7 @@ def test_each_step_is_the_same(env_id):
 def test_cart_pole_steps_the_same():
     own = gym.make("CartPole-v1").unwrapped
     own.reset(seed=0)
-    pool = EnvpoolBackend("CartPole-v1", 1, CPU)._build((3,))
+    pool = EnvpoolBackend("CartPole-v1", 1, CPU)._build(3)
     obs, _ = pool.reset()
     for t in range(200):
         own.state, own.steps_beyond_terminated = tuple(obs[0].astype(np.float64)), None

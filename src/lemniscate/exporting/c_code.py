@@ -13,10 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
-from lemniscate import __version__
 from lemniscate.exporting.deployed import safe_action, safe_sentence
 from lemniscate.exporting.operations import ELEMENTWISE, VIEWS, Operand, Operation, Program, Value
 from lemniscate.spec import Action, Discrete
+from lemniscate.system.machine import version
 from lemniscate.system.templates import filled
 
 TEMPLATES = Path(__file__).parent / "templates"
@@ -55,7 +55,7 @@ def c_files(
     context = {
         "title": title,
         "origin": origin,
-        "version": __version__,
+        "version": version(),
         "period": None if period is None else np.float32(period),
         "program": program,
         "action": action,

@@ -4,11 +4,11 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from lemniscate import __version__
 from lemniscate.envs.backend import Interface, Quantity
 from lemniscate.errors import UserError
 from lemniscate.exporting.c_code import TEMPLATES, comment, literal
 from lemniscate.spec import Action, Box
+from lemniscate.system.machine import version
 from lemniscate.system.templates import filled
 
 COMMANDS = ("roll", "pitch", "yaw", "thrust")
@@ -60,7 +60,7 @@ def crazyflie_files(
     sensed = {i: SENSED[name] for i, name in enumerate(names) if name in SENSED}
     context = {
         "title": title,
-        "version": __version__,
+        "version": version(),
         "rate": rate,
         "action": action,
         "interface": interface,

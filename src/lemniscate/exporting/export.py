@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from lemniscate import __version__, algos
+from lemniscate import algos
 from lemniscate.api.policy import Trained, TrainedPolicy, load, path_of
 from lemniscate.envs.backend import Interface, Quantity
 from lemniscate.errors import UserError, is_installed
@@ -28,6 +28,7 @@ from lemniscate.hub.repository import is_address
 from lemniscate.spec import Action, Box, Discrete, MultiDiscrete, ObservationPart, Spec
 from lemniscate.system.console import say
 from lemniscate.system.files import DamagedFileError, read_json, replace_directory, replace_file, write_json
+from lemniscate.system.machine import version
 
 MANIFEST, PARITY, ONNX = "manifest.json", "parity.json", "policy.onnx"
 CRAZYFLIE = "crazyflie"
@@ -168,7 +169,7 @@ def manifest(
         "algorithm": algorithm(policy),
         "step": policy.step,
         "seed": policy.config.seed,
-        "lemniscate": __version__,
+        "lemniscate": version(),
         "commit": commit(),
         "control_period_s": interface.period,
         "delay_s": interface.delay,

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from lemniscate import __version__
 from lemniscate.exporting.deployed import Act, as_rows
 from lemniscate.exporting.operations import Operand, Operation, Program, Value
+from lemniscate.system.machine import version
 
 OPSET, IR = 18, 10
 """of 2022 and 2024, so that runtimes that are some years old can read the model"""
@@ -36,7 +36,7 @@ def onnx_model(program: Program, facts: Mapping[str, Any]) -> bytes:
     graph = helper.make_graph(writer.nodes, "policy", [ends["obs"]], [ends["action"]], initializer=writer.initializers)
     opset = helper.make_opsetid("", OPSET)
     model = helper.make_model(graph, opset_imports=[opset], ir_version=IR, producer_name="lemniscate")
-    model.producer_version = __version__
+    model.producer_version = version()
     helper.set_model_props(model, {name: json.dumps(value) for name, value in facts.items()})
     onnx.checker.check_model(model, full_check=True)
     return model.SerializeToString()

@@ -9,7 +9,6 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor
 
-from lemniscate import __version__
 from lemniscate.api.policy import Trained, TrainedPolicy, load, path_of
 from lemniscate.envs import registry
 from lemniscate.envs.probe import Act, Probe
@@ -28,6 +27,7 @@ from lemniscate.run.evaluate import EVALUATION
 from lemniscate.run.seeding import derive
 from lemniscate.system.console import say
 from lemniscate.system.files import DamagedFileError, read_json, write_json
+from lemniscate.system.machine import version
 
 FORMAT = 1
 Starts = Annotated[int, Range(4, 1000)]
@@ -68,7 +68,7 @@ class Preflight:
         """One object of JSON; a margin is the deviation from the nominal value, on each side that was tried."""
         own = {name: value for name, value in vars(self).items() if name not in ("axes", "sentences")}
         axes = {one.axis.name: one.to_json() for one in self.axes}
-        origin = {"lemniscate": __version__, "commit": commit()}
+        origin = {"lemniscate": version(), "commit": commit()}
         return {"preflight": FORMAT, **own, "axes": axes, "sentences": list(self.sentences), **origin}
 
 

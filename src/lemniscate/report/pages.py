@@ -19,7 +19,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from lemniscate import __version__, algos
+from lemniscate import algos
 from lemniscate.errors import UserError, resume_line
 from lemniscate.report import advice, curves
 from lemniscate.report.playback import FILMS
@@ -369,7 +369,7 @@ def _write_page(file: Path, template: str, **context: Any) -> Path:
     versions = [f"{package} {version(package)}" for package in ("torch", "numpy", "gymnasium")]
     machine = f"Python {platform.python_version()} on {platform.system()} {platform.machine()}"
     date = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
-    written = f"Written on {date} by lemniscate {__version__}, {', '.join(versions)}, {machine}."
+    written = f"Written on {date} by lemniscate {version('lemniscate')}, {', '.join(versions)}, {machine}."
     page = filled(TEMPLATES / template, FILTERS, written=written, **context)
     file.parent.mkdir(parents=True, exist_ok=True)
     replace_file(file, page.encode("utf-8", errors="xmlcharrefreplace"))

@@ -3,6 +3,7 @@
 import os
 import sys
 from collections.abc import Mapping
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,11 @@ import torch
 from lemniscate.errors import UserError
 
 CGROUPS = Path("/sys/fs/cgroup")
+
+
+def version() -> str:
+    """The version of lemniscate that is installed."""
+    return metadata.version("lemniscate")
 
 
 def require_free(what: str, parts: Mapping[str, int], fields: Mapping[str, Any], device: torch.device | None) -> None:
