@@ -47,7 +47,7 @@ def test_a_baseline_keeps_the_mean_of_the_gradient_and_lowers_its_variance():
     for _ in range(20):  # V learns what a guess is worth
         rollout = draw()
         batch, rows = reinforce.weights(configs["value"], state.networks, rollout), rollout.valid_rows
-        minibatches = epoch_minibatches(rows, len(rows[0]), 16, state.rng.minibatch)
+        minibatches = epoch_minibatches(rows, len(rows), 16, state.rng.minibatch)
         reinforce.learn(configs["value"], state, batch, minibatches, update_policy=False)
     gradients = {kind: [] for kind in configs}
     for _ in range(100):
