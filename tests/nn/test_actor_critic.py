@@ -7,7 +7,7 @@ from helpers import equal, spec_of
 from lemniscate.errors import UserError
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.actor_q import ActorQ, SoftActorQ
-from lemniscate.nn.bounded_policies import DeterministicPolicy, SquashedGaussianPolicy
+from lemniscate.nn.bounded import DeterministicPolicy, SquashedGaussianPolicy
 from lemniscate.nn.networks import Layers
 from lemniscate.nn.normalizer import NoNorm, RunningNorm
 

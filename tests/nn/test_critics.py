@@ -10,8 +10,8 @@ from helpers import spec_of
 from lemniscate.nn.actor_categorical_q import ActorCategoricalQ
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.actor_q import ActorQ
+from lemniscate.nn.bounded import Temperature
 from lemniscate.nn.networks import Layers
-from lemniscate.nn.q_values import Temperature
 
 
 def test_a_value_is_one_number_for_each_observation():

@@ -13,8 +13,8 @@ from torch import Tensor
 from lemniscate.data.replay import interact
 from lemniscate.maths import means, polyak, td_target, value_loss
 from lemniscate.nn.actor_q import ActorQ
+from lemniscate.nn.bounded import Critics
 from lemniscate.nn.policies import Policy
-from lemniscate.nn.q_values import Critics
 from lemniscate.optim.adam import Adam, linear
 from lemniscate.run.config import NonNegative
 from lemniscate.run.off_policy import OffPolicyConfig, OffPolicyState

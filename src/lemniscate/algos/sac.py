@@ -14,10 +14,10 @@ from lemniscate.data.replay import interact
 from lemniscate.errors import UserError
 from lemniscate.maths import means, polyak, td_target
 from lemniscate.nn.actor_q import SoftActorQ
+from lemniscate.nn.bounded import Critics, Temperature
 from lemniscate.nn.categorical_q import Bins, normalize_units
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.nn.policies import Policy
-from lemniscate.nn.q_values import Critics, Temperature
 from lemniscate.optim.adam import Adam, linear
 from lemniscate.run.config import Finite, Positive
 from lemniscate.run.off_policy import OffPolicyConfig, OffPolicyState

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from lemniscate.nn.actor_critic import encoder_of, network_of, normalizer_of
-from lemniscate.nn.bounded_policies import SquashedGaussianPolicy
+from lemniscate.nn.bounded import SquashedGaussianPolicy
 from lemniscate.nn.categorical_q import BINS, Bins, CategoricalQ
 from lemniscate.nn.networks import Layers
 from lemniscate.spec import Spec

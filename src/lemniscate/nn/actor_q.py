@@ -7,12 +7,11 @@ import torch
 from torch import Generator, Tensor, nn
 
 from lemniscate.nn.actor_critic import encoder_of, network_of, normalizer_of
-from lemniscate.nn.bounded_policies import DeterministicPolicy, SquashedGaussianPolicy
+from lemniscate.nn.bounded import Critics, DeterministicPolicy, QValue, SquashedGaussianPolicy, Temperature
 from lemniscate.nn.categorical_q import BINS, Bins, CategoricalQ
 from lemniscate.nn.networks import Layers
 from lemniscate.nn.normalizer import NoNorm
 from lemniscate.nn.policies import Policy
-from lemniscate.nn.q_values import Critics, QValue, Temperature
 from lemniscate.spec import Spec
 
 Module = TypeVar("Module", bound=nn.Module)

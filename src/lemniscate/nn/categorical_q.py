@@ -4,8 +4,8 @@ import torch
 from torch import Tensor, nn
 
 from lemniscate.maths import cross_entropy, hl_gauss
+from lemniscate.nn.bounded import QValue
 from lemniscate.nn.normalizer import NoNorm, RewardScale, WideBuffers
-from lemniscate.nn.q_values import QValue
 
 BINS = 101
 """K, the number of bins of a Q that is a distribution"""

@@ -1,13 +1,55 @@
-"""Values of actions, Q(s, a), behind the policy's observation normalizer; and the price of entropy."""
+"""Networks of the algorithms that learn from a replay buffer: policies of bounded continuous actions, and Q(s, a)."""
 
 import math
 from collections.abc import Iterable, Sequence
 
 import torch
-from torch import Tensor, nn
+from torch import Generator, Tensor, nn
 
-from lemniscate.maths import value_loss
+from lemniscate.maths import Deterministic, SquashedGaussian, value_loss
 from lemniscate.nn.normalizer import NoNorm, with_privileged
+from lemniscate.nn.policies import Policy
+
+
+class DeterministicPolicy(Policy):
+    """One action at each observation, tanh of a network: in [-1, 1]^A, which the env floor maps onto its bounds."""
+
+    def __init__(self, normalizer: NoNorm, net: nn.Module, size: int) -> None:
+        super().__init__(normalizer, net)
+        self.size = size
+
+    def forward(self, obs: Tensor) -> Deterministic:
+        """[B, O] to [B, A]."""
+        return Deterministic(torch.tanh(self.net(self.normalizer(obs))))
+
+    def draw_noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
+        """Zeros, [*shape, A]: the policy has no randomness of its own."""
+        return torch.zeros(*shape, self.size, device=generator.device)
+
+
+class SquashedGaussianPolicy(Policy):
+    """tanh(u), u ~ N(μ(s), σ(s)²); log σ is kept in [-5, 2], softly, as tanh moves from one end to the other.
+
+    Args:
+        normalizer: of observations.
+        net: from normalized observations to μ and what log σ is made of, [B, 2 A].
+        size: A.
+        initial_log_std: log σ, inside (-5, 2), where the network says 0, as it does at first.
+    """
+
+    def __init__(self, normalizer: NoNorm, net: nn.Module, size: int, initial_log_std: float = -1.5) -> None:
+        super().__init__(normalizer, net)
+        self.size = size
+        self._offset = math.atanh((initial_log_std + 5) / 3.5 - 1)
+
+    def forward(self, obs: Tensor) -> SquashedGaussian:
+        """[B, O] to μ and log σ, [B, A] each."""
+        mean, log_std = self.net(self.normalizer(obs)).chunk(2, dim=-1)
+        return SquashedGaussian(mean, -5 + 3.5 * (torch.tanh(log_std + self._offset) + 1))
+
+    def draw_noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
+        """Standard normal, [*shape, A]."""
+        return torch.randn(*shape, self.size, generator=generator, device=generator.device)
 
 
 class QValue(nn.Module):
