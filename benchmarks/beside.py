@@ -2,9 +2,11 @@
 
     git worktree add ../old 42897e5
     .venv/bin/python benchmarks/beside.py ../old
+    .venv/bin/python benchmarks/beside.py ../old --algorithm sac
 
-Two processes take turns of four updates, PPO with its preset, compiled, so that both see the same machine. Printed are
-the median and the quartiles of this checkout's time over the other's, in all, in `collect` and in `update`.
+Two processes train with the preset, compiled, and take turns of four logged lines, so that both see the same machine.
+Printed are the median and the quartiles of this checkout's time over the other's, in all, in `time/collect` and in
+`time/learn` of the metrics. A callback makes them wait, so any two versions can be compared that have callbacks.
 """
 
 import argparse
@@ -17,74 +19,72 @@ from statistics import median, quantiles
 ROOT = Path(__file__).parents[1]
 LOOP = """
 import sys
-from time import perf_counter as now
-
-import torch
+import tempfile
 
 import lemniscate as lem
-from lemniscate.algos import ppo
-from lemniscate.data.rollout import collect
-from lemniscate.envs import registry
 
-torch.set_num_threads(1)
-torch.manual_seed(0)
-config = lem.config_for("ppo", sys.argv[1])
-env = registry.make(sys.argv[1], config.num_envs)
-env.restart(0)
-state = ppo.init(config, env.spec, torch.device("cpu"))
-state.compile()
+lines = []
 
 
-def once():
-    began = now()
-    rollout = collect(env, state.networks.policy, config.num_steps, state.rng.action)
-    collected = now()
-    ppo.update(config, state, rollout)
-    state.step = 0
-    return collected - began, now() - collected
+def take_turns(step, metrics, policy):
+    lines.append((metrics["time/collect"], metrics["time/learn"]))
+    if len(lines) < 4:
+        return False
+    print(*map(sum, zip(*lines)), flush=True)
+    lines.clear()
+    return not sys.stdin.readline()
 
 
-for _ in range(6):
-    once()
-print("ready", flush=True)
-for _ in sys.stdin:
-    print(*map(sum, zip(*(once() for _ in range(4)))), flush=True)
+with tempfile.TemporaryDirectory() as folder:
+    settings = {"checkpoint_every": 10**9, "total_steps": 10**8, "buffer_size": 10**5, "learning_starts": 1000}
+    given = {name: value for name, value in settings.items() if hasattr(lem.config_for(sys.argv[1], sys.argv[2]), name)}
+    callbacks = {"callbacks": take_turns, "progress": False, "run": folder + "/run"}
+    lem.train(sys.argv[1], sys.argv[2], compile="on", threads=1, **given, **callbacks)
 """
+WARM_UP = 3
+"""turns that are not counted: compilation, and what SAC collects before it learns"""
 
 
-def begin(source, env):
-    """A process that has compiled its loop, and runs four updates for each line it reads."""
+def begin(source, algorithm, env):
+    """A process that trains four lines of metrics for each line it reads."""
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-    return subprocess.Popen([sys.executable, "-c", LOOP, env], env={**os.environ, "PYTHONPATH": str(source)}, **pipes)
+    command = [sys.executable, "-c", LOOP, algorithm, env]
+    process = subprocess.Popen(command, env={**os.environ, "PYTHONPATH": str(source)}, **pipes)
+    process.stdout.readline()
+    return process
 
 
 def turn(process):
-    """Seconds in `collect` and in `update`."""
+    """Seconds in `collect` and in `learn`."""
     process.stdin.write("\n")
     process.stdin.flush()
-    return [float(word) for word in process.stdout.readline().split()]
+    words = process.stdout.readline().split()
+    if not words:
+        raise SystemExit("One of the two has ended; see above.")
+    return [float(word) for word in words]
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("other", type=Path, help="the other checkout")
+    parser.add_argument("--algorithm", default="ppo")
     parser.add_argument("--env", default="HalfCheetah-v5")
     parser.add_argument("--turns", type=int, default=60)
     given = parser.parse_args()
-    here, there = (begin(checkout.resolve() / "src", given.env) for checkout in (ROOT, given.other))
-    if [process.stdout.readline().strip() for process in (here, there)] != ["ready", "ready"]:
-        raise SystemExit("One of the two did not begin; see above.")
-    ratios = {"all": [], "collect": [], "update": []}
-    for k in range(given.turns):
+    here, there = (begin(it.resolve() / "src", given.algorithm, given.env) for it in (ROOT, given.other))
+    ratios = {"all": [], "collect": [], "learn": []}
+    for k in range(-WARM_UP, given.turns):
         order = (here, there) if k % 2 else (there, here)
         seconds = {process: turn(process) for process in order}
-        for name, of in (("all", sum), ("collect", lambda both: both[0]), ("update", lambda both: both[1])):
-            ratios[name].append(of(seconds[here]) / of(seconds[there]))
+        for name, of in (("all", sum), ("collect", lambda both: both[0]), ("learn", lambda both: both[1])):
+            if k >= 0:
+                ratios[name].append(of(seconds[here]) / of(seconds[there]))
     for name, found in ratios.items():
         first, _, third = quantiles(found, n=4)
         print(f"{name}: {median(found):.3f} of the other's time ({first:.3f} to {third:.3f})")
     for process in (here, there):
-        process.kill()
+        process.stdin.close()
+        process.wait()
 
 
 if __name__ == "__main__":

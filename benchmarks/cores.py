@@ -95,6 +95,8 @@ def threads(rounds):
     """Milliseconds of a compiled gradient step of PPO, HalfCheetah's sizes, on one thread and on two."""
     from lemniscate.algos import ppo
     from lemniscate.data.rollout import epoch_minibatches
+    from lemniscate.optim.compiled import Compiler
+    from lemniscate.system.world import ALONE
 
     spec, rollout = random_rollout(64)
 
@@ -111,10 +113,10 @@ def threads(rounds):
             torch.set_num_threads(count)
             config = ppo.Config(num_envs=64, num_steps=128, minibatch_size=rows)
             state = ppo.init(config, spec, torch.device("cpu"))
-            state.compile()
+            state.prepare(ALONE, Compiler())
             state.optimizer.learning_rate = 3e-4
             batch = ppo.advantages(config, state.networks, rollout)
-            minibatches = epoch_minibatches([torch.arange(8192)], 8192, rows, state.rng.minibatch)
+            minibatches = epoch_minibatches(torch.arange(8192), 8192, rows, state.rng.minibatch)
             ways[f"threads: {count}"] = partial(milliseconds, state, config, batch, minibatches, count)
             ways[f"threads: {count}"]()
         print(f"{rows} rows, milliseconds of a gradient step")

@@ -173,6 +173,8 @@ def parts(rounds, stamp):
     from lemniscate.algos import ppo
     from lemniscate.data.rollout import epoch_minibatches
     from lemniscate.maths import gae, means
+    from lemniscate.optim.compiled import Compiler
+    from lemniscate.system.world import ALONE
 
     torch.set_num_threads(1)
     config, device = ppo.Config(**SHARED), torch.device("cpu")
@@ -189,11 +191,11 @@ def parts(rounds, stamp):
     for how in ("eager", "compiled"):
         state = ppo.init(config, spec, device)
         if how == "compiled":
-            state.compile()
+            state.prepare(ALONE, Compiler())
         state.optimizer.learning_rate = 3e-4
         networks, noise = state.networks, state.policy.draw_noise((16,), state.rng.action)
         batch = ppo.advantages(config, networks, rollout)
-        minibatches = epoch_minibatches([torch.arange(2048)], 2048, 64, state.rng.minibatch)
+        minibatches = epoch_minibatches(torch.arange(2048), 2048, 64, state.rng.minibatch)
         with torch.no_grad():
             act = milliseconds(lambda: networks.policy.act(rollout.obs[0], noise), 500)  # noqa: B023
         rows = batch, minibatches, batch.advantage[minibatches]
