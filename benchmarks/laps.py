@@ -50,13 +50,14 @@ def mellinger(lap):
     """The same of crazyflow's Mellinger controller at 100 Hz, told position, velocity and acceleration at 50 Hz."""
     from crazyflow.sim import Sim
 
+    from lemniscate.drones.crazyflow import programs
     from lemniscate.envs import registry
     from lemniscate.run.evaluate import EVALUATION
     from lemniscate.run.seeding import derive
 
     env = registry.make(ENV, STARTS, kwargs=arguments(lap))
     obs = env.restart(derive(0, EVALUATION, 0)).numpy()
-    drones = env.backend._drones
+    _, (drones,) = programs(ENV, STARTS, "cpu", tuple(sorted(arguments(lap).items())))
     points = np.asarray(drones.env.trajectory, np.float32)
     sim = Sim(n_worlds=STARTS, drone=drones.env.sim.drone, dynamics=drones.dynamics, control="state")
     states = sim.data.states.replace(pos=obs[:, None, 0:3], vel=obs[:, None, 7:10])
