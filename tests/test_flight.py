@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import lemniscate as lem
-from lemniscate.api import results
+from lemniscate.api import plots
 from lemniscate.envs.backend import Scene
 from lemniscate.envs.gymnasium import GymnasiumBackend
 from lemniscate.report import curves, flight, playback
@@ -89,7 +89,7 @@ def test_a_scene_that_is_known_when_environments_are_made_is_drawn_and_they_are_
 
 def test_the_film_of_a_report_is_named_before_its_page(run, drawn, monkeypatch):
     monkeypatch.setattr(curves, "plot_runs", lambda *_, **__: [])
-    assert [file.name for file in results.draw_run(run, film=True)[-2:]] == ["flight.gif", "report.html"]
+    assert [file.name for file in plots.draw_run(run, film=True)[-2:]] == ["flight.gif", "report.html"]
 
 
 def test_a_flight_is_drawn_wherever_it_is():
