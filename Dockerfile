@@ -1,6 +1,6 @@
 # lemniscate on the CPU:
 #   docker build --tag lemniscate .
-#   docker run --rm --user "$(id -u)" --volume "$PWD/runs:/work/runs" lemniscate train ppo --env CartPole-v1 --run runs/cartpole
+#   docker run --rm --user "$(id -u)" --volume "$PWD/runs:/data/runs" lemniscate train ppo --env CartPole-v1 --run runs/cartpole
 FROM python:3.12-slim-bookworm
 
 # g++ is what torch.compile calls in long runs, swig what Box2D is built with; OSMesa draws MuJoCo without a screen.
@@ -17,10 +17,10 @@ COPY . /src
 RUN pip install "/src[box2d,classic-control,drone,envpool,mujoco,video]" && rm -rf /src
 
 # Any user may be chosen with --user: caches go where everyone may write.
-RUN useradd --uid 1000 lemniscate && mkdir --parents /work/runs && chmod 777 /work /work/runs
+RUN useradd --uid 1000 lemniscate && mkdir --parents /data/runs && chmod 777 /data /data/runs
 ENV HOME=/tmp USER=lemniscate
 USER lemniscate
-WORKDIR /work
+WORKDIR /data
 
 ENTRYPOINT ["lemniscate"]
 CMD ["--help"]

@@ -105,7 +105,7 @@ def checked(path):
     assert all(finding.sentence.endswith(".") for finding in each_finding(path))
 
 
-@pytest.mark.parametrize("times", [pytest.param(often(1500), marks=pytest.mark.faults), 60])
+@pytest.mark.parametrize("times", [pytest.param(often(1500), marks=pytest.mark.faults), 40])
 def test_records_of_odd_content_and_right_hashes_are_a_sentence(run, tmp_path, capsys, times):
     names = ["config.json", "final.json", f"{STEP}/state.json", f"{STEP}/manifest.json"]
     refused = 0
