@@ -38,7 +38,7 @@ class TrainedPolicy:
 
     @cached_property
     def _noise(self) -> torch.Generator:
-        """Of the actions that are drawn."""
+        """The generator of the noise of sampled actions."""
         return generator(self.config.seed, torch.device("cpu"), 4)
 
     @property

@@ -82,7 +82,7 @@ def algorithm_parser(command: str, algorithm: str) -> Parser:
 
 
 def _kind(hint: Any) -> dict[str, Any]:
-    """How argparse reads a field of this type: a switch, several words or one; `read` knows the rest."""
+    """The arguments of `add_argument` for a field of this type: a switch, several words or one."""
     if bool in kinds_of(hint):
         return {"action": argparse.BooleanOptionalAction}
     return {"nargs": "+"} if tuple in kinds_of(hint) else {}

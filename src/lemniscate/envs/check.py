@@ -101,7 +101,7 @@ def _one_line(message: object) -> str:
 
 
 def _spaces(env: VecEnv, served_by: str) -> Iterator[Finding]:
-    """What is observed and done, and what happens at an episode's end."""
+    """The findings on observations, actions and the ends of episodes."""
     spec, mode = env.spec, env.backend.mode
     yield Finding(GOOD, f"Served by {served_by}; observes {_seen(spec)}; acts by {_acts(spec.action)}.")
     flat = [part for part in spec.observation_parts if len(part.shape) > 1 and min(sorted(part.shape)[-2:]) > 16]

@@ -76,7 +76,7 @@ def crazyflie_files(
 
 
 def _history(names: list[str], past: list[str], action: Box, before: tuple[float, ...]) -> dict[str, Any]:
-    """What is kept of earlier steps and given to the policy, the newest first.
+    """The quantities of earlier steps that are given to the policy, the newest first.
 
     `kept` has the expressions of a quantity: among the observations, where it is one, and among the actions.
 

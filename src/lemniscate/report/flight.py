@@ -93,7 +93,7 @@ def show_flights(
     video: Path | None = None,
     tell: Tell = say,
 ) -> Evaluation:
-    """What `playback.show_episodes` does, for environments that have a scene.
+    """Show flights in their scene, in a window, a notebook or a film; returns their evaluation.
 
     The flights are those of `evaluate`, and played together. Of more flights than there are environments, the first of
     each is shown.

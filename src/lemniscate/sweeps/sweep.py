@@ -271,7 +271,7 @@ class _Training(SetOfRuns):
         self._bar.show(Line(runs, steps, total, f"{steps:,} of {total:,} steps"), lines)
 
     def _line(self, run: Path) -> Line:
-        """How far a run has come that is under way."""
+        """The progress of a run that is under way."""
         step, episode_return, rate = progress_of(run)
         total = self._totals[run]
         self._steps[run] = min(step, total)
