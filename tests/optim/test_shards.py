@@ -1,6 +1,7 @@
 """Gradients over shards: those of all rows at once, to rounding, in every algorithm's losses."""
 
 import copy
+from dataclasses import replace
 from functools import partial
 
 import pytest
@@ -82,15 +83,18 @@ def test_the_losses_of_reppo_too(rng):
 
 
 @pytest.mark.parametrize("size", [2, 4])
-def test_any_number_of_processes_has_the_same_gradient_to_the_last_bit(size):
+def test_any_number_of_processes_has_the_same_gradient_to_the_last_bit(size, rng):
     networks, config = small_networks(entropy_coef=0.1)
-    batch = numbers()
+    batch, weight = numbers(), torch.rand(24, generator=rng)  # a record of rows, and a tensor of them
+
+    def loss(networks, batch, weight):
+        return ppo.loss(config, networks, replace(batch, advantage=weight * batch.advantage))
 
     def step(world):
         optimizer = Adam(copy.deepcopy(networks))
         optimizer.learning_rate = 0.01
         optimizer.over_shards = GradientOverShards(optimizer, world, None)
-        return optimizer.step(partial(ppo.loss, config), batch), optimizer.vector
+        return optimizer.step(loss, batch, weight), optimizer.vector
 
     ((metrics, vector),) = in_world(4, 1, step)
     for theirs, other in in_world(4, size, step):

@@ -13,7 +13,9 @@ def drawn(rng, count=20):
 
 def test_the_generators_of_a_run_are_streams_of_its_seed_that_share_nothing():
     one, again, other = (drawn(Generators(seed, CPU)) for seed in (3, 3, 4))
-    assert vars(Generators(3, CPU)).keys() == {"action", "minibatch"}
+    streams = vars(Generators(3, CPU))
+    assert streams.keys() == {"action", "minibatch"}
+    assert len(set(streams.values())) == 2
     assert all(map(torch.equal, one, again))
     assert len(torch.stack([*one, *other]).unique(dim=0)) == 4
 
