@@ -115,7 +115,7 @@ def train(
             leaves it saved.
         report: evaluate the final policy, and draw it into `plots/` and `videos/`.
         progress: the live line on standard error.
-        processes: of this machine, W; environments, minibatches and replay are divided among them. See `shards`.
+        processes: of this machine, W; the steps of the environments, estimates and gradients are divided among them.
         cluster: "ray" or "ray=ADDRESS": train in `workers` processes that Ray places, and replaces where they die.
         workers: of the cluster; by default one.
         storage: a folder, or an address in a cloud, that all machines of the cluster reach; by default of this one.
