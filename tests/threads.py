@@ -1,7 +1,7 @@
 """A world of several processes, played by threads: what they gather passes through a barrier."""
 
 from concurrent.futures import ThreadPoolExecutor
-from threading import Barrier
+from threading import Barrier, BrokenBarrierError
 
 import torch
 
@@ -27,10 +27,21 @@ class Member(World):
 
 
 def in_world(shards, size, work):
-    """The results of `work(world)` in each of `size` threads that share so many shards."""
+    """The results of `work(world)` in each of `size` threads that share so many shards; raises what one of them raised."""
     if size == 1:
         return [work(World(shards))]
-    barrier, places = Barrier(size, timeout=60), [None] * size
-    members = [Member(shards, rank, size, barrier, places) for rank in range(size)]
+    barrier, places = Barrier(size, timeout=300), [None] * size
+
+    def play(rank):
+        try:
+            return work(Member(shards, rank, size, barrier, places))
+        except BaseException:
+            barrier.abort()  # the others wait for this thread
+            raise
+
     with ThreadPoolExecutor(size) as pool:
-        return list(pool.map(work, members))
+        played = [pool.submit(play, rank) for rank in range(size)]
+    failures = [failure for future in played if (failure := future.exception())]
+    for failure in sorted(failures, key=lambda failure: isinstance(failure, BrokenBarrierError)):
+        raise failure
+    return [future.result() for future in played]

@@ -7,6 +7,8 @@ options of an algorithm's Config, which imports torch; `commands` works.
 """
 
 import argparse
+import atexit
+import gc
 import os
 import sys
 from collections.abc import Sequence
@@ -21,6 +23,7 @@ FAILURES = (NonFiniteError, WorkerError, NotStoredError, RankError, SweepError, 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
+    atexit.register(gc.freeze)  # else the interpreter spends a second on looking through torch for what to free
     given = argparse.Namespace(command=None)
     if "RANK" in os.environ:  # torch has whole pages to say of a connection that ends
         os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "ERROR")
