@@ -149,7 +149,15 @@ def _update(module, config, env, state):
 
 
 @pytest.mark.parametrize(
-    ("case", "device"), [(case, "cuda:1") for case in CASES] + [(case, "mps") for case in CASES if "box" in case]
+    ("case", "device"),
+    [
+        *((case, "cuda:1") for case in CASES),
+        *((case, "mps") for case in ("ppo box", "sac box")),
+        *(
+            pytest.param(f"{name} box", "mps", marks=pytest.mark.long)
+            for name in ("a2c", "ddpg", "reinforce", "reppo", "td3", "trpo")
+        ),
+    ],
 )
 def test_each_algorithm_keeps_to_its_device_and_to_the_numbers_of_the_cpu(case, device, tmp_path):
     with pretend():

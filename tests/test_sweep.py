@@ -198,6 +198,7 @@ def test_runs_end_with_the_sweep_that_is_killed_and_it_goes_on(tmp_path):
         pass
 
 
+@pytest.mark.faults
 def test_ctrl_c_stops_every_run_and_the_sweep_goes_on_to_the_same_bits(tmp_path):
     path = tmp_path / "stopped"
     fields = [*SMALL, "--total-steps", "3_200", "--checkpoint-every", "512"]

@@ -59,7 +59,13 @@ def test_the_stored_notebook_ran_whole_and_says_nothing_of_its_machine(file):
     assert file.with_suffix(".ipynb").stat().st_size < 1_500_000
 
 
-@each_tutorial
+@pytest.mark.parametrize(
+    "file",
+    [
+        pytest.param(file, id=file.stem, marks=pytest.mark.long if file.stem in ("3_ddpg_hopper", "5_ant") else ())
+        for file in TUTORIALS
+    ],
+)
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # a fork beside another test's JAX
 def test_it_runs_and_every_function_in_it_is_right(file, tmp_path, monkeypatch, capsys):
     for module, name in ((ppo, "gae"), (ppo, "clipped_surrogate"), (ppo, "value_loss"), (ddpg, "td_target"),

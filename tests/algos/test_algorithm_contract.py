@@ -18,8 +18,22 @@ OFF_POLICY = {
 }
 
 
-@pytest.mark.parametrize("check", ALGORITHM_CONTRACT, ids=lambda check: check.__name__)
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+TRAINS_OFTEN = ("check_seeds", "check_resume")
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "check"),
+    [
+        pytest.param(
+            algorithm,
+            check,
+            marks=pytest.mark.long if check.__name__ in TRAINS_OFTEN and algorithm not in ("ppo", "sac") else (),
+            id=f"{algorithm}-{check.__name__}",
+        )
+        for algorithm in ALGORITHMS
+        for check in ALGORITHM_CONTRACT
+    ],
+)
 def test_the_contract_holds(check, algorithm, tmp_path):
     settings = OFF_POLICY if algorithm in ("ddpg", "td3", "sac") else ON_POLICY
     if algorithm == "reppo":

@@ -213,7 +213,14 @@ def compiled_equals_eager(algo, delay=1, updates=1, matmul="float32"):
 
 
 @pytest.mark.parametrize("compiler", COMPILERS)
-@pytest.mark.parametrize("case", ["ddpg, delay=2, updates=2", "td3, delay=2", "ddpg, matmul='bfloat16'"])
+@pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param("ddpg, delay=2, updates=2", marks=pytest.mark.long),
+        "td3, delay=2",
+        pytest.param("ddpg, matmul='bfloat16'", marks=pytest.mark.long),
+    ],
+)
 def test_traced_updates_equal_eager_ones(case, compiler):
     require_in_own_process(__name__, f"compiled_equals_eager({case})", compiler)
 

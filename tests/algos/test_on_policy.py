@@ -61,8 +61,14 @@ def test_with_reset_rows_the_value_is_wrong(algo):
     assert learned_value(algo, "NEXT_STEP", everything) > 15
 
 
-@EACH
-@pytest.mark.parametrize("kind", environments.KINDS)
+@pytest.mark.parametrize(
+    ("algo", "kind"),
+    [
+        pytest.param(algo, kind, marks=() if name == "ppo" or kind in ("box", "masked") else pytest.mark.long)
+        for name, algo in ALGORITHMS.items()
+        for kind in environments.KINDS
+    ],
+)
 def test_learns_in_spaces_of_every_kind(algo, kind):
     size = {"num_envs": 16, "num_steps": 16, "initial_log_std": -1.0, "normalize_observations": False}
     size |= {"total_steps": 30 * 256} if algo is ppo else {}
@@ -163,11 +169,11 @@ def compiled_equals_eager(algo, env, programs):
 @pytest.mark.parametrize(
     "case",
     [
-        "trpo, 'Pendulum-v1', programs=4",  # act, the estimates, the Fisher product, the value
-        "trpo, 'CartPole-v1', programs=4",
-        "a2c, 'Pendulum-v1', programs=3",
+        "trpo, 'CartPole-v1', programs=4",  # act, the estimates, the Fisher product, the value
+        pytest.param("trpo, 'Pendulum-v1', programs=4", marks=pytest.mark.long),
+        pytest.param("a2c, 'Pendulum-v1', programs=3", marks=pytest.mark.long),
         "reppo, 'Pendulum-v1', programs=3",  # act, the estimates, the gradient steps
-        "reinforce, 'CartPole-v1', programs=4",  # act, the estimates, the policy, the value
+        pytest.param("reinforce, 'CartPole-v1', programs=4", marks=pytest.mark.long),
     ],
 )
 def test_traced_updates_equal_eager_ones(case, compiler):

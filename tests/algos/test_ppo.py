@@ -13,7 +13,9 @@ from lemniscate.data.rollout import collect
 from lemniscate.errors import UserError
 
 
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize(
+    "mode", [mode if mode == "SAME_STEP" else pytest.param(mode, marks=pytest.mark.long) for mode in MODES]
+)
 def test_learns_to_match(mode):
     size = {"num_envs": 16, "num_steps": 16, "total_steps": 16 * 16 * 25, "epochs": 4}
     config = tiny("Matching-v0", **size, learning_rate=0.01, desired_kl=None)

@@ -160,7 +160,9 @@ def learned_q(mode="DISABLED", spoil=lambda rollout: rollout, env="EndlessLevers
     return state.networks.critic(torch.ones(1, 3), torch.zeros(1, 1)).item()
 
 
-@pytest.mark.parametrize("mode", ["NEXT_STEP", "SAME_STEP", "DISABLED"])
+@pytest.mark.parametrize(
+    "mode", ["NEXT_STEP", *(pytest.param(m, marks=pytest.mark.long) for m in ("SAME_STEP", "DISABLED"))]
+)
 def test_values_are_bootstrapped_at_time_limits_and_ignore_reset_rows(mode):
     assert learned_q(mode, length=None, horizon=4) == pytest.approx(10, abs=0.5)
 
@@ -192,7 +194,7 @@ def test_the_policy_stays_within_its_bound():
     torch.manual_seed(0)
     env = vectorize("Greedy-v0", 16, mode="DISABLED", length=None, horizon=4)
     state = reppo.init(config, env.spec, CPU)
-    for _ in range(5):
+    for _ in range(2):
         rollout = collect(env, state.policy, config.num_steps, state.rng.action)
         old = state.policy(rollout.obs)
         reppo.update(config, state, rollout)

@@ -65,7 +65,9 @@ def test_bins_follow_the_spread_of_the_returns_and_the_targets_share_them():
     assert not state.reward_scale.running.any()
 
 
-@pytest.mark.parametrize("mode", ["NEXT_STEP", "SAME_STEP", "DISABLED"])
+@pytest.mark.parametrize(
+    "mode", ["NEXT_STEP", *(pytest.param(m, marks=pytest.mark.long) for m in ("SAME_STEP", "DISABLED"))]
+)
 def test_a_q_that_is_a_distribution_has_the_values_of_the_rewards_themselves(mode):
     config = small_off_policy(sac, "EndlessLevers-v0", value_range=20.0)
     state, _ = begin_off_policy(sac, config, mode, length=None, horizon=4)

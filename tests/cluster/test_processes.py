@@ -70,7 +70,8 @@ def check_kills(folder, kind, kills, rng):
 
 
 @pytest.mark.parametrize(
-    ("kind", "kills"), [("ppo", 1), *(pytest.param(kind, 15, marks=pytest.mark.cluster) for kind in ("ppo", "sac"))]
+    ("kind", "kills"),
+    [pytest.param(kind, kills, marks=pytest.mark.cluster) for kind, kills in (("ppo", 1), ("ppo", 15), ("sac", 15))],
 )
 def test_a_killed_rank_costs_nothing_and_the_run_goes_on_with_fewer(tmp_path, kind, kills):
     seed = random.SystemRandom().randrange(10**6)
@@ -225,6 +226,7 @@ def ends_well(*processes):
     assert "Traceback" not in "".join(said), said
 
 
+@pytest.mark.cluster
 def test_torchrun_on_one_machine_gives_the_bits_of_one_process(tmp_path):
     train(1, *words("ppo"), "--run", tmp_path / "one")
     port = ["--master-port", free_port()]

@@ -293,6 +293,7 @@ def mixed():
     return registry.make(ENV, 64, stagger=True, kwargs={**kwargs, "max_episode_time": 0.2})
 
 
+@pytest.mark.long
 def test_each_drone_has_conditions_of_its_own_which_end_with_its_episode(mixed):
     mixed.restart(1)
     action, changed = torch.zeros(64, 4), 0
@@ -311,6 +312,7 @@ def test_each_drone_has_conditions_of_its_own_which_end_with_its_episode(mixed):
     assert changed >= 64
 
 
+@pytest.mark.long
 def test_rows_of_drones_that_go_on_are_not_measured_again(mixed):
     """The true next observation is the next one that is acted on, noise included, unless the episode ended."""
     mixed.restart(1)
@@ -321,6 +323,7 @@ def test_rows_of_drones_that_go_on_are_not_measured_again(mixed):
         assert torch.equal(mixed.obs[goes_on], step.next_obs[goes_on])
 
 
+@pytest.mark.long
 def test_drones_of_several_dynamics_take_turns(mixed):
     """Those of first principles that begin at the beginning, with rotors at rest, fall freely at first."""
     mixed.restart(2)
@@ -333,6 +336,7 @@ def test_drones_of_several_dynamics_take_turns(mixed):
     assert at_once.mean() - later.mean() > 0.1
 
 
+@pytest.mark.long
 def test_what_is_privileged_is_the_truth_about_each_drone_and_changes_no_flight():
     kwargs = {
         "dynamics": ["so_rpy", "first_principles"],
@@ -377,7 +381,9 @@ def hovering(data):
     return low
 
 
-@pytest.mark.parametrize("algorithm", ["ppo", "reppo", "sac"])
+@pytest.mark.parametrize(
+    "algorithm", ["ppo", *(pytest.param(name, marks=pytest.mark.long) for name in ("reppo", "sac"))]
+)
 def test_critics_are_told_what_policies_are_not(algorithm, tmp_path):
     kwargs = {"mass": [0.5, 2.0], "privileged": True, "max_episode_time": 0.4}
     fields = {"num_envs": 8, "total_steps": 64, "hidden": (16,), "compile": "off", "env_kwargs": kwargs}

@@ -30,9 +30,10 @@ EVERY = [
     ("Copy-tuple-v0", "gymnasium-async"),
     ("Copy-masked-v0", "gymnasium-async"),
     ("DroneFigureEightTrajectory-v0", "crazyflow"),
-    ("DroneReachPos-v0", "crazyflow"),
-    ("DroneReachVel-v0", "crazyflow"),
-    ("DroneLanding-v0", "crazyflow"),
+    *(
+        pytest.param(f"Drone{name}-v0", "crazyflow", marks=pytest.mark.long)
+        for name in ("ReachPos", "ReachVel", "Landing")
+    ),
 ]
 
 

@@ -64,7 +64,10 @@ def programs_are_not_mixed_up():
 
 
 @pytest.mark.parametrize("compiler", COMPILERS)
-@pytest.mark.parametrize("call", ["compiled_equals_eager('discrete')", "programs_are_not_mixed_up()"])
+@pytest.mark.parametrize(
+    "call",
+    ["compiled_equals_eager('discrete')", pytest.param("programs_are_not_mixed_up()", marks=pytest.mark.long)],
+)
 def test_traced_steps_equal_eager_ones(call, compiler):
     require_in_own_process(__name__, call, compiler)
 

@@ -126,7 +126,7 @@ def test_evaluation_changes_no_bit_of_training(tmp_path, env):
     assert losses[0] == losses[1]
 
 
-@pytest.mark.parametrize("env", ["CartPole-v1", "sac"])
+@pytest.mark.parametrize("env", ["CartPole-v1", pytest.param("sac", marks=pytest.mark.long)])
 def test_recordings_change_no_bit_of_training_and_survive_a_resume(tmp_path, env, monkeypatch):
     monkeypatch.setattr(lem.api.training, "is_installed", lambda name: name != "imageio_ffmpeg")
     train(tmp_path / "without", env, checkpoint_every=64)
@@ -203,8 +203,7 @@ def test_a_run_resumed_from_any_checkpoint_ends_in_the_same_bits(tmp_path, env):
     fields = {"checkpoint_every": 64, "keep_checkpoints": 10}
     train(tmp_path / "whole", env, **fields)
     for back in (1, 2, 3):
-        path = tmp_path / f"back{back}"
-        train(path, env, **fields)
+        path = shutil.copytree(tmp_path / "whole", tmp_path / f"back{back}")
         for step in checkpoint.list_steps(path / "checkpoints")[-back:]:
             (path / "checkpoints" / f"step-{step}" / "manifest.json").unlink()
         lem.resume(path, progress=False)
@@ -393,12 +392,12 @@ def test_stopped_and_resumed_it_ends_in_the_same_bits(tmp_path):
 
 
 def test_many_steps_between_two_lines_are_stopped_amid_and_resumed_to_the_same_bits(tmp_path):
-    fields = {**OFF_POLICY["sac"], "log_every": 500, "total_steps": 4_000, "checkpoint_every": 1000, "compile": "off"}
+    fields = {**OFF_POLICY["sac"], "log_every": 500, "total_steps": 2_000, "checkpoint_every": 1000, "compile": "off"}
     words = [word for name, value in tiny_off_policy(**fields).items() for word in words_for(name, value)]
     train_sac = ["train", "sac", "--env", "Pendulum-v1", *words, "--run"]
     assert command(*train_sac, tmp_path / "whole").wait() == 0
     process = command(*train_sac, tmp_path / "r")
-    wait_for(lambda: len(read_metrics(tmp_path / "r")) >= 2, process)
+    wait_for(lambda: len(read_metrics(tmp_path / "r")) >= 1, process)
     time.sleep(0.1)
     process.send_signal(signal.SIGINT)
     assert "the policy is saved" in process.communicate()[1]
