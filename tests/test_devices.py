@@ -140,7 +140,7 @@ def _update(module, config, env, state):
             random = state.step < config.learning_starts
             interact(env, policy, state.replay, state.action_noise, rng, random=random)
             state.step += env.num_envs
-            metrics = module.update(config, state) if config.updates_at(state.step) else {}
+            metrics = module.update(config, state) if state.step > config.learning_starts else {}
     elif getattr(config, "episodes", 0):
         metrics = module.update(config, state, collect_episodes(env, policy, config.episodes, rng))
     else:

@@ -713,9 +713,9 @@ MUTANTS = [
     ),
     (
         "an update at every step",
-        "run/off_policy.py",
-        " and step // self.num_envs % self.update_every == 0",
-        "",
+        "algos/sac.py",
+        "state.step % (config.num_envs * config.update_every) == 0",
+        "True",
         OFF + "as_many_gradient_steps_are_taken_as_the_config_says",
     ),
     (

@@ -1,6 +1,5 @@
 """Data records of tensors. Shapes: T time, N environments, B batch, O observation, A action."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Self
 
@@ -27,16 +26,12 @@ def wide_float(device: torch.device) -> torch.dtype:
 class Record:
     """Tensors that share their leading dimensions."""
 
-    def map(self, function: Callable[[Tensor], Tensor]) -> Self:
-        """The record of what `function` makes of each tensor."""
-        return type(self)(*map(function, vars(self).values()))
-
     def __getitem__(self, rows: Tensor | slice) -> Self:
-        return self.map(lambda x: x[rows])
+        return type(self)(*(tensor[rows] for tensor in vars(self).values()))
 
     def flatten(self) -> Self:
         """[T, N, …] to [T · N, …]."""
-        return self.map(lambda x: x.flatten(0, 1))
+        return type(self)(*(tensor.flatten(0, 1) for tensor in vars(self).values()))
 
     @classmethod
     def stack(cls, rows: list[Self]) -> Self:

@@ -15,7 +15,7 @@ from lemniscate.maths import standardize
 from lemniscate.optim.adam import Adam
 from lemniscate.optim.shards import EstimatesOverShards, GradientOverShards
 from lemniscate.system.world import World
-from lemniscate.types import Batch, Transition
+from lemniscate.types import Batch, Rollout, Transition
 from threads import in_world
 
 
@@ -139,7 +139,7 @@ def test_updates_over_four_shards_are_those_over_all_rows(algo, dtype, rtol):
             8,
             states[0].rng.action,
         )
-        wide = rollout.map(lambda x: x.to(dtype) if x.is_floating_point() else x)
+        wide = Rollout(*(x.to(dtype) if x.is_floating_point() else x for x in vars(rollout).values()))
         for state in states:
             algo.update(config, state, wide)
         one, two = (torch.cat([p.flatten() for p in state.networks.parameters()]) for state in states)

@@ -159,7 +159,8 @@ def train(config: Config, run: Run) -> State:
             policy, random = state.networks.policy, state.step < config.learning_starts
             state.observe(interact(env, policy, state.replay, state.action_noise, state.rng.action, random=random))
             state.step += config.num_envs
-            if config.updates_at(state.step):
+            due = state.step % (config.num_envs * config.update_every) == 0
+            if due and state.step > config.learning_starts:
                 metrics.append(update(config, state))
         run.log(state, means(metrics), env.take_episodes())
     return state

@@ -119,7 +119,8 @@ def train(config: Config, run: Run) -> State:
             random = state.step < config.learning_starts
             interact(env, policy, state.replay, state.action_noise, rng, noise_std=config.noise_std, random=random)
             state.step += config.num_envs
-            if config.updates_at(state.step):
+            due = state.step % (config.num_envs * config.update_every) == 0
+            if due and state.step > config.learning_starts:
                 metrics.append(update(config, state))
         run.log(state, means(metrics), env.take_episodes())
     return state

@@ -1,6 +1,7 @@
 """Callbacks: functions of the user's that see a run while it trains, and may stop it."""
 
 from collections.abc import Callable, Mapping, Sequence
+from itertools import product
 from types import MappingProxyType
 from typing import Any
 
@@ -63,9 +64,9 @@ def call_callbacks(
         config: of the run.
     """
 
-    def observe(step: int, metrics: Mapping[str, float], state: TrainState) -> bool:
+    def observe(lines: Sequence[tuple[int, Mapping[str, float]]], state: TrainState) -> bool:
         stop = False
-        for function in functions:
+        for (step, metrics), function in product(lines, functions):
             policy = PolicySnapshot(lambda: copy_networks(state), spec, config, step)
             stop = bool(function(step, MappingProxyType(dict(metrics)), policy)) or stop
             policy.expire()

@@ -137,10 +137,6 @@ class OffPolicyConfig(RunConfig):
         shape, length = (self.num_envs, spec.bounded_box().size), spec.max_episode_steps or 1000
         return ActionNoise(self.action_noise, shape, length, device, time=self.noise_time, exponent=self.noise_exponent)
 
-    def updates_at(self, step: int) -> bool:
-        """Whether an update follows environment step `step`."""
-        return step > self.learning_starts and step // self.num_envs % self.update_every == 0
-
 
 @dataclass(kw_only=True)
 class OffPolicyState(TrainState[Networks]):

@@ -16,15 +16,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cached_property
 from pathlib import Path
-from socket import gethostname
 from typing import TypeVar
-from zlib import crc32
 
 import numpy as np
 import torch
 
-from lemniscate.envs.vec_env import Episodes, Stopwatch, VecEnv
-from lemniscate.errors import NonFiniteError, NotStoredError, RankError, UserError, resume_line
+from lemniscate.envs.vec_env import Episodes, VecEnv
+from lemniscate.errors import NonFiniteError, NotStoredError, UserError, resume_line
 from lemniscate.optim.compiled import Compiler
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import Saver
@@ -32,7 +30,7 @@ from lemniscate.run.evaluate import critic_of, evaluate
 from lemniscate.run.loggers import NO_EPISODES, JsonLines, Logger, LoggerClass, TensorBoard
 from lemniscate.run.metrics import read_metrics
 from lemniscate.run.seeding import derive, seed_globals
-from lemniscate.run.state import TrainState
+from lemniscate.run.state import TrainState, require_agreement
 from lemniscate.run.stopping import Stopped, StopRequest
 from lemniscate.run.warm_start import load_networks
 from lemniscate.system.console import ProgressBar, say
@@ -48,8 +46,8 @@ TRAINING = 0
 """the stream of seeds that training environments restart from"""
 
 S = TypeVar("S", bound=TrainState)
-Observer = Callable[[int, Mapping[str, float], TrainState], bool]
-"""(step, metrics, state) of a logged line, to whether the run is to stop; it leaves the state as it is"""
+Observer = Callable[[Sequence[tuple[int, Mapping[str, float]]], TrainState], bool]
+"""(step, metrics) of new lines and the state, to whether the run is to stop; it leaves the state as it is"""
 
 
 class Run:
@@ -92,7 +90,8 @@ class Run:
         """whether the body of the loop took fewer steps than it was to: its state is nobody's to resume from"""
         self._line_time, self._line_step = 0.0, 0
         """when the last line was logged, and at which step"""
-        self._between_bodies = Stopwatch()
+        self._seconds_between = 0.0
+        """since then, spent between the bodies of the loop"""
 
     def restore(self, state: S) -> S:
         """Restore `state` from the newest planned checkpoint, if there is one; then open the loggers.
@@ -139,8 +138,9 @@ class Run:
                 while going_on and state.step < total_steps:
                     before, self._episodes_before = state.step, self._episodes
                     yield self.env
-                    with self._between_bodies:
-                        going_on = self._between(state, before, total_steps)
+                    body_ended = time.monotonic()
+                    going_on = self._between(state, before, total_steps)
+                    self._seconds_between += time.monotonic() - body_ended
         finally:
             self.seconds = time.monotonic() - started
             self._bar.close()
@@ -194,8 +194,8 @@ class Run:
         """The speed since the last line, everything included, and the seconds of the loop's bodies by their use."""
         now, collect = time.monotonic(), self.env.collecting.take()
         seconds, steps = max(now - self._line_time, 1e-9), step - self._line_step
-        self._line_time, self._line_step = now, step
-        learn = seconds - self._between_bodies.take() - collect
+        learn = seconds - self._seconds_between - collect
+        self._line_time, self._line_step, self._seconds_between = now, step, 0.0
         return {"time/steps_per_second": steps / seconds, "time/collect": collect, "time/learn": learn}
 
     def _between(self, state: TrainState, before: int, total_steps: int) -> bool:
@@ -229,7 +229,12 @@ class Run:
         """
         stop, signum = True, 0
         try:
-            stop = self._ask_callbacks(state)
+            lines, self._unobserved = self._unobserved, []
+            if self._observer:
+                with globals_undisturbed():
+                    stop = self._observer(lines, state)
+            else:
+                stop = False
             signum = self._stop.signum  # one that comes from here on counts at the next update
             if self.world.size > 1:
                 said = self.world.each((stop, signum))
@@ -247,15 +252,6 @@ class Run:
         """Save a run that stops where no checkpoint is planned."""
         if not planned and state.step > self._saver.planned_at:
             self._saver.save(state, planned=False, logged=self._logged)
-
-    def _ask_callbacks(self, state: TrainState) -> bool:
-        """Show the callbacks the lines that they have not seen; returns whether one of them stops the run."""
-        lines, self._unobserved, stop = self._unobserved, [], False
-        if self._observer:
-            with globals_undisturbed():
-                for step, numbers in lines:
-                    stop |= self._observer(step, numbers, state)
-        return stop
 
     def _is_asked_to_stop(self, number: int) -> bool:
         """Whether a signal has come; several processes agree on that now and then."""
@@ -357,23 +353,6 @@ def require_finite(state: TrainState, numbers: Mapping[str, float]) -> None:
         if len(bad):
             said = f"The parameter {name} is {bad[0].item()} after the update"
             raise NonFiniteError(f"{said} that ends at step {state.step:,}.")
-
-
-def require_agreement(world: World, state: TrainState) -> None:
-    """Raise `RankError` where the networks of a process are not those of the first."""
-    said = world.each((fingerprint(state), gethostname()))
-    for rank, (theirs, host) in enumerate(said):
-        if theirs != said[0][0]:
-            sentence = f"The networks of rank {rank} on {host} differ from those of rank 0 on {said[0][1]}"
-            raise RankError(f"{sentence} after the update that ends at step {state.step:,}." if world.is_first else "")
-
-
-def fingerprint(state: TrainState) -> int:
-    """A checksum of the networks, the same in every process of a run."""
-    checksum = 0
-    for values in state.networks.state_dict().values():
-        checksum = crc32(values.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy(), checksum)
-    return checksum
 
 
 def is_compiled(config: RunConfig) -> bool:

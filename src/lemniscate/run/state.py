@@ -2,8 +2,13 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
+from socket import gethostname
 from typing import Any, Generic, TypeVar
+from zlib import crc32
 
+import torch
+
+from lemniscate.errors import RankError
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.nn.policies import Policy
 from lemniscate.optim.adam import Adam
@@ -83,3 +88,20 @@ class ScaledState(TrainState[Networks]):
         """Forget the running returns."""
         super().on_restart()
         self.reward_scale.on_restart()
+
+
+def require_agreement(world: World, state: TrainState) -> None:
+    """Raise `RankError` where the networks of a process are not those of the first."""
+    said = world.each((fingerprint(state), gethostname()))
+    for rank, (theirs, host) in enumerate(said):
+        if theirs != said[0][0]:
+            sentence = f"The networks of rank {rank} on {host} differ from those of rank 0 on {said[0][1]}"
+            raise RankError(f"{sentence} after the update that ends at step {state.step:,}." if world.is_first else "")
+
+
+def fingerprint(state: TrainState) -> int:
+    """A checksum of the networks, the same in every process of a run."""
+    checksum = 0
+    for values in state.networks.state_dict().values():
+        checksum = crc32(values.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy(), checksum)
+    return checksum
