@@ -716,7 +716,7 @@ MUTANTS = [
         "algos/sac.py",
         "state.step % (config.num_envs * config.update_every) == 0",
         "True",
-        OFF + "as_many_gradient_steps_are_taken_as_the_config_says",
+        OFF + "as_many_gradient_steps_are_taken_as_the_config_says[rhythm2-sac]",
     ),
     (
         "Q is the larger one",
