@@ -13,7 +13,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lemniscate.errors import unknown_name
 from lemniscate.report.style import COLORS, finish, legend_above, limit_axis, run_styles, save
 from lemniscate.run.directory import read_config
 from lemniscate.run.evaluate import QBias
@@ -79,12 +78,6 @@ def learning_curve(runs: list[Path], file: Path, labels: Sequence[str] | None = 
     else:
         axes.text(0.5, 0.5, "no whole training episode yet", transform=axes.transAxes, ha="center", color="grey")
     return save(figure, file)
-
-
-def require_by(by: str) -> None:
-    """Raise `UserError` for an axis that a learning curve does not have."""
-    if by not in BY:
-        raise unknown_name("axis", by, BY)
 
 
 def _draw_episodes(axes: Axes, run: Path, by: str, color: object, label: str) -> int:
