@@ -52,13 +52,8 @@ def plot_runs(
 def learning_curve(runs: list[Path], file: Path, labels: Sequence[str] | None = None, by: str = "step") -> Path:
     """Return of each whole training episode, and the mean of the last ones: of 20, or of 2 % if that is more.
 
-    By episode the mean is that of the last 20 always. The line is interrupted where no episode ended for long.
-
-    Args:
-        runs: one, or several in different colours.
-        file: of the picture.
-        labels: of the runs; by default their names.
-        by: "step", "episode" or "minute", the horizontal axis.
+    By episode the mean is that of the last 20 always. The line is interrupted where no episode ended for long. The
+    horizontal axis is one of `BY`; several runs have different colours.
     """
     figure = Figure(figsize=(7, 4), layout="constrained")
     axes = figure.subplots()
@@ -66,7 +61,8 @@ def learning_curve(runs: list[Path], file: Path, labels: Sequence[str] | None = 
     drawn = [_draw_episodes(axes, run, by, color, label * several) for run, color, label in run_styles(runs, labels)]
     windows = sorted(filter(None, drawn))
     axes.set(xlabel=BY[by], ylabel="return of an episode")
-    axes.set_title(_title(runs), loc="left")
+    algorithm, config = read_config(runs[0])
+    axes.set_title(f"{f'{len(runs)} runs' if several else algorithm.upper()} on {config['env']}", loc="left")
     axes.set_xlim(left=0)
     finish(axes)
     if windows:
@@ -251,8 +247,3 @@ def moving_average(values: np.ndarray, window: int) -> np.ndarray:
     total = np.cumsum(np.insert(values, 0, 0.0))
     start = np.maximum(0, np.arange(1, len(values) + 1) - window)
     return (total[1:] - total[start]) / (np.arange(1, len(values) + 1) - start)
-
-
-def _title(runs: list[Path]) -> str:
-    algorithm, config = read_config(runs[0])
-    return f"{algorithm.upper() if len(runs) == 1 else f'{len(runs)} runs'} on {config['env']}"

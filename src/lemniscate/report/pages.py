@@ -23,7 +23,7 @@ from lemniscate import algos
 from lemniscate.errors import UserError, resume_line
 from lemniscate.report import advice, curves
 from lemniscate.report.playback import FILMS
-from lemniscate.report.seeds import Group, Scores
+from lemniscate.report.seeds import Group, Scores, differing
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import is_finished, read_config
 from lemniscate.run.evaluate import Evaluation, QBias
@@ -40,20 +40,17 @@ KINDS = {".png": "image/png", ".gif": "image/gif", ".webp": "image/webp", ".mp4"
 NOT_MEASURES = {field.name for field in fields(Evaluation)} | {"step", "seed"}
 """names among scores that are not measures of the environment"""
 
+Evaluated = Mapping[str, Any]
+"""what `Evaluation.to_json` returns; of a run's policy also its `step`, and the `seed` of the starts"""
+
 TEMPLATES = Path(__file__).parent / "templates"
 
 TASK = "reinforcement-learning"
 """the name of the field on the Hub"""
 
 
-def write_run(run: Path, pictures: Sequence[Path], scores: Mapping[str, Any] | None) -> Path:
-    """Write the page of a run: curves, film, evaluation, settings, commands, what to try next.
-
-    Args:
-        run: the run directory.
-        pictures: of the run; they are embedded.
-        scores: of its newest policy, those of `Evaluation.to_json` and the `seed` of the starts, if there are any.
-    """
+def write_run(run: Path, pictures: Sequence[Path], scores: Evaluated | None) -> Path:
+    """Write the page of a run: curves, film, evaluation, settings, commands, what to try next."""
     algorithm, config = read_config(run)
     log = read_metrics(run)
     taken, total = (log[-1]["step"] if log else 0), config.get("total_steps", 0)
@@ -109,20 +106,12 @@ def comparison_part(
     remarks: Sequence[str],
     pictures: Sequence[Path],
 ) -> dict[str, Any]:
-    """The part of one environment: the table, remarks, pictures, settings that differ, runs, commands.
+    """The part of one environment: the table with its heading, remarks, pictures, settings that differ, runs, commands.
 
-    Args:
-        page: that the part is for.
-        groups: in that environment.
-        scores: final returns of the finished runs.
-        rows: the table of final returns, its heading first.
-        remarks: sentences on what cannot be compared.
-        pictures: of the comparison, embedded.
+    Links in it lead from the `page` that it is for.
     """
     spread = [(one.label, advice.seeds_differ(one.finals(scores))) for one in groups]
     kinds = [{"algorithm": one.algorithm, **one.config} for one in groups]
-    names = [name for name in dict.fromkeys(name for kind in kinds for name in kind) if name != "seed"]
-    differ = [name for name in names if any(kind.get(name) != kinds[0].get(name) for kind in kinds)]
     seeds = {run: str(read_config(run)[1].get("seed")) for one in groups for run in one.runs}
     return {
         "env": groups[0].env,
@@ -130,7 +119,9 @@ def comparison_part(
         "rows": rows,
         "remarks": [*remarks, *(f"{label}: {sentence}" for label, sentence in spread if sentence)],
         "pictures": pictures,
-        "differences": [[name, *(_shown(kind[name]) if name in kind else "–" for kind in kinds)] for name in differ],
+        "differences": [
+            [name, *(_shown(kind[name]) if name in kind else "–" for kind in kinds)] for name in differing(kinds)
+        ],
         "runs": [
             {
                 "path": run,
@@ -160,20 +151,20 @@ def write_card(
     config: RunConfig,
     *,
     step: int,
-    scores: Mapping[str, Any] | None,
+    scores: Evaluated | None,
     license: str | None,
     code: Sequence[str],
 ) -> None:
-    """Write the card of a repository on the Hugging Face Hub beside its files; it shows those that are there.
+    """Write the card of a repository on the Hugging Face Hub beside its files, and show these.
 
     Args:
-        folder: the repository's files.
-        name: user/name of the repository.
+        folder: the files of the repository.
+        name: user/name.
         algorithm: by name.
         config: of the run.
         step: of the policy.
-        scores: those of `Evaluation.to_json` and the `seed` of the starts, if there are any.
-        license: as the Hub abbreviates it, such as "mit"; none is named without.
+        scores: of the policy, if it could be evaluated.
+        license: as the Hub abbreviates it, such as "mit", if there is one.
         code: the names of the code that it needs and that is not lemniscate's.
     """
     text = filled(
@@ -192,9 +183,7 @@ def write_card(
     (folder / "README.md").write_text(text, encoding="utf-8")
 
 
-def _metadata(
-    name: str, algorithm: str, config: RunConfig, scores: Mapping[str, Any] | None, license: str | None
-) -> str:
+def _metadata(name: str, algorithm: str, config: RunConfig, scores: Evaluated | None, license: str | None) -> str:
     """The front matter in YAML, by which the Hub lists a policy: library, tags, and the scores as a `model-index`.
 
     In the words of the Hub the return of an episode is its reward.
@@ -203,7 +192,6 @@ def _metadata(
 
     results = []
     if scores:
-        seeds = {"seed": scores["seed"], "training_seeds": [config.seed]}
         result = EvalResult(
             task_type=TASK,
             task_name=TASK,
@@ -212,7 +200,7 @@ def _metadata(
             metric_type="mean_reward",
             metric_name="mean_reward",
             metric_value=f"{scores['mean_return']:.2f} +/- {scores['std_return']:.2f}",
-            metric_args={"episodes": scores["episodes"], **seeds},
+            metric_args={"episodes": scores["episodes"], "seed": scores["seed"], "training_seeds": [config.seed]},
         )
         results.append(result)
     data = ModelCardData(
@@ -226,8 +214,8 @@ def _metadata(
     return data.to_yaml()
 
 
-def sentence(scores: Mapping[str, Any]) -> str:
-    """The scores of an evaluation, as `Evaluation.to_json` has them, in one sentence, or two."""
+def sentence(scores: Evaluated) -> str:
+    """The scores of an evaluation in one sentence, or two."""
     mean, std = scores["mean_return"], scores["std_return"]
     said = f"{mean:.1f} ± {std:.1f} return over {scores['episodes']} episodes of {scores['env_id']}"
     if measures := _measures(scores):
@@ -235,7 +223,7 @@ def sentence(scores: Mapping[str, Any]) -> str:
     return f"{said}.\n{q_bias(scores)}." if "q_bias" in scores else f"{said}."
 
 
-def score_rows(scores: Mapping[str, Any]) -> list[tuple[str, str]]:
+def score_rows(scores: Evaluated) -> list[tuple[str, str]]:
     """The scores of an evaluation, each with its name in words."""
     returns, lengths = scores["returns"], scores["lengths"]
     return [
@@ -248,7 +236,7 @@ def score_rows(scores: Mapping[str, Any]) -> list[tuple[str, str]]:
     ]
 
 
-def _measures(scores: Mapping[str, Any]) -> list[tuple[str, str]]:
+def _measures(scores: Evaluated) -> list[tuple[str, str]]:
     """(name in words, value) of what the environment measures besides reward; the ending `_mm` is a unit."""
     return [
         (name.removesuffix("_mm").replace("_", " "), f"{value:.4g}{' mm' * name.endswith('_mm')}")
@@ -257,7 +245,7 @@ def _measures(scores: Mapping[str, Any]) -> list[tuple[str, str]]:
     ]
 
 
-def q_bias(scores: Mapping[str, Any]) -> QBias:
+def q_bias(scores: Evaluated) -> QBias:
     """The bias of Q in the scores of an evaluation that has one."""
     return QBias(scores["q_bias"]["predicted"], scores["q_bias"]["realised"])
 

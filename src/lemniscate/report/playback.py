@@ -128,7 +128,7 @@ def _play(
     Stops after each reset and each step, for a picture. Raises `UserError` for an action of another kind, and for an
     episode that does not end where there is no time limit.
     """
-    first, names = derive(seed, EVALUATION, 0), measures_of(env.metadata)
+    first, measured = derive(seed, EVALUATION, 0), measures_of(env.metadata)
     limit = env.spec.max_episode_steps if env.spec else None
     for number in range(episodes):
         obs, info = env.reset(seed=first + number)
@@ -141,7 +141,16 @@ def _play(
             obs, reward, terminated, truncated, info = env.step(action)
             total, length = total + float(reward), length + 1
             done = terminated or truncated
-            table.add(_step(reward, terminated, truncated, {name: info[name] for name in names if name in info}), ONE)
+            step = Step(
+                obs=ONE,  # the table counts no observations
+                next_obs=ONE,
+                reward=torch.tensor([float(reward)]),
+                terminated=torch.tensor([bool(terminated)]),
+                truncated=torch.tensor([bool(truncated)]),
+                valid=ONE,
+                measures={part: torch.tensor([float(info[part])]) for part in measured if part in info},
+            )
+            table.add(step, ONE)
             yield
         tell(sentence(number + 1, total, length))
 
@@ -151,19 +160,6 @@ def _require_in(space: gym.Space, action: Any, name: str) -> None:
     fits = np.shape(action) == space.shape if isinstance(space, gym.spaces.Box) else space.contains(action)
     if not fits:
         raise UserError(f"{name} takes actions of {space}, not {shown(action)}.")
-
-
-def _step(reward: Any, terminated: bool, truncated: bool, measures: dict[str, Any]) -> Step:
-    """One step of one environment, without observations."""
-    return Step(
-        obs=ONE,
-        next_obs=ONE,
-        reward=torch.tensor([float(reward)]),
-        terminated=torch.tensor([bool(terminated)]),
-        truncated=torch.tensor([bool(truncated)]),
-        valid=ONE,
-        measures={name: torch.tensor([float(value)]) for name, value in measures.items()},
-    )
 
 
 def _random(env: gym.Env, seed: int) -> Act:

@@ -14,12 +14,13 @@ import time
 from collections.abc import Iterable, Mapping
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
 
-Track = Mapping[str, np.ndarray]
-"""one flight of T steps: `position` and `reference` [T, 3] in metres, `attitude` [T, 4] (xyzw)"""
+Track = Mapping[str, Any]
+"""the arrays of one flight of T steps: `position` and `reference` [T, 3] in metres, `attitude` [T, 4] (xyzw)"""
 
 SIZE = (360, 600)
 REFERENCE = np.array([0.9, 0.5, 0.1, 0.4], dtype=np.float32)
