@@ -127,13 +127,8 @@ def require_uploads(name: str) -> None:
 def upload(folder: Path, name: str, private: bool) -> str:
     """Upload all files in `folder` into the model repository `name`, in one commit; it is created if need be.
 
-    Args:
-        folder: with a checkpoint at its root.
-        name: user/name.
-        private: make a new repository private.
-
-    Returns:
-        The address of its page.
+    The folder has a checkpoint at its root, and a new repository is `private` if that is asked for. Returns the address
+    of its page.
 
     Raises:
         UserError: the Hub refuses or cannot be reached; the repository holds something else than a policy, or is public

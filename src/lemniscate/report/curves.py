@@ -5,7 +5,6 @@ import math
 import time
 import tomllib
 from collections.abc import Mapping, Sequence
-from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -81,21 +80,17 @@ def _draw_episodes(axes: Axes, run: Path, by: str, color: object, label: str) ->
     steps, returns = episode_returns(run)
     if not len(steps):
         return 0
-    window = WINDOW if by == "episode" else window_of(returns)
+    window, x, interrupted = window_of(returns), steps, gaps(steps)
+    if by == "episode":
+        window, x, interrupted = WINDOW, np.arange(1.0, len(steps) + 1), np.zeros_like(interrupted)
+    elif by == "minute":
+        x = np.interp(steps, *training_minutes(run))
     some = np.linspace(0, len(steps) - 1, min(len(steps), POINTS)).astype(int)
-    x, averages = _positions(run, steps, by)[some], moving_average(returns, window)[some]
+    x, averages = x[some], moving_average(returns, window)[some]
     axes.plot(x, returns[some], ".", color=color, alpha=0.25 if len(x) > 300 else 0.5, markersize=3)
-    interrupted = gaps(steps) & (by != "episode")
     cuts = np.flatnonzero(np.diff(np.cumsum([False, *interrupted])[some])) + 1
     axes.plot(np.insert(x, cuts, np.nan), np.insert(averages, cuts, np.nan), color=color, linewidth=1.5, label=label)
     return window
-
-
-def _positions(run: Path, steps: np.ndarray, by: str) -> np.ndarray:
-    """The horizontal positions of the episodes that ended at `steps`."""
-    if by == "episode":
-        return np.arange(1.0, len(steps) + 1)
-    return np.interp(steps, *training_minutes(run)) if by == "minute" else steps
 
 
 def diagnostics(runs: list[Path], file: Path, labels: Sequence[str] | None = None) -> Path:
@@ -109,10 +104,8 @@ def diagnostics(runs: list[Path], file: Path, labels: Sequence[str] | None = Non
     names = [name for name in TITLES if name in logged] + own
     rows = max(1, math.ceil(len(names) / 3))
     figure = Figure(figsize=(10, 2.4 * rows + 0.4), layout="constrained")
-    for i, (axes, name) in enumerate(zip_longest(figure.subplots(rows, 3, squeeze=False).flat, names)):
-        if name is None:
-            axes.set_visible(False)
-            continue
+    for i, name in enumerate(names):
+        axes = figure.add_subplot(rows, 3, i + 1)
         for run, color, label in run_styles(runs, labels):
             draw_metric(axes, logs[run], name, color, label, width=1.5 if len(runs) <= 5 else 0.7)
         title, unit = TITLES.get(name, (name, ""))

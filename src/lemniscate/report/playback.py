@@ -9,7 +9,7 @@ import warnings
 from base64 import b64encode
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -62,16 +62,12 @@ def show_episodes(
     """
     in_window = video is None and not in_notebook()
     table, name = EpisodeTable(1, torch.device("cpu")), arguments["env"]
-    with _quiet_sdl(in_window):
-        env = _rendered(arguments, "human" if in_window else "rgb_array")
+    with _quiet_sdl(in_window), closing(_rendered(arguments, "human" if in_window else "rgb_array")) as env:
         played = _play(env, act or _random(env, seed), name, episodes, seed, table, tell)
-        try:
-            if in_window:
-                deque(played, maxlen=0)  # Gymnasium draws at each step
-            else:
-                give((_picture(env, name) for _ in played), float(env.metadata.get("render_fps", 30)), video)
-        finally:
-            env.close()
+        if in_window:
+            deque(played, maxlen=0)  # Gymnasium draws at each step
+        else:
+            give((_picture(env, name) for _ in played), float(env.metadata.get("render_fps", 30)), video)
     return table.evaluation(name, SUMMARIES)
 
 
@@ -87,10 +83,8 @@ def play_single(act: Act, arguments: dict[str, Any], episodes: int, seed: int, t
         if makes_vector(maker_of(name)):
             raise UserError(f"{name} makes several environments at once, and a function acts in a single one.")
         env = make_one(maker_of(name), tuple(map(find_callable, wrappers)), **kwargs)
-    try:
+    with closing(env):
         deque(_play(env, act, name, episodes, seed, table, tell), maxlen=0)
-    finally:
-        env.close()
     return table.evaluation(name, SUMMARIES)
 
 
