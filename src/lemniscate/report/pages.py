@@ -155,17 +155,10 @@ def write_card(
     license: str | None,
     code: Sequence[str],
 ) -> None:
-    """Write the card of a repository on the Hugging Face Hub beside its files, and show these.
+    """Write the card of the repository user/`name` on the Hugging Face Hub into the `folder` of its files.
 
-    Args:
-        folder: the files of the repository.
-        name: user/name.
-        algorithm: by name.
-        config: of the run.
-        step: of the policy.
-        scores: of the policy, if it could be evaluated.
-        license: as the Hub abbreviates it, such as "mit", if there is one.
-        code: the names of the code that it needs and that is not lemniscate's.
+    It shows the files that are there, and the `scores` if the policy at `step` could be evaluated. A `license` is
+    written as the Hub abbreviates it, such as "mit"; `code` are the names of what the policy needs besides lemniscate.
     """
     text = filled(
         TEMPLATES / "card.md.j2",
