@@ -1,10 +1,11 @@
 """The verb for the curves of runs, plot; and the pictures and the page of one run."""
 
+from contextlib import closing
 from pathlib import Path
 
 from lemniscate.api.policy import TrainedPolicy, TrainedRun, load, path_of
 from lemniscate.api.results import final_return, final_scores
-from lemniscate.errors import UserError
+from lemniscate.errors import UserError, unknown_name
 from lemniscate.report import compare, curves, flight, pages
 from lemniscate.report.seeds import group
 from lemniscate.run import checkpoint
@@ -42,34 +43,34 @@ def plot(*runs: Plotted | list[Plotted], by: str = "step") -> list[Path]:
     Raises:
         UserError: no runs, or without metrics; another axis.
     """
-    curves.require_by(by)
+    if by not in curves.BY:
+        raise unknown_name("axis", by, curves.BY)
     given = [run for one in runs for run in (one if isinstance(one, list | tuple) else [one])]
     paths = [path_of(run) for run in given]
     if not paths:
         raise UserError("There is nothing to plot: name one run or several, such as plot('runs/lander').")
     found = [run for path in paths for run in _members(path)]
+    folder = paths[0] / "plots" if len(paths) == 1 else Path("plots")
     if len(paths) == 1:
-        make_directory(paths[0] / "plots")
+        make_directory(folder)
     if found == paths[:1]:
         files = draw_run(paths[0], by)
     else:
-        folder = paths[0] / "plots" if len(paths) == 1 else Path("plots")
         files = compare.report(group(found), _final_returns(found), folder, by)
     if in_notebook():
         from IPython.display import Image, display
 
-        for file in files:
-            if file.suffix == ".png":
-                display(Image(filename=str(file)))
+        for file in _pictures(files):
+            display(Image(filename=str(file)))
     return files
 
 
 def report_on(run: TrainedRun) -> list[Path]:
-    """Evaluate a run's final policy, draw it, and name the files; returns the pages."""
+    """Evaluate a run's final policy, draw it, and name the files; returns the pictures."""
     files = draw_run(run, film=True)
     for file in files:
         say(file)
-    return [file for file in files if file.suffix == ".png"]
+    return _pictures(files)
 
 
 def draw_run(run: str | Path | TrainedRun, by: str = "step", *, film: bool = False) -> list[Path]:
@@ -79,25 +80,28 @@ def draw_run(run: str | Path | TrainedRun, by: str = "step", *, film: bool = Fal
     a scene.
     """
     path, scores, flights = path_of(run), None, list[Path]()
-    make_directory(path / "plots")
+    folder = path / "plots"
+    make_directory(folder)
     if checkpoint.list_steps(path / "checkpoints"):
         try:
             scores = final_scores(run)
             say(pages.sentence(scores))
-            flights = _draw_flights(load(run), path, film)
+            policy = load(run)
+            episodes = policy.config.evaluate_episodes
+            with closing(evaluation_env(policy.config, episodes)) as env:
+                flights = flight.draw_flights(policy.module, env, path, episodes, film) if env.scene else []
         except UserError as error:
             say(f"{path} is drawn without an evaluation: {error}")
-    return pages.draw_run(path, scores, flights, by)
+    files = curves.plot_runs([path], folder, by=by)
+    if scores and "q_bias" in scores:
+        files.append(curves.draw_q_bias(pages.q_bias(scores), path, folder / "q.png"))
+    files += flights
+    return [*files, pages.write_run(path, _pictures(files), scores)]
 
 
-def _draw_flights(policy: TrainedPolicy, path: Path, film: bool) -> list[Path]:
-    """The pictures of a policy's flights, into the `plots/` of a run; none where there is no scene."""
-    episodes = policy.config.evaluate_episodes
-    env = evaluation_env(policy.config, episodes)
-    try:
-        return flight.draw_flights(policy.module, env, path, episodes, film) if env.scene else []
-    finally:
-        env.close()
+def _pictures(files: list[Path]) -> list[Path]:
+    """The files without films and pages."""
+    return [file for file in files if file.suffix == ".png"]
 
 
 def _final_returns(runs: list[Path]) -> dict[Path, float]:

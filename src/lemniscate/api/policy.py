@@ -135,7 +135,7 @@ def load(run: Trained, *, trust: bool = False) -> TrainedPolicy:
     with prefix_errors(str(address)):
         found = find_checkpoint(path)
         with parsing(found.path):
-            hub.require_trusted(_own_code(found), trust=trust)
+            hub.require_trusted(own_code(found), trust=trust)
         return _read(found, path)
 
 
@@ -144,7 +144,7 @@ def _read(found: checkpoint.Checkpoint, path: Path) -> TrainedPolicy:
     with parsing(found.path):
         name, fields, step = found.record["algorithm"], found.record["config"], found.numbers["step"]
         spec = checkpoint.spec_from_json(found.record["spec"])
-        has_own_code = bool(_own_code(found))
+        has_own_code = bool(own_code(found))
     config = algos.find(name).Config.from_json(fields)
     with nullcontext() if has_own_code else parsing(found.path):  # what the user's own code raises is not damage
         networks = config.networks(spec)
@@ -155,7 +155,7 @@ def _read(found: checkpoint.Checkpoint, path: Path) -> TrainedPolicy:
     return TrainedPolicy(networks, spec, config, step, path)
 
 
-def _own_code(found: checkpoint.Checkpoint) -> list[str]:
+def own_code(found: checkpoint.Checkpoint) -> list[str]:
     """The names of the code that a checkpoint needs and that is not lemniscate's: algorithm, environment, networks."""
     name = found.record["algorithm"]
     return [*([] if name in algos.ALGORITHMS else [str(name)]), *hub.own_code(found.record["config"])]

@@ -5,11 +5,12 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from lemniscate.api.policy import Trained, TrainedPolicy, algorithm_of, load, save
+from lemniscate.api.policy import Trained, TrainedPolicy, algorithm_of, load, own_code, save
 from lemniscate.api.results import FINAL_EPISODES, evaluate, final_scores, scores_of
 from lemniscate.errors import UserError
 from lemniscate.hub import repository as hub
 from lemniscate.report import pages
+from lemniscate.run import checkpoint
 from lemniscate.run.directory import CONFIG
 from lemniscate.system.console import say
 from lemniscate.system.files import write_json
@@ -18,9 +19,9 @@ from lemniscate.system.files import write_json
 def push(run: Trained, name: str, *, private: bool = False, license: str | None = None, trust: bool = False) -> str:
     """Upload the policy of a run to the Hugging Face Hub, as the model repository `name`, in one commit.
 
-    The files are those of `save`: raw tensors and JSON, each with its sha256. Beside them are a
-    model card with the scores, the command that trains it again and the lines that load it; the final scores of the
-    run, its figures (`plots/`), its newest film, or one that is made now if the environment can be rendered; and what
+    The files are those of `save`: raw tensors and JSON, each with its sha256. Beside them are a model card with the
+    scores, the command that trains it again and the lines that load it; the final scores of the run, its figures
+    (`plots/`), its newest film, or one that is made now if the environment can be rendered; and what
     `lemniscate export` wrote (`export/`), if it did. `load("hf://user/name")` loads the policy.
 
     Args:
@@ -43,44 +44,35 @@ def push(run: Trained, name: str, *, private: bool = False, license: str | None 
     with TemporaryDirectory() as temporary:
         folder = Path(temporary) / "policy"
         save(policy, folder)
-        _write_repository(folder, policy, name, license)
+        code = own_code(checkpoint.read(folder))
+        path = policy.path if policy.path and (policy.path / CONFIG).is_file() else None
+        for place, file in _shown(path).items() if path else ():
+            (folder / place).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(file, folder / place)
+        if not (path and pages.newest_film(path)):
+            _make_film(policy, folder)
+        scores = _scores(policy, path)
+        if scores:
+            write_json(folder / "final.json", scores)
+        own = {"step": policy.step, "scores": scores, "license": license, "code": code}
+        pages.write_card(folder, name, algorithm_of(policy), policy.config, **own)
         return hub.upload(folder, name, private)
 
 
-def _write_repository(folder: Path, policy: TrainedPolicy, name: str, license: str | None) -> None:
-    """Write beside a stored policy what its run has to show, and the card."""
-    run = policy.path if policy.path and (policy.path / CONFIG).is_file() else None
-    if run:
-        _copy_shown(run, folder)
-    if not (run and _copy_film(run, folder)):
-        _make_film(policy, folder)
-    scores = _scores(policy, run)
-    if scores:
-        write_json(folder / "final.json", scores)
-    of_policy = {"step": policy.step, "scores": scores, "license": license}
-    pages.write_card(folder, name, algorithm_of(policy), policy.config, **of_policy)
+def _shown(run: Path) -> dict[str, Path]:
+    """What a run has to show, by its path in the repository; no links.
 
-
-def _copy_shown(run: Path, folder: Path) -> None:
-    """Copy the figures of a run, and its export where there is a whole one; no links."""
-    shown = [*(run / "plots").glob("*.png")]
+    It is the figures, the export where there is a whole one, and the newest film: a video by the name that the Hub
+    plays, else in `videos/`.
+    """
+    files = [*(run / "plots").glob("*.png")]
     if (run / "export" / "policy.onnx").is_file():
-        shown += (run / "export").rglob("*")
-    for file in shown:
-        if file.is_file() and file.resolve() == run.resolve() / file.relative_to(run):
-            copy = folder / file.relative_to(run)
-            copy.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(file, copy)
-
-
-def _copy_film(run: Path, folder: Path) -> bool:
-    """Copy the newest film of a run, if there is one: a video by the name that the Hub plays, else into `videos/`."""
-    film = pages.newest_film(run)
-    if film:
-        copy = folder / ("replay.mp4" if film.suffix == ".mp4" else f"videos/{film.name}")
-        copy.parent.mkdir(exist_ok=True)
-        shutil.copyfile(film, copy)
-    return film is not None
+        files += (run / "export").rglob("*")
+    own = [file for file in files if file.is_file() and file.resolve() == run.resolve() / file.relative_to(run)]
+    shown = {file.relative_to(run).as_posix(): file for file in own}
+    if film := pages.newest_film(run):
+        shown["replay.mp4" if film.suffix == ".mp4" else f"videos/{film.name}"] = film
+    return shown
 
 
 def _make_film(policy: TrainedPolicy, folder: Path) -> None:

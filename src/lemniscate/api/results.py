@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from functools import partial
 from os import PathLike
 from pathlib import Path
@@ -205,10 +205,8 @@ def final_scores(run: str | Path | TrainedRun) -> dict[str, Any]:
 
 def _known_scores(file: Path) -> dict[str, Any]:
     """The scores that were kept; none where the file is not there, or is damaged: they can be found again."""
-    if not os.path.lexists(file):
-        return {}
     try:
-        return read_json(file)
+        return read_json(file) if os.path.lexists(file) else {}
     except DamagedFileError as error:
         say(error)
         return {}
@@ -223,44 +221,39 @@ def _film(video: str | Path | None) -> Path | None:
     return None if video is None else Path(video)
 
 
-def _config_of(agent: TrainedPolicy | Agent | None, env: str | Callable[..., Any] | None) -> RunConfig:
-    """The Config of a policy; without one, that of `env` alone. Raises `UserError` for a function without `env`."""
-    if isinstance(agent, TrainedPolicy):
-        return agent.config
-    if agent is not None and not takes(agent, 1):
-        raise UserError(f"A policy that is a function takes one observation; {shown(agent)} does not.")
-    if env is None:
-        raise UserError("A function acts in an environment that is named with it, such as env='CartPole-v1'.")
-    return RunConfig(env=registry.name_of(env))
-
-
 @contextmanager
 def _environments(
     agent: TrainedPolicy | Agent | None, episodes: int, env: str | Callable[..., Any] | None, **elsewhere: Any
 ) -> Iterator[tuple[VecEnv, dict[str, Any]]]:
-    """The environments of an evaluation, and the arguments of a single one. Raises `UserError` for other spaces."""
-    config = _config_of(agent, env)
+    """The environments of an evaluation, and the arguments of a single one.
+
+    Raises `UserError` for other spaces than those of a policy, and for a function without `env`.
+    """
+    if isinstance(agent, TrainedPolicy):
+        config = agent.config
+    elif agent is not None and not takes(agent, 1):
+        raise UserError(f"A policy that is a function takes one observation; {shown(agent)} does not.")
+    elif env is None:
+        raise UserError("A function acts in an environment that is named with it, such as env='CartPole-v1'.")
+    else:
+        config = RunConfig(env=registry.name_of(env))
     arguments = env_arguments(config, env=env, **elsewhere)
-    vec = evaluation_env(config, episodes, env=env, **elsewhere)
-    try:
+    with closing(evaluation_env(config, episodes, env=env, **elsewhere)) as vec:
         if isinstance(agent, TrainedPolicy) and not vec.spec.fits(agent.spec):
             ours, theirs = agent.spec.env_id, vec.spec.env_id
             raise UserError(f"A policy for {ours} cannot act in {theirs}: observation or action spaces differ.")
         yield vec, arguments
-    finally:
-        vec.close()
 
 
 def _show(
     agent: TrainedPolicy | Agent | None, vec: VecEnv, arguments: dict[str, Any], *, deterministic: bool, **how: Any
 ) -> Evaluation:
     """Play flights where `vec` has a scene, else episodes in a rendered environment; at random without an agent."""
-    if isinstance(agent, TrainedPolicy):
-        if vec.scene:
-            return flight.show_flights(agent.module, vec, deterministic=deterministic, **how)
+    trained = isinstance(agent, TrainedPolicy)
+    if vec.scene and (trained or agent is None):
+        return flight.show_flights(agent.module if trained else None, vec, deterministic=deterministic, **how)
+    if trained:
         drawn = TrainedPolicy(agent.networks, agent.spec, agent.config.replace(seed=how["seed"]), agent.step)
         act = partial(drawn.act, deterministic=deterministic)
         return playback.show_episodes(act if drawn.is_masked else playback.act_by(act), arguments, **how)
-    if vec.scene and agent is None:
-        return flight.show_flights(None, vec, **how)
-    return playback.show_episodes(playback.act_by(agent) if agent else None, arguments, **how)
+    return playback.show_episodes(agent and playback.act_by(agent), arguments, **how)

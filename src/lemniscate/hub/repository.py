@@ -25,13 +25,16 @@ CHECKPOINT = (MANIFEST, *FILES)
 EXECUTABLE = (".bin", ".ckpt", ".joblib", ".pickle", ".pkl", ".pt", ".pth", ".py", ".zip")
 """endings of what other libraries store policies as, and which may execute code when it is read"""
 
-REPLACED = ("export/", "plots/", "videos/", "replay.mp4", "final.json")
-"""beginnings of the paths that belong to one upload: what the next one does not have of them is deleted"""
+REPLACED = ("export/*", "plots/*", "videos/*", "replay.mp4", "final.json")
+"""the paths that belong to one upload: what the next one does not have of them is deleted"""
+
+KEPT = (".gitattributes", "README.md", "LICENSE")
+"""the files of a repository that is still empty"""
 
 REASONS = {
-    401: "it does not know your token; log in again with `hf auth login`, or renew HF_TOKEN",
-    403: "your token has no right to it",
-    429: "too many requests in a short time; try again later",
+    401: "refuses: it does not know your token; log in again with `hf auth login`, or renew HF_TOKEN",
+    403: "refuses: your token has no right to it",
+    429: "refuses: too many requests in a short time; try again later",
 }
 """what the Hub means by a status"""
 
@@ -97,7 +100,14 @@ def download(address: Address) -> Path:
             snapshot_download(address.name, revision=revision, local_dir=folder, allow_patterns=[*CHECKPOINT])
         if any(not (folder / name).is_file() for name in CHECKPOINT):
             there = get_cached_repo_tree(address.name, revision=revision, local_dir=folder)
-            raise _no_policy([file.path for file in there])
+            listed = [file.path for file in there]
+            missing = next(name for name in CHECKPOINT if name not in listed)
+            if executable := [name for name in listed if name.endswith(EXECUTABLE)]:
+                raise UserError(
+                    f"The repository has no {missing} but {executable[0]}, which may execute code when it is read;"
+                    " it is not downloaded. Only policies of lemniscate can be loaded."
+                )
+            raise UserError(f"The repository holds no policy of lemniscate: it has no {missing}.")
     return folder
 
 
@@ -117,52 +127,28 @@ def require_uploads(name: str) -> None:
 def upload(folder: Path, name: str, private: bool) -> str:
     """Upload all files in `folder` into the model repository `name`, in one commit; it is created if need be.
 
-    Args:
-        folder: with a checkpoint at its root.
-        name: user/name.
-        private: make a new repository private.
-
-    Returns:
-        The address of its page.
+    The folder has a checkpoint at its root, and a new repository is `private` if that is asked for. Returns the address
+    of its page.
 
     Raises:
         UserError: the Hub refuses or cannot be reached; the repository holds something else than a policy, or is public
             where it is to be private.
     """
-    files = {file.relative_to(folder).as_posix(): file for file in sorted(folder.rglob("*")) if file.is_file()}
     with _answers(name), _quiet():
-        from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi
+        from huggingface_hub import HfApi
 
         api = HfApi()
         page = api.create_repo(name, private=private or None, exist_ok=True)
         there = api.model_info(name)
+        if private and not there.private:
+            raise UserError("The repository is public already; make it private on its page, or choose another name.")
         listed = [file.rfilename for file in there.siblings or ()]
-        _require_replaceable(listed, public=private and not there.private)
-        stale = [file for file in listed if file.startswith(REPLACED) and file not in files]
-        deleted, added = map(CommitOperationDelete, stale), (CommitOperationAdd(*file) for file in files.items())
-        api.create_commit(name, [*deleted, *added], commit_message="Upload a policy of lemniscate")
+        others = [file for file in listed if file not in KEPT]
+        if others and MANIFEST not in listed:
+            raise UserError(f"The repository holds no policy of lemniscate but {others[0]}; choose another name.")
+        said = "Upload a policy of lemniscate"
+        api.upload_folder(repo_id=name, folder_path=folder, commit_message=said, delete_patterns=[*REPLACED])
     return str(page)
-
-
-def _require_replaceable(listed: Sequence[str], *, public: bool) -> None:
-    """Raise `UserError` for a repository that an upload must not change: a public one, or of something else."""
-    if public:
-        raise UserError("The repository is public already; make it private on its page, or choose another name.")
-    others = [name for name in listed if name not in (".gitattributes", "README.md", "LICENSE")]
-    if others and MANIFEST not in listed:
-        raise UserError(f"The repository holds no policy of lemniscate but {others[0]}; choose another name.")
-
-
-def _no_policy(listed: Sequence[str]) -> UserError:
-    """The sentence for a repository without a whole checkpoint at its root."""
-    missing = next(name for name in CHECKPOINT if name not in listed)
-    for name in listed:
-        if name.endswith(EXECUTABLE):
-            return UserError(
-                f"The repository has no {missing} but {name}, which may execute code when it is read; it is not"
-                " downloaded. Only policies of lemniscate can be loaded."
-            )
-    return UserError(f"The repository holds no policy of lemniscate: it has no {missing}.")
 
 
 @contextmanager
@@ -184,7 +170,9 @@ def _answers(name: str) -> Iterator[None]:
             sentence = "There is no such repository on the Hub, or you may not read it; `hf auth login` logs you in."
             raise UserError(sentence) from None
         except errors.HfHubHTTPError as error:
-            raise UserError(_refusal(error.response.status_code, error.server_message)) from None
+            status, message = error.response.status_code, error.server_message
+            answer = f"answers with status {status}{f': {message}' if message else ''}"
+            raise UserError(f"The Hub {REASONS.get(status, answer)}.") from None
         except (RuntimeError, ValueError) as error:
             reasons = [_first_line(known) for known in (error, error.__cause__) if known]
             raise UserError(f"{': '.join(reasons)}.") from error
@@ -192,13 +180,6 @@ def _answers(name: str) -> Iterator[None]:
             if isinstance(error, OSError) and error.errno:  # of this machine's disk
                 raise
             raise UserError(f"The Hub cannot be reached: {_first_line(error.__cause__ or error)}.") from error
-
-
-def _refusal(status: int, message: str | None) -> str:
-    """The sentence for an error that the Hub answered with."""
-    if status in REASONS:
-        return f"The Hub refuses: {REASONS[status]}."
-    return f"The Hub answers with status {status}{f': {message}' if message else ''}."
 
 
 def _first_line(error: BaseException) -> str:

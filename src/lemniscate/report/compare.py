@@ -44,15 +44,9 @@ SHORT = 10
 def report(groups: list[Group], scores: Scores, folder: Path, by: str = "step") -> list[Path]:
     """A table on standard error, pictures in `folder`, and a page with all of it; returns the files.
 
-    Args:
-        groups: in any environments; each has its own table and pictures.
-        scores: final returns of the finished runs.
-        folder: of the files.
-        by: "step", "episode" or "minute", the horizontal axis of the learning curves.
+    Each environment has its own table and pictures. `by` is the horizontal axis of the learning curves.
     """
-    files: list[Path] = []
-    parts: list[dict[str, Any]] = []
-    page = folder / "report.html"
+    page, files, parts = folder / "report.html", list[Path](), list[dict[str, Any]]()
     envs = list(dict.fromkeys(one.env for one in groups))
     for env in envs:
         same = [one for one in groups if one.env == env]
@@ -60,10 +54,10 @@ def report(groups: list[Group], scores: Scores, folder: Path, by: str = "step") 
         for line in [f"{env}:", *table(cells), *said]:
             say(line)
         ending = ".png" if len(envs) == 1 else f"-{file_name(env)}.png"
-        pictures = [draw(same, scores, folder / f"comparison{ending}", _why_unranked(same, scores))]
         runs = [run for one in same for run in one.runs]
         apart = len(same) == 1 and len(runs) <= len(COLORS)
         labels = [run.name if apart else one.label for one in same for run in one.runs]
+        pictures = [draw(same, scores, folder / f"comparison{ending}")]
         pictures += plot_runs(runs, folder, labels, ending, by)
         parts.append(pages.comparison_part(page, same, scores, cells, said, pictures))
         files += pictures
@@ -129,27 +123,18 @@ def _improvement(one: Group, other: Group, scores: Scores) -> str:
 
 
 def _why_unranked(groups: list[Group], scores: Scores) -> str | None:
-    """A sentence on why nothing is ranked; None if every group has enough seeds."""
-    if is_ranked(groups, scores):
+    """A sentence on why nothing is ranked; None if every group has final returns of two seeds at least."""
+    if all(len(one.finals(scores)) > 1 for one in groups):
         return None
     return ONE_SEED if any(len(one.runs) == 1 for one in groups) else UNFINISHED
 
 
-def is_ranked(groups: list[Group], scores: Scores) -> bool:
-    """Whether every group has final returns of two seeds at least."""
-    return all(len(one.finals(scores)) > 1 for one in groups)
-
-
-def draw(groups: list[Group], scores: Scores, file: Path, unranked: str | None = None) -> Path:
+def draw(groups: list[Group], scores: Scores, file: Path) -> Path:
     """Returns in training against steps and minutes; below them final returns and probabilities of improvement.
 
-    Args:
-        groups: in one environment.
-        scores: final returns, of two runs of each group at least unless `unranked`.
-        file: of the picture.
-        unranked: the reason why nothing is ranked, written in the place of the lower half.
+    Where nothing is ranked, a sentence says why in the place of the lower half. The groups are in one environment.
     """
-    pairs = list(combinations(range(len(groups)), 2))
+    pairs, unranked = list(combinations(range(len(groups)), 2)), _why_unranked(groups, scores)
     lower = 0.3 if unranked else 0.9 + 0.3 * max(len(groups), len(pairs))
     figure = Figure(figsize=(11, 4.4 + lower), layout="constrained")
     grid = figure.add_gridspec(2, 2, height_ratios=[3.6, lower])
@@ -168,20 +153,21 @@ def draw(groups: list[Group], scores: Scores, file: Path, unranked: str | None =
 
 def _draw_training(figure: Figure, by_step: Axes, by_minute: Axes, groups: list[Group]) -> None:
     """Mean and interval of the finished seeds of a group, or of all if none is; the other seeds as thin lines."""
-    thin = False
+    unfinished = False
     for i, (one, name) in enumerate(zip(groups, _names(groups), strict=True)):
         curves = {run: curve for run in one.runs if len((curve := _curve(run))[0])}
         whole = [run for run in curves if is_finished(run)] or list(curves)
         rest = [run for run in curves if run not in whole]
-        thin = thin or bool(rest)
-        label = f"{name if name == one.label else f'{name}: {one.label}'} ({_seeds(len(whole))})"
+        unfinished = unfinished or bool(rest)
+        seeds = f"{len(whole)} seed{'s' * (len(whole) != 1)}" if whole else "no whole episode yet"
+        label = f"{name if name == one.label else f'{name}: {one.label}'} ({seeds})"
         by_step.plot([], [], color=COLORS[i % 10], label=label)  # in the legend, even if no episode is whole yet
         for unit, axes in enumerate((by_step, by_minute)):
             for run in rest:
                 axes.plot(curves[run][unit], curves[run][2], color=COLORS[i % 10], linewidth=0.7)
             if whole:
                 _band(axes, [(curves[run][unit], curves[run][2]) for run in whole], COLORS[i % 10])
-    if thin:
+    if unfinished:
         by_step.plot([], [], color="grey", linewidth=0.7, label="not finished")
     several = any(len(one.runs) > 1 for one in groups)
     by_step.set_title(f"{groups[0].env}{': mean and 95 % over seeds' if several else ''}", loc="left", fontsize=10)
@@ -250,7 +236,3 @@ def _names(groups: list[Group]) -> list[str]:
     """The labels of the groups; where one is long, their numbers in the legend."""
     long = max(len(one.label) for one in groups) > SHORT
     return [str(i) if long else one.label for i, one in enumerate(groups, 1)]
-
-
-def _seeds(count: int) -> str:
-    return f"{count} seed{'s' * (count != 1)}" if count else "no whole episode yet"

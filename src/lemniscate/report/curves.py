@@ -5,7 +5,6 @@ import math
 import time
 import tomllib
 from collections.abc import Mapping, Sequence
-from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lemniscate.errors import unknown_name
 from lemniscate.report.style import COLORS, finish, legend_above, limit_axis, run_styles, save
 from lemniscate.run.directory import read_config
 from lemniscate.run.evaluate import QBias
@@ -53,13 +51,8 @@ def plot_runs(
 def learning_curve(runs: list[Path], file: Path, labels: Sequence[str] | None = None, by: str = "step") -> Path:
     """Return of each whole training episode, and the mean of the last ones: of 20, or of 2 % if that is more.
 
-    By episode the mean is that of the last 20 always. The line is interrupted where no episode ended for long.
-
-    Args:
-        runs: one, or several in different colours.
-        file: of the picture.
-        labels: of the runs; by default their names.
-        by: "step", "episode" or "minute", the horizontal axis.
+    By episode the mean is that of the last 20 always. The line is interrupted where no episode ended for long. The
+    horizontal axis is one of `BY`; several runs have different colours.
     """
     figure = Figure(figsize=(7, 4), layout="constrained")
     axes = figure.subplots()
@@ -67,7 +60,8 @@ def learning_curve(runs: list[Path], file: Path, labels: Sequence[str] | None = 
     drawn = [_draw_episodes(axes, run, by, color, label * several) for run, color, label in run_styles(runs, labels)]
     windows = sorted(filter(None, drawn))
     axes.set(xlabel=BY[by], ylabel="return of an episode")
-    axes.set_title(_title(runs), loc="left")
+    algorithm, config = read_config(runs[0])
+    axes.set_title(f"{f'{len(runs)} runs' if several else algorithm.upper()} on {config['env']}", loc="left")
     axes.set_xlim(left=0)
     finish(axes)
     if windows:
@@ -81,32 +75,22 @@ def learning_curve(runs: list[Path], file: Path, labels: Sequence[str] | None = 
     return save(figure, file)
 
 
-def require_by(by: str) -> None:
-    """Raise `UserError` for an axis that a learning curve does not have."""
-    if by not in BY:
-        raise unknown_name("axis", by, BY)
-
-
 def _draw_episodes(axes: Axes, run: Path, by: str, color: object, label: str) -> int:
     """The episodes of a run as dots, their moving average as a line; returns over how many, 0 if there is none yet."""
     steps, returns = episode_returns(run)
     if not len(steps):
         return 0
-    window = WINDOW if by == "episode" else window_of(returns)
+    window, x, interrupted = window_of(returns), steps, gaps(steps)
+    if by == "episode":
+        window, x, interrupted = WINDOW, np.arange(1.0, len(steps) + 1), np.zeros_like(interrupted)
+    elif by == "minute":
+        x = np.interp(steps, *training_minutes(run))
     some = np.linspace(0, len(steps) - 1, min(len(steps), POINTS)).astype(int)
-    x, averages = _positions(run, steps, by)[some], moving_average(returns, window)[some]
+    x, averages = x[some], moving_average(returns, window)[some]
     axes.plot(x, returns[some], ".", color=color, alpha=0.25 if len(x) > 300 else 0.5, markersize=3)
-    interrupted = gaps(steps) & (by != "episode")
     cuts = np.flatnonzero(np.diff(np.cumsum([False, *interrupted])[some])) + 1
     axes.plot(np.insert(x, cuts, np.nan), np.insert(averages, cuts, np.nan), color=color, linewidth=1.5, label=label)
     return window
-
-
-def _positions(run: Path, steps: np.ndarray, by: str) -> np.ndarray:
-    """The horizontal positions of the episodes that ended at `steps`."""
-    if by == "episode":
-        return np.arange(1.0, len(steps) + 1)
-    return np.interp(steps, *training_minutes(run)) if by == "minute" else steps
 
 
 def diagnostics(runs: list[Path], file: Path, labels: Sequence[str] | None = None) -> Path:
@@ -120,10 +104,8 @@ def diagnostics(runs: list[Path], file: Path, labels: Sequence[str] | None = Non
     names = [name for name in TITLES if name in logged] + own
     rows = max(1, math.ceil(len(names) / 3))
     figure = Figure(figsize=(10, 2.4 * rows + 0.4), layout="constrained")
-    for i, (axes, name) in enumerate(zip_longest(figure.subplots(rows, 3, squeeze=False).flat, names)):
-        if name is None:
-            axes.set_visible(False)
-            continue
+    for i, name in enumerate(names):
+        axes = figure.add_subplot(rows, 3, i + 1)
         for run, color, label in run_styles(runs, labels):
             draw_metric(axes, logs[run], name, color, label, width=1.5 if len(runs) <= 5 else 0.7)
         title, unit = TITLES.get(name, (name, ""))
@@ -258,8 +240,3 @@ def moving_average(values: np.ndarray, window: int) -> np.ndarray:
     total = np.cumsum(np.insert(values, 0, 0.0))
     start = np.maximum(0, np.arange(1, len(values) + 1) - window)
     return (total[1:] - total[start]) / (np.arange(1, len(values) + 1) - start)
-
-
-def _title(runs: list[Path]) -> str:
-    algorithm, config = read_config(runs[0])
-    return f"{algorithm.upper() if len(runs) == 1 else f'{len(runs)} runs'} on {config['env']}"

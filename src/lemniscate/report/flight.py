@@ -13,7 +13,6 @@ from matplotlib.figure import Figure
 
 from lemniscate.envs.backend import Baseline
 from lemniscate.envs.vec_env import VecEnv
-from lemniscate.errors import UserError
 from lemniscate.nn.policies import Policy
 from lemniscate.report.playback import Tell, give, sentence
 from lemniscate.report.style import finish, save
@@ -45,6 +44,11 @@ class Flight:
         return Flight(self.position[flown, own], self.reference[flown, own], self.attitude[flown, own], self.time_step)
 
     @property
+    def track(self) -> dict[str, np.ndarray]:
+        """The first of the flights, as `scene` takes it."""
+        return {name: getattr(self, name)[:, 0] for name in ("position", "attitude", "reference")}
+
+    @property
     def error_mm(self) -> np.ndarray:
         """Distance to the reference, [T, M]."""
         return 1000 * np.linalg.norm(self.position - self.reference, axis=-1)
@@ -66,11 +70,10 @@ def record(
     """Play what `evaluate` plays, and keep the tracks; in `table` also what `evaluate` keeps.
 
     Of more flights than there are environments, the track of each environment's first is kept. Without a policy,
-    actions are uniformly random. Raises `UserError` where there is no scene.
+    actions are uniformly random. The environment has a scene.
     """
     scene = env.scene
-    if scene is None:
-        raise UserError(f"{env.spec.env_id} has no reference to track, so no flight can be drawn against one.")
+    assert scene is not None
     rows, first = [], torch.ones(env.num_envs, dtype=torch.bool, device=env.device)
     for _, _, step, counts in play_episodes(policy, env, flights, seed, deterministic):
         if table:
@@ -105,12 +108,12 @@ def show_flights(
         say(f"{env.num_envs} of the {episodes} flights are shown, the first of each environment.")
     for number, of_episode in enumerate(zip(scores.returns, scores.lengths, strict=True), start=1):
         tell(sentence(number, *of_episode))
-    flights = [track.one(number) for number in range(track.position.shape[1])]
-    model = env.scene.model if env.scene else None
+    assert env.scene is not None
+    flights, model = [track.one(number) for number in range(track.position.shape[1])], env.scene.model
     if video is None and not in_notebook():
         from lemniscate.report import scene
 
-        scene.show(flights, model)
+        scene.show([one.track for one in flights], model, track.time_step)
     else:
         frames, how = _frames(flights, model)
         give(frames, 1 / (STRIDE * track.time_step), video)
@@ -119,7 +122,10 @@ def show_flights(
 
 
 def draw_flights(policy: Policy, env: VecEnv, run: Path, flights: int, film: bool) -> list[Path]:
-    """Path and error of some flights in a scene, into the `plots/` of a run; with `film` one of them into `videos/`."""
+    """Path and error of some flights in a scene, into the `plots/` of a run; with `film` one of them into `videos/`.
+
+    Returns the files, the film last.
+    """
     track = record(policy, env, flights, seed=0)
     beside = record(env.baseline, env, flights, seed=0) if env.baseline else None
     folder, video = run / "plots", run / "videos" / "flight.gif"
@@ -135,18 +141,16 @@ def draw_path(flight: Flight, file: Path) -> Path:
     figure = Figure(figsize=(7, 4.4), layout="constrained")
     axes = figure.subplots()
     reference, path = flight.reference[:, 0], flight.position[:, 0]
-    first_second = flight.time <= 1
+    late = flight.time > 1
     axes.plot(*reference[:, [0, 2]].T, color=ORANGE, linewidth=5, alpha=0.35, label="reference")
     for other in range(1, flight.position.shape[1]):
-        axes.plot(*flight.position[first_second, other][:, [0, 2]].T, color=GREY, linewidth=0.6, alpha=0.6)
+        axes.plot(*flight.position[~late, other][:, [0, 2]].T, color=GREY, linewidth=0.6, alpha=0.6)
     axes.plot([], [], color=GREY, linewidth=0.8, label=f"first second of {flight.position.shape[1] - 1} other starts")
     axes.plot(*path[:, [0, 2]].T, color=BLUE, linewidth=1.2, label="flown")
     axes.plot(*path[0, [0, 2]], "o", color=BLUE, markersize=5)
-    if first_second.all():
-        axes.set_title(f"Tracking error: {_rms(flight.error_mm):.1f} mm", loc="left")
-    else:
-        late = flight.error_mm[~first_second]
-        axes.set_title(f"Tracking error after the first second: {_rms(late):.1f} mm", loc="left")
+    counted, when = (late, " after the first second") if late.any() else (slice(None), "")
+    rms = np.sqrt(np.nanmean(np.square(flight.error_mm[counted])))
+    axes.set_title(f"Tracking error{when}: {rms:.1f} mm", loc="left")
     axes.set(xlabel="x / m", ylabel="z / m", aspect="equal")
     finish(axes)
     axes.legend(frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=3)
@@ -176,10 +180,11 @@ def _frames(flights: list[Flight], model: Any) -> tuple[Iterable[np.ndarray], st
     """Frames of flights, one after the other, and how they are drawn."""
     from lemniscate.report import scene
 
-    first = scene.render(flights[0], model, STRIDE)
+    rendered = (scene.render(one.track, model, STRIDE) for one in flights)
+    first = next(rendered)
     if first is not None:
-        more = (scene.render(one, model, STRIDE) for one in flights[1:])
-        return chain(first, chain.from_iterable(frames for frames in more if frames is not None)), "Rendered by MuJoCo."
+        more = chain.from_iterable(frames for frames in rendered if frames is not None)
+        return chain(first, more), "Rendered by MuJoCo."
     how = (
         "Drawn with matplotlib, since there is no off-screen OpenGL; for a MuJoCo rendering install EGL or OSMesa"
         " (Debian: libegl1 and libgl1-mesa-dri, or libosmesa6)."
@@ -220,7 +225,3 @@ def animate(flight: Flight, every: int) -> list[np.ndarray]:
             axes.draw_artist(artist)
         frames.append(np.asarray(canvas.buffer_rgba())[..., :3].copy())
     return frames
-
-
-def _rms(error: np.ndarray) -> float:
-    return float(np.sqrt(np.nanmean(np.square(error))))

@@ -11,11 +11,11 @@ import os
 import platform
 import shlex
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 
 import numpy as np
 
@@ -23,13 +23,12 @@ from lemniscate import algos
 from lemniscate.errors import UserError, resume_line
 from lemniscate.report import advice, curves
 from lemniscate.report.playback import FILMS
-from lemniscate.report.seeds import Group, Scores
+from lemniscate.report.seeds import Group, Scores, differing
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import is_finished, read_config
-from lemniscate.run.evaluate import QBias
+from lemniscate.run.evaluate import Evaluation, QBias
 from lemniscate.run.fields import flag
 from lemniscate.run.metrics import read_metrics
-from lemniscate.system import named
 from lemniscate.system.files import replace_file
 from lemniscate.system.templates import filled
 
@@ -38,18 +37,11 @@ MOST_BYTES = 5_000_000
 
 KINDS = {".png": "image/png", ".gif": "image/gif", ".webp": "image/webp", ".mp4": "video/mp4"}
 
-CAPTIONS = {
-    "learning_curve": "Return of each whole training episode, from a policy that explores",
-    "diagnostics": "Metrics of the updates; triangles mark values beyond an axis",
-    "q": "What Q predicts at the beginning of each episode, and the discounted return that followed",
-    "flight": "The first flight of the evaluation over its reference",
-    "error": "Distance to the reference over time",
-    "comparison": "Returns in training, final returns, and probabilities of improvement",
-}
-"""what is below a picture, by the beginning of its name"""
+NOT_MEASURES = {field.name for field in fields(Evaluation)} | {"step", "seed"}
+"""names among scores that are not measures of the environment"""
 
-NOT_MEASURES = ("env_id", "episodes", "mean_return", "std_return", "returns", "lengths", "terminated", "q_bias")
-"""names in the JSON of an `Evaluation` that are not measures of the environment"""
+Evaluated = Mapping[str, Any]
+"""what `Evaluation.to_json` returns; of a run's policy also its `step`, and the `seed` of the starts"""
 
 TEMPLATES = Path(__file__).parent / "templates"
 
@@ -57,65 +49,31 @@ TASK = "reinforcement-learning"
 """the name of the field on the Hub"""
 
 
-def draw_run(run: Path, scores: Mapping[str, Any] | None, flights: Sequence[Path], by: str) -> list[Path]:
-    """Draw the curves of a run and write its page; returns the files, the page last.
-
-    Args:
-        run: the run directory.
-        scores: of its newest policy, those of `results.final_scores`, if there are any.
-        flights: what `flight.draw_flights` returned.
-        by: "step", "episode" or "minute", the horizontal axis of the learning curve.
-    """
-    pictures = curves.plot_runs([run], run / "plots", by=by)
-    if scores and "q_bias" in scores:
-        pictures.append(curves.draw_q_bias(_q_bias(scores), run, run / "plots" / "q.png"))
-    pictures += [file for file in flights if file.suffix == ".png"]
-    films = [file for file in flights if file not in pictures]
-    return [*pictures, *films, write_run(run, pictures, scores)]
-
-
-def write_run(run: Path, pictures: Sequence[Path], scores: Mapping[str, Any] | None) -> Path:
-    """Write the page of a run: curves, film, evaluation, settings, commands, what to try next.
-
-    Args:
-        run: the run directory.
-        pictures: of the run; they are embedded.
-        scores: of its newest policy, those of `Evaluation.to_json` and the `seed` of the starts, if there are any.
-    """
+def write_run(run: Path, pictures: Sequence[Path], scores: Evaluated | None) -> Path:
+    """Write the page of a run: curves, film, evaluation, settings, commands, what to try next."""
     algorithm, config = read_config(run)
-    log, file, film = read_metrics(run), run / "plots" / "report.html", newest_film(run)
+    log = read_metrics(run)
     taken, total = (log[-1]["step"] if log else 0), config.get("total_steps", 0)
     progress = f"{taken:,} steps" if taken >= total else f"{taken:,} of {total:,} steps"
-    evaluated = scores if scores and scores.get("returns") else None
     changed = changed_fields(algorithm, config)
     evaluate = shlex.join(["lemniscate", "evaluate", str(run), "--episodes", "100", "--seed", "1"])
     return _write_page(
-        file,
+        run / "plots" / "report.html",
         "run.html.j2",
         title=f"{algorithm.upper()} on {config.get('env')}",
         subtitle=f"{run} · seed {config.get('seed')} · {progress}",
-        headline=_headline(run, scores),
+        minutes=curves.training_minutes(run)[1][-1],
         advice=[*advice.sentences(advice.Evidence(config, log, scores or {})), advice.ONE_SEED],
         pictures=pictures,
-        film=film,
-        film_link=_link(film, file.parent) if film else "",
+        film=newest_film(run),
         embedded_bytes=MOST_BYTES,
-        scores=score_rows(evaluated) if evaluated else [],
-        histogram=_histogram(evaluated["returns"]) if evaluated else None,
+        scores=scores,
+        rows=score_rows(scores) if scores else [],
+        histogram=_histogram(scores["returns"]) if scores else None,
         changed=[(name, *map(_shown, values)) for name, values in changed.items()],
         unchanged=[(name, _shown(value)) for name, value in config.items() if name not in changed],
         commands=(train_command(algorithm, config), resume_line(run), evaluate),
     )
-
-
-def _headline(run: Path, scores: Mapping[str, Any] | None) -> list[tuple[str, str]]:
-    """(name, number) of the few numbers at the top."""
-    spent = ("minutes of training", f"{curves.training_minutes(run)[1][-1]:,.1f}")
-    if not scores or "mean_return" not in scores:
-        return [spent]
-    means = ("final return, mean ± std", f"{scores['mean_return']:,.1f} ± {scores['std_return']:,.1f}")
-    worst = ("worst episode", f"{min(scores['returns']):,.1f}")
-    return [means, worst, *(row for row in _measures(scores) if row[1].endswith(" mm")), spent]
 
 
 def newest_film(run: Path) -> Path | None:
@@ -148,46 +106,42 @@ def comparison_part(
     remarks: Sequence[str],
     pictures: Sequence[Path],
 ) -> dict[str, Any]:
-    """The part of one environment: the table, remarks, pictures, settings that differ, runs, commands.
+    """The part of one environment: the table with its heading, remarks, pictures, settings that differ, runs, commands.
 
-    Args:
-        page: that the part is for.
-        groups: in that environment.
-        scores: final returns of the finished runs.
-        rows: the table of final returns, its heading first.
-        remarks: sentences on what cannot be compared.
-        pictures: of the comparison, embedded.
+    Links in it lead from the `page` that it is for.
     """
     spread = [(one.label, advice.seeds_differ(one.finals(scores))) for one in groups]
     kinds = [{"algorithm": one.algorithm, **one.config} for one in groups]
-    names = [name for name in dict.fromkeys(name for kind in kinds for name in kind) if name != "seed"]
-    differ = [name for name in names if any(kind.get(name) != kinds[0].get(name) for kind in kinds)]
     seeds = {run: str(read_config(run)[1].get("seed")) for one in groups for run in one.runs}
-    commands = {one.label: (one, ",".join(seeds[run] for run in one.runs)) for one in groups}
     return {
         "env": groups[0].env,
         "labels": [one.label for one in groups],
         "rows": rows,
         "remarks": [*remarks, *(f"{label}: {sentence}" for label, sentence in spread if sentence)],
         "pictures": pictures,
-        "differences": [[name, *(_shown(kind[name]) if name in kind else "–" for kind in kinds)] for name in differ],
-        "runs": [_run_row(run, seed, scores, page) for run, seed in seeds.items()],
+        "differences": [
+            [name, *(_shown(kind[name]) if name in kind else "–" for kind in kinds)] for name in differing(kinds)
+        ],
+        "runs": [
+            {
+                "path": run,
+                "page": _from(page, run / "plots" / "report.html"),
+                "seed": seed,
+                "final": f"{scores[run]:,.1f}" if run in scores else "–",
+                "state": "finished" if is_finished(run) else "not finished",
+            }
+            for run, seed in seeds.items()
+        ],
         "commands": {
-            label: train_command(one.algorithm, one.config, seeds=seeds) for label, (one, seeds) in commands.items()
+            one.label: train_command(one.algorithm, one.config, seeds=",".join(seeds[run] for run in one.runs))
+            for one in groups
         },
     }
 
 
-def _run_row(run: Path, seed: str, scores: Scores, page: Path) -> dict[str, str]:
-    """The row of a run, with a link to its own page, if there is one."""
-    own = run / "plots" / "report.html"
-    return {
-        "path": str(run),
-        "page": _link(own, page.parent) if own.exists() else "",
-        "seed": seed,
-        "final": f"{scores[run]:,.1f}" if run in scores else "–",
-        "state": "finished" if is_finished(run) else "not finished",
-    }
+def _from(page: Path, file: Path) -> str:
+    """The path from a page to a file, which holds as long as both are moved together; none where it is not there."""
+    return Path(os.path.relpath(file, page.parent)).as_posix() if file.exists() else ""
 
 
 def write_card(
@@ -197,25 +151,15 @@ def write_card(
     config: RunConfig,
     *,
     step: int,
-    scores: Mapping[str, Any] | None,
+    scores: Evaluated | None,
     license: str | None,
+    code: Sequence[str],
 ) -> None:
-    """Write the card of a repository on the Hugging Face Hub beside its files; it shows those that are there.
+    """Write the card of the repository user/`name` on the Hugging Face Hub into the `folder` of its files.
 
-    Args:
-        folder: the repository's files.
-        name: user/name of the repository.
-        algorithm: by name.
-        config: of the run.
-        step: of the policy.
-        scores: those of `Evaluation.to_json` and the `seed` of the starts, if there are any.
-        license: as the Hub abbreviates it, such as "mit"; none is named without.
+    It shows the files that are there, and the `scores` if the policy at `step` could be evaluated. A `license` is
+    written as the Hub abbreviates it, such as "mit"; `code` are the names of what the policy needs besides lemniscate.
     """
-    stored = config.to_json()
-    places = [stored.get("env"), stored.get("network"), *(stored.get("wrappers") or ())]
-    code = [place for place in map(str, places) if ":" in place and not named.is_passed(place)]
-    shown = {"videos": "videos/*", "plots": "plots/*.png", "export": "export/**/*"}
-    found = {kind: sorted(filter(Path.is_file, folder.glob(pattern))) for kind, pattern in shown.items()}
     text = filled(
         TEMPLATES / "card.md.j2",
         FILTERS,
@@ -224,18 +168,15 @@ def write_card(
         algorithm=algorithm,
         config=config,
         step=step,
-        replay=(folder / "replay.mp4").exists(),
         scores=score_rows(scores) if scores else [],
-        code=code if algorithm in algos.ALGORITHMS else [algorithm, *code],
-        command=train_command(algorithm, stored),
-        files={kind: [(file, _link(file, folder)) for file in files] for kind, files in found.items()},
+        code=code,
+        command=train_command(algorithm, config.to_json()),
+        files=[file.relative_to(folder) for file in sorted(folder.rglob("*")) if file.is_file()],
     )
     (folder / "README.md").write_text(text, encoding="utf-8")
 
 
-def _metadata(
-    name: str, algorithm: str, config: RunConfig, scores: Mapping[str, Any] | None, license: str | None
-) -> str:
+def _metadata(name: str, algorithm: str, config: RunConfig, scores: Evaluated | None, license: str | None) -> str:
     """The front matter in YAML, by which the Hub lists a policy: library, tags, and the scores as a `model-index`.
 
     In the words of the Hub the return of an episode is its reward.
@@ -244,7 +185,6 @@ def _metadata(
 
     results = []
     if scores:
-        seeds = {"seed": scores["seed"], "training_seeds": [config.seed]}
         result = EvalResult(
             task_type=TASK,
             task_name=TASK,
@@ -253,7 +193,7 @@ def _metadata(
             metric_type="mean_reward",
             metric_name="mean_reward",
             metric_value=f"{scores['mean_return']:.2f} +/- {scores['std_return']:.2f}",
-            metric_args={"episodes": scores["episodes"], **seeds},
+            metric_args={"episodes": scores["episodes"], "seed": scores["seed"], "training_seeds": [config.seed]},
         )
         results.append(result)
     data = ModelCardData(
@@ -267,16 +207,16 @@ def _metadata(
     return data.to_yaml()
 
 
-def sentence(scores: Mapping[str, Any]) -> str:
-    """The scores of an evaluation, as `Evaluation.to_json` has them, in one sentence, or two."""
+def sentence(scores: Evaluated) -> str:
+    """The scores of an evaluation in one sentence, or two."""
     mean, std = scores["mean_return"], scores["std_return"]
     said = f"{mean:.1f} ± {std:.1f} return over {scores['episodes']} episodes of {scores['env_id']}"
     if measures := _measures(scores):
         said += f", {scores['terminated']} of them terminated; {', '.join(map(' '.join, measures))}"
-    return f"{said}.\n{_q_bias(scores)}." if "q_bias" in scores else f"{said}."
+    return f"{said}.\n{q_bias(scores)}." if "q_bias" in scores else f"{said}."
 
 
-def score_rows(scores: Mapping[str, Any]) -> list[tuple[str, str]]:
+def score_rows(scores: Evaluated) -> list[tuple[str, str]]:
     """The scores of an evaluation, each with its name in words."""
     returns, lengths = scores["returns"], scores["lengths"]
     return [
@@ -289,17 +229,17 @@ def score_rows(scores: Mapping[str, Any]) -> list[tuple[str, str]]:
     ]
 
 
-def _measures(scores: Mapping[str, Any]) -> list[tuple[str, str]]:
+def _measures(scores: Evaluated) -> list[tuple[str, str]]:
     """(name in words, value) of what the environment measures besides reward; the ending `_mm` is a unit."""
-    numbers = {name: value for name, value in scores.items() if name not in (*NOT_MEASURES, "step", "seed")}
     return [
         (name.removesuffix("_mm").replace("_", " "), f"{value:.4g}{' mm' * name.endswith('_mm')}")
-        for name, value in numbers.items()
-        if isinstance(value, int | float) and math.isfinite(value)
+        for name, value in scores.items()
+        if name not in NOT_MEASURES and isinstance(value, int | float) and math.isfinite(value)
     ]
 
 
-def _q_bias(scores: Mapping[str, Any]) -> QBias:
+def q_bias(scores: Evaluated) -> QBias:
+    """The bias of Q in the scores of an evaluation that has one."""
     return QBias(scores["q_bias"]["predicted"], scores["q_bias"]["realised"])
 
 
@@ -349,17 +289,6 @@ def _shown(value: Any) -> str:
     return "none" if value in (None, "", {}) else str(value)
 
 
-def caption(picture: Path) -> str:
-    """The caption of a picture."""
-    known = [text for name, text in CAPTIONS.items() if picture.stem.startswith(name)]
-    return [picture.stem, *known][-1]
-
-
-def _link(file: Path, folder: Path) -> str:
-    """A link to a file from a page in `folder`, which holds as long as both are moved together."""
-    return quote(os.path.relpath(file, folder).replace(os.sep, "/"))
-
-
 def _embedded(file: Path) -> str:
     return f"data:{KINDS[file.suffix]};base64,{base64.b64encode(file.read_bytes()).decode()}"
 
@@ -376,5 +305,5 @@ def _write_page(file: Path, template: str, **context: Any) -> Path:
     return file
 
 
-FILTERS = {"embedded": _embedded, "caption": caption}
+FILTERS = {"embedded": _embedded}
 """the functions that templates call"""

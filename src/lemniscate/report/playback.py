@@ -9,7 +9,7 @@ import warnings
 from base64 import b64encode
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -62,16 +62,12 @@ def show_episodes(
     """
     in_window = video is None and not in_notebook()
     table, name = EpisodeTable(1, torch.device("cpu")), arguments["env"]
-    with _quiet_sdl(in_window):
-        env = _rendered(arguments, "human" if in_window else "rgb_array")
+    with _quiet_sdl(in_window), closing(_rendered(arguments, "human" if in_window else "rgb_array")) as env:
         played = _play(env, act or _random(env, seed), name, episodes, seed, table, tell)
-        try:
-            if in_window:
-                deque(played, maxlen=0)  # Gymnasium draws at each step
-            else:
-                give((_picture(env, name) for _ in played), float(env.metadata.get("render_fps", 30)), video)
-        finally:
-            env.close()
+        if in_window:
+            deque(played, maxlen=0)  # Gymnasium draws at each step
+        else:
+            give((_picture(env, name) for _ in played), float(env.metadata.get("render_fps", 30)), video)
     return table.evaluation(name, SUMMARIES)
 
 
@@ -87,10 +83,8 @@ def play_single(act: Act, arguments: dict[str, Any], episodes: int, seed: int, t
         if makes_vector(maker_of(name)):
             raise UserError(f"{name} makes several environments at once, and a function acts in a single one.")
         env = make_one(maker_of(name), tuple(map(find_callable, wrappers)), **kwargs)
-    try:
+    with closing(env):
         deque(_play(env, act, name, episodes, seed, table, tell), maxlen=0)
-    finally:
-        env.close()
     return table.evaluation(name, SUMMARIES)
 
 
@@ -128,7 +122,7 @@ def _play(
     Stops after each reset and each step, for a picture. Raises `UserError` for an action of another kind, and for an
     episode that does not end where there is no time limit.
     """
-    first, names = derive(seed, EVALUATION, 0), measures_of(env.metadata)
+    first, measured = derive(seed, EVALUATION, 0), measures_of(env.metadata)
     limit = env.spec.max_episode_steps if env.spec else None
     for number in range(episodes):
         obs, info = env.reset(seed=first + number)
@@ -141,7 +135,16 @@ def _play(
             obs, reward, terminated, truncated, info = env.step(action)
             total, length = total + float(reward), length + 1
             done = terminated or truncated
-            table.add(_step(reward, terminated, truncated, {name: info[name] for name in names if name in info}), ONE)
+            step = Step(
+                obs=ONE,  # the table counts no observations
+                next_obs=ONE,
+                reward=torch.tensor([float(reward)]),
+                terminated=torch.tensor([bool(terminated)]),
+                truncated=torch.tensor([bool(truncated)]),
+                valid=ONE,
+                measures={part: torch.tensor([float(info[part])]) for part in measured if part in info},
+            )
+            table.add(step, ONE)
             yield
         tell(sentence(number + 1, total, length))
 
@@ -151,19 +154,6 @@ def _require_in(space: gym.Space, action: Any, name: str) -> None:
     fits = np.shape(action) == space.shape if isinstance(space, gym.spaces.Box) else space.contains(action)
     if not fits:
         raise UserError(f"{name} takes actions of {space}, not {shown(action)}.")
-
-
-def _step(reward: Any, terminated: bool, truncated: bool, measures: dict[str, Any]) -> Step:
-    """One step of one environment, without observations."""
-    return Step(
-        obs=ONE,
-        next_obs=ONE,
-        reward=torch.tensor([float(reward)]),
-        terminated=torch.tensor([bool(terminated)]),
-        truncated=torch.tensor([bool(truncated)]),
-        valid=ONE,
-        measures={name: torch.tensor([float(value)]) for name, value in measures.items()},
-    )
 
 
 def _random(env: gym.Env, seed: int) -> Act:

@@ -11,14 +11,16 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
 
-from lemniscate.report.flight import Flight
+Track = Mapping[str, Any]
+"""the arrays of one flight of T steps: `position` and `reference` [T, 3] in metres, `attitude` [T, 4] (xyzw)"""
 
 SIZE = (360, 600)
 REFERENCE = np.array([0.9, 0.5, 0.1, 0.4], dtype=np.float32)
@@ -27,15 +29,14 @@ CAMERA = ((0, 0, 0.95), 90, -8, 2.3)
 TRAIL = np.array([0.2, 0.9, 1.0, 1.0], dtype=np.float32)
 
 
-def render(flight: Flight, model: mujoco.MjModel, every: int) -> np.ndarray | None:
-    """Frames of the first flight, one each `every` steps, [F, H, W, 3] uint8; None without an off-screen OpenGL.
+def render(track: Track, model: mujoco.MjModel, every: int) -> np.ndarray | None:
+    """Frames of a flight, one each `every` steps, [F, H, W, 3] uint8; None without an off-screen OpenGL.
 
     The OpenGL is that of MUJOCO_GL, or else the first of EGL and OSMesa that works.
     """
     with tempfile.TemporaryDirectory() as folder:
         mujoco.mj_saveModel(model, f"{folder}/model.mjb")
-        tracks = {name: getattr(flight, name)[:, 0] for name in ("position", "attitude", "reference")}
-        np.savez(f"{folder}/flight.npz", every=every, **tracks)
+        np.savez(f"{folder}/flight.npz", every=every, **track)
         for backend in [os.environ["MUJOCO_GL"]] if "MUJOCO_GL" in os.environ else ["egl", "osmesa"]:
             command = [sys.executable, "-m", "lemniscate.report.scene", folder]
             done = subprocess.run(command, env={**os.environ, "MUJOCO_GL": backend}, capture_output=True)
@@ -44,7 +45,7 @@ def render(flight: Flight, model: mujoco.MjModel, every: int) -> np.ndarray | No
     return None
 
 
-def show(flights: Iterable[Flight], model: mujoco.MjModel) -> None:
+def show(tracks: Iterable[Track], model: mujoco.MjModel, time_step: float) -> None:
     """Play the flights one by one in MuJoCo's window, at their own speed, until they end or the window is closed."""
     from mujoco import viewer
 
@@ -53,45 +54,45 @@ def show(flights: Iterable[Flight], model: mujoco.MjModel) -> None:
         assert window.user_scn is not None
         window.cam.lookat[:], window.cam.azimuth = CAMERA[0], CAMERA[1]
         window.cam.elevation, window.cam.distance = CAMERA[2], CAMERA[3]
-        for flight in flights:
-            for t in range(len(flight.position)):
+        for track in tracks:
+            for t in range(len(track["position"])):
                 if not window.is_running():
                     return
-                _place(model, data, flight.position[t, 0], flight.attitude[t, 0])
+                _place(model, data, track, t)
                 window.user_scn.ngeom = 0
-                _draw_lines(window.user_scn, flight.reference[:, 0], flight.position[: t + 1, 0])
+                _draw_lines(window.user_scn, track, t)
                 window.sync()
-                time.sleep(flight.time_step)
+                time.sleep(time_step)
 
 
-def _place(model: mujoco.MjModel, data: mujoco.MjData, position: np.ndarray, attitude: np.ndarray) -> None:
-    data.mocap_pos[0] = position
-    data.mocap_quat[0] = np.roll(attitude, 1)  # ours xyzw, MuJoCo's wxyz
+def _place(model: mujoco.MjModel, data: mujoco.MjData, track: Track, t: int) -> None:
+    data.mocap_pos[0] = track["position"][t]
+    data.mocap_quat[0] = np.roll(track["attitude"][t], 1)  # ours xyzw, MuJoCo's wxyz
     mujoco.mj_kinematics(model, data)
     mujoco.mj_camlight(model, data)
 
 
 def _render_here(folder: Path) -> None:
     model = mujoco.MjModel.from_binary_path(str(folder / "model.mjb"))
-    flight = np.load(folder / "flight.npz")
-    path, attitude, reference = flight["position"], flight["attitude"], flight["reference"]
+    track = dict(np.load(folder / "flight.npz"))
     model.vis.global_.offheight, model.vis.global_.offwidth = SIZE
     data = mujoco.MjData(model)
     camera = mujoco.MjvCamera()
     camera.lookat[:], camera.azimuth, camera.elevation, camera.distance = CAMERA
     frames = []
     with mujoco.Renderer(model, *SIZE) as renderer:
-        for t in range(0, len(path), int(flight["every"])):
-            _place(model, data, path[t], attitude[t])
+        for t in range(0, len(track["position"]), int(track["every"])):
+            _place(model, data, track, t)
             renderer.update_scene(data, camera)
-            _draw_lines(renderer.scene, reference, path[: t + 1])
+            _draw_lines(renderer.scene, track, t)
             frames.append(renderer.render())
     np.save(folder / "frames.npy", np.stack(frames))
 
 
-def _draw_lines(scene: mujoco.MjvScene, reference: np.ndarray, flown: np.ndarray) -> None:
+def _draw_lines(scene: mujoco.MjvScene, track: Track, t: int) -> None:
     """Add the reference and the last hundred steps that were flown."""
-    for points, color, width in ((reference[::5], REFERENCE, 3), (flown[-101::2], TRAIL, 4)):
+    flown = track["position"][: t + 1][-101::2]
+    for points, color, width in ((track["reference"][::5], REFERENCE, 3), (flown, TRAIL, 4)):
         for start, end in pairwise(points):
             geom = scene.geoms[scene.ngeom]
             mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_LINE, np.zeros(3), np.zeros(3), np.zeros(9), color)

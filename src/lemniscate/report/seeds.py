@@ -70,11 +70,16 @@ def _key(kind: dict[str, Any], but: str = "") -> str:
     return json.dumps({name: value for name, value in kind.items() if name != but}, sort_keys=True)
 
 
+def differing(kinds: Sequence[Mapping[str, Any]]) -> list[str]:
+    """The names of the fields in which Configs differ, besides the seed."""
+    names = dict.fromkeys(name for kind in kinds for name in kind if name != "seed")
+    return [name for name in names if any(kind.get(name) != kinds[0].get(name) for kind in kinds)]
+
+
 def _label(kind: dict[str, Any], kinds: list[dict[str, Any]]) -> str:
     """The algorithm; where it has several groups in one environment, also what tells this one from the others."""
     rivals = [other for other in kinds if all(other[name] == kind[name] for name in ("algorithm", "env"))]
-    names = [name for name in dict.fromkeys(name for rival in rivals for name in rival) if name != "seed"]
-    differ = [name for name in names if len({_word(rival.get(name)) for rival in rivals}) > 1]
+    differ = differing(rivals)
     few = differ[:FIELDS]
     if len({tuple(_word(rival.get(name)) for name in few) for rival in rivals}) < len(rivals):
         few = differ

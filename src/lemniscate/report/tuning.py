@@ -17,13 +17,7 @@ FEW = 4
 
 
 def draw(study: Any, names: Sequence[str], folder: Path) -> list[Path]:
-    """Draw what there is to see in a study of Optuna's; returns the files.
-
-    Args:
-        study: with at least one complete trial.
-        names: of the settings that it searches.
-        folder: of the pictures.
-    """
+    """Draw a study of Optuna's that has a complete trial, and searches the settings `names`; returns the files."""
     make_directory(folder)
     complete = [trial for trial in study.trials if trial.state.name == "COMPLETE"]
     files = [_history(study, folder / "history.png")]
