@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from lemniscate.run.run import globals_undisturbed
 from lemniscate.run.seeding import seed_globals
 
+TEMPLATES = Path(__file__).parent / "templates"
 Function = Callable[..., Any]
 
 LIBRARIES = (str(Path(__file__).parents[1]), *(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib")))
