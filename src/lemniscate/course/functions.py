@@ -88,8 +88,8 @@ def calculate_v_loss(
     newvalue: Tensor, b_returns: Tensor, b_values: Tensor, mb_inds: Tensor, if_clip: bool, clip_coef: float
 ) -> Tensor:
     """`value_loss`, where `newvalue` is of the rows `mb_inds` of the batch."""
-    clip = (b_values[mb_inds], clip_coef) if if_clip else ()
-    return value_loss(newvalue, b_returns[mb_inds], *clip)
+    old_value, clip = (b_values[mb_inds], clip_coef) if if_clip else (None, None)
+    return value_loss(newvalue, b_returns[mb_inds], old_value, clip)
 
 
 def compute_loss(self: Any, states: Tensor, actions: Tensor, advantages: Tensor, targets: Tensor, old: Tensor) -> Any:
