@@ -6,7 +6,7 @@ course: a method, with other names, another layout or other outputs. A mistake i
 
 import inspect
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -15,42 +15,6 @@ from torch import Tensor
 from lemniscate import maths
 from lemniscate.course.exercise import TEMPLATES, Case, Exercise, Function
 from lemniscate.maths import clipped_surrogate, gae, reward_to_go, value_loss
-
-MISTAKES: dict[str, dict[str, list[str]]] = tomllib.loads((TEMPLATES / "mistakes.toml").read_text())
-
-
-def edited(functions: Sequence[Function], edits: Sequence[str]) -> Function:
-    """The last of some functions, each of which may call those before it, when their text is edited.
-
-    Args:
-        functions: as Python has their source.
-        edits: old, new, old, new, …: texts that stand there, and what stands there instead.
-
-    Raises:
-        ValueError: an old text does not stand there.
-    """
-    originals = [inspect.unwrap(function) for function in functions]
-    text = "\n".join(map(inspect.getsource, originals))
-    for old, new in zip(edits[::2], edits[1::2], strict=True):
-        if old not in text:
-            raise ValueError(f"{originals[-1].__name__} has no {old!r} to be replaced")
-        text = text.replace(old, new)
-    names = {name: value for original in originals for name, value in original.__globals__.items()}
-    exec(compile(text, f"<{originals[-1].__name__} with a mistake>", "exec"), names)
-    return names[originals[-1].__name__]
-
-
-def _exercise(
-    functions: Sequence[Function],
-    outputs: tuple[str, ...],
-    cases: Sequence[Case],
-    mistakes: Mapping[str, Sequence[str]],
-    **options: Any,
-) -> Exercise:
-    """The exercise whose reference is the last of these functions."""
-    wrong = {words: edited(functions, edits) for words, edits in mistakes.items()}
-    return Exercise(functions[-1], outputs, cases, wrong, **options)
-
 
 # --- the forms of the courses ---
 
@@ -112,6 +76,11 @@ def _drawn(*shape: int, seed: int = 0) -> Tensor:
     return torch.randn(shape, generator=torch.Generator().manual_seed(sum(shape) + 100 * seed))
 
 
+def _late(flags: Tensor) -> Tensor:
+    """The flag of row t + 1 in row t, and that of the last row there too."""
+    return torch.cat([flags[1:], flags[-1:]])
+
+
 def _column(*numbers: float) -> Tensor:
     return torch.tensor(numbers)[:, None]
 
@@ -130,12 +99,6 @@ FOUR = (torch.ones(4, 1), _column(0.5, 0.6, 0.7, 0.8))
 """rewards and V(s) of the drone's course"""
 FOUR_VALUES = (torch.tensor([2.5, 1.5, 3.0, 4.5]), torch.tensor([3.0, 1, 2, 5]), torch.tensor([2.0, 1, 2.5, 4]))
 SHUFFLED = (_drawn(3), _drawn(6), _drawn(6) + 0.4, torch.tensor([4, 1, 5]))
-LATE = "; also, the flags are read one row too late, as in the loop that the course gives"
-READ_LATE = [
-    "self.terminated_buffer.bool()",
-    "torch.cat([self.terminated_buffer[1:], self.terminated_buffer[-1:]]).bool()",
-]
-DELTA = MISTAKES["delta_of_the_given_loop"]
 
 
 def _drone_case(about: str, next_value: Tensor, rewards: Tensor, values: Tensor, ended: Tensor) -> Case:
@@ -169,143 +132,124 @@ EIGHT, OLD_LOG_PROBS = torch.tensor([0, 1, 1, 0, 0, 1, 0, 1]), _drawn(8, seed=2)
 """actions of the lander, and log π_old of them"""
 LANDER = {"epsilon": 0.2, "compute_log_probs": _log_probs, "compute_values": _values}
 
+CASES: dict[str, list[Case]] = {
+    "gae": [
+        Case("no end", (R, V, N, NEVER, NEVER), DISCOUNTS),
+        Case("a death at the last row", (R, V, N, AT_3, AT_3), DISCOUNTS),
+        Case("a death at row 1", (R, V, N, AT_1, AT_1), DISCOUNTS),
+        Case("a time-out at row 1", (R, V, N, NEVER, AT_1), DISCOUNTS),
+        Case("two environments, ends of both kinds", (TWO_R, TWO_V, TWO_V + 1, TWO_ENDS, TWO_DONE), DISCOUNTS),
+    ],
+    "calculate_advantages": [
+        _drone_case("no end", _column(0.9), *FOUR, NEVER),
+        _drone_case("a death at the last row", _column(0.0), *FOUR, AT_3),
+        _drone_case("two environments", _drawn(1, 2), _drawn(5, 2), _drawn(5, 2, seed=1), TWO_ENDS),
+    ],
+    "compute_advantages": [
+        _lander_case("one step of three environments", 3, 1, 1),
+        _lander_case("four steps of one environment", 1, 4),
+        _lander_case("a death in between", 1, 4, 1),
+        _lander_case("two environments of three steps", 2, 3),
+        _lander_case("two environments, a death at a border", 2, 3, 2, 4),
+    ],
+    "reward_to_go": [
+        Case("no end", (R, N, NEVER, NEVER), GAMMA),
+        Case("a death at row 1", (R, N, AT_1, AT_1), GAMMA),
+        Case("a time-out at row 1", (R, N, NEVER, AT_1), GAMMA),
+        Case("two environments, ends of both kinds", (TWO_R, TWO_V + 1, TWO_ENDS, TWO_DONE), GAMMA),
+    ],
+    "discounted_returns": [
+        Case("one step", (torch.tensor([2.0]),), GAMMA),
+        Case("five steps", (_drawn(5) + 1,), GAMMA),
+    ],
+    "td_target": [
+        Case("nothing ends", (_drawn(6), _drawn(6) + 1, torch.zeros(6).bool()), GAMMA),
+        Case("some end", (_drawn(6), _drawn(6) + 1, torch.tensor([0, 1, 0, 0, 1, 1]).bool()), GAMMA),
+    ],
+    "policy_gradient": [Case("eight actions", (_drawn(8), _drawn(8) + 0.5))],
+    "clipped_surrogate": [
+        Case("ratios of one", (torch.zeros(4), torch.tensor([1.0, 2.0, -1.0, 0.5])), CLIP),
+        Case("good actions", (torch.tensor([-0.5, -0.1, 0.1, 0.5]), torch.ones(4)), CLIP),
+        Case("bad actions", (torch.tensor([-0.5, -0.1, 0.1, 0.5]), -torch.ones(4)), CLIP),
+        Case("of all kinds", (_drawn(12) / 3, _drawn(12).flip(0)), {"clip": 0.1}),
+    ],
+    "calculate_pg_loss": [
+        Case("the course's", (torch.tensor([1, 0.5, -1, -0.5]), torch.tensor([1.1, 1.3, 0.7, 0.9])), CLIP_COEF),
+        Case("of all kinds", (_drawn(12), (_drawn(12, seed=1) / 3).exp()), {"clip_coef": 0.1}),
+    ],
+    "compute_loss": [
+        Case("eight actions", (_drawn(8, 3), EIGHT, _drawn(8), _drawn(8, seed=1), OLD_LOG_PROBS), LANDER, NETWORKS)
+    ],
+    "value_loss": [
+        Case("without a clip", (_drawn(6), _drawn(6) + 1)),
+        Case("with a clip", (_drawn(8), _drawn(8).flip(0), _drawn(8) + 0.3, 0.2)),
+        Case("with an old value, and None for the clip", (_drawn(8), _drawn(8).flip(0), _drawn(8) + 0.3, None)),
+    ],
+    "calculate_v_loss": [
+        Case("without a clip", (*FOUR_VALUES, torch.arange(4), False), CLIP_COEF),
+        Case("with a clip", (*FOUR_VALUES, torch.arange(4), True), CLIP_COEF),
+        Case("rows of a larger batch", (*SHUFFLED, False), CLIP_COEF),
+        Case("rows of a larger batch, with a clip", (*SHUFFLED, True), CLIP_COEF),
+    ],
+    "polyak": [Case("two tensors", ([_drawn(3), _drawn(2, 2)], [_drawn(3) + 1, _drawn(2, 2) - 1], 0.1))],
+    "select_at_index": [Case("three rows of four", (_drawn(3, 4), torch.tensor([2, 0, 3])))],
+}
+
+# --- the mistakes ---
+
+TABLES: dict[str, dict[str, Any]] = tomllib.loads((TEMPLATES / "mistakes.toml").read_text())
+
+
+def edited(functions: Sequence[Function], edits: Sequence[str]) -> Function:
+    """The last of some functions, each of which may call those before it, when their text is edited.
+
+    Args:
+        functions: as Python has their source.
+        edits: old, new, old, new, …: texts that stand there, and what stands there instead.
+
+    Raises:
+        ValueError: an old text does not stand there.
+    """
+    originals = [inspect.unwrap(function) for function in functions]
+    text = "\n".join(map(inspect.getsource, originals))
+    for old, new in zip(edits[::2], edits[1::2], strict=True):
+        if old not in text:
+            raise ValueError(f"{originals[-1].__name__} has no {old!r} to be replaced")
+        text = text.replace(old, new)
+    names = dict(globals())  # an edit may call what stands in this file, such as `_late`
+    for original in originals:
+        names |= original.__globals__
+    exec(compile(text, f"<{originals[-1].__name__} with a mistake>", "exec"), names)
+    return names[originals[-1].__name__]
+
+
+def _exercise(*functions: Function, outputs: tuple[str, ...], **options: Any) -> Exercise:
+    """The exercise whose reference is the last of these functions, each of which may call those before it."""
+    name = functions[-1].__name__
+    table = dict(TABLES[name])
+    edits = {
+        before + words: pairs
+        for shared, before in table.pop("extends", {}).items()
+        for words, pairs in TABLES[shared].items()
+    }
+    mistakes = {words: edited(functions, pairs) for words, pairs in (edits | table).items()}
+    accepted = {note: edited(functions, pairs) for note, pairs in TABLES["accepted"].get(name, {}).items()}
+    return Exercise(functions[-1], outputs, CASES[name], mistakes, accepted, **options)
+
+
 EXERCISES: dict[str, Exercise] = {
-    "gae": _exercise(
-        [gae],
-        ("advantage", "target"),
-        [
-            Case("no end", (R, V, N, NEVER, NEVER), DISCOUNTS),
-            Case("a death at the last row", (R, V, N, AT_3, AT_3), DISCOUNTS),
-            Case("a death at row 1", (R, V, N, AT_1, AT_1), DISCOUNTS),
-            Case("a time-out at row 1", (R, V, N, NEVER, AT_1), DISCOUNTS),
-            Case("two environments, ends of both kinds", (TWO_R, TWO_V, TWO_V + 1, TWO_ENDS, TWO_DONE), DISCOUNTS),
-        ],
-        MISTAKES["gae"],
-    ),
-    "calculate_advantages": _exercise(
-        [gae, calculate_advantages],
-        ("returns", "advantages"),
-        [
-            _drone_case("no end", _column(0.9), *FOUR, NEVER),
-            _drone_case("a death at the last row", _column(0.0), *FOUR, AT_3),
-            _drone_case("two environments", _drawn(1, 2), _drawn(5, 2), _drawn(5, 2, seed=1), TWO_ENDS),
-        ],
-        MISTAKES["calculate_advantages"] | DELTA | {words + LATE: READ_LATE + edits for words, edits in DELTA.items()},
-        accepted={
-            "the loop that the course gives reads the flags one row too late, and its own test expects that. Row t"
-            " holds what action t ended, so a crash is cut off from the action before it. With terminated_buffer[t] in"
-            " every row it is right, but fails the course's test": edited([gae, calculate_advantages], READ_LATE),
-        },
-    ),
-    "compute_advantages": _exercise(
-        [gae, compute_advantages],
-        ("advantages", "critic_targets"),
-        [
-            _lander_case("one step of three environments", 3, 1, 1),
-            _lander_case("four steps of one environment", 1, 4),
-            _lander_case("a death in between", 1, 4, 1),
-            _lander_case("two environments of three steps", 2, 3),
-            _lander_case("two environments, a death at a border", 2, 3, 2, 4),
-        ],
-        MISTAKES["compute_advantages"],
-    ),
-    "reward_to_go": _exercise(
-        [reward_to_go],
-        ("return",),
-        [
-            Case("no end", (R, N, NEVER, NEVER), GAMMA),
-            Case("a death at row 1", (R, N, AT_1, AT_1), GAMMA),
-            Case("a time-out at row 1", (R, N, NEVER, AT_1), GAMMA),
-            Case("two environments, ends of both kinds", (TWO_R, TWO_V + 1, TWO_ENDS, TWO_DONE), GAMMA),
-        ],
-        MISTAKES["reward_to_go"] | MISTAKES["return"],
-    ),
-    "discounted_returns": _exercise(
-        [reward_to_go, discounted_returns],
-        ("returns",),
-        [Case("one step", (torch.tensor([2.0]),), GAMMA), Case("five steps", (_drawn(5) + 1,), GAMMA)],
-        MISTAKES["discounted_returns"] | MISTAKES["return"],
-    ),
-    "td_target": _exercise(
-        [maths.td_target],
-        ("target",),
-        [
-            Case("nothing ends", (_drawn(6), _drawn(6) + 1, torch.zeros(6).bool()), GAMMA),
-            Case("some end", (_drawn(6), _drawn(6) + 1, torch.tensor([0, 1, 0, 0, 1, 1]).bool()), GAMMA),
-        ],
-        MISTAKES["td_target"],
-    ),
-    "policy_gradient": _exercise(
-        [maths.policy_gradient],
-        ("loss",),
-        [Case("eight actions", (_drawn(8), _drawn(8) + 0.5))],
-        MISTAKES["policy_gradient"],
-        gradient_in=0,
-    ),
-    "clipped_surrogate": _exercise(
-        [clipped_surrogate],
-        ("loss",),
-        [
-            Case("ratios of one", (torch.zeros(4), torch.tensor([1.0, 2.0, -1.0, 0.5])), CLIP),
-            Case("good actions", (torch.tensor([-0.5, -0.1, 0.1, 0.5]), torch.ones(4)), CLIP),
-            Case("bad actions", (torch.tensor([-0.5, -0.1, 0.1, 0.5]), -torch.ones(4)), CLIP),
-            Case("of all kinds", (_drawn(12) / 3, _drawn(12).flip(0)), {"clip": 0.1}),
-        ],
-        MISTAKES["clipped"] | MISTAKES["ratio"],
-        gradient_in=0,
-    ),
-    "calculate_pg_loss": _exercise(
-        [clipped_surrogate, calculate_pg_loss],
-        ("pg_loss",),
-        [
-            Case("the course's", (torch.tensor([1, 0.5, -1, -0.5]), torch.tensor([1.1, 1.3, 0.7, 0.9])), CLIP_COEF),
-            Case("of all kinds", (_drawn(12), (_drawn(12, seed=1) / 3).exp()), {"clip_coef": 0.1}),
-        ],
-        MISTAKES["clipped"] | MISTAKES["calculate_pg_loss"],
-        gradient_in=1,
-    ),
-    "compute_loss": _exercise(
-        [clipped_surrogate, compute_loss],
-        ("actor_loss", "critic_loss"),
-        [Case("eight actions", (_drawn(8, 3), EIGHT, _drawn(8), _drawn(8, seed=1), OLD_LOG_PROBS), LANDER, NETWORKS)],
-        {f"in the actor's loss, {words}": edits for words, edits in (MISTAKES["clipped"] | MISTAKES["ratio"]).items()}
-        | MISTAKES["compute_loss"],
-        gradient_in=0,
-    ),
-    "value_loss": _exercise(
-        [value_loss],
-        ("loss",),
-        [
-            Case("without a clip", (_drawn(6), _drawn(6) + 1)),
-            Case("with a clip", (_drawn(8), _drawn(8).flip(0), _drawn(8) + 0.3, 0.2)),
-            Case("with an old value, and None for the clip", (_drawn(8), _drawn(8).flip(0), _drawn(8) + 0.3, None)),
-        ],
-        MISTAKES["value_loss"],
-        gradient_in=0,
-    ),
-    "calculate_v_loss": _exercise(
-        [value_loss, calculate_v_loss],
-        ("v_loss",),
-        [
-            Case("without a clip", (*FOUR_VALUES, torch.arange(4), False), CLIP_COEF),
-            Case("with a clip", (*FOUR_VALUES, torch.arange(4), True), CLIP_COEF),
-            Case("rows of a larger batch", (*SHUFFLED, False), CLIP_COEF),
-            Case("rows of a larger batch, with a clip", (*SHUFFLED, True), CLIP_COEF),
-        ],
-        MISTAKES["value_loss"] | MISTAKES["calculate_v_loss"],
-        gradient_in=0,
-    ),
-    "polyak": _exercise(
-        [maths.polyak],
-        ("target[0]", "target[1]", "online[0]", "online[1]"),
-        [Case("two tensors", ([_drawn(3), _drawn(2, 2)], [_drawn(3) + 1, _drawn(2, 2) - 1], 0.1))],
-        MISTAKES["polyak"],
-        in_place=True,
-    ),
-    "select_at_index": _exercise(
-        [select_at_index],
-        ("result",),
-        [Case("three rows of four", (_drawn(3, 4), torch.tensor([2, 0, 3])))],
-        MISTAKES["select_at_index"],
-    ),
+    "gae": _exercise(gae, outputs=("advantage", "target")),
+    "calculate_advantages": _exercise(gae, calculate_advantages, outputs=("returns", "advantages")),
+    "compute_advantages": _exercise(gae, compute_advantages, outputs=("advantages", "critic_targets")),
+    "reward_to_go": _exercise(reward_to_go, outputs=("return",)),
+    "discounted_returns": _exercise(reward_to_go, discounted_returns, outputs=("returns",)),
+    "td_target": _exercise(maths.td_target, outputs=("target",)),
+    "policy_gradient": _exercise(maths.policy_gradient, outputs=("loss",), gradient_in=0),
+    "clipped_surrogate": _exercise(clipped_surrogate, outputs=("loss",), gradient_in=0),
+    "calculate_pg_loss": _exercise(clipped_surrogate, calculate_pg_loss, outputs=("pg_loss",), gradient_in=1),
+    "compute_loss": _exercise(clipped_surrogate, compute_loss, outputs=("actor_loss", "critic_loss"), gradient_in=0),
+    "value_loss": _exercise(value_loss, outputs=("loss",), gradient_in=0),
+    "calculate_v_loss": _exercise(value_loss, calculate_v_loss, outputs=("v_loss",), gradient_in=0),
+    "polyak": _exercise(maths.polyak, outputs=("target[0]", "target[1]", "online[0]", "online[1]"), in_place=True),
+    "select_at_index": _exercise(select_at_index, outputs=("result",)),
 }
