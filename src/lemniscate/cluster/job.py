@@ -214,16 +214,12 @@ class RayWorker(World):
 
     def saved(self, path: Path) -> None:
         """Keep the run directory in the job's storage."""
-        _keep(path, True)
-
-
-class RayWorkers(Processes):
-    """The workers of a job."""
-
-    def saved(self, path: Path) -> None:
-        """Keep the run directory in the job's storage."""
         with self.busy():
             _keep(path, self.is_first)
+
+
+class RayWorkers(RayWorker, Processes):
+    """The workers of a job."""
 
 
 def together() -> AbstractContextManager[World]:

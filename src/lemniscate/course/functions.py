@@ -7,6 +7,7 @@ course: a method, with other names, another layout or other outputs. A mistake i
 import inspect
 import tomllib
 from collections.abc import Sequence
+from functools import cache
 from typing import Any
 
 import torch
@@ -197,6 +198,7 @@ CASES: dict[str, list[Case]] = {
 
 # --- the mistakes ---
 
+_source = cache(inspect.getsource)
 TABLES: dict[str, dict[str, Any]] = tomllib.loads((TEMPLATES / "mistakes.toml").read_text())
 
 
@@ -211,7 +213,7 @@ def edited(functions: Sequence[Function], edits: Sequence[str]) -> Function:
         ValueError: an old text does not stand there.
     """
     originals = [inspect.unwrap(function) for function in functions]
-    text = "\n".join(map(inspect.getsource, originals))
+    text = "\n".join(map(_source, originals))
     for old, new in zip(edits[::2], edits[1::2], strict=True):
         if old not in text:
             raise ValueError(f"{originals[-1].__name__} has no {old!r} to be replaced")

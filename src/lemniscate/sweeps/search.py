@@ -200,8 +200,8 @@ class Search:
     def sweep(self, name: str, fields: Mapping[str, Any]) -> Sweep:
         """The sweep of one trial."""
         config = self.config.replace(**fields).to_json()
-        but_seed = {name: value for name, value in config.items() if name != "seed"}
-        return Sweep(self.path / TRIALS / name, self.seeds, {self.algorithm: but_seed})
+        del config["seed"]
+        return Sweep(self.path / TRIALS / name, self.seeds, {self.algorithm: config})
 
     def write_preset(self, best: "optuna.trial.FrozenTrial") -> Preset:
         """Write the settings of the best trial, with their provenance, into `preset.json`."""
