@@ -199,6 +199,7 @@ CASES: dict[str, list[Case]] = {
 # --- the mistakes ---
 
 _source = cache(inspect.getsource)
+"""the text of a function, which several mistakes edit"""
 TABLES: dict[str, dict[str, Any]] = tomllib.loads((TEMPLATES / "mistakes.toml").read_text())
 
 
@@ -216,7 +217,7 @@ def edited(functions: Sequence[Function], edits: Sequence[str]) -> Function:
     text = "\n".join(map(_source, originals))
     for old, new in zip(edits[::2], edits[1::2], strict=True):
         if old not in text:
-            raise ValueError(f"{originals[-1].__name__} has no {old!r} to be replaced")
+            raise ValueError(f"mistakes.toml: {originals[-1].__name__} has no {old!r} to be replaced")
         text = text.replace(old, new)
     names = dict(globals())  # an edit may call what stands in this file, such as `_late`
     for original in originals:
