@@ -16,7 +16,7 @@ import traceback
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
-from shutil import copytree, rmtree
+from shutil import copytree, ignore_patterns, rmtree
 from types import FrameType
 from typing import Any
 
@@ -57,37 +57,53 @@ def train_on_ray(
     """
     workers = cluster.workers or 1
     with connected(cluster):  # before the directory is made: a cluster that does not answer leaves nothing
+        from ray.train.v2.api.exceptions import TrainingFailedError
+
         if not (path / CONFIG).exists():
             config = config.replace(shards=max(config.shards, workers))
             create_directory(path, CONFIG, {"algorithm": algorithm, "config": config.to_json()})
-        _train_on_ray(path, algorithm, config, workers, cluster.storage, resume, options)
+        name = path.name if cluster.storage else JOB
+        storage = cluster.storage or str((path / STORAGE).absolute())
+        given = {
+            "name": path.name,
+            "record": {"algorithm": algorithm, "config": config.to_json()},
+            "begun": pack(path) if (path / "checkpoints").exists() else None,
+            "resume": resume,
+            "options": dict(options),
+        }
+        trainer = _trainer(given, config, workers, name, storage)
+        shown = _shown_progress(Path(storage) / name, config.total_steps) if options["progress"] else nullcontext()
+        asked: list[int] = []  # Ray makes exceptions of its own of what a handler raises
+
+        def stop(signum: int, _frame: FrameType | None) -> None:
+            asked.append(signum)
+            raise KeyboardInterrupt
+
+        try:
+            with stop_signals_to(stop), shown:
+                result = trainer.fit()
+        except (KeyboardInterrupt, SystemExit):
+            again = f"{resume_line(path)} --cluster ray --workers {workers}"
+            sentence = f"Stopped; the last checkpoint is kept. Go on with: {again}"
+            raise Stopped(sentence, asked[0] if asked else signal.SIGINT) from None  # Ray has Ctrl-C for itself
+        except TrainingFailedError as error:
+            raise RankError(f"The workers failed {FAILURES} times; the last time: {error}") from None
+        if result.checkpoint is not None:
+            with result.checkpoint.as_directory() as stored:  # the config of the directory stays
+                rmtree(path / "checkpoints", ignore_errors=True)
+                copytree(stored, path, dirs_exist_ok=True, ignore=ignore_patterns(CONFIG, LOCK))
+        if result.return_value:
+            raise RankError(result.return_value)
+        rmtree(path / STORAGE, ignore_errors=True)
 
 
-def _train_on_ray(
-    path: Path,
-    algorithm: str,
-    config: RunConfig,
-    workers: int,
-    storage: str | None,
-    resume: str,
-    options: Mapping[str, Any],
-) -> None:
-    """Train on the cluster that is connected."""
+def _trainer(given: dict[str, Any], config: RunConfig, workers: int, name: str, storage: str) -> Any:
+    """Ray's trainer of a job with this name in its storage; each worker gets what is given."""
     from ray.train import CheckpointConfig, FailureConfig, ScalingConfig
     from ray.train import RunConfig as JobConfig
     from ray.train.torch import TorchConfig, TorchTrainer
-    from ray.train.v2.api.exceptions import TrainingFailedError
 
-    name = path.name if storage else JOB
-    storage = storage or str((path / STORAGE).absolute())
-    given = {
-        "name": path.name,
-        "record": {"algorithm": algorithm, "config": config.to_json()},
-        "begun": pack(path) if (path / "checkpoints").exists() else None,
-        "resume": resume,
-        "options": dict(options),
-    }
-    trainer = TorchTrainer(
+    return TorchTrainer(
         _work,
         train_loop_config=given,
         torch_config=TorchConfig(backend="gloo"),
@@ -103,26 +119,6 @@ def _train_on_ray(
             failure_config=FailureConfig(max_failures=FAILURES),
         ),
     )
-    shown = _shown_progress(Path(storage) / name, config.total_steps) if options["progress"] else nullcontext()
-    asked: list[int] = []  # Ray makes exceptions of its own of what a handler raises
-
-    def stop(signum: int, _frame: FrameType | None) -> None:
-        asked.append(signum)
-        raise KeyboardInterrupt
-
-    try:
-        with stop_signals_to(stop), shown:
-            result = trainer.fit()
-    except (KeyboardInterrupt, SystemExit):
-        again = f"{resume_line(path)} --cluster ray --workers {workers}"
-        sentence = f"Stopped; the last checkpoint is kept. Go on with: {again}"
-        raise Stopped(sentence, asked[0] if asked else signal.SIGINT) from None  # Ray has Ctrl-C for itself
-    except TrainingFailedError as error:
-        raise RankError(f"The workers failed {FAILURES} times; the last time: {error}") from None
-    _fetch(result.checkpoint, path)
-    if result.return_value:
-        raise RankError(result.return_value)
-    rmtree(path / STORAGE, ignore_errors=True)
 
 
 @contextmanager
@@ -149,20 +145,6 @@ def _shown_progress(storage: Path, total_steps: int) -> Iterator[None]:
         thread.join()
 
 
-def _usable(shards: int, workers: int) -> int:
-    """The most workers, not above those there are, that can share the shards equally; the others stand by."""
-    return next(n for n in range(workers, 0, -1) if shards % n == 0)
-
-
-def _fetch(checkpoint: Any, path: Path) -> None:
-    """Put what the job's storage has of a run into its directory, whose own config stays."""
-    if checkpoint is None:
-        return
-    with checkpoint.as_directory() as stored:
-        rmtree(path / "checkpoints", ignore_errors=True)
-        copytree(stored, path, dirs_exist_ok=True, ignore=lambda _, names: {CONFIG, LOCK} & set(names))
-
-
 def _work(given: dict[str, Any]) -> str | None:
     """The program of each worker. Returns the sentence of what ended the run, if that would end it again."""
     import ray.train
@@ -172,7 +154,8 @@ def _work(given: dict[str, Any]) -> str | None:
     context = ray.train.get_context()
     if dist.is_initialized():  # Ray's own group, of all workers; ours is of those that can share the shards
         dist.destroy_process_group()
-    rank, size = context.get_world_rank(), _usable(given["record"]["config"]["shards"], context.get_world_size())
+    rank, workers, shards = context.get_world_rank(), context.get_world_size(), given["record"]["config"]["shards"]
+    size = next(n for n in range(workers, 0, -1) if shards % n == 0)  # the most that can share the shards equally
     with socket.socket() as free:
         free.bind(("", 0))
         here = socket.gethostbyname(socket.gethostname()), free.getsockname()[1]
@@ -187,23 +170,19 @@ def _work(given: dict[str, Any]) -> str | None:
     with tempfile.TemporaryDirectory(prefix="lemniscate-") as folder:
         path = Path(folder) / given["name"]
         if rank == 0:
-            _begin(path, given, ray.train.get_checkpoint())
+            checkpoint = ray.train.get_checkpoint()
+            if checkpoint is not None:  # the job's storage has it
+                with checkpoint.as_directory() as stored:
+                    copytree(stored, path)
+            elif given["begun"]:
+                unpack(given["begun"], path)
+            else:
+                create_directory(path, CONFIG, given["record"])
         sentence = _train(path, given["resume"], given["options"])
         if sentence is None:
             _keep(path, rank == 0)
         broadcast_from_rank_zero(False)
     return sentence
-
-
-def _begin(path: Path, given: Mapping[str, Any], checkpoint: Any) -> None:
-    """Make the run directory as the job's storage has it, or as it was when the job began, or new."""
-    if checkpoint is not None:
-        with checkpoint.as_directory() as stored:
-            copytree(stored, path)
-    elif given["begun"]:
-        unpack(given["begun"], path)
-    else:
-        create_directory(path, CONFIG, given["record"])
 
 
 def _train(path: Path, resume: str, options: Mapping[str, Any]) -> str | None:
@@ -235,16 +214,12 @@ class RayWorker(World):
 
     def saved(self, path: Path) -> None:
         """Keep the run directory in the job's storage."""
-        _keep(path, True)
-
-
-class RayWorkers(Processes):
-    """The workers of a job."""
-
-    def saved(self, path: Path) -> None:
-        """Keep the run directory in the job's storage."""
         with self.busy():
             _keep(path, self.is_first)
+
+
+class RayWorkers(RayWorker, Processes):
+    """The workers of a job."""
 
 
 def together() -> AbstractContextManager[World]:

@@ -63,7 +63,7 @@ class _Running:
     task: Any
     said: Any
     options: Sequence[str]
-    lost: int = 0
+    lost: int
     begun: bool = False
 
 
@@ -92,9 +92,11 @@ class RayTasks(Places):
         cores = int(self._ray.cluster_resources().get("CPU", 1))
         return min(self._most or cores, max(1, cores // self._threads))
 
-    def start(self, run: Path, options: Sequence[str]) -> None:
-        """Send a run to a machine that has room, or will have."""
-        self._begin(run, options, lost=0)
+    def start(self, run: Path, options: Sequence[str], lost: int = 0) -> None:
+        """Send a run, of which so many tasks were lost, to a machine that has room, or will have."""
+        task = self._task.remote()
+        said = task.train.options(num_returns="streaming").remote(run.name, pack(run), options)
+        self._running[run] = _Running(task, said, options, lost)
 
     def close(self) -> None:
         """Stop all runs, wait for them, and leave the cluster."""
@@ -111,11 +113,6 @@ class RayTasks(Places):
 
     def _release(self, trainer: _Running) -> None:
         self._ray.kill(trainer.task)
-
-    def _begin(self, run: Path, options: Sequence[str], lost: int) -> None:
-        task = self._task.remote()
-        said = task.train.options(num_returns="streaming").remote(run.name, pack(run), options)
-        self._running[run] = _Running(task, said, options, lost)
 
     def _code_of(self, run: Path) -> int | None:
         """Store what a task has sent; its exit code if it has ended. A task that is lost begins again."""
@@ -138,5 +135,5 @@ class RayTasks(Places):
             if running.lost == MOST_LOSSES:
                 (run / LOG).write_text(f"{MOST_LOSSES + 1} tasks of this run were lost; the last: {error}")
                 return 1
-            self._begin(run, running.options, running.lost + 1)
+            self.start(run, running.options, running.lost + 1)
         return code

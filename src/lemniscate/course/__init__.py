@@ -49,26 +49,17 @@ def check(function: Function, name: str | None = None) -> Finding:
     Raises:
         UserError: a solution that is no function and no class, or has no name of its own; a name that is no exercise.
     """
-    name = name or _name_of(function)
+    name = name or getattr(function, "__name__", "<lambda>")
+    if name == "<lambda>":
+        raise UserError(f'Which exercise is {shown(function)}? Name it: course.check(solution, "gae").')
     if name not in EXERCISES:
-        raise _unknown(name, function)
+        methods = [method for method in EXERCISES if isinstance(function, type) and hasattr(function, method)]
+        if not methods:
+            raise unknown_name("exercise", name, EXERCISES)
+        checks = ", ".join(f"course.check({name}.{method})" for method in methods)
+        raise UserError(f"{name} is judged by its methods: {checks}.")
     if not callable(function):
         raise UserError(f"What can be checked is a function or a class, not {shown(function)}.")
     finding = EXERCISES[name].judge(name, function)
     say(finding)
     return finding
-
-
-def _name_of(solution: Function) -> str:
-    name = getattr(solution, "__name__", "<lambda>")
-    if name == "<lambda>":
-        raise UserError(f'Which exercise is {shown(solution)}? Name it: course.check(solution, "gae").')
-    return name
-
-
-def _unknown(name: str, solution: Function) -> UserError:
-    """The sentence on a name that is no exercise; for a class whose methods are exercises, it names those."""
-    methods = [method for method in EXERCISES if isinstance(solution, type) and hasattr(solution, method)]
-    if not methods:
-        return unknown_name("exercise", name, EXERCISES)
-    return UserError(f"{name} is judged by its methods: {', '.join(f'course.check({name}.{m})' for m in methods)}.")

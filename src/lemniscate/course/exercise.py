@@ -5,6 +5,7 @@ import inspect
 import sysconfig
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,6 +17,7 @@ from torch import Tensor, nn
 from lemniscate.run.run import globals_undisturbed
 from lemniscate.run.seeding import seed_globals
 
+TEMPLATES = Path(__file__).parent / "templates"
 Function = Callable[..., Any]
 
 LIBRARIES = (str(Path(__file__).parents[1]), *(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib")))
@@ -115,11 +117,9 @@ class Exercise:
         """The cases whose arguments the function can take; all of them if it can take none."""
         fitting = []
         for case in self.cases:
-            try:
+            with suppress(TypeError, ValueError):  # other arguments; a function written in C, which has no signature
                 inspect.signature(function).bind(*case.args, **case.options)
-            except (TypeError, ValueError):  # other arguments; a function written in C, which has no signature
-                continue
-            fitting.append(case)
+                fitting.append(case)
         return fitting or list(self.cases)
 
     def _complaint(self, function: Function, case: Case) -> str | None:
@@ -237,6 +237,5 @@ def _close(mine: Tensor, right: Tensor) -> bool:
 
 def _same(mine: Answer, other: Answer) -> bool:
     pairs = list(zip(mine.outputs, other.outputs, strict=True))
-    return all(a.shape == b.shape and _close(a.to(b.dtype), b) for a, b in pairs) and _close(
-        mine.gradient(), other.gradient()
-    )
+    is_same = all(a.shape == b.shape and _close(a.to(b.dtype), b) for a, b in pairs)
+    return is_same and _close(mine.gradient(), other.gradient())

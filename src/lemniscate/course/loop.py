@@ -17,12 +17,11 @@ import gymnasium as gym
 import numpy as np
 import torch
 
-from lemniscate.course.exercise import Function, raised
+from lemniscate.course.exercise import TEMPLATES, Function, raised
 from lemniscate.envs.vector_view import VectorView, make_vec
 from lemniscate.errors import UserError, unknown_name
 from lemniscate.system.console import say
 
-TEMPLATES = Path(__file__).parent / "templates"
 SKELETONS = ("ppo",)
 SOLUTION = re.compile(r"^( *)# <solution>\n.*?# </solution>\n", re.DOTALL | re.MULTILINE)
 """the lines of a program that its skeleton leaves out"""
@@ -61,24 +60,11 @@ def solution(name: str) -> str:
 
 
 @dataclass(frozen=True)
-class Move:
-    """The effect of an action in a state."""
-
-    reward: float
-    state: int
-    """the next one"""
-    ends: str = ""
-    """death, time-out, or nothing"""
-    next_bonus: float = 0.0
-    """added to the first reward of the next episode"""
-
-
-@dataclass(frozen=True)
 class World:
     """A small world in which action 0 is better than action 1 in state 0."""
 
-    moves: list[list[list[Any]]]
-    """by state and action: the arguments of a `Move`"""
+    moves: list[list[dict[str, Any]]]
+    """by state and action: its effect, as `worlds.toml` says"""
     starts: list[float]
     """by state: the probability that an episode begins there"""
     mistake: str
@@ -108,9 +94,10 @@ class WorldEnv(gym.Env):
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict]:
         """The move of that action."""
-        move = Move(*self.world.moves[self._state][int(action)])
-        reward, self._bonus, self._state = move.reward + self._bonus, move.next_bonus, move.state
-        return self.world.obs(self._state), reward, move.ends == "death", move.ends == "time-out", {}
+        move = self.world.moves[self._state][int(action)]
+        reward, end = move["reward"] + self._bonus, move.get("end")
+        self._bonus, self._state = move.get("next_bonus", 0.0), move["to"]
+        return self.world.obs(self._state), reward, end == "death", end == "time-out", {}
 
 
 class BoxEnv(WorldEnv):

@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     import optuna
 
 JOURNAL, PRESET, TRIALS = "study.journal", "preset.json", "trials"
-FIELDS = ("algorithm", "config", "search", "seeds", "trials", "prune")
 RETURNS = 100
 """newest training episodes that a trial is compared by before its end"""
 
@@ -194,25 +193,33 @@ class Search:
 
     def create(self) -> None:
         """Write `tune.json` into a new directory. Raises `UserError` if the directory exists already."""
-        record = {name: getattr(self, name) for name in FIELDS} | {"config": self.config.to_json()}
+        record = {**vars(self), "config": self.config.to_json()}
+        del record["path"]
         create_directory(self.path, TUNE, record)
 
     def sweep(self, name: str, fields: Mapping[str, Any]) -> Sweep:
         """The sweep of one trial."""
         config = self.config.replace(**fields).to_json()
-        but_seed = {name: value for name, value in config.items() if name != "seed"}
-        return Sweep(self.path / TRIALS / name, self.seeds, {self.algorithm: but_seed})
+        del config["seed"]
+        return Sweep(self.path / TRIALS / name, self.seeds, {self.algorithm: config})
 
-    def preset(self, which: str, settings: Mapping[str, Any], score: float) -> Preset:
-        """The best settings, with their provenance."""
+    def write_preset(self, best: "optuna.trial.FrozenTrial") -> Preset:
+        """Write the settings of the best trial, with their provenance, into `preset.json`."""
         seeds = ", ".join(map(str, self.seeds))
-        source = f"lemniscate tune: {which}, {self.what}, seeds {seeds}, score {score:,.1f}"
+        which = f"trial {best.number} of {self.trials}, {self.what}, seeds {seeds}, score {best.value:,.1f}"
+        settings = draw(self.space, import_optuna().trial.FixedTrial(best.params))
         config = self.config.replace(**settings, evaluate_every=0, evaluate_episodes=20)
-        return Preset(self.path.name, config, source, f"{date.today():%Y-%m}")
+        preset = Preset(self.path.name, config, f"lemniscate tune: {which}", f"{date.today():%Y-%m}")
+        preset.write(self.path / PRESET, self.algorithm)
+        return preset
 
-    def rungs(self) -> list[int]:
-        """The steps after which a trial may end, planned checkpoints all of them."""
-        return [ninths * self.config.checkpoint_every for ninths in RUNGS] if self.prune else []
+    @property
+    def rungs(self) -> list[int | None]:
+        """The steps to which the runs of a trial go on, one after the other; None is their end.
+
+        After the others, planned checkpoints all of them, the trial may end.
+        """
+        return [*(ninths * self.config.checkpoint_every for ninths in RUNGS if self.prune), None]
 
     def study(self) -> "optuna.Study":
         """Optuna's study, new or as the journal has it."""

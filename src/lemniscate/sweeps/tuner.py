@@ -15,7 +15,6 @@ from lemniscate.api import training
 from lemniscate.api.policy import path_of
 from lemniscate.cluster.connection import Cluster, find_cluster
 from lemniscate.errors import SweepError, UserError
-from lemniscate.presets import Preset
 from lemniscate.report import tuning as pictures
 from lemniscate.run.config import Range, checked
 from lemniscate.run.places import LOG, Sweep, failure_of, is_sweep
@@ -131,7 +130,7 @@ class _Trial:
 
     asked: "optuna.Trial"
     sweep: Sweep
-    rung: int = 0
+    rung: int
     """how many it has passed"""
     waiting: list[Path] = field(default_factory=list)
     training: set[Path] = field(default_factory=set)
@@ -144,12 +143,24 @@ class _Tuner(SetOfRuns):
     def __init__(self, search: Search, progress: bool, cluster: Cluster | None) -> None:
         super().__init__(search.path, [search.config.to_json()], cluster)
         self._search, self._progress = search, progress
-        self._space, self._rungs, self._study = search.space, search.rungs(), search.study()
+        self._space, self._study = search.space, search.study()
         self._trials: list[_Trial] = []
 
     def tune(self) -> Tuned:
-        """Try everything that is left to try. Raises `Stopped` after a signal."""
-        self._begin()
+        """Take up what was interrupted, and try everything that is left to try. Raises `Stopped` after a signal."""
+        optuna, known = import_optuna(), self._study.trials
+        if not known:  # of a new search, the first trial has the settings as they are
+            values = {name: getattr(self._search.config, name) for name in self._space}
+            keys = {name: self._space[name].key_of(value) for name, value in values.items()}
+            self._study.enqueue_trial({name: key for name, key in keys.items() if key is not None})
+        for frozen in known:
+            if frozen.state.name == "RUNNING":
+                asked = optuna.trial.Trial(self._study, frozen._trial_id)
+                self._take_up(asked, rung=len(frozen.intermediate_values))
+        self._say(
+            f"{self._search.path}: {len(self._trials) + self._missing} of {self._search.trials} trials to run, with"
+            f" {len(self._search.seeds)} seeds each, {self._places.count} runs at a time: {self._search.what}"
+        )
         self._train_all()
         return self._result()
 
@@ -158,39 +169,20 @@ class _Tuner(SetOfRuns):
         """The number of trials that have not begun."""
         return self._search.trials - sum(trial.state.name != "WAITING" for trial in self._study.trials)
 
-    def _begin(self) -> None:
-        """Take up what was interrupted; of a new search, the first trial has the settings as they are."""
-        optuna, known = import_optuna(), self._study.trials
-        if not known:
-            values = {name: getattr(self._search.config, name) for name in self._space}
-            keys = {name: self._space[name].key_of(value) for name, value in values.items()}
-            self._study.enqueue_trial({name: key for name, key in keys.items() if key is not None})
-        for frozen in known:
-            if frozen.state.name == "RUNNING":
-                trial = self._trial(optuna.trial.Trial(self._study, frozen._trial_id))
-                trial.rung = len(frozen.intermediate_values)
-                self._queue(trial)
-        self._say(
-            f"{self._search.path}: {len(self._trials) + self._missing} of {self._search.trials} trials to run, with"
-            f" {len(self._search.seeds)} seeds each, {self._places.count} runs at a time: {self._search.what}"
-        )
-
-    def _trial(self, asked: "optuna.Trial") -> _Trial:
-        trial = _Trial(asked, self._search.sweep(f"{asked.number:03d}", draw(self._space, asked)))
+    def _take_up(self, asked: "optuna.Trial", rung: int = 0) -> _Trial:
+        """Let the runs of a trial, which begins or was interrupted, wait for places."""
+        trial = _Trial(asked, self._search.sweep(f"{asked.number:03d}", draw(self._space, asked)), rung)
         if not is_sweep(trial.sweep.path):
             trial.sweep.create()
         trial.sweep.create_runs()
         self._trials.append(trial)
+        self._queue(trial)
         return trial
 
     def _queue(self, trial: _Trial) -> None:
         """Let the runs of a trial wait for a place, in which they go on to its next rung, or to their end."""
-        until = self._until(trial)
+        until = self._search.rungs[trial.rung]
         trial.waiting = [run for run in trial.sweep.runs if not has_come(run, until)]
-
-    def _until(self, trial: _Trial) -> int | None:
-        """The step to which the runs of a trial go on; None for their end."""
-        return [*self._rungs, None][trial.rung]
 
     def _begin_runs(self) -> bool:
         """Compare the trials that have come to a rung, then start runs: those of the trials that are furthest first."""
@@ -201,9 +193,8 @@ class _Tuner(SetOfRuns):
             if trial is None:
                 if not self._missing:
                     break
-                trial = self._trial(self._search.ask(self._study))
-                self._queue(trial)
-            until = self._until(trial)
+                trial = self._take_up(self._search.ask(self._study))
+            until = self._search.rungs[trial.rung]
             options = ["--callbacks", f"lemniscate.api.callbacks:StopAt(steps={until})"] if until else []
             run = trial.waiting.pop(0)
             trial.training.add(run)
@@ -223,56 +214,48 @@ class _Tuner(SetOfRuns):
 
     def _compare(self, trial: _Trial) -> None:
         """Decide whether a trial whose runs have all come to a rung goes on, or take its score at its end."""
-        number, asked = trial.asked.number, trial.asked
+        until = self._search.rungs[trial.rung]
         if trial.failure:
-            self._study.tell(asked, state=import_optuna().trial.TrialState.FAIL)
-            return self._end(trial, f"failed, {trial.failure}")
-        if trial.rung == len(self._rungs):
+            self._end(trial, f"failed, {trial.failure}", state="FAIL")
+        elif until is None:
             score = final_score(trial.sweep.runs)
-            self._study.tell(asked, score)
-            self._end(trial, f"score {score:,.1f}")
-            if self._study.best_trial.number == number:
-                self._preset().write(self._search.path / PRESET, self._search.algorithm)
-            return None
-        score, ninths = score_at(trial.sweep.runs, self._rungs[trial.rung]), RUNGS[trial.rung]
-        trial.rung += 1
-        if score is not None:
-            asked.report(score, ninths)
-            if asked.should_prune():
-                self._study.tell(asked, state=import_optuna().trial.TrialState.PRUNED)
-                return self._end(trial, f"ended after {ninths} of {NINTHS} parts, where its return was {score:,.1f}")
-        self._queue(trial)
-        return None
+            self._end(trial, f"score {score:,.1f}", score)
+            if self._study.best_trial.number == trial.asked.number:
+                self._search.write_preset(self._study.best_trial)
+        else:
+            score, ninths = score_at(trial.sweep.runs, until), RUNGS[trial.rung]
+            trial.rung += 1
+            if score is not None:
+                trial.asked.report(score, ninths)
+            if score is not None and trial.asked.should_prune():
+                sentence = f"ended after {ninths} of {NINTHS} parts, where its return was {score:,.1f}"
+                self._end(trial, sentence, state="PRUNED")
+            else:
+                self._queue(trial)
 
-    def _end(self, trial: _Trial, sentence: str) -> None:
+    def _end(self, trial: _Trial, sentence: str, score: float | None = None, state: str = "") -> None:
+        self._study.tell(trial.asked, score, import_optuna().trial.TrialState[state] if state else None)
         self._trials.remove(trial)
         self._say(f"trial {trial.asked.number}: {sentence}; {as_text(trial.asked.params)}")
 
     def _result(self) -> Tuned:
         """The best trial, and pictures of all."""
-        complete = [trial for trial in self._study.trials if trial.state.name == "COMPLETE"]
-        if not complete:
+        trials, path = self._study.trials, self._search.path
+        if all(trial.state.name != "COMPLETE" for trial in trials):
             raise SweepError(f"None of the {self._search.trials} trials has come to its end; their logs say why.")
-        preset, best = self._preset(), self._study.best_trial
-        preset.write(self._search.path / PRESET, self._search.algorithm)
+        best = self._study.best_trial
+        preset = self._search.write_preset(best)
         assert best.value is not None
-        self._say(f"Best of {len(self._study.trials)} trials: number {best.number}, score {best.value:,.1f}.")
+        self._say(f"Best of {len(trials)} trials: number {best.number}, score {best.value:,.1f}.")
         self._say(preset.to_toml())
-        for picture in pictures.draw(self._study, list(self._space), self._search.path / "plots"):
+        for picture in pictures.draw(self._study, list(self._space), path / "plots"):
             self._say(str(picture))
         self._say(
             f"Evaluate it with seeds that the search has not seen: lemniscate train {self._search.algorithm} --preset"
-            f" {self._search.path / PRESET} --seeds 1-10"
+            f" {path / PRESET} --seeds 1-10"
         )
-        trials = [{"number": t.number, "state": t.state.name, "score": t.value, **t.params} for t in self._study.trials]
-        return Tuned(self._search.path, preset, best.value, trials)
-
-    def _preset(self) -> Preset:
-        """The settings of the best trial, with their provenance."""
-        best = self._study.best_trial
-        assert best.value is not None
-        settings = draw(self._space, import_optuna().trial.FixedTrial(best.params))
-        return self._search.preset(f"trial {best.number} of {self._search.trials}", settings, best.value)
+        records = [{"number": t.number, "state": t.state.name, "score": t.value, **t.params} for t in trials]
+        return Tuned(path, preset, best.value, records)
 
     def _say(self, text: str) -> None:
         if self._progress:
