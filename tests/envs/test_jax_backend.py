@@ -6,8 +6,9 @@ import torch
 jax = pytest.importorskip("jax")
 import jax.numpy as jnp
 
+from lemniscate.drones.crazyflow import JaxBackend
+from lemniscate.drones.drones import Programs
 from lemniscate.envs import registry
-from lemniscate.envs.jax_backend import JaxBackend, Programs
 from lemniscate.spec import Box, ObservationPart, Spec
 
 N, LIMIT = 4, 20

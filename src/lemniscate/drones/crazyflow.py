@@ -2,7 +2,7 @@
 """crazyflow's drones behind the contract of environments.
 
 crazyflow's environments are NEXT_STEP: they simulate, then reset what ended one step earlier, then compute a reward at
-the reset state. Here the same methods are called in another order, that of `jax_backend`, so that every row is real.
+the reset state. Here the same methods are called in another order, that of `drones.Programs`, so every row is real.
 """
 
 from __future__ import annotations
@@ -17,19 +17,21 @@ from functools import lru_cache, partial
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
+import numpy as np
 import torch
+from torch import Tensor
 
 from lemniscate.drones.pd import GAINS, PD
 from lemniscate.drones.vehicle import CONDITIONS, DYNAMICS, Ranges, interface_of, read_ranges
-from lemniscate.envs.backend import Scene, Summary
+from lemniscate.envs.backend import Backend, Scene, Summary
 from lemniscate.envs.factory import model_warnings_off, sentences
-from lemniscate.envs.jax_backend import JaxBackend, Programs, jax_device
 from lemniscate.envs.spaces import action_kind
 from lemniscate.errors import UserError, missing_extra, unknown_name
 from lemniscate.spec import Action, Box, Spec
+from lemniscate.types import Step
 
 if TYPE_CHECKING:
-    from lemniscate.drones.drones import Drones
+    from lemniscate.drones.drones import Drones, Programs
     from lemniscate.drones.probe import DroneProbe
 
 IDS = ("DroneFigureEightTrajectory-v0", "DroneLanding-v0", "DroneReachPos-v0", "DroneReachVel-v0")
@@ -48,7 +50,7 @@ def programs(
     Also the drones that they fly: one vector of them for each of the dynamics.
     """
     # JAX takes a second to import, and this module is imported wherever a backend is looked for.
-    from lemniscate.drones.drones import Mixed
+    from lemniscate.drones.drones import Mixed, Programs
 
     given = dict(kwargs)
     ranges, each = read_ranges(given), dynamics_of(given) or (None,)
@@ -75,6 +77,52 @@ def spec_of(env_id: str, drones: Drones) -> Spec:
     assert isinstance(action, Box)
     time_limit = drones.episode_steps
     return Spec(env_id, drones.parts, action, max_episode_steps=time_limit, privileged=drones.privileged)
+
+
+class JaxBackend(Backend):
+    """N environments that are stepped by compiled programs; what a subclass adds is their making, and the Spec."""
+
+    compiled = True
+
+    def __init__(self, programs: Programs, num_envs: int, device: torch.device, *, stagger: bool) -> None:
+        import jax
+
+        self.num_envs, self.device = num_envs, device
+        self._programs, self._from_dlpack = programs, jax.dlpack.from_dlpack
+        # Committed to the device like everything that follows, or the step would be compiled a second time.
+        self._put = lambda value: jax.device_put(value, programs.device)
+        self._stagger = self._put(np.bool_(stagger))
+        self._valid = torch.ones(num_envs, dtype=torch.bool, device=device)
+
+    def restart(self, seed: int, first: int = 0) -> Tensor:
+        """Begin again from `seed + first`, the seed of this vector."""
+        self._state, obs, fragment = self._programs.restart(self._put(np.uint32(seed + first)), self._stagger)
+        self.counts = ~torch.from_dlpack(fragment)
+        return torch.from_dlpack(obs)
+
+    def step(self, action: Tensor) -> Step:
+        """[N, A] actions in [-1, 1]; every row of the answer is real."""
+        command = self._from_dlpack(action.contiguous())
+        self._state, (*out, measures) = self._programs.step(self._state, command, self._stagger)
+        obs, next_obs, reward, flags = map(torch.from_dlpack, out)
+        terminated, truncated, fragment = flags
+        self.counts = (self.counts | terminated | truncated) & ~fragment
+        named = {name: torch.from_dlpack(values) for name, values in measures.items()}
+        return Step(obs, next_obs, reward, terminated, truncated, self._valid, named)
+
+    def close(self) -> None:
+        """Nothing to give back: the programs are shared."""
+
+
+def jax_device(device: torch.device) -> str:
+    """The name of a torch device in JAX. Raises `UserError` for mps, cuda:1, …, and cuda where JAX sees no GPU."""
+    import jax
+
+    if device.type == "mps" or device.index:
+        raise UserError(f"JAX's environments run on cpu or cuda, the first GPU, not on {device}.")
+    if device.type == "cuda" and not any(d.platform == "gpu" for d in jax.devices()):
+        raise UserError("JAX sees no GPU, so this cannot run on cuda; it comes with: pip install 'jax[cuda12]'")
+    return "gpu" if device.type == "cuda" else "cpu"
 
 
 class CrazyflowBackend(JaxBackend):

@@ -1,10 +1,16 @@
 # pyright: reportAttributeAccessIssue=false
-"""crazyflow's drones as pure functions of their state, fit to be traced: `JaxEnvs` in other words."""
+"""crazyflow's drones as pure functions of their state, and the programs that JAX compiles from such functions.
+
+    act → step → true observation, reward, ends → reset what ended → where to act next
+
+is traced once into a single XLA program, so every row is real.
+"""
 
 import contextlib
 import math
-from collections.abc import Iterator, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -12,8 +18,12 @@ import numpy as np
 
 from lemniscate.drones.air import Acting, Air, parameter_factors
 from lemniscate.drones.vehicle import DYNAMICS, STATE_PARTS, STATE_SIZE, Ranges
-from lemniscate.envs.jax_backend import Outcome, State
 from lemniscate.spec import ObservationPart
+
+State: TypeAlias = Any
+"""a pytree of arrays"""
+Outcome: TypeAlias = tuple[Any, Any, Any, Any, dict[str, Any]]
+"""observation [N, O], reward [N], terminated [N], truncated [N], and measures by name, [N] each"""
 
 AHEAD = 0.75
 """the share of staggered episodes that begin ahead of their beginning"""
@@ -251,3 +261,39 @@ def hovering_rotors(dynamics: str, params: Any) -> float:
         k0, k1, k2 = map(float, params.rpm2thrust.reshape(-1, 3)[0])
         return (-k1 + math.sqrt(k1**2 - 4 * k2 * (k0 - weight / 4))) / (2 * k2)
     return (weight - float(params.acc_coef.ravel()[0])) / float(params.cmd_f_coef.ravel()[0])
+
+
+class Programs:
+    """The two compiled programs of N environments: `restart(seed, stagger)` and `step(state, action, stagger)`.
+
+    Args:
+        envs: pure functions as those of `Drones`: `init(key)`, `reset(state, mask, stagger)` and `step(state, action)`,
+            which resets none; and their `num_envs`, `action_size` and `device`.
+    """
+
+    def __init__(self, envs: Any) -> None:
+        def restart(seed: jax.Array, stagger: jax.Array) -> tuple[State, jax.Array, jax.Array]:
+            return envs.reset(envs.init(jax.random.key(seed)), jnp.ones(envs.num_envs, dtype=bool), stagger)
+
+        def step(state: State, action: jax.Array, stagger: jax.Array) -> tuple[State, tuple[Any, ...]]:
+            state, (next_obs, reward, terminated, truncated, measures) = envs.step(state, action)
+            truncated = truncated & ~terminated
+            state, obs, fragment = envs.reset(state, terminated | truncated, stagger)
+            flags = jnp.stack((terminated, truncated, fragment))  # each array costs a conversion
+            return state, (obs, next_obs, reward, flags, measures)
+
+        self.device = envs.device
+        seed, stagger = jax.device_put((np.uint32(0), np.bool_(False)), envs.device)
+        action = jax.device_put(np.zeros((envs.num_envs, envs.action_size), np.float32), envs.device)
+        begun = jax.jit(restart).lower(seed, stagger)
+        stepped = jax.jit(step).lower(begun.out_info[0], action, stagger)
+        self.restart, self.step = compile_side_by_side([begun, stepped])
+
+
+def compile_side_by_side(lowered: Sequence[Any]) -> list[Callable]:
+    """The programs of what `jax.jit` has lowered, compiled by two threads.
+
+    Tracing goes before, one after the other, since it may use one object.
+    """
+    with ThreadPoolExecutor(2) as pool:
+        return list(pool.map(lambda one: one.compile(), lowered))

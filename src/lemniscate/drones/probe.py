@@ -12,9 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 import torch
 
-from lemniscate.drones.drones import Drones
+from lemniscate.drones.drones import Drones, compile_side_by_side
 from lemniscate.drones.vehicle import CONDITIONS, TABLES, Ranges
-from lemniscate.envs.jax_backend import compile_side_by_side
 from lemniscate.envs.probe import Act, Axis, Flown, Tally
 from lemniscate.spec import Spec
 

@@ -5,7 +5,8 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
-from functools import partial
+from functools import partial, reduce
+from operator import getitem
 from textwrap import wrap
 from typing import Any
 
@@ -18,7 +19,6 @@ from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
 from lemniscate.envs import registry
-from lemniscate.envs.conversion import follow
 from lemniscate.envs.factory import make_one, maker_of
 from lemniscate.envs.spaces import is_image, observation_parts, random_action
 from lemniscate.envs.vec_env import VecEnv
@@ -300,7 +300,7 @@ def _why_outside(env: gym.Env) -> str:
 
 def _dtypes(env: gym.Env, env_id: str) -> Finding:
     obs, space = env.reset(seed=0)[0], env.observation_space
-    kinds = {np.asarray(follow(part.path, obs)).dtype.name for part in observation_parts(space, env_id)}
+    kinds = {np.asarray(reduce(getitem, part.path, obs)).dtype.name for part in observation_parts(space, env_id)}
     as_what = "stay bytes" if kinds == {"uint8"} and is_image(space) else "reach the policy as float32"
     return Finding(GOOD, f"Its observations are {', '.join(sorted(kinds))}, and {as_what}.")
 

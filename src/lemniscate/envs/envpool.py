@@ -12,8 +12,7 @@ from torch import Tensor
 
 from lemniscate.envs.backend import Backend
 from lemniscate.envs.conversion import flatten_observation, physical_action, row_of
-from lemniscate.envs.observations import SUCCESS, SUMMARIES, measured
-from lemniscate.envs.spaces import action_kind, is_image, observation_parts
+from lemniscate.envs.spaces import SUCCESS, SUMMARIES, action_kind, is_image, measured, observation_parts
 from lemniscate.envs.vec_env import Stagger
 from lemniscate.errors import UserError, is_installed, missing_extra, unknown_name
 from lemniscate.spec import Spec

@@ -14,8 +14,15 @@ from torch import Tensor
 from lemniscate.envs.backend import Backend
 from lemniscate.envs.conversion import flatten_observation, physical_action, row_of
 from lemniscate.envs.factory import make_one, make_vector, maker_of, makes_vector, sentences
-from lemniscate.envs.observations import SUMMARIES, ActionMasks, measured, measures_of
-from lemniscate.envs.spaces import action_kind, is_image, observation_parts
+from lemniscate.envs.spaces import (
+    SUMMARIES,
+    ActionMasks,
+    action_kind,
+    is_image,
+    measured,
+    measures_of,
+    observation_parts,
+)
 from lemniscate.envs.vec_env import Stagger
 from lemniscate.errors import UserError
 from lemniscate.spec import Discrete, Spec
@@ -97,11 +104,6 @@ class GymnasiumBackend(Backend):
         self._measures = measures_of(self._envs.metadata)
         self.spec = Spec(env, parts, action, max_episode_steps=limit, image=is_image(space))
 
-    @classmethod
-    def divides(cls, env: str) -> bool:
-        """Whether it is made of single environments, each of which has a seed of its own."""
-        return cls.wraps(env)
-
     def restart(self, seed: int, first: int = 0) -> Tensor:
         """Close the environments and build them again: some (Box2D) carry more over a reset than they tell.
 
@@ -111,13 +113,12 @@ class GymnasiumBackend(Backend):
             self._envs.close()
             self._envs, _ = self._build()
         self._used = True
-        self._resetting = np.zeros(self.num_envs, dtype=bool)
+        self._resetting, self._valid = np.zeros(self.num_envs, dtype=bool), np.ones(self.num_envs, dtype=bool)
         self._stagger = Stagger(self.num_envs, self._stagger_up_to, seed, first)
         self.counts = self._tensor(self._stagger.counts)
         kind = self.spec.action
-        self._masks = None
-        if isinstance(kind, Discrete) and kind.masked:
-            self._masks = ActionMasks(self.spec.env_id, self.num_envs, kind.n)
+        masked = isinstance(kind, Discrete) and kind.masked
+        self._masks = ActionMasks(self.spec.env_id, self.num_envs, kind.n) if masked else None
         return self._tensor(self._observe(*self._envs.reset(seed=seed + first)))
 
     def step(self, action: Tensor) -> Step:
@@ -126,8 +127,7 @@ class GymnasiumBackend(Backend):
         raw, reward, terminated, truncated, info = self._envs.step(physical)
         terminated, truncated = terminated.copy(), truncated.copy()  # a vector environment may write over its own
         obs = next_obs = self._observe(raw, info)
-        valid = np.ones(self.num_envs, dtype=bool)
-        done = terminated | truncated
+        valid, done = self._valid, terminated | truncated
         if self.mode is AutoresetMode.NEXT_STEP:
             valid, self._resetting = ~self._resetting, done
         elif self.mode is AutoresetMode.SAME_STEP:
@@ -137,7 +137,7 @@ class GymnasiumBackend(Backend):
             done = terminated | truncated
             if done.any():
                 obs = self._observe(*self._envs.reset(options={"reset_mask": done.copy()}))
-        self.counts = self._tensor(self._stagger.counts)
+                self.counts = self._tensor(self._stagger.counts)
         there = self._tensor(next_obs)
         here = there if obs is next_obs else self._tensor(obs)
         rewards, *flags = map(self._tensor, (reward.astype(np.float32), terminated, truncated, valid))
