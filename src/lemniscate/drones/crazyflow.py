@@ -13,7 +13,7 @@ import io
 import os
 import warnings
 from collections.abc import Collection, Mapping, Sequence
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -27,7 +27,7 @@ from lemniscate.envs.backend import Backend, Scene, Summary
 from lemniscate.envs.factory import model_warnings_off, sentences
 from lemniscate.envs.spaces import action_kind
 from lemniscate.errors import UserError, missing_extra, unknown_name
-from lemniscate.spec import Action, Box, Spec
+from lemniscate.spec import Spec
 from lemniscate.types import Step
 
 if TYPE_CHECKING:
@@ -73,9 +73,7 @@ def make_drones(
 
 def spec_of(env_id: str, drones: Drones) -> Spec:
     """The Spec of drones."""
-    action = action_kind(drones.env.single_action_space, env_id)
-    assert isinstance(action, Box)
-    time_limit = drones.episode_steps
+    action, time_limit = action_kind(drones.env.single_action_space, env_id), drones.episode_steps
     return Spec(env_id, drones.parts, action, max_episode_steps=time_limit, privileged=drones.privileged)
 
 
@@ -144,11 +142,6 @@ class CrazyflowBackend(JaxBackend):
         """Crazyflow's four tasks."""
         return IDS
 
-    @classmethod
-    def serves(cls, env: str) -> bool:
-        """Whether it is one of them."""
-        return env in IDS
-
     def __init__(
         self,
         env: str,
@@ -176,7 +169,10 @@ class CrazyflowBackend(JaxBackend):
                 Summary("rmse_after_1s_mm", "tracking_error", "rms", scale=1000, skip=drones.env.freq),
             )
             self.scene = Scene(drones.env.sim.mj_model, 1 / drones.env.freq, slice(0, 3), slice(3, 7), drones.error)
-            self.baseline = _pd_of(drones, self.spec.action, drones.error.start)
+            first = drones.error.start
+            reference, preview = slice(first, first + 3 * drones.env.n_samples), drones.env.samples_dt
+            action = self.spec.bounded_box()
+            self.baseline = PD(GAINS[drones.dynamics], drones.mass, action, reference, slice(7, 10), preview)
 
     @classmethod
     def probe(cls, env: str, starts: int, trained: Mapping[str, Any], given: Mapping[str, Any]) -> DroneProbe:
@@ -192,19 +188,8 @@ class CrazyflowBackend(JaxBackend):
         dynamics = (*dynamics_of(own), None)[0]
         kwargs = {**own, "dynamics": dynamics} if dynamics else own
         _check(env, starts, kwargs)
-
-        def make(other: str | None, ranges: Ranges) -> Drones:
-            return make_drones(env, starts, "cpu", kwargs, other or dynamics, ranges)
-
         with sentences(env, kwargs):
-            return DroneProbe(make, DYNAMICS, read_ranges(kwargs), starts, partial(spec_of, env))
-
-
-def _pd_of(drones: Drones, action: Action, first: int) -> PD:
-    """A PD controller with its gains for these dynamics, for drones whose observation has the reference at `first`."""
-    assert isinstance(action, Box)
-    where = {"reference": slice(first, first + 3 * drones.env.n_samples), "velocity": slice(7, 10)}
-    return PD(GAINS[drones.dynamics], drones.mass, action, **where, preview=drones.env.samples_dt)
+            return DroneProbe(env, starts, kwargs, DYNAMICS)
 
 
 def _import() -> None:

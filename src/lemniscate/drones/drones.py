@@ -145,8 +145,10 @@ class Drones:
                 data = env.sim.data
                 env.sim.data = data.replace(states=data.states.replace(force=force[:, None]))
             air = self.air.observe(air, self._simulate(air, acting), action)
-            obs = self._observe(air)
-            measures = {} if self.error is None else {"tracking_error": jnp.linalg.norm(self._way(obs), axis=-1)}
+            obs, measures = self._observe(air), {}
+            if self.error:
+                true_way = env.obs()[REFERENCE][:, :3] if self.air.is_blurred else obs[:, self.error]
+                measures = {"tracking_error": jnp.linalg.norm(true_way, axis=-1)}
             return (*self._take(), air), (obs, env.reward(), env.terminated(), env.truncated(), measures)
 
     def _apply_conditions(self, air: dict[str, Any], mask: jax.Array) -> None:
@@ -208,10 +210,6 @@ class Drones:
         each = [jnp.broadcast_to(part, (self.num_envs, part.shape[-1])) for part in (rotors, dynamics)]
         return jnp.concatenate([self.air.truth(air), *each], axis=-1)
 
-    def _way(self, obs: jax.Array) -> jax.Array:
-        """The true way to the reference, [N, 3] m."""
-        return self.env.obs()[REFERENCE][:, :3] if self.air.is_blurred else obs[:, self.error]
-
 
 class Mixed:
     """Drones of several dynamics in one vector, by turns: drone i has dynamics i mod k.
@@ -232,18 +230,20 @@ class Mixed:
 
     def reset(self, state: State, mask: jax.Array, stagger: jax.Array) -> tuple[State, jax.Array, jax.Array]:
         """Reset the masked drones, as `Drones.reset`."""
-        every = [one.reset(its, mask[i :: len(self.drones)], stagger) for i, (one, its) in self._each(state)]
+        parts = zip(self.drones, state, self._parts(mask), strict=True)
+        every = [one.reset(its, begins, stagger) for one, its, begins in parts]
         states, obs, fragment = zip(*every, strict=True)
         return list(states), _by_turns(*obs), _by_turns(*fragment)
 
     def step(self, state: State, action: jax.Array) -> tuple[State, Outcome]:
         """One control step of every drone, as `Drones.step`."""
-        every = [one.step(its, action[i :: len(self.drones)]) for i, (one, its) in self._each(state)]
+        parts = zip(self.drones, state, self._parts(action), strict=True)
+        every = [one.step(its, command) for one, its, command in parts]
         states, outcomes = zip(*every, strict=True)
         return list(states), jax.tree.map(_by_turns, *outcomes)
 
-    def _each(self, state: State) -> Iterator[tuple[int, tuple[Drones, State]]]:
-        return enumerate(zip(self.drones, state, strict=True))
+    def _parts(self, rows: jax.Array) -> list[jax.Array]:
+        return [rows[i :: len(self.drones)] for i in range(len(self.drones))]
 
 
 def _by_turns(*parts: jax.Array) -> jax.Array:

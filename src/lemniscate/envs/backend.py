@@ -215,9 +215,9 @@ class Backend(ABC):
     def divides(cls, env: str) -> bool:
         """Whether each environment has a seed of its own, and nothing of one depends on the others beside it.
 
-        Those that are made one by one have. Where one has not, each shard of a run has a backend.
+        Where it has not, each shard of a run has a backend.
         """
-        return cls.wraps(env)
+        return False
 
     @classmethod
     def probe(cls, env: str, starts: int, trained: Mapping[str, Any], given: Mapping[str, Any]) -> Probe | None:

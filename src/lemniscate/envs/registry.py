@@ -23,6 +23,21 @@ BACKENDS = {
 }
 """each is imported when it is used; the first that serves an id runs it"""
 
+BEGINNINGS = {
+    "crazyflow": ("Drone",),
+    "envpool": (
+        "EnvPool/",
+        "Ant-v5",
+        "CartPole-v1",
+        "HalfCheetah-v5",
+        "Hopper-v5",
+        "Humanoid-v5",
+        "LunarLander-v3",
+        "Walker2d-v5",
+    ),
+}
+"""how the ids begin that a backend may serve, so that no other id needs it imported; others may serve any"""
+
 MOST_ENVS = 1_000_000
 """parallel environments that may be asked for"""
 
@@ -37,7 +52,8 @@ def backend_for(env: str, wrappers: Sequence[str] = ()) -> str:
 
     Raises `UserError` with the nearest names if there is none.
     """
-    serving = [name for name in BACKENDS if backend_class(name).serves(env)]
+    asked = [name for name in BACKENDS if env.startswith(BEGINNINGS.get(name, ""))]
+    serving = [name for name in asked if backend_class(name).serves(env)]
     if not serving:
         raise unknown_name("environment", env, known_ids(), "one of your own is named as module:Class.")
     return next((name for name in serving if not wrappers or backend_class(name).wraps(env)), serving[0])

@@ -42,8 +42,9 @@ def observation_parts(space: gym.Space, env_id: str, path: tuple[str | int, ...]
     if isinstance(space, spaces.MultiDiscrete):
         return (ObservationPart(path, tuple(space.shape), _whole(space.nvec), _whole(space.start)),)
     if isinstance(space, spaces.Dict | spaces.Tuple):
-        inside = space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces)
-        return tuple(part for name, piece in inside for part in observation_parts(piece, env_id, (*path, name)))
+        named = space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces)
+        inside = [observation_parts(part, env_id, (*path, name)) for name, part in named]
+        return tuple(part for parts in inside for part in parts)
     raise UserError(
         f"{env_id} observes a {type(space).__name__}, whose size is not fixed; what a network can look at is Box,"
         " Discrete, MultiDiscrete, MultiBinary, and Dict and Tuple of these."
