@@ -28,7 +28,7 @@ def step(state, action):
 
 
 class Vectorized:
-    """`JaxEnvs` from the two functions of a single environment, with a time limit.
+    """What `Programs` takes, from the two functions of a single environment, with a time limit.
 
     `reset(key) -> (state, obs [O])` and `step(state, action [A]) -> (state, obs [O], reward, terminated, measures)` are
     pure functions of one environment. With staggering, the first episode of each is cut after a random number of

@@ -22,7 +22,7 @@ from lemniscate.types import Step
 
 PREFIX, *GYMNASIUM_IDS = BEGINNINGS["envpool"]
 """what an id of EnvPool's own begins with here, so that it is not mistaken for Gymnasium's of that name; and the ids
-that behave in EnvPool as in Gymnasium: tests/envs/test_envpool.py compares them"""
+that are the same in both: tests/envs/test_envpool.py compares them"""
 
 REFUSED = {
     "procgen": "its games begin the next level in the step that ends one, which hides the final observation.",

@@ -36,7 +36,8 @@ BEGINNINGS = {
         "Walker2d-v5",
     ),
 }
-"""how the ids begin that a backend may serve, so that no other id needs it imported; others may serve any"""
+"""how the ids begin that a backend may serve: for no other is it imported. Those not named here may serve any id.
+EnvPool's own ids begin with `EnvPool/`; the others are Gymnasium's, which behave there as in Gymnasium"""
 
 MOST_ENVS = 1_000_000
 """parallel environments that may be asked for"""
