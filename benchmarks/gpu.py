@@ -155,7 +155,7 @@ def zero_copy(device: torch.device) -> dict[str, Any]:
     """Whether an array of JAX and the tensor made of it are one piece of memory, and the other way round."""
     import jax
 
-    from lemniscate.envs.jax_backend import jax_device
+    from lemniscate.drones.crazyflow import jax_device
 
     array = jax.device_put(jax.numpy.ones((64, 64)), jax.devices(jax_device(device))[0])
     tensor = torch.from_dlpack(array)

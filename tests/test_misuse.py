@@ -10,7 +10,7 @@ import lemniscate as lem
 from conftest import tiny_fields
 from lemniscate.cli import main
 from lemniscate.envs import registry
-from lemniscate.envs.observations import read_observation
+from lemniscate.envs.spaces import read_observation
 from lemniscate.errors import UserError, missing_extra, shown
 
 

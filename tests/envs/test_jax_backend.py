@@ -6,8 +6,9 @@ import torch
 jax = pytest.importorskip("jax")
 import jax.numpy as jnp
 
+from lemniscate.drones.crazyflow import JaxBackend
+from lemniscate.drones.drones import Programs
 from lemniscate.envs import registry
-from lemniscate.envs.jax_backend import JaxBackend, Programs
 from lemniscate.spec import Box, ObservationPart, Spec
 
 N, LIMIT = 4, 20
@@ -27,7 +28,7 @@ def step(state, action):
 
 
 class Vectorized:
-    """`JaxEnvs` from the two functions of a single environment, with a time limit.
+    """What `Programs` takes, from the two functions of a single environment, with a time limit.
 
     `reset(key) -> (state, obs [O])` and `step(state, action [A]) -> (state, obs [O], reward, terminated, measures)` are
     pure functions of one environment. With staggering, the first episode of each is cut after a random number of

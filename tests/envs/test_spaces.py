@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lemniscate.envs.conversion import flatten_observation, physical_action, scale_action
-from lemniscate.envs.observations import ActionMasks
-from lemniscate.envs.spaces import action_kind, is_image, observation_parts
+from lemniscate.envs.spaces import ActionMasks, action_kind, is_image, observation_parts
 from lemniscate.errors import UserError
 from lemniscate.spec import Box, Discrete
 

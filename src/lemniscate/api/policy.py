@@ -13,7 +13,7 @@ import torch
 
 from lemniscate import algos
 from lemniscate.envs.conversion import physical_action
-from lemniscate.envs.observations import read_mask, read_observation
+from lemniscate.envs.spaces import read_mask, read_observation
 from lemniscate.errors import UserError, prefix_errors, shown
 from lemniscate.hub import repository as hub
 from lemniscate.nn.policies import Policy

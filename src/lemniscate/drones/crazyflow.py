@@ -2,7 +2,7 @@
 """crazyflow's drones behind the contract of environments.
 
 crazyflow's environments are NEXT_STEP: they simulate, then reset what ended one step earlier, then compute a reward at
-the reset state. Here the same methods are called in another order, that of `jax_backend`, so that every row is real.
+the reset state. Here the same methods are called in another order, that of `drones.Programs`, so every row is real.
 """
 
 from __future__ import annotations
@@ -13,23 +13,25 @@ import io
 import os
 import warnings
 from collections.abc import Collection, Mapping, Sequence
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
+import numpy as np
 import torch
+from torch import Tensor
 
 from lemniscate.drones.pd import GAINS, PD
 from lemniscate.drones.vehicle import CONDITIONS, DYNAMICS, Ranges, interface_of, read_ranges
-from lemniscate.envs.backend import Scene, Summary
+from lemniscate.envs.backend import Backend, Scene, Summary
 from lemniscate.envs.factory import model_warnings_off, sentences
-from lemniscate.envs.jax_backend import JaxBackend, Programs, jax_device
 from lemniscate.envs.spaces import action_kind
 from lemniscate.errors import UserError, missing_extra, unknown_name
-from lemniscate.spec import Action, Box, Spec
+from lemniscate.spec import Spec
+from lemniscate.types import Step
 
 if TYPE_CHECKING:
-    from lemniscate.drones.drones import Drones
+    from lemniscate.drones.drones import Drones, Programs
     from lemniscate.drones.probe import DroneProbe
 
 IDS = ("DroneFigureEightTrajectory-v0", "DroneLanding-v0", "DroneReachPos-v0", "DroneReachVel-v0")
@@ -48,7 +50,7 @@ def programs(
     Also the drones that they fly: one vector of them for each of the dynamics.
     """
     # JAX takes a second to import, and this module is imported wherever a backend is looked for.
-    from lemniscate.drones.drones import Mixed
+    from lemniscate.drones.drones import Mixed, Programs
 
     given = dict(kwargs)
     ranges, each = read_ranges(given), dynamics_of(given) or (None,)
@@ -71,10 +73,54 @@ def make_drones(
 
 def spec_of(env_id: str, drones: Drones) -> Spec:
     """The Spec of drones."""
-    action = action_kind(drones.env.single_action_space, env_id)
-    assert isinstance(action, Box)
-    time_limit = drones.episode_steps
+    action, time_limit = action_kind(drones.env.single_action_space, env_id), drones.episode_steps
     return Spec(env_id, drones.parts, action, max_episode_steps=time_limit, privileged=drones.privileged)
+
+
+class JaxBackend(Backend):
+    """N environments that are stepped by compiled programs; what a subclass adds is their making, and the Spec."""
+
+    compiled = True
+
+    def __init__(self, programs: Programs, num_envs: int, device: torch.device, *, stagger: bool) -> None:
+        import jax
+
+        self.num_envs, self.device = num_envs, device
+        self._programs, self._from_dlpack = programs, jax.dlpack.from_dlpack
+        # Committed to the device like everything that follows, or the step would be compiled a second time.
+        self._put = lambda value: jax.device_put(value, programs.device)
+        self._stagger = self._put(np.bool_(stagger))
+        self._valid = torch.ones(num_envs, dtype=torch.bool, device=device)
+
+    def restart(self, seed: int, first: int = 0) -> Tensor:
+        """Begin again from `seed + first`, the seed of this vector."""
+        self._state, obs, fragment = self._programs.restart(self._put(np.uint32(seed + first)), self._stagger)
+        self.counts = ~torch.from_dlpack(fragment)
+        return torch.from_dlpack(obs)
+
+    def step(self, action: Tensor) -> Step:
+        """[N, A] actions in [-1, 1]; every row of the answer is real."""
+        command = self._from_dlpack(action.contiguous())
+        self._state, (*out, measures) = self._programs.step(self._state, command, self._stagger)
+        obs, next_obs, reward, flags = map(torch.from_dlpack, out)
+        terminated, truncated, fragment = flags
+        self.counts = (self.counts | terminated | truncated) & ~fragment
+        named = {name: torch.from_dlpack(values) for name, values in measures.items()}
+        return Step(obs, next_obs, reward, terminated, truncated, self._valid, named)
+
+    def close(self) -> None:
+        """Nothing to give back: the programs are shared."""
+
+
+def jax_device(device: torch.device) -> str:
+    """The name of a torch device in JAX. Raises `UserError` for mps, cuda:1, …, and cuda where JAX sees no GPU."""
+    import jax
+
+    if device.type == "mps" or device.index:
+        raise UserError(f"JAX's environments run on cpu or cuda, the first GPU, not on {device}.")
+    if device.type == "cuda" and not any(d.platform == "gpu" for d in jax.devices()):
+        raise UserError("JAX sees no GPU, so this cannot run on cuda; it comes with: pip install 'jax[cuda12]'")
+    return "gpu" if device.type == "cuda" else "cpu"
 
 
 class CrazyflowBackend(JaxBackend):
@@ -95,11 +141,6 @@ class CrazyflowBackend(JaxBackend):
     def ids(cls) -> Collection[str]:
         """Crazyflow's four tasks."""
         return IDS
-
-    @classmethod
-    def serves(cls, env: str) -> bool:
-        """Whether it is one of them."""
-        return env in IDS
 
     def __init__(
         self,
@@ -128,7 +169,10 @@ class CrazyflowBackend(JaxBackend):
                 Summary("rmse_after_1s_mm", "tracking_error", "rms", scale=1000, skip=drones.env.freq),
             )
             self.scene = Scene(drones.env.sim.mj_model, 1 / drones.env.freq, slice(0, 3), slice(3, 7), drones.error)
-            self.baseline = _pd_of(drones, self.spec.action, drones.error.start)
+            first = drones.error.start
+            reference, preview = slice(first, first + 3 * drones.env.n_samples), drones.env.samples_dt
+            action = self.spec.bounded_box()
+            self.baseline = PD(GAINS[drones.dynamics], drones.mass, action, reference, slice(7, 10), preview)
 
     @classmethod
     def probe(cls, env: str, starts: int, trained: Mapping[str, Any], given: Mapping[str, Any]) -> DroneProbe:
@@ -144,19 +188,8 @@ class CrazyflowBackend(JaxBackend):
         dynamics = (*dynamics_of(own), None)[0]
         kwargs = {**own, "dynamics": dynamics} if dynamics else own
         _check(env, starts, kwargs)
-
-        def make(other: str | None, ranges: Ranges) -> Drones:
-            return make_drones(env, starts, "cpu", kwargs, other or dynamics, ranges)
-
         with sentences(env, kwargs):
-            return DroneProbe(make, DYNAMICS, read_ranges(kwargs), starts, partial(spec_of, env))
-
-
-def _pd_of(drones: Drones, action: Action, first: int) -> PD:
-    """A PD controller with its gains for these dynamics, for drones whose observation has the reference at `first`."""
-    assert isinstance(action, Box)
-    where = {"reference": slice(first, first + 3 * drones.env.n_samples), "velocity": slice(7, 10)}
-    return PD(GAINS[drones.dynamics], drones.mass, action, **where, preview=drones.env.samples_dt)
+            return DroneProbe(env, starts, kwargs, DYNAMICS)
 
 
 def _import() -> None:

@@ -1,10 +1,16 @@
 # pyright: reportAttributeAccessIssue=false
-"""crazyflow's drones as pure functions of their state, fit to be traced: `JaxEnvs` in other words."""
+"""crazyflow's drones as pure functions of their state, and the programs that JAX compiles from such functions.
+
+    act → step → true observation, reward, ends → reset what ended → where to act next
+
+is traced once into a single XLA program, so every row is real.
+"""
 
 import contextlib
 import math
-from collections.abc import Iterator, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -12,8 +18,12 @@ import numpy as np
 
 from lemniscate.drones.air import Acting, Air, parameter_factors
 from lemniscate.drones.vehicle import DYNAMICS, STATE_PARTS, STATE_SIZE, Ranges
-from lemniscate.envs.jax_backend import Outcome, State
 from lemniscate.spec import ObservationPart
+
+State: TypeAlias = Any
+"""a pytree of arrays"""
+Outcome: TypeAlias = tuple[Any, Any, Any, Any, dict[str, Any]]
+"""observation [N, O], reward [N], terminated [N], truncated [N], and measures by name, [N] each"""
 
 AHEAD = 0.75
 """the share of staggered episodes that begin ahead of their beginning"""
@@ -135,8 +145,10 @@ class Drones:
                 data = env.sim.data
                 env.sim.data = data.replace(states=data.states.replace(force=force[:, None]))
             air = self.air.observe(air, self._simulate(air, acting), action)
-            obs = self._observe(air)
-            measures = {} if self.error is None else {"tracking_error": jnp.linalg.norm(self._way(obs), axis=-1)}
+            obs, measures = self._observe(air), {}
+            if self.error:
+                true_way = env.obs()[REFERENCE][:, :3] if self.air.is_blurred else obs[:, self.error]
+                measures = {"tracking_error": jnp.linalg.norm(true_way, axis=-1)}
             return (*self._take(), air), (obs, env.reward(), env.terminated(), env.truncated(), measures)
 
     def _apply_conditions(self, air: dict[str, Any], mask: jax.Array) -> None:
@@ -198,10 +210,6 @@ class Drones:
         each = [jnp.broadcast_to(part, (self.num_envs, part.shape[-1])) for part in (rotors, dynamics)]
         return jnp.concatenate([self.air.truth(air), *each], axis=-1)
 
-    def _way(self, obs: jax.Array) -> jax.Array:
-        """The true way to the reference, [N, 3] m."""
-        return self.env.obs()[REFERENCE][:, :3] if self.air.is_blurred else obs[:, self.error]
-
 
 class Mixed:
     """Drones of several dynamics in one vector, by turns: drone i has dynamics i mod k.
@@ -222,18 +230,20 @@ class Mixed:
 
     def reset(self, state: State, mask: jax.Array, stagger: jax.Array) -> tuple[State, jax.Array, jax.Array]:
         """Reset the masked drones, as `Drones.reset`."""
-        every = [one.reset(its, mask[i :: len(self.drones)], stagger) for i, (one, its) in self._each(state)]
+        parts = zip(self.drones, state, self._parts(mask), strict=True)
+        every = [one.reset(its, begins, stagger) for one, its, begins in parts]
         states, obs, fragment = zip(*every, strict=True)
         return list(states), _by_turns(*obs), _by_turns(*fragment)
 
     def step(self, state: State, action: jax.Array) -> tuple[State, Outcome]:
         """One control step of every drone, as `Drones.step`."""
-        every = [one.step(its, action[i :: len(self.drones)]) for i, (one, its) in self._each(state)]
+        parts = zip(self.drones, state, self._parts(action), strict=True)
+        every = [one.step(its, command) for one, its, command in parts]
         states, outcomes = zip(*every, strict=True)
         return list(states), jax.tree.map(_by_turns, *outcomes)
 
-    def _each(self, state: State) -> Iterator[tuple[int, tuple[Drones, State]]]:
-        return enumerate(zip(self.drones, state, strict=True))
+    def _parts(self, rows: jax.Array) -> list[jax.Array]:
+        return [rows[i :: len(self.drones)] for i in range(len(self.drones))]
 
 
 def _by_turns(*parts: jax.Array) -> jax.Array:
@@ -251,3 +261,39 @@ def hovering_rotors(dynamics: str, params: Any) -> float:
         k0, k1, k2 = map(float, params.rpm2thrust.reshape(-1, 3)[0])
         return (-k1 + math.sqrt(k1**2 - 4 * k2 * (k0 - weight / 4))) / (2 * k2)
     return (weight - float(params.acc_coef.ravel()[0])) / float(params.cmd_f_coef.ravel()[0])
+
+
+class Programs:
+    """The two compiled programs of N environments: `restart(seed, stagger)` and `step(state, action, stagger)`.
+
+    Args:
+        envs: pure functions as those of `Drones`: `init(key)`, `reset(state, mask, stagger)` and `step(state, action)`,
+            which resets none; and their `num_envs`, `action_size` and `device`.
+    """
+
+    def __init__(self, envs: Any) -> None:
+        def restart(seed: jax.Array, stagger: jax.Array) -> tuple[State, jax.Array, jax.Array]:
+            return envs.reset(envs.init(jax.random.key(seed)), jnp.ones(envs.num_envs, dtype=bool), stagger)
+
+        def step(state: State, action: jax.Array, stagger: jax.Array) -> tuple[State, tuple[Any, ...]]:
+            state, (next_obs, reward, terminated, truncated, measures) = envs.step(state, action)
+            truncated = truncated & ~terminated
+            state, obs, fragment = envs.reset(state, terminated | truncated, stagger)
+            flags = jnp.stack((terminated, truncated, fragment))  # each array costs a conversion
+            return state, (obs, next_obs, reward, flags, measures)
+
+        self.device = envs.device
+        seed, stagger = jax.device_put((np.uint32(0), np.bool_(False)), envs.device)
+        action = jax.device_put(np.zeros((envs.num_envs, envs.action_size), np.float32), envs.device)
+        begun = jax.jit(restart).lower(seed, stagger)
+        stepped = jax.jit(step).lower(begun.out_info[0], action, stagger)
+        self.restart, self.step = compile_side_by_side([begun, stepped])
+
+
+def compile_side_by_side(lowered: Sequence[Any]) -> list[Callable]:
+    """The programs of what `jax.jit` has lowered, compiled by two threads.
+
+    Tracing goes before, one after the other, since it may use one object.
+    """
+    with ThreadPoolExecutor(2) as pool:
+        return list(pool.map(lambda one: one.compile(), lowered))

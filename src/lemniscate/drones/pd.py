@@ -6,6 +6,7 @@ without their attitude loop, which the drone has itself.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -24,10 +25,11 @@ GAINS = {
 return from 192 starts of the figure eight (`benchmarks/air.py --gains`)"""
 
 
+@dataclass(frozen=True)
 class PD:
     """The controller, as a function of flat observations.
 
-    Args:
+    Attributes:
         gains: kp, kd, kp_z, kd_z.
         mass: that it believes in, kg.
         action: the bounds of roll, pitch, yaw (rad) and thrust (N).
@@ -36,30 +38,30 @@ class PD:
         preview: seconds from one point to the next.
     """
 
-    def __init__(
-        self, gains: Sequence[float], mass: float, action: Box, reference: slice, velocity: slice, preview: float
-    ) -> None:
-        self._made_of = mass, action, reference, velocity, preview
-        kp, kd, kp_z, kd_z = gains
-        self.kp, self.kd = torch.tensor((kp, kp, kp_z)), torch.tensor((kd, kd, kd_z))
-        self.mass, self.preview = mass, preview
-        self.low, self.high = torch.tensor(action.low), torch.tensor(action.high)
-        self.reference, self.velocity = reference, velocity
+    gains: Sequence[float]
+    mass: float
+    action: Box
+    reference: slice
+    velocity: slice
+    preview: float
 
     def with_gains(self, gains: Sequence[float]) -> "PD":
         """The same controller with other gains."""
-        return PD(gains, *self._made_of)
+        return replace(self, gains=gains)
 
     def __call__(self, obs: Tensor) -> Deterministic:
         """The action [N, 4] at each observation [N, O]."""
+        horizontal, vertical = self.gains[:2], self.gains[2:]
+        kp, kd = (torch.tensor((one, one, other)) for one, other in zip(horizontal, vertical, strict=True))
         points = obs[:, self.reference].unflatten(1, (-1, 3))
         here, next_, after = points[:, 0], points[:, 1], points[:, 2]
         velocity = (-3 * here + 4 * next_ - after) / (2 * self.preview)  # derivatives of the parabola through them
         acceleration = (here - 2 * next_ + after) / self.preview**2
-        wish = self.kp * here + self.kd * (velocity - obs[:, self.velocity]) + acceleration
+        wish = kp * here + kd * (velocity - obs[:, self.velocity]) + acceleration
         wish = wish + torch.tensor((0.0, 0.0, GRAVITY))
         size = wish.norm(dim=1)
         x, y, z = (wish / size[:, None]).unbind(1)
         roll, pitch = -torch.asin(y.clamp(-1, 1)), torch.atan2(x, z)
         command = torch.stack([roll, pitch, torch.zeros_like(roll), self.mass * size], dim=1)
-        return Deterministic((2 * (command - self.low) / (self.high - self.low) - 1).clamp(-1, 1))
+        low, high = torch.tensor(self.action.low), torch.tensor(self.action.high)
+        return Deterministic((2 * (command - low) / (high - low) - 1).clamp(-1, 1))

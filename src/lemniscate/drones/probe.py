@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from functools import cached_property
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cached_property, partial
 from typing import Any
 
 import jax
@@ -12,11 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 import torch
 
-from lemniscate.drones.drones import Drones
-from lemniscate.drones.vehicle import CONDITIONS, TABLES, Ranges
-from lemniscate.envs.jax_backend import compile_side_by_side
+from lemniscate.drones.crazyflow import make_drones, spec_of
+from lemniscate.drones.drones import Drones, compile_side_by_side
+from lemniscate.drones.vehicle import CONDITIONS, TABLES, read_ranges
 from lemniscate.envs.probe import Act, Axis, Flown, Tally
-from lemniscate.spec import Spec
 
 MOST_FLIGHTS = 1024
 """flights side by side: as many as a cache holds, and few enough that batches of crashed drones end early"""
@@ -30,9 +29,6 @@ def _axis(name: str, values: Sequence[float], shown: tuple[str, float] = ("", 1.
 
 CONDITION_AXES = tuple(_axis(name, **row) for name, row in TABLES["axes"].items())
 
-Make = Callable[[str | None, Ranges], Drones]
-"""the drones of as many flights as there are starts, in dynamics by name, or in those that are nominal"""
-
 
 class DroneProbe:
     """A probe of drones: a point is a value of one condition, while the others are as they are nominally.
@@ -41,25 +37,29 @@ class DroneProbe:
     starts, the noise and the direction of the wind are the same. Each of the other dynamics is a program of its own.
 
     Args:
-        make: the drones.
-        dynamics: all that there are.
-        given: conditions that are nominal here, though not in the simulator as it is.
+        env: the id.
         starts: E.
-        spec: of the environment with these drones.
+        kwargs: of the environment; conditions among them are nominal here, though not in the simulator as it is, and of
+            one that is drawn from a range there is no axis.
+        dynamics: all that there are.
     """
 
     ends_by_failure = True
 
-    def __init__(self, make: Make, dynamics: Sequence[str], given: Ranges, starts: int, spec: Callable) -> None:
-        self._make, self._given = make, given
-        conditions = tuple(_conditions(given))
-        ranges = {**given, **{axis.name: (min(axis.values), max(axis.values)) for axis in conditions}}
-        self._drones = make(None, ranges)
-        nominal, self._ends = self._drones.dynamics, _ends(ranges, given)
+    def __init__(self, env: str, starts: int, kwargs: Mapping[str, Any], dynamics: Sequence[str]) -> None:
+        self._make, self._given = partial(make_drones, env, starts, "cpu", kwargs), read_ranges(kwargs)
+        ends = {name: (one.nominal, one.nominal) for name, one in CONDITIONS.items()} | self._given
+        fixed = {name: low for name, (low, high) in ends.items() if low == high}
+        conditions = [axis.around(fixed[axis.name]) for axis in CONDITION_AXES if axis.name in fixed]
+        ranges = {**self._given, **{axis.name: (min(axis.values), max(axis.values)) for axis in conditions}}
+        self._drones = self._make(kwargs.get("dynamics"), ranges)
+        self._ends = np.array([ends[name] for name in ranges], dtype=np.float32).reshape(-1, 2)
+        """the ends [K, 2] of the nominal ranges"""
+        nominal = self._drones.dynamics
         ordered = tuple(axis for axis in conditions if axis.name != "motor_time" or nominal != "so_rpy")
         every = Axis("dynamics", tuple(dynamics), nominal, "name", "dynamics", "the dynamics {}")
         self.axes = (*ordered, every)
-        self.spec: Spec = spec(self._drones)
+        self.spec = spec_of(env, self._drones)
         self.period = 1 / self._drones.env.freq
         self._points = [(axis.name, value) for axis in ordered for value in axis.values if value != axis.nominal]
         batches = math.ceil((1 + len(self._points)) / max(1, MOST_FLIGHTS // starts))
@@ -96,20 +96,6 @@ class DroneProbe:
             ends[row, names.index(name)] = value
         for begin in range(0, len(ends), self._size):
             yield from programs.fly(act, seed, ends[begin : begin + self._size], keep_first=begin == 0)
-
-
-def _conditions(given: Ranges) -> Iterator[Axis]:
-    """The axes of conditions about their nominal values; none of a condition that is drawn from a range."""
-    for axis in CONDITION_AXES:
-        low, high = given.get(axis.name, (CONDITIONS[axis.name].nominal,) * 2)
-        if low == high:
-            yield axis.around(low)
-
-
-def _ends(ranges: Ranges, given: Ranges) -> np.ndarray:
-    """The ends [K, 2] of the nominal ranges."""
-    nominal = [given.get(name, (CONDITIONS[name].nominal,) * 2) for name in ranges]
-    return np.array(nominal, dtype=np.float32).reshape(-1, 2)
 
 
 class _Programs:

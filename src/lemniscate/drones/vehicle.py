@@ -106,10 +106,9 @@ def interface_of(
         ahead = [_vector(f"to_reference_in_{text}", "m", WORLD) for text in seconds]
         parts["local_samples"] = tuple(quantity for vector in ahead for quantity in vector)
     seen = [*(quantity for name in STATE_PARTS for quantity in PARTS[name]), *PAST_ACTION]
-    steps = range(1, history + 1)
     parts["history"] = tuple(
         Quantity(f"{q.name}_{ago}_steps_ago{'' if q in PAST_ACTION else '_less_now'}", q.unit, q.frame)
-        for ago in steps
+        for ago in range(1, history + 1)
         for q in seen
     )
     drone = str(env.sim.drone)

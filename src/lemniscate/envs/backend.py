@@ -1,9 +1,9 @@
 """The contract of the environment floor: what a backend provides."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, TypeAlias
 
 import gymnasium as gym
 import numpy as np
@@ -51,12 +51,8 @@ class Scene:
     error: slice
 
 
-class Baseline(Protocol):
-    """A controller that was not learned: a function of flat observations [N, O] to a distribution over actions."""
-
-    def __call__(self, obs: Tensor) -> Distribution:
-        """All probability on one action, [N, A]."""
-        ...
+Baseline: TypeAlias = Callable[[Tensor], Distribution]
+"""a controller that was not learned: of flat observations [N, O] to a distribution with all on one action, [N, A]"""
 
 
 @dataclass(frozen=True)
@@ -257,11 +253,16 @@ class Joined(Backend):
         return obs
 
     def step(self, action: Tensor) -> Step:
-        """The step of all parts; see `Backend.step`."""
+        """The step of all parts; see `Backend.step`. A measure that some of them lack is NaN there."""
         parts = zip(self._backends, action.chunk(len(self._backends)), strict=True)
         steps = [backend.step(part) for backend, part in parts]
         self._count()
-        return joined(steps)
+        columns = ("obs", "next_obs", "reward", "terminated", "truncated", "valid")
+        joined = {name: torch.cat([getattr(step, name) for step in steps]) for name in columns}
+        missing = torch.full_like(steps[0].reward, torch.nan)
+        names = dict.fromkeys(name for step in steps for name in step.measures)
+        measures = {name: torch.cat([step.measures.get(name, missing) for step in steps]) for name in names}
+        return Step(**joined, measures=measures)
 
     def close(self) -> None:
         """Close them all."""
@@ -270,15 +271,3 @@ class Joined(Backend):
 
     def _count(self) -> None:
         self.counts = torch.cat([backend.counts for backend in self._backends])
-
-
-def joined(steps: Sequence[Step]) -> Step:
-    """The steps of several vectors of environments as one; a measure that some lack is NaN there."""
-    names = dict.fromkeys(name for step in steps for name in step.measures)
-    missing = [torch.full_like(step.reward, torch.nan) for step in steps]
-    measures = {
-        name: torch.cat([step.measures.get(name, nan) for step, nan in zip(steps, missing, strict=True)])
-        for name in names
-    }
-    columns = ("obs", "next_obs", "reward", "terminated", "truncated", "valid")
-    return Step(**{name: torch.cat([getattr(step, name) for step in steps]) for name in columns}, measures=measures)

@@ -5,7 +5,8 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass
-from functools import partial
+from functools import partial, reduce
+from operator import getitem
 from textwrap import wrap
 from typing import Any
 
@@ -18,7 +19,6 @@ from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
 from lemniscate.envs import registry
-from lemniscate.envs.conversion import follow
 from lemniscate.envs.factory import make_one, maker_of
 from lemniscate.envs.spaces import is_image, observation_parts, random_action
 from lemniscate.envs.vec_env import VecEnv
@@ -54,11 +54,14 @@ class Finding:
         return f"{MARKS[self.grade]} " + "\n  ".join(lines)
 
 
+good, note, bad = (partial(Finding, grade) for grade in (GOOD, NOTE, BAD))
+
+
 def verdict(env_id: str, findings: Sequence[Finding]) -> str:
     """Whether an environment is suitable for training, in one sentence."""
-    bad, notes = (sum(finding.grade == grade for finding in findings) for grade in (BAD, NOTE))
-    if bad:
-        return f"{env_id} is not suitable for training: {bad} finding{'s' * (bad > 1)} above, marked {MARKS[BAD]}."
+    flaws, notes = (sum(finding.grade == grade for finding in findings) for grade in (BAD, NOTE))
+    if flaws:
+        return f"{env_id} is not suitable for training: {flaws} finding{'s' * (flaws > 1)} above, marked {MARKS[BAD]}."
     look = f"; look at the {notes} note{'s' * (notes > 1)} above, marked {MARKS[NOTE]}" if notes else ""
     return f"{env_id} is suitable for training{look}."
 
@@ -88,10 +91,9 @@ def each_finding(
 
 def _raised(error: Exception, what: str) -> Finding:
     if isinstance(error, NonFiniteError):
-        return Finding(BAD, f"{error} Learning would stop there.")
-    if isinstance(error, UserError):
-        return Finding(BAD, str(error))
-    return Finding(BAD, f"{what}: {type(error).__name__}: {_one_line(error).rstrip('.')}.")
+        return bad(f"{error} Learning would stop there.")
+    known = isinstance(error, UserError)
+    return bad(str(error) if known else f"{what}: {type(error).__name__}: {_one_line(error).rstrip('.')}.")
 
 
 def _one_line(message: object) -> str:
@@ -103,25 +105,22 @@ def _one_line(message: object) -> str:
 def _spaces(env: VecEnv, served_by: str) -> Iterator[Finding]:
     """The findings on observations, actions and the ends of episodes."""
     spec, mode = env.spec, env.backend.mode
-    yield Finding(GOOD, f"Served by {served_by}; observes {_seen(spec)}; acts by {_acts(spec.action)}.")
+    yield good(f"Served by {served_by}; observes {_seen(spec)}; acts by {_acts(spec.action)}.")
     flat = [part for part in spec.observation_parts if len(part.shape) > 1 and min(sorted(part.shape)[-2:]) > 16]
     if flat and not spec.image:
         part = flat[0]
-        yield Finding(
-            NOTE,
+        yield note(
             f"The array {part.name} {part.shape} becomes {part.size:,} numbers without their places; if it is an image,"
-            " return uint8 of height × width × channels, or with the channels first, for a convolutional network.",
+            " return uint8 of height × width × channels, or with the channels first, for a convolutional network."
         )
     if mode is AutoresetMode.SAME_STEP:
-        yield Finding(GOOD, "Resets in the step that ends an episode, and gives the final observation in its info.")
+        yield good("Resets in the step that ends an episode, and gives the final observation in its info.")
     elif mode is AutoresetMode.NEXT_STEP:
-        yield Finding(GOOD, "Resets in the step after an end; the action of that step is ignored and not learned from.")
+        yield good("Resets in the step after an end; the action of that step is ignored and not learned from.")
     else:
-        yield Finding(GOOD, "Is reset here, right after an episode's end; the final observation is kept.")
+        yield good("Is reset here, right after an episode's end; the final observation is kept.")
     if isinstance(spec.action, Box) and not np.isfinite([*spec.action.low, *spec.action.high]).all():
-        yield Finding(
-            NOTE, "Some actions have no bound: a policy begins around zero, or around one unit from the only bound."
-        )
+        yield note("Some actions have no bound: a policy begins around zero, or around one unit from the only bound.")
 
 
 def _seen(spec: Spec) -> str:
@@ -156,31 +155,29 @@ def _random_play(env: VecEnv) -> Iterator[Finding]:
     except Exception as error:
         yield _raised(error, "It cannot be played with random actions")
         return
-    yield Finding(GOOD, f"{STEPS} random steps: every observation and reward is finite.")
+    yield good(f"{STEPS} random steps: every observation and reward is finite.")
     if not repeated:
-        yield Finding(BAD, "The same seed and actions give another episode: runs cannot be repeated, nor resumed.")
+        yield bad("The same seed and actions give another episode: runs cannot be repeated, nor resumed.")
     elif torch.equal(first.obs, other.obs):
-        yield Finding(NOTE, "Another seed gives the same episodes: everything about it is deterministic.")
+        yield note("Another seed gives the same episodes: everything about it is deterministic.")
     else:
-        yield Finding(GOOD, "The same seed gives the same episodes, another one others.")
+        yield good("The same seed gives the same episodes, another one others.")
     if _same(first[: STEPS // 2], acted) and not torch.equal(first.action[: STEPS // 2], acted.action):
-        yield Finding(
-            NOTE,
+        yield note(
             "Other actions from the same seed had the same outcome in every step: nothing can be learned where actions"
-            " are ignored; look whether step() uses its argument.",
+            " are ignored; look whether step() uses its argument."
         )
     inside = (first.valid & ~first.done)[:-1]
     if not torch.equal(first.next_obs[:-1][inside], first.obs[1:][inside]):
-        yield Finding(BAD, "Within an episode, an observation is not the one that the step before ended in.")
+        yield bad("Within an episode, an observation is not the one that the step before ended in.")
     ended, timed_out, ignored = (int(x.sum()) for x in (first.terminated, first.truncated, ~first.valid))
     resets = f", and {ignored} steps in which it ignored its action to reset itself, which are not learned from"
-    yield Finding(
-        GOOD, f"{ended} episodes ended by its rules and {timed_out} by the time limit{resets if ignored else ''}."
-    )
-    yield from _ends_and_rewards([first, other], lengths + more_lengths, env.spec)
+    yield good(f"{ended} episodes ended by its rules and {timed_out} by the time limit{resets if ignored else ''}.")
+    both = Rollout(*map(torch.cat, zip(vars(first).values(), vars(other).values(), strict=True)))
+    yield from _ends_and_rewards(both, lengths + more_lengths, env.spec)
     if not env.spec.image:
-        yield from _sizes(torch.cat([rollout.obs[rollout.valid] for rollout in (first, other)]), env.spec)
-    yield Finding(GOOD, f"{speed:,.0f} steps a second ({NUM_ENVS} parallel environments, random actions).")
+        yield from _sizes(both.obs[both.valid], env.spec)
+    yield good(f"{speed:,.0f} steps a second ({NUM_ENVS} parallel environments, random actions).")
 
 
 def _play(env: VecEnv, seed: int, actions: int = 7, steps: int = STEPS) -> tuple[Rollout, list[int]]:
@@ -202,35 +199,29 @@ def _same(one: Rollout, other: Rollout) -> bool:
     return all(torch.equal(getattr(one, name), getattr(other, name)) for name in outcome)
 
 
-def _ends_and_rewards(rollouts: Sequence[Rollout], lengths: Sequence[int], spec: Spec) -> Iterator[Finding]:
+def _ends_and_rewards(rows: Rollout, lengths: Sequence[int], spec: Spec) -> Iterator[Finding]:
     """Obstacles to learning in the ends of episodes and in the rewards, each with what to do."""
-    rewards = torch.cat([rollout.reward[rollout.valid] for rollout in rollouts])
-    terminated = any(rollout.terminated.any() for rollout in rollouts)
-    truncated = any(rollout.truncated.any() for rollout in rollouts)
+    rewards, terminated, truncated = rows.reward[rows.valid], rows.terminated.any(), rows.truncated.any()
     alike = len(lengths) > 2 and len(set(lengths)) == 1
     if spec.max_episode_steps is None and not truncated:
-        yield Finding(
-            NOTE,
+        yield note(
             "It has no time limit: an episode that a policy does not end cannot be evaluated; register it with"
-            " max_episode_steps, or add --wrappers 'gymnasium.wrappers:TimeLimit(max_episode_steps=1000)'.",
+            " max_episode_steps, or add --wrappers 'gymnasium.wrappers:TimeLimit(max_episode_steps=1000)'."
         )
     if alike and terminated and not truncated and lengths[0] > 1:
-        yield Finding(
-            NOTE,
+        yield note(
             f"Each of {len(lengths)} episodes terminated after exactly {lengths[0]} steps: if that is a time"
-            " limit, report it as truncated, or learning takes the value there to be 0.",
+            " limit, report it as truncated, or learning takes the value there to be 0."
         )
     if (rewards == rewards[0]).all() and (rewards[0] == 0 or alike or not len(lengths)):
-        yield Finding(
-            NOTE,
+        yield note(
             f"Every reward was {rewards[0]:g}, whatever was done: nothing is learned until random actions meet another;"
-            " if rewards are meant to be rare, reward the way there too.",
+            " if rewards are meant to be rare, reward the way there too."
         )
     if rewards.abs().max() > LARGE_REWARD:
-        yield Finding(
-            NOTE,
+        yield note(
             f"Rewards reach {rewards.abs().max():.3g}, which makes the first value errors too large; train with"
-            " --scale-rewards (on-policy), or pay less.",
+            " --scale-rewards (on-policy), or pay less."
         )
 
 
@@ -243,10 +234,9 @@ def _sizes(obs: Tensor, spec: Spec) -> Iterator[Finding]:
     high, low = sizes.nan_to_num(0).argmax(), sizes.nan_to_num(torch.inf).argmin()
     if sizes[high] >= LARGE_RATIO * sizes[low]:
         names = [f"{part.name}[{i}]" for part in spec.observation_parts for i in range(part.size)]
-        yield Finding(
-            NOTE,
+        yield note(
             f"Observations reach {sizes[high]:.1g} in {names[high]} and {sizes[low]:.1g} in {names[low]}: the network"
-            " does not see the small ones; train with --normalize-observations, or bring them to about 1.",
+            " does not see the small ones; train with --normalize-observations, or bring them to about 1."
         )
 
 
@@ -265,19 +255,21 @@ def _gymnasium(make: Callable[[], gym.Env], env_id: str, wrapped: bool) -> Itera
             check_env(careful, skip_render_check=True, skip_close_check=wrapped)
         except Exception as error:
             why = _why_outside(careful) if "not within the observation space" in str(error) else ""
-            found.append(Finding(BAD, f"Gymnasium's checker: {_one_line(error)}{why}"))
+            found.append(bad(f"Gymnasium's checker: {_one_line(error)}{why}"))
     told = {_one_line(warning.message) for warning in caught if warning.category is UserWarning}
     minded = sorted(sentence for sentence in told if not any(part in sentence for part in BESIDE_THE_POINT))
-    notes = [Finding(NOTE, f"Gymnasium's checker: {sentence}") for sentence in minded]
-    yield from found + notes or [Finding(GOOD, "Gymnasium's checker finds nothing.")]
+    notes = [note(f"Gymnasium's checker: {sentence}") for sentence in minded]
+    yield from found + notes or [good("Gymnasium's checker finds nothing.")]
     if careful.reuses:
-        yield Finding(
-            NOTE,
+        yield note(
             "It writes each observation into the array that it returned before, which changes what others kept of it;"
-            " return a copy, obs.copy(). (lemniscate copies every observation.)",
+            " return a copy, obs.copy(). (lemniscate copies every observation.)"
         )
     if not found:
-        yield _dtypes(env, env_id)
+        obs, space = env.reset(seed=0)[0], env.observation_space
+        kinds = {np.asarray(reduce(getitem, part.path, obs)).dtype.name for part in observation_parts(space, env_id)}
+        as_what = "stay bytes" if kinds == {"uint8"} and is_image(space) else "reach the policy as float32"
+        yield good(f"Its observations are {', '.join(sorted(kinds))}, and {as_what}.")
     env.close()
 
 
@@ -298,38 +290,23 @@ def _why_outside(env: gym.Env) -> str:
     return f" Its number {', '.join(map(str, place))} is {obs[place]:g}, outside of {bounds}."
 
 
-def _dtypes(env: gym.Env, env_id: str) -> Finding:
-    obs, space = env.reset(seed=0)[0], env.observation_space
-    kinds = {np.asarray(follow(part.path, obs)).dtype.name for part in observation_parts(space, env_id)}
-    as_what = "stay bytes" if kinds == {"uint8"} and is_image(space) else "reach the policy as float32"
-    return Finding(GOOD, f"Its observations are {', '.join(sorted(kinds))}, and {as_what}.")
-
-
-class Careful(gym.Wrapper):
+class Careful(gym.Env):
     """An environment as learning uses it: only legal actions, and of every observation a copy.
 
-    `reuses` is whether an observation changed after it had been returned.
+    It is no `gym.Wrapper`, since Gymnasium's checker warns of an environment with one. `reuses` is whether an
+    observation changed after it had been returned.
     """
 
     def __init__(self, env: gym.Env) -> None:
-        super().__init__(env)
+        self.env, self.spec, self.metadata = env, env.spec, env.metadata
+        self.observation_space, self.action_space = env.observation_space, env.action_space
         self.reuses = False
         self._mask: Any = None
         self._returned: Any = None
         self._copy: Any = None
 
     @property
-    def unwrapped(self) -> gym.Env:
-        """Itself, since Gymnasium's checker warns of an environment with a wrapper."""
-        return self
-
-    @property
-    def spec(self) -> Any:
-        """The spec of the environment; `gym.Wrapper` would look for the arguments of this wrapper."""
-        return self.env.spec
-
-    @property
-    def _np_random(self) -> np.random.Generator | None:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def _np_random(self) -> np.random.Generator | None:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.env.unwrapped._np_random
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:

@@ -1,6 +1,7 @@
 """What happens at every step: observations flattened for a policy, its actions in the units of the environment."""
 
-from functools import lru_cache
+from functools import lru_cache, reduce
+from operator import getitem
 from typing import Any
 
 import numpy as np
@@ -11,15 +12,27 @@ from lemniscate.spec import Action, Box, Discrete, MultiBinary, MultiDiscrete, O
 
 def flatten_observation(parts: tuple[ObservationPart, ...], obs: Any, *, image: bool = False) -> np.ndarray:
     """A batch of raw observations as [N, O]: float32, or the bytes of an image."""
-    pieces = [_flatten(part, follow(part.path, obs), image) for part in parts]
+    pieces = []
+    for part in parts:
+        own = reduce(getitem, part.path, obs)
+        if part.nvec:
+            own = _one_hot(part, own)
+        numbers = np.asarray(own, dtype=np.uint8 if image else np.float32)
+        if part.axes:
+            numbers = numbers.reshape(-1, *part.own_shape).transpose(0, *(axis + 1 for axis in part.axes))
+        pieces.append(numbers.reshape(-1, part.size))
     return pieces[0] if len(pieces) == 1 else np.concatenate(pieces, axis=-1)
 
 
-def follow(path: tuple[str | int, ...], obs: Any) -> Any:
-    """The piece of an observation that a part's path leads to."""
-    for step in path:
-        obs = obs[step]
-    return obs
+def _one_hot(part: ObservationPart, obs: Any) -> np.ndarray:
+    """A batch of whole numbers, each as a one-hot vector. Raises `ValueError` for one that is not in its space."""
+    numbers = np.asarray(obs).reshape(-1, len(part.nvec)) - np.array(part.start)
+    if (numbers < 0).any() or (numbers >= np.array(part.nvec)).any():
+        raise ValueError(f"{part.name} is {obs}, which is not in its space")
+    hot = np.zeros((len(numbers), part.size), dtype=np.float32)
+    columns = numbers + np.cumsum((0, *part.nvec[:-1]))
+    hot[np.arange(len(numbers))[:, None], columns] = 1
+    return hot
 
 
 def row_of(batch: Any, row: int) -> Any:
@@ -27,21 +40,6 @@ def row_of(batch: Any, row: int) -> Any:
     if isinstance(batch, dict):
         return {name: row_of(part, row) for name, part in batch.items()}
     return tuple(row_of(part, row) for part in batch) if isinstance(batch, tuple) else batch[row]
-
-
-def _flatten(part: ObservationPart, obs: Any, image: bool) -> np.ndarray:
-    if part.nvec:
-        numbers = np.asarray(obs).reshape(-1, len(part.nvec)) - np.array(part.start)
-        if (numbers < 0).any() or (numbers >= np.array(part.nvec)).any():
-            raise ValueError(f"{part.name} is {obs}, which is not in its space")
-        hot = np.zeros((len(numbers), part.size), dtype=np.float32)
-        columns = numbers + np.cumsum((0, *part.nvec[:-1]))
-        hot[np.arange(len(numbers))[:, None], columns] = 1
-        return hot
-    numbers = np.asarray(obs, dtype=np.uint8 if image else np.float32)
-    if part.axes:
-        numbers = numbers.reshape(-1, *part.own_shape).transpose(0, *(axis + 1 for axis in part.axes))
-    return numbers.reshape(-1, part.size)
 
 
 def scale_action(action: np.ndarray, box: Box) -> np.ndarray:

@@ -12,27 +12,17 @@ from torch import Tensor
 
 from lemniscate.envs.backend import Backend
 from lemniscate.envs.conversion import flatten_observation, physical_action, row_of
-from lemniscate.envs.observations import SUCCESS, SUMMARIES, measured
-from lemniscate.envs.spaces import action_kind, is_image, observation_parts
+from lemniscate.envs.registry import BEGINNINGS
+from lemniscate.envs.spaces import SUCCESS, SUMMARIES, action_kind, is_image, measured, observation_parts
 from lemniscate.envs.vec_env import Stagger
 from lemniscate.errors import UserError, is_installed, missing_extra, unknown_name
 from lemniscate.spec import Spec
 from lemniscate.system.machine import cores
 from lemniscate.types import Step
 
-PREFIX = "EnvPool/"
-"""what an id of EnvPool's own begins with here, so that it is not mistaken for Gymnasium's of that name"""
-
-GYMNASIUM_IDS = (
-    "Ant-v5",
-    "CartPole-v1",
-    "HalfCheetah-v5",
-    "Hopper-v5",
-    "Humanoid-v5",
-    "LunarLander-v3",
-    "Walker2d-v5",
-)
-"""those that behave in EnvPool as in Gymnasium: tests/envs/test_envpool.py compares them"""
+PREFIX, *GYMNASIUM_IDS = BEGINNINGS["envpool"]
+"""what an id of EnvPool's own begins with here, so that it is not mistaken for Gymnasium's of that name; and the ids
+that are the same in both: tests/envs/test_envpool.py compares them"""
 
 REFUSED = {
     "procgen": "its games begin the next level in the step that ends one, which hides the final observation.",
@@ -193,8 +183,7 @@ def make_pool(task: str, options: Mapping[str, Any], seed: int) -> Any:
     except (ImportError, TypeError, ValueError, RuntimeError, AssertionError) as error:
         first_line = str(error).partition("\n")[0]
         raise UserError(f"EnvPool cannot make {task}: {first_line}") from error
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # Gymnasium's, on bounds that are float64 here and float32 there
+    with warnings.catch_warnings(action="ignore"):  # Gymnasium's: bounds are float64 here and float32 there
         _ = pool.observation_space, pool.action_space  # made and kept when first looked at
     return pool
 

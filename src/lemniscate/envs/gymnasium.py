@@ -11,11 +11,10 @@ import torch
 from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
+from lemniscate.envs import spaces
 from lemniscate.envs.backend import Backend
 from lemniscate.envs.conversion import flatten_observation, physical_action, row_of
 from lemniscate.envs.factory import make_one, make_vector, maker_of, makes_vector, sentences
-from lemniscate.envs.observations import SUMMARIES, ActionMasks, measured, measures_of
-from lemniscate.envs.spaces import action_kind, is_image, observation_parts
 from lemniscate.envs.vec_env import Stagger
 from lemniscate.errors import UserError
 from lemniscate.spec import Discrete, Spec
@@ -38,7 +37,7 @@ class GymnasiumBackend(Backend):
     """
 
     workers = False
-    summaries = SUMMARIES
+    summaries = spaces.SUMMARIES
 
     @classmethod
     def ids(cls) -> Collection[str]:
@@ -54,6 +53,8 @@ class GymnasiumBackend(Backend):
     def wraps(cls, env: str) -> bool:
         """Whether it is made of single environments."""
         return not makes_vector(maker_of(env))
+
+    divides = wraps  # each single environment has a seed of its own
 
     @classmethod
     def room(cls, env: str) -> tuple[int, int]:
@@ -87,20 +88,15 @@ class GymnasiumBackend(Backend):
         if not isinstance(mode, AutoresetMode):
             raise UserError(f"{env} does not say when it resets: its metadata needs an autoreset_mode.")
         self.mode = mode
-        space, action = self._envs.single_observation_space, action_kind(self._envs.single_action_space, env)
-        parts = observation_parts(space, env)
+        space, action = self._envs.single_observation_space, spaces.action_kind(self._envs.single_action_space, env)
+        parts = spaces.observation_parts(space, env)
         self._reuses = makes_vector(maker)  # it may write over its own observations
         self._used = isinstance(action, Discrete)
         if isinstance(action, Discrete) and "action_mask" in self._envs.reset(seed=0)[1]:
             action = replace(action, masked=True)
         self._stagger_up_to = limit if stagger and self.mode is AutoresetMode.DISABLED else None
-        self._measures = measures_of(self._envs.metadata)
-        self.spec = Spec(env, parts, action, max_episode_steps=limit, image=is_image(space))
-
-    @classmethod
-    def divides(cls, env: str) -> bool:
-        """Whether it is made of single environments, each of which has a seed of its own."""
-        return cls.wraps(env)
+        self._measures = spaces.measures_of(self._envs.metadata)
+        self.spec = Spec(env, parts, action, max_episode_steps=limit, image=spaces.is_image(space))
 
     def restart(self, seed: int, first: int = 0) -> Tensor:
         """Close the environments and build them again: some (Box2D) carry more over a reset than they tell.
@@ -111,13 +107,13 @@ class GymnasiumBackend(Backend):
             self._envs.close()
             self._envs, _ = self._build()
         self._used = True
-        self._resetting = np.zeros(self.num_envs, dtype=bool)
+        self._resetting, self._valid = np.zeros(self.num_envs, dtype=bool), np.ones(self.num_envs, dtype=bool)
         self._stagger = Stagger(self.num_envs, self._stagger_up_to, seed, first)
         self.counts = self._tensor(self._stagger.counts)
         kind = self.spec.action
         self._masks = None
         if isinstance(kind, Discrete) and kind.masked:
-            self._masks = ActionMasks(self.spec.env_id, self.num_envs, kind.n)
+            self._masks = spaces.ActionMasks(self.spec.env_id, self.num_envs, kind.n)
         return self._tensor(self._observe(*self._envs.reset(seed=seed + first)))
 
     def step(self, action: Tensor) -> Step:
@@ -126,8 +122,7 @@ class GymnasiumBackend(Backend):
         raw, reward, terminated, truncated, info = self._envs.step(physical)
         terminated, truncated = terminated.copy(), truncated.copy()  # a vector environment may write over its own
         obs = next_obs = self._observe(raw, info)
-        valid = np.ones(self.num_envs, dtype=bool)
-        done = terminated | truncated
+        valid, done = self._valid, terminated | truncated
         if self.mode is AutoresetMode.NEXT_STEP:
             valid, self._resetting = ~self._resetting, done
         elif self.mode is AutoresetMode.SAME_STEP:
@@ -137,11 +132,11 @@ class GymnasiumBackend(Backend):
             done = terminated | truncated
             if done.any():
                 obs = self._observe(*self._envs.reset(options={"reset_mask": done.copy()}))
-        self.counts = self._tensor(self._stagger.counts)
+                self.counts = self._tensor(self._stagger.counts)
         there = self._tensor(next_obs)
         here = there if obs is next_obs else self._tensor(obs)
         rewards, *flags = map(self._tensor, (reward.astype(np.float32), terminated, truncated, valid))
-        measures = measured(info, self._measures, self.num_envs, self.device) if info else {}
+        measures = spaces.measured(info, self._measures, self.num_envs, self.device) if info else {}
         return Step(here, there, rewards, *flags, measures=measures)
 
     def close(self) -> None:
@@ -178,11 +173,6 @@ class AsyncGymnasiumBackend(GymnasiumBackend):
 
     workers = True
     in_process = "gymnasium"
-
-    @classmethod
-    def ids(cls) -> Collection[str]:
-        """None."""
-        return ()
 
     @classmethod
     def room(cls, env: str) -> tuple[int, int]:

@@ -23,6 +23,22 @@ BACKENDS = {
 }
 """each is imported when it is used; the first that serves an id runs it"""
 
+BEGINNINGS = {
+    "crazyflow": ("Drone",),
+    "envpool": (
+        "EnvPool/",
+        "Ant-v5",
+        "CartPole-v1",
+        "HalfCheetah-v5",
+        "Hopper-v5",
+        "Humanoid-v5",
+        "LunarLander-v3",
+        "Walker2d-v5",
+    ),
+}
+"""how the ids begin that a backend may serve: for no other is it imported. Those not named here may serve any id.
+EnvPool's own ids begin with `EnvPool/`; the others are Gymnasium's, which behave there as in Gymnasium"""
+
 MOST_ENVS = 1_000_000
 """parallel environments that may be asked for"""
 
@@ -35,12 +51,18 @@ def known_ids() -> list[str]:
 def backend_for(env: str, wrappers: Sequence[str] = ()) -> str:
     """The name of the backend that runs `env`: an id, or the name of a class or function of one's own.
 
-    Raises `UserError` with the nearest names if there is none.
+    It is the first that serves it and can put wrappers around it; the first that serves it where none can. Raises
+    `UserError` with the nearest names if there is none.
     """
-    serving = [name for name in BACKENDS if backend_class(name).serves(env)]
-    if not serving:
+    serving = None
+    for name in BACKENDS:
+        if env.startswith(BEGINNINGS.get(name, "")) and backend_class(name).serves(env):
+            if not wrappers or backend_class(name).wraps(env):
+                return name
+            serving = serving or name
+    if serving is None:
         raise unknown_name("environment", env, known_ids(), "one of your own is named as module:Class.")
-    return next((name for name in serving if not wrappers or backend_class(name).wraps(env)), serving[0])
+    return serving
 
 
 def backend_class(backend: str) -> type["Backend"]:
@@ -48,22 +70,18 @@ def backend_class(backend: str) -> type["Backend"]:
 
     Raises `UserError` with the nearest names for one that is not known, or with what a user's own lacks.
     """
-    if not isinstance(backend, str) or (backend not in BACKENDS and ":" not in backend):
-        raise unknown_name("backend", backend, BACKENDS)
-    if backend in BACKENDS:
+    if isinstance(backend, str) and backend in BACKENDS:
         return resolve_name(BACKENDS[backend])
-    return _require_backend(named.find(backend), backend)
-
-
-def _require_backend(found: Any, name: str) -> type["Backend"]:
-    """The class itself. Raises `UserError` for a user's own that lacks a part of the contract."""
+    if not isinstance(backend, str) or ":" not in backend:
+        raise unknown_name("backend", backend, BACKENDS)
     from lemniscate.envs.backend import Backend
 
+    found = named.find(backend)
     members = [member for member in vars(Backend) if not member.startswith("_")]
     lacking = getattr(found, "__abstractmethods__", ()) or [part for part in members if not hasattr(found, part)]
     if not isinstance(found, type) or lacking:
         what = f"lacks {', '.join(sorted(lacking))}" if isinstance(found, type) else "is not a class"
-        raise UserError(f"{name} {what}: a backend is derived from lemniscate.envs.backend.Backend.")
+        raise UserError(f"{backend} {what}: a backend is derived from lemniscate.envs.backend.Backend.")
     return found
 
 

@@ -20,8 +20,8 @@ import torch
 from PIL import Image
 
 from lemniscate.envs.factory import make_one, maker_of, makes_vector, sentences
-from lemniscate.envs.observations import SUMMARIES, measures_of
 from lemniscate.envs.registry import make_rendered
+from lemniscate.envs.spaces import SUMMARIES, measures_of
 from lemniscate.envs.vec_env import VecEnv, require_end
 from lemniscate.errors import UserError, is_installed, missing_extra, shown
 from lemniscate.run.config import RunConfig
