@@ -1113,8 +1113,8 @@ MUTANTS = [
     (
         "a safe choice is not counted from the first one",
         "exporting/deployed.py",
-        "np.array([action.start], dtype",
-        "np.array([0], dtype",
+        "if isinstance(action, MultiBinary) else action.start",
+        "if isinstance(action, MultiBinary) else 0 * action.start",
         "export/test_translation.py::test_every_kind_of_actions",
     ),
     (

@@ -13,7 +13,7 @@ from lemniscate.envs import registry
 from lemniscate.envs.backend import Interface
 from lemniscate.errors import UserError, is_installed, missing_extra
 from lemniscate.exporting import compiled
-from lemniscate.exporting.compiled import HostPolicy
+from lemniscate.exporting.compiled import CORE, EMULATOR, TARGET_COMPILER, HostPolicy
 from lemniscate.exporting.deployed import Act, act_with, for_policy, input_size
 from lemniscate.exporting.onnx_model import onnx_act
 from lemniscate.exporting.operations import Program
@@ -92,12 +92,6 @@ def _clear(policy: TrainedPolicy, obs: np.ndarray) -> np.ndarray:
     return clear if clear.any() else ~clear
 
 
-def origin(policy: TrainedPolicy, tests: int) -> str:
-    """The origin of a self-test's observations, in words."""
-    edges = f", and {tests - TESTS} with one number far outside of them" if tests > TESTS else ""
-    return f"{TESTS} of episodes of {policy.spec.env_id}{edges}"
-
-
 def parity(
     program: Program, act: Act, obs: np.ndarray, files: Mapping[str, str], model: bytes | None, host: HostPolicy | None
 ) -> dict[str, Any]:
@@ -155,14 +149,15 @@ def _on_target(
 ) -> tuple[dict[str, Any] | None, list[str]]:
     """The figures of a Cortex-M4F, and a sentence for what is not installed."""
     absent = compiled.missing_target_tools()
-    if compiled.TARGET_COMPILER in absent:
-        name = compiled.TARGET_COMPILER
-        return None, [f"{name} is not installed: nothing is known of the target (Debian: gcc-arm-none-eabi)."]
-    command = " ".join((compiled.TARGET_COMPILER, *compiled.CORE))
+    if TARGET_COMPILER in absent:
+        return None, [
+            f"{TARGET_COMPILER} is not installed: nothing is known of the target (Debian: gcc-arm-none-eabi)."
+        ]
+    command = " ".join((TARGET_COMPILER, *CORE))
     record: dict[str, Any] = {**compiled.target_sizes(files), "compiled_with": command}
     if absent:
-        name = compiled.EMULATOR
-        return record, [f"{name} is not installed: policy.c is not run on the target (Debian: qemu-system-arm)."]
+        missing = f"{EMULATOR} is not installed: policy.c is not run on the target (Debian: qemu-system-arm)."
+        return record, [missing]
     rows = min(len(obs), max(64, INSTRUCTIONS // (8 * program.multiplications + 10_000)))
     try:
         actions, self_test, instructions = compiled.simulate(files, obs[:rows], true.shape[1])
