@@ -171,7 +171,11 @@ def sentences(record: Mapping[str, Any]) -> list[str]:
     """The record as sentences for a person."""
     names = {"onnx": "ONNX", "c_host": "C", "c_cortex_m4f": "C on the simulated Cortex-M4F"}
     compared = {name: record[key] for key, name in names.items() if (record[key] or {}).get("observations")}
-    said = [_distance(name, each) for name, each in compared.items()]
+    said = list[str]()
+    for name, each in compared.items():
+        largest = each["max_abs_difference"]
+        distance = f"differs from the policy by at most {largest:.1e}" if largest else "is exact"
+        said.append(f"{name} {distance} at {each['observations']:,} observations.")
     if sizes := record["c_cortex_m4f"]:
         instructions = sizes.get("instructions_per_call")
         said.append(
@@ -182,8 +186,3 @@ def sentences(record: Mapping[str, Any]) -> list[str]:
         if each["above_tolerance"]:
             said.append(f"{name} is beyond {record['tolerance']:g} at {each['above_tolerance']:,} of them.")
     return [*said, *record["missing"]]
-
-
-def _distance(name: str, compared: Mapping[str, Any]) -> str:
-    largest, rows = compared["max_abs_difference"], f"at {compared['observations']:,} observations."
-    return f"{name} differs from the policy by at most {largest:.1e} {rows}" if largest else f"{name} is exact {rows}"

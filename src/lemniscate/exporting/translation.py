@@ -146,26 +146,18 @@ def array(operand: Any) -> np.ndarray:
     return np.asarray(operand, dtype=np.float32 if isinstance(operand, float) else None)
 
 
-def _unary(name: str) -> Translation:
-    def translation(walk: Walk, x: Value) -> Value:
-        return walk.rounded(walk.add(name, walk.as_kind(x, "bool" if name == "Not" else "float"), kind=walk.kind))
+def _elementwise(name: str, kind: Kind | None = None) -> Translation:
+    """An operation number by number, on operands of that kind, or else of the kind of its result."""
 
-    return translation
-
-
-def _arithmetic(name: str) -> Translation:
-    def translation(walk: Walk, a: Any, b: Any, *, alpha: float = 1, rounding_mode: str | None = None) -> Value:
+    def translation(walk: Walk, *operands: Any, alpha: float = 1, rounding_mode: str | None = None) -> Value:
         if rounding_mode is not None:
             raise UntranslatableError(f"{walk.name} with rounding has no translation")
-        a, b = walk.as_kind(a, walk.kind), walk.as_kind(b, walk.kind)
-        b = b if alpha == 1 else walk.add("Mul", b, walk.as_kind(alpha, walk.kind), kind=walk.kind)
-        return walk.rounded(walk.add(name, a, b, kind=walk.kind))
+        own = [walk.as_kind(operand, kind or walk.kind) for operand in operands]
+        if alpha != 1:
+            own[1] = walk.add("Mul", own[1], walk.as_kind(alpha, walk.kind), kind=walk.kind)
+        return walk.rounded(walk.add(name, *own, kind=walk.kind))
 
     return translation
-
-
-def _comparison(name: str, kind: Kind = "float") -> Translation:
-    return lambda walk, a, b: walk.add(name, walk.as_kind(a, kind), walk.as_kind(b, kind), kind="bool")
 
 
 def _clamp(walk: Walk, x: Value, low: Any = None, high: Any = None, *, min: Any = None, max: Any = None) -> Value:
@@ -301,20 +293,20 @@ def _full(walk: Walk, _size: Any, number: float = 0.0, **_: Any) -> Tensor:
 
 
 TRANSLATIONS: dict[str, Translation] = {
-    **{name: _unary(name.capitalize()) for name in ("neg", "abs", "exp", "log", "sqrt", "sin", "cos", "tanh")},
-    **{name: _unary(name.capitalize()) for name in ("sigmoid", "erf", "floor")},
-    **{name: _arithmetic(name.capitalize()) for name in ("add", "sub", "mul", "div")},
-    "maximum": _arithmetic("Max"),
-    "minimum": _arithmetic("Min"),
-    "gt": _comparison("Greater"),
-    "ge": _comparison("GreaterOrEqual"),
-    "lt": _comparison("Less"),
-    "le": _comparison("LessOrEqual"),
-    "eq": _comparison("Equal"),
-    "ne": lambda walk, a, b: walk.add("Not", _comparison("Equal")(walk, a, b), kind="bool"),
-    **dict.fromkeys(("logical_and", "bitwise_and"), _comparison("And", "bool")),
-    **dict.fromkeys(("logical_or", "bitwise_or"), _comparison("Or", "bool")),
-    **dict.fromkeys(("logical_not", "bitwise_not"), _unary("Not")),
+    **{name: _elementwise(name.capitalize()) for name in ("exp", "log", "sqrt", "sin", "cos", "tanh")},
+    **{name: _elementwise(name.capitalize()) for name in ("sigmoid", "erf", "floor", "neg", "abs")},
+    **{name: _elementwise(name.capitalize()) for name in ("add", "sub", "mul", "div")},
+    "maximum": _elementwise("Max"),
+    "minimum": _elementwise("Min"),
+    "gt": _elementwise("Greater", "float"),
+    "ge": _elementwise("GreaterOrEqual", "float"),
+    "lt": _elementwise("Less", "float"),
+    "le": _elementwise("LessOrEqual", "float"),
+    "eq": _elementwise("Equal", "float"),
+    "ne": lambda walk, a, b: walk.add("Not", _elementwise("Equal", "float")(walk, a, b), kind="bool"),
+    **dict.fromkeys(("logical_and", "bitwise_and"), _elementwise("And", "bool")),
+    **dict.fromkeys(("logical_or", "bitwise_or"), _elementwise("Or", "bool")),
+    **dict.fromkeys(("logical_not", "bitwise_not"), _elementwise("Not", "bool")),
     "where": _where,
     **dict.fromkeys(("_to_copy", "to"), lambda walk, x, *_, **__: walk.rounded(walk.as_kind(x, walk.kind))),
     "relu": lambda walk, x: walk.add("Max", x, np.float32(0)),

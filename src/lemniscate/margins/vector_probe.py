@@ -5,6 +5,7 @@ of MuJoCo.
 """
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -15,8 +16,9 @@ from lemniscate.envs import registry
 from lemniscate.envs.factory import make_one, maker_of, makes_vector
 from lemniscate.envs.probe import CHANNEL_AXES, MODEL_AXES, Act, Axis, Flown, Tally, Value
 from lemniscate.envs.vec_env import VecEnv
+from lemniscate.exporting.deployed import input_size
 from lemniscate.run.seeding import derive, generator
-from lemniscate.spec import Discrete, Spec
+from lemniscate.spec import Spec
 
 FACTORS = "lemniscate.margins.vector_probe:ModelFactors"
 CPU = torch.device("cpu")
@@ -111,10 +113,10 @@ class VectorProbe:
         self, env: str, starts: int, kwargs: Mapping[str, Any], wrappers: tuple[str, ...], backend: str | None
     ) -> None:
         own = (backend is None or backend in registry.BACKENDS) and registry.backend_class("gymnasium").serves(env)
-        self._arguments: dict[str, Any] = {"env": env, "num_envs": starts, "kwargs": kwargs}
-        self._arguments |= {"backend": "gymnasium" if own else backend}
+        backend = "gymnasium" if own else backend
+        self._make = partial(registry.make, env, starts, kwargs=kwargs, backend=backend)
         self._wrappers = wrappers
-        self._env = self._make()
+        self._env = self._make(wrappers=wrappers)
         self.spec: Spec = self._env.spec
         single = own and not makes_vector(maker_of(env))
         self.axes = _axes(self.spec, single and has_model(env, kwargs))
@@ -138,19 +140,16 @@ class VectorProbe:
         if axis not in MODEL_AXES:
             disturbance: dict[str, Any] = {axis.name: value}
             return _fly(self._env, Channel(act, scale=scale, rng=rng, **disturbance), seed)
-        env = self._make(f"{FACTORS}({axis.name}={value})")
+        env = self._make(wrappers=(*self._wrappers, f"{FACTORS}({axis.name}={value})"))
         try:
             return _fly(env, act, seed)
         finally:
             env.close()
 
-    def _make(self, *wrappers: str) -> VecEnv:
-        return registry.make(**self._arguments, wrappers=(*self._wrappers, *wrappers))
-
 
 def _axes(spec: Spec, has_model: bool) -> tuple[Axis, ...]:
     """The axes of an environment: with a mask no action can be late, and only numbers can be noisy."""
-    masked = isinstance(spec.action, Discrete) and spec.action.masked
+    masked = input_size(spec) > spec.observation_size
     noisy = bool(_is_number(spec).any())
     channel = (axis for axis in CHANNEL_AXES if (noisy if axis.name == "observation_noise" else not masked))
     return (*channel, *(MODEL_AXES if has_model else ()))
@@ -159,8 +158,7 @@ def _axes(spec: Spec, has_model: bool) -> tuple[Axis, ...]:
 def _is_number(spec: Spec) -> Tensor:
     """[O] bool, of the whole observation: numbers, which are no choices, masks or pixels."""
     own = [not part.nvec and not spec.image for part in spec.observation_parts for _ in range(part.size)]
-    mask = spec.action.n if isinstance(spec.action, Discrete) and spec.action.masked else 0
-    return torch.tensor([*own, *[False] * mask])
+    return torch.tensor([*own, *[False] * (input_size(spec) - len(own))])
 
 
 def _fly(env: VecEnv, act: Act, seed: int, seen: list[Tensor] | None = None) -> Flown:
