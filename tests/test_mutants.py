@@ -1078,8 +1078,8 @@ MUTANTS = [
     (
         "delayed actions are a step early",
         "margins/vector_probe.py",
-        "len(self._sent) > self._delay",
-        "len(self._sent) >= self._delay",
+        "len(self._sent) > self.action_delay",
+        "len(self._sent) >= self.action_delay",
         "margins/test_vector_probe.py::test_a_late_action_acts_so_many_steps_later",
     ),
     (

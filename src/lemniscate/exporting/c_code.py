@@ -1,6 +1,6 @@
 """`policy.c` and `policy.h`: C99 from a list of operations.
 
-Results that are computed number by number are expressions of an index `i`, and are written into an array only where
+Results that are computed number by number are expressions of an index, `#`, and are written into an array only where
 something needs them whole or twice. Arrays share one static scratch memory: each has its place there as long as
 something still reads it.
 """
@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from lemniscate.exporting.deployed import safe_action, safe_sentence
-from lemniscate.exporting.operations import ELEMENTWISE, VIEWS, Operand, Operation, Program, Value
+from lemniscate.exporting.operations import Operand, Operation, Program, Value
 from lemniscate.spec import Action, Discrete
 from lemniscate.system.machine import version
 from lemniscate.system.templates import filled
@@ -150,17 +150,29 @@ class Body:
         return places, max((places[name] + size for name, size in self.sizes.items()), default=0)
 
     def _add(self, operation: Operation) -> None:
-        """Translate one operation."""
-        output = operation.output
-        if operation.name in VIEWS:
-            self._results[output] = self._view(operation)
-        elif operation.name in ELEMENTWISE:
-            self._results[output] = self._elementwise(operation)
-            if self._uses[output] > 1:
-                self._array(output)
-        else:
-            {"Linear": self._linear, "Concat": self._concat}.get(operation.name, self._reduce)(operation)
-            self._results[output] = self._new(output)
+        """Translate one operation; those that are not named here are computed number by number."""
+        x, output, settings = operation.inputs[0], operation.output, operation.settings
+        places = _places(x.shape)
+        match operation.name:
+            case "Reshape":
+                self._results[output] = self._seen(x, places.reshape(output.shape))
+            case "Expand":
+                self._results[output] = self._seen(x, np.broadcast_to(places, output.shape))
+            case "Transpose":
+                self._results[output] = self._seen(x, places.transpose(settings["axes"]))
+            case "Slice":
+                view = _part(places, settings["axis"], settings["start"], output.shape[settings["axis"]])
+                self._results[output] = self._seen(x, view)
+            case "Linear":
+                self._linear(operation)
+            case "Concat":
+                self._concat(operation)
+            case "ArgMax" | "ReduceSum" | "ReduceMean" | "ReduceMax" | "ReduceMin":
+                self._reduce(operation)
+            case _:
+                self._results[output] = self._elementwise(operation)
+                if self._uses[output] > 1:
+                    self._array(output)
 
     def _new(self, value: Value) -> Numbers:
         """A new array for a result."""
@@ -216,19 +228,6 @@ class Body:
             return Numbers(OPERATORS[operation.name].format(*inputs))
         return Numbers(f"policy_{operation.name.lower()}({', '.join(map(_bare, inputs))})")
 
-    def _view(self, operation: Operation) -> Numbers:
-        (x,), settings, shape = operation.inputs, operation.settings, operation.output.shape
-        places = _places(x.shape)
-        match operation.name:
-            case "Reshape":
-                return self._seen(x, places.reshape(shape))
-            case "Expand":
-                return self._seen(x, np.broadcast_to(places, shape))
-            case "Transpose":
-                return self._seen(x, places.transpose(settings["axes"]))
-            case _:
-                return self._seen(x, _part(places, settings["axis"], settings["start"], shape[settings["axis"]]))
-
     def _linear(self, operation: Operation) -> None:
         x, _, *biases = operation.inputs
         assert isinstance(x, Value)
@@ -239,6 +238,7 @@ class Body:
         for row in range(x.size // inputs):
             ends = f"{_plus(source, row * inputs)}, {inputs}, {outputs}, {_plus(target, row * outputs)}"
             self.statements.append(f"policy_linear({weight}, {bias}, {ends});")
+        self._results[operation.output] = self._new(operation.output)
 
     def _concat(self, operation: Operation) -> None:
         axis, output, start = operation.settings["axis"], operation.output, 0
@@ -247,12 +247,14 @@ class Body:
             place = _place("#", _part(_places(output.shape), axis, start, part.shape[axis]))
             self.statements.append(_loop(f"{output.name}[{place}] = {self._stored(part)};", part.size))
             start += part.shape[axis]
+        self._results[output] = self._new(output)
 
     def _reduce(self, operation: Operation) -> None:
         (x,), output = operation.inputs, operation.output
         assert isinstance(x, Value)
         call = f"policy_{operation.name.lower()}({self._array(x)} + # * {x.shape[-1]}, {x.shape[-1]})"
         self.statements.append(_loop(f"{output.name}[#] = {call};", output.size))
+        self._results[output] = self._new(output)
 
 
 def _bare(expression: str) -> str:

@@ -32,14 +32,9 @@ PAST = re.compile(r"(.+)_(\d+)_steps_ago(_less_now)?")
 def crazyflie_files(
     interface: Interface, quantities: list[Quantity], action: Action, c_files: Mapping[str, str], title: str
 ) -> dict[str, str]:
-    """The texts of the folder's files, by name.
+    """The texts of the folder's files, by name, those of `c_files` among them.
 
-    Args:
-        interface: of the environment of training.
-        quantities: of the whole observation, in its order.
-        action: the kind of actions.
-        c_files: the texts of `policy.c` and `policy.h`.
-        title: what the policy is for.
+    The policy sees `quantities`, in their order, in an environment with this interface.
 
     Raises:
         UserError: actions other than attitude and thrust; quantities that the firmware does not have; a rate that does

@@ -17,9 +17,7 @@ OPSET, IR = 18, 10
 def onnx_model(program: Program, facts: Mapping[str, Any]) -> bytes:
     """A model with the input `obs` [batch, O] float32 and the output `action` [batch, …], checked.
 
-    Args:
-        program: the policy.
-        facts: the model's metadata, each value as JSON.
+    Its metadata are the `facts`, each as JSON.
     """
     writer = _Writer()
     helper, checker = writer.onnx.helper, writer.onnx.checker

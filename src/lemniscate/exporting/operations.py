@@ -2,7 +2,8 @@
 
 Shapes are those of one observation: the batch axis is left out, and every operation treats the rows of a batch alike.
 Operations have ONNX's names, except for `Linear`, x Wᵀ + b, and `RoundBfloat16`, which rounds to 8 bits of mantissa.
-Reductions and `ArgMax` work along the last axis, which a reduction keeps with length 1.
+Reductions and `ArgMax` work along the last axis, which a reduction keeps with length 1. What neither multiplies
+matrices nor moves numbers to other places works number by number, with broadcasting.
 """
 
 import math
@@ -13,13 +14,6 @@ import numpy as np
 
 Kind = Literal["float", "int", "bool"]
 """the kind of a value's numbers; in C all of them are floats"""
-
-ELEMENTWISE = {"Neg", "Abs", "Exp", "Log", "Sqrt", "Sin", "Cos", "Tanh", "Sigmoid", "Erf", "Floor", "RoundBfloat16"}
-ELEMENTWISE |= {"Add", "Sub", "Mul", "Div", "Max", "Min", "Greater", "GreaterOrEqual", "Less", "LessOrEqual", "Equal"}
-ELEMENTWISE |= {"Not", "And", "Or", "Where", "Cast"}
-"""operations that work number by number, with broadcasting"""
-VIEWS = {"Slice", "Reshape", "Transpose", "Expand"}
-"""operations whose result has the same numbers at other places"""
 
 
 @dataclass(frozen=True, eq=False)

@@ -97,13 +97,8 @@ def parity(
 ) -> dict[str, Any]:
     """The record; `missing` has a sentence for everything that could not be compared.
 
-    Args:
-        program: the policy.
-        act: the policy itself, in torch.
-        obs: the observations at which all are compared, [R, O].
-        files: the texts of `policy.c` and `policy.h`.
-        model: `policy.onnx`.
-        host: `policy.c` on this machine.
+    Compared with `act`, the policy itself, at the observations `obs` [R, O]: `model`, which is `policy.onnx`, and the C
+    in `files`, which is compiled here as `host`.
     """
     true, tolerance = act(obs), BFLOAT16_TOLERANCE if program.is_rounded else TOLERANCE
     costs: dict[str, float | None] = {"c": None, "onnxruntime": None, "torch": nanoseconds(lambda: act(obs[:1]))}

@@ -231,8 +231,7 @@ def _slice(walk: Walk, x: Value, axis: int = 0, start: int | None = None, end: A
     if step != 1:
         raise UntranslatableError("a slice with steps has no translation")
     own = walk.axis(axis, len(x.shape))
-    size = x.shape[own]
-    begin = min(max((start or 0) + (size if (start or 0) < 0 else 0), 0), size)
+    begin, _, _ = slice(start, None).indices(x.shape[own])
     return walk.add("Slice", x, kind=x.kind, axis=own, start=begin)
 
 

@@ -55,12 +55,7 @@ def _short(axis: Axis, value: Value) -> str:
 
 
 def sentences(found: Sequence[AxisMargins], words: Words) -> Iterator[str]:
-    """A sentence for each axis; one for all where not even the nominal episodes are alive.
-
-    Args:
-        found: the margins.
-        words: `FAILS` or `FALLS_SHORT`.
-    """
+    """A sentence for each axis, with these verbs; one for all where not even the nominal episodes are alive."""
     flies, fails = words
     for one in found:
         if any(side.last is None for side in one.sides.values()):

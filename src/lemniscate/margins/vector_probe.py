@@ -5,6 +5,7 @@ of MuJoCo.
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -24,43 +25,38 @@ FACTORS = "lemniscate.margins.vector_probe:ModelFactors"
 CPU = torch.device("cpu")
 
 
+@dataclass
 class Channel:
     """The way between a policy and N environments: late and lost actions, blurred observations.
 
     Before the first action has arrived it acts already; a lost one is replaced by the one that acted before it.
 
-    Args:
+    Attributes:
         act: the policy.
+        rng: of noise and losses.
         action_delay: in steps.
         observation_noise: standard deviation of each number of an observation, in multiples of `scale`.
         lost_actions: probability that an action is lost.
         scale: [O].
-        rng: of noise and losses.
     """
 
-    def __init__(
-        self,
-        act: Act,
-        *,
-        action_delay: int = 0,
-        observation_noise: float = 0.0,
-        lost_actions: float = 0.0,
-        scale: Tensor | None = None,
-        rng: torch.Generator,
-    ) -> None:
-        self._act, self._delay, self._lost, self._rng = act, int(action_delay), lost_actions, rng
-        self._noise = observation_noise * scale if scale is not None and observation_noise else None
-        self._sent: list[Tensor] = []
-        self._acting: Tensor | None = None
+    act: Act
+    rng: torch.Generator
+    action_delay: int = 0
+    observation_noise: float = 0.0
+    lost_actions: float = 0.0
+    scale: Tensor | None = None
+    _sent: list[Tensor] = field(default_factory=list, init=False)
+    _acting: Tensor | None = field(default=None, init=False)
 
     def __call__(self, obs: Tensor) -> Tensor:
         """The actions [N, …] that act now, after the observations [N, O]."""
-        if self._noise is not None:
-            obs = obs + self._noise * torch.randn(obs.shape, generator=self._rng)
-        self._sent.append(self._act(obs))
-        arrived = self._sent.pop(0) if len(self._sent) > self._delay else self._sent[0]
-        if self._lost and self._acting is not None:
-            lost = torch.rand(len(obs), generator=self._rng) < self._lost
+        if self.scale is not None and self.observation_noise:
+            obs = obs + self.observation_noise * self.scale * torch.randn(obs.shape, generator=self.rng)
+        self._sent.append(self.act(obs))
+        arrived = self._sent.pop(0) if len(self._sent) > self.action_delay else self._sent[0]
+        if self.lost_actions and self._acting is not None:
+            lost = torch.rand(len(obs), generator=self.rng) < self.lost_actions
             arrived = torch.where(lost.reshape(-1, *[1] * (arrived.ndim - 1)), self._acting, arrived)
         self._acting = arrived
         return arrived
@@ -139,7 +135,7 @@ class VectorProbe:
         rng = generator(seed, CPU, 1)
         if axis not in MODEL_AXES:
             disturbance: dict[str, Any] = {axis.name: value}
-            return _fly(self._env, Channel(act, scale=scale, rng=rng, **disturbance), seed)
+            return _fly(self._env, Channel(act, rng, scale=scale, **disturbance), seed)
         env = self._make(wrappers=(*self._wrappers, f"{FACTORS}({axis.name}={value})"))
         try:
             return _fly(env, act, seed)
