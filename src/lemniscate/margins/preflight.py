@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import torch
-from torch import Tensor
 
 from lemniscate.api.policy import Trained, TrainedPolicy, load, path_of
 from lemniscate.envs import registry
@@ -166,11 +165,7 @@ def _compiled(policy: TrainedPolicy, run: Path) -> Act:
     if step != policy.step:
         raise UserError(f"{folder} is of step {step:,}, the policy of step {policy.step:,}: lemniscate export {run}")
     host, kind = HostPolicy(files, compiler), policy.spec.action
-
-    def act(obs: Tensor) -> Tensor:
-        return for_policy(host.act(obs.numpy()), kind)
-
-    return act
+    return lambda obs: for_policy(host.act(obs.numpy()), kind)
 
 
 def _probe(policy: TrainedPolicy, episodes: int, given: Mapping[str, Any]) -> Probe:
