@@ -219,8 +219,10 @@ class Body:
         for operand in operation.inputs:
             if isinstance(operand, Value) and operand.size < output.size:
                 self._array(operand)  # computed once for all numbers that need it, not in the loop
-        views = [np.broadcast_to(_places(operand.shape), output.shape) for operand in operation.inputs]
-        inputs = [self._seen(operand, view).text for operand, view in zip(operation.inputs, views, strict=True)]
+        inputs = list[str]()
+        for operand in operation.inputs:
+            view = np.broadcast_to(_places(operand.shape), output.shape)
+            inputs.append(self._seen(operand, view).text)
         if operation.name == "Cast":
             (x,) = operation.inputs
             return Numbers(_cast(inputs[0], x.kind if isinstance(x, Value) else "float", output.kind))
