@@ -1078,8 +1078,8 @@ MUTANTS = [
     (
         "delayed actions are a step early",
         "margins/vector_probe.py",
-        "len(self._sent) > self._delay",
-        "len(self._sent) >= self._delay",
+        "len(self._sent) > self.action_delay",
+        "len(self._sent) >= self.action_delay",
         "margins/test_vector_probe.py::test_a_late_action_acts_so_many_steps_later",
     ),
     (
@@ -1113,8 +1113,8 @@ MUTANTS = [
     (
         "a safe choice is not counted from the first one",
         "exporting/deployed.py",
-        "np.array([action.start], dtype",
-        "np.array([0], dtype",
+        "if isinstance(action, MultiBinary) else action.start",
+        "if isinstance(action, MultiBinary) else 0 * action.start",
         "export/test_translation.py::test_every_kind_of_actions",
     ),
     (

@@ -1,20 +1,20 @@
 """`policy.c` and `policy.h`: C99 from a list of operations.
 
-Results that are computed number by number are expressions of an index `i`, and are written into an array only where
+Results that are computed number by number are expressions of an index, `#`, and are written into an array only where
 something needs them whole or twice. Arrays share one static scratch memory: each has its place there as long as
 something still reads it.
 """
 
 import math
+import re
 from collections import Counter
-from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from lemniscate.exporting.deployed import safe_action, safe_sentence
-from lemniscate.exporting.operations import ELEMENTWISE, VIEWS, Operand, Operation, Program, Value
+from lemniscate.exporting.operations import Operand, Operation, Program, Value
 from lemniscate.spec import Action, Discrete
 from lemniscate.system.machine import version
 from lemniscate.system.templates import filled
@@ -68,7 +68,7 @@ def c_files(
         "constants": body.constants,
         "scratch": max(scratch, 1),
         "places": {name: places[name] for name in body.sizes},
-        "statements": [statement.text for statement in body.statements],
+        "statements": body.statements,
     }
     filters = {"braces": braces, "comment": comment, "functions": functions}
     return {name: filled(TEMPLATES / name, filters, **context) for name in ("policy.c", "policy.h")}
@@ -101,23 +101,13 @@ def functions(text: str) -> str:
 
 @dataclass(frozen=True)
 class Numbers:
-    """A result as C: `at(index)` is the expression of one number of it, which reads `arrays`.
+    """A result as C: `text` is the expression of number `#` of it.
 
     `whole` is a pointer to all of them, where they stand in a row in memory.
     """
 
-    at: Callable[[str], str]
-    arrays: frozenset[str]
-    whole: str | None = None
-
-
-@dataclass(frozen=True)
-class Statement:
-    """A statement, the arrays that it reads, and the one that it writes."""
-
     text: str
-    reads: frozenset[str]
-    writes: str
+    whole: str | None = None
 
 
 class Body:
@@ -131,9 +121,9 @@ class Body:
 
     def __init__(self, program: Program) -> None:
         self.constants: list[str] = []
-        self.statements: list[Statement] = []
+        self.statements: list[str] = []
         self.sizes: dict[str, int] = {}
-        self._results = {program.obs: Numbers(lambda index: f"obs[{index}]", frozenset(), "obs")}
+        self._results = {program.obs: Numbers("obs[#]", "obs")}
         self._uses = Counter(x for operation in program.operations for x in operation.inputs if isinstance(x, Value))
         for operation in program.operations:
             self._add(operation)
@@ -142,10 +132,10 @@ class Body:
     def places(self) -> tuple[dict[str, int], int]:
         """The place of each array in the scratch memory, and the size of that.
 
-        First fit, the largest first; an array lives from the first statement that writes it to the last that reads it.
+        First fit, the largest first; an array lives from the first statement that names it to the last.
         """
-        named = [{statement.writes, *statement.reads} for statement in self.statements]
-        at = {name: [i for i, names in enumerate(named) if name in names] for name in self.sizes}
+        words = [set(re.findall(r"\w+", statement)) for statement in self.statements]
+        at = {name: [i for i, named in enumerate(words) if name in named] for name in self.sizes}
         lives = {name: (numbers[0], numbers[-1]) for name, numbers in at.items()}
         places: dict[str, int] = {}
         for name, (born, dead) in sorted(lives.items(), key=lambda life: (-self.sizes[life[0]], life[1])):
@@ -160,48 +150,63 @@ class Body:
         return places, max((places[name] + size for name, size in self.sizes.items()), default=0)
 
     def _add(self, operation: Operation) -> None:
-        """Translate one operation."""
-        output = operation.output
-        if operation.name in VIEWS:
-            self._results[output] = self._view(operation)
-        elif operation.name in ELEMENTWISE:
-            self._results[output] = self._elementwise(operation)
-            if self._uses[output] > 1:
-                self._results[output] = self._array(output)
-        else:
-            {"Linear": self._linear, "Concat": self._concat}.get(operation.name, self._reduce)(operation)
-
-    def _write(self, value: Value, array: str) -> None:
-        """A loop that writes a result into an array."""
-        numbers, number = self._results[value], "0" if value.size == 1 else "i"
-        text = f"{array}[{number}] = {_bare(_float(numbers.at(number), value))};"
-        self._say(text if value.size == 1 else _loop(text, value.size), numbers.arrays, array)
-
-    def _say(self, text: str, reads: Iterable[str], writes: str) -> None:
-        self.statements.append(Statement(text, frozenset(reads), writes))
+        """Translate one operation; those that are not named here are computed number by number."""
+        x, output, settings = operation.inputs[0], operation.output, operation.settings
+        places = _places(x.shape)
+        match operation.name:
+            case "Reshape":
+                self._results[output] = self._seen(x, places.reshape(output.shape))
+            case "Expand":
+                self._results[output] = self._seen(x, np.broadcast_to(places, output.shape))
+            case "Transpose":
+                self._results[output] = self._seen(x, places.transpose(settings["axes"]))
+            case "Slice":
+                view = _part(places, settings["axis"], settings["start"], output.shape[settings["axis"]])
+                self._results[output] = self._seen(x, view)
+            case "Linear":
+                self._linear(operation)
+            case "Concat":
+                self._concat(operation)
+            case "ArgMax" | "ReduceSum" | "ReduceMean" | "ReduceMax" | "ReduceMin":
+                self._reduce(operation)
+            case _:
+                self._results[output] = self._elementwise(operation)
+                if self._uses[output] > 1:
+                    self._array(output)
 
     def _new(self, value: Value) -> Numbers:
         """A new array for a result."""
-        name = value.name
-        self.sizes[name] = value.size
-        number = f"({name}[{{}}] != 0.0F)" if value.kind == "bool" else f"{name}[{{}}]"
-        return Numbers(number.format, frozenset({name}), name)
+        self.sizes[value.name] = value.size
+        number = f"{value.name}[#]"
+        return Numbers(f"({number} != 0.0F)" if value.kind == "bool" else number, value.name)
 
-    def _array(self, value: Value) -> Numbers:
-        """The result in an array: the one where it is already, or a new one."""
+    def _array(self, value: Value) -> str:
+        """The array of a result: the one where it is already, or a new one."""
         if not self._results[value].whole:
-            new = self._new(value)
             self._write(value, value.name)
-            self._results[value] = new
-        return self._results[value]
+            self._results[value] = self._new(value)
+        return str(self._results[value].whole)
 
-    def _numbers(self, operand: Operand) -> Numbers:
+    def _write(self, value: Value, array: str) -> None:
+        """Write a result into an array."""
+        text = f"{array}[#] = {self._stored(value)};"
+        self.statements.append(text.replace("#", "0") if value.size == 1 else _loop(text, value.size))
+
+    def _stored(self, value: Value) -> str:
+        """A number of a result, as it stands in an array of floats."""
+        return _bare(_cast(self._results[value].text, value.kind, "float"))
+
+    def _seen(self, operand: Operand, view: np.ndarray) -> Numbers:
+        """The numbers of an operand in another order: those at the places in `view`."""
         if isinstance(operand, Value):
-            return self._results[operand]
-        if operand.size == 1:
-            return Numbers(lambda _: literal(operand.item()), frozenset())
-        name = self._constant(operand)
-        return Numbers(lambda index: f"{name}[{index}]", frozenset(), name)
+            numbers = self._results[operand]
+        elif operand.size == 1:
+            numbers = Numbers(literal(operand.item()))
+        else:
+            name = self._constant(operand)
+            numbers = Numbers(f"{name}[#]", name)
+        whole = _place(numbers.whole, view) if numbers.whole and view.flags.c_contiguous else None
+        return Numbers(numbers.text.replace("#", _place("#", view)), whole)
 
     def _constant(self, numbers: np.ndarray, kind: str = "constant") -> str:
         """The name of a new constant array."""
@@ -214,69 +219,44 @@ class Body:
         for operand in operation.inputs:
             if isinstance(operand, Value) and operand.size < output.size:
                 self._array(operand)  # computed once for all numbers that need it, not in the loop
-        inputs = [self._broadcast(operand, output.shape) for operand in operation.inputs]
-        kinds = [operand.kind if isinstance(operand, Value) else "float" for operand in operation.inputs]
-
-        def at(index: str) -> str:
-            return _expression(operation, [x.at(index) for x in inputs], kinds)
-
-        return Numbers(at, frozenset().union(*(x.arrays for x in inputs)))
-
-    def _broadcast(self, operand: Operand, shape: tuple[int, ...]) -> Numbers:
-        return _seen(self._numbers(operand), np.broadcast_to(_places(operand.shape), shape))
-
-    def _view(self, operation: Operation) -> Numbers:
-        (x,), settings, shape = operation.inputs, operation.settings, operation.output.shape
-        if operation.name == "Reshape":
-            return self._numbers(x)
-        if operation.name == "Expand":
-            return self._broadcast(x, shape)
-        places = _places(x.shape)
-        if operation.name == "Transpose":
-            return _seen(self._numbers(x), places.transpose(settings["axes"]))
-        axis, start = settings["axis"], settings["start"]
-        return _seen(self._numbers(x), _part(places, axis, start, shape[axis]))
+        inputs = list[str]()
+        for operand in operation.inputs:
+            view = np.broadcast_to(_places(operand.shape), output.shape)
+            inputs.append(self._seen(operand, view).text)
+        if operation.name == "Cast":
+            (x,) = operation.inputs
+            return Numbers(_cast(inputs[0], x.kind if isinstance(x, Value) else "float", output.kind))
+        if operation.name in OPERATORS:
+            return Numbers(OPERATORS[operation.name].format(*inputs))
+        return Numbers(f"policy_{operation.name.lower()}({', '.join(map(_bare, inputs))})")
 
     def _linear(self, operation: Operation) -> None:
         x, _, *biases = operation.inputs
         assert isinstance(x, Value)
-        source, target = self._array(x), self._new(operation.output)
+        source, target = self._array(x), operation.output.name
         weight = self._constant(operation.weight, "weight")
         bias = self._constant(np.asarray(biases[0]), "bias") if biases else "0"
         outputs, inputs = operation.weight.shape
         for row in range(x.size // inputs):
-            ends = f"{_plus(source.whole, row * inputs)}, {inputs}, {outputs}, {_plus(target.whole, row * outputs)}"
-            self._say(f"policy_linear({weight}, {bias}, {ends});", source.arrays, operation.output.name)
-        self._results[operation.output] = target
+            ends = f"{_plus(source, row * inputs)}, {inputs}, {outputs}, {_plus(target, row * outputs)}"
+            self.statements.append(f"policy_linear({weight}, {bias}, {ends});")
+        self._results[operation.output] = self._new(operation.output)
 
     def _concat(self, operation: Operation) -> None:
-        axis, output = operation.settings["axis"], operation.output
-        target, places, start = self._new(output), _places(output.shape), 0
+        axis, output, start = operation.settings["axis"], operation.output, 0
         for part in operation.inputs:
             assert isinstance(part, Value)
-            numbers, size = self._results[part], part.shape[axis]
-            place = _place("i", _part(places, axis, start, size))
-            text = f"{output.name}[{place}] = {_bare(_float(numbers.at('i'), part))};"
-            self._say(_loop(text, part.size), numbers.arrays, output.name)
-            start += size
-        self._results[output] = target
+            place = _place("#", _part(_places(output.shape), axis, start, part.shape[axis]))
+            self.statements.append(_loop(f"{output.name}[{place}] = {self._stored(part)};", part.size))
+            start += part.shape[axis]
+        self._results[output] = self._new(output)
 
     def _reduce(self, operation: Operation) -> None:
         (x,), output = operation.inputs, operation.output
         assert isinstance(x, Value)
-        source, target, size = self._array(x), self._new(output), x.shape[-1]
-        call = f"policy_{operation.name.lower()}({source.whole} + i * {size}, {size})"
-        self._say(_loop(f"{target.whole}[i] = {call};", output.size), source.arrays, output.name)
-        self._results[output] = target
-
-
-def _expression(operation: Operation, inputs: list[str], kinds: list[str]) -> str:
-    """One number of an elementwise operation."""
-    if operation.name == "Cast":
-        return _cast(inputs[0], kinds[0], operation.output.kind)
-    if operation.name in OPERATORS:
-        return OPERATORS[operation.name].format(*inputs)
-    return f"policy_{operation.name.lower()}({', '.join(map(_bare, inputs))})"
+        call = f"policy_{operation.name.lower()}({self._array(x)} + # * {x.shape[-1]}, {x.shape[-1]})"
+        self.statements.append(_loop(f"{output.name}[#] = {call};", output.size))
+        self._results[output] = self._new(output)
 
 
 def _bare(expression: str) -> str:
@@ -297,16 +277,12 @@ def _cast(number: str, before: str, after: str) -> str:
     return f"(float)(int32_t)({number})" if after == "int" else number
 
 
-def _float(expression: str, value: Value) -> str:
-    return f"({expression} ? 1.0F : 0.0F)" if value.kind == "bool" else expression
-
-
 def _loop(text: str, size: int) -> str:
-    return f"for (i = 0; i < {size}; ++i) {{\n        {text}\n    }}"
+    return f"for (i = 0; i < {size}; ++i) {{\n        {text.replace('#', 'i')}\n    }}"
 
 
-def _plus(pointer: str | None, offset: int) -> str:
-    return f"{pointer} + {offset}" if offset else str(pointer)
+def _plus(pointer: str, offset: int) -> str:
+    return f"{pointer} + {offset}" if offset else pointer
 
 
 def _places(shape: tuple[int, ...]) -> np.ndarray:
@@ -317,12 +293,6 @@ def _places(shape: tuple[int, ...]) -> np.ndarray:
 def _part(places: np.ndarray, axis: int, start: int, size: int) -> np.ndarray:
     """A view of `size` rows along an axis; `np.take` would copy, and forget the strides."""
     return places[(slice(None),) * axis + (slice(start, start + size),)]
-
-
-def _seen(numbers: Numbers, view: np.ndarray) -> Numbers:
-    """The numbers in another order: those at the places in `view`."""
-    whole = _place(numbers.whole, view) if numbers.whole and view.flags.c_contiguous else None
-    return Numbers(lambda index: numbers.at(_place(index, view)), numbers.arrays, whole)
 
 
 def _place(index: str, view: np.ndarray) -> str:
@@ -353,6 +323,4 @@ def literal(number: np.generic | float) -> str:
     value = np.float32(number)
     if not np.isfinite(value):
         return LARGEST if value > 0 else f"(-{LARGEST})"
-    text = f"{np.format_float_positional(value, trim='0')}" if 1e-4 <= abs(value) < 1e6 or value == 0 else f"{value!s}"
-    text = text if "." in text or "e" in text else f"{text}.0"
-    return f"{text}F" if not text.startswith("-") else f"({text}F)"
+    return f"({value!s}F)" if np.signbit(value) else f"{value!s}F"

@@ -6,7 +6,8 @@ import re
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -41,9 +42,7 @@ class HostPolicy:
     """
 
     def __init__(self, files: Mapping[str, str], compiler: str, flags: tuple[str, ...] = ("-O2",)) -> None:
-        with tempfile.TemporaryDirectory() as name:
-            folder = Path(name)
-            _write(folder, files, "rows.c")
+        with _written(files, "rows.c") as folder:
             command = [compiler, *FLAGS, *flags, "-fPIC", "-shared", "-o", "policy.so", "policy.c", "rows.c"]
             run_tool(command, folder)
             self._library = ctypes.CDLL(str(folder / "policy.so"))
@@ -89,9 +88,7 @@ def target_sizes(files: Mapping[str, str]) -> dict[str, int]:
     They come from the sections of its object file and from the stack of each function; the stacks of `policy_act` and
     of all functions that it may call are added up.
     """
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        _write(folder, files)
+    with _written(files) as folder:
         run_tool([TARGET_COMPILER, *FLAGS, *CORE, *SECTIONS, "-c", "policy.c", "-o", "policy.o"], folder)
         listed = run_tool([TARGET_COMPILER.replace("gcc", "size"), "-A", "policy.o"], folder)
         stacks = (folder / "policy.su").read_text()
@@ -116,9 +113,7 @@ def simulate(files: Mapping[str, str], obs: np.ndarray, actions: int) -> tuple[n
     Raises:
         UserError: compiler or emulator fails.
     """
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        _write(folder, files, "runner.c", "runner.ld")
+    with _written(files, "runner.c", "runner.ld") as folder:
         linked = ["-nostartfiles", "--specs=nano.specs", "-T", "runner.ld", "-Wl,--no-warn-rwx-segments"]
         run_tool([TARGET_COMPILER, *CORE, "-std=gnu99", *linked, "policy.c", "runner.c", "-o", "runner.elf"], folder)
         obs.astype("<f4").tofile(folder / "observations.bin")
@@ -130,7 +125,11 @@ def simulate(files: Mapping[str, str], obs: np.ndarray, actions: int) -> tuple[n
     return done, float(self_test), round(float(instructions))
 
 
-def _write(folder: Path, files: Mapping[str, str], *templates: str) -> None:
-    """Write texts by name, and templates that have nothing to be filled in."""
-    for name, text in {**files, **{name: (TEMPLATES / name).read_text() for name in templates}}.items():
-        (folder / name).write_text(text)
+@contextmanager
+def _written(files: Mapping[str, str], *templates: str) -> Iterator[Path]:
+    """A temporary directory with texts by name, and with templates that have nothing to be filled in."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        for file, text in {**files, **{file: (TEMPLATES / file).read_text() for file in templates}}.items():
+            (folder / file).write_text(text)
+        yield folder

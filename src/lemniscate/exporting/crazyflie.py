@@ -32,14 +32,9 @@ PAST = re.compile(r"(.+)_(\d+)_steps_ago(_less_now)?")
 def crazyflie_files(
     interface: Interface, quantities: list[Quantity], action: Action, c_files: Mapping[str, str], title: str
 ) -> dict[str, str]:
-    """The texts of the folder's files, by name.
+    """The texts of the folder's files, by name, those of `c_files` among them.
 
-    Args:
-        interface: of the environment of training.
-        quantities: of the whole observation, in its order.
-        action: the kind of actions.
-        c_files: the texts of `policy.c` and `policy.h`.
-        title: what the policy is for.
+    The policy sees `quantities`, in their order, in an environment with this interface.
 
     Raises:
         UserError: actions other than attitude and thrust; quantities that the firmware does not have; a rate that does
@@ -51,13 +46,11 @@ def crazyflie_files(
     if not rate or LOOP % rate:
         raise UserError(f"its {rate} actions a second do not divide the firmware's {LOOP}")
     names = [quantity.name for quantity in quantities]
-    is_reference = [bool(interface.reference and TO_REFERENCE.fullmatch(name)) for name in names]
+    references = [name for name in names if interface.reference and TO_REFERENCE.fullmatch(name)]
     past = [name for name in names if PAST.fullmatch(name)]
-    seen = zip(names, is_reference, strict=True)
-    strangers = [name for name, is_point in seen if not is_point and name not in (*SENSED, *past)]
-    if strangers:
-        raise UserError(f"nothing in the firmware gives {strangers[0]}")
-    sensed = {i: SENSED[name] for i, name in enumerate(names) if name in SENSED}
+    for name in names:
+        if name not in (*SENSED, *references, *past):
+            raise UserError(f"nothing in the firmware gives {name}")
     context = {
         "title": title,
         "version": version(),
@@ -65,14 +58,13 @@ def crazyflie_files(
         "action": action,
         "interface": interface,
         "reference": interface.reference,
-        "to_reference": is_reference.index(True) if any(is_reference) else None,
-        "sensed": sensed,
+        "to_reference": names.index(references[0]) if references else None,
+        "sensed": {i: SENSED[name] for i, name in enumerate(names) if name in SENSED},
         "history": _history(names, past, action, interface.action_before) if past else None,
     }
     folder, filters = TEMPLATES / "crazyflie", {"literal": literal, "comment": comment}
-    texts = {name: filled(folder / name, filters, **context) for name in ("policy_controller.c", "README.md")}
-    copied = {name: (folder / name).read_text() for name in ("Makefile", "Kbuild", "app-config")}
-    return {**c_files, **texts, **copied}
+    names_of_files = ("policy_controller.c", "README.md", "Makefile", "Kbuild", "app-config")
+    return {**c_files, **{name: filled(folder / name, filters, **context) for name in names_of_files}}
 
 
 def _history(names: list[str], past: list[str], action: Box, before: tuple[float, ...]) -> dict[str, Any]:

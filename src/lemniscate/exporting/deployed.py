@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from lemniscate.api.policy import TrainedPolicy
 from lemniscate.envs.conversion import normalized_action, physical_action, scale_of
-from lemniscate.spec import Action, Box, Discrete, MultiDiscrete, Spec
+from lemniscate.spec import Action, Box, Discrete, MultiBinary, MultiDiscrete, Spec
 
 Act = Callable[[np.ndarray], np.ndarray]
 """raw observations [R, O] float32 to actions for `env.step`, [R, A] float32"""
@@ -62,14 +62,13 @@ def safe_action(action: Action) -> np.ndarray:
     """The action [A] for an observation that is not finite.
 
     The middle of each range of a Box; where one bound is infinite, 1 from the other, and 0 where both are. The first
-    choice of Discrete and MultiDiscrete, 0 of MultiBinary.
+    choice of the others.
     """
     if isinstance(action, Box):
         low, high, middle, _ = scale_of(action)
         return np.clip(middle, low, high).astype(np.float32)
-    if isinstance(action, Discrete):
-        return np.array([action.start], dtype=np.float32)
-    return np.array(action.start if isinstance(action, MultiDiscrete) else [0] * action.n, dtype=np.float32)
+    first = [0] * action.n if isinstance(action, MultiBinary) else action.start
+    return np.ravel(first).astype(np.float32)
 
 
 def safe_sentence(action: Action) -> str:

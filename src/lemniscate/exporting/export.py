@@ -4,7 +4,6 @@ import hashlib
 import json
 import math
 import subprocess
-import sys
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
@@ -12,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from lemniscate import algos
-from lemniscate.api.policy import Trained, TrainedPolicy, load, path_of
+from lemniscate.api.policy import Trained, TrainedPolicy, algorithm_of, load, path_of
 from lemniscate.envs.backend import Interface, Quantity
 from lemniscate.errors import UserError, is_installed
 from lemniscate.exporting.c_code import c_files
@@ -22,7 +20,7 @@ from lemniscate.exporting.crazyflie import crazyflie_files
 from lemniscate.exporting.deployed import Act, Deployed, act_with, input_size, safe_action, safe_sentence
 from lemniscate.exporting.onnx_model import onnx_act, onnx_model
 from lemniscate.exporting.operations import Program
-from lemniscate.exporting.parity import fly, origin, parity, self_tests, sentences
+from lemniscate.exporting.parity import TESTS, fly, parity, self_tests, sentences
 from lemniscate.exporting.translation import translate
 from lemniscate.hub.repository import is_address
 from lemniscate.spec import Action, Box, Discrete, MultiDiscrete, ObservationPart, Spec
@@ -67,7 +65,11 @@ def export(run: Trained, to: str | Path | None = None, *, trust: bool = False) -
     program = translate(Deployed(policy).eval(), input_size(policy.spec))
     contents, record, said = _contents(policy, program)
     try:
-        _write(folder, contents, record)
+        with replace_directory(folder) as aside:
+            for name, content in contents.items():
+                (aside / name).parent.mkdir(exist_ok=True)
+                replace_file(aside / name, content)
+            write_json(aside / MANIFEST, record)
     except OSError as error:
         raise UserError(f"{folder} cannot be written: {error.strerror or error}.") from error
     for sentence in said:
@@ -95,21 +97,28 @@ def is_export(folder: Path) -> bool:
 
 def _contents(policy: TrainedPolicy, program: Program) -> tuple[dict[str, bytes], dict[str, Any], list[str]]:
     """The content of every file but the manifest by its name, the manifest, and sentences for a person."""
-    true, action, compiler = act_with(policy), policy.spec.action, host_compiler()
-    facts = {"title": title(policy), "environment": policy.spec.env_id, "step": policy.step}
+    true, action, compiler, named = act_with(policy), policy.spec.action, host_compiler(), title(policy)
+    facts = {"title": named, "environment": policy.spec.env_id, "step": policy.step}
     model = onnx_model(program, facts) if is_installed("onnx") else None
     acting, act = _actor(policy, program, model, compiler)
     obs, interface = fly(policy, act)
     tests = self_tests(policy, obs)
-    named = {"title": facts["title"], "origin": origin(policy, len(tests)), "period": interface.period}
-    texts = c_files(program, action, tests, true(tests), **named)
+    edges = f", and {len(tests) - TESTS} with one number far outside of them" if len(tests) > TESTS else ""
+    origin = f"{TESTS} of episodes of {policy.spec.env_id}{edges}"
+    texts = c_files(program, action, tests, true(tests), title=named, origin=origin, period=interface.period)
     found = parity(program, true, obs, texts, model, HostPolicy(texts, compiler) if compiler else None)
     record = {"environment": policy.spec.env_id, "acting": acting, "reference": "torch", **found}
-    vehicle, left_out = _vehicle_files(policy, interface, texts)
+    said, vehicle = sentences(record), dict[str, str]()
+    if interface.vehicle == CRAZYFLIE:
+        try:
+            vehicle = crazyflie_files(interface, observed(policy.spec, interface), action, texts, named)
+        except UserError as error:
+            said.append(f"{CRAZYFLIE}/ is left out: {error}.")
     contents: dict[str, bytes] = {} if model is None else {ONNX: model}
-    contents |= {name: text.encode() for name, text in {**texts, **vehicle}.items()}
+    contents |= {name: text.encode() for name, text in texts.items()}
+    contents |= {f"{CRAZYFLIE}/{name}": text.encode() for name, text in vehicle.items()}
     contents[PARITY] = (json.dumps(record, indent=1, allow_nan=False) + "\n").encode()
-    return contents, manifest(policy, program, interface, obs, contents), [*sentences(record), *left_out]
+    return contents, _manifest(policy, program, interface, obs, contents), said
 
 
 def _actor(policy: TrainedPolicy, program: Program, model: bytes | None, compiler: str | None) -> tuple[str, Act]:
@@ -124,40 +133,12 @@ def _actor(policy: TrainedPolicy, program: Program, model: bytes | None, compile
     return "the policy itself", act_with(policy)
 
 
-def _vehicle_files(
-    policy: TrainedPolicy, interface: Interface, texts: Mapping[str, str]
-) -> tuple[dict[str, str], list[str]]:
-    """The files for the vehicle's firmware, and why there are none for a vehicle that could have some."""
-    if interface.vehicle != CRAZYFLIE:
-        return {}, []
-    quantities = observed(policy.spec, interface)
-    try:
-        found = crazyflie_files(interface, quantities, policy.spec.action, texts, title(policy))
-    except UserError as error:
-        return {}, [f"{CRAZYFLIE}/ is left out: {error}."]
-    return {f"{CRAZYFLIE}/{name}": text for name, text in found.items()}, []
-
-
-def _write(folder: Path, contents: Mapping[str, bytes], record: Mapping[str, Any]) -> None:
-    """Write all files aside, then put the directory in its place. Raises `OSError`, and leaves nothing behind then."""
-    with replace_directory(folder) as aside:
-        for name, content in contents.items():
-            (aside / name).parent.mkdir(exist_ok=True)
-            replace_file(aside / name, content)
-        write_json(aside / MANIFEST, record)
-
-
-def manifest(
+def _manifest(
     policy: TrainedPolicy, program: Program, interface: Interface, obs: np.ndarray, files: Mapping[str, bytes]
 ) -> dict[str, Any]:
-    """`manifest.json`: what every number of an exported policy means, and where it is from.
+    """What every number of an exported policy means, and where it is from.
 
-    Args:
-        policy: the exported policy.
-        program: its translation.
-        interface: of its environment.
-        obs: observations of its episodes, [R, O]; their range is that of each observation's entry.
-        files: the content of the other files, for their sha256.
+    Observations have the range of `obs` [R, O], those of its episodes; `files` are named with their sha256.
     """
     action = policy.spec.action
     seen = zip(obs.min(0).tolist(), obs.max(0).tolist(), strict=True)
@@ -166,7 +147,7 @@ def manifest(
         "title": title(policy),
         "environment": policy.spec.env_id,
         "env_kwargs": dict(policy.config.env_kwargs),
-        "algorithm": algorithm(policy),
+        "algorithm": algorithm_of(policy),
         "step": policy.step,
         "seed": policy.config.seed,
         "lemniscate": version(),
@@ -208,12 +189,8 @@ def commit() -> str | None:
 
 def title(policy: TrainedPolicy) -> str:
     """The environment, algorithm, seed and step of a policy, in a line."""
-    return f"A policy for {policy.spec.env_id}: {algorithm(policy)}, seed {policy.config.seed}, step {policy.step:,}."
-
-
-def algorithm(policy: TrainedPolicy) -> str:
-    """The name of the algorithm that trained a policy."""
-    return algos.name_of(sys.modules[type(policy.config).__module__])
+    name, seed = algorithm_of(policy), policy.config.seed
+    return f"A policy for {policy.spec.env_id}: {name}, seed {seed}, step {policy.step:,}."
 
 
 def observed(spec: Spec, interface: Interface) -> list[Quantity]:
@@ -222,9 +199,7 @@ def observed(spec: Spec, interface: Interface) -> list[Quantity]:
     for part in spec.observation_parts:
         known = interface.parts.get(part.name, ())
         found += known if len(known) == part.size else map(Quantity, _names(part))
-    if isinstance(spec.action, Discrete) and spec.action.masked:
-        found += [Quantity(f"action_mask[{i}]") for i in range(spec.action.n)]
-    return found
+    return found + [Quantity(f"action_mask[{i}]") for i in range(input_size(spec) - spec.observation_size)]
 
 
 def _names(part: ObservationPart) -> list[str]:

@@ -17,28 +17,23 @@ OPSET, IR = 18, 10
 def onnx_model(program: Program, facts: Mapping[str, Any]) -> bytes:
     """A model with the input `obs` [batch, O] float32 and the output `action` [batch, …], checked.
 
-    Args:
-        program: the policy.
-        facts: the model's metadata, each value as JSON.
+    Its metadata are the `facts`, each as JSON.
     """
-    import onnx
-    from onnx import helper
-
     writer = _Writer()
+    helper, checker = writer.onnx.helper, writer.onnx.checker
     for operation in program.operations:
         writer.add(operation)
     writer.node("Identity", [program.action.name], "action")
-    batch = {"obs": program.obs, "action": program.action}
-    ends = {
-        name: helper.make_tensor_value_info(name, writer.types[value.kind], ["batch", *value.shape])
-        for name, value in batch.items()
-    }
-    graph = helper.make_graph(writer.nodes, "policy", [ends["obs"]], [ends["action"]], initializer=writer.initializers)
+    obs, action = (
+        helper.make_tensor_value_info(name, writer.types[value.kind], ["batch", *value.shape])
+        for name, value in (("obs", program.obs), ("action", program.action))
+    )
+    graph = helper.make_graph(writer.nodes, "policy", [obs], [action], initializer=writer.initializers)
     opset = helper.make_opsetid("", OPSET)
     model = helper.make_model(graph, opset_imports=[opset], ir_version=IR, producer_name="lemniscate")
     model.producer_version = version()
     helper.set_model_props(model, {name: json.dumps(value) for name, value in facts.items()})
-    onnx.checker.check_model(model, full_check=True)
+    checker.check_model(model, full_check=True)
     return model.SerializeToString()
 
 
@@ -55,31 +50,25 @@ def onnx_act(model: bytes) -> tuple[Act, str]:
 
 class _Writer:
     def __init__(self) -> None:
-        from onnx import TensorProto
+        import onnx
 
-        self.types = {"float": TensorProto.FLOAT, "int": TensorProto.INT64, "bool": TensorProto.BOOL}
-        self.bfloat16 = TensorProto.BFLOAT16
+        self.onnx, number = onnx, onnx.TensorProto
+        self.types = {"float": number.FLOAT, "int": number.INT64, "bool": number.BOOL}
         self.nodes: list[Any] = []
         self.initializers: list[Any] = []
 
     def node(self, name: str, inputs: list[str], output: str, **attributes: Any) -> str:
         """A new node; returns the name of its output."""
-        from onnx import helper
-
-        self.nodes.append(helper.make_node(name, inputs, [output], **attributes))
+        self.nodes.append(self.onnx.helper.make_node(name, inputs, [output], **attributes))
         return output
-
-    def constant(self, numbers: np.ndarray) -> str:
-        """A new constant; returns its name."""
-        from onnx import numpy_helper
-
-        name = f"constant_{len(self.initializers)}"
-        self.initializers.append(numpy_helper.from_array(np.ascontiguousarray(numbers), name))
-        return name
 
     def operand(self, operand: Operand) -> str:
         """The name of a result or of a new constant."""
-        return operand.name if isinstance(operand, Value) else self.constant(operand)
+        if isinstance(operand, Value):
+            return operand.name
+        name = f"constant_{len(self.initializers)}"
+        self.initializers.append(self.onnx.numpy_helper.from_array(np.ascontiguousarray(operand), name))
+        return name
 
     def add(self, operation: Operation) -> None:
         """Translate one operation."""
@@ -87,13 +76,13 @@ class _Writer:
         if name == "Linear":
             self._linear(operation)
             return
-        inputs = [self.operand(operand) for operand in operation.inputs]
-        if name == "RoundBfloat16":
-            rounded = self.node("Cast", inputs, f"{output}_bfloat16", to=self.bfloat16)
-            self.node("Cast", [rounded], output, to=self.types["float"])
-            return
         places, attributes = self._settings(operation)
-        self.node(name, [*inputs, *(self.constant(np.array(numbers)) for numbers in places)], output, **attributes)
+        inputs = [self.operand(operand) for operand in (*operation.inputs, *map(np.array, places))]
+        if name == "RoundBfloat16":
+            rounded = self.node("Cast", inputs, f"{output}_bfloat16", to=self.onnx.TensorProto.BFLOAT16)
+            self.node("Cast", [rounded], output, to=self.types["float"])
+        else:
+            self.node(name, inputs, output, **attributes)
 
     def _settings(self, operation: Operation) -> tuple[list[list[int]], dict[str, Any]]:
         """Further inputs of whole numbers, and attributes; here axes and shapes count the batch."""
@@ -120,9 +109,9 @@ class _Writer:
         x, output = self.operand(operation.inputs[0]), operation.output.name
         biases = [self.operand(operand) for operand in operation.inputs[2:]]
         if len(operation.output.shape) == 1:  # Gemm takes matrices only, MatMul any number of axes
-            self.node("Gemm", [x, self.constant(operation.weight), *biases], output, transB=1)
+            self.node("Gemm", [x, self.operand(operation.weight), *biases], output, transB=1)
             return
-        weight = self.constant(operation.weight.T)
+        weight = self.operand(operation.weight.T)
         product = self.node("MatMul", [x, weight], f"{output}_product" if biases else output)
         if biases:
             self.node("Add", [product, *biases], output)

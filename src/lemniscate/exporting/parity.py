@@ -13,7 +13,7 @@ from lemniscate.envs import registry
 from lemniscate.envs.backend import Interface
 from lemniscate.errors import UserError, is_installed, missing_extra
 from lemniscate.exporting import compiled
-from lemniscate.exporting.compiled import HostPolicy
+from lemniscate.exporting.compiled import CORE, EMULATOR, TARGET_COMPILER, HostPolicy
 from lemniscate.exporting.deployed import Act, act_with, for_policy, input_size
 from lemniscate.exporting.onnx_model import onnx_act
 from lemniscate.exporting.operations import Program
@@ -92,24 +92,13 @@ def _clear(policy: TrainedPolicy, obs: np.ndarray) -> np.ndarray:
     return clear if clear.any() else ~clear
 
 
-def origin(policy: TrainedPolicy, tests: int) -> str:
-    """The origin of a self-test's observations, in words."""
-    edges = f", and {tests - TESTS} with one number far outside of them" if tests > TESTS else ""
-    return f"{TESTS} of episodes of {policy.spec.env_id}{edges}"
-
-
 def parity(
     program: Program, act: Act, obs: np.ndarray, files: Mapping[str, str], model: bytes | None, host: HostPolicy | None
 ) -> dict[str, Any]:
     """The record; `missing` has a sentence for everything that could not be compared.
 
-    Args:
-        program: the policy.
-        act: the policy itself, in torch.
-        obs: the observations at which all are compared, [R, O].
-        files: the texts of `policy.c` and `policy.h`.
-        model: `policy.onnx`.
-        host: `policy.c` on this machine.
+    Compared with `act`, the policy itself, at the observations `obs` [R, O]: `model`, which is `policy.onnx`, and the C
+    in `files`, which is compiled here as `host`.
     """
     true, tolerance = act(obs), BFLOAT16_TOLERANCE if program.is_rounded else TOLERANCE
     costs: dict[str, float | None] = {"c": None, "onnxruntime": None, "torch": nanoseconds(lambda: act(obs[:1]))}
@@ -155,14 +144,15 @@ def _on_target(
 ) -> tuple[dict[str, Any] | None, list[str]]:
     """The figures of a Cortex-M4F, and a sentence for what is not installed."""
     absent = compiled.missing_target_tools()
-    if compiled.TARGET_COMPILER in absent:
-        name = compiled.TARGET_COMPILER
-        return None, [f"{name} is not installed: nothing is known of the target (Debian: gcc-arm-none-eabi)."]
-    command = " ".join((compiled.TARGET_COMPILER, *compiled.CORE))
+    if TARGET_COMPILER in absent:
+        return None, [
+            f"{TARGET_COMPILER} is not installed: nothing is known of the target (Debian: gcc-arm-none-eabi)."
+        ]
+    command = " ".join((TARGET_COMPILER, *CORE))
     record: dict[str, Any] = {**compiled.target_sizes(files), "compiled_with": command}
     if absent:
-        name = compiled.EMULATOR
-        return record, [f"{name} is not installed: policy.c is not run on the target (Debian: qemu-system-arm)."]
+        missing = f"{EMULATOR} is not installed: policy.c is not run on the target (Debian: qemu-system-arm)."
+        return record, [missing]
     rows = min(len(obs), max(64, INSTRUCTIONS // (8 * program.multiplications + 10_000)))
     try:
         actions, self_test, instructions = compiled.simulate(files, obs[:rows], true.shape[1])
@@ -176,7 +166,11 @@ def sentences(record: Mapping[str, Any]) -> list[str]:
     """The record as sentences for a person."""
     names = {"onnx": "ONNX", "c_host": "C", "c_cortex_m4f": "C on the simulated Cortex-M4F"}
     compared = {name: record[key] for key, name in names.items() if (record[key] or {}).get("observations")}
-    said = [_distance(name, each) for name, each in compared.items()]
+    said = list[str]()
+    for name, each in compared.items():
+        largest = each["max_abs_difference"]
+        distance = f"differs from the policy by at most {largest:.1e}" if largest else "is exact"
+        said.append(f"{name} {distance} at {each['observations']:,} observations.")
     if sizes := record["c_cortex_m4f"]:
         instructions = sizes.get("instructions_per_call")
         said.append(
@@ -187,8 +181,3 @@ def sentences(record: Mapping[str, Any]) -> list[str]:
         if each["above_tolerance"]:
             said.append(f"{name} is beyond {record['tolerance']:g} at {each['above_tolerance']:,} of them.")
     return [*said, *record["missing"]]
-
-
-def _distance(name: str, compared: Mapping[str, Any]) -> str:
-    largest, rows = compared["max_abs_difference"], f"at {compared['observations']:,} observations."
-    return f"{name} differs from the policy by at most {largest:.1e} {rows}" if largest else f"{name} is exact {rows}"

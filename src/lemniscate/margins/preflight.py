@@ -1,13 +1,11 @@
 """`preflight`: the margins of a policy, with one thing at a time other than in training."""
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
 import torch
-from torch import Tensor
 
 from lemniscate.api.policy import Trained, TrainedPolicy, load, path_of
 from lemniscate.envs import registry
@@ -72,6 +70,7 @@ class Preflight:
         return {"preflight": FORMAT, **own, "axes": axes, "sentences": list(self.sentences), **origin}
 
 
+@torch.no_grad()
 def preflight(
     run: Trained,
     compiled: bool = False,
@@ -110,10 +109,42 @@ def preflight(
     policy = load(run, trust=trust)
     act = _compiled(policy, folder) if compiled else lambda obs: policy.module(obs).mode()
     probe = _probe(policy, episodes, given)
-    result = _fly(policy, act, probe, {"episodes": episodes, "seed": seed, "compiled": compiled, "env_kwargs": given})
-    for line in [*table(rows(result.axes)), *result.sentences]:
+    threads = torch.get_num_threads()
+    # several threads wait for each other longer than a small network takes, if simulators run too
+    torch.set_num_threads(1)
+    try:
+        nominal, flown = probe.fly(act, derive(seed, EVALUATION, 0))
+    finally:
+        torch.set_num_threads(threads)
+    least = None if probe.ends_by_failure else worst_accepted(nominal)
+    axes = tuple(margins_of(axis, flown[axis.name], least) for axis in probe.axes)
+    said, smooth = [*sentences(axes, FAILS if least is None else FALLS_SHORT)], None
+    if probe.period is not None and nominal.actions is not None:
+        smooth = smoothness(nominal.actions, probe.period)
+        said.append(smoothness_sentence(smooth))
+    alive_means = "no crash" if least is None else f"a return of at least {least:.6g}"
+    result = Preflight(
+        env_id=policy.spec.env_id,
+        step=policy.step,
+        episodes=episodes,
+        seed=seed,
+        compiled=compiled,
+        alive_means=alive_means,
+        nominal_return=float(nominal.returns.mean()),
+        axes=axes,
+        smoothness=smooth,
+        sentences=tuple(said),
+        env_kwargs=given,
+    )
+    for line in [*table(rows(axes)), *said]:
         say(line)
-    _write(result, folder)
+    acting = f"{result.env_id}: {'the exported C' if compiled else 'the policy'} of step {result.step:,}"
+    try:
+        title = f"{acting}, {episodes} starts a point, alive is {alive_means}"
+        draw(axes, title, folder / "plots" / "preflight.png")
+        write_json(folder / "preflight.json", result.to_json())
+    except OSError as error:
+        raise UserError(f"{folder} cannot be written: {error.strerror or error}.") from error
     return result
 
 
@@ -134,11 +165,7 @@ def _compiled(policy: TrainedPolicy, run: Path) -> Act:
     if step != policy.step:
         raise UserError(f"{folder} is of step {step:,}, the policy of step {policy.step:,}: lemniscate export {run}")
     host, kind = HostPolicy(files, compiler), policy.spec.action
-
-    def act(obs: Tensor) -> Tensor:
-        return for_policy(host.act(obs.numpy()), kind)
-
-    return act
+    return lambda obs: for_policy(host.act(obs.numpy()), kind)
 
 
 def _probe(policy: TrainedPolicy, episodes: int, given: Mapping[str, Any]) -> Probe:
@@ -155,49 +182,3 @@ def _probe(policy: TrainedPolicy, episodes: int, given: Mapping[str, Any]) -> Pr
     if not probe.axes:
         raise UserError(f"{policy.spec.env_id} has nothing that could be changed: masked choices, and no numbers.")
     return probe
-
-
-@torch.no_grad()
-def _fly(policy: TrainedPolicy, act: Act, probe: Probe, how: dict[str, Any]) -> Preflight:
-    with _one_thread():
-        nominal, flown = probe.fly(act, derive(how["seed"], EVALUATION, 0))
-    least = None if probe.ends_by_failure else worst_accepted(nominal)
-    axes = tuple(margins_of(axis, flown[axis.name], least) for axis in probe.axes)
-    known = probe.period is not None and nominal.actions is not None
-    smooth = smoothness(nominal.actions, probe.period) if known else None  # pyright: ignore[reportArgumentType]
-    said = [*sentences(axes, FAILS if least is None else FALLS_SHORT)]
-    if smooth:
-        said.append(smoothness_sentence(smooth))
-    return Preflight(
-        env_id=policy.spec.env_id,
-        step=policy.step,
-        alive_means="no crash" if least is None else f"a return of at least {least:.6g}",
-        nominal_return=float(nominal.returns.mean()),
-        axes=axes,
-        smoothness=smooth,
-        sentences=tuple(said),
-        **how,
-    )
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """One thread of torch's: several wait for each other longer than a small network takes, if simulators run too."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
-
-
-def _write(result: Preflight, folder: Path) -> None:
-    """The picture, then the record. Raises `UserError` where the run cannot be written."""
-    acting = "the exported C" if result.compiled else "the policy"
-    acts = f"{result.env_id}: {acting} of step {result.step:,}"
-    title = f"{acts}, {result.episodes} starts a point, alive is {result.alive_means}"
-    try:
-        draw(result.axes, title, folder / "plots" / "preflight.png")
-        write_json(folder / "preflight.json", result.to_json())
-    except OSError as error:
-        raise UserError(f"{folder} cannot be written: {error.strerror or error}.") from error

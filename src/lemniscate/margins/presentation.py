@@ -12,7 +12,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import MaxNLocator
 
 from lemniscate.envs.probe import Axis, Value
-from lemniscate.margins.record import AxisMargins, Side
+from lemniscate.margins.record import AxisMargins
 from lemniscate.report.style import COLORS, finish, legend_above, save
 
 Words = tuple[str, str]
@@ -26,21 +26,16 @@ ALIVE, RETURN, BEYOND = COLORS[0], COLORS[1], COLORS[3]
 
 def rows(found: Sequence[AxisMargins]) -> list[list[str]]:
     """The cells of the table, its heading first: what was tried, what is within the margins, what is beyond."""
-    heading = ["", "tried", "within margins", "mean return there", "alive beyond"]
-    return [heading, *map(_row, found)]
-
-
-def _row(one: AxisMargins) -> list[str]:
-    axis, inside, episodes = one.axis, one.within(), one.episodes
-    returns = [one.return_at(value) for value in inside]
-    beyond = [side.first for side in one.sides.values() if side.first is not None]
-    return [
-        axis.title,
-        _span(axis, axis.values),
-        _span(axis, inside) if inside else "nothing",
-        f"{min(returns):,.4g}" if returns else "–",
-        ", ".join(f"{episodes - one.lost_at(value)} of {episodes} at {_short(axis, value)}" for value in beyond) or "–",
-    ]
+    cells = [["", "tried", "within margins", "mean return there", "alive beyond"]]
+    for one in found:
+        axis, inside, episodes = one.axis, one.within(), one.episodes
+        least = min(map(one.return_at, inside), default=None)
+        firsts = [side.first for side in one.sides.values() if side.first is not None]
+        beyond = [f"{episodes - one.lost_at(edge)} of {episodes} at {_short(axis, edge)}" for edge in firsts]
+        within = _span(axis, inside) if inside else "nothing"
+        mean = "–" if least is None else f"{least:,.4g}"
+        cells.append([axis.title, _span(axis, axis.values), within, mean, ", ".join(beyond) or "–"])
+    return cells
 
 
 def _span(axis: Axis, values: Sequence[Value]) -> str:
@@ -60,12 +55,7 @@ def _short(axis: Axis, value: Value) -> str:
 
 
 def sentences(found: Sequence[AxisMargins], words: Words) -> Iterator[str]:
-    """A sentence for each axis; one for all where not even the nominal episodes are alive.
-
-    Args:
-        found: the margins.
-        words: `FAILS` or `FALLS_SHORT`.
-    """
+    """A sentence for each axis, with these verbs; one for all where not even the nominal episodes are alive."""
     flies, fails = words
     for one in found:
         if any(side.last is None for side in one.sides.values()):
@@ -77,32 +67,21 @@ def sentences(found: Sequence[AxisMargins], words: Words) -> Iterator[str]:
         yield f"{said[0].upper()}{said[1:]}."
 
 
-def _sides(one: AxisMargins, flies: str, fails: str) -> list[str]:
+def _sides(one: AxisMargins, flies: str, fails: str) -> Iterator[str]:
     """The clauses of each side; one of both at once where nothing beyond them was tried."""
     axis, sides = one.axis, list(one.sides.values())
-    lasts = [side.last for side in sides if side.last is not None]
-    if len(sides) > 1 and all(side.first is None for side in sides):
-        both = axis.phrase.format(" to ".join(map(axis.text, lasts)))
-        return [f"{flies} with {both}, the most that was tried{_losses(one, lasts)}"]
-    return [_side(one, side, flies, fails) for side in sides]
-
-
-def _side(one: AxisMargins, side: Side, flies: str, fails: str) -> str:
-    axis = one.axis
-    assert side.last is not None
-    with_last = f"{flies} with {axis.phrase.format(axis.text(side.last))}"
-    if side.first is None:
-        return f"{with_last}, the most that was tried{_losses(one, [side.last])}"
-    lost = f"{one.lost_at(side.first)} of {one.episodes} {fails}"
-    if side.last == axis.nominal:
-        return f"{lost} with {axis.phrase.format(axis.text(side.first))}, the least that was tried"
-    return f"{with_last}{_losses(one, [side.last])}; at {axis.text(side.first)} {lost}"
-
-
-def _losses(one: AxisMargins, values: Sequence[Value]) -> str:
-    """The losses within the margins, where there are some."""
-    lost = max(map(one.lost_at, values))
-    return f", and loses {lost} of {one.episodes} there" if lost else ""
+    for group in [sides] if all(side.first is None for side in sides) else [[side] for side in sides]:
+        first, lasts = group[0].first, [side.last for side in group if side.last is not None]
+        with_lasts = f"{flies} with {axis.phrase.format(' to '.join(map(axis.text, lasts)))}"
+        lost = max(map(one.lost_at, lasts))
+        losses = f", and loses {lost} of {one.episodes} there" if lost else ""
+        beyond = "" if first is None else f"{one.lost_at(first)} of {one.episodes} {fails}"
+        if first is None:
+            yield f"{with_lasts}, the most that was tried{losses}"
+        elif lasts == [axis.nominal]:
+            yield f"{beyond} with {axis.phrase.format(axis.text(first))}, the least that was tried"
+        else:
+            yield f"{with_lasts}{losses}; at {axis.text(first)} {beyond}"
 
 
 def _choices(one: AxisMargins, flies: str, fails: str) -> list[str]:
@@ -134,14 +113,12 @@ def draw(found: Sequence[AxisMargins], title: str, file: Path) -> Path:
         right = axes.twinx()
         right.set_ylim(low - 0.04 * (high - low), high + 0.08 * (high - low))
         _draw(axes, right, one)
-        if i % columns:
-            axes.set_yticklabels([])
-        else:
-            axes.set_ylabel("share alive", fontsize=8, color=ALIVE)
-        if (i + 1) % columns:
-            right.set_yticklabels([])
-        else:
-            right.set_ylabel("mean return", fontsize=8, color=RETURN)
+        labels = (axes, "share alive", ALIVE, 0), (right, "mean return", RETURN, columns - 1)
+        for side, label, color, outermost in labels:
+            if i % columns == outermost:
+                side.set_ylabel(label, fontsize=8, color=color)
+            else:
+                side.set_yticklabels([])
     legend_above(figure)
     figure.suptitle(title, x=0.99, ha="right", fontsize=9, color="dimgrey")
     return save(figure, file)

@@ -5,6 +5,8 @@ of MuJoCo.
 """
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -15,50 +17,46 @@ from lemniscate.envs import registry
 from lemniscate.envs.factory import make_one, maker_of, makes_vector
 from lemniscate.envs.probe import CHANNEL_AXES, MODEL_AXES, Act, Axis, Flown, Tally, Value
 from lemniscate.envs.vec_env import VecEnv
+from lemniscate.exporting.deployed import input_size
 from lemniscate.run.seeding import derive, generator
-from lemniscate.spec import Discrete, Spec
+from lemniscate.spec import Spec
 
 FACTORS = "lemniscate.margins.vector_probe:ModelFactors"
 CPU = torch.device("cpu")
 
 
+@dataclass
 class Channel:
     """The way between a policy and N environments: late and lost actions, blurred observations.
 
     Before the first action has arrived it acts already; a lost one is replaced by the one that acted before it.
 
-    Args:
+    Attributes:
         act: the policy.
+        rng: of noise and losses.
         action_delay: in steps.
         observation_noise: standard deviation of each number of an observation, in multiples of `scale`.
         lost_actions: probability that an action is lost.
         scale: [O].
-        rng: of noise and losses.
     """
 
-    def __init__(
-        self,
-        act: Act,
-        *,
-        action_delay: int = 0,
-        observation_noise: float = 0.0,
-        lost_actions: float = 0.0,
-        scale: Tensor | None = None,
-        rng: torch.Generator,
-    ) -> None:
-        self._act, self._delay, self._lost, self._rng = act, int(action_delay), lost_actions, rng
-        self._noise = observation_noise * scale if scale is not None and observation_noise else None
-        self._sent: list[Tensor] = []
-        self._acting: Tensor | None = None
+    act: Act
+    rng: torch.Generator
+    action_delay: int = 0
+    observation_noise: float = 0.0
+    lost_actions: float = 0.0
+    scale: Tensor | None = None
+    _sent: list[Tensor] = field(default_factory=list, init=False)
+    _acting: Tensor | None = field(default=None, init=False)
 
     def __call__(self, obs: Tensor) -> Tensor:
         """The actions [N, …] that act now, after the observations [N, O]."""
-        if self._noise is not None:
-            obs = obs + self._noise * torch.randn(obs.shape, generator=self._rng)
-        self._sent.append(self._act(obs))
-        arrived = self._sent.pop(0) if len(self._sent) > self._delay else self._sent[0]
-        if self._lost and self._acting is not None:
-            lost = torch.rand(len(obs), generator=self._rng) < self._lost
+        if self.scale is not None and self.observation_noise:
+            obs = obs + self.observation_noise * self.scale * torch.randn(obs.shape, generator=self.rng)
+        self._sent.append(self.act(obs))
+        arrived = self._sent.pop(0) if len(self._sent) > self.action_delay else self._sent[0]
+        if self.lost_actions and self._acting is not None:
+            lost = torch.rand(len(obs), generator=self.rng) < self.lost_actions
             arrived = torch.where(lost.reshape(-1, *[1] * (arrived.ndim - 1)), self._acting, arrived)
         self._acting = arrived
         return arrived
@@ -111,10 +109,10 @@ class VectorProbe:
         self, env: str, starts: int, kwargs: Mapping[str, Any], wrappers: tuple[str, ...], backend: str | None
     ) -> None:
         own = (backend is None or backend in registry.BACKENDS) and registry.backend_class("gymnasium").serves(env)
-        self._arguments: dict[str, Any] = {"env": env, "num_envs": starts, "kwargs": kwargs}
-        self._arguments |= {"backend": "gymnasium" if own else backend}
+        backend = "gymnasium" if own else backend
+        self._make = partial(registry.make, env, starts, kwargs=kwargs, backend=backend)
         self._wrappers = wrappers
-        self._env = self._make()
+        self._env = self._make(wrappers=wrappers)
         self.spec: Spec = self._env.spec
         single = own and not makes_vector(maker_of(env))
         self.axes = _axes(self.spec, single and has_model(env, kwargs))
@@ -137,20 +135,17 @@ class VectorProbe:
         rng = generator(seed, CPU, 1)
         if axis not in MODEL_AXES:
             disturbance: dict[str, Any] = {axis.name: value}
-            return _fly(self._env, Channel(act, scale=scale, rng=rng, **disturbance), seed)
-        env = self._make(f"{FACTORS}({axis.name}={value})")
+            return _fly(self._env, Channel(act, rng, scale=scale, **disturbance), seed)
+        env = self._make(wrappers=(*self._wrappers, f"{FACTORS}({axis.name}={value})"))
         try:
             return _fly(env, act, seed)
         finally:
             env.close()
 
-    def _make(self, *wrappers: str) -> VecEnv:
-        return registry.make(**self._arguments, wrappers=(*self._wrappers, *wrappers))
-
 
 def _axes(spec: Spec, has_model: bool) -> tuple[Axis, ...]:
     """The axes of an environment: with a mask no action can be late, and only numbers can be noisy."""
-    masked = isinstance(spec.action, Discrete) and spec.action.masked
+    masked = input_size(spec) > spec.observation_size
     noisy = bool(_is_number(spec).any())
     channel = (axis for axis in CHANNEL_AXES if (noisy if axis.name == "observation_noise" else not masked))
     return (*channel, *(MODEL_AXES if has_model else ()))
@@ -159,8 +154,7 @@ def _axes(spec: Spec, has_model: bool) -> tuple[Axis, ...]:
 def _is_number(spec: Spec) -> Tensor:
     """[O] bool, of the whole observation: numbers, which are no choices, masks or pixels."""
     own = [not part.nvec and not spec.image for part in spec.observation_parts for _ in range(part.size)]
-    mask = spec.action.n if isinstance(spec.action, Discrete) and spec.action.masked else 0
-    return torch.tensor([*own, *[False] * mask])
+    return torch.tensor([*own, *[False] * (input_size(spec) - len(own))])
 
 
 def _fly(env: VecEnv, act: Act, seed: int, seen: list[Tensor] | None = None) -> Flown:
