@@ -21,6 +21,14 @@ from lemniscate.types import Batch
 
 CPU = torch.device("cpu")
 MODES = ["NEXT_STEP", "SAME_STEP", "DISABLED"]
+
+
+def long(*values):
+    """Values of a parameter that only `make test-long` tries."""
+    return [pytest.param(value, marks=pytest.mark.long) for value in values]
+
+
+ONE_MODE = ["NEXT_STEP", *long("SAME_STEP", "DISABLED")]
 TESTS = Path(__file__).parent
 
 

@@ -59,6 +59,8 @@ CASES = {
     "sac bins": ("box", {**OFF_POLICY, "value_range": 5.0, "network": "layer_norm", "unit_weights": True}),
     "sac simba": ("box", {**OFF_POLICY, "network": "simba", "activation": "relu", "matmul": "bfloat16"}),
 }
+SIBLINGS = ("reinforce discrete", "a2c discrete", "a2c multi", "trpo discrete", "ppo discrete", "sac bins", "sac simba")
+"""cases beside one of the same algorithm: only make test-long tries them"""
 ACTIONS = {
     "box": Box((-1.0, -1.0), (1.0, 1.0)),
     "discrete": Discrete(3, masked=True),
@@ -151,7 +153,7 @@ def _update(module, config, env, state):
 @pytest.mark.parametrize(
     ("case", "device"),
     [
-        *((case, "cuda:1") for case in CASES),
+        *(pytest.param(case, "cuda:1", marks=pytest.mark.long if case in SIBLINGS else ()) for case in CASES),
         *((case, "mps") for case in ("ppo box", "sac box")),
         *(
             pytest.param(f"{name} box", "mps", marks=pytest.mark.long)
@@ -167,7 +169,7 @@ def test_each_algorithm_keeps_to_its_device_and_to_the_numbers_of_the_cpu(case, 
         assert row == other if device != "mps" else row == pytest.approx(other, rel=1e-3, abs=1e-4)
 
 
-@pytest.mark.parametrize("algorithm", ["ppo", "sac"])
+@pytest.mark.parametrize("algorithm", ["ppo", pytest.param("sac", marks=pytest.mark.long)])
 def test_a_whole_run_on_the_second_gpu_resumes_and_its_policy_is_evaluated_anywhere(algorithm, tmp_path):
     fields = {
         "device": "cuda:1",

@@ -185,6 +185,7 @@ def test_what_is_counted_is_counted():
     assert f"on {len(contract)} environments" in guarantees
 
 
+@pytest.mark.long
 def test_the_python_of_the_lander_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "notes" / "lander.md").read_text(), re.DOTALL)
@@ -227,6 +228,7 @@ def test_baselines_lower_the_variance_of_the_gradient_in_the_picture():
     assert value < to_go < whole
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "fields"), [("collapse", {"seeds": (1,)}), ("traces", {})])
 def test_the_pictures_of_training_are_drawn(name, fields):
     figure = drawing(name)["draw"](steps=4096, **fields)

@@ -24,6 +24,7 @@ def policy(tmp_path_factory):
     return lem.train("ppo", "CartPole-v1", run=path, progress=False, total_steps=256, compile="off").policy
 
 
+@pytest.mark.long
 def test_a_notebook_shows_the_episode_while_it_is_played(tmp_path):
     """A real kernel runs the cells of a real notebook; every frame replaces the one before."""
     cell = textwrap.dedent(

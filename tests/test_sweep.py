@@ -172,6 +172,7 @@ ONE_CORE = "import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})"
 """a sweep trains its runs one after the other"""
 
 
+@pytest.mark.faults
 def test_runs_end_with_the_sweep_that_is_killed_and_it_goes_on(tmp_path):
     path = tmp_path / "killed"
     process = command(

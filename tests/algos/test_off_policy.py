@@ -12,12 +12,13 @@ from conftest import tiny_off_policy
 from helpers import (
     COMPILERS,
     CPU,
-    MODES,
+    ONE_MODE,
     CompiledCalls,
     Loop,
     begin_off_policy,
     copy_of,
     equal,
+    long,
     play,
     require_in_own_process,
     small_off_policy,
@@ -43,7 +44,7 @@ def learned_q(algo, state, config, obs):
 
 
 @EACH
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("mode", ONE_MODE)
 def test_values_are_bootstrapped_at_time_limits_and_ignore_reset_rows(algo, mode):
     config = small_off_policy(algo, "EndlessLevers-v0", policy_delay=1)
     state, _ = begin_off_policy(algo, config, mode, length=None, horizon=4)
@@ -60,7 +61,7 @@ def test_values_end_at_terminations(algo):
     assert (learned_q(algo, state, config, obs) - torch.tensor(expected)).abs().max() < 0.5
 
 
-@EACH
+@pytest.mark.parametrize("algo", [sac, *long(ddpg, td3)])
 def test_learns_to_copy_its_observation(algo):
     """Bounds that lie asymmetrically: the policy must be right about the scale."""
     torch.manual_seed(0)
@@ -213,14 +214,7 @@ def compiled_equals_eager(algo, delay=1, updates=1, matmul="float32"):
 
 
 @pytest.mark.parametrize("compiler", COMPILERS)
-@pytest.mark.parametrize(
-    "case",
-    [
-        pytest.param("ddpg, delay=2, updates=2", marks=pytest.mark.long),
-        "td3, delay=2",
-        pytest.param("ddpg, matmul='bfloat16'", marks=pytest.mark.long),
-    ],
-)
+@pytest.mark.parametrize("case", long("ddpg, delay=2, updates=2", "td3, delay=2", "ddpg, matmul='bfloat16'"))
 def test_traced_updates_equal_eager_ones(case, compiler):
     require_in_own_process(__name__, f"compiled_equals_eager({case})", compiler)
 

@@ -7,7 +7,17 @@ import pytest
 import torch
 
 import environments
-from helpers import COMPILERS, MODES, CompiledCalls, begin, copy_of, equal, one_rollout, require_in_own_process, small
+from helpers import (
+    COMPILERS,
+    ONE_MODE,
+    CompiledCalls,
+    begin,
+    copy_of,
+    equal,
+    one_rollout,
+    require_in_own_process,
+    small,
+)
 from lemniscate.algos import a2c, ppo, reinforce, reppo, trpo  # noqa: F401  (a case names REPPO)
 from lemniscate.data.rollout import collect
 from lemniscate.errors import UserError
@@ -44,7 +54,7 @@ def learned_value(algo, mode, spoil=lambda rollout: rollout):
 
 
 @EACH
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("mode", ONE_MODE)
 def test_values_are_bootstrapped_at_time_limits_and_ignore_reset_rows(algo, mode):
     assert learned_value(algo, mode) == pytest.approx(10.0, abs=0.4 if algo is ppo else 0.5)
 
@@ -64,7 +74,7 @@ def test_with_reset_rows_the_value_is_wrong(algo):
 @pytest.mark.parametrize(
     ("algo", "kind"),
     [
-        pytest.param(algo, kind, marks=() if name == "ppo" or kind in ("box", "masked") else pytest.mark.long)
+        pytest.param(algo, kind, marks=() if name == "ppo" or (kind == "box" and name != "trpo") else pytest.mark.long)
         for name, algo in ALGORITHMS.items()
         for kind in environments.KINDS
     ],
@@ -172,7 +182,9 @@ def compiled_equals_eager(algo, env, programs):
         "trpo, 'CartPole-v1', programs=4",  # act, the estimates, the Fisher product, the value
         pytest.param("trpo, 'Pendulum-v1', programs=4", marks=pytest.mark.long),
         pytest.param("a2c, 'Pendulum-v1', programs=3", marks=pytest.mark.long),
-        "reppo, 'Pendulum-v1', programs=3",  # act, the estimates, the gradient steps
+        pytest.param(
+            "reppo, 'Pendulum-v1', programs=3", marks=pytest.mark.long
+        ),  # act, the estimates, the gradient steps
         pytest.param("reinforce, 'CartPole-v1', programs=4", marks=pytest.mark.long),
     ],
 )

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from helpers import MODES, begin, learned_with, one_rollout, slope, small
+from helpers import MODES, ONE_MODE, begin, learned_with, one_rollout, slope, small
 from lemniscate.algos import reinforce
 from lemniscate.data.rollout import epoch_minibatches
 from lemniscate.data.whole_episodes import collect_episodes
@@ -71,7 +71,7 @@ def test_a_batch_of_one_row_changes_nothing():
     assert reinforce.update(config, state, rollout)["losses/policy"] == 0
 
 
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("mode", ONE_MODE)
 @pytest.mark.parametrize("baseline", ["none", "mean", "value"])
 def test_learns_from_whole_episodes(mode, baseline):
     fields = {"num_envs": 8, "episodes": 1, "learning_rate": 0.03, "baseline": baseline, "standardize": False}

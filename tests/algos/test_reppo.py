@@ -8,7 +8,7 @@ from torch.nn.functional import cross_entropy
 
 import environments  # noqa: F401  (registers Copy-box-v0)
 import helpers
-from helpers import CPU, begin, copy_of, equal, slope, spec_of, vectorize
+from helpers import CPU, ONE_MODE, begin, copy_of, equal, slope, spec_of, vectorize
 from lemniscate.algos import reppo
 from lemniscate.data.rollout import collect
 from lemniscate.data.soft_batch import SoftBatch
@@ -160,9 +160,7 @@ def learned_q(mode="DISABLED", spoil=lambda rollout: rollout, env="EndlessLevers
     return state.networks.critic(torch.ones(1, 3), torch.zeros(1, 1)).item()
 
 
-@pytest.mark.parametrize(
-    "mode", ["NEXT_STEP", *(pytest.param(m, marks=pytest.mark.long) for m in ("SAME_STEP", "DISABLED"))]
-)
+@pytest.mark.parametrize("mode", ONE_MODE)
 def test_values_are_bootstrapped_at_time_limits_and_ignore_reset_rows(mode):
     assert learned_q(mode, length=None, horizon=4) == pytest.approx(10, abs=0.5)
 
@@ -171,6 +169,7 @@ def test_without_the_bootstrap_the_value_is_wrong():
     assert learned_q(spoil=lambda r: dataclasses.replace(r, terminated=r.truncated), length=None, horizon=4) < 6
 
 
+@pytest.mark.long
 def test_the_entropy_reaches_its_target():
     """The best policy would be deterministic; a uniform one has log 2 = 0.69."""
     fields = {"target_entropy": -0.5, "gamma": 0.5, "learning_rate": 0.01, "epochs": 4}

@@ -5,7 +5,17 @@ import pytest
 import torch
 from torch.nn.functional import cross_entropy
 
-from helpers import CPU, begin_off_policy, half_square, play, q_of, slope, small_off_policy, with_random_targets
+from helpers import (
+    CPU,
+    ONE_MODE,
+    begin_off_policy,
+    half_square,
+    play,
+    q_of,
+    slope,
+    small_off_policy,
+    with_random_targets,
+)
 from lemniscate.algos import sac
 from lemniscate.errors import UserError
 from lemniscate.maths import hl_gauss
@@ -65,9 +75,7 @@ def test_bins_follow_the_spread_of_the_returns_and_the_targets_share_them():
     assert not state.reward_scale.running.any()
 
 
-@pytest.mark.parametrize(
-    "mode", ["NEXT_STEP", *(pytest.param(m, marks=pytest.mark.long) for m in ("SAME_STEP", "DISABLED"))]
-)
+@pytest.mark.parametrize("mode", ONE_MODE)
 def test_a_q_that_is_a_distribution_has_the_values_of_the_rewards_themselves(mode):
     config = small_off_policy(sac, "EndlessLevers-v0", value_range=20.0)
     state, _ = begin_off_policy(sac, config, mode, length=None, horizon=4)

@@ -19,7 +19,7 @@ from forks import command
 from lemniscate.errors import UserError
 from lemniscate.system.world import World
 
-ALWAYS = ("ppo", "sac")
+ALWAYS = ("ppo",)
 """the kinds that are trained in every run of the suite"""
 
 

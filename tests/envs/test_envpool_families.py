@@ -136,6 +136,7 @@ def test_ids_are_listed_and_none_is_mistaken_for_gymnasiums():
     assert registry.backend_for("EnvPool/Pong-v5") == registry.backend_for("Hopper-v5") == "envpool"
 
 
+@pytest.mark.long
 def test_lives_of_an_atari_game_are_episodes_if_asked():
     """Breakout has five lives; without a ball in play, nothing is lost but by random actions."""
 

@@ -9,42 +9,7 @@ import environments
 import toy
 from lemniscate.envs import registry
 from lemniscate.errors import UserError
-
-
-class Reach(gym.Env):
-    """Episodes of `length` steps; success is reached in the last one, or never in every other environment."""
-
-    observation_space = gym.spaces.Box(-1, 1, (1,), np.float32)
-    action_space = gym.spaces.Discrete(2)
-    metadata = {"render_modes": [], "measures": ["height"]}  # noqa: RUF012
-
-    def __init__(self, length=4, reward=1.0, render_mode=None):
-        self.length, self.reward = length, reward
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.t = 0
-        return np.zeros(1, np.float32), {}
-
-    def step(self, action):
-        self.t += 1
-        info = {"is_success": self.t == self.length, "unnamed": 7.0}
-        if self.t != 2:
-            info["height"] = float(self.t)
-        return np.zeros(1, np.float32), self.reward, self.t == self.length, False, info
-
-
-class PlusOne(gym.RewardWrapper):
-    def __init__(self, env, by=1.0):
-        super().__init__(env)
-        self.by = by
-
-    def reward(self, reward):
-        return reward + self.by
-
-
-def times_ten(env):
-    return gym.wrappers.TransformReward(env, lambda reward: 10 * reward)
+from wrapped import PlusOne, Reach, times_ten
 
 
 def reward_of(env, **kwargs):
@@ -57,7 +22,7 @@ def reward_of(env, **kwargs):
 
 
 def test_an_environment_is_named_in_four_ways():
-    assert reward_of(f"{__name__}:Reach", kwargs={"reward": 2.0}) == 2
+    assert reward_of("wrapped:Reach", kwargs={"reward": 2.0}) == 2
     assert reward_of(Reach, kwargs={"reward": 3.0}) == 3
     assert reward_of(lambda reward=4.0: Reach(reward=reward)) == 4
     assert reward_of(lambda reward: Reach(reward=reward), kwargs={"reward": 5.0}) == 5
@@ -66,7 +31,7 @@ def test_an_environment_is_named_in_four_ways():
 
 @pytest.mark.parametrize("backend", ["gymnasium", "gymnasium-async"])
 def test_wrappers_are_applied_in_order(backend):
-    wrappers = (f"{__name__}:PlusOne", times_ten, f"{__name__}:PlusOne(by=0.5)")
+    wrappers = ("wrapped:PlusOne", times_ten, "wrapped:PlusOne(by=0.5)")
     assert reward_of(Reach, wrappers=wrappers, backend=backend) == 20.5
     assert reward_of(Reach, wrappers=(times_ten, PlusOne), backend=backend) == 11
 
@@ -94,7 +59,7 @@ def test_wrappers_choose_the_backend_that_can_wrap():
     [
         ("Pendulum-v1", {"kwargs": {"gravity": 1}}, "Pendulum-v1 cannot be made with gravity=1"),
         ("Pendulum-v1", {"kwargs": ["g"]}, "The arguments of an environment are a dictionary"),
-        (Reach, {"wrappers": [f"{__name__}:PlusOne(of=2)"]}, "unexpected keyword argument 'of'"),
+        (Reach, {"wrappers": ["wrapped:PlusOne(of=2)"]}, "unexpected keyword argument 'of'"),
         (Reach, {"wrappers": ["gymnasium.wrappers:Nothing"]}, "gymnasium.wrappers has no Nothing"),
         (Reach, {"wrappers": ["math:sqrt"]}, "cannot be made with math:sqrt: must be real number"),
         ("EnvPool/Pong-v5", {"wrappers": ["m:f"]}, "The envpool backend cannot wrap EnvPool/Pong-v5"),

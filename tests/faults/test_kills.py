@@ -113,6 +113,6 @@ def test_killed_at_random_times_a_run_ends_in_the_same_bits(trials, tmp_path, ki
     print(f"{kind}: {runs} runs killed {wanted} times, 0 differ")
 
 
-@pytest.mark.parametrize("kind", ["ppo-async", "ddpg-sync"])
+@pytest.mark.parametrize("kind", ["ddpg-sync", pytest.param("ppo-async", marks=pytest.mark.faults)])
 def test_killed_now_and_then_a_run_ends_in_the_same_bits(trials, tmp_path, kind):
     check_kills(trials, tmp_path, kind, wanted=1, names=("whole",), each=1, total_steps=640)

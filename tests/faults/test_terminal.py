@@ -52,7 +52,7 @@ def reading(path, bytes_free, updates):
     return process, reader
 
 
-@pytest.mark.parametrize("ignored", [False, True])
+@pytest.mark.parametrize("ignored", [False, pytest.param(True, marks=pytest.mark.faults)])
 def test_when_the_terminal_is_closed_a_run_is_saved_and_with_nohup_it_goes_on(whole, tmp_path, ignored):
     path = tmp_path / "r"
     process, terminal = in_a_terminal(path, ignored)
@@ -81,6 +81,7 @@ def test_output_that_nobody_reads_any_more_costs_no_step(tmp_path):
     assert checkpoint.list_steps(path / "checkpoints")[-1] == 150 * 32
 
 
+@pytest.mark.faults
 def test_a_pipe_that_is_full_does_not_keep_a_run_from_stopping(tmp_path):
     path = tmp_path / "r"
     process, reader = reading(path, 300, updates=1000)

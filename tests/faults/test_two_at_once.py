@@ -71,7 +71,8 @@ def test_of_two_that_resume_a_run_one_is_refused_or_finds_nothing_to_do(whole, t
     print(f"{times} runs resumed twice at once, 0 differ")
 
 
-@pytest.mark.parametrize("times", [pytest.param(often(10), marks=pytest.mark.faults), 1])
+@pytest.mark.faults
+@pytest.mark.parametrize("times", [often(10)])
 def test_of_two_sweeps_in_a_new_directory_one_is_refused(whole, tmp_path, times):
     rng = random.Random(3)
     for number in range(times):

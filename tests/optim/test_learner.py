@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from helpers import COMPILERS, CPU, CompiledCalls, numbers, require_in_own_process, small_networks
+from helpers import COMPILERS, CPU, CompiledCalls, long, numbers, require_in_own_process, small_networks
 from lemniscate.algos import ppo
 from lemniscate.maths import means, standardize
 from lemniscate.optim.adam import Adam
@@ -66,7 +66,7 @@ def programs_are_not_mixed_up():
 @pytest.mark.parametrize("compiler", COMPILERS)
 @pytest.mark.parametrize(
     "call",
-    ["compiled_equals_eager('discrete')", pytest.param("programs_are_not_mixed_up()", marks=pytest.mark.long)],
+    long("compiled_equals_eager('discrete')", "programs_are_not_mixed_up()"),
 )
 def test_traced_steps_equal_eager_ones(call, compiler):
     require_in_own_process(__name__, call, compiler)

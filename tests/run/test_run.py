@@ -19,6 +19,7 @@ import lemniscate as lem
 import toy
 from conftest import tiny_fields, tiny_off_policy
 from forks import command
+from helpers import long
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.run import checkpoint
 from lemniscate.run.evaluate import EVALUATION
@@ -103,7 +104,9 @@ def test_what_follows_episodes_is_restarted_with_the_environments(tmp_path, monk
     assert told == [0, 64, 128, 192]
 
 
-@pytest.mark.parametrize("env", ["Countdown-v0", "Matching-v0", "CartPole-v1", "Pendulum-v1", *OFF_POLICY, *ON_POLICY])
+@pytest.mark.parametrize(
+    "env", ["CartPole-v1", *long("Countdown-v0", "Matching-v0", "Pendulum-v1", *OFF_POLICY, *ON_POLICY)]
+)
 def test_the_same_seed_gives_the_same_bits_and_another_seed_does_not(tmp_path, env):
     for name, seed in (("a", 1), ("b", 1), ("c", 2)):
         train(tmp_path / name, env, seed=seed)
