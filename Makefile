@@ -23,7 +23,7 @@ fly: setup  ## train a drone to fly the figure eight, fly it from unseen starts,
 test: setup  ## the whole suite but the long ones
 	$(BIN)/python -m pytest -n auto --dist loadfile -m "not long and not faults and not soak and not cluster"
 
-test-long: setup  ## the tests that train for minutes
+test-long: setup  ## the tests that train for minutes, and those beside one of the same kind
 	$(BIN)/python -m pytest -m long
 
 test-faults: setup  ## every way to break a run, many times: half an hour; FAULTS_SHARE=1 for more than an hour
