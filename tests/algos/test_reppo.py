@@ -193,7 +193,7 @@ def test_the_policy_stays_within_its_bound():
     torch.manual_seed(0)
     env = vectorize("Greedy-v0", 16, mode="DISABLED", length=None, horizon=4)
     state = reppo.init(config, env.spec, CPU)
-    for _ in range(2):
+    for _ in range(5):
         rollout = collect(env, state.policy, config.num_steps, state.rng.action)
         old = state.policy(rollout.obs)
         reppo.update(config, state, rollout)
