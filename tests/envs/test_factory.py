@@ -7,9 +7,9 @@ import torch
 
 import environments
 import toy
+from environments import PlusOne, Reach, times_ten
 from lemniscate.envs import registry
 from lemniscate.errors import UserError
-from wrapped import PlusOne, Reach, times_ten
 
 
 def reward_of(env, **kwargs):
@@ -22,7 +22,7 @@ def reward_of(env, **kwargs):
 
 
 def test_an_environment_is_named_in_four_ways():
-    assert reward_of("wrapped:Reach", kwargs={"reward": 2.0}) == 2
+    assert reward_of("environments:Reach", kwargs={"reward": 2.0}) == 2
     assert reward_of(Reach, kwargs={"reward": 3.0}) == 3
     assert reward_of(lambda reward=4.0: Reach(reward=reward)) == 4
     assert reward_of(lambda reward: Reach(reward=reward), kwargs={"reward": 5.0}) == 5
@@ -31,7 +31,7 @@ def test_an_environment_is_named_in_four_ways():
 
 @pytest.mark.parametrize("backend", ["gymnasium", "gymnasium-async"])
 def test_wrappers_are_applied_in_order(backend):
-    wrappers = ("wrapped:PlusOne", times_ten, "wrapped:PlusOne(by=0.5)")
+    wrappers = ("environments:PlusOne", times_ten, "environments:PlusOne(by=0.5)")
     assert reward_of(Reach, wrappers=wrappers, backend=backend) == 20.5
     assert reward_of(Reach, wrappers=(times_ten, PlusOne), backend=backend) == 11
 
@@ -59,7 +59,7 @@ def test_wrappers_choose_the_backend_that_can_wrap():
     [
         ("Pendulum-v1", {"kwargs": {"gravity": 1}}, "Pendulum-v1 cannot be made with gravity=1"),
         ("Pendulum-v1", {"kwargs": ["g"]}, "The arguments of an environment are a dictionary"),
-        (Reach, {"wrappers": ["wrapped:PlusOne(of=2)"]}, "unexpected keyword argument 'of'"),
+        (Reach, {"wrappers": ["environments:PlusOne(of=2)"]}, "unexpected keyword argument 'of'"),
         (Reach, {"wrappers": ["gymnasium.wrappers:Nothing"]}, "gymnasium.wrappers has no Nothing"),
         (Reach, {"wrappers": ["math:sqrt"]}, "cannot be made with math:sqrt: must be real number"),
         ("EnvPool/Pong-v5", {"wrappers": ["m:f"]}, "The envpool backend cannot wrap EnvPool/Pong-v5"),

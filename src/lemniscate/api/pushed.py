@@ -60,9 +60,9 @@ def push(run: Trained, name: str, *, private: bool = False, license: str | None 
 
 
 def _shown(run: Path) -> dict[str, Path]:
-    """What a run has to show, by its path in the repository; no links.
+    """The files of a run that are uploaded beside its policy, by their paths in the repository; no links.
 
-    It is the figures, the export where there is a whole one, and the newest film: a video by the name that the Hub
+    They are the figures, the export where there is a whole one, and the newest film: a video by the name that the Hub
     plays, else in `videos/`.
     """
     files = [*(run / "plots").glob("*.png")]

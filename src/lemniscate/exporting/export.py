@@ -136,7 +136,7 @@ def _actor(policy: TrainedPolicy, program: Program, model: bytes | None, compile
 def _manifest(
     policy: TrainedPolicy, program: Program, interface: Interface, obs: np.ndarray, files: Mapping[str, bytes]
 ) -> dict[str, Any]:
-    """What every number of an exported policy means, and where it is from.
+    """The content of `manifest.json`: the meaning of every number of an exported policy, and its origin.
 
     Observations have the range of `obs` [R, O], those of its episodes; `files` are named with their sha256.
     """
