@@ -11,14 +11,17 @@ from lemniscate.errors import UserError
 class Box:
     """Continuous actions. A policy acts in [-1, 1]^A; the environment floor maps that onto [low, high].
 
-    Where a bound is infinite the unit stays what it is: see `envs.spaces.scale_action`.
-    `shape` is how the environment wants the A coordinates, if not in a row, and `dtype` in which numbers.
+    Where a bound is infinite the unit stays what it is: see `envs.conversion.scale_action`.
+    `shape` is how the environment wants the A coordinates, if not in a row, and `dtype` in which numbers; whole ones
+    are rounded to.
     """
 
     low: tuple[float, ...]
     high: tuple[float, ...]
     shape: tuple[int, ...] | None = None
     dtype: str = "float32"
+
+    mask_size = 0
 
     @property
     def size(self) -> int:
@@ -45,14 +48,28 @@ class Discrete:
     start: int = 0
     masked: bool = False
 
+    @property
+    def mask_size(self) -> int:
+        """The length of the mask behind the observation."""
+        return self.n if self.masked else 0
+
 
 @dataclass(frozen=True)
 class MultiDiscrete:
-    """One of n_k actions for each of K components; the environment floor adds `start`."""
+    """One of n_k actions for each of K components; the environment floor adds `start`.
+
+    With `masked`, the observation ends in the masks of all components, Σ n_k numbers: see `Discrete`.
+    """
 
     nvec: tuple[int, ...]
     start: tuple[int, ...]
     shape: tuple[int, ...] | None = None
+    masked: bool = False
+
+    @property
+    def mask_size(self) -> int:
+        """The length of the masks behind the observation."""
+        return sum(self.nvec) if self.masked else 0
 
 
 @dataclass(frozen=True)
@@ -61,6 +78,8 @@ class MultiBinary:
 
     n: int
     shape: tuple[int, ...] | None = None
+
+    mask_size = 0
 
 
 Action = Box | Discrete | MultiDiscrete | MultiBinary

@@ -116,6 +116,9 @@ class Backend(ABC):
         counts: [N] bool, the episode under way counts in the statistics. False where staggering made it a fragment, by
             beginning it late or by cutting it early. Read before a step, it speaks of the episodes that the step may
             end.
+        once: it steps an environment of one's own that may exist once at a time, such as a robot. While another is made
+            for evaluation or a film, it is closed; `restart` makes it again.
+        takes_reset_options: it is given the `reset_options` of a run, and gives them to every reset.
         mode: what an environment does after an end, in Gymnasium's words. DISABLED is reset here, in the same step.
         summaries: the numbers that evaluation makes of the measures besides their means.
         scene: what is drawn where a Gymnasium environment would be rendered.
@@ -130,6 +133,8 @@ class Backend(ABC):
     num_envs: int
     device: torch.device
     counts: Tensor
+    once: bool = False
+    takes_reset_options: bool = False
     mode: AutoresetMode = AutoresetMode.DISABLED
     summaries: tuple[Summary, ...] = ()
     scene: Scene | None = None
@@ -209,6 +214,11 @@ class Backend(ABC):
     @classmethod
     def wraps(cls, env: str) -> bool:
         """Whether it makes `env` of single environments of Gymnasium's interface, which can be wrapped."""
+        return False
+
+    @classmethod
+    def exists_once(cls, env: str, num_envs: int) -> bool:
+        """Whether a backend of so many would have `once`."""
         return False
 
     @classmethod

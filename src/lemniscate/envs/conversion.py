@@ -1,13 +1,306 @@
-"""What happens at every step: observations flattened for a policy, its actions in the units of the environment."""
+"""What passes between a policy and environments at every step: what these return, checked, and the actions."""
 
+import math
+from collections.abc import Iterator, Mapping
 from functools import lru_cache, reduce
+from inspect import signature
 from operator import getitem
+from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
+import torch
+from gymnasium import spaces
+from torch import Tensor
 
-from lemniscate.errors import UserError
+from lemniscate.errors import UserError, shown
 from lemniscate.spec import Action, Box, Discrete, MultiBinary, MultiDiscrete, ObservationPart
+
+MASKS = ("action_mask", "action_masks", "legal_action_mask")
+"""what environments call their action mask: in `info`, as a key of a Dict observation, or as a method"""
+
+SUCCESS = ("is_success", "success")
+"""what robotics environments call their success: 1 or 0, or True and False"""
+
+APART = {*MASKS, "final_info", "final_obs", "env_id", "players", "elapsed_step"}
+"""entries of the info of a vector environment that measure nothing"""
+
+VALUES = {"reset": "2 values, (observation, info)", "step": "5 values, (obs, reward, terminated, truncated, info)"}
+
+
+class Returns:
+    """The values that `reset` and `step` return, checked; where they are not as they must be, a `UserError` says so.
+
+    Args:
+        env: one environment, or a vector environment.
+        space: of one observation.
+        lead: () for one environment, (N,) for a vector of N.
+    """
+
+    def __init__(self, env: Any, space: gym.Space, lead: tuple[int, ...] = ()) -> None:
+        self._env, self._space, self._lead = env, space, lead
+
+    def of_reset(self, returned: Any) -> tuple[Any, dict[str, Any]]:
+        """The observation, in the types of its space, and the info."""
+        obs, info = self._several("reset", returned, 2)
+        return self._observation("reset", obs), self._info("reset", info)
+
+    def of_step(self, returned: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """The observation, in the types of its space; the reward, the flags and the info."""
+        obs, reward, terminated, truncated, info = self._several("step", returned, 5)
+        if type(reward) is not float:
+            reward = self._numbers("reward", reward, float)
+        if type(terminated) is not bool:
+            terminated = self._numbers("terminated", terminated, bool)
+        if type(truncated) is not bool:
+            truncated = self._numbers("truncated", truncated, bool)
+        return self._observation("step", obs), reward, terminated, truncated, self._info("step", info)
+
+    def wrong(self, method: str, what: str) -> UserError:
+        """The sentence on a method: its name, where it is written, and `what` it did."""
+        return UserError(f"{_author(self._env, method)} {what}.")
+
+    def _several(self, method: str, returned: Any, count: int) -> Any:
+        if not isinstance(returned, tuple) or len(returned) != count:
+            what = f"{len(returned)} values" if isinstance(returned, tuple) else kind_of(returned)
+            raise self.wrong(method, f"returned {what}; it must return {VALUES[method]}")
+        return returned
+
+    def _observation(self, method: str, obs: Any) -> Any:
+        try:
+            return _fitted(self._space, obs, self._lead)
+        except ValueError as error:
+            raise self.wrong(method, f"returned an observation {error}") from None
+
+    def _info(self, method: str, info: Any) -> dict[str, Any]:
+        if not isinstance(info, dict):
+            raise self.wrong(method, f"returned {kind_of(info)} as info; it must be a dictionary, such as {{}}")
+        return info
+
+    def _numbers(self, name: str, value: Any, kind: type) -> Any:
+        """A number or a flag of one environment, or a new array [N] of them."""
+        array = _array(value)
+        fits = array.dtype.kind in "biuf" and (array.shape == self._lead or (array.size == 1 and not self._lead))
+        if not fits or (kind is bool and not ((array == 0) | (array == 1)).all()):
+            wanted = f"{'a number' if kind is float else 'True or False'}{' for each environment' if self._lead else ''}"
+            raise self.wrong("step", f"returned {kind_of(value)} as {name}; it must be {wanted}")
+        return array.astype(kind) if self._lead else kind(array.item())
+
+
+class SingleEnv(gym.Wrapper):
+    """One environment whose returns are checked, and whose `info` has numbers and the action mask alone.
+
+    Those of nested dictionaries are named "outer/inner". The mask is a row in `info["action_mask"]`, wherever it stood.
+
+    Args:
+        env: the environment.
+        reset_options: of every reset; None for none.
+
+    Raises:
+        UserError: an environment without spaces.
+    """
+
+    def __init__(self, env: gym.Env, reset_options: Mapping[str, Any] | None = None) -> None:
+        super().__init__(env)
+        for name in ("observation_space", "action_space"):
+            if not isinstance(getattr(env, name, None), gym.Space):
+                kind = type(env.unwrapped).__name__
+                raise UserError(f"{kind} has no {name}: set self.{name} in its __init__, such as a Box.")
+        for layer in _layers(env):
+            parameters = signature(layer.reset).parameters
+            if not any(p.kind is p.VAR_KEYWORD for p in parameters.values()) and not {"seed", "options"} <= set(parameters):
+                right = "reset(self, *, seed=None, options=None)"
+                raise UserError(f"{_place(layer, 'reset')} takes no seed or no options; it must be {right}.")
+        self._returns = Returns(env, env.observation_space)
+        self._options = dict(reset_options) if reset_options else None
+        asked = [env.get_wrapper_attr(name) for name in MASKS if env.has_wrapper_attr(name)]
+        self._ask = next(filter(callable, asked), None)
+        seen = env.observation_space
+        self._masked = bool(self._ask or (isinstance(seen, spaces.Dict) and seen.spaces.keys() & set(MASKS)))
+        self._declared = measures_of(env.metadata or {})
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Gymnasium's, with the options of every reset."""
+        obs, info = self._returns.of_reset(self.env.reset(seed=seed, options=self._options or options))
+        return obs, self._told("reset", obs, info)
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Gymnasium's."""
+        obs, *rest, info = self._returns.of_step(self.env.step(action))
+        return obs, *rest, self._told("step", obs, info)
+
+    def _told(self, method: str, obs: Any, info: dict[str, Any]) -> dict[str, Any]:
+        if not info and not self._masked:
+            return info
+        numbers: dict[str, Any] = dict(_scalars(info))
+        for name in self._declared:
+            if info.get(name) is not None and name not in numbers:
+                raise self._returns.wrong(method, f"returned {kind_of(info[name])} in info[{name!r}]; it must be a number")
+        _, mask = mask_in(obs, info)
+        mask = self._ask() if mask is None and self._ask else mask
+        if mask is not None:
+            try:
+                numbers["action_mask"] = flat_mask(mask, self.action_space)
+            except ValueError as error:
+                raise self._returns.wrong(method, f"comes with an action mask {error}") from None
+        return numbers
+
+
+def _layers(env: Any) -> Iterator[Any]:
+    """An environment, and what is inside of it if it is a wrapper, the outermost first."""
+    while env is not None:
+        yield env
+        env = vars(env).get("env")
+
+
+def _author(env: Any, method: str) -> str:
+    """The method of the outermost layer whose class is not Gymnasium's."""
+    layers = list(_layers(env))
+    own = (layer for layer in layers if not getattr(type(layer), method).__module__.startswith("gymnasium."))
+    return _place(next(own, layers[-1]), method)
+
+
+def _place(layer: Any, method: str) -> str:
+    """The name of a method, and where it is written."""
+    function = getattr(type(layer), method)
+    code = getattr(function, "__code__", None)
+    place = f" ({Path(code.co_filename).name}, line {code.co_firstlineno})" if code else ""
+    return f"{'.'.join(function.__qualname__.split('.')[-2:])}(){place}"
+
+
+def kind_of(value: Any) -> str:
+    """A value in a sentence: an array by its shape and type, a number as it is, others by their type."""
+    if hasattr(value, "dtype") and getattr(value, "shape", ()):
+        return f"an array of shape {tuple(value.shape)} and type {value.dtype}"
+    return shown(value)
+
+
+def _array(value: Any) -> np.ndarray:
+    """As an array; of objects where it cannot be one, such as a list of lists of different lengths."""
+    try:
+        return np.asarray(value.detach().cpu() if isinstance(value, Tensor) else value)
+    except (ValueError, TypeError, RuntimeError):
+        return np.full((), None, dtype=object)
+
+
+def _fitted(space: gym.Space, obs: Any, lead: tuple[int, ...], where: str = "") -> Any:
+    """An observation in the types of its space. Raises `ValueError` with the rest of a sentence where it does not fit."""
+    inside = f" in {where}" if where else ""
+    if isinstance(space, spaces.Dict):
+        if not isinstance(obs, Mapping) or not space.spaces.keys() <= obs.keys():
+            lacking = f"without {next(k for k in space if k not in obs)!r}" if isinstance(obs, Mapping) else kind_of(obs)
+            raise ValueError(f"that is {lacking}{inside}; its space is a Dict with the keys {', '.join(space)}")
+        return {key: _fitted(part, obs[key], lead, f"{where}[{key!r}]") for key, part in space.items()}
+    if isinstance(space, spaces.Tuple):
+        if not isinstance(obs, tuple | list) or len(obs) != len(space):
+            raise ValueError(f"that is {kind_of(obs)}{inside}; its space is a Tuple of {len(space)}")
+        return tuple(_fitted(part, obs[i], lead, f"{where}[{i}]") for i, part in enumerate(space))
+    shape = (*lead, *(space.shape or ()))
+    if type(obs) is np.ndarray and obs.dtype == space.dtype and obs.shape == shape and not hasattr(space, "start"):
+        return obs
+    array, kind = _array(obs), np.dtype(space.dtype)
+    if array.shape != shape or array.dtype.kind not in "biuf":
+        said = f"of shape {array.shape}" if array.dtype.kind in "biuf" else f"that is {kind_of(obs)}"
+        raise ValueError(f"{said}{inside}; its space is {shown_space(space)}, whose shape is {space.shape}")
+    with np.errstate(invalid="ignore"):
+        fitted = array.astype(kind)
+    if kind.kind in "iub" and not np.array_equal(fitted, array):
+        raise ValueError(f"of type {array.dtype}{inside} with numbers that are no {kind}, which its space has")
+    if hasattr(space, "start"):
+        count = space.n if isinstance(space, spaces.Discrete) else space.nvec
+        outside = (fitted < space.start) | (fitted >= space.start + count)
+        if outside.any():
+            raise ValueError(f"with {fitted[outside].flat[0]}{inside}, which is not in its space, {shown_space(space)}")
+    return fitted if fitted.shape else fitted[()]
+
+
+def shown_space(space: gym.Space) -> str:
+    """A space in a sentence."""
+    return " ".join(str(space).split())
+
+
+def mask_in(obs: Any, info: Mapping[str, Any]) -> tuple[str, Any]:
+    """The action mask of an environment, and its name in `info`; ("", None) where there is none."""
+    for name in MASKS:
+        if name in info:
+            return name, info[name]
+        if isinstance(obs, Mapping) and name in obs:
+            return "", obs[name]
+    return "", None
+
+
+def flat_mask(mask: Any, action: gym.Space | Action) -> np.ndarray:
+    """An action mask as one row, [n] bool; of a MultiDiscrete, those of its components one after the other.
+
+    Raises `ValueError`, with the rest of a sentence, for another size, a mask that permits nothing, and other actions.
+    """
+    counts = getattr(action, "nvec", None)
+    counts = np.ravel(getattr(action, "n", 0) if counts is None else counts)
+    if not isinstance(action, spaces.Discrete | spaces.MultiDiscrete | Discrete | MultiDiscrete):
+        raise ValueError("; masks are for Discrete and MultiDiscrete actions")
+    row = _row(mask)
+    if len(row) != counts.sum():
+        raise ValueError(f"of {len(row)} numbers; it must have {counts.sum()}, of 1 and 0")
+    permitted = row.astype(bool)
+    if not all(part.any() for part in np.split(permitted, np.cumsum(counts)[:-1])):
+        raise ValueError("that rules out every action")
+    return permitted
+
+
+def _row(mask: Any) -> np.ndarray:
+    """Nested tuples and lists of arrays as one row."""
+    if isinstance(mask, tuple | list) and len(mask):
+        return np.concatenate([_row(part) for part in mask])
+    return np.ravel(mask)
+
+
+def _scalars(info: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, float]]:
+    """Every number in `info`, an array of one too, and those of its dictionaries, by "outer/inner"."""
+    for key, value in info.items():
+        if isinstance(value, float | int):
+            yield f"{prefix}{key}", float(value)
+        elif isinstance(value, Mapping):
+            yield from _scalars(value, f"{prefix}{key}/")
+        elif hasattr(value, "__array__") and math.prod(getattr(value, "shape", (0,))) == 1:
+            array = _array(value)
+            if array.dtype.kind in "biuf":
+                yield f"{prefix}{key}", float(array.item())
+
+
+def measures_of(metadata: Mapping[str, Any]) -> tuple[str, ...]:
+    """The names of an environment's measures: its success, and those that its `metadata["measures"]` lists."""
+    return tuple(dict.fromkeys((*SUCCESS, *metadata.get("measures", ()))))
+
+
+def measured(
+    info: Mapping[str, Any], declared: tuple[str, ...], num_envs: int, device: torch.device, prefix: str = ""
+) -> dict[str, Tensor]:
+    """The numbers [N] float32 in the info of a vector environment; NaN where an environment gave none.
+
+    Measures, `declared`, have their names; the others "info/" before it. `info[name]` counts where `info["_" + name]`
+    is True. Where an environment was reset in the same step, its true info is in `info["final_info"]`.
+    """
+    found: dict[str, Tensor] = {}
+    for source in (info, info.get("final_info", {})):
+        for key, values in source.items():
+            if key in APART or key[:1] == "_":
+                continue
+            if isinstance(values, Mapping):
+                found |= measured(values, declared, num_envs, device, f"{prefix}{key}/")
+                continue
+            array = np.asarray(values)
+            if array.dtype.kind not in "biuf" or array.size != num_envs:
+                if key in declared:
+                    raise UserError(f"info[{key!r}] is {kind_of(array)}; a measure is a number for each environment.")
+                continue
+            numbers, given = torch.from_numpy(array.reshape(num_envs).astype(np.float32)).to(device), source.get(f"_{key}")
+            name = key if key in declared else f"info/{prefix}{key}"
+            if given is not None and not given.all():
+                before = found.get(name, torch.full((num_envs,), torch.nan, device=device))
+                numbers = torch.where(torch.from_numpy(np.asarray(given)).to(device), numbers, before)
+            found[name] = numbers
+    return found
 
 
 def flatten_observation(parts: tuple[ObservationPart, ...], obs: Any, *, image: bool = False) -> np.ndarray:
@@ -48,21 +341,23 @@ def scale_action(action: np.ndarray, box: Box) -> np.ndarray:
         a_phys = clip(low + ½ (a + 1) (high − low), low, high)
 
     With one infinite bound, −1 is the finite one and the unit stays: low + 1 + a, or high − 1 + a. With two, a is not
-    changed.
+    changed. Whole numbers are those nearest.
     """
     low, high, middle, half = scale_of(box)
-    return np.minimum(np.maximum(middle + half * action, low), high)
+    physical = np.minimum(np.maximum(middle + half * action, low), high)
+    return physical if physical.dtype == box.dtype else np.rint(physical).astype(box.dtype)
 
 
 @lru_cache
 def scale_of(box: Box) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """low, high, middle and half of the width of each coordinate, [A] each, as `scale_action` takes them."""
-    low, high = np.array(box.low, dtype=box.dtype), np.array(box.high, dtype=box.dtype)
+    kind = np.dtype(box.dtype) if np.dtype(box.dtype).kind == "f" else np.float64
+    low, high = np.array(box.low, dtype=kind), np.array(box.high, dtype=kind)
     below, above = np.isfinite(low), np.isfinite(high)
     with np.errstate(invalid="ignore"):  # ∞ − ∞, of which nothing is taken
         cases = [(below & above, 0.5 * low + 0.5 * high), (below & ~above, low + 1), (~below & above, high - 1)]
-        half = np.where(below & above, 0.5 * high - 0.5 * low, 1).astype(box.dtype)
-    middle = np.select(*zip(*cases, strict=True), default=0).astype(box.dtype)
+        half = np.where(below & above, 0.5 * high - 0.5 * low, 1).astype(kind)
+    middle = np.select(*zip(*cases, strict=True), default=0).astype(kind)
     return low, high, middle, half
 
 

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from lemniscate.envs.backend import Backend
-from lemniscate.envs.conversion import flatten_observation, physical_action, row_of
+from lemniscate.envs.conversion import SUCCESS, flatten_observation, measured, physical_action, row_of
 from lemniscate.envs.registry import BEGINNINGS
-from lemniscate.envs.spaces import SUCCESS, SUMMARIES, action_kind, is_image, measured, observation_parts
+from lemniscate.envs.spaces import SUMMARIES, ActionMasks, action_kind, is_image, masked, observation_parts
 from lemniscate.envs.vec_env import Stagger
 from lemniscate.errors import UserError, is_installed, missing_extra, unknown_name
 from lemniscate.spec import Spec
@@ -98,6 +98,8 @@ class EnvpoolBackend(Backend):
         self._stagger_up_to = self._limit if stagger else None
         space = self._pool.observation_space
         parts, action = observation_parts(space, env), action_kind(self._pool.action_space, env)
+        if not is_image(space):  # no game has a mask, and to reset many takes seconds
+            action = masked(action, *self._pool.reset())
         self.spec = Spec(env, parts, action, max_episode_steps=self._limit, image=is_image(space))
 
     @classmethod
@@ -111,14 +113,14 @@ class EnvpoolBackend(Backend):
         self._pool = self._build(seed + first)
         self._stagger = Stagger(self.num_envs, self._stagger_up_to, seed, first)
         self.counts = self._tensor(self._stagger.counts)
-        obs, _ = self._pool.reset()
-        return self._tensor(self._flatten(obs))
+        self._masks = ActionMasks(self.spec, self.num_envs) if self.spec.action.mask_size else None
+        return self._tensor(self._observe(*self._pool.reset()))
 
     def step(self, action: Tensor) -> Step:
         """Step all environments, then reset those whose episode has ended."""
         physical = physical_action(action.cpu().numpy(), self.spec.action)
         raw, reward, terminated, truncated, info = self._pool.step(physical)
-        next_obs = self._flatten(raw)
+        next_obs = self._observe(raw, info)
         if self._limit:
             truncated |= info["elapsed_step"] >= self._limit  # not every family ends there by itself
         truncated = self._stagger.apply(terminated, truncated & ~terminated)
@@ -127,7 +129,7 @@ class EnvpoolBackend(Backend):
         if done.any():
             fresh, reset_info = self._pool.reset(np.flatnonzero(done).astype(np.int32))
             obs = next_obs.copy()
-            obs[reset_info["env_id"]] = self._flatten(fresh)
+            obs[reset_info["env_id"]] = self._observe(fresh, reset_info)
             here, self.counts = self._tensor(obs), self._tensor(self._stagger.counts)
         reward, ended, cut = map(self._tensor, (reward.astype(np.float32), terminated, truncated))
         measures = measured(info, SUCCESS, self.num_envs, self.device)
@@ -137,8 +139,10 @@ class EnvpoolBackend(Backend):
         """Let the pool's threads end."""
         self._pool.close()
 
-    def _flatten(self, raw: Any) -> np.ndarray:
-        return flatten_observation(self.spec.observation_parts, raw, image=self.spec.image)
+    def _observe(self, raw: Any, info: Mapping[str, Any]) -> np.ndarray:
+        """The flat observations of all, or of those that were reset; after them the action masks, where there are."""
+        flat = flatten_observation(self.spec.observation_parts, raw, image=self.spec.image)
+        return self._masks.append_to(flat, raw, info, info["env_id"]) if self._masks else flat
 
     def _tensor(self, array: np.ndarray) -> Tensor:
         return torch.from_numpy(array).to(self.device)

@@ -3,15 +3,19 @@
 import inspect
 import multiprocessing
 import os
+import sys
+import sysconfig
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from functools import partial
+from importlib.util import find_spec
 from typing import Any
 
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
+from lemniscate.envs.conversion import SingleEnv
 from lemniscate.envs.workers import WatchedVectorEnv, Worker
 from lemniscate.errors import UserError
 from lemniscate.system import named
@@ -48,24 +52,44 @@ def makes_vector(maker: Maker) -> bool:
     return is_class or "num_envs" in inspect.signature(maker).parameters
 
 
-def make_one(maker: Maker, wrappers: Sequence[Callable[..., Any]] = (), **kwargs: Any) -> gym.Env:
+def is_own(maker: Maker) -> bool:
+    """Whether an environment is the user's own: neither of an installed package nor of the standard library."""
+    made_by = getattr(maker, "entry_point", maker)
+    name = made_by.partition(":")[0] if isinstance(made_by, str) else getattr(made_by, "__module__", "")
+    file = getattr(sys.modules.get(name) or (name and find_spec(name)), "__file__", None)
+    installed = [sysconfig.get_path(kind) for kind in ("stdlib", "purelib", "platlib")]
+    return not any(str(file or "").startswith(folder) for folder in installed)
+
+
+def make_one(
+    maker: Maker,
+    wrappers: Sequence[Callable[..., Any]] = (),
+    reset_options: Mapping[str, Any] | None = None,
+    **kwargs: Any,
+) -> SingleEnv:
     """One environment, by its maker: a worker process may not know the id."""
     theirs = "gymnasium.envs.mujoco" in str(getattr(maker, "entry_point", ""))
     with model_warnings_off() if theirs else nullcontext():
-        env = gym.make(maker, **kwargs) if isinstance(maker, EnvSpec) else maker(**kwargs)
+        # Gymnasium's own checker would speak first, in warnings and asserts; `SingleEnv` checks every step.
+        env = gym.make(maker, disable_env_checker=True, **kwargs) if isinstance(maker, EnvSpec) else maker(**kwargs)
     for wrap in wrappers:
         env = wrap(env)
     if not isinstance(env, gym.Env):
         kind = type(env).__name__
         raise TypeError(f"it makes {'an' if kind[0] in 'aeiouAEIOU' else 'a'} {kind}, not a gymnasium.Env")
-    return env
+    return SingleEnv(env, reset_options)
 
 
 def make_vector(
-    maker: Maker, num_envs: int, kwargs: Mapping[str, Any], wrappers: Sequence[Callable[..., Any]], workers: bool
+    maker: Maker,
+    num_envs: int,
+    kwargs: Mapping[str, Any],
+    wrappers: Sequence[Callable[..., Any]],
+    workers: bool,
+    reset_options: Mapping[str, Any] | None = None,
 ) -> tuple[VectorEnv, int | None]:
     """N environments of a maker, and their time limit in steps; with `workers`, each in a process of its own."""
-    makers = [partial(make_one, maker, wrappers, **kwargs)] * num_envs
+    makers = [partial(make_one, maker, wrappers, reset_options, **kwargs)] * num_envs
     if makes_vector(maker):
         make = partial(gym.make_vec, maker) if isinstance(maker, EnvSpec) else maker
         envs = one = make(num_envs=num_envs, **kwargs)
@@ -76,7 +100,7 @@ def make_vector(
         in_workers = [partial(Worker, make, os.getpid()) for make in makers]
         envs = WatchedVectorEnv(in_workers, context="forkserver", autoreset_mode=AutoresetMode.DISABLED)
     else:
-        envs = SyncVectorEnv(makers, autoreset_mode=AutoresetMode.DISABLED)
+        envs = SyncVectorEnv(makers, copy=False, autoreset_mode=AutoresetMode.DISABLED)
         one = envs.envs[0]
     return envs, one.spec.max_episode_steps if one.spec else None
 

@@ -1,7 +1,6 @@
 """Gymnasium environments, in all three autoreset modes."""
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -13,11 +12,11 @@ from torch import Tensor
 
 from lemniscate.envs import spaces
 from lemniscate.envs.backend import Backend
-from lemniscate.envs.conversion import flatten_observation, physical_action, row_of
-from lemniscate.envs.factory import make_one, make_vector, maker_of, makes_vector, sentences
+from lemniscate.envs.conversion import Returns, flatten_observation, measured, measures_of, physical_action, row_of
+from lemniscate.envs.factory import is_own, make_one, make_vector, maker_of, makes_vector, sentences
 from lemniscate.envs.vec_env import Stagger
 from lemniscate.errors import UserError
-from lemniscate.spec import Discrete, Spec
+from lemniscate.spec import Discrete, MultiDiscrete, Spec
 from lemniscate.system.named import find_callable
 from lemniscate.types import Step
 
@@ -33,10 +32,15 @@ class GymnasiumBackend(Backend):
     - NEXT_STEP: the returned observation is the true final one; the next action is ignored (`valid` False).
 
     With `stagger`, first episodes are cut (see `Stagger`) where the environment can be reset at will (DISABLED).
-    Measures are the entries of `info` that the environment's metadata names in `measures`, and `is_success`.
+    Measures are the numbers in `info`; those that the environment's metadata names in `measures`, and `is_success`, by
+    these names, the others as `info/name`.
+
+    An environment of one's own is made once at a time where there is one: it may be a robot, or hold a port. It is then
+    reset where others are made again, and has no staggered episodes.
     """
 
     workers = False
+    takes_reset_options = True
     summaries = spaces.SUMMARIES
 
     @classmethod
@@ -62,9 +66,21 @@ class GymnasiumBackend(Backend):
         return 8_000 if cls.wraps(env) else 200, 0
 
     @classmethod
-    def make_rendered(cls, env: str, mode: str, kwargs: Mapping[str, Any], wrappers: Sequence[str]) -> gym.Env:
+    def exists_once(cls, env: str, num_envs: int) -> bool:
+        """Whether it is the only one, and one's own."""
+        return num_envs == 1 and is_own(maker_of(env))
+
+    @classmethod
+    def make_rendered(
+        cls,
+        env: str,
+        mode: str,
+        kwargs: Mapping[str, Any],
+        wrappers: Sequence[str],
+        reset_options: Mapping[str, Any] | None = None,
+    ) -> gym.Env:
         """One environment that renders itself in `mode`."""
-        return make_one(maker_of(env), tuple(map(find_callable, wrappers)), render_mode=mode, **kwargs)
+        return make_one(maker_of(env), tuple(map(find_callable, wrappers)), reset_options, render_mode=mode, **kwargs)
 
     def __init__(
         self,
@@ -75,13 +91,15 @@ class GymnasiumBackend(Backend):
         stagger: bool = False,
         kwargs: Mapping[str, Any] | None = None,
         wrappers: Sequence[str] = (),
+        reset_options: Mapping[str, Any] | None = None,
     ) -> None:
         self.num_envs, self.device = num_envs, device
         maker = maker_of(env)
         if makes_vector(maker) and self.workers:
             raise UserError(f"{env} makes {num_envs} environments at once, so there is none for a process of its own.")
         wraps = tuple(map(find_callable, wrappers))
-        self._build = partial(make_vector, maker, num_envs, dict(kwargs or {}), wraps, self.workers)
+        self._build = partial(make_vector, maker, num_envs, dict(kwargs or {}), wraps, self.workers, reset_options)
+        self.once = self.exists_once(env, num_envs)
         with sentences(env, kwargs, wrappers):
             self._envs, limit = self._build()
         mode = self._envs.metadata.get("autoreset_mode")
@@ -90,12 +108,15 @@ class GymnasiumBackend(Backend):
         self.mode = mode
         space, action = self._envs.single_observation_space, spaces.action_kind(self._envs.single_action_space, env)
         parts = spaces.observation_parts(space, env)
-        self._reuses = makes_vector(maker)  # it may write over its own observations
-        self._used = isinstance(action, Discrete)
-        if isinstance(action, Discrete) and "action_mask" in self._envs.reset(seed=0)[1]:
-            action = replace(action, masked=True)
-        self._stagger_up_to = limit if stagger and self.mode is AutoresetMode.DISABLED else None
-        self._measures = spaces.measures_of(self._envs.metadata)
+        self._reset_options = dict(reset_options or {}) if makes_vector(maker) else {}  # single ones have them already
+        if self._reset_options and self.mode is not AutoresetMode.DISABLED:
+            raise UserError(f"{env} resets itself, so reset_options would not reach its resets.")
+        self._returns = Returns(self._envs, space, (num_envs,)) if makes_vector(maker) else None
+        self._used = isinstance(action, Discrete | MultiDiscrete)
+        if self._used:
+            action = spaces.masked(action, *self._reset(0))
+        self._stagger_up_to = limit if stagger and self.mode is AutoresetMode.DISABLED and not self.once else None
+        self._measures = measures_of(self._envs.metadata or {})
         self.spec = Spec(env, parts, action, max_episode_steps=limit, image=spaces.is_image(space))
 
     def restart(self, seed: int, first: int = 0) -> Tensor:
@@ -103,23 +124,21 @@ class GymnasiumBackend(Backend):
 
         Environment i of these has the seed `seed + first + i`: Gymnasium counts up.
         """
-        if self._used:
+        if (self._used and not self.once) or self._envs.closed:
             self._envs.close()
             self._envs, _ = self._build()
         self._used = True
         self._resetting, self._valid = np.zeros(self.num_envs, dtype=bool), np.ones(self.num_envs, dtype=bool)
         self._stagger = Stagger(self.num_envs, self._stagger_up_to, seed, first)
         self.counts = self._tensor(self._stagger.counts)
-        kind = self.spec.action
-        self._masks = None
-        if isinstance(kind, Discrete) and kind.masked:
-            self._masks = spaces.ActionMasks(self.spec.env_id, self.num_envs, kind.n)
-        return self._tensor(self._observe(*self._envs.reset(seed=seed + first)))
+        self._masks = spaces.ActionMasks(self.spec, self.num_envs) if self.spec.action.mask_size else None
+        return self._tensor(self._observe(*self._reset(seed + first)))
 
     def step(self, action: Tensor) -> Step:
         """Step, then find the true successor of each row and where to act next, as the mode demands."""
         physical = physical_action(action.cpu().numpy(), self.spec.action)
-        raw, reward, terminated, truncated, info = self._envs.step(physical)
+        returned = self._envs.step(physical)
+        raw, reward, terminated, truncated, info = self._returns.of_step(returned) if self._returns else returned
         terminated, truncated = terminated.copy(), truncated.copy()  # a vector environment may write over its own
         obs = next_obs = self._observe(raw, info)
         valid, done = self._valid, terminated | truncated
@@ -131,12 +150,12 @@ class GymnasiumBackend(Backend):
             truncated = self._stagger.apply(terminated, truncated)
             done = terminated | truncated
             if done.any():
-                obs = self._observe(*self._envs.reset(options={"reset_mask": done.copy()}))
+                obs = self._observe(*self._reset(None, {"reset_mask": done.copy()}))
                 self.counts = self._tensor(self._stagger.counts)
         there = self._tensor(next_obs)
         here = there if obs is next_obs else self._tensor(obs)
         rewards, *flags = map(self._tensor, (reward.astype(np.float32), terminated, truncated, valid))
-        measures = spaces.measured(info, self._measures, self.num_envs, self.device) if info else {}
+        measures = measured(info, self._measures, self.num_envs, self.device) if info else {}
         return Step(here, there, rewards, *flags, measures=measures)
 
     def close(self) -> None:
@@ -157,12 +176,18 @@ class GymnasiumBackend(Backend):
             next_obs[row, :size] = flatten_observation(self.spec.observation_parts, final, image=self.spec.image)
         return next_obs
 
+    def _reset(self, seed: int | None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """The observations and the info of a reset, of all or of those in a mask."""
+        returned = self._envs.reset(seed=seed, options={**self._reset_options, **(options or {})} or None)
+        return self._returns.of_reset(returned) if self._returns else returned
+
     def _observe(self, raw: Any, info: dict) -> np.ndarray:
-        """The flat observation; after it the action mask, where there is one."""
+        """The flat observation, a copy; after it the action mask, where there is one."""
         flat = flatten_observation(self.spec.observation_parts, raw, image=self.spec.image)
         if self._masks:
-            return self._masks.append_to(flat, info)
-        return flat.copy() if self._reuses else flat
+            return self._masks.append_to(flat, raw, info)
+        spaces.require_no_mask(self.spec, raw, info)
+        return flat.copy()
 
     def _tensor(self, array: np.ndarray) -> Tensor:
         return torch.from_numpy(array).to(self.device)

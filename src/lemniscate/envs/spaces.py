@@ -1,7 +1,8 @@
-"""What an environment says and returns, read and checked: its spaces as records, observations, masks and measures."""
+"""What an environment says of itself, read and checked: its spaces as records; masks; observations given by hand."""
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import reduce
 from operator import getitem
 from typing import Any
@@ -13,26 +14,45 @@ from gymnasium import spaces
 from torch import Generator, Tensor
 
 from lemniscate.envs.backend import Summary
-from lemniscate.envs.conversion import flatten_observation
+from lemniscate.envs.conversion import MASKS, SUCCESS, flat_mask, flatten_observation, mask_in, row_of, shown_space
 from lemniscate.errors import UserError
 from lemniscate.spec import Action, Box, Discrete, MultiBinary, MultiDiscrete, ObservationPart, Spec
 
 IMAGE_CHANNELS = 16
 """an image has at most so many channels, and a stack of images at most so many images"""
 
-SUCCESS = ("is_success", "success")
-"""what robotics environments call their success: 1 or 0, or True and False"""
+MOST_NUMBERS = 1_000_000
+"""of an observation, of which a whole number of n choices is n, and of an action's choices"""
+
+UNBOUNDED, UNBOUNDED_WHOLE = 1e30, 2**31 - 1
+"""a bound of actions from which on there is none: libraries write the largest number of a type for infinity"""
 
 SUMMARIES = tuple(Summary(f"{name}_at_end", name, "last") for name in SUCCESS)
 
 
-def observation_parts(space: gym.Space, env_id: str, path: tuple[str | int, ...] = ()) -> tuple[ObservationPart, ...]:
+def observation_parts(space: gym.Space, env_id: str) -> tuple[ObservationPart, ...]:
     """The parts of the flat observation, in order.
 
     A Box of any shape and dtype is flattened in C order, as float32; so is a MultiBinary. An image of bytes is brought
     to height × width × channels. Each number of a Discrete or MultiDiscrete becomes one-hot. A Dict is laid out in the
-    order of its own keys (Gymnasium sorts them), a Tuple in its order. Raises `UserError` for anything else.
+    order of its own keys (Gymnasium sorts them), a Tuple in its order.
+
+    Raises `UserError` for anything else, for no numbers at all, and for a one-hot vector that no network could take.
     """
+    parts = tuple(part for part in _parts(space, env_id, ()) if part.size)
+    if not parts:
+        raise UserError(f"{env_id} observes nothing: its observation_space, {shown_space(space)}, has no numbers.")
+    for part in parts:
+        if part.nvec and part.size > MOST_NUMBERS:
+            raise UserError(
+                f"{env_id} observes {part.name} as one of {part.size:,} choices ({shown_space(space)}), each an input of"
+                f" the network; at most {MOST_NUMBERS:,} can be. Observe such a number as a Box, or its digits as a"
+                " MultiDiscrete."
+            )
+    return parts
+
+
+def _parts(space: gym.Space, env_id: str, path: tuple[str | int, ...]) -> tuple[ObservationPart, ...]:
     if not path and is_image(space):
         return (image_part(tuple(map(int, space.shape or ()))),)
     if isinstance(space, spaces.Box | spaces.MultiBinary):
@@ -43,7 +63,7 @@ def observation_parts(space: gym.Space, env_id: str, path: tuple[str | int, ...]
         return (ObservationPart(path, tuple(space.shape), _whole(space.nvec), _whole(space.start)),)
     if isinstance(space, spaces.Dict | spaces.Tuple):
         named = space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces)
-        inside = [observation_parts(part, env_id, (*path, name)) for name, part in named]
+        inside = [_parts(part, env_id, (*path, name)) for name, part in named]
         return tuple(part for parts in inside for part in parts)
     raise UserError(
         f"{env_id} observes a {type(space).__name__}, whose size is not fixed; what a network can look at is Box,"
@@ -76,18 +96,30 @@ def image_part(own: tuple[int, ...]) -> ObservationPart:
 
 def action_kind(space: gym.Space, env_id: str) -> Action:
     """The action space as a record. Raises `UserError` for what no policy here can act in."""
+    choices = int(np.sum(getattr(space, "nvec", getattr(space, "n", 1)), dtype=np.int64))
+    if choices > MOST_NUMBERS:
+        raise UserError(
+            f"{env_id} acts by {shown_space(space)}, {choices:,} choices, each an output of the network; at most"
+            f" {MOST_NUMBERS:,} can be. Act by a Box, or by the digits of such a number as a MultiDiscrete."
+        )
+    if 0 in (space.shape or ()):
+        raise UserError(f"{env_id} has no actions: its action_space is {shown_space(space)}.")
     if isinstance(space, spaces.Discrete):
         return Discrete(int(space.n), int(space.start))
     if isinstance(space, spaces.MultiDiscrete):
         return MultiDiscrete(_whole(space.nvec), _whole(space.start), tuple(space.shape))
     if isinstance(space, spaces.MultiBinary):
         return MultiBinary(int(np.prod(space.shape)), tuple(map(int, space.shape)))
-    if isinstance(space, spaces.Box) and np.issubdtype(space.dtype, np.floating):
-        low, high = (tuple(map(float, np.ravel(bound))) for bound in (space.low, space.high))
+    if isinstance(space, spaces.Box):
+        most = UNBOUNDED if np.issubdtype(space.dtype, np.floating) else UNBOUNDED_WHOLE
+        low, high = (
+            tuple(math.copysign(math.inf, x) if abs(x) >= most else x for x in map(float, np.ravel(bound)))
+            for bound in (space.low, space.high)
+        )
         return Box(low, high, tuple(map(int, space.shape)), space.dtype.name)
     raise UserError(
-        f"{env_id} takes {space} actions; what can be acted in is Discrete, MultiDiscrete, MultiBinary and a Box of"
-        " floating-point numbers."
+        f"{env_id} takes {shown_space(space)} actions; what can be acted in is Discrete, MultiDiscrete, MultiBinary and"
+        " Box."
     )
 
 
@@ -98,8 +130,8 @@ def _whole(numbers: np.ndarray) -> tuple[int, ...]:
 def random_action(spec: Spec, obs: Tensor, generator: Generator) -> Tensor:
     """One action for each of the observations [N, O + n], as `VecEnv.step` takes them.
 
-    Uniform in [-1, 1]^A for a Box, over the n choices of a Discrete (those that the mask in `obs` allows), and over the
-    choices of each component of a MultiDiscrete or MultiBinary.
+    Uniform in [-1, 1]^A for a Box, over the choices of a Discrete, and over those of each component of a MultiDiscrete
+    or MultiBinary; where there is a mask in `obs`, over those that it permits.
     """
     action, drawn = spec.action, {"generator": generator, "device": obs.device}
     num_envs = len(obs)
@@ -110,66 +142,81 @@ def random_action(spec: Spec, obs: Tensor, generator: Generator) -> Tensor:
     if isinstance(action, Discrete):
         allowed = obs[:, -action.n :] if action.masked else torch.ones(num_envs, action.n, device=obs.device)
         return torch.multinomial(allowed.float(), 1, generator=generator)[:, 0]
+    if action.masked:
+        permitted = obs[:, -action.mask_size :].float().split(action.nvec, dim=-1)
+        return torch.cat([torch.multinomial(part, 1, generator=generator) for part in permitted], dim=1)
     return torch.stack([torch.randint(n, (num_envs,), **drawn) for n in action.nvec], dim=1)
 
 
-def measures_of(metadata: Mapping[str, Any]) -> tuple[str, ...]:
-    """The names of an environment's measures: its success, and those that its `metadata["measures"]` lists."""
-    return tuple(dict.fromkeys((*SUCCESS, *metadata.get("measures", ()))))
-
-
-def measured(info: Mapping[str, Any], names: tuple[str, ...], num_envs: int, device: torch.device) -> dict[str, Tensor]:
-    """The measures [N] float32 in the info of a vector environment; NaN where an environment gave none.
-
-    `info[name]` counts where `info["_" + name]` is True. Where an environment was reset in the same step, its true
-    info is in `info["final_info"]`.
-    """
-    found: dict[str, Tensor] = {}
-    for source in (info, info.get("final_info", {})):
-        for name in names:
-            if name in source:
-                values = np.asarray(source[name], dtype=np.float32)
-                given = torch.from_numpy(source.get(f"_{name}", np.ones(num_envs, dtype=bool))).to(device)
-                before = found.get(name, torch.full((num_envs,), torch.nan, device=device))
-                found[name] = torch.where(given, torch.from_numpy(values).to(device), before)
-    return found
-
-
 class ActionMasks:
-    """The present action mask of each of N environments with n actions; all are valid where none was given."""
+    """The present action mask [n] of each of N environments; all is permitted where none was given."""
 
-    def __init__(self, env_id: str, num_envs: int, n: int) -> None:
-        self._env_id = env_id
-        self._masks = np.ones((num_envs, n), dtype=bool)
+    def __init__(self, spec: Spec, num_envs: int) -> None:
+        self._spec = spec
+        self._masks = np.ones((num_envs, spec.action.mask_size), dtype=bool)
 
-    def append_to(self, flat: np.ndarray, info: Mapping[str, Any]) -> np.ndarray:
-        """[N, O] to [N, O + n]: with the masks after it, brought up to date from `info`.
+    def append_to(
+        self, flat: np.ndarray, obs: Any, info: Mapping[str, Any], numbers: np.ndarray | slice = slice(None)
+    ) -> np.ndarray:
+        """[N, O] to [N, O + n]: with the masks after it, brought up to date from the observation or the info.
 
-        Raises `UserError` where an environment rules out every action.
+        With `numbers` [M] the rows are of these environments alone. Raises `UserError` for a mask of another size, or
+        one that rules out every action of a component.
         """
-        if "action_mask" in info:
-            self._masks = self._masks.copy()
-            for row in np.flatnonzero(info.get("_action_mask", np.ones(len(flat), dtype=bool))):
-                self._masks[row] = info["action_mask"][row]
-            if not self._masks.any(axis=1).all():
-                number = int(np.argmin(self._masks.any(axis=1)))
-                raise UserError(
-                    f"{self._env_id} rules out every action of environment {number}: its action_mask is all zero."
-                )
-        return np.concatenate([flat, self._masks.astype(flat.dtype)], axis=-1)
+        name, mask = mask_in(obs, info)
+        masks = self._masks[numbers].copy()
+        if mask is not None:
+            for row in np.flatnonzero(info.get(f"_{name}", np.ones(len(flat), dtype=bool))):
+                try:
+                    masks[row] = flat_mask(row_of(mask, row), self._spec.action)
+                except ValueError as error:
+                    raise UserError(f"Environment {row} of {self._spec.env_id} has an action mask {error}.") from None
+            self._masks[numbers] = masks
+        return np.concatenate([flat, masks.astype(flat.dtype)], axis=-1)
 
 
-def read_mask(mask: Any, batch: int, n: int) -> np.ndarray:
-    """The action masks [B, n] of `info["action_mask"]`, [n] or [B, n]; None permits every action.
+def masked(action: Action, obs: Any, info: Mapping[str, Any]) -> Action:
+    """The record of actions, masked if a first observation, or the info beside it, has an action mask."""
+    can = isinstance(action, Discrete | MultiDiscrete) and mask_in(obs, info)[1] is not None
+    return replace(action, masked=True) if can else action
 
-    Raises:
-        UserError: another shape, or a row that permits nothing.
+
+def require_no_mask(spec: Spec, obs: Any, info: Mapping[str, Any]) -> None:
+    """Raise `UserError` for an action mask that cannot be followed, since the first observation had none."""
+    if mask_in(obs, info)[1] is not None:
+        if isinstance(spec.action, Discrete | MultiDiscrete):
+            remedy = "give one with reset() too, of ones where all is permitted."
+        else:
+            remedy = "masks are for Discrete and MultiDiscrete actions."
+        raise UserError(f"{spec.env_id} gives an action mask in step() that reset() did not give: {remedy}")
+
+
+def read_mask(mask: Any, spec: Spec, flat: np.ndarray) -> np.ndarray:
+    """The masks [B, n] for observations [B, O]: of `info["action_mask"]`, for one observation or B of them.
+
+    With None, that in the observation, if it has one; else all is permitted. Raises `UserError` for another size, or a
+    mask that permits nothing.
     """
-    mask = np.ones(n) if mask is None else np.asarray(mask)
-    if mask.shape not in ((n,), (batch, n)) or not mask.any(-1).all():
-        wrong = "permits nothing" if mask.shape[-1:] == (n,) else f"has the shape {mask.shape}"
-        raise UserError(f"An action_mask is ({n},) or a batch, ({batch}, {n}), of 1 and 0; this one {wrong}.")
-    return np.broadcast_to(mask, (batch, n))
+    batch, size = len(flat), spec.action.mask_size
+    if mask is None:
+        mask = _mask_in_flat(spec, flat)
+    several = isinstance(mask, np.ndarray) and mask.ndim > 1 and mask.shape == (batch, size)
+    try:
+        rows = [flat_mask(row, spec.action) for row in (mask if several else [mask])]
+    except ValueError as error:
+        raise UserError(f"An action_mask of {spec.env_id} is of {size} numbers, or a batch; this is one {error}.") from None
+    return np.broadcast_to(np.stack(rows), (batch, size))
+
+
+def _mask_in_flat(spec: Spec, flat: np.ndarray) -> np.ndarray:
+    """The masks [B, n] that stand in the flat observations themselves; of ones where they have none."""
+    ends = np.cumsum([part.size for part in spec.observation_parts])
+    columns = [
+        flat[:, end - part.size : end]
+        for part, end in zip(spec.observation_parts, ends, strict=True)
+        if part.path[:1] and part.path[0] in MASKS
+    ]
+    return np.concatenate(columns, axis=-1) if columns else np.ones((len(flat), spec.action.mask_size))
 
 
 def read_observation(spec: Spec, obs: Any) -> tuple[np.ndarray, bool]:

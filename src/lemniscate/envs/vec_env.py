@@ -68,7 +68,7 @@ class VecEnv:
             self._require_finite(action=action)
         mine = action if self._world.size == 1 else action[self._first : self._first + self.backend.num_envs]
         counts = self.backend.counts
-        step = self.backend.step(mine)
+        step = self.backend.step(mine.clone())  # an environment may write into the action that it was given
         self._require_finite(observation=step.next_obs, reward=step.reward)
         if step.obs is not step.next_obs:
             self._require_finite(observation=step.obs)

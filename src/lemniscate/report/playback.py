@@ -21,7 +21,8 @@ from PIL import Image
 
 from lemniscate.envs.factory import make_one, maker_of, makes_vector, sentences
 from lemniscate.envs.registry import make_rendered
-from lemniscate.envs.spaces import SUMMARIES, measures_of
+from lemniscate.envs.conversion import measured, measures_of
+from lemniscate.envs.spaces import SUMMARIES
 from lemniscate.envs.vec_env import VecEnv, require_end
 from lemniscate.errors import UserError, is_installed, missing_extra, shown
 from lemniscate.run.config import RunConfig
@@ -77,12 +78,12 @@ def play_single(act: Act, arguments: dict[str, Any], episodes: int, seed: int, t
     Raises:
         UserError: an environment that cannot be made, or only several at once; an episode without an end.
     """
-    name, kwargs, wrappers = (arguments[part] for part in ("env", "kwargs", "wrappers"))
+    name, kwargs, wrappers, options = (arguments[part] for part in ("env", "kwargs", "wrappers", "reset_options"))
     table = EpisodeTable(1, torch.device("cpu"))
     with sentences(name, kwargs, wrappers):
         if makes_vector(maker_of(name)):
             raise UserError(f"{name} makes several environments at once, and a function acts in a single one.")
-        env = make_one(maker_of(name), tuple(map(find_callable, wrappers)), **kwargs)
+        env = make_one(maker_of(name), tuple(map(find_callable, wrappers)), options, **kwargs)
     with closing(env):
         deque(_play(env, act, name, episodes, seed, table, tell), maxlen=0)
     return table.evaluation(name, SUMMARIES)
@@ -122,7 +123,7 @@ def _play(
     Stops after each reset and each step, for a picture. Raises `UserError` for an action of another kind, and for an
     episode that does not end where there is no time limit.
     """
-    first, measured = derive(seed, EVALUATION, 0), measures_of(env.metadata)
+    first, declared = derive(seed, EVALUATION, 0), measures_of(env.metadata or {})
     limit = env.spec.max_episode_steps if env.spec else None
     for number in range(episodes):
         obs, info = env.reset(seed=first + number)
@@ -142,7 +143,7 @@ def _play(
                 terminated=torch.tensor([bool(terminated)]),
                 truncated=torch.tensor([bool(truncated)]),
                 valid=ONE,
-                measures={part: torch.tensor([float(info[part])]) for part in measured if part in info},
+                measures=measured(info, declared, 1, ONE.device),
             )
             table.add(step, ONE)
             yield

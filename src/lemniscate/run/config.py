@@ -18,7 +18,7 @@ from lemniscate.envs.registry import MOST_ENVS
 from lemniscate.errors import UserError, shown
 from lemniscate.run.fields import options_of, unknown_field
 from lemniscate.run.seeding import Generators
-from lemniscate.spec import Spec
+from lemniscate.spec import Box, Spec
 
 MOST_WHOLE, MOST_REAL = 10**15, 1e38
 """the largest numbers of a field: float64, and so JSON, counts exactly to 9e15; the float32 of networks ends at 3e38"""
@@ -170,6 +170,8 @@ class RunConfig:
     """run, checkpoint or hf://user/name whose networks this run begins with"""
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     """arguments of the environment, as JSON: '{"dynamics": "first_principles"}'"""
+    reset_options: dict[str, Any] = field(default_factory=dict)
+    """options of every reset of the environment, as JSON: '{"level": 3}'"""
     wrappers: tuple[str, ...] = ()
     """wrappers of each environment, the first innermost: module:name or module:name(key=value)"""
 
@@ -207,7 +209,12 @@ class RunConfig:
 
     def notices(self, spec: Spec, device: torch.device) -> list[str]:
         """Sentences that a person should read before a run of this Config starts."""
-        return []
+        if not isinstance(spec.action, Box) or all(map(math.isfinite, (*spec.action.low, *spec.action.high))):
+            return []
+        return [
+            f"Some actions of {spec.env_id} have no bound, so the policy begins with steps of about 1; better give their"
+            " Box a finite low and high."
+        ]
 
     def replace(self, **changes: object) -> Self:
         """A copy with some fields changed. Raises `UserError` for an unknown field or a value out of range."""

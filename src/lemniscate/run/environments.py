@@ -21,7 +21,8 @@ BYTES_PER_PARAMETER = 16
 def make_envs(config: RunConfig) -> tuple[VecEnv, VecEnv]:
     """Two vectors of environments that share nothing: one for training, staggered, and one for evaluation.
 
-    They are restarted with seeds of different streams, so no start of one is ever a start of the other.
+    They are restarted with seeds of different streams, so no start of one is ever a start of the other. One environment
+    of one's own that may exist once at a time (`Backend.once`) is both.
 
     Raises:
         UserError: as `lemniscate.envs.registry.make`; no Config; a device that is not there; a run that takes more
@@ -31,6 +32,8 @@ def make_envs(config: RunConfig) -> tuple[VecEnv, VecEnv]:
         raise UserError(f"make_envs needs a Config, such as config_for('ppo', 'CartPole-v1'), not {shown(config)}.")
     device = device_for(config.device)
     eval_env = evaluation_env(config, config.evaluate_episodes, device=str(device))  # the few, before the many
+    if eval_env.backend.once:
+        return eval_env, eval_env
     try:
         require_memory(config, eval_env.spec, device)
         return training_env(config, World(config.shards)), eval_env
@@ -48,8 +51,8 @@ def envs_of(config: RunConfig, world: World) -> tuple[VecEnv, VecEnv | None]:
 
 def training_env(config: RunConfig, world: World) -> VecEnv:
     """The environments of training, staggered, shared by the processes of a world."""
-    own = {"kwargs": config.env_kwargs, "wrappers": config.wrappers, "backend": config.backend}
-    device = str(device_for(config.device))
+    own: dict[str, Any] = {"kwargs": config.env_kwargs, "wrappers": config.wrappers, "backend": config.backend}
+    own["reset_options"], device = config.reset_options, str(device_for(config.device))
     return registry.make(config.env, config.num_envs, device=device, stagger=True, world=world, **own)
 
 
@@ -67,9 +70,11 @@ def evaluation_env(
     `env_kwargs` change those of the run; in another environment they are the only ones.
     """
     arguments = env_arguments(config, env, env_kwargs, backend)
-    served_by = arguments["backend"] or registry.backend_for(arguments["env"], config.wrappers)
-    num_envs = config.num_envs if registry.backend_class(served_by).compiled else min(episodes, 16)
-    return registry.make(num_envs=num_envs, device=device, **arguments)
+    served_by = registry.backend_class(
+        arguments["backend"] or registry.backend_for(arguments["env"], config.wrappers)
+    )
+    as_in_training = served_by.compiled or served_by.exists_once(arguments["env"], config.num_envs)
+    return registry.make(num_envs=config.num_envs if as_in_training else min(episodes, 16), device=device, **arguments)
 
 
 def env_arguments(
@@ -78,12 +83,13 @@ def env_arguments(
     env_kwargs: Mapping[str, Any] | None = None,
     backend: str | None = None,
 ) -> dict[str, Any]:
-    """The arguments of `registry.make` for the evaluation of a run: env, kwargs, wrappers, backend."""
+    """The arguments of `registry.make` for the evaluation of a run: env, kwargs, wrappers, backend, reset_options."""
     name = config.env if env is None else registry.name_of(env)
     kwargs = {**(config.env_kwargs if name == config.env else {}), **(env_kwargs or {})}
     if env is None and backend is None:
         backend = registry.for_evaluation(config.backend)
-    return {"env": name, "kwargs": kwargs, "wrappers": config.wrappers, "backend": backend}
+    own = config.reset_options if name == config.env else {}
+    return {"env": name, "kwargs": kwargs, "wrappers": config.wrappers, "backend": backend, "reset_options": own}
 
 
 def device_for(name: str) -> torch.device:

@@ -300,10 +300,15 @@ class Run:
             return
         try:
             with globals_undisturbed(), self.world.busy():
+                if self.env.backend.once:
+                    self.env.close()
                 if self._film:
                     self._film(state)
         except (UserError, OSError) as error:  # no display any more, a full disk: it costs this recording, not the run
             say(f"No recording at step {state.step:,}: {error}")
+        finally:
+            if self.env.backend.once:
+                self._restart(state)
 
     def _evaluate(self, state: TrainState) -> None:
         if not self.eval_env:
@@ -315,6 +320,9 @@ class Run:
         except UserError as error:  # an endless episode costs this evaluation, not the run
             say(f"No evaluation at step {state.step:,}: {error}")
             return
+        finally:
+            if self.eval_env is self.env:
+                self._restart(state)
         self._write(state.step, {f"evaluation/{name}": value for name, value in scores.means().items()})
 
     def _write(self, step: int, numbers: dict[str, float], episodes: Episodes = NO_EPISODES) -> None:
