@@ -53,7 +53,8 @@ class Step:
         valid: [N] bool, False where the environment ignored the action in order to reset itself. Such a row reaches no
             loss, no replay buffer and no statistic.
         measures: what the environment measures besides the reward, such as `tracking_error` or `is_success`: [N] each,
-            by name; NaN in a row that has none. Evaluation averages them; nothing learns from them.
+            by name; NaN in a row that has none. The other numbers in an `info` begin with "info/". Evaluation and the
+            lines of metrics have their means; nothing learns from them.
     """
 
     obs: Tensor

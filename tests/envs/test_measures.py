@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from lemniscate.envs.spaces import measured
+from lemniscate.envs.conversion import measured
 
 
 def test_what_an_environment_did_not_give_is_nan_and_not_zero():

@@ -22,7 +22,7 @@ from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import find_checkpoint
 from lemniscate.run.seeding import generator
 from lemniscate.run.warm_start import difference
-from lemniscate.spec import Discrete, Spec
+from lemniscate.spec import Spec
 from lemniscate.system.files import parsing
 
 
@@ -49,7 +49,7 @@ class TrainedPolicy:
     @property
     def is_masked(self) -> bool:
         """Whether its environment says at each step which actions are valid."""
-        return isinstance(self.spec.action, Discrete) and self.spec.action.masked
+        return self.spec.action.mask_size > 0
 
     @torch.no_grad()
     def act(self, obs: Any, deterministic: bool = True, action_mask: Any = None) -> np.ndarray:
@@ -59,7 +59,8 @@ class TrainedPolicy:
             obs: as the environment returns it: an array, a number, or a dictionary or tuple of these; or the flat
                 observation [O] or [B, O].
             deterministic: the mode of the distribution; otherwise a sample.
-            action_mask: `info["action_mask"]`, [n] or [B, n], where the environment gives one; all are valid otherwise.
+            action_mask: `info["action_mask"]`, for one observation or a batch [B, n], where the environment gives one;
+                by default that in a Dict observation, or else all are valid.
 
         Returns:
             In the environment's own units and shape, [A] or [B, A] for Box; a scalar array or [B] for Discrete.
@@ -71,8 +72,8 @@ class TrainedPolicy:
         flat, batched = read_observation(self.spec, obs)
         if action_mask is not None and not self.is_masked:
             raise UserError(f"{self.spec.env_id} has no action mask, so this policy cannot follow one.")
-        if isinstance(self.spec.action, Discrete) and self.spec.action.masked:
-            mask = read_mask(action_mask, len(flat), self.spec.action.n)
+        if self.is_masked:
+            mask = read_mask(action_mask, self.spec, flat)
             flat = np.concatenate([flat, mask.astype(flat.dtype)], axis=-1)
         distribution = self.module(torch.from_numpy(flat))
         if deterministic:

@@ -81,6 +81,7 @@ def evaluate(
         if file:
             return _show(agent, vec, arguments, deterministic=deterministic, video=file, **how)
         if not isinstance(agent, TrainedPolicy):
+            vec.close()
             return playback.play_single(playback.act_by(agent), arguments, **how)
         critic = critic_of(agent.networks, agent.config)
         return evaluate_policy(agent.module, vec, episodes, seed, deterministic, critic)
@@ -130,7 +131,7 @@ def watch(
             raise UserError(f"At most {vec.num_envs} flights of this run can be shown, not {episodes}.")
         how = {"episodes": episodes, "seed": seed, "deterministic": deterministic, "video": file}
         scores = _show(None if random else agent, vec, arguments, **how)
-    if episodes > 1 or scores.measures:
+    if episodes > 1 or any(not name.startswith("info/") for name in scores.measures):
         say(pages.sentence(scores.to_json()))
     if file:
         say(f"Recorded in {file}.")
@@ -236,7 +237,7 @@ def _environments(
     elif env is None:
         raise UserError("A function acts in an environment that is named with it, such as env='CartPole-v1'.")
     else:
-        config = RunConfig(env=registry.name_of(env))
+        config = RunConfig(env=registry.name_of(env), num_envs=1)
     arguments = env_arguments(config, env=env, **elsewhere)
     with closing(evaluation_env(config, episodes, env=env, **elsewhere)) as vec:
         if isinstance(agent, TrainedPolicy) and not vec.spec.fits(agent.spec):
@@ -252,6 +253,7 @@ def _show(
     trained = isinstance(agent, TrainedPolicy)
     if vec.scene and (trained or agent is None):
         return flight.show_flights(agent.module if trained else None, vec, deterministic=deterministic, **how)
+    vec.close()  # of some environments there can be one at a time
     if trained:
         drawn = TrainedPolicy(agent.networks, agent.spec, agent.config.replace(seed=how["seed"]), agent.step)
         act = partial(drawn.act, deterministic=deterministic)

@@ -71,7 +71,7 @@ def choose_config(
     if chosen == "default" and env is None:
         raise UserError("Which environment? Name one with env; `lemniscate envs` lists them.")
     if not config.backend:
-        config = config.replace(backend=registry.backend_for(config.env, config.wrappers))
+        config = config.replace(backend=registry.backend_for(config.env, config.all_wrappers))
     return name, chosen, config
 
 
@@ -284,6 +284,8 @@ def _train_here(
         for notice in config.notices(spec, envs[0].device) if progress else ():
             say(notice)
         state = algos.find(algorithm).train(config, run)
+        if envs[0].backend.once:
+            envs[0].close()  # before a report makes another one
         trained = TrainedRun(path, TrainedPolicy(state.networks.cpu(), spec, config, state.step, path), run.seconds)
         if options.reports and world.is_first:
             pictures = _report_on(trained)

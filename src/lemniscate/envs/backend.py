@@ -118,7 +118,7 @@ class Backend(ABC):
             end.
         once: it steps an environment of one's own that may exist once at a time, such as a robot. While another is made
             for evaluation or a film, it is closed; `restart` makes it again.
-        takes_reset_options: it is given the `reset_options` of a run, and gives them to every reset.
+        notice: a sentence on what was observed so far, for the one who trains; None where all is well.
         mode: what an environment does after an end, in Gymnasium's words. DISABLED is reset here, in the same step.
         summaries: the numbers that evaluation makes of the measures besides their means.
         scene: what is drawn where a Gymnasium environment would be rendered.
@@ -134,7 +134,7 @@ class Backend(ABC):
     device: torch.device
     counts: Tensor
     once: bool = False
-    takes_reset_options: bool = False
+    notice: str | None = None
     mode: AutoresetMode = AutoresetMode.DISABLED
     summaries: tuple[Summary, ...] = ()
     scene: Scene | None = None

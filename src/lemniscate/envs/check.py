@@ -3,6 +3,7 @@
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from copy import deepcopy
 from dataclasses import dataclass
 from functools import partial, reduce
@@ -19,6 +20,7 @@ from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
 from lemniscate.envs import registry
+from lemniscate.envs.conversion import SingleEnv, flat_mask, mask_in
 from lemniscate.envs.factory import make_one, maker_of
 from lemniscate.envs.spaces import is_image, observation_parts, random_action
 from lemniscate.envs.vec_env import VecEnv
@@ -156,6 +158,8 @@ def _random_play(env: VecEnv) -> Iterator[Finding]:
         yield _raised(error, "It cannot be played with random actions")
         return
     yield good(f"{STEPS} random steps: every observation and reward is finite.")
+    if env.backend.notice:
+        yield note(env.backend.notice)
     if not repeated:
         yield bad("The same seed and actions give another episode: runs cannot be repeated, nor resumed.")
     elif torch.equal(first.obs, other.obs):
@@ -240,7 +244,7 @@ def _sizes(obs: Tensor, spec: Spec) -> Iterator[Finding]:
         )
 
 
-def _gymnasium(make: Callable[[], gym.Env], env_id: str, wrapped: bool) -> Iterator[Finding]:
+def _gymnasium(make: Callable[[], SingleEnv], env_id: str, wrapped: bool) -> Iterator[Finding]:
     """The result of Gymnasium's checker without its false alarms, and whether observations are copies.
 
     `wrapped` checks the environment as `make` returns it, with the user's own wrappers; otherwise what is inside of
@@ -248,7 +252,7 @@ def _gymnasium(make: Callable[[], gym.Env], env_id: str, wrapped: bool) -> Itera
     """
     found: list[Finding] = []
     env = make()
-    careful = Careful(env if wrapped else env.unwrapped)
+    careful = Careful(env.env if wrapped else env.unwrapped)  # what is looked at are its own returns
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
@@ -301,7 +305,7 @@ class Careful(gym.Env):
         self.env, self.spec, self.metadata = env, env.spec, env.metadata
         self.observation_space, self.action_space = env.observation_space, env.action_space
         self.reuses = False
-        self._mask: Any = None
+        self._mask: np.ndarray | None = None
         self._returned: Any = None
         self._copy: Any = None
 
@@ -315,9 +319,12 @@ class Careful(gym.Env):
 
     def step(self, action: Any) -> Any:
         """Take the action, or the first legal one."""
-        if self._mask is not None and isinstance(self.action_space, gym.spaces.Discrete):
-            start = self.action_space.start
-            action = action if self._mask[action - start] else start + np.argmax(self._mask)
+        space, mask = self.action_space, self._mask
+        if mask is not None and isinstance(space, gym.spaces.Discrete):
+            action = action if mask[action - space.start] else space.start + np.argmax(mask)
+        elif mask is not None and isinstance(space, gym.spaces.MultiDiscrete):
+            parts = np.split(mask, np.cumsum(space.nvec)[:-1])
+            action = space.start + np.reshape([np.argmax(part) for part in parts], space.shape)
         obs, reward, terminated, truncated, info = self.env.step(action)
         obs, info = self._copied(obs, info)
         return obs, reward, terminated, truncated, info
@@ -328,5 +335,7 @@ class Careful(gym.Env):
         self.reuses |= comparable and not data_equivalence(self._returned, self._copy, exact=True)
         self._returned, self._copy = obs, deepcopy(obs)
         if isinstance(info, dict):
-            self._mask = info.get("action_mask", self._mask)
+            _, mask = mask_in(obs, info)
+            with suppress(ValueError):  # one that is wrong is found by random play
+                self._mask = self._mask if mask is None else flat_mask(mask, self.action_space)
         return deepcopy(obs), deepcopy(info)

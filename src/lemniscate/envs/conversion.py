@@ -83,8 +83,9 @@ class Returns:
         array = _array(value)
         fits = array.dtype.kind in "biuf" and (array.shape == self._lead or (array.size == 1 and not self._lead))
         if not fits or (kind is bool and not ((array == 0) | (array == 1)).all()):
-            wanted = f"{'a number' if kind is float else 'True or False'}{' for each environment' if self._lead else ''}"
-            raise self.wrong("step", f"returned {kind_of(value)} as {name}; it must be {wanted}")
+            wanted = "a number" if kind is float else "True or False"
+            each = " for each environment" if self._lead else ""
+            raise self.wrong("step", f"returned {kind_of(value)} as {name}; it must be {wanted}{each}")
         return array.astype(kind) if self._lead else kind(array.item())
 
 
@@ -93,27 +94,24 @@ class SingleEnv(gym.Wrapper):
 
     Those of nested dictionaries are named "outer/inner". The mask is a row in `info["action_mask"]`, wherever it stood.
 
-    Args:
-        env: the environment.
-        reset_options: of every reset; None for none.
-
     Raises:
-        UserError: an environment without spaces.
+        UserError: an environment without spaces, or whose reset takes no seed or no options.
     """
 
-    def __init__(self, env: gym.Env, reset_options: Mapping[str, Any] | None = None) -> None:
+    def __init__(self, env: gym.Env) -> None:
         super().__init__(env)
         for name in ("observation_space", "action_space"):
             if not isinstance(getattr(env, name, None), gym.Space):
                 kind = type(env.unwrapped).__name__
                 raise UserError(f"{kind} has no {name}: set self.{name} in its __init__, such as a Box.")
         for layer in _layers(env):
-            parameters = signature(layer.reset).parameters
-            if not any(p.kind is p.VAR_KEYWORD for p in parameters.values()) and not {"seed", "options"} <= set(parameters):
+            taken = signature(layer.reset).parameters
+            if not taken.keys() >= {"seed", "options"} and all(
+                one.kind is not one.VAR_KEYWORD for one in taken.values()
+            ):
                 right = "reset(self, *, seed=None, options=None)"
                 raise UserError(f"{_place(layer, 'reset')} takes no seed or no options; it must be {right}.")
         self._returns = Returns(env, env.observation_space)
-        self._options = dict(reset_options) if reset_options else None
         asked = [env.get_wrapper_attr(name) for name in MASKS if env.has_wrapper_attr(name)]
         self._ask = next(filter(callable, asked), None)
         seen = env.observation_space
@@ -121,8 +119,8 @@ class SingleEnv(gym.Wrapper):
         self._declared = measures_of(env.metadata or {})
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Gymnasium's, with the options of every reset."""
-        obs, info = self._returns.of_reset(self.env.reset(seed=seed, options=self._options or options))
+        """Gymnasium's."""
+        obs, info = self._returns.of_reset(self.env.reset(seed=seed, options=options))
         return obs, self._told("reset", obs, info)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -136,7 +134,8 @@ class SingleEnv(gym.Wrapper):
         numbers: dict[str, Any] = dict(_scalars(info))
         for name in self._declared:
             if info.get(name) is not None and name not in numbers:
-                raise self._returns.wrong(method, f"returned {kind_of(info[name])} in info[{name!r}]; it must be a number")
+                what = f"returned {kind_of(info[name])} as info[{name!r}]; a measure is a number"
+                raise self._returns.wrong(method, what)
         _, mask = mask_in(obs, info)
         mask = self._ask() if mask is None and self._ask else mask
         if mask is not None:
@@ -185,33 +184,38 @@ def _array(value: Any) -> np.ndarray:
 
 
 def _fitted(space: gym.Space, obs: Any, lead: tuple[int, ...], where: str = "") -> Any:
-    """An observation in the types of its space. Raises `ValueError` with the rest of a sentence where it does not fit."""
-    inside = f" in {where}" if where else ""
+    """An observation in the types of its space. Raises `ValueError`, with the rest of a sentence, where it is none."""
     if isinstance(space, spaces.Dict):
-        if not isinstance(obs, Mapping) or not space.spaces.keys() <= obs.keys():
-            lacking = f"without {next(k for k in space if k not in obs)!r}" if isinstance(obs, Mapping) else kind_of(obs)
-            raise ValueError(f"that is {lacking}{inside}; its space is a Dict with the keys {', '.join(space)}")
-        return {key: _fitted(part, obs[key], lead, f"{where}[{key!r}]") for key, part in space.items()}
+        keys = ", ".join(map(str, space.spaces))
+        if not isinstance(obs, Mapping):
+            raise ValueError(f"that is {kind_of(obs)}{where}; its space is a Dict with the keys {keys}")
+        if lacking := [key for key in space.spaces if key not in obs]:
+            raise ValueError(f"without {lacking[0]}{where}; its space is a Dict with the keys {keys}")
+        return {key: _fitted(part, obs[key], lead, f"{where} in {key}") for key, part in space.items()}
     if isinstance(space, spaces.Tuple):
         if not isinstance(obs, tuple | list) or len(obs) != len(space):
-            raise ValueError(f"that is {kind_of(obs)}{inside}; its space is a Tuple of {len(space)}")
-        return tuple(_fitted(part, obs[i], lead, f"{where}[{i}]") for i, part in enumerate(space))
-    shape = (*lead, *(space.shape or ()))
-    if type(obs) is np.ndarray and obs.dtype == space.dtype and obs.shape == shape and not hasattr(space, "start"):
+            raise ValueError(f"that is {kind_of(obs)}{where}; its space is a Tuple of {len(space)}")
+        return tuple(_fitted(part, obs[i], lead, f"{where} in part {i}") for i, part in enumerate(space))
+    return _fitted_array(space, obs, (*lead, *(space.shape or ())), where)
+
+
+def _fitted_array(space: gym.Space, obs: Any, shape: tuple[int, ...], where: str) -> Any:
+    counted = isinstance(space, spaces.Discrete | spaces.MultiDiscrete)
+    if not counted and type(obs) is np.ndarray and obs.dtype == space.dtype and obs.shape == shape:
         return obs
     array, kind = _array(obs), np.dtype(space.dtype)
-    if array.shape != shape or array.dtype.kind not in "biuf":
+    if array.dtype.kind not in "biuf" or array.shape != shape:
         said = f"of shape {array.shape}" if array.dtype.kind in "biuf" else f"that is {kind_of(obs)}"
-        raise ValueError(f"{said}{inside}; its space is {shown_space(space)}, whose shape is {space.shape}")
-    with np.errstate(invalid="ignore"):
+        raise ValueError(f"{said}{where}; its space is {shown_space(space)}, of shape {space.shape}")
+    with np.errstate(invalid="ignore"):  # a NaN as a whole number, which the next line finds
         fitted = array.astype(kind)
     if kind.kind in "iub" and not np.array_equal(fitted, array):
-        raise ValueError(f"of type {array.dtype}{inside} with numbers that are no {kind}, which its space has")
-    if hasattr(space, "start"):
+        raise ValueError(f"of type {array.dtype}{where}, whose numbers are not all of type {kind}, as its space says")
+    if isinstance(space, spaces.Discrete | spaces.MultiDiscrete):
         count = space.n if isinstance(space, spaces.Discrete) else space.nvec
-        outside = (fitted < space.start) | (fitted >= space.start + count)
-        if outside.any():
-            raise ValueError(f"with {fitted[outside].flat[0]}{inside}, which is not in its space, {shown_space(space)}")
+        outside = fitted[(fitted < space.start) | (fitted >= space.start + count)]
+        if outside.size:
+            raise ValueError(f"with {outside.flat[0]}{where}, which is not in its space, {shown_space(space)}")
     return fitted if fitted.shape else fitted[()]
 
 
@@ -294,8 +298,8 @@ def measured(
                 if key in declared:
                     raise UserError(f"info[{key!r}] is {kind_of(array)}; a measure is a number for each environment.")
                 continue
-            numbers, given = torch.from_numpy(array.reshape(num_envs).astype(np.float32)).to(device), source.get(f"_{key}")
-            name = key if key in declared else f"info/{prefix}{key}"
+            numbers = torch.from_numpy(array.reshape(num_envs).astype(np.float32)).to(device)
+            name, given = key if key in declared else f"info/{prefix}{key}", source.get(f"_{key}")
             if given is not None and not given.all():
                 before = found.get(name, torch.full((num_envs,), torch.nan, device=device))
                 numbers = torch.where(torch.from_numpy(np.asarray(given)).to(device), numbers, before)

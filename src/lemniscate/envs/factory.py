@@ -61,12 +61,19 @@ def is_own(maker: Maker) -> bool:
     return not any(str(file or "").startswith(folder) for folder in installed)
 
 
-def make_one(
-    maker: Maker,
-    wrappers: Sequence[Callable[..., Any]] = (),
-    reset_options: Mapping[str, Any] | None = None,
-    **kwargs: Any,
-) -> SingleEnv:
+class ResetOptions(gym.Wrapper):
+    """An environment whose every reset is given the same options."""
+
+    def __init__(self, env: gym.Env, options: dict[str, Any]) -> None:
+        super().__init__(env)
+        self._options = options
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """The environment's."""
+        return self.env.reset(seed=seed, options={**self._options, **(options or {})})
+
+
+def make_one(maker: Maker, wrappers: Sequence[Callable[..., Any]] = (), **kwargs: Any) -> SingleEnv:
     """One environment, by its maker: a worker process may not know the id."""
     theirs = "gymnasium.envs.mujoco" in str(getattr(maker, "entry_point", ""))
     with model_warnings_off() if theirs else nullcontext():
@@ -77,19 +84,14 @@ def make_one(
     if not isinstance(env, gym.Env):
         kind = type(env).__name__
         raise TypeError(f"it makes {'an' if kind[0] in 'aeiouAEIOU' else 'a'} {kind}, not a gymnasium.Env")
-    return SingleEnv(env, reset_options)
+    return SingleEnv(env)
 
 
 def make_vector(
-    maker: Maker,
-    num_envs: int,
-    kwargs: Mapping[str, Any],
-    wrappers: Sequence[Callable[..., Any]],
-    workers: bool,
-    reset_options: Mapping[str, Any] | None = None,
+    maker: Maker, num_envs: int, kwargs: Mapping[str, Any], wrappers: Sequence[Callable[..., Any]], workers: bool
 ) -> tuple[VectorEnv, int | None]:
     """N environments of a maker, and their time limit in steps; with `workers`, each in a process of its own."""
-    makers = [partial(make_one, maker, wrappers, reset_options, **kwargs)] * num_envs
+    makers = [partial(make_one, maker, wrappers, **kwargs)] * num_envs
     if makes_vector(maker):
         make = partial(gym.make_vec, maker) if isinstance(maker, EnvSpec) else maker
         envs = one = make(num_envs=num_envs, **kwargs)

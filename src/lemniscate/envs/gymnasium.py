@@ -40,7 +40,6 @@ class GymnasiumBackend(Backend):
     """
 
     workers = False
-    takes_reset_options = True
     summaries = spaces.SUMMARIES
 
     @classmethod
@@ -71,16 +70,9 @@ class GymnasiumBackend(Backend):
         return num_envs == 1 and is_own(maker_of(env))
 
     @classmethod
-    def make_rendered(
-        cls,
-        env: str,
-        mode: str,
-        kwargs: Mapping[str, Any],
-        wrappers: Sequence[str],
-        reset_options: Mapping[str, Any] | None = None,
-    ) -> gym.Env:
+    def make_rendered(cls, env: str, mode: str, kwargs: Mapping[str, Any], wrappers: Sequence[str]) -> gym.Env:
         """One environment that renders itself in `mode`."""
-        return make_one(maker_of(env), tuple(map(find_callable, wrappers)), reset_options, render_mode=mode, **kwargs)
+        return make_one(maker_of(env), tuple(map(find_callable, wrappers)), render_mode=mode, **kwargs)
 
     def __init__(
         self,
@@ -91,14 +83,13 @@ class GymnasiumBackend(Backend):
         stagger: bool = False,
         kwargs: Mapping[str, Any] | None = None,
         wrappers: Sequence[str] = (),
-        reset_options: Mapping[str, Any] | None = None,
     ) -> None:
         self.num_envs, self.device = num_envs, device
         maker = maker_of(env)
         if makes_vector(maker) and self.workers:
             raise UserError(f"{env} makes {num_envs} environments at once, so there is none for a process of its own.")
         wraps = tuple(map(find_callable, wrappers))
-        self._build = partial(make_vector, maker, num_envs, dict(kwargs or {}), wraps, self.workers, reset_options)
+        self._build = partial(make_vector, maker, num_envs, dict(kwargs or {}), wraps, self.workers)
         self.once = self.exists_once(env, num_envs)
         with sentences(env, kwargs, wrappers):
             self._envs, limit = self._build()
@@ -108,9 +99,6 @@ class GymnasiumBackend(Backend):
         self.mode = mode
         space, action = self._envs.single_observation_space, spaces.action_kind(self._envs.single_action_space, env)
         parts = spaces.observation_parts(space, env)
-        self._reset_options = dict(reset_options or {}) if makes_vector(maker) else {}  # single ones have them already
-        if self._reset_options and self.mode is not AutoresetMode.DISABLED:
-            raise UserError(f"{env} resets itself, so reset_options would not reach its resets.")
         self._returns = Returns(self._envs, space, (num_envs,)) if makes_vector(maker) else None
         self._used = isinstance(action, Discrete | MultiDiscrete)
         if self._used:
@@ -118,6 +106,7 @@ class GymnasiumBackend(Backend):
         self._stagger_up_to = limit if stagger and self.mode is AutoresetMode.DISABLED and not self.once else None
         self._measures = measures_of(self._envs.metadata or {})
         self.spec = Spec(env, parts, action, max_episode_steps=limit, image=spaces.is_image(space))
+        self._digits: spaces.LostDigits | None = None if self.spec.image else spaces.LostDigits(self.spec)
 
     def restart(self, seed: int, first: int = 0) -> Tensor:
         """Close the environments and build them again: some (Box2D) carry more over a reset than they tell.
@@ -178,12 +167,14 @@ class GymnasiumBackend(Backend):
 
     def _reset(self, seed: int | None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """The observations and the info of a reset, of all or of those in a mask."""
-        returned = self._envs.reset(seed=seed, options={**self._reset_options, **(options or {})} or None)
+        returned = self._envs.reset(seed=seed, options=options)
         return self._returns.of_reset(returned) if self._returns else returned
 
     def _observe(self, raw: Any, info: dict) -> np.ndarray:
         """The flat observation, a copy; after it the action mask, where there is one."""
         flat = flatten_observation(self.spec.observation_parts, raw, image=self.spec.image)
+        if self._digits and self._digits.add(raw):
+            self.notice, self._digits = self._digits.sentence(), None
         if self._masks:
             return self._masks.append_to(flat, raw, info)
         spaces.require_no_mask(self.spec, raw, info)

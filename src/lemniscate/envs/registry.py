@@ -137,12 +137,7 @@ def require_room(env: str, num_envs: int, backend: str) -> None:
 
 
 def make_rendered(
-    env: str,
-    mode: str,
-    kwargs: Mapping[str, Any],
-    wrappers: Sequence[str],
-    backend: str | None,
-    reset_options: Mapping[str, Any] | None = None,
+    env: str, mode: str, kwargs: Mapping[str, Any], wrappers: Sequence[str], backend: str | None
 ) -> "gym.Env":
     """One environment of Gymnasium's interface that renders itself in `mode`, "rgb_array" or "human".
 
@@ -151,8 +146,7 @@ def make_rendered(
     """
     chosen = backend or backend_for(env, wrappers)
     for found in map(backend_class, (chosen, *BACKENDS)):
-        given = {"reset_options": reset_options} if reset_options and found.takes_reset_options else {}
-        made = found.make_rendered(env, mode, kwargs, wrappers, **given) if found.serves(env) else None
+        made = found.make_rendered(env, mode, kwargs, wrappers) if found.serves(env) else None
         if made is not None:
             return made
     raise UserError(f"the {chosen} backend renders no single environment.")
@@ -172,7 +166,6 @@ def make(
     device: str = "cpu",
     stagger: bool = False,
     backend: str | None = None,
-    reset_options: Mapping[str, Any] | None = None,
     world: "World | None" = None,
 ) -> "VecEnv":
     """N parallel environments on `device`; `restart` them before the first step.
@@ -187,7 +180,6 @@ def make(
         device: of the tensors: cpu, cuda, …
         stagger: spread the first episodes over time.
         backend: a name of `BACKENDS`, or `module:Class`; by default the first that serves `env`.
-        reset_options: `options` of every reset.
         world: the processes that share the environments; by default this one has all.
 
     Raises:
@@ -201,25 +193,21 @@ def make(
     from lemniscate.system.world import ALONE
 
     name, wraps, num_envs = name_of(env), names_of(wrappers), _checked_count(num_envs)
-    for what, given in (("arguments of an environment", kwargs), ("reset_options", reset_options)):
-        if not isinstance(given, Mapping | None):
-            raise UserError(f"The {what} are a dictionary, such as {{'x': 1}}, not {given!r}.")
+    if kwargs is not None and not isinstance(kwargs, Mapping):
+        raise UserError(f"The arguments of an environment are a dictionary, such as {{'x': 1}}, not {kwargs!r}.")
     chosen = backend_for(name, wraps) if backend is None else backend
     cls = backend_class(chosen)
     if not cls.serves(name):
         raise UserError(f"{name} cannot be served by the {chosen} backend; {backend_for(name, wraps)} serves it.")
     if wraps and not cls.wraps(name):
         raise UserError(
-            f"The {chosen} backend cannot wrap {name}; wrappers go around single environments of the gymnasium backend."
+            f"The {chosen} backend cannot wrap {name}; wrappers and reset_options are for single environments of the"
+            " gymnasium backend."
         )
     world = world or ALONE
     mine = num_envs // world.size
     require_room(name, mine, chosen)
     vectors = 1 if cls.divides(name) else len(world.held)
-    options: dict[str, Any] = {"stagger": stagger, "kwargs": kwargs, "wrappers": wraps}
-    if reset_options:
-        if not cls.takes_reset_options:
-            raise UserError(f"The {chosen} backend has no reset_options; the gymnasium backend has.")
-        options["reset_options"] = reset_options
+    options = {"stagger": stagger, "kwargs": kwargs, "wrappers": wraps}
     made = [cls(name, mine // vectors, torch.device(device), **options) for _ in range(vectors)]
     return VecEnv(made[0] if vectors == 1 else Joined(made), world)

@@ -27,6 +27,9 @@ MOST_NUMBERS = 1_000_000
 UNBOUNDED, UNBOUNDED_WHOLE = 1e30, 2**31 - 1
 """a bound of actions from which on there is none: libraries write the largest number of a type for infinity"""
 
+WIDE, LARGE = ("float64", "longdouble", "int32", "uint32", "int64", "uint64"), 1e4
+"""types of numbers that float32 cannot hold all of, and the size from which on it loses what may matter"""
+
 SUMMARIES = tuple(Summary(f"{name}_at_end", name, "last") for name in SUCCESS)
 
 
@@ -45,9 +48,8 @@ def observation_parts(space: gym.Space, env_id: str) -> tuple[ObservationPart, .
     for part in parts:
         if part.nvec and part.size > MOST_NUMBERS:
             raise UserError(
-                f"{env_id} observes {part.name} as one of {part.size:,} choices ({shown_space(space)}), each an input of"
-                f" the network; at most {MOST_NUMBERS:,} can be. Observe such a number as a Box, or its digits as a"
-                " MultiDiscrete."
+                f"{env_id} observes {shown_space(space)}, whose {part.size:,} choices are each an input of the network;"
+                f" at most {MOST_NUMBERS:,} can be. Observe such a number as a Box, or its digits as a MultiDiscrete."
             )
     return parts
 
@@ -99,8 +101,8 @@ def action_kind(space: gym.Space, env_id: str) -> Action:
     choices = int(np.sum(getattr(space, "nvec", getattr(space, "n", 1)), dtype=np.int64))
     if choices > MOST_NUMBERS:
         raise UserError(
-            f"{env_id} acts by {shown_space(space)}, {choices:,} choices, each an output of the network; at most"
-            f" {MOST_NUMBERS:,} can be. Act by a Box, or by the digits of such a number as a MultiDiscrete."
+            f"{env_id} acts by {shown_space(space)}, whose {choices:,} choices are each an output of the network; at"
+            f" most {MOST_NUMBERS:,} can be. Act by a Box, or by the digits of such a number as a MultiDiscrete."
         )
     if 0 in (space.shape or ()):
         raise UserError(f"{env_id} has no actions: its action_space is {shown_space(space)}.")
@@ -148,6 +150,39 @@ def random_action(spec: Spec, obs: Tensor, generator: Generator) -> Tensor:
     return torch.stack([torch.randint(n, (num_envs,), **drawn) for n in action.nvec], dim=1)
 
 
+class LostDigits:
+    """A look at the first observations of 64 bits, and at whole numbers: what float32 takes from them.
+
+    Args:
+        spec: of the environment.
+    """
+
+    STEPS, ENVS = 200, 8
+
+    def __init__(self, spec: Spec) -> None:
+        self._spec, self._rows = spec, list[np.ndarray]()
+
+    def add(self, raw: Any) -> bool:
+        """A batch of observations, as the environment returned it; returns whether that was the last to look at."""
+        own = [np.asarray(reduce(getitem, part.path, raw)) for part in self._spec.observation_parts if not part.nvec]
+        flat = [x.reshape(len(x), -1)[: self.ENVS].astype(np.float64) for x in own if x.dtype.name in WIDE]
+        self._rows += [np.concatenate(flat, axis=1)] if flat else []
+        return not flat or len(self._rows) == self.STEPS
+
+    def sentence(self) -> str | None:
+        """A sentence on the number that loses most, if half of the different values of one become equal."""
+        rows = np.concatenate(self._rows) if self._rows else np.zeros((1, 0))
+        columns = [(len(np.unique(x)), len(np.unique(x.astype(np.float32))), float(np.abs(x).max())) for x in rows.T]
+        lost = [(before / left, before, left, most) for before, left, most in columns if most >= LARGE and before > 4]
+        ratio, before, left, most = max(lost, default=(1, 0, 0, 0))
+        if ratio < 2:
+            return None
+        return (
+            f"{self._spec.env_id} observes numbers up to {most:.3g}, too large for the digits of float32: {before}"
+            f" different values became {left}. Subtract what is constant in them, in the environment or in a wrapper."
+        )
+
+
 class ActionMasks:
     """The present action mask [n] of each of N environments; all is permitted where none was given."""
 
@@ -168,7 +203,7 @@ class ActionMasks:
         if mask is not None:
             for row in np.flatnonzero(info.get(f"_{name}", np.ones(len(flat), dtype=bool))):
                 try:
-                    masks[row] = flat_mask(row_of(mask, row), self._spec.action)
+                    masks[row] = flat_mask(row_of(mask, int(row)), self._spec.action)
                 except ValueError as error:
                     raise UserError(f"Environment {row} of {self._spec.env_id} has an action mask {error}.") from None
             self._masks[numbers] = masks
@@ -204,7 +239,7 @@ def read_mask(mask: Any, spec: Spec, flat: np.ndarray) -> np.ndarray:
     try:
         rows = [flat_mask(row, spec.action) for row in (mask if several else [mask])]
     except ValueError as error:
-        raise UserError(f"An action_mask of {spec.env_id} is of {size} numbers, or a batch; this is one {error}.") from None
+        raise UserError(f"{spec.env_id} has action masks of {size} numbers; this is one {error}.") from None
     return np.broadcast_to(np.stack(rows), (batch, size))
 
 

@@ -2,7 +2,7 @@
 
 import math
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -42,7 +42,7 @@ class VecEnv:
         self.collecting = Stopwatch()
         """seconds that the functions of `data` spend acting and stepping"""
         self.steps = 0
-        self._statistics = EpisodeStatistics(self.num_envs, self.device)
+        self._statistics, self._measures = EpisodeStatistics(self.num_envs, self.device), Means()
         self._actions: tuple[torch.Size, torch.dtype] | None = None  # before it is restarted, none is right
 
     def restart(self, seed: int, steps: int = 0) -> Tensor:
@@ -70,6 +70,8 @@ class VecEnv:
         counts = self.backend.counts
         step = self.backend.step(mine.clone())  # an environment may write into the action that it was given
         self._require_finite(observation=step.next_obs, reward=step.reward)
+        if step.measures:
+            self._measures.log(step.measures, step.valid)
         if step.obs is not step.next_obs:
             self._require_finite(observation=step.obs)
         if self._world.size > 1:
@@ -99,8 +101,8 @@ class VecEnv:
         require_end(self.spec.env_id, age, self.spec.max_episode_steps)
 
     def take_episodes(self) -> "Episodes":
-        """The whole episodes that ended since the last call."""
-        return self._statistics.take()
+        """The whole episodes that ended since the last call, and the means of all measures over its steps."""
+        return replace(self._statistics.take(), measures=self._measures.take(self._world))
 
     def close(self) -> None:
         """Give back processes and windows."""
@@ -145,10 +147,51 @@ class Stopwatch:
 
 @dataclass(frozen=True)
 class Episodes:
-    """Whole episodes that ended, in the order of their ends."""
+    """Whole episodes that ended, in the order of their ends, and the means of what the environments measured."""
 
     returns: list[float]
     lengths: list[int]
+    measures: dict[str, float] = field(default_factory=dict)
+
+
+class Means:
+    """The mean of each measure, over the steps in which it was given."""
+
+    def __init__(self) -> None:
+        self._log: list[tuple[dict[str, Tensor], Tensor]] = []
+        self._sums: dict[str, Tensor] = {}
+        """[2, N] by name: the sum of each environment, and how many numbers it has"""
+
+    def log(self, measures: dict[str, Tensor], valid: Tensor) -> None:
+        """One step of every environment; what is not finite, or not `valid` [N], is left out."""
+        self._log.append((measures, valid))
+        if len(self._log) == LOG_ROWS:
+            self._sum_up()
+
+    def take(self, world: World) -> dict[str, float]:
+        """The means since the last call, over the environments of all processes."""
+        self._sum_up()
+        sums, self._sums = self._sums, {}
+        if world.size > 1:
+            parts = [{name: torch.tensor(own) for name, own in part.items()} for part in world.each(_lists(sums))]
+            names = dict.fromkeys(name for part in parts for name in part)
+            sums = {name: torch.cat([part[name] for part in parts if name in part], dim=1) for name in names}
+        totals = {name: own.sum(1).tolist() for name, own in sums.items()}
+        return {name: total / count for name, (total, count) in totals.items() if count}
+
+    def _sum_up(self) -> None:
+        for name in dict.fromkeys(name for measures, _ in self._log for name in measures):
+            rows = [(measures[name], valid) for measures, valid in self._log if name in measures]
+            values, valid = map(torch.stack, zip(*rows, strict=True))
+            counts = values.isfinite() & valid
+            wide = values.where(counts, 0).to(wide_float(values.device))
+            new = torch.stack([wide, counts.to(wide.dtype)]).sum(1)
+            self._sums[name] = self._sums[name] + new if name in self._sums else new
+        self._log = []
+
+
+def _lists(sums: dict[str, Tensor]) -> dict[str, list[list[float]]]:
+    return {name: own.tolist() for name, own in sums.items()}
 
 
 class EpisodeStatistics:

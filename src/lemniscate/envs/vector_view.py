@@ -104,7 +104,7 @@ class VectorView(VectorEnv):
         """The `info` of Gymnasium's layout: the entries of an ended episode are under `final_info`."""
         done = (step.terminated | step.truncated).numpy().copy()
         info = self._masks(step.obs)
-        measures = {name: values.numpy().copy() for name, values in step.measures.items()}
+        measures = {name.removeprefix("info/"): values.numpy().copy() for name, values in step.measures.items()}
         given = {name: ~np.isnan(values) for name, values in measures.items()}
         running = ~done if not self._next_step else np.ones_like(done)
         for name, values in measures.items():
@@ -123,8 +123,7 @@ class VectorView(VectorEnv):
         return flat.reshape(self.num_envs, *(self.single_observation_space.shape or ())).copy()
 
     def _masks(self, obs: torch.Tensor) -> dict[str, Any]:
-        action = self.env.spec.action
-        if not (isinstance(action, Discrete) and action.masked):
+        if not self.env.spec.action.mask_size:
             return {}
         masks = obs[:, self.env.spec.observation_size :].cpu().numpy().astype(np.int8)
         return {"action_mask": masks, "_action_mask": np.ones(self.num_envs, dtype=bool)}

@@ -15,7 +15,7 @@ import gymnasium as gym
 from gymnasium.vector import AsyncVectorEnv
 from gymnasium.vector.async_vector_env import AsyncState
 
-from lemniscate.errors import WorkerError
+from lemniscate.errors import UserError, WorkerError
 from lemniscate.system.watchdog import end_when_closed
 
 CLOSING_SECONDS = 2.0
@@ -28,6 +28,10 @@ MOST_LETTERS = 500
 
 class RaisedInWorkerError(RuntimeError):
     """An exception of an environment, as a sentence: the exception itself may not pass through a pipe."""
+
+
+class RefusedInWorkerError(RaisedInWorkerError):
+    """A `UserError` on what an environment returned."""
 
 
 class Unmade(gym.Env):
@@ -74,6 +78,8 @@ class Worker(gym.Wrapper):
 def _told(call: Callable[..., Any], *args: Any, **options: Any) -> Any:
     try:
         return call(*args, **options)
+    except UserError as error:
+        raise RefusedInWorkerError(str(error)) from None
     except BaseException as error:  # also what ends a process: this one ends with its owner
         place = traceback.extract_tb(error.__traceback__)[-1]
         raise RaisedInWorkerError(f"{_words_of(error)} ({Path(place.filename).name}, line {place.lineno})") from None
@@ -124,7 +130,9 @@ class WatchedVectorEnv(AsyncVectorEnv):
         if failed:
             said = f"Environment {failed[0]} failed"
             with suppress(queue.Empty):
-                index, _, error, _ = self.error_queue.get(timeout=1.0)
+                index, kind, error, _ = self.error_queue.get(timeout=1.0)
+                if issubclass(kind, RefusedInWorkerError):
+                    raise UserError(str(error))
                 said = f"Environment {index} raised {error}"
             raise WorkerError(f"{said}.")
 

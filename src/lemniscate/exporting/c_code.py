@@ -15,7 +15,7 @@ import numpy as np
 
 from lemniscate.exporting.deployed import safe_action, safe_sentence
 from lemniscate.exporting.operations import Operand, Operation, Program, Value
-from lemniscate.spec import Action, Discrete
+from lemniscate.spec import Action, Discrete, MultiDiscrete
 from lemniscate.system.machine import version
 from lemniscate.system.templates import filled
 
@@ -59,7 +59,7 @@ def c_files(
         "period": None if period is None else np.float32(period),
         "program": program,
         "action": action,
-        "masked": isinstance(action, Discrete) and action.masked,
+        "masked": _masked(action),
         "safe": safe_action(action),
         "safe_sentence": safe_sentence(action),
         "observations": observations,
@@ -72,6 +72,14 @@ def c_files(
     }
     filters = {"braces": braces, "comment": comment, "functions": functions}
     return {name: filled(TEMPLATES / name, filters, **context) for name in ("policy.c", "policy.h")}
+
+
+def _masked(action: Action) -> list[tuple[int, int, int]]:
+    """Of each component with a mask: its number of choices, the first one, and where its mask begins in all of them."""
+    if not isinstance(action, Discrete | MultiDiscrete) or not action.masked:
+        return []
+    counts, firsts = ((action.n,), (action.start,)) if isinstance(action, Discrete) else (action.nvec, action.start)
+    return [(n, first, sum(counts[:k])) for k, (n, first) in enumerate(zip(counts, firsts, strict=True))]
 
 
 def comment(text: str) -> str:

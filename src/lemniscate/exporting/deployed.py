@@ -55,7 +55,7 @@ class Deployed(nn.Module):
 
 def input_size(spec: Spec) -> int:
     """The length of a policy's input: the flat observation, and the action mask where there is one."""
-    return spec.observation_size + (spec.action.n if isinstance(spec.action, Discrete) and spec.action.masked else 0)
+    return spec.observation_size + spec.action.mask_size
 
 
 def safe_action(action: Action) -> np.ndarray:
@@ -75,7 +75,7 @@ def safe_sentence(action: Action) -> str:
     """The safe action in words."""
     if isinstance(action, Box):
         return "the middle of each coordinate's range (1 from its bound where it has only one, 0 where it has none)"
-    if isinstance(action, Discrete) and action.masked:
+    if action.mask_size:
         return "the first that the mask permits"
     return "the first choice of each"
 

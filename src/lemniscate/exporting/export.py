@@ -62,6 +62,8 @@ def export(run: Trained, to: str | Path | None = None, *, trust: bool = False) -
     folder = _destination(run, policy, to)
     if policy.spec.image:
         raise UserError(f"A policy for {policy.spec.env_id} looks at images; what can be exported looks at vectors.")
+    if isinstance(policy.spec.action, Box) and not policy.spec.action.dtype.startswith("float"):
+        raise UserError(f"{policy.spec.env_id} takes a Box of whole numbers; what can be exported acts by fractions.")
     program = translate(Deployed(policy).eval(), input_size(policy.spec))
     contents, record, said = _contents(policy, program)
     try:

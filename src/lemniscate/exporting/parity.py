@@ -9,7 +9,6 @@ import numpy as np
 from torch import Tensor
 
 from lemniscate.api.policy import TrainedPolicy
-from lemniscate.envs import registry
 from lemniscate.envs.backend import Interface
 from lemniscate.errors import UserError, is_installed, missing_extra
 from lemniscate.exporting import compiled
@@ -19,7 +18,7 @@ from lemniscate.exporting.onnx_model import onnx_act
 from lemniscate.exporting.operations import Program
 from lemniscate.maths import Deterministic
 from lemniscate.nn.normalizer import RunningNorm
-from lemniscate.run.environments import env_arguments
+from lemniscate.run.environments import evaluation_env
 from lemniscate.run.evaluate import play_episodes
 from lemniscate.spec import Box
 
@@ -42,7 +41,7 @@ def fly(policy: TrainedPolicy, act: Act, rows: int = ROWS, seed: int = 0) -> tup
     Raises:
         UserError: the environment cannot be made, or has other spaces now.
     """
-    env = registry.make(num_envs=ENVIRONMENTS, device="cpu", **env_arguments(policy.config))
+    env = evaluation_env(policy.config, ENVIRONMENTS)
     size, seen = input_size(policy.spec), list[np.ndarray]()
 
     def driver(obs: Tensor) -> Deterministic:

@@ -71,10 +71,7 @@ class CategoricalPolicy(Policy):
 
     def forward(self, obs: Tensor) -> Categorical:
         """[B, O] to logits [B, n]."""
-        logits = self.net(self.normalizer(obs))
-        if self.action.masked:
-            logits = logits.masked_fill(obs[..., -self.action.n :] == 0, -1e9)
-        return Categorical(logits)
+        return Categorical(_permitted(self.net(self.normalizer(obs)), obs, self.action))
 
     def draw_noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
         """Uniform in [0, 1), [*shape]."""
@@ -82,7 +79,7 @@ class CategoricalPolicy(Policy):
 
 
 class MultiCategoricalPolicy(Policy):
-    """K independent softmaxes over n_k actions each."""
+    """K independent softmaxes over n_k actions each; those that the mask rules out get probability zero."""
 
     def __init__(self, normalizer: NoNorm, net: nn.Module, action: MultiDiscrete) -> None:
         super().__init__(normalizer, net)
@@ -90,12 +87,17 @@ class MultiCategoricalPolicy(Policy):
 
     def forward(self, obs: Tensor) -> MultiCategorical:
         """[B, O] to logits [B, n_k] for each of K."""
-        logits = self.net(self.normalizer(obs)).split(self.action.nvec, dim=-1)
+        logits = _permitted(self.net(self.normalizer(obs)), obs, self.action).split(self.action.nvec, dim=-1)
         return MultiCategorical(tuple(Categorical(part) for part in logits))
 
     def draw_noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
         """Uniform in [0, 1), [*shape, K]."""
         return torch.rand(*shape, len(self.action.nvec), generator=generator, device=generator.device)
+
+
+def _permitted(logits: Tensor, obs: Tensor, action: Discrete | MultiDiscrete) -> Tensor:
+    """The logits [B, n], those of actions that the mask at the end of `obs` rules out at −10⁹."""
+    return logits.masked_fill(obs[..., -action.mask_size :] == 0, -1e9) if action.masked else logits
 
 
 class BernoulliPolicy(Policy):

@@ -234,7 +234,9 @@ def _measures(scores: Evaluated) -> list[tuple[str, str]]:
     return [
         (name.removesuffix("_mm").replace("_", " "), f"{value:.4g}{' mm' * name.endswith('_mm')}")
         for name, value in scores.items()
-        if name not in NOT_MEASURES and isinstance(value, int | float) and math.isfinite(value)
+        if not (name in NOT_MEASURES or name.startswith("info/"))
+        and isinstance(value, int | float)
+        and math.isfinite(value)
     ]
 
 

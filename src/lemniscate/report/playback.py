@@ -19,9 +19,9 @@ import numpy as np
 import torch
 from PIL import Image
 
+from lemniscate.envs.conversion import measured, measures_of
 from lemniscate.envs.factory import make_one, maker_of, makes_vector, sentences
 from lemniscate.envs.registry import make_rendered
-from lemniscate.envs.conversion import measured, measures_of
 from lemniscate.envs.spaces import SUMMARIES
 from lemniscate.envs.vec_env import VecEnv, require_end
 from lemniscate.errors import UserError, is_installed, missing_extra, shown
@@ -78,12 +78,12 @@ def play_single(act: Act, arguments: dict[str, Any], episodes: int, seed: int, t
     Raises:
         UserError: an environment that cannot be made, or only several at once; an episode without an end.
     """
-    name, kwargs, wrappers, options = (arguments[part] for part in ("env", "kwargs", "wrappers", "reset_options"))
+    name, kwargs, wrappers = (arguments[part] for part in ("env", "kwargs", "wrappers"))
     table = EpisodeTable(1, torch.device("cpu"))
     with sentences(name, kwargs, wrappers):
         if makes_vector(maker_of(name)):
             raise UserError(f"{name} makes several environments at once, and a function acts in a single one.")
-        env = make_one(maker_of(name), tuple(map(find_callable, wrappers)), options, **kwargs)
+        env = make_one(maker_of(name), tuple(map(find_callable, wrappers)), **kwargs)
     with closing(env):
         deque(_play(env, act, name, episodes, seed, table, tell), maxlen=0)
     return table.evaluation(name, SUMMARIES)
@@ -97,6 +97,8 @@ def act_by(function: Callable[[Any], Any]) -> Act:
 def require_pictures(config: RunConfig, env: VecEnv) -> None:
     """Raise `UserError` where an environment cannot be recorded; one with a scene always can."""
     if not env.scene:
+        if env.backend.once:
+            env.close()
         with _quiet_sdl(in_window=False):
             _rendered(env_arguments(config), "rgb_array").close()
 
@@ -159,10 +161,16 @@ def _require_in(space: gym.Space, action: Any, name: str) -> None:
 
 def _random(env: gym.Env, seed: int) -> Act:
     """Uniformly random actions, of those that the mask allows."""
-    env.action_space.seed(seed)
-    return lambda obs, action_mask=None: env.action_space.sample(
-        None if action_mask is None else np.asarray(action_mask, dtype=np.int8)
-    )
+    space = env.action_space
+    space.seed(seed)
+
+    def sample(obs: Any, action_mask: np.ndarray | None = None) -> Any:
+        mask: Any = None if action_mask is None else action_mask.astype(np.int8)
+        if mask is not None and isinstance(space, gym.spaces.MultiDiscrete):
+            mask = tuple(np.split(mask, np.cumsum(space.nvec)[:-1]))
+        return space.sample(mask)
+
+    return sample
 
 
 def _rendered(arguments: dict[str, Any], mode: str) -> gym.Env:

@@ -191,6 +191,12 @@ class RunConfig:
             raise UserError(f"shards {self.shards:,} does not divide {name} {getattr(self, name):,}.")
 
     @property
+    def all_wrappers(self) -> tuple[str, ...]:
+        """The wrappers, and inside of them one that gives the reset_options, if there are any."""
+        options = f"lemniscate.envs.factory:ResetOptions(options={self.reset_options!r})"
+        return (options, *self.wrappers) if self.reset_options else self.wrappers
+
+    @property
     def gradient_steps(self) -> int:
         """The number of gradient steps of the whole run."""
         raise NotImplementedError
@@ -212,8 +218,8 @@ class RunConfig:
         if not isinstance(spec.action, Box) or all(map(math.isfinite, (*spec.action.low, *spec.action.high))):
             return []
         return [
-            f"Some actions of {spec.env_id} have no bound, so the policy begins with steps of about 1; better give their"
-            " Box a finite low and high."
+            f"Some actions of {spec.env_id} have no bound, so the policy begins with steps of about 1; better give the"
+            " Box of its action_space a finite low and high."
         ]
 
     def replace(self, **changes: object) -> Self:

@@ -51,8 +51,8 @@ def envs_of(config: RunConfig, world: World) -> tuple[VecEnv, VecEnv | None]:
 
 def training_env(config: RunConfig, world: World) -> VecEnv:
     """The environments of training, staggered, shared by the processes of a world."""
-    own: dict[str, Any] = {"kwargs": config.env_kwargs, "wrappers": config.wrappers, "backend": config.backend}
-    own["reset_options"], device = config.reset_options, str(device_for(config.device))
+    own = {"kwargs": config.env_kwargs, "wrappers": config.all_wrappers, "backend": config.backend}
+    device = str(device_for(config.device))
     return registry.make(config.env, config.num_envs, device=device, stagger=True, world=world, **own)
 
 
@@ -71,7 +71,7 @@ def evaluation_env(
     """
     arguments = env_arguments(config, env, env_kwargs, backend)
     served_by = registry.backend_class(
-        arguments["backend"] or registry.backend_for(arguments["env"], config.wrappers)
+        arguments["backend"] or registry.backend_for(arguments["env"], config.all_wrappers)
     )
     as_in_training = served_by.compiled or served_by.exists_once(arguments["env"], config.num_envs)
     return registry.make(num_envs=config.num_envs if as_in_training else min(episodes, 16), device=device, **arguments)
@@ -83,13 +83,12 @@ def env_arguments(
     env_kwargs: Mapping[str, Any] | None = None,
     backend: str | None = None,
 ) -> dict[str, Any]:
-    """The arguments of `registry.make` for the evaluation of a run: env, kwargs, wrappers, backend, reset_options."""
+    """The arguments of `registry.make` for the evaluation of a run: env, kwargs, wrappers, backend."""
     name = config.env if env is None else registry.name_of(env)
     kwargs = {**(config.env_kwargs if name == config.env else {}), **(env_kwargs or {})}
     if env is None and backend is None:
         backend = registry.for_evaluation(config.backend)
-    own = config.reset_options if name == config.env else {}
-    return {"env": name, "kwargs": kwargs, "wrappers": config.wrappers, "backend": backend, "reset_options": own}
+    return {"env": name, "kwargs": kwargs, "wrappers": config.all_wrappers, "backend": backend}
 
 
 def device_for(name: str) -> torch.device:

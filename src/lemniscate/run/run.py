@@ -168,7 +168,11 @@ class Run:
             self._recent_returns = (self._recent_returns + episodes.returns)[-100:]
             numbers["episode/return"] = sum(episodes.returns) / len(episodes.returns)
             numbers["episode/length"] = sum(episodes.lengths) / len(episodes.lengths)
+        numbers |= {f"info/{name.removeprefix('info/')}": mean for name, mean in episodes.measures.items()}
         self._write(state.step, numbers | self._times(state.step), episodes)
+        if self._visible and self.env.backend.notice:
+            say(self.env.backend.notice)
+        self.env.backend.notice = None
         recent = self._recent_returns
         self._bar.update(state.step, sum(recent) / len(recent) if recent else None)
 

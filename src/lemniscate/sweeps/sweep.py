@@ -328,7 +328,7 @@ def require_trainable(configs: dict[str, RunConfig], seeds: list[int]) -> None:
         device = device_for(config.device)
         for seed in seeds:
             config.replace(seed=seed)
-        own = {"kwargs": config.env_kwargs, "wrappers": config.wrappers, "backend": config.backend}
+        own = {"kwargs": config.env_kwargs, "wrappers": config.all_wrappers, "backend": config.backend}
         with prefix_errors(name):
             env = registry.make(config.env, 1, **own)
             env.close()

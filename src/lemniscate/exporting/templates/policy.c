@@ -30,15 +30,15 @@ int policy_act(const float obs[POLICY_OBSERVATIONS], float action[POLICY_ACTIONS
     for (i = 0; i < POLICY_OBSERVATIONS; ++i) {
         if (!is_finite(obs[i])) {
             memcpy(action, safe_action, sizeof safe_action);
-{% if masked %}
-            for (i = 0; i < {{ action.n }}; ++i) {
-                const float permitted = obs[POLICY_OBSERVATIONS - {{ action.n }} + i];
+{% for n, first, begin in masked %}
+            for (i = 0; i < {{ n }}; ++i) {
+                const float permitted = obs[POLICY_OBSERVATIONS - {{ action.mask_size - begin }} + i];
                 if (is_finite(permitted) && permitted != 0.0F) {
-                    action[0] = (float)(i + {{ action.start }});
+                    action[{{ loop.index0 }}] = (float)(i + {{ first }});
                     break;
                 }
             }
-{% endif %}
+{% endfor %}
             return 1;
         }
     }
