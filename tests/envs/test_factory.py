@@ -84,7 +84,7 @@ def test_measures_are_what_the_metadata_names_and_success():
     env = registry.make(Reach, 2)
     env.restart(0)
     steps = [env.step(torch.zeros(2, dtype=torch.int64)).measures for _ in range(5)]
-    assert set(steps[0]) == {"is_success", "height"}
+    assert set(steps[0]) == {"is_success", "height", "info/unnamed"}
     assert [step["is_success"][0].item() for step in steps] == [0, 0, 0, 1, 0]
     assert steps[0]["height"].tolist() == [1, 1]
     assert "height" not in steps[1]

@@ -1,6 +1,5 @@
 import math
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -10,7 +9,7 @@ from hypothesis import strategies as st
 from lemniscate.envs.conversion import flatten_observation, physical_action, scale_action
 from lemniscate.envs.spaces import ActionMasks, action_kind, is_image, observation_parts
 from lemniscate.errors import UserError
-from lemniscate.spec import Box, Discrete
+from lemniscate.spec import Box, Discrete, Spec
 
 
 @given(st.floats(-10, 10, width=32), st.floats(0.125, 10, width=32), st.floats(-3, 3, width=32))
@@ -137,14 +136,16 @@ def test_other_spaces_get_a_sentence():
         observation_parts(spaces.Sequence(spaces.Discrete(2)), "myenv")
     with pytest.raises(UserError, match="what can be acted in is"):
         action_kind(spaces.Dict({"a": spaces.Discrete(2)}), "myenv")
-    with pytest.raises(UserError, match="a Box of floating-point numbers"):
-        action_kind(gym.spaces.Box(0, 9, (2,), np.int64), "myenv")
 
 
 def test_a_mask_that_is_given_for_some_environments_is_theirs_alone():
-    masks = ActionMasks("Env-v0", 3, 2)
+    masks = ActionMasks(Spec("Env-v0", (), Discrete(2, masked=True)), 3)
     info = {"action_mask": np.array([[0, 1], [1, 0], [0, 1]]), "_action_mask": np.array([False, True, True])}
-    assert masks.append_to(np.zeros((3, 1)), info).tolist() == [[0, 1, 1], [0, 1, 0], [0, 0, 1]]
-    assert masks.append_to(np.zeros((3, 1)), {}).tolist() == [[0, 1, 1], [0, 1, 0], [0, 0, 1]], "until another is given"
+    flat, everyone = np.zeros((3, 1)), np.ones(3, dtype=bool)
+    assert masks.append_to(flat, flat, info).tolist() == [[0, 1, 1], [0, 1, 0], [0, 0, 1]]
+    assert masks.append_to(flat, flat, {}).tolist() == [[0, 1, 1], [0, 1, 0], [0, 0, 1]], "until another is given"
+    masks.require_choice(masks.append_to(flat, flat, {}), everyone)
+    none_left = masks.append_to(flat, flat, {"action_mask": np.array([[1, 1], [1, 1], [0, 0]])})
+    masks.require_choice(none_left, np.array([True, True, False]))
     with pytest.raises(UserError, match="rules out every action of environment 2"):
-        masks.append_to(np.zeros((3, 1)), {"action_mask": np.array([[1, 1], [1, 1], [0, 0]])})
+        masks.require_choice(none_left, everyone)

@@ -33,7 +33,6 @@ def test_one_that_never_comes_to_life_is_named(monkeypatch, name, patience, sent
     ("name", "sentence"),
     [
         ("Failing", r"Environment \d raised ValueError: the motor is off \(broken.py, line \d+\)\."),
-        ("Locked", r"Environment \d raised .*pickle"),
     ],
 )
 def test_one_that_raises_is_named_with_the_place(capfd, name, sentence):

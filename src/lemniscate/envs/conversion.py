@@ -237,7 +237,7 @@ def mask_in(obs: Any, info: Mapping[str, Any]) -> tuple[str, Any]:
 def flat_mask(mask: Any, action: gym.Space | Action) -> np.ndarray:
     """An action mask as one row, [n] bool; of a MultiDiscrete, those of its components one after the other.
 
-    Raises `ValueError`, with the rest of a sentence, for another size, a mask that permits nothing, and other actions.
+    Raises `ValueError`, with the rest of a sentence, for another size, and for actions that are no choices.
     """
     counts = getattr(action, "nvec", None)
     counts = np.ravel(getattr(action, "n", 0) if counts is None else counts)
@@ -246,10 +246,7 @@ def flat_mask(mask: Any, action: gym.Space | Action) -> np.ndarray:
     row = _row(mask)
     if len(row) != counts.sum():
         raise ValueError(f"of {len(row)} numbers; it must have {counts.sum()}, of 1 and 0")
-    permitted = row.astype(bool)
-    if not all(part.any() for part in np.split(permitted, np.cumsum(counts)[:-1])):
-        raise ValueError("that rules out every action")
-    return permitted
+    return row.astype(bool)
 
 
 def _row(mask: Any) -> np.ndarray:
@@ -349,13 +346,13 @@ def scale_action(action: np.ndarray, box: Box) -> np.ndarray:
     """
     low, high, middle, half = scale_of(box)
     physical = np.minimum(np.maximum(middle + half * action, low), high)
-    return physical if physical.dtype == box.dtype else np.rint(physical).astype(box.dtype)
+    return physical if box.dtype.startswith("float") else np.rint(physical).astype(box.dtype)
 
 
 @lru_cache
 def scale_of(box: Box) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """low, high, middle and half of the width of each coordinate, [A] each, as `scale_action` takes them."""
-    kind = np.dtype(box.dtype) if np.dtype(box.dtype).kind == "f" else np.float64
+    kind = box.dtype if box.dtype.startswith("float") else "float64"
     low, high = np.array(box.low, dtype=kind), np.array(box.high, dtype=kind)
     below, above = np.isfinite(low), np.isfinite(high)
     with np.errstate(invalid="ignore"):  # ∞ − ∞, of which nothing is taken

@@ -131,6 +131,9 @@ class EnvpoolBackend(Backend):
             obs = next_obs.copy()
             obs[reset_info["env_id"]] = self._observe(fresh, reset_info)
             here, self.counts = self._tensor(obs), self._tensor(self._stagger.counts)
+            next_obs = obs
+        if self._masks:
+            self._masks.require_choice(next_obs, np.ones(self.num_envs, dtype=bool))
         reward, ended, cut = map(self._tensor, (reward.astype(np.float32), terminated, truncated))
         measures = measured(info, SUCCESS, self.num_envs, self.device)
         return Step(here, there, reward, ended, cut, self._valid, measures)

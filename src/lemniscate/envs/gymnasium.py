@@ -121,7 +121,10 @@ class GymnasiumBackend(Backend):
         self._stagger = Stagger(self.num_envs, self._stagger_up_to, seed, first)
         self.counts = self._tensor(self._stagger.counts)
         self._masks = spaces.ActionMasks(self.spec, self.num_envs) if self.spec.action.mask_size else None
-        return self._tensor(self._observe(*self._reset(seed + first)))
+        obs = self._observe(*self._reset(seed + first))
+        if self._masks:
+            self._masks.require_choice(obs, self._valid)
+        return self._tensor(obs)
 
     def step(self, action: Tensor) -> Step:
         """Step, then find the true successor of each row and where to act next, as the mode demands."""
@@ -141,6 +144,8 @@ class GymnasiumBackend(Backend):
             if done.any():
                 obs = self._observe(*self._reset(None, {"reset_mask": done.copy()}))
                 self.counts = self._tensor(self._stagger.counts)
+        if self._masks:
+            self._masks.require_choice(obs, ~self._resetting)
         there = self._tensor(next_obs)
         here = there if obs is next_obs else self._tensor(obs)
         rewards, *flags = map(self._tensor, (reward.astype(np.float32), terminated, truncated, valid))

@@ -187,7 +187,7 @@ class ActionMasks:
     """The present action mask [n] of each of N environments; all is permitted where none was given."""
 
     def __init__(self, spec: Spec, num_envs: int) -> None:
-        self._spec = spec
+        self._spec: Any = spec
         self._masks = np.ones((num_envs, spec.action.mask_size), dtype=bool)
 
     def append_to(
@@ -195,8 +195,7 @@ class ActionMasks:
     ) -> np.ndarray:
         """[N, O] to [N, O + n]: with the masks after it, brought up to date from the observation or the info.
 
-        With `numbers` [M] the rows are of these environments alone. Raises `UserError` for a mask of another size, or
-        one that rules out every action of a component.
+        With `numbers` [M] the rows are of these environments alone. Raises `UserError` for a mask of another size.
         """
         name, mask = mask_in(obs, info)
         masks = self._masks[numbers].copy()
@@ -208,6 +207,23 @@ class ActionMasks:
                     raise UserError(f"Environment {row} of {self._spec.env_id} has an action mask {error}.") from None
             self._masks[numbers] = masks
         return np.concatenate([flat, masks.astype(flat.dtype)], axis=-1)
+
+    def require_choice(self, obs: np.ndarray, acting: np.ndarray) -> None:
+        """Raise `UserError` where a mask in `obs` [N, O + n] permits nothing to an environment that is `acting` [N].
+
+        After the end of an episode nothing may be left to choose from.
+        """
+        wrong = acting & ~_permits(obs, self._spec.action)
+        if wrong.any():
+            name, number = self._spec.env_id, int(np.argmax(wrong))
+            raise UserError(f"{name} rules out every action of environment {number}: its action_mask is all zero.")
+
+
+def _permits(masks: np.ndarray, action: Discrete | MultiDiscrete) -> np.ndarray:
+    """[B] bool: the mask at the end of each row [B, …] permits a choice in every component."""
+    counts = action.nvec if isinstance(action, MultiDiscrete) else (action.n,)
+    parts = np.split(masks[:, masks.shape[1] - action.mask_size :], np.cumsum(counts)[:-1], axis=1)
+    return np.all([part.any(axis=1) for part in parts], axis=0)
 
 
 def masked(action: Action, obs: Any, info: Mapping[str, Any]) -> Action:
@@ -237,10 +253,12 @@ def read_mask(mask: Any, spec: Spec, flat: np.ndarray) -> np.ndarray:
         mask = _mask_in_flat(spec, flat)
     several = isinstance(mask, np.ndarray) and mask.ndim > 1 and mask.shape == (batch, size)
     try:
-        rows = [flat_mask(row, spec.action) for row in (mask if several else [mask])]
+        rows = np.stack([flat_mask(row, spec.action) for row in (mask if several else [mask])])
     except ValueError as error:
         raise UserError(f"{spec.env_id} has action masks of {size} numbers; this is one {error}.") from None
-    return np.broadcast_to(np.stack(rows), (batch, size))
+    if isinstance(spec.action, Discrete | MultiDiscrete) and not _permits(rows, spec.action).all():
+        raise UserError(f"This action_mask of {spec.env_id} permits nothing.")
+    return np.broadcast_to(rows, (batch, size))
 
 
 def _mask_in_flat(spec: Spec, flat: np.ndarray) -> np.ndarray:

@@ -70,10 +70,9 @@ def evaluation_env(
     `env_kwargs` change those of the run; in another environment they are the only ones.
     """
     arguments = env_arguments(config, env, env_kwargs, backend)
-    served_by = registry.backend_class(
-        arguments["backend"] or registry.backend_for(arguments["env"], config.all_wrappers)
-    )
-    as_in_training = served_by.compiled or served_by.exists_once(arguments["env"], config.num_envs)
+    name = arguments["env"]
+    served_by = registry.backend_class(arguments["backend"] or registry.backend_for(name, config.all_wrappers))
+    as_in_training = served_by.compiled or served_by.exists_once(name, config.num_envs)
     return registry.make(num_envs=config.num_envs if as_in_training else min(episodes, 16), device=device, **arguments)
 
 
