@@ -62,7 +62,7 @@ def test_a_time_limit_cuts_and_shows_the_true_final_observation(part):
     for _ in range(2):
         begun = usual.restart(3).clone()
         assert begun.dtype == (torch.uint8 if usual.spec.image else torch.float32)
-        assert begun.shape == (N, usual.spec.observation_size)
+        assert begun.shape == (N, usual.spec.observation_size + usual.spec.action.mask_size)
         assert torch.equal(begun, short.restart(3))
         assert first is None or torch.equal(begun, first)  # the same seed, the same beginning
         first = begun
