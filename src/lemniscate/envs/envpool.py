@@ -131,9 +131,6 @@ class EnvpoolBackend(Backend):
             obs = next_obs.copy()
             obs[reset_info["env_id"]] = self._observe(fresh, reset_info)
             here, self.counts = self._tensor(obs), self._tensor(self._stagger.counts)
-            next_obs = obs
-        if self._masks:
-            self._masks.require_choice(next_obs, np.ones(self.num_envs, dtype=bool))
         reward, ended, cut = map(self._tensor, (reward.astype(np.float32), terminated, truncated))
         measures = measured(info, SUCCESS, self.num_envs, self.device)
         return Step(here, there, reward, ended, cut, self._valid, measures)
@@ -145,7 +142,12 @@ class EnvpoolBackend(Backend):
     def _observe(self, raw: Any, info: Mapping[str, Any]) -> np.ndarray:
         """The flat observations of all, or of those that were reset; after them the action masks, where there are."""
         flat = flatten_observation(self.spec.observation_parts, raw, image=self.spec.image)
-        return self._masks.append_to(flat, raw, info, info["env_id"]) if self._masks else flat
+        if self._masks is None:
+            return flat
+        rows = self._masks.append_to(flat, raw, info, info["env_id"])
+        masks = rows[:, flat.shape[1] :]
+        masks[~masks.any(axis=1)] = 1  # mazes without a way begin so; any action ends them
+        return rows
 
     def _tensor(self, array: np.ndarray) -> Tensor:
         return torch.from_numpy(array).to(self.device)
