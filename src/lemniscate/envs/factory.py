@@ -10,7 +10,7 @@ from typing import Any
 
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
-from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 
 from lemniscate.envs.workers import WatchedVectorEnv, Worker
 from lemniscate.errors import UserError
@@ -78,7 +78,47 @@ def make_vector(
     else:
         envs = SyncVectorEnv(makers, autoreset_mode=AutoresetMode.DISABLED)
         one = envs.envs[0]
+    require_no_statistics(one, envs)
     return envs, one.spec.max_episode_steps if one.spec else None
+
+
+STATISTICS = {"obs_rms", "return_rms", "ret_rms", "reward_rms", "running_mean_std"}
+"""the attributes that hold running statistics in Gymnasium's wrappers and in those modelled on them"""
+
+
+def layers(env: Any) -> Iterator[gym.Env | VectorEnv]:
+    """The wrappers of an environment, the outermost first, then itself; of a vector also those of its first one."""
+    while isinstance(env, gym.Env | VectorEnv):
+        yield env
+        held = vars(env)
+        env = held.get("env", next(iter(held.get("envs") or ()), None))
+
+
+def require_no_statistics(env: gym.Env | VectorEnv, vector: VectorEnv) -> None:
+    """Close `vector` and raise `UserError` where `env` or a wrapper of it learns statistics: no checkpoint has them.
+
+    Statistics that are fixed, by Gymnasium's `update_running_mean = False`, belong to the environment.
+    """
+    for layer in layers(env):
+        held = {name.strip("_"): value for name, value in vars(layer).items()}
+        if held.get("update_running_mean", True) and (STATISTICS & held.keys() or any(map(_is_running, held.values()))):
+            name = type(layer).__name__
+        elif isinstance(layer, AsyncVectorEnv) and any(any(layer.call("has_wrapper_attr", it)) for it in STATISTICS):
+            name = "a wrapper in its workers"
+        else:
+            continue
+        vector.close()
+        raise UserError(
+            f"{name} learns statistics that no checkpoint has, so a run that is resumed, and a policy that is loaded,"
+            " would see other numbers: leave it out, and train with normalize_observations, or for rewards with"
+            " scale_rewards (on the command line --normalize-observations, --scale-rewards)."
+        )
+
+
+def _is_running(value: object) -> bool:
+    """Whether it is a running mean and variance, as `RunningMeanStd` is; of an array or a table these are methods."""
+    names = set(dir(value))
+    return {"mean", "var"} <= names and bool({"update", "count"} & names) and not callable(getattr(value, "mean", len))
 
 
 @contextmanager

@@ -8,12 +8,13 @@ something still reads it.
 import math
 import re
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from lemniscate.exporting.deployed import safe_action, safe_sentence
+from lemniscate.exporting.deployed import difference_units, safe_action, safe_sentence
 from lemniscate.exporting.operations import Operand, Operation, Program, Value
 from lemniscate.spec import Action, Discrete
 from lemniscate.system.machine import version
@@ -38,6 +39,7 @@ def c_files(
     title: str,
     origin: str,
     period: float | None = None,
+    wrappers: Sequence[str] = (),
 ) -> dict[str, str]:
     """The texts of `policy.c` and `policy.h`.
 
@@ -49,6 +51,7 @@ def c_files(
         title: what the policy is for.
         origin: where the observations are from.
         period: seconds between two actions, where known.
+        wrappers: what stands between the environment and the policy in training, and is not in the program.
     """
     body = Body(program)
     places, scratch = body.places()
@@ -64,7 +67,9 @@ def c_files(
         "safe_sentence": safe_sentence(action),
         "observations": observations,
         "actions": actions,
-        "bound": f"{self_test_bound(program, actions):.0e}F",
+        "bound": "0.05F" if program.is_rounded else "1e-4F",  # ten times the effect of another order of sums
+        "units": difference_units(action, actions),
+        "wrappers": wrappers,
         "constants": body.constants,
         "scratch": max(scratch, 1),
         "places": {name: places[name] for name in body.sizes},
@@ -77,12 +82,6 @@ def c_files(
 def comment(text: str) -> str:
     """Text that cannot end the comment in C in which it stands; anyone may have written the run that it comes from."""
     return " ".join(text.replace("*/", "* /").replace("\\", "/").split())
-
-
-def self_test_bound(program: Program, actions: np.ndarray) -> float:
-    """The error bound of the self-test: ten times the effect of another order of sums, by the size of the actions."""
-    largest = float(np.abs(actions).max())
-    return 0.05 * max(1.0, largest) if program.is_rounded else 1e-5 * max(10.0, largest)
 
 
 def functions(text: str) -> str:

@@ -80,6 +80,26 @@ def safe_sentence(action: Action) -> str:
     return "the first choice of each"
 
 
+def difference_units(action: Action, true: np.ndarray) -> np.ndarray:
+    """The size [A] in which a difference from the true actions [R, A] is counted.
+
+    Half the range of a coordinate of a Box; of one without two bounds 1, or its largest true action where that is more;
+    1 of the others. Where float32 divides a range into few numbers, a difference between two neighbours counts 1e-5.
+    """
+    if not isinstance(action, Box):
+        return np.ones(true.shape[1])
+    low, high, _, half = scale_of(action)
+    bounded = np.isfinite(low) & np.isfinite(high)
+    spacing = np.spacing(np.where(bounded, np.maximum(np.abs(low), np.abs(high)), 1).astype(np.float32))
+    return np.where(bounded, np.maximum(half, spacing / 1e-5), np.maximum(1, np.abs(true).max(0)))
+
+
+DIFFERENCES_ARE = (
+    "shares of half the range of each action; where a bound is infinite, of its unit, or of its largest value above 1"
+)
+"""the words for `difference_units`"""
+
+
 def act_with(policy: TrainedPolicy) -> Act:
     """The policy itself as a function of rows; every export is compared with it."""
 
