@@ -51,6 +51,24 @@ def test_gymnasiums_own_arguments_and_wrappers():
     assert stacked.spec.observation_parts[0].shape == (3, 4)
 
 
+@pytest.mark.parametrize("backend", ["gymnasium", "gymnasium-async", "envpool"])
+@pytest.mark.parametrize(("argument", "instead"), registry.ARGUMENTS_OF_MAKE.items())
+def test_arguments_of_make_are_left_out(backend, argument, instead):
+    with pytest.raises(UserError) as raised:
+        registry.make("CartPole-v1", 2, kwargs={argument: None}, backend=backend)
+    assert str(raised.value).startswith(f"{argument} is no argument of an environment: leave it out")
+    assert instead in str(raised.value)
+
+
+def test_ones_own_environment_may_have_a_seed_among_its_arguments():
+    def seeded(seed, reward=1.0):
+        return Reach(reward=seed)
+
+    assert reward_of(seeded, kwargs={"seed": 5}) == 5
+    with pytest.raises(UserError, match="render_mode is no argument .* with a video"):
+        reward_of(Reach, kwargs={"render_mode": "human"})
+
+
 class Running(gym.Wrapper):
     """A wrapper of one's own with a running mean and variance."""
 

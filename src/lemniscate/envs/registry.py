@@ -39,6 +39,18 @@ BEGINNINGS = {
 """how the ids begin that a backend may serve: for no other is it imported. Those not named here may serve any id.
 EnvPool's own ids begin with `EnvPool/`; the others are Gymnasium's, which behave there as in Gymnasium"""
 
+ARGUMENTS_OF_MAKE = {
+    "render_mode": "films are made by watch and evaluate with a video (--video FILE), in training with video_every",
+    "num_envs": "the number of parallel environments is the field num_envs",
+    "seed": "the seed of a run is the field seed, and that of an evaluation its argument seed",
+    "vectorization_mode": "the backend gymnasium-async gives each environment a process",
+    "disable_env_checker": "lemniscate check ENV is where the checker runs",
+    "autoreset": "environments are reset here",
+    "apply_step_api_compatibility": "environments of the old interface are wrapped by a function of your own",
+}
+"""what is no argument of an environment but of `gym.make` and its kin, and what takes its place here; the environment
+of one's own may have all but the first two"""
+
 MOST_ENVS = 1_000_000
 """parallel environments that may be asked for"""
 
@@ -195,6 +207,11 @@ def make(
     name, wraps, num_envs = name_of(env), names_of(wrappers), _checked_count(num_envs)
     if kwargs is not None and not isinstance(kwargs, Mapping):
         raise UserError(f"The arguments of an environment are a dictionary, such as {{'x': 1}}, not {kwargs!r}.")
+    for argument, instead in ARGUMENTS_OF_MAKE.items():
+        if argument in (kwargs or {}) and (argument in ("render_mode", "num_envs") or ":" not in name):
+            raise UserError(
+                f"{argument} is no argument of an environment: leave it out of env_kwargs (--env-args); {instead}."
+            )
     chosen = backend_for(name, wraps) if backend is None else backend
     cls = backend_class(chosen)
     if not cls.serves(name):

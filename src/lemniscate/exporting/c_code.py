@@ -16,7 +16,7 @@ import numpy as np
 
 from lemniscate.exporting.deployed import difference_units, safe_action, safe_sentence
 from lemniscate.exporting.operations import Operand, Operation, Program, Value
-from lemniscate.spec import Action, Discrete
+from lemniscate.spec import Action, Box, Discrete
 from lemniscate.system.machine import version
 from lemniscate.system.templates import filled
 
@@ -62,6 +62,7 @@ def c_files(
         "period": None if period is None else np.float32(period),
         "program": program,
         "action": action,
+        "is_box": isinstance(action, Box),
         "masked": isinstance(action, Discrete) and action.masked,
         "safe": safe_action(action),
         "safe_sentence": safe_sentence(action),

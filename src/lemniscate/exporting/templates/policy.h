@@ -30,7 +30,7 @@ int policy_act(const float obs[POLICY_OBSERVATIONS], float action[POLICY_ACTIONS
 
 /* The largest difference from the actions of training's own policy, at POLICY_SELF_TESTS observations that are stored
  * beside the weights: {{ origin | comment }}.
-{% if action.low %}
+{% if is_box %}
  * Differences are shares of half the range of each action; where a bound is infinite, of its unit, or of its largest
  * value above 1.
 {% endif %}
