@@ -223,7 +223,7 @@ def _parse_algorithm(command: str, words: list[str]) -> argparse.Namespace:
 def algorithms() -> dict[str, str]:
     """The algorithms, and the first line of each file, read from there: to import them is to import torch."""
     folder = Path(__file__).parents[1] / "algos"
-    lines = {name: (folder / f"{name}.py").read_text().partition("\n")[0] for name in ALGORITHMS}
+    lines = {name: (folder / f"{name}.py").read_text("utf-8").partition("\n")[0] for name in ALGORITHMS}
     return {name: line.removeprefix('"""') for name, line in lines.items()}
 
 

@@ -90,7 +90,7 @@ def functions(text: str) -> str:
 
     A block of that file begins with a line `// name`.
     """
-    blocks = f"\n{(TEMPLATES / 'functions.c').read_text()}".split("\n// ")[1:]
+    blocks = f"\n{(TEMPLATES / 'functions.c').read_text('utf-8')}".split("\n// ")[1:]
     found = ""
     for block in reversed(blocks):  # C defines a function before it is called, so one pass finds all of them
         name, _, block_text = block.partition("\n")

@@ -190,7 +190,9 @@ def commit() -> str | None:
     try:
         # the first command fails where lemniscate is installed into the directory of another repository
         for command in (["ls-files", "--error-unmatch", "__init__.py"], ["rev-parse", "HEAD"]):
-            done = subprocess.run(["git", *command], cwd=folder, capture_output=True, text=True, timeout=10, check=True)
+            done = subprocess.run(
+                ["git", *command], cwd=folder, capture_output=True, encoding="utf-8", timeout=10, check=True
+            )
         return done.stdout.strip()
     except (OSError, subprocess.SubprocessError):
         return None

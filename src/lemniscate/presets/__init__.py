@@ -109,7 +109,7 @@ def read_preset(file: Path, algorithm: str) -> Preset:
 @cache
 def _stored(algorithm: str) -> list[Preset]:
     """The presets in the file of an algorithm of this library."""
-    return read_toml(algorithm, (Path(__file__).parent / f"{algorithm}.toml").read_text())
+    return read_toml(algorithm, (Path(__file__).parent / f"{algorithm}.toml").read_text("utf-8"))
 
 
 def read_toml(algorithm: str, text: str) -> list[Preset]:

@@ -92,7 +92,7 @@ def _split(word: str) -> list[str]:
 @cache
 def rows() -> list[list[str]]:
     """The cells of each row: our field, and the other libraries' words for it; of the first row, their names."""
-    lines = TABLE.read_text().splitlines()
+    lines = TABLE.read_text("utf-8").splitlines()
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if not line.startswith("| ---")]
 
 
