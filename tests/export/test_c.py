@@ -190,7 +190,7 @@ def test_differences_are_shares_of_the_range_of_each_action():
     assert found["max_difference"] == pytest.approx(2e-5, rel=0.01)
     assert found["max_abs_difference"] == pytest.approx(2e-3, rel=0.01)
     assert found["above_tolerance"] == 1  # 2e-3 of 500 N is none
-    assert (difference_units(MultiDiscrete((3, 5)), true[:, :2]) == 1).all()
+    assert (difference_units(MultiDiscrete((3, 5), (0, 0)), true[:, :2]) == 1).all()
     (coarse,) = difference_units(Box((1000.0,), (1000.001,)), true[:, :1])
     assert np.spacing(np.float32(1000)) / coarse <= 1e-5  # float32 has some sixteen numbers there
 

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+from itertools import groupby
 from shutil import get_terminal_size
 from typing import Any
 
@@ -10,7 +11,7 @@ from lemniscate.api import training
 from lemniscate.api.options import RunOptions
 from lemniscate.api.policy import TrainedRun
 from lemniscate.envs import registry
-from lemniscate.errors import UserError, unknown_name
+from lemniscate.errors import UserError, is_installed, missing_extra
 from lemniscate.run.directory import SWEEP, TUNE
 from lemniscate.run.fields import number, read, read_json
 from lemniscate.run.run import is_compiled
@@ -137,16 +138,41 @@ def push(given: argparse.Namespace) -> None:
 
 
 def envs(given: argparse.Namespace) -> None:
-    """List the environments, the backend of each, and the presets that fit."""
+    """List the families of environments; those of one, each with its backend and the presets that fit."""
     from lemniscate.presets import best
 
-    found = [env_id for env_id in registry.known_ids() if given.filter.lower() in env_id.lower()]
+    ids, wanted = registry.known_ids(), given.filter.lower()
+    if not wanted:
+        families = groupby(sorted(ids, key=_family), key=_family)
+        for family, (first, *rest) in families:
+            say(f"{family:<28} {1 + len(rest):>4}  {first}{', …' if rest else ''}")
+        say("`lemniscate envs NAME` lists those with that word in family or id, and the presets that fit.")
+        for package, extra in registry.EXTRAS.items():
+            if not is_installed(package):
+                say(missing_extra(package, extra))
+        return
+    found = [env_id for env_id in ids if wanted in env_id.lower() or wanted in _family(env_id).lower()]
     if not found:
-        raise unknown_name("environment", given.filter, registry.known_ids())
+        raise registry.unknown_env(given.filter)
     for env_id in found:
         presets = ((algorithm, best(algorithm, env_id)) for algorithm in ALGORITHMS)
         fitting = ", ".join(f"{algorithm}: {preset}" for algorithm, preset in presets if preset != "default")
         say(f"{env_id:<40} {registry.backend_for(env_id):<12} {fitting or 'default'}")
+
+
+def _family(env_id: str) -> str:
+    """The library of an id, and the part of it that the id belongs to."""
+    from gymnasium import registry as theirs
+
+    library, _, task = env_id.partition("/")
+    if library == "EnvPool":
+        from lemniscate.envs.envpool import family
+
+        return f"EnvPool {family(task)}"
+    spec = theirs.get(env_id)
+    place = str(spec and (spec.entry_point or spec.vector_entry_point)).split(".")
+    own = f"Gymnasium {place[2]}" if place[:2] == ["gymnasium", "envs"] else place[0]
+    return own if spec else registry.backend_for(env_id)
 
 
 def check(given: argparse.Namespace) -> None:

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
 
-from lemniscate.errors import UserError, is_installed, shown, unknown_name
+from lemniscate.errors import UserError, is_installed, missing_extra, shown, unknown_name
 from lemniscate.system import named
 
 if TYPE_CHECKING:
@@ -38,6 +38,9 @@ BEGINNINGS = {
 }
 """how the ids begin that a backend may serve: for no other is it imported. Those not named here may serve any id.
 EnvPool's own ids begin with `EnvPool/`; the others are Gymnasium's, which behave there as in Gymnasium"""
+
+EXTRAS = {"envpool": "envpool", "mujoco": "mujoco", "Box2D": "box2d", "crazyflow": "drone"}
+"""the packages with environments, and the extra that each comes with"""
 
 ARGUMENTS_OF_MAKE = {
     "render_mode": "films are made by watch and evaluate with a video (--video FILE), in training with video_every",
@@ -73,8 +76,27 @@ def backend_for(env: str, wrappers: Sequence[str] = ()) -> str:
                 return name
             serving = serving or name
     if serving is None:
-        raise unknown_name("environment", env, known_ids(), "one of your own is named as module:Class.")
+        raise unknown_env(env)
     return serving
+
+
+def unknown_env(env: str) -> UserError:
+    """The sentence for an environment that is not served: ours of that name in another version or library; or near it.
+
+    Of several versions it is the newest, and Gymnasium's before that of EnvPool.
+    """
+    same = [known for known in known_ids() if _stem(known) == _stem(env)]
+    if same:
+        best = max(same, key=lambda known: ("/" not in known, [int(n) for n in re.findall(r"-v(\d+)$", known)]))
+        return UserError(f"There is no environment {env!r}: did you mean {best}?")
+    more = "" if is_installed("envpool") else f" (Atari, dm_control and more: {missing_extra('envpool', 'envpool')})"
+    return unknown_name("environment", env, known_ids(), f"one of your own is named as module:Class{more}.")
+
+
+def _stem(env: str) -> str:
+    """The letters and digits of an id without library, version and the variants that Atari's ids had."""
+    name = re.sub(r"(NoFrameskip|Deterministic|-ram|-ramNoFrameskip)?(-v\d+)?$", "", env.rpartition("/")[2])
+    return re.sub(r"[^a-z0-9]", "", name.lower())
 
 
 def backend_class(backend: str) -> type["Backend"]:
