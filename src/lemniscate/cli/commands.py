@@ -89,7 +89,7 @@ def evaluate(given: argparse.Namespace) -> None:
     from lemniscate.report import pages
 
     own = {"backend": given.backend, "baseline": given.baseline, "video": given.video, "trust": given.trust}
-    scores = results.evaluate(given.run, **_episodes(given), **own)
+    scores = results.evaluate(given.run, deterministic=not given.stochastic, **_episodes(given), **own)
     if given.json:
         print(json.dumps(scores.to_json(), allow_nan=False))
     else:
@@ -103,7 +103,7 @@ def watch(given: argparse.Namespace) -> None:
     if not given.run and not (given.random and given.env):
         raise UserError("Watch what? lemniscate watch RUN; before training, lemniscate watch --random --env ID.")
     own = {"random": given.random, "video": given.video, "trust": given.trust}
-    results.watch(given.run, given.env, deterministic=not given.sample, **_episodes(given), **own)
+    results.watch(given.run, given.env, deterministic=not (given.stochastic or given.sample), **_episodes(given), **own)
 
 
 def export(given: argparse.Namespace) -> None:

@@ -64,7 +64,8 @@ def find_cluster(cluster: object, workers: object = None, storage: object = None
     if not is_installed("ray"):
         raise missing_extra("ray", "ray")
     _require_answer(address or os.environ.get("RAY_ADDRESS", ""))
-    return Cluster(address or None, most, None if storage is None else str(storage))
+    place = None if storage is None else os.path.expanduser(str(storage))  # noqa: PTH111 (it may be an address)
+    return Cluster(address or None, most, place)
 
 
 @contextmanager

@@ -49,7 +49,9 @@ def read(name: str, hint: Any, text: Any) -> Any:
     """
     kinds = kinds_of(hint)
     if isinstance(text, list):
-        parts = [part for word in text for part in _split(word)]
+        joined = ",".join(text).strip()
+        inner = joined[1:-1] if joined[:1] + joined[-1:] in ("[]", "()") else joined  # as Python writes several
+        parts = [part.strip("'\"") for part in _split(inner)]
         return () if parts == ["none"] else tuple(read(name, kinds[tuple][0], part) for part in parts)
     if NoneType in kinds and text == "none":
         return None

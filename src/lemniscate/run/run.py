@@ -170,7 +170,7 @@ class Run:
             numbers["episode/length"] = sum(episodes.lengths) / len(episodes.lengths)
         self._write(state.step, numbers | self._times(state.step), episodes)
         recent = self._recent_returns
-        self._bar.update(state.step, sum(recent) / len(recent) if recent else None)
+        self._bar.update(state.step, sum(recent) / len(recent) if recent else None, learned=bool(metrics))
 
     def require_stored(self) -> None:
         """Raise `NotStoredError` if the disk refused the last checkpoint."""
