@@ -143,13 +143,17 @@ def envs(given: argparse.Namespace) -> None:
 
     ids, wanted = registry.known_ids(), given.filter.lower()
     if not wanted:
-        families = groupby(sorted(ids, key=_family), key=_family)
-        for family, (first, *rest) in families:
+        for family, found in groupby(sorted(ids, key=_family), _family):
+            first, *rest = found
             say(f"{family:<28} {1 + len(rest):>4}  {first}{', …' if rest else ''}")
         say("`lemniscate envs NAME` lists those with that word in family or id, and the presets that fit.")
-        for package, extra in registry.EXTRAS.items():
-            if not is_installed(package):
-                say(missing_extra(package, extra))
+        for package, extra in {
+            "envpool": "envpool",
+            "mujoco": "mujoco",
+            "Box2D": "box2d",
+            "crazyflow": "drone",
+        }.items():
+            say("" if is_installed(package) else missing_extra(package, extra))
         return
     found = [env_id for env_id in ids if wanted in env_id.lower() or wanted in _family(env_id).lower()]
     if not found:
@@ -164,15 +168,13 @@ def _family(env_id: str) -> str:
     """The library of an id, and the part of it that the id belongs to."""
     from gymnasium import registry as theirs
 
-    library, _, task = env_id.partition("/")
-    if library == "EnvPool":
+    if env_id.startswith("EnvPool/"):
         from lemniscate.envs.envpool import family
 
-        return f"EnvPool {family(task)}"
+        return f"EnvPool {family(env_id.partition('/')[2])}"
     spec = theirs.get(env_id)
-    place = str(spec and (spec.entry_point or spec.vector_entry_point)).split(".")
-    own = f"Gymnasium {place[2]}" if place[:2] == ["gymnasium", "envs"] else place[0]
-    return own if spec else registry.backend_for(env_id)
+    place = str((spec.entry_point or spec.vector_entry_point) if spec else registry.backend_for(env_id)).split(".")
+    return f"Gymnasium {place[2]}" if place[:2] == ["gymnasium", "envs"] else place[0]
 
 
 def check(given: argparse.Namespace) -> None:

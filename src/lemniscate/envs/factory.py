@@ -86,33 +86,23 @@ STATISTICS = {"obs_rms", "return_rms", "ret_rms", "reward_rms", "running_mean_st
 """the attributes that hold running statistics in Gymnasium's wrappers and in those modelled on them"""
 
 
-def layers(env: Any) -> Iterator[gym.Env | VectorEnv]:
-    """The wrappers of an environment, the outermost first, then itself; of a vector also those of its first one."""
-    while isinstance(env, gym.Env | VectorEnv):
-        yield env
-        held = vars(env)
-        env = held.get("env", next(iter(held.get("envs") or ()), None))
-
-
-def require_no_statistics(env: gym.Env | VectorEnv, vector: VectorEnv) -> None:
+def require_no_statistics(env: Any, vector: VectorEnv) -> None:
     """Close `vector` and raise `UserError` where `env` or a wrapper of it learns statistics: no checkpoint has them.
 
-    Statistics that are fixed, by Gymnasium's `update_running_mean = False`, belong to the environment.
+    Of a vector the first environment is looked at. Those that are fixed (`update_running_mean` False) may stay.
     """
-    for layer in layers(env):
-        held = {name.strip("_"): value for name, value in vars(layer).items()}
-        if held.get("update_running_mean", True) and (STATISTICS & held.keys() or any(map(_is_running, held.values()))):
-            name = type(layer).__name__
-        elif isinstance(layer, AsyncVectorEnv) and any(any(layer.call("has_wrapper_attr", it)) for it in STATISTICS):
-            name = "a wrapper in its workers"
-        else:
-            continue
-        vector.close()
-        raise UserError(
-            f"{name} learns statistics that no checkpoint has, so a run that is resumed, and a policy that is loaded,"
-            " would see other numbers: leave it out, and train with normalize_observations, or for rewards with"
-            " scale_rewards (on the command line --normalize-observations, --scale-rewards)."
-        )
+    while isinstance(env, gym.Env | VectorEnv):
+        held = {name.strip("_"): value for name, value in vars(env).items()}
+        learns = STATISTICS & held.keys() or any(map(_is_running, held.values()))
+        if isinstance(env, AsyncVectorEnv):
+            learns = any(any(env.call("has_wrapper_attr", name)) for name in STATISTICS)
+        if learns and held.get("update_running_mean", True):
+            vector.close()
+            raise UserError(
+                f"{type(env).__name__} learns statistics that no checkpoint has: leave it out, and train with"
+                " normalize_observations, for rewards with scale_rewards (--normalize-observations, --scale-rewards)."
+            )
+        env = held.get("env", next(iter(held.get("envs") or ()), None))
 
 
 def _is_running(value: object) -> bool:

@@ -39,20 +39,14 @@ BEGINNINGS = {
 """how the ids begin that a backend may serve: for no other is it imported. Those not named here may serve any id.
 EnvPool's own ids begin with `EnvPool/`; the others are Gymnasium's, which behave there as in Gymnasium"""
 
-EXTRAS = {"envpool": "envpool", "mujoco": "mujoco", "Box2D": "box2d", "crazyflow": "drone"}
-"""the packages with environments, and the extra that each comes with"""
-
 ARGUMENTS_OF_MAKE = {
-    "render_mode": "films are made by watch and evaluate with a video (--video FILE), in training with video_every",
+    "render_mode": "films are made with a video (--video FILE) by watch and evaluate, in training with video_every",
     "num_envs": "the number of parallel environments is the field num_envs",
-    "seed": "the seed of a run is the field seed, and that of an evaluation its argument seed",
+    "seed": "the seed of a run is the field seed",
     "vectorization_mode": "the backend gymnasium-async gives each environment a process",
-    "disable_env_checker": "lemniscate check ENV is where the checker runs",
-    "autoreset": "environments are reset here",
-    "apply_step_api_compatibility": "environments of the old interface are wrapped by a function of your own",
+    **dict.fromkeys(("disable_env_checker", "autoreset", "apply_step_api_compatibility"), "it has no part here"),
 }
-"""what is no argument of an environment but of `gym.make` and its kin, and what takes its place here; the environment
-of one's own may have all but the first two"""
+"""arguments of `gym.make` and its kin, and what takes their place; one's own environment may have all but two"""
 
 MOST_ENVS = 1_000_000
 """parallel environments that may be asked for"""

@@ -81,10 +81,10 @@ def safe_sentence(action: Action) -> str:
 
 
 def difference_units(action: Action, true: np.ndarray) -> np.ndarray:
-    """The size [A] in which a difference from the true actions [R, A] is counted.
+    """What differences from the true actions [R, A] are shares of, [A]: half the range of each coordinate of a Box.
 
-    Half the range of a coordinate of a Box; of one without two bounds 1, or its largest true action where that is more;
-    1 of the others. Where float32 divides a range into few numbers, a difference between two neighbours counts 1e-5.
+    Without a range it is 1, or the largest action; where float32 divides a range into few numbers, neighbours differ by
+    1e-5. Of other kinds of actions it is 1.
     """
     if not isinstance(action, Box):
         return np.ones(true.shape[1])
@@ -92,12 +92,6 @@ def difference_units(action: Action, true: np.ndarray) -> np.ndarray:
     bounded = np.isfinite(low) & np.isfinite(high)
     spacing = np.spacing(np.where(bounded, np.maximum(np.abs(low), np.abs(high)), 1).astype(np.float32))
     return np.where(bounded, np.maximum(half, spacing / 1e-5), np.maximum(1, np.abs(true).max(0)))
-
-
-DIFFERENCES_ARE = (
-    "shares of half the range of each action; where a bound is infinite, of its unit, or of its largest value above 1"
-)
-"""the words for `difference_units`"""
 
 
 def act_with(policy: TrainedPolicy) -> Act:

@@ -15,7 +15,7 @@ from lemniscate.envs.backend import Interface
 from lemniscate.errors import UserError, is_installed, missing_extra
 from lemniscate.exporting import compiled
 from lemniscate.exporting.compiled import CORE, EMULATOR, TARGET_COMPILER, HostPolicy
-from lemniscate.exporting.deployed import DIFFERENCES_ARE, Act, act_with, difference_units, for_policy, input_size
+from lemniscate.exporting.deployed import Act, act_with, difference_units, for_policy, input_size
 from lemniscate.exporting.onnx_model import onnx_act
 from lemniscate.exporting.operations import Program
 from lemniscate.maths import Deterministic
@@ -111,9 +111,8 @@ def parity(
     units = difference_units(action, true)
     compared_with = partial(compare, units=units, tolerance=tolerance)
     costs: dict[str, float | None] = {"c": None, "onnxruntime": None, "torch": nanoseconds(lambda: act(obs[:1]))}
-    record: dict[str, Any] = {"observations": len(obs), "tolerance": tolerance, "onnx": None, "c_host": None}
-    what = DIFFERENCES_ARE if isinstance(action, Box) else "choices"
-    record |= {"differences_are": what, "difference_units": units.tolist()}
+    record: dict[str, Any] = {"observations": len(obs), "tolerance": tolerance, "difference_units": units.tolist()}
+    record |= {"onnx": None, "c_host": None}
     left_out = {"onnx": "policy.onnx is left out", "onnxruntime": "policy.onnx is not compared"}
     missing = [f"{missing_extra(name, 'export')}; {what}." for name, what in left_out.items() if not is_installed(name)]
     if model is not None and is_installed("onnxruntime"):
@@ -139,17 +138,13 @@ def nanoseconds(call: Callable[[], object], calls: int = 20) -> float:
 
 
 def compare(actions: np.ndarray, true: np.ndarray, units: np.ndarray, tolerance: float) -> dict[str, Any]:
-    """The difference of actions [R, A] from the true ones: the largest, in `units` [A] and in the environment's own.
-
-    That is also given in last places of the largest action.
-    """
+    """The largest difference of actions [R, A] from the true ones, as a share of `units` [A] and in their own unit."""
     difference = np.abs(actions.astype(np.float64) - true)
     largest, shares = float(difference.max()), difference / units
     return {
         "observations": len(actions),
         "max_difference": float(shares.max()),
         "max_abs_difference": largest,
-        "max_ulp": largest / float(np.spacing(np.float32(np.abs(true).max()))),
         "above_tolerance": int((shares.max(1) > tolerance).sum()),
     }
 
@@ -181,10 +176,10 @@ def sentences(record: Mapping[str, Any]) -> list[str]:
     """The record as sentences for a person."""
     names = {"onnx": "ONNX", "c_host": "C", "c_cortex_m4f": "C on the simulated Cortex-M4F"}
     compared = {name: record[key] for key, name in names.items() if (record[key] or {}).get("observations")}
-    share, said = "" if record["differences_are"] == "choices" else " of half the range", list[str]()
+    said, share = list[str](), " of half the range"
     for name, each in compared.items():
         largest = each["max_difference"]
-        distance = f"differs from the policy by at most {largest:.1e}{share}" if largest else "is exact"
+        distance = f"differs from the policy by at most {largest:.1e}{share * (largest < 1)}" if largest else "is exact"
         said.append(f"{name} {distance} at {each['observations']:,} observations.")
     if sizes := record["c_cortex_m4f"]:
         instructions = sizes.get("instructions_per_call")

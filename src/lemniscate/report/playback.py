@@ -166,14 +166,9 @@ def _random(env: gym.Env, seed: int) -> Act:
 
 
 def _choose_opengl() -> None:
-    """Have MuJoCo draw by EGL, or else by OSMesa, where there is no display and MUJOCO_GL does not say by what.
-
-    It chose a window's OpenGL when it was imported, whose place is taken here.
-    """
-    chosen = {"DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL"} & os.environ.keys()
-    if sys.platform != "linux" or chosen or "mujoco" not in sys.modules:
-        return
-    for name in ("egl", "osmesa"):
+    """Have MuJoCo draw by EGL, or else by OSMesa, where there is no display and MUJOCO_GL does not say by what."""
+    chosen = sys.platform != "linux" or {"DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL"} & os.environ.keys()
+    for name in () if chosen or "mujoco" not in sys.modules else ("egl", "osmesa"):
         with suppress(Exception):  # what is not installed raises errors of several kinds
             context = import_module(f"mujoco.{name}").GLContext
             import_module("mujoco.rendering.classic.gl_context").GLContext = context
