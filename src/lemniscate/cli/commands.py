@@ -173,7 +173,8 @@ def _family(env_id: str) -> str:
 
         return f"EnvPool {family(env_id.partition('/')[2])}"
     spec = theirs.get(env_id)
-    place = str((spec.entry_point or spec.vector_entry_point) if spec else registry.backend_for(env_id)).split(".")
+    maker: Any = (spec.entry_point or spec.vector_entry_point) if spec else registry.backend_for(env_id)
+    place = getattr(maker, "__module__", maker).partition(":")[0].split(".")
     return f"Gymnasium {place[2]}" if place[:2] == ["gymnasium", "envs"] else place[0]
 
 

@@ -83,13 +83,14 @@ def unknown_env(env: str) -> UserError:
     if same:
         best = max(same, key=lambda known: ("/" not in known, [int(n) for n in re.findall(r"-v(\d+)$", known)]))
         return UserError(f"There is no environment {env!r}: did you mean {best}?")
-    more = "" if is_installed("envpool") else f" (Atari, dm_control and more: {missing_extra('envpool', 'envpool')})"
-    return unknown_name("environment", env, known_ids(), f"one of your own is named as module:Class{more}.")
+    more = "" if is_installed("envpool") else f" Atari, dm_control and others: {missing_extra('envpool', 'envpool')}."
+    near = unknown_name("environment", env, known_ids(), "one of your own is named as module:Class.")
+    return UserError(f"{near}{more}")
 
 
 def _stem(env: str) -> str:
     """The letters and digits of an id without library, version and the variants that Atari's ids had."""
-    name = re.sub(r"(NoFrameskip|Deterministic|-ram|-ramNoFrameskip)?(-v\d+)?$", "", env.rpartition("/")[2])
+    name = re.sub(r"(-ram)?(NoFrameskip|Deterministic)?(-v\d+)?$", "", env.rpartition("/")[2])
     return re.sub(r"[^a-z0-9]", "", name.lower())
 
 
