@@ -1,6 +1,8 @@
 """The front door, from Python."""
 
 import json
+import subprocess
+import sys
 
 import gymnasium as gym
 import numpy as np
@@ -243,6 +245,36 @@ def test_set_seeds_covers_every_generator():
 def test_the_public_names_are_sorted_and_exist():
     assert lem.__all__ == sorted(lem.__all__)
     assert all(hasattr(lem, name) for name in lem.__all__)
+
+
+EVERYTHING = """
+import pkgutil
+import lemniscate as lem
+from importlib import import_module
+
+def require_meanings():
+    for module, names in lem.MODULES.items():
+        for name in names:
+            assert getattr(lem, name) is getattr(import_module(f"lemniscate.{module}"), name), name
+            assert callable(getattr(lem, name)), name
+
+for found in pkgutil.walk_packages(lem.__path__, "lemniscate."):
+    if not found.name.endswith("__main__"):
+        try:
+            import_module(found.name)
+        except ImportError as error:  # of an extra
+            assert not str(error.name).startswith("lemniscate"), error
+require_meanings()
+for found in pkgutil.iter_modules(lem.__path__):
+    assert found.name == "__main__" or not hasattr(lem, found.name) or found.name not in lem.__all__, found.name
+"""
+
+
+def test_a_public_name_means_the_same_whatever_was_imported_before():
+    """Every module is imported first; a verb that a module of its name hid would show."""
+    subprocess.run([sys.executable, "-c", EVERYTHING], check=True)
+    first = "import lemniscate.processes, lemniscate.system.watchdog, lemniscate as lem; assert callable(lem.watch)"
+    subprocess.run([sys.executable, "-c", first], check=True)
 
 
 def test_a_config_has_dot_access_and_is_frozen():

@@ -15,6 +15,8 @@ from conftest import tiny_fields
 from lemniscate.algos import find
 from lemniscate.cli import main, parse
 from lemniscate.cli.parsers import algorithms
+from lemniscate.envs import registry
+from lemniscate.errors import UserError
 from lemniscate.run.fields import read
 
 TINY = [
@@ -117,6 +119,97 @@ def test_envs_lists_backend_and_preset(capsys):
     assert "DroneFigureEightTrajectory-v0" in err
     assert "crazyflow" in err
     assert "figure-eight" in err
+
+
+def test_envs_is_a_page_of_families(capsys):
+    assert main(["envs"]) == 0
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) <= 40
+    counts = [int(found[1]) for line in lines if (found := re.match(r"[\w. ]{28} +(\d+)  \S", line))]
+    assert sum(counts) == len(registry.known_ids())
+    assert main(["envs", "classic_control"]) == 0
+    assert "CartPole-v1" in (listed := capsys.readouterr().err)
+    assert "LunarLander" not in listed
+
+
+@pytest.mark.parametrize(
+    ("written", "here"),
+    [
+        ("LunarLander-v2", "LunarLander-v3"),
+        ("HalfCheetah-v3", "HalfCheetah-v5"),
+        ("HalfCheetah-v2", "HalfCheetah-v5"),
+        ("CartPole", "CartPole-v1"),
+        ("cartpole", "CartPole-v1"),
+        ("Pendulum-v0", "Pendulum-v1"),
+        ("PongNoFrameskip-v4", "EnvPool/Pong-v5"),
+        ("ALE/Pong-v5", "EnvPool/Pong-v5"),
+        ("Breakout-ramDeterministic-v4", "EnvPool/Breakout-v5"),
+        ("dm_control/cartpole-balance-v0", "EnvPool/CartpoleBalance-v1"),
+        ("walker_walk", "EnvPool/WalkerWalk-v1"),
+        ("MiniGrid-Empty-5x5-v0", "EnvPool/MiniGrid-Empty-5x5-v0"),
+        ("FetchReach-v2", "EnvPool/FetchReach-v4"),
+    ],
+)
+def test_names_of_other_versions_and_libraries_get_the_name_here(written, here):
+    if here.startswith("EnvPool"):
+        pytest.importorskip("envpool")
+    with pytest.raises(UserError, match=f"^There is no environment '{written}': did you mean {here}\\?$"):
+        registry.backend_for(written)
+
+
+def test_without_envpool_what_it_has_is_named(monkeypatch):
+    monkeypatch.setattr(registry, "is_installed", lambda package: False)
+    monkeypatch.setattr(registry, "known_ids", lambda: list(gym.registry))
+    for written in ("PongNoFrameskip-v4", "ALE/Pong-v5", "Nothing-v0"):
+        with pytest.raises(UserError, match=r"Atari.*envpool is not installed"):
+            registry.backend_for(written)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--hidden", "32", "16"],
+        ["--hidden", "32,16"],
+        ["--hidden=[32, 16]"],
+        ["--hidden", "[32, 16]"],
+        ["--hidden", "[32,", "16]"],
+        ["--hidden", "(32, 16)"],
+    ],
+)
+def test_several_values_are_read_as_every_program_writes_them(words):
+    given = parse(["train", "ppo", "--env", "CartPole-v1", *words])
+    assert given.fields["hidden"] == (32, 16)
+
+
+def test_names_are_read_as_python_writes_several():
+    given = parse(["train", "ppo", "--env", "x", "--wrappers", "['a:b', \"c:d(x=[1, 2], y='z')\"]", "--hidden=[]"])
+    assert given.fields["wrappers"] == ("a:b", "c:d(x=[1, 2], y='z')")
+    assert given.fields["hidden"] == ()
+
+
+def test_the_home_folder_is_meant_wherever_a_path_is_taken(run, tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    lem.train("ppo", env="CartPole-v1", run="~/a", progress=False, **tiny_fields("CartPole-v1"))
+    assert main(["train", "ppo", "--env", "CartPole-v1", "--run=~/b", "--warm-start", "~/a", "--hidden", "16", *TINY]) == 0
+    assert lem.load("~/b").path == tmp_path / "b"
+    assert lem.resume("~/b", progress=False).path == tmp_path / "b"
+    for command in ("evaluate --episodes 1", "watch --video=~/film.gif", "plot", "check"):
+        assert main([*command.split(), "~/b"]) == 0
+    lem.save(lem.load("~/b"), "~/policy")
+    assert (tmp_path / "film.gif").exists()
+    assert (tmp_path / "policy").is_dir()
+    assert not any(tmp_path.glob("*~*"))
+
+
+def test_stochastic_means_the_same_in_evaluate_and_watch(run, capsys):
+    returns = []
+    for words in ([], ["--stochastic"]):
+        assert main(["evaluate", str(run), "--episodes", "8", "--json", *words]) == 0
+        returns.append(json.loads(capsys.readouterr().out)["returns"])
+    assert returns[0] != returns[1]
+    given = [parse(["watch", "r", *words]) for words in ([], ["--stochastic"], ["--sample"])]
+    assert [one.stochastic or one.sample for one in given] == [False, True, True]
 
 
 @pytest.mark.parametrize(

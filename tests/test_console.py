@@ -11,6 +11,8 @@ import nbformat
 import pytest
 from nbclient import NotebookClient
 
+from lemniscate.system import console
+
 THREE_UPDATES = """
 from lemniscate.system.console import ProgressBar
 bar = ProgressBar(1_000, 0)
@@ -38,6 +40,23 @@ def test_a_pipe_gets_a_line_at_each_tenth_of_a_run():
     assert re.fullmatch(r"500 of 1,000 steps  [\d,]+ steps/s  return 12.3  \d:\d\d:\d\d left", first)
     assert re.fullmatch(r"1,000 of 1,000 steps  [\d,]+ steps/s  return 12.3  \d:\d\d:\d\d in all", last)
     assert not done.stdout
+
+
+def test_the_time_left_is_by_the_last_interval_and_unknown_while_nothing_is_learned(monkeypatch, capsys):
+    """Steps before learning begins are fast, and say nothing of those after."""
+    now = iter([0, 1, 2, 12, 32, 42])
+    monkeypatch.setattr(console.time, "monotonic", lambda: next(now))
+    bar = console.ProgressBar(500, 0)
+    for step, learned in ((100, False), (200, True), (300, True), (400, True)):
+        bar.update(step, None, learned)
+    assert [line.split("  ")[-1] for line in capsys.readouterr().err.splitlines()] == [
+        "0:00:01 so far",
+        "0:00:02 so far",  # a part of this interval was not learned from
+        "0:00:20 left",  # 10 s for 100 steps
+        "0:00:20 left",  # 20 s for 100 steps
+    ]
+    bar.update(612, None)
+    assert capsys.readouterr().err.startswith("612 steps, the end of the update that reached 500  ")
 
 
 def test_a_pipe_gets_the_runs_of_a_set_at_each_tenth_of_all_steps(capsys):

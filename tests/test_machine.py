@@ -1,8 +1,6 @@
 """What a machine has left: the least of its own memory, its container's, and the limit of the process."""
 
-import inspect
 import os
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -11,6 +9,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+import lemniscate as lem
 from forks import forks
 from lemniscate.errors import UserError
 from lemniscate.system import files, machine
@@ -54,28 +53,69 @@ def test_the_limit_of_the_process_counts():
     assert none == 0
 
 
-def without_unix():
-    """Take away what Windows lacks: a module, and signals; psutil needs the module here, and has its own there."""
-    sys.modules["resource"] = sys.modules["fcntl"] = sys.modules["psutil"] = None
-    for name in ("SIGHUP", "SIGUSR1", "SIGUSR2"):
-        delattr(signal, name)
-    del os.sched_getaffinity
-
-
-ON_WINDOWS = f"""
-import os, signal, sys
-{inspect.getsource(without_unix)}
-without_unix()
+ELSEWHERE = """
+import os, signal, sys, warnings
+warnings.filterwarnings("error", category=EncodingWarning, module=r"lemniscate\\.")
+for module in ("resource", "fcntl", "psutil", "termios", "tty", "pty", "pwd", "grp", "syslog"):
+    sys.modules[module] = None  # as where there is none
+for name in ("SIGHUP", "SIGUSR1", "SIGUSR2", "SIGALRM", "SIGKILL", "SIGIO", "SIGCHLD", "SIGQUIT", "SIGPIPE"):
+    delattr(signal, name)
+for name in ("pthread_kill", "alarm", "setitimer"):
+    delattr(signal, name)
+for name in ("fork", "getuid", "geteuid", "setsid", "killpg", "mkfifo", "O_ASYNC", "O_NONBLOCK", "O_NOFOLLOW"):
+    delattr(os, name)
+del os.sched_getaffinity
 import lemniscate as lem
-small = dict(total_steps=64, num_envs=2, num_steps=16, minibatch_size=16, backend="gymnasium", progress=False)
-run = lem.train("ppo", "CartPole-v1", run="r", **small)
-print(len(lem.evaluate(run.policy, episodes=2).returns), lem.load("r").step)
+from lemniscate.cli import main
+
+small = {"total_steps": 128, "num_envs": 2, "num_steps": 32, "minibatch_size": 32, "checkpoint_every": 64}
+stop = lambda step, metrics, policy: True
+run = lem.train("ppo", env="CartPole-v1", backend="gymnasium", run="r", callbacks=stop, progress=False, **small)
+assert run.policy.step == 64
+assert lem.resume("r", progress=False).policy.step == 128
+commands = ("evaluate r --episodes 2 --video film.gif", "plot r", "export r", "check r", "train ppo --lr 1")
+codes = [main(command.split()) for command in commands]
+print(codes)
+sys.exit(codes != [0, 0, 0, 0, 2])
 """
 
 
-def test_without_what_windows_lacks_runs_are_trained_and_evaluated(tmp_path):
-    done = subprocess.run([sys.executable, "-c", ON_WINDOWS], cwd=tmp_path, capture_output=True, text=True)
-    assert done.stdout.split() == ["2", "64"], done.stderr
+def test_without_the_modules_and_signals_of_unix_everything_works_but_processes(tmp_path):
+    """As on Windows, with text files of another encoding unless one is named: train, resume, look, export, check."""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    command = [sys.executable, "-X", "warn_default_encoding", "-c", ELSEWHERE]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert (tmp_path / "r" / "export" / "policy.h").exists()
+
+
+@pytest.mark.parametrize("given", [{"processes": 2}, {"cluster": "ray"}])
+def test_what_needs_linux_says_so(given, tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "platform", "darwin")
+    with pytest.raises(UserError, match=r"needs Linux.*one process"):
+        lem.train("ppo", env="CartPole-v1", run=tmp_path / "run", **given)
+    assert not (tmp_path / "run").exists()
+
+
+OWNED = """
+import os, sys, time
+sys.platform = "darwin"
+os.environ["LEMNISCATE_OWNED"] = "/dev/stdin"
+from lemniscate.system.watchdog import end_with_owner
+assert end_with_owner()
+print("watched", flush=True)
+time.sleep(60)
+"""
+
+
+def test_a_run_ends_with_its_sweep_where_no_signal_comes_from_a_pipe():
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    with subprocess.Popen([sys.executable, "-c", OWNED], env=environment, text=True, **pipes) as process:
+        assert process.stdout.readline() == "watched\n"
+        assert process.poll() is None
+        process.stdin.close()
+        assert process.wait(timeout=20) == 1
 
 
 def test_where_windows_syncs_no_directory_files_are_written_all_the_same(tmp_path, monkeypatch):

@@ -238,3 +238,63 @@ def test_another_environment_must_fit(policy):
         lem.watch(policy, "Pendulum-v1", video="film.gif")
     with pytest.raises(lem.UserError, match="Watch what"):
         lem.watch(random=True)
+
+
+BODY = """
+<mujoco><worldbody><light pos="0 0 2"/><body><joint name="a" axis="0 1 0"/>
+<geom type="capsule" fromto="0 0 0 0 0 .5" size=".05"/></body></worldbody><actuator><motor joint="a"/></actuator></mujoco>
+"""
+
+ARM = f'''
+import gymnasium as gym, mujoco, numpy as np
+
+class Arm(gym.Env):
+    metadata = {{"render_modes": ["rgb_array"], "render_fps": 30}}
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float32)
+    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+
+    def __init__(self, render_mode=None):
+        self.render_mode, self.model = render_mode, mujoco.MjModel.from_xml_string("""{BODY}""")
+        self.data, self.renderer = mujoco.MjData(self.model), None
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        mujoco.mj_resetData(self.model, self.data)
+        return np.zeros(2, np.float32), {{}}
+
+    def step(self, action):
+        self.data.ctrl[:] = action
+        mujoco.mj_step(self.model, self.data)
+        return np.r_[self.data.qpos, self.data.qvel].astype(np.float32), 0.0, False, self.data.time > 0.02, {{}}
+
+    def render(self):
+        self.renderer = self.renderer or mujoco.Renderer(self.model, 64, 64)
+        self.renderer.update_scene(self.data)
+        return self.renderer.render()
+'''
+
+
+def has_egl():
+    code = "import os; os.environ['MUJOCO_GL'] = 'egl'; import mujoco; mujoco.GLContext(8, 8)"
+    return subprocess.run([sys.executable, "-c", code], capture_output=True).returncode == 0
+
+
+def test_a_report_has_a_film_of_ones_own_model_without_a_display_or_says_why_not(tmp_path):
+    """MuJoCo draws by EGL of itself; where MUJOCO_GL names what is not there, the sentence names that variable."""
+    pytest.importorskip("mujoco")
+    (tmp_path / "arm.py").write_text(ARM)
+    shown = {"DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL"}
+    environment = {name: value for name, value in os.environ.items() if name not in shown}
+    environment["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))
+    small = "--total-steps 64 --num-envs 2 --num-steps 32 --minibatch-size 32 --quiet --run"
+    train = [sys.executable, "-m", "lemniscate", "train", "ppo", "--env", "arm:Arm", *small.split()]
+    where = {"cwd": tmp_path, "capture_output": True, "text": True}
+    done = subprocess.run([*train, "r", "--report"], env=environment, **where)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "r" / "videos" / "step-64.gif").exists() or "No film: arm:Arm cannot be shown" in done.stderr
+    assert (tmp_path / "r" / "videos" / "step-64.gif").exists() == has_egl()
+    watch = [sys.executable, "-m", "lemniscate", "watch", "r", "--video", "a.gif"]
+    done = subprocess.run(watch, env={**environment, "MUJOCO_GL": "glfw"}, **where)
+    assert done.returncode == 2
+    assert "cannot be shown here" in done.stderr
+    assert "MUJOCO_GL=egl" in done.stderr

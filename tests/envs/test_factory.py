@@ -4,6 +4,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from gymnasium.wrappers import NormalizeReward, vector
+from gymnasium.wrappers.utils import RunningMeanStd
 
 import environments
 import toy
@@ -47,6 +49,93 @@ def test_gymnasiums_own_arguments_and_wrappers():
         assert step.truncated.all() == (t == 2)
     stacked = registry.make("CartPole-v1", 2, wrappers=["gymnasium.wrappers:FrameStackObservation(stack_size=3)"])
     assert stacked.spec.observation_parts[0].shape == (3, 4)
+
+
+@pytest.mark.parametrize("backend", ["gymnasium", "gymnasium-async", "envpool"])
+@pytest.mark.parametrize(("argument", "instead"), registry.ARGUMENTS_OF_MAKE.items())
+def test_arguments_of_make_are_left_out(backend, argument, instead):
+    with pytest.raises(UserError) as raised:
+        registry.make("CartPole-v1", 2, kwargs={argument: None}, backend=backend)
+    assert str(raised.value).startswith(f"{argument} is no argument of an environment: leave it out")
+    assert instead in str(raised.value)
+
+
+def test_ones_own_environment_may_have_a_seed_among_its_arguments():
+    def seeded(seed, reward=1.0):
+        return Reach(reward=seed)
+
+    assert reward_of(seeded, kwargs={"seed": 5}) == 5
+    with pytest.raises(UserError, match=r"render_mode is no argument .* with a video"):
+        reward_of(Reach, kwargs={"render_mode": "human"})
+
+
+class Running(gym.Wrapper):
+    """A wrapper of one's own with a running mean and variance."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        self._scale = RunningMeanStd(shape=())
+
+
+class Named(gym.Wrapper):
+    """Its statistics are of another make, but have the usual name."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.obs_rms = {"all": 0.0}
+
+
+class Within(Reach):
+    """It learns inside, of another environment that it holds."""
+
+    def __init__(self):
+        super().__init__()
+        self.env = NormalizeReward(Reach())
+
+
+def hidden():
+    return gym.wrappers.ClipReward(NormalizeReward(Reach()), -1, 1)
+
+
+def fixed():
+    env = NormalizeReward(Reach())
+    env.update_running_mean = False
+    return env
+
+
+gym.register("Learns-v0", Reach, additional_wrappers=(NormalizeReward.wrapper_spec(gamma=0.9, epsilon=1e-8),))
+
+
+@pytest.mark.parametrize(
+    ("env", "fields", "name"),
+    [
+        (Reach, {"wrappers": ["gymnasium.wrappers:NormalizeObservation"]}, "NormalizeObservation"),
+        (Reach, {"wrappers": [lambda env: PlusOne(NormalizeReward(env))]}, "NormalizeReward"),
+        (Reach, {"wrappers": [Running]}, "Running"),
+        (Reach, {"wrappers": [Named]}, "Named"),
+        (Within, {}, "NormalizeReward"),
+        (hidden, {}, "NormalizeReward"),
+        (hidden, {"backend": "gymnasium-async"}, "NormalizeReward"),
+        ("Learns-v0", {}, "NormalizeReward"),
+        (lambda num_envs: gym.vector.SyncVectorEnv([hidden] * num_envs), {}, "NormalizeReward"),
+        (lambda num_envs: gym.vector.AsyncVectorEnv([hidden] * num_envs), {}, "a wrapper in its workers"),
+        (lambda num_envs: vector.NormalizeReward(gym.vector.SyncVectorEnv([Reach] * num_envs)), {}, "NormalizeReward"),
+    ],
+)
+def test_what_learns_statistics_is_refused_wherever_it_stands(env, fields, name):
+    with pytest.raises(UserError, match=f"{name} learns statistics .* normalize_observations, .*scale_rewards"):
+        registry.make(env, 2, **fields)
+
+
+def test_fixed_statistics_and_tables_are_the_environments_own():
+    class Table(gym.Wrapper):
+        def __init__(self, env):
+            super().__init__(env)
+            self.prices = np.ones((3, 3))  # has methods mean and var
+            self.count = {"mean": 0, "var": 1}
+
+    assert reward_of(fixed) == 1
+    assert reward_of(Reach, wrappers=[Table]) == 1
 
 
 def test_wrappers_choose_the_backend_that_can_wrap():

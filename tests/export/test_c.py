@@ -1,6 +1,7 @@
 """The C itself: its functions, its warnings, its memory."""
 
 import ctypes
+import math
 import re
 import subprocess
 
@@ -11,6 +12,9 @@ from exported import BOX, exported, needs_compiler, plain, policy_for
 from lemniscate.errors import UserError
 from lemniscate.exporting.c_code import c_files, functions
 from lemniscate.exporting.compiled import FLAGS, HostPolicy, host_compiler, run_tool
+from lemniscate.exporting.deployed import difference_units
+from lemniscate.exporting.parity import compare
+from lemniscate.spec import Box, MultiDiscrete
 
 pytestmark = needs_compiler
 
@@ -172,11 +176,37 @@ def test_a_run_cannot_write_code_into_a_comment():
         assert not re.search(r"^#error", text, re.MULTILINE)
 
 
-@pytest.mark.parametrize(("scale", "bound"), [(1, "1e-04F"), (1e6, "1e+01F")])
-def test_the_bound_of_the_self_test_grows_with_the_actions(scale, bound):
-    copy = plain()
-    header = c_files(copy.program, BOX, copy.obs[:1], np.full((1, 3), scale), title="", origin="")["policy.h"]
-    assert f"#define POLICY_SELF_TEST_BOUND {bound}\n" in header
+NEWTONS = Box((-500.0, -1e-3, -math.inf), (500.0, 1e-3, math.inf))
+"""a wide range, a narrow one, and none"""
+
+
+def test_differences_are_shares_of_the_range_of_each_action():
+    """A millionth of the range counts the same in newtons and in radians; without a range the largest action counts."""
+    true = np.array([[100.0, 2e-4, -3.0], [-100.0, 1e-4, 30.0]], dtype=np.float32)
+    units = difference_units(NEWTONS, true)
+    np.testing.assert_allclose(units, [500, 1e-3, 30], rtol=1e-6)
+    off = true + np.array([[2e-3, 0, 0], [0, 2e-8, 0]])
+    found = compare(off, true, units, 1e-5)
+    assert found["max_difference"] == pytest.approx(2e-5, rel=0.01)
+    assert found["max_abs_difference"] == pytest.approx(2e-3, rel=0.01)
+    assert found["above_tolerance"] == 1  # 2e-3 of 500 N is none
+    assert (difference_units(MultiDiscrete((3, 5), (0, 0)), true[:, :2]) == 1).all()
+    (coarse,) = difference_units(Box((1000.0,), (1000.001,)), true[:, :1])
+    assert np.spacing(np.float32(1000)) / coarse <= 1e-5  # float32 has some sixteen numbers there
+
+
+def test_the_self_test_counts_in_shares_of_the_range():
+    """An export that is wrong by a thousandth of each range fails by the same number in every unit."""
+    copy = exported(policy_for(NEWTONS))
+    tests = copy.obs[:16], copy.true[:16]
+    bound = float(re.findall(r"SELF_TEST_BOUND ([\d.e-]+)F", copy.files()["policy.h"])[0])
+    for coordinate, unit in enumerate(difference_units(NEWTONS, copy.true[:16])):
+        wrong = tests[1].copy()
+        wrong[:, coordinate] += 1e-3 * unit
+        host = HostPolicy(c_files(copy.program, NEWTONS, tests[0], wrong, title="", origin=""), host_compiler())
+        assert host.self_test() == pytest.approx(1e-3, rel=0.05)
+        assert bound < 1e-3
+    assert copy.host().self_test() < bound / 10
 
 
 def test_a_compiler_that_refuses_is_quoted():

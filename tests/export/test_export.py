@@ -203,6 +203,25 @@ def test_in_closed_loop_the_c_does_what_the_policy_does(kind):
     assert len(acted(env.spec.action, Interface())) == len(ranges(env.spec.action)) == program.action.size
 
 
+@needs_compiler
+def test_wrappers_that_are_not_in_the_files_are_named(tmp_path, few, capsys):
+    """In the message, the manifest, the header, and the metadata of ONNX; an export without wrappers has no such word."""
+    wrappers = ("environments:PlusOne", "environments:PlusOne(by=0.5)")
+    for name, given in (("bare", ()), ("wrapped", wrappers)):
+        env = registry.make("Copy-box-v0", 1, wrappers=given)
+        env.close()
+        config = ppo.Config(env="Copy-box-v0", hidden=(8,), wrappers=given)
+        folder = lem.export(TrainedPolicy(config.networks(env.spec), env.spec, config, 0), tmp_path / name)
+        manifest, header = json.loads((folder / "manifest.json").read_text()), (folder / "policy.h").read_text()
+        assert manifest["wrappers"] == list(given)
+        assert ("NOT IN THIS FILE" in header) == bool(given)
+        assert ("NOT in the files" in capsys.readouterr().err) == bool(given)
+    assert "environments:PlusOne, environments:PlusOne(by=0.5)" in header
+    if onnx := pytest.importorskip("onnx"):
+        facts = {prop.key: prop.value for prop in onnx.load(folder / "policy.onnx").metadata_props}
+        assert json.loads(facts["wrappers"]) == list(wrappers)
+
+
 def test_observations_without_units_have_the_names_of_their_parts():
     def names(kind):
         env = registry.make(f"Copy-{kind}-v0", 1)

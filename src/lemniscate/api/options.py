@@ -18,6 +18,7 @@ from lemniscate.run.directory import CONFIG, create_directory
 from lemniscate.run.loggers import TRACKERS, JsonLines, LoggerClass, TensorBoard
 from lemniscate.run.stopping import Stopped
 from lemniscate.system import named
+from lemniscate.system.machine import require_linux
 from lemniscate.system.watchdog import OWNED
 from lemniscate.system.world import World
 
@@ -123,6 +124,7 @@ def train_in_processes(path: Path, algorithm: str, config: RunConfig, options: R
 
     A new run has a shard for each process, unless its Config has more. Raises as `launch`.
     """
+    require_linux("Training in several processes", "one process, with --threads")
     if (path / CONFIG).exists() or config.shards > 1:
         World(config.shards, size=options.processes).divide(config.shards)
     words = options.words()

@@ -4,7 +4,7 @@ from contextlib import closing
 from pathlib import Path
 
 from lemniscate.api.policy import TrainedPolicy, TrainedRun, load, path_of
-from lemniscate.api.results import final_return, final_scores
+from lemniscate.api.results import film_or_say, final_return, final_scores
 from lemniscate.errors import UserError, unknown_name
 from lemniscate.report import compare, curves, flight, pages
 from lemniscate.report.seeds import group
@@ -76,8 +76,8 @@ def report_on(run: TrainedRun) -> list[Path]:
 def draw_run(run: str | Path | TrainedRun, by: str = "step", *, film: bool = False) -> list[Path]:
     """Draw a run and its final scores into its `plots/`, and write its page; returns the files, the page last.
 
-    What cannot be evaluated here is left out, and a line says so. With `film` a flight is recorded too, where there is
-    a scene.
+    What cannot be evaluated here is left out, and a line says so. With `film` a flight or an
+    episode is recorded too.
     """
     path, scores, flights = path_of(run), None, list[Path]()
     folder = path / "plots"
@@ -89,7 +89,10 @@ def draw_run(run: str | Path | TrainedRun, by: str = "step", *, film: bool = Fal
             policy = load(run)
             episodes = policy.config.evaluate_episodes
             with closing(evaluation_env(policy.config, episodes)) as env:
-                flights = flight.draw_flights(policy.module, env, path, episodes, film) if env.scene else []
+                scene = env.scene
+                flights = flight.draw_flights(policy.module, env, path, episodes, film) if scene else []
+            if film and not scene:
+                film_or_say(policy, path / "videos" / f"step-{policy.step}.gif")
         except UserError as error:
             say(f"{path} is drawn without an evaluation: {error}")
     files = curves.plot_runs([path], folder, by=by)

@@ -23,7 +23,7 @@ from lemniscate.run.directory import find_checkpoint
 from lemniscate.run.seeding import generator
 from lemniscate.run.warm_start import difference
 from lemniscate.spec import Spec
-from lemniscate.system.files import parsing
+from lemniscate.system.files import at_home, parsing
 
 
 class TrainedPolicy:
@@ -109,7 +109,7 @@ def path_of(run: object) -> Path:
     if Path(path).parts[:1] == (hub.SCHEME,):
         address = hub.read_address(path)
         raise UserError(f"{address} is on the Hub, and no run directory: it can be loaded, evaluated and watched.")
-    return Path(path)
+    return at_home(path)
 
 
 def load(run: Trained, *, trust: bool = False) -> TrainedPolicy:

@@ -6,7 +6,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from lemniscate.api.policy import Trained, TrainedPolicy, algorithm_of, load, own_code, save
-from lemniscate.api.results import FINAL_EPISODES, evaluate, final_scores, scores_of
+from lemniscate.api.results import FINAL_EPISODES, film_or_say, final_scores, scores_of
 from lemniscate.errors import UserError
 from lemniscate.hub import repository as hub
 from lemniscate.report import pages
@@ -50,7 +50,7 @@ def push(run: Trained, name: str, *, private: bool = False, license: str | None 
             (folder / place).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(file, folder / place)
         if not (path and pages.newest_film(path)):
-            _make_film(policy, folder)
+            film_or_say(policy, folder / "videos" / "episode.gif")
         scores = _scores(policy, path)
         if scores:
             write_json(folder / "final.json", scores)
@@ -73,14 +73,6 @@ def _shown(run: Path) -> dict[str, Path]:
     if film := pages.newest_film(run):
         shown["replay.mp4" if film.suffix == ".mp4" else f"videos/{film.name}"] = film
     return shown
-
-
-def _make_film(policy: TrainedPolicy, folder: Path) -> None:
-    """Record an episode, where the environment can be rendered; a line says why where it cannot."""
-    try:
-        evaluate(policy, episodes=1, video=folder / "videos" / "episode.gif")
-    except Exception as error:  # whatever a renderer raises: a policy without a film is a policy
-        say(f"No film: {error}")
 
 
 def _scores(policy: TrainedPolicy, run: Path | None) -> dict[str, Any] | None:

@@ -22,7 +22,7 @@ from lemniscate.run.environments import env_arguments, evaluation_env
 from lemniscate.run.evaluate import Evaluation, critic_of
 from lemniscate.run.evaluate import evaluate as evaluate_policy
 from lemniscate.system.console import say
-from lemniscate.system.files import DamagedFileError, read_json, write_json
+from lemniscate.system.files import DamagedFileError, at_home, read_json, write_json
 from lemniscate.system.named import takes
 
 Agent = Callable[[Any], Any]
@@ -171,14 +171,18 @@ def each_finding(
     what: str, backend: str | None, env_kwargs: Mapping[str, Any] | None, wrappers: Sequence[str]
 ) -> Iterator[Finding]:
     """The findings of `check`, one by one."""
-    if run_check.is_stored(Path(what)):
-        return run_check.each_finding(Path(what))
+    if run_check.is_stored(at_home(what)):
+        return run_check.each_finding(at_home(what))
     return env_check.each_finding(what, backend, env_kwargs, wrappers)
 
 
 def verdict(what: str, found: list[Finding]) -> str:
     """The conclusion from the findings, in a sentence or two."""
-    return run_check.verdict(Path(what), found) if run_check.is_stored(Path(what)) else env_check.verdict(what, found)
+    return (
+        run_check.verdict(at_home(what), found)
+        if run_check.is_stored(at_home(what))
+        else env_check.verdict(what, found)
+    )
 
 
 def scores_of(policy: TrainedPolicy) -> dict[str, Any]:
@@ -213,13 +217,22 @@ def _known_scores(file: Path) -> dict[str, Any]:
         return {}
 
 
+def film_or_say(policy: TrainedPolicy, file: Path) -> None:
+    """Record an episode, where the environment can be rendered; a line says why where it cannot."""
+    try:
+        evaluate(policy, episodes=1, video=file)
+    except Exception as error:  # whatever a renderer raises: a policy without a film is a policy
+        say(f"No film: {error}")
+
+
 def _film(video: str | Path | None) -> Path | None:
     """The file of a film. Raises `UserError` for one that could not be written."""
     if not isinstance(video, str | PathLike | None):
         raise UserError(f"video must be a path, such as 'film.gif', not {shown(video)}.")
-    if video is not None:
-        playback.check_film(Path(video))
-    return None if video is None else Path(video)
+    if video is None:
+        return None
+    playback.check_film(at_home(video))
+    return at_home(video)
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+from itertools import groupby
 from shutil import get_terminal_size
 from typing import Any
 
@@ -10,7 +11,7 @@ from lemniscate.api import training
 from lemniscate.api.options import RunOptions
 from lemniscate.api.policy import TrainedRun
 from lemniscate.envs import registry
-from lemniscate.errors import UserError, unknown_name
+from lemniscate.errors import UserError, is_installed, missing_extra
 from lemniscate.run.directory import SWEEP, TUNE
 from lemniscate.run.fields import number, read, read_json
 from lemniscate.run.run import is_compiled
@@ -88,7 +89,7 @@ def evaluate(given: argparse.Namespace) -> None:
     from lemniscate.report import pages
 
     own = {"backend": given.backend, "baseline": given.baseline, "video": given.video, "trust": given.trust}
-    scores = results.evaluate(given.run, **_episodes(given), **own)
+    scores = results.evaluate(given.run, deterministic=not given.stochastic, **_episodes(given), **own)
     if given.json:
         print(json.dumps(scores.to_json(), allow_nan=False))
     else:
@@ -102,7 +103,7 @@ def watch(given: argparse.Namespace) -> None:
     if not given.run and not (given.random and given.env):
         raise UserError("Watch what? lemniscate watch RUN; before training, lemniscate watch --random --env ID.")
     own = {"random": given.random, "video": given.video, "trust": given.trust}
-    results.watch(given.run, given.env, deterministic=not given.sample, **_episodes(given), **own)
+    results.watch(given.run, given.env, deterministic=not (given.stochastic or given.sample), **_episodes(given), **own)
 
 
 def export(given: argparse.Namespace) -> None:
@@ -137,16 +138,44 @@ def push(given: argparse.Namespace) -> None:
 
 
 def envs(given: argparse.Namespace) -> None:
-    """List the environments, the backend of each, and the presets that fit."""
+    """List the families of environments; those of one, each with its backend and the presets that fit."""
     from lemniscate.presets import best
 
-    found = [env_id for env_id in registry.known_ids() if given.filter.lower() in env_id.lower()]
+    ids, wanted = registry.known_ids(), given.filter.lower()
+    if not wanted:
+        for family, found in groupby(sorted(ids, key=_family), _family):
+            first, *rest = found
+            say(f"{family:<28} {1 + len(rest):>4}  {first}{', …' if rest else ''}")
+        say("`lemniscate envs NAME` lists those with that word in family or id, and the presets that fit.")
+        for package, extra in {
+            "envpool": "envpool",
+            "mujoco": "mujoco",
+            "Box2D": "box2d",
+            "crazyflow": "drone",
+        }.items():
+            say("" if is_installed(package) else missing_extra(package, extra))
+        return
+    found = [env_id for env_id in ids if wanted in env_id.lower() or wanted in _family(env_id).lower()]
     if not found:
-        raise unknown_name("environment", given.filter, registry.known_ids())
+        raise registry.unknown_env(given.filter)
     for env_id in found:
         presets = ((algorithm, best(algorithm, env_id)) for algorithm in ALGORITHMS)
         fitting = ", ".join(f"{algorithm}: {preset}" for algorithm, preset in presets if preset != "default")
         say(f"{env_id:<40} {registry.backend_for(env_id):<12} {fitting or 'default'}")
+
+
+def _family(env_id: str) -> str:
+    """The library of an id, and the part of it that the id belongs to."""
+    from gymnasium import registry as theirs
+
+    if env_id.startswith("EnvPool/"):
+        from lemniscate.envs.envpool import family
+
+        return f"EnvPool {family(env_id.partition('/')[2])}"
+    spec = theirs.get(env_id)
+    maker: Any = (spec.entry_point or spec.vector_entry_point) if spec else registry.backend_for(env_id)
+    place = getattr(maker, "__module__", maker).partition(":")[0].split(".")
+    return f"Gymnasium {place[2]}" if place[:2] == ["gymnasium", "envs"] else place[0]
 
 
 def check(given: argparse.Namespace) -> None:

@@ -10,6 +10,7 @@ from typing import Any, NoReturn
 
 from lemniscate.algos import ALGORITHMS, RECOMMENDED
 from lemniscate.errors import UserError, is_installed, unknown_name
+from lemniscate.system.files import at_home
 
 SHELLS = ("bash", "zsh", "fish")
 
@@ -57,6 +58,7 @@ OPTIONS: list[tuple[str, str, str, Any]] = [
     ("train resume tune", "--quiet", "no progress on standard error", False),
     ("train resume", "--report", "evaluate the final policy, draw plots and videos", False),
     ("train resume", "--score", "store the final return over 100 episodes", False),
+    ("evaluate watch", "--stochastic", "draw actions from the policy [the most likely ones]", False),
     ("evaluate watch export", "--trust", "import the code (module:name) that a policy from hf:// names", False),
     ("evaluate export", "run RUN", "a run, a checkpoint or hf://user/name", None),
     ("watch", "run [RUN]", "a run, a checkpoint or hf://user/name", None),
@@ -72,7 +74,7 @@ OPTIONS: list[tuple[str, str, str, Any]] = [
     ("evaluate", "--baseline", "play by the environment's classical controller instead", False),
     ("evaluate", "--video FILE", ".gif, .webp or .mp4 to record all episodes into", None),
     ("evaluate", "--json", "print one JSON object on standard output", False),
-    ("watch", "--sample", "draw actions from the policy [the most likely ones]", False),
+    ("watch", "--sample", argparse.SUPPRESS, False),
     ("watch", "--random", "act uniformly at random", False),
     ("watch", "--video FILE", ".gif, .webp or .mp4 instead of a window", None),
     ("watch", "--env ID", "environment [that of training]; without RUN, with --random", None),
@@ -119,7 +121,7 @@ class Parser(argparse.ArgumentParser):
         if metavar.endswith(" …") or metavar.startswith("["):
             shared["nargs"] = "?" if metavar.startswith("[") else "+"
             metavar = metavar.removesuffix(" …").strip("[]")
-        self.add_argument(name, metavar=metavar, type=Path if metavar in PATHS else str, **shared)
+        self.add_argument(name, metavar=metavar, type=at_home if metavar in PATHS else str, **shared)
 
 
 class _Help(argparse.RawDescriptionHelpFormatter):
@@ -223,7 +225,7 @@ def _parse_algorithm(command: str, words: list[str]) -> argparse.Namespace:
 def algorithms() -> dict[str, str]:
     """The algorithms, and the first line of each file, read from there: to import them is to import torch."""
     folder = Path(__file__).parents[1] / "algos"
-    lines = {name: (folder / f"{name}.py").read_text().partition("\n")[0] for name in ALGORITHMS}
+    lines = {name: (folder / f"{name}.py").read_text("utf-8").partition("\n")[0] for name in ALGORITHMS}
     return {name: line.removeprefix('"""') for name, line in lines.items()}
 
 

@@ -21,6 +21,7 @@ from lemniscate.errors import UserError, is_installed, missing_extra, shown
 from lemniscate.run.config import Range, checked
 from lemniscate.run.directory import CONFIG, LOCK
 from lemniscate.system.files import make_directory, remove
+from lemniscate.system.machine import require_linux
 
 Workers = Annotated[int, Range(1, 4096)]
 STORAGE = "ray"
@@ -59,10 +60,12 @@ def find_cluster(cluster: object, workers: object = None, storage: object = None
     if kind != "ray":
         raise UserError(f"cluster must be ray or ray=ADDRESS, not {shown(cluster)}.")
     most = None if workers is None else checked("workers", workers, Workers)
+    require_linux("Training on Ray", "one process, with --threads")
     if not is_installed("ray"):
         raise missing_extra("ray", "ray")
     _require_answer(address or os.environ.get("RAY_ADDRESS", ""))
-    return Cluster(address or None, most, None if storage is None else str(storage))
+    place = None if storage is None else os.path.expanduser(str(storage))  # noqa: PTH111 (it may be an address)
+    return Cluster(address or None, most, place)
 
 
 @contextmanager

@@ -200,7 +200,7 @@ CASES: dict[str, list[Case]] = {
 
 _source = cache(inspect.getsource)
 """the text of a function, which several mistakes edit"""
-TABLES: dict[str, dict[str, Any]] = tomllib.loads((TEMPLATES / "mistakes.toml").read_text())
+TABLES: dict[str, dict[str, Any]] = tomllib.loads((TEMPLATES / "mistakes.toml").read_text("utf-8"))
 
 
 def edited(functions: Sequence[Function], edits: Sequence[str]) -> Function:

@@ -47,7 +47,7 @@ def skeleton(name: str = "ppo", path: str | Path | None = None) -> Path:
         raise UserError(f"{path} exists already; name another file with path.")
     with_gaps = SOLUTION.sub(r'\1raise NotImplementedError("to be written")\n', solution(name))
     try:
-        path.write_text(with_gaps.replace(f"python {name}.py", f"python {path.name}"))
+        path.write_text(with_gaps.replace(f"python {name}.py", f"python {path.name}"), "utf-8")
     except OSError as error:
         raise UserError(f"{path} cannot be written: {error.strerror}.") from error
     return path
@@ -56,7 +56,7 @@ def skeleton(name: str = "ppo", path: str | Path | None = None) -> Path:
 def solution(name: str) -> str:
     """The program of a skeleton without gaps."""
     # Not a module: it is a text for the reader's own file, and nothing here may come to import it.
-    return (TEMPLATES / f"{name}.py.txt").read_text()
+    return (TEMPLATES / f"{name}.py.txt").read_text("utf-8")
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ class BoxEnv(WorldEnv):
         return self.world.obs(0), float(action[0] - action[1]), True, False, {}
 
 
-WORLDS = [World(**world) for world in tomllib.loads((TEMPLATES / "worlds.toml").read_text())["world"]]
+WORLDS = [World(**world) for world in tomllib.loads((TEMPLATES / "worlds.toml").read_text("utf-8"))["world"]]
 
 
 def train(function: Function) -> Iterator[str]:

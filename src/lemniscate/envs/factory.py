@@ -13,7 +13,7 @@ from typing import Any
 
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
-from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 
 from lemniscate.envs.conversion import SingleEnv
 from lemniscate.envs.workers import WatchedVectorEnv, Worker
@@ -104,7 +104,37 @@ def make_vector(
     else:
         envs = SyncVectorEnv(makers, copy=False, autoreset_mode=AutoresetMode.DISABLED)
         one = envs.envs[0]
+    require_no_statistics(one, envs)
     return envs, one.spec.max_episode_steps if one.spec else None
+
+
+STATISTICS = {"obs_rms", "return_rms", "ret_rms", "reward_rms", "running_mean_std"}
+"""the attributes that hold running statistics in Gymnasium's wrappers and in those modelled on them"""
+
+
+def require_no_statistics(env: Any, vector: VectorEnv) -> None:
+    """Close `vector` and raise `UserError` where `env` or a wrapper of it learns statistics: no checkpoint has them.
+
+    Of a vector the first environment is looked at. Those that are fixed (`update_running_mean` False) may stay.
+    """
+    while isinstance(env, gym.Env | VectorEnv):
+        held = {name.strip("_"): value for name, value in vars(env).items()}
+        learns = STATISTICS & held.keys() or any(map(_is_running, held.values()))
+        if isinstance(env, AsyncVectorEnv):
+            learns = any(any(env.call("has_wrapper_attr", name)) for name in STATISTICS)
+        if learns and held.get("update_running_mean", True):
+            vector.close()
+            raise UserError(
+                f"{type(env).__name__} learns statistics that no checkpoint has: leave it out, and train with"
+                " normalize_observations, for rewards with scale_rewards (--normalize-observations, --scale-rewards)."
+            )
+        env = held.get("env", next(iter(held.get("envs") or ()), None))
+
+
+def _is_running(value: object) -> bool:
+    """Whether it is a running mean and variance, as `RunningMeanStd` is; of an array or a table these are methods."""
+    names = set(dir(value))
+    return {"mean", "var"} <= names and bool({"update", "count"} & names) and not callable(getattr(value, "mean", len))
 
 
 @contextmanager

@@ -44,13 +44,13 @@ class GymnasiumBackend(Backend):
 
     @classmethod
     def ids(cls) -> Collection[str]:
-        """The ids of Gymnasium's registry."""
-        return gym.registry
+        """The ids of Gymnasium's registry, without those of environments that have moved to other projects."""
+        return [name for name, spec in gym.registry.items() if "function _raise" not in str(spec.entry_point)]
 
     @classmethod
     def serves(cls, env: str) -> bool:
         """Registered ids, and classes and functions of one's own. Raises `UserError` if these are not there."""
-        return bool(maker_of(env)) if ":" in env else env in gym.registry
+        return bool(maker_of(env)) if ":" in env else env in cls.ids()
 
     @classmethod
     def wraps(cls, env: str) -> bool:

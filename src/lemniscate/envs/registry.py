@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
 
-from lemniscate.errors import UserError, is_installed, shown, unknown_name
+from lemniscate.errors import UserError, is_installed, missing_extra, shown, unknown_name
 from lemniscate.system import named
 
 if TYPE_CHECKING:
@@ -39,6 +39,15 @@ BEGINNINGS = {
 """how the ids begin that a backend may serve: for no other is it imported. Those not named here may serve any id.
 EnvPool's own ids begin with `EnvPool/`; the others are Gymnasium's, which behave there as in Gymnasium"""
 
+ARGUMENTS_OF_MAKE = {
+    "render_mode": "films are made with a video (--video FILE) by watch and evaluate, in training with video_every",
+    "num_envs": "the number of parallel environments is the field num_envs",
+    "seed": "the seed of a run is the field seed",
+    "vectorization_mode": "the backend gymnasium-async gives each environment a process",
+    **dict.fromkeys(("disable_env_checker", "autoreset", "apply_step_api_compatibility"), "it has no part here"),
+}
+"""arguments of `gym.make` and its kin, and what takes their place; one's own environment may have all but two"""
+
 MOST_ENVS = 1_000_000
 """parallel environments that may be asked for"""
 
@@ -61,8 +70,28 @@ def backend_for(env: str, wrappers: Sequence[str] = ()) -> str:
                 return name
             serving = serving or name
     if serving is None:
-        raise unknown_name("environment", env, known_ids(), "one of your own is named as module:Class.")
+        raise unknown_env(env)
     return serving
+
+
+def unknown_env(env: str) -> UserError:
+    """The sentence for an environment that is not served: ours of that name in another version or library; or near it.
+
+    Of several versions it is the newest, and Gymnasium's before that of EnvPool.
+    """
+    same = [known for known in known_ids() if _stem(known) == _stem(env)]
+    if same:
+        best = max(same, key=lambda known: ("/" not in known, [int(n) for n in re.findall(r"-v(\d+)$", known)]))
+        return UserError(f"There is no environment {env!r}: did you mean {best}?")
+    more = "" if is_installed("envpool") else f" Atari, dm_control and others: {missing_extra('envpool', 'envpool')}."
+    near = unknown_name("environment", env, known_ids(), "one of your own is named as module:Class.")
+    return UserError(f"{near}{more}")
+
+
+def _stem(env: str) -> str:
+    """The letters and digits of an id without library, version and the variants that Atari's ids had."""
+    name = re.sub(r"(-ram)?(NoFrameskip|Deterministic)?(-v\d+)?$", "", env.rpartition("/")[2])
+    return re.sub(r"[^a-z0-9]", "", name.lower())
 
 
 def backend_class(backend: str) -> type["Backend"]:
@@ -195,6 +224,11 @@ def make(
     name, wraps, num_envs = name_of(env), names_of(wrappers), _checked_count(num_envs)
     if kwargs is not None and not isinstance(kwargs, Mapping):
         raise UserError(f"The arguments of an environment are a dictionary, such as {{'x': 1}}, not {kwargs!r}.")
+    for argument, instead in ARGUMENTS_OF_MAKE.items():
+        if argument in (kwargs or {}) and (argument in ("render_mode", "num_envs") or ":" not in name):
+            raise UserError(
+                f"{argument} is no argument of an environment: leave it out of env_kwargs (--env-args); {instead}."
+            )
     chosen = backend_for(name, wraps) if backend is None else backend
     cls = backend_class(chosen)
     if not cls.serves(name):

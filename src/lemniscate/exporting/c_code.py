@@ -8,14 +8,15 @@ something still reads it.
 import math
 import re
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from lemniscate.exporting.deployed import safe_action, safe_sentence
+from lemniscate.exporting.deployed import difference_units, safe_action, safe_sentence
 from lemniscate.exporting.operations import Operand, Operation, Program, Value
-from lemniscate.spec import Action, Discrete, MultiDiscrete
+from lemniscate.spec import Action, Box, Discrete, MultiDiscrete
 from lemniscate.system.machine import version
 from lemniscate.system.templates import filled
 
@@ -38,6 +39,7 @@ def c_files(
     title: str,
     origin: str,
     period: float | None = None,
+    wrappers: Sequence[str] = (),
 ) -> dict[str, str]:
     """The texts of `policy.c` and `policy.h`.
 
@@ -49,6 +51,7 @@ def c_files(
         title: what the policy is for.
         origin: where the observations are from.
         period: seconds between two actions, where known.
+        wrappers: what stands between the environment and the policy in training, and is not in the program.
     """
     body = Body(program)
     places, scratch = body.places()
@@ -59,12 +62,15 @@ def c_files(
         "period": None if period is None else np.float32(period),
         "program": program,
         "action": action,
+        "is_box": isinstance(action, Box),
         "masked": _masked(action),
         "safe": safe_action(action),
         "safe_sentence": safe_sentence(action),
         "observations": observations,
         "actions": actions,
-        "bound": f"{self_test_bound(program, actions):.0e}F",
+        "bound": "0.05F" if program.is_rounded else "1e-4F",  # ten times the effect of another order of sums
+        "units": difference_units(action, actions),
+        "wrappers": wrappers,
         "constants": body.constants,
         "scratch": max(scratch, 1),
         "places": {name: places[name] for name in body.sizes},
@@ -87,18 +93,12 @@ def comment(text: str) -> str:
     return " ".join(text.replace("*/", "* /").replace("\\", "/").split())
 
 
-def self_test_bound(program: Program, actions: np.ndarray) -> float:
-    """The error bound of the self-test: ten times the effect of another order of sums, by the size of the actions."""
-    largest = float(np.abs(actions).max())
-    return 0.05 * max(1.0, largest) if program.is_rounded else 1e-5 * max(10.0, largest)
-
-
 def functions(text: str) -> str:
     """The functions in functions.c that `text` calls, and those that they call, in the order of their file.
 
     A block of that file begins with a line `// name`.
     """
-    blocks = f"\n{(TEMPLATES / 'functions.c').read_text()}".split("\n// ")[1:]
+    blocks = f"\n{(TEMPLATES / 'functions.c').read_text('utf-8')}".split("\n// ")[1:]
     found = ""
     for block in reversed(blocks):  # C defines a function before it is called, so one pass finds all of them
         name, _, block_text = block.partition("\n")

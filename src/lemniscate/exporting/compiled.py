@@ -67,7 +67,9 @@ class HostPolicy:
 def run_tool(command: list[str], folder: Path, seconds: float = 120) -> str:
     """Standard output of a compiler or an emulator. Raises `UserError` with its first complaint where it fails."""
     try:
-        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=seconds, check=False)
+        done = subprocess.run(
+            command, cwd=folder, capture_output=True, encoding="utf-8", errors="replace", timeout=seconds, check=False
+        )
     except (OSError, subprocess.TimeoutExpired) as error:
         raise UserError(f"{Path(command[0]).name} did not run: {str(error).partition(chr(10))[0]}.") from None
     if done.returncode:
@@ -91,7 +93,7 @@ def target_sizes(files: Mapping[str, str]) -> dict[str, int]:
     with _written(files) as folder:
         run_tool([TARGET_COMPILER, *FLAGS, *CORE, *SECTIONS, "-c", "policy.c", "-o", "policy.o"], folder)
         listed = run_tool([TARGET_COMPILER.replace("gcc", "size"), "-A", "policy.o"], folder)
-        stacks = (folder / "policy.su").read_text()
+        stacks = (folder / "policy.su").read_text("utf-8")
     sections = {line.split()[0]: int(line.split()[1]) for line in listed.splitlines() if line.startswith(".")}
     flash = {name: size for name, size in sections.items() if re.match(r"\.(text|rodata|data)", name)}
     test = sum(size for name, size in flash.items() if "self_test" in name)
@@ -128,8 +130,8 @@ def simulate(files: Mapping[str, str], obs: np.ndarray, actions: int) -> tuple[n
 @contextmanager
 def _written(files: Mapping[str, str], *templates: str) -> Iterator[Path]:
     """A temporary directory with texts by name, and with templates that have nothing to be filled in."""
-    with tempfile.TemporaryDirectory() as name:
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as name:
         folder = Path(name)
-        for file, text in {**files, **{file: (TEMPLATES / file).read_text() for file in templates}}.items():
-            (folder / file).write_text(text)
+        for file, text in {**files, **{file: (TEMPLATES / file).read_text("utf-8") for file in templates}}.items():
+            (folder / file).write_text(text, "utf-8")
         yield folder

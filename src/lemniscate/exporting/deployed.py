@@ -80,6 +80,20 @@ def safe_sentence(action: Action) -> str:
     return "the first choice of each"
 
 
+def difference_units(action: Action, true: np.ndarray) -> np.ndarray:
+    """What differences from the true actions [R, A] are shares of, [A]: half the range of each coordinate of a Box.
+
+    Without a range it is 1, or the largest action; where float32 divides a range into few numbers, neighbours differ by
+    1e-5. Of other kinds of actions it is 1.
+    """
+    if not isinstance(action, Box):
+        return np.ones(true.shape[1])
+    low, high, _, half = scale_of(action)
+    bounded = np.isfinite(low) & np.isfinite(high)
+    spacing = np.spacing(np.where(bounded, np.maximum(np.abs(low), np.abs(high)), 1).astype(np.float32))
+    return np.where(bounded, np.maximum(half, spacing / 1e-5), np.maximum(1, np.abs(true).max(0)))
+
+
 def act_with(policy: TrainedPolicy) -> Act:
     """The policy itself as a function of rows; every export is compared with it."""
 

@@ -100,17 +100,23 @@ def is_export(folder: Path) -> bool:
 def _contents(policy: TrainedPolicy, program: Program) -> tuple[dict[str, bytes], dict[str, Any], list[str]]:
     """The content of every file but the manifest by its name, the manifest, and sentences for a person."""
     true, action, compiler, named = act_with(policy), policy.spec.action, host_compiler(), title(policy)
-    facts = {"title": named, "environment": policy.spec.env_id, "step": policy.step}
+    wrappers = list(policy.config.wrappers)
+    facts = {"title": named, "environment": policy.spec.env_id, "wrappers": wrappers, "step": policy.step}
     model = onnx_model(program, facts) if is_installed("onnx") else None
     acting, act = _actor(policy, program, model, compiler)
     obs, interface = fly(policy, act)
     tests = self_tests(policy, obs)
     edges = f", and {len(tests) - TESTS} with one number far outside of them" if len(tests) > TESTS else ""
     origin = f"{TESTS} of episodes of {policy.spec.env_id}{edges}"
-    texts = c_files(program, action, tests, true(tests), title=named, origin=origin, period=interface.period)
-    found = parity(program, true, obs, texts, model, HostPolicy(texts, compiler) if compiler else None)
+    about = {"title": named, "origin": origin, "period": interface.period, "wrappers": wrappers}
+    texts = c_files(program, action, tests, true(tests), **about)
+    found = parity(program, action, true, obs, texts, model, HostPolicy(texts, compiler) if compiler else None)
     record = {"environment": policy.spec.env_id, "acting": acting, "reference": "torch", **found}
     said, vehicle = sentences(record), dict[str, str]()
+    if wrappers:
+        said.append(
+            f"NOT in the files: the wrappers {', '.join(wrappers)}; what they do is to be done around the policy."
+        )
     if interface.vehicle == CRAZYFLIE:
         try:
             vehicle = crazyflie_files(interface, observed(policy.spec, interface), action, texts, named)
@@ -149,6 +155,9 @@ def _manifest(
         "title": title(policy),
         "environment": policy.spec.env_id,
         "env_kwargs": dict(policy.config.env_kwargs),
+        "wrappers": list(policy.config.wrappers),
+        "wrappers_are": "between environment and policy, the first innermost, and NOT in the files: the last returns"
+        " the observations and takes the actions below; wrappers that an environment brings by itself are part of it",
         "algorithm": algorithm_of(policy),
         "step": policy.step,
         "seed": policy.config.seed,
@@ -183,7 +192,9 @@ def commit() -> str | None:
     try:
         # the first command fails where lemniscate is installed into the directory of another repository
         for command in (["ls-files", "--error-unmatch", "__init__.py"], ["rev-parse", "HEAD"]):
-            done = subprocess.run(["git", *command], cwd=folder, capture_output=True, text=True, timeout=10, check=True)
+            done = subprocess.run(
+                ["git", *command], cwd=folder, capture_output=True, encoding="utf-8", timeout=10, check=True
+            )
         return done.stdout.strip()
     except (OSError, subprocess.SubprocessError):
         return None

@@ -3,6 +3,7 @@
 import platform
 import timeit
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,21 +14,21 @@ from lemniscate.envs.backend import Interface
 from lemniscate.errors import UserError, is_installed, missing_extra
 from lemniscate.exporting import compiled
 from lemniscate.exporting.compiled import CORE, EMULATOR, TARGET_COMPILER, HostPolicy
-from lemniscate.exporting.deployed import Act, act_with, for_policy, input_size
+from lemniscate.exporting.deployed import Act, act_with, difference_units, for_policy, input_size
 from lemniscate.exporting.onnx_model import onnx_act
 from lemniscate.exporting.operations import Program
 from lemniscate.maths import Deterministic
 from lemniscate.nn.normalizer import RunningNorm
 from lemniscate.run.environments import evaluation_env
 from lemniscate.run.evaluate import play_episodes
-from lemniscate.spec import Box
+from lemniscate.spec import Action, Box
 
 ENVIRONMENTS, ROWS, TESTS = 16, 10_000, 64
 """environments side by side; observations at least; the number of them that the self-test has"""
 EDGES = 8
 """further observations of the self-test, for the clips"""
 TOLERANCE, BFLOAT16_TOLERANCE = 1e-5, 0.05
-"""of an action; with bfloat16 a sum in another order is sometimes rounded the other way, to the next number"""
+"""of `difference_units`; with bfloat16 a sum in another order is sometimes rounded the other way, to the next number"""
 INSTRUCTIONS = 10**9
 """of a simulation of the target, at most: it takes some ten seconds"""
 
@@ -92,29 +93,38 @@ def _clear(policy: TrainedPolicy, obs: np.ndarray) -> np.ndarray:
 
 
 def parity(
-    program: Program, act: Act, obs: np.ndarray, files: Mapping[str, str], model: bytes | None, host: HostPolicy | None
+    program: Program,
+    action: Action,
+    act: Act,
+    obs: np.ndarray,
+    files: Mapping[str, str],
+    model: bytes | None,
+    host: HostPolicy | None,
 ) -> dict[str, Any]:
     """The record; `missing` has a sentence for everything that could not be compared.
 
-    Compared with `act`, the policy itself, at the observations `obs` [R, O]: `model`, which is `policy.onnx`, and the C
-    in `files`, which is compiled here as `host`.
+    Compared with `act`, the policy itself with its kind of actions, at the observations `obs` [R, O]: `model`, which is
+    `policy.onnx`, and the C in `files`, which is compiled here as `host`.
     """
     true, tolerance = act(obs), BFLOAT16_TOLERANCE if program.is_rounded else TOLERANCE
+    units = difference_units(action, true)
+    compared_with = partial(compare, units=units, tolerance=tolerance)
     costs: dict[str, float | None] = {"c": None, "onnxruntime": None, "torch": nanoseconds(lambda: act(obs[:1]))}
-    record: dict[str, Any] = {"observations": len(obs), "tolerance": tolerance, "onnx": None, "c_host": None}
+    record: dict[str, Any] = {"observations": len(obs), "tolerance": tolerance, "difference_units": units.tolist()}
+    record |= {"onnx": None, "c_host": None}
     left_out = {"onnx": "policy.onnx is left out", "onnxruntime": "policy.onnx is not compared"}
     missing = [f"{missing_extra(name, 'export')}; {what}." for name, what in left_out.items() if not is_installed(name)]
     if model is not None and is_installed("onnxruntime"):
         run, version = onnx_act(model)
-        record["onnx"] = {**compare(run(obs), true, tolerance), "onnxruntime": version}
+        record["onnx"] = {**compared_with(run(obs), true), "onnxruntime": version}
         costs["onnxruntime"] = nanoseconds(lambda: run(obs[:1]))
     if host is None:
         missing.append("There is no C compiler here (cc, gcc, clang or CC): policy.c is not compared on this machine.")
     else:
-        compared = compare(host.act(obs), true, tolerance)
+        compared = compared_with(host.act(obs), true)
         record["c_host"] = {**compared, "self_test": host.self_test(), "compiler": host.compiler}
         costs["c"] = nanoseconds(lambda: host.act(obs)) / len(obs)
-    record["c_cortex_m4f"], said = _on_target(program, files, obs, true, tolerance)
+    record["c_cortex_m4f"], said = _on_target(program, files, obs, true, compared_with)
     record["multiplications"] = program.multiplications
     record["ns_per_action"] = {name: cost and round(cost) for name, cost in costs.items()}
     record["ns_are"] = "C in a loop in C, the others called from Python with one observation, all on one core"
@@ -126,20 +136,20 @@ def nanoseconds(call: Callable[[], object], calls: int = 20) -> float:
     return 1e9 * min(timeit.repeat(call, number=1, repeat=calls))
 
 
-def compare(actions: np.ndarray, true: np.ndarray, tolerance: float) -> dict[str, Any]:
-    """The difference of actions [R, A] from the true ones: the largest, also in last places of the largest action."""
+def compare(actions: np.ndarray, true: np.ndarray, units: np.ndarray, tolerance: float) -> dict[str, Any]:
+    """The largest difference of actions [R, A] from the true ones, as a share of `units` [A] and in their own unit."""
     difference = np.abs(actions.astype(np.float64) - true)
-    largest = float(difference.max())
+    largest, shares = float(difference.max()), difference / units
     return {
         "observations": len(actions),
+        "max_difference": float(shares.max()),
         "max_abs_difference": largest,
-        "max_ulp": largest / float(np.spacing(np.float32(np.abs(true).max()))),
-        "above_tolerance": int((difference.max(1) > tolerance).sum()),
+        "above_tolerance": int((shares.max(1) > tolerance).sum()),
     }
 
 
 def _on_target(
-    program: Program, files: Mapping[str, str], obs: np.ndarray, true: np.ndarray, tolerance: float
+    program: Program, files: Mapping[str, str], obs: np.ndarray, true: np.ndarray, compared_with: Callable[..., Any]
 ) -> tuple[dict[str, Any] | None, list[str]]:
     """The figures of a Cortex-M4F, and a sentence for what is not installed."""
     absent = compiled.missing_target_tools()
@@ -157,7 +167,7 @@ def _on_target(
         actions, self_test, instructions = compiled.simulate(files, obs[:rows], true.shape[1])
     except UserError as error:
         return record, [f"policy.c is not run on the target: {error}"]
-    record |= compare(actions, true[: len(actions)], tolerance)
+    record |= compared_with(actions, true[: len(actions)])
     return {**record, "self_test": self_test, "instructions_per_call": instructions}, []
 
 
@@ -165,10 +175,10 @@ def sentences(record: Mapping[str, Any]) -> list[str]:
     """The record as sentences for a person."""
     names = {"onnx": "ONNX", "c_host": "C", "c_cortex_m4f": "C on the simulated Cortex-M4F"}
     compared = {name: record[key] for key, name in names.items() if (record[key] or {}).get("observations")}
-    said = list[str]()
+    said, share = list[str](), " of half the range"
     for name, each in compared.items():
-        largest = each["max_abs_difference"]
-        distance = f"differs from the policy by at most {largest:.1e}" if largest else "is exact"
+        largest = each["max_difference"]
+        distance = f"differs from the policy by at most {largest:.1e}{share * (largest < 1)}" if largest else "is exact"
         said.append(f"{name} {distance} at {each['observations']:,} observations.")
     if sizes := record["c_cortex_m4f"]:
         instructions = sizes.get("instructions_per_call")
@@ -178,5 +188,5 @@ def sentences(record: Mapping[str, Any]) -> list[str]:
         )
     for name, each in compared.items():
         if each["above_tolerance"]:
-            said.append(f"{name} is beyond {record['tolerance']:g} at {each['above_tolerance']:,} of them.")
+            said.append(f"{name} is beyond {record['tolerance']:g}{share} at {each['above_tolerance']:,} of them.")
     return [*said, *record["missing"]]

@@ -15,6 +15,7 @@ from typing import Any
 from lemniscate.errors import UserError, is_installed, missing_extra, prefix_errors
 from lemniscate.run.checkpoint import FILES, MANIFEST
 from lemniscate.system import named
+from lemniscate.system.files import at_home
 
 SCHEME = "hf:"
 """the first part of an address as a path"""
@@ -66,7 +67,7 @@ def read_address(place: str | PathLike[str]) -> Address:
 
 def local_path(place: str | PathLike[str]) -> Path:
     """The path of a run or a checkpoint; for an address, of its downloaded checkpoint. Raises as `download`."""
-    return download(read_address(place)) if is_address(place) else Path(place)
+    return download(read_address(place)) if is_address(place) else at_home(place)
 
 
 def own_code(config: Mapping[str, Any]) -> list[str]:

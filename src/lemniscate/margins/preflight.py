@@ -159,7 +159,7 @@ def _compiled(policy: TrainedPolicy, run: Path) -> Act:
         raise UserError("There is no C compiler here (cc, gcc, clang or CC), which --compiled needs.")
     try:
         step = read_json(folder / MANIFEST)["step"]
-        files = {name: (folder / name).read_text() for name in ("policy.c", "policy.h")}
+        files = {name: (folder / name).read_text("utf-8") for name in ("policy.c", "policy.h")}
     except (DamagedFileError, OSError, KeyError):
         raise UserError(f"There is no whole export of {run}: lemniscate export {run}") from None
     if step != policy.step:

@@ -19,7 +19,7 @@ from lemniscate.algos import ALGORITHMS, find
 from lemniscate.errors import UserError, unknown_name
 from lemniscate.run.config import RunConfig
 from lemniscate.run.fields import read
-from lemniscate.system.files import DamagedFileError, parsing, read_json, write_json
+from lemniscate.system.files import DamagedFileError, at_home, parsing, read_json, write_json
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def choose(algorithm: str, env_id: str | None, name: str | None) -> tuple[str, R
     if not isinstance(name, str):
         raise unknown_name("preset", name, names(algorithm))
     if name.endswith(".json"):
-        config = read_preset(Path(name), algorithm).config
+        config = read_preset(at_home(name), algorithm).config
         return Path(name).stem, config if env_id is None else config.replace(env=env_id)
     named = [preset.config for preset in of(algorithm) if preset.name == name]
     if name == "default":
@@ -109,7 +109,7 @@ def read_preset(file: Path, algorithm: str) -> Preset:
 @cache
 def _stored(algorithm: str) -> list[Preset]:
     """The presets in the file of an algorithm of this library."""
-    return read_toml(algorithm, (Path(__file__).parent / f"{algorithm}.toml").read_text())
+    return read_toml(algorithm, (Path(__file__).parent / f"{algorithm}.toml").read_text("utf-8"))
 
 
 def read_toml(algorithm: str, text: str) -> list[Preset]:

@@ -9,7 +9,8 @@ import warnings
 from base64 import b64encode
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
+from importlib import import_module
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -173,17 +174,30 @@ def _random(env: gym.Env, seed: int) -> Act:
     return sample
 
 
+def _choose_opengl() -> None:
+    """Have MuJoCo draw by EGL, or else by OSMesa, where there is no display and MUJOCO_GL does not say by what."""
+    chosen = sys.platform != "linux" or {"DISPLAY", "WAYLAND_DISPLAY", "MUJOCO_GL"} & os.environ.keys()
+    for name in () if chosen or "mujoco" not in sys.modules else ("egl", "osmesa"):
+        with suppress(Exception):  # what is not installed raises errors of several kinds
+            context = import_module(f"mujoco.{name}").GLContext
+            import_module("mujoco.rendering.classic.gl_context").GLContext = context
+            os.environ["MUJOCO_GL"] = name
+            return
+
+
 def _rendered(arguments: dict[str, Any], mode: str) -> gym.Env:
     """An environment that has rendered its first picture. Raises `UserError` where it cannot."""
     name = arguments["env"]
     try:
+        _choose_opengl()
         env = make_rendered(mode=mode, **arguments)
         env.reset(seed=0)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # Gymnasium's on pictures, which are looked at below
             env.render()
     except Exception as error:  # pygame, GLFW and MuJoCo each have their own
-        raise UserError(f"{name} cannot be shown here: {error}") from error
+        hint = " (without a display MuJoCo needs MUJOCO_GL=egl or osmesa)" if "OpenGL" in str(error) else ""
+        raise UserError(f"{name} cannot be shown here: {error}{hint}") from error
     try:
         if mode == "rgb_array":
             _picture(env, name)

@@ -49,7 +49,9 @@ def read(name: str, hint: Any, text: Any) -> Any:
     """
     kinds = kinds_of(hint)
     if isinstance(text, list):
-        parts = [part for word in text for part in _split(word)]
+        joined = ",".join(text).strip()
+        inner = joined[1:-1] if joined[:1] + joined[-1:] in ("[]", "()") else joined  # as Python writes several
+        parts = [part.strip("'\"") for part in _split(inner)]
         return () if parts == ["none"] else tuple(read(name, kinds[tuple][0], part) for part in parts)
     if NoneType in kinds and text == "none":
         return None
@@ -92,7 +94,7 @@ def _split(word: str) -> list[str]:
 @cache
 def rows() -> list[list[str]]:
     """The cells of each row: our field, and the other libraries' words for it; of the first row, their names."""
-    lines = TABLE.read_text().splitlines()
+    lines = TABLE.read_text("utf-8").splitlines()
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if not line.startswith("| ---")]
 
 

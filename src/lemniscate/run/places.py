@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from lemniscate.envs.registry import file_name
 from lemniscate.errors import UserError
 from lemniscate.run.directory import CONFIG, SWEEP, create_directory
 from lemniscate.system.files import DamagedFileError, open_log, open_regular, parsing, read_json
@@ -41,7 +42,7 @@ class Sweep:
     def runs(self) -> dict[Path, dict[str, Any]]:
         """The run directories and the content of their `config.json`, ordered by seed, then by algorithm."""
         return {
-            self.path / f"{algorithm}-{seed}": {"algorithm": algorithm, "config": {**config, "seed": seed}}
+            self.path / file_name(f"{algorithm}-{seed}"): {"algorithm": algorithm, "config": {**config, "seed": seed}}
             for seed in self.seeds
             for algorithm, config in self.configs.items()
         }
@@ -181,7 +182,7 @@ class Processes(Places):
 def failure_of(run: Path, code: int) -> str:
     """The signal that ended a process, or else the last line that it wrote."""
     if code < 0 or code in (129, 130, 143):
-        why = ", as the system does where memory has run out" if code == -signal.SIGKILL else ""
+        why = ", as the system does where memory has run out" if code == -9 else ""
         return f"{signal.strsignal(-code if code < 0 else code - 128)}{why}."
     with open_regular(run / LOG) as log:
         written = log.read().decode(errors="replace").split("\n")

@@ -174,7 +174,7 @@ class Run:
             say(self.env.backend.notice)
         self.env.backend.notice = None
         recent = self._recent_returns
-        self._bar.update(state.step, sum(recent) / len(recent) if recent else None)
+        self._bar.update(state.step, sum(recent) / len(recent) if recent else None, learned=bool(metrics))
 
     def require_stored(self) -> None:
         """Raise `NotStoredError` if the disk refused the last checkpoint."""

@@ -75,7 +75,10 @@ class StopRequest:
 
     def _ask_again(self) -> None:
         """In a thread: send the signal again; where even that is not heard, end the process."""
-        signal.pthread_kill(threading.main_thread().ident or 0, self.signum)
+        if hasattr(signal, "pthread_kill"):
+            signal.pthread_kill(threading.main_thread().ident or 0, self.signum)
+        else:  # Windows
+            signal.raise_signal(self.signum)
         if not self._ended.wait(self._patience):
             say(f"Stopped; the update did not let itself be interrupted. {self._go_on()}")
             os._exit(128 + self.signum)

@@ -100,14 +100,22 @@ class ProgressBar:
         self._tasks: dict[str, Any] = {}
         """rich's number of each live bar"""
         self._visible, self._total, self._tenth = visible, total, 10 * done // total
-        self._started, self._done_before = time.monotonic(), done
+        self._started = self._updated_at = time.monotonic()
+        self._step, self._learned = done, True
 
-    def update(self, step: int, episode_return: float | None) -> None:
-        """Show that a single run has reached `step`, and the mean return of its last episodes."""
-        seconds = time.monotonic() - self._started + 1e-9
-        rate = (step - self._done_before) / seconds
-        text = pace(rate, episode_return, self._total - step, f"{_clock(seconds)} in all")
-        self.show(Line(f"{step:,} of {self._total:,} steps", step, self._total, text))
+    def update(self, step: int, episode_return: float | None, learned: bool = True) -> None:
+        """Show that a single run has reached `step`, and the mean return of its last episodes.
+
+        The time left is by the speed since the last call, and unknown where a part of that was not `learned` from.
+        """
+        now, total, known = time.monotonic(), self._total, learned and self._learned
+        rate = (step - self._step) / (now - self._updated_at + 1e-9)
+        self._step, self._updated_at, self._learned = step, now, learned
+        passed = f"{_clock(now - self._started)} {'so far' if step < total else 'in all'}"
+        name = f"{step:,} of {total:,} steps"
+        if step > total:
+            name = f"{step:,} steps, the end of the update that reached {total:,}"
+        self.show(Line(name, step, total, pace(rate, episode_return, known * (total - step), passed)))
 
     def show(self, whole: Line, runs: Sequence[Line] = ()) -> None:
         """Show how far all have come together, and each of the runs that are under way."""

@@ -29,6 +29,11 @@ class DamagedFileError(UserError):
     """A file that is missing, or is not what was written: names it."""
 
 
+def at_home(path: str | os.PathLike[str]) -> Path:
+    """A path as a person gives it: `~` at its beginning is the home folder."""
+    return Path(os.path.expanduser(path))  # noqa: PTH111 (pathlib's raises where `~name` is no user)
+
+
 def write_json(path: Path, record: Mapping[str, Any]) -> None:
     """Write a record with the sha256 of its content, in the place of a file that is there. Raises `OSError`."""
     replace_file(path, (json.dumps({HASH: _hash_of(record), **record}, indent=1) + "\n").encode())

@@ -49,6 +49,12 @@ def require_files(what: str, count: int, each: int) -> None:
         raise UserError(f"{what} {needed}: choose num_envs at most {most // each:,}.")
 
 
+def require_linux(what: str, instead: str) -> None:
+    """Raise `UserError` on another system, where the processes of `what` could not be ended together."""
+    if sys.platform != "linux":
+        raise UserError(f"{what} needs Linux, as under WSL or in the Dockerfile's image; here: {instead}.")
+
+
 def free_memory(device: torch.device | None = None) -> int:
     """Bytes that this process can still take: of the GPU; else of the machine, its container and its own limit."""
     if device and device.type == "cuda":

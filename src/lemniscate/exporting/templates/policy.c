@@ -60,6 +60,8 @@ static const float self_test_actions[POLICY_SELF_TESTS][POLICY_ACTIONS] = {
 {% endfor %}
 };
 
+static const float self_test_units[POLICY_ACTIONS] = {{ units | braces }};
+
 float policy_self_test(void)
 {
     float action[POLICY_ACTIONS], difference, largest = 0.0F;
@@ -67,7 +69,7 @@ float policy_self_test(void)
     for (test = 0; test < POLICY_SELF_TESTS; ++test) {
         const int flag = policy_act(self_test_observations[test], action);
         for (i = 0; i < POLICY_ACTIONS; ++i) {
-            difference = action[i] - self_test_actions[test][i];
+            difference = (action[i] - self_test_actions[test][i]) / self_test_units[i];
             difference = difference < 0.0F ? -difference : difference;
             if (flag || !is_finite(difference)) {
                 return 3.402823466e+38F;

@@ -17,6 +17,11 @@ extern "C" {
 #define POLICY_SELF_TESTS {{ observations | length }}
 #define POLICY_SELF_TEST_BOUND {{ bound }}
 
+{% if wrappers %}
+/* NOT IN THIS FILE: the wrappers of training, {{ wrappers | join(", ") | comment }}.
+ * `obs` is what the last of them returns, and `action` goes into it; what they do is to be done around policy_act. */
+
+{% endif %}
 /* Acts at one raw observation, in the manifest's order; `action` is in the units of the environment. Returns 0, or 1
  * where an observation is NaN or infinite: the action is then the safe one,
  * {{ safe_sentence }}.
@@ -25,6 +30,10 @@ int policy_act(const float obs[POLICY_OBSERVATIONS], float action[POLICY_ACTIONS
 
 /* The largest difference from the actions of training's own policy, at POLICY_SELF_TESTS observations that are stored
  * beside the weights: {{ origin | comment }}.
+{% if is_box %}
+ * Differences are shares of half the range of each action; where a bound is infinite, of its unit, or of its largest
+ * value above 1.
+{% endif %}
  * It is below POLICY_SELF_TEST_BOUND where compiler and memory do as they should. A program that does not call it does
  * not carry them, if it is linked with -ffunction-sections -fdata-sections -Wl,--gc-sections. */
 float policy_self_test(void);
