@@ -22,7 +22,6 @@ OFF_POLICY = {
 }
 
 
-
 def settings_of(algorithm):
     settings = OFF_POLICY if algorithm in ("ddpg", "td3", "sac") else ON_POLICY
     if algorithm == "reppo":
@@ -71,7 +70,8 @@ class Pretrained(nn.Module):
         self.other.weight = self.one.weight
 
     def forward(self, x):
-        assert x.dim() == 2
+        if x.dim() != 2:  # an assertion that pytest rewrites cannot be compiled
+            raise ValueError(x.shape)
         return self.head(self.other(torch.tanh(self.one(self.encoder(self.scale * x[:, self.order])))))
 
 

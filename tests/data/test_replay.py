@@ -84,5 +84,5 @@ def test_a_million_of_hopper_fit_into_130_megabytes():
 
 
 def test_an_image_stays_bytes():
-    image = Spec("x", (ObservationPart((), (4, 4, 3)),), Box((-1.0,), (1.0,)), image=True)
+    image = Spec("x", (ObservationPart((), (4, 4, 3), image=True),), Box((-1.0,), (1.0,)))
     assert ReplayBuffer(image, 5, CPU).transitions.next_obs.dtype == torch.uint8

@@ -10,20 +10,40 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from lemniscate import algos
-from lemniscate.envs.conversion import physical_action
+from lemniscate.envs.conversion import normalized_action, physical_action, scale_of
 from lemniscate.envs.spaces import read_mask, read_observation
 from lemniscate.errors import UserError, prefix_errors, shown
 from lemniscate.hub import repository as hub
+from lemniscate.maths import mean_and_std
 from lemniscate.nn.policies import Policy
 from lemniscate.run import checkpoint
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import find_checkpoint
-from lemniscate.run.seeding import generator
+from lemniscate.run.seeding import generator, torch_defaults
 from lemniscate.run.warm_start import difference
-from lemniscate.spec import Discrete, Spec
+from lemniscate.spec import Discrete, MultiBinary, MultiDiscrete, Spec
 from lemniscate.system.files import parsing
+
+
+@dataclass(frozen=True)
+class ActionDistribution:
+    """The distribution of a policy's actions at one observation, or at each of a batch of B.
+
+    Attributes:
+        probabilities: of the n actions of a Discrete, [n] or [B, n]; of a MultiDiscrete, such an array for each
+            component; of a MultiBinary, those of 1, in the shape of the action. None of a Box.
+        mean: the mean of the actions of a Box, in the environment's units and shape: of a Gaussian, before it is
+            clipped to the bounds; of a Gaussian that is squashed by tanh, after that, so that it is not the action of
+            `act`, which is the squashed mean. None of the others.
+        std: their standard deviation, in the same units; 0 of a deterministic policy.
+    """
+
+    probabilities: np.ndarray | tuple[np.ndarray, ...] | None = None
+    mean: np.ndarray | None = None
+    std: np.ndarray | None = None
 
 
 class TrainedPolicy:
@@ -51,6 +71,7 @@ class TrainedPolicy:
         """Whether its environment says at each step which actions are valid."""
         return isinstance(self.spec.action, Discrete) and self.spec.action.masked
 
+    @torch_defaults()
     @torch.no_grad()
     def act(self, obs: Any, deterministic: bool = True, action_mask: Any = None) -> np.ndarray:
         """The action at one raw observation, or at each of a batch; ready for `env.step`.
@@ -68,19 +89,97 @@ class TrainedPolicy:
             UserError: an observation or a mask of another shape, or that is not finite; a mask where the environment
                 of training gave none.
         """
-        flat, batched = read_observation(self.spec, obs)
-        if action_mask is not None and not self.is_masked:
-            raise UserError(f"{self.spec.env_id} has no action mask, so this policy cannot follow one.")
-        if isinstance(self.spec.action, Discrete) and self.spec.action.masked:
-            mask = read_mask(action_mask, len(flat), self.spec.action.n)
-            flat = np.concatenate([flat, mask.astype(flat.dtype)], axis=-1)
-        distribution = self.module(torch.from_numpy(flat))
+        flat, batched = self._read(obs, action_mask)
+        distribution = self.module(flat)
         if deterministic:
             action = distribution.mode()
         else:
             action = distribution.sample(self.module.draw_noise((len(flat),), self._noise))
         physical = physical_action(action.numpy(), self.spec.action)
         return physical if batched else physical[0]
+
+    @torch_defaults()
+    @torch.no_grad()
+    def distribution(self, obs: Any, action_mask: Any = None) -> ActionDistribution:
+        """The distribution of the actions at one raw observation, or at each of a batch; takes and raises as `act`."""
+        (flat, batched), kind = self._read(obs, action_mask), self.spec.action
+        found: Any = self.module(flat)
+
+        def numbers(values: Tensor, shape: tuple[int, ...] | None) -> np.ndarray:
+            rows = values.numpy() if shape is None else values.numpy().reshape(-1, *shape)
+            return rows if batched else rows[0]
+
+        if isinstance(kind, Discrete):
+            return ActionDistribution(numbers(found.logits.softmax(-1), None))
+        if isinstance(kind, MultiDiscrete):
+            return ActionDistribution(tuple(numbers(part.logits.softmax(-1), None) for part in found.parts))
+        if isinstance(kind, MultiBinary):
+            return ActionDistribution(numbers(found.logits.sigmoid(), kind.shape))
+        mean, std = mean_and_std(found)
+        _, _, middle, half = map(torch.from_numpy, scale_of(kind))
+        return ActionDistribution(mean=numbers(middle + half * mean, kind.shape), std=numbers(half * std, kind.shape))
+
+    @torch_defaults()
+    @torch.no_grad()
+    def value(self, obs: Any) -> np.ndarray:
+        """V(s) of one raw observation, a scalar array, or of each of a batch, [B].
+
+        It is the discounted return that the policy expects from there, in units of the scaled reward where the run has
+        `scale_rewards`.
+
+        Raises:
+            UserError: an observation as in `act`; an algorithm that learns no V(s); one that sees privileged numbers.
+        """
+        flat, batched = self._read_for("value", "V(s)", obs)
+        value = self.networks.value(flat).numpy()
+        return value if batched else value[0]
+
+    @torch_defaults()
+    @torch.no_grad()
+    def q_value(self, obs: Any, action: Any) -> np.ndarray:
+        """Q(s, a) of one raw observation and action, a scalar array, or of each of a batch, [B].
+
+        It is the discounted return that the policy expects after that action, in the units of `value`: the smaller of
+        two critics; of SAC and REPPO with the entropy that is rewarded on the way.
+
+        Args:
+            obs: as in `act`.
+            action: as `act` returns it, in the environment's units; what is outside of its bounds is clipped.
+
+        Raises:
+            UserError: as `value`; an action of another shape, or that is not finite; an algorithm that learns no Q.
+        """
+        flat, batched = self._read_for("q", "Q(s, a)", obs)
+        kind, given = self.spec.bounded_box(), np.asarray(action, dtype=np.float32)
+        wanted = ((len(flat),) if batched else ()) + (kind.shape or (kind.size,))
+        if given.shape != wanted or not np.isfinite(given).all():
+            raise UserError(
+                f"action must be finite numbers of the shape {wanted}, not {given.shape}: as act returns it."
+            )
+        own = torch.from_numpy(normalized_action(given.reshape(len(flat), -1), kind)).clamp(-1, 1)
+        q = self.networks.q(flat, own).numpy()
+        return q if batched else q[0]
+
+    def _read(self, obs: Any, action_mask: Any = None) -> tuple[Tensor, bool]:
+        """The flat observations [B, O], with the mask where there is one, and whether they are a batch."""
+        flat, batched = read_observation(self.spec, obs)
+        if action_mask is not None and not self.is_masked:
+            raise UserError(f"{self.spec.env_id} has no action mask, so this policy cannot follow one.")
+        if isinstance(self.spec.action, Discrete) and self.spec.action.masked:
+            mask = read_mask(action_mask, len(flat), self.spec.action.n)
+            flat = np.concatenate([flat, mask.astype(flat.dtype)], axis=-1)
+        return torch.from_numpy(flat), batched
+
+    def _read_for(self, attribute: str, what: str, obs: Any) -> tuple[Tensor, bool]:
+        """As `_read`, for a critic. Raises `UserError` where there is none, or it takes more numbers."""
+        other = {"value": "q", "q": "value"}[attribute]
+        if not hasattr(self.networks, attribute) or getattr(self.config, "baseline", attribute) != attribute:
+            has = hasattr(self.networks, other)
+            there = f": it has policy.{'q_value(obs, action)' if other == 'q' else 'value(obs)'}" if has else ""
+            raise UserError(f"The {algorithm_of(self)} of this policy has learned no {what}{there}.")
+        if self.spec.privileged:
+            raise UserError(f"{what} takes {self.spec.privileged} privileged numbers that are in no observation.")
+        return self._read(obs)
 
 
 @dataclass(frozen=True)
@@ -111,6 +210,7 @@ def path_of(run: object) -> Path:
     return Path(path)
 
 
+@torch_defaults()
 def load(run: Trained, *, trust: bool = False) -> TrainedPolicy:
     """The policy of a run (its newest whole checkpoint), of one checkpoint or on the Hub. No file is executed.
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from lemniscate.envs.backend import Backend
 from lemniscate.envs.conversion import flatten_observation, physical_action, row_of
 from lemniscate.envs.registry import BEGINNINGS
-from lemniscate.envs.spaces import SUCCESS, SUMMARIES, action_kind, is_image, measured, observation_parts
+from lemniscate.envs.spaces import SUCCESS, SUMMARIES, action_kind, measured, observation_parts
 from lemniscate.envs.vec_env import Stagger
 from lemniscate.errors import UserError, is_installed, missing_extra, unknown_name
 from lemniscate.spec import Spec
@@ -98,7 +98,7 @@ class EnvpoolBackend(Backend):
         self._stagger_up_to = self._limit if stagger else None
         space = self._pool.observation_space
         parts, action = observation_parts(space, env), action_kind(self._pool.action_space, env)
-        self.spec = Spec(env, parts, action, max_episode_steps=self._limit, image=is_image(space))
+        self.spec = Spec(env, parts, action, max_episode_steps=self._limit)
 
     @classmethod
     def divides(cls, env: str) -> bool:

@@ -96,7 +96,7 @@ class GymnasiumBackend(Backend):
             action = replace(action, masked=True)
         self._stagger_up_to = limit if stagger and self.mode is AutoresetMode.DISABLED else None
         self._measures = spaces.measures_of(self._envs.metadata)
-        self.spec = Spec(env, parts, action, max_episode_steps=limit, image=spaces.is_image(space))
+        self.spec = Spec(env, parts, action, max_episode_steps=limit)
 
     def restart(self, seed: int, first: int = 0) -> Tensor:
         """Close the environments and build them again: some (Box2D) carry more over a reset than they tell.

@@ -1,6 +1,6 @@
 """Networks: perceptrons, residual blocks, modules of one's own; and the encoder of images."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal
@@ -11,6 +11,7 @@ from torch.nn.parameter import is_lazy
 
 from lemniscate.errors import UserError, unknown_name
 from lemniscate.maths import tanh
+from lemniscate.spec import ObservationPart
 from lemniscate.system.named import find_callable
 
 Activation = Literal["tanh", "relu", "elu", "silu"]
@@ -212,7 +213,7 @@ class ImageEncoder(nn.Module):
     policy's encoder, which learns from the advantage alone, may end with the same output for every image.
     """
 
-    def __init__(self, shape: tuple[int, int, int]) -> None:
+    def __init__(self, shape: tuple[int, ...]) -> None:
         super().__init__()
         self.shape = height, width, channels = shape
         if min(height, width) < 36:
@@ -231,3 +232,24 @@ class ImageEncoder(nn.Module):
         """[…, H · W · C] in [-½, ½] to […, `size`]."""
         images = pixels.reshape(-1, *self.shape).movedim(-1, 1)
         return self.layers(images).reshape(*pixels.shape[:-1], self.size)
+
+
+class PartsEncoder(nn.Module):
+    """The features of several images, each with an encoder of its own, beside numbers as they are.
+
+    Args:
+        parts: of the observation, in its order.
+    """
+
+    def __init__(self, parts: Sequence[ObservationPart]) -> None:
+        super().__init__()
+        self._sizes = [part.size for part in parts]
+        self.encoders = nn.ModuleList(ImageEncoder(part.shape) if part.image else nn.Identity() for part in parts)
+        encoded = zip(self.encoders, self._sizes, strict=True)
+        self.size = sum(encoder.size if isinstance(encoder, ImageEncoder) else size for encoder, size in encoded)
+        """length of what comes out"""
+
+    def forward(self, obs: Tensor) -> Tensor:
+        """Normalized observations […, O] to […, `size`]."""
+        pieces = zip(self.encoders, obs.split(self._sizes, dim=-1), strict=True)
+        return torch.cat([encoder(piece) for encoder, piece in pieces], dim=-1)

@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal, Self, get_args, get_origin, get_type
 import torch
 
 from lemniscate.envs.registry import MOST_ENVS
-from lemniscate.errors import UserError, shown
+from lemniscate.errors import UserError, shown, unknown_name
 from lemniscate.run.fields import options_of, unknown_field
 from lemniscate.run.seeding import Generators
 from lemniscate.spec import Spec
@@ -125,6 +125,11 @@ def _number(value: Any, kind: type, limits: Range = Range()) -> int | float:
     raise ValueError(wanted)
 
 
+def is_below(name: str, beginning: str) -> bool:
+    """Whether a parameter's name is `beginning`, or goes on after it with a dot."""
+    return f"{name}.".startswith(f"{beginning.rstrip('.')}.")
+
+
 @cache
 def _hints_of(config: type) -> dict[str, Any]:
     return get_type_hints(config, include_extras=True)
@@ -168,6 +173,9 @@ class RunConfig:
     """training episodes between such recordings; 0: none"""
     warm_start: str | None = None
     """run, checkpoint or hf://user/name whose networks this run begins with"""
+    freeze: tuple[str, ...] = ()
+    """parameters that keep their values, by the beginnings of their names, such as policy.net.0; mostly with
+    warm_start"""
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     """arguments of the environment, as JSON: '{"dynamics": "first_principles"}'"""
     wrappers: tuple[str, ...] = ()
@@ -200,6 +208,22 @@ class RunConfig:
     def networks(self, spec: Spec) -> Any:
         """New networks for the spaces in `spec`, a module with a `policy`. Raises `UserError` if they do not fit."""
         raise NotImplementedError
+
+    def make_networks(self, spec: Spec, device: torch.device) -> Any:
+        """The networks to train, on a device; of those in `freeze` no parameter needs a gradient.
+
+        Raises:
+            UserError: they do not fit, or there is nothing of that name to freeze.
+        """
+        networks = self.networks(spec).to(device)
+        named = dict(networks.named_parameters())
+        for beginning in self.freeze:
+            frozen = [parameter for name, parameter in named.items() if is_below(name, beginning)]
+            if not frozen:
+                raise unknown_name("parameter to freeze", beginning, named, f"there is {', '.join(named)}.")
+            for parameter in frozen:
+                parameter.requires_grad_(False)
+        return networks
 
     def memory(self, spec: Spec) -> dict[str, int]:
         """Bytes that training takes at least, beside networks and environments, by the field that they grow with."""
