@@ -71,8 +71,7 @@ class Config(OnPolicyConfig):
 
     def networks(self, spec: Spec) -> ActorCategoricalQ:
         """New networks for the spaces in `spec`: π, Q, α and β."""
-        own = self.normalize_observations, self.initial_log_std, self.value_range
-        return ActorCategoricalQ(spec, self.layers, self.critic_layers, *own)
+        return ActorCategoricalQ(spec, *self.network_settings, self.initial_log_std, self.value_range)
 
     @property
     def gradient_steps(self) -> int:

@@ -24,21 +24,20 @@ from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import find_checkpoint
 from lemniscate.run.seeding import generator, torch_defaults
 from lemniscate.run.warm_start import difference
-from lemniscate.spec import Discrete, MultiBinary, MultiDiscrete, Spec
+from lemniscate.spec import Box, Discrete, MultiDiscrete, Spec
 from lemniscate.system.files import parsing
 
 
 @dataclass(frozen=True)
 class ActionDistribution:
-    """The distribution of a policy's actions at one observation, or at each of a batch of B.
+    """The distribution of actions at one observation or at each of B; None is what its kind of action space has not.
 
     Attributes:
-        probabilities: of the n actions of a Discrete, [n] or [B, n]; of a MultiDiscrete, such an array for each
-            component; of a MultiBinary, those of 1, in the shape of the action. None of a Box.
-        mean: the mean of the actions of a Box, in the environment's units and shape: of a Gaussian, before it is
-            clipped to the bounds; of a Gaussian that is squashed by tanh, after that, so that it is not the action of
-            `act`, which is the squashed mean. None of the others.
-        std: their standard deviation, in the same units; 0 of a deterministic policy.
+        probabilities: of a Discrete [n] or [B, n]; of a MultiDiscrete one such array for each component; of a
+            MultiBinary those of 1, in the shape of the action.
+        mean: of a Box, in the environment's units and shape: of a Gaussian before it is clipped to the bounds; of one
+            that tanh squashes, after that (`act` takes the squashed mean instead).
+        std: standard deviation, in the same units; 0 of a deterministic policy.
     """
 
     probabilities: np.ndarray | tuple[np.ndarray, ...] | None = None
@@ -105,51 +104,41 @@ class TrainedPolicy:
         (flat, batched), kind = self._read(obs, action_mask), self.spec.action
         found: Any = self.module(flat)
 
-        def numbers(values: Tensor, shape: tuple[int, ...] | None) -> np.ndarray:
-            rows = values.numpy() if shape is None else values.numpy().reshape(-1, *shape)
-            return rows if batched else rows[0]
+        def rows(values: Tensor, shape: tuple[int, ...] | None = None) -> np.ndarray:
+            array = values.numpy() if shape is None else values.numpy().reshape(-1, *shape)
+            return array if batched else array[0]
 
-        if isinstance(kind, Discrete):
-            return ActionDistribution(numbers(found.logits.softmax(-1), None))
         if isinstance(kind, MultiDiscrete):
-            return ActionDistribution(tuple(numbers(part.logits.softmax(-1), None) for part in found.parts))
-        if isinstance(kind, MultiBinary):
-            return ActionDistribution(numbers(found.logits.sigmoid(), kind.shape))
+            return ActionDistribution(tuple(rows(part.logits.softmax(-1)) for part in found.parts))
+        if not isinstance(kind, Box):
+            probabilities = found.logits.softmax(-1) if isinstance(kind, Discrete) else found.logits.sigmoid()
+            return ActionDistribution(rows(probabilities, getattr(kind, "shape", None)))
         mean, std = mean_and_std(found)
         _, _, middle, half = map(torch.from_numpy, scale_of(kind))
-        return ActionDistribution(mean=numbers(middle + half * mean, kind.shape), std=numbers(half * std, kind.shape))
+        return ActionDistribution(mean=rows(middle + half * mean, kind.shape), std=rows(half * std, kind.shape))
 
     @torch_defaults()
     @torch.no_grad()
     def value(self, obs: Any) -> np.ndarray:
-        """V(s) of one raw observation, a scalar array, or of each of a batch, [B].
+        """V(s) of one raw observation, a scalar array, or of each of a batch, [B]; takes and raises as `act`.
 
-        It is the discounted return that the policy expects from there, in units of the scaled reward where the run has
-        `scale_rewards`.
-
-        Raises:
-            UserError: an observation as in `act`; an algorithm that learns no V(s); one that sees privileged numbers.
+        It is the discounted return that the policy expects, in units of the scaled reward where the run has
+        `scale_rewards`. Raises `UserError` for an algorithm that learns no V(s), or one of privileged numbers too.
         """
-        flat, batched = self._read_for("value", "V(s)", obs)
+        flat, batched = self._read_for("value", obs)
         value = self.networks.value(flat).numpy()
         return value if batched else value[0]
 
     @torch_defaults()
     @torch.no_grad()
     def q_value(self, obs: Any, action: Any) -> np.ndarray:
-        """Q(s, a) of one raw observation and action, a scalar array, or of each of a batch, [B].
+        """Q(s, a) of one raw observation and action, a scalar array, or of each of a batch, [B]; raises as `value`.
 
         It is the discounted return that the policy expects after that action, in the units of `value`: the smaller of
-        two critics; of SAC and REPPO with the entropy that is rewarded on the way.
-
-        Args:
-            obs: as in `act`.
-            action: as `act` returns it, in the environment's units; what is outside of its bounds is clipped.
-
-        Raises:
-            UserError: as `value`; an action of another shape, or that is not finite; an algorithm that learns no Q.
+        two critics; of SAC and REPPO with the entropy that is rewarded on the way. Actions are as `act` returns them,
+        in the environment's units; what is outside of the bounds is clipped.
         """
-        flat, batched = self._read_for("q", "Q(s, a)", obs)
+        flat, batched = self._read_for("q", obs)
         kind, given = self.spec.bounded_box(), np.asarray(action, dtype=np.float32)
         wanted = ((len(flat),) if batched else ()) + (kind.shape or (kind.size,))
         if given.shape != wanted or not np.isfinite(given).all():
@@ -170,15 +159,17 @@ class TrainedPolicy:
             flat = np.concatenate([flat, mask.astype(flat.dtype)], axis=-1)
         return torch.from_numpy(flat), batched
 
-    def _read_for(self, attribute: str, what: str, obs: Any) -> tuple[Tensor, bool]:
-        """As `_read`, for a critic. Raises `UserError` where there is none, or it takes more numbers."""
-        other = {"value": "q", "q": "value"}[attribute]
-        if not hasattr(self.networks, attribute) or getattr(self.config, "baseline", attribute) != attribute:
-            has = hasattr(self.networks, other)
-            there = f": it has policy.{'q_value(obs, action)' if other == 'q' else 'value(obs)'}" if has else ""
-            raise UserError(f"The {algorithm_of(self)} of this policy has learned no {what}{there}.")
+    def _read_for(self, critic: str, obs: Any) -> tuple[Tensor, bool]:
+        """As `_read`, for "value" or "q". Raises `UserError` where that has not been learned, or takes more numbers."""
+        verbs = {"value": "policy.value(obs)", "q": "policy.q_value(obs, action)"}
+        here = [verb for name, verb in verbs.items() if hasattr(self.networks, name)]
+        if verbs[critic] not in here or getattr(self.config, "baseline", critic) != critic:
+            there = f"; it has {here[0]}" if here and verbs[critic] not in here else ""
+            raise UserError(f"This policy of {algorithm_of(self)} has learned no {verbs[critic]}{there}.")
         if self.spec.privileged:
-            raise UserError(f"{what} takes {self.spec.privileged} privileged numbers that are in no observation.")
+            raise UserError(
+                f"{verbs[critic]} takes {self.spec.privileged} privileged numbers, which no observation has."
+            )
         return self._read(obs)
 
 

@@ -69,7 +69,7 @@ class ActorCategoricalQ(nn.Module):
         self.multipliers = Multipliers([INITIAL_MULTIPLIER] * 2)
 
     def q(self, obs: Tensor, action: Tensor) -> Tensor:
-        """Q(s, a) of [B, O] and [B, A], [B]."""
+        """[B, O] and [B, A] to Q(s, a), [B]."""
         return self.critic(obs, action)
 
     def estimates(self, obs: Tensor, next_obs: Tensor, action: Tensor, noise: Tensor) -> tuple[Tensor, ...]:

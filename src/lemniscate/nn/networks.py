@@ -109,21 +109,16 @@ NETWORKS: dict[str, Callable[[Layers, int], tuple[list[nn.Module], int]]] = {
 
 
 class OwnNetwork(nn.Module):
-    """A module of one's own: it takes rows [B, inputs] to [B, outputs], whatever dimensions lead here.
-
-    Args:
-        name: of a class or function that makes the module, called with `inputs` and `outputs`.
-        inputs: of the module.
-        outputs: of the module.
+    """A module of one's own, which `name` makes: it takes rows [B, inputs] to [B, outputs], whatever dimensions lead.
 
     Raises:
-        UserError: it cannot be made or called; nothing in it can learn; or what it does in training could not be
-            repeated: it is random, it changes its own parameters or buffers, or it cannot be saved.
+        UserError: it cannot be made, called or saved; nothing in it learns; or what it does in training could not be
+            repeated, since it is random or changes its own tensors.
     """
 
     def __init__(self, name: str, inputs: int, outputs: int) -> None:
         super().__init__()
-        self.name, rows = name, torch.randn(64, inputs, generator=torch.Generator().manual_seed(0))
+        self.name, self.least, rows = name, 1, torch.randn(64, inputs, generator=torch.Generator().manual_seed(0))
         wanted = f"{name}({inputs}, {outputs}) must make a module that takes [B, {inputs}] to [B, {outputs}]"
         try:
             self.module = find_callable(name)(inputs, outputs)
@@ -134,7 +129,6 @@ class OwnNetwork(nn.Module):
                 again = self.module(rows)
             changed = [key for key, tensor in self._tensors().items() if not _equal(before.get(key, tensor), tensor)]
             lost = [key for key, tensor in self.state_dict().items() if not tensor.isfinite().all()]
-            types = {parameter.dtype for parameter in self.parameters() if parameter.requires_grad}
         except UserError:
             raise
         except Exception as error:
@@ -143,21 +137,17 @@ class OwnNetwork(nn.Module):
             what = f"{list(out.shape)} of {out.dtype}" if isinstance(out, Tensor) else f"a {type(out).__name__}"
             raise UserError(f"{wanted}, in float32; it takes [{len(rows)}, {inputs}] to {what}.")
         if changed:
-            raise UserError(
-                f"{name} changes {changed[0].removeprefix('module.')} in forward, which compiled and resumed runs could"
-                " not repeat; of batch normalization, take track_running_stats=False or, better, LayerNorm."
-            )
+            how = f"changes {changed[0].removeprefix('module.')} in forward, which no other process would repeat"
+            raise UserError(f"{name} {how}; of batch normalization, take track_running_stats=False, or LayerNorm.")
         if not _equal(out, again):
-            raise UserError(
-                f"{name} is random: two calls with the same rows differ. The ratio of new to old probabilities would be"
-                " noise; leave its dropout out, or set it to 0."
-            )
+            how = "is random: two calls with the same rows differ, and so would old and new probabilities"
+            raise UserError(f"{name} {how}; leave its dropout out, or set it to 0.")
         if lost:
             raise UserError(f"{name} has a number in {lost[0].removeprefix('module.')} that is not finite.")
-        if not out.requires_grad or types != {torch.float32}:
-            kinds = f"parameters of {', '.join(sorted(map(str, types)))}" if types else "no parameter to learn"
+        types = {str(parameter.dtype) for parameter in self.parameters() if parameter.requires_grad}
+        if not out.requires_grad or types != {"torch.float32"}:
+            kinds = f"parameters of {', '.join(sorted(types))}" if types else "no parameter to learn"
             raise UserError(f"{name} has {kinds}; it must have some of torch.float32 that its outputs depend on.")
-        self.least = 1
         try:
             with torch.no_grad():
                 self.module(rows[:1])
@@ -235,11 +225,7 @@ class ImageEncoder(nn.Module):
 
 
 class PartsEncoder(nn.Module):
-    """The features of several images, each with an encoder of its own, beside numbers as they are.
-
-    Args:
-        parts: of the observation, in its order.
-    """
+    """The features of several parts of the observation: images by an encoder each, beside numbers as they are."""
 
     def __init__(self, parts: Sequence[ObservationPart]) -> None:
         super().__init__()

@@ -47,16 +47,15 @@ class NormByPart(NoNorm):
 
     def forward(self, obs: Tensor) -> Tensor:
         """[…, O or more] to […, O]."""
-        return torch.cat([part(piece) for part, piece in self._pieces(obs)], dim=-1)
+        return torch.cat([part(piece) for part, piece in zip(self.parts, self._pieces(obs), strict=True)], dim=-1)
 
     def update(self, obs: Tensor, valid: Tensor | None = None) -> None:
         """Each its part of the observations."""
-        for part, piece in self._pieces(obs):
+        for part, piece in zip(self.parts, self._pieces(obs), strict=True):
             part.update(piece, valid)
 
-    def _pieces(self, obs: Tensor) -> Iterable[tuple[NoNorm, Tensor]]:
-        sizes = [part.size for part in self.parts]
-        return zip(self.parts, super().forward(obs).split(sizes, dim=-1), strict=True)
+    def _pieces(self, obs: Tensor) -> Sequence[Tensor]:
+        return super().forward(obs).split([part.size for part in self.parts], dim=-1)
 
 
 def with_privileged(features: Tensor, obs: Tensor, size: int, privileged: int) -> Tensor:

@@ -125,11 +125,6 @@ def _number(value: Any, kind: type, limits: Range = Range()) -> int | float:
     raise ValueError(wanted)
 
 
-def is_below(name: str, beginning: str) -> bool:
-    """Whether a parameter's name is `beginning`, or goes on after it with a dot."""
-    return f"{name}.".startswith(f"{beginning.rstrip('.')}.")
-
-
 @cache
 def _hints_of(config: type) -> dict[str, Any]:
     return get_type_hints(config, include_extras=True)
@@ -210,19 +205,15 @@ class RunConfig:
         raise NotImplementedError
 
     def make_networks(self, spec: Spec, device: torch.device) -> Any:
-        """The networks to train, on a device; of those in `freeze` no parameter needs a gradient.
-
-        Raises:
-            UserError: they do not fit, or there is nothing of that name to freeze.
-        """
+        """`networks` to train, on a device, with those in `freeze` frozen. Raises `UserError` if there are none."""
         networks = self.networks(spec).to(device)
-        named = dict(networks.named_parameters())
         for beginning in self.freeze:
-            frozen = [parameter for name, parameter in named.items() if is_below(name, beginning)]
+            named = dict(networks.named_parameters())
+            frozen = [name for name in named if f"{name}.".startswith(f"{beginning}.")]
             if not frozen:
                 raise unknown_name("parameter to freeze", beginning, named, f"there is {', '.join(named)}.")
-            for parameter in frozen:
-                parameter.requires_grad_(False)
+            for name in frozen:
+                named[name].requires_grad_(False)
         return networks
 
     def memory(self, spec: Spec) -> dict[str, int]:

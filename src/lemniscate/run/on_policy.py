@@ -37,28 +37,25 @@ class OnPolicyConfig(RunConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for layers in (self.layers, self.critic_layers):
+        for layers in self.network_settings[:2]:
             layers.check()
 
     def networks(self, spec: Spec) -> Any:
         """New networks for the spaces in `spec`: the policy and V(s)."""
-        own = self.initial_log_std, self.normalize_observations
-        return ActorCritic(spec, self.layers, *own, critic_layers=self.critic_layers)
+        layers, critic_layers, normalize = self.network_settings
+        return ActorCritic(spec, layers, self.initial_log_std, normalize, critic_layers=critic_layers)
 
     def memory(self, spec: Spec) -> dict[str, int]:
         """The bytes of a rollout, and of its rows in the widest layer."""
-        rows = 4 * self.num_rows * max((*self.hidden, *self.critic_layers.hidden), default=0)
+        rows = 4 * self.num_rows * max((*self.hidden, *(self.critic_hidden or ())), default=0)
         return {"num_steps": rows + rollout_bytes(spec, self.num_steps, self.num_envs)}
 
     @property
-    def layers(self) -> Layers:
-        """The hidden layers of the policy."""
-        return Layers(self.hidden, self.activation, self.network)
-
-    @property
-    def critic_layers(self) -> Layers:
-        """The hidden layers of the value."""
-        return replace(self.layers, hidden=self.hidden if self.critic_hidden is None else self.critic_hidden)
+    def network_settings(self) -> tuple[Layers, Layers, bool]:
+        """The hidden layers of the policy and of the value, and whether observations are normalized."""
+        layers = Layers(self.hidden, self.activation, self.network)
+        critic_hidden = self.hidden if self.critic_hidden is None else self.critic_hidden
+        return layers, replace(layers, hidden=critic_hidden), self.normalize_observations
 
     @property
     def num_rows(self) -> int:

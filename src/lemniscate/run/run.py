@@ -24,7 +24,7 @@ import torch
 from lemniscate.envs.vec_env import Episodes, VecEnv
 from lemniscate.errors import NonFiniteError, NotStoredError, UserError, resume_line
 from lemniscate.optim.compiled import Compiler
-from lemniscate.run.config import RunConfig, is_below
+from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import Saver
 from lemniscate.run.evaluate import critic_of, evaluate
 from lemniscate.run.loggers import NO_EPISODES, JsonLines, Logger, LoggerClass, TensorBoard
@@ -99,10 +99,7 @@ class Run:
         The directory of a new run is created here: a state that cannot be made leaves nothing behind. A warm start is
         saved as a checkpoint at step 0, so that from then on the run does not depend on where its networks came from.
         """
-        saver, freeze = self._saver, self.config.freeze
-        learning = (name for name, parameter in state.networks.named_parameters() if parameter.requires_grad)
-        if freeze and any(is_below(name, beginning) for name in learning for beginning in freeze):
-            raise UserError(f"{self.algorithm} freezes nothing: its init must make networks by config.make_networks.")
+        saver = self._saver
         if self.config.warm_start and not saver.exists:  # first, since it may fail
             self._begin_warm(state)
         saver.open()

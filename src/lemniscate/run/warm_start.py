@@ -33,10 +33,11 @@ def load_networks(networks: nn.Module, config: RunConfig, spec: Spec, locate: Ca
     their_spec = checkpoint.spec_from_json(source.record["spec"])
     elsewhere = "" if their_spec.fits(spec) else f"; it was trained on {their_spec.env_id}, with other spaces"
     theirs, ours = source.record["config"], config.to_json()
-    for field in FUNCTION:
-        if field in theirs and field in ours and theirs[field] != ours[field]:
-            there, here = theirs[field], ours[field]
-            raise UserError(f"warm_start: {name} does not fit: {field} is {there!r} there and {here!r} here.")
+    shared = [field for field in (*FUNCTION, "hidden") if field in theirs and field in ours]
+    differing = [field for field in shared if theirs[field] != ours[field]]
+    settings = [f"{field} is {theirs[field]!r} there and {ours[field]!r} here" for field in differing]
+    if set(differing) & set(FUNCTION):
+        raise UserError(f"warm_start: {name} does not fit: {settings[0]}.")
     found, own = source.tensors_of("networks"), networks.state_dict()
     comparable = theirs.get("value_range") == ours.get("value_range")  # else a Q of these shapes says another
     fits = {
@@ -44,12 +45,10 @@ def load_networks(networks: nn.Module, config: RunConfig, spec: Spec, locate: Ca
         for key, tensor in found.items()
         if key in own and tensor.shape == own[key].shape and (comparable or key.startswith("policy."))
     }
-    counts = [key for key in fits if key.endswith(".count") and key.replace("count", "mean") in {*own} - {*fits}]
-    fits = {key: tensor for key, tensor in fits.items() if key not in counts}
+    resized = [key.removesuffix("mean") + "count" for key in own if key.endswith(".mean") and key not in fits]
+    fits = {key: tensor for key, tensor in fits.items() if key not in resized}
     if not any(key.startswith("policy.") and tensor.ndim > 1 for key, tensor in fits.items()):
-        reason = difference(
-            *({key: x for key, x in side.items() if key.startswith("policy.")} for side in (found, own))
-        )
+        reason = [*settings, difference(found, own)][0]
         raise UserError(f"warm_start: no layer of the policy of {name} fits: {reason}{elsewhere}.")
     networks.load_state_dict(fits, strict=False)
     named = (*networks.named_parameters(), *networks.named_buffers())  # a normalizer that networks share is one
