@@ -72,7 +72,7 @@ class FourNumbers(gym.Env):
     """As many numbers as CartPole observes, and continuous actions."""
 
     observation_space = gym.spaces.Box(-1, 1, (4,), np.float32)
-    action_space = gym.spaces.Box(-2, 2, (2,), np.float32)
+    action_space = gym.spaces.Box(-2, 2, (3,), np.float32)
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
