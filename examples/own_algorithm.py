@@ -63,7 +63,7 @@ PRESETS = [Preset("careful", Config(env="CartPole-v1", beta=10.0), "an example, 
 
 def init(config: Config, spec: Spec, device: torch.device) -> State:
     """A new state, seeded by the run's seed."""
-    networks = config.networks(spec).to(device)
+    networks = config.make_networks(spec, device)
     optimizer = Adam(networks, max_grad_norm=1.0)
     optimizer.learning_rate = config.learning_rate
     return State(

@@ -68,6 +68,25 @@ class Greedy(EndlessLevers):
         return actions[:, 0]
 
 
+class FourNumbers(gym.Env):
+    """As many numbers as CartPole observes, and continuous actions."""
+
+    observation_space = gym.spaces.Box(-1, 1, (4,), np.float32)
+    action_space = gym.spaces.Box(-2, 2, (3,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.time = 0
+        return self._look(), {}
+
+    def step(self, action):
+        self.time += 1
+        return self._look(), float(-np.square(action).sum()), False, self.time >= 10, {}
+
+    def _look(self):
+        return self.np_random.uniform(-1, 1, 4).astype(np.float32)
+
+
 for world in (Endless, Levers, EndlessLevers, Greedy):
     gym.register(f"{world.__name__}-v0", vector_entry_point=f"helpers:{world.__name__}")
 

@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from contextlib import contextmanager, nullcontext
 
 import gymnasium as gym
 import numpy as np
@@ -282,3 +283,98 @@ def test_a_config_has_dot_access_and_is_frozen():
     assert config.seed == 7
     with pytest.raises(AttributeError):
         config.seed = 8
+
+
+def test_a_policy_says_its_probabilities_and_its_value(cartpole):
+    policy, obs = lem.load(cartpole.path), np.random.default_rng(0).normal(size=(5, 4)).astype(np.float32)
+    found, values = policy.distribution(obs), policy.value(obs)
+    assert (found.probabilities.shape, values.shape, found.mean, found.std) == ((5, 2), (5,), None, None)
+    np.testing.assert_allclose(found.probabilities.sum(-1), 1, rtol=1e-5)
+    np.testing.assert_array_equal(found.probabilities.argmax(-1), policy.act(obs))
+    with torch.no_grad():
+        np.testing.assert_array_equal(values, policy.networks.value(torch.from_numpy(obs)).numpy())
+    one = policy.distribution(obs[2])
+    np.testing.assert_allclose(one.probabilities, found.probabilities[2], rtol=1e-5)
+    np.testing.assert_allclose(policy.value(obs[2]), values[2], rtol=1e-5)
+    with pytest.raises(
+        lem.UserError, match=r"of ppo has learned no policy.q_value\(obs, action\); it has policy.value"
+    ):
+        policy.q_value(obs, policy.act(obs))
+    with pytest.raises(lem.UserError, match="has no action mask"):
+        policy.distribution(obs[0], action_mask=[1, 0])
+
+
+def test_mean_and_std_are_in_the_units_of_the_environment(pendulum):
+    """Pendulum's torque is from -2 to 2, so a unit of the policy is two of its own."""
+    policy, obs = lem.load(pendulum.path), np.zeros((3, 3), np.float32)
+    found = policy.distribution(obs)
+    assert found.mean.shape == found.std.shape == (3, 1)
+    assert found.probabilities is None
+    np.testing.assert_allclose(found.std, 2 * policy.module.log_std.detach().exp().numpy() * np.ones((3, 1)), rtol=1e-4)
+    np.testing.assert_allclose(found.mean.clip(-2, 2), policy.act(obs), rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("algorithm", ["reppo", "sac", "ddpg"])
+def test_a_policy_says_the_q_of_an_action_in_the_units_of_the_environment(algorithm, tmp_path):
+    config = lem.config_for(algorithm, "Pendulum-v1", hidden=(8,), critic_hidden=(8,))
+    env = registry.make("Pendulum-v1", 1)
+    policy = lem.TrainedPolicy(config.networks(env.spec), env.spec, config, 0)
+    env.close()
+    obs, action = np.random.default_rng(0).normal(size=(4, 3)).astype(np.float32), np.linspace(-2, 2, 4)[:, None]
+    with torch.no_grad():
+        expected = policy.networks.q(torch.from_numpy(obs), torch.from_numpy(action).float() / 2).numpy()
+    np.testing.assert_allclose(policy.q_value(obs, action), expected, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(policy.q_value(obs[1], action[1]), expected[1], rtol=1e-4, atol=1e-6)
+    for wrong in (action[0], action[:, 0], action * np.nan):
+        with pytest.raises(lem.UserError, match=r"action must be finite numbers of the shape \(4, 1\)"):
+            policy.q_value(obs, wrong)
+    with pytest.raises(
+        lem.UserError, match=rf"of {algorithm} has learned no policy.value\(obs\); it has policy.q_value"
+    ):
+        policy.value(obs)
+
+
+@contextmanager
+def as_default(setter, value, before):
+    setter(value)
+    try:
+        yield
+    finally:
+        setter(before)
+
+
+SETTINGS = {
+    "nothing": nullcontext,
+    "float64": lambda: as_default(torch.set_default_dtype, torch.float64, torch.float32),
+    "device": lambda: as_default(torch.set_default_device, "meta", None),
+    "inner device": lambda: torch.device("meta"),
+    "no_grad": torch.no_grad,
+    "inference_mode": torch.inference_mode,
+    "set_grad_enabled": lambda: as_default(torch.set_grad_enabled, False, True),
+    "autocast": lambda: torch.autocast("cpu", dtype=torch.bfloat16),
+}
+
+
+def settings_of_torch():
+    return (
+        torch.get_default_dtype(),
+        torch.get_default_device(),
+        torch.is_grad_enabled(),
+        torch.is_inference_mode_enabled(),
+        torch.is_autocast_enabled("cpu"),
+    )
+
+
+def test_what_the_caller_has_set_in_torch_changes_nothing_and_stays(tmp_path):
+    """Training, a resume, loading, acting and evaluation: the same numbers under every setting."""
+    found = {}
+    for name, setting in SETTINGS.items():
+        with setting():
+            before = settings_of_torch()
+            run = lem.train("ppo", "Pendulum-v1", run=tmp_path / name, **tiny_fields("Pendulum-v1"), progress=False)
+            policy = lem.load(run.path)
+            actions = policy.act(np.zeros((2, 3)), deterministic=False)
+            scores = lem.evaluate(policy, episodes=2, seed=0, deterministic=False).returns
+            assert settings_of_torch() == before
+        found[name] = actions.tolist(), scores, actions.dtype
+    assert all(each == found["nothing"] for each in found.values())

@@ -191,7 +191,9 @@ def test_the_home_folder_is_meant_wherever_a_path_is_taken(run, tmp_path, monkey
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.chdir(tmp_path)
     lem.train("ppo", env="CartPole-v1", run="~/a", progress=False, **tiny_fields("CartPole-v1"))
-    assert main(["train", "ppo", "--env", "CartPole-v1", "--run=~/b", "--warm-start", "~/a", "--hidden", "16", *TINY]) == 0
+    assert (
+        main(["train", "ppo", "--env", "CartPole-v1", "--run=~/b", "--warm-start", "~/a", "--hidden", "16", *TINY]) == 0
+    )
     assert lem.load("~/b").path == tmp_path / "b"
     assert lem.resume("~/b", progress=False).path == tmp_path / "b"
     for command in ("evaluate --episodes 1", "watch --video=~/film.gif", "plot", "check"):

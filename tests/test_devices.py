@@ -76,8 +76,8 @@ class Noise(Backend):
 
     def __init__(self, actions, num_envs, device):
         image, masked = actions == "image", actions == "discrete"
-        layout = (ObservationPart((), (6, 6, 1) if image else (4,)),)
-        self.spec = Spec("Noise-v0", layout, ACTIONS[actions], max_episode_steps=5, image=image)
+        layout = (ObservationPart((), (6, 6, 1) if image else (4,), image=image),)
+        self.spec = Spec("Noise-v0", layout, ACTIONS[actions], max_episode_steps=5)
         self.size = self.spec.observation_size + (3 if masked else 0)
         self.num_envs, self.device = num_envs, device
         self.counts = torch.ones(num_envs, dtype=torch.bool, device=device)
@@ -202,7 +202,7 @@ MUTANTS = [
     ("rows are drawn by the CPU's generator", "run/seeding.py", "generator(seed, device, 3)", 'generator(seed, torch.device("cpu"), 3)', "ppo box"),
     ("rows are drawn with no generator's device", "data/replay.py", "(minibatches, size), generator=generator, device=generator.device)", "(minibatches, size), generator=generator)", "sac box"),
     ("the reward scale stays on the CPU", "algos/a2c.py", "RewardScale(config.num_envs, config.gamma).to(device)", "RewardScale(config.num_envs, config.gamma)", "a2c box"),
-    ("the networks stay on the CPU", "algos/trpo.py", "config.networks(spec).to(device)", "config.networks(spec)", "trpo box"),
+    ("the networks stay on the CPU", "algos/trpo.py", "config.make_networks(spec, device)", "config.networks(spec)", "trpo box"),
     ("Adam's scalars stay on the CPU", "optim/adam.py", ".log().to(device, wide_float(device))", ".log()", "a2c box"),
     ("the first GPU, whichever was asked for", "run/seeding.py", "torch.Generator(device)", "torch.Generator(device.type)", "ppo box"),
     ("what ended is counted on the CPU", "data/whole_episodes.py", "dtype=torch.int64, device=env.device)", "dtype=torch.int64)", "reinforce episodes"),

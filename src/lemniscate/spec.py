@@ -92,7 +92,7 @@ class ObservationPart:
     `path` leads through Dict keys and Tuple indices; it is empty where the observation is the piece itself. With
     `nvec`, each number of the piece becomes a one-hot vector, counted from `start`. With `axes`, the environment's own
     array has the shape `own_shape`, and its axes are put in that order to get `shape`: an image with its channels
-    first, or a stack of images.
+    first, or a stack of images. With `image`, it is a picture of bytes, height × width × channels.
     """
 
     path: tuple[str | int, ...]
@@ -101,6 +101,7 @@ class ObservationPart:
     start: tuple[int, ...] = ()
     own_shape: tuple[int, ...] = ()
     axes: tuple[int, ...] = ()
+    image: bool = False
 
     @property
     def name(self) -> str:
@@ -117,8 +118,8 @@ class ObservationPart:
 class Spec:
     """The description of an environment that a policy needs; saved with every checkpoint.
 
-    `observation_parts` are the parts of the flat observation in their order; their sizes sum to O. With `image`, the
-    only part is an image of bytes, height × width × channels, and stays bytes. `max_episode_steps` is the time limit.
+    `observation_parts` are the parts of the flat observation in their order; their sizes sum to O. Where all of them
+    are images the observation stays bytes; else it is float32. `max_episode_steps` is the time limit.
     In training, P = `privileged` numbers follow the observation: what a simulator knows and a vehicle does not. Critics
     see them and policies do not (Pinto et al. 2018, arXiv:1710.06542), so a policy acts without them.
     """
@@ -127,14 +128,23 @@ class Spec:
     observation_parts: tuple[ObservationPart, ...]
     action: Action
     max_episode_steps: int | None = None
-    image: bool = False
     privileged: int = 0
 
     def fits(self, other: "Spec") -> bool:
         """Whether a policy for one environment can act in the other."""
         mine, its = self.action, other.action
         same_action = mine.same_as(its) if isinstance(mine, Box) else mine == its
-        return same_action and (self.observation_parts, self.image) == (other.observation_parts, other.image)
+        return same_action and self.observation_parts == other.observation_parts
+
+    @cached_property
+    def image(self) -> bool:
+        """Whether observations are images alone, and stay bytes."""
+        return self.has_images and all(part.image for part in self.observation_parts)
+
+    @property
+    def has_images(self) -> bool:
+        """Whether a part of the observation is an image."""
+        return any(part.image for part in self.observation_parts)
 
     def bounded_box(self) -> Box:
         """The actions. Raises `UserError` unless they are numbers between finite bounds."""

@@ -1,8 +1,12 @@
 """Every algorithm passes the contract that `lemniscate.testing` offers for algorithms of one's own."""
 
 import pytest
+import torch
+from torch import nn
 
+import lemniscate as lem
 from lemniscate.algos import ALGORITHMS
+from lemniscate.run import checkpoint
 from lemniscate.testing import ALGORITHM_CONTRACT
 
 ON_POLICY = {"env": "CartPole-v1", "num_envs": 4, "num_steps": 32, "total_steps": 1280, "hidden": (8,)}
@@ -16,6 +20,19 @@ OFF_POLICY = {
     "hidden": (8,),
     "critic_hidden": (8,),
 }
+
+
+def settings_of(algorithm):
+    settings = OFF_POLICY if algorithm in ("ddpg", "td3", "sac") else ON_POLICY
+    if algorithm == "reppo":
+        settings = settings | {"env": "Pendulum-v1"}
+    minibatch = {
+        "reppo": "minibatch_size",
+        "ppo": "minibatch_size",
+        "trpo": "critic_minibatch_size",
+        "reinforce": "critic_minibatch_size",
+    }
+    return settings | ({minibatch[algorithm]: 64} if algorithm in minibatch else {})
 
 
 TRAINS_OFTEN = ("check_seeds", "check_resume")
@@ -35,14 +52,45 @@ TRAINS_OFTEN = ("check_seeds", "check_resume")
     ],
 )
 def test_the_contract_holds(check, algorithm, tmp_path):
-    settings = OFF_POLICY if algorithm in ("ddpg", "td3", "sac") else ON_POLICY
-    if algorithm == "reppo":
-        settings = settings | {"env": "Pendulum-v1"}
-    minibatch = {
-        "reppo": "minibatch_size",
-        "ppo": "minibatch_size",
-        "trpo": "critic_minibatch_size",
-        "reinforce": "critic_minibatch_size",
-    }
-    settings = settings | ({minibatch[algorithm]: 64} if algorithm in minibatch else {})
+    settings = settings_of(algorithm)
     check(algorithm, tmp_path, **settings, checkpoint_every=settings["total_steps"] // 4, evaluate_episodes=2)
+
+
+class Pretrained(nn.Module):
+    """A frozen encoder, whole numbers, a constant buffer and one weight in two places; it takes rows alone."""
+
+    scale: torch.Tensor
+
+    def __init__(self, inputs, outputs):
+        super().__init__()
+        self.order = nn.Parameter(torch.arange(inputs).flip(0), requires_grad=False)
+        self.register_buffer("scale", torch.tensor(0.5))
+        self.encoder = nn.Linear(inputs, 8).requires_grad_(False)
+        self.one, self.other, self.head = nn.Linear(8, 8), nn.Linear(8, 8), nn.Linear(8, outputs)
+        self.other.weight = self.one.weight
+
+    def forward(self, x):
+        if x.dim() != 2:  # an assertion that pytest rewrites cannot be compiled
+            raise ValueError(x.shape)
+        return self.head(self.other(torch.tanh(self.one(self.encoder(self.scale * x[:, self.order])))))
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "compile"),
+    [
+        *((algorithm, "off") for algorithm in ALGORITHMS),
+        *(pytest.param(algorithm, "on", marks=pytest.mark.long) for algorithm in ("ppo", "trpo", "sac")),
+    ],
+)
+def test_in_a_network_of_ones_own_what_is_frozen_stays_and_the_rest_learns(algorithm, compile, tmp_path, capsys):
+    settings = settings_of(algorithm) | {"network": Pretrained, "compile": compile, "progress": False, "shards": 2}
+    every = settings["total_steps"] // 4
+    path = lem.train(algorithm, run=tmp_path / "r", checkpoint_every=every, **settings).path
+    assert "torch.compile failed" not in capsys.readouterr().err
+    steps = checkpoint.list_steps(path / "checkpoints")
+    first, last = (checkpoint.read(path / "checkpoints" / f"step-{step}").tensors for step in (steps[0], steps[-1]))
+    own = [name for name in first if ".module." in name]
+    assert own
+    for name in own:
+        frozen = name.rpartition(".module.")[2] in ("order", "scale", "encoder.weight", "encoder.bias")
+        assert torch.equal(first[name], last[name]) == frozen, name

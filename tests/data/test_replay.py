@@ -5,6 +5,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lemniscate.algos import sac
 from lemniscate.data.replay import ReplayBuffer, bytes_per_transition
 from lemniscate.spec import Box, ObservationPart, Spec
 from lemniscate.types import Transition
@@ -84,5 +85,15 @@ def test_a_million_of_hopper_fit_into_130_megabytes():
 
 
 def test_an_image_stays_bytes():
-    image = Spec("x", (ObservationPart((), (4, 4, 3)),), Box((-1.0,), (1.0,)), image=True)
+    image = Spec("x", (ObservationPart((), (4, 4, 3), image=True),), Box((-1.0,), (1.0,)))
     assert ReplayBuffer(image, 5, CPU).transitions.next_obs.dtype == torch.uint8
+    assert bytes_per_transition(image) == 2 * 48 + 4 + 4 + 1
+
+
+def test_beside_numbers_an_image_is_float32_which_is_counted_and_said():
+    parts = ObservationPart(("a",), (4, 4, 3), image=True), ObservationPart(("b",), (2,))
+    mixed = Spec("x", parts, Box((-1.0,), (1.0,)))
+    replay = ReplayBuffer(mixed, 5, CPU)
+    assert 5 * bytes_per_transition(mixed) == sum(t.nbytes for t in vars(replay.transitions).values())
+    assert "pixels are stored as float32" in sac.Config().notices(mixed, CPU)[1]
+    assert len(sac.Config().notices(SPEC, CPU)) == 1

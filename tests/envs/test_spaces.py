@@ -131,6 +131,24 @@ def test_images_stay_bytes():
     assert flat.shape == (1, 60)
 
 
+def test_a_grey_picture_of_two_dimensions_is_an_image_and_a_small_or_narrow_table_of_bytes_is_not():
+    (part,) = observation_parts(spaces.Box(0, 255, (20, 24), np.uint8), "x")
+    assert (part.shape, part.own_shape, part.axes, part.image) == ((20, 24, 1), (20, 24), (0, 1), True)
+    for table in (spaces.Box(0, 255, (16, 40), np.uint8), spaces.Box(0, 9, (20, 24), np.uint8)):
+        assert not is_image(table)
+
+
+def test_pictures_in_a_dictionary_are_laid_out_as_alone_and_keep_their_values():
+    alone = spaces.Box(0, 255, (3, 20, 24), np.uint8)
+    space = spaces.Dict({"camera": alone, "joints": spaces.Box(-1, 1, (2,)), "inner": spaces.Tuple((alone,))})
+    parts, sample = observation_parts(space, "x"), space.sample()
+    assert [(part.name, part.image) for part in parts] == [("camera", True), ("inner/0", True), ("joints", False)]
+    flat, one = flatten_observation(parts, sample), flatten_observation(observation_parts(alone, "x"), sample["camera"])
+    assert flat.dtype == np.float32
+    np.testing.assert_array_equal(flat[:, :1440], one)
+    np.testing.assert_array_equal(flat[:, -2:], sample["joints"][None])
+
+
 def test_other_spaces_get_a_sentence():
     with pytest.raises(UserError, match="myenv observes a Sequence, whose size is not fixed"):
         observation_parts(spaces.Sequence(spaces.Discrete(2)), "myenv")

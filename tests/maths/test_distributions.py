@@ -6,7 +6,30 @@ import pytest
 import torch
 from torch import distributions
 
-from lemniscate.maths import Bernoulli, Categorical, Deterministic, Gaussian, MultiCategorical, SquashedGaussian
+from lemniscate.maths import (
+    Bernoulli,
+    Categorical,
+    Deterministic,
+    Gaussian,
+    MultiCategorical,
+    SquashedGaussian,
+    mean_and_std,
+)
+
+
+def test_mean_and_std_are_those_of_many_samples(rng):
+    mean, log_std = torch.tensor([[0.3, -2.0, 0.0]]), torch.tensor([[-1.0, 0.5, 2.0]])
+    noise = torch.randn(400_000, 3, generator=rng)
+    for distribution in (Gaussian(mean, log_std), SquashedGaussian(mean, log_std)):
+        samples = distribution.sample(noise)
+        for found, expected in zip(mean_and_std(distribution), (samples.mean(0), samples.std(0)), strict=True):
+            torch.testing.assert_close(
+                found[0], expected, atol=0.05 if isinstance(distribution, Gaussian) else 0.005, rtol=0
+            )
+    action = torch.tensor([[0.25, -1.0]])
+    found, none = mean_and_std(Deterministic(action))
+    torch.testing.assert_close(found, action)
+    torch.testing.assert_close(none, torch.zeros(1, 2), atol=1e-6, rtol=0)
 
 
 def test_gaussian(rng):

@@ -8,8 +8,9 @@ from lemniscate.errors import UserError
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.actor_q import ActorQ, SoftActorQ
 from lemniscate.nn.bounded import DeterministicPolicy, SquashedGaussianPolicy
-from lemniscate.nn.networks import Layers
+from lemniscate.nn.networks import ImageEncoder, Layers
 from lemniscate.nn.normalizer import NoNorm, RunningNorm
+from lemniscate.spec import Box, ObservationPart, Spec
 
 SMALL = Layers((8,))
 
@@ -66,3 +67,38 @@ def test_the_entropy_bonus_is_the_temperature_times_the_entropy(rng):
 def test_discrete_actions_are_refused():
     with pytest.raises(UserError, match="has Discrete actions; this algorithm needs continuous ones"):
         ActorQ(spec_of("discrete"), SMALL, SMALL, False, critics=1)
+
+
+CAMERAS = (
+    ObservationPart(("left",), (20, 20, 3), image=True),
+    ObservationPart(("joints",), (2,)),
+    ObservationPart(("right",), (36, 40, 1), image=True),
+    ObservationPart(("wrist",), (1,)),
+)
+
+
+@pytest.mark.parametrize("kind", [ActorCritic, ActorQ, SoftActorQ])
+def test_pictures_go_through_convolutions_beside_normalized_numbers(kind, rng):
+    spec = Spec("x", CAMERAS, Box((-1.0,), (1.0,)))
+    extra = {"initial_temperature": 0.5} if kind is SoftActorQ else {}
+    settings = (SMALL, 0.0, True) if kind is ActorCritic else (SMALL, SMALL, True)
+    networks = kind(spec, *settings, **(extra if kind is ActorCritic else {"critics": 2, **extra}))
+    pixels = [torch.randint(256, (7, size), generator=rng).float() for size in (1200, 1440)]
+    joints, wrist = 5 + 3 * torch.randn(7, 2, generator=rng), torch.randn(7, 1, generator=rng)
+    obs = torch.cat([pixels[0], joints, pixels[1], wrist], dim=-1)
+    networks.policy.observe(obs)
+    seen = networks.policy.normalizer(obs)
+    torch.testing.assert_close(seen[:, :1200], pixels[0] / 255 - 0.5)
+    torch.testing.assert_close(seen[:, 1202:-1], pixels[1] / 255 - 0.5)
+    torch.testing.assert_close(seen[:, 1200:1202].mean(0), torch.zeros(2), atol=1e-5, rtol=0)
+    encoder = networks.policy.net[0]
+    left, right = (module for module in encoder.encoders if isinstance(module, ImageEncoder))
+    features = torch.cat([left(seen[:, :1200]), seen[:, 1200:1202], right(seen[:, 1202:-1]), seen[:, -1:]], dim=-1)
+    torch.testing.assert_close(encoder(seen), features)
+    assert features.shape == (7, encoder.size)
+
+
+def test_the_value_may_have_layers_of_its_own():
+    networks = ActorCritic(spec_of(), SMALL, critic_layers=Layers((32, 16)))
+    assert [layer.out_features for layer in networks.policy.net[::2]] == [8, 2]
+    assert [layer.out_features for layer in networks.value.net[::2]] == [32, 16, 1]

@@ -30,7 +30,7 @@ def test_critics_see_what_is_privileged_and_policies_do_not(kind):
         networks = ActorQ(spec, layers, layers, False, critics=2)
         critic = partial(networks.q, action=torch.zeros(20, 2))
     else:
-        networks = ActorCategoricalQ(spec, layers, False, -1.0, 10.0)
+        networks = ActorCategoricalQ(spec, layers, layers, False, -1.0, 10.0)
         critic = partial(networks.critic, action=torch.zeros(20, 2))
     obs = torch.randn(20, 8)
     other = torch.cat([obs[:, :5], torch.randn(20, 3)], dim=1)

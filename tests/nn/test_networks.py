@@ -4,8 +4,12 @@ import math
 
 import pytest
 import torch
+from torch import nn
 
+from lemniscate.errors import UserError
 from lemniscate.nn.networks import Bfloat16Linear, ImageEncoder, Layers, Tanh
+from lemniscate.optim.vector import ParameterVector
+from lemniscate.system.named import name_of
 
 
 def test_layers_are_orthogonal_with_their_gains():
@@ -98,3 +102,88 @@ def test_the_layout_of_an_image_is_height_width_channels():
     assert seen[0].shape == (1, 2, 40, 44)
     assert seen[0][0, 1, :, 7].eq(1).all()
     assert seen[0].sum() == 40
+
+
+class Own(nn.Module):
+    """Two layers; others have `between` to change."""
+
+    def __init__(self, inputs, outputs):
+        super().__init__()
+        self.first, self.last = nn.Linear(inputs, 8), nn.Linear(8, outputs)
+        self.between = nn.Identity()
+        self.change()
+
+    def change(self):
+        pass
+
+    def forward(self, x):
+        assert x.dim() == 2
+        return self.last(self.between(torch.tanh(self.first(x))))
+
+
+def kind(**methods):
+    return type("Changed", (Own,), methods)
+
+
+def changed(change):
+    return kind(change=change)
+
+
+def own(network, inputs=5, outputs=3):
+    return Layers(kind=name_of(network)).network(inputs, outputs, last_gain=1.0)
+
+
+def test_a_network_of_ones_own_gets_rows_whatever_dimensions_lead(rng):
+    network, x = own(Own), torch.randn(4, 6, 5, generator=rng)
+    assert network(x).shape == (4, 6, 3)
+    torch.testing.assert_close(network(x)[1, 2], network(x[1, 2]))
+    torch.testing.assert_close(network(x).flatten(0, 1), network(x.flatten(0, 1)))
+
+
+def count_calls(self):
+    self.register_buffer("calls", torch.tensor(0))
+    self.between.register_forward_hook(lambda *_: self.calls.add_(1) and None)
+
+
+@pytest.mark.parametrize(
+    ("network", "said"),
+    [
+        (changed(lambda self: setattr(self, "between", nn.BatchNorm1d(8))), "changes between.running_mean in forward.*L"),
+        (changed(lambda self: setattr(self, "between", nn.LazyBatchNorm1d())), "changes between.num_batches_tracked in"),
+        (changed(count_calls), "changes calls in forward"),
+        (changed(lambda self: nn.utils.parametrizations.spectral_norm(self.first)), "changes first.param.* in forward"),
+        (changed(lambda self: setattr(self, "between", nn.Dropout(0.1))), "is random: two calls with the same rows"),
+        (changed(lambda self: self.requires_grad_(False)), "has no parameter to learn"),
+        (kind(forward=torch.no_grad()(Own.forward)), "that its outputs depend on"),
+        (changed(lambda self: self.register_buffer("mask", torch.tensor(-math.inf))), "number in mask that is not fini"),
+        (kind(forward=lambda self, x: (Own.forward(self, x), x)), r"takes \[B, 5\] to \[B, 3\], in float32; .* to a tup"),
+        (kind(forward=lambda self, x: Own.forward(self, x).double()), r"to \[64, 3\] of torch.float64"),
+        (kind(forward=lambda self, x: self.first(x)), r"to \[64, 8\] of torch.float32"),
+        (changed(lambda self: self.double()), r"takes \[B, 5\] to \[B, 3\]: RuntimeError: "),
+        (kind(forward=lambda self, x: Own.forward(self.double(), x.double()).float()), "parameters of torch.float64"),
+        (kind(forward=lambda self, x: {}["no"]), "KeyError: 'no'"),
+        (kind(get_extra_state=lambda self: {"a": 1}), "must make a module"),
+        (lambda inputs, outputs: lambda x: x[:, :outputs], "has no parameter to learn"),
+    ],
+)  # fmt: skip
+def test_a_network_that_could_not_be_trained_again_is_one_sentence(network, said):
+    with pytest.raises(UserError, match=said) as error:
+        own(network)
+    assert "\n" not in str(error.value)
+
+
+def test_a_network_that_looks_at_all_rows_at_once_says_so_on_one():
+    network = own(changed(lambda self: setattr(self, "between", nn.BatchNorm1d(8, track_running_stats=False))))
+    assert network(torch.zeros(2, 5)).shape == (2, 3)
+    with pytest.raises(UserError, match="needs 2 rows or more at once, so it cannot act on 1"):
+        network(torch.zeros(1, 5))
+
+
+def test_parameters_that_need_no_gradient_are_not_in_the_vector():
+    network = own(changed(lambda self: self.first.requires_grad_(False)))
+    before = network.module.first.weight.clone()
+    vector = ParameterVector(network)
+    assert vector.vector.shape == (8 * 3 + 3,)
+    vector.vector.zero_()
+    assert not network.module.last.weight.any()
+    assert torch.equal(network.module.first.weight, before)

@@ -80,7 +80,7 @@ def test_the_policy_and_the_value_still_share_their_normalizer(tmp_path):
     [
         SPEC,
         Spec("y", (ObservationPart(("a",), (), (4,), (1,)), ObservationPart(("b", 0), (2,))), Discrete(4, 1)),
-        Spec("z", (), MultiDiscrete((2, 3), (0, 1), (2,)), image=True),
+        Spec("z", (ObservationPart((), (6, 6, 1), image=True),), MultiDiscrete((2, 3), (0, 1), (2,))),
         Spec("w", (), MultiBinary(3)),
     ],
 )

@@ -165,7 +165,7 @@ def test_target_networks_begin_as_copies_of_the_loaded_ones(tmp_path, algorithm)
             "ppo",
             "Acrobot-v1",
             {},
-            "trained on CartPole-v1, whose observation or action spaces differ from those of Acro",
+            r"no layer of the policy of .* fits: .* is .* here; it was trained on CartPole-v1, with other spaces",
         ),
         ("ppo", "CartPole-v1", {"warm_start": "no/such/run"}, "no/such/run is not a run directory"),
     ],
@@ -177,14 +177,76 @@ def test_what_does_not_fit_is_one_sentence_and_leaves_nothing_behind(source, tmp
     assert not path.exists()
 
 
-def test_another_kind_of_policy_does_not_fit(tmp_path):
-    """A Gaussian policy has parameters that a deterministic one lacks, and one output for each action as well."""
+def begun_from(source, path, capsys, algorithm="ppo", env="Pendulum-v1", **fields):
+    """The tensors of `source`, those that a run begins with from it, and what was said."""
+    given = {**tiny_fields(env), **fields} if algorithm == "ppo" else {**tiny_off_policy(), **fields}
+    lem.train(algorithm, env, run=path, **{**given, "checkpoint_every": 1 << 20, "warm_start": str(source)})
+    return networks_at(source), networks_at(path, 0), capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def deep(tmp_path_factory):
+    path = tmp_path_factory.mktemp("deep") / "r"
+    train(path, hidden=(16, 16), normalize_observations=True)
+    return path
+
+
+def test_what_fits_is_taken_over_and_what_does_not_begins_anew(deep, tmp_path, capsys):
+    """Other actions: the last layer of the policy and its σ are new; the other layers and the normalizer are not."""
+    fields = {"env": "helpers:FourNumbers", "hidden": (16, 16), "normalize_observations": True}
+    theirs, begun, said = begun_from(deep, tmp_path / "r", capsys, **fields)
+    new = {name for name in begun if name not in theirs or not torch.equal(begun[name], theirs[name])}
+    assert new == {"policy.log_std", "policy.net.4.weight", "policy.net.4.bias"}
+    assert "3 begin anew, policy.log_std, policy.net.4.weight, policy.net.4.bias; it was trained on Cart" in said
+
+
+def test_a_normalizer_of_another_size_begins_anew_with_its_count(deep, tmp_path, capsys):
+    fields = {"env": "Acrobot-v1", "hidden": (16, 16), "normalize_observations": True}
+    theirs, begun, _ = begun_from(deep, tmp_path / "r", capsys, **fields)
+    assert torch.equal(theirs["policy.net.2.weight"], begun["policy.net.2.weight"])
+    assert float(theirs["policy.normalizer.count"]) > 0 == float(begun["policy.normalizer.count"])
+
+
+def test_of_another_kind_of_policy_the_layers_are_taken_over(tmp_path, capsys):
     train(tmp_path / "ppo", "ppo", "Pendulum-v1", activation="relu", normalize_observations=False)
-    with pytest.raises(lem.UserError, match=r"does not fit: policy.log_std is \[1\] there and missing here"):
-        train(tmp_path / "r", "ddpg", "Pendulum-v1", network="mlp", warm_start=str(tmp_path / "ppo"))
+    theirs, begun, said = begun_from(tmp_path / "ppo", tmp_path / "ddpg", capsys, "ddpg", network="mlp")
+    policy = [name for name in begun if name.startswith("policy.")]
+    assert all(torch.equal(begun[name], theirs[name]) for name in policy)
+    assert f"{len(policy)} tensors of" in said
 
 
 def test_a_sweep_says_so_before_it_starts(source, tmp_path):
-    with pytest.raises(lem.UserError, match="ppo: warm_start: the policy of"):
-        lem.train_sweep("ppo", "CartPole-v1", "1-2", run=tmp_path / "s", warm_start=str(source), hidden=(8,))
+    fields = {"warm_start": str(source), "hidden": (8,), "normalize_observations": True}
+    with pytest.raises(lem.UserError, match="ppo: warm_start: no layer of the policy of"):
+        lem.train_sweep("ppo", "CartPole-v1", "1-2", run=tmp_path / "s", **fields)
     assert not (tmp_path / "s").exists()
+
+
+@pytest.mark.parametrize("algorithm", ["ppo", "trpo", "td3"])
+def test_what_is_frozen_keeps_its_values_also_in_a_run_that_goes_on(tmp_path, algorithm):
+    freeze = ("policy.net.0", "critics.members.0" if algorithm == "td3" else "value.net.2")
+    fields = {"freeze": freeze, "checkpoint_every": 64, "keep_checkpoints": 10}
+    train(tmp_path / "whole", algorithm, "Pendulum-v1", **fields)
+    steps = checkpoint.list_steps(tmp_path / "whole" / "checkpoints")
+    first, last = (networks_at(tmp_path / "whole", step) for step in (steps[0], steps[-1]))
+    parameters = [name for name in first if "net" in name]
+    kept = {name for name in parameters if torch.equal(first[name], last[name])}
+    assert kept == {name for name in parameters if name.startswith(freeze)}
+    cut = shutil.copytree(tmp_path / "whole", tmp_path / "cut")
+    shutil.rmtree(cut / "checkpoints" / f"step-{steps[-1]}")
+    lem.resume(cut, progress=False)
+    assert final_hashes(cut) == final_hashes(tmp_path / "whole")
+
+
+@pytest.mark.parametrize(
+    ("freeze", "said"),
+    [
+        (("policy.net.9",), "There is no parameter to freeze 'policy.net.9': did you mean policy.net"),
+        (("policy.ne",), "There is no parameter to freeze 'policy.ne'"),
+        (("policy", "value"), "There is nothing to learn: of one of the networks every parameter is frozen"),
+    ],
+)
+def test_what_cannot_be_frozen_is_one_sentence(tmp_path, freeze, said):
+    with pytest.raises(lem.UserError, match=said):
+        train(tmp_path / "r", freeze=freeze)
+    assert not (tmp_path / "r").exists()

@@ -45,7 +45,7 @@ class State(OffPolicyState[ActorQ]):
 
 def init(config: Config, spec: Spec, device: torch.device) -> State:
     """A new state with an empty replay buffer, seeded by the run's seed."""
-    networks = config.networks(spec).to(device)
+    networks = config.make_networks(spec, device)
     return State(
         networks=networks,
         targets=networks.target(),

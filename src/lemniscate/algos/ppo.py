@@ -89,7 +89,7 @@ class State(OnPolicyState[ActorCritic]):
 
 def init(config: Config, spec: Spec, device: torch.device) -> State:
     """A new state, seeded by the run's seed."""
-    networks = config.networks(spec).to(device)
+    networks = config.make_networks(spec, device)
     betas = (0.9, config.adam_beta2)
     return State(
         networks=networks,

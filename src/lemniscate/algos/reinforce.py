@@ -98,7 +98,7 @@ class State(OnPolicyState[ActorCritic]):
 
 def init(config: Config, spec: Spec, device: torch.device) -> State:
     """A new state, seeded by the run's seed."""
-    networks = config.networks(spec).to(device)
+    networks = config.make_networks(spec, device)
     return State(
         networks=networks,
         optimizer=Adam(networks.policy),

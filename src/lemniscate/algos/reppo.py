@@ -57,7 +57,7 @@ class Config(OnPolicyConfig):
     value_range: Positive = 10.0
     """the bins of Q's distribution cover [-value_range, value_range], in units of scaled rewards; usually 5 to 20"""
     hidden: tuple[Width, ...] = (128, 128)
-    """widths of the hidden layers of the policy, and of Q"""
+    """widths of the policy's hidden layers; usually 2 or 3 of 64 to 512"""
     initial_log_std: SquashedLogStd = -1.0
     """initial log σ of the policy before its tanh; usually -1.5 to -0.5"""
     activation: Activation = "silu"
@@ -71,7 +71,7 @@ class Config(OnPolicyConfig):
 
     def networks(self, spec: Spec) -> ActorCategoricalQ:
         """New networks for the spaces in `spec`: π, Q, α and β."""
-        return ActorCategoricalQ(spec, self.layers, self.normalize_observations, self.initial_log_std, self.value_range)
+        return ActorCategoricalQ(spec, *self.network_settings, self.initial_log_std, self.value_range)
 
     @property
     def gradient_steps(self) -> int:
@@ -90,7 +90,7 @@ class State(OnPolicyState[ActorCategoricalQ]):
 
 def init(config: Config, spec: Spec, device: torch.device) -> State:
     """A new state, seeded by the run's seed."""
-    networks = config.networks(spec).to(device)
+    networks = config.make_networks(spec, device)
     return State(
         networks=networks,
         actor_optimizer=Adam(networks.policy, max_grad_norm=config.max_grad_norm, name="actor"),

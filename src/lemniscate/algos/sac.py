@@ -77,7 +77,7 @@ class State(OffPolicyState[SoftActorQ], ScaledState[SoftActorQ]):
 
 def init(config: Config, spec: Spec, device: torch.device) -> State:
     """A new state with an empty replay buffer, seeded by the run's seed."""
-    networks = config.networks(spec).to(device)
+    networks = config.make_networks(spec, device)
     if config.unit_weights:
         normalize_units(networks.critics)
     return State(

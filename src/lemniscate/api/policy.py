@@ -10,20 +10,39 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from lemniscate import algos
-from lemniscate.envs.conversion import physical_action
+from lemniscate.envs.conversion import normalized_action, physical_action, scale_of
 from lemniscate.envs.spaces import read_mask, read_observation
 from lemniscate.errors import UserError, prefix_errors, shown
 from lemniscate.hub import repository as hub
+from lemniscate.maths import mean_and_std
 from lemniscate.nn.policies import Policy
 from lemniscate.run import checkpoint
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import find_checkpoint
-from lemniscate.run.seeding import generator
+from lemniscate.run.seeding import generator, torch_defaults
 from lemniscate.run.warm_start import difference
-from lemniscate.spec import Spec
+from lemniscate.spec import Box, Discrete, MultiDiscrete, Spec
 from lemniscate.system.files import at_home, parsing
+
+
+@dataclass(frozen=True)
+class ActionDistribution:
+    """The distribution of actions at one observation or at each of B; None is what its kind of action space has not.
+
+    Attributes:
+        probabilities: of a Discrete [n] or [B, n]; of a MultiDiscrete one such array for each component; of a
+            MultiBinary those of 1, in the shape of the action.
+        mean: of a Box, in the environment's units and shape: of a Gaussian before it is clipped to the bounds; of one
+            that tanh squashes, after that (`act` takes the squashed mean instead).
+        std: standard deviation, in the same units; 0 of a deterministic policy.
+    """
+
+    probabilities: np.ndarray | tuple[np.ndarray, ...] | None = None
+    mean: np.ndarray | None = None
+    std: np.ndarray | None = None
 
 
 class TrainedPolicy:
@@ -51,6 +70,7 @@ class TrainedPolicy:
         """Whether its environment says at each step which actions are valid."""
         return self.spec.action.mask_size > 0
 
+    @torch_defaults()
     @torch.no_grad()
     def act(self, obs: Any, deterministic: bool = True, action_mask: Any = None) -> np.ndarray:
         """The action at one raw observation, or at each of a batch; ready for `env.step`.
@@ -69,19 +89,89 @@ class TrainedPolicy:
             UserError: an observation or a mask of another shape, or that is not finite; a mask where the environment
                 of training gave none.
         """
-        flat, batched = read_observation(self.spec, obs)
-        if action_mask is not None and not self.is_masked:
-            raise UserError(f"{self.spec.env_id} has no action mask, so this policy cannot follow one.")
-        if self.is_masked:
-            mask = read_mask(action_mask, self.spec, flat)
-            flat = np.concatenate([flat, mask.astype(flat.dtype)], axis=-1)
-        distribution = self.module(torch.from_numpy(flat))
+        flat, batched = self._read(obs, action_mask)
+        distribution = self.module(flat)
         if deterministic:
             action = distribution.mode()
         else:
             action = distribution.sample(self.module.draw_noise((len(flat),), self._noise))
         physical = physical_action(action.numpy(), self.spec.action)
         return physical if batched else physical[0]
+
+    @torch_defaults()
+    @torch.no_grad()
+    def distribution(self, obs: Any, action_mask: Any = None) -> ActionDistribution:
+        """The distribution of the actions at one raw observation, or at each of a batch; takes and raises as `act`."""
+        (flat, batched), kind = self._read(obs, action_mask), self.spec.action
+        found: Any = self.module(flat)
+
+        def rows(values: Tensor, shape: tuple[int, ...] | None = None) -> np.ndarray:
+            array = values.numpy() if shape is None else values.numpy().reshape(-1, *shape)
+            return array if batched else array[0]
+
+        if isinstance(kind, MultiDiscrete):
+            return ActionDistribution(tuple(rows(part.logits.softmax(-1)) for part in found.parts))
+        if not isinstance(kind, Box):
+            probabilities = found.logits.softmax(-1) if isinstance(kind, Discrete) else found.logits.sigmoid()
+            return ActionDistribution(rows(probabilities, getattr(kind, "shape", None)))
+        mean, std = mean_and_std(found)
+        _, _, middle, half = map(torch.from_numpy, scale_of(kind))
+        return ActionDistribution(mean=rows(middle + half * mean, kind.shape), std=rows(half * std, kind.shape))
+
+    @torch_defaults()
+    @torch.no_grad()
+    def value(self, obs: Any) -> np.ndarray:
+        """V(s) of one raw observation, a scalar array, or of each of a batch, [B]; takes and raises as `act`.
+
+        It is the discounted return that the policy expects, in units of the scaled reward where the run has
+        `scale_rewards`. Raises `UserError` for an algorithm that learns no V(s), or one of privileged numbers too.
+        """
+        flat, batched = self._read_for("value", obs)
+        value = self.networks.value(flat).numpy()
+        return value if batched else value[0]
+
+    @torch_defaults()
+    @torch.no_grad()
+    def q_value(self, obs: Any, action: Any) -> np.ndarray:
+        """Q(s, a) of one raw observation and action, a scalar array, or of each of a batch, [B]; raises as `value`.
+
+        It is the discounted return that the policy expects after that action, in the units of `value`: the smaller of
+        two critics; of SAC and REPPO with the entropy that is rewarded on the way. Actions are as `act` returns them,
+        in the environment's units; what is outside of the bounds is clipped.
+        """
+        flat, batched = self._read_for("q", obs)
+        kind, given = self.spec.bounded_box(), np.asarray(action, dtype=np.float32)
+        wanted = ((len(flat),) if batched else ()) + (kind.shape or (kind.size,))
+        if given.shape != wanted or not np.isfinite(given).all():
+            raise UserError(
+                f"action must be finite numbers of the shape {wanted}, not {given.shape}: as act returns it."
+            )
+        own = torch.from_numpy(normalized_action(given.reshape(len(flat), -1), kind)).clamp(-1, 1)
+        q = self.networks.q(flat, own).numpy()
+        return q if batched else q[0]
+
+    def _read(self, obs: Any, action_mask: Any = None) -> tuple[Tensor, bool]:
+        """The flat observations [B, O], with the mask where there is one, and whether they are a batch."""
+        flat, batched = read_observation(self.spec, obs)
+        if action_mask is not None and not self.is_masked:
+            raise UserError(f"{self.spec.env_id} has no action mask, so this policy cannot follow one.")
+        if self.is_masked:
+            mask = read_mask(action_mask, self.spec, flat)
+            flat = np.concatenate([flat, mask.astype(flat.dtype)], axis=-1)
+        return torch.from_numpy(flat), batched
+
+    def _read_for(self, critic: str, obs: Any) -> tuple[Tensor, bool]:
+        """As `_read`, for "value" or "q". Raises `UserError` where that has not been learned, or takes more numbers."""
+        verbs = {"value": "policy.value(obs)", "q": "policy.q_value(obs, action)"}
+        here = [verb for name, verb in verbs.items() if hasattr(self.networks, name)]
+        if verbs[critic] not in here or getattr(self.config, "baseline", critic) != critic:
+            there = f"; it has {here[0]}" if here and verbs[critic] not in here else ""
+            raise UserError(f"This policy of {algorithm_of(self)} has learned no {verbs[critic]}{there}.")
+        if self.spec.privileged:
+            raise UserError(
+                f"{verbs[critic]} takes {self.spec.privileged} privileged numbers, which no observation has."
+            )
+        return self._read(obs)
 
 
 @dataclass(frozen=True)
@@ -112,6 +202,7 @@ def path_of(run: object) -> Path:
     return at_home(path)
 
 
+@torch_defaults()
 def load(run: Trained, *, trust: bool = False) -> TrainedPolicy:
     """The policy of a run (its newest whole checkpoint), of one checkpoint or on the Hub. No file is executed.
 

@@ -21,6 +21,7 @@ from lemniscate.run.config import Episodes, Natural, RunConfig, checked
 from lemniscate.run.environments import env_arguments, evaluation_env
 from lemniscate.run.evaluate import Evaluation, critic_of
 from lemniscate.run.evaluate import evaluate as evaluate_policy
+from lemniscate.run.seeding import torch_defaults
 from lemniscate.system.console import say
 from lemniscate.system.files import DamagedFileError, at_home, read_json, write_json
 from lemniscate.system.named import takes
@@ -32,6 +33,7 @@ FINAL_EPISODES = 100
 """that a run's final policy is judged by where runs are compared"""
 
 
+@torch_defaults()
 def evaluate(
     policy: Trained | Agent,
     env: str | Callable[..., Any] | None = None,
@@ -87,6 +89,7 @@ def evaluate(
         return evaluate_policy(agent.module, vec, episodes, seed, deterministic, critic)
 
 
+@torch_defaults()
 def watch(
     policy: Trained | Agent | None = None,
     env: str | Callable[..., Any] | None = None,
@@ -138,6 +141,7 @@ def watch(
     return scores
 
 
+@torch_defaults()
 def check(
     what: "str | Path | TrainedRun | Callable[..., Any]",
     backend: str | None = None,

@@ -24,7 +24,7 @@ from lemniscate.run.directory import is_finished, read_record, require_absent
 from lemniscate.run.environments import envs_of, make_envs
 from lemniscate.run.loggers import LoggerClass
 from lemniscate.run.run import Run
-from lemniscate.run.seeding import set_seeds
+from lemniscate.run.seeding import set_seeds, torch_defaults
 from lemniscate.run.state import TrainState
 from lemniscate.system import named
 from lemniscate.system.console import say
@@ -133,6 +133,7 @@ def train(
     return begin(name, config, run, options)
 
 
+@torch_defaults()
 def begin(algorithm: str, config: RunConfig, run: str | Path | None, options: RunOptions) -> TrainedRun:
     """Train by a Config that is chosen: in this process, in several, or on a cluster. Raises as `train`."""
     there = options.find_cluster()
@@ -191,6 +192,7 @@ def resume(
     return go_on(path_of(run), options, {name: name_in_config(x) for name, x in again.items() if x is not None})
 
 
+@torch_defaults()
 def go_on(path: Path, options: RunOptions, changes: Mapping[str, object]) -> TrainedRun:
     """Go on with the run in a directory; `changes` are fields whose objects were passed again. Raises as `resume`."""
     there = options.find_cluster()

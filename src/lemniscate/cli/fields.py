@@ -17,7 +17,7 @@ from lemniscate.run.config import RunConfig
 from lemniscate.run.fields import flag, kinds_of, read, unknown_field
 
 GROUPS: dict[str, tuple[str, ...]] = {
-    "run": ("seed", "total_steps", "device", "threads", "shards", "compile", "matmul", "warm_start"),
+    "run": ("seed", "total_steps", "device", "threads", "shards", "compile", "matmul", "warm_start", "freeze"),
     "environment": ("env_kwargs", "wrappers", "backend", "num_envs"),
     "algorithm": (),
     "networks": ("network", "hidden", "critic_hidden", "activation", "initial_log_std", "normalize_observations"),

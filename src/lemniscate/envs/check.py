@@ -22,10 +22,10 @@ from torch import Tensor
 from lemniscate.envs import registry
 from lemniscate.envs.conversion import SingleEnv, flat_mask, mask_in
 from lemniscate.envs.factory import make_one, maker_of
-from lemniscate.envs.spaces import is_image, observation_parts, random_action
+from lemniscate.envs.spaces import observation_parts, random_action
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import NonFiniteError, UserError
-from lemniscate.spec import Action, Box, Discrete, MultiDiscrete, Spec
+from lemniscate.spec import Action, Box, Discrete, MultiDiscrete, ObservationPart, Spec
 from lemniscate.system.named import find_callable
 from lemniscate.types import Rollout
 
@@ -109,7 +109,8 @@ def _spaces(env: VecEnv, served_by: str) -> Iterator[Finding]:
     spec, mode = env.spec, env.backend.mode
     yield good(f"Served by {served_by}; observes {_seen(spec)}; acts by {_acts(spec.action)}.")
     flat = [part for part in spec.observation_parts if len(part.shape) > 1 and min(sorted(part.shape)[-2:]) > 16]
-    if flat and not spec.image:
+    flat = [part for part in flat if not part.image]
+    if flat:
         part = flat[0]
         yield note(
             f"The array {part.name} {part.shape} becomes {part.size:,} numbers without their places; if it is an image,"
@@ -126,12 +127,18 @@ def _spaces(env: VecEnv, served_by: str) -> Iterator[Finding]:
 
 
 def _seen(spec: Spec) -> str:
-    if not spec.image:
-        parts = ", ".join(f"{part.name} {part.size}" for part in spec.observation_parts)
-        return f"{spec.observation_size} numbers ({parts})"
-    (part,) = spec.observation_parts
+    numbers = [part for part in spec.observation_parts if not part.image]
+    seen = [_image(part) for part in spec.observation_parts if part.image]
+    if numbers:
+        size, parts = sum(part.size for part in numbers), ", ".join(f"{part.name} {part.size}" for part in numbers)
+        seen.append(f"{size} numbers ({parts})")
+    return " and ".join(seen)
+
+
+def _image(part: ObservationPart) -> str:
     height, width, channels = part.shape
-    how = f"an image of {height} × {width} bytes with {channels} channel{'s' * (channels > 1)}"
+    name = f" {part.name}" if part.path else ""
+    how = f"an image{name} of {height} × {width} bytes with {channels} channel{'s' * (channels > 1)}"
     return f"{how}, from arrays {part.own_shape}" if part.own_shape else how
 
 
@@ -179,8 +186,7 @@ def _random_play(env: VecEnv) -> Iterator[Finding]:
     yield good(f"{ended} episodes ended by its rules and {timed_out} by the time limit{resets if ignored else ''}.")
     both = Rollout(*map(torch.cat, zip(vars(first).values(), vars(other).values(), strict=True)))
     yield from _ends_and_rewards(both, lengths + more_lengths, env.spec)
-    if not env.spec.image:
-        yield from _sizes(both.obs[both.valid], env.spec)
+    yield from _sizes(both.obs[both.valid], env.spec)
     yield good(f"{speed:,.0f} steps a second ({NUM_ENVS} parallel environments, random actions).")
 
 
@@ -232,7 +238,8 @@ def _ends_and_rewards(rows: Rollout, lengths: Sequence[int], spec: Spec) -> Iter
 def _sizes(obs: Tensor, spec: Spec) -> Iterator[Finding]:
     """A note on observations of very different sizes."""
     largest = obs[:, : spec.observation_size].abs().amax(dim=0)
-    sizes = torch.where(largest > 0, largest, torch.nan)
+    numbers = torch.tensor([not part.image for part in spec.observation_parts for _ in range(part.size)])
+    sizes = torch.where((largest > 0) & numbers, largest, torch.nan)
     if sizes.isnan().all():
         return
     high, low = sizes.nan_to_num(0).argmax(), sizes.nan_to_num(torch.inf).argmin()
@@ -271,8 +278,9 @@ def _gymnasium(make: Callable[[], SingleEnv], env_id: str, wrapped: bool) -> Ite
         )
     if not found:
         obs, space = env.reset(seed=0)[0], env.observation_space
-        kinds = {np.asarray(reduce(getitem, part.path, obs)).dtype.name for part in observation_parts(space, env_id)}
-        as_what = "stay bytes" if kinds == {"uint8"} and is_image(space) else "reach the policy as float32"
+        parts = observation_parts(space, env_id)
+        kinds = {np.asarray(reduce(getitem, part.path, obs)).dtype.name for part in parts}
+        as_what = "stay bytes" if all(part.image for part in parts) else "reach the policy as float32"
         yield good(f"Its observations are {', '.join(sorted(kinds))}, and {as_what}.")
     env.close()
 

@@ -100,7 +100,7 @@ class EnvpoolBackend(Backend):
         parts, action = observation_parts(space, env), action_kind(self._pool.action_space, env)
         if not is_image(space):  # no game has a mask, and to reset many takes seconds
             action = masked(action, *self._pool.reset())
-        self.spec = Spec(env, parts, action, max_episode_steps=self._limit, image=is_image(space))
+        self.spec = Spec(env, parts, action, max_episode_steps=self._limit)
 
     @classmethod
     def divides(cls, env: str) -> bool:

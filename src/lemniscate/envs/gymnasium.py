@@ -105,7 +105,7 @@ class GymnasiumBackend(Backend):
             action = spaces.masked(action, *self._reset(0))
         self._stagger_up_to = limit if stagger and self.mode is AutoresetMode.DISABLED and not self.once else None
         self._measures = measures_of(self._envs.metadata or {})
-        self.spec = Spec(env, parts, action, max_episode_steps=limit, image=spaces.is_image(space))
+        self.spec = Spec(env, parts, action, max_episode_steps=limit)
         self._digits: spaces.LostDigits | None = None if self.spec.image else spaces.LostDigits(self.spec)
 
     def restart(self, seed: int, first: int = 0) -> Tensor:

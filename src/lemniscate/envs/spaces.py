@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import reduce
 from operator import getitem
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -36,9 +36,9 @@ SUMMARIES = tuple(Summary(f"{name}_at_end", name, "last") for name in SUCCESS)
 def observation_parts(space: gym.Space, env_id: str) -> tuple[ObservationPart, ...]:
     """The parts of the flat observation, in order.
 
-    A Box of any shape and dtype is flattened in C order, as float32; so is a MultiBinary. An image of bytes is brought
-    to height × width × channels. Each number of a Discrete or MultiDiscrete becomes one-hot. A Dict is laid out in the
-    order of its own keys (Gymnasium sorts them), a Tuple in its order.
+    A Box of any shape and dtype is flattened in C order, as float32; so is a MultiBinary. An image of bytes, alone or
+    in a Dict, is brought to height × width × channels. Each number of a Discrete or MultiDiscrete becomes one-hot. A
+    Dict is laid out in the order of its own keys (Gymnasium sorts them), a Tuple in its order.
 
     Raises `UserError` for anything else, for no numbers at all, and for a one-hot vector that no network could take.
     """
@@ -55,8 +55,8 @@ def observation_parts(space: gym.Space, env_id: str) -> tuple[ObservationPart, .
 
 
 def _parts(space: gym.Space, env_id: str, path: tuple[str | int, ...]) -> tuple[ObservationPart, ...]:
-    if not path and is_image(space):
-        return (image_part(tuple(map(int, space.shape or ()))),)
+    if is_image(space):
+        return (image_part(path, tuple(map(int, space.shape or ()))),)
     if isinstance(space, spaces.Box | spaces.MultiBinary):
         return (ObservationPart(path, tuple(map(int, space.shape))),)
     if isinstance(space, spaces.Discrete):
@@ -74,8 +74,11 @@ def _parts(space: gym.Space, env_id: str, path: tuple[str | int, ...]) -> tuple[
 
 
 def is_image(space: gym.Space) -> bool:
-    """Whether observations are images of bytes, or stacks of images: they stay bytes, for a convolutional network."""
-    return isinstance(space, spaces.Box) and space.dtype == np.uint8 and bool(_image_axes(space.shape))
+    """Whether it is of images of bytes, or of stacks of images, for a convolutional network; a grey one is [H, W]."""
+    if not isinstance(space, spaces.Box) or space.dtype != np.uint8:
+        return False
+    whole_range = len(space.shape) > 2 or (space.low.max(initial=0) == 0 and space.high.min(initial=255) == 255)
+    return whole_range and bool(_image_axes(space.shape))
 
 
 def _image_axes(shape: tuple[int, ...]) -> tuple[int, ...]:
@@ -83,17 +86,20 @@ def _image_axes(shape: tuple[int, ...]) -> tuple[int, ...]:
     if len(shape) == 4 and shape[0] <= IMAGE_CHANNELS:
         inner = tuple(axis + 1 for axis in _image_axes(shape[1:]))
         return (*inner[:2], 0, *inner[2:]) if inner else ()
+    if len(shape) == 2 and min(shape) > IMAGE_CHANNELS:
+        return (0, 1)
     if len(shape) != 3 or min(shape[0], shape[2]) > IMAGE_CHANNELS:
         return ()
     return (0, 1, 2) if shape[2] <= shape[0] else (1, 2, 0)
 
 
-def image_part(own: tuple[int, ...]) -> ObservationPart:
+def image_part(path: tuple[str | int, ...], own: tuple[int, ...]) -> ObservationPart:
     """The part of an observation that is an image of the shape `own`, laid out height × width × channels."""
     axes = _image_axes(own)
     height, width, *channels = (own[axis] for axis in axes)
     shape = (height, width, math.prod(channels))
-    return ObservationPart((), shape) if own == shape else ObservationPart((), shape, own_shape=own, axes=axes)
+    layout: dict[str, Any] = {} if own == shape else {"own_shape": own, "axes": axes}
+    return ObservationPart(path, shape, **layout, image=True)
 
 
 def action_kind(space: gym.Space, env_id: str) -> Action:
@@ -284,13 +290,16 @@ def read_observation(spec: Spec, obs: Any) -> tuple[np.ndarray, bool]:
             not whole or not from 0 to 255.
     """
     try:
-        if spec.image:
-            _require_bytes(np.asarray(obs))
         if not isinstance(obs, dict | tuple) and _is_flat(spec, np.asarray(obs)):
+            if spec.image:
+                _require_bytes(np.asarray(obs))
             flat = np.asarray(obs, dtype=np.uint8 if spec.image else np.float32)
             flat, batched = flat.reshape(-1, spec.observation_size), flat.ndim == 2
         else:
             batched = _is_batch(spec, obs)
+            for part in spec.observation_parts:
+                if part.image:
+                    _require_bytes(np.asarray(reduce(getitem, part.path, cast(Any, obs))))
             flat = flatten_observation(spec.observation_parts, obs, image=spec.image)
     except (KeyError, IndexError, TypeError, ValueError) as error:
         raise _unreadable(spec, obs, error) from None

@@ -23,6 +23,7 @@ from lemniscate.exporting.operations import Program
 from lemniscate.exporting.parity import TESTS, fly, parity, self_tests, sentences
 from lemniscate.exporting.translation import translate
 from lemniscate.hub.repository import is_address
+from lemniscate.run.seeding import torch_defaults
 from lemniscate.spec import Action, Box, Discrete, MultiDiscrete, ObservationPart, Spec
 from lemniscate.system.console import say
 from lemniscate.system.files import DamagedFileError, read_json, replace_directory, replace_file, write_json
@@ -38,6 +39,7 @@ LICENCE = (
 )
 
 
+@torch_defaults()
 def export(run: Trained, to: str | Path | None = None, *, trust: bool = False) -> Path:
     """Write a policy as ONNX and as C99 for microcontrollers, from the raw observation to the action for `env.step`.
 
@@ -60,7 +62,7 @@ def export(run: Trained, to: str | Path | None = None, *, trust: bool = False) -
     """
     policy = load(run, trust=trust)
     folder = _destination(run, policy, to)
-    if policy.spec.image:
+    if policy.spec.has_images:
         raise UserError(f"A policy for {policy.spec.env_id} looks at images; what can be exported looks at vectors.")
     if isinstance(policy.spec.action, Box) and not policy.spec.action.dtype.startswith("float"):
         raise UserError(f"{policy.spec.env_id} takes a Box of whole numbers; what can be exported acts by fractions.")

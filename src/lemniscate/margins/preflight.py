@@ -22,7 +22,7 @@ from lemniscate.run.config import Natural, Range, checked
 from lemniscate.run.directory import read_config
 from lemniscate.run.environments import env_arguments
 from lemniscate.run.evaluate import EVALUATION
-from lemniscate.run.seeding import derive
+from lemniscate.run.seeding import derive, torch_defaults
 from lemniscate.system.console import say
 from lemniscate.system.files import DamagedFileError, read_json, write_json
 from lemniscate.system.machine import version
@@ -70,6 +70,7 @@ class Preflight:
         return {"preflight": FORMAT, **own, "axes": axes, "sentences": list(self.sentences), **origin}
 
 
+@torch_defaults()
 @torch.no_grad()
 def preflight(
     run: Trained,

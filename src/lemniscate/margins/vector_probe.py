@@ -153,7 +153,7 @@ def _axes(spec: Spec, has_model: bool) -> tuple[Axis, ...]:
 
 def _is_number(spec: Spec) -> Tensor:
     """[O] bool, of the whole observation: numbers, which are no choices, masks or pixels."""
-    own = [not part.nvec and not spec.image for part in spec.observation_parts for _ in range(part.size)]
+    own = [not part.nvec and not part.image for part in spec.observation_parts for _ in range(part.size)]
     return torch.tensor([*own, *[False] * (input_size(spec) - len(own))])
 
 

@@ -1,6 +1,6 @@
 """The mathematics: pure functions on tensors, each with its equation and a test against brute force."""
 
-from lemniscate.maths.bounded import Deterministic, SquashedGaussian
+from lemniscate.maths.bounded import Deterministic, SquashedGaussian, mean_and_std
 from lemniscate.maths.discrete import Bernoulli, Categorical, MultiCategorical
 from lemniscate.maths.distributions import Distribution, Gaussian, tanh
 from lemniscate.maths.losses import clipped_surrogate, policy_gradient, surrogate, value_loss
@@ -42,6 +42,7 @@ __all__ = [
     "hl_gauss",
     "kl_k1",
     "kl_k3",
+    "mean_and_std",
     "means",
     "merge_moments",
     "moments",

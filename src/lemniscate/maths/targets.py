@@ -42,4 +42,5 @@ def polyak(target: Iterable[Tensor], online: Iterable[Tensor], tau: float) -> No
         tau: τ in [0, 1]; 1 copies.
     """
     for mine, theirs in zip(target, online, strict=True):
-        mine.lerp_(theirs, tau)
+        if mine.is_floating_point():  # whole numbers do not learn
+            mine.lerp_(theirs, tau)

@@ -38,7 +38,8 @@ class ActorCategoricalQ(nn.Module):
 
     Args:
         spec: of the environment.
-        layers: of the policy, and of the critic.
+        actor_layers: of the policy.
+        critic_layers: of the critic.
         normalize_observations: put a running normalizer in front of both.
         initial_log_std: log σ of the policy before the tanh, at first.
         value_range: of the critic's bins.
@@ -50,7 +51,8 @@ class ActorCategoricalQ(nn.Module):
     def __init__(
         self,
         spec: Spec,
-        layers: Layers,
+        actor_layers: Layers,
+        critic_layers: Layers,
         normalize_observations: bool,
         initial_log_std: float,
         value_range: float,
@@ -58,13 +60,17 @@ class ActorCategoricalQ(nn.Module):
         super().__init__()
         size = spec.bounded_box().size
         normalizer = normalizer_of(spec, normalize_observations)
-        net = network_of(spec, layers, 2 * size, last_gain=0.01)
+        net = network_of(spec, actor_layers, 2 * size, last_gain=0.01)
         self.policy = SquashedGaussianPolicy(normalizer, net, size, initial_log_std)
         encoder, features = encoder_of(spec)
-        critic = layers.network(features + spec.privileged + size, BINS, last_gain=0.01)
+        critic = critic_layers.network(features + spec.privileged + size, BINS, last_gain=0.01)
         gain = ((features + spec.privileged) / size) ** 0.5  # of two parts of the input, neither drowns the other
         self.critic = CategoricalQ(normalizer, encoder, critic, Bins(value_range), gain, spec.privileged)
         self.multipliers = Multipliers([INITIAL_MULTIPLIER] * 2)
+
+    def q(self, obs: Tensor, action: Tensor) -> Tensor:
+        """[B, O] and [B, A] to Q(s, a), [B]."""
+        return self.critic(obs, action)
 
     def estimates(self, obs: Tensor, next_obs: Tensor, action: Tensor, noise: Tensor) -> tuple[Tensor, ...]:
         """Q(s, a), Q(s', a') and log π(a'|s') of an a' drawn with `noise`, μ and log σ of π(·|s): of rows […, …]."""

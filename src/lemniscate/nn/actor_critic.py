@@ -2,8 +2,8 @@
 
 from torch import Tensor, nn
 
-from lemniscate.nn.networks import ImageEncoder, Layers
-from lemniscate.nn.normalizer import NoNorm, RunningNorm, ScaleBytes, with_privileged
+from lemniscate.nn.networks import ImageEncoder, Layers, PartsEncoder
+from lemniscate.nn.normalizer import NoNorm, NormByPart, RunningNorm, ScaleBytes, with_privileged
 from lemniscate.nn.policies import BernoulliPolicy, CategoricalPolicy, GaussianPolicy, MultiCategoricalPolicy, Policy
 from lemniscate.spec import Action, Box, Discrete, MultiDiscrete, Spec
 
@@ -24,14 +24,20 @@ class Value(nn.Module):
 
 
 class ActorCritic(nn.Module):
-    """A policy for any actions, and V(s)."""
+    """A policy for any actions, and V(s), with `critic_layers` if they are not as those of the policy."""
 
     def __init__(
-        self, spec: Spec, layers: Layers, initial_log_std: float = 0.0, normalize_observations: bool = False
+        self,
+        spec: Spec,
+        layers: Layers,
+        initial_log_std: float = 0.0,
+        normalize_observations: bool = False,
+        *,
+        critic_layers: Layers | None = None,
     ) -> None:
         super().__init__()
         self.policy = _policy(normalizer_of(spec, normalize_observations), spec, layers, initial_log_std)
-        net = network_of(spec, layers, 1, last_gain=1.0, more=spec.privileged)
+        net = network_of(spec, critic_layers or layers, 1, last_gain=1.0, more=spec.privileged)
         self.value = Value(self.policy.normalizer, net, spec.privileged)
 
     def estimates(self, obs: Tensor, next_obs: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -40,9 +46,11 @@ class ActorCritic(nn.Module):
 
 
 def normalizer_of(spec: Spec, normalize_observations: bool) -> NoNorm:
-    """The normalizer of observations."""
-    kind = ScaleBytes if spec.image else RunningNorm if normalize_observations else NoNorm
-    return kind(spec.observation_size)
+    """The normalizer of observations: pixels are scaled, numbers normalized or as they are."""
+    numbers, parts = RunningNorm if normalize_observations else NoNorm, spec.observation_parts
+    if spec.has_images and not spec.image:
+        return NormByPart((ScaleBytes if part.image else numbers)(part.size) for part in parts)
+    return (ScaleBytes if spec.image else numbers)(spec.observation_size)
 
 
 def _policy(normalizer: NoNorm, spec: Spec, layers: Layers, initial_log_std: float) -> Policy:
@@ -66,10 +74,10 @@ def _outputs(action: Action) -> int:
 
 def encoder_of(spec: Spec) -> tuple[nn.Module, int]:
     """The module that turns a normalized observation into features, and their number."""
-    if not spec.image:
+    if not spec.has_images:
         return nn.Identity(), spec.observation_size
-    height, width, channels = spec.observation_parts[0].shape
-    encoder = ImageEncoder((height, width, channels))
+    parts = spec.observation_parts
+    encoder = ImageEncoder(parts[0].shape) if len(parts) == 1 else PartsEncoder(parts)
     return encoder, encoder.size
 
 
@@ -77,4 +85,4 @@ def network_of(spec: Spec, layers: Layers, outputs: int, last_gain: float, more:
     """A network from normalized observations, with an encoder before it where these are images, and `more` inputs."""
     encoder, features = encoder_of(spec)
     net = layers.network(features + more, outputs, last_gain)
-    return nn.Sequential(encoder, net) if spec.image else net
+    return nn.Sequential(encoder, net) if spec.has_images else net

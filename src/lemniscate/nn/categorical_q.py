@@ -90,5 +90,5 @@ def normalize_units(networks: nn.Module) -> None:
     A constraint on networks with normalized layers: weights that cannot grow are turned as far by each step of Adam.
     """
     for layer in networks.modules():
-        if isinstance(layer, nn.Linear):
+        if isinstance(layer, nn.Linear) and layer.weight.requires_grad:
             layer.weight.div_(torch.linalg.vector_norm(layer.weight, dim=1, keepdim=True) + 1e-8)

@@ -1,15 +1,17 @@
 """Networks: perceptrons, residual blocks, modules of one's own; and the encoder of images."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal
 
 import torch
 from torch import Tensor, nn
+from torch.nn.parameter import is_lazy
 
 from lemniscate.errors import UserError, unknown_name
 from lemniscate.maths import tanh
+from lemniscate.spec import ObservationPart
 from lemniscate.system.named import find_callable
 
 Activation = Literal["tanh", "relu", "elu", "silu"]
@@ -69,7 +71,7 @@ class Layers:
         it observes (Andrychowicz et al. 2021, arXiv:2006.05990, section 3.2), 1 for a value; the others have √2.
         """
         if self.kind not in NETWORKS:
-            return _own_network(self.kind, inputs, outputs)
+            return OwnNetwork(self.kind, inputs, outputs)
         layers, width = NETWORKS[self.kind](self, inputs)
         return nn.Sequential(*layers, orthogonal(nn.Linear(width, outputs), last_gain))
 
@@ -106,15 +108,68 @@ NETWORKS: dict[str, Callable[[Layers, int], tuple[list[nn.Module], int]]] = {
 """The layers before the last one, and the number of their outputs."""
 
 
-def _own_network(name: str, inputs: int, outputs: int) -> nn.Module:
-    try:
-        network = find_callable(name)(inputs, outputs)
-        shape = network(torch.zeros(2, inputs)).shape
-    except (TypeError, RuntimeError, AttributeError) as error:
-        raise UserError(f"{name}({inputs}, {outputs}) must make a module for [2, {inputs}]: {error}") from None
-    if shape != (2, outputs):
-        raise UserError(f"{name} must take [2, {inputs}] to [2, {outputs}]; it returns {list(shape)}.")
-    return network
+class OwnNetwork(nn.Module):
+    """A module of one's own, which `name` makes: it takes rows [B, inputs] to [B, outputs], whatever dimensions lead.
+
+    Raises:
+        UserError: it cannot be made, called or saved; nothing in it learns; or what it does in training could not be
+            repeated, since it is random or changes its own tensors.
+    """
+
+    def __init__(self, name: str, inputs: int, outputs: int) -> None:
+        super().__init__()
+        self.name, self.least, rows = name, 1, torch.randn(64, inputs, generator=torch.Generator().manual_seed(0))
+        wanted = f"{name}({inputs}, {outputs}) must make a module that takes [B, {inputs}] to [B, {outputs}]"
+        try:
+            self.module = find_callable(name)(inputs, outputs)
+            before = self._tensors()
+            with torch.enable_grad():
+                out = self.module(rows)
+            with torch.no_grad():  # last, so that nothing that the module keeps has a graph, which could not be copied
+                again = self.module(rows)
+            changed = [key for key, tensor in self._tensors().items() if not _equal(before.get(key, tensor), tensor)]
+            lost = [key for key, tensor in self.state_dict().items() if not tensor.isfinite().all()]
+        except UserError:
+            raise
+        except Exception as error:
+            raise UserError(f"{wanted}: {type(error).__name__}: {error}") from error
+        if not isinstance(out, Tensor) or (*out.shape, out.dtype) != (len(rows), outputs, torch.float32):
+            what = f"{list(out.shape)} of {out.dtype}" if isinstance(out, Tensor) else f"a {type(out).__name__}"
+            raise UserError(f"{wanted}, in float32; it takes [{len(rows)}, {inputs}] to {what}.")
+        if changed:
+            how = f"changes {changed[0].removeprefix('module.')} in forward, which no other process would repeat"
+            raise UserError(f"{name} {how}; of batch normalization, take track_running_stats=False, or LayerNorm.")
+        if not _equal(out, again):
+            how = "is random: two calls with the same rows differ, and so would old and new probabilities"
+            raise UserError(f"{name} {how}; leave its dropout out, or set it to 0.")
+        if lost:
+            raise UserError(f"{name} has a number in {lost[0].removeprefix('module.')} that is not finite.")
+        types = {str(parameter.dtype) for parameter in self.parameters() if parameter.requires_grad}
+        if not out.requires_grad or types != {"torch.float32"}:
+            kinds = f"parameters of {', '.join(sorted(types))}" if types else "no parameter to learn"
+            raise UserError(f"{name} has {kinds}; it must have some of torch.float32 that its outputs depend on.")
+        try:
+            with torch.no_grad():
+                self.module(rows[:1])
+        except ValueError:  # of batch normalization, by the statistics of the rows themselves
+            self.least = 2
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[…, inputs] to […, outputs]."""
+        rows = x.reshape(-1, x.shape[-1]) if x.dim() != 2 else x
+        if len(rows) < self.least:
+            raise UserError(f"{self.name} needs 2 rows or more at once, so it cannot act on 1; LayerNorm can.")
+        out = self.module(rows)
+        return out.reshape(*x.shape[:-1], out.shape[-1]) if x.dim() != 2 else out
+
+    def _tensors(self) -> dict[str, Tensor]:
+        """Copies of all parameters and buffers, but of those that get their shape in the first call."""
+        named = (*self.named_parameters(), *self.named_buffers())
+        return {name: tensor.detach().clone() for name, tensor in named if not is_lazy(tensor)}
+
+
+def _equal(one: Tensor, other: Tensor) -> bool:
+    return torch.equal(one.nan_to_num(), other.nan_to_num())
 
 
 class Residual(nn.Module):
@@ -148,7 +203,7 @@ class ImageEncoder(nn.Module):
     policy's encoder, which learns from the advantage alone, may end with the same output for every image.
     """
 
-    def __init__(self, shape: tuple[int, int, int]) -> None:
+    def __init__(self, shape: tuple[int, ...]) -> None:
         super().__init__()
         self.shape = height, width, channels = shape
         if min(height, width) < 36:
@@ -167,3 +222,20 @@ class ImageEncoder(nn.Module):
         """[…, H · W · C] in [-½, ½] to […, `size`]."""
         images = pixels.reshape(-1, *self.shape).movedim(-1, 1)
         return self.layers(images).reshape(*pixels.shape[:-1], self.size)
+
+
+class PartsEncoder(nn.Module):
+    """The features of several parts of the observation: images by an encoder each, beside numbers as they are."""
+
+    def __init__(self, parts: Sequence[ObservationPart]) -> None:
+        super().__init__()
+        self._sizes = [part.size for part in parts]
+        self.encoders = nn.ModuleList(ImageEncoder(part.shape) if part.image else nn.Identity() for part in parts)
+        encoded = zip(self.encoders, self._sizes, strict=True)
+        self.size = sum(encoder.size if isinstance(encoder, ImageEncoder) else size for encoder, size in encoded)
+        """length of what comes out"""
+
+    def forward(self, obs: Tensor) -> Tensor:
+        """Normalized observations […, O] to […, `size`]."""
+        pieces = zip(self.encoders, obs.split(self._sizes, dim=-1), strict=True)
+        return torch.cat([encoder(piece) for encoder, piece in pieces], dim=-1)

@@ -3,7 +3,7 @@
 The observation normalizer is part of the policy, and evaluated with it; the reward scale is for training only.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Self
 
@@ -33,8 +33,29 @@ class ScaleBytes(NoNorm):
     """Bytes to numbers from -½ to ½."""
 
     def forward(self, obs: Tensor) -> Tensor:
-        """[…, O or more] uint8 to […, O]."""
+        """[…, O or more], uint8 or the same in float32, to […, O]."""
         return super().forward(obs).float() / 255 - 0.5
+
+
+class NormByPart(NoNorm):
+    """A normalizer of its own for each of several parts of the observation, which follow each other."""
+
+    def __init__(self, parts: Iterable[NoNorm]) -> None:
+        own = list(parts)
+        super().__init__(sum(part.size for part in own))
+        self.parts: Sequence[NoNorm] = nn.ModuleList(own)  # pyright: ignore[reportAttributeAccessIssue]
+
+    def forward(self, obs: Tensor) -> Tensor:
+        """[…, O or more] to […, O]."""
+        return torch.cat([part(piece) for part, piece in zip(self.parts, self._pieces(obs), strict=True)], dim=-1)
+
+    def update(self, obs: Tensor, valid: Tensor | None = None) -> None:
+        """Each its part of the observations."""
+        for part, piece in zip(self.parts, self._pieces(obs), strict=True):
+            part.update(piece, valid)
+
+    def _pieces(self, obs: Tensor) -> Sequence[Tensor]:
+        return super().forward(obs).split([part.size for part in self.parts], dim=-1)
 
 
 def with_privileged(features: Tensor, obs: Tensor, size: int, privileged: int) -> Tensor:

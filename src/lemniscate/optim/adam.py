@@ -60,7 +60,7 @@ def adam(
 
 
 class Adam:
-    """Adam for the parameters of `networks`, which become views of one vector (`ParameterVector`).
+    """Adam for the parameters of `networks` that need a gradient, which become views of one vector (`ParameterVector`).
 
     Args:
         networks: the module whose parameters move, already on its device. Other networks may take part in a loss.
@@ -92,7 +92,7 @@ class Adam:
         self._norm_name = f"gradient_norm/{name}" if name else "gradient_norm"
         self.over_shards: Callable[..., tuple[Tensor, Metrics]] | None = None
         """takes the place of `gradient` where there are several shards: `optim.shards`"""
-        self._inputs = list(self.module.parameters())
+        self._inputs = self._parameters.parameters
         for parameter, gradient in zip(self._inputs, self._parameters.views(self._gradient).values(), strict=True):
             parameter.grad = gradient
 

@@ -6,17 +6,21 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call
 
+from lemniscate.errors import UserError
 from lemniscate.maths import fisher_product
 
 
 class ParameterVector:
-    """The parameters of a module in one vector [P], of which they become views.
+    """The parameters of a module in one vector [P], of which they become views; those that need no gradient stay apart.
 
-    They remain ordinary `nn.Parameter`s. Move the module to its device before.
+    They remain ordinary `nn.Parameter`s. Move the module to its device before. Raises `UserError` if there are none.
     """
 
     def __init__(self, module: nn.Module) -> None:
-        named = dict(module.named_parameters())
+        named = {name: parameter for name, parameter in module.named_parameters() if parameter.requires_grad}
+        if not named:
+            raise UserError("There is nothing to learn: of one of the networks every parameter is frozen.")
+        self.parameters = list(named.values())
         self._names = list(named)
         self._shapes = [parameter.shape for parameter in named.values()]
         self._sizes = [parameter.numel() for parameter in named.values()]

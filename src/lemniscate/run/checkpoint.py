@@ -35,7 +35,7 @@ from lemniscate.system.files import (
     write_json,
 )
 
-FORMAT = 4
+FORMAT = 5
 TENSORS, STATE, MANIFEST = "tensors.safetensors", "state.json", "manifest.json"
 FILES = (TENSORS, STATE)
 

@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal, Self, get_args, get_origin, get_type
 import torch
 
 from lemniscate.envs.registry import MOST_ENVS
-from lemniscate.errors import UserError, shown
+from lemniscate.errors import UserError, shown, unknown_name
 from lemniscate.run.fields import options_of, unknown_field
 from lemniscate.run.seeding import Generators
 from lemniscate.spec import Box, Spec
@@ -168,6 +168,9 @@ class RunConfig:
     """training episodes between such recordings; 0: none"""
     warm_start: str | None = None
     """run, checkpoint or hf://user/name whose networks this run begins with"""
+    freeze: tuple[str, ...] = ()
+    """parameters that keep their values, by the beginnings of their names, such as policy.net.0; mostly with
+    warm_start"""
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     """arguments of the environment, as JSON: '{"dynamics": "first_principles"}'"""
     reset_options: dict[str, Any] = field(default_factory=dict)
@@ -208,6 +211,18 @@ class RunConfig:
     def networks(self, spec: Spec) -> Any:
         """New networks for the spaces in `spec`, a module with a `policy`. Raises `UserError` if they do not fit."""
         raise NotImplementedError
+
+    def make_networks(self, spec: Spec, device: torch.device) -> Any:
+        """`networks` to train, on a device, with those in `freeze` frozen. Raises `UserError` if there are none."""
+        networks = self.networks(spec).to(device)
+        for beginning in self.freeze:
+            named = dict(networks.named_parameters())
+            frozen = [name for name in named if f"{name}.".startswith(f"{beginning}.")]
+            if not frozen:
+                raise unknown_name("parameter to freeze", beginning, named, f"there is {', '.join(named)}.")
+            for name in frozen:
+                named[name].requires_grad_(False)
+        return networks
 
     def memory(self, spec: Spec) -> dict[str, int]:
         """Bytes that training takes at least, beside networks and environments, by the field that they grow with."""

@@ -102,6 +102,8 @@ class OffPolicyConfig(RunConfig):
         """The size of the replay buffer; and products in bfloat16 where the processor has none."""
         size = self.capacity * bytes_per_transition(spec) / 1e6
         notices = [f"Replay buffer: {self.capacity:,} transitions, {size:,.1f} MB (also in each checkpoint)."]
+        if spec.has_images and not spec.image:
+            notices.append("Beside numbers, pixels are stored as float32, four times the bytes of images alone.")
         if self.matmul == "bfloat16" and not has_bfloat16(device):
             notices.append("This processor has no products in bfloat16; --matmul float32 is faster.")
         return notices

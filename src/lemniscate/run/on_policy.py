@@ -1,6 +1,6 @@
 """Settings and training state of the algorithms that learn from their newest rollout."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from lemniscate.data.rollout import rollout_bytes
@@ -21,7 +21,9 @@ class OnPolicyConfig(RunConfig):
     gamma: Fraction = 0.99
     """discount factor γ; usually 0.9 to 0.999"""
     hidden: tuple[Width, ...] = (64, 64)
-    """widths of the hidden layers of the policy, and of the value"""
+    """widths of the policy's hidden layers; usually 1 to 3 of 32 to 256"""
+    critic_hidden: tuple[Width, ...] | None = None
+    """widths of the hidden layers of the value, or of Q; usually as wide as the policy's or wider; none: as hidden"""
     activation: Activation = "tanh"
     """activation function between the layers"""
     network: str = "mlp"
@@ -35,21 +37,25 @@ class OnPolicyConfig(RunConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.layers.check()
+        for layers in self.network_settings[:2]:
+            layers.check()
 
     def networks(self, spec: Spec) -> Any:
         """New networks for the spaces in `spec`: the policy and V(s)."""
-        return ActorCritic(spec, self.layers, self.initial_log_std, self.normalize_observations)
+        layers, critic_layers, normalize = self.network_settings
+        return ActorCritic(spec, layers, self.initial_log_std, normalize, critic_layers=critic_layers)
 
     def memory(self, spec: Spec) -> dict[str, int]:
         """The bytes of a rollout, and of its rows in the widest layer."""
-        rows = 4 * self.num_rows * max(self.hidden, default=0)
+        rows = 4 * self.num_rows * max((*self.hidden, *(self.critic_hidden or ())), default=0)
         return {"num_steps": rows + rollout_bytes(spec, self.num_steps, self.num_envs)}
 
     @property
-    def layers(self) -> Layers:
-        """The hidden layers of the policy, and of the value."""
-        return Layers(self.hidden, self.activation, self.network)
+    def network_settings(self) -> tuple[Layers, Layers, bool]:
+        """The hidden layers of the policy and of the value, and whether observations are normalized."""
+        layers = Layers(self.hidden, self.activation, self.network)
+        critic_hidden = self.hidden if self.critic_hidden is None else self.critic_hidden
+        return layers, replace(layers, hidden=critic_hidden), self.normalize_observations
 
     @property
     def num_rows(self) -> int:

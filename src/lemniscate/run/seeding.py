@@ -2,7 +2,8 @@
 
 import os
 import random
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, nullcontext
 
 import numpy as np
 import torch
@@ -37,6 +38,23 @@ def set_seeds(seed: int, deterministic: bool = True) -> None:
         flags = os.environ.get("XLA_FLAGS", "")
         if "xla_gpu_deterministic_ops" not in flags:
             os.environ["XLA_FLAGS"] = f"{flags} --xla_gpu_deterministic_ops=true".strip()
+
+
+@contextmanager
+def torch_defaults() -> Iterator[None]:
+    """The defaults of torch itself while a verb works, whatever its caller has set; afterwards the caller's again.
+
+    These are float32, the CPU, and gradients on, also inside of `torch.no_grad` and `torch.inference_mode`.
+    """
+    dtype, device = torch.get_default_dtype(), torch.get_default_device()
+    torch.set_default_dtype(torch.float32)
+    # To name a device costs time at every call of torch, so it is named only where the caller has another one.
+    on_cpu = nullcontext() if device.type == "cpu" else torch.device("cpu")
+    try:
+        with on_cpu, torch.inference_mode(False), torch.enable_grad(), torch.autocast("cpu", enabled=False):
+            yield
+    finally:
+        torch.set_default_dtype(dtype)
 
 
 def seed_globals(seed: int) -> None:

@@ -11,52 +11,53 @@ from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import find_checkpoint
 from lemniscate.spec import Spec
 
-FUNCTION = ("network", "activation")
+FUNCTION = ("network", "activation", "normalize_observations")
 """fields of a Config that change what networks of the same shapes compute"""
-
-SHAPE = ("hidden", "normalize_observations")
-"""fields of a Config that a policy of other shapes may come from"""
 
 
 def load_networks(networks: nn.Module, config: RunConfig, spec: Spec, locate: Callable[[str], Path] = Path) -> str:
-    """Load the networks of the run or checkpoint `config.warm_start` into `networks`, as many as fit.
+    """Load the networks of the run or checkpoint `config.warm_start` into `networks`, as much as fits.
 
-    All of them if they have the same names and shapes; else the policy, with its normalizer, if it has. `locate` finds
-    the directory that `config.warm_start` names: a run knows no address but a path.
+    The tensors of equal names and shapes are taken over, the others stay new: another head, other observations, other
+    critics. A normalizer is taken over whole or not at all. `locate` finds the directory that `config.warm_start`
+    names: a run knows no address but a path.
 
     Returns:
         A sentence on what was loaded.
 
     Raises:
-        UserError: no such checkpoint; other spaces; a policy of other shapes.
+        UserError: no such checkpoint; networks of another function; no layer of the policy fits.
     """
     source = find_checkpoint(locate(str(config.warm_start)))
     name = f"{config.warm_start} at step {source.numbers['step']:,}"
     their_spec = checkpoint.spec_from_json(source.record["spec"])
-    if not their_spec.fits(spec):
-        raise UserError(
-            f"warm_start: {name} was trained on {their_spec.env_id}, whose observation or action spaces differ from"
-            f" those of {spec.env_id}."
-        )
-    theirs, mine = source.record["config"], config.to_json()
-    shared = [field for field in (*FUNCTION, *SHAPE) if field in theirs and field in mine]
-    differing = [field for field in shared if theirs[field] != mine[field]]
-    settings = [f"{field} is {theirs[field]!r} there and {mine[field]!r} here" for field in differing]
+    elsewhere = "" if their_spec.fits(spec) else f"; it was trained on {their_spec.env_id}, with other spaces"
+    theirs, ours = source.record["config"], config.to_json()
+    shared = [field for field in (*FUNCTION, "hidden") if field in theirs and field in ours]
+    differing = [field for field in shared if theirs[field] != ours[field]]
+    settings = [f"{field} is {theirs[field]!r} there and {ours[field]!r} here" for field in differing]
     if set(differing) & set(FUNCTION):
         raise UserError(f"warm_start: {name} does not fit: {settings[0]}.")
     found, own = source.tensors_of("networks"), networks.state_dict()
-    if not difference(found, own) and theirs.get("value_range") == mine.get("value_range"):  # else a Q says another
-        networks.load_state_dict(found)
-        return f"Warm start: all networks of {name}."
-    policy, own_policy = _policy(found), _policy(own)
-    if differs := difference(policy, own_policy):
-        raise UserError(f"warm_start: the policy of {name} does not fit: {[*settings, differs][0]}.")
-    networks.load_state_dict(policy, strict=False)
-    return f"Warm start: the policy of {name}; the other networks are new."
-
-
-def _policy(networks: dict[str, Tensor]) -> dict[str, Tensor]:
-    return {name: tensor for name, tensor in networks.items() if name.startswith("policy.")}
+    comparable = theirs.get("value_range") == ours.get("value_range")  # else a Q of these shapes says another
+    fits = {
+        key: tensor
+        for key, tensor in found.items()
+        if key in own and tensor.shape == own[key].shape and (comparable or key.startswith("policy."))
+    }
+    resized = [key.removesuffix("mean") + "count" for key in own if key.endswith(".mean") and key not in fits]
+    fits = {key: tensor for key, tensor in fits.items() if key not in resized}
+    if not any(key.startswith("policy.") and tensor.ndim > 1 for key, tensor in fits.items()):
+        reason = [*settings, difference(found, own)][0]
+        raise UserError(f"warm_start: no layer of the policy of {name} fits: {reason}{elsewhere}.")
+    networks.load_state_dict(fits, strict=False)
+    named = (*networks.named_parameters(), *networks.named_buffers())  # a normalizer that networks share is one
+    mine = [key for key, _ in named if key in own]
+    new = [key for key in mine if key not in fits]
+    if not new:
+        return f"Warm start: all networks of {name}{elsewhere}."
+    some = ", ".join(new[:3]) + ", …" * (len(new) > 3)
+    return f"Warm start: {len(mine) - len(new):,} tensors of {name}; {len(new):,} begin anew, {some}{elsewhere}."
 
 
 def difference(theirs: dict[str, Tensor], mine: dict[str, Tensor]) -> str:

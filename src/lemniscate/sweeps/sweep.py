@@ -32,6 +32,7 @@ from lemniscate.run.directory import LOCK, is_finished
 from lemniscate.run.environments import device_for, require_memory
 from lemniscate.run.metrics import progress_of
 from lemniscate.run.places import LOG, Places, Processes, Sweep, failure_of, read_sweep
+from lemniscate.run.seeding import torch_defaults
 from lemniscate.run.stopping import Stopped, stop_signals_to
 from lemniscate.run.warm_start import load_networks
 from lemniscate.system.console import Line, ProgressBar, pace, say
@@ -321,6 +322,7 @@ def seeds_of(seeds: str | int | Iterable[int]) -> list[int]:
     return list(numbers)
 
 
+@torch_defaults()
 def require_trainable(configs: dict[str, RunConfig], seeds: list[int]) -> None:
     """Raise `UserError` where a run could not begin: one sentence now, instead of one from each run."""
     for name, config in configs.items():
