@@ -65,6 +65,7 @@ class MultiDiscrete:
     start: tuple[int, ...]
     shape: tuple[int, ...] | None = None
     masked: bool = False
+    dtype: str = "int64"
 
     @property
     def mask_size(self) -> int:

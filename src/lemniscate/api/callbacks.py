@@ -5,8 +5,10 @@ from itertools import product
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
+
 from lemniscate.api.policy import TrainedPolicy
-from lemniscate.errors import UserError
+from lemniscate.errors import UserError, shown
 from lemniscate.run.config import RunConfig
 from lemniscate.run.run import Observer
 from lemniscate.run.state import TrainState
@@ -31,6 +33,9 @@ class StopAt:
         return step >= self.steps
 
 
+COPIER = "_copy_networks"
+
+
 class PolicySnapshot(TrainedPolicy):
     """The policy of a run at the line that a callback is shown. Its weights are copied when it is first used.
 
@@ -46,6 +51,9 @@ class PolicySnapshot(TrainedPolicy):
             raise AttributeError(f"A policy has no attribute {name!r}.")
         self.networks = self._copy_networks().eval()
         return self.networks
+
+    def __getstate__(self) -> dict[str, Any]:  # of a copy: a function of this process cannot be pickled
+        return {name: value for name, value in {**vars(self), "networks": self.networks}.items() if name != COPIER}
 
     def expire(self) -> None:
         """Refuse to copy the weights from now on: the run goes on to change them."""
@@ -68,7 +76,12 @@ def call_callbacks(
         stop = False
         for (step, metrics), function in product(lines, functions):
             policy = PolicySnapshot(lambda: copy_networks(state), spec, config, step)
-            stop = bool(function(step, MappingProxyType(dict(metrics)), policy)) or stop
+            said = function(step, MappingProxyType(dict(metrics)), policy)
+            if not isinstance(said, bool | np.bool_ | None):
+                raise UserError(
+                    f"A callback returns True to stop, or False or None; {function} returned {shown(said)}."
+                )
+            stop = bool(said) or stop
             policy.expire()
         return stop
 

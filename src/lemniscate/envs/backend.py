@@ -118,7 +118,7 @@ class Backend(ABC):
             end.
         once: it steps an environment of one's own that may exist once at a time, such as a robot. While another is made
             for evaluation or a film, it is closed; `restart` makes it again.
-        notice: a sentence on what was observed so far, for the one who trains; None where all is well.
+        notices: sentences on its spaces and on what was observed so far, for the one who trains.
         mode: what an environment does after an end, in Gymnasium's words. DISABLED is reset here, in the same step.
         summaries: the numbers that evaluation makes of the measures besides their means.
         scene: what is drawn where a Gymnasium environment would be rendered.
@@ -134,7 +134,7 @@ class Backend(ABC):
     device: torch.device
     counts: Tensor
     once: bool = False
-    notice: str | None = None
+    notices: Sequence[str] = ()
     mode: AutoresetMode = AutoresetMode.DISABLED
     summaries: tuple[Summary, ...] = ()
     scene: Scene | None = None

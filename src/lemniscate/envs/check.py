@@ -108,22 +108,12 @@ def _spaces(env: VecEnv, served_by: str) -> Iterator[Finding]:
     """The findings on observations, actions and the ends of episodes."""
     spec, mode = env.spec, env.backend.mode
     yield good(f"Served by {served_by}; observes {_seen(spec)}; acts by {_acts(spec.action)}.")
-    flat = [part for part in spec.observation_parts if len(part.shape) > 1 and min(sorted(part.shape)[-2:]) > 16]
-    flat = [part for part in flat if not part.image]
-    if flat:
-        part = flat[0]
-        yield note(
-            f"The array {part.name} {part.shape} becomes {part.size:,} numbers without their places; if it is an image,"
-            " return uint8 of height × width × channels, or with the channels first, for a convolutional network."
-        )
     if mode is AutoresetMode.SAME_STEP:
         yield good("Resets in the step that ends an episode, and gives the final observation in its info.")
     elif mode is AutoresetMode.NEXT_STEP:
         yield good("Resets in the step after an end; the action of that step is ignored and not learned from.")
     else:
         yield good("Is reset here, right after an episode's end; the final observation is kept.")
-    if isinstance(spec.action, Box) and not np.isfinite([*spec.action.low, *spec.action.high]).all():
-        yield note("Some actions have no bound: a policy begins around zero, or around one unit from the only bound.")
 
 
 def _seen(spec: Spec) -> str:
@@ -165,8 +155,7 @@ def _random_play(env: VecEnv) -> Iterator[Finding]:
         yield _raised(error, "It cannot be played with random actions")
         return
     yield good(f"{STEPS} random steps: every observation and reward is finite.")
-    if env.backend.notice:
-        yield note(env.backend.notice)
+    yield from map(note, env.backend.notices)
     if not repeated:
         yield bad("The same seed and actions give another episode: runs cannot be repeated, nor resumed.")
     elif torch.equal(first.obs, other.obs):
@@ -338,7 +327,7 @@ class Careful(gym.Env):
         return obs, reward, terminated, truncated, info
 
     def _copied(self, obs: Any, info: Any) -> tuple[Any, Any]:
-        """Copies of both. Notes whether the observation before has changed since it was copied, and the new mask."""
+        """A copy of the observation, and the info. Notes the mask, and whether the observation before has changed."""
         comparable = self._copy is not None and data_equivalence(self._copy, self._copy, exact=True)  # not with a NaN
         self.reuses |= comparable and not data_equivalence(self._returned, self._copy, exact=True)
         self._returned, self._copy = obs, deepcopy(obs)
@@ -346,4 +335,4 @@ class Careful(gym.Env):
             _, mask = mask_in(obs, info)
             with suppress(ValueError):  # one that is wrong is found by random play
                 self._mask = self._mask if mask is None else flat_mask(mask, self.action_space)
-        return deepcopy(obs), deepcopy(info)
+        return deepcopy(obs), info

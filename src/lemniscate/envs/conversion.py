@@ -16,6 +16,7 @@ from torch import Tensor
 
 from lemniscate.errors import UserError, shown
 from lemniscate.spec import Action, Box, Discrete, MultiBinary, MultiDiscrete, ObservationPart
+from lemniscate.system.console import say
 
 MASKS = ("action_mask", "action_masks", "legal_action_mask")
 """what environments call their action mask: in `info`, as a key of a Dict observation, or as a method"""
@@ -80,7 +81,7 @@ class Returns:
 
     def _numbers(self, name: str, value: Any, kind: type) -> Any:
         """A number or a flag of one environment, or a new array [N] of them."""
-        array = _array(value)
+        array = as_array(value)
         fits = array.dtype.kind in "biuf" and (array.shape == self._lead or (array.size == 1 and not self._lead))
         if not fits or (kind is bool and not ((array == 0) | (array == 1)).all()):
             wanted = "a number" if kind is float else "True or False"
@@ -127,6 +128,13 @@ class SingleEnv(gym.Wrapper):
         """Gymnasium's."""
         obs, *rest, info = self._returns.of_step(self.env.step(action))
         return obs, *rest, self._told("step", obs, info)
+
+    def close(self) -> None:
+        """Gymnasium's. An exception in it is said, and costs nothing that was learned."""
+        try:
+            self.env.close()
+        except Exception as error:
+            say(f"{_author(self.env, 'close')} raised {type(error).__name__}: {error}")
 
     def _told(self, method: str, obs: Any, info: dict[str, Any]) -> dict[str, Any]:
         if not info and not self._masked:
@@ -175,8 +183,10 @@ def kind_of(value: Any) -> str:
     return shown(value)
 
 
-def _array(value: Any) -> np.ndarray:
-    """As an array; of objects where it cannot be one, such as a list of lists of different lengths."""
+def as_array(value: Any) -> np.ndarray:
+    """As an array; of objects where it cannot be one, such as lists of different lengths, or a number is masked."""
+    if np.ma.is_masked(value):
+        return np.full((), None, dtype=object)
     try:
         return np.asarray(value.detach().cpu() if isinstance(value, Tensor) else value)
     except (ValueError, TypeError, RuntimeError):
@@ -203,7 +213,7 @@ def _fitted_array(space: gym.Space, obs: Any, shape: tuple[int, ...], where: str
     counted = isinstance(space, spaces.Discrete | spaces.MultiDiscrete)
     if not counted and type(obs) is np.ndarray and obs.dtype == space.dtype and obs.shape == shape:
         return obs
-    array, kind = _array(obs), np.dtype(space.dtype)
+    array, kind = as_array(obs), np.dtype(space.dtype)
     if array.dtype.kind not in "biuf" or array.shape != shape:
         said = f"of shape {array.shape}" if array.dtype.kind in "biuf" else f"that is {kind_of(obs)}"
         raise ValueError(f"{said}{where}; its space is {shown_space(space)}, of shape {space.shape}")
@@ -264,14 +274,15 @@ def _scalars(info: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, f
         elif isinstance(value, Mapping):
             yield from _scalars(value, f"{prefix}{key}/")
         elif hasattr(value, "__array__") and math.prod(getattr(value, "shape", (0,))) == 1:
-            array = _array(value)
+            array = as_array(value)
             if array.dtype.kind in "biuf":
                 yield f"{prefix}{key}", float(array.item())
 
 
 def measures_of(metadata: Mapping[str, Any]) -> tuple[str, ...]:
     """The names of an environment's measures: its success, and those that its `metadata["measures"]` lists."""
-    return tuple(dict.fromkeys((*SUCCESS, *metadata.get("measures", ()))))
+    named = metadata.get("measures", ()) if isinstance(metadata, Mapping) else ()
+    return tuple(dict.fromkeys((*SUCCESS, *([named] if isinstance(named, str) else named))))
 
 
 def measured(
@@ -377,7 +388,7 @@ def physical_action(action: np.ndarray, kind: Action) -> np.ndarray:
     elif isinstance(kind, Discrete):
         return _require_below(kind.n, action) + kind.start
     elif isinstance(kind, MultiDiscrete):
-        action = _require_below(np.array(kind.nvec), action) + np.array(kind.start)
+        action = (_require_below(np.array(kind.nvec), action) + np.array(kind.start)).astype(kind.dtype)
     else:
         _require_below(2, action)
     return action if kind.shape is None else action.reshape(-1, *kind.shape)

@@ -104,6 +104,8 @@ def make_vector(
     else:
         envs = SyncVectorEnv(makers, copy=False, autoreset_mode=AutoresetMode.DISABLED)
         one = envs.envs[0]
+        if len({id(env.unwrapped) for env in envs.envs}) < num_envs:
+            raise UserError("it returned the same environment again; make a new one at each call")
     require_no_statistics(one, envs)
     return envs, one.spec.max_episode_steps if one.spec else None
 

@@ -106,6 +106,7 @@ class GymnasiumBackend(Backend):
         self._stagger_up_to = limit if stagger and self.mode is AutoresetMode.DISABLED and not self.once else None
         self._measures = measures_of(self._envs.metadata or {})
         self.spec = Spec(env, parts, action, max_episode_steps=limit)
+        self.notices = spaces.notices(self.spec)
         self._digits: spaces.LostDigits | None = None if self.spec.image else spaces.LostDigits(self.spec)
 
     def restart(self, seed: int, first: int = 0) -> Tensor:
@@ -131,7 +132,7 @@ class GymnasiumBackend(Backend):
         physical = physical_action(action.cpu().numpy(), self.spec.action)
         returned = self._envs.step(physical)
         raw, reward, terminated, truncated, info = self._returns.of_step(returned) if self._returns else returned
-        terminated, truncated = terminated.copy(), truncated.copy()  # a vector environment may write over its own
+        terminated, truncated = terminated.copy(), truncated & ~terminated  # new ones: a vector may write over its own
         obs = next_obs = self._observe(raw, info)
         valid, done = self._valid, terminated | truncated
         if self.mode is AutoresetMode.NEXT_STEP:
@@ -179,7 +180,7 @@ class GymnasiumBackend(Backend):
         """The flat observation, a copy; after it the action mask, where there is one."""
         flat = flatten_observation(self.spec.observation_parts, raw, image=self.spec.image)
         if self._digits and self._digits.add(raw):
-            self.notice, self._digits = self._digits.sentence(), None
+            self.notices, self._digits = self._digits.notices(), None
         if self._masks:
             return self._masks.append_to(flat, raw, info)
         spaces.require_no_mask(self.spec, raw, info)

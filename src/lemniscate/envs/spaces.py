@@ -115,7 +115,8 @@ def action_kind(space: gym.Space, env_id: str) -> Action:
     if isinstance(space, spaces.Discrete):
         return Discrete(int(space.n), int(space.start))
     if isinstance(space, spaces.MultiDiscrete):
-        return MultiDiscrete(_whole(space.nvec), _whole(space.start), tuple(space.shape))
+        kind = np.dtype(space.dtype).name
+        return MultiDiscrete(_whole(space.nvec), _whole(space.start), tuple(space.shape), dtype=kind)
     if isinstance(space, spaces.MultiBinary):
         return MultiBinary(int(np.prod(space.shape)), tuple(map(int, space.shape)))
     if isinstance(space, spaces.Box):
@@ -156,6 +157,24 @@ def random_action(spec: Spec, obs: Tensor, generator: Generator) -> Tensor:
     return torch.stack([torch.randint(n, (num_envs,), **drawn) for n in action.nvec], dim=1)
 
 
+def notices(spec: Spec) -> list[str]:
+    """Sentences on spaces that can be learned in, and may not be as they were meant."""
+    found, action = list[str](), spec.action
+    for part in spec.observation_parts:
+        if not part.image and len(part.shape) > 1 and min(sorted(part.shape)[-2:]) > IMAGE_CHANNELS:
+            found.append(
+                f"The array {part.name} {part.shape} becomes {part.size:,} numbers without their places; if it is an"
+                " image, return uint8 of height × width × channels, or with the channels first, for a convolutional"
+                " network."
+            )
+    if isinstance(action, Box) and not all(map(math.isfinite, (*action.low, *action.high))):
+        found.append(
+            f"Some actions of {spec.env_id} have no bound, so a policy begins around zero, or one unit from the only"
+            " bound; give the Box a finite low and high where there are any."
+        )
+    return found
+
+
 class LostDigits:
     """A look at the first observations of 64 bits, and at whole numbers: what float32 takes from them.
 
@@ -175,18 +194,18 @@ class LostDigits:
         self._rows += [np.concatenate(flat, axis=1)] if flat else []
         return not flat or len(self._rows) == self.STEPS
 
-    def sentence(self) -> str | None:
+    def notices(self) -> list[str]:
         """A sentence on the number that loses most, if half of the different values of one become equal."""
         rows = np.concatenate(self._rows) if self._rows else np.zeros((1, 0))
         columns = [(len(np.unique(x)), len(np.unique(x.astype(np.float32))), float(np.abs(x).max())) for x in rows.T]
         lost = [(before / left, before, left, most) for before, left, most in columns if most >= LARGE and before > 4]
         ratio, before, left, most = max(lost, default=(1, 0, 0, 0))
         if ratio < 2:
-            return None
-        return (
+            return []
+        return [
             f"{self._spec.env_id} observes numbers up to {most:.3g}, too large for the digits of float32: {before}"
             f" different values became {left}. Subtract what is constant in them, in the environment or in a wrapper."
-        )
+        ]
 
 
 class ActionMasks:

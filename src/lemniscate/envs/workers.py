@@ -140,7 +140,8 @@ class WatchedVectorEnv(AsyncVectorEnv):
         for i, process in enumerate(self.processes):
             process.join(timeout=0.1)  # one that has just closed its pipe may not be dead yet
             if not process.is_alive():
-                return f"The process of environment {i} died (exit code {process.exitcode})."
+                guard = " A script needs `if __name__ == '__main__':` before it." if process.exitcode == 1 else ""
+                return f"The process of environment {i} died (exit code {process.exitcode}).{guard}"
         silent = [str(i) for i, pipe in enumerate(self.parent_pipes) if not pipe.poll(0)]
         return f"Environment {', '.join(silent) or 'unknown'} has not answered for {self.patience:g} s."
 

@@ -20,12 +20,12 @@ import numpy as np
 import torch
 from PIL import Image
 
-from lemniscate.envs.conversion import measured, measures_of
+from lemniscate.envs.conversion import as_array, measured, measures_of
 from lemniscate.envs.factory import make_one, maker_of, makes_vector, sentences
 from lemniscate.envs.registry import make_rendered
 from lemniscate.envs.spaces import SUMMARIES
 from lemniscate.envs.vec_env import VecEnv, require_end
-from lemniscate.errors import UserError, is_installed, missing_extra, shown
+from lemniscate.errors import NonFiniteError, UserError, is_installed, missing_extra, shown
 from lemniscate.run.config import RunConfig
 from lemniscate.run.environments import env_arguments
 from lemniscate.run.evaluate import EVALUATION, EpisodeTable, Evaluation
@@ -69,7 +69,7 @@ def show_episodes(
         if in_window:
             deque(played, maxlen=0)  # Gymnasium draws at each step
         else:
-            give((_picture(env, name) for _ in played), float(env.metadata.get("render_fps", 30)), video)
+            give((_picture(env, name) for _ in played), float((env.metadata or {}).get("render_fps") or 30), video)
     return table.evaluation(name, SUMMARIES)
 
 
@@ -137,6 +137,8 @@ def _play(
             action = act(obs, action_mask=info.get("action_mask"))
             _require_in(env.action_space, action, name)
             obs, reward, terminated, truncated, info = env.step(action)
+            if not math.isfinite(reward):
+                raise NonFiniteError(f"The reward of {name} is {reward} in step {length + 1} of an episode.")
             total, length = total + float(reward), length + 1
             done = terminated or truncated
             step = Step(
@@ -155,7 +157,10 @@ def _play(
 
 def _require_in(space: gym.Space, action: Any, name: str) -> None:
     """Raise `UserError` for an action that is not of the space; of a Box the shape counts, the environment may clip."""
-    fits = np.shape(action) == space.shape if isinstance(space, gym.spaces.Box) else space.contains(action)
+    fits = space.contains(action)
+    if isinstance(space, gym.spaces.Box):
+        numbers = as_array(action)
+        fits = numbers.shape == space.shape and numbers.dtype.kind in "biuf" and np.isfinite(numbers).all()
     if not fits:
         raise UserError(f"{name} takes actions of {space}, not {shown(action)}.")
 

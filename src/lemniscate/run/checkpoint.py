@@ -170,7 +170,11 @@ def spec_from_json(record: dict[str, Any]) -> Spec:
 
 
 def _tuples(record: dict[str, Any]) -> dict[str, Any]:
-    return {name: tuple(value) if isinstance(value, list) else value for name, value in record.items()}
+    return {name: _tuple(value) for name, value in record.items()}
+
+
+def _tuple(value: Any) -> Any:
+    return tuple(map(_tuple, value)) if isinstance(value, list) else value
 
 
 def _not_finite(tensors: Mapping[str, Tensor]) -> str | None:

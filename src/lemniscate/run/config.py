@@ -18,7 +18,7 @@ from lemniscate.envs.registry import MOST_ENVS
 from lemniscate.errors import UserError, shown, unknown_name
 from lemniscate.run.fields import options_of, unknown_field
 from lemniscate.run.seeding import Generators
-from lemniscate.spec import Box, Spec
+from lemniscate.spec import Spec
 
 MOST_WHOLE, MOST_REAL = 10**15, 1e38
 """the largest numbers of a field: float64, and so JSON, counts exactly to 9e15; the float32 of networks ends at 3e38"""
@@ -106,11 +106,20 @@ def _convert(value: Any, option: Any) -> Any:
         if kind is basic and not isinstance(value, basic):
             raise ValueError(wanted)
     if kind is dict:
-        try:
-            json.dumps(value, allow_nan=False)
-        except (TypeError, ValueError, RecursionError):  # it could not be saved with the run
+        try:  # what a run is trained with is what it is evaluated with when it comes back from its file
+            return json.loads(json.dumps(value, allow_nan=False, default=_plain))
+        except (TypeError, ValueError, RecursionError):
             raise ValueError("a dictionary of what JSON can hold") from None
     return value
+
+
+def _plain(value: Any) -> Any:
+    """A NumPy value or a path as JSON can hold it. Raises `TypeError` for anything else."""
+    if isinstance(value, PurePath):
+        return str(value)
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    raise TypeError(type(value))
 
 
 def _number(value: Any, kind: type, limits: Range = Range()) -> int | float:
@@ -230,12 +239,7 @@ class RunConfig:
 
     def notices(self, spec: Spec, device: torch.device) -> list[str]:
         """Sentences that a person should read before a run of this Config starts."""
-        if not isinstance(spec.action, Box) or all(map(math.isfinite, (*spec.action.low, *spec.action.high))):
-            return []
-        return [
-            f"Some actions of {spec.env_id} have no bound, so the policy begins with steps of about 1; better give the"
-            " Box of its action_space a finite low and high."
-        ]
+        return []
 
     def replace(self, **changes: object) -> Self:
         """A copy with some fields changed. Raises `UserError` for an unknown field or a value out of range."""

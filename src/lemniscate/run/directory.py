@@ -1,5 +1,6 @@
 """The run directory: its creation, its config, its lock, and the checkpoints in it."""
 
+import json
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -158,6 +159,7 @@ class Saver:
         found = _newest(self.path, planned_only=True) if self._world.is_first else None
         found = self._world.from_first(found)
         if found:
+            self._require_same_spaces(found)
             found.restore(state)
             self.last_planned = self.planned_at = state.step
         if not self._world.is_first:
@@ -171,6 +173,16 @@ class Saver:
             if step > state.step:
                 remove(self._checkpoints / f"step-{step}")
         return found is not None
+
+    def _require_same_spaces(self, found: checkpoint.Checkpoint) -> None:
+        """Raise `UserError` where the environment has other spaces than those that a checkpoint was made in."""
+        before, now = (found.record["spec"], self._record["spec"])
+        for what in ("observation_parts", "action"):
+            if json.dumps(before[what]) != json.dumps(now[what]):
+                space = "action" if what == "action" else "observation"
+                raise UserError(
+                    f"{self.path} was trained with another {space} space than {now['env_id']} has here now."
+                )
 
     def _keep_damaged_metrics(self, logged: int) -> None:
         """Copy metrics that are damaged, before they are written again without what is damaged."""

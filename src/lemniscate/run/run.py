@@ -170,9 +170,9 @@ class Run:
             numbers["episode/length"] = sum(episodes.lengths) / len(episodes.lengths)
         numbers |= {f"info/{name.removeprefix('info/')}": mean for name, mean in episodes.measures.items()}
         self._write(state.step, numbers | self._times(state.step), episodes)
-        if self._visible and self.env.backend.notice:
-            say(self.env.backend.notice)
-        self.env.backend.notice = None
+        for notice in self.env.backend.notices if self.world.is_first else ():
+            say(notice)
+        self.env.backend.notices = ()
         recent = self._recent_returns
         self._bar.update(state.step, sum(recent) / len(recent) if recent else None, learned=bool(metrics))
 

@@ -44,9 +44,10 @@ def set_seeds(seed: int, deterministic: bool = True) -> None:
 def torch_defaults() -> Iterator[None]:
     """The defaults of torch itself while a verb works, whatever its caller has set; afterwards the caller's again.
 
-    These are float32, the CPU, and gradients on, also inside of `torch.no_grad` and `torch.inference_mode`.
+    These are float32, the CPU, and gradients on, also inside of `torch.no_grad` and `torch.inference_mode`; the number
+    of threads is the caller's until the verb sets it.
     """
-    dtype, device = torch.get_default_dtype(), torch.get_default_device()
+    dtype, device, threads = torch.get_default_dtype(), torch.get_default_device(), torch.get_num_threads()
     torch.set_default_dtype(torch.float32)
     # To name a device costs time at every call of torch, so it is named only where the caller has another one.
     on_cpu = nullcontext() if device.type == "cpu" else torch.device("cpu")
@@ -55,6 +56,8 @@ def torch_defaults() -> Iterator[None]:
             yield
     finally:
         torch.set_default_dtype(dtype)
+        if torch.get_num_threads() != threads:
+            torch.set_num_threads(threads)
 
 
 def seed_globals(seed: int) -> None:

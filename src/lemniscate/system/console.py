@@ -34,7 +34,7 @@ def say(text: object) -> None:
     waits or ends for want of a reader.
     """
     stream = sys.stdout if in_notebook() else sys.stderr
-    with suppress(OSError):
+    with suppress(OSError, ValueError):
         if str(text) and _takes_a_line(stream):
             print(text, file=stream, flush=True)
 

@@ -92,7 +92,9 @@ def _absent(name: str, inside: Any, part: str) -> UserError:
         hint = f": did you mean {known[near[0]]}?"
     else:
         hint = "."
-    return UserError(f"{name} cannot be found: {module_name} has no {qualname}{hint}")
+    file = Path(getattr(inside, "__file__", None) or "")
+    where = f" ({file})" if file.name and not file.is_relative_to(Path.cwd()) else ""
+    return UserError(f"{name} cannot be found: {module_name}{where} has no {qualname}{hint}")
 
 
 def module_of(name: str) -> ModuleType:
