@@ -190,10 +190,9 @@ def test_names_are_read_as_python_writes_several():
 def test_the_home_folder_is_meant_wherever_a_path_is_taken(run, tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.chdir(tmp_path)
-    lem.train("ppo", env="CartPole-v1", run="~/a", progress=False, **tiny_fields("CartPole-v1"))
-    assert (
-        main(["train", "ppo", "--env", "CartPole-v1", "--run=~/b", "--warm-start", "~/a", "--hidden", "16", *TINY]) == 0
-    )
+    assert main(["train", "ppo", "--env", "CartPole-v1", "--run=~/a", *TINY]) == 0
+    small = {"total_steps": 256, "num_envs": 4, "num_steps": 64, "minibatch_size": 64, "progress": False}
+    lem.train("ppo", env="CartPole-v1", run="~/b", warm_start="~/a", **small)
     assert lem.load("~/b").path == tmp_path / "b"
     assert lem.resume("~/b", progress=False).path == tmp_path / "b"
     for command in ("evaluate --episodes 1", "watch --video=~/film.gif", "plot", "check"):

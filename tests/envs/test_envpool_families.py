@@ -119,7 +119,7 @@ def test_no_other_environment_has_several_players():
             {"episodic_life": "x"},
             "episodic_life of EnvPool's Pong-v5 must be of type bool, such as False",
         ),
-        ("EnvPool/Pong-v5", {"seed": 3}, "no option of EnvPool’s Pong-v5 'seed'"),
+        ("EnvPool/Pong-v5", {"seed": 3}, "seed is no argument of an environment"),
         ("CartPole-v1", {"sutton_barto_reward": True}, "are those of the gymnasium backend"),
     ],
 )

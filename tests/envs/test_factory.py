@@ -118,7 +118,7 @@ gym.register("Learns-v0", Reach, additional_wrappers=(NormalizeReward.wrapper_sp
         (hidden, {"backend": "gymnasium-async"}, "NormalizeReward"),
         ("Learns-v0", {}, "NormalizeReward"),
         (lambda num_envs: gym.vector.SyncVectorEnv([hidden] * num_envs), {}, "NormalizeReward"),
-        (lambda num_envs: gym.vector.AsyncVectorEnv([hidden] * num_envs), {}, "a wrapper in its workers"),
+        (lambda num_envs: gym.vector.AsyncVectorEnv([hidden] * num_envs), {}, "AsyncVectorEnv"),
         (lambda num_envs: vector.NormalizeReward(gym.vector.SyncVectorEnv([Reach] * num_envs)), {}, "NormalizeReward"),
     ],
 )

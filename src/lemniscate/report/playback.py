@@ -185,7 +185,7 @@ def _choose_opengl() -> None:
     for name in () if chosen or "mujoco" not in sys.modules else ("egl", "osmesa"):
         with suppress(Exception):  # what is not installed raises errors of several kinds
             context = import_module(f"mujoco.{name}").GLContext
-            import_module("mujoco.rendering.classic.gl_context").GLContext = context
+            vars(import_module("mujoco.rendering.classic.gl_context"))["GLContext"] = context
             os.environ["MUJOCO_GL"] = name
             return
 
