@@ -157,7 +157,7 @@ class OwnNetwork(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """[…, inputs] to […, outputs]."""
         rows = x.reshape(-1, x.shape[-1]) if x.dim() != 2 else x
-        if len(rows) < self.least:
+        if rows.shape[0] < self.least:  # its `len` would fix the number of rows where it is exported
             raise UserError(f"{self.name} needs 2 rows or more at once, so it cannot act on 1; LayerNorm can.")
         out = self.module(rows)
         return out.reshape(*x.shape[:-1], out.shape[-1]) if x.dim() != 2 else out

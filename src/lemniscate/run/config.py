@@ -152,8 +152,7 @@ class RunConfig:
     seed: Seed = 1
     """seed of the run, from which all others are derived"""
     total_steps: Count = 1_000_000
-    """environment steps of the whole run, summed over the parallel environments; it ends with the update that reaches
-    them"""
+    """environment steps of the whole run, of all environments; the update that reaches them is the last"""
     device: str = "cpu"
     """device of the networks, and of simulators that can use it: cpu, cuda, cuda:N (GPU N, from 0) or mps; auto takes
     cuda if there is one"""
@@ -178,8 +177,7 @@ class RunConfig:
     warm_start: str | None = None
     """run, checkpoint or hf://user/name whose networks this run begins with"""
     freeze: tuple[str, ...] = ()
-    """parameters that keep their values, by the beginnings of their names, such as policy.net.0; mostly with
-    warm_start"""
+    """parameters that keep their values, such as policy.net.0"""
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     """arguments of the environment, as JSON: '{"dynamics": "first_principles"}'"""
     reset_options: dict[str, Any] = field(default_factory=dict)

@@ -30,9 +30,9 @@ class OffPolicyConfig(RunConfig):
     update_every: Count = 1
     """steps of each environment between updates"""
     num_updates: Count = 1
-    """gradient steps of the critics at each update; so num_updates / (N · update_every) for each environment step"""
+    """gradient steps of the critics at each update; usually N · update_every"""
     log_every: Count = 500
-    """steps of each environment between lines of metrics; evaluations and checkpoints wait for the next one"""
+    """steps of each environment between lines of metrics, evaluations and checkpoints"""
     actor_learning_rate: Positive = 3e-4
     """step size of the policy's Adam; usually 1e-4 to 1e-3"""
     critic_learning_rate: Positive = 3e-4

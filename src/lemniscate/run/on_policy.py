@@ -21,9 +21,9 @@ class OnPolicyConfig(RunConfig):
     gamma: Fraction = 0.99
     """discount factor γ; usually 0.9 to 0.999"""
     hidden: tuple[Width, ...] = (64, 64)
-    """widths of the policy's hidden layers; usually 1 to 3 of 32 to 256"""
+    """widths of the policy's hidden layers"""
     critic_hidden: tuple[Width, ...] | None = None
-    """widths of the hidden layers of the value, or of Q; usually as wide as the policy's or wider; none: as hidden"""
+    """those of the value, or of Q; usually as wide or wider; none: as hidden"""
     activation: Activation = "tanh"
     """activation function between the layers"""
     network: str = "mlp"
