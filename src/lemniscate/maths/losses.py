@@ -40,7 +40,7 @@ def surrogate(log_ratio: Float[Tensor, " B"], advantage: Float[Tensor, " B"]) ->
 
 
 def clipped_surrogate(
-    log_ratio: Float[Tensor, " B"], advantage: Float[Tensor, " B"], clip: float = 0.2
+    log_ratio: Float[Tensor, " B"], advantage: Float[Tensor, " B"], clip: float | Float[Tensor, ""] = 0.2
 ) -> Float[Tensor, ""]:
     """PPO's clipped surrogate, negated: Schulman et al. 2017, arXiv:1707.06347, eq. 7.
 
@@ -65,7 +65,7 @@ def value_loss(
     value: Float[Tensor, " B"],
     target: Float[Tensor, " B"],
     old_value: Float[Tensor, " B"] | None = None,
-    clip: float | None = None,
+    clip: float | Float[Tensor, ""] | None = None,
 ) -> Float[Tensor, ""]:
     """The critic's loss, L^VF of arXiv:1707.06347, eq. 9, with the conventional half: ½ E[(V − target)²].
 
