@@ -20,7 +20,7 @@ from lemniscate.envs import registry
 from lemniscate.errors import NotStoredError, UserError, is_installed
 from lemniscate.hub.repository import local_path
 from lemniscate.run.config import RunConfig
-from lemniscate.run.directory import is_finished, read_record, require_absent
+from lemniscate.run.directory import extend, is_finished, read_record, require_absent
 from lemniscate.run.environments import envs_of, make_envs
 from lemniscate.run.loggers import LoggerClass
 from lemniscate.run.run import Run
@@ -153,6 +153,7 @@ def begin(algorithm: str, config: RunConfig, run: str | Path | None, options: Ru
 def resume(
     run: str | Path | TrainedRun | TrainedPolicy,
     *,
+    total_steps: float | None = None,
     env: str | Callable[..., Any] | None = None,
     wrappers: Sequence[str | Callable[..., Any]] | None = None,
     network: str | Callable[..., Any] | None = None,
@@ -167,10 +168,13 @@ def resume(
 ) -> TrainedRun:
     """Resume an interrupted run from its newest whole planned checkpoint, and train it to its end.
 
-    A run that is finished stays as it is; with `report` it is evaluated and drawn again.
+    A run that is finished stays as it is; with `report` it is evaluated and drawn again. With `total_steps` it goes on,
+    with its optimizers, normalizer, replay buffer and random generators. What changes over the whole run (schedules, an
+    annealed learning rate) is of the new total from then on.
 
     Args:
         run: its directory, or what `train` returned.
+        total_steps: of the whole run, where they are to be other than they were; above the step where it stands.
         env: only of a run that began with an object that no file holds, such as a lambda: the same object again.
         wrappers: the same; and so `network`.
         track: as in `train`, like `callbacks`, `report` and `progress`; none of them is saved with the run.
@@ -187,12 +191,12 @@ def resume(
         Stopped: Ctrl-C or SIGTERM, when the run has saved itself.
     """
     options = RunOptions(track, callbacks, report, progress, processes, cluster, workers, storage)
-    again = {"env": env, "wrappers": wrappers, "network": network}
+    again = {"total_steps": total_steps, "env": env, "wrappers": wrappers, "network": network}
     return go_on(path_of(run), options, {name: name_in_config(x) for name, x in again.items() if x is not None})
 
 
 def go_on(path: Path, options: RunOptions, changes: Mapping[str, object]) -> TrainedRun:
-    """Go on with the run in a directory; `changes` are fields whose objects were passed again. Raises as `resume`."""
+    """Go on with the run in a directory; `changes` are `total_steps` and objects passed again. Raises as `resume`."""
     there = options.find_cluster()
     with together() as world:
         record = world.from_first(read_record(path) if world.is_first else {})
@@ -201,11 +205,24 @@ def go_on(path: Path, options: RunOptions, changes: Mapping[str, object]) -> Tra
         config = algos.find(algorithm).Config.from_json(fields).replace(**changes)
         world.divide(config.shards)
         loggers, callbacks = options.loggers(), options.functions()
+        if "total_steps" in changes and world.is_first:
+            extend(path, config.total_steps)
+            if options.progress and (names := over_the_run(config)):
+                say(f"Over the new total of {config.total_steps:,} steps from here on: {', '.join(names)}.")
         if world.from_first(world.is_first and is_finished(path)):
             return _leave(path, options, world)
         if there is not None or (options.processes > 1 and world.size == 1):
             return _train_elsewhere(path, algorithm, config, options, there)
         return _train_here(world, path, algorithm, config, loggers, callbacks, options)
+
+
+def over_the_run(config: RunConfig) -> list[str]:
+    """The fields that make others change over the steps of the whole run, with their values."""
+    fields = dict(config.schedules)
+    if getattr(config, "desired_kl", None) is None:
+        annealed = {name: getattr(config, name, 1.0) for name in ("final_learning_rate", "final_critic_learning_rate")}
+        fields |= {name: fraction for name, fraction in annealed.items() if fraction != 1}
+    return [f"{name} {value}" for name, value in fields.items()]
 
 
 def _leave(path: Path, options: RunOptions, world: World) -> TrainedRun:

@@ -64,6 +64,9 @@ def tune(given: argparse.Namespace) -> None:
 def resume(given: argparse.Namespace) -> None:
     """Continue an interrupted run, sweep or search. The runs of the latter two are begun by this command, too."""
     owned = end_with_owner()
+    changes = {} if given.total_steps is None else {"total_steps": number(given.total_steps)}
+    if changes and ((given.run / TUNE).exists() or (given.run / SWEEP).exists()):
+        raise UserError(f"--total-steps is for one run, and {given.run} is a set of them: name one of its runs.")
     if (given.run / TUNE).exists():
         from lemniscate.sweeps.tuner import resume_tuning
 
@@ -73,7 +76,7 @@ def resume(given: argparse.Namespace) -> None:
 
         run = resume_sweep(given.run, **_of_several(given))
     else:
-        run = training.go_on(training.path_of(given.run), _options(given), {})
+        run = training.go_on(training.path_of(given.run), _options(given), changes)
         if given.score:
             _say_score(run)
         if not run.seconds:  # it was finished, which has been said

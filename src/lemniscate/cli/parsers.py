@@ -48,6 +48,7 @@ OPTIONS: list[tuple[str, str, str, Any]] = [
     ("tune", "--seeds LIST", "of each trial [101-103]", "101-103"),
     ("tune", "--[no-]prune", "end a trial after 1/9 or 1/3 of its steps if it is not among the best third [on]", True),
     ("resume", "run RUN", "a run, a sweep or a search", None),
+    ("resume", "--total-steps INT", "go on to so many steps of the whole run [as it was to be]", None),
     ("train resume", "--track LOGGER", "another logger: wandb, or module:Class of your own", None),
     ("train resume", "--callbacks FUNCTION …", "called after each logged line: module:function", None),
     ("train resume", "--processes INT", "processes of this machine for one run [1]", 1),

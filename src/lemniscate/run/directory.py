@@ -1,5 +1,7 @@
 """The run directory: its creation, its config, its lock, and the checkpoints in it."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -26,7 +28,7 @@ from lemniscate.system.files import (
 )
 from lemniscate.system.world import World
 
-CONFIG, LOCK = "config.json", ".lock"
+CONFIG, LOCK, FINAL = "config.json", ".lock", "final.json"
 SWEEP = "sweep.json"
 """the file that the directory of a sweep has in the place of a `config.json`"""
 TUNE = "tune.json"
@@ -83,6 +85,36 @@ def is_finished(path: Path) -> bool:
     _, config = read_config(path)
     steps = checkpoint.list_steps(path / "checkpoints")
     return steps[-1:] >= [config["total_steps"]] and checkpoint.is_whole(path / "checkpoints" / f"step-{steps[-1]}")
+
+
+@contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """The directory of a run or a set of runs, for this process alone. Raises `UserError` if another trains there."""
+    try:
+        with FileLock(path / LOCK, timeout=0):
+            yield
+    except Timeout:
+        raise UserError(f"{path} is being trained by another process.") from None
+
+
+def extend(path: Path, total_steps: int) -> None:
+    """Let a run go on to `total_steps`, which its `config.json` says from here on. Its final scores are not final then.
+
+    Raises `UserError` where the run stands at that step or beyond it, or is being trained by another process.
+    """
+    newest = max(checkpoint.list_steps(path / "checkpoints"), default=0)
+    if total_steps <= newest:
+        raise UserError(
+            f"{path} stands at step {newest:,}; to go on, total_steps must be above that, not {total_steps:,}."
+        )
+    try:
+        with locked(path):
+            record = read_record(path)
+            with parsing(path / CONFIG):
+                write_json(path / CONFIG, {**record, "config": {**record["config"], "total_steps": total_steps}})
+            remove(path / FINAL)
+    except OSError as error:
+        raise UserError(f"{path} cannot be written: {error.strerror or error}.") from error
 
 
 def find_checkpoint(path: Path) -> checkpoint.Checkpoint:
