@@ -157,6 +157,7 @@ def resume(
     env: str | Callable[..., Any] | None = None,
     wrappers: Sequence[str | Callable[..., Any]] | None = None,
     network: str | Callable[..., Any] | None = None,
+    curriculum: str | Callable[..., Any] | None = None,
     track: str | LoggerClass | None = None,
     callbacks: Callback | str | Sequence[Callback | str] = (),
     report: bool = False,
@@ -176,7 +177,7 @@ def resume(
         run: its directory, or what `train` returned.
         total_steps: of the whole run, where they are to be other than they were; above the step where it stands.
         env: only of a run that began with an object that no file holds, such as a lambda: the same object again.
-        wrappers: the same; and so `network`.
+        wrappers: the same; and so `network` and `curriculum`.
         track: as in `train`, like `callbacks`, `report` and `progress`; none of them is saved with the run.
         processes: of this machine; any number that divides the run's `shards`, whatever it began with.
         cluster: as in `train`: go on there, from what its storage has, or else this directory.
@@ -191,7 +192,8 @@ def resume(
         Stopped: Ctrl-C or SIGTERM, when the run has saved itself.
     """
     options = RunOptions(track, callbacks, report, progress, processes, cluster, workers, storage)
-    again = {"total_steps": total_steps, "env": env, "wrappers": wrappers, "network": network}
+    again = {"total_steps": total_steps, "env": env, "wrappers": wrappers}
+    again |= {"network": network, "curriculum": curriculum}
     return go_on(path_of(run), options, {name: name_in_config(x) for name, x in again.items() if x is not None})
 
 
@@ -207,7 +209,7 @@ def go_on(path: Path, options: RunOptions, changes: Mapping[str, object]) -> Tra
         loggers, callbacks = options.loggers(), options.functions()
         if "total_steps" in changes and world.is_first:
             extend(path, config.total_steps)
-            if options.progress and (names := over_the_run(config)):
+            if options.progress and (names := _annealed(config)):
                 say(f"Over the new total of {config.total_steps:,} steps from here on: {', '.join(names)}.")
         if world.from_first(world.is_first and is_finished(path)):
             return _leave(path, options, world)
@@ -216,13 +218,11 @@ def go_on(path: Path, options: RunOptions, changes: Mapping[str, object]) -> Tra
         return _train_here(world, path, algorithm, config, loggers, callbacks, options)
 
 
-def over_the_run(config: RunConfig) -> list[str]:
+def _annealed(config: RunConfig) -> list[str]:
     """The fields that make others change over the steps of the whole run, with their values."""
-    fields = dict(config.schedules)
-    if getattr(config, "desired_kl", None) is None:
-        annealed = {name: getattr(config, name, 1.0) for name in ("final_learning_rate", "final_critic_learning_rate")}
-        fields |= {name: fraction for name, fraction in annealed.items() if fraction != 1}
-    return [f"{name} {value}" for name, value in fields.items()]
+    fractions = ("final_learning_rate", "final_critic_learning_rate") if not getattr(config, "desired_kl", None) else ()
+    fields = {**config.schedules, **{name: getattr(config, name, 1.0) for name in fractions}}
+    return [f"{name} {value}" for name, value in fields.items() if value != 1]
 
 
 def _leave(path: Path, options: RunOptions, world: World) -> TrainedRun:

@@ -90,8 +90,8 @@ def evaluate(given: argparse.Namespace) -> None:
     from lemniscate.api import results
     from lemniscate.report import pages
 
-    own = {"backend": given.backend, "baseline": given.baseline, "video": given.video, "trust": given.trust}
-    scores = results.evaluate(given.run, **_episodes(given), **own)
+    own = {"backend": given.backend, "baseline": given.baseline, "video": given.video}
+    scores = results.evaluate(given.run, **_episodes(given), **own, **_policy(given))
     if given.json:
         print(json.dumps(scores.to_json(), allow_nan=False))
     else:
@@ -104,15 +104,15 @@ def watch(given: argparse.Namespace) -> None:
 
     if not given.run and not (given.random and given.env):
         raise UserError("Watch what? lemniscate watch RUN; before training, lemniscate watch --random --env ID.")
-    own = {"random": given.random, "video": given.video, "trust": given.trust}
-    results.watch(given.run, given.env, deterministic=not given.sample, **_episodes(given), **own)
+    own = {"random": given.random, "video": given.video, "deterministic": not given.sample}
+    results.watch(given.run, given.env, **_episodes(given), **own, **_policy(given))
 
 
 def export(given: argparse.Namespace) -> None:
     """Write a policy as C and ONNX, and say how far these are from it."""
     from lemniscate.exporting.export import export
 
-    say(f"Everything is in {export(given.run, given.to, trust=given.trust)}")
+    say(f"Everything is in {export(given.run, given.to, **_policy(given))}")
 
 
 def preflight(given: argparse.Namespace) -> None:
@@ -205,6 +205,11 @@ def _episodes(given: argparse.Namespace) -> dict[str, Any]:
     """The episodes that are to be played."""
     numbers = {"episodes": number(given.episodes), "seed": number(given.seed)}
     return {**numbers, "env_kwargs": _env_args(given)}
+
+
+def _policy(given: argparse.Namespace) -> dict[str, Any]:
+    """Which policy of a run or an address it is."""
+    return {"checkpoint": given.checkpoint and number(given.checkpoint), "trust": given.trust}
 
 
 def _env_args(given: argparse.Namespace) -> dict[str, Any] | None:

@@ -19,7 +19,7 @@ from lemniscate.types import Schedule
 
 GROUPS: dict[str, tuple[str, ...]] = {
     "run": ("seed", "total_steps", "device", "threads", "shards", "compile", "matmul", "warm_start"),
-    "environment": ("env_kwargs", "wrappers", "backend", "num_envs"),
+    "environment": ("env_kwargs", "wrappers", "curriculum", "backend", "num_envs"),
     "algorithm": (),
     "networks": ("network", "hidden", "critic_hidden", "activation", "initial_log_std", "normalize_observations"),
     "logging and checkpoints": (
@@ -28,6 +28,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
         "keep_checkpoints",
         "evaluate_every",
         "evaluate_episodes",
+        "keep_best",
         "video_every",
         "video_every_episodes",
     ),

@@ -59,6 +59,7 @@ OPTIONS: list[tuple[str, str, str, Any]] = [
     ("train resume", "--report", "evaluate the final policy, draw plots and videos", False),
     ("train resume", "--score", "store the final return over 100 episodes", False),
     ("evaluate watch export", "--trust", "import the code (module:name) that a policy from hf:// names", False),
+    ("evaluate watch export", "--checkpoint NAME", "best (see --keep-best), or a step [the newest]", None),
     ("evaluate export", "run RUN", "a run, a checkpoint or hf://user/name", None),
     ("watch", "run [RUN]", "a run, a checkpoint or hf://user/name", None),
     ("preflight", "run RUN", "a run", None),

@@ -58,7 +58,8 @@ def clipped_surrogate(
         −L^CLIP, a scalar.
     """
     ratio = log_ratio.exp()
-    return -torch.min(ratio * advantage, ratio.clamp(1 - clip, 1 + clip) * advantage).mean()
+    clipped = ratio.clamp(1 - clip, 1 + clip)  # pyright: ignore[reportCallIssue, reportArgumentType]
+    return -torch.min(ratio * advantage, clipped * advantage).mean()
 
 
 def value_loss(
@@ -90,6 +91,7 @@ def value_loss(
     if clip is not None:
         if old_value is None:
             raise ValueError("value_loss with clip needs old_value, the values at collection.")
-        clipped = old_value + (value - old_value).clamp(-clip, clip)
+        moved = (value - old_value).clamp(-clip, clip)  # pyright: ignore[reportCallIssue, reportArgumentType]
+        clipped = old_value + moved
         error = torch.max(error, (clipped - target).square())
     return 0.5 * error.mean()

@@ -181,6 +181,8 @@ class RunConfig:
     """steps between evaluations; 0: none"""
     evaluate_episodes: Episodes = 20
     """episodes of each evaluation in training"""
+    keep_best: bool = False
+    """keep the state after the best of these evaluations, beside the newest, as checkpoints/best"""
     video_every: Natural = 0
     """steps between recordings of an episode into videos/step-N; 0: none"""
     video_every_episodes: Natural = 0
@@ -189,6 +191,9 @@ class RunConfig:
     """run, checkpoint or hf://user/name whose networks this run begins with"""
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     """arguments of the environment, as JSON: '{"dynamics": "first_principles"}'"""
+    curriculum: str | None = None
+    """calls of methods of each training environment as it learns: module:function of (step, metrics) to a dictionary
+    such as {"set_level": 2}, called at step 0 and after each logged line"""
     wrappers: tuple[str, ...] = ()
     """wrappers of each environment, the first innermost: module:name or module:name(key=value)"""
 
@@ -201,6 +206,8 @@ class RunConfig:
                 f"device must be one of auto, cpu, cuda, cuda:N (such as cuda:1), mps, not {self.device!r}."
             )
         self._require_divisible("num_envs")
+        if self.keep_best and not self.evaluate_every:
+            raise UserError("keep_best needs evaluations in training: give evaluate_every, such as 10_000 steps.")
 
     def _require_divisible(self, name: str) -> None:
         """Raise `UserError` if `shards` does not divide the field `name`."""
