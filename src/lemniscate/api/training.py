@@ -68,6 +68,9 @@ def choose_config(
         name = algos.name_of(algorithm)
         chosen, config = presets.choose(name, env, preset)
     config = config.replace(**{name: name_in_config(value) for name, value in fields.items()})
+    for final in (name for name in fields if name.startswith("final_")):
+        if ended := [name for name in config.schedules if name.endswith(final.removeprefix("final_"))]:
+            raise UserError(f"{ended[0]} {config.schedules[ended[0]]} has its own end: {final} does not go with it.")
     if chosen == "default" and env is None:
         raise UserError("Which environment? Name one with env; `lemniscate envs` lists them.")
     if not config.backend:

@@ -163,7 +163,7 @@ class RunConfig:
     """seed of the run, from which all others are derived"""
     total_steps: Count = 1_000_000
     """environment steps of the whole run, summed over the parallel environments; it ends with the update that reaches
-    them"""
+    them; schedules are over these"""
     device: str = "cpu"
     """device of the networks, and of simulators that can use it: cpu, cuda, cuda:N (GPU N, from 0) or mps; auto takes
     cuda if there is one"""
