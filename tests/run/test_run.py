@@ -274,9 +274,7 @@ def test_a_run_that_goes_on_is_interrupted_like_any_other(tmp_path, capsys):
 def test_a_run_goes_on_to_a_step_above_the_one_where_it_stands(tmp_path, capsys):
     path = train(tmp_path / "r", checkpoint_every=64).path
     for steps in (256, 100):
-        with pytest.raises(
-            lem.UserError, match=rf"stands at step 256; .*total_steps must be above that, not {steps}\."
-        ):
+        with pytest.raises(lem.UserError, match=rf"stands at step 256: total_steps must be above that, not {steps}\."):
             lem.resume(path, total_steps=steps)
     with pytest.raises(lem.UserError, match="total_steps must be a whole number"):
         lem.resume(path, total_steps="more")

@@ -15,7 +15,6 @@ from lemniscate.errors import UserError, prefix_errors, unknown_name
 from lemniscate.presets import names
 from lemniscate.run.config import RunConfig
 from lemniscate.run.fields import flag, kinds_of, read, unknown_field
-from lemniscate.types import Schedule
 
 GROUPS: dict[str, tuple[str, ...]] = {
     "run": ("seed", "total_steps", "device", "threads", "shards", "compile", "matmul", "warm_start"),
@@ -104,7 +103,7 @@ def explain(parser: Parser, algorithm: str) -> None:
                 text += f" [{_shown(default)}]"
             action.help, action.metavar = text.replace("%", "%%"), _metavar(hint)
     bracket = "[…] is the default, where neither --preset nor the environment's own preset says otherwise."
-    schedule = "FLOAT>FLOAT in quotes, such as '3e-4>1e-5': from the first to the last, linearly over total_steps."
+    schedule = "Learning rates, clips, entropy_coef, noise_std: also '3e-4>1e-5' in quotes, linear over total_steps."
     parser.epilog = fill(f"presets: {', '.join(names(algorithm))}", 110) + f"\n{schedule}\n{bracket}"
 
 
@@ -140,10 +139,9 @@ def _unknown_flag(word: str, known: list[str]) -> UserError:
 
 
 def _metavar(hint: Any) -> str:
-    """INT, FLOAT, FLOAT[>FLOAT], NAME or JSON; `|none` where nothing is a value too."""
+    """INT, FLOAT, NAME or JSON; `|none` where nothing is a value too."""
+    words = {int: "INT", float: "FLOAT", dict: "JSON", NoneType: "none"}
     kinds = kinds_of(hint).items()
-    number = "FLOAT[>FLOAT]" if Schedule in kinds_of(hint).get(float, ()) else "FLOAT"
-    words = {int: "INT", float: number, dict: "JSON", NoneType: "none"}
     return "|".join(dict.fromkeys(_metavar(of[0]) if kind is tuple else words.get(kind, "NAME") for kind, of in kinds))
 
 

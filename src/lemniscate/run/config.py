@@ -163,7 +163,7 @@ class RunConfig:
     """seed of the run, from which all others are derived"""
     total_steps: Count = 1_000_000
     """environment steps of the whole run, summed over the parallel environments; it ends with the update that reaches
-    them; schedules are over these"""
+    them"""
     device: str = "cpu"
     """device of the networks, and of simulators that can use it: cpu, cuda, cuda:N (GPU N, from 0) or mps; auto takes
     cuda if there is one"""
@@ -182,20 +182,19 @@ class RunConfig:
     evaluate_episodes: Episodes = 20
     """episodes of each evaluation in training"""
     keep_best: bool = False
-    """keep the state after the best of these evaluations, beside the newest, as checkpoints/best"""
+    """keep the best state as checkpoints/best"""
     video_every: Natural = 0
     """steps between recordings of an episode into videos/step-N; 0: none"""
     video_every_episodes: Natural = 0
-    """training episodes between such recordings; 0: none"""
+    """training episodes between these; 0: none"""
     warm_start: str | None = None
     """run, checkpoint or hf://user/name whose networks this run begins with"""
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     """arguments of the environment, as JSON: '{"dynamics": "first_principles"}'"""
     curriculum: str | None = None
-    """calls of methods of each training environment as it learns: module:function of (step, metrics) to a dictionary
-    such as {"set_level": 2}, called at step 0 and after each logged line"""
+    """module:function of (step, metrics) to {method: argument} of the environments"""
     wrappers: tuple[str, ...] = ()
-    """wrappers of each environment, the first innermost: module:name or module:name(key=value)"""
+    """wrappers of each environment, first innermost: module:name or module:name(key=value)"""
 
     def __post_init__(self) -> None:
         hints = _hints_of(type(self))

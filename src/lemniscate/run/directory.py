@@ -101,15 +101,10 @@ def locked(path: Path) -> Iterator[None]:
 
 
 def extend(path: Path, total_steps: int) -> None:
-    """Let a run go on to `total_steps`, which its `config.json` says from here on. Its final scores are not final then.
-
-    Raises `UserError` where the run stands at that step or beyond it, or is being trained by another process.
-    """
+    """Let a run go on to `total_steps`; its final scores are no longer final. Raises `UserError` if it stands there."""
     newest = max(checkpoint.list_steps(path / "checkpoints"), default=0)
     if total_steps <= newest:
-        raise UserError(
-            f"{path} stands at step {newest:,}; to go on, total_steps must be above that, not {total_steps:,}."
-        )
+        raise UserError(f"{path} stands at step {newest:,}: total_steps must be above that, not {total_steps:,}.")
     try:
         with locked(path):
             record = read_record(path)

@@ -33,7 +33,7 @@ def kinds_of(hint: Any) -> dict[Any, tuple[Any, ...]]:
     kinds: dict[Any, tuple[Any, ...]] = {}
     for option in options_of(hint):
         kind, arguments = get_origin(option) or option, get_args(option)
-        kinds |= {arguments[0]: arguments[1:]} if kind is Annotated else {kind: arguments}
+        kinds |= {arguments[0]: ()} if kind is Annotated else {kind: arguments}
     return kinds
 
 

@@ -26,7 +26,7 @@ class OffPolicyConfig(RunConfig):
     batch_size: Count = 256
     """rows of each gradient step, M; usually 64 to 512"""
     learning_starts: Natural = 5_000
-    """environment steps with random actions before the first update; usually 1,000 to 25,000"""
+    """environment steps at random before the first update; usually 1,000 to 25,000"""
     update_every: Count = 1
     """steps of each environment between updates"""
     num_updates: Count = 1

@@ -50,8 +50,6 @@ TRAINING = 0
 S = TypeVar("S", bound=TrainState)
 Observer = Callable[[Sequence[tuple[int, Mapping[str, float]]], TrainState], bool]
 """(step, metrics) of new lines and the state, to whether the run is to stop; it leaves the state as it is"""
-Curriculum = Callable[[int, Mapping[str, float]], Mapping[str, Any]]
-"""a pure function of (step, metrics) of a line to the methods of each environment that are called, with an argument"""
 
 
 class Run:
@@ -298,7 +296,7 @@ class Run:
             say(sentence)
 
     @cached_property
-    def _curriculum(self) -> Curriculum | None:
+    def _curriculum(self) -> Callable[..., Any] | None:
         """The function that the Config names, if it does. Raises `UserError` for one that cannot be found or called."""
         function = named.find_callable(self.config.curriculum) if self.config.curriculum else None
         if function and not named.takes(function, 2):
@@ -356,7 +354,7 @@ class Run:
         self._unobserved.append((step, numbers))
 
 
-def decide(curriculum: Curriculum, step: int, metrics: Mapping[str, float]) -> dict[str, Any]:
+def decide(curriculum: Callable[..., Any], step: int, metrics: Mapping[str, float]) -> dict[str, Any]:
     """The calls that a curriculum returns, as JSON holds them, so that they are the same from a checkpoint.
 
     It does not see the measured times: on them a run would not have the same bits twice. Raises `UserError` for what it
