@@ -172,7 +172,7 @@ class RunConfig:
     shards: Annotated[int, Range(1, 4096)] = 1
     """equal parts of the environments and of minibatches, S, whose work processes share"""
     compile: Literal["auto", "on", "off"] = "auto"
-    """compile the gradient steps and the policy; auto compiles long runs, where it saves time"""
+    """compile the gradient steps and the policy; auto does so in long runs"""
     checkpoint_every: Natural = 0
     """steps between checkpoints, and restarts; 0: a fifth of the run, or 3 episodes"""
     keep_checkpoints: Count = 3
