@@ -203,3 +203,32 @@ class Hanging(Copy):
         if self.steps == 50:
             time.sleep(1000)
         return super().step(action)
+
+
+class Graded(gym.Env):
+    """What is seen is noise, and rewards are higher by a level, which is 0 unless it is set."""
+
+    observation_space, action_space, level = spaces.Box(-1, 1, (2,), np.float32), spaces.Discrete(2), 0.0
+
+    def set_level(self, level):
+        if level < 0:
+            raise ValueError("no such level")
+        self.level = level
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        return self._see(), {}
+
+    def step(self, action):
+        self.t += 1
+        return self._see(), self.level, False, self.t >= 8, {}
+
+    def _see(self):
+        return self.np_random.uniform(-1, 1, 2).astype(np.float32)
+
+
+def harder(step, metrics):
+    """A level that grows with the step, and with what was reached."""
+    assert not any(name.startswith("time/") for name in metrics)
+    return {"set_level": np.float64(1 + step // 32 + min(metrics.get("episode/return", 0.0), 64.0) / 128)}

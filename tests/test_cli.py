@@ -423,7 +423,7 @@ def test_who_names_no_algorithm_gets_the_recommended_one_and_is_told_why(tmp_pat
         (["train", "ppo", "--env", "CartPole-v1", "--gamma", "3"], "gamma must be a number from 0 to 1, not 3."),
         (["train", "ppo", "--env", "CartPole-v1", "--epochs", "1.5"], "epochs must be a whole number from 1 to 10,000, not 1.5."),
         (["train", "ppo", "--env", "CartPole-v1", "--hidden", "8,x"], "hidden must be a whole number from 1 to 1,000,000, not 'x'."),
-        (["train", "ppo", "--env", "CartPole-v1", "--clip-value", "0"], "clip_value must be a number above 0 or None, not 0."),
+        (["train", "ppo", "--env", "CartPole-v1", "--clip-value", "0"], "clip_value must be a number above 0, or a schedule 'FIRST>LAST' of two such numbers or None, not 0."),
         (["train", "ppo", "--env", "CartPole-v1", "--minibatch-size", "1"], "normalize_advantage needs batches of 2"),
         (["train", "ppo", "--env", "CartPole-v1", "--activation", "x"], "activation must be one of tanh, relu, elu, silu, not 'x'"),
         (["train", "ppo", "--env", "CartPole-v1", "--backend", "envpol"], "There is no backend 'envpol'"),

@@ -14,6 +14,15 @@ Flags = tuple[bool, ...]
 """a constant for each gradient step, [K]"""
 
 
+class Schedule(str):
+    """The text "FIRST>LAST" of two numbers: from the first at the beginning of a run to the last at its end."""
+
+    def at(self, progress: float) -> float:
+        """The number at a progress of 0 to 1 of the run, linear in between; at 1 and beyond it is the last."""
+        first, last = map(float, self.split(">"))
+        return first + (last - first) * min(1.0, progress)
+
+
 def wide_float(device: torch.device) -> torch.dtype:
     """The type of sums over a whole run: float64; float32 on mps, which has no float64.
 

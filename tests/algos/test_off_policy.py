@@ -178,6 +178,35 @@ def test_learning_rates_fall_linearly_over_the_run(algo):
             assert furthest == pytest.approx(rate * (1 - 0.8 * step / 1000), rel=1e-4)  # Adam's first step is α
 
 
+@EACH
+def test_a_learning_rate_follows_its_schedule(algo):
+    rates = {"actor_learning_rate": "0.02>0.01", "critic_learning_rate": "0.1>0"}
+    config = small_off_policy(algo, total_steps=1000, policy_delay=1, **rates)
+    state, _ = begin_off_policy(algo, config)
+    state.step = 250
+    parts = [(0.075, state.networks.critics), (0.0175, state.networks.policy)]
+    before = [copy_of(part.parameters()) for _, part in parts]
+    algo.update(config, state)
+    for (rate, part), was in zip(parts, before, strict=True):
+        furthest = max((p - q).abs().max().item() for p, q in zip(part.parameters(), was, strict=True))
+        assert furthest == pytest.approx(rate, rel=1e-4)
+
+
+@pytest.mark.parametrize("algo", [ddpg, td3])
+def test_action_noise_follows_its_schedule(algo, tmp_path, monkeypatch):
+    given = []
+    interact = algo.interact
+
+    def record(*args, noise_std, **rest):
+        given.append(noise_std)
+        return interact(*args, noise_std=noise_std, **rest)
+
+    monkeypatch.setattr(algo, "interact", record)
+    fields = tiny_off_policy(noise_std="0.4>0.2", total_steps=64, learning_starts=8, num_envs=2)
+    lem.train(algo.__name__.rpartition(".")[2], "Pendulum-v1", run=tmp_path / "r", progress=False, **fields)
+    assert given == pytest.approx([0.4 - 0.2 * step / 64 for step in range(0, 64, 2)])
+
+
 def filled(algo, config):
     """A state for five numbers in and two out, with a replay buffer of noise; always the same."""
     torch.manual_seed(0)

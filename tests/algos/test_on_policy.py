@@ -145,6 +145,28 @@ def test_learning_rates_fall_to_zero_where_the_settings_say_so(algo):
 
 
 @EACH
+def test_a_schedule_is_linear_in_steps_from_its_first_number_to_its_last(algo):
+    """At each step of the run an update is that of the number there, for all fields that may have a schedule."""
+    ends = {"critic_learning_rate": (0.1, 0.02)} if algo in (trpo, reinforce) else {}
+    ends |= {"learning_rate": (0.1, 0.02)} if algo is not trpo else {}
+    ends |= {"entropy_coef": (0.5, 0.1)} if algo in (ppo, a2c, reinforce) else {}
+    ends |= {"clip": (0.2, 0.01), "clip_value": (0.2, 0.01)} if algo is ppo else {}
+    free = {"desired_kl": None} if algo is ppo else {}
+    config, _, rollout = one_rollout(algo, **{name: f"{a}>{b}" for name, (a, b) in ends.items()}, **free)
+    final = "final_critic_learning_rate" if algo is trpo else "final_learning_rate"
+    for step in (0, config.total_steps // 4, config.total_steps):
+        numbers = {name: a + (b - a) * step / config.total_steps for name, (a, b) in ends.items()}
+        moved = []
+        for settings in (config, config.replace(**numbers, **{final: 1.0})):
+            state, _ = begin(algo, settings)
+            state.step = step
+            algo.update(settings, state, rollout)
+            moved.append(state.networks.parameters())
+        for p, q in zip(*moved, strict=True):
+            torch.testing.assert_close(p, q)
+
+
+@EACH
 def test_a_single_row_has_no_standard_deviation(algo):
     with pytest.raises(UserError, match=r"(standardize|normalize_advantage) needs batches of 2 rows"):
         small(

@@ -12,6 +12,7 @@ from lemniscate.algos import ppo
 from lemniscate.maths import means, standardize
 from lemniscate.optim.adam import Adam
 from lemniscate.optim.compiled import Compiled, Compiler, Learner
+from lemniscate.run.state import TrainState
 
 
 @dataclass
@@ -61,6 +62,28 @@ def programs_are_not_mixed_up():
         obs = torch.randn(size, 5, dtype=torch.float64)
         noise = torch.zeros(size, 2, dtype=torch.float64)
         torch.testing.assert_close(act(obs, noise), one.networks.policy.act(obs, noise))
+
+
+def schedules_act():
+    """One program, compiled at the beginning of a run, at three of its steps: the number is that of the step."""
+    compiled = CompiledCalls()
+    config, one = new_state(clip="0.2>0.001", clip_value="0.3>0.001", entropy_coef="0.5>0", total_steps=1000)
+    _, two = new_state()
+    learner = Learner(ppo.learn, [two.optimizer], Compiler())
+    batch, minibatches = numbers(), torch.arange(24).view(3, 8)
+    given = batch, minibatches, standardize(batch.advantage[minibatches])
+    for step in (0, 500, 1000):
+        one.step = step
+        now = TrainState.apply_schedules(one, config)
+        a, b = (means(learn(now, state, *given)) for learn, state in ((ppo.learn, one), (learner, two)))
+        torch.testing.assert_close(a["clip_fraction"], b["clip_fraction"])
+        for p, q in zip(one.networks.parameters(), two.networks.parameters(), strict=True):
+            torch.testing.assert_close(p, q)
+    assert compiled.calls == [3]
+
+
+def test_a_schedule_acts_in_a_compiled_step():
+    require_in_own_process(__name__, "schedules_act()")
 
 
 @pytest.mark.parametrize("compiler", COMPILERS)

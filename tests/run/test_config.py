@@ -1,5 +1,6 @@
 """What a Config takes, what it makes of it, and what it says of the rest."""
 
+import json
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -7,9 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from lemniscate.algos import ppo
+from lemniscate.algos import ALGORITHMS, find, ppo
+from lemniscate.api.training import config_for
 from lemniscate.errors import UserError
 from lemniscate.run.config import RunConfig
+from lemniscate.types import Schedule
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,12 +71,51 @@ def test_numbers_of_every_kind_become_pythons(name, value, kept):
         ("activation", "x", "activation must be one of tanh, relu, elu, silu, not 'x'."),
         ("normalize_advantage", "no", "normalize_advantage must be True or False, not 'no'."),
         ("env", 3, "env must be a text, not 3."),
+        (
+            "clip",
+            "x>0.2",
+            "clip must be a number above 0, or a schedule 'FIRST>LAST' of two such numbers, not 'x>0.2'.",
+        ),
+        (
+            "entropy_coef",
+            "0.01>-1",
+            "entropy_coef must be a number at least 0, or a schedule 'FIRST>LAST' of two such numbers, not '0.01>-1'.",
+        ),
+        ("gamma", "0.9>0.99", "gamma must be a number from 0 to 1, not '0.9>0.99'."),
+        ("keep_best", True, "keep_best needs evaluations in training: give evaluate_every, such as 10_000 steps."),
+        (
+            "learning_rate",
+            "3e-4>0",
+            "learning_rate 0.0003>0.0 is a schedule, which desired_kl does not follow: desired_kl must be none.",
+        ),
     ],
 )
 def test_a_value_that_does_not_fit_is_told_with_what_would(name, value, said):
     with pytest.raises(UserError) as caught:
         ppo.Config(**{name: value})
     assert str(caught.value) == said
+
+
+@pytest.mark.parametrize("text", ["0.01>0", " 1e-2 > 0.0", Schedule("0.01>0")])
+def test_a_schedule_is_a_text_that_survives_json(text):
+    config = ppo.Config(entropy_coef=text, clip_value="0.2>0.1")
+    assert config.schedules == {"entropy_coef": "0.01>0.0", "clip_value": "0.2>0.1"}
+    assert [config.entropy_coef.at(progress) for progress in (0, 0.25, 1, 1.5)] == [0.01, 0.0075, 0, 0]
+    again = ppo.Config.from_json(json.loads(json.dumps(config.to_json())))
+    assert again == config
+    assert again.schedules == config.schedules
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_every_learning_rate_may_have_a_schedule_with_an_end_of_its_own(algorithm):
+    config = find(algorithm).Config()
+    rates = [name for name in config.names() if name.endswith("learning_rate") and not name.startswith("final")]
+    free = {"desired_kl": None} if algorithm == "ppo" else {}
+    assert rates
+    assert config.replace(**dict.fromkeys(rates, "1e-3>0"), **free).schedules.keys() == set(rates)
+    final = next(name for name in config.names() if name.startswith("final"))
+    with pytest.raises(UserError, match=rf"0.001>0.0 has its own end: {final} does not go with it"):
+        config_for(algorithm, "Pendulum-v1", **dict.fromkeys(rates, "1e-3>0"), **free, **{final: 0.5})
 
 
 @pytest.mark.parametrize(

@@ -15,24 +15,43 @@ import numpy as np
 import pytest
 import torch
 
+import environments
 import lemniscate as lem
 import toy
 from conftest import tiny_fields, tiny_off_policy
 from forks import command
 from helpers import long
+from lemniscate.api.callbacks import StopAt
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.run import checkpoint
+from lemniscate.run.directory import Saver
 from lemniscate.run.evaluate import EVALUATION
 from lemniscate.run.metrics import read_metrics
 from lemniscate.run.run import TRAINING
 from lemniscate.run.seeding import derive
 from lemniscate.system.files import read_json, write_json
 
+
+class GradedVector(toy.Countdown):
+    """Rewards are higher by a level, and zero at first."""
+
+    level = 0.0
+
+    def __init__(self, num_envs):
+        super().__init__(num_envs, mode="DISABLED")
+
+    def set_level(self, level):
+        self.level = level
+
+    def _reward(self, actions):
+        return self.level * np.ones(self.num_envs)
+
+
 OFF_POLICY = {
     # name: algorithm and fields; in Pendulum-v1, whose episodes are longer than the distance of checkpoints
     "ddpg": {"action_noise": "ou", "policy_delay": 2, "normalize_observations": True},
     "ddpg-pink": {"action_noise": "coloured", "update_every": 2, "num_updates": 3, "network": "simba"},
-    "td3": {"network": "layer_norm"},
+    "td3": {"network": "layer_norm", "noise_std": "0.3>0.1", "actor_learning_rate": "1e-3>0"},
     "sac": {"action_noise": "coloured"},
     "sac-bins": {"value_range": 5.0, "num_envs": 4},
 }
@@ -42,7 +61,7 @@ ON_POLICY = {
     # name: algorithm and fields; in CartPole-v1, REPPO in Pendulum-v1
     "reinforce": {"scale_rewards": True, "critic_minibatch_size": 32},
     "reinforce-episodes": {"episodes": 1, "baseline": "mean", "returns": "episode"},
-    "a2c": {"gae_lambda": 0.9},
+    "a2c": {"gae_lambda": 0.9, "entropy_coef": "0.1>0"},
     "trpo": {"final_critic_learning_rate": 0.1, "critic_minibatch_size": 32},
     "reppo": {"epochs": 2, "minibatch_size": 16},
 }
@@ -212,6 +231,143 @@ def test_a_run_resumed_from_any_checkpoint_ends_in_the_same_bits(tmp_path, env):
         lem.resume(path, progress=False)
         assert final_hashes(path) == final_hashes(tmp_path / "whole")
         assert history(path) == history(tmp_path / "whole")
+
+
+LONG_MEMORY = {"buffer_size": 1000, "final_learning_rate": 1.0}
+
+
+@pytest.mark.parametrize("env", ["CartPole-v1", "sac", "ddpg"])
+def test_a_run_that_goes_on_beyond_its_end_is_the_longer_run(tmp_path, env):
+    """Nothing here is annealed: so it makes no difference when the longer total was asked for. The buffer grows."""
+    fields = {"checkpoint_every": 64, "keep_checkpoints": 20, **({} if env == "CartPole-v1" else LONG_MEMORY)}
+    train(tmp_path / "whole", env, total_steps=512, **fields)
+    path = train(tmp_path / "r", env, **fields).path
+    (path / "final.json").write_text("{}")
+    assert lem.resume(path, total_steps=512, progress=False).policy.step == 512
+    assert not (path / "final.json").exists()
+    assert final_hashes(path) == final_hashes(tmp_path / "whole")
+    assert history(path) == history(tmp_path / "whole")
+
+
+def test_a_run_that_goes_on_is_interrupted_like_any_other(tmp_path, capsys):
+    """With annealing, and checkpoints by the length of the run: the first part keeps its own."""
+    path = train(tmp_path / "r", desired_kl=None, clip="0.2>0.1", keep_checkpoints=20).path
+    first = checkpoint.list_steps(path / "checkpoints")
+    whole = shutil.copytree(path, tmp_path / "whole")
+    lem.resume(whole, total_steps=544)
+    said = "Over the new total of 544 steps from here on: clip 0.2>0.1, final_learning_rate 0.0."
+    assert said in capsys.readouterr().err
+    later = checkpoint.list_steps(whole / "checkpoints")
+    assert later == [*first, 352, 448, 544]  # a fifth of the new total, in whole updates
+    lines = {line["step"]: line["learning_rate"] for line in history(whole)}
+    assert lines[256] == pytest.approx(3e-4 * (1 - 224 / 256))
+    assert lines[288] == pytest.approx(3e-4 * (1 - 256 / 544))
+    for back in (1, 2, 3):  # the last time, before a checkpoint beyond the first part
+        interrupted = shutil.copytree(whole, tmp_path / f"back{back}")
+        for step in later[-back:]:
+            shutil.rmtree(interrupted / "checkpoints" / f"step-{step}")
+        lem.resume(interrupted, progress=False)
+        assert final_hashes(interrupted) == final_hashes(whole)
+        assert history(interrupted) == history(whole)
+
+
+def test_a_run_goes_on_to_a_step_above_the_one_where_it_stands(tmp_path, capsys):
+    path = train(tmp_path / "r", checkpoint_every=64).path
+    for steps in (256, 100):
+        with pytest.raises(lem.UserError, match=rf"stands at step 256: total_steps must be above that, not {steps}\."):
+            lem.resume(path, total_steps=steps)
+    with pytest.raises(lem.UserError, match="total_steps must be a whole number"):
+        lem.resume(path, total_steps="more")
+    assert read_json(path / "config.json")["config"]["total_steps"] == 256
+    shutil.rmtree(path / "checkpoints" / "step-256")
+    assert lem.resume(path, total_steps=224.0, progress=False).policy.step == 224  # an unfinished one may end earlier
+    from filelock import FileLock
+
+    with FileLock(path / ".lock"), pytest.raises(lem.UserError, match="being trained by another process"):
+        lem.resume(path, total_steps=512)
+
+
+def test_the_best_checkpoint_is_kept_and_the_final_one_stays_the_policy_of_the_run(tmp_path, monkeypatch):
+    scores = {32: 1.0, 64: 5.0, 96: 2.0, 128: 4.0, 160: 7.0, 192: 3.0, 224: 7.0, 256: 6.0, 288: 1.0}
+    save = Saver.save_if_best
+    monkeypatch.setattr(
+        Saver, "save_if_best", lambda self, state, _, logged: save(self, state, scores[state.step], logged)
+    )
+    every = {"evaluate_every": 32, "checkpoint_every": 96, "keep_checkpoints": 1}
+    fields = {**tiny_fields("CartPole-v1", keep_best=True, **every), "env": "CartPole-v1", "progress": False}
+    whole = lem.train("ppo", run=tmp_path / "whole", **fields).path
+    assert [lem.load(whole, checkpoint=which).step for which in ("best", 256, None)] == [160, 256, 256]
+    assert lem.load(whole / "checkpoints" / "best").step == 160
+    assert lem.load(lem.load(whole), checkpoint="best").step == 160
+    with pytest.raises(lem.UserError, match="has no checkpoint 96; those at steps: 256; best is kept with keep_best"):
+        lem.load(whole, checkpoint=96)
+    with pytest.raises(lem.UserError, match="checkpoint must be a whole number at least 0 or one of best, not 'bst'"):
+        lem.load(whole, checkpoint="bst")
+    assert any("Whole checkpoints: 160, 256; it is finished." in finding.sentence for finding in lem.check(whole))
+    names = ("manifest.json", "state.json", "tensors.safetensors")
+    expected = [(whole / "checkpoints" / "best" / name).read_bytes() for name in names]
+    for stop in (128, 160, 224):  # before it; at it, beyond the checkpoint that is resumed; and after it
+        path = tmp_path / str(stop)
+        lem.train("ppo", run=path, callbacks=[StopAt(stop)], **fields)
+        lem.resume(path, progress=False)
+        assert [(path / "checkpoints" / "best" / name).read_bytes() for name in names] == expected
+    tensors = whole / "checkpoints" / "best" / "tensors.safetensors"
+    tensors.write_bytes(tensors.read_bytes()[:-1])
+    with pytest.raises(lem.UserError, match=r"best/tensors\.safetensors is damaged"):
+        lem.load(whole, checkpoint="best")
+    assert lem.resume(whole, total_steps=288, progress=False).policy.step == 288
+
+
+LEVELS = {
+    # environment and backend: each environment, each in a process of its own, a vector that is one by itself
+    "each": (environments.Graded, "gymnasium"),
+    "processes": (environments.Graded, "gymnasium-async"),
+    "vector": (GradedVector, "gymnasium"),
+}
+
+
+@pytest.mark.parametrize("kind", ["each", "vector", *long("processes")])
+def test_a_curriculum_is_the_same_after_a_resume_and_is_for_training_alone(tmp_path, kind):
+    env, backend = LEVELS[kind]
+    own = {"env": env, "backend": backend, "curriculum": environments.harder, "progress": False}
+    fields = tiny_fields("CartPole-v1", checkpoint_every=64, keep_checkpoints=10, evaluate_every=64, shards=2)
+    whole = lem.train("ppo", run=tmp_path / "whole", **{**fields, **own}).path
+    lines = history(whole)
+    returns = [line["episode/return"] for line in lines if "episode/return" in line]
+    assert returns[0] < returns[-1]
+    assert all(line["evaluation/return"] == 0 for line in lines if "evaluation/return" in line)
+    calls = [read_json(file)["record"]["calls"] for file in (whole / "checkpoints").glob("*/state.json")]
+    assert len({call["set_level"] for call in calls}) == len(calls)
+    for back in (1, 3, 4):
+        path = shutil.copytree(whole, tmp_path / f"back{back}")
+        for step in checkpoint.list_steps(path / "checkpoints")[-back:]:
+            shutil.rmtree(path / "checkpoints" / f"step-{step}")
+        lem.resume(path, progress=False)
+        assert final_hashes(path) == final_hashes(whole)
+        assert history(path) == lines
+
+
+@pytest.mark.parametrize(
+    ("curriculum", "backend", "said"),
+    [
+        (lambda step, metrics: 3, "gymnasium", "must return a dictionary of methods .* at step 0 it returned 3"),
+        (lambda step, metrics: None, "gymnasium", "must return a dictionary of methods .* at step 0 it returned None"),
+        (lambda step, metrics: {"set_level": object()}, "gymnasium", "that JSON can hold"),
+        (lambda step, metrics: {"set_level": -1}, "gymnasium", r"Graded.set_level\(-1\), which .* ValueError: no such"),
+        (lambda step, metrics: {"set_levl": 1}, "gymnasium", "There is no method Graded.set_levl"),
+        (lambda step, metrics: {"set_levl": 1}, "gymnasium-async", "There is no method Graded.set_levl"),
+        (lambda step, metrics: metrics["x"], "gymnasium", "The curriculum raised KeyError at step 0: 'x'"),
+        (lambda step: {}, "gymnasium", r"A curriculum must be a function of \(step, metrics\), not a function"),
+        ("environments:nothing", "gymnasium", "environments has no nothing"),
+        (lambda step, metrics: {}, "envpool", "EnvpoolBackend calls no methods of its environments"),
+    ],
+)
+def test_a_curriculum_that_cannot_be_followed_is_told_before_a_run_begins(tmp_path, curriculum, backend, said):
+    env = "CartPole-v1" if backend == "envpool" else environments.Graded
+    given = {**tiny_fields("CartPole-v1", num_envs=2), "env": env, "backend": backend, "curriculum": curriculum}
+    with pytest.raises(lem.UserError, match=said):
+        lem.train("ppo", run=tmp_path / "r", progress=False, **given)
+    assert not (tmp_path / "r").exists()
 
 
 def test_a_damaged_checkpoint_is_named_and_the_one_before_is_taken(tmp_path, capsys):

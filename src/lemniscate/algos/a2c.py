@@ -15,7 +15,7 @@ from lemniscate.maths import explained_variance, gae, means, policy_gradient, st
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.optim.adam import Adam, linear
-from lemniscate.run.config import Count, Epsilon, Fraction, LogStd, NonNegative, Positive
+from lemniscate.run.config import Count, Epsilon, Fraction, LogStd, NonNegative, Positive, Scheduled
 from lemniscate.run.on_policy import OnPolicyConfig, OnPolicyState
 from lemniscate.run.run import Run
 from lemniscate.spec import Spec
@@ -30,7 +30,7 @@ class Config(OnPolicyConfig):
     """steps of each environment between updates, T; usually 5 to 32"""
     initial_log_std: LogStd = -1.0
     """initial log σ of a Gaussian policy, in units of half the action range; usually -1 to 0"""
-    learning_rate: Positive = 1e-3
+    learning_rate: Scheduled[Positive] = 1e-3
     """Adam's initial step size; usually 3e-4 to 3e-3"""
     final_learning_rate: Fraction = 0.0
     """final learning rate as a fraction of the initial one, annealed linearly; 1: constant"""
@@ -42,7 +42,7 @@ class Config(OnPolicyConfig):
     """standardize advantages within each batch"""
     value_coef: NonNegative = 0.5
     """weight of the value loss; usually 0.25 to 1"""
-    entropy_coef: NonNegative = 0.0
+    entropy_coef: Scheduled[NonNegative] = 0.0
     """weight β of the entropy bonus; usually 0 to 0.01"""
     max_grad_norm: Positive | None = 0.5
     """gradient clipping by global norm, usually 0.5 to 1; none: no clipping"""
@@ -114,6 +114,7 @@ def update(config: Config, state: State, rollout: Rollout) -> dict[str, Tensor |
     networks = state.networks
     rate = linear(config.learning_rate, config.final_learning_rate, state.step / config.total_steps)
     state.optimizer.learning_rate = rate
+    config = state.apply_schedules(config) if config.schedules else config
     if config.scale_rewards:
         rollout = state.reward_scale.scale(rollout)
     batch = advantages(config, networks, rollout)

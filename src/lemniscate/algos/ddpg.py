@@ -16,7 +16,7 @@ from lemniscate.nn.actor_q import ActorQ
 from lemniscate.nn.bounded import Critics
 from lemniscate.nn.policies import Policy
 from lemniscate.optim.adam import Adam, linear
-from lemniscate.run.config import NonNegative
+from lemniscate.run.config import NonNegative, Scheduled
 from lemniscate.run.off_policy import OffPolicyConfig, OffPolicyState
 from lemniscate.run.run import Run
 from lemniscate.spec import Spec
@@ -27,7 +27,7 @@ from lemniscate.types import Flags, Loss, Metrics, Transition
 class Config(OffPolicyConfig):
     """The settings of DDPG."""
 
-    noise_std: NonNegative = 0.1
+    noise_std: Scheduled[NonNegative] = 0.1
     """standard deviation of the action noise, in units of half the action range; usually 0.1 to 0.3"""
 
     def networks(self, spec: Spec) -> ActorQ:
@@ -107,7 +107,8 @@ def train(config: Config, run: Run) -> State:
         for _ in run.steps(config.log_every):
             policy, rng = state.networks.policy, state.rng.action
             random = state.step < config.learning_starts
-            interact(env, policy, state.replay, state.action_noise, rng, noise_std=config.noise_std, random=random)
+            noise_std = linear(config.noise_std, 1.0, state.step / config.total_steps)
+            interact(env, policy, state.replay, state.action_noise, rng, noise_std=noise_std, random=random)
             state.step += config.num_envs
             due = state.step % (config.num_envs * config.update_every) == 0
             if due and state.step > config.learning_starts:

@@ -24,7 +24,7 @@ from lemniscate.maths import (
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.optim.adam import Adam, adapt_to_kl, linear
-from lemniscate.run.config import Count, Epsilon, Fraction, NonNegative, Positive, Range, Repeats
+from lemniscate.run.config import Count, Epsilon, Fraction, NonNegative, Positive, Range, Repeats, Scheduled
 from lemniscate.run.on_policy import OnPolicyConfig, OnPolicyState
 from lemniscate.run.run import Run
 from lemniscate.spec import Spec
@@ -39,7 +39,7 @@ class Config(OnPolicyConfig):
     """passes over each rollout; usually 3 to 15"""
     minibatch_size: Count = 256
     """rows of each gradient step, M; at most N · T, usually 64 to 1024"""
-    learning_rate: Positive = 3e-4
+    learning_rate: Scheduled[Positive] = 3e-4
     """Adam's initial step size; usually 1e-4 to 1e-3"""
     final_learning_rate: Fraction = 0.0
     """final learning rate as a fraction of the initial one, annealed linearly; not used with desired_kl"""
@@ -51,13 +51,13 @@ class Config(OnPolicyConfig):
     """Adam's decay of squared gradients; usually 0.99 to 0.999"""
     gae_lambda: Fraction = 0.95
     """trace decay λ of the advantage estimate, usually 0.9 to 1; 0 is one-step TD, 1 Monte Carlo"""
-    clip: Positive = 0.2
+    clip: Scheduled[Positive] = 0.2
     """clip range ε of the probability ratio; usually 0.1 to 0.3"""
-    clip_value: Positive | None = None
+    clip_value: Scheduled[Positive] | None = None
     """clip range of the value around its old prediction; none: no clipping"""
     value_coef: NonNegative = 1.0
     """weight c₁ of the value loss; usually 0.25 to 1"""
-    entropy_coef: NonNegative = 0.0
+    entropy_coef: Scheduled[NonNegative] = 0.0
     """weight c₂ of the entropy bonus; usually 0 to 0.01"""
     normalize_advantage: bool = True
     """standardize advantages within each minibatch"""
@@ -72,6 +72,7 @@ class Config(OnPolicyConfig):
         super().__post_init__()
         self._require_minibatch("minibatch_size")
         self._require_rows("normalize_advantage", self.minibatch_size)
+        self._require_constant("learning_rate", adapted_by="desired_kl")
 
     @property
     def gradient_steps(self) -> int:
@@ -94,7 +95,7 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
     return State(
         networks=networks,
         optimizer=Adam(networks, betas=betas, eps=config.adam_eps, max_grad_norm=config.max_grad_norm),
-        learning_rate=config.learning_rate,
+        learning_rate=linear(config.learning_rate, 1.0, progress=0.0),
         reward_scale=RewardScale(config.num_envs, config.gamma).to(device),
         rng=config.generators(device),
         learn=learn,
@@ -138,17 +139,17 @@ def learn(config: Config, state: State, batch: Batch, minibatches: Tensor, advan
 
 def update(config: Config, state: State, rollout: Rollout) -> dict[str, Tensor | float]:
     """Some epochs of minibatch steps on one rollout (algorithm 1); returns the means of the metrics."""
-    networks = state.networks
     if config.desired_kl is None:
         state.learning_rate = linear(config.learning_rate, config.final_learning_rate, state.step / config.total_steps)
+    config = state.apply_schedules(config) if config.schedules else config
     if config.scale_rewards:
         rollout = state.reward_scale.scale(rollout)
-    batch = collected = advantages(config, networks, rollout)
+    batch = collected = advantages(config, state.networks, rollout)
     valid_rows = rollout.valid_rows
     metrics: list[Metrics] = []
     for epoch in range(config.epochs):
         if config.recompute_advantages and epoch > 0:
-            batch = replace(advantages(config, networks, rollout), log_prob=collected.log_prob)
+            batch = replace(advantages(config, state.networks, rollout), log_prob=collected.log_prob)
         minibatches = epoch_minibatches(valid_rows, rollout.num_rows, config.minibatch_size, state.rng.minibatch)
         advantage = batch.advantage[minibatches]
         if config.normalize_advantage:
@@ -160,11 +161,11 @@ def update(config: Config, state: State, rollout: Rollout) -> dict[str, Tensor |
             state.learning_rate = adapt_to_kl(state.learning_rate, kl, config.desired_kl)
         if config.target_kl is not None and kl > config.target_kl:
             break
-    networks.policy.observe(rollout.obs, rollout.valid)  # last: old and new probabilities share a normalizer
+    state.networks.policy.observe(rollout.obs, rollout.valid)  # last: old and new probabilities share a normalizer
     state.step += config.num_steps * config.num_envs
     return {
         **means(metrics),
-        **networks.policy.metrics(),
+        **state.networks.policy.metrics(),
         "learning_rate": state.learning_rate,
         "explained_variance": explained_variance(collected.value[valid_rows], collected.target[valid_rows]),
     }

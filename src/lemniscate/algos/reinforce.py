@@ -28,7 +28,7 @@ from lemniscate.nn.actor_critic import ActorCritic, Value
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.nn.policies import Policy
 from lemniscate.optim.adam import Adam, linear
-from lemniscate.run.config import Count, Fraction, LogStd, NonNegative, NumEnvs, Positive, Range, Repeats
+from lemniscate.run.config import Count, Fraction, LogStd, NonNegative, NumEnvs, Positive, Range, Repeats, Scheduled
 from lemniscate.run.on_policy import OnPolicyConfig, OnPolicyState
 from lemniscate.run.run import Run
 from lemniscate.spec import Spec
@@ -55,17 +55,17 @@ class Config(OnPolicyConfig):
     """baseline subtracted from the return: none, the mean of the batch, or a learned V(s)"""
     standardize: bool = True
     """standardize the weights within each batch; subtracting their mean is a baseline, too"""
-    learning_rate: Positive = 3e-3
+    learning_rate: Scheduled[Positive] = 3e-3
     """initial step size of the policy's Adam; usually 1e-3 to 1e-2"""
     final_learning_rate: Fraction = 0.0
     """final learning rate as a fraction of the initial one, annealed linearly; 1: constant"""
-    entropy_coef: NonNegative = 0.0
+    entropy_coef: Scheduled[NonNegative] = 0.0
     """weight of the entropy bonus; usually 0 to 0.01"""
     critic_epochs: Repeats = 10
     """passes of the value over each batch; usually 5 to 80"""
     critic_minibatch_size: Count = 128
     """rows of each gradient step of the value; usually 64 to 512"""
-    critic_learning_rate: Positive = 1e-3
+    critic_learning_rate: Scheduled[Positive] = 1e-3
     """step size of the value's Adam; usually 3e-4 to 3e-3"""
 
     def __post_init__(self) -> None:
@@ -147,11 +147,11 @@ def learn(config: Config, state: State, batch: Batch, minibatches: Tensor, *, up
 def update(config: Config, state: State, rollout: Rollout) -> dict[str, Tensor | float]:
     """One step of the policy on one rollout, some epochs of the baseline; returns the metrics."""
     rate = linear(config.learning_rate, config.final_learning_rate, state.step / config.total_steps)
+    config = state.apply_schedules(config) if config.schedules else config
     state.optimizer.learning_rate, state.critic_optimizer.learning_rate = rate, config.critic_learning_rate
     if config.scale_rewards:
         rollout = state.reward_scale.scale(rollout)
-    batch = weights(config, state.networks, rollout)
-    valid_rows = rollout.valid_rows
+    batch, valid_rows = weights(config, state.networks, rollout), rollout.valid_rows
     size = len(valid_rows) if config.episodes else rollout.num_rows
     learned = batch[one_minibatch(valid_rows, size)[0]]
     if config.standardize:

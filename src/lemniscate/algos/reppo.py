@@ -19,7 +19,7 @@ from lemniscate.nn.networks import Activation
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.nn.policies import Policy
 from lemniscate.optim.adam import Adam, linear
-from lemniscate.run.config import Count, Finite, Fraction, NumEnvs, Positive, Repeats, SquashedLogStd, Width
+from lemniscate.run.config import Count, Finite, Fraction, NumEnvs, Positive, Repeats, Scheduled, SquashedLogStd, Width
 from lemniscate.run.on_policy import OnPolicyConfig, OnPolicyState
 from lemniscate.run.run import Run
 from lemniscate.spec import Spec
@@ -40,7 +40,7 @@ class Config(OnPolicyConfig):
     """passes over each rollout; usually 4 to 8"""
     minibatch_size: Count = 256
     """rows of each gradient step, M; at most N · T, usually 256 to 2048"""
-    learning_rate: Positive = 1e-3
+    learning_rate: Scheduled[Positive] = 1e-3
     """Adam's initial step size, of all networks; usually 3e-4 to 1e-3"""
     final_learning_rate: Fraction = 0.1
     """final learning rate as a fraction of the initial one, annealed linearly; 1: constant"""

@@ -17,7 +17,7 @@ from lemniscate.nn.actor_critic import ActorCritic, Value
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.optim.adam import Adam, linear
 from lemniscate.optim.vector import PolicyVector
-from lemniscate.run.config import Count, Fraction, NonNegative, Positive, Range, Repeats
+from lemniscate.run.config import Count, Fraction, NonNegative, Positive, Range, Repeats, Scheduled
 from lemniscate.run.on_policy import OnPolicyConfig, OnPolicyState
 from lemniscate.run.run import Run
 from lemniscate.spec import Spec
@@ -50,7 +50,7 @@ class Config(OnPolicyConfig):
     """passes of the value over each rollout; usually 5 to 80"""
     critic_minibatch_size: Count = 128
     """rows of each gradient step of the value; usually 64 to 512"""
-    critic_learning_rate: Positive = 1e-3
+    critic_learning_rate: Scheduled[Positive] = 1e-3
     """initial step size of the value's Adam; usually 3e-4 to 3e-3"""
     final_critic_learning_rate: Fraction = 1.0
     """final value of it as a fraction of the initial one, annealed linearly; 1: constant"""

@@ -98,7 +98,7 @@ class RunOptions:
 
 def require_importable(config: RunConfig) -> None:
     """Raise `UserError` for an object that a Config names and that another process could not import."""
-    _require_importable(config.env, *config.wrappers, getattr(config, "network", ""))
+    _require_importable(config.env, *config.wrappers, getattr(config, "network", ""), config.curriculum or "")
 
 
 def _require_importable(*names: Any) -> None:

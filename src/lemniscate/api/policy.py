@@ -203,25 +203,26 @@ def path_of(run: object) -> Path:
 
 
 @torch_defaults()
-def load(run: Trained, *, trust: bool = False) -> TrainedPolicy:
+def load(run: Trained, *, checkpoint: str | int | None = None, trust: bool = False) -> TrainedPolicy:
     """The policy of a run (its newest whole checkpoint), of one checkpoint or on the Hub. No file is executed.
 
-    What `train` returned has its policy already, and a policy is returned as it is.
+    What `train` returned has its policy already, and a policy is returned as it is, unless a `checkpoint` is named.
 
     Args:
         run: its directory or a checkpoint's; `hf://user/name` or `hf://user/name@revision`, which is downloaded; what
             `train` returned; a policy.
+        checkpoint: of a run, "best" (see `keep_best`) or the step of one that is kept.
         trust: import the code that a downloaded policy names as `module:name`.
 
     Raises:
-        UserError: neither a run nor a checkpoint, or a run without a whole checkpoint; a damaged checkpoint; networks
+        UserError: neither a run nor a checkpoint, or a run without a whole one or that one; a damaged one; networks
             of the user's own that have other parameters now; an address without a policy, a Hub that refuses or cannot
             be reached; a downloaded policy that names code of its own, without `trust`.
     """
-    if isinstance(run, TrainedRun | TrainedPolicy):
+    if checkpoint is None and isinstance(run, TrainedRun | TrainedPolicy):
         return run.policy if isinstance(run, TrainedRun) else run
-    if not hub.is_address(run):
-        return _read(find_checkpoint(path_of(run)), path_of(run))
+    if checkpoint is not None or isinstance(run, TrainedRun | TrainedPolicy) or not hub.is_address(run):
+        return _read(find_checkpoint(path_of(run), checkpoint), path_of(run))
     address = hub.read_address(run)
     path = hub.download(address)
     with prefix_errors(str(address)):

@@ -16,7 +16,7 @@ from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError, shown
 from lemniscate.report import flight, pages, playback
 from lemniscate.run import check as run_check
-from lemniscate.run import checkpoint
+from lemniscate.run.checkpoint import list_steps
 from lemniscate.run.config import Episodes, Natural, RunConfig, checked
 from lemniscate.run.environments import env_arguments, evaluation_env
 from lemniscate.run.evaluate import Evaluation, critic_of
@@ -45,6 +45,7 @@ def evaluate(
     env_kwargs: Mapping[str, Any] | None = None,
     baseline: bool = False,
     video: str | Path | None = None,
+    checkpoint: str | int | None = None,
     trust: bool = False,
 ) -> Evaluation:
     """Play whole episodes from starts drawn with `seed`, none of which training ever saw.
@@ -64,14 +65,15 @@ def evaluate(
             rendered environment, without a measurement of the Q bias. The first 16 starts are the same; from the 17th
             on, and in other backends than gymnasium, returns may differ from those without a film. Of flights in a
             scene, which are those without a film, the first of each parallel environment is recorded.
-        trust: as in `load`.
+        checkpoint: as in `load`, like `trust`.
+        trust: import code that a downloaded policy names.
 
     Raises:
         UserError: numbers out of range; an environment that cannot be made, or whose spaces differ; one without a
             baseline, if it is asked for; an episode that does not end in an environment without a time limit; with
             `video`, an environment that renders no pictures, or another kind of file.
     """
-    agent = policy if callable(policy) else load(policy, trust=trust)
+    agent = policy if callable(policy) else load(policy, checkpoint=checkpoint, trust=trust)
     episodes, seed, file = checked("episodes", episodes, Episodes), checked("seed", seed, Natural), _film(video)
     kwargs = checked("env_kwargs", env_kwargs, dict | None)
     how: dict[str, Any] = {"episodes": episodes, "seed": seed, "tell": lambda text: None}
@@ -100,6 +102,7 @@ def watch(
     random: bool = False,
     video: str | Path | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
+    checkpoint: str | int | None = None,
     trust: bool = False,
 ) -> Evaluation:
     """Show episodes: below the cell in a notebook, in a window elsewhere, or recorded into a film.
@@ -115,14 +118,15 @@ def watch(
         random: act uniformly at random, in the environment of the policy.
         video: a .gif, .webp or .mp4 to record all episodes into.
         env_kwargs: as in `evaluate`.
-        trust: as in `load`.
+        checkpoint: as in `load`, like `trust`.
+        trust: import code that a downloaded policy names.
 
     Raises:
         UserError: nothing to show it on; numbers out of range; an environment that cannot be made, renders no pictures,
             or whose spaces differ; an episode that does not end; more flights than parallel environments; another kind
             of file.
     """
-    agent = policy if policy is None or callable(policy) else load(policy, trust=trust)
+    agent = policy if policy is None or callable(policy) else load(policy, checkpoint=checkpoint, trust=trust)
     episodes, seed, file = checked("episodes", episodes, Episodes), checked("seed", seed, Natural), _film(video)
     if agent is None and env is None:
         raise UserError("Watch what? Name a run, or an environment to act in at random.")
@@ -205,7 +209,7 @@ def final_scores(run: str | Path | TrainedRun) -> dict[str, Any]:
     path = path_of(run)
     file = path / "final.json"
     known = _known_scores(file)
-    if known.get("step") not in checkpoint.list_steps(path / "checkpoints")[-1:]:
+    if known.get("step") not in list_steps(path / "checkpoints")[-1:]:
         say(f"Evaluating {path}: {FINAL_EPISODES} episodes.")
         known = scores_of(load(run))
         write_json(file, known)

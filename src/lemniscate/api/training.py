@@ -20,7 +20,7 @@ from lemniscate.envs import registry
 from lemniscate.errors import NotStoredError, UserError, is_installed
 from lemniscate.hub.repository import local_path
 from lemniscate.run.config import RunConfig
-from lemniscate.run.directory import is_finished, read_record, require_absent
+from lemniscate.run.directory import extend, is_finished, read_record, require_absent
 from lemniscate.run.environments import envs_of, make_envs
 from lemniscate.run.loggers import LoggerClass
 from lemniscate.run.run import Run
@@ -68,6 +68,9 @@ def choose_config(
         name = algos.name_of(algorithm)
         chosen, config = presets.choose(name, env, preset)
     config = config.replace(**{name: name_in_config(value) for name, value in fields.items()})
+    for final in (name for name in fields if name.startswith("final_")):
+        if ended := [name for name in config.schedules if name.endswith(final.removeprefix("final_"))]:
+            raise UserError(f"{ended[0]} {config.schedules[ended[0]]} has its own end: {final} does not go with it.")
     if chosen == "default" and env is None:
         raise UserError("Which environment? Name one with env; `lemniscate envs` lists them.")
     if not config.backend:
@@ -154,9 +157,11 @@ def begin(algorithm: str, config: RunConfig, run: str | Path | None, options: Ru
 def resume(
     run: str | Path | TrainedRun | TrainedPolicy,
     *,
+    total_steps: float | None = None,
     env: str | Callable[..., Any] | None = None,
     wrappers: Sequence[str | Callable[..., Any]] | None = None,
     network: str | Callable[..., Any] | None = None,
+    curriculum: str | Callable[..., Any] | None = None,
     track: str | LoggerClass | None = None,
     callbacks: Callback | str | Sequence[Callback | str] = (),
     report: bool = False,
@@ -168,12 +173,15 @@ def resume(
 ) -> TrainedRun:
     """Resume an interrupted run from its newest whole planned checkpoint, and train it to its end.
 
-    A run that is finished stays as it is; with `report` it is evaluated and drawn again.
+    A run that is finished stays as it is; with `report` it is evaluated and drawn again. With `total_steps` it goes on,
+    with its optimizers, normalizer, replay buffer and random generators. What changes over the whole run (schedules, an
+    annealed learning rate) is of the new total from then on.
 
     Args:
         run: its directory, or what `train` returned.
+        total_steps: of the whole run, where they are to be other than they were; above the step where it stands.
         env: only of a run that began with an object that no file holds, such as a lambda: the same object again.
-        wrappers: the same; and so `network`.
+        wrappers: the same; and so `network` and `curriculum`.
         track: as in `train`, like `callbacks`, `report` and `progress`; none of them is saved with the run.
         processes: of this machine; any number that divides the run's `shards`, whatever it began with.
         cluster: as in `train`: go on there, from what its storage has, or else this directory.
@@ -188,13 +196,14 @@ def resume(
         Stopped: Ctrl-C or SIGTERM, when the run has saved itself.
     """
     options = RunOptions(track, callbacks, report, progress, processes, cluster, workers, storage)
-    again = {"env": env, "wrappers": wrappers, "network": network}
+    again = {"total_steps": total_steps, "env": env, "wrappers": wrappers}
+    again |= {"network": network, "curriculum": curriculum}
     return go_on(path_of(run), options, {name: name_in_config(x) for name, x in again.items() if x is not None})
 
 
 @torch_defaults()
 def go_on(path: Path, options: RunOptions, changes: Mapping[str, object]) -> TrainedRun:
-    """Go on with the run in a directory; `changes` are fields whose objects were passed again. Raises as `resume`."""
+    """Go on with the run in a directory; `changes` are `total_steps` and objects passed again. Raises as `resume`."""
     there = options.find_cluster()
     with together() as world:
         record = world.from_first(read_record(path) if world.is_first else {})
@@ -203,11 +212,22 @@ def go_on(path: Path, options: RunOptions, changes: Mapping[str, object]) -> Tra
         config = algos.find(algorithm).Config.from_json(fields).replace(**changes)
         world.divide(config.shards)
         loggers, callbacks = options.loggers(), options.functions()
+        if "total_steps" in changes and world.is_first:
+            extend(path, config.total_steps)
+            if options.progress and (names := _annealed(config)):
+                say(f"Over the new total of {config.total_steps:,} steps from here on: {', '.join(names)}.")
         if world.from_first(world.is_first and is_finished(path)):
             return _leave(path, options, world)
         if there is not None or (options.processes > 1 and world.size == 1):
             return _train_elsewhere(path, algorithm, config, options, there)
         return _train_here(world, path, algorithm, config, loggers, callbacks, options)
+
+
+def _annealed(config: RunConfig) -> list[str]:
+    """The fields that make others change over the steps of the whole run, with their values."""
+    fractions = ("final_learning_rate", "final_critic_learning_rate") if not getattr(config, "desired_kl", None) else ()
+    fields = {**config.schedules, **{name: getattr(config, name, 1.0) for name in fractions}}
+    return [f"{name} {value}" for name, value in fields.items() if value != 1]
 
 
 def _leave(path: Path, options: RunOptions, world: World) -> TrainedRun:

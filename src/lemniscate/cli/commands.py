@@ -65,6 +65,9 @@ def tune(given: argparse.Namespace) -> None:
 def resume(given: argparse.Namespace) -> None:
     """Continue an interrupted run, sweep or search. The runs of the latter two are begun by this command, too."""
     owned = end_with_owner()
+    changes = {} if given.total_steps is None else {"total_steps": number(given.total_steps)}
+    if changes and ((given.run / TUNE).exists() or (given.run / SWEEP).exists()):
+        raise UserError(f"--total-steps is for one run, and {given.run} is a set of them: name one of its runs.")
     if (given.run / TUNE).exists():
         from lemniscate.sweeps.tuner import resume_tuning
 
@@ -74,7 +77,7 @@ def resume(given: argparse.Namespace) -> None:
 
         run = resume_sweep(given.run, **_of_several(given))
     else:
-        run = training.go_on(training.path_of(given.run), _options(given), {})
+        run = training.go_on(training.path_of(given.run), _options(given), changes)
         if given.score:
             _say_score(run)
         if not run.seconds:  # it was finished, which has been said
@@ -88,8 +91,9 @@ def evaluate(given: argparse.Namespace) -> None:
     from lemniscate.api import results
     from lemniscate.report import pages
 
-    own = {"backend": given.backend, "baseline": given.baseline, "video": given.video, "trust": given.trust}
-    scores = results.evaluate(given.run, deterministic=not given.stochastic, **_episodes(given), **own)
+    own = {"backend": given.backend, "baseline": given.baseline, "video": given.video}
+    own["deterministic"] = not given.stochastic
+    scores = results.evaluate(given.run, **_episodes(given), **own, **_policy(given))
     if given.json:
         print(json.dumps(scores.to_json(), allow_nan=False))
     else:
@@ -102,15 +106,15 @@ def watch(given: argparse.Namespace) -> None:
 
     if not given.run and not (given.random and given.env):
         raise UserError("Watch what? lemniscate watch RUN; before training, lemniscate watch --random --env ID.")
-    own = {"random": given.random, "video": given.video, "trust": given.trust}
-    results.watch(given.run, given.env, deterministic=not (given.stochastic or given.sample), **_episodes(given), **own)
+    own = {"random": given.random, "video": given.video, "deterministic": not (given.stochastic or given.sample)}
+    results.watch(given.run, given.env, **_episodes(given), **own, **_policy(given))
 
 
 def export(given: argparse.Namespace) -> None:
     """Write a policy as C and ONNX, and say how far these are from it."""
     from lemniscate.exporting.export import export
 
-    say(f"Everything is in {export(given.run, given.to, trust=given.trust)}")
+    say(f"Everything is in {export(given.run, given.to, **_policy(given))}")
 
 
 def preflight(given: argparse.Namespace) -> None:
@@ -231,6 +235,11 @@ def _episodes(given: argparse.Namespace) -> dict[str, Any]:
     """The episodes that are to be played."""
     numbers = {"episodes": number(given.episodes), "seed": number(given.seed)}
     return {**numbers, "env_kwargs": _env_args(given)}
+
+
+def _policy(given: argparse.Namespace) -> dict[str, Any]:
+    """Which policy of a run or an address it is."""
+    return {"checkpoint": given.checkpoint and number(given.checkpoint), "trust": given.trust}
 
 
 def _env_args(given: argparse.Namespace) -> dict[str, Any] | None:

@@ -18,7 +18,7 @@ from lemniscate.run.fields import flag, kinds_of, read, unknown_field
 
 GROUPS: dict[str, tuple[str, ...]] = {
     "run": ("seed", "total_steps", "device", "threads", "shards", "compile", "matmul", "warm_start", "freeze"),
-    "environment": ("env_kwargs", "wrappers", "backend", "num_envs"),
+    "environment": ("env_kwargs", "reset_options", "wrappers", "curriculum", "backend", "num_envs"),
     "algorithm": (),
     "networks": ("network", "hidden", "critic_hidden", "activation", "initial_log_std", "normalize_observations"),
     "logging and checkpoints": (
@@ -27,6 +27,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
         "keep_checkpoints",
         "evaluate_every",
         "evaluate_episodes",
+        "keep_best",
         "video_every",
         "video_every_episodes",
     ),
@@ -102,7 +103,8 @@ def explain(parser: Parser, algorithm: str) -> None:
                 text += f" [{_shown(default)}]"
             action.help, action.metavar = text.replace("%", "%%"), _metavar(hint)
     bracket = "[…] is the default, where neither --preset nor the environment's own preset says otherwise."
-    parser.epilog = fill(f"presets: {', '.join(names(algorithm))}", 110) + f"\n{bracket}"
+    schedule = "Learning rates, clips, entropy_coef, noise_std: also '3e-4>1e-5' in quotes, linear over total_steps."
+    parser.epilog = fill(f"presets: {', '.join(names(algorithm))}", 110) + f"\n{schedule}\n{bracket}"
 
 
 def field_help(config: type[RunConfig]) -> dict[str, str]:

@@ -28,6 +28,7 @@ from lemniscate.run.metrics import progress_of
 from lemniscate.run.stopping import Stopped, stop_signals_to
 from lemniscate.system import named, processes
 from lemniscate.system.console import ProgressBar
+from lemniscate.system.files import write_json
 from lemniscate.system.processes import Processes
 from lemniscate.system.world import CLUSTER, World
 
@@ -174,6 +175,7 @@ def _work(given: dict[str, Any]) -> str | None:
             if checkpoint is not None:  # the job's storage has it
                 with checkpoint.as_directory() as stored:
                     copytree(stored, path)
+                write_json(path / CONFIG, given["record"])  # which may ask for more steps than there
             elif given["begun"]:
                 unpack(given["begun"], path)
             else:

@@ -12,6 +12,7 @@ from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
 from lemniscate.envs.probe import Probe
+from lemniscate.errors import UserError
 from lemniscate.maths import Distribution
 from lemniscate.spec import Spec
 from lemniscate.types import Step
@@ -193,6 +194,14 @@ class Backend(ABC):
     def close(self) -> None:
         """Give back processes and windows."""
 
+    def call(self, calls: Mapping[str, Any]) -> None:
+        """Call methods of every environment, each with its argument: now, and again whenever they are built again.
+
+        Raises `UserError` for a method that is not there or raises, and where a backend calls none.
+        """
+        cannot = f"{type(self).__name__} calls no methods of its environments, so there can be no curriculum"
+        raise UserError(f"{cannot}; --backend gymnasium does, where it serves {self.spec.env_id}.")
+
     @classmethod
     def ids(cls) -> Collection[str]:
         """The ids that it serves where no backend is named, for lists; may import heavy packages."""
@@ -273,6 +282,11 @@ class Joined(Backend):
         names = dict.fromkeys(name for step in steps for name in step.measures)
         measures = {name: torch.cat([step.measures.get(name, missing) for step in steps]) for name in names}
         return Step(**joined, measures=measures)
+
+    def call(self, calls: Mapping[str, Any]) -> None:
+        """Call methods of all of them; see `Backend.call`."""
+        for backend in self._backends:
+            backend.call(calls)
 
     def close(self) -> None:
         """Close them all."""

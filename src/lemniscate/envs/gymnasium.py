@@ -7,7 +7,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch
-from gymnasium.vector import AutoresetMode
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from torch import Tensor
 
 from lemniscate.envs import spaces
@@ -15,6 +15,7 @@ from lemniscate.envs.backend import Backend
 from lemniscate.envs.conversion import Returns, flatten_observation, measured, measures_of, physical_action, row_of
 from lemniscate.envs.factory import is_own, make_one, make_vector, maker_of, makes_vector, sentences
 from lemniscate.envs.vec_env import Stagger
+from lemniscate.envs.workers import WatchedVectorEnv, call_method
 from lemniscate.errors import UserError
 from lemniscate.spec import Discrete, MultiDiscrete, Spec
 from lemniscate.system.named import find_callable
@@ -104,6 +105,7 @@ class GymnasiumBackend(Backend):
         if self._used:
             action = spaces.masked(action, *self._reset(0))
         self._stagger_up_to = limit if stagger and self.mode is AutoresetMode.DISABLED and not self.once else None
+        self._calls: dict[str, Any] = {}
         self._measures = measures_of(self._envs.metadata or {})
         self.spec = Spec(env, parts, action, max_episode_steps=limit)
         self.notices = spaces.notices(self.spec)
@@ -117,6 +119,7 @@ class GymnasiumBackend(Backend):
         if (self._used and not self.once) or self._envs.closed:
             self._envs.close()
             self._envs, _ = self._build()
+            self.call(dict(self._calls))
         self._used = True
         self._resetting, self._valid = np.zeros(self.num_envs, dtype=bool), np.ones(self.num_envs, dtype=bool)
         self._stagger = Stagger(self.num_envs, self._stagger_up_to, seed, first)
@@ -152,6 +155,16 @@ class GymnasiumBackend(Backend):
         rewards, *flags = map(self._tensor, (reward.astype(np.float32), terminated, truncated, valid))
         measures = measured(info, self._measures, self.num_envs, self.device) if info else {}
         return Step(here, there, rewards, *flags, measures=measures)
+
+    def call(self, calls: Mapping[str, Any]) -> None:
+        """Call methods of each environment or of its wrappers; of what is a vector environment by itself, its own."""
+        self._calls |= calls
+        for name, argument in calls.items():
+            if isinstance(self._envs, WatchedVectorEnv):
+                self._envs.call_method(name, argument)
+            else:
+                for env in self._envs.envs if isinstance(self._envs, SyncVectorEnv) else [self._envs]:
+                    call_method(env, name, argument)
 
     def close(self) -> None:
         """Close the environments and their workers."""

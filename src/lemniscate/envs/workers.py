@@ -8,11 +8,12 @@ import time
 import traceback
 from collections.abc import Callable, Iterable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-from gymnasium.vector import AsyncVectorEnv
+from gymnasium.vector import AsyncVectorEnv, VectorEnv
 from gymnasium.vector.async_vector_env import AsyncState
 
 from lemniscate.errors import UserError, WorkerError
@@ -74,6 +75,26 @@ class Worker(gym.Wrapper):
         """The environment's. Raises `RaisedInWorkerError` for whatever it raises."""
         return _told(self.env.step, action)
 
+    def call_method(self, name: str, argument: Any) -> str | None:
+        """As `call_method`; returns the sentence of the `UserError` instead of raising it."""
+        try:
+            call_method(self.env, name, argument)
+        except UserError as error:
+            return str(error)
+
+
+def call_method(env: gym.Env | VectorEnv, name: str, argument: Any) -> None:
+    """Call a method of an environment or of one of its wrappers. Raises `UserError` if it is not there, or raises."""
+    what = f"{type(env.unwrapped).__name__}.{name}"
+    try:
+        method = env.get_wrapper_attr(name) if isinstance(env, gym.Env) else getattr(env, name)
+    except AttributeError:
+        raise UserError(f"There is no method {what}, which the curriculum calls.") from None
+    try:
+        method(argument)
+    except Exception as error:
+        raise UserError(f"{what}({argument!r}), which the curriculum calls, raised {_words_of(error)}.") from error
+
 
 def _told(call: Callable[..., Any], *args: Any, **options: Any) -> Any:
     try:
@@ -106,6 +127,12 @@ class WatchedVectorEnv(AsyncVectorEnv):
     def step(self, actions: Any) -> Any:
         """Gymnasium's, with the timeout. Raises `WorkerError` if a worker died or does not answer."""
         return self._watched(lambda: self.step_async(actions), self.step_wait)
+
+    def call_method(self, name: str, argument: Any) -> None:
+        """Call a method of each environment. Raises `UserError` as `call_method`, and `WorkerError` as `step`."""
+        ask = partial(self.call_async, "call_method", name, argument)
+        if sentences := [said for said in self._watched(ask, self.call_wait) if said]:
+            raise UserError(sentences[0])
 
     def _check_spaces(self) -> None:
         """Gymnasium's, which waits without end; so every worker has to answer once before."""

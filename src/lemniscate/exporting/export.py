@@ -40,7 +40,9 @@ LICENCE = (
 
 
 @torch_defaults()
-def export(run: Trained, to: str | Path | None = None, *, trust: bool = False) -> Path:
+def export(
+    run: Trained, to: str | Path | None = None, *, checkpoint: str | int | None = None, trust: bool = False
+) -> Path:
     """Write a policy as ONNX and as C99 for microcontrollers, from the raw observation to the action for `env.step`.
 
     These are `policy.onnx`, `policy.c` and `policy.h`; `manifest.json` says what every number means. The exported C
@@ -51,7 +53,8 @@ def export(run: Trained, to: str | Path | None = None, *, trust: bool = False) -
     Args:
         run: as in `load`.
         to: the new directory; by default `export` in that of the run. An export that is there is replaced.
-        trust: as in `load`.
+        checkpoint: as in `load`, like `trust`.
+        trust: import code that a downloaded policy names.
 
     Returns:
         The directory.
@@ -60,7 +63,7 @@ def export(run: Trained, to: str | Path | None = None, *, trust: bool = False) -
         UserError: a policy that looks at images; a network that cannot be translated; an environment that cannot be
             made; a directory that is no export, or that cannot be written. Nothing is left half-written.
     """
-    policy = load(run, trust=trust)
+    policy = load(run, checkpoint=checkpoint, trust=trust)
     folder = _destination(run, policy, to)
     if policy.spec.has_images:
         raise UserError(f"A policy for {policy.spec.env_id} looks at images; what can be exported looks at vectors.")

@@ -1,5 +1,7 @@
 """Losses: scalars to descend."""
 
+from typing import Any
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -40,7 +42,7 @@ def surrogate(log_ratio: Float[Tensor, " B"], advantage: Float[Tensor, " B"]) ->
 
 
 def clipped_surrogate(
-    log_ratio: Float[Tensor, " B"], advantage: Float[Tensor, " B"], clip: float = 0.2
+    log_ratio: Float[Tensor, " B"], advantage: Float[Tensor, " B"], clip: Any = 0.2
 ) -> Float[Tensor, ""]:
     """PPO's clipped surrogate, negated: Schulman et al. 2017, arXiv:1707.06347, eq. 7.
 
@@ -52,7 +54,7 @@ def clipped_surrogate(
     Args:
         log_ratio: log π(a|s) − log π_old(a|s).
         advantage: A, no gradient.
-        clip: ε > 0.
+        clip: ε > 0, a number or a scalar tensor.
 
     Returns:
         −L^CLIP, a scalar.
@@ -65,7 +67,7 @@ def value_loss(
     value: Float[Tensor, " B"],
     target: Float[Tensor, " B"],
     old_value: Float[Tensor, " B"] | None = None,
-    clip: float | None = None,
+    clip: Any = None,
 ) -> Float[Tensor, ""]:
     """The critic's loss, L^VF of arXiv:1707.06347, eq. 9, with the conventional half: ½ E[(V − target)²].
 
@@ -78,7 +80,7 @@ def value_loss(
         value: V(s) now.
         target: what it should be, no gradient.
         old_value: V(s) at collection; needed with `clip`.
-        clip: ε > 0, or None for the plain loss.
+        clip: ε > 0, a number or a scalar tensor; None for the plain loss.
 
     Returns:
         A scalar.

@@ -58,12 +58,12 @@ def kl_k3(log_ratio: Tensor) -> Tensor:
     return (log_ratio.exp() - 1 - log_ratio).mean()
 
 
-def clip_fraction(log_ratio: Tensor, clip: float) -> Tensor:
+def clip_fraction(log_ratio: Tensor, clip: float | Tensor) -> Tensor:
     """The share of ratios outside [1−ε, 1+ε]."""
     return ((log_ratio.exp() - 1).abs() > clip).float().mean()
 
 
-def ratio_statistics(log_ratio: Tensor, clip: float) -> dict[str, Tensor]:
+def ratio_statistics(log_ratio: Tensor, clip: float | Tensor) -> dict[str, Tensor]:
     """The distance that a policy has moved: the two KL estimates and the clip fraction, by their usual names."""
     return {
         "approx_kl": kl_k3(log_ratio),

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.func import functional_call, grad_and_value
 
 from lemniscate.optim.vector import ParameterVector
-from lemniscate.types import Loss, Metrics, wide_float
+from lemniscate.types import Loss, Metrics, Schedule, wide_float
 
 LossFunction = Callable[..., Loss]
 """loss(networks, *args)"""
@@ -153,7 +153,9 @@ class Adam:
 
 
 def linear(start: float, final_fraction: float, progress: float) -> float:
-    """From `start` at progress 0 to `final_fraction` of it at progress 1, and no further."""
+    """From `start` at progress 0 to `final_fraction` of it at progress 1, and no further; a `Schedule` says both."""
+    if isinstance(start, Schedule):
+        return start.at(progress)
     return start * (1 - (1 - final_fraction) * min(1.0, progress))
 
 

@@ -8,12 +8,10 @@ from filelock import FileLock, Timeout
 from lemniscate.envs.check import BAD, GOOD, NOTE, Finding
 from lemniscate.errors import UserError, resume_line
 from lemniscate.run import checkpoint
-from lemniscate.run.directory import CONFIG, LOCK, SWEEP
+from lemniscate.run.directory import BEST, CONFIG, FINAL, LOCK, SWEEP
 from lemniscate.run.metrics import METRICS, damage, read_metrics
 from lemniscate.run.places import is_sweep, read_sweep
 from lemniscate.system.files import DamagedFileError, is_whole, parsing, read_json
-
-FINAL = "final.json"
 
 
 def is_stored(path: Path) -> bool:
@@ -76,12 +74,14 @@ def _of_run(path: Path) -> Iterator[Finding]:
 def _checkpoints(path: Path) -> tuple[list[checkpoint.Checkpoint], list[Finding]]:
     """The checkpoints that are whole, the oldest first, and what is wrong with the others."""
     whole, broken = [], []
-    for step in checkpoint.list_steps(path / "checkpoints"):
+    folders = [path / "checkpoints" / f"step-{step}" for step in checkpoint.list_steps(path / "checkpoints")]
+    for folder in [*folders, path / "checkpoints" / BEST]:
         try:
-            whole.append(checkpoint.read(path / "checkpoints" / f"step-{step}"))
+            if folder.is_dir():
+                whole.append(checkpoint.read(folder))
         except UserError as error:
             broken.append(Finding(BAD, str(error)))
-    return whole, broken
+    return sorted(whole, key=lambda found: found.numbers["step"]), broken
 
 
 def _config(path: Path, whole: list[checkpoint.Checkpoint]) -> Finding:
@@ -106,7 +106,10 @@ def _going_on(path: Path, whole: list[checkpoint.Checkpoint]) -> Finding:
     try:
         with parsing(planned[-1].path):
             steps = ", ".join(f"{found.numbers['step']:,}" for found in whole)
-            last, total = planned[-1].numbers["step"], planned[-1].record["config"]["total_steps"]
+            record = (
+                read_json(path / CONFIG) if is_whole(path / CONFIG) else planned[-1].record
+            )  # a run may be extended
+            last, total = planned[-1].numbers["step"], record["config"]["total_steps"]
             what = "it is finished" if last >= total else f"resume goes on from step {last:,}"
     except DamagedFileError as error:
         return Finding(BAD, str(error))

@@ -6,24 +6,28 @@ import math
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, cached_property
 from itertools import islice
 from pathlib import PurePath
 from types import NoneType
-from typing import Annotated, Any, Literal, Self, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, Self, TypeVar, get_args, get_origin, get_type_hints
 
 import torch
 
 from lemniscate.envs.registry import MOST_ENVS
 from lemniscate.errors import UserError, shown, unknown_name
-from lemniscate.run.fields import options_of, unknown_field
+from lemniscate.run.fields import number, options_of, unknown_field
 from lemniscate.run.seeding import Generators
 from lemniscate.spec import Spec
+from lemniscate.types import Schedule
 
 MOST_WHOLE, MOST_REAL = 10**15, 1e38
 """the largest numbers of a field: float64, and so JSON, counts exactly to 9e15; the float32 of networks ends at 3e38"""
 MOST_ITEMS = 1_000
 """the most values of a field that has several"""
+
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -55,6 +59,7 @@ Fraction = Annotated[float, Range(0, 1)]
 Positive = Annotated[float, Range(0, above=True)]
 NonNegative = Annotated[float, Range(0)]
 Finite = Annotated[float, Range()]
+Scheduled = Annotated[T, Schedule]  # Scheduled[Positive]: such a number, or the text "FIRST>LAST" of two
 Epsilon = Annotated[float, Range(1e-30, 1)]  # a smaller one is a zero in float32
 LogStd = Annotated[float, Range(-10, 5)]
 SquashedLogStd = Annotated[float, Range(-4.9, 1.9)]  # of a `SquashedGaussianPolicy`
@@ -93,8 +98,9 @@ def _convert(value: Any, option: Any) -> Any:
     """`value` as an `option` that is no union. Raises `ValueError` with what would be right."""
     kind = get_origin(option) or option
     if kind is Annotated or kind in (int, float):
-        number, *limits = get_args(option) if kind is Annotated else (kind,)
-        return _number(value, number, *(limit for limit in limits if isinstance(limit, Range)))
+        basic, *marks = get_args(option) if kind is Annotated else (kind,)
+        read = _number_or_schedule if Schedule in marks else _number
+        return read(value, basic, *(mark for mark in marks if isinstance(mark, Range)))
     if kind is NoneType:
         raise ValueError("None")
     if kind is Literal and value not in get_args(option):
@@ -134,6 +140,19 @@ def _number(value: Any, kind: type, limits: Range = Range()) -> int | float:
     raise ValueError(wanted)
 
 
+def _number_or_schedule(value: Any, kind: type, limits: Range) -> int | float | Schedule:
+    """A number within `limits`, or a `Schedule` from one to another; what all are to be above, it may end at."""
+    ends = value.split(">") if isinstance(value, str) else ()
+    try:
+        if len(ends) == 2:
+            first = _number(number(ends[0]), kind, limits)
+            last = _number(number(ends[1]), kind, dataclasses.replace(limits, above=False))  # no update is at the end
+            return Schedule(f"{first}>{last}")
+        return _number(value, kind, limits)
+    except ValueError as error:
+        raise ValueError(f"{error}, or a schedule 'FIRST>LAST' of two such numbers") from None
+
+
 @cache
 def _hints_of(config: type) -> dict[str, Any]:
     return get_type_hints(config, include_extras=True)
@@ -161,7 +180,7 @@ class RunConfig:
     shards: Annotated[int, Range(1, 4096)] = 1
     """equal parts of the environments and of minibatches, S, whose work processes share"""
     compile: Literal["auto", "on", "off"] = "auto"
-    """compile the gradient steps and the policy; auto compiles long runs, where it saves time"""
+    """compile the gradient steps and the policy; auto does so in long runs"""
     checkpoint_every: Natural = 0
     """steps between checkpoints, and restarts; 0: a fifth of the run, or 3 episodes"""
     keep_checkpoints: Count = 3
@@ -170,10 +189,12 @@ class RunConfig:
     """steps between evaluations; 0: none"""
     evaluate_episodes: Episodes = 20
     """episodes of each evaluation in training"""
+    keep_best: bool = False
+    """keep the best state as checkpoints/best"""
     video_every: Natural = 0
     """steps between recordings of an episode into videos/step-N; 0: none"""
     video_every_episodes: Natural = 0
-    """training episodes between such recordings; 0: none"""
+    """training episodes between these; 0: none"""
     warm_start: str | None = None
     """run, checkpoint or hf://user/name whose networks this run begins with"""
     freeze: tuple[str, ...] = ()
@@ -182,8 +203,10 @@ class RunConfig:
     """arguments of the environment, as JSON: '{"dynamics": "first_principles"}'"""
     reset_options: dict[str, Any] = field(default_factory=dict)
     """options of every reset of the environment, as JSON: '{"level": 3}'"""
+    curriculum: str | None = None
+    """module:function of (step, metrics) to {method: argument} of the environments"""
     wrappers: tuple[str, ...] = ()
-    """wrappers of each environment, the first innermost: module:name or module:name(key=value)"""
+    """wrappers of each environment, first innermost: module:name or module:name(key=value)"""
 
     def __post_init__(self) -> None:
         hints = _hints_of(type(self))
@@ -194,11 +217,18 @@ class RunConfig:
                 f"device must be one of auto, cpu, cuda, cuda:N (such as cuda:1), mps, not {self.device!r}."
             )
         self._require_divisible("num_envs")
+        if self.keep_best and not self.evaluate_every:
+            raise UserError("keep_best needs evaluations in training: give evaluate_every, such as 10_000 steps.")
 
     def _require_divisible(self, name: str) -> None:
         """Raise `UserError` if `shards` does not divide the field `name`."""
         if getattr(self, name) % self.shards:
             raise UserError(f"shards {self.shards:,} does not divide {name} {getattr(self, name):,}.")
+
+    @cached_property
+    def schedules(self) -> dict[str, Schedule]:
+        """The fields that change over the run as a `Schedule` says."""
+        return {name: value for name in self.names() if isinstance(value := getattr(self, name), Schedule)}
 
     @property
     def all_wrappers(self) -> tuple[str, ...]:

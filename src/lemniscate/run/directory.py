@@ -1,15 +1,18 @@
 """The run directory: its creation, its config, its lock, and the checkpoints in it."""
 
 import json
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from filelock import FileLock, Timeout
 
 from lemniscate.errors import UserError, resume_line
 from lemniscate.run import checkpoint
-from lemniscate.run.config import RunConfig
+from lemniscate.run.config import Natural, RunConfig, checked
 from lemniscate.run.metrics import METRICS, damage
 from lemniscate.run.state import TrainState
 from lemniscate.spec import Spec
@@ -27,7 +30,9 @@ from lemniscate.system.files import (
 )
 from lemniscate.system.world import World
 
-CONFIG, LOCK = "config.json", ".lock"
+CONFIG, LOCK, FINAL = "config.json", ".lock", "final.json"
+BEST = "best"
+"""the checkpoint with the best evaluation in training, beside those that are named by their steps"""
 SWEEP = "sweep.json"
 """the file that the directory of a sweep has in the place of a `config.json`"""
 TUNE = "tune.json"
@@ -86,15 +91,47 @@ def is_finished(path: Path) -> bool:
     return steps[-1:] >= [config["total_steps"]] and checkpoint.is_whole(path / "checkpoints" / f"step-{steps[-1]}")
 
 
-def find_checkpoint(path: Path) -> checkpoint.Checkpoint:
-    """A checkpoint, named by its own directory or by that of its run, of which it is the newest whole one.
+@contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """The directory of a run or a set of runs, for this process alone. Raises `UserError` if another trains there."""
+    try:
+        with FileLock(path / LOCK, timeout=0):
+            yield
+    except Timeout:
+        raise UserError(f"{path} is being trained by another process.") from None
+
+
+def extend(path: Path, total_steps: int) -> None:
+    """Let a run go on to `total_steps`; its final scores are no longer final. Raises `UserError` if it stands there."""
+    newest = max(checkpoint.list_steps(path / "checkpoints"), default=0)
+    if total_steps <= newest:
+        raise UserError(f"{path} stands at step {newest:,}: total_steps must be above that, not {total_steps:,}.")
+    try:
+        with locked(path):
+            record = read_record(path)
+            with parsing(path / CONFIG):
+                write_json(path / CONFIG, {**record, "config": {**record["config"], "total_steps": total_steps}})
+            remove(path / FINAL)
+    except OSError as error:
+        raise UserError(f"{path} cannot be written: {error.strerror or error}.") from error
+
+
+def find_checkpoint(path: Path, which: str | int | None = None) -> checkpoint.Checkpoint:
+    """A checkpoint, named by its own directory or by that of its run; of a run "best", a step, or the newest whole one.
 
     Raises:
-        UserError: neither a run nor a checkpoint; a run without a whole checkpoint; a damaged checkpoint.
+        UserError: neither a run nor a checkpoint; a run without a whole one, or that one; a damaged checkpoint.
     """
-    if (path / "manifest.json").exists():
+    if which is None and (path / "manifest.json").exists():
         return checkpoint.read(path)
     read_config(path)
+    if which is not None:
+        which = checked("checkpoint", which, Natural | Literal["best"])
+        chosen = path / "checkpoints" / (BEST if which == BEST else f"step-{which}")
+        if not chosen.is_dir():
+            there = ", ".join(map(str, checkpoint.list_steps(path / "checkpoints"))) or "none"
+            raise UserError(f"{path} has no checkpoint {which}; those at steps: {there}; best is kept with keep_best.")
+        return checkpoint.read(chosen)
     found = _newest(path, planned_only=False)
     if found is None:
         raise UserError(f"{path} has no checkpoint that can be read yet.")
@@ -134,6 +171,10 @@ class Saver:
         """the step of the last planned checkpoint, stored or not"""
         self.failure: OSError | None = None
         """why the last checkpoint could not be written, if it could not"""
+        self._best = -math.inf
+        """the mean return of the evaluation that the checkpoint `best` was kept for"""
+        self.calls = dict[str, Any]()
+        """the latest calls of a curriculum, as methods and arguments; part of every checkpoint"""
 
     def open(self) -> None:
         """Lock the directory, then create it if it is new. Raises `UserError` if another process trains in it."""
@@ -162,6 +203,7 @@ class Saver:
             self._require_same_spaces(found)
             found.restore(state)
             self.last_planned = self.planned_at = state.step
+            self.calls = dict(found.record.get("calls", {}))
         if not self._world.is_first:
             return found is not None
         steps = checkpoint.list_steps(self._checkpoints)
@@ -172,6 +214,7 @@ class Saver:
         for step in steps:
             if step > state.step:
                 remove(self._checkpoints / f"step-{step}")
+        self._restore_best(state.step)
         return found is not None
 
     def _require_same_spaces(self, found: checkpoint.Checkpoint) -> None:
@@ -180,9 +223,18 @@ class Saver:
         for what in ("observation_parts", "action"):
             if json.dumps(before[what]) != json.dumps(now[what]):
                 space = "action" if what == "action" else "observation"
-                raise UserError(
-                    f"{self.path} was trained with another {space} space than {now['env_id']} has here now."
-                )
+                raise UserError(f"{self.path} was trained with another {space} space than {now['env_id']} has now.")
+
+    def _restore_best(self, step: int) -> None:
+        """Know the best checkpoint again; remove one that is damaged or later: the run comes there again."""
+        best = self._checkpoints / BEST
+        if checkpoint.is_whole(best):
+            found = read_json(best / checkpoint.STATE)
+            with parsing(best):
+                if found["numbers"]["step"] <= step:
+                    self._best = float(found["record"]["return"])
+                    return
+        remove(best)
 
     def _keep_damaged_metrics(self, logged: int) -> None:
         """Copy metrics that are damaged, before they are written again without what is damaged."""
@@ -214,12 +266,23 @@ class Saver:
         try:
             if (self.path / METRICS).exists():
                 sync(self.path / METRICS)  # before the checkpoint, which says up to which step they are whole
-            record = {**self._record, "planned": planned, "logged": logged}
+            record = {**self._record, "planned": planned, "logged": logged, "calls": self.calls}
             checkpoint.write(self._checkpoints, fields, state.step, record, keep)
             self.last_planned = state.step if planned else self.last_planned
         except OSError as error:
             self.failure = error
             say(f"The checkpoint at step {state.step:,} could not be written: {error}.")
+
+    def save_if_best(self, state: TrainState, mean_return: float, logged: int) -> None:
+        """Keep the state as the checkpoint `best` where no evaluation before had so high a mean return."""
+        if mean_return <= self._best:
+            return
+        record = {**self._record, "planned": False, "logged": logged, "return": mean_return}
+        try:
+            checkpoint.write_fields(self._checkpoints / BEST, state.saved(), record)
+            self._best = mean_return
+        except OSError as error:
+            say(f"The best checkpoint, at step {state.step:,}, could not be written: {error}.")
 
     def close(self) -> None:
         """Unlock the directory."""

@@ -8,7 +8,7 @@ import torch
 from lemniscate.data.replay import ActionNoise, Kind, ReplayBuffer, bytes_per_transition
 from lemniscate.errors import UserError
 from lemniscate.nn.networks import Activation, Layers, Matmul
-from lemniscate.run.config import Count, Fraction, Natural, NonNegative, NumEnvs, Positive, RunConfig, Width
+from lemniscate.run.config import Count, Fraction, Natural, NonNegative, NumEnvs, Positive, RunConfig, Scheduled, Width
 from lemniscate.run.state import Networks, TrainState
 from lemniscate.spec import Spec
 
@@ -26,16 +26,16 @@ class OffPolicyConfig(RunConfig):
     batch_size: Count = 256
     """rows of each gradient step, M; usually 64 to 512"""
     learning_starts: Natural = 5_000
-    """environment steps with random actions before the first update; usually 1,000 to 25,000"""
+    """environment steps at random before the first update; usually 1,000 to 25,000"""
     update_every: Count = 1
     """steps of each environment between updates"""
     num_updates: Count = 1
     """gradient steps of the critics at each update; usually N · update_every"""
     log_every: Count = 500
     """steps of each environment between lines of metrics, evaluations and checkpoints"""
-    actor_learning_rate: Positive = 3e-4
+    actor_learning_rate: Scheduled[Positive] = 3e-4
     """step size of the policy's Adam; usually 1e-4 to 1e-3"""
-    critic_learning_rate: Positive = 3e-4
+    critic_learning_rate: Scheduled[Positive] = 3e-4
     """step size of the critics' Adam; usually 1e-4 to 1e-3"""
     final_learning_rate: Fraction = 1.0
     """final value of both as a fraction of the initial one, annealed linearly; 1: constant"""

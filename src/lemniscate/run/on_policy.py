@@ -74,6 +74,12 @@ class OnPolicyConfig(RunConfig):
             raise UserError(f"{field} {getattr(self, field):,} is above the {rows}.")
         self._require_divisible(field)
 
+    def _require_constant(self, field: str, adapted_by: str) -> None:
+        """Raise `UserError` if a `field` that another one adapts has a schedule."""
+        if getattr(self, adapted_by) is not None and field in self.schedules:
+            schedule = f"{field} {getattr(self, field)}"
+            raise UserError(f"{schedule} is a schedule, which {adapted_by} does not follow: {adapted_by} must be none.")
+
     def _require_rows(self, field: str, rows: int) -> None:
         """Raise `UserError` if `field`, which standardizes, would have a single row to do it with."""
         if rows == 1 and getattr(self, field):

@@ -9,20 +9,21 @@ At a planned checkpoint the environments restart from a seed derived from (run s
 one that is resumed. So both end in the same bits, whatever the simulator.
 """
 
+import json
 import math
 import random
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cached_property
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 
 from lemniscate.envs.vec_env import Episodes, VecEnv
-from lemniscate.errors import NonFiniteError, NotStoredError, UserError, resume_line
+from lemniscate.errors import NonFiniteError, NotStoredError, UserError, resume_line, shown
 from lemniscate.optim.compiled import Compiler
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import Saver
@@ -33,6 +34,7 @@ from lemniscate.run.seeding import derive, seed_globals
 from lemniscate.run.state import TrainState, require_agreement
 from lemniscate.run.stopping import Stopped, StopRequest
 from lemniscate.run.warm_start import load_networks
+from lemniscate.system import named
 from lemniscate.system.console import ProgressBar, say
 from lemniscate.system.world import World
 
@@ -102,8 +104,14 @@ class Run:
         saver = self._saver
         if self.config.warm_start and not saver.exists:  # first, since it may fail
             self._begin_warm(state)
+        if self._curriculum and not saver.exists:  # and so may this
+            self._advance_curriculum([(0, {})])
         saver.open()
         restored = saver.restore(state)
+        if self._curriculum and restored:
+            self.env.backend.call(saver.calls)
+        elif self._curriculum and saver.exists:
+            self._advance_curriculum([(0, {})])
         if self.config.warm_start and not restored:
             if saver.exists:
                 self._begin_warm(state)
@@ -210,6 +218,8 @@ class Run:
         config, step, whole = self.config, state.step, not self._cut_short
         if whole and _passed(config.evaluate_every, before, step):
             self._evaluate(state)
+        if whole and config.curriculum:
+            self._advance_curriculum(self._unobserved)
         by_episodes = _passed(config.video_every_episodes, self._episodes_before, self._episodes)
         if whole and (by_episodes or _passed(config.video_every, before, step)):
             self._record(state)
@@ -290,6 +300,24 @@ class Run:
             say(sentence)
 
     @cached_property
+    def _curriculum(self) -> Callable[..., Any] | None:
+        """The function that the Config names, if it does. Raises `UserError` for one that cannot be found or called."""
+        function = named.find_callable(self.config.curriculum) if self.config.curriculum else None
+        if function and not named.takes(function, 2):
+            raise UserError(f"A curriculum must be a function of (step, metrics), not {shown(function)}.")
+        return function
+
+    def _advance_curriculum(self, lines: Sequence[tuple[int, Mapping[str, float]]]) -> None:
+        """Make the calls that the curriculum decides on at each new line; those of rank 0, in every process."""
+        decided = list[dict[str, Any]]()
+        if self.world.is_first and self._curriculum:
+            with globals_undisturbed():
+                decided = [decide(self._curriculum, step, metrics) for step, metrics in lines]
+        for calls in self.world.from_first(decided):
+            self.env.backend.call(calls)
+            self._saver.calls |= calls
+
+    @cached_property
     def _checkpoint_every(self) -> int:
         """The configured interval; else a fifth of the run, or three episodes of each environment if that is longer.
 
@@ -328,12 +356,31 @@ class Run:
             if self.eval_env is self.env:
                 self._restart(state)
         self._write(state.step, {f"evaluation/{name}": value for name, value in scores.means().items()})
+        if self.config.keep_best:
+            self._saver.save_if_best(state, scores.mean_return, self._logged)
 
     def _write(self, step: int, numbers: dict[str, float], episodes: Episodes = NO_EPISODES) -> None:
         for logger in self._loggers:
             logger.write(step, numbers, episodes)
         self._logged = step
         self._unobserved.append((step, numbers))
+
+
+def decide(curriculum: Callable[..., Any], step: int, metrics: Mapping[str, float]) -> dict[str, Any]:
+    """The calls that a curriculum returns, as JSON holds them, so that they are the same from a checkpoint.
+
+    It does not see the measured times: on them a run would not have the same bits twice. Raises `UserError` for what it
+    raises, and for what is no such dictionary.
+    """
+    try:
+        calls = curriculum(step, {name: value for name, value in metrics.items() if not name.startswith("time/")})
+    except Exception as error:
+        raise UserError(f"The curriculum raised {type(error).__name__} at step {step:,}: {error}") from error
+    with suppress(TypeError, ValueError, AttributeError, RecursionError):
+        if isinstance(calls, Mapping) and all(isinstance(name, str) for name in calls):
+            return json.loads(json.dumps(dict(calls), allow_nan=False, default=lambda array: array.tolist()))
+    wanted = "a dictionary of methods with an argument each that JSON can hold, such as {'set_level': 1}"
+    raise UserError(f"The curriculum must return {wanted}; at step {step:,} it returned {shown(calls)}.")
 
 
 @contextmanager

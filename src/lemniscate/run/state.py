@@ -1,6 +1,7 @@
 """Training states: what a checkpoint holds, and what a run asks of it."""
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, field, fields
 from socket import gethostname
 from typing import Any, Generic, TypeVar
@@ -14,10 +15,12 @@ from lemniscate.nn.policies import Policy
 from lemniscate.optim.adam import Adam
 from lemniscate.optim.compiled import Compiled, Compiler, Learner
 from lemniscate.optim.shards import EstimatesOverShards, GradientOverShards
+from lemniscate.run.config import RunConfig
 from lemniscate.run.seeding import Generators
 from lemniscate.system.world import World
 
 Networks = TypeVar("Networks", bound=Any)
+C = TypeVar("C", bound=RunConfig)
 
 
 @dataclass(kw_only=True)
@@ -48,6 +51,17 @@ class TrainState(Generic[Networks]):
     def optimizers(self) -> list[Adam]:
         """All optimizers of the state."""
         return [value for value in vars(self).values() if isinstance(value, Adam)]
+
+    def apply_schedules(self, config: C) -> C:
+        """A copy of `config` that has the present value in the place of each schedule.
+
+        It is a tensor, since a compiled gradient step takes a number of a Config for a constant.
+        """
+        now, progress = copy(config), self.step / config.total_steps
+        device = next(self.networks.parameters()).device
+        for name, schedule in config.schedules.items():
+            object.__setattr__(now, name, torch.tensor(schedule.at(progress), device=device))
+        return now
 
     def on_restart(self) -> None:
         """Forget the running episodes: the environments have been restarted."""

@@ -8,15 +8,12 @@ each of its runs ends in the same bits as if it had been trained alone. A search
 import re
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from types import FrameType
 from typing import Any
-
-from filelock import FileLock, Timeout
 
 from lemniscate.algos import ALGORITHMS, name_of
 from lemniscate.api import plots, training
@@ -28,7 +25,7 @@ from lemniscate.envs import registry
 from lemniscate.errors import SweepError, UserError, prefix_errors, resume_line, shown
 from lemniscate.hub.repository import local_path
 from lemniscate.run.config import RunConfig
-from lemniscate.run.directory import LOCK, is_finished
+from lemniscate.run.directory import is_finished, locked
 from lemniscate.run.environments import device_for, require_memory
 from lemniscate.run.metrics import progress_of
 from lemniscate.run.places import LOG, Places, Processes, Sweep, failure_of, read_sweep
@@ -142,16 +139,6 @@ def _train(runs: Sweep, options: list[str], progress: bool, cluster: Cluster | N
             f"Try them again with: {resume_line(runs.path)}"
         )
     return TrainedSweep(runs.path, list(runs.runs))
-
-
-@contextmanager
-def locked(path: Path) -> Iterator[None]:
-    """The directory of a set, for this process alone. Raises `UserError` if another one trains its runs."""
-    try:
-        with FileLock(path / LOCK, timeout=0):
-            yield
-    except Timeout:
-        raise UserError(f"{path} is being trained by another process.") from None
 
 
 def places_on(cluster: Cluster | None, configs: Iterable[Mapping[str, Any]]) -> Places:

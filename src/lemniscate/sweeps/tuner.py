@@ -17,6 +17,7 @@ from lemniscate.cluster.connection import Cluster, find_cluster
 from lemniscate.errors import SweepError, UserError
 from lemniscate.report import tuning as pictures
 from lemniscate.run.config import Range, checked
+from lemniscate.run.directory import locked
 from lemniscate.run.places import LOG, Sweep, failure_of, is_sweep
 from lemniscate.sweeps.search import (
     NINTHS,
@@ -34,7 +35,7 @@ from lemniscate.sweeps.search import (
     read_texts,
     score_at,
 )
-from lemniscate.sweeps.sweep import SetOfRuns, locked, require_trainable, seeds_of
+from lemniscate.sweeps.sweep import SetOfRuns, require_trainable, seeds_of
 from lemniscate.system.console import say
 
 if TYPE_CHECKING:
