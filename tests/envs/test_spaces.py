@@ -1,13 +1,16 @@
 import math
 
+import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lemniscate.envs import registry
 from lemniscate.envs.conversion import flatten_observation, physical_action, scale_action
-from lemniscate.envs.spaces import ActionMasks, action_kind, is_image, observation_parts
+from lemniscate.envs.spaces import ActionMasks, action_kind, is_image, notices, observation_parts
 from lemniscate.errors import UserError
 from lemniscate.spec import Box, Discrete, Spec
 
@@ -167,3 +170,100 @@ def test_a_mask_that_is_given_for_some_environments_is_theirs_alone():
     masks.require_choice(none_left, np.array([True, True, False]))
     with pytest.raises(UserError, match="rules out every action of environment 2"):
         masks.require_choice(none_left, everyone)
+
+
+def test_whole_numbers_are_rounded_and_clipped():
+    kind = action_kind(spaces.Box(np.array([0, -3]), np.array([4, 3]), dtype=np.int8), "myenv")
+    rows = physical_action(np.float32([[-1, -1], [0, 0.1], [0.2, 0.4], [9, 9]]), kind)
+    assert rows.dtype == np.int8
+    assert rows.tolist() == [[0, -3], [2, 0], [2, 1], [4, 3]]
+    assert scale_action(np.float32([[0.2]]), Box((0.0,), (1.0,))).item() == pytest.approx(0.6)
+
+
+@pytest.mark.parametrize("bound", [np.inf, 1e300, np.finfo(np.float32).max])
+def test_the_largest_number_is_no_bound(bound):
+    kind = action_kind(spaces.Box(-bound, bound, (1,), np.float64), "myenv")
+    assert (kind.low, kind.high) == ((-np.inf,), (np.inf,))
+    whole = action_kind(spaces.Box(-np.inf, np.inf, (1,), np.int64), "myenv")
+    assert (whole.low, whole.high) == ((-np.inf,), (np.inf,))
+    assert "have no bound" in notices(Spec("myenv", (), kind))[0]
+    with pytest.raises(UserError, match=r"has actions without bounds.*give its Box a finite low and high"):
+        Spec("myenv", (), whole).bounded_box()
+
+
+@pytest.mark.parametrize(
+    ("space", "sentence"),
+    [
+        (
+            spaces.Discrete(10**9),
+            r"myenv observes Discrete\(1000000000\), whose 1,000,000,000 choices are each an input",
+        ),
+        (spaces.MultiDiscrete([10**6, 2]), r"whose 1,000,002 choices"),
+        (spaces.Dict({"a": spaces.Box(0, 1, (0,))}), "observes nothing: its observation_space, Dict.*, has no numbers"),
+        (spaces.Tuple([]), "observes nothing"),
+    ],
+)
+def test_a_space_without_numbers_or_with_too_many_is_named(space, sentence):
+    with pytest.raises(UserError, match=sentence):
+        observation_parts(space, "myenv")
+
+
+@pytest.mark.parametrize(
+    ("space", "sentence"),
+    [
+        (spaces.Discrete(10**9), r"myenv acts by Discrete\(1000000000\), whose 1,000,000,000 choices"),
+        (spaces.MultiDiscrete([2**31, 2**31]), r"whose 4,294,967,296 choices"),
+        (spaces.Box(-1, 1, (0,)), "myenv has no actions: its action_space is Box"),
+        (spaces.MultiDiscrete(np.zeros((0,), dtype=np.int64)), "myenv has no actions"),
+    ],
+)
+def test_actions_that_nothing_can_choose_from_are_named(space, sentence):
+    with pytest.raises(UserError, match=sentence):
+        action_kind(space, "myenv")
+
+
+def test_a_part_without_numbers_is_left_out():
+    space = spaces.Dict({"a": spaces.Box(0, 1, (0,)), "b": spaces.Box(0, 1, (2,))})
+    (part,) = observation_parts(space, "myenv")
+    assert part.path == ("b",)
+
+
+class Far(gym.Env):
+    """Numbers of 64 bits, whose changes float32 holds or not."""
+
+    action_space = spaces.Discrete(2)
+
+    def __init__(self, start, by, kind):
+        self.start, self.by = np.array(start, kind), np.array(by, kind)
+        self.observation_space = spaces.Dict({"far": spaces.Box(-np.inf, np.inf, self.start.shape, kind)})
+
+    def reset(self, *, seed=None, options=None):
+        self.t = 0
+        return {"far": self.start}, {}
+
+    def step(self, action):
+        self.t += 1
+        return {"far": self.start + self.t * self.by}, 0.0, False, self.t == 20, {}
+
+
+@pytest.mark.parametrize(
+    ("start", "by", "kind", "lost"),
+    [
+        ([1.7e9, 0], [1, 1], np.float64, True),
+        ([0.0, 5_813_000], [1, 0.05], np.float64, True),
+        ([2**40], [1], np.int64, True),
+        ([5_813_000.0], [1.0], np.float64, False),
+        ([1.25], [1e-9], np.float64, False),
+        ([1.7e9], [1e4], np.float64, False),
+        ([1e4], [0.1], np.float32, False),
+    ],
+)
+def test_digits_that_float32_loses_are_said(start, by, kind, lost):
+    env = registry.make(lambda: Far(start, by, kind), 2)
+    env.restart(0)
+    for _ in range(200):
+        env.step(torch.zeros(2, dtype=torch.int64))
+    assert len(env.backend.notices) == lost
+    assert all(
+        "too large for the digits of float32: 21 different values became" in said for said in env.backend.notices
+    )

@@ -1,0 +1,308 @@
+"""What environments return, and what they do to what they are given: read right, or one sentence."""
+
+import os
+import subprocess
+import sys
+from itertools import count
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, VectorEnv
+
+import lemniscate as lem
+from lemniscate.data.rollout import collect
+from lemniscate.envs import registry
+from lemniscate.envs.conversion import physical_action
+from lemniscate.errors import UserError
+from lemniscate.nn.actor_critic import ActorCritic
+from lemniscate.nn.networks import Layers
+
+TWO = spaces.Box(-1, 1, (2,), np.float32)
+SEEN = np.array([0.25, -0.5], np.float32)
+
+
+def after(obs=SEEN, reward=1.0, terminated=False, truncated=True, info=None):
+    return obs, reward, terminated, truncated, {} if info is None else info
+
+
+class Told(gym.Env):
+    """Returns what it was told to."""
+
+    action_space = spaces.Discrete(2)
+
+    def __init__(self, step=None, reset=None, space=TWO):
+        self.observation_space = space
+        self.told = {"step": after() if step is None else step, "reset": (SEEN, {}) if reset is None else reset}
+
+    def reset(self, *, seed=None, options=None):
+        return self.told["reset"]
+
+    def step(self, action):
+        return self.told["step"]
+
+
+def played(backend="gymnasium", **told):
+    """The first step of one such environment."""
+    env = registry.make(Told, 1, kwargs=told, backend=backend)
+    try:
+        first = env.restart(0)
+        return first, env.step(torch.zeros(1, dtype=torch.int64))
+    finally:
+        env.close()
+
+
+DICT = spaces.Dict({"a": TWO, "b": spaces.Dict({"c": spaces.Discrete(3)})})
+
+WRONG = {
+    "four values": ({"step": (SEEN, 1.0, True, {})}, r"Told.step\(\) \(test_returns.py, line \d+\) returned 4 values; it must"),
+    "a list": ({"step": [SEEN, 1.0, True, False, {}]}, r"step\(\).* it must return 5 values, \(obs, reward, terminated"),
+    "no info": ({"reset": SEEN}, r"reset\(\) .*returned an array of shape \(2,\) and type float32; it must return 2 values"),
+    "a number seen": ({"step": after(0.0)}, r"returned an observation of shape \(\); its space is Box.*, of shape \(2,\)"),
+    "a row seen": ({"step": after(SEEN[None])}, r"of shape \(1, 2\); its space"),
+    "seen at reset": ({"reset": (np.zeros(3), {})}, r"reset\(\) .*of shape \(3,\)"),
+    "a text seen": ({"step": after("ab")}, r"an observation that is 'ab'; its space"),
+    "nothing seen": ({"step": after(None)}, r"an observation that is None; its space"),
+    "masked numbers": ({"step": after(np.ma.array(SEEN, mask=[1, 0]))}, r"an observation that is"),
+    "reward of three": ({"step": after(reward=np.zeros(3))}, r"an array of shape \(3,\) and type float64 as reward; it must be a number"),
+    "no reward": ({"step": after(reward=None)}, r"returned None as reward; it must be a number"),
+    "a written reward": ({"step": after(reward="1.0")}, r"returned '1.0' as reward"),
+    "three ends": ({"step": after(terminated=np.zeros(3, bool))}, r"as terminated; it must be True or False"),
+    "a written end": ({"step": after(terminated="False")}, r"returned 'False' as terminated; it must be True or False"),
+    "half an end": ({"step": after(truncated=0.5)}, r"returned 0.5 as truncated"),
+    "no end": ({"step": after(truncated=None)}, r"returned None as truncated"),
+    "info None": ({"step": (SEEN, 1.0, False, True, None)}, r"returned None as info; it must be a dictionary"),
+    "a list as info": ({"reset": (SEEN, [])}, r"reset\(\) .*returned \[\] as info"),
+    "beyond bytes": ({"step": after(np.array([0, 300])), "reset": (np.zeros(2, np.uint8), {}), "space": spaces.Box(0, 255, (2,), np.uint8)}, "numbers are not all of type uint8"),
+    "fractions of a byte": ({"reset": (SEEN, {}), "space": spaces.Box(0, 255, (2,), np.uint8)}, "of type float32, whose numbers are not all of type uint8"),
+    "no such choice": ({"reset": (8, {}), "space": spaces.Discrete(3, start=5)}, r"with 8, which is not in its space, Discrete\(3, start=5\)"),
+    "half a choice": ({"reset": (5.5, {}), "space": spaces.Discrete(3, start=5)}, "not all of type int64"),
+    "a key missing": ({"reset": ({"a": SEEN}, {}), "space": DICT}, "an observation without b; its space is a Dict with the keys a, b"),
+    "an inner key": ({"reset": ({"a": SEEN, "b": {}}, {}), "space": DICT}, "an observation without c in b"),
+    "no dictionary": ({"reset": (SEEN, {}), "space": DICT}, "its space is a Dict with the keys a, b"),
+    "a shorter tuple": ({"reset": ((SEEN,), {}), "space": spaces.Tuple([TWO, TWO])}, "its space is a Tuple of 2"),
+    "a measure of two": ({"step": after(info={"is_success": np.zeros(2)})}, r"returned an array of shape \(2,\).* as info\['is_success'\]; a measure is a number"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("told", "sentence"), WRONG.values(), ids=WRONG)
+def test_what_is_returned_wrongly_is_said_with_the_place(told, sentence):
+    with pytest.raises(UserError, match=sentence) as raised:
+        played(**told)
+    assert "\n" not in str(raised.value)
+
+
+def test_a_worker_says_the_same():
+    with pytest.raises(UserError, match=r"^Told.step\(\) \(test_returns.py, line \d+\) returned None as reward"):
+        played("gymnasium-async", step=after(reward=None))
+
+
+@pytest.mark.parametrize("number", [1, 1.0, True, np.float16(1), np.array(1.0), np.array([1.0]), torch.tensor(1.0)])
+def test_a_number_is_read_in_any_form(number):
+    _, step = played(step=after(reward=number, terminated=number, truncated=0, info={"is_success": number}))
+    assert (step.reward.tolist(), step.terminated.tolist(), step.truncated.tolist()) == ([1], [True], [False])
+    assert step.measures["is_success"].tolist() == [1]
+
+
+@pytest.mark.parametrize("form", [list, tuple, np.float64, np.float16, torch.tensor, lambda x: x[::-1][::-1]])
+def test_an_observation_is_read_in_any_form(form):
+    first, step = played(reset=(form(SEEN), {}), step=after(form(SEEN)))
+    assert first.tolist() == step.next_obs.tolist() == [SEEN.tolist()]
+
+
+def test_what_ends_by_its_rules_is_not_cut_too():
+    _, step = played(step=after(terminated=True, truncated=True))
+    assert (step.terminated.item(), step.truncated.item()) == (True, False)
+
+
+def test_info_may_hold_anything_and_its_numbers_are_measured():
+    numbers = (
+        {"a": 1, "b": "x", "c": {"d": 2.5, "_": None}},
+        {"a": 0.5, "b": [1], "c": {"d": np.array([1.0])}, "e": np.zeros(9)},
+    )
+    made = count()
+
+    def make():
+        return Told(step=after(info=numbers[next(made) % 2]))
+
+    env = registry.make(make, 2)
+    env.restart(0)
+    for _ in range(3):
+        step = env.step(torch.zeros(2, dtype=torch.int64))
+    assert {name: values.tolist() for name, values in step.measures.items()} == {
+        "info/a": [1, 0.5],
+        "info/c/d": [2.5, 1],
+    }
+    assert env.take_episodes().measures == {"info/a": 0.75, "info/c/d": 1.75}
+    assert env.take_episodes().measures == {}
+    env.close()
+
+
+class OldReset(Told):
+    def reset(self):
+        return self.told["reset"]
+
+
+class Bare(gym.Env):
+    def reset(self, *, seed=None, options=None):
+        return SEEN, {}
+
+
+def test_a_class_without_seed_or_spaces_is_told_what_it_lacks():
+    with pytest.raises(
+        UserError, match=r"OldReset.reset\(\) .*takes no seed or no options; it must be reset\(self, \*, seed"
+    ):
+        registry.make(OldReset, 1)
+    with pytest.raises(UserError, match=r"Bare has no observation_space: set self.observation_space in its __init__"):
+        registry.make(Bare, 1)
+
+
+def test_one_environment_cannot_be_two():
+    env = Told()
+    with pytest.raises(UserError, match="it returned the same environment again; make a new one at each call"):
+        registry.make(lambda: env, 2)
+    registry.make(lambda: env, 1).close()
+
+
+class Scribbler(gym.Env):
+    """Overwrites the action that it was given, and what it returned."""
+
+    observation_space = TWO
+
+    def __init__(self, action_space):
+        self.action_space, self.got, self.seen = action_space, [], SEEN.copy()
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.seen, {}
+
+    def step(self, action):
+        assert self.action_space.contains(
+            np.asarray(action, self.action_space.dtype) if not self.action_space.shape else action
+        )
+        self.got.append(np.array(action))
+        if getattr(action, "ndim", 0):
+            action[...] = self.action_space.sample()
+        self.seen += 1
+        return self.seen, 0.0, False, False, {}
+
+
+ACTIONS = [
+    spaces.Box(-3, 1, (2,), np.float32),
+    spaces.Box(0, 4, (2, 1), np.int64),
+    spaces.Box(-5, 5, (), np.float64),
+    spaces.Discrete(3, start=-1),
+    spaces.MultiDiscrete([2, 3], dtype=np.int8),
+    spaces.MultiDiscrete([[2, 3], [4, 2]]),
+    spaces.MultiBinary(4),
+    spaces.MultiBinary((2, 2)),
+]
+
+
+@pytest.mark.parametrize("space", ACTIONS, ids=str)
+def test_what_an_environment_does_to_its_arguments_reaches_no_rollout(space):
+    env = registry.make(lambda: Scribbler(space), 1)
+    assert env.restart(0).tolist() == [SEEN.tolist()]
+    made = env.backend._envs.envs[0].unwrapped
+    policy = ActorCritic(env.spec, Layers((4,))).policy
+    rollout = collect(env, policy, 20, torch.Generator().manual_seed(0))
+    assert rollout.obs[:, 0].tolist() == [(SEEN + t).tolist() for t in range(20)]
+    np.testing.assert_array_equal(physical_action(rollout.action[:, 0].numpy(), env.spec.action), np.stack(made.got))
+
+
+def test_an_action_is_the_callers_in_every_kind_of_vector():
+    class Vector(VectorEnv):
+        num_envs, metadata = 2, {"autoreset_mode": AutoresetMode.DISABLED}
+        single_observation_space, single_action_space = TWO, spaces.MultiBinary(3)
+
+        def __init__(self, num_envs):
+            self.seen = np.zeros((2, 2), np.float32)
+
+        def reset(self, *, seed=None, options=None):
+            return self.seen, {}
+
+        def step(self, actions):
+            actions[...], self.seen[...] = 1, self.seen + 1
+            return self.seen, [1, 2], np.zeros(2, int), [0.0, 0.0], {}
+
+    env = registry.make(Vector, 2)
+    first = env.restart(0)
+    action = torch.zeros(2, 3, dtype=torch.int64)
+    step = env.step(action)
+    assert (action.sum().item(), first.sum().item(), step.next_obs.sum().item()) == (0, 0, 4)
+    assert (step.reward.tolist(), step.truncated.dtype) == ([1, 2], torch.bool)
+    Vector.step = lambda self, actions: (self.seen[:1], np.zeros(2), np.zeros(2, bool), np.zeros(2, bool), {})
+    with pytest.raises(UserError, match=r"returned an observation of shape \(1, 2\)"):
+        env.step(action)
+    Vector.step = lambda self, actions: (self.seen, np.zeros(3), np.zeros(2, bool), np.zeros(2, bool), {})
+    with pytest.raises(UserError, match="as reward; it must be a number for each environment"):
+        env.step(action)
+
+
+def test_an_environment_that_cannot_be_closed_costs_nothing(tmp_path, capfd):
+    class Sticky(Told):
+        def close(self):
+            raise OSError("the port is gone")
+
+    small = {"num_envs": 2, "num_steps": 8, "minibatch_size": 8, "total_steps": 32, "progress": False}
+    run = lem.train("ppo", env=Sticky, run=tmp_path / "run", **small)
+    assert run.policy.step == 32
+    assert "Sticky.close() (test_returns.py, line" in capfd.readouterr().err
+
+
+def test_options_reach_every_reset(tmp_path):
+    class Levels(Told):
+        seen = set()  # noqa: RUF012
+
+        def reset(self, *, seed=None, options=None):
+            Levels.seen.add(options["level"])
+            return self.told["reset"]
+
+    small = {"num_envs": 2, "num_steps": 8, "minibatch_size": 8, "total_steps": 32, "progress": False}
+    run = lem.train("ppo", env=Levels, reset_options={"level": 3}, run=tmp_path / "run", **small)
+    lem.evaluate(run.policy, episodes=2)
+    lem.evaluate(run.policy, episodes=1, seed=1, env_kwargs={})
+    assert Levels.seen == {3}
+    with pytest.raises(UserError, match="wrappers and reset_options are for single environments of the gymnasium"):
+        lem.train("ppo", env="CartPole-v1", backend="envpool", reset_options={"a": 1}, **small)
+
+
+SCRIPT = """
+import gymnasium as gym, numpy as np
+import lemniscate as lem
+from envs.test_returns import Told
+run = lem.train("ppo", env=Told, num_envs=2, num_steps=8, minibatch_size=8, total_steps=16, progress=False,
+                backend="gymnasium-async", run=RUN)
+"""
+
+
+def test_a_script_without_a_guard_is_told_of_it(tmp_path):
+    file = tmp_path / "script.py"
+    file.write_text(SCRIPT.replace("RUN", repr(str(tmp_path / "run"))))
+    path = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run([sys.executable, file], capture_output=True, text=True, env=path)
+    assert "A script needs `if __name__ == '__main__':`" in done.stderr
+
+
+def test_the_numbers_of_info_are_curves_of_training_and_evaluation(tmp_path):
+    class Terms(Told):
+        def __init__(self):
+            super().__init__(step=after(truncated=False))
+            self.t = 0
+
+        def step(self, action):
+            self.t = self.t % 4 + 1
+            return after(truncated=self.t == 4, info={"energy": -0.5, **({"length": 4} if self.t == 4 else {})})
+
+    small = {"num_envs": 2, "num_steps": 8, "minibatch_size": 8, "total_steps": 32, "evaluate_every": 16}
+    run = lem.train("ppo", env=Terms, run=tmp_path / "run", evaluate_episodes=2, progress=False, **small)
+    from lemniscate.run.metrics import read_metrics
+
+    lines = read_metrics(run.path)
+    assert {(line["info/energy"], line["info/length"]) for line in lines if "info/energy" in line} == {(-0.5, 4.0)}
+    assert any(line.get("evaluation/info/energy") == -0.5 for line in lines)
+    scores = lem.evaluate(run.policy, episodes=2)
+    assert scores.measures == {"info/energy": -0.5, "info/length": 4.0}
+    assert scores.to_json()["info/energy"] == -0.5
