@@ -180,7 +180,7 @@ def test_whole_numbers_are_rounded_and_clipped():
     assert scale_action(np.float32([[0.2]]), Box((0.0,), (1.0,))).item() == pytest.approx(0.6)
 
 
-@pytest.mark.parametrize("bound", [np.inf, 1e300, np.finfo(np.float32).max])
+@pytest.mark.parametrize("bound", [np.inf, 1e300, float(np.finfo(np.float32).max)])
 def test_the_largest_number_is_no_bound(bound):
     kind = action_kind(spaces.Box(-bound, bound, (1,), np.float64), "myenv")
     assert (kind.low, kind.high) == ((-np.inf,), (np.inf,))
