@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 from lemniscate.algos import reinforce
 from lemniscate.data.rollout import collect
-from lemniscate.data.whole_episodes import collect_episodes
+from lemniscate.data.batches import collect_episodes
 from lemniscate.envs.registry import make
 from lemniscate.maths import policy_gradient
 

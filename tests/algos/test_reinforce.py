@@ -8,8 +8,8 @@ import torch
 
 from helpers import MODES, ONE_MODE, begin, learned_with, one_rollout, slope, small
 from lemniscate.algos import reinforce
+from lemniscate.data.batches import collect_episodes
 from lemniscate.data.rollout import epoch_minibatches
-from lemniscate.data.whole_episodes import collect_episodes
 from lemniscate.errors import UserError
 
 

@@ -6,8 +6,8 @@ import torch
 
 from helpers import CPU, MODES, vectorize
 from lemniscate.algos import reinforce
+from lemniscate.data.batches import collect_episodes
 from lemniscate.data.rollout import collect, epoch_minibatches, one_minibatch
-from lemniscate.data.whole_episodes import collect_episodes
 from lemniscate.errors import UserError
 from lemniscate.types import Rollout
 

@@ -11,8 +11,8 @@ from typing import Annotated, Literal
 import torch
 from torch import Tensor
 
+from lemniscate.data.batches import collect_episodes
 from lemniscate.data.rollout import collect, epoch_minibatches, one_minibatch
-from lemniscate.data.whole_episodes import collect_episodes
 from lemniscate.errors import UserError
 from lemniscate.maths import (
     episode_return,

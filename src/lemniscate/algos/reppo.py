@@ -10,8 +10,8 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from lemniscate.data.batches import SoftBatch
 from lemniscate.data.rollout import collect, epoch_minibatches
-from lemniscate.data.soft_batch import SoftBatch
 from lemniscate.maths import cross_entropy, explained_variance, hl_gauss, means, soft_lambda_return
 from lemniscate.nn.actor_categorical_q import ActorCategoricalQ, Multipliers
 from lemniscate.nn.categorical_q import CategoricalQ

@@ -20,8 +20,9 @@ from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
 from lemniscate.envs import registry
-from lemniscate.envs.conversion import SingleEnv, flat_mask, mask_in
+from lemniscate.envs.conversion import SingleEnv
 from lemniscate.envs.factory import make_one, maker_of
+from lemniscate.envs.returns import flat_mask, mask_in
 from lemniscate.envs.spaces import observation_parts, random_action
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import NonFiniteError, UserError

@@ -1,11 +1,9 @@
-"""What passes between a policy and environments at every step: what these return, checked, and the actions."""
+"""What passes between a policy and environments at every step: returns, checked and laid out, and actions."""
 
-import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from functools import lru_cache, reduce
 from inspect import signature
 from operator import getitem
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -14,12 +12,10 @@ import torch
 from gymnasium import spaces
 from torch import Tensor
 
-from lemniscate.errors import UserError, shown
+from lemniscate.envs.returns import MASKS, Returns, author, flat_mask, kind_of, layers, mask_in, place, scalars
+from lemniscate.errors import UserError
 from lemniscate.spec import Action, Box, Discrete, MultiBinary, MultiDiscrete, ObservationPart
 from lemniscate.system.console import say
-
-MASKS = ("action_mask", "action_masks", "legal_action_mask")
-"""what environments call their action mask: in `info`, as a key of a Dict observation, or as a method"""
 
 SUCCESS = ("is_success", "success")
 """what robotics environments call their success: 1 or 0, or True and False"""
@@ -27,67 +23,8 @@ SUCCESS = ("is_success", "success")
 APART = {*MASKS, "final_info", "final_obs", "env_id", "players", "elapsed_step"}
 """entries of the info of a vector environment that measure nothing"""
 
-VALUES = {"reset": "2 values, (observation, info)", "step": "5 values, (obs, reward, terminated, truncated, info)"}
 
-
-class Returns:
-    """The values that `reset` and `step` return, checked; where they are not as they must be, a `UserError` says so.
-
-    Args:
-        env: one environment, or a vector environment.
-        space: of one observation.
-        lead: () for one environment, (N,) for a vector of N.
-    """
-
-    def __init__(self, env: Any, space: gym.Space, lead: tuple[int, ...] = ()) -> None:
-        self._env, self._space, self._lead = env, space, lead
-
-    def of_reset(self, returned: Any) -> tuple[Any, dict[str, Any]]:
-        """The observation, in the types of its space, and the info."""
-        obs, info = self._several("reset", returned, 2)
-        return self._observation("reset", obs), self._info("reset", info)
-
-    def of_step(self, returned: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
-        """The observation, in the types of its space; the reward, the flags and the info."""
-        obs, reward, terminated, truncated, info = self._several("step", returned, 5)
-        if type(reward) is not float:
-            reward = self._numbers("reward", reward, float)
-        if type(terminated) is not bool:
-            terminated = self._numbers("terminated", terminated, bool)
-        if type(truncated) is not bool:
-            truncated = self._numbers("truncated", truncated, bool)
-        return self._observation("step", obs), reward, terminated, truncated, self._info("step", info)
-
-    def wrong(self, method: str, what: str) -> UserError:
-        """The sentence on a method: its name, where it is written, and `what` it did."""
-        return UserError(f"{_author(self._env, method)} {what}.")
-
-    def _several(self, method: str, returned: Any, count: int) -> Any:
-        if not isinstance(returned, tuple) or len(returned) != count:
-            what = f"{len(returned)} values" if isinstance(returned, tuple) else kind_of(returned)
-            raise self.wrong(method, f"returned {what}; it must return {VALUES[method]}")
-        return returned
-
-    def _observation(self, method: str, obs: Any) -> Any:
-        try:
-            return _fitted(self._space, obs, self._lead)
-        except ValueError as error:
-            raise self.wrong(method, f"returned an observation {error}") from None
-
-    def _info(self, method: str, info: Any) -> dict[str, Any]:
-        if not isinstance(info, dict):
-            raise self.wrong(method, f"returned {kind_of(info)} as info; it must be a dictionary, such as {{}}")
-        return info
-
-    def _numbers(self, name: str, value: Any, kind: type) -> Any:
-        """A number or a flag of one environment, or a new array [N] of them."""
-        array = as_array(value)
-        fits = array.dtype.kind in "biuf" and (array.shape == self._lead or (array.size == 1 and not self._lead))
-        if not fits or (kind is bool and not ((array == 0) | (array == 1)).all()):
-            wanted = "a number" if kind is float else "True or False"
-            each = " for each environment" if self._lead else ""
-            raise self.wrong("step", f"returned {kind_of(value)} as {name}; it must be {wanted}{each}")
-        return array.astype(kind) if self._lead else kind(array.item())
+REAL = (float, np.floating)
 
 
 class SingleEnv(gym.Wrapper):
@@ -105,41 +42,59 @@ class SingleEnv(gym.Wrapper):
             if not isinstance(getattr(env, name, None), gym.Space):
                 kind = type(env.unwrapped).__name__
                 raise UserError(f"{kind} has no {name}: set self.{name} in its __init__, such as a Box.")
-        for layer in _layers(env):
+        for layer in layers(env):
             taken = signature(layer.reset).parameters
             if not taken.keys() >= {"seed", "options"} and all(
                 one.kind is not one.VAR_KEYWORD for one in taken.values()
             ):
                 right = "reset(self, *, seed=None, options=None)"
-                raise UserError(f"{_place(layer, 'reset')} takes no seed or no options; it must be {right}.")
+                raise UserError(f"{place(layer, 'reset')} takes no seed or no options; it must be {right}.")
         self._returns = Returns(env, env.observation_space)
         asked = [env.get_wrapper_attr(name) for name in MASKS if env.has_wrapper_attr(name)]
         self._ask = next(filter(callable, asked), None)
-        seen = env.observation_space
+        seen, self._declared = env.observation_space, measures_of(env.metadata)
         self._masked = bool(self._ask or (isinstance(seen, spaces.Dict) and seen.spaces.keys() & set(MASKS)))
-        self._declared = measures_of(env.metadata or {})
+        self._usual = (seen.shape, seen.dtype) if isinstance(seen, spaces.Box | spaces.MultiBinary) else ()
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Gymnasium's."""
-        obs, info = self._returns.of_reset(self.env.reset(seed=seed, options=options))
-        return obs, self._told("reset", obs, info)
+        returned: Any = self.env.reset(seed=seed, options=options)
+        if type(returned) is not tuple or len(returned) != 2 or not self._is_usual(*returned):
+            returned = self._returns.of_reset(returned)
+        return returned if returned[1] == {} and not self._masked else (returned[0], self._told("reset", *returned))
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Gymnasium's."""
-        obs, *rest, info = self._returns.of_step(self.env.step(action))
-        return obs, *rest, self._told("step", obs, info)
+        returned: Any = self.env.step(action)
+        if (
+            type(returned) is not tuple
+            or len(returned) != 5
+            or not self._is_usual(returned[0], returned[4], *returned[1:4])
+        ):
+            returned = self._returns.of_step(returned)
+        obs, *rest, info = returned
+        return returned if info == {} and not self._masked else (obs, *rest, self._told("step", obs, info))
+
+    def _is_usual(
+        self, obs: Any, info: Any, reward: Any = 0.0, terminated: Any = False, truncated: Any = False
+    ) -> bool:
+        """Whether all are of their types already: so it is in most environments, and then it costs nothing."""
+        if type(obs) is not np.ndarray or (obs.shape, obs.dtype) != self._usual or not isinstance(reward, float):
+            return False
+        return type(info) is dict and type(terminated) is type(truncated) is bool
 
     def close(self) -> None:
         """Gymnasium's. An exception in it is said, and costs nothing that was learned."""
         try:
             self.env.close()
         except Exception as error:
-            say(f"{_author(self.env, 'close')} raised {type(error).__name__}: {error}")
+            say(f"{author(self.env, 'close')} raised {type(error).__name__}: {error}")
 
     def _told(self, method: str, obs: Any, info: dict[str, Any]) -> dict[str, Any]:
-        if not info and not self._masked:
-            return info
-        numbers: dict[str, Any] = dict(_scalars(info))
+        numbers: dict[str, Any] = {name: float(value) for name, value in info.items() if isinstance(value, REAL)}
+        if len(numbers) == len(info) and not self._masked:
+            return numbers
+        numbers = dict(scalars(info))
         for name in self._declared:
             if info.get(name) is not None and name not in numbers:
                 what = f"returned {kind_of(info[name])} as info[{name!r}]; a measure is a number"
@@ -152,131 +107,6 @@ class SingleEnv(gym.Wrapper):
             except ValueError as error:
                 raise self._returns.wrong(method, f"comes with an action mask {error}") from None
         return numbers
-
-
-def _layers(env: Any) -> Iterator[Any]:
-    """An environment, and what is inside of it if it is a wrapper, the outermost first."""
-    while env is not None:
-        yield env
-        env = vars(env).get("env")
-
-
-def _author(env: Any, method: str) -> str:
-    """The method of the outermost layer whose class is not Gymnasium's."""
-    layers = list(_layers(env))
-    own = (layer for layer in layers if not getattr(type(layer), method).__module__.startswith("gymnasium."))
-    return _place(next(own, layers[-1]), method)
-
-
-def _place(layer: Any, method: str) -> str:
-    """The name of a method, and where it is written."""
-    function = getattr(type(layer), method)
-    code = getattr(function, "__code__", None)
-    place = f" ({Path(code.co_filename).name}, line {code.co_firstlineno})" if code else ""
-    return f"{'.'.join(function.__qualname__.split('.')[-2:])}(){place}"
-
-
-def kind_of(value: Any) -> str:
-    """A value in a sentence: an array by its shape and type, a number as it is, others by their type."""
-    if hasattr(value, "dtype") and getattr(value, "shape", ()):
-        return f"an array of shape {tuple(value.shape)} and type {value.dtype}"
-    return shown(value)
-
-
-def as_array(value: Any) -> np.ndarray:
-    """As an array; of objects where it cannot be one, such as lists of different lengths, or a number is masked."""
-    if np.ma.is_masked(value):
-        return np.full((), None, dtype=object)
-    try:
-        return np.asarray(value.detach().cpu() if isinstance(value, Tensor) else value)
-    except (ValueError, TypeError, RuntimeError):
-        return np.full((), None, dtype=object)
-
-
-def _fitted(space: gym.Space, obs: Any, lead: tuple[int, ...], where: str = "") -> Any:
-    """An observation in the types of its space. Raises `ValueError`, with the rest of a sentence, where it is none."""
-    if isinstance(space, spaces.Dict):
-        keys = ", ".join(map(str, space.spaces))
-        if not isinstance(obs, Mapping):
-            raise ValueError(f"that is {kind_of(obs)}{where}; its space is a Dict with the keys {keys}")
-        if lacking := [key for key in space.spaces if key not in obs]:
-            raise ValueError(f"without {lacking[0]}{where}; its space is a Dict with the keys {keys}")
-        return {key: _fitted(part, obs[key], lead, f"{where} in {key}") for key, part in space.items()}
-    if isinstance(space, spaces.Tuple):
-        if not isinstance(obs, tuple | list) or len(obs) != len(space):
-            raise ValueError(f"that is {kind_of(obs)}{where}; its space is a Tuple of {len(space)}")
-        return tuple(_fitted(part, obs[i], lead, f"{where} in part {i}") for i, part in enumerate(space))
-    return _fitted_array(space, obs, (*lead, *(space.shape or ())), where)
-
-
-def _fitted_array(space: gym.Space, obs: Any, shape: tuple[int, ...], where: str) -> Any:
-    counted = isinstance(space, spaces.Discrete | spaces.MultiDiscrete)
-    if not counted and type(obs) is np.ndarray and obs.dtype == space.dtype and obs.shape == shape:
-        return obs
-    array, kind = as_array(obs), np.dtype(space.dtype)
-    if array.dtype.kind not in "biuf" or array.shape != shape:
-        said = f"of shape {array.shape}" if array.dtype.kind in "biuf" else f"that is {kind_of(obs)}"
-        raise ValueError(f"{said}{where}; its space is {shown_space(space)}, of shape {space.shape}")
-    with np.errstate(invalid="ignore"):  # a NaN as a whole number, which the next line finds
-        fitted = array.astype(kind)
-    if kind.kind in "iub" and not np.array_equal(fitted, array):
-        raise ValueError(f"of type {array.dtype}{where}, whose numbers are not all of type {kind}, as its space says")
-    if isinstance(space, spaces.Discrete | spaces.MultiDiscrete):
-        count = space.n if isinstance(space, spaces.Discrete) else space.nvec
-        outside = fitted[(fitted < space.start) | (fitted >= space.start + count)]
-        if outside.size:
-            raise ValueError(f"with {outside.flat[0]}{where}, which is not in its space, {shown_space(space)}")
-    return fitted if fitted.shape else fitted[()]
-
-
-def shown_space(space: gym.Space) -> str:
-    """A space in a sentence."""
-    return " ".join(str(space).split())
-
-
-def mask_in(obs: Any, info: Mapping[str, Any]) -> tuple[str, Any]:
-    """The action mask of an environment, and its name in `info`; ("", None) where there is none."""
-    for name in MASKS:
-        if name in info:
-            return name, info[name]
-        if isinstance(obs, Mapping) and name in obs:
-            return "", obs[name]
-    return "", None
-
-
-def flat_mask(mask: Any, action: gym.Space | Action) -> np.ndarray:
-    """An action mask as one row, [n] bool; of a MultiDiscrete, those of its components one after the other.
-
-    Raises `ValueError`, with the rest of a sentence, for another size, and for actions that are no choices.
-    """
-    counts = getattr(action, "nvec", None)
-    counts = np.ravel(getattr(action, "n", 0) if counts is None else counts)
-    if not isinstance(action, spaces.Discrete | spaces.MultiDiscrete | Discrete | MultiDiscrete):
-        raise ValueError("; masks are for Discrete and MultiDiscrete actions")
-    row = _row(mask)
-    if len(row) != counts.sum():
-        raise ValueError(f"of {len(row)} numbers; it must have {counts.sum()}, of 1 and 0")
-    return row.astype(bool)
-
-
-def _row(mask: Any) -> np.ndarray:
-    """Nested tuples and lists of arrays as one row."""
-    if isinstance(mask, tuple | list) and len(mask):
-        return np.concatenate([_row(part) for part in mask])
-    return np.ravel(mask)
-
-
-def _scalars(info: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, float]]:
-    """Every number in `info`, an array of one too, and those of its dictionaries, by "outer/inner"."""
-    for key, value in info.items():
-        if isinstance(value, float | int):
-            yield f"{prefix}{key}", float(value)
-        elif isinstance(value, Mapping):
-            yield from _scalars(value, f"{prefix}{key}/")
-        elif hasattr(value, "__array__") and math.prod(getattr(value, "shape", (0,))) == 1:
-            array = as_array(value)
-            if array.dtype.kind in "biuf":
-                yield f"{prefix}{key}", float(array.item())
 
 
 def measures_of(metadata: Mapping[str, Any]) -> tuple[str, ...]:

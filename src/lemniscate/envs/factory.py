@@ -16,6 +16,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 
 from lemniscate.envs.conversion import SingleEnv
+from lemniscate.envs.returns import CheckedVector
 from lemniscate.envs.workers import WatchedVectorEnv, Worker
 from lemniscate.errors import UserError
 from lemniscate.system import named
@@ -94,7 +95,7 @@ def make_vector(
     makers = [partial(make_one, maker, wrappers, **kwargs)] * num_envs
     if makes_vector(maker):
         make = partial(gym.make_vec, maker) if isinstance(maker, EnvSpec) else maker
-        envs = one = make(num_envs=num_envs, **kwargs)
+        envs = one = CheckedVector(make(num_envs=num_envs, **kwargs))
     elif workers:
         multiprocessing.get_context("forkserver").set_forkserver_preload([__name__])  # imported once, for all
         one = makers[0]()

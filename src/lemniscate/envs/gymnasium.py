@@ -2,7 +2,7 @@
 
 from collections.abc import Collection, Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -12,7 +12,7 @@ from torch import Tensor
 
 from lemniscate.envs import spaces
 from lemniscate.envs.backend import Backend
-from lemniscate.envs.conversion import Returns, flatten_observation, measured, measures_of, physical_action, row_of
+from lemniscate.envs.conversion import flatten_observation, measured, measures_of, physical_action, row_of
 from lemniscate.envs.factory import is_own, make_one, make_vector, maker_of, makes_vector, sentences
 from lemniscate.envs.vec_env import Stagger
 from lemniscate.envs.workers import WatchedVectorEnv, call_method
@@ -100,13 +100,12 @@ class GymnasiumBackend(Backend):
         self.mode = mode
         space, action = self._envs.single_observation_space, spaces.action_kind(self._envs.single_action_space, env)
         parts = spaces.observation_parts(space, env)
-        self._returns = Returns(self._envs, space, (num_envs,)) if makes_vector(maker) else None
         self._used = isinstance(action, Discrete | MultiDiscrete)
         if self._used:
-            action = spaces.masked(action, *self._reset(0))
+            action = spaces.masked(action, *self._envs.reset(seed=0))
         self._stagger_up_to = limit if stagger and self.mode is AutoresetMode.DISABLED and not self.once else None
         self._calls: dict[str, Any] = {}
-        self._measures = measures_of(self._envs.metadata or {})
+        self._measures = measures_of(self._envs.metadata)
         self.spec = Spec(env, parts, action, max_episode_steps=limit)
         self.notices = spaces.notices(self.spec)
         self._digits: spaces.LostDigits | None = None if self.spec.image else spaces.LostDigits(self.spec)
@@ -123,18 +122,17 @@ class GymnasiumBackend(Backend):
         self._used = True
         self._resetting, self._valid = np.zeros(self.num_envs, dtype=bool), np.ones(self.num_envs, dtype=bool)
         self._stagger = Stagger(self.num_envs, self._stagger_up_to, seed, first)
-        self.counts = self._tensor(self._stagger.counts)
+        self.counts = torch.as_tensor(self._stagger.counts, device=self.device)
         self._masks = spaces.ActionMasks(self.spec, self.num_envs) if self.spec.action.mask_size else None
-        obs = self._observe(*self._reset(seed + first))
+        obs = self._observe(*self._envs.reset(seed=seed + first))
         if self._masks:
             self._masks.require_choice(obs, self._valid)
-        return self._tensor(obs)
+        return torch.as_tensor(obs, device=self.device)
 
     def step(self, action: Tensor) -> Step:
         """Step, then find the true successor of each row and where to act next, as the mode demands."""
         physical = physical_action(action.cpu().numpy(), self.spec.action)
-        returned = self._envs.step(physical)
-        raw, reward, terminated, truncated, info = self._returns.of_step(returned) if self._returns else returned
+        raw, reward, terminated, truncated, info = self._envs.step(physical)
         terminated, truncated = terminated.copy(), truncated & ~terminated  # new ones: a vector may write over its own
         obs = next_obs = self._observe(raw, info)
         valid, done = self._valid, terminated | truncated
@@ -146,13 +144,14 @@ class GymnasiumBackend(Backend):
             truncated = self._stagger.apply(terminated, truncated)
             done = terminated | truncated
             if done.any():
-                obs = self._observe(*self._reset(None, {"reset_mask": done.copy()}))
-                self.counts = self._tensor(self._stagger.counts)
+                obs = self._observe(*self._envs.reset(options={"reset_mask": done.copy()}))
+                self.counts = torch.as_tensor(self._stagger.counts, device=self.device)
         if self._masks:
             self._masks.require_choice(obs, ~self._resetting)
-        there = self._tensor(next_obs)
-        here = there if obs is next_obs else self._tensor(obs)
-        rewards, *flags = map(self._tensor, (reward.astype(np.float32), terminated, truncated, valid))
+        there = torch.as_tensor(next_obs, device=self.device)
+        here = there if obs is next_obs else torch.as_tensor(obs, device=self.device)
+        tensor = partial(torch.as_tensor, device=self.device)
+        rewards, *flags = map(tensor, (reward.astype(np.float32), terminated, truncated, valid))
         measures = measured(info, self._measures, self.num_envs, self.device) if info else {}
         return Step(here, there, rewards, *flags, measures=measures)
 
@@ -163,7 +162,7 @@ class GymnasiumBackend(Backend):
             if isinstance(self._envs, WatchedVectorEnv):
                 self._envs.call_method(name, argument)
             else:
-                for env in self._envs.envs if isinstance(self._envs, SyncVectorEnv) else [self._envs]:
+                for env in self._envs.envs if isinstance(self._envs, SyncVectorEnv) else [cast(Any, self._envs).env]:
                     call_method(env, name, argument)
 
     def close(self) -> None:
@@ -184,11 +183,6 @@ class GymnasiumBackend(Backend):
             next_obs[row, :size] = flatten_observation(self.spec.observation_parts, final, image=self.spec.image)
         return next_obs
 
-    def _reset(self, seed: int | None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """The observations and the info of a reset, of all or of those in a mask."""
-        returned = self._envs.reset(seed=seed, options=options)
-        return self._returns.of_reset(returned) if self._returns else returned
-
     def _observe(self, raw: Any, info: dict) -> np.ndarray:
         """The flat observation, a copy; after it the action mask, where there is one."""
         flat = flatten_observation(self.spec.observation_parts, raw, image=self.spec.image)
@@ -196,11 +190,9 @@ class GymnasiumBackend(Backend):
             self.notices, self._digits = self._digits.notices(), None
         if self._masks:
             return self._masks.append_to(flat, raw, info)
-        spaces.require_no_mask(self.spec, raw, info)
+        if not spaces.MASKS.isdisjoint(info):
+            raise spaces.late_mask(self.spec)
         return flat.copy()
-
-    def _tensor(self, array: np.ndarray) -> Tensor:
-        return torch.from_numpy(array).to(self.device)
 
 
 class AsyncGymnasiumBackend(GymnasiumBackend):

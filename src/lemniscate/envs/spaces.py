@@ -14,7 +14,8 @@ from gymnasium import spaces
 from torch import Generator, Tensor
 
 from lemniscate.envs.backend import Summary
-from lemniscate.envs.conversion import MASKS, SUCCESS, flat_mask, flatten_observation, mask_in, row_of, shown_space
+from lemniscate.envs.conversion import SUCCESS, flatten_observation, row_of
+from lemniscate.envs.returns import MASKS, flat_mask, mask_in, shown_space
 from lemniscate.errors import UserError
 from lemniscate.spec import Action, Box, Discrete, MultiBinary, MultiDiscrete, ObservationPart, Spec
 
@@ -257,14 +258,13 @@ def masked(action: Action, obs: Any, info: Mapping[str, Any]) -> Action:
     return replace(action, masked=True) if can else action
 
 
-def require_no_mask(spec: Spec, obs: Any, info: Mapping[str, Any]) -> None:
-    """Raise `UserError` for an action mask that cannot be followed, since the first observation had none."""
-    if mask_in(obs, info)[1] is not None:
-        if isinstance(spec.action, Discrete | MultiDiscrete):
-            remedy = "give one with reset() too, of ones where all is permitted."
-        else:
-            remedy = "masks are for Discrete and MultiDiscrete actions."
-        raise UserError(f"{spec.env_id} gives an action mask in step() that reset() did not give: {remedy}")
+def late_mask(spec: Spec) -> UserError:
+    """The sentence on an action mask that cannot be followed, since the first observation came without one."""
+    if isinstance(spec.action, Discrete | MultiDiscrete):
+        remedy = "give one with reset() too, of ones where all is permitted."
+    else:
+        remedy = "masks are for Discrete and MultiDiscrete actions."
+    return UserError(f"{spec.env_id} gives an action mask in step() that reset() did not give: {remedy}")
 
 
 def read_mask(mask: Any, spec: Spec, flat: np.ndarray) -> np.ndarray:

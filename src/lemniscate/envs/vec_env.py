@@ -42,7 +42,7 @@ class VecEnv:
         self.collecting = Stopwatch()
         """seconds that the functions of `data` spend acting and stepping"""
         self.steps = 0
-        self._statistics, self._measures = EpisodeStatistics(self.num_envs, self.device), Means()
+        self._statistics = EpisodeStatistics(self.num_envs, self.device)
         self._actions: tuple[torch.Size, torch.dtype] | None = None  # before it is restarted, none is right
 
     def restart(self, seed: int, steps: int = 0) -> Tensor:
@@ -70,15 +70,14 @@ class VecEnv:
         counts = self.backend.counts
         step = self.backend.step(mine.clone())  # an environment may write into the action that it was given
         self._require_finite(observation=step.next_obs, reward=step.reward)
-        if step.measures:
-            self._measures.log(step.measures, step.valid)
+        measures, valid = step.measures, step.valid
         if step.obs is not step.next_obs:
             self._require_finite(observation=step.obs)
         if self._world.size > 1:
             step, counts = self._of_all(step, counts)
         self.obs = step.obs
         self.steps += self.num_envs
-        self._statistics.log(step, counts)
+        self._statistics.log(step, counts, measures, valid)
         return step
 
     def _of_all(self, step: Step, counts: Tensor) -> tuple[Step, Tensor]:
@@ -102,7 +101,7 @@ class VecEnv:
 
     def take_episodes(self) -> "Episodes":
         """The whole episodes that ended since the last call, and the means of all measures over its steps."""
-        return replace(self._statistics.take(), measures=self._measures.take(self._world))
+        return self._statistics.take(self._world)
 
     def close(self) -> None:
         """Give back processes and windows."""
@@ -154,78 +153,64 @@ class Episodes:
     measures: dict[str, float] = field(default_factory=dict)
 
 
-class Means:
-    """The mean of each measure, over the steps in which it was given."""
-
-    def __init__(self) -> None:
-        self._log: list[tuple[dict[str, Tensor], Tensor]] = []
-        self._sums: dict[str, Tensor] = {}
-        """[2, N] by name: the sum of each environment, and how many numbers it has"""
-
-    def log(self, measures: dict[str, Tensor], valid: Tensor) -> None:
-        """One step of every environment; what is not finite, or not `valid` [N], is left out."""
-        self._log.append((measures, valid))
-        if len(self._log) == LOG_ROWS:
-            self._sum_up()
-
-    def take(self, world: World) -> dict[str, float]:
-        """The means since the last call, over the environments of all processes."""
-        self._sum_up()
-        sums, self._sums = self._sums, {}
-        if world.size > 1:
-            parts = [{name: torch.tensor(own) for name, own in part.items()} for part in world.each(_lists(sums))]
-            names = dict.fromkeys(name for part in parts for name in part)
-            sums = {name: torch.cat([part[name] for part in parts if name in part], dim=1) for name in names}
-        totals = {name: own.sum(1).tolist() for name, own in sums.items()}
-        return {name: total / count for name, (total, count) in totals.items() if count}
-
-    def _sum_up(self) -> None:
-        for name in dict.fromkeys(name for measures, _ in self._log for name in measures):
-            rows = [(measures[name], valid) for measures, valid in self._log if name in measures]
-            values, valid = map(torch.stack, zip(*rows, strict=True))
-            counts = values.isfinite() & valid
-            wide = values.where(counts, 0).to(wide_float(values.device))
-            new = torch.stack([wide, counts.to(wide.dtype)]).sum(1)
-            self._sums[name] = self._sums[name] + new if name in self._sums else new
-        self._log = []
-
-
-def _lists(sums: dict[str, Tensor]) -> dict[str, list[list[float]]]:
-    return {name: own.tolist() for name, own in sums.items()}
-
-
 class EpisodeStatistics:
     """Returns and lengths, summed up over many logged steps at once, since [T, N] costs hardly more than [N].
 
     Fragments (episodes that staggering began late or cut early) and ignored actions (`valid` False) are not counted.
+    Beside them are the means of all measures, over the steps in which they were given.
     """
 
     def __init__(self, num_envs: int, device: torch.device) -> None:
         self._log: list[tuple[Tensor, ...]] = []
         self._running = torch.zeros(2, num_envs, dtype=wide_float(device), device=device)
         self._ended: list[Tensor] = []
+        self._measured: dict[str, list[Tensor]] = {}
+        """by name: [2, N] for each logged step, the numbers and where they count"""
+        self._sums: dict[str, Tensor] = {}
+        """by name: [2, N], the sum of each environment, and how many numbers it has"""
 
-    def log(self, step: Step, counts: Tensor) -> None:
-        """One step of every environment; `counts` [N] is False where the episode is a fragment."""
+    def log(self, step: Step, counts: Tensor, measures: dict[str, Tensor], valid: Tensor) -> None:
+        """One step of every environment; `counts` [N] is False where the episode is a fragment.
+
+        Of several processes, each has the `measures` of its own environments, and where these are `valid`.
+        """
         self._log.append((step.reward, step.terminated, step.truncated, step.valid, counts))
+        for name, values in measures.items():
+            self._measured.setdefault(name, []).append(torch.stack([values, valid]))
         if len(self._log) == LOG_ROWS:
             self._sum_up()
 
-    def take(self) -> Episodes:
-        """The whole episodes that ended since the last call."""
+    def take(self, world: World = ALONE) -> Episodes:
+        """The whole episodes that ended since the last call, and the means of what all processes measured."""
         if self._log:
             self._sum_up()
         returns, lengths = torch.cat([self._running.new_zeros(2, 0), *self._ended], dim=1)
         self._ended = []
-        return Episodes(returns.tolist(), lengths.int().tolist())
+        means = self._means(world) if self._sums or world.size > 1 else {}
+        return Episodes(returns.tolist(), lengths.int().tolist(), means)
 
     def _sum_up(self) -> None:
-        reward, terminated, truncated, valid, counts = (torch.stack(column) for column in zip(*self._log, strict=True))
+        reward, terminated, truncated, valid, counts = map(torch.stack, zip(*self._log, strict=True))
         done = (terminated | truncated) & valid
         running = episode_sums(torch.stack([reward * valid, valid]).to(self._running.dtype), done, self._running)
         self._ended.append(running[:, done & counts])  # by time, then by environment
         self._running = running[:, -1] * ~done[-1]
-        self._log = []
+        for name, rows in self._measured.items():
+            values, valid = torch.stack(rows).to(self._running.dtype).unbind(1)
+            counted = values.isfinite() & valid.bool()
+            sums = torch.stack([values.where(counted, 0), counted]).sum(1)
+            self._sums[name] = self._sums[name] + sums if name in self._sums else sums
+        self._log, self._measured = [], {}
+
+    def _means(self, world: World) -> dict[str, float]:
+        """The mean of each measure, summed up over the environments in their order, whichever process has them."""
+        own = {name: sums.tolist() for name, sums in self._sums.items()}
+        self._sums, totals = {}, dict[str, list[list[float]]]()
+        for part in world.each(own):
+            for name, (sums, counts) in part.items():
+                before = totals.setdefault(name, [[], []])
+                totals[name] = [before[0] + sums, before[1] + counts]
+        return {name: sum(sums) / sum(counts) for name, (sums, counts) in totals.items() if sum(counts)}
 
 
 def episode_sums(rows: Tensor, done: Tensor, carried: Tensor) -> Tensor:

@@ -20,9 +20,10 @@ import numpy as np
 import torch
 from PIL import Image
 
-from lemniscate.envs.conversion import as_array, measured, measures_of
+from lemniscate.envs.conversion import measured, measures_of
 from lemniscate.envs.factory import make_one, maker_of, makes_vector, sentences
 from lemniscate.envs.registry import make_rendered
+from lemniscate.envs.returns import as_array
 from lemniscate.envs.spaces import SUMMARIES
 from lemniscate.envs.vec_env import VecEnv, require_end
 from lemniscate.errors import NonFiniteError, UserError, is_installed, missing_extra, shown

@@ -123,8 +123,9 @@ class ProgressBar:
         if self._bars:
             self._show_bars(whole, runs)
         elif self._cell or (self._visible and tenth > self._tenth):
-            lines = "".join(f"\n  {run.name}: {run.text}" for run in runs)
-            text = f"{whole.name}  {whole.text}{lines}"
+            text = f"{whole.name}  {whole.text}"
+            for run in runs:
+                text += f"\n  {run.name}: {run.text}"
             if self._cell:
                 filled = round(20 * min(1.0, whole.done / self._total))
                 self._text = f"{'━' * filled}{'╌' * (20 - filled)} {text}"

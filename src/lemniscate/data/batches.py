@@ -1,13 +1,15 @@
-"""Collecting whole episodes."""
+"""Whole episodes, which REINFORCE learns from, and the rows of REPPO."""
 
+from dataclasses import dataclass
 from functools import partial
 
 import torch
-from torch import Generator
+from torch import Generator, Tensor
 
 from lemniscate.envs.vec_env import VecEnv
+from lemniscate.maths import Gaussian, SquashedGaussian
 from lemniscate.nn.policies import Policy
-from lemniscate.types import Rollout
+from lemniscate.types import Record, Rollout
 
 
 @torch.no_grad()
@@ -35,3 +37,19 @@ def collect_episodes(env: VecEnv, policy: Policy, episodes: int, generator: Gene
             done = (step.terminated | step.truncated) & step.valid
             ended, age = ended + done.int(), (age + 1) * ~done
         return Rollout.stack(rows)
+
+
+@dataclass(frozen=True)
+class SoftBatch(Record):
+    """The rows of a rollout with Q(s, a), its target, and the policy's μ and log σ at collection, [B, …]."""
+
+    obs: Tensor
+    action: Tensor
+    value: Tensor
+    target: Tensor
+    mean: Tensor
+    log_std: Tensor
+
+    def kl_to(self, policy: SquashedGaussian) -> Tensor:
+        """KL(π_old ‖ π) of each row, [B]: that of the normals before the tanh, which maps both in the same way."""
+        return Gaussian(self.mean, self.log_std).kl(Gaussian(policy.mean, policy.log_std))

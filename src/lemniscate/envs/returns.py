@@ -1,0 +1,221 @@
+"""What `reset` and `step` of an environment return, checked: each fault is a sentence that says where it is written."""
+
+import math
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import VectorEnv, VectorWrapper
+from torch import Tensor
+
+from lemniscate.errors import UserError, shown
+from lemniscate.spec import Action, Discrete, MultiDiscrete
+
+MASKS = frozenset(("action_mask", "action_masks", "legal_action_mask"))
+"""what environments call their action mask: in `info`, as a key of a Dict observation, or as a method"""
+
+VALUES = {"reset": "2 values, (observation, info)", "step": "5 values, (obs, reward, terminated, truncated, info)"}
+
+
+class Returns:
+    """The values that `reset` and `step` return, checked; where they are not as they must be, a `UserError` says so.
+
+    Args:
+        env: one environment, or a vector environment.
+        space: of one observation.
+        lead: () for one environment, (N,) for a vector of N.
+    """
+
+    def __init__(self, env: Any, space: gym.Space, lead: tuple[int, ...] = ()) -> None:
+        self._env, self._space, self._lead = env, space, lead
+
+    def of_reset(self, returned: Any) -> tuple[Any, dict[str, Any]]:
+        """The observation, in the types of its space, and the info."""
+        obs, info = self._several("reset", returned, 2)
+        return self._observation("reset", obs), self._info("reset", info)
+
+    def of_step(self, returned: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """The observation, in the types of its space; the reward, the flags and the info."""
+        obs, reward, terminated, truncated, info = self._several("step", returned, 5)
+        if type(reward) is not float:
+            reward = self._numbers("reward", reward, float)
+        if type(terminated) is not bool:
+            terminated = self._numbers("terminated", terminated, bool)
+        if type(truncated) is not bool:
+            truncated = self._numbers("truncated", truncated, bool)
+        return self._observation("step", obs), reward, terminated, truncated, self._info("step", info)
+
+    def wrong(self, method: str, what: str) -> UserError:
+        """The sentence on a method: its name, where it is written, and `what` it did."""
+        return UserError(f"{author(self._env, method)} {what}.")
+
+    def _several(self, method: str, returned: Any, count: int) -> Any:
+        if not isinstance(returned, tuple) or len(returned) != count:
+            what = f"{len(returned)} values" if isinstance(returned, tuple) else kind_of(returned)
+            raise self.wrong(method, f"returned {what}; it must return {VALUES[method]}")
+        return returned
+
+    def _observation(self, method: str, obs: Any) -> Any:
+        try:
+            return _fitted(self._space, obs, self._lead)
+        except ValueError as error:
+            raise self.wrong(method, f"returned an observation {error}") from None
+
+    def _info(self, method: str, info: Any) -> dict[str, Any]:
+        if not isinstance(info, dict):
+            raise self.wrong(method, f"returned {kind_of(info)} as info; it must be a dictionary, such as {{}}")
+        return info
+
+    def _numbers(self, name: str, value: Any, kind: type) -> Any:
+        """A number or a flag of one environment, or a new array [N] of them."""
+        array = as_array(value)
+        fits = array.dtype.kind in "biuf" and (array.shape == self._lead or (array.size == 1 and not self._lead))
+        if not fits or (kind is bool and not ((array == 0) | (array == 1)).all()):
+            wanted = "a number" if kind is float else "True or False"
+            each = " for each environment" if self._lead else ""
+            raise self.wrong("step", f"returned {kind_of(value)} as {name}; it must be {wanted}{each}")
+        return array.astype(kind) if self._lead else kind(array.item())
+
+
+class CheckedVector(VectorWrapper):
+    """A vector environment whose returns are checked."""
+
+    def __init__(self, env: VectorEnv) -> None:
+        super().__init__(env)
+        self._returns = Returns(env, env.single_observation_space, (env.num_envs,))
+
+    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Gymnasium's."""
+        return self._returns.of_reset(self.env.reset(seed=seed, options=options))
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """Gymnasium's."""
+        return self._returns.of_step(self.env.step(actions))
+
+
+def layers(env: Any) -> Iterator[Any]:
+    """An environment, and what is inside of it if it is a wrapper, the outermost first."""
+    while env is not None:
+        yield env
+        env = vars(env).get("env")
+
+
+def author(env: Any, method: str) -> str:
+    """The method of the outermost layer whose class is not Gymnasium's."""
+    inside = list(layers(env))
+    own = (layer for layer in inside if not getattr(type(layer), method).__module__.startswith("gymnasium."))
+    return place(next(own, inside[-1]), method)
+
+
+def place(layer: Any, method: str) -> str:
+    """The name of a method, and where it is written."""
+    function = getattr(type(layer), method)
+    code = getattr(function, "__code__", None)
+    line = f" ({Path(code.co_filename).name}, line {code.co_firstlineno})" if code else ""
+    return f"{'.'.join(function.__qualname__.split('.')[-2:])}(){line}"
+
+
+def kind_of(value: Any) -> str:
+    """A value in a sentence: an array by its shape and type, a number as it is, others by their type."""
+    if hasattr(value, "dtype") and getattr(value, "shape", ()):
+        return f"an array of shape {tuple(value.shape)} and type {value.dtype}"
+    return shown(value)
+
+
+def as_array(value: Any) -> np.ndarray:
+    """As an array; of objects where it cannot be one, such as lists of different lengths, or a number is masked."""
+    if np.ma.is_masked(value):
+        return np.full((), None, dtype=object)
+    try:
+        return np.asarray(value.detach().cpu() if isinstance(value, Tensor) else value)
+    except (ValueError, TypeError, RuntimeError):
+        return np.full((), None, dtype=object)
+
+
+def _fitted(space: gym.Space, obs: Any, lead: tuple[int, ...], where: str = "") -> Any:
+    """An observation in the types of its space. Raises `ValueError`, with the rest of a sentence, where it is none."""
+    if isinstance(space, spaces.Dict):
+        keys = ", ".join(map(str, space.spaces))
+        if not isinstance(obs, Mapping):
+            raise ValueError(f"that is {kind_of(obs)}{where}; its space is a Dict with the keys {keys}")
+        if lacking := [key for key in space.spaces if key not in obs]:
+            raise ValueError(f"without {lacking[0]}{where}; its space is a Dict with the keys {keys}")
+        return {key: _fitted(part, obs[key], lead, f"{where} in {key}") for key, part in space.items()}
+    if isinstance(space, spaces.Tuple):
+        if not isinstance(obs, tuple | list) or len(obs) != len(space):
+            raise ValueError(f"that is {kind_of(obs)}{where}; its space is a Tuple of {len(space)}")
+        return tuple(_fitted(part, obs[i], lead, f"{where} in part {i}") for i, part in enumerate(space))
+    return _fitted_array(space, obs, (*lead, *(space.shape or ())), where)
+
+
+def _fitted_array(space: gym.Space, obs: Any, shape: tuple[int, ...], where: str) -> Any:
+    counted = isinstance(space, spaces.Discrete | spaces.MultiDiscrete)
+    if not counted and type(obs) is np.ndarray and obs.dtype == space.dtype and obs.shape == shape:
+        return obs
+    array, kind = as_array(obs), np.dtype(space.dtype)
+    if array.dtype.kind not in "biuf" or array.shape != shape:
+        said = f"of shape {array.shape}" if array.dtype.kind in "biuf" else f"that is {kind_of(obs)}"
+        raise ValueError(f"{said}{where}; its space is {shown_space(space)}, of shape {space.shape}")
+    with np.errstate(invalid="ignore"):  # a NaN as a whole number, which the next line finds
+        fitted = array.astype(kind)
+    if kind.kind in "iub" and not np.array_equal(fitted, array):
+        raise ValueError(f"of type {array.dtype}{where}, whose numbers are not all of type {kind}, as its space says")
+    if isinstance(space, spaces.Discrete | spaces.MultiDiscrete):
+        count = space.n if isinstance(space, spaces.Discrete) else space.nvec
+        outside = fitted[(fitted < space.start) | (fitted >= space.start + count)]
+        if outside.size:
+            raise ValueError(f"with {outside.flat[0]}{where}, which is not in its space, {shown_space(space)}")
+    return fitted if fitted.shape else fitted[()]
+
+
+def shown_space(space: gym.Space) -> str:
+    """A space in a sentence."""
+    return " ".join(str(space).split())
+
+
+def mask_in(obs: Any, info: Mapping[str, Any]) -> tuple[str, Any]:
+    """The action mask of an environment, and its name in `info`; ("", None) where there is none."""
+    for name in MASKS:
+        if name in info:
+            return name, info[name]
+        if isinstance(obs, Mapping) and name in obs:
+            return "", obs[name]
+    return "", None
+
+
+def flat_mask(mask: Any, action: gym.Space | Action) -> np.ndarray:
+    """An action mask as one row, [n] bool; of a MultiDiscrete, those of its components one after the other.
+
+    Raises `ValueError`, with the rest of a sentence, for another size, and for actions that are no choices.
+    """
+    counts = getattr(action, "nvec", None)
+    counts = np.ravel(getattr(action, "n", 0) if counts is None else counts)
+    if not isinstance(action, spaces.Discrete | spaces.MultiDiscrete | Discrete | MultiDiscrete):
+        raise ValueError("; masks are for Discrete and MultiDiscrete actions")
+    row = _row(mask)
+    if len(row) != counts.sum():
+        raise ValueError(f"of {len(row)} numbers; it must have {counts.sum()}, of 1 and 0")
+    return row.astype(bool)
+
+
+def _row(mask: Any) -> np.ndarray:
+    """Nested tuples and lists of arrays as one row."""
+    if isinstance(mask, tuple | list) and len(mask):
+        return np.concatenate([_row(part) for part in mask])
+    return np.ravel(mask)
+
+
+def scalars(info: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, float]]:
+    """Every number in `info`, an array of one too, and those of its dictionaries, by "outer/inner"."""
+    for key, value in info.items():
+        if isinstance(value, float | int):
+            yield f"{prefix}{key}", float(value)
+        elif isinstance(value, Mapping):
+            yield from scalars(value, f"{prefix}{key}/")
+        elif hasattr(value, "__array__") and math.prod(getattr(value, "shape", (0,))) == 1:
+            array = as_array(value)
+            if array.dtype.kind in "biuf":
+                yield f"{prefix}{key}", float(array.item())
