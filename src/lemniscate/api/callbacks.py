@@ -33,9 +33,6 @@ class StopAt:
         return step >= self.steps
 
 
-COPIER = "_copy_networks"
-
-
 class PolicySnapshot(TrainedPolicy):
     """The policy of a run at the line that a callback is shown. Its weights are copied when it is first used.
 
@@ -53,7 +50,7 @@ class PolicySnapshot(TrainedPolicy):
         return self.networks
 
     def __getstate__(self) -> dict[str, Any]:  # of a copy: a function of this process cannot be pickled
-        return {name: value for name, value in {**vars(self), "networks": self.networks}.items() if name != COPIER}
+        return {**vars(self), "networks": self.networks, "_copy_networks": _too_late}
 
     def expire(self) -> None:
         """Refuse to copy the weights from now on: the run goes on to change them."""

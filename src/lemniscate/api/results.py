@@ -179,18 +179,16 @@ def each_finding(
     what: str, backend: str | None, env_kwargs: Mapping[str, Any] | None, wrappers: Sequence[str]
 ) -> Iterator[Finding]:
     """The findings of `check`, one by one."""
-    if run_check.is_stored(at_home(what)):
-        return run_check.each_finding(at_home(what))
+    path = at_home(what)
+    if run_check.is_stored(path):
+        return run_check.each_finding(path)
     return env_check.each_finding(what, backend, env_kwargs, wrappers)
 
 
 def verdict(what: str, found: list[Finding]) -> str:
     """The conclusion from the findings, in a sentence or two."""
-    return (
-        run_check.verdict(at_home(what), found)
-        if run_check.is_stored(at_home(what))
-        else env_check.verdict(what, found)
-    )
+    path = at_home(what)
+    return run_check.verdict(path, found) if run_check.is_stored(path) else env_check.verdict(what, found)
 
 
 def scores_of(policy: TrainedPolicy) -> dict[str, Any]:

@@ -106,9 +106,8 @@ def _going_on(path: Path, whole: list[checkpoint.Checkpoint]) -> Finding:
     try:
         with parsing(planned[-1].path):
             steps = ", ".join(f"{found.numbers['step']:,}" for found in whole)
-            record = (
-                read_json(path / CONFIG) if is_whole(path / CONFIG) else planned[-1].record
-            )  # a run may be extended
+            # The run may have been extended since.
+            record = read_json(path / CONFIG) if is_whole(path / CONFIG) else planned[-1].record
             last, total = planned[-1].numbers["step"], record["config"]["total_steps"]
             what = "it is finished" if last >= total else f"resume goes on from step {last:,}"
     except DamagedFileError as error:

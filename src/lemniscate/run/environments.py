@@ -51,9 +51,8 @@ def envs_of(config: RunConfig, world: World) -> tuple[VecEnv, VecEnv | None]:
 
 def training_env(config: RunConfig, world: World) -> VecEnv:
     """The environments of training, staggered, shared by the processes of a world."""
-    own = {"kwargs": config.env_kwargs, "wrappers": config.all_wrappers, "backend": config.backend}
-    device = str(device_for(config.device))
-    return registry.make(config.env, config.num_envs, device=device, stagger=True, world=world, **own)
+    arguments, device = env_arguments(config, backend=config.backend), str(device_for(config.device))
+    return registry.make(num_envs=config.num_envs, device=device, stagger=True, world=world, **arguments)
 
 
 def evaluation_env(
@@ -82,7 +81,7 @@ def env_arguments(
     env_kwargs: Mapping[str, Any] | None = None,
     backend: str | None = None,
 ) -> dict[str, Any]:
-    """The arguments of `registry.make` for the evaluation of a run: env, kwargs, wrappers, backend."""
+    """The arguments of `registry.make`: env, kwargs, wrappers, backend; by default those of a run's evaluation."""
     name = config.env if env is None else registry.name_of(env)
     kwargs = {**(config.env_kwargs if name == config.env else {}), **(env_kwargs or {})}
     if env is None and backend is None:
