@@ -126,9 +126,8 @@ class TrainedPolicy:
     def q_value(self, obs: Any, action: Any) -> np.ndarray:
         """Q(s, a) of one raw observation and action, a scalar array, or of each of a batch, [B]; raises as `value`.
 
-        It is the discounted return that the policy expects after that action, in the units of `value`: the smaller of
-        two critics; of SAC and REPPO with the entropy that is rewarded on the way. Actions are as `act` returns them,
-        in the environment's units; what is outside of the bounds is clipped.
+        The return is that of `value`, of several critics the smallest; of SAC and REPPO with the entropy that is
+        rewarded on the way. Actions are as `act` returns them; what is outside of the bounds is clipped.
         """
         flat, batched = self._read_for("q", obs)
         kind, given = self.spec.bounded_box(), np.asarray(action, dtype=np.float32)

@@ -65,8 +65,7 @@ def evaluate(
             rendered environment, without a measurement of the Q bias. The first 16 starts are the same; from the 17th
             on, and in other backends than gymnasium, returns may differ from those without a film. Of flights in a
             scene, which are those without a film, the first of each parallel environment is recorded.
-        checkpoint: as in `load`, like `trust`.
-        trust: import code that a downloaded policy names.
+        checkpoint: as in `load`; and so `trust`.
 
     Raises:
         UserError: numbers out of range; an environment that cannot be made, or whose spaces differ; one without a
@@ -118,8 +117,7 @@ def watch(
         random: act uniformly at random, in the environment of the policy.
         video: a .gif, .webp or .mp4 to record all episodes into.
         env_kwargs: as in `evaluate`.
-        checkpoint: as in `load`, like `trust`.
-        trust: import code that a downloaded policy names.
+        checkpoint: as in `load`; and so `trust`.
 
     Raises:
         UserError: nothing to show it on; numbers out of range; an environment that cannot be made, renders no pictures,

@@ -3,12 +3,10 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-from filelock import FileLock, Timeout
-
 from lemniscate.envs.check import BAD, GOOD, NOTE, Finding
 from lemniscate.errors import UserError, resume_line
 from lemniscate.run import checkpoint
-from lemniscate.run.directory import BEST, CONFIG, FINAL, LOCK, SWEEP
+from lemniscate.run.directory import BEST, CONFIG, FINAL, LOCK, SWEEP, locked
 from lemniscate.run.metrics import METRICS, damage, read_metrics
 from lemniscate.run.places import is_sweep, read_sweep
 from lemniscate.system.files import DamagedFileError, is_whole, parsing, read_json
@@ -67,7 +65,7 @@ def _of_run(path: Path) -> Iterator[Finding]:
             yield Finding(BAD, f"{path / FINAL} is damaged; its scores are computed again where they are asked for.")
     if left := sorted(file.relative_to(path).as_posix() for file in path.rglob("*.tmp")):
         yield Finding(NOTE, f"Left by a write that was interrupted, and harmless: {', '.join(left)}.")
-    if (path / LOCK).exists() and _is_locked(path / LOCK):
+    if (path / LOCK).exists() and _is_locked(path):
         yield Finding(NOTE, "It is being trained by another process, and may have changed meanwhile.")
 
 
@@ -124,11 +122,11 @@ def _metrics(path: Path, whole: list[checkpoint.Checkpoint]) -> Iterator[Finding
         yield Finding(GOOD, f"{METRICS}: {len(lines):,} lines up to step {lines[-1]['step']:,}.")
 
 
-def _is_locked(file: Path) -> bool:
+def _is_locked(path: Path) -> bool:
     try:
-        with FileLock(file, timeout=0):
+        with locked(path):
             return False
-    except Timeout:
+    except UserError:
         return True
     except OSError:  # read-only: nobody can train there
         return False

@@ -365,10 +365,9 @@ class Run:
 def decide(curriculum: Callable[..., Any], step: int, metrics: Mapping[str, float]) -> dict[str, Any]:
     """The calls that a curriculum returns, as JSON holds them, so that they are the same from a checkpoint.
 
-    It does not see the measured times: on them a run would not have the same bits twice. Raises `UserError` for what it
-    raises, and for what is no such dictionary.
+    Raises `UserError` for what it raises, and for what is no such dictionary.
     """
-    try:
+    try:  # without the measured times: on them a run would not have the same bits twice
         calls = curriculum(step, {name: value for name, value in metrics.items() if not name.startswith("time/")})
     except Exception as error:
         raise UserError(f"The curriculum raised {type(error).__name__} at step {step:,}: {error}") from error
