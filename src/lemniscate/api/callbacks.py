@@ -1,6 +1,7 @@
 """Callbacks: functions of the user's that see a run while it trains, and may stop it."""
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 from itertools import product
 from types import MappingProxyType
 from typing import Any
@@ -43,11 +44,10 @@ class PolicySnapshot(TrainedPolicy):
         self.spec, self.config, self.step = spec, config, step
         self._copy_networks = copy_networks
 
-    def __getattr__(self, name: str) -> Any:  # called for what is not there: the networks, until they are copied
-        if name != "networks":
-            raise AttributeError(f"A policy has no attribute {name!r}.")
-        self.networks = self._copy_networks().eval()
-        return self.networks
+    @cached_property
+    def networks(self) -> Any:
+        """The copy."""
+        return self._copy_networks().eval()
 
     def __getstate__(self) -> dict[str, Any]:  # of a copy: a function of this process cannot be pickled
         return {**vars(self), "networks": self.networks, "_copy_networks": _too_late}

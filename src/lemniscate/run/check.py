@@ -40,11 +40,8 @@ def verdict(path: Path, found: list[Finding]) -> str:
     damaged = sum(finding.grade == BAD for finding in found)
     if not damaged:
         return f"{path} is whole."
-    repairable = (
-        is_whole(path / SWEEP)
-        if is_sweep(path)
-        else any(found.record.get("planned") for found in _checkpoints(path)[0])
-    )
+    planned = any(found.record.get("planned") for found in _checkpoints(path)[0])
+    repairable = is_whole(path / SWEEP) if is_sweep(path) else planned
     files = f"{damaged} finding{'s' * (damaged > 1)} above, marked ✗"
     if repairable:
         return f"{path} is damaged: {files}. What can be repaired, this repairs: {resume_line(path)}"
