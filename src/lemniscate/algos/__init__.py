@@ -49,10 +49,8 @@ def _import(name: str) -> Any:
         sys.path.append(str(Path.cwd()))
     try:
         return import_module(name)
-    except ModuleNotFoundError as error:
-        if error.name in (name, name.partition(".")[0]):
+    except (ImportError, SyntaxError, ValueError, TypeError) as error:
+        if isinstance(error, ModuleNotFoundError) and error.name in (name, name.partition(".")[0]):
             said = unknown_name("algorithm", name, ALGORITHMS)
             raise UserError(f"{said} A module of your own is not {named.WHERE}.") from None
-        raise UserError(f"The algorithm {name} cannot be imported: {error}.") from error
-    except (ImportError, SyntaxError, ValueError, TypeError) as error:
         raise UserError(f"The algorithm {name} cannot be imported: {error}.") from error

@@ -1,6 +1,7 @@
 """Callbacks: functions of the user's that see a run while it trains, and may stop it."""
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 from itertools import product
 from types import MappingProxyType
 from typing import Any
@@ -33,9 +34,6 @@ class StopAt:
         return step >= self.steps
 
 
-COPIER = "_copy_networks"
-
-
 class PolicySnapshot(TrainedPolicy):
     """The policy of a run at the line that a callback is shown. Its weights are copied when it is first used.
 
@@ -46,14 +44,13 @@ class PolicySnapshot(TrainedPolicy):
         self.spec, self.config, self.step = spec, config, step
         self._copy_networks = copy_networks
 
-    def __getattr__(self, name: str) -> Any:  # called for what is not there: the networks, until they are copied
-        if name != "networks":
-            raise AttributeError(f"A policy has no attribute {name!r}.")
-        self.networks = self._copy_networks().eval()
-        return self.networks
+    @cached_property
+    def networks(self) -> Any:
+        """The copy."""
+        return self._copy_networks().eval()
 
     def __getstate__(self) -> dict[str, Any]:  # of a copy: a function of this process cannot be pickled
-        return {name: value for name, value in {**vars(self), "networks": self.networks}.items() if name != COPIER}
+        return {**vars(self), "networks": self.networks, "_copy_networks": _too_late}
 
     def expire(self) -> None:
         """Refuse to copy the weights from now on: the run goes on to change them."""

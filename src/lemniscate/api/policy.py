@@ -3,7 +3,7 @@
 import sys
 from contextlib import nullcontext
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -70,8 +70,7 @@ class TrainedPolicy:
         """Whether its environment says at each step which actions are valid."""
         return self.spec.action.mask_size > 0
 
-    @torch_defaults()
-    @torch.no_grad()
+    @torch_defaults(grad=False)
     def act(self, obs: Any, deterministic: bool = True, action_mask: Any = None) -> np.ndarray:
         """The action at one raw observation, or at each of a batch; ready for `env.step`.
 
@@ -98,17 +97,12 @@ class TrainedPolicy:
         physical = physical_action(action.numpy(), self.spec.action)
         return physical if batched else physical[0]
 
-    @torch_defaults()
-    @torch.no_grad()
+    @torch_defaults(grad=False)
     def distribution(self, obs: Any, action_mask: Any = None) -> ActionDistribution:
         """The distribution of the actions at one raw observation, or at each of a batch; takes and raises as `act`."""
         (flat, batched), kind = self._read(obs, action_mask), self.spec.action
         found: Any = self.module(flat)
-
-        def rows(values: Tensor, shape: tuple[int, ...] | None = None) -> np.ndarray:
-            array = values.numpy() if shape is None else values.numpy().reshape(-1, *shape)
-            return array if batched else array[0]
-
+        rows = partial(_rows, batched=batched)
         if isinstance(kind, MultiDiscrete):
             return ActionDistribution(tuple(rows(part.logits.softmax(-1)) for part in found.parts))
         if not isinstance(kind, Box):
@@ -118,8 +112,7 @@ class TrainedPolicy:
         _, _, middle, half = map(torch.from_numpy, scale_of(kind))
         return ActionDistribution(mean=rows(middle + half * mean, kind.shape), std=rows(half * std, kind.shape))
 
-    @torch_defaults()
-    @torch.no_grad()
+    @torch_defaults(grad=False)
     def value(self, obs: Any) -> np.ndarray:
         """V(s) of one raw observation, a scalar array, or of each of a batch, [B]; takes and raises as `act`.
 
@@ -127,17 +120,14 @@ class TrainedPolicy:
         `scale_rewards`. Raises `UserError` for an algorithm that learns no V(s), or one of privileged numbers too.
         """
         flat, batched = self._read_for("value", obs)
-        value = self.networks.value(flat).numpy()
-        return value if batched else value[0]
+        return _rows(self.networks.value(flat), batched=batched)
 
-    @torch_defaults()
-    @torch.no_grad()
+    @torch_defaults(grad=False)
     def q_value(self, obs: Any, action: Any) -> np.ndarray:
         """Q(s, a) of one raw observation and action, a scalar array, or of each of a batch, [B]; raises as `value`.
 
-        It is the discounted return that the policy expects after that action, in the units of `value`: the smaller of
-        two critics; of SAC and REPPO with the entropy that is rewarded on the way. Actions are as `act` returns them,
-        in the environment's units; what is outside of the bounds is clipped.
+        The return is that of `value`, of several critics the smallest; of SAC and REPPO with the entropy that is
+        rewarded on the way. Actions are as `act` returns them; what is outside of the bounds is clipped.
         """
         flat, batched = self._read_for("q", obs)
         kind, given = self.spec.bounded_box(), np.asarray(action, dtype=np.float32)
@@ -147,8 +137,7 @@ class TrainedPolicy:
                 f"action must be finite numbers of the shape {wanted}, not {given.shape}: as act returns it."
             )
         own = torch.from_numpy(normalized_action(given.reshape(len(flat), -1), kind)).clamp(-1, 1)
-        q = self.networks.q(flat, own).numpy()
-        return q if batched else q[0]
+        return _rows(self.networks.q(flat, own), batched=batched)
 
     def _read(self, obs: Any, action_mask: Any = None) -> tuple[Tensor, bool]:
         """The flat observations [B, O], with the mask where there is one, and whether they are a batch."""
@@ -172,6 +161,12 @@ class TrainedPolicy:
                 f"{verbs[critic]} takes {self.spec.privileged} privileged numbers, which no observation has."
             )
         return self._read(obs)
+
+
+def _rows(values: Tensor, shape: tuple[int, ...] | None = None, *, batched: bool) -> np.ndarray:
+    """Values [B, …] as an array, each in this shape if one is given; the only one if they are no batch."""
+    array = values.numpy() if shape is None else values.numpy().reshape(-1, *shape)
+    return array if batched else array[0]
 
 
 @dataclass(frozen=True)

@@ -65,8 +65,7 @@ def evaluate(
             rendered environment, without a measurement of the Q bias. The first 16 starts are the same; from the 17th
             on, and in other backends than gymnasium, returns may differ from those without a film. Of flights in a
             scene, which are those without a film, the first of each parallel environment is recorded.
-        checkpoint: as in `load`, like `trust`.
-        trust: import code that a downloaded policy names.
+        checkpoint: as in `load`; and so `trust`.
 
     Raises:
         UserError: numbers out of range; an environment that cannot be made, or whose spaces differ; one without a
@@ -118,8 +117,7 @@ def watch(
         random: act uniformly at random, in the environment of the policy.
         video: a .gif, .webp or .mp4 to record all episodes into.
         env_kwargs: as in `evaluate`.
-        checkpoint: as in `load`, like `trust`.
-        trust: import code that a downloaded policy names.
+        checkpoint: as in `load`; and so `trust`.
 
     Raises:
         UserError: nothing to show it on; numbers out of range; an environment that cannot be made, renders no pictures,
@@ -179,18 +177,16 @@ def each_finding(
     what: str, backend: str | None, env_kwargs: Mapping[str, Any] | None, wrappers: Sequence[str]
 ) -> Iterator[Finding]:
     """The findings of `check`, one by one."""
-    if run_check.is_stored(at_home(what)):
-        return run_check.each_finding(at_home(what))
+    path = at_home(what)
+    if run_check.is_stored(path):
+        return run_check.each_finding(path)
     return env_check.each_finding(what, backend, env_kwargs, wrappers)
 
 
 def verdict(what: str, found: list[Finding]) -> str:
     """The conclusion from the findings, in a sentence or two."""
-    return (
-        run_check.verdict(at_home(what), found)
-        if run_check.is_stored(at_home(what))
-        else env_check.verdict(what, found)
-    )
+    path = at_home(what)
+    return run_check.verdict(path, found) if run_check.is_stored(path) else env_check.verdict(what, found)
 
 
 def scores_of(policy: TrainedPolicy) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from lemniscate.errors import NotStoredError, UserError, is_installed
 from lemniscate.hub.repository import local_path
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import extend, is_finished, read_record, require_absent
-from lemniscate.run.environments import envs_of, make_envs
+from lemniscate.run.environments import envs_of
 from lemniscate.run.loggers import LoggerClass
 from lemniscate.run.run import Run
 from lemniscate.run.seeding import set_seeds, torch_defaults
@@ -283,7 +283,7 @@ def _train_here(
     progress = options.progress and world.is_first
     set_seeds(config.seed)  # before JAX starts, which reads its flags then
     torch.set_num_threads(config.threads)
-    envs = make_envs(config) if world.size == 1 else envs_of(config, world)
+    envs = envs_of(config, world)
     spec = envs[0].spec
 
     def copy_networks(state: TrainState) -> Any:

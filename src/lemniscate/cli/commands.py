@@ -151,12 +151,8 @@ def envs(given: argparse.Namespace) -> None:
             first, *rest = found
             say(f"{family:<28} {1 + len(rest):>4}  {first}{', …' if rest else ''}")
         say("`lemniscate envs NAME` lists those with that word in family or id, and the presets that fit.")
-        for package, extra in {
-            "envpool": "envpool",
-            "mujoco": "mujoco",
-            "Box2D": "box2d",
-            "crazyflow": "drone",
-        }.items():
+        extras = {"envpool": "envpool", "mujoco": "mujoco", "Box2D": "box2d", "crazyflow": "drone"}
+        for package, extra in extras.items():
             say("" if is_installed(package) else missing_extra(package, extra))
         return
     found = [env_id for env_id in ids if wanted in env_id.lower() or wanted in _family(env_id).lower()]

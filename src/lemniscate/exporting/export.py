@@ -53,8 +53,7 @@ def export(
     Args:
         run: as in `load`.
         to: the new directory; by default `export` in that of the run. An export that is there is replaced.
-        checkpoint: as in `load`, like `trust`.
-        trust: import code that a downloaded policy names.
+        checkpoint: as in `load`; and so `trust`.
 
     Returns:
         The directory.

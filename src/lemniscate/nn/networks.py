@@ -231,8 +231,7 @@ class PartsEncoder(nn.Module):
         super().__init__()
         self._sizes = [part.size for part in parts]
         self.encoders = nn.ModuleList(ImageEncoder(part.shape) if part.image else nn.Identity() for part in parts)
-        encoded = zip(self.encoders, self._sizes, strict=True)
-        self.size = sum(encoder.size if isinstance(encoder, ImageEncoder) else size for encoder, size in encoded)
+        self.size = sum(getattr(encoder, "size", part.size) for encoder, part in zip(self.encoders, parts, strict=True))
         """length of what comes out"""
 
     def forward(self, obs: Tensor) -> Tensor:

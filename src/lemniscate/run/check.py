@@ -3,12 +3,10 @@
 from collections.abc import Iterator
 from pathlib import Path
 
-from filelock import FileLock, Timeout
-
 from lemniscate.envs.check import BAD, GOOD, NOTE, Finding
 from lemniscate.errors import UserError, resume_line
 from lemniscate.run import checkpoint
-from lemniscate.run.directory import BEST, CONFIG, FINAL, LOCK, SWEEP
+from lemniscate.run.directory import BEST, CONFIG, FINAL, LOCK, SWEEP, locked
 from lemniscate.run.metrics import METRICS, damage, read_metrics
 from lemniscate.run.places import is_sweep, read_sweep
 from lemniscate.system.files import DamagedFileError, is_whole, parsing, read_json
@@ -42,11 +40,8 @@ def verdict(path: Path, found: list[Finding]) -> str:
     damaged = sum(finding.grade == BAD for finding in found)
     if not damaged:
         return f"{path} is whole."
-    repairable = (
-        is_whole(path / SWEEP)
-        if is_sweep(path)
-        else any(found.record.get("planned") for found in _checkpoints(path)[0])
-    )
+    planned = any(found.record.get("planned") for found in _checkpoints(path)[0])
+    repairable = is_whole(path / SWEEP) if is_sweep(path) else planned
     files = f"{damaged} finding{'s' * (damaged > 1)} above, marked ✗"
     if repairable:
         return f"{path} is damaged: {files}. What can be repaired, this repairs: {resume_line(path)}"
@@ -67,7 +62,7 @@ def _of_run(path: Path) -> Iterator[Finding]:
             yield Finding(BAD, f"{path / FINAL} is damaged; its scores are computed again where they are asked for.")
     if left := sorted(file.relative_to(path).as_posix() for file in path.rglob("*.tmp")):
         yield Finding(NOTE, f"Left by a write that was interrupted, and harmless: {', '.join(left)}.")
-    if (path / LOCK).exists() and _is_locked(path / LOCK):
+    if (path / LOCK).exists() and _is_locked(path):
         yield Finding(NOTE, "It is being trained by another process, and may have changed meanwhile.")
 
 
@@ -106,9 +101,8 @@ def _going_on(path: Path, whole: list[checkpoint.Checkpoint]) -> Finding:
     try:
         with parsing(planned[-1].path):
             steps = ", ".join(f"{found.numbers['step']:,}" for found in whole)
-            record = (
-                read_json(path / CONFIG) if is_whole(path / CONFIG) else planned[-1].record
-            )  # a run may be extended
+            # The run may have been extended since.
+            record = read_json(path / CONFIG) if is_whole(path / CONFIG) else planned[-1].record
             last, total = planned[-1].numbers["step"], record["config"]["total_steps"]
             what = "it is finished" if last >= total else f"resume goes on from step {last:,}"
     except DamagedFileError as error:
@@ -125,11 +119,11 @@ def _metrics(path: Path, whole: list[checkpoint.Checkpoint]) -> Iterator[Finding
         yield Finding(GOOD, f"{METRICS}: {len(lines):,} lines up to step {lines[-1]['step']:,}.")
 
 
-def _is_locked(file: Path) -> bool:
+def _is_locked(path: Path) -> bool:
     try:
-        with FileLock(file, timeout=0):
+        with locked(path):
             return False
-    except Timeout:
+    except UserError:
         return True
     except OSError:  # read-only: nobody can train there
         return False

@@ -26,7 +26,6 @@ MOST_WHOLE, MOST_REAL = 10**15, 1e38
 MOST_ITEMS = 1_000
 """the most values of a field that has several"""
 
-
 T = TypeVar("T")
 
 
@@ -73,11 +72,7 @@ def checked(name: str, value: Any, hint: Any) -> Any:
     Raises:
         UserError: a value that no option of `hint` has room for.
     """
-    if hasattr(value, "tolist"):
-        value = value.tolist()
-    if isinstance(value, torch.device | PurePath):
-        value = str(value)
-    options = options_of(hint)
+    value, options = plain(value), options_of(hint)
     if value is None and NoneType in options:
         return None
     wanted: list[str] = []
@@ -113,19 +108,17 @@ def _convert(value: Any, option: Any) -> Any:
             raise ValueError(wanted)
     if kind is dict:
         try:  # what a run is trained with is what it is evaluated with when it comes back from its file
-            return json.loads(json.dumps(value, allow_nan=False, default=_plain))
+            return json.loads(json.dumps(value, allow_nan=False, default=plain))
         except (TypeError, ValueError, RecursionError):
             raise ValueError("a dictionary of what JSON can hold") from None
     return value
 
 
-def _plain(value: Any) -> Any:
-    """A NumPy value or a path as JSON can hold it. Raises `TypeError` for anything else."""
-    if isinstance(value, PurePath):
-        return str(value)
+def plain(value: Any) -> Any:
+    """A value of NumPy or torch as Python's, a path as its text; anything else as it is, which `json` then refuses."""
     if hasattr(value, "tolist"):
         return value.tolist()
-    raise TypeError(type(value))
+    return str(value) if isinstance(value, torch.device | PurePath) else value
 
 
 def _number(value: Any, kind: type, limits: Range = Range()) -> int | float:

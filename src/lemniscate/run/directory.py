@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from itertools import count
 from pathlib import Path
 from typing import Any, Literal
@@ -164,7 +164,7 @@ class Saver:
         self._config, self._checkpoints = config, path / "checkpoints"
         self._identity = {"algorithm": algorithm, "config": config.to_json()}
         self._record = {**self._identity, "spec": checkpoint.spec_to_json(spec)}
-        self._lock = FileLock(path / LOCK, timeout=0)
+        self._held = ExitStack()
         self.last_planned = 0
         """the step that `resume` would go on from"""
         self.planned_at = 0
@@ -182,9 +182,7 @@ class Saver:
             return
         try:
             make_directory(self.path)
-            self._lock.acquire()
-        except Timeout:
-            raise UserError(f"{self.path} is being trained by another process.") from None
+            self._held.enter_context(locked(self.path))
         except OSError as error:
             raise UserError(f"{self.path} cannot be written: {error.strerror or error}.") from error
         if not self.exists:
@@ -219,10 +217,9 @@ class Saver:
 
     def _require_same_spaces(self, found: checkpoint.Checkpoint) -> None:
         """Raise `UserError` where the environment has other spaces than those that a checkpoint was made in."""
-        before, now = (found.record["spec"], self._record["spec"])
-        for what in ("observation_parts", "action"):
+        before, now = found.record["spec"], self._record["spec"]
+        for what, space in (("observation_parts", "observation"), ("action", "action")):
             if json.dumps(before[what]) != json.dumps(now[what]):
-                space = "action" if what == "action" else "observation"
                 raise UserError(f"{self.path} was trained with another {space} space than {now['env_id']} has now.")
 
     def _restore_best(self, step: int) -> None:
@@ -286,4 +283,4 @@ class Saver:
 
     def close(self) -> None:
         """Unlock the directory."""
-        self._lock.release()
+        self._held.close()

@@ -1,6 +1,7 @@
 """The environments of a run, for training and for evaluation, and whether there is room for it."""
 
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from typing import Any
 
 import torch
@@ -30,30 +31,26 @@ def make_envs(config: RunConfig) -> tuple[VecEnv, VecEnv]:
     """
     if not isinstance(config, RunConfig):
         raise UserError(f"make_envs needs a Config, such as config_for('ppo', 'CartPole-v1'), not {shown(config)}.")
-    device = device_for(config.device)
-    eval_env = evaluation_env(config, config.evaluate_episodes, device=str(device))  # the few, before the many
-    if eval_env.backend.once:
-        return eval_env, eval_env
-    try:
-        require_memory(config, eval_env.spec, device)
-        return training_env(config, World(config.shards)), eval_env
-    except BaseException:
-        eval_env.close()
-        raise
+    env, eval_env = envs_of(config, World(config.shards))
+    assert eval_env is not None
+    return env, eval_env
 
 
 def envs_of(config: RunConfig, world: World) -> tuple[VecEnv, VecEnv | None]:
-    """The environments of one of several processes: only the first evaluates. Raises as `make_envs`."""
-    device = device_for(config.device)
-    eval_env = evaluation_env(config, config.evaluate_episodes, device=str(device)) if world.is_first else None
-    return training_env(config, world), eval_env
-
-
-def training_env(config: RunConfig, world: World) -> VecEnv:
-    """The environments of training, staggered, shared by the processes of a world."""
-    own = {"kwargs": config.env_kwargs, "wrappers": config.all_wrappers, "backend": config.backend}
-    device = str(device_for(config.device))
-    return registry.make(config.env, config.num_envs, device=device, stagger=True, world=world, **own)
+    """The environments of one process of a run; of several, only the first evaluates. Raises as `make_envs`."""
+    device, arguments = device_for(config.device), env_arguments(config, backend=config.backend)
+    with ExitStack() as failing:
+        eval_env = None
+        if world.is_first:  # the few, before the many
+            eval_env = evaluation_env(config, config.evaluate_episodes, device=str(device))
+            if eval_env.backend.once:
+                return eval_env, eval_env
+            failing.callback(eval_env.close)
+            if world.size == 1:
+                require_memory(config, eval_env.spec, device)
+        env = registry.make(num_envs=config.num_envs, device=str(device), stagger=True, world=world, **arguments)
+        failing.pop_all()
+        return env, eval_env
 
 
 def evaluation_env(
@@ -82,7 +79,7 @@ def env_arguments(
     env_kwargs: Mapping[str, Any] | None = None,
     backend: str | None = None,
 ) -> dict[str, Any]:
-    """The arguments of `registry.make` for the evaluation of a run: env, kwargs, wrappers, backend."""
+    """The arguments of `registry.make`: env, kwargs, wrappers, backend; by default those of a run's evaluation."""
     name = config.env if env is None else registry.name_of(env)
     kwargs = {**(config.env_kwargs if name == config.env else {}), **(env_kwargs or {})}
     if env is None and backend is None:

@@ -25,7 +25,7 @@ import torch
 from lemniscate.envs.vec_env import Episodes, VecEnv
 from lemniscate.errors import NonFiniteError, NotStoredError, UserError, resume_line, shown
 from lemniscate.optim.compiled import Compiler
-from lemniscate.run.config import RunConfig
+from lemniscate.run.config import RunConfig, plain
 from lemniscate.run.directory import Saver
 from lemniscate.run.evaluate import critic_of, evaluate
 from lemniscate.run.loggers import NO_EPISODES, JsonLines, Logger, LoggerClass, TensorBoard
@@ -102,20 +102,16 @@ class Run:
         saved as a checkpoint at step 0, so that from then on the run does not depend on where its networks came from.
         """
         saver = self._saver
-        if self.config.warm_start and not saver.exists:  # first, since it may fail
-            self._begin_warm(state)
-        if self._curriculum and not saver.exists:  # and so may this
-            self._advance_curriculum([(0, {})])
+        if not saver.exists:  # first, since it may fail
+            self._begin(state)
         saver.open()
         restored = saver.restore(state)
-        if self._curriculum and restored:
-            self.env.backend.call(saver.calls)
-        elif self._curriculum and saver.exists:
-            self._advance_curriculum([(0, {})])
-        if self.config.warm_start and not restored:
-            if saver.exists:
-                self._begin_warm(state)
+        if not restored and saver.exists:
+            self._begin(state)
+        if not restored and self.config.warm_start:
             saver.save(state, planned=True, logged=0)
+        if restored and self._curriculum:
+            self.env.backend.call(saver.calls)
         compiled = is_compiled(self.config)
         if compiled and self._visible:
             say("Compiling: up to a minute the first time, 5 to 10 s from then on.")
@@ -257,15 +253,11 @@ class Run:
         finally:
             if stop:
                 self._stop.settle()
-                self._save_unplanned(state, planned)
+                if not planned and state.step > self._saver.planned_at:
+                    self._saver.save(state, planned=False, logged=self._logged)
         if stop and not finished:
             self._tell_stop(state.step, signum)
         return stop
-
-    def _save_unplanned(self, state: TrainState, planned: bool) -> None:
-        """Save a run that stops where no checkpoint is planned."""
-        if not planned and state.step > self._saver.planned_at:
-            self._saver.save(state, planned=False, logged=self._logged)
 
     def _is_asked_to_stop(self, number: int) -> bool:
         """Whether a signal has come; several processes agree on that now and then."""
@@ -293,11 +285,15 @@ class Run:
         self.env.restart(seed, state.step)
         state.on_restart()
 
-    def _begin_warm(self, state: TrainState) -> None:
-        sentence = load_networks(state.networks, self.config, self.spec, self._locate)
-        state.on_warm_start()
-        if self._visible:
-            say(sentence)
+    def _begin(self, state: TrainState) -> None:
+        """Do what is done before step 0: load the networks of a warm start, and ask the curriculum."""
+        if self.config.warm_start:
+            sentence = load_networks(state.networks, self.config, self.spec, self._locate)
+            state.on_warm_start()
+            if self._visible:
+                say(sentence)
+        if self._curriculum:
+            self._advance_curriculum([(0, {})])
 
     @cached_property
     def _curriculum(self) -> Callable[..., Any] | None:
@@ -369,16 +365,15 @@ class Run:
 def decide(curriculum: Callable[..., Any], step: int, metrics: Mapping[str, float]) -> dict[str, Any]:
     """The calls that a curriculum returns, as JSON holds them, so that they are the same from a checkpoint.
 
-    It does not see the measured times: on them a run would not have the same bits twice. Raises `UserError` for what it
-    raises, and for what is no such dictionary.
+    Raises `UserError` for what it raises, and for what is no such dictionary.
     """
-    try:
+    try:  # without the measured times: on them a run would not have the same bits twice
         calls = curriculum(step, {name: value for name, value in metrics.items() if not name.startswith("time/")})
     except Exception as error:
         raise UserError(f"The curriculum raised {type(error).__name__} at step {step:,}: {error}") from error
     with suppress(TypeError, ValueError, AttributeError, RecursionError):
         if isinstance(calls, Mapping) and all(isinstance(name, str) for name in calls):
-            return json.loads(json.dumps(dict(calls), allow_nan=False, default=lambda array: array.tolist()))
+            return json.loads(json.dumps(dict(calls), allow_nan=False, default=plain))
     wanted = "a dictionary of methods with an argument each that JSON can hold, such as {'set_level': 1}"
     raise UserError(f"The curriculum must return {wanted}; at step {step:,} it returned {shown(calls)}.")
 

@@ -26,7 +26,7 @@ from lemniscate.errors import SweepError, UserError, prefix_errors, resume_line,
 from lemniscate.hub.repository import local_path
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import is_finished, locked
-from lemniscate.run.environments import device_for, require_memory
+from lemniscate.run.environments import device_for, env_arguments, require_memory
 from lemniscate.run.metrics import progress_of
 from lemniscate.run.places import LOG, Places, Processes, Sweep, failure_of, read_sweep
 from lemniscate.run.seeding import torch_defaults
@@ -317,9 +317,8 @@ def require_trainable(configs: dict[str, RunConfig], seeds: list[int]) -> None:
         device = device_for(config.device)
         for seed in seeds:
             config.replace(seed=seed)
-        own = {"kwargs": config.env_kwargs, "wrappers": config.all_wrappers, "backend": config.backend}
         with prefix_errors(name):
-            env = registry.make(config.env, 1, **own)
+            env = registry.make(num_envs=1, **env_arguments(config, backend=config.backend))
             env.close()
             require_memory(config, env.spec, device)
             networks = config.networks(env.spec)

@@ -93,8 +93,8 @@ def _absent(name: str, inside: Any, part: str) -> UserError:
     else:
         hint = "."
     file = Path(getattr(inside, "__file__", None) or "")
-    where = f" ({file})" if file.name and not file.is_relative_to(Path.cwd()) else ""
-    return UserError(f"{name} cannot be found: {module_name}{where} has no {qualname}{hint}")
+    where = f" {module_name} is {file}." if file.name and not file.is_relative_to(Path.cwd()) else ""
+    return UserError(f"{name} cannot be found: {module_name} has no {qualname}{hint}{where}")
 
 
 def module_of(name: str) -> ModuleType:
@@ -111,11 +111,10 @@ def module_of(name: str) -> ModuleType:
         sys.path.append(str(Path.cwd()))
     try:
         return importlib.import_module(module_name)
-    except ModuleNotFoundError as error:
-        if error.name and f"{module_name}.".startswith(f"{error.name}."):
-            raise UserError(f"{name} cannot be found: there is no module {error.name} {WHERE}.") from None
-        raise UserError(f"{name} cannot be found: {error}.") from error
     except (ImportError, SyntaxError, ValueError, TypeError) as error:
+        missing = error.name if isinstance(error, ModuleNotFoundError) else None
+        if missing and f"{module_name}.".startswith(f"{missing}."):
+            raise UserError(f"{name} cannot be found: there is no module {missing} {WHERE}.") from None
         raise UserError(f"{name} cannot be found: {error}.") from error
 
 
