@@ -1,6 +1,7 @@
 """What passes between a policy and environments at every step: what these return, checked, and the actions."""
 
 import math
+import traceback
 from collections.abc import Iterator, Mapping
 from functools import lru_cache, reduce
 from inspect import signature
@@ -50,11 +51,11 @@ class Returns:
     def of_step(self, returned: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """The observation, in the types of its space; the reward, the flags and the info."""
         obs, reward, terminated, truncated, info = self._several("step", returned, 5)
-        if type(reward) is not float:
+        if self._lead or type(reward) is not float:
             reward = self._numbers("reward", reward, float)
-        if type(terminated) is not bool:
+        if self._lead or type(terminated) is not bool:
             terminated = self._numbers("terminated", terminated, bool)
-        if type(truncated) is not bool:
+        if self._lead or type(truncated) is not bool:
             truncated = self._numbers("truncated", truncated, bool)
         return self._observation("step", obs), reward, terminated, truncated, self._info("step", info)
 
@@ -121,12 +122,20 @@ class SingleEnv(gym.Wrapper):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Gymnasium's."""
-        obs, info = self._returns.of_reset(self.env.reset(seed=seed, options=options))
+        try:
+            returned = self.env.reset(seed=seed, options=options)
+        except (TypeError, ValueError) as error:
+            raise self._in_wrapper("reset", error) from error.__cause__
+        obs, info = self._returns.of_reset(returned)
         return obs, self._told("reset", obs, info)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Gymnasium's."""
-        obs, *rest, info = self._returns.of_step(self.env.step(action))
+        try:
+            returned = self.env.step(action)
+        except (TypeError, ValueError) as error:
+            raise self._in_wrapper("step", error) from error.__cause__
+        obs, *rest, info = self._returns.of_step(returned)
         return obs, *rest, self._told("step", obs, info)
 
     def close(self) -> None:
@@ -135,6 +144,13 @@ class SingleEnv(gym.Wrapper):
             self.env.close()
         except Exception as error:
             say(f"{_author(self.env, 'close')} raised {type(error).__name__}: {error}")
+
+    def _in_wrapper(self, method: str, error: Exception) -> Exception:
+        """The sentence where a wrapper of Gymnasium's could not unpack what `method` returned; else the error itself."""
+        *_, last = traceback.walk_tb(error.__traceback__)
+        if "unpack" not in str(error) or not last[0].f_globals["__name__"].startswith("gymnasium."):
+            return error
+        return UserError(f"{_author(self.env, method)} must return {VALUES[method]}: {error}.")
 
     def _told(self, method: str, obs: Any, info: dict[str, Any]) -> dict[str, Any]:
         if not info and not self._masked:
@@ -201,6 +217,8 @@ def _fitted(space: gym.Space, obs: Any, lead: tuple[int, ...], where: str = "") 
             raise ValueError(f"that is {kind_of(obs)}{where}; its space is a Dict with the keys {keys}")
         if lacking := [key for key in space.spaces if key not in obs]:
             raise ValueError(f"without {lacking[0]}{where}; its space is a Dict with the keys {keys}")
+        if beside := [name for name in MASKS if name in obs and name not in space.spaces]:
+            raise ValueError(f"with {beside[0]}{where}, which is not in its space, a Dict with the keys {keys}")
         return {key: _fitted(part, obs[key], lead, f"{where} in {key}") for key, part in space.items()}
     if isinstance(space, spaces.Tuple):
         if not isinstance(obs, tuple | list) or len(obs) != len(space):
@@ -222,8 +240,8 @@ def _fitted_array(space: gym.Space, obs: Any, shape: tuple[int, ...], where: str
     if kind.kind in "iub" and not np.array_equal(fitted, array):
         raise ValueError(f"of type {array.dtype}{where}, whose numbers are not all of type {kind}, as its space says")
     if isinstance(space, spaces.Discrete | spaces.MultiDiscrete):
-        count = space.n if isinstance(space, spaces.Discrete) else space.nvec
-        outside = fitted[(fitted < space.start) | (fitted >= space.start + count)]
+        count, start = getattr(space, "nvec", getattr(space, "n", 0)), np.asarray(space.start, dtype=np.int64)
+        outside = fitted[(fitted < start) | (fitted >= start + count)]  # a small type may not hold the first beyond it
         if outside.size:
             raise ValueError(f"with {outside.flat[0]}{where}, which is not in its space, {shown_space(space)}")
     return fitted if fitted.shape else fitted[()]
@@ -269,11 +287,11 @@ def _row(mask: Any) -> np.ndarray:
 def _scalars(info: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, float]]:
     """Every number in `info`, an array of one too, and those of its dictionaries, by "outer/inner"."""
     for key, value in info.items():
-        if isinstance(value, float | int):
+        if isinstance(value, float):
             yield f"{prefix}{key}", float(value)
         elif isinstance(value, Mapping):
             yield from _scalars(value, f"{prefix}{key}/")
-        elif hasattr(value, "__array__") and math.prod(getattr(value, "shape", (0,))) == 1:
+        elif isinstance(value, int) or (hasattr(value, "__array__") and math.prod(getattr(value, "shape", (0,))) == 1):
             array = as_array(value)
             if array.dtype.kind in "biuf":
                 yield f"{prefix}{key}", float(array.item())
@@ -331,7 +349,8 @@ def flatten_observation(parts: tuple[ObservationPart, ...], obs: Any, *, image: 
 
 def _one_hot(part: ObservationPart, obs: Any) -> np.ndarray:
     """A batch of whole numbers, each as a one-hot vector. Raises `ValueError` for one that is not in its space."""
-    numbers = np.asarray(obs).reshape(-1, len(part.nvec)) - np.array(part.start)
+    whole = np.asarray(obs).astype(np.int64, casting="same_kind")  # of uint64 and int64 NumPy makes float64
+    numbers = whole.reshape(-1, len(part.nvec)) - np.array(part.start)
     if (numbers < 0).any() or (numbers >= np.array(part.nvec)).any():
         raise ValueError(f"{part.name} is {obs}, which is not in its space")
     hot = np.zeros((len(numbers), part.size), dtype=np.float32)
@@ -357,7 +376,7 @@ def scale_action(action: np.ndarray, box: Box) -> np.ndarray:
     """
     low, high, middle, half = scale_of(box)
     physical = np.minimum(np.maximum(middle + half * action, low), high)
-    return physical if box.dtype.startswith("float") else np.rint(physical).astype(box.dtype)
+    return (physical if box.dtype.startswith("float") else np.rint(physical)).astype(box.dtype, copy=False)
 
 
 @lru_cache

@@ -12,7 +12,16 @@ from torch import Tensor
 
 from lemniscate.envs import spaces
 from lemniscate.envs.backend import Backend
-from lemniscate.envs.conversion import Returns, flatten_observation, measured, measures_of, physical_action, row_of
+from lemniscate.envs.conversion import (
+    Returns,
+    flat_mask,
+    flatten_observation,
+    mask_in,
+    measured,
+    measures_of,
+    physical_action,
+    row_of,
+)
 from lemniscate.envs.factory import is_own, make_one, make_vector, maker_of, makes_vector, sentences
 from lemniscate.envs.vec_env import Stagger
 from lemniscate.envs.workers import WatchedVectorEnv, call_method
@@ -182,6 +191,9 @@ class GymnasiumBackend(Backend):
         for row in np.flatnonzero(done):
             final = row_of(info["final_obs"], int(row))
             next_obs[row, :size] = flatten_observation(self.spec.observation_parts, final, image=self.spec.image)
+            name, mask = mask_in(final, info.get("final_info", {}))
+            if self._masks and mask is not None:
+                next_obs[row, size:] = flat_mask(row_of(mask, int(row)) if name else mask, self.spec.action)
         return next_obs
 
     def _reset(self, seed: int | None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
