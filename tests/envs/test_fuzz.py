@@ -200,7 +200,6 @@ class Drawn(gym.Env):
         given = np.array(action)
         if self.plan.scribbles and isinstance(action, np.ndarray) and action.flags.writeable:
             action[...] = 1
-        self.given_type = type(action)
         returned = self._event(given, self.t >= length)
         return self._spoil("arity", returned)
 
@@ -632,46 +631,44 @@ def _draw_fault(draw, plan):
 
 
 def _draw_subtle_fault(draw, plan, kind):
-    space, choosing = plan.observation, isinstance(plan.action, spaces.Discrete | spaces.MultiDiscrete)
-    own = plan.form not in ("buffer",) and plan.mask != "key"
-    is_box = isinstance(space, spaces.Box) and own
-    if kind == "longer" and isinstance(space, spaces.Box | spaces.MultiDiscrete | spaces.MultiBinary) and own:
-        plan.spoiled = lambda obs: np.stack([np.asarray(obs)] * 2)
-    elif kind == "not finite" and is_box and not is_picture(space):
-        plan.spoiled = np.full(space.shape, draw(st.sampled_from([np.nan, np.inf, -np.inf])))
-    elif kind == "fraction" and is_box and space.dtype.kind in "iu":
-        plan.spoiled = np.full(space.shape, 0.5)
-    elif kind == "outside" and isinstance(space, spaces.Discrete | spaces.MultiDiscrete) and own:
-        count = space.n if isinstance(space, spaces.Discrete) else space.nvec
-        low, high = np.int64(space.start) - 1, np.int64(space.start) + np.int64(count)
-        plan.spoiled = draw(st.sampled_from([low, high]))
-    elif kind == "lacking" and isinstance(space, spaces.Dict | spaces.Tuple):
-        cut = (lambda obs: dict(list(obs.items())[1:])) if isinstance(space, spaces.Dict) else (lambda obs: obs[1:])
-        plan.spoiled = cut
-    elif kind == "measure" and plan.way in ("function", "class"):
-        plan.info.pop("is_success", None)
-        plan.spoiled = draw(st.sampled_from(["yes", np.zeros(3), object(), [1.0]]))
-    elif kind in ("mask size", "mask kind", "no choice") and choosing:
-        plan.mask, plan.none_at_end = (
-            plan.mask if plan.mask in (None, "action_mask", "method") else "action_mask",
-            False,
-        )
-        plan.observation = space["seen"] if isinstance(space, spaces.Dict) and "action_mask" in space.keys() else space
-        plan.mask, plan.mask_in_steps = plan.mask or "action_mask", True
-        count = int(plan.choices().sum())
-        kinds = (None if count == 1 else "x", np.zeros((2, count)), {}, [1] * (count + 2))
-        plan.spoiled = [1] * (count + 1) if kind == "mask size" else draw(st.sampled_from(kinds))
-        if plan.spoiled is None:
-            plan.spoiled = np.zeros((3, 1))
-    elif kind == "mask beside" and isinstance(space, spaces.Dict) and plan.mask != "key":
-        plan.spoiled = lambda obs: {**obs, "action_mask": np.ones(2, bool)}
-    elif kind == "late mask" and choosing and plan.mask is None:
-        pass
-    elif kind == "mask kind" and not choosing:
-        plan.spoiled = draw(st.sampled_from([[1, 0], np.ones(3, bool)]))
-    else:
-        return
-    plan.wrong = kind
+    one_of = lambda *options: draw(st.sampled_from(options))  # noqa: E731
+    choosing = isinstance(plan.action, spaces.Discrete | spaces.MultiDiscrete)
+    if kind in ("mask size", "mask kind", "no choice") and choosing:
+        _give_mask(plan)
+    space, count = plan.observation, int(plan.choices().sum()) if choosing else 0
+    own = plan.form != "buffer" and plan.mask != "key"
+    counted = isinstance(space, spaces.Discrete | spaces.MultiDiscrete) and own
+    boxed = isinstance(space, spaces.Box) and own
+    arrays = boxed or (own and isinstance(space, spaces.MultiDiscrete | spaces.MultiBinary))
+    whole_masks = ([1] * (count + 2), np.zeros((2, count)), *["x", {}] * (count > 1)) if choosing else ([1, 0],)
+    first = lambda: int(np.ravel(space.start)[0])  # noqa: E731
+    beyond = lambda: first() + int(np.max(getattr(space, "nvec", getattr(space, "n", 0))))  # noqa: E731
+    room, spoiled = {
+        "longer": (arrays, lambda: lambda obs: np.stack([np.asarray(obs)] * 2)),
+        "not finite": (boxed and not is_picture(space), lambda: np.full(space.shape, one_of(np.nan, np.inf, -np.inf))),
+        "fraction": (boxed and space.dtype.kind in "iu", lambda: np.full(space.shape, 0.5)),
+        "outside": (counted, lambda: np.full(space.shape, one_of(first() - 1, beyond()))),
+        "lacking": (isinstance(space, spaces.Dict | spaces.Tuple), lambda: without_the_first),
+        "mask beside": (isinstance(space, spaces.Dict) and own, lambda: lambda obs: {**obs, "action_mask": [1, 1]}),
+        "measure": ("is_success" not in plan.info, lambda: one_of("yes", np.zeros(3), object(), [1.0])),
+        "mask size": (choosing, lambda: [1] * (count + 1)),
+        "mask kind": (True, lambda: one_of(*whole_masks)),
+        "no choice": (choosing, lambda: None),
+        "late mask": (choosing and plan.mask is None, lambda: None),
+    }[kind]
+    if room:
+        plan.wrong, plan.spoiled = kind, spoiled()
+
+
+def _give_mask(plan):
+    if plan.mask == "key":
+        plan.observation = plan.observation["seen"]
+    plan.mask = "method" if plan.mask == "method" else "action_mask"
+    plan.mask_in_steps, plan.none_at_end = True, False
+
+
+def without_the_first(obs):
+    return dict(list(obs.items())[1:]) if hasattr(obs, "items") else obs[1:]
 
 
 # The property
@@ -732,42 +729,42 @@ def train(plan, env):
     return rollout, steps
 
 
-def check(plan, env, rollout, steps):
+def check(plan, rollout, steps):
     """Every row of the rollout against what the environment recorded."""
     space = plan.observation
     for name in plan.wrappers:
         space = aged_space(space) if name == "aged" else space
-    envs = plan.made[-plan.num_envs :]
-    for i, one in enumerate(envs):
+    rows = {name: column.numpy() for name, column in vars(rollout).items()}
+    after = np.stack([step.obs.numpy() for step in steps])
+    for i, one in enumerate(plan.made[-plan.num_envs :]):
         events = iter(one.log)
-        before, expected = None, next(events)
+        event = next(events)
+        same(seen(plan, space, event), rows["obs"][0, i])
         for t in range(STEPS):
-            row = rollout[t : t + 1]
-            obs, next_obs = row.obs[0, i].numpy(), row.next_obs[0, i].numpy()
-            same(seen(plan, space, expected), obs)
-            before, expected = expected, next(events)
-            same(seen(plan, space, expected), next_obs)
-            if not row.valid[0, i]:
-                assert expected.action is None
-                continue
-            check_action(plan, before, expected, row.action[0, i].numpy())
-            assert row.reward[0, i].item() == np.float32(expected.reward * (10 if "tenfold" in plan.wrappers else 1))
-            late = plan.limit is not None and expected.t >= plan.limit
-            assert row.terminated[0, i].item() == expected.terminated
-            assert row.truncated[0, i].item() == ((expected.truncated or late) and not expected.terminated)
-            check_measures(expected, {name: values[i].item() for name, values in steps[t].measures.items()})
-            done = expected.terminated or expected.truncated or late
-            if done and plan.way != "NEXT_STEP":
-                expected = next(events)
-                assert expected.action is None
-            assert expected.t == (0 if done and plan.way != "NEXT_STEP" else before.t + 1)
-            same(seen(plan, space, expected), steps[t].obs[i].numpy())
+            row = {name: column[t, i] for name, column in rows.items()}
+            before, event = event, next(events)
+            same(seen(plan, space, event), row["next_obs"])
+            if row["valid"]:
+                late = plan.limit is not None and event.t >= plan.limit
+                assert event.t == before.t + 1
+                check_action(plan, before, event, row["action"])
+                assert row["reward"] == np.float32(event.reward * (10 if "tenfold" in plan.wrappers else 1))
+                assert row["terminated"] == event.terminated
+                assert row["truncated"] == ((event.truncated or late) and not event.terminated)
+                check_measures(event, {name: values[i].item() for name, values in steps[t].measures.items()})
+                if (event.terminated or event.truncated or late) and plan.way != "NEXT_STEP":
+                    event = next(events)
+                    assert event.action is None
+            else:
+                assert event.action is None
+            same(seen(plan, space, event), after[t, i])
+            same(after[t, i], rows["obs"][t + 1, i] if t + 1 < STEPS else after[t, i])
         assert next(events, None) is None
 
 
 def same(expected, got):
     assert expected.dtype == got.dtype
-    np.testing.assert_array_equal(got, expected)
+    assert np.array_equal(expected, got), (expected, got)
 
 
 def seen(plan, space, event):
@@ -860,7 +857,7 @@ def answer(plan):
         if env is not None:
             env.close()
     assert not plan.wrong, f"trains, though it is wrong: {plan.wrong}"
-    check(plan, env, rollout, steps)
+    check(plan, rollout, steps)
     return "trains"
 
 

@@ -146,7 +146,7 @@ class SingleEnv(gym.Wrapper):
             say(f"{_author(self.env, 'close')} raised {type(error).__name__}: {error}")
 
     def _in_wrapper(self, method: str, error: Exception) -> Exception:
-        """The sentence where a wrapper of Gymnasium's could not unpack what `method` returned; else the error itself."""
+        """The sentence where a wrapper of Gymnasium could not unpack what `method` returned; else the error itself."""
         *_, last = traceback.walk_tb(error.__traceback__)
         if "unpack" not in str(error) or not last[0].f_globals["__name__"].startswith("gymnasium."):
             return error

@@ -14,7 +14,6 @@ from lemniscate.envs import spaces
 from lemniscate.envs.backend import Backend
 from lemniscate.envs.conversion import (
     Returns,
-    flat_mask,
     flatten_observation,
     mask_in,
     measured,
@@ -191,9 +190,10 @@ class GymnasiumBackend(Backend):
         for row in np.flatnonzero(done):
             final = row_of(info["final_obs"], int(row))
             next_obs[row, :size] = flatten_observation(self.spec.observation_parts, final, image=self.spec.image)
-            name, mask = mask_in(final, info.get("final_info", {}))
-            if self._masks and mask is not None:
-                next_obs[row, size:] = flat_mask(row_of(mask, int(row)) if name else mask, self.spec.action)
+            final_info = info.get("final_info", {})
+            name, mask = mask_in(final, final_info)
+            if self._masks and mask is not None and final_info.get(f"_{name}", done)[row]:
+                next_obs[row, size:] = self._masks.of_row(row_of(mask, int(row)) if name else mask, int(row))
         return next_obs
 
     def _reset(self, seed: int | None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
