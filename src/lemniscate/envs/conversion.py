@@ -58,14 +58,20 @@ class SingleEnv(gym.Wrapper):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Gymnasium's."""
-        returned: Any = self.env.reset(seed=seed, options=options)
+        try:
+            returned: Any = self.env.reset(seed=seed, options=options)
+        except (TypeError, ValueError) as error:
+            raise self._returns.in_wrapper("reset", error) from error.__cause__
         if type(returned) is not tuple or len(returned) != 2 or not self._is_usual(*returned):
             returned = self._returns.of_reset(returned)
         return returned if returned[1] == {} and not self._masked else (returned[0], self._told("reset", *returned))
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Gymnasium's."""
-        returned: Any = self.env.step(action)
+        try:
+            returned: Any = self.env.step(action)
+        except (TypeError, ValueError) as error:
+            raise self._returns.in_wrapper("step", error) from error.__cause__
         if (
             type(returned) is not tuple
             or len(returned) != 5
@@ -161,7 +167,8 @@ def flatten_observation(parts: tuple[ObservationPart, ...], obs: Any, *, image: 
 
 def _one_hot(part: ObservationPart, obs: Any) -> np.ndarray:
     """A batch of whole numbers, each as a one-hot vector. Raises `ValueError` for one that is not in its space."""
-    numbers = np.asarray(obs).reshape(-1, len(part.nvec)) - np.array(part.start)
+    whole = np.asarray(obs).astype(np.int64, casting="same_kind")  # of uint64 and int64 NumPy makes float64
+    numbers = whole.reshape(-1, len(part.nvec)) - np.array(part.start)
     if (numbers < 0).any() or (numbers >= np.array(part.nvec)).any():
         raise ValueError(f"{part.name} is {obs}, which is not in its space")
     hot = np.zeros((len(numbers), part.size), dtype=np.float32)
@@ -187,7 +194,7 @@ def scale_action(action: np.ndarray, box: Box) -> np.ndarray:
     """
     low, high, middle, half = scale_of(box)
     physical = np.minimum(np.maximum(middle + half * action, low), high)
-    return physical if box.dtype.startswith("float") else np.rint(physical).astype(box.dtype)
+    return (physical if box.dtype.startswith("float") else np.rint(physical)).astype(box.dtype, copy=False)
 
 
 @lru_cache

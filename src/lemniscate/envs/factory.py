@@ -18,7 +18,7 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, Vecto
 from lemniscate.envs.conversion import SingleEnv
 from lemniscate.envs.returns import CheckedVector
 from lemniscate.envs.workers import WatchedVectorEnv, Worker
-from lemniscate.errors import UserError
+from lemniscate.errors import UserError, shown
 from lemniscate.system import named
 
 Maker = EnvSpec | Callable[..., Any]
@@ -161,7 +161,7 @@ def sentences(env: str, kwargs: Mapping[str, Any] | None, wrappers: Sequence[str
     try:
         yield
     except (gym.error.Error, ImportError, TypeError, ValueError, KeyError, AssertionError) as error:
-        given = [f"{name}={value!r}" for name, value in (kwargs or {}).items()] + list(wrappers)
+        given = [f"{name}={shown(value)}" for name, value in (kwargs or {}).items()] + list(wrappers)
         with_these = f" with {', '.join(given)}" if given else ""
         said = str(error).partition(" was raised from the environment creator")[0]
         if "required positional argument" in said:

@@ -14,6 +14,7 @@ from lemniscate.envs import spaces
 from lemniscate.envs.backend import Backend
 from lemniscate.envs.conversion import flatten_observation, measured, measures_of, physical_action, row_of
 from lemniscate.envs.factory import is_own, make_one, make_vector, maker_of, makes_vector, sentences
+from lemniscate.envs.returns import mask_in
 from lemniscate.envs.vec_env import Stagger
 from lemniscate.envs.workers import WatchedVectorEnv, call_method
 from lemniscate.errors import UserError
@@ -181,6 +182,10 @@ class GymnasiumBackend(Backend):
         for row in np.flatnonzero(done):
             final = row_of(info["final_obs"], int(row))
             next_obs[row, :size] = flatten_observation(self.spec.observation_parts, final, image=self.spec.image)
+            final_info = info.get("final_info", {})
+            name, mask = mask_in(final, final_info)
+            if self._masks and mask is not None and final_info.get(f"_{name}", done)[row]:
+                next_obs[row, size:] = self._masks.of_row(row_of(mask, int(row)) if name else mask, int(row))
         return next_obs
 
     def _observe(self, raw: Any, info: dict) -> np.ndarray:

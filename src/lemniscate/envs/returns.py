@@ -1,6 +1,7 @@
 """What `reset` and `step` of an environment return, checked: each fault is a sentence that says where it is written."""
 
 import math
+import traceback
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -40,13 +41,20 @@ class Returns:
     def of_step(self, returned: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """The observation, in the types of its space; the reward, the flags and the info."""
         obs, reward, terminated, truncated, info = self._several("step", returned, 5)
-        if type(reward) is not float:
+        if self._lead or type(reward) is not float:
             reward = self._numbers("reward", reward, float)
-        if type(terminated) is not bool:
+        if self._lead or type(terminated) is not bool:
             terminated = self._numbers("terminated", terminated, bool)
-        if type(truncated) is not bool:
+        if self._lead or type(truncated) is not bool:
             truncated = self._numbers("truncated", truncated, bool)
         return self._observation("step", obs), reward, terminated, truncated, self._info("step", info)
+
+    def in_wrapper(self, method: str, error: Exception) -> Exception:
+        """The sentence where a wrapper of Gymnasium could not unpack what `method` returned; else the error itself."""
+        *_, last = traceback.walk_tb(error.__traceback__)
+        if "unpack" not in str(error) or not last[0].f_globals["__name__"].startswith("gymnasium."):
+            return error
+        return UserError(f"{author(self._env, method)} must return {VALUES[method]}: {error}.")
 
     def wrong(self, method: str, what: str) -> UserError:
         """The sentence on a method: its name, where it is written, and `what` it did."""
@@ -143,6 +151,8 @@ def _fitted(space: gym.Space, obs: Any, lead: tuple[int, ...], where: str = "") 
             raise ValueError(f"that is {kind_of(obs)}{where}; its space is a Dict with the keys {keys}")
         if lacking := [key for key in space.spaces if key not in obs]:
             raise ValueError(f"without {lacking[0]}{where}; its space is a Dict with the keys {keys}")
+        if beside := [name for name in MASKS if name in obs and name not in space.spaces]:
+            raise ValueError(f"with {beside[0]}{where}, which is not in its space, a Dict with the keys {keys}")
         return {key: _fitted(part, obs[key], lead, f"{where} in {key}") for key, part in space.items()}
     if isinstance(space, spaces.Tuple):
         if not isinstance(obs, tuple | list) or len(obs) != len(space):
@@ -164,8 +174,8 @@ def _fitted_array(space: gym.Space, obs: Any, shape: tuple[int, ...], where: str
     if kind.kind in "iub" and not np.array_equal(fitted, array):
         raise ValueError(f"of type {array.dtype}{where}, whose numbers are not all of type {kind}, as its space says")
     if isinstance(space, spaces.Discrete | spaces.MultiDiscrete):
-        count = space.n if isinstance(space, spaces.Discrete) else space.nvec
-        outside = fitted[(fitted < space.start) | (fitted >= space.start + count)]
+        count, start = getattr(space, "nvec", getattr(space, "n", 0)), np.asarray(space.start, dtype=np.int64)
+        outside = fitted[(fitted < start) | (fitted >= start + count)]  # a small type may not hold the first beyond it
         if outside.size:
             raise ValueError(f"with {outside.flat[0]}{where}, which is not in its space, {shown_space(space)}")
     return fitted if fitted.shape else fitted[()]
@@ -211,11 +221,11 @@ def _row(mask: Any) -> np.ndarray:
 def scalars(info: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, float]]:
     """Every number in `info`, an array of one too, and those of its dictionaries, by "outer/inner"."""
     for key, value in info.items():
-        if isinstance(value, float | int):
+        if isinstance(value, float):
             yield f"{prefix}{key}", float(value)
         elif isinstance(value, Mapping):
             yield from scalars(value, f"{prefix}{key}/")
-        elif hasattr(value, "__array__") and math.prod(getattr(value, "shape", (0,))) == 1:
+        elif isinstance(value, int) or (hasattr(value, "__array__") and math.prod(getattr(value, "shape", (0,))) == 1):
             array = as_array(value)
             if array.dtype.kind in "biuf":
                 yield f"{prefix}{key}", float(array.item())

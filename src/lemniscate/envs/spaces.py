@@ -227,12 +227,16 @@ class ActionMasks:
         masks = self._masks[numbers].copy()
         if mask is not None:
             for row in np.flatnonzero(info.get(f"_{name}", np.ones(len(flat), dtype=bool))):
-                try:
-                    masks[row] = flat_mask(row_of(mask, int(row)), self._spec.action)
-                except ValueError as error:
-                    raise UserError(f"Environment {row} of {self._spec.env_id} has an action mask {error}.") from None
+                masks[row] = self.of_row(row_of(mask, int(row)), int(row))
             self._masks[numbers] = masks
         return np.concatenate([flat, masks.astype(flat.dtype)], axis=-1)
+
+    def of_row(self, mask: Any, row: int) -> np.ndarray:
+        """The mask that environment `row` gave as [n] bool. Raises `UserError` for another size."""
+        try:
+            return flat_mask(mask, self._spec.action)
+        except ValueError as error:
+            raise UserError(f"Environment {row} of {self._spec.env_id} has an action mask {error}.") from None
 
     def require_choice(self, obs: np.ndarray, acting: np.ndarray) -> None:
         """Raise `UserError` where a mask in `obs` [N, O + n] permits nothing to an environment that is `acting` [N].
