@@ -61,7 +61,7 @@ def test_every_absurd_number_gets_one_sentence_or_a_run(tmp_path, processes, tot
         ("--hidden 1000000000", "hidden must be a whole number from 1 to 1,000,000"),
         ("--hidden 100000 100000", r"at least [\d,]+ MB, of which [\d,]+ MB are for hidden .* choose a smaller hidden"),
         (f"--total-steps 1{'0' * 400}", r"at least 1, and at most 1e\+15, not a number of 401 digits"),
-        ("--clip 1e300", r"clip must be a number above 0, and at most 1e\+38, not 1e\+300"),
+        ("--clip 1e300", r"clip must be a number above 0, and at most 1e\+38, or a schedule 'FIRST>LAST' of two such numbers, not 1e\+300"),
         ("--evaluate-episodes 1e12", "evaluate_episodes must be a whole number from 1 to 1,000,000"),
         ("--threads 100000", "threads must be a whole number from 1 to 256"),
         ("--num-envs 1e6 --backend gymnasium-async", "1,000,000 × CartPole-v1 in the gymnasium-async backend take at"),

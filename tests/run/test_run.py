@@ -632,8 +632,8 @@ def test_environments_that_draw_from_global_generators_resume_exactly_too(tmp_pa
 def test_a_checkpoint_of_a_newer_format_is_refused_and_not_deleted(tmp_path):
     train(tmp_path / "r")
     manifest = tmp_path / "r" / "checkpoints" / "step-256" / "manifest.json"
-    write_json(manifest, {**read_json(manifest), "format": 5})
-    with pytest.raises(lem.UserError, match="has format 5; this version of lemniscate reads 4"):
+    write_json(manifest, {**read_json(manifest), "format": 6})
+    with pytest.raises(lem.UserError, match="has format 6; this version of lemniscate reads 5"):
         lem.resume(tmp_path / "r", progress=False)
     assert manifest.exists()
 

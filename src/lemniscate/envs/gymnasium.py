@@ -192,7 +192,7 @@ class GymnasiumBackend(Backend):
         """The flat observation, a copy; after it the action mask, where there is one."""
         flat = flatten_observation(self.spec.observation_parts, raw, image=self.spec.image)
         if self._digits and self._digits.add(raw):
-            self.notices, self._digits = self._digits.notices(), None
+            self.notices, self._digits = [*self.notices, *self._digits.notices()], None
         if self._masks:
             return self._masks.append_to(flat, raw, info)
         if not spaces.MASKS.isdisjoint(info):

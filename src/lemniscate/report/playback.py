@@ -158,10 +158,11 @@ def _play(
 
 def _require_in(space: gym.Space, action: Any, name: str) -> None:
     """Raise `UserError` for an action that is not of the space; of a Box the shape counts, the environment may clip."""
-    fits = space.contains(action)
-    if isinstance(space, gym.spaces.Box):
+    if isinstance(space, gym.spaces.Box):  # what is outside of its bounds the environment may clip
         numbers = as_array(action)
         fits = numbers.shape == space.shape and numbers.dtype.kind in "biuf" and np.isfinite(numbers).all()
+    else:
+        fits = space.contains(action)
     if not fits:
         raise UserError(f"{name} takes actions of {space}, not {shown(action)}.")
 

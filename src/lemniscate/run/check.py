@@ -76,7 +76,13 @@ def _checkpoints(path: Path) -> tuple[list[checkpoint.Checkpoint], list[Finding]
                 whole.append(checkpoint.read(folder))
         except UserError as error:
             broken.append(Finding(BAD, str(error)))
-    return sorted(whole, key=lambda found: found.numbers["step"]), broken
+    return sorted(whole, key=_step), broken
+
+
+def _step(found: checkpoint.Checkpoint) -> int:
+    """The step of a checkpoint; 0 where its file has something else there."""
+    step = found.numbers.get("step")
+    return step if isinstance(step, int) else 0
 
 
 def _config(path: Path, whole: list[checkpoint.Checkpoint]) -> Finding:

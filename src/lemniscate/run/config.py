@@ -191,15 +191,15 @@ class RunConfig:
     warm_start: str | None = None
     """run, checkpoint or hf://user/name whose networks this run begins with"""
     freeze: tuple[str, ...] = ()
-    """parameters that keep their values, such as policy.net.0"""
+    """parameters to keep, such as policy.net.0"""
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     """arguments of the environment, as JSON: '{"dynamics": "first_principles"}'"""
     reset_options: dict[str, Any] = field(default_factory=dict)
-    """options of every reset of the environment, as JSON: '{"level": 3}'"""
+    """options of every reset of the environment"""
     curriculum: str | None = None
     """module:function of (step, metrics) to {method: argument} of the environments"""
     wrappers: tuple[str, ...] = ()
-    """wrappers of each environment, first innermost: module:name or module:name(key=value)"""
+    """module:name or module:name(key=value), the innermost first"""
 
     def __post_init__(self) -> None:
         hints = _hints_of(type(self))
