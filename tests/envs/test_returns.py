@@ -119,7 +119,7 @@ def test_what_ends_by_its_rules_is_not_cut_too():
 
 def test_info_may_hold_anything_and_its_numbers_are_measured():
     numbers = (
-        {"a": 1, "b": "x", "c": {"d": 2.5, "_": None}},
+        {"a": 1, "b": "x", "c": {"d": 2.5, "_": None}, "only": 3.0},
         {"a": 0.5, "b": [1], "c": {"d": np.array([1.0])}, "e": np.zeros(9)},
     )
     made = count()
@@ -131,11 +131,9 @@ def test_info_may_hold_anything_and_its_numbers_are_measured():
     env.restart(0)
     for _ in range(3):
         step = env.step(torch.zeros(2, dtype=torch.int64))
-    assert {name: values.tolist() for name, values in step.measures.items()} == {
-        "info/a": [1, 0.5],
-        "info/c/d": [2.5, 1],
-    }
-    assert env.take_episodes().measures == {"info/a": 0.75, "info/c/d": 1.75}
+    found = {name: values.tolist() for name, values in step.measures.items()}
+    np.testing.assert_equal(found, {"info/a": [1, 0.5], "info/c/d": [2.5, 1], "info/only": [3, np.nan]})
+    assert env.take_episodes().measures == {"info/a": 0.75, "info/c/d": 1.75, "info/only": 3}
     assert env.take_episodes().measures == {}
     env.close()
 
