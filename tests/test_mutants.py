@@ -169,7 +169,7 @@ MUTANTS = [
         "the normalizer moves before the update",
         "algos/ppo.py",
         "    valid_rows = rollout.valid_rows\n    metrics: list",
-        "    networks.policy.observe(rollout.obs[rollout.valid])\n    valid_rows = rollout.valid_rows\n    metrics: list",
+        "    state.networks.policy.observe(rollout.obs[rollout.valid])\n    valid_rows = rollout.valid_rows\n    metrics: list",
         PPO + "the_first_gradient_step_of_every_update_has_ratios_of_one",
     ),
     (
@@ -1129,14 +1129,14 @@ MUTANTS = [
         "envs/vec_env.py",
         "self.backend.step(mine.clone())",
         "self.backend.step(mine)",
-        "envs/test_returns.py::test_what_an_environment_does_to_its_arguments_reaches_no_rollout",
+        "envs/test_returned.py::test_what_an_environment_does_to_its_arguments_reaches_no_rollout",
     ),
     (
         "an observation is taken from the buffer that the next step overwrites",
         "envs/gymnasium.py",
         "return flat.copy()",
         "return flat",
-        "envs/test_returns.py::test_what_an_environment_does_to_its_arguments_reaches_no_rollout",
+        "envs/test_returned.py::test_what_an_environment_does_to_its_arguments_reaches_no_rollout",
     ),
     (
         "a component's mask is the next one's",
@@ -1157,7 +1157,7 @@ MUTANTS = [
         "envs/vec_env.py",
         "counted = values.isfinite() & valid.bool()",
         "counted = valid.bool()",
-        "envs/test_returns.py::test_info_may_hold_anything_and_its_numbers_are_measured",
+        "envs/test_returned.py::test_info_may_hold_anything_and_its_numbers_are_measured",
     ),
     (
         "a mask is of another environment",

@@ -97,7 +97,7 @@ class SingleEnv(gym.Wrapper):
             say(f"{author(self.env, 'close')} raised {type(error).__name__}: {error}")
 
     def _told(self, method: str, obs: Any, info: dict[str, Any]) -> dict[str, Any]:
-        numbers: dict[str, Any] = {name: float(value) for name, value in info.items() if isinstance(value, REAL)}
+        numbers: dict[str, Any] = {str(name): float(value) for name, value in info.items() if isinstance(value, REAL)}
         if len(numbers) == len(info) and not self._masked:
             return numbers
         numbers = dict(scalars(info))

@@ -57,7 +57,7 @@ def played(backend="gymnasium", **told):
 DICT = spaces.Dict({"a": TWO, "b": spaces.Dict({"c": spaces.Discrete(3)})})
 
 WRONG = {
-    "four values": ({"step": (SEEN, 1.0, True, {})}, r"Told.step\(\) \(test_returns.py, line \d+\) returned 4 values; it must"),
+    "four values": ({"step": (SEEN, 1.0, True, {})}, r"Told.step\(\) \(test_returned.py, line \d+\) returned 4 values; it must"),
     "a list": ({"step": [SEEN, 1.0, True, False, {}]}, r"step\(\).* it must return 5 values, \(obs, reward, terminated"),
     "no info": ({"reset": SEEN}, r"reset\(\) .*returned an array of shape \(2,\) and type float32; it must return 2 values"),
     "a number seen": ({"step": after(0.0)}, r"returned an observation of shape \(\); its space is Box.*, of shape \(2,\)"),
@@ -95,7 +95,7 @@ def test_what_is_returned_wrongly_is_said_with_the_place(told, sentence):
 
 
 def test_a_worker_says_the_same():
-    with pytest.raises(UserError, match=r"^Told.step\(\) \(test_returns.py, line \d+\) returned None as reward"):
+    with pytest.raises(UserError, match=r"^Told.step\(\) \(test_returned.py, line \d+\) returned None as reward"):
         played("gymnasium-async", step=after(reward=None))
 
 
@@ -247,7 +247,7 @@ def test_an_environment_that_cannot_be_closed_costs_nothing(tmp_path, capfd):
     small = {"num_envs": 2, "num_steps": 8, "minibatch_size": 8, "total_steps": 32, "progress": False}
     run = lem.train("ppo", env=Sticky, run=tmp_path / "run", **small)
     assert run.policy.step == 32
-    assert "Sticky.close() (test_returns.py, line" in capfd.readouterr().err
+    assert "Sticky.close() (test_returned.py, line" in capfd.readouterr().err
 
 
 def test_options_reach_every_reset(tmp_path):
@@ -270,7 +270,7 @@ def test_options_reach_every_reset(tmp_path):
 SCRIPT = """
 import gymnasium as gym, numpy as np
 import lemniscate as lem
-from envs.test_returns import Told
+from envs.test_returned import Told
 run = lem.train("ppo", env=Told, num_envs=2, num_steps=8, minibatch_size=8, total_steps=16, progress=False,
                 backend="gymnasium-async", run=RUN)
 """
