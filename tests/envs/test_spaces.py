@@ -174,9 +174,9 @@ def test_a_mask_that_is_given_for_some_environments_is_theirs_alone():
 
 def test_whole_numbers_are_rounded_and_clipped():
     kind = action_kind(spaces.Box(np.array([0, -3]), np.array([4, 3]), dtype=np.int8), "myenv")
-    rows = physical_action(np.float32([[-1, -1], [0, 0.1], [0.2, 0.4], [9, 9]]), kind)
+    rows = physical_action(np.float32([[-1, -1], [0, 0.1], [0.3, 0.6], [9, 9]]), kind)
     assert rows.dtype == np.int8
-    assert rows.tolist() == [[0, -3], [2, 0], [2, 1], [4, 3]]
+    assert rows.tolist() == [[0, -3], [2, 0], [3, 2], [4, 3]]
     assert scale_action(np.float32([[0.2]]), Box((0.0,), (1.0,))).item() == pytest.approx(0.6)
 
 
