@@ -1155,8 +1155,8 @@ MUTANTS = [
     (
         "numbers of info are averaged over all steps",
         "envs/vec_env.py",
-        "counted = values.isfinite() & valid.bool()",
-        "counted = valid.bool()",
+        "counted = values.isfinite() & valid",
+        "counted = valid",
         "envs/test_returned.py::test_info_may_hold_anything_and_its_numbers_are_measured",
     ),
     (

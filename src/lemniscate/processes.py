@@ -1,4 +1,4 @@
-"""The world of several processes, `lemniscate.system.processes`, by its short name."""
+"""`lemniscate.system.processes` by the name that it had before it moved there, for programs that import it."""
 
 from lemniscate.system.processes import Processes as Processes
 from lemniscate.system.processes import together as together

@@ -76,8 +76,7 @@ def report_on(run: TrainedRun) -> list[Path]:
 def draw_run(run: str | Path | TrainedRun, by: str = "step", *, film: bool = False) -> list[Path]:
     """Draw a run and its final scores into its `plots/`, and write its page; returns the files, the page last.
 
-    What cannot be evaluated here is left out, and a line says so. With `film` a flight or an
-    episode is recorded too.
+    What cannot be evaluated here is left out, and a line says so. With `film` a flight or an episode is recorded too.
     """
     path, scores, flights = path_of(run), None, list[Path]()
     folder = path / "plots"

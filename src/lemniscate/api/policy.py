@@ -150,7 +150,7 @@ class TrainedPolicy:
         return torch.from_numpy(flat), batched
 
     def _read_for(self, critic: str, obs: Any) -> tuple[Tensor, bool]:
-        """As `_read`, for "value" or "q". Raises `UserError` where that has not been learned, or takes more numbers."""
+        """The observations of `_read` for a critic, "value" or "q". Raises `UserError` where none has been learned."""
         verbs = {"value": "policy.value(obs)", "q": "policy.q_value(obs, action)"}
         here = [verb for name, verb in verbs.items() if hasattr(self.networks, name)]
         if verbs[critic] not in here or getattr(self.config, "baseline", critic) != critic:

@@ -24,9 +24,6 @@ APART = {*MASKS, "final_info", "final_obs", "env_id", "players", "elapsed_step"}
 """entries of the info of a vector environment that measure nothing"""
 
 
-REAL = (float, np.floating)
-
-
 class SingleEnv(gym.Wrapper):
     """One environment whose returns are checked, and whose `info` has numbers and the action mask alone.
 
@@ -54,7 +51,8 @@ class SingleEnv(gym.Wrapper):
         self._ask = next(filter(callable, asked), None)
         seen, self._declared = env.observation_space, measures_of(env.metadata)
         self._masked = bool(self._ask or (isinstance(seen, spaces.Dict) and seen.spaces.keys() & set(MASKS)))
-        self._usual = (seen.shape, seen.dtype) if isinstance(seen, spaces.Box | spaces.MultiBinary) else ()
+        self._shape = seen.shape if isinstance(seen, spaces.Box | spaces.MultiBinary) else None
+        self._dtype = seen.dtype
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Gymnasium's."""
@@ -62,9 +60,11 @@ class SingleEnv(gym.Wrapper):
             returned: Any = self.env.reset(seed=seed, options=options)
         except (TypeError, ValueError) as error:
             raise self._returns.in_wrapper("reset", error) from error.__cause__
-        if type(returned) is not tuple or len(returned) != 2 or not self._is_usual(*returned):
+        two = type(returned) is tuple and len(returned) == 2
+        if not (two and self._is_usual(returned[0], 0.0, False, False, returned[1])):
             returned = self._returns.of_reset(returned)
-        return returned if returned[1] == {} and not self._masked else (returned[0], self._told("reset", *returned))
+        obs, info = returned
+        return (obs, self._told("reset", obs, info)) if info or self._masked else returned
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Gymnasium's."""
@@ -72,22 +72,17 @@ class SingleEnv(gym.Wrapper):
             returned: Any = self.env.step(action)
         except (TypeError, ValueError) as error:
             raise self._returns.in_wrapper("step", error) from error.__cause__
-        if (
-            type(returned) is not tuple
-            or len(returned) != 5
-            or not self._is_usual(returned[0], returned[4], *returned[1:4])
-        ):
+        if not (type(returned) is tuple and len(returned) == 5 and self._is_usual(*returned)):
             returned = self._returns.of_step(returned)
         obs, *rest, info = returned
-        return returned if info == {} and not self._masked else (obs, *rest, self._told("step", obs, info))
+        return (obs, *rest, self._told("step", obs, info)) if info or self._masked else returned
 
-    def _is_usual(
-        self, obs: Any, info: Any, reward: Any = 0.0, terminated: Any = False, truncated: Any = False
-    ) -> bool:
-        """Whether all are of their types already: so it is in most environments, and then it costs nothing."""
-        if type(obs) is not np.ndarray or (obs.shape, obs.dtype) != self._usual or not isinstance(reward, float):
+    def _is_usual(self, obs: Any, reward: Any, terminated: Any, truncated: Any, info: Any) -> bool:
+        """Whether each is of its type already, as mostly, and has to cost nothing."""
+        if type(obs) is not np.ndarray or obs.shape != self._shape or obs.dtype != self._dtype:
             return False
-        return type(info) is dict and type(terminated) is type(truncated) is bool
+        flags = type(terminated) is bool and type(truncated) is bool
+        return flags and isinstance(reward, float) and type(info) is dict
 
     def close(self) -> None:
         """Gymnasium's. An exception in it is said, and costs nothing that was learned."""
@@ -97,7 +92,9 @@ class SingleEnv(gym.Wrapper):
             say(f"{author(self.env, 'close')} raised {type(error).__name__}: {error}")
 
     def _told(self, method: str, obs: Any, info: dict[str, Any]) -> dict[str, Any]:
-        numbers: dict[str, Any] = {str(name): float(value) for name, value in info.items() if isinstance(value, REAL)}
+        numbers: dict[str, Any] = {
+            str(name): float(value) for name, value in info.items() if isinstance(value, float | np.floating)
+        }
         if len(numbers) == len(info) and not self._masked:
             return numbers
         numbers = dict(scalars(info))

@@ -195,7 +195,7 @@ class GymnasiumBackend(Backend):
             self.notices, self._digits = [*self.notices, *self._digits.notices()], None
         if self._masks:
             return self._masks.append_to(flat, raw, info)
-        if not spaces.MASKS.isdisjoint(info):
+        if not info.keys().isdisjoint(spaces.MASKS):
             raise spaces.late_mask(self.spec)
         return flat.copy()
 

@@ -15,8 +15,8 @@ from torch import Tensor
 from lemniscate.errors import UserError, shown
 from lemniscate.spec import Action, Discrete, MultiDiscrete
 
-MASKS = frozenset(("action_mask", "action_masks", "legal_action_mask"))
-"""what environments call their action mask: in `info`, as a key of a Dict observation, or as a method"""
+MASKS = ("action_mask", "action_masks", "legal_action_mask")
+"""what environments call their action mask in `info`, as a key of a Dict observation, or as a method"""
 
 VALUES = {"reset": "2 values, (observation, info)", "step": "5 values, (obs, reward, terminated, truncated, info)"}
 
@@ -134,7 +134,7 @@ def kind_of(value: Any) -> str:
 
 
 def as_array(value: Any) -> np.ndarray:
-    """As an array; of objects where it cannot be one, such as lists of different lengths, or a number is masked."""
+    """The array that a value stands for; one of objects for lists of different lengths, masked numbers and the like."""
     if np.ma.is_masked(value):
         return np.full((), None, dtype=object)
     try:
@@ -204,7 +204,7 @@ def flat_mask(mask: Any, action: gym.Space | Action) -> np.ndarray:
     counts = getattr(action, "nvec", None)
     counts = np.ravel(getattr(action, "n", 0) if counts is None else counts)
     if not isinstance(action, spaces.Discrete | spaces.MultiDiscrete | Discrete | MultiDiscrete):
-        raise ValueError("; masks are for Discrete and MultiDiscrete actions")
+        raise ValueError("that cannot be followed: masks are for Discrete and MultiDiscrete actions")
     row = _row(mask)
     if len(row) != counts.sum():
         raise ValueError(f"of {len(row)} numbers; it must have {counts.sum()}, of 1 and 0")

@@ -164,8 +164,8 @@ class EpisodeStatistics:
         self._log: list[tuple[Tensor, ...]] = []
         self._running = torch.zeros(2, num_envs, dtype=wide_float(device), device=device)
         self._ended: list[Tensor] = []
-        self._measured: dict[str, list[Tensor]] = {}
-        """by name: [2, N] for each logged step, the numbers and where they count"""
+        self._measured: list[tuple[dict[str, Tensor], Tensor]] = []
+        """the measures of each logged step, and where they count, [N]"""
         self._sums: dict[str, Tensor] = {}
         """by name: [2, N], the sum of each environment, and how many numbers it has"""
 
@@ -175,8 +175,8 @@ class EpisodeStatistics:
         Of several processes, each has the `measures` of its own environments, and where these are `valid`.
         """
         self._log.append((step.reward, step.terminated, step.truncated, step.valid, counts))
-        for name, values in measures.items():
-            self._measured.setdefault(name, []).append(torch.stack([values, valid]))
+        if measures:
+            self._measured.append((measures, valid))
         if len(self._log) == LOG_ROWS:
             self._sum_up()
 
@@ -195,12 +195,16 @@ class EpisodeStatistics:
         running = episode_sums(torch.stack([reward * valid, valid]).to(self._running.dtype), done, self._running)
         self._ended.append(running[:, done & counts])  # by time, then by environment
         self._running = running[:, -1] * ~done[-1]
-        for name, rows in self._measured.items():
-            values, valid = torch.stack(rows).to(self._running.dtype).unbind(1)
-            counted = values.isfinite() & valid.bool()
-            sums = torch.stack([values.where(counted, 0), counted]).sum(1)
+        columns: dict[str, list[tuple[Tensor, Tensor]]] = {}
+        for measures, valid in self._measured:
+            for name, values in measures.items():
+                columns.setdefault(name, []).append((values, valid))
+        for name, rows in columns.items():
+            values, valid = map(torch.stack, zip(*rows, strict=True))
+            counted = values.isfinite() & valid
+            sums = torch.stack([values.where(counted, 0), counted]).to(self._running.dtype).sum(1)
             self._sums[name] = self._sums[name] + sums if name in self._sums else sums
-        self._log, self._measured = [], {}
+        self._log, self._measured = [], []
 
     def _means(self, world: World) -> dict[str, float]:
         """The mean of each measure, summed up over the environments in their order, whichever process has them."""

@@ -76,7 +76,7 @@ class Worker(gym.Wrapper):
         return _told(self.env.step, action)
 
     def call_method(self, name: str, argument: Any) -> str | None:
-        """As `call_method`; returns the sentence of the `UserError` instead of raising it."""
+        """The sentence of the `UserError` that the function `call_method` raises here, if it does."""
         try:
             call_method(self.env, name, argument)
         except UserError as error:

@@ -81,7 +81,7 @@ def c_files(
 
 
 def _masked(action: Action) -> list[tuple[int, int, int]]:
-    """Of each component with a mask: its number of choices, the first one, and where its mask begins in all of them."""
+    """(number of choices, the first one, the place of its mask in the row of masks) of each component that has one."""
     if not isinstance(action, Discrete | MultiDiscrete) or not action.masked:
         return []
     counts, firsts = ((action.n,), (action.start,)) if isinstance(action, Discrete) else (action.nvec, action.start)

@@ -81,10 +81,10 @@ def safe_sentence(action: Action) -> str:
 
 
 def difference_units(action: Action, true: np.ndarray) -> np.ndarray:
-    """What differences from the true actions [R, A] are shares of, [A]: half the range of each coordinate of a Box.
+    """The size of each coordinate, [A], by which differences from the true actions [R, A] are divided.
 
-    Without a range it is 1, or the largest action; where float32 divides a range into few numbers, neighbours differ by
-    1e-5. Of other kinds of actions it is 1.
+    Of a Box it is half the range, or without one the largest action, and at least 1. Where float32 has few numbers
+    within the range it is larger, so that neighbours differ by 1e-5. Of other kinds of actions it is 1.
     """
     if not isinstance(action, Box):
         return np.ones(true.shape[1])

@@ -43,11 +43,12 @@ def envs_of(config: RunConfig, world: World) -> tuple[VecEnv, VecEnv | None]:
         eval_env = None
         if world.is_first:  # the few, before the many
             eval_env = evaluation_env(config, config.evaluate_episodes, device=str(device))
-            if eval_env.backend.once:
-                return eval_env, eval_env
             failing.callback(eval_env.close)
             if world.size == 1:
                 require_memory(config, eval_env.spec, device)
+            if eval_env.backend.once:
+                failing.pop_all()
+                return eval_env, eval_env
         env = registry.make(num_envs=config.num_envs, device=str(device), stagger=True, world=world, **arguments)
         failing.pop_all()
         return env, eval_env
