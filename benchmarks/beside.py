@@ -39,16 +39,16 @@ with tempfile.TemporaryDirectory() as folder:
     settings = {"checkpoint_every": 10**9, "total_steps": 10**8, "buffer_size": 10**5, "learning_starts": 1000}
     given = {name: value for name, value in settings.items() if hasattr(lem.config_for(sys.argv[1], sys.argv[2]), name)}
     callbacks = {"callbacks": take_turns, "progress": False, "run": folder + "/run"}
-    lem.train(sys.argv[1], sys.argv[2], compile="on", threads=1, **given, **callbacks)
+    lem.train(sys.argv[1], sys.argv[2], backend=sys.argv[3], compile="on", threads=1, **given, **callbacks)
 """
 WARM_UP = 3
 """turns that are not counted: compilation, and what SAC collects before it learns"""
 
 
-def begin(source, algorithm, env):
+def begin(source, algorithm, env, backend):
     """A process that trains four lines of metrics for each line it reads."""
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-    command = [sys.executable, "-c", LOOP, algorithm, env]
+    command = [sys.executable, "-c", LOOP, algorithm, env, backend]
     process = subprocess.Popen(command, env={**os.environ, "PYTHONPATH": str(source)}, **pipes)
     process.stdout.readline()
     return process
@@ -69,9 +69,11 @@ def main():
     parser.add_argument("other", type=Path, help="the other checkout")
     parser.add_argument("--algorithm", default="ppo")
     parser.add_argument("--env", default="HalfCheetah-v5")
+    parser.add_argument("--backend", default="envpool")
     parser.add_argument("--turns", type=int, default=60)
     given = parser.parse_args()
-    here, there = (begin(it.resolve() / "src", given.algorithm, given.env) for it in (ROOT, given.other))
+    what = given.algorithm, given.env, given.backend
+    here, there = (begin(it.resolve() / "src", *what) for it in (ROOT, given.other))
     ratios = {"all": [], "collect": [], "learn": []}
     for k in range(-WARM_UP, given.turns):
         order = (here, there) if k % 2 else (there, here)

@@ -206,7 +206,7 @@ class Hanging(Copy):
 
 
 class Graded(gym.Env):
-    """What is seen is noise, and rewards are higher by a level, which is 0 unless it is set."""
+    """What is seen is noise, and rewards are higher by a level, which is 0 unless it is set, and is told."""
 
     observation_space, action_space, level = spaces.Box(-1, 1, (2,), np.float32), spaces.Discrete(2), 0.0
 
@@ -222,7 +222,7 @@ class Graded(gym.Env):
 
     def step(self, action):
         self.t += 1
-        return self._see(), self.level, False, self.t >= 8, {}
+        return self._see(), self.level, False, self.t >= 8, {"level": self.level}
 
     def _see(self):
         return self.np_random.uniform(-1, 1, 2).astype(np.float32)

@@ -1,9 +1,11 @@
 """The front door, from Python."""
 
 import json
+import re
 import subprocess
 import sys
 from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
@@ -300,6 +302,9 @@ def test_a_policy_says_its_probabilities_and_its_value(cartpole):
         lem.UserError, match=r"of ppo has learned no policy.q_value\(obs, action\); it has policy.value"
     ):
         policy.q_value(obs, policy.act(obs))
+    told = lem.TrainedPolicy(policy.networks, replace(policy.spec, privileged=2), policy.config, 0)
+    with pytest.raises(lem.UserError, match=r"policy.value\(obs\) takes 2 privileged numbers, which no observation"):
+        told.value(obs)
     with pytest.raises(lem.UserError, match="has no action mask"):
         policy.distribution(obs[0], action_mask=[1, 0])
 
@@ -352,6 +357,7 @@ SETTINGS = {
     "inference_mode": torch.inference_mode,
     "set_grad_enabled": lambda: as_default(torch.set_grad_enabled, False, True),
     "autocast": lambda: torch.autocast("cpu", dtype=torch.bfloat16),
+    "threads": lambda: as_default(torch.set_num_threads, 2, torch.get_num_threads()),
 }
 
 
@@ -362,19 +368,42 @@ def settings_of_torch():
         torch.is_grad_enabled(),
         torch.is_inference_mode_enabled(),
         torch.is_autocast_enabled("cpu"),
+        torch.get_num_threads(),
     )
 
 
 def test_what_the_caller_has_set_in_torch_changes_nothing_and_stays(tmp_path):
     """Training, a resume, loading, acting and evaluation: the same numbers under every setting."""
-    found = {}
+    found, longer = {}, {"total_steps": 288, "progress": False}
     for name, setting in SETTINGS.items():
         with setting():
             before = settings_of_torch()
             run = lem.train("ppo", "Pendulum-v1", run=tmp_path / name, **tiny_fields("Pendulum-v1"), progress=False)
+            assert lem.resume(run.path, **longer).policy.step == 288
             policy = lem.load(run.path)
             actions = policy.act(np.zeros((2, 3)), deterministic=False)
             scores = lem.evaluate(policy, episodes=2, seed=0, deterministic=False).returns
             assert settings_of_torch() == before
         found[name] = actions.tolist(), scores, actions.dtype
     assert all(each == found["nothing"] for each in found.values())
+
+
+def test_what_the_caller_has_set_in_torch_does_not_reach_what_looks_at_a_policy(cartpole, pendulum, tmp_path):
+    """What a policy says of itself, a film, and the check of a whole environment, each under every setting."""
+    critic = lem.config_for("ddpg", "Pendulum-v1", hidden=(8,), critic_hidden=(8,))
+    learned = lem.TrainedPolicy(critic.networks(pendulum.policy.spec), pendulum.policy.spec, critic, 0)
+    obs, found = np.linspace(-1, 1, 6).reshape(2, 3), {}
+    for name, setting in SETTINGS.items():
+        with setting():
+            before = settings_of_torch()
+            said = pendulum.policy.distribution(obs), pendulum.policy.value(obs), learned.q_value(obs, np.ones((2, 1)))
+            film = lem.watch(cartpole.policy, seed=1, video=tmp_path / "film.gif")
+            checked = [finding.sentence for finding in lem.check("Pendulum-v1", backend="gymnasium")]
+            assert settings_of_torch() == before
+        numbers = [said[0].mean, said[0].std, *said[1:]]
+        found[name] = [each.tolist() for each in numbers], [each.dtype for each in numbers], film.returns, checked
+    first = found["nothing"]
+    for name, each in found.items():
+        assert each[1:3] == first[1:3], name
+        assert [re.sub(r"[\d.,]+", "", said) for said in each[3]] == [re.sub(r"[\d.,]+", "", said) for said in first[3]]
+        assert each[0] == first[0], name

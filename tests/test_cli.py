@@ -203,6 +203,23 @@ def test_the_home_folder_is_meant_wherever_a_path_is_taken(run, tmp_path, monkey
     assert not any(tmp_path.glob("*~*"))
 
 
+def test_a_run_goes_on_to_more_steps_and_one_of_its_checkpoints_is_named(tmp_path, capsys):
+    words = ["--run", str(tmp_path / "r"), "--checkpoint-every", "64", "--keep-checkpoints", "10"]
+    assert main(["train", "ppo", "--env", "CartPole-v1", *TINY, *words]) == 0
+    assert main(["resume", str(tmp_path / "r"), "--total-steps", "320"]) == 0
+    assert lem.load(tmp_path / "r").step == 320
+    returns = {}
+    for step in (None, 64):
+        capsys.readouterr()
+        named = [] if step is None else ["--checkpoint", str(step)]
+        assert main(["evaluate", str(tmp_path / "r"), "--episodes", "8", "--json", *named]) == 0
+        returns[step] = json.loads(capsys.readouterr().out)["returns"]
+        assert returns[step] == lem.evaluate(tmp_path / "r", episodes=8, checkpoint=step).returns
+    assert returns[None] != returns[64]
+    assert main(["evaluate", str(tmp_path / "r"), "--checkpoint", "best"]) == 2
+    assert "has no checkpoint best; those at steps: 64, 128, 192, 256, 320" in capsys.readouterr().err
+
+
 def test_stochastic_means_the_same_in_evaluate_and_watch(run, capsys):
     returns = []
     for words in ([], ["--stochastic"]):

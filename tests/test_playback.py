@@ -1,6 +1,7 @@
 """Episodes shown where a person sits: in a notebook and in a window, or recorded."""
 
 import io
+import math
 import os
 import subprocess
 import sys
@@ -225,12 +226,27 @@ def test_a_function_is_a_policy(policy, unwritten, capsys):
         (lambda: 0, "CartPole-v1", "takes one observation; a function does not"),
         (lambda obs: 7, "CartPole-v1", r"CartPole-v1 takes actions of Discrete\(2\), not 7"),
         (lambda obs: 0.0, "Pendulum-v1", r"Pendulum-v1 takes actions of Box.*, not 0.0"),
+        (lambda obs: [np.nan], "Pendulum-v1", r"Pendulum-v1 takes actions of Box.*, not \[nan\]"),
+        (lambda obs: ["0.5"], "Pendulum-v1", r"Pendulum-v1 takes actions of Box.*, not \['0.5'\]"),
         (lambda obs: 0, "Countdown-v0", "Countdown-v0 makes several environments at once"),
     ],
 )
 def test_a_function_that_cannot_act_is_refused_in_a_sentence(function, env, said):
     with pytest.raises(lem.UserError, match=said):
         lem.evaluate(function, env, episodes=1)
+
+
+def test_a_reward_that_is_not_finite_is_no_score_of_a_function():
+    rewards = iter((1.0, 2.0, math.nan))
+
+    def scored(env):
+        return gym.wrappers.TransformReward(env, lambda reward: next(rewards))
+
+    def make():
+        return scored(gym.make("CartPole-v1"))
+
+    with pytest.raises(lem.NonFiniteError, match=r"The reward of .* is nan in step 3 of an episode"):
+        lem.evaluate(lambda obs: int(obs[2] > 0), env=make, episodes=1)
 
 
 def test_another_environment_must_fit(policy):

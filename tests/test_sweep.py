@@ -118,6 +118,8 @@ def test_what_needs_one_run_says_so_of_a_sweep(trained, capsys):
         assert capsys.readouterr().err == said
     with pytest.raises(lem.UserError, match="is a sweep"):
         lem.resume(path)
+    assert main(["resume", str(path), "--total-steps", "99"]) == 2
+    assert f"--total-steps is for one run, and {path} is a set of them" in capsys.readouterr().err
 
 
 def test_resuming_a_sweep_goes_on_begins_and_leaves_alone(trained, tmp_path, capsys):

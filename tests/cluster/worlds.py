@@ -17,6 +17,11 @@ KINDS = {
     "ppo-sync": ("ppo", "CartPole-v1", {"backend": "gymnasium", "minibatch_size": 16}),
     "ppo-async": ("ppo", "CartPole-v1", {"backend": "gymnasium-async", "minibatch_size": 16}),
     "ppo-cheetah": ("ppo", "HalfCheetah-v5", {"minibatch_size": 32, "evaluate_every": 800}),
+    "ppo-curriculum": (
+        "ppo",
+        "environments:Graded",
+        {"curriculum": "environments:harder", "backend": "gymnasium", "minibatch_size": 16, "evaluate_every": 512},
+    ),
     "ppo-compiled": ("ppo", "CartPole-v1", {"compile": "on", "minibatch_size": 16}),
     "reinforce": ("reinforce", "Pendulum-v1", {"critic_minibatch_size": 16}),
     "a2c": ("a2c", "CartPole-v1", {}),

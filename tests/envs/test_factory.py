@@ -12,6 +12,7 @@ import toy
 from environments import PlusOne, Reach, times_ten
 from lemniscate.envs import registry
 from lemniscate.errors import UserError
+from lemniscate.system.world import World
 
 
 def reward_of(env, **kwargs):
@@ -67,6 +68,20 @@ def test_ones_own_environment_may_have_a_seed_among_its_arguments():
     assert reward_of(seeded, kwargs={"seed": 5}) == 5
     with pytest.raises(UserError, match=r"render_mode is no argument .* with a video"):
         reward_of(Reach, kwargs={"render_mode": "human"})
+
+
+@pytest.mark.parametrize("wrappers", [(), (PlusOne,)])
+@pytest.mark.parametrize("shards", [1, 2])
+def test_a_method_is_called_of_every_environment_and_again_of_those_that_are_built_again(shards, wrappers):
+    """A run restarts its environments at each checkpoint: what a curriculum has decided holds there too."""
+    made = registry.make(environments.Graded, 4, wrappers=wrappers, world=World(shards))
+    for level, seed in ((0.0, 0), (3.0, 1), (3.0, 2)):
+        made.restart(seed)
+        if seed == 1:
+            made.backend.call({"set_level": level})
+        for _ in range(10):  # beyond the end of an episode
+            assert made.step(torch.zeros(4, dtype=torch.int64)).reward.tolist() == [level + len(wrappers)] * 4
+    made.close()
 
 
 class Running(gym.Wrapper):

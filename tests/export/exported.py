@@ -16,7 +16,7 @@ from lemniscate.exporting.deployed import Deployed, act_with, input_size
 from lemniscate.exporting.onnx_model import onnx_act, onnx_model
 from lemniscate.exporting.operations import Program
 from lemniscate.exporting.translation import translate
-from lemniscate.spec import Box, Discrete, ObservationPart, Spec
+from lemniscate.spec import Box, ObservationPart, Spec
 
 needs_compiler = pytest.mark.skipif(not host_compiler(), reason="there is no C compiler")
 BOX = Box((-1.0, -2.0, 0.0), (1.0, 2.0, 0.5))
@@ -64,8 +64,9 @@ def observations_for(policy, rows=500, seed=1):
     """Random observations, and in a masked environment masks that permit something."""
     rng = np.random.default_rng(seed)
     obs = rng.normal(0, 3, (rows, policy.spec.observation_size)).astype(np.float32)
-    if isinstance(policy.spec.action, Discrete) and policy.spec.action.masked:
-        mask = rng.random((rows, policy.spec.action.n)) < 0.5
+    action = policy.spec.action
+    for count in getattr(action, "nvec", (action.mask_size,)) if action.mask_size else ():
+        mask = rng.random((rows, count)) < 0.5
         mask[:, -1] |= ~mask.any(1)
         obs = np.concatenate([obs, mask], axis=1).astype(np.float32)
     return obs

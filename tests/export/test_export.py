@@ -28,6 +28,7 @@ from lemniscate.exporting.deployed import Deployed, act_with, input_size
 from lemniscate.exporting.export import acted, observed, ranges
 from lemniscate.exporting.parity import fly
 from lemniscate.exporting.translation import translate
+from lemniscate.spec import Box, ObservationPart, Spec
 
 
 @pytest.fixture(scope="module")
@@ -159,6 +160,10 @@ def test_images_and_policies_of_no_run_are_refused(tmp_path):
     image.close()
     with pytest.raises(lem.UserError, match="A policy for Copy-image-v0 looks at images; what can be exported"):
         lem.export(policy, tmp_path / "e")
+    steps = Spec("Steps-v0", (ObservationPart((), (3,)),), Box((0.0,), (4.0,), dtype="int64"))
+    whole = TrainedPolicy(config.networks(steps), steps, config, 0)
+    with pytest.raises(lem.UserError, match="Steps-v0 takes a Box of whole numbers; what can be exported acts by frac"):
+        lem.export(whole, tmp_path / "e")
     with pytest.raises(lem.UserError, match="This policy is of no run here: name the directory"):
         lem.export(policy_for())
     with pytest.raises(lem.UserError, match="of no run here"):

@@ -23,6 +23,7 @@ KINDS = {
     "discrete": Discrete(5, start=-2),
     "masked": Discrete(4, masked=True),
     "multi-discrete": MultiDiscrete((2, 3), (1, 0)),
+    "masked components": MultiDiscrete((3, 4), (1, 0), masked=True),
     "multi-binary": MultiBinary(4, (2, 2)),
 }
 SAFE = {
@@ -33,8 +34,12 @@ SAFE = {
     "discrete": [-2],
     "masked": [0],
     "multi-discrete": [1, 0],
+    "masked components": [1, 0],
     "multi-binary": [0, 0, 0, 0],
 }
+
+MASKED = {"masked": ([0, 0, 1, 1], [2]), "masked components": ([0, 0, 1, 0, 1, 0, 1], [3, 1])}
+"""a mask, and the first action that it permits in each component"""
 
 
 def require_parity(copy, tolerance=1e-5):
@@ -55,12 +60,12 @@ def test_every_kind_of_actions(kind):
     assert np.array_equal(safe_action(KINDS[kind]), np.float32(SAFE[kind]))
     bad = np.repeat(copy.obs[:1], 3, axis=0)
     bad[:, 2] = [np.nan, np.inf, -np.inf]
-    if kind == "masked":
-        bad[:, -4:] = [0, 0, 1, 1]
+    mask, first = MASKED.get(kind, ([], SAFE[kind]))
+    bad[:, bad.shape[1] - len(mask) :] = mask
     # Of -ffast-math this is what matters here; linked with all of it, the library would flush subnormals everywhere.
-    for flags in [("-O0",), *([("-O3", "-ffinite-math-only")] if kind == "masked" else [])]:
+    for flags in [("-O0",), *([("-O3", "-ffinite-math-only")] if mask else [])]:
         host = copy.host(*flags)
-        assert np.array_equal(host.act(bad), [[2]] * 3 if kind == "masked" else [SAFE[kind]] * 3)
+        assert np.array_equal(host.act(bad), [first] * 3)
         assert host.flags == 3
         host.act(copy.obs)
         assert host.flags == 0

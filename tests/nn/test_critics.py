@@ -11,6 +11,7 @@ from lemniscate.nn.actor_categorical_q import ActorCategoricalQ
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.actor_q import ActorQ
 from lemniscate.nn.bounded import Temperature
+from lemniscate.nn.categorical_q import normalize_units
 from lemniscate.nn.networks import Layers
 
 
@@ -18,6 +19,15 @@ def test_a_value_is_one_number_for_each_observation():
     value, obs = ActorCritic(spec_of(), Layers()).value, torch.randn(20, 5)
     assert value(obs).shape == (20,)
     assert value(obs.view(4, 5, 5)).shape == (4, 5)
+
+
+def test_units_of_a_frozen_layer_keep_their_length():
+    free, frozen = torch.nn.Linear(3, 4), torch.nn.Linear(3, 4).requires_grad_(False)
+    before = frozen.weight.clone()
+    with torch.no_grad():
+        normalize_units(torch.nn.Sequential(free, frozen))
+    torch.testing.assert_close(free.weight.norm(dim=1), torch.ones(4))
+    assert torch.equal(frozen.weight, before)
 
 
 @pytest.mark.parametrize("kind", [ActorCritic, ActorQ, ActorCategoricalQ])

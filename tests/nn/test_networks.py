@@ -78,6 +78,7 @@ def test_simba_is_residual_blocks_between_a_layer_and_a_norm(rng):
 )
 def test_images_of_any_size_become_normalized_features(shape, size):
     """Adam could not silence them: what two images differ in stays of the size of a normalized number."""
+    torch.manual_seed(0)
     encoder = ImageEncoder(shape)
     image = torch.full((2, 5, math.prod(shape)), 0.4)
     image[:, :, -1] = -0.5
@@ -170,6 +171,11 @@ def test_a_network_that_could_not_be_trained_again_is_one_sentence(network, said
     with pytest.raises(UserError, match=said) as error:
         own(network)
     assert "\n" not in str(error.value)
+
+
+def test_a_network_of_ones_own_is_looked_at_with_gradients_wherever_it_is_made():
+    with torch.no_grad():
+        assert own(Own)(torch.zeros(2, 5)).shape == (2, 3)
 
 
 def test_a_network_that_looks_at_all_rows_at_once_says_so_on_one():

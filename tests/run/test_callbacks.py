@@ -1,5 +1,7 @@
 """Callbacks see a run and may stop it; nothing that they do changes a bit of it."""
 
+import copy
+import pickle
 import random
 import textwrap
 
@@ -146,6 +148,33 @@ def test_a_callback_is_named_as_module_and_function(tmp_path, monkeypatch):
     (tmp_path / "my_callbacks.py").write_text("def stop(step, metrics, policy):\n    return step == 64\n")
     monkeypatch.chdir(tmp_path)
     assert train(tmp_path / "r", callbacks=["my_callbacks:stop"]).policy.step == 64
+
+
+@pytest.mark.parametrize("said", ["stop", 1, 0.0, np.float64(3), {"stop": False}])
+def test_a_callback_that_returns_something_else_is_told_so(tmp_path, said):
+    """A number or a text would be taken for a wish to stop, or pass for none, without a word."""
+    with pytest.raises(lem.UserError, match=r"A callback returns True to stop, or False or None; .* returned "):
+        train(tmp_path / "r", callbacks=[lambda *_: said])
+
+
+def test_a_callback_may_stop_by_a_boolean_of_numpy(tmp_path):
+    assert train(tmp_path / "r", callbacks=[lambda step, *_: np.float64(step) >= 64]).policy.step == 64
+
+
+def test_the_policy_of_a_callback_can_be_pickled_and_copied(tmp_path):
+    """Also one that was not used before: the weights are those of its step."""
+    kept = {}
+
+    def keep(step, _, policy):
+        kept[step] = pickle.dumps(policy), copy.deepcopy(policy)
+
+    run = train(tmp_path / "r", callbacks=[keep])
+    saved = run.policy.networks.state_dict()
+    for policy in (pickle.loads(kept[256][0]), kept[256][1]):
+        assert policy.act(OBS["ppo"]) == run.policy.act(OBS["ppo"])
+        assert all(torch.equal(tensor, saved[name]) for name, tensor in policy.networks.state_dict().items())
+    early = pickle.loads(kept[32][0]).networks.state_dict()
+    assert not all(torch.equal(tensor, saved[name]) for name, tensor in early.items())
 
 
 class Above:

@@ -82,6 +82,7 @@ def test_the_policy_and_the_value_still_share_their_normalizer(tmp_path):
         Spec("y", (ObservationPart(("a",), (), (4,), (1,)), ObservationPart(("b", 0), (2,))), Discrete(4, 1)),
         Spec("z", (ObservationPart((), (6, 6, 1), image=True),), MultiDiscrete((2, 3), (0, 1), (2,))),
         Spec("w", (), MultiBinary(3)),
+        Spec("v", (ObservationPart((("arm", 1), "q"), (2,)),), MultiDiscrete((2, 3), (0, 1), (2,), True, "int8")),
     ],
 )
 def test_a_spec_survives_json(spec):

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import dataclass, field
+from pathlib import PurePath
 from typing import Any, Literal
 
 import numpy as np
@@ -94,6 +95,27 @@ def test_a_value_that_does_not_fit_is_told_with_what_would(name, value, said):
     with pytest.raises(UserError) as caught:
         ppo.Config(**{name: value})
     assert str(caught.value) == said
+
+
+@pytest.mark.parametrize("name", ["env_kwargs", "reset_options"])
+def test_arguments_are_from_the_beginning_what_they_are_when_the_run_comes_back(name):
+    """So an environment is trained with what it is evaluated with; and what the caller changes later changes no run."""
+    given = {
+        "pair": (1, 2),
+        3: np.float32(0.5),
+        "grid": np.eye(2, dtype=int),
+        "model": PurePath("a/b"),
+        "deep": {"t": (1,)},
+    }
+    config = ppo.Config(**{name: given})
+    found = getattr(config, name)
+    assert found == {"pair": [1, 2], "3": 0.5, "grid": [[1, 0], [0, 1]], "model": "a/b", "deep": {"t": [1]}}
+    assert type(found["pair"]) is type(found["deep"]["t"]) is list
+    assert ppo.Config.from_json(json.loads(json.dumps(config.to_json()))) == config
+    given["deep"]["t"] = 7
+    assert found["deep"] == {"t": [1]}
+    with pytest.raises(UserError, match=f"{name} must be a dictionary of what JSON can hold"):
+        ppo.Config(**{name: {"x": object()}})
 
 
 @pytest.mark.parametrize("text", ["0.01>0", " 1e-2 > 0.0", Schedule("0.01>0")])

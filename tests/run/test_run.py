@@ -11,6 +11,7 @@ import time
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
@@ -311,6 +312,11 @@ def test_the_best_checkpoint_is_kept_and_the_final_one_stays_the_policy_of_the_r
         lem.train("ppo", run=path, callbacks=[StopAt(stop)], **fields)
         lem.resume(path, progress=False)
         assert [(path / "checkpoints" / "best" / name).read_bytes() for name in names] == expected
+    path = tmp_path / "shorter"  # which never comes again to the step of the best
+    lem.train("ppo", run=path, callbacks=[StopAt(160)], **fields)
+    shutil.rmtree(path / "checkpoints" / "step-160")
+    lem.resume(path, total_steps=128, progress=False)
+    assert lem.load(path, checkpoint="best").step == 128
     tensors = whole / "checkpoints" / "best" / "tensors.safetensors"
     tensors.write_bytes(tensors.read_bytes()[:-1])
     with pytest.raises(lem.UserError, match=r"best/tensors\.safetensors is damaged"):
@@ -368,6 +374,35 @@ def test_a_curriculum_that_cannot_be_followed_is_told_before_a_run_begins(tmp_pa
     with pytest.raises(lem.UserError, match=said):
         lem.train("ppo", run=tmp_path / "r", progress=False, **given)
     assert not (tmp_path / "r").exists()
+
+
+class Narrow(environments.Graded):
+    """Other spaces than when the run began: one number to see, or one choice more."""
+
+    observation_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+
+    def _see(self):
+        return super()._see()[:1]
+
+
+class Wide(environments.Graded):
+    action_space = gym.spaces.Discrete(3)
+
+
+@pytest.mark.parametrize(("now", "space"), [(Narrow, "observation"), (Wide, "action")])
+def test_a_run_does_not_go_on_in_other_spaces(tmp_path, monkeypatch, now, space):
+    """Before anything is restored or removed, so that the run goes on once the environment is what it was."""
+    monkeypatch.setattr(environments, "Later", type("Later", (environments.Graded,), {}), raising=False)
+    fields = tiny_fields("CartPole-v1", checkpoint_every=64, keep_checkpoints=10)
+    path = lem.train("ppo", "environments:Later", run=tmp_path / "r", progress=False, **fields).path
+    shutil.rmtree(path / "checkpoints" / "step-256")
+    before = {file: file.read_bytes() for file in (path / "checkpoints").rglob("*") if file.is_file()}
+    monkeypatch.setattr(environments, "Later", now)
+    with pytest.raises(
+        lem.UserError, match=f"r was trained with another {space} space than environments:Later has now"
+    ):
+        lem.resume(path, progress=False)
+    assert {file: file.read_bytes() for file in (path / "checkpoints").rglob("*") if file.is_file()} == before
 
 
 def test_a_damaged_checkpoint_is_named_and_the_one_before_is_taken(tmp_path, capsys):

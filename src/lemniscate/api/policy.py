@@ -30,7 +30,7 @@ from lemniscate.system.files import at_home, parsing
 
 @dataclass(frozen=True)
 class ActionDistribution:
-    """The distribution of actions at one observation or at each of B; None is what its kind of action space has not.
+    """The distribution of actions at one observation or at each of B; a field is None where the actions have none.
 
     Attributes:
         probabilities: of a Discrete [n] or [B, n]; of a MultiDiscrete one such array for each component; of a
@@ -131,7 +131,7 @@ class TrainedPolicy:
         """
         flat, batched = self._read_for("q", obs)
         kind, given = self.spec.bounded_box(), np.asarray(action, dtype=np.float32)
-        wanted = ((len(flat),) if batched else ()) + (kind.shape or (kind.size,))
+        wanted = ((len(flat),) if batched else ()) + ((kind.size,) if kind.shape is None else kind.shape)
         if given.shape != wanted or not np.isfinite(given).all():
             raise UserError(
                 f"action must be finite numbers of the shape {wanted}, not {given.shape}: as act returns it."
@@ -152,9 +152,12 @@ class TrainedPolicy:
     def _read_for(self, critic: str, obs: Any) -> tuple[Tensor, bool]:
         """The observations of `_read` for a critic, "value" or "q". Raises `UserError` where none has been learned."""
         verbs = {"value": "policy.value(obs)", "q": "policy.q_value(obs, action)"}
-        here = [verb for name, verb in verbs.items() if hasattr(self.networks, name)]
-        if verbs[critic] not in here or getattr(self.config, "baseline", critic) != critic:
-            there = f"; it has {here[0]}" if here and verbs[critic] not in here else ""
+        own = [name for name in verbs if hasattr(self.networks, name)]
+        here = [
+            verbs[name] for name in own if getattr(self.config, "baseline", name) == name
+        ]  # REINFORCE's, if learned
+        if verbs[critic] not in here:
+            there = f"; it has {here[0]}" if here else ""
             raise UserError(f"This policy of {algorithm_of(self)} has learned no {verbs[critic]}{there}.")
         if self.spec.privileged:
             raise UserError(
@@ -216,9 +219,11 @@ def load(run: Trained, *, checkpoint: str | int | None = None, trust: bool = Fal
     """
     if checkpoint is None and isinstance(run, TrainedRun | TrainedPolicy):
         return run.policy if isinstance(run, TrainedRun) else run
-    if checkpoint is not None or isinstance(run, TrainedRun | TrainedPolicy) or not hub.is_address(run):
+    if isinstance(run, TrainedRun | TrainedPolicy) or not hub.is_address(run):
         return _read(find_checkpoint(path_of(run), checkpoint), path_of(run))
     address = hub.read_address(run)
+    if checkpoint is not None:
+        raise UserError(f"{address} is one checkpoint: none of it can be chosen.")
     path = hub.download(address)
     with prefix_errors(str(address)):
         found = find_checkpoint(path)

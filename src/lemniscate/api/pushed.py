@@ -11,7 +11,7 @@ from lemniscate.errors import UserError
 from lemniscate.hub import repository as hub
 from lemniscate.report import pages
 from lemniscate.run import checkpoint
-from lemniscate.run.directory import CONFIG
+from lemniscate.run.directory import CONFIG, FINAL
 from lemniscate.system.console import say
 from lemniscate.system.files import write_json
 
@@ -53,7 +53,7 @@ def push(run: Trained, name: str, *, private: bool = False, license: str | None 
             film_or_say(policy, folder / "videos" / "episode.gif")
         scores = _scores(policy, path)
         if scores:
-            write_json(folder / "final.json", scores)
+            write_json(folder / FINAL, scores)
         own = {"step": policy.step, "scores": scores, "license": license, "code": code}
         pages.write_card(folder, name, algorithm_of(policy), policy.config, **own)
         return hub.upload(folder, name, private)

@@ -18,6 +18,7 @@ from lemniscate.report import flight, pages, playback
 from lemniscate.run import check as run_check
 from lemniscate.run.checkpoint import list_steps
 from lemniscate.run.config import Episodes, Natural, RunConfig, checked
+from lemniscate.run.directory import FINAL
 from lemniscate.run.environments import env_arguments, evaluation_env
 from lemniscate.run.evaluate import Evaluation, critic_of
 from lemniscate.run.evaluate import evaluate as evaluate_policy
@@ -203,7 +204,7 @@ def final_return(run: str | Path | TrainedRun) -> float:
 def final_scores(run: str | Path | TrainedRun) -> dict[str, Any]:
     """The `scores_of` a run's newest policy; kept in `final.json` until there is a newer policy."""
     path = path_of(run)
-    file = path / "final.json"
+    file = path / FINAL
     known = _known_scores(file)
     if known.get("step") not in list_steps(path / "checkpoints")[-1:]:
         say(f"Evaluating {path}: {FINAL_EPISODES} episodes.")

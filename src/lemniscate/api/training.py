@@ -69,7 +69,8 @@ def choose_config(
         chosen, config = presets.choose(name, env, preset)
     config = config.replace(**{name: name_in_config(value) for name, value in fields.items()})
     for final in (name for name in fields if name.startswith("final_")):
-        if ended := [name for name in config.schedules if name.endswith(final.removeprefix("final_"))]:
+        rate = final.removeprefix("final_")  # where there is no such field, it is that of actor and critic
+        if ended := [name for name in config.schedules if name == rate or not hasattr(config, rate)]:
             raise UserError(f"{ended[0]} {config.schedules[ended[0]]} has its own end: {final} does not go with it.")
     if chosen == "default" and env is None:
         raise UserError("Which environment? Name one with env; `lemniscate envs` lists them.")
@@ -225,8 +226,9 @@ def go_on(path: Path, options: RunOptions, changes: Mapping[str, object]) -> Tra
 
 def _annealed(config: RunConfig) -> list[str]:
     """The fields that make others change over the steps of the whole run, with their values."""
-    fractions = ("final_learning_rate", "final_critic_learning_rate") if not getattr(config, "desired_kl", None) else ()
-    fields = {**config.schedules, **{name: getattr(config, name, 1.0) for name in fractions}}
+    fractions = () if getattr(config, "desired_kl", None) else ("final_learning_rate", "final_critic_learning_rate")
+    annealed = [name for name in fractions if name.removeprefix("final_") not in config.schedules]
+    fields = {**config.schedules, **{name: getattr(config, name, 1.0) for name in annealed}}
     return [f"{name} {value}" for name, value in fields.items() if value != 1]
 
 

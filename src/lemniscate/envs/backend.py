@@ -227,7 +227,7 @@ class Backend(ABC):
 
     @classmethod
     def exists_once(cls, env: str, num_envs: int) -> bool:
-        """Whether a backend of so many would have `once`."""
+        """Whether a backend of so many gets `once`: they are the user's own, and may exist once at a time."""
         return False
 
     @classmethod
@@ -263,6 +263,11 @@ class Joined(Backend):
         self.spec, self.device = backends[0].spec, backends[0].device
         self.num_envs = sum(backend.num_envs for backend in backends)
         self.summaries, self.scene, self.baseline = backends[0].summaries, backends[0].scene, backends[0].baseline
+
+    @property
+    def notices(self) -> Sequence[str]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Those of the first part: the others observe the same."""
+        return self._backends[0].notices
 
     def restart(self, seed: int, first: int = 0) -> Tensor:
         """Begin again; see `Backend.restart`."""

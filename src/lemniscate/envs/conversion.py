@@ -1,6 +1,6 @@
 """What passes between a policy and environments at every step: returns, checked and laid out, and actions."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import lru_cache, reduce
 from inspect import signature
 from operator import getitem
@@ -119,7 +119,7 @@ def measures_of(metadata: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def measured(
-    info: Mapping[str, Any], declared: tuple[str, ...], num_envs: int, device: torch.device, prefix: str = ""
+    info: Mapping[str, Any], declared: tuple[str, ...], num_envs: int, device: torch.device
 ) -> dict[str, Tensor]:
     """The numbers [N] float32 in the info of a vector environment; NaN where an environment gave none.
 
@@ -128,24 +128,29 @@ def measured(
     """
     found: dict[str, Tensor] = {}
     for source in (info, info.get("final_info", {})):
-        for key, values in source.items():
-            if key in APART or key[:1] == "_":
-                continue
-            if isinstance(values, Mapping):
-                found |= measured(values, declared, num_envs, device, f"{prefix}{key}/")
-                continue
-            array = np.asarray(values)
-            if array.dtype.kind not in "biuf" or array.size != num_envs:
+        for key, values, given in _columns(source):
+            if values.dtype.kind not in "biuf" or values.size != num_envs:
                 if key in declared:
-                    raise UserError(f"info[{key!r}] is {kind_of(array)}; a measure is a number for each environment.")
+                    raise UserError(f"info[{key!r}] is {kind_of(values)}; a measure is a number for each environment.")
                 continue
-            numbers = torch.from_numpy(array.reshape(num_envs).astype(np.float32)).to(device)
-            name, given = key if key in declared else f"info/{prefix}{key}", source.get(f"_{key}")
+            numbers = torch.from_numpy(values.reshape(num_envs).astype(np.float32)).to(device)
+            name = key if key in declared else f"info/{key}"
             if given is not None and not given.all():
                 before = found.get(name, torch.full((num_envs,), torch.nan, device=device))
                 numbers = torch.where(torch.from_numpy(np.asarray(given)).to(device), numbers, before)
             found[name] = numbers
     return found
+
+
+def _columns(info: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, np.ndarray, Any]]:
+    """(name, values, where they count) of each entry that may be a number, those of dictionaries by "outer/inner"."""
+    for key, values in info.items():
+        if key in APART or key[:1] == "_":
+            continue
+        if isinstance(values, Mapping):
+            yield from _columns(values, f"{prefix}{key}/")
+        else:
+            yield f"{prefix}{key}", np.asarray(values), info.get(f"_{key}")
 
 
 def flatten_observation(parts: tuple[ObservationPart, ...], obs: Any, *, image: bool = False) -> np.ndarray:

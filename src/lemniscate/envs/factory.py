@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from functools import partial
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -57,9 +58,11 @@ def is_own(maker: Maker) -> bool:
     """Whether an environment is the user's own: neither of an installed package nor of the standard library."""
     made_by = getattr(maker, "entry_point", maker)
     name = made_by.partition(":")[0] if isinstance(made_by, str) else getattr(made_by, "__module__", "")
-    file = getattr(sys.modules.get(name) or (name and find_spec(name)), "__file__", None)
-    installed = [sysconfig.get_path(kind) for kind in ("stdlib", "purelib", "platlib")]
-    return not any(str(file or "").startswith(folder) for folder in installed)
+    package = name.partition(".")[0]  # to look for what is inside of it would import it
+    found = sys.modules.get(package) or (package and find_spec(package))
+    file = Path(getattr(found, "__file__", None) or getattr(found, "origin", None) or "")
+    installed = {"site-packages", "dist-packages"} & set(file.parts)
+    return not installed and not file.is_relative_to(sysconfig.get_path("stdlib"))
 
 
 class ResetOptions(gym.Wrapper):

@@ -92,7 +92,6 @@ class GymnasiumBackend(Backend):
             raise UserError(f"{env} makes {num_envs} environments at once, so there is none for a process of its own.")
         wraps = tuple(map(find_callable, wrappers))
         self._build = partial(make_vector, maker, num_envs, dict(kwargs or {}), wraps, self.workers)
-        self.once = self.exists_once(env, num_envs)
         with sentences(env, kwargs, wrappers):
             self._envs, limit = self._build()
         mode = self._envs.metadata.get("autoreset_mode")
@@ -104,7 +103,7 @@ class GymnasiumBackend(Backend):
         self._used = isinstance(action, Discrete | MultiDiscrete)
         if self._used:
             action = spaces.masked(action, *self._envs.reset(seed=0))
-        self._stagger_up_to = limit if stagger and self.mode is AutoresetMode.DISABLED and not self.once else None
+        self._stagger_up_to = limit if stagger and self.mode is AutoresetMode.DISABLED else None
         self._calls: dict[str, Any] = {}
         self._measures = measures_of(self._envs.metadata)
         self.spec = Spec(env, parts, action, max_episode_steps=limit)

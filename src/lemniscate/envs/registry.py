@@ -242,6 +242,8 @@ def make(
     mine = num_envs // world.size
     require_room(name, mine, chosen)
     vectors = 1 if cls.divides(name) else len(world.held)
-    options = {"stagger": stagger, "kwargs": kwargs, "wrappers": wraps}
+    once = cls.exists_once(name, num_envs)
+    options = {"stagger": stagger and not once, "kwargs": kwargs, "wrappers": wraps}
     made = [cls(name, mine // vectors, torch.device(device), **options) for _ in range(vectors)]
+    made[0].once = once
     return VecEnv(made[0] if vectors == 1 else Joined(made), world)

@@ -108,7 +108,7 @@ def layers(env: Any) -> Iterator[Any]:
     """An environment, and what is inside of it if it is a wrapper, the outermost first."""
     while env is not None:
         yield env
-        env = vars(env).get("env")
+        env = env.env if isinstance(env, gym.Wrapper | VectorWrapper) else None
 
 
 def author(env: Any, method: str) -> str:
@@ -206,8 +206,8 @@ def flat_mask(mask: Any, action: gym.Space | Action) -> np.ndarray:
     if not isinstance(action, spaces.Discrete | spaces.MultiDiscrete | Discrete | MultiDiscrete):
         raise ValueError("that cannot be followed: masks are for Discrete and MultiDiscrete actions")
     row = _row(mask)
-    if len(row) != counts.sum():
-        raise ValueError(f"of {len(row)} numbers; it must have {counts.sum()}, of 1 and 0")
+    if len(row) != counts.sum() or not ((row == 0) | (row == 1)).all():
+        raise ValueError(f"of {len(row)} numbers, {shown(row.tolist())}; it must have {counts.sum()}, of 1 and 0")
     return row.astype(bool)
 
 

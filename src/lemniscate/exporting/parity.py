@@ -44,6 +44,7 @@ def fly(policy: TrainedPolicy, act: Act, rows: int = ROWS, seed: int = 0) -> tup
     """
     env = evaluation_env(policy.config, ENVIRONMENTS)
     size, seen = input_size(policy.spec), list[np.ndarray]()
+    stride = max(1, env.num_envs // ENVIRONMENTS)  # of many, all would be seen in the same few steps
 
     def driver(obs: Tensor) -> Deterministic:
         given = np.ascontiguousarray(obs[:, :size].numpy())  # without what is privileged
@@ -53,7 +54,7 @@ def fly(policy: TrainedPolicy, act: Act, rows: int = ROWS, seed: int = 0) -> tup
         if not env.spec.fits(policy.spec):
             raise UserError(f"{policy.spec.env_id} has other spaces here than in training.")
         for obs, _, _, counts in play_episodes(driver, env, episodes=10**9, seed=seed):
-            seen.append(obs[counts][:, :size].numpy().copy())
+            seen.append(obs[counts][::stride, :size].numpy().copy())
             if sum(map(len, seen)) >= rows:
                 break
         return np.concatenate(seen), env.backend.interface
@@ -175,10 +176,10 @@ def sentences(record: Mapping[str, Any]) -> list[str]:
     """The record as sentences for a person."""
     names = {"onnx": "ONNX", "c_host": "C", "c_cortex_m4f": "C on the simulated Cortex-M4F"}
     compared = {name: record[key] for key, name in names.items() if (record[key] or {}).get("observations")}
-    said, share = list[str](), " of half the range"
+    said, share = list[str](), "" if set(record["difference_units"]) == {1.0} else " of an action's size"
     for name, each in compared.items():
         largest = each["max_difference"]
-        distance = f"differs from the policy by at most {largest:.1e}{share * (largest < 1)}" if largest else "is exact"
+        distance = f"differs from the policy by at most {largest:.1e}{share}" if largest else "is exact"
         said.append(f"{name} {distance} at {each['observations']:,} observations.")
     if sizes := record["c_cortex_m4f"]:
         instructions = sizes.get("instructions_per_call")

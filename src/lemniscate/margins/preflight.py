@@ -70,8 +70,7 @@ class Preflight:
         return {"preflight": FORMAT, **own, "axes": axes, "sentences": list(self.sentences), **origin}
 
 
-@torch_defaults()
-@torch.no_grad()
+@torch_defaults(grad=False)
 def preflight(
     run: Trained,
     compiled: bool = False,

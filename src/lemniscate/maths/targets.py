@@ -39,7 +39,7 @@ def polyak(target: Iterable[Tensor], online: Iterable[Tensor], tau: float) -> No
     Args:
         target: θ', changed.
         online: θ, of the same shapes.
-        tau: τ in [0, 1]; 1 copies.
+        tau: τ in [0, 1]; 1 copies. Whole numbers stay as they are.
     """
     for mine, theirs in zip(target, online, strict=True):
         if mine.is_floating_point():  # whole numbers do not learn

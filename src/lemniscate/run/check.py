@@ -106,7 +106,7 @@ def _going_on(path: Path, whole: list[checkpoint.Checkpoint]) -> Finding:
         return Finding(NOTE, "There is no whole planned checkpoint: resume would begin at step 0.")
     try:
         with parsing(planned[-1].path):
-            steps = ", ".join(f"{found.numbers['step']:,}" for found in whole)
+            steps = ", ".join(f"{found.numbers['step']:,}" for found in whole if found.path.name != BEST)
             # The run may have been extended since.
             record = read_json(path / CONFIG) if is_whole(path / CONFIG) else planned[-1].record
             last, total = planned[-1].numbers["step"], record["config"]["total_steps"]

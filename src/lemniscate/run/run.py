@@ -86,8 +86,8 @@ class Run:
         """logged lines that callbacks have not seen"""
         self._episodes, self._episodes_before = 0, 0
         """whole training episodes so far, and before the present body of the loop"""
-        self._logged = 0
-        """the step of the last line of metrics"""
+        self._logged, self._told = 0, 0
+        """the step of the last line of metrics, and how many notices of the environments have been said"""
         self._cut_short = False
         """whether the body of the loop took fewer steps than it was to: its state is nobody's to resume from"""
         self._line_time, self._line_step = 0.0, 0
@@ -174,9 +174,10 @@ class Run:
             numbers["episode/length"] = sum(episodes.lengths) / len(episodes.lengths)
         numbers |= {f"info/{name.removeprefix('info/')}": mean for name, mean in episodes.measures.items()}
         self._write(state.step, numbers | self._times(state.step), episodes)
-        for notice in self.env.backend.notices if self.world.is_first else ():
+        notices = self.env.backend.notices if self.world.is_first else ()
+        for notice in notices[self._told :]:
             say(notice)
-        self.env.backend.notices = ()
+        self._told = len(notices)
         recent = self._recent_returns
         self._bar.update(state.step, sum(recent) / len(recent) if recent else None, learned=bool(metrics))
 
@@ -353,7 +354,8 @@ class Run:
                 self._restart(state)
         self._write(state.step, {f"evaluation/{name}": value for name, value in scores.means().items()})
         if self.config.keep_best:
-            self._saver.save_if_best(state, scores.mean_return, self._logged)
+            with self.world.busy():
+                self._saver.save_if_best(state, scores.mean_return, self._logged)
 
     def _write(self, step: int, numbers: dict[str, float], episodes: Episodes = NO_EPISODES) -> None:
         for logger in self._loggers:

@@ -44,14 +44,16 @@ def set_seeds(seed: int, deterministic: bool = True) -> None:
 def torch_defaults(grad: bool = True) -> Iterator[None]:
     """The defaults of torch itself while a verb works, whatever its caller has set; afterwards the caller's again.
 
-    These are float32, the CPU, and gradients on (off without `grad`); the number of threads is the caller's at first.
+    These are float32, the CPU, no autocast, and gradients on (off without `grad`). The number of threads, which a verb
+    may change, is restored.
     """
     dtype, device, threads = torch.get_default_dtype(), torch.get_default_device(), torch.get_num_threads()
     torch.set_default_dtype(torch.float32)
     # To name a device costs time at every call of torch, so it is named only where the caller has another one.
     on_cpu = nullcontext() if device.type == "cpu" else torch.device("cpu")
     try:
-        with on_cpu, torch.inference_mode(False), torch.set_grad_enabled(grad), torch.autocast("cpu", enabled=False):
+        exact = torch.autocast("cpu", enabled=False), torch.autocast("cuda", enabled=False)
+        with on_cpu, torch.inference_mode(False), torch.set_grad_enabled(grad), exact[0], exact[1]:
             yield
     finally:
         torch.set_default_dtype(dtype)
