@@ -109,7 +109,7 @@ def diagnostics(runs: list[Path], file: Path, labels: Sequence[str] | None = Non
         for run, color, label in run_styles(runs, labels):
             draw_metric(axes, logs[run], name, color, label, width=1.5 if len(runs) <= 5 else 0.7)
         words = name.removeprefix("info/").replace("_", " ")
-        title, unit = TITLES.get(name, (words[:1].upper() + words[1:], ""))
+        title, unit = TITLES.get(name, (words[:1].upper() + words[1:] if name.startswith("info/") else name, ""))
         axes.set_title(title, loc="left", fontsize=10)
         axes.set_ylabel(unit, fontsize=8)
         axes.set_xlabel("environment steps" if i >= len(names) - 3 else "", fontsize=9)
