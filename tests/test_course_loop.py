@@ -1,38 +1,100 @@
-"""Whole training loops: the solution passes, each mistake is caught by the small world that is made for it."""
+"""Whole training loops: the solution passes; each mistake is seen inside, and in the small world that is made for it."""
 
 import re
+from contextlib import closing
 
+import numpy as np
 import pytest
+import torch
+from torch.nn.modules.module import _global_forward_hooks, _global_forward_pre_hooks
+from torch.optim.optimizer import _global_optimizer_pre_hooks
 
 from lemniscate import UserError, course
-from lemniscate.course import loop
+from lemniscate.course import inside, loop
+from lemniscate.course.exercise import Note
+from lemniscate.envs.vector_view import make_vec
 
 SOLUTION = loop.solution("ppo")
 
+CLIPPED = "ratio.clamp(1 - clip, 1 + clip) * advantage"
+COLUMNS = "x, a, adv, goal, old = (column[rows] for column in columns)"
 MISTAKES = {
-    "sign": ("return -torch.min(ratio", "return torch.min(ratio", "the sign of the policy's loss is turned"),
-    "chain": ("trace = delta + gamma * lam * trace * ~done[t]", "trace = delta", "there is no chain in the advantage"),
-    "death": ("next_value[t] * ~terminated[t]", "next_value[t]", "a value follows a death"),
-    "uncut": ("lam * trace * ~done[t]", "lam * trace", "the chain is not cut where an episode ends"),
-    "cut at deaths alone": ("lam * trace * ~done[t]", "lam * trace * ~terminated[t]", "the chain is cut at deaths alone"),
-    "time-out": ("next_value[t] * ~terminated[t]", "next_value[t] * ~done[t]", "a time-out is taken for a death"),
-    "final_obs": ('next_obs[i] = infos["final_obs"][i]', "pass", 'infos["final_obs"] is not used'),
-    "old probabilities": (
-        "log_prob(a) - old,",
-        "log_prob(a) - agent.distribution(x).log_prob(a).detach(),",
-        "the old log-probabilities are computed again",
+    "no exponential": ([("log_ratio.exp()", "log_ratio")], "the ratio is exp of the difference of log-probabilities, not"),
+    "1 + log": ([("log_ratio.exp()", "1 + log_ratio")], "not 1 + the difference"),
+    "upside down": ([("log_ratio.exp()", "(-log_ratio).exp()")], "the ratio is upside down"),
+    "sign": ([("return -torch.min(ratio", "return torch.min(ratio")], "the sign of the policy's loss is turned"),
+    "max": ([("-torch.min(ratio", "-torch.max(ratio")], "the larger of the two objectives is taken"),
+    "only clipped": ([(f"torch.min(ratio * advantage, {CLIPPED})", f"({CLIPPED})")], "only the clipped ratio counts"),
+    "no clip": ([(CLIPPED, "ratio * advantage")], "is not clipped where it is far below 1 and above 1"),
+    "half a clip": ([("clamp(1 - clip, 1 + clip)", "clamp(max=1 + clip)")], "the ratio is not clipped where it is far below 1"),
+    "chain": ([("trace = delta + gamma * lam * trace * ~done[t]", "trace = delta")], "there is no chain"),
+    "no λ": ([("gamma * lam * trace", "gamma * trace")], "λ is left out"),
+    "death": ([("next_value[t] * ~terminated[t]", "next_value[t]")], "a value follows a death"),
+    "uncut": ([("lam * trace * ~done[t]", "lam * trace")], "the chain is cut nowhere"),
+    "cut at deaths": ([("trace * ~done[t]", "trace * ~terminated[t]")], "the chain is not cut at time-outs"),
+    "time-out": ([("next_value[t] * ~terminated[t]", "next_value[t] * ~done[t]")], "a time-out is taken for a death"),
+    "final_obs": ([('next_obs[i] = infos["final_obs"][i]', "pass")], 'infos["final_obs"] is not used'),
+    "old, again": (
+        [("log_prob(a) - old,", "log_prob(a) - agent.distribution(x).log_prob(a).detach(),")],
+        "the ratio is 1 in every gradient step",
     ),
-    "other rows": ("x, a, adv, goal, old = (column[rows] for column in columns)",
-                   "x, a, adv, goal, old = (*(column[rows] for column in columns[:4]), columns[4][: len(rows)])",
-                   "the ratio is not 1 in the first gradient step"),
+    "old of other rows": (
+        [(COLUMNS, "x, a, adv, goal, old = (*(column[rows] for column in columns[:4]), columns[4][: len(rows)])")],
+        "the ratio is not 1 in the first gradient step: the old log-probabilities are of other rows",
+    ),
+    "advantage of other rows": ([(COLUMNS, f"{COLUMNS}; adv = columns[2][: len(rows)]")], "are of other rows than log π"),
+    "shuffled apart": ([(COLUMNS, f"{COLUMNS}; adv = adv[torch.randperm(len(adv))]")], "nothing to do with the advantage"),
+    "other actions": ([("log_prob(a) - old", "log_prob(distribution.sample()) - old")], "log π is of other actions"),
+    "broadcast": ([("log_prob(a) - old, adv,", "log_prob(a) - old, adv[:, None],")], "shapes [M, 1] and [M] give [M, M]"),
+    "broadcast V": ([("agent.value(x), goal", "agent.value(x)[:, None], goal")], "the mean of all targets"),
+    "V's sign": ([("return 0.5 * (value", "return -0.5 * (value")], "the sign of the critic's loss is turned"),
+    "no V": ([("value_loss(agent.value(x)", "value_loss(agent.value(x).detach()")], "the last layer of the critic never"),
+    "target": ([("return advantage, advantage + value", "return advantage, advantage")], "V is not added to the target"),
+    "target, normalized": ([(COLUMNS, f"{COLUMNS}; goal = goal - columns[2].mean()")], "what moves V is off by a constant"),
+    "zero_grad": ([("            optimizer.zero_grad()\n", "")], "zero_grad is missing"),
+    "zero_grad, late": ([("optimizer.step()", "optimizer.zero_grad(); optimizer.step()")], "set to zero between backward and"),
+    "no step": ([("            optimizer.step()\n", "")], "no optimizer makes a step"),
+    "no backward": ([("            loss.backward()\n", "")], "backward() is not called"),
+    "half an optimizer": ([("Adam(agent.parameters()", "Adam(agent.actor.parameters()")], "has its parameters"),
+    "one minibatch": ([("split(config.minibatch_size):", "split(config.minibatch_size)[:1]:"),
+                       ("torch.randperm(len(columns[0]))", "torch.arange(len(columns[0]))")], "the same 64 of the 256 rows of a rollout are trained on"),
+    "entropy": ([("loss - config.entropy_coef", "loss + config.entropy_coef"),
+                 ("entropy_coef: float = 0.0", "entropy_coef: float = 0.01")], "the entropy is made smaller"),
 }  # fmt: skip
 
-
-@pytest.fixture(autouse=True)
-def fewer_steps(request, monkeypatch):
-    """Half the steps show every mistake too; the long test takes all."""
-    if "long" not in request.keywords:
-        monkeypatch.setattr(loop, "STEPS", loop.STEPS // 2)
+STYLES = {
+    "unnormalized, clipped value, entropy": [
+        ("            adv = (adv - adv.mean()) / (adv.std() + 1e-8)\n", ""),
+        ("value_loss(agent.value(x), goal)", "huber(agent.value(x), goal)"),
+        ("entropy_coef: float = 0.0", "entropy_coef: float = 0.01"),
+        ("def value_loss(", "huber = nn.functional.mse_loss\n\n\ndef value_loss("),
+    ],
+    "normalized once, full batch, AdamW": [
+        ("            adv = (adv - adv.mean()) / (adv.std() + 1e-8)\n", ""),
+        (
+            "    columns = [column",
+            "    advantage = (advantage - advantage.mean()) / advantage.std()\n    columns = [column",
+        ),
+        ("minibatch_size: int = 64", "minibatch_size: int = 256"),
+        ("torch.optim.Adam(", "torch.optim.AdamW("),
+    ],
+    "two optimizers, float64": [
+        (
+            "torch.optim.Adam(agent.parameters(), lr=config.learning_rate, eps=1e-5)",
+            "torch.optim.Adam(agent.actor.parameters())",
+        ),
+        (
+            "    obs, _ = envs.reset(seed=seed)\n",
+            "    update.other = torch.optim.RMSprop(agent.critic.parameters())\n    obs, _ = envs.reset(seed=seed)\n",
+        ),
+        ("            optimizer.zero_grad()\n", "            optimizer.zero_grad(); update.other.zero_grad()\n"),
+        ("            optimizer.step()\n", "            optimizer.step(); update.other.step()\n"),
+    ],
+    "rewards scaled, rows drawn with replacement": [
+        ("step = (obs, action, reward,", "step = (obs, action, reward / 10,"),
+        ("torch.randperm(len(columns[0])).split(", "torch.randint(len(columns[0]), (len(columns[0]),)).split("),
+    ],
+}
 
 
 def program(changes=()):
@@ -46,50 +108,144 @@ def program(changes=()):
     return scope["train"]
 
 
-def in_worlds(train, *numbers):
-    """The first finding in some of the small worlds, as `loop.train` looks for it."""
-    return next((sentence for number in numbers for sentence in loop.in_world(train, number)), None)
+def inside_of(train, seed=1):
+    return inside.judged(inside.watched(lambda envs: train(envs, 60_000, seed), train.__globals__))
 
 
-@pytest.mark.parametrize("name", MISTAKES)
-def test_a_mistake_is_found_where_it_shows(name, monkeypatch):
-    right, wrong, words = MISTAKES[name]
-    number = next((i for i, world in enumerate(loop.WORLDS) if words in world.mistake), 0)
-    if number == 0 and name != "sign":  # seen by the ratio, in the first updates
-        monkeypatch.setattr(loop, "STEPS", 512)
-        assert words in list(loop.in_world(program([(right, wrong)]), 0))[-1]
-    else:
-        assert words in in_worlds(program([(right, wrong)]), number)
+QUICK = ("no exponential", "upside down", "half a clip", "death", "time-out", "final_obs", "old, again", "broadcast",
+         "target", "zero_grad", "half an optimizer", "one minibatch", "entropy")  # fmt: skip
+"""one of each kind; the long tests take all"""
 
 
-def test_the_solution_finds_the_better_action_of_the_hardest_worlds():
-    assert in_worlds(program(), 1, 6) is None
+@pytest.mark.parametrize("name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.long) for n in MISTAKES])
+def test_a_mistake_is_seen_inside(name):
+    changes, words = MISTAKES[name]
+    assert words in inside_of(program(changes)).sentence
 
 
-def test_a_clipped_loss_of_the_ratio_is_none_of_the_log_ratio(monkeypatch):
-    monkeypatch.setattr(loop, "STEPS", 256)
-    ratios = [
-        ("def clipped_surrogate(log_ratio: Tensor,", "def clipped_surrogate(ratio: Tensor,"),
-        ("    ratio = log_ratio.exp()\n", ""),
-        ("distribution.log_prob(a) - old, adv", "(distribution.log_prob(a) - old).exp(), adv"),
+@pytest.mark.parametrize("style", [None, *STYLES])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.long)])
+def test_a_right_loop_is_proved_right_inside_in_any_style(style, seed):
+    assert inside_of(program(STYLES.get(style, ())), seed) == inside.Verdict(None, True)
+
+
+def test_what_is_not_understood_is_no_finding():
+    dropout = [
+        ("nn.Tanh(), layer(64, outputs, last_gain)", "nn.Tanh(), nn.Dropout(0.1), layer(64, outputs, last_gain)")
     ]
-    assert not any("the ratio" in sentence for sentence in loop.in_world(program(ratios), 0))
+    own_observations = [
+        (
+            "        self.actor, self.critic =",
+            "        self.register_forward_pre_hook(lambda *_: None)\n        self.actor, self.critic =",
+        ),
+        ("out = self.actor(obs)\n        return Categorical", "out = self.actor(obs / 2)\n        return Categorical"),
+        ("self.critic(obs)", "self.critic(obs / 2)"),
+    ]
+    penalty = [
+        (
+            "            loss = policy_loss + ",
+            "            loss = policy_loss + (old - distribution.log_prob(a)).exp().mean() + ",
+        )
+    ]
+    for changes in (dropout, own_observations, penalty):
+        assert inside_of(program(changes)) == inside.Verdict(None, False)
 
 
-def of_box(changes=()):
-    return next(loop.with_box_actions(program(changes)), None)
+def test_the_hooks_are_gone_afterwards_whatever_happens():
+    def train(envs, total_steps, seed):
+        envs.reset(seed=seed)
+        raise KeyboardInterrupt
+
+    before = [len(hooks) for hooks in (_global_forward_hooks, _global_forward_pre_hooks, _global_optimizer_pre_hooks)]
+    with pytest.raises(KeyboardInterrupt):
+        inside_of(train)
+    assert [
+        len(hooks) for hooks in (_global_forward_hooks, _global_forward_pre_hooks, _global_optimizer_pre_hooks)
+    ] == before
 
 
-def test_a_loop_is_judged_with_box_actions_too():
-    assert of_box() is None
+def better_action(train, number, steps=2_048):
+    """Whether a loop takes the better action of a small world."""
+    with closing(make_vec(loop.WorldEnv, loop.NUM_ENVS, env_kwargs={"world": number})) as envs:
+        return loop._mean_action(train, envs, loop.WORLDS[number].obs(0), steps) < 0.5
+
+
+@pytest.mark.parametrize(("name", "number"), [("sign", 0), ("chain", 1), ("death", 2), ("uncut", 3), ("cut at deaths", 4),
+                                              ("time-out", 5), ("final_obs", 6)])  # fmt: skip
+def test_a_mistake_shows_in_the_world_that_is_made_for_it(name, number):
+    assert not better_action(program(MISTAKES[name][0]), number, 1_024)
+
+
+@pytest.mark.parametrize("number", [1, 6])
+def test_the_solution_finds_the_better_action_of_the_hardest_worlds(number):
+    assert better_action(program(), number, 1_024)
+
+
+def test_what_is_not_understood_inside_is_judged_by_worlds_and_by_returns():
+    unclear = {"inside": {"steps": {}, "events": [], "stays": []}}
+    worlds = {f"world {number}": 0.0 for number in range(len(loop.WORLDS))}
+    assert loop.WORLDS[2].mistake in next(loop.train(unclear | worlds | {"world 2": 1.0}))
+    few = unclear | worlds | {"box": [0.5, -0.5], "return": 20.0}
+    assert "the mean return after 60,000 steps is 20" in next(loop.train(few))
+    assert next(loop.train(few | {"return": 500.0}), None) is None
+
+
+def of_box(changes, monkeypatch):
+    monkeypatch.setattr(loop, "STEPS", 1_024)
+    monkeypatch.setattr(inside, "judged", lambda seen: inside.Verdict(None, True))
+    monkeypatch.setattr(inside, "watched", lambda start, names: {})
+    seen = {}
+    loop.observe_train(program(changes), seen)
+    return next(loop.train(seen), None)
+
+
+def test_a_loop_is_judged_with_box_actions_too(monkeypatch):
+    assert of_box((), monkeypatch) is None
     one_each = [("Independent(Normal(out, self.log_std.exp()), 1)", "Normal(out, self.log_std.exp())")]
-    assert of_box(one_each).startswith("in the small world with Box actions it raised RuntimeError: ")
+    assert of_box(one_each, monkeypatch).startswith("in the small world with Box actions it raised RuntimeError: ")
     other = [("action = agent.distribution(torch.as_tensor(obs)).sample().numpy()",
-              "action = agent.distribution(torch.as_tensor(obs)).sample().numpy()[:, ::-1].copy()"),
-             ("step = (obs, action,", "step = (obs, action[:, ::-1].copy(),")]  # fmt: skip
-    assert "it takes" in of_box(other)
-    discrete = [("action.shape[0]", "action.n")]
-    assert "has no attribute 'n', in __init__ (line " in of_box(discrete)
+              "action = agent.distribution(torch.as_tensor(obs)).sample().numpy()[..., ::-1].copy()"),
+             ("step = (obs, action,", "step = (obs, action[..., ::-1].copy(),")]  # fmt: skip
+    assert "it takes" in of_box(other, monkeypatch)
+
+
+def test_a_loop_for_discrete_actions_alone_is_right_with_a_note(monkeypatch):
+    said = of_box([("action.shape[0]", "action.n")], monkeypatch)
+    assert isinstance(said, Note)
+    assert "has no attribute 'n', in __init__ (line " in said
+
+
+def test_what_a_loop_returns_may_act_in_several_ways():
+    with closing(make_vec("CartPole-v1", 3)) as envs:
+        obs, right = np.zeros((3, 4), np.float32), [1, 1, 1]
+        network = torch.nn.Linear(4, 2)
+        network.bias.data.copy_(torch.tensor([-9.0, 9.0]))
+        predicts, draws = (
+            type("P", (), {"predict": lambda self, obs: (np.ones(len(obs), int), None)})(),
+            type("D", (), {"get_action": lambda self, obs: torch.ones(len(obs.float()), dtype=torch.int64)})(),
+        )
+        for made in (predicts, draws, network, lambda obs: np.ones((3, 1), int)):
+            assert loop.acting(made, envs)(obs).tolist() == right
+        with pytest.raises(TypeError, match="train returned NoneType; it should return an agent"):
+            loop.acting(None, envs)
+
+
+def test_a_loop_is_called_by_what_its_parameters_mean():
+    def mine(total_timesteps, venv, random_seed=0, num_steps=128):
+        return venv, total_timesteps, random_seed, num_steps
+
+    class Trainer:
+        def __init__(self, envs, n_steps=16):
+            self.envs, self.n_steps = envs, n_steps
+
+        def train(self, steps):
+            self.seen = (self.envs, steps, self.n_steps)
+
+    with closing(make_vec("CartPole-v1", 1)) as envs:
+        assert loop.started(mine, envs, 50) == (envs, 50, 1, 128)
+        assert loop.started(Trainer, envs, 50).seen == (envs, 50, 16)
+        with pytest.raises(TypeError, match="its parameter config is not known"):
+            loop.started(lambda envs, total_steps, config: None, envs, 50)
 
 
 @pytest.mark.long

@@ -2,6 +2,7 @@
 
 import ast
 import json
+import math
 import re
 import runpy
 import shlex
@@ -219,6 +220,15 @@ def test_the_clip_is_drawn_and_its_gradient_stops_where_the_note_says():
         assert ((slope == 0) == stops(ratio)).double().mean() > 0.98  # but for rounding at the edge
         assert (clipped <= plain + 1e-12).all()
     assert len(drawing("clip")["draw"]().axes) == 2
+
+
+def test_a_normal_covers_two_peaks_or_takes_the_higher_one_by_the_direction_of_the_kl():
+    kl, log_peaks, log_normal, fits, draw = map(drawing("kl").get, ("kl", "log_peaks", "log_normal", "fits", "draw"))
+    forward, reverse = fits().values()
+    assert forward == pytest.approx((-0.4, (0.25 + 3.84) ** 0.5), abs=1e-3)  # mean and std of the mixture
+    assert reverse == pytest.approx((-2.0, 0.5), abs=2e-3)
+    assert kl(log_normal(*reverse), log_peaks()) == pytest.approx(math.log(1 / 0.6), abs=1e-2)
+    assert all(panel.get_title(loc="left").endswith(name) for panel, name in zip(draw().axes, fits(), strict=True))
 
 
 def test_baselines_lower_the_variance_of_the_gradient_in_the_picture():

@@ -86,7 +86,7 @@ def test_runs_are_plotted_one_by_one_or_in_a_list(run):
         (lambda run: lem.plot(lem.TrainedPolicy), "A run is a directory, .* not a type"),
         (lambda run: lem.load(None), "A run is a directory, .* not None"),
         (lambda run: lem.resume(3), "A run is a directory, .* not 3"),
-        (lambda run: lem.watch(3), "A run is a directory, .* not 3"),
+        (lambda run: lem.watch(3), "A policy is a run, a function, a torch module, .* not 3"),
         (lambda run: lem.evaluate(run, episodes="3"), "episodes must be a whole number from 1 to 1,000,000, not '3'"),
         (lambda run: lem.evaluate(run, episodes=2.5), "episodes must be a whole number from 1 to 1,000,000, not 2.5"),
         (lambda run: lem.evaluate(run, seed=None), "seed must be a whole number at least 0, not None"),

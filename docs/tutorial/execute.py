@@ -1,4 +1,4 @@
-"""Make the notebooks from their Python files, run them, and keep their outputs: make tutorials.
+"""Run the course's notebooks, solved, and keep them with their outputs: make tutorials.
 
 .venv/bin/python docs/tutorial/execute.py [NAME…]
 """
@@ -6,30 +6,25 @@
 import os
 import sys
 import tempfile
+from copy import deepcopy
 from pathlib import Path
 
-import jupytext
 import nbformat
 from nbclient import NotebookClient
 
+from lemniscate.course import loop
+
 HERE = Path(__file__).parent
-METADATA = {
-    "kernelspec": {"name": "python3", "display_name": "Python 3", "language": "python"},
-    "language_info": {"name": "python"},
-}
-"""nothing of the machine that ran it"""
 
 
 def execute(file):
-    """The notebook of a Python file with its outputs; what it writes on disk is thrown away."""
-    notebook = jupytext.read(file)
-    notebook.metadata = METADATA
-    for number, cell in enumerate(notebook.cells):
-        cell.id, cell.metadata = f"cell-{number}", {}
+    """The notebook of a program with its outputs; what it writes on disk is thrown away."""
+    notebook = nbformat.reads(loop.notebook(loop.SOLUTION.sub(loop.SOLVED, file.read_text())), as_version=4)
+    metadata = deepcopy(notebook.metadata)  # the client adds what machine ran it
     with tempfile.TemporaryDirectory() as folder:
         options = {"timeout": 1800, "record_timing": False, "coalesce_streams": True}
         NotebookClient(notebook, resources={"metadata": {"path": folder}}, **options).execute()
-    notebook.metadata = METADATA
+    notebook.metadata = metadata
     return without_words_for_pictures(notebook)
 
 
@@ -44,6 +39,6 @@ def without_words_for_pictures(notebook):
 if __name__ == "__main__":
     if sys.platform == "linux" and not os.environ.get("DISPLAY"):
         os.environ.setdefault("MUJOCO_GL", "egl")  # Gymnasium's renderer looks for a window first
-    for name in sys.argv[1:] or sorted(file.stem for file in HERE.glob("[0-9]_*.py")):
+    for name in sys.argv[1:] or sorted(file.name.partition(".")[0] for file in loop.NOTEBOOKS.glob("*.py.txt")):
         print(name, flush=True)
-        nbformat.write(execute(HERE / f"{name}.py"), HERE / f"{name}.ipynb")
+        nbformat.write(execute(loop.NOTEBOOKS / f"{name}.py.txt"), HERE / f"{name}.ipynb")

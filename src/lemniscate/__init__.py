@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from lemniscate.api.policy import TrainedRun as TrainedRun
     from lemniscate.api.policy import load as load
     from lemniscate.api.policy import save as save
-    from lemniscate.api.pushed import push as push
     from lemniscate.api.results import check as check
     from lemniscate.api.results import evaluate as evaluate
+    from lemniscate.api.results import push as push
     from lemniscate.api.results import watch as watch
     from lemniscate.api.training import config_for as config_for
     from lemniscate.api.training import resume as resume
@@ -44,8 +44,7 @@ if TYPE_CHECKING:
 MODULES = {
     "api.plots": ("plot",),
     "api.policy": ("TrainedPolicy", "TrainedRun", "load", "save"),
-    "api.pushed": ("push",),
-    "api.results": ("check", "evaluate", "watch"),
+    "api.results": ("check", "evaluate", "push", "watch"),
     "api.training": ("config_for", "resume", "train"),
     "envs.vector_view": ("make_vec",),
     "errors": ("NonFiniteError", "NotStoredError", "SweepError", "UserError"),

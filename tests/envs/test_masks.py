@@ -172,7 +172,10 @@ class Pushed(Board):
     ("env", "sentence"),
     [
         (Late, r"gives an action mask in step\(\) that reset\(\) did not give: give one with reset\(\) too, of ones"),
-        (Long, r"Board.reset\(\) \(test_masks.py, line \d+\) comes with an action mask of 3 numbers, \[1, 1, 1\]; it must have 4"),
+        (
+            Long,
+            r"Board.reset\(\) \(test_masks.py, line \d+\) comes with an action mask of 3 numbers, \[1, 1, 1\]; it must have 4",
+        ),
         (Single, r"comes with an action mask of 1 numbers, \[1\]; it must have 4, of 1 and 0"),
         (Stuck, r"rules out every action of environment 0: its action_mask is all zero"),
         (

@@ -14,8 +14,7 @@ from lemniscate.exporting.c_code import c_files
 from lemniscate.exporting.compiled import HostPolicy, host_compiler
 from lemniscate.exporting.deployed import Deployed, act_with, input_size
 from lemniscate.exporting.onnx_model import onnx_act, onnx_model
-from lemniscate.exporting.operations import Program
-from lemniscate.exporting.translation import translate
+from lemniscate.exporting.translation import Program, translate
 from lemniscate.spec import Box, ObservationPart, Spec
 
 needs_compiler = pytest.mark.skipif(not host_compiler(), reason="there is no C compiler")

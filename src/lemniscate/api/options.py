@@ -5,22 +5,103 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
+from itertools import product
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from lemniscate.api.callbacks import Callback
+import numpy as np
+
+from lemniscate.api.policy import TrainedPolicy
 from lemniscate.errors import RankError, UserError, is_installed, missing_extra, shown, unknown_name
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import CONFIG, create_directory
 from lemniscate.run.loggers import TRACKERS, JsonLines, LoggerClass, TensorBoard
+from lemniscate.run.run import Observer
+from lemniscate.run.state import TrainState
 from lemniscate.run.stopping import Stopped
+from lemniscate.spec import Spec
 from lemniscate.system import named
 from lemniscate.system.machine import require_linux
 from lemniscate.system.watchdog import OWNED
 from lemniscate.system.world import World
+
+Callback = Callable[[int, Mapping[str, float], TrainedPolicy], object]
+"""(step, metrics, policy) of a logged line; a true result stops the run"""
+
+
+class StopAt:
+    """Stops a run at its first logged line at or after so many steps; `resume` goes on with it.
+
+    Args:
+        steps: if they are planned checkpoints, nothing is computed again when the run goes on.
+    """
+
+    def __init__(self, steps: int) -> None:
+        self.steps = steps
+
+    def __call__(self, step: int, _metrics: Mapping[str, float], _policy: TrainedPolicy) -> bool:
+        """Whether the run has come so far."""
+        return step >= self.steps
+
+
+class PolicySnapshot(TrainedPolicy):
+    """The policy of a run at the line that a callback is shown. Its weights are copied when it is first used.
+
+    A callback may keep a policy that it has used. One that it has not used raises `UserError` later.
+    """
+
+    def __init__(self, copy_networks: Callable[[], Any], spec: Spec, config: RunConfig, step: int) -> None:
+        self.spec, self.config, self.step = spec, config, step
+        self._copy_networks = copy_networks
+
+    @cached_property
+    def networks(self) -> Any:
+        """The copy."""
+        return self._copy_networks().eval()
+
+    def __getstate__(self) -> dict[str, Any]:  # of a copy: a function of this process cannot be pickled
+        return {**vars(self), "networks": self.networks, "_copy_networks": _too_late}
+
+    def expire(self) -> None:
+        """Refuse to copy the weights from now on: the run goes on to change them."""
+        self._copy_networks = _too_late
+
+
+def call_callbacks(
+    functions: Sequence[Callback], copy_networks: Callable[[TrainState], Any], spec: Spec, config: RunConfig
+) -> Observer:
+    """The function that a run calls after each logged line: every callback in turn, each with a policy of its own.
+
+    Args:
+        functions: the callbacks.
+        copy_networks: networks on the CPU that share nothing with those of the state.
+        spec: of the policy.
+        config: of the run.
+    """
+
+    def observe(lines: Sequence[tuple[int, Mapping[str, float]]], state: TrainState) -> bool:
+        stop = False
+        for (step, metrics), function in product(lines, functions):
+            policy = PolicySnapshot(lambda: copy_networks(state), spec, config, step)
+            said = function(step, MappingProxyType(dict(metrics)), policy)
+            if not isinstance(said, bool | np.bool_ | None):
+                raise UserError(
+                    f"A callback returns True to stop, or False or None; {function} returned {shown(said)}."
+                )
+            stop = bool(said) or stop
+            policy.expire()
+        return stop
+
+    return observe
+
+
+def _too_late() -> Any:
+    raise UserError("This policy was not used while its callback ran, and the run has changed since; use it there.")
+
 
 if TYPE_CHECKING:
     from lemniscate.cluster.connection import Cluster

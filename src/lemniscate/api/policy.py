@@ -27,6 +27,9 @@ from lemniscate.run.warm_start import difference
 from lemniscate.spec import Box, Discrete, MultiDiscrete, Spec
 from lemniscate.system.files import at_home, parsing
 
+FILES = (".pt", ".pth", ".zip", ".pkl", ".pickle", ".safetensors", ".onnx", ".bin")
+"""endings of the files that other libraries keep policies in"""
+
 
 @dataclass(frozen=True)
 class ActionDistribution:
@@ -220,6 +223,11 @@ def load(run: Trained, *, checkpoint: str | int | None = None, trust: bool = Fal
     if checkpoint is None and isinstance(run, TrainedRun | TrainedPolicy):
         return run.policy if isinstance(run, TrainedRun) else run
     if isinstance(run, TrainedRun | TrainedPolicy) or not hub.is_address(run):
+        if path_of(run).is_file():
+            raise UserError(
+                f"{run} is a file, and a policy of lemniscate is a folder: lem.evaluate('{run}', env=…) plays the"
+                " weights of a .pt file and lem.watch shows it; that of another library is to be loaded by it."
+            )
         return _read(find_checkpoint(path_of(run), checkpoint), path_of(run))
     address = hub.read_address(run)
     if checkpoint is not None:
@@ -263,11 +271,17 @@ def save(policy: Any, path: str | Path) -> Path:
         path: a new directory, or a policy stored before, which is replaced.
 
     Raises:
-        UserError: something else is at `path`, or it cannot be written.
+        UserError: something else is at `path`, it has the ending of a file, or it cannot be written.
     """
     path, policy = path_of(path), getattr(policy, "policy", policy)
     if not isinstance(policy, TrainedPolicy):
         raise UserError(f"What can be stored is a policy, from load or train, not a {type(policy).__name__}.")
+    if path.suffix in FILES:
+        raise UserError(
+            f"{path} is the name of a file, and a policy is stored as a folder, weights, normalizer and settings:"
+            f" lem.save(policy, {str(path.with_suffix(''))!r}). Its weights alone:"
+            f" torch.save(policy.networks.state_dict(), {path.name!r})."
+        )
     if path.exists() and not _is_stored(path):
         raise UserError(f"{path} exists already, and is not a stored policy; choose another path.")
     record = {"algorithm": algorithm_of(policy), "config": policy.config.to_json()}

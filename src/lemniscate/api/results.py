@@ -1,34 +1,37 @@
 """The verbs that look: evaluate, watch, check; and the final scores by which runs are compared."""
 
 import os
+import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from functools import partial
 from os import PathLike
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
-from lemniscate.api.policy import Trained, TrainedPolicy, TrainedRun, load, path_of
+from lemniscate import presets
+from lemniscate.algos import RECOMMENDED
+from lemniscate.api import agents
+from lemniscate.api.policy import Trained, TrainedPolicy, TrainedRun, algorithm_of, load, own_code, path_of, save
 from lemniscate.envs import check as env_check
 from lemniscate.envs import registry
 from lemniscate.envs.check import Finding
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError, shown
+from lemniscate.hub import repository as hub
 from lemniscate.report import flight, pages, playback
 from lemniscate.run import check as run_check
+from lemniscate.run import checkpoint
 from lemniscate.run.checkpoint import list_steps
 from lemniscate.run.config import Episodes, Natural, RunConfig, checked
-from lemniscate.run.directory import FINAL
+from lemniscate.run.directory import CONFIG, FINAL
 from lemniscate.run.environments import env_arguments, evaluation_env
 from lemniscate.run.evaluate import Evaluation, critic_of
 from lemniscate.run.evaluate import evaluate as evaluate_policy
 from lemniscate.run.seeding import torch_defaults
 from lemniscate.system.console import say
-from lemniscate.system.files import DamagedFileError, at_home, read_json, write_json
-from lemniscate.system.named import takes
-
-Agent = Callable[[Any], Any]
-"""a function of one observation, as Gymnasium's environment returns it, to an action for its `step`"""
+from lemniscate.system.files import DamagedFileError, at_home, make_directory, read_json, write_json
 
 FINAL_EPISODES = 100
 """that a run's final policy is judged by where runs are compared"""
@@ -36,7 +39,7 @@ FINAL_EPISODES = 100
 
 @torch_defaults()
 def evaluate(
-    policy: Trained | Agent,
+    policy: Any,
     env: str | Callable[..., Any] | None = None,
     episodes: int = 100,
     seed: int = 0,
@@ -46,16 +49,20 @@ def evaluate(
     env_kwargs: Mapping[str, Any] | None = None,
     baseline: bool = False,
     video: str | Path | None = None,
+    report: str | Path | None = None,
+    agent: Callable[..., Any] | str | None = None,
+    normalized_actions: bool | None = None,
     checkpoint: str | int | None = None,
     trust: bool = False,
 ) -> Evaluation:
     """Play whole episodes from starts drawn with `seed`, none of which training ever saw.
 
     Args:
-        policy: from `load` or `train`, or the path of a run or a checkpoint; or a function of one observation, as the
-            environment returns it, to an action for its `step`.
+        policy: from `load` or `train`, or the path of a run or a checkpoint. Or one of your own, or its name as
+            `module:name`: a function of one observation or of a batch to actions for the environment's `step`, a torch
+            module, an object with a method such as `act` or `predict`, or the path of a .pt file of weights.
         env: an id, `module:Class`, a class, or a function that makes an environment; by default the one of training. A
-            function as a policy needs one, of Gymnasium's interface.
+            policy of your own needs one.
         episodes: how many.
         seed: of the starts.
         deterministic: act by the mode of the distribution.
@@ -66,6 +73,11 @@ def evaluate(
             rendered environment, without a measurement of the Q bias. The first 16 starts are the same; from the 17th
             on, and in other backends than gymnasium, returns may differ from those without a film. Of flights in a
             scene, which are those without a film, the first of each parallel environment is recorded.
+        report: a directory for a page of the evaluation, `plots/report.html`, with its pictures and a film.
+        agent: for a .pt file, the class of the module that it has the weights of, a function that makes it, or its
+            name; not needed for the layouts of the courses.
+        normalized_actions: of a policy of your own, whether its actions are in [-1, 1] between the bounds, and not in
+            the environment's units; those of a file are by default what is worth more, which is said.
         checkpoint: as in `load`; and so `trust`.
 
     Raises:
@@ -73,27 +85,36 @@ def evaluate(
             baseline, if it is asked for; an episode that does not end in an environment without a time limit; with
             `video`, an environment that renders no pictures, or another kind of file.
     """
-    agent = policy if callable(policy) else load(policy, checkpoint=checkpoint, trust=trust)
+    chosen = agents.find(policy, checkpoint=checkpoint, trust=trust)
     episodes, seed, file = checked("episodes", episodes, Episodes), checked("seed", seed, Natural), _film(video)
     kwargs = checked("env_kwargs", env_kwargs, dict | None)
-    how: dict[str, Any] = {"episodes": episodes, "seed": seed, "tell": lambda text: None}
-    with _environments(agent, episodes, env, env_kwargs=kwargs, backend=backend) as (vec, arguments):
+    how: dict[str, Any] = {"episodes": episodes, "seed": seed, "deterministic": deterministic}
+    own = {"agent": agent, "normalized": normalized_actions}
+    with _environments(chosen, env, own, how, env_kwargs=kwargs, backend=backend) as (player, vec, arguments):
         if baseline and vec.baseline is None:
             raise UserError(f"{vec.spec.env_id} has no baseline to compare with.")
         if baseline and vec.baseline:
             return evaluate_policy(vec.baseline, vec, episodes, seed)
         if file:
-            return _show(agent, vec, arguments, deterministic=deterministic, video=file, **how)
-        if not isinstance(agent, TrainedPolicy):
-            vec.close()
-            return playback.play_single(playback.act_by(agent), arguments, **how)
-        critic = critic_of(agent.networks, agent.config)
-        return evaluate_policy(agent.module, vec, episodes, seed, deterministic, critic)
+            scores = _show(player, vec, arguments, **how, video=file, tell=_nothing)
+        elif isinstance(player, TrainedPolicy):
+            critic = critic_of(player.networks, player.config)
+            scores = evaluate_policy(player.module, vec, episodes, seed, deterministic, critic)
+        else:
+            scores = evaluate_policy(player, vec, episodes, seed)
+        if report:
+            pictures = _draw(
+                player, vec, arguments, {**how, "episodes": min(episodes, vec.num_envs, 20)}, path_of(report)
+            )
+            page = pages.write_evaluation(path_of(report), str(policy), pictures, scores, seed)
+            for made in (*pictures, page):
+                say(made)
+        return scores
 
 
 @torch_defaults()
 def watch(
-    policy: Trained | Agent | None = None,
+    policy: Any = None,
     env: str | Callable[..., Any] | None = None,
     *,
     episodes: int = 1,
@@ -102,6 +123,8 @@ def watch(
     random: bool = False,
     video: str | Path | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
+    agent: Callable[..., Any] | str | None = None,
+    normalized_actions: bool | None = None,
     checkpoint: str | int | None = None,
     trust: bool = False,
 ) -> Evaluation:
@@ -117,7 +140,7 @@ def watch(
         deterministic: act by the mode of the distribution; otherwise actions are drawn from it.
         random: act uniformly at random, in the environment of the policy.
         video: a .gif, .webp or .mp4 to record all episodes into.
-        env_kwargs: as in `evaluate`.
+        env_kwargs: as in `evaluate`, and so `agent` and `normalized_actions`.
         checkpoint: as in `load`; and so `trust`.
 
     Raises:
@@ -125,18 +148,19 @@ def watch(
             or whose spaces differ; an episode that does not end; more flights than parallel environments; another kind
             of file.
     """
-    agent = policy if policy is None or callable(policy) else load(policy, checkpoint=checkpoint, trust=trust)
+    chosen = None if policy is None else agents.find(policy, checkpoint=checkpoint, trust=trust)
     episodes, seed, file = checked("episodes", episodes, Episodes), checked("seed", seed, Natural), _film(video)
-    if agent is None and env is None:
+    if chosen is None and env is None:
         raise UserError("Watch what? Name a run, or an environment to act in at random.")
     kwargs = checked("env_kwargs", env_kwargs, dict | None)
-    with _environments(agent, episodes, env, env_kwargs=kwargs) as (vec, arguments):
+    own = {"agent": agent, "normalized": normalized_actions}
+    how: dict[str, Any] = {"episodes": episodes, "seed": seed, "deterministic": deterministic}
+    with _environments(chosen, env, own, how, env_kwargs=kwargs) as (player, vec, arguments):
         if file is None:
             playback.require_display()
         if vec.scene and episodes > vec.num_envs:
             raise UserError(f"At most {vec.num_envs} flights of this run can be shown, not {episodes}.")
-        how = {"episodes": episodes, "seed": seed, "deterministic": deterministic, "video": file}
-        scores = _show(None if random else agent, vec, arguments, **how)
+        scores = _show(None if random else player, vec, arguments, video=file, **how)
     if episodes > 1 or any(not name.startswith("info/") for name in scores.measures):
         say(pages.sentence(scores.to_json()))
     if file:
@@ -242,38 +266,138 @@ def _film(video: str | Path | None) -> Path | None:
 
 @contextmanager
 def _environments(
-    agent: TrainedPolicy | Agent | None, episodes: int, env: str | Callable[..., Any] | None, **elsewhere: Any
-) -> Iterator[tuple[VecEnv, dict[str, Any]]]:
-    """The environments of an evaluation, and the arguments of a single one.
+    chosen: Any, env: str | Callable[..., Any] | None, own: Mapping[str, Any], how: dict[str, Any], **elsewhere: Any
+) -> Iterator[tuple[Any, VecEnv, dict[str, Any]]]:
+    """Who plays, the environments of an evaluation, and the arguments of a single one.
 
-    Raises `UserError` for other spaces than those of a policy, and for a function without `env`.
+    Raises `UserError` for other spaces than those of a policy, and for one of the user's own without `env`.
     """
-    if isinstance(agent, TrainedPolicy):
-        config = agent.config
-    elif agent is not None and not takes(agent, 1):
-        raise UserError(f"A policy that is a function takes one observation; {shown(agent)} does not.")
+    if isinstance(chosen, TrainedPolicy):
+        config = chosen.config
     elif env is None:
-        raise UserError("A function acts in an environment that is named with it, such as env='CartPole-v1'.")
+        raise UserError("A policy of your own acts in an environment that is named with it, such as env='CartPole-v1'.")
     else:
-        config = RunConfig(env=registry.name_of(env), num_envs=1)
+        name = registry.name_of(env)
+        compiled = registry.backend_class(elsewhere.get("backend") or registry.backend_for(name)).compiled
+        usual = presets.choose(RECOMMENDED, name, None)[1].num_envs  # of which the starts are those of most runs
+        config = RunConfig(env=name, num_envs=usual if compiled else 1)
     arguments = env_arguments(config, env=env, **elsewhere)
-    with closing(evaluation_env(config, episodes, env=env, **elsewhere)) as vec:
-        if isinstance(agent, TrainedPolicy) and not vec.spec.fits(agent.spec):
-            ours, theirs = agent.spec.env_id, vec.spec.env_id
-            raise UserError(f"A policy for {ours} cannot act in {theirs}: observation or action spaces differ.")
-        yield vec, arguments
+    with ExitStack() as stack:
+        vec = stack.enter_context(closing(evaluation_env(config, how["episodes"], env=env, **elsewhere)))
+        player = chosen
+        if isinstance(chosen, TrainedPolicy):
+            if not vec.spec.fits(chosen.spec):
+                ours, theirs = chosen.spec.env_id, vec.spec.env_id
+                raise UserError(f"A policy for {ours} cannot act in {theirs}: observation or action spaces differ.")
+        elif chosen is not None:
+            player = stack.enter_context(
+                agents.playing(chosen, vec, how["seed"], deterministic=how["deterministic"], **own)
+            )
+            if player.remembers and vec.num_envs > 1:
+                say("This policy remembers what it was called with, so it plays in one environment at a time.")
+                vec.close()
+                one = evaluation_env(config.replace(num_envs=1), 1, env=env, **elsewhere)
+                vec = stack.enter_context(closing(one))
+        yield player, vec, arguments
 
 
-def _show(
-    agent: TrainedPolicy | Agent | None, vec: VecEnv, arguments: dict[str, Any], *, deterministic: bool, **how: Any
-) -> Evaluation:
-    """Play flights where `vec` has a scene, else episodes in a rendered environment; at random without an agent."""
-    trained = isinstance(agent, TrainedPolicy)
-    if vec.scene and (trained or agent is None):
-        return flight.show_flights(agent.module if trained else None, vec, deterministic=deterministic, **how)
+def _show(player: Any, vec: VecEnv, arguments: dict[str, Any], *, deterministic: bool, **how: Any) -> Evaluation:
+    """Play flights where `vec` has a scene, else episodes in a rendered environment; at random without a player."""
+    trained = isinstance(player, TrainedPolicy)
+    if vec.scene:
+        return flight.show_flights(player.module if trained else player, vec, deterministic=deterministic, **how)
     vec.close()  # of some environments there can be one at a time
     if trained:
-        drawn = TrainedPolicy(agent.networks, agent.spec, agent.config.replace(seed=how["seed"]), agent.step)
+        drawn = TrainedPolicy(player.networks, player.spec, player.config.replace(seed=how["seed"]), player.step)
         act = partial(drawn.act, deterministic=deterministic)
         return playback.show_episodes(act if drawn.is_masked else playback.act_by(act), arguments, **how)
-    return playback.show_episodes(agent and playback.act_by(agent), arguments, **how)
+    return playback.show_episodes(player and player.act, arguments, **how)
+
+
+def _draw(player: Any, vec: VecEnv, arguments: dict[str, Any], how: dict[str, Any], folder: Path) -> list[Path]:
+    """Record an episode into a folder, where it can be shown, and flights in pictures, which are returned."""
+    make_directory(folder / "plots")
+    if vec.scene:
+        act = player.module if isinstance(player, TrainedPolicy) else player
+        return flight.draw_flights(act, vec, folder, how["episodes"], film=True, seed=how["seed"])[:-1]
+    try:
+        film = folder / "videos" / "episode.gif"
+        _show(player, vec, arguments, **{**how, "episodes": 1}, video=film, tell=_nothing)
+    except Exception as error:  # whatever a renderer raises
+        say(f"No film: {error}")
+    return []
+
+
+def _nothing(_text: str) -> None:
+    """Say nothing."""
+
+
+def push(run: Trained, name: str, *, private: bool = False, license: str | None = None, trust: bool = False) -> str:
+    """Upload the policy of a run to the Hugging Face Hub, as the model repository `name`, in one commit.
+
+    The files are those of `save`: raw tensors and JSON, each with its sha256. Beside them are a model card with the
+    scores, the command that trains it again and the lines that load it; the final scores of the run, its figures
+    (`plots/`), its newest film, or one that is made now if the environment can be rendered; and what
+    `lemniscate export` wrote (`export/`), if it did. `load("hf://user/name")` loads the policy.
+
+    Args:
+        run: its directory or a checkpoint's, what `train` returned, or a policy.
+        name: "user/name". A new repository is created, and a policy that is there is replaced.
+        private: make a new repository private.
+        license: as the Hub abbreviates it, such as "mit"; without, the card names none.
+        trust: as in `load`.
+
+    Returns:
+        The address of the repository's page.
+
+    Raises:
+        UserError: `huggingface_hub` is not installed; no name of a repository; no token; no policy to upload; a Hub
+            that refuses or cannot be reached; a repository that holds something else, or is public in spite of
+            `private`.
+    """
+    hub.require_uploads(name)
+    policy = load(run, trust=trust)
+    with TemporaryDirectory() as temporary:
+        folder = Path(temporary) / "policy"
+        save(policy, folder)
+        code = own_code(checkpoint.read(folder))
+        path = policy.path if policy.path and (policy.path / CONFIG).is_file() else None
+        for place, file in _shown(path).items() if path else ():
+            (folder / place).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(file, folder / place)
+        if not (path and pages.newest_film(path)):
+            film_or_say(policy, folder / "videos" / "episode.gif")
+        scores = _scores(policy, path)
+        if scores:
+            write_json(folder / FINAL, scores)
+        own = {"step": policy.step, "scores": scores, "license": license, "code": code}
+        pages.write_card(folder, name, algorithm_of(policy), policy.config, **own)
+        return hub.upload(folder, name, private)
+
+
+def _shown(run: Path) -> dict[str, Path]:
+    """The files of a run that are uploaded beside its policy, by their paths in the repository; no links.
+
+    They are the figures, the export where there is a whole one, and the newest film: a video by the name that the Hub
+    plays, else in `videos/`.
+    """
+    files = [*(run / "plots").glob("*.png")]
+    if (run / "export" / "policy.onnx").is_file():
+        files += (run / "export").rglob("*")
+    own = [file for file in files if file.is_file() and file.resolve() == run.resolve() / file.relative_to(run)]
+    shown = {file.relative_to(run).as_posix(): file for file in own}
+    if film := pages.newest_film(run):
+        shown["replay.mp4" if film.suffix == ".mp4" else f"videos/{film.name}"] = film
+    return shown
+
+
+def _scores(policy: TrainedPolicy, run: Path | None) -> dict[str, Any] | None:
+    """The final scores of a run, or those of a policy without one; none where it cannot be evaluated here."""
+    try:
+        if run:
+            return final_scores(run)
+        say(f"Evaluating the policy: {FINAL_EPISODES} episodes.")
+        return scores_of(policy)
+    except UserError as error:
+        say(f"No scores: {error}")
+        return None

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from lemniscate import algos, presets
-from lemniscate.api.callbacks import Callback, call_callbacks
-from lemniscate.api.options import RunOptions, require_importable, train_in_processes
+from lemniscate.api.options import Callback, RunOptions, call_callbacks, require_importable, train_in_processes
 from lemniscate.api.policy import TrainedPolicy, TrainedRun, load, path_of
 from lemniscate.envs import registry
 from lemniscate.errors import NotStoredError, UserError, is_installed

@@ -11,7 +11,7 @@ from lemniscate.api import training
 from lemniscate.api.options import RunOptions
 from lemniscate.api.policy import TrainedRun
 from lemniscate.envs import registry
-from lemniscate.errors import UserError, is_installed, missing_extra
+from lemniscate.errors import UserError, is_installed, missing_extra, unknown_name
 from lemniscate.run.directory import SWEEP, TUNE
 from lemniscate.run.fields import number, read, read_json
 from lemniscate.run.run import is_compiled
@@ -91,9 +91,9 @@ def evaluate(given: argparse.Namespace) -> None:
     from lemniscate.api import results
     from lemniscate.report import pages
 
-    own = {"backend": given.backend, "baseline": given.baseline, "video": given.video}
-    own["deterministic"] = not given.stochastic
-    scores = results.evaluate(given.run, **_episodes(given), **own, **_policy(given))
+    own = {"backend": given.backend, "baseline": given.baseline, "video": given.video, "report": given.report}
+    own |= {"deterministic": not given.stochastic, **_own(given)}
+    scores = results.evaluate(given.run, given.env, **_episodes(given), **own, **_policy(given))
     if given.json:
         print(json.dumps(scores.to_json(), allow_nan=False))
     else:
@@ -107,6 +107,7 @@ def watch(given: argparse.Namespace) -> None:
     if not given.run and not (given.random and given.env):
         raise UserError("Watch what? lemniscate watch RUN; before training, lemniscate watch --random --env ID.")
     own = {"random": given.random, "video": given.video, "deterministic": not (given.stochastic or given.sample)}
+    own |= _own(given)
     results.watch(given.run, given.env, **_episodes(given), **own, **_policy(given))
 
 
@@ -135,7 +136,7 @@ def plot(given: argparse.Namespace) -> None:
 
 def push(given: argparse.Namespace) -> None:
     """Upload the policy of a run to the Hub."""
-    from lemniscate.api.pushed import push
+    from lemniscate.api.results import push
 
     page = push(given.run, given.name, private=given.private, license=given.license)
     say(f"Uploaded: {page}. It is loaded from hf://{given.name}.")
@@ -192,6 +193,26 @@ def check(given: argparse.Namespace) -> None:
     say(verdict(given.what, found))
 
 
+def course(given: argparse.Namespace) -> None:
+    """Lay out the course, and name the page to begin with."""
+    from lemniscate.course import start
+
+    if given.action != "start":
+        raise unknown_name("word after `course`", given.action, ("start",))
+    say(f"Begin with {start(given.folder, solutions=given.solutions)}")
+
+
+def grade(given: argparse.Namespace) -> None:
+    """Judge hand-ins: a table, and on standard output what a program reads."""
+    from lemniscate.course.grading import as_csv, grade
+
+    grades = grade(given.folder, given.exercises, to=given.to)
+    if given.json:
+        print(json.dumps(grades))
+    if given.csv:
+        print(as_csv(grades), end="")
+
+
 def completion(given: argparse.Namespace) -> None:
     """Print the script with which a shell completes."""
     from lemniscate.cli.completion import script
@@ -236,6 +257,11 @@ def _episodes(given: argparse.Namespace) -> dict[str, Any]:
 def _policy(given: argparse.Namespace) -> dict[str, Any]:
     """Which policy of a run or an address it is."""
     return {"checkpoint": given.checkpoint and number(given.checkpoint), "trust": given.trust}
+
+
+def _own(given: argparse.Namespace) -> dict[str, Any]:
+    """What is said of a policy that was not trained here."""
+    return {"agent": given.agent, "normalized_actions": given.normalized_actions}
 
 
 def _env_args(given: argparse.Namespace) -> dict[str, Any] | None:

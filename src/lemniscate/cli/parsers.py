@@ -18,7 +18,7 @@ COMMANDS = {
     "train": "Train a policy, or one for each of several algorithms and seeds, to compare them.",
     "tune": "Search for the settings with which an algorithm learns an environment best.",
     "resume": "Continue an interrupted run, sweep or search.",
-    "evaluate": "Play whole episodes with the newest policy of a run.",
+    "evaluate": "Play whole episodes with the newest policy of a run, or with one of your own.",
     "watch": "Show episodes in a window, or record them.",
     "export": "Write a policy as C for microcontrollers and as ONNX, and measure how far these are from it.",
     "preflight": "Measure how much delay, mass, wind and noise a policy bears, one at a time.",
@@ -26,6 +26,8 @@ COMMANDS = {
     "push": "Upload the policy of a run to the Hugging Face Hub, with a page about it.",
     "envs": "List the environments, their backends, and the preset that fits.",
     "check": "Check that an environment is suitable for training, or that the files of a run are whole.",
+    "course": "Lay out the course: notebooks with gaps to fill in and their checks, and a page on the order.",
+    "grade": "Judge a folder of students' hand-ins: a table, every finding, a page for each.",
     "completion": "Print the script with which a shell completes; its first line says where to write it.",
 }
 
@@ -62,8 +64,11 @@ OPTIONS: list[tuple[str, str, str, Any]] = [
     ("evaluate watch", "--stochastic", "draw actions from the policy [the most likely ones]", False),
     ("evaluate watch export", "--trust", "import the code (module:name) that a policy from hf:// names", False),
     ("evaluate watch export", "--checkpoint NAME", "best (see --keep-best), or a step [the newest]", None),
-    ("evaluate export", "run RUN", "a run, a checkpoint or hf://user/name", None),
-    ("watch", "run [RUN]", "a run, a checkpoint or hf://user/name", None),
+    ("export", "run RUN", "a run, a checkpoint or hf://user/name", None),
+    ("evaluate", "run RUN", "a run, a checkpoint or hf://user/name; or a .pt file or module:policy, with --env", None),
+    ("watch", "run [RUN]", "a run, a checkpoint or hf://user/name; or a .pt file or module:policy, with --env", None),
+    ("evaluate watch", "--agent NAME", "module:Class that the weights of a .pt file are of [a course's]", None),
+    ("evaluate watch", "--[no-]normalized-actions", "a .pt file acts in [-1, 1] [as it flies better]", None),
     ("preflight", "run RUN", "a run", None),
     ("push", "run RUN", "a run or a checkpoint", None),
     ("export", "--to DIR", "new directory, or an export [RUN/export]", None),
@@ -73,9 +78,15 @@ OPTIONS: list[tuple[str, str, str, Any]] = [
     ("evaluate watch preflight", "--seed INT", "seed of the starts [0]", 0),
     ("evaluate watch preflight", "--env-args JSON", "arguments of the environment [as in training]", None),
     ("evaluate", "--backend NAME", "simulation backend [as in training]", None),
+    ("evaluate", "--env ID", "environment [that of training]", None),
+    ("evaluate", "--report DIR", "directory for a page with pictures and a film, plots/report.html", None),
     ("evaluate", "--baseline", "play by the environment's classical controller instead", False),
     ("evaluate", "--video FILE", ".gif, .webp or .mp4 to record all episodes into", None),
-    ("evaluate", "--json", "print one JSON object on standard output", False),
+    ("grade", "folder FOLDER", "a .py file, a .ipynb file or a folder for each hand-in", None),
+    ("grade", "--exercises LIST", "those that are asked for: gae,Agent [those that are found]", ""),
+    ("grade", "--to DIR", "where findings, pages and results go [FOLDER-grades]", None),
+    ("grade", "--csv", "print the table as CSV on standard output", False),
+    ("evaluate grade", "--json", "print one JSON object on standard output", False),
     ("watch", "--sample", argparse.SUPPRESS, False),
     ("watch", "--random", "act uniformly at random", False),
     ("watch", "--video FILE", ".gif, .webp or .mp4 instead of a window", None),
@@ -91,11 +102,14 @@ OPTIONS: list[tuple[str, str, str, Any]] = [
     ("check", "--env-args JSON", "arguments of the environment", None),
     ("check", "--wrappers NAME …", "wrappers, as in training", []),
     ("check", "--backend NAME", "simulation backend [chosen from the id]", None),
+    ("course", "action start", "lay it out", None),
+    ("course", "folder DIR", "where to; no file is overwritten", None),
+    ("course", "--solutions", "the solutions too, in DIR/solutions", False),
     ("completion", "shell SHELL", ", ".join(SHELLS), None),
 ]
 """(commands, the option as the help shows it, its text, its default): all but the fields of a Config"""
 
-PATHS = ("RUN", "DIR", "FILE")
+PATHS = ("RUN", "DIR", "FILE", "FOLDER")
 """what stands for a path; Ray's storage may also be the address of one in a cloud"""
 
 

@@ -8,31 +8,38 @@
 
 A function is compared with a reference on small cases, each with one difficulty. Where a value differs, the result is
 compared with those of well-known mistakes, and the mistake that agrees is named. A class, or a function with effects,
-is judged by what it does; a whole training loop (`skeleton`) by what it learns.
+is judged by what it does; a whole training loop (`skeleton`) by what it learns. `start` lays out the notebooks.
 """
 
+from importlib.machinery import SourceFileLoader
+from importlib.util import module_from_spec, spec_from_loader
+from types import FunctionType, ModuleType
+
 from lemniscate.course import functions, loop, parts, setup
-from lemniscate.course.exercise import Exercise, Finding, Function, Inspection
-from lemniscate.course.loop import skeleton
+from lemniscate.course.exercise import TEMPLATES, Exercise, Finding, Inspection
+from lemniscate.course.grading import grade
+from lemniscate.course.loop import skeleton, start
+from lemniscate.course.solution import Function, owner_of
 from lemniscate.errors import UserError, shown, unknown_name
 from lemniscate.system.console import say
 
-__all__ = ["EXERCISES", "Finding", "check", "skeleton"]
+__all__ = ["EXERCISES", "Finding", "check", "grade", "skeleton", "start"]
+
 
 EXERCISES: dict[str, Exercise | Inspection] = {
     **functions.EXERCISES,
-    "sample_categorical": Inspection(parts.sample_categorical),
-    "Agent": Inspection(parts.agent),
-    "Actor": Inspection(parts.actor),
-    "QNetwork": Inspection(parts.q_network),
-    "set_seeds": Inspection(setup.set_seeds),
-    "make_envs": Inspection(setup.make_envs),
-    "save_model": Inspection(setup.save_model),
-    "load_model": Inspection(setup.load_model),
-    "sync_envs": Inspection(setup.sync_envs),
-    "ReplayBuffer": Inspection(parts.replay_buffer),
-    "add_to_replay": Inspection(parts.add_to_replay),
-    "train": Inspection(loop.train),
+    "sample_categorical": Inspection(parts.see_sample_categorical, parts.sample_categorical),
+    "Agent": Inspection(parts.see_agent, parts.agent),
+    "Actor": Inspection(parts.see_actor, parts.actor),
+    "QNetwork": Inspection(parts.see_q_network, parts.q_network),
+    "set_seeds": Inspection(setup.see_set_seeds, setup.set_seeds),
+    "make_envs": Inspection(setup.see_make_envs, setup.make_envs),
+    "save_model": Inspection(setup.see_save_model, setup.save_model),
+    "load_model": Inspection(setup.see_load_model, setup.load_model),
+    "sync_envs": Inspection(setup.see_sync_envs, setup.sync_envs),
+    "ReplayBuffer": Inspection(parts.see_replay_buffer, parts.replay_buffer),
+    "add_to_replay": Inspection(parts.see_add_to_replay, parts.add_to_replay),
+    "train": Inspection(loop.observe_train, loop.train, limit=300.0),
 }
 """each exercise by the name of the function or class to write"""
 
@@ -49,17 +56,35 @@ def check(function: Function, name: str | None = None) -> Finding:
     Raises:
         UserError: a solution that is no function and no class, or has no name of its own; a name that is no exercise.
     """
-    name = name or getattr(function, "__name__", "<lambda>")
+    name = str(name or getattr(function, "__name__", "<lambda>"))
+    if name not in EXERCISES and isinstance(function, FunctionType) and (owner := owner_of(function)):
+        name = owner[1]  # a decorator has given it another name
     if name == "<lambda>":
         raise UserError(f'Which exercise is {shown(function)}? Name it: course.check(solution, "gae").')
+    if isinstance(function, type) and name in EXERCISES:
+        function = getattr(function, name, function)
     if name not in EXERCISES:
-        methods = [method for method in EXERCISES if isinstance(function, type) and hasattr(function, method)]
+        classes = [cls for cls in getattr(function, "__mro__", ()) if not cls.__module__.startswith("torch")]
+        methods = [method for method in EXERCISES if any(method in vars(cls) for cls in classes)]
         if not methods:
             raise unknown_name("exercise", name, EXERCISES)
         checks = ", ".join(f"course.check({name}.{method})" for method in methods)
         raise UserError(f"{name} is judged by its methods: {checks}.")
     if not callable(function):
         raise UserError(f"What can be checked is a function or a class, not {shown(function)}.")
-    finding = EXERCISES[name].judge(name, function)
+    exercise = EXERCISES[name]
+    finding = exercise.judge(name, exercise.observe(function))
     say(finding)
     return finding
+
+
+def __getattr__(name: str) -> ModuleType:
+    """`ppo_from_scratch`: the solution of `skeleton("ppo")`, a text for the reader's own file, as a module."""
+    if name != "ppo_from_scratch":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}", name=name)
+    loader = SourceFileLoader(f"{__name__}.{name}", str(TEMPLATES / "ppo.py.txt"))
+    spec = spec_from_loader(loader.name, loader)
+    assert spec is not None
+    module = module_from_spec(spec)
+    loader.exec_module(module)
+    return module

@@ -7,14 +7,15 @@ course: a method, with other names, another layout or other outputs. A mistake i
 import inspect
 import tomllib
 from collections.abc import Sequence
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from lemniscate import maths
-from lemniscate.course.exercise import TEMPLATES, Case, Exercise, Function
+from lemniscate.course.exercise import TEMPLATES, Case, Exercise, normalised  # noqa: F401  (an edit may call it)
+from lemniscate.course.solution import Function, Held, Settings
 from lemniscate.maths import clipped_surrogate, gae, reward_to_go, value_loss
 
 # --- the forms of the courses ---
@@ -25,7 +26,7 @@ def calculate_advantages(self: Any, next_value: Tensor) -> tuple[Tensor, Tensor]
     ended = self.terminated_buffer.bool()
     following = torch.cat([self.values_buffer[1:], next_value.reshape(1, -1)])
     rows = (self.rewards_buffer, self.values_buffer, following, ended, ended)
-    advantages, returns = gae(*rows, gamma=self.gamma, lam=self.gae_lambda)
+    advantages, returns = gae(*rows, gamma=self.config.gamma, lam=self.config.gae_lambda)
     return returns, advantages
 
 
@@ -82,69 +83,143 @@ def _late(flags: Tensor) -> Tensor:
     return torch.cat([flags[1:], flags[-1:]])
 
 
+def _early(flags: Tensor) -> Tensor:
+    """The flag of row t − 1 in row t, and none in the first."""
+    return torch.cat([torch.zeros_like(flags[:1]), flags[:-1]])
+
+
+def _sums(reward: Tensor, done: Tensor, gamma: float) -> Tensor:
+    """The discounted rewards of each episode from row t on."""
+    return reward_to_go(reward, torch.zeros_like(reward), done, done, gamma=gamma)
+
+
+def _entropy(scores: Tensor) -> Tensor:
+    return torch.distributions.Categorical(logits=scores).entropy().mean()
+
+
 def _column(*numbers: float) -> Tensor:
     return torch.tensor(numbers)[:, None]
 
 
-R, V, N = _column(1.0, -0.5, 2.0, 0.5), _column(0.3, 1.2, -0.4, 0.8), _column(0.9, -0.7, 0.6, 1.5)
-"""reward, V(s) and V(s') of four steps of one environment"""
+def _following(values: Tensor, done: Tensor, own: Tensor) -> Tensor:
+    """V(s'): that of the next row, but at an end and in the last row its own."""
+    following = torch.cat([values[1:], own[-1:]])
+    return torch.where(done, own, following)
+
+
+R, V = _column(1.0, -0.5, 2.0, 0.5), _column(0.3, 1.2, -0.4, 0.8)
+"""reward and V(s) of four steps of one environment"""
 NEVER, AT_1, AT_3 = _column(0, 0, 0, 0).bool(), _column(0, 1, 0, 0).bool(), _column(0, 0, 0, 1).bool()
+N, N_1 = (_following(V, done, _column(0.9, -0.7, 0.6, 1.5)) for done in (NEVER, AT_1))
+"""V(s') where no episode ends at row 1, and where one does"""
 TWO_R, TWO_V = _drawn(5, 2), _drawn(2, 5).T.contiguous()
 TWO_ENDS = torch.tensor([[0, 0], [1, 0], [0, 0], [0, 1], [0, 0]]).bool()
 """a death in each of two environments"""
 TWO_DONE = TWO_ENDS | torch.tensor([[0, 1], [0, 0], [0, 0], [0, 0], [1, 0]]).bool()
 """the deaths, and a time-out in each of the two environments"""
+TWO_N = _following(TWO_V, TWO_DONE, TWO_V + 1)
 GAMMA, DISCOUNTS, CLIP, CLIP_COEF = {"gamma": 0.9}, {"gamma": 0.9, "lam": 0.8}, {"clip": 0.2}, {"clip_coef": 0.2}
 
+TRAIN_CONFIG = Settings(
+    {
+        "n_envs": 4,
+        "n_eval_envs": 2,
+        "n_eval_steps": 10,
+        "eval_interval": 1000,
+        "total_timesteps": 1000,
+        "seed": 0,
+        "n_steps": 16,
+        "n_minibatches": 4,
+        "n_epochs": 2,
+        "learning_rate": 1.5e-3,
+        "lr_decay": True,
+        "target_kl": None,
+        "device": "cpu",
+        "norm_adv": True,
+        "clip_vloss": True,
+        "ent_coef": 0.01,
+        "vf_coef": 0.5,
+        "max_grad_norm": 5.0,
+        "gamma": 0.9,
+        "gae_lambda": 0.95,
+        "clip_coef": 0.25,
+        "save_model": False,
+        "wandb_log": False,
+    }
+)
+"""the configuration of the drone's course, with fewer environments"""
+TRAINER = Held(config=TRAIN_CONFIG)
 FOUR = (torch.ones(4, 1), _column(0.5, 0.6, 0.7, 0.8))
 """rewards and V(s) of the drone's course"""
 FOUR_VALUES = (torch.tensor([2.5, 1.5, 3.0, 4.5]), torch.tensor([3.0, 1, 2, 5]), torch.tensor([2.0, 1, 2.5, 4]))
-SHUFFLED = (_drawn(3), _drawn(6), _drawn(6) + 0.4, torch.tensor([4, 1, 5]))
+OLD = _drawn(12) + 0.6 * _drawn(12, seed=1)
+"""values at collection, some within 0.2 of those now, some beyond on either side"""
+INDS = torch.tensor([4, 1, 13, 5, 0, 7, 11, 9, 2, 14, 8, 3])
+SHUFFLED = (_drawn(12), _drawn(15, seed=2), torch.zeros(15).index_put((INDS,), OLD), INDS)
 
 
-def _drone_case(about: str, next_value: Tensor, rewards: Tensor, values: Tensor, ended: Tensor) -> Case:
+def _drone_case(
+    about: str, next_value: Tensor, rewards: Tensor, values: Tensor, ended: Tensor, done: Tensor | None = None
+) -> Case:
     buffers = {"rewards_buffer": rewards, "values_buffer": values, "terminated_buffer": ended.float()}
-    return Case(about, (next_value,), {**buffers, "n_steps": len(rewards), "gamma": 0.99, "gae_lambda": 0.95})
+    done = ended if done is None else done
+    more = Held(
+        config=TRAIN_CONFIG,
+        dones_buffer=done.float(),
+        truncated_buffer=done.float() - ended.float(),
+        n_envs=rewards.shape[1],
+    )
+    held = {**buffers, "n_steps": len(rewards), "gamma": 0.99, "gae_lambda": 0.95}
+    return Case(about, (next_value,), held, more)
 
 
 def _values(states: Tensor) -> Tensor:
-    return states @ torch.tensor([0.5, -1.0, 0.25])
-
-
-def _scores(states: Tensor) -> Tensor:
-    return states @ torch.tensor([[1.0, 0.0], [-1.0, 0.5], [0.5, 1.0]])
+    return NETWORKS["critic"](states)[:, 0]
 
 
 def _log_probs(states: Tensor, actions: Tensor) -> Tensor:
-    return _scores(states).log_softmax(1).gather(1, actions[:, None])[:, 0]
+    return NETWORKS["actor"](states).log_softmax(1).gather(1, actions[:, None])[:, 0]
 
 
-NETWORKS = {"actor": _scores, "critic": lambda states: _values(states)[:, None]}
+def _layer(columns: Tensor) -> nn.Linear:
+    """A layer without bias, of these columns."""
+    made = nn.Linear(*columns.shape, bias=False)
+    made.weight.data.copy_(columns.T)
+    return made
+
+
+NETWORKS = Held(
+    actor=_layer(torch.tensor([[1.0, 0.0], [-1.0, 0.5], [0.5, 1.0]])), critic=_layer(_column(0.5, -1.0, 0.25))
+)
 
 
 def _lander_case(about: str, num_envs: int, steps: int, *ends: int) -> Case:
     rows = num_envs * steps
     ended = torch.tensor([row in ends for row in range(rows)])
     held = {"gamma": 0.9, "lmbda": 0.8, "num_steps": steps, "compute_values": _values}
-    return Case(about, (_drawn(rows, 3), _drawn(rows), _drawn(rows, 3, seed=1), ended), held, NETWORKS)
+    states, last = _drawn(rows, 3), torch.arange(1, rows + 1) % steps == 0
+    following = torch.where((ended | last)[:, None], _drawn(rows, 3, seed=1), states.roll(-1, 0))
+    return Case(about, (states, _drawn(rows), following, ended), held, NETWORKS)
 
 
-EIGHT, OLD_LOG_PROBS = torch.tensor([0, 1, 1, 0, 0, 1, 0, 1]), _drawn(8, seed=2) / 4 - 0.7
-"""actions of the lander, and log π_old of them"""
+ROWS, MANY = _drawn(24, 3), torch.arange(24) % 2
+"""states and actions of the lander"""
+OLD_LOG_PROBS = _log_probs(ROWS, MANY).detach() + _drawn(24, seed=2) / 2
 LANDER = {"epsilon": 0.2, "compute_log_probs": _log_probs, "compute_values": _values}
 
 CASES: dict[str, list[Case]] = {
     "gae": [
         Case("no end", (R, V, N, NEVER, NEVER), DISCOUNTS),
         Case("a death at the last row", (R, V, N, AT_3, AT_3), DISCOUNTS),
-        Case("a death at row 1", (R, V, N, AT_1, AT_1), DISCOUNTS),
-        Case("a time-out at row 1", (R, V, N, NEVER, AT_1), DISCOUNTS),
-        Case("two environments, ends of both kinds", (TWO_R, TWO_V, TWO_V + 1, TWO_ENDS, TWO_DONE), DISCOUNTS),
+        Case("a death at row 1", (R, V, N_1, AT_1, AT_1), DISCOUNTS),
+        Case("a time-out at row 1", (R, V, N_1, NEVER, AT_1), DISCOUNTS),
+        Case("two environments, ends of both kinds", (TWO_R, TWO_V, TWO_N, TWO_ENDS, TWO_DONE), DISCOUNTS),
     ],
     "calculate_advantages": [
         _drone_case("no end", _column(0.9), *FOUR, NEVER),
         _drone_case("a death at the last row", _column(0.0), *FOUR, AT_3),
         _drone_case("two environments", _drawn(1, 2), _drawn(5, 2), _drawn(5, 2, seed=1), TWO_ENDS),
+        _drone_case("a time-out, which the loop does not look at", _column(0.9), *FOUR, NEVER, AT_1),
     ],
     "compute_advantages": [
         _lander_case("one step of three environments", 3, 1, 1),
@@ -166,34 +241,53 @@ CASES: dict[str, list[Case]] = {
     "td_target": [
         Case("nothing ends", (_drawn(6), _drawn(6) + 1, torch.zeros(6).bool()), GAMMA),
         Case("some end", (_drawn(6), _drawn(6) + 1, torch.tensor([0, 1, 0, 0, 1, 1]).bool()), GAMMA),
+        Case("two critics", (_drawn(6), _drawn(2, 6) + 1, torch.tensor([0, 1, 0, 0, 1, 1]).bool()), {"gamma": 0.8}),
     ],
-    "policy_gradient": [Case("eight actions", (_drawn(8), _drawn(8) + 0.5))],
+    "policy_gradient": [Case("eight actions", (_drawn(8), _drawn(8, seed=1) + 0.5))],
     "clipped_surrogate": [
         Case("ratios of one", (torch.zeros(4), torch.tensor([1.0, 2.0, -1.0, 0.5])), CLIP),
         Case("good actions", (torch.tensor([-0.5, -0.1, 0.1, 0.5]), torch.ones(4)), CLIP),
-        Case("bad actions", (torch.tensor([-0.5, -0.1, 0.1, 0.5]), -torch.ones(4)), CLIP),
+        Case("bad actions", (torch.tensor([-0.5, -0.1, 0.1, 0.5, 1.5]), -torch.ones(5)), CLIP),
         Case("of all kinds", (_drawn(12) / 3, _drawn(12).flip(0)), {"clip": 0.1}),
+        Case("one row", (torch.tensor([0.05]), torch.tensor([1.5])), {"clip": 0.2}),
     ],
     "calculate_pg_loss": [
-        Case("the course's", (torch.tensor([1, 0.5, -1, -0.5]), torch.tensor([1.1, 1.3, 0.7, 0.9])), CLIP_COEF),
-        Case("of all kinds", (_drawn(12), (_drawn(12, seed=1) / 3).exp()), {"clip_coef": 0.1}),
+        Case(
+            "the course's", (torch.tensor([1, 0.5, -1, -0.5]), torch.tensor([1.1, 1.3, 0.7, 0.9])), CLIP_COEF, TRAINER
+        ),
+        Case("of all kinds", (_drawn(12), (_drawn(12, seed=1) / 3).exp()), {"clip_coef": 0.1}, TRAINER),
     ],
     "compute_loss": [
-        Case("eight actions", (_drawn(8, 3), EIGHT, _drawn(8), _drawn(8, seed=1), OLD_LOG_PROBS), LANDER, NETWORKS)
+        Case("many actions", (ROWS, MANY, _drawn(24), _drawn(24, seed=1), OLD_LOG_PROBS), LANDER, NETWORKS),
+        Case(
+            "one action",
+            (ROWS[:1], MANY[:1], _drawn(1), _drawn(1, seed=1), OLD_LOG_PROBS[:1]),
+            LANDER | {"epsilon": 0.1},
+            NETWORKS,
+        ),
     ],
     "value_loss": [
         Case("without a clip", (_drawn(6), _drawn(6) + 1)),
-        Case("with a clip", (_drawn(8), _drawn(8).flip(0), _drawn(8) + 0.3, 0.2)),
-        Case("with an old value, and None for the clip", (_drawn(8), _drawn(8).flip(0), _drawn(8) + 0.3, None)),
+        Case("with a clip", (_drawn(12), _drawn(12, seed=2), OLD, 0.2)),
+        Case("with an old value, and None for the clip", (_drawn(12), _drawn(12, seed=2), OLD, None)),
     ],
     "calculate_v_loss": [
-        Case("without a clip", (*FOUR_VALUES, torch.arange(4), False), CLIP_COEF),
-        Case("with a clip", (*FOUR_VALUES, torch.arange(4), True), CLIP_COEF),
-        Case("rows of a larger batch", (*SHUFFLED, False), CLIP_COEF),
-        Case("rows of a larger batch, with a clip", (*SHUFFLED, True), CLIP_COEF),
+        Case("without a clip", (*FOUR_VALUES, torch.arange(4), False), CLIP_COEF, TRAINER),
+        Case("with a clip", (*FOUR_VALUES, torch.arange(4), True), CLIP_COEF, TRAINER),
+        Case("rows of a larger batch", (*SHUFFLED, False), CLIP_COEF, TRAINER),
+        Case("rows of a larger batch, with a clip", (*SHUFFLED, True), CLIP_COEF, TRAINER),
+        Case("with another clip", (*SHUFFLED, True), {"clip_coef": 0.3}, TRAINER),
     ],
-    "polyak": [Case("two tensors", ([_drawn(3), _drawn(2, 2)], [_drawn(3) + 1, _drawn(2, 2) - 1], 0.1))],
-    "select_at_index": [Case("three rows of four", (_drawn(3, 4), torch.tensor([2, 0, 3])))],
+    "polyak": [
+        Case(
+            "three tensors",
+            ([_drawn(3), _drawn(2, 2), _drawn(2)], [_drawn(3) + 1, _drawn(2, 2) - 1, _drawn(2) / 2], 0.1),
+        )
+    ],
+    "select_at_index": [
+        Case("three rows of four", (_drawn(3, 4), torch.tensor([2, 0, 3]))),
+        Case("one row", (_drawn(1, 4), torch.tensor([2]))),
+    ],
 }
 
 # --- the mistakes ---
@@ -235,24 +329,39 @@ def _exercise(*functions: Function, outputs: tuple[str, ...], **options: Any) ->
         for shared, before in table.pop("extends", {}).items()
         for words, pairs in TABLES[shared].items()
     }
-    mistakes = {words: edited(functions, pairs) for words, pairs in (edits | table).items()}
-    accepted = {note: edited(functions, pairs) for note, pairs in TABLES["accepted"].get(name, {}).items()}
-    return Exercise(functions[-1], outputs, CASES[name], mistakes, accepted, **options)
+    return Exercise(
+        functions[-1],
+        outputs,
+        CASES[name],
+        partial(edited, functions),
+        edits | table,
+        TABLES["accepted"].get(name, {}),
+        **options,
+    )
 
 
 EXERCISES: dict[str, Exercise] = {
     "gae": _exercise(gae, outputs=("advantage", "target")),
     "calculate_advantages": _exercise(gae, calculate_advantages, outputs=("returns", "advantages")),
-    "compute_advantages": _exercise(gae, compute_advantages, outputs=("advantages", "critic_targets")),
+    "compute_advantages": _exercise(gae, compute_advantages, outputs=("advantages", "critic_targets"), detached=True),
     "reward_to_go": _exercise(reward_to_go, outputs=("return",)),
     "discounted_returns": _exercise(reward_to_go, discounted_returns, outputs=("returns",)),
     "td_target": _exercise(maths.td_target, outputs=("target",)),
-    "policy_gradient": _exercise(maths.policy_gradient, outputs=("loss",), gradient_in=0),
+    "policy_gradient": _exercise(maths.policy_gradient, outputs=("loss",), gradient_in=0, value_is_free=True),
     "clipped_surrogate": _exercise(clipped_surrogate, outputs=("loss",), gradient_in=0),
     "calculate_pg_loss": _exercise(clipped_surrogate, calculate_pg_loss, outputs=("pg_loss",), gradient_in=1),
-    "compute_loss": _exercise(clipped_surrogate, compute_loss, outputs=("actor_loss", "critic_loss"), gradient_in=0),
+    "compute_loss": _exercise(
+        clipped_surrogate,
+        compute_loss,
+        outputs=("actor_loss", "critic_loss"),
+        gradient_in=0,
+    ),
     "value_loss": _exercise(value_loss, outputs=("loss",), gradient_in=0),
     "calculate_v_loss": _exercise(value_loss, calculate_v_loss, outputs=("v_loss",), gradient_in=0),
-    "polyak": _exercise(maths.polyak, outputs=("target[0]", "target[1]", "online[0]", "online[1]"), in_place=True),
-    "select_at_index": _exercise(select_at_index, outputs=("result",)),
+    "polyak": _exercise(
+        maths.polyak,
+        outputs=tuple(f"{network}[{i}]" for network in ("target", "online") for i in range(3)),
+        in_place=True,
+    ),
+    "select_at_index": _exercise(select_at_index, outputs=("result",), gradient_in=0),
 }

@@ -167,6 +167,31 @@ def flatten_observation(parts: tuple[ObservationPart, ...], obs: Any, *, image: 
     return pieces[0] if len(pieces) == 1 else np.concatenate(pieces, axis=-1)
 
 
+def unflatten_observation(parts: tuple[ObservationPart, ...], flat: np.ndarray) -> Any:
+    """The inverse of `flatten_observation`, of [N, O] or more; what is neither an image nor counted stays float32."""
+    found: dict[Any, Any] = {}
+    ends = np.cumsum([part.size for part in parts])
+    for part, own in zip(parts, np.split(flat, ends, axis=1), strict=False):  # behind the last may be an action mask
+        if part.nvec:
+            digits = np.split(own, np.cumsum(part.nvec)[:-1], axis=1)
+            own = np.stack([digit.argmax(axis=1) for digit in digits], axis=1) + np.array(part.start)
+        own = own.reshape(len(flat), *([part.own_shape[axis] for axis in part.axes] or part.shape))
+        own = own.transpose(0, *(np.argsort(part.axes) + 1)) if part.axes else own
+        inside = found
+        for key in ("", *part.path[:-1]) if part.path else ():
+            inside = inside.setdefault(key, {})
+        inside[part.path[-1] if part.path else ""] = own.astype(np.uint8) if part.image else own
+    return _with_tuples(found[""])
+
+
+def _with_tuples(tree: Any) -> Any:
+    """Nested dictionaries, those that are numbered as tuples."""
+    if not isinstance(tree, dict):
+        return tree
+    inside = {key: _with_tuples(value) for key, value in tree.items()}
+    return tuple(inside.values()) if all(isinstance(key, int) for key in inside) else inside
+
+
 def _one_hot(part: ObservationPart, obs: Any) -> np.ndarray:
     """A batch of whole numbers, each as a one-hot vector. Raises `ValueError` for one that is not in its space."""
     whole = np.asarray(obs).astype(np.int64, casting="same_kind")  # of uint64 and int64 NumPy makes float64

@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 
 from lemniscate.exporting.deployed import difference_units, safe_action, safe_sentence
-from lemniscate.exporting.operations import Operand, Operation, Program, Value
+from lemniscate.exporting.translation import Operand, Operation, Program, Value
 from lemniscate.spec import Action, Box, Discrete, MultiDiscrete
+from lemniscate.system.files import filled
 from lemniscate.system.machine import version
-from lemniscate.system.templates import filled
 
 TEMPLATES = Path(__file__).parent / "templates"
 LARGEST = "3.402823466e+38F"

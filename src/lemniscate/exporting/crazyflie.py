@@ -8,8 +8,8 @@ from lemniscate.envs.backend import Interface, Quantity
 from lemniscate.errors import UserError
 from lemniscate.exporting.c_code import TEMPLATES, comment, literal
 from lemniscate.spec import Action, Box
+from lemniscate.system.files import filled
 from lemniscate.system.machine import version
-from lemniscate.system.templates import filled
 
 COMMANDS = ("roll", "pitch", "yaw", "thrust")
 LOOP = 1000

@@ -19,9 +19,8 @@ from lemniscate.exporting.compiled import HostPolicy, host_compiler
 from lemniscate.exporting.crazyflie import crazyflie_files
 from lemniscate.exporting.deployed import Act, Deployed, act_with, input_size, safe_action, safe_sentence
 from lemniscate.exporting.onnx_model import onnx_act, onnx_model
-from lemniscate.exporting.operations import Program
 from lemniscate.exporting.parity import TESTS, fly, parity, self_tests, sentences
-from lemniscate.exporting.translation import translate
+from lemniscate.exporting.translation import Program, translate
 from lemniscate.hub.repository import is_address
 from lemniscate.run.seeding import torch_defaults
 from lemniscate.spec import Action, Box, Discrete, MultiDiscrete, ObservationPart, Spec

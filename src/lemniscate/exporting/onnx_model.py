@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from lemniscate.exporting.deployed import Act, as_rows
-from lemniscate.exporting.operations import Operand, Operation, Program, Value
+from lemniscate.exporting.translation import Operand, Operation, Program, Value
 from lemniscate.system.machine import version
 
 OPSET, IR = 18, 10

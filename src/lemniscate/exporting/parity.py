@@ -16,7 +16,7 @@ from lemniscate.exporting import compiled
 from lemniscate.exporting.compiled import CORE, EMULATOR, TARGET_COMPILER, HostPolicy
 from lemniscate.exporting.deployed import Act, act_with, difference_units, for_policy, input_size
 from lemniscate.exporting.onnx_model import onnx_act
-from lemniscate.exporting.operations import Program
+from lemniscate.exporting.translation import Program
 from lemniscate.maths import Deterministic
 from lemniscate.nn.normalizer import RunningNorm
 from lemniscate.run.environments import evaluation_env

@@ -88,7 +88,7 @@ def record(
 
 
 def show_flights(
-    policy: Policy | None,
+    policy: Policy | Baseline | None,
     env: VecEnv,
     episodes: int,
     seed: int,
@@ -121,17 +121,19 @@ def show_flights(
     return scores
 
 
-def draw_flights(policy: Policy, env: VecEnv, run: Path, flights: int, film: bool) -> list[Path]:
+def draw_flights(
+    policy: Policy | Baseline, env: VecEnv, run: Path, flights: int, film: bool, seed: int = 0
+) -> list[Path]:
     """Path and error of some flights in a scene, into the `plots/` of a run; with `film` one of them into `videos/`.
 
     Returns the files, the film last.
     """
-    track = record(policy, env, flights, seed=0)
-    beside = record(env.baseline, env, flights, seed=0) if env.baseline else None
+    track = record(policy, env, flights, seed)
+    beside = record(env.baseline, env, flights, seed) if env.baseline else None
     folder, video = run / "plots", run / "videos" / "flight.gif"
     if film:
         make_directory(video.parent)
-        show_flights(policy, env, 1, seed=0, video=video, tell=lambda text: None)
+        show_flights(policy, env, 1, seed, video=video, tell=lambda text: None)
     drawn = [draw_path(track, folder / "flight.png"), draw_error(track, folder / "error.png", beside)]
     return [*drawn, video] if film else drawn
 

@@ -29,8 +29,7 @@ from lemniscate.run.directory import is_finished, read_config
 from lemniscate.run.evaluate import Evaluation, QBias
 from lemniscate.run.fields import flag
 from lemniscate.run.metrics import read_metrics
-from lemniscate.system.files import replace_file
-from lemniscate.system.templates import filled
+from lemniscate.system.files import filled, replace_file
 
 MOST_BYTES = 5_000_000
 """the largest film that is embedded; a larger one is linked"""
@@ -57,7 +56,7 @@ def write_run(run: Path, pictures: Sequence[Path], scores: Evaluated | None) -> 
     progress = f"{taken:,} steps" if taken >= total else f"{taken:,} of {total:,} steps"
     changed = changed_fields(algorithm, config)
     evaluate = shlex.join(["lemniscate", "evaluate", str(run), "--episodes", "100", "--seed", "1"])
-    return _write_page(
+    return write_page(
         run / "plots" / "report.html",
         "run.html.j2",
         title=f"{algorithm.upper()} on {config.get('env')}",
@@ -73,6 +72,21 @@ def write_run(run: Path, pictures: Sequence[Path], scores: Evaluated | None) -> 
         changed=[(name, *map(_shown, values)) for name, values in changed.items()],
         unchanged=[(name, _shown(value)) for name, value in config.items() if name not in changed],
         commands=(train_command(algorithm, config), resume_line(run), evaluate),
+    )
+
+
+def write_evaluation(folder: Path, name: str, pictures: Sequence[Path], scores: Evaluation, seed: int) -> Path:
+    """Write the page of an evaluation of the policy `name`, which need not be of a run: film, scores, pictures."""
+    return write_page(
+        folder / "plots" / "report.html",
+        "evaluation.html.j2",
+        title=f"{name} in {scores.env_id}",
+        subtitle=f"{scores.episodes:,} episodes · seed {seed}",
+        pictures=pictures,
+        film=newest_film(folder),
+        embedded_bytes=MOST_BYTES,
+        rows=score_rows({**scores.to_json(), "seed": seed}),
+        histogram=_histogram(scores.returns),
     )
 
 
@@ -95,7 +109,7 @@ def _histogram(returns: Sequence[float]) -> dict[str, Any] | None:
 def write_comparison(page: Path, parts: Sequence[Mapping[str, Any]]) -> Path:
     """Write the page of a comparison from what `comparison_part` returned for each environment."""
     title = f"Comparison on {', '.join(part['env'] for part in parts)}"
-    return _write_page(page, "comparison.html.j2", title=title, subtitle=str(page), parts=parts)
+    return write_page(page, "comparison.html.j2", title=title, subtitle=str(page), parts=parts)
 
 
 def comparison_part(
@@ -295,7 +309,7 @@ def _embedded(file: Path) -> str:
     return f"data:{KINDS[file.suffix]};base64,{base64.b64encode(file.read_bytes()).decode()}"
 
 
-def _write_page(file: Path, template: str, **context: Any) -> Path:
+def write_page(file: Path, template: str, **context: Any) -> Path:
     """Fill a template, and say at its end by which versions that was done."""
     versions = [f"{package} {version(package)}" for package in ("torch", "numpy", "gymnasium")]
     machine = f"Python {platform.python_version()} on {platform.system()} {platform.machine()}"

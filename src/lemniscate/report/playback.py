@@ -21,9 +21,7 @@ import torch
 from PIL import Image
 
 from lemniscate.envs.conversion import measured, measures_of
-from lemniscate.envs.factory import make_one, maker_of, makes_vector, sentences
 from lemniscate.envs.registry import make_rendered
-from lemniscate.envs.returns import as_array
 from lemniscate.envs.spaces import SUMMARIES
 from lemniscate.envs.vec_env import VecEnv, require_end
 from lemniscate.errors import NonFiniteError, UserError, is_installed, missing_extra, shown
@@ -33,7 +31,6 @@ from lemniscate.run.evaluate import EVALUATION, EpisodeTable, Evaluation
 from lemniscate.run.seeding import derive
 from lemniscate.system.console import Place, in_notebook, say
 from lemniscate.system.files import remove
-from lemniscate.system.named import find_callable
 from lemniscate.types import Step
 
 Act = Callable[..., np.ndarray]
@@ -71,23 +68,6 @@ def show_episodes(
             deque(played, maxlen=0)  # Gymnasium draws at each step
         else:
             give((_picture(env, name) for _ in played), float((env.metadata or {}).get("render_fps") or 30), video)
-    return table.evaluation(name, SUMMARIES)
-
-
-def play_single(act: Act, arguments: dict[str, Any], episodes: int, seed: int, tell: Tell = say) -> Evaluation:
-    """The same episodes, not shown: one after the other in one environment of Gymnasium's interface.
-
-    Raises:
-        UserError: an environment that cannot be made, or only several at once; an episode without an end.
-    """
-    name, kwargs, wrappers = (arguments[part] for part in ("env", "kwargs", "wrappers"))
-    table = EpisodeTable(1, torch.device("cpu"))
-    with sentences(name, kwargs, wrappers):
-        if makes_vector(maker_of(name)):
-            raise UserError(f"{name} makes several environments at once, and a function acts in a single one.")
-        env = make_one(maker_of(name), tuple(map(find_callable, wrappers)), **kwargs)
-    with closing(env):
-        deque(_play(env, act, name, episodes, seed, table, tell), maxlen=0)
     return table.evaluation(name, SUMMARIES)
 
 
@@ -135,9 +115,7 @@ def _play(
         total, length, done = 0.0, 0, False
         while not done:
             require_end(name, length, limit)
-            action = act(obs, action_mask=info.get("action_mask"))
-            _require_in(env.action_space, action, name)
-            obs, reward, terminated, truncated, info = env.step(action)
+            obs, reward, terminated, truncated, info = env.step(act(obs, action_mask=info.get("action_mask")))
             if not math.isfinite(reward):
                 raise NonFiniteError(f"The reward of {name} is {reward} in step {length + 1} of an episode.")
             total, length = total + float(reward), length + 1
@@ -154,17 +132,6 @@ def _play(
             table.add(step, ONE)
             yield
         tell(sentence(number + 1, total, length))
-
-
-def _require_in(space: gym.Space, action: Any, name: str) -> None:
-    """Raise `UserError` for an action that is not of the space; of a Box the shape counts, the environment may clip."""
-    if isinstance(space, gym.spaces.Box):  # what is outside of its bounds the environment may clip
-        numbers = as_array(action)
-        fits = numbers.shape == space.shape and numbers.dtype.kind in "biuf" and np.isfinite(numbers).all()
-    else:
-        fits = space.contains(action)
-    if not fits:
-        raise UserError(f"{name} takes actions of {space}, not {shown(action)}.")
 
 
 def _random(env: gym.Env, seed: int) -> Act:

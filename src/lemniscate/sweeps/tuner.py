@@ -15,7 +15,7 @@ from lemniscate.api import training
 from lemniscate.api.policy import path_of
 from lemniscate.cluster.connection import Cluster, find_cluster
 from lemniscate.errors import SweepError, UserError
-from lemniscate.report import tuning as pictures
+from lemniscate.report import curves
 from lemniscate.run.config import Range, checked
 from lemniscate.run.directory import locked
 from lemniscate.run.places import LOG, Sweep, failure_of, is_sweep
@@ -196,7 +196,7 @@ class _Tuner(SetOfRuns):
                     break
                 trial = self._take_up(self._search.ask(self._study))
             until = self._search.rungs[trial.rung]
-            options = ["--callbacks", f"lemniscate.api.callbacks:StopAt(steps={until})"] if until else []
+            options = ["--callbacks", f"lemniscate.api.options:StopAt(steps={until})"] if until else []
             run = trial.waiting.pop(0)
             trial.training.add(run)
             self._start(run, options)
@@ -249,7 +249,7 @@ class _Tuner(SetOfRuns):
         assert best.value is not None
         self._say(f"Best of {len(trials)} trials: number {best.number}, score {best.value:,.1f}.")
         self._say(preset.to_toml())
-        for picture in pictures.draw(self._study, list(self._space), path / "plots"):
+        for picture in curves.draw_study(self._study, list(self._space), path / "plots"):
             self._say(str(picture))
         self._say(
             f"Evaluate it with seeds that the search has not seen: lemniscate train {self._search.algorithm} --preset"

@@ -49,11 +49,11 @@ def _takes_a_line(stream: TextIO, seconds: float = 1.0) -> bool:
 def pace(rate: float, episode_return: float | None, steps_left: int, at_the_end: str) -> str:
     """The speed of a run in steps per second, its return, and the time that is left, or else what is at the end."""
     ret = "–" if episode_return is None else f"{episode_return:.1f}"
-    left = f"{_clock(steps_left / rate)} left" if rate and steps_left > 0 else at_the_end
+    left = f"{clock(steps_left / rate)} left" if rate and steps_left > 0 else at_the_end
     return f"{rate:,.0f} steps/s  return {ret}  {left}"
 
 
-def _clock(seconds: float) -> str:
+def clock(seconds: float) -> str:
     """Hours, minutes and seconds: 0:00:18."""
     return str(timedelta(seconds=round(seconds)))
 
@@ -111,7 +111,7 @@ class ProgressBar:
         now, total, known = time.monotonic(), self._total, learned and self._learned
         rate = (step - self._step) / (now - self._updated_at + 1e-9)
         self._step, self._updated_at, self._learned = step, now, learned
-        passed = f"{_clock(now - self._started)} {'so far' if step < total else 'in all'}"
+        passed = f"{clock(now - self._started)} {'so far' if step < total else 'in all'}"
         name = f"{step:,} of {total:,} steps"
         if step > total:
             name = f"{step:,} steps, the end of the update that reached {total:,}"

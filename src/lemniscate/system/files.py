@@ -11,7 +11,7 @@ import json
 import os
 import shutil
 import stat
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from io import BufferedReader, FileIO
 from pathlib import Path
@@ -182,3 +182,25 @@ def sync(path: Path) -> None:
 
 def _hash_of(record: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
+
+
+def filled(template: Path, filters: dict[str, Callable[..., Any]], **context: Any) -> str:
+    """The text of a template of Jinja's; what is put into HTML is escaped, into other texts not.
+
+    Args:
+        template: its file, beside those that it includes.
+        filters: functions that it calls by these names.
+        context: the values that it names.
+    """
+    from jinja2 import Environment, FileSystemLoader, StrictUndefined  # a training without a report needs none
+
+    templates = Environment(
+        loader=FileSystemLoader(template.parent),
+        autoescape=".html" in template.name,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    templates.filters |= filters
+    return templates.get_template(template.name).render(context)

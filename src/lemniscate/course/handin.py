@@ -1,0 +1,289 @@
+"""The child's half of `lemniscate grade`: a hand-in is read and tried in a process of its own, which judges nothing.
+
+The definitions count: imports, functions, classes and assignments are executed one by one; what raises is noted with
+its line. Loops, `with` blocks and bare expressions at the top level, which train, draw, test and print, are left out,
+unless a function uses a name that they assign.
+"""
+
+import __future__
+
+import ast
+import ctypes
+import importlib.util
+import inspect
+import json
+import os
+import re
+import signal
+import socket
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from importlib.machinery import FileFinder, SourceFileLoader
+from multiprocessing import parent_process
+from pathlib import Path
+from types import ModuleType
+from typing import Any, NoReturn
+
+import psutil
+import torch
+
+from lemniscate import course
+from lemniscate.course.exercise import raised
+from lemniscate.course.solution import LIMIT, TooLong, limited
+from lemniscate.system.watchdog import end_when_closed
+
+SUFFIXES = (".py", ".ipynb")
+IMPORTING, ASSIGNING, GRACE = 30.0, 3.0, 5.0
+"""seconds that an import, and any other statement, may take; and beyond an exercise's own limit, until it is killed"""
+LIMITS = {"RLIMIT_DATA": 4 * 2**30, "RLIMIT_FSIZE": 2**28, "RLIMIT_CORE": 0}
+"""bytes of memory, and of a file"""
+LEFT_OUT = (ast.For, ast.While, ast.With, ast.Expr, ast.Assert, ast.Raise, ast.AsyncFor, ast.AsyncWith, ast.Match)
+MAGIC = re.compile(r"^(\s*)(?:[%!?].*|[\w.]+\?+|[\w, ]+=\s*[%!].*)$", re.MULTILINE)
+"""a line of a notebook that is not Python"""
+UNREADABLE = (SyntaxError, ValueError, LookupError, TypeError, RecursionError, MemoryError)
+
+
+class Missing:
+    """What an import that failed was to bind: raises the reason once it is called."""
+
+    def __init__(self, reason: str) -> None:
+        self._reason = reason
+
+    def __call__(self, *_args: Any, **_options: Any) -> NoReturn:  # noqa: D102
+        raise ImportError(self._reason)
+
+    def __getattr__(self, name: str) -> "Missing":
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return self
+
+    def __mro_entries__(self, _bases: tuple[Any, ...]) -> tuple[type, ...]:
+        return ()
+
+
+class Reader:
+    """Reads a hand-in: `defined` are the modules that define each name, `notes` what could not be read."""
+
+    def __init__(self, work: Path) -> None:
+        self.defined: dict[str, dict[str, ModuleType]] = {}
+        self.notes: list[str] = []
+        self._work = work
+
+    def read(self) -> None:
+        """Execute the modules, then the notebooks, that no other one has imported."""
+        files = [file for file in sorted((self._work / "hand-in").rglob("*")) if file.suffix in SUFFIXES]
+        execute = {"exec_module": lambda _, module: self._execute(module)}
+        loader: Any = type("Loader", (SourceFileLoader,), execute), list(SUFFIXES)
+        sys.path[:0] = folders = dict.fromkeys(str(file.parent) for file in files)
+        sys.path_importer_cache |= {folder: FileFinder(folder, loader) for folder in folders}
+        for file in sorted(files, key=lambda file: file.suffix != ".py"):
+            if not any(getattr(module, "__file__", None) == str(file) for module in [*sys.modules.values()]):
+                name = file.stem if file.stem not in sys.modules else f"{file.stem} as it was handed in"
+                module = sys.modules[name] = ModuleType(name)
+                module.__file__ = str(file)
+                self._execute(module)
+
+    def _execute(self, module: ModuleType) -> None:
+        """Execute a module or a notebook, one statement after the other."""
+        file, flags = Path(str(module.__file__)), 0
+        module.__dict__.setdefault("display", print)
+        parsed = [(code, node) for code, tree in self._trees(file) for node in tree.body]
+        used = set().union(*(_free(node) for _, node in parsed if isinstance(node, ast.FunctionDef | ast.ClassDef)))
+        for code, node in parsed:
+            if isinstance(node, ast.ImportFrom) and node.module == "__future__":
+                flags |= sum(getattr(__future__, each.name).compiler_flag for each in node.names)
+            if not isinstance(node, LEFT_OUT) or _bound(node) & used:
+                self._run(node, code, flags, module.__dict__)
+                self.defined |= {each: {**self.defined.get(each, {}), file.name: module} for each in _bound(node)}
+
+    def _run(self, node: ast.stmt, file: Path, flags: int, scope: dict[str, Any]) -> None:
+        imports = [each for each in ast.walk(node) if isinstance(each, ast.Import | ast.ImportFrom)]
+        seconds, where = IMPORTING if imports else ASSIGNING, f"{file.name}, line {node.lineno}"
+        try:
+            with limited(seconds):
+                exec(compile(ast.Module([node], []), str(file), "exec", flags, dont_inherit=True), scope)
+        except TooLong:
+            self.notes.append(f"{where}: left out, since it did not end within {seconds:g} s.")
+        except BaseException as error:  # what ends a program, too, ends this statement alone
+            absent = isinstance(error, ModuleNotFoundError) and f"the package {error.name} is not installed here"
+            reason = absent or f"{type(error).__name__}: {error}".rstrip(".")
+            self.notes.append(f"{where}: {reason}.")
+            for each in imports[0].names if imports and imports[0] is node else ():
+                scope.setdefault(each.asname or each.name.partition(".")[0], Missing(reason))
+
+    def _trees(self, file: Path) -> Iterator[tuple[Path, ast.Module]]:
+        """The statements of a module, or of each cell, with the file that Python names in a traceback."""
+        is_module = file.suffix == ".py"
+        try:
+            text = importlib.util.decode_source(file.read_bytes())
+            cells = [{"cell_type": "code", "source": text}] if is_module else json.loads(text)["cells"]
+            sources = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
+        except UNREADABLE as error:
+            self.notes.append(f"{file.name} cannot be read: {type(error).__name__}: {error}.")
+            return
+        (self._work / "cells").mkdir(exist_ok=True)
+        for number, source in enumerate(sources, start=1):
+            code = file if is_module else self._work / "cells" / f"code cell {number} of {file.name}"
+            if not is_module:
+                code.write_text(source, "utf-8", "replace")  # so that inspect finds it
+            try:
+                yield code, _parsed(source)
+            except UNREADABLE as error:
+                line = f", line {error.lineno}" if isinstance(error, SyntaxError) else ""
+                self.notes.append(f"{code.name}{line}: {type(error).__name__}: {getattr(error, 'msg', error)}.")
+
+
+def _parsed(source: str) -> ast.Module:
+    """The statements of a cell, without magics; none of a cell in another language."""
+    with suppress(SyntaxError):
+        return ast.parse(source)
+    if source.lstrip().startswith("%%") and source.split()[0] not in ("%%time", "%%timeit", "%%capture"):
+        return ast.parse("")
+    return ast.parse(MAGIC.sub(r"\1pass", source))
+
+
+def _bound(node: ast.AST) -> set[str]:
+    """The names that a statement at the top level assigns or defines."""
+    if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+        return {node.name}
+    own = {node.id} if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store) else set()
+    return own.union(*map(_bound, ast.iter_child_nodes(node)))
+
+
+def _free(function: ast.AST) -> set[str]:
+    """The names that a function or a class uses and nothing in it assigns."""
+    names = [node for node in ast.walk(function) if isinstance(node, ast.Name)]
+    arguments = {node.arg for node in ast.walk(function) if isinstance(node, ast.arg)}
+    return {each.id for each in names} - {each.id for each in names if isinstance(each.ctx, ast.Store)} - arguments
+
+
+def solutions(reader: Reader, demanded: list[str]) -> dict[str, tuple[Any, str]]:
+    """The answers to exercises among what was defined, each with its file: the last one that has the name."""
+    found: dict[str, tuple[Any, str]] = {}
+    for name, modules in reader.defined.items():
+        file, module = [*modules.items()][-1]
+        thing = module.__dict__.get(name)
+        methods = {each: getattr(thing, each) for each in vars(thing)} if isinstance(thing, type) else {}
+        for each, answer in {**methods, name: thing}.items():
+            if each not in course.EXERCISES or not callable(answer) or isinstance(answer, Missing):
+                continue
+            if str(getattr(answer, "__module__", "")).startswith("lemniscate."):
+                reader.notes.append(f"{file}: {each} is lemniscate's own, so there is nothing to judge.")
+            elif each in demanded or (not demanded and _is_meant(each, answer, each in methods)):
+                found[each] = answer, file
+                if len(modules) > 1:
+                    reader.notes.append(f"{name} is defined in {' and '.join(modules)}; the one in {file} counts.")
+    return found
+
+
+def _is_meant(name: str, answer: Any, is_method: bool) -> bool:
+    """Whether what has the name of an exercise is an answer to it: other courses have an Agent, and most a train."""
+    if name == "train":
+        with suppress(TypeError, ValueError):
+            return bool(inspect.signature(answer).bind(None, total_steps=1, seed=1))
+        return False
+    is_function = isinstance(course.EXERCISES[name], course.Exercise)
+    return hasattr(answer, "action_and_value") if name == "Agent" else is_function or not is_method
+
+
+def run(work: Path, demanded: list[str]) -> None:
+    """Read a hand-in, and try its exercises: those that are demanded, or all that are found; each in a fork.
+
+    `work` has a copy of it in `hand-in`. What is found goes into `seen`: `read.json`, then for each exercise NAME.pt,
+    or NAME.txt with the sentence on why there is none.
+    """
+    alone, save = _fenced(work), torch.save
+    # A hand-in that imports the checker gets another copy of it, in which it may change what it likes.
+    for name in [name for name in sys.modules if name.startswith("lemniscate.course")]:
+        del sys.modules[name]
+    delattr(sys.modules["lemniscate"], "course")
+    reader = Reader(work)
+    reader.read()
+    sys.settrace(None)
+    found = solutions(reader, demanded)
+    files = {name: found[name][1] for name in course.EXERCISES if name in found}
+    things = [module.__dict__.get(name) for name, modules in reader.defined.items() for module in modules.values()]
+    names = {*reader.defined, *(name for each in things if isinstance(each, type) for name in vars(each))}
+    about = {"files": files, "names": sorted(names), "notes": [*dict.fromkeys(reader.notes)][:20], "alone": alone}
+    (work / "seen" / "read.json").write_text(json.dumps(about), "utf-8")
+    for name in files:
+        exercise, to = course.EXERCISES[name], work / "seen" / f"{name}.txt"
+        pid = os.fork() if hasattr(os, "fork") else 0
+        if pid:
+            code = _exit_code(pid, getattr(exercise, "limit", LIMIT) + GRACE)
+            if not to.exists() and not to.with_suffix(".pt").exists():
+                to.write_text(f"{ending(code)}.", "utf-8")
+            continue
+        if sys.platform == "linux":
+            set_parent_death_signal = 1
+            ctypes.CDLL(None).prctl(set_parent_death_signal, signal.SIGKILL)
+        try:
+            save(dict(exercise.observe(found[name][0])), work / name)
+            (work / name).rename(to.with_suffix(".pt"))  # whole, or not there
+        except BaseException as error:
+            to.write_text(f"{raised(error)[:400]}.", "utf-8")
+        if hasattr(os, "fork"):
+            break
+    os._exit(0)  # nothing that the hand-in has left for the end is done
+
+
+def _exit_code(pid: int, seconds: float) -> int | None:
+    """The exit code of an exercise's process, None where it is late; ends whatever was started by then."""
+    deadline, ended = time.monotonic() + seconds, (0, 0)
+    while ended == (0, 0) and time.monotonic() < deadline:
+        time.sleep(0.01)
+        ended = os.waitpid(pid, os.WNOHANG)
+    end_family(os.getpid())
+    return os.waitstatus_to_exitcode(ended[1]) if ended[0] else None
+
+
+def ending(code: int | None) -> str:
+    """How a process has ended, in words."""
+    known = {None: "it did not end in time", -9: "it was killed, most likely for memory", -11: "it crashed (SIGSEGV)"}
+    return known.get(code, f"it ended the process (exit code {code})")
+
+
+def _fenced(work: Path) -> bool:
+    """Give up what a hand-in does not need; returns whether the system keeps the network away, or Python alone."""
+    parent = parent_process()
+    nothing, printed = os.open(os.devnull, os.O_RDWR), os.open(work / "printed", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+    if parent and hasattr(os, "setsid"):
+        os.setsid()  # Ctrl-C in the terminal is for the process that judges
+        end_when_closed(parent.sentinel)
+        kept = {0, 1, 2, printed, nothing, parent.sentinel}
+        for handle in {int(each.name) for each in Path("/dev/fd").iterdir()} - kept:
+            with suppress(OSError):  # these lead to the processes that judge and start
+                os.dup2(nothing, handle, inheritable=False)
+    os.chdir(work / "hand-in")
+    for number, handle in enumerate((nothing, printed, printed)):
+        os.dup2(handle, number)
+    sys.stdout = sys.stderr = open(1, "w", 1, "utf-8", "replace", closefd=False)  # noqa: SIM115
+    os.environ |= {"WANDB_MODE": "offline", "MPLBACKEND": "Agg", "CUDA_VISIBLE_DEVICES": "", "TMPDIR": str(work)}
+    torch.set_num_threads(1)
+    with suppress(ImportError):  # Windows has no such limits
+        import resource
+
+        for name, most in LIMITS.items():
+            resource.setrlimit(getattr(resource, name), (most, most))
+    if sys.platform == "linux":
+        libc, set_child_subreaper, user_and_net = ctypes.CDLL(None), 36, 0x50000000
+        libc.prctl(set_child_subreaper, 1)  # what loses its parent stays below this process
+        if libc.unshare(user_and_net) == 0:
+            return True
+
+    def refuse(*_args: Any, **_options: Any) -> NoReturn:
+        raise OSError("there is no network where this is graded")
+
+    socket.socket.connect = socket.socket.connect_ex = socket.getaddrinfo = refuse
+    return False
+
+
+def end_family(pid: int) -> None:
+    """Kill all processes below one, and those that they start meanwhile."""
+    with suppress(psutil.Error):
+        while alive := [each for each in psutil.Process(pid).children(recursive=True) if each.status() != "zombie"]:
+            for each in alive:
+                with suppress(psutil.NoSuchProcess):
+                    each.kill()

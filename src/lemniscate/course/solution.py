@@ -1,0 +1,530 @@
+"""How a reader's solution is called, whatever its style: its names and order of arguments, a method, NumPy.
+
+A method gets an object of its own class. What the course's constructor sets is put there; the reader's own constructor
+runs only where the method asks for more, and as far as it comes.
+"""
+
+import ast
+import copy
+import ctypes
+import dataclasses
+import inspect
+import sys
+import textwrap
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from functools import partial
+from itertools import accumulate, takewhile
+from types import FunctionType, MethodType, SimpleNamespace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+Function = Callable[..., Any]
+
+NAMES = {
+    "reward": ("rewards", "r", "rew", "rews", "rs"),
+    "value": ("values", "v", "val", "vals", "vs", "v_s", "state_values", "new_value", "newvalue", "new_values", "pred"),
+    "next_value": ("next_values", "nv", "next_v", "v_next", "values_next", "next_vals", "v_prime", "vp", "v_s_next"),
+    "terminated": ("terminations", "terminateds", "term", "terms", "terminal", "terminals", "death", "deaths", "te"),
+    "done": ("dones", "d", "ended", "ends", "end", "over", "episode_over", "finished"),
+    "gamma": ("discount", "discount_factor", "g", "γ"),
+    "lam": ("lambda", "lmbda", "gae_lambda", "lambd", "lamda", "gae_lam", "l", "λ"),
+    "gae_lambda": ("lambda", "lmbda", "lam", "lambd", "lamda", "gae_lam", "l", "λ"),
+    "lmbda": ("lambda", "lam", "gae_lambda", "lambd", "lamda", "gae_lam", "l", "λ"),
+    "clip": ("clip_coef", "epsilon", "eps", "clip_eps", "clip_range", "clip_ratio", "clip_epsilon", "clip_param", "ε"),
+    "clip_coef": ("clip", "epsilon", "eps", "clip_eps", "clip_range", "clip_ratio", "clip_epsilon", "clip_param", "ε"),
+    "epsilon": ("clip", "clip_coef", "eps", "clip_eps", "clip_range", "clip_ratio", "clip_epsilon", "clip_param", "ε"),
+    "num_steps": ("n_steps", "t_max", "num_collection_steps", "horizon", "rollout_length", "steps"),
+    "n_steps": ("num_steps", "rollout_length", "horizon", "steps"),
+    "rewards": ("reward", "r", "rew", "rews", "rs"),
+    "states": ("state", "s", "obs", "observations"),
+    "actions": ("action", "a", "acts"),
+    "next_states": ("next_state", "s_next", "next_obs", "next_observations", "s_prime", "s2"),
+    "ended": ("terminations", "terminated", "terminals", "dones", "done", "term"),
+    "advantages": ("advantage", "adv", "advs", "advantage_estimates"),
+    "advantage": ("advantages", "adv", "advs", "a_hat", "mb_advantages", "advantage_estimates"),
+    "mb_advantages": ("advantages", "advantage", "adv", "advs", "mb_adv", "minibatch_advantages"),
+    "targets": ("critic_targets", "target", "returns", "value_targets", "v_target", "v_targets"),
+    "target": ("targets", "returns", "return_", "ret", "value_target", "v_target", "b_returns"),
+    "old": ("log_probs_old", "old_log_probs", "log_prob_old", "old_log_prob", "logp_old", "old_logp"),
+    "ratio": ("ratios", "r_t", "rt", "prob_ratio", "rho", "importance_ratio"),
+    "log_ratio": ("logratio", "log_ratios", "logratios", "log_r", "logr", "lr"),
+    "newvalue": ("new_value", "newvalues", "new_values", "values", "value", "mb_values", "pred"),
+    "b_returns": ("returns", "batch_returns", "targets"),
+    "b_values": ("old_values", "batch_values", "values_old"),
+    "mb_inds": ("inds", "indices", "idx", "mb_idx", "mb_indices", "rows"),
+    "if_clip": ("clip_vloss", "use_clip", "clip_value_loss", "do_clip", "clipped"),
+    "old_value": ("old_values", "value_old", "values_old", "v_old", "old_v", "old"),
+    "log_prob": ("log_probs", "logprob", "logprobs", "logp", "log_pi", "log_p"),
+    "weight": ("weights", "advantage", "advantages", "adv", "returns", "psi", "ψ", "w"),
+    "online": ("source", "params", "parameters", "main", "local", "online_params", "net", "model", "src"),
+    "x": ("values", "input", "matrix", "q", "q_values", "logits", "scores"),
+    "indices": ("index", "idx", "inds", "actions", "action", "i"),
+    "probs": ("p", "probabilities", "prob", "pi", "π"),
+    "tau": ("polyak", "polyak_coef", "rho", "alpha", "t", "τ"),
+}
+"""other names of an argument, by its name in the exercise"""
+SETTINGS = ("config", "cfg", "conf", "args", "hp", "hparams", "hyperparameters", "params", "settings", "train_config")
+"""names of what holds a reader's settings"""
+LIMIT = 15.0
+"""seconds that a function may take for all its cases; what is right takes milliseconds"""
+
+
+def standard(name: str, among: Mapping[str, Any]) -> str | None:
+    """Which of some names of arguments another name stands for; None if for none of them."""
+    name = name.lower().strip("_")
+    if name in among:
+        return name
+    return next((known for known in among if name in NAMES.get(known, ())), None)
+
+
+class Settings(dict):
+    """A configuration as a course has it: `config.gamma`, `config["gamma"]`, `config.get("gamma")`."""
+
+    def __getattr__(self, name: str) -> Any:
+        try:
+            return self[name]
+        except KeyError:
+            raise AttributeError(f"the configuration has no {name}", name=name, obj=self) from None
+
+
+class OwnSettings(Settings):
+    """A configuration of the reader's, in which a number may have another name than in the exercise."""
+
+    def __missing__(self, name: str) -> Any:
+        known = None if name.startswith("__") else standard(name, self)
+        if known is None:
+            raise KeyError(name)
+        return self[known]
+
+    def get(self, name: str, default: Any = None) -> Any:
+        """The value of that name, or of another name of it; else the default."""
+        return self[name] if standard(name, self) else default
+
+
+class MisfitError(TypeError):
+    """A solution takes fewer arguments than a case has."""
+
+
+class Held(dict):
+    """What an object has besides options, where the exercise is a method."""
+
+
+class TooLong(BaseException):
+    """Raised within a solution that has not ended in time; not an Exception, which a solution might catch."""
+
+
+@contextmanager
+def limited(seconds: float) -> Iterator[None]:
+    """Raise `TooLong` in this thread, and again every half second, once the time is over; also in an endless loop."""
+    thread, over, sent = ctypes.c_ulong(threading.get_ident()), threading.Event(), threading.Event()
+
+    def interrupt() -> None:
+        wait = seconds
+        while not over.wait(wait):
+            sent.set()
+            ctypes.pythonapi.PyThreadState_SetAsyncExc(thread, ctypes.py_object(TooLong))
+            wait = 0.5
+
+    watch = threading.Thread(target=interrupt, daemon=True)
+    watch.start()
+    try:
+        yield
+    finally:
+        over.set()
+        watch.join()
+        if sent.is_set():  # with nothing to take back, Python 3.11 hangs where a trace function is set
+            ctypes.pythonapi.PyThreadState_SetAsyncExc(thread, None)
+            _forget_halves()
+
+
+def _forget_halves() -> None:
+    """Remove the parts of packages whose import was broken off, which would leave the next import without them."""
+    for name in list(sys.modules):
+        parents = accumulate(name.split(".")[:-1], "{}.{}".format)
+        if any(parent not in sys.modules for parent in parents):
+            del sys.modules[name]
+
+
+# --- arguments ---
+
+
+def arranged(
+    function: Function, given: Mapping[str, Any], options: Mapping[str, Any], are_held: bool = False
+) -> tuple[list[Any], dict]:
+    """Positional and keyword arguments: by their names where these are known, the rest in the order of the exercise.
+
+    Args:
+        function: the solution.
+        given: what it must take, by the names of the exercise.
+        options: what it may take.
+        are_held: whether an object has the options too, so that a function that takes anything is not given them.
+
+    Raises:
+        MisfitError: it takes less than there is.
+        TypeError: it wants more than there is.
+    """
+    # What one calls a module is its forward, but its signature is that of any module.
+    parameters = inspect.signature(function.forward if isinstance(function, nn.Module) else function).parameters
+    kinds = {parameter.kind for parameter in parameters.values()}
+    named = {
+        name: each for name, each in parameters.items() if each.kind not in (each.VAR_POSITIONAL, each.VAR_KEYWORD)
+    }
+    if not named and inspect.Parameter.VAR_POSITIONAL in kinds:
+        if are_held or inspect.Parameter.VAR_KEYWORD in kinds:
+            return list(given.values()), {} if are_held else dict(options)
+        return [*given.values(), *options.values()], {}
+    chosen, left = _chosen(named, {**given, **options})
+    for name, each in named.items():
+        if name not in chosen and each.default is each.empty:
+            if name.lower() not in SETTINGS:
+                raise TypeError(f"its parameter {name} is none of those that this exercise has: {', '.join(given)}")
+            chosen[name] = OwnSettings(options)
+    if inspect.Parameter.VAR_KEYWORD in kinds and not are_held:
+        chosen, left = {**chosen, **left}, {}
+    if unused := [name for name in left if name in given]:
+        raise MisfitError(f"it takes too few arguments, no {', '.join(unused)}; there are {', '.join(given)}")
+    # Options by name, as a course calls them; the rest as they stand, which a wrapper may expect.
+    leading = takewhile(lambda name: name in chosen and named[name].kind is not named[name].KEYWORD_ONLY, named)
+    return [chosen.pop(name) for name in [*leading]], chosen
+
+
+def _chosen(named: Mapping[str, inspect.Parameter], left: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The values of parameters, and what is left of those that there are."""
+    chosen = {name: left.pop(name) for name in named if name in left}  # before those that another name may mean
+    for name in named:
+        if name not in chosen and (known := standard(name, left)):
+            chosen[name] = left.pop(known)
+    for name, each in named.items():
+        if name in chosen or not left or name.lower() in SETTINGS:
+            continue
+        if each.default is each.empty or _is_number(each.default):
+            chosen[name] = left.pop(next(iter(left)))
+    return chosen, left
+
+
+def _is_number(value: Any) -> bool:
+    return value is None or (isinstance(value, int | float) and not isinstance(value, bool))
+
+
+def call_by_name(function: Function, needed: Mapping[str, Any], offered: Mapping[str, Any] | None = None) -> Any:
+    """Call a function with values by the names of its parameters; where it has other names, by position.
+
+    Args:
+        function: a function, a class, a torch module, or a method of an object.
+        needed: the values of the exercise in its order, each by its names, "next_obs next_state".
+        offered: more of them, given only to parameters of these names, and to those without a default.
+
+    Raises:
+        TypeError: the function takes another argument, which has no default.
+    """
+    values = {**needed, **(offered or {})}
+    by_name = {name: names for names in values for name in names.split()}
+    try:
+        bound = _signature(function).bind_partial()
+    except ValueError:  # written in C
+        return function(*needed.values())
+    parameters = bound.signature.parameters.values()
+    plain = [parameter for parameter in parameters if parameter.kind not in VARIADIC]
+    given = {parameter.name: by_name[parameter.name] for parameter in plain if parameter.name in by_name}
+    left = [names for names in values if names not in given.values()]
+    for parameter in sorted(plain, key=lambda parameter: parameter.default is not parameter.empty):
+        if parameter.name in given:
+            continue
+        if parameter.default is parameter.empty and not left:
+            known = ", ".join(names.split()[0] for names in values)
+            raise TypeError(f"its parameter {parameter.name} is none of those that this exercise has: {known}")
+        if left and (parameter.default is parameter.empty or left[0] in needed):
+            given[parameter.name] = left.pop(0)
+    bound.arguments.update({name: values[names] for name, names in given.items()})
+    left, kinds = [names for names in left if names in needed], {parameter.kind: parameter for parameter in parameters}
+    if inspect.Parameter.VAR_POSITIONAL in kinds:
+        bound.arguments[kinds[inspect.Parameter.VAR_POSITIONAL].name] = tuple(values[names] for names in left)
+    elif inspect.Parameter.VAR_KEYWORD in kinds:
+        named = {names.split()[0]: values[names] for names in left}
+        bound.arguments[kinds[inspect.Parameter.VAR_KEYWORD].name] = named
+    return function(*bound.args, **bound.kwargs)
+
+
+VARIADIC = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+
+
+def _signature(function: Function) -> inspect.Signature:
+    """The signature; that of the function inside, where a decorator hides it."""
+    function = function.forward if isinstance(function, nn.Module) else function
+    signature = inspect.signature(function)
+    inner = [cell.cell_contents for cell in getattr(function, "__closure__", None) or ()]
+    is_hidden = all(parameter.kind in VARIADIC for parameter in signature.parameters.values())
+    if is_hidden and len(inner) == 1 and inspect.isfunction(inner[0]):
+        return _signature(inner[0].__get__(function.__self__) if inspect.ismethod(function) else inner[0])
+    return signature
+
+
+def first_that_works(*attempts: Callable[[], Any]) -> Any:
+    """What the first of several attempts returns that raises no error; if all do, the error of the first."""
+    errors: list[Exception] = []
+    for attempt in attempts:
+        try:
+            return attempt()
+        except Exception as error:  # an error of the solution, which the next attempt may not meet
+            errors.append(error)
+    raise errors[0]
+
+
+# --- objects of the reader's class ---
+
+
+def owner_of(function: Function) -> tuple[type, str] | None:
+    """The class in whose text a function stands, or the last one that inherits it, and its name there."""
+    found, seen, waiting = None, {object}, [object]
+    is_wrapper = function.__qualname__.rpartition(".")[0].endswith("<locals>")  # it may be of any file
+    while waiting and "." in function.__qualname__:
+        below = set(type.__subclasses__(waiting.pop())) - seen
+        seen |= below
+        waiting += below
+        for cls in below if is_wrapper else (cls for cls in below if cls.__module__ == function.__module__):
+            for name, held in list(vars(cls).items()):
+                if held is function or getattr(held, "__func__", None) is function:
+                    found = cls, name
+    while found and (heirs := [sub for sub in type.__subclasses__(found[0]) if found[1] not in vars(sub)]):
+        found = heirs[-1], found[1]
+    return found
+
+
+class Solution:
+    """A function, a method, or a module of the reader's, ready to be called in a case.
+
+    Args:
+        function: what was given to the check.
+        takes_self: whether its first argument is an object, where that cannot be seen from a class.
+    """
+
+    def __init__(self, function: Function, takes_self: bool = False) -> None:
+        self._bound = getattr(function, "__self__", None) if inspect.ismethod(function) else None
+        self._function = plain = getattr(function, "__func__", function)
+        owner = None if self._bound is not None or not isinstance(plain, FunctionType) else owner_of(plain)
+        self._class = type(self._bound) if self._bound is not None else owner and owner[0]
+        if isinstance(self._bound, type):  # a class method
+            self._class = type(self._bound.__name__, (self._bound,), {})
+        static = owner is not None and isinstance(inspect.getattr_static(*owner), staticmethod)
+        named = takes_self and isinstance(plain, FunctionType) and _has_one_more(plain)
+        self._takes_self = self._bound is not None or (owner is not None and not static) or named
+        self._endless = set[int]()
+        """statements of the constructor that take too long here"""
+
+    def call(self, given: Mapping[str, Any], options: Mapping[str, Any], attributes: Mapping[str, Any]) -> Any:
+        """Call it with the arguments of a case; a method with an object that has options and attributes.
+
+        Raises:
+            Exception: what the solution raises.
+        """
+        if not self._takes_self:
+            args, named = arranged(self._function, given, options)
+            taken = {id(value) for value in [*args, *named.values()]}
+            with _constants(self._function, {name: each for name, each in options.items() if id(each) not in taken}):
+                return self._function(*args, **named)
+        args, named = arranged(partial(self._function, None), given, options, are_held=True)
+        taken = {id(value) for value in [*args, *named.values()]}
+        if not isinstance(attributes, Held):
+            options = {name: each for name, each in options.items() if id(each) not in taken}
+        return self._function(self._object(options, attributes), *args, **named)
+
+    def _object(self, options: Mapping[str, Any], attributes: Mapping[str, Any]) -> Any:
+        """An object of the class: after the reader's constructor, with what the course's sets."""
+        config = attributes.get("config")
+        held = {**attributes, **options, "device": torch.device("cpu")}
+        if config is not None:  # the course's trainer has numbers in its configuration alone
+            config.update(options)
+            held = {name: each for name, each in held.items() if not isinstance(each, int | float) or name == "n_envs"}
+        if not isinstance(attributes, Held):  # it is of no course: its own constructor sets what there is
+            held = {}
+        if self._class is None:
+            return SimpleNamespace(**held)
+        made, known = self._blank(), OwnSettings({**options, **(config or {})})
+        constructed = self._bound is None and self._construct(made, known)
+        for name, value in held.items():
+            if name != "config" or not constructed:
+                _set(made, name, value)
+        has_numbers = constructed and config is not None
+        for name, value in [*_members(made)]:
+            if name not in held and (mine := _in_place_of(name, value, known, attributes, has_numbers)) is not None:
+                _set(made, name, mine)
+        return made
+
+    def _construct(self, made: Any, config: Settings) -> bool:
+        """Run the reader's constructor, statement by statement: those that make environments cannot run here.
+
+        Returns:
+            Whether there is one.
+        """
+        function = inspect.unwrap(type(made).__init__)
+        known = {"config": config, "wandb_log": False, **config, "state_dim": 3, "num_actions": 2, "envs": None}
+        with suppress(Exception):
+            args, named = arranged(partial(function, made), {}, known)
+            bound = inspect.signature(function).bind(made, *args, **named)
+            bound.apply_defaults()
+            scope = {**function.__globals__, **bound.arguments, "super": partial(super, type(made), made)}
+            (definition,) = ast.parse(textwrap.dedent(inspect.getsource(function))).body
+            assert isinstance(definition, ast.FunctionDef)
+            for number, statement in enumerate(definition.body):
+                try:
+                    with limited(LIMIT / 3):
+                        if number not in self._endless:
+                            exec(compile(ast.Module([statement], []), inspect.getfile(function), "exec"), scope)
+                except TooLong:
+                    self._endless.add(number)
+                except (Exception, SystemExit):
+                    pass
+            return True
+        return False
+
+    def _blank(self) -> Any:
+        """What a method is called on, before anything is set: a copy, or an object that was not constructed."""
+        if isinstance(self._bound, type):
+            return self._class
+        if self._bound is not None:
+            made = copy.copy(self._bound)
+            vars(made).update({name: copy.copy(each) for name, each in vars(made).items() if isinstance(each, dict)})
+            return made
+        made: Any = object.__new__(self._class or object)
+        if isinstance(made, nn.Module):
+            nn.Module.__init__(made)
+        return made
+
+
+def bound(function: Function) -> Function:
+    """A function that stands in a class as a method of an object of it; any other as it is."""
+    solution = Solution(function)
+    if inspect.ismethod(function) or not solution._takes_self:
+        return function
+    return MethodType(function, solution._object({}, Held()))
+
+
+def _has_one_more(function: Function) -> bool:
+    """Whether the first parameter of a function that stands in no class is an object."""
+    first = next(iter(inspect.signature(function).parameters), "")
+    return first in ("self", "this", "me", "trainer", "agent", "ppo")
+
+
+def _set(made: Any, name: str, value: Any) -> None:
+    """Set an attribute where the class lets one; a property of its own stays."""
+    try:
+        setattr(made, name, value)
+    except Exception:
+        with suppress(Exception):
+            object.__setattr__(made, name, value)
+
+
+def _members(made: Any) -> Iterator[tuple[str, Any]]:
+    """The attributes of an object, modules and those of its class among them, without methods and private names."""
+    for cls in reversed((made if isinstance(made, type) else type(made)).__mro__):
+        yield from ((name, each) for name, each in vars(cls).items() if _is_setting(each) or name.lower() in SETTINGS)
+    yield from (getattr(made, "__dict__", {}) if not isinstance(made, type) else {}).items()
+    if isinstance(made, nn.Module):
+        yield from made.named_children()
+
+
+def _is_setting(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) > 1e-3
+
+
+def _fields(value: Any) -> dict[str, Any]:
+    """The values of a reader's own configuration."""
+    if isinstance(value, Mapping):
+        return dict(value)
+    if dataclasses.is_dataclass(value):
+        return {each.name: getattr(value, each.name) for each in dataclasses.fields(value)}
+    return dict(getattr(value, "__dict__", {}))
+
+
+def _in_place_of(
+    name: str, value: Any, known: OwnSettings, attributes: Mapping[str, Any], has_numbers: bool
+) -> Any | None:
+    """What a case has for an attribute of the reader's: a configuration, a number, a network; None if nothing."""
+    if name.lower() in SETTINGS:
+        return OwnSettings({**_fields(value), **known})
+    if isinstance(value, nn.Module):
+        layers = [module for module in value.modules() if isinstance(module, nn.Linear)]
+        ours = [other for other in attributes.values() if isinstance(other, nn.Linear)]
+        return next((other for other in ours if layers and layers[-1].out_features == other.out_features), None)
+    if _is_setting(value) and not has_numbers:
+        return known.get(name)
+    return None
+
+
+@contextmanager
+def _constants(function: Function, options: Mapping[str, Any]) -> Iterator[None]:
+    """The options in place of the constants of the reader's file that are called like them, such as GAMMA."""
+    names: dict[str, Any] = getattr(inspect.unwrap(function), "__globals__", {})
+    found = {name: value for name, value in names.items() if len(name) > 1 and not name.startswith("__")}
+    ours = {
+        name: options[known]
+        for name, value in found.items()
+        if _is_setting(value) and (known := standard(name, options))
+    }
+    for name, value in found.items():
+        if name.lower() in SETTINGS and options and not isinstance(value, type | FunctionType):
+            ours[name] = Settings({**_fields(value), **options})
+    before = {name: names[name] for name in ours}
+    names.update(ours)
+    try:
+        yield
+    finally:
+        names.update(before)
+
+
+# --- kinds of numbers ---
+
+
+def numbers(value: Any) -> Tensor | None:
+    """What a solution returned as a tensor, if it is one or can be made one: an array, a number, a list of them."""
+    if isinstance(value, Tensor):
+        return value.as_subclass(Tensor)
+    with suppress(Exception):
+        if isinstance(value, list | tuple) and value and isinstance(value[0], Tensor):
+            return torch.stack([torch.as_tensor(each) for each in value])
+        array = np.asarray(value)
+        return torch.from_numpy(array.copy()) if array.dtype.kind in "fiub" else None
+    return None
+
+
+def _as_given(value: Any) -> Any:
+    return value
+
+
+def _as_array(value: Any) -> Any:
+    return value.numpy() if isinstance(value, Tensor) else value
+
+
+KINDS: Sequence[tuple[str, Callable[[Any], Any]]] = (
+    ("", _as_given),
+    ("it takes arrays of NumPy alone", _as_array),
+)
+"""what a solution may want its arguments to be, and what is then said of it"""
+PARAMETERS: Sequence[tuple[str, Callable[[Any], Any]]] = (
+    # Iterators, which can be gone through once, since that is what `module.parameters()` returns.
+    ("", lambda value: iter(value) if isinstance(value, list) else value),
+    ("", _as_given),
+    ("", lambda value: nn.ParameterList(value) if isinstance(value, list) else value),
+)
+"""what a solution that moves parameters may want: an iterator, a list, or a module"""
+
+
+def plain(value: Any) -> Any:
+    """The same as tensors, numbers, text, lists and dictionaries; of any other object the name of its class."""
+    if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
+        return torch.tensor(value)
+    if isinstance(value, Tensor):
+        return value.detach().cpu().clone()
+    if isinstance(value, np.generic | np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, Mapping):
+        return {name if isinstance(name, int) else str(name): plain(part) for name, part in value.items()}
+    if isinstance(value, list | tuple | set):
+        return [plain(part) for part in value]
+    kinds = [kind for kind in (bool, int, float, str) if isinstance(value, kind)]
+    return value if value is None else kinds[0](value) if kinds else f"<{type(value).__name__}>"

@@ -1,0 +1,33 @@
+"""The checker's error rates over the zoo: no false alarm, few misses, most causes named. Training loops are long."""
+
+from collections import Counter  # noqa: I001
+
+import pytest
+
+import checker
+from lemniscate import course
+
+COUNT = Counter()
+"""over the exercises judged so far"""
+
+
+@pytest.mark.parametrize(
+    "exercise", [name if name != "train" else pytest.param(name, marks=pytest.mark.long) for name in course.EXERCISES]
+)
+def test_right_solutions_pass_and_wrong_ones_do_not(exercise, monkeypatch):
+    monkeypatch.setattr("lemniscate.course.exercise.LIMIT", 3.0)  # some of them never end
+    results = checker.zoo(exercise)
+    assert [each for each in results if "false alarm" in each.counts] == []
+    count = Counter(column for each in results for column in each.counts)
+    assert count["right"] >= 4
+    assert count["wrong"] >= 12
+    assert count["miss"] <= max(1, 0.04 * count["wrong"]), [each for each in results if "miss" in each.counts]
+    assert count["named"] >= 0.75 * (count["wrong"] - count["miss"])
+    COUNT.update(count)
+
+
+def test_over_all_exercises():
+    if COUNT["right"] < 200:
+        pytest.skip("only some of the exercises were judged")
+    assert COUNT["miss"] <= 0.02 * COUNT["wrong"]
+    assert COUNT["named"] >= 0.85 * (COUNT["wrong"] - COUNT["miss"])

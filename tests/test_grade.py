@@ -1,0 +1,342 @@
+"""`lemniscate grade`: hand-ins of all kinds, each tried in a process of its own; what is written; what is not done twice."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from types import ModuleType, SimpleNamespace
+
+import psutil
+import pytest
+from rich.cells import cell_len
+
+import hand_ins
+from lemniscate import course
+from lemniscate.cli import main
+from lemniscate.course import grading
+from lemniscate.system.files import filled
+
+SLOW = ("endless", "endless and deaf", "sleeps", "fills the memory")
+QUICK = [name for name in hand_ins.NASTY if name not in SLOW]
+COMMAND = [sys.executable, "-m", "lemniscate", "grade"]
+EIGHT = list(hand_ins.RIGHT)
+
+
+def contents(folder):
+    return {path: path.is_file() and path.read_bytes() for path in folder.rglob("*")}
+
+
+def marks(grades):
+    return {
+        record["hand_in"]: {
+            name: finding["right"] if finding["found"] else None for name, finding in record["exercises"].items()
+        }
+        for record in grades["hand_ins"]
+    }
+
+
+def sentence(graded, hand_in, exercise):
+    (record,) = (record for record in graded.grades["hand_ins"] if record["hand_in"] == hand_in)
+    return record["exercises"][exercise]["sentence"]
+
+
+def notes(graded, hand_in):
+    (record,) = (record for record in graded.grades["hand_ins"] if record["hand_in"] == hand_in)
+    return " ".join(record["notes"])
+
+
+def strays():
+    """Processes that a hand-in has started, and left."""
+    found = []
+    for process in psutil.process_iter(["cmdline"]):
+        found += [process.pid] if "time.sleep(987654)" in " ".join(process.info["cmdline"] or ()) else []
+    return found
+
+
+@pytest.fixture(scope="module")
+def graded(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("ex06 – Übung")
+    expected = hand_ins.write(folder, len(QUICK) + 6, QUICK)
+    before = contents(folder)
+    grades = course.grade(folder, EIGHT)
+    to = folder.with_name(f"{folder.name}-grades")
+    return SimpleNamespace(folder=folder, to=to, expected=expected, before=before, grades=grades)
+
+
+def test_every_hand_in_is_judged_as_it_should_be(graded):
+    assert marks(graded.grades) == graded.expected
+    assert graded.grades["exercises"] == [name for name in course.EXERCISES if name in EIGHT]
+
+
+def test_nothing_is_changed_beside_the_hand_ins_and_nothing_goes_on(graded):
+    assert contents(graded.folder) == graded.before
+    assert strays() == []
+
+
+SENTENCES = [
+    ("leaves in a function.py", "gae", "SystemExit"),
+    ("leaves at once in a function.py", "gae", "it ended the process (exit code 0)"),
+    ("segfault.py", "gae", "it crashed (SIGSEGV)"),
+    ("asks.py", "td_target", "EOFError"),
+    ("patches.py", "gae", "Likely: a value follows a death"),
+    ("missing package in use.py", "td_target", "the package nosuch is not installed here"),
+    (
+        "misspelt.py",
+        "calculate_pg_loss",
+        "there is no function or class calculate_pg_loss; did you mean calculate_pgloss?",
+    ),
+    ("syntax error.py", "gae", "there is no function or class gae."),
+]
+
+
+@pytest.mark.parametrize(("hand_in", "exercise", "words"), SENTENCES)
+def test_what_is_wrong_is_said_in_a_sentence(graded, hand_in, exercise, words):
+    assert words in sentence(graded, hand_in, exercise)
+
+
+NOTES = [
+    ("leaves at once.py", "While it was read, it ended the process (exit code 0)."),
+    ("leaves at import.py", "leaves at import.py, line 6: SystemExit: 0."),
+    ("endless import.py", "line 5: left out, since it did not end within 3 s."),
+    ("syntax error.py", "syntax error.py, line 17: SyntaxError"),
+    ("missing package.py", "line 6: the package nosuch is not installed here."),
+    ("trains.ipynb", "code cell 5 of trains.ipynb, line 1: SyntaxError"),
+    ("nothing", "There is no .py and no .ipynb file."),
+    ("library.py", "value_loss is lemniscate's own"),
+    ("no notebook.ipynb", "cannot be read"),
+]
+
+
+@pytest.mark.parametrize(("hand_in", "words"), NOTES)
+def test_what_cannot_be_read_is_noted_with_its_line(graded, hand_in, words):
+    assert words in notes(graded, hand_in)
+
+
+def test_what_is_printed_is_kept_in_part_and_reaches_nobody(graded, capfd):
+    (record,) = (record for record in graded.grades["hand_ins"] if record["hand_in"] == "prints megabytes.py")
+    assert record["printed"].startswith("lemniscate ")
+    assert len(record["printed"]) == 2_000
+    assert "lemniscate lemniscate" not in "".join(capfd.readouterr())
+
+
+def test_the_files_are_there_for_teachers_gradescope_and_students(graded):
+    assert json.loads((graded.to / "findings.json").read_text()) == graded.grades
+    for name, expected in graded.expected.items():
+        results = json.loads((graded.to / name / "results.json").read_text())
+        assert {test["name"]: (test["score"], test["max_score"], test["status"]) for test in results["tests"]} == {
+            exercise: (1.0, 1.0, "passed") if right else (0.0, 1.0, "failed") for exercise, right in expected.items()
+        }
+        assert all(test["output"] for test in results["tests"])
+        page = (graded.to / name / "page.html").read_text()
+        assert all(exercise in page for exercise in expected)
+        assert f"{sum(map(bool, expected.values()))} of 8 exercises are right." in page
+
+
+def test_the_test_file_for_otter_checks_in_the_notebook(graded, monkeypatch):
+    module = ModuleType("otter.test_files")
+    module.test_case = lambda: lambda function: function  # as Otter calls it: with the notebook's names as `env`
+    monkeypatch.setitem(sys.modules, "otter", ModuleType("otter"))
+    monkeypatch.setitem(sys.modules, "otter.test_files", module)
+    for exercise in EIGHT:
+        scope, right, wrong = {}, {}, {}
+        exec((graded.to / "otter" / f"{exercise}.py").read_text(), scope)
+        assert (scope["OK_FORMAT"], scope["name"], scope["points"]) == (False, exercise, 1)
+        test = scope[f"test_{exercise}"]
+        exec(hand_ins.IMPORTS + hand_ins.RIGHT[exercise], right)
+        test(right)
+        exec(hand_ins.IMPORTS + hand_ins.wrong(exercise), wrong)
+        with pytest.raises(AssertionError, match=r"\w+"):
+            test(wrong)
+        with pytest.raises(AssertionError, match="there is no function or class"):
+            test({})
+
+
+def stored(to):
+    return {path.parent.name: path.stat().st_mtime_ns for path in to.glob("*/record.json")}
+
+
+def test_what_has_not_changed_is_not_judged_again(graded, capsys):
+    before = stored(graded.to)
+    assert course.grade(graded.folder, EIGHT) == graded.grades
+    assert stored(graded.to) == before
+    capsys.readouterr()
+    (graded.folder / "twice.py").write_text(hand_ins.IMPORTS + hand_ins.wrong("gae"))
+    (graded.to / "shadows" / "record.json").write_text("{")
+    try:
+        assert main(["grade", str(graded.folder), "--exercises", ",".join(EIGHT), "--csv"]) == 0
+    finally:
+        (graded.folder / "twice.py").write_bytes(graded.before[graded.folder / "twice.py"])
+    after, (out, err) = stored(graded.to), capsys.readouterr()
+    assert {name for name in after if after[name] != before[name]} == {"twice.py", "shadows"}
+    header, *rows = out.splitlines()
+    assert header == f"hand_in,right,of,{','.join(graded.grades['exercises'])},notes"
+    assert "twice.py,0,8,0,,,,,,,," in rows
+    assert len(rows) == len(graded.expected)
+    assert "Each ran without a network." in err or "The network was refused by Python" in err
+
+
+def test_without_names_those_that_are_found_are_judged(tmp_path, capsys):
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / "a.py").write_text(hand_ins.IMPORTS + hand_ins.RIGHT["polyak"])
+    (tmp_path / "in" / "b.py").write_text(f"{hand_ins.IMPORTS}{hand_ins.PG}\nclass Agent:\n    def act(self): ...\n")
+    assert main(["grade", str(tmp_path / "in"), "--json", "--to", str(tmp_path / "out")]) == 0
+    out, err = capsys.readouterr()
+    assert marks(json.loads(out)) == {"a.py": {"polyak": True}, "b.py": {"calculate_pg_loss": True}}
+    rows = [line.split() for line in err.splitlines()]
+    assert ["a.py", "–", "✓", "1/2"] in rows
+    assert ["1", "✓", "0", "✗", "1", "–", "└", "calculate_pg_loss"] in rows
+
+
+SCRIPT = """
+import json, sys
+from pathlib import Path
+from lemniscate.course import handin
+reader = handin.Reader(Path(sys.argv[1]))
+reader.read()
+print(json.dumps([sorted(handin.solutions(reader, sys.argv[2:])), reader.notes]))
+"""
+
+
+def found_in(work, demanded=(), **files):
+    """The exercises that are found in a hand-in, and the notes on it."""
+    for name, text in files.items():
+        path = work / "hand-in" / name.replace("__", ".")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    done = subprocess.run([sys.executable, "-c", SCRIPT, work, *demanded], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def test_an_agent_and_a_train_of_another_course_are_not_meant(tmp_path):
+    """The skeleton's agent has other methods than the drone's; every module of torch has a `train`."""
+    from lemniscate.course import loop
+
+    other = "class Agent:\n    def learn(self): ...\n    def save_model(self, path): ...\n\ndef train(args): ...\n"
+    skeleton, mine = tmp_path / "skeleton", tmp_path / "mine"
+    assert found_in(skeleton, ppo__py=loop.solution("ppo"))[0] == ["clipped_surrogate", "gae", "train", "value_loss"]
+    assert found_in(mine, ddpg__py=other)[0] == []
+    assert found_in(mine, ["Agent", "train"])[0] == ["Agent", "train"]
+
+
+def test_a_name_in_two_files_is_that_of_the_last(tmp_path):
+    notebook = hand_ins.notebook("from utils import td_target\n", "def gae(): ...")
+    found, said = found_in(tmp_path, utils__py="def gae(): ...\ndef td_target(): ...\n", work__ipynb=notebook)
+    assert found == ["gae", "td_target"]
+    assert said == ["gae is defined in utils.py and work.ipynb; the one in work.ipynb counts."]
+
+
+def test_without_a_namespace_python_refuses_the_network(tmp_path):
+    (tmp_path / "hand-in").mkdir()
+    code = (
+        "import socket, sys; from pathlib import Path; from types import SimpleNamespace as S\n"
+        "from lemniscate.course import handin\n"
+        "handin.ctypes.CDLL = lambda name: S(prctl=print, unshare=lambda flags: -1)\n"
+        "assert handin._fenced(Path(sys.argv[1])) is False\n"
+        "try: socket.create_connection(('127.0.0.1', 9))\n"
+        "except OSError as error: assert 'no network' in str(error)\n"
+        "else: sys.exit(3)\n"
+    )
+    assert subprocess.run([sys.executable, "-c", code, tmp_path]).returncode == 0
+
+
+def test_a_script_needs_no_guard(tmp_path):
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / "a.py").write_text(hand_ins.IMPORTS + hand_ins.RIGHT["polyak"])
+    (tmp_path / "script.py").write_text("from lemniscate import course\nprint('once')\ncourse.grade('in')\n")
+    done = subprocess.run([sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0
+    assert done.stdout == "once\n"
+    assert ["a.py", "✓", "1/1"] in [line.split() for line in done.stderr.splitlines()]
+
+
+def wait_for(condition, seconds=120):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+
+
+@pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGKILL])
+def test_stopped_or_killed_it_goes_on(tmp_path, signum):
+    folder, to = tmp_path / "in", tmp_path / "in-grades"
+    folder.mkdir()
+    for number in range(3):
+        (folder / f"{number}.py").write_text(hand_ins.IMPORTS + hand_ins.RIGHT["polyak"])
+    endless = "import subprocess, sys, time\ndef gae(*a, **k):\n    open('/{}/mark', 'w')\n    time.sleep(987654)\n"
+    (folder / "z.py").write_text(endless.format(tmp_path))
+    process = subprocess.Popen([*COMMAND, folder], stderr=subprocess.PIPE, text=True, start_new_session=True)
+    wait_for(lambda: len(stored(to)) == 3 and (tmp_path / "mark").exists())
+    family = psutil.Process(process.pid).children(recursive=True)
+    process.send_signal(signum)
+    _, err = process.communicate(timeout=60)
+    if signum == signal.SIGINT:
+        assert process.returncode == 130
+        assert f"Go on with: lemniscate grade {folder}" in err
+    wait_for(lambda: not any(each.is_running() and each.status() != "zombie" for each in family), 30)
+    before = stored(to)
+    (folder / "z.py").write_text(hand_ins.IMPORTS + hand_ins.RIGHT["gae"])
+    assert subprocess.run([*COMMAND, folder], capture_output=True).returncode == 0
+    after = stored(to)
+    assert {name: after[name] for name in before} == before
+    assert "z.py" in after
+
+
+def test_mistakes_are_one_sentence(tmp_path, capsys):
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / "a.py").touch()
+    (tmp_path / "taken").touch()
+    said = []
+    for words in (
+        ["nowhere"],
+        ["empty"],
+        ["in", "--exercises", "gaee"],
+        ["in", "--to", str(tmp_path / "in" / "grades")],
+        ["in", "--to", str(tmp_path / "taken")],
+    ):
+        assert main(["grade", str(tmp_path / words[0]), *words[1:]]) == 2
+        said.append(capsys.readouterr().err.strip())
+    assert all(text and "\n" not in text.replace("1 of 1 hand-ins  0:00:00 left\n", "") for text in said)
+    for text, words in zip(
+        said, ("is no folder", "has no hand-in", "did you mean gae", "choose another --to", "taken"), strict=True
+    ):
+        assert words in text
+
+
+@pytest.mark.parametrize("columns", [80, 120])
+def test_the_table_fits_the_terminal(columns):
+    names = [*course.EXERCISES][:8]
+    finding = {"right": True, "found": True}
+    records = [
+        {
+            "hand_in": name,
+            "exercises": dict.fromkeys(names[: number % 9], finding),
+            "notes": ["Long. " * 30],
+            "without_network": True,
+        }
+        for number, name in enumerate(["李小龙" * 9, *(f"{name} {i:03}" for i in range(25) for name in hand_ins.NAMES)])
+    ]
+    grades = {"exercises": names, "hand_ins": records}
+    text = filled(grading.TEMPLATES / "grades.txt.j2", grading.FILTERS, **grades, columns=columns)
+    lines = text.splitlines()
+    assert max(map(cell_len, lines)) <= columns
+    assert [line.split("┌ ")[-1] for line in lines[:8]] == names
+    rows = lines[8:-9]
+    assert len(rows) == len(records)
+    first = {cell_len(row[: min(row.find(mark) for mark in "✓–" if mark in row)]) for row in rows}
+    assert len(first) == 1
+    assert lines[-2].split() == ["178", "✓", "0", "✗", "23", "–", "└", names[0]]
+
+
+@pytest.mark.long
+def test_two_hundred_hand_ins(tmp_path):
+    folder = tmp_path / "in"
+    folder.mkdir()
+    expected, begun = hand_ins.write(folder, 200), time.monotonic()
+    grades = course.grade(folder, EIGHT)
+    assert marks(grades) == expected
+    assert time.monotonic() - begun < 600 * max(1, 2 / len(os.sched_getaffinity(0)))
+    assert strays() == []

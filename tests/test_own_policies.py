@@ -1,0 +1,438 @@
+"""Policies that were not trained here, flown: functions, modules, objects, and files of weights."""
+
+from itertools import pairwise
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+import environments
+import lemniscate as lem
+from lemniscate.api import agents
+from lemniscate.cli import main
+from lemniscate.envs import registry
+from lemniscate.envs.conversion import flatten_observation, unflatten_observation
+from lemniscate.envs.spaces import observation_parts
+from lemniscate.run.config import RunConfig
+from test_flight import Aviary, Glider
+
+DRONE = "DroneFigureEightTrajectory-v0"
+WEIGHTS = torch.tensor([0.1, 0.0, 1.0, 0.0])
+
+
+@pytest.fixture(scope="module")
+def policy(tmp_path_factory):
+    path = tmp_path_factory.mktemp("own") / "run"
+    return lem.train("ppo", "CartPole-v1", run=path, progress=False, total_steps=256, compile="off").policy
+
+
+@pytest.fixture
+def unwritten(monkeypatch):
+    """Films are drawn, and not written: that takes time."""
+    monkeypatch.setattr("lemniscate.report.playback.save_frames", lambda frames, file, fps: [None for _ in frames])
+
+
+class Net(nn.Module):
+    """Two numbers for each observation of CartPole, of which the second is larger where WEIGHTS say so."""
+
+    def __init__(self):
+        super().__init__()
+        self.layer = nn.Linear(4, 2, bias=False)
+        self.layer.weight.data = torch.stack([0 * WEIGHTS, WEIGHTS])
+
+    def forward(self, obs):
+        return self.layer(obs)
+
+
+class Drawn(Net):
+    def forward(self, obs):
+        return torch.distributions.Categorical(logits=self.layer(obs))
+
+
+class Course(Net):
+    """As the drone course's agent: no forward; several things beside the action, in a batch alone."""
+
+    forward = nn.Module.forward
+
+    def action_and_value(self, x, action=None, deterministic=False):
+        found = torch.distributions.Categorical(logits=self.layer(x))
+        action = found.mode if deterministic else found.sample()
+        return action, found.log_prob(action), found.entropy(), x.sum(1)
+
+
+class Dropping(Net):
+    """Wrong unless it is in evaluation mode."""
+
+    def forward(self, obs):
+        return nn.functional.dropout(self.layer(obs), 0.9, training=self.training)
+
+
+class Model:
+    """As a model of Stable-Baselines3."""
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        assert deterministic
+        return (np.asarray(observation) @ WEIGHTS.numpy() > 0).astype(np.int64), state
+
+
+def one(obs):
+    return int(obs @ WEIGHTS.numpy() > 0)
+
+
+SAME = {
+    "one observation": one,
+    "a method": Model().predict,
+    "an object": Model(),
+    "a batch": lambda obs: [int(row[0] * 0.1 + row[2] > 0) for row in obs],
+    "tensors": lambda obs: (torch.mv(obs, WEIGHTS) > 0).long().unsqueeze(-1),
+    "one tensor": lambda obs: torch.dot(obs, WEIGHTS) > 0,
+    "float64": lambda obs: int(torch.as_tensor(obs) @ WEIGHTS.double() > 0),
+    "numbers for each action": Net(),
+    "a module in float64": Net().double(),
+    "a module in training mode": Dropping(),
+    "a distribution": Drawn(),
+    "an agent of the course": Course(),
+    "the name": "test_own_policies:one",
+    "the name of a class with arguments": "test_own_policies:Model()",
+}
+
+
+def test_policies_of_every_form_are_the_same_policy():
+    """All of them play from the same starts, as one of ours does: those of the backend that the id has by default."""
+    how = {"env": "CartPole-v1", "episodes": 3, "seed": 7}
+    expected = lem.evaluate(one, **how)
+    assert len(set(expected.returns)) > 1
+    for name, given in SAME.items():
+        assert lem.evaluate(given, **how) == expected, name
+    assert SAME["a module in training mode"].training
+
+
+def test_ours_as_a_function_has_the_returns_of_ours(policy):
+    """Also from the 17th episode on, which only parallel environments that go on can begin alike."""
+    how = {"env": "CartPole-v1", "episodes": 20, "seed": 7}
+    expected = lem.evaluate(policy, **how)
+    assert lem.evaluate(policy.act, **how) == expected
+    assert lem.evaluate(lambda obs: policy.act(obs), **how) == expected
+
+
+@pytest.mark.parametrize("kind", ["box", "discrete", "multi-discrete", "multi-binary", "tuple", "image"])
+def test_observations_of_every_space_come_as_the_environment_returns_them(kind):
+    """A film's single environment and parallel ones: what is seen is copied, in the units of the actions."""
+
+    def copied(obs):
+        if kind == "box":
+            return np.array([[1], [0.5]]) + np.array([[2], [0.5]]) * obs
+        if kind == "multi-discrete":
+            return obs + np.array([1, 0])
+        if kind == "image":
+            assert obs.dtype == np.uint8
+            return int(obs[0, 6, 1] > 0)
+        return {"discrete": lambda: obs - 6, "multi-binary": lambda: obs, "tuple": lambda: obs[0]}[kind]()
+
+    def make():
+        return environments.Copy(kind)
+
+    scores = lem.evaluate(copied, env=make, episodes=2)
+    assert scores.returns == pytest.approx([8, 8], abs=1e-4)
+
+
+@pytest.mark.parametrize("space", [*(seen for seen, _ in environments.KINDS.values()),
+                                   gym.spaces.Box(0, 255, (3, 20, 24), np.uint8)], ids=str)  # fmt: skip
+def test_flat_observations_have_their_structure_again(space):
+    space.seed(0)
+    batch = gym.vector.utils.concatenate(
+        space, [space.sample() for _ in range(3)], gym.vector.utils.create_empty_array(space, 3)
+    )
+    parts = observation_parts(space, "x")
+    again = unflatten_observation(parts, flatten_observation(parts, batch))
+    flat = flatten_observation(parts, again)
+    np.testing.assert_array_equal(flat, flatten_observation(parts, batch))
+    assert type(again) is type(batch)
+
+
+class Summing:
+    """A controller that remembers: it sums up what it sees."""
+
+    def __init__(self):
+        self.sum = 0.0
+
+    def act(self, obs):
+        self.sum = 0.9 * self.sum + float(obs[2])
+        return int(obs[2] + 0.5 * obs[3] + 0.1 * self.sum > 0)
+
+
+def test_what_remembers_plays_in_one_environment_at_a_time(capsys):
+    seen = []
+
+    def remembering(obs):
+        seen.append(np.asarray(obs))
+        return len(seen) % 2
+
+    how = {"env": "CartPole-v1", "episodes": 4, "seed": 7}
+    lem.evaluate(remembering, **how)
+    steps = np.array(seen[6:])[:, [0, 1]]  # positions follow from speeds within an episode
+    assert np.mean(np.abs(np.diff(steps[:, 0]) - 0.02 * steps[:-1, 1]) < 1e-5) > 0.8
+    assert capsys.readouterr().err.count("one environment at a time") == 1
+    lem.evaluate(Summing(), **how)
+    assert "one environment at a time" in capsys.readouterr().err
+    lem.evaluate(lambda obs: np.random.randint(2), **how)  # noqa: NPY002
+    assert capsys.readouterr().err == ""
+
+
+def test_one_environment_begins_where_the_first_of_many_do():
+    class Start(gym.Env):
+        observation_space, action_space = gym.spaces.Box(-1, 1, (1,)), gym.spaces.Discrete(2)
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            self.start = self.np_random.uniform()
+            return np.zeros(1, np.float32), {}
+
+        def step(self, action):
+            return np.zeros(1, np.float32), self.start, True, False, {}
+
+    many = registry.make(Start, 4)
+    expected = list(
+        agents.evaluate(agents.Agent(lambda obs: np.zeros(len(obs), int), many.spec, True, False), many, 4, 5).returns
+    )
+    assert lem.evaluate(lambda obs: 0, env=Start, episodes=4, seed=5).returns == expected
+
+
+def test_draws_come_from_the_seed_and_the_callers_generators_stay_as_they_were():
+    how = {"env": "CartPole-v1", "episodes": 3, "deterministic": False}
+    net, before = Drawn(), torch.get_rng_state()
+    drawn = [lem.evaluate(net, **how, seed=seed).returns for seed in (1, 1, 2)]
+    assert drawn[0] == drawn[1] != drawn[2]
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_actions_can_be_normalized():
+    how = {"env": "Pendulum-v1", "episodes": 1}
+    expected = lem.evaluate(lambda obs: 2.0 * obs[1], **how)
+    assert lem.evaluate(lambda obs: obs[1:2], **how, normalized_actions=True) == expected
+    assert lem.evaluate(lambda obs: obs[1:2], **how).returns != expected.returns
+
+
+class Recurrent:
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        return np.zeros(len(observation), np.int64), (np.zeros(3),)
+
+
+def two(obs, info):
+    return 0
+
+
+WRONG = {
+    "a class": (Net, "Net is a class: give an object of it"),
+    "a class by name": ("test_own_policies:Net", "Net is a class"),
+    "a number": (3, "A policy is a run, a function, a torch module, or an object with act, predict, .*; not 3"),
+    "two arguments": (two, "takes one observation; a function does not"),
+    "our module": (None, "acts in .* give the policy that it is of"),
+    "another size": (
+        nn.Linear(17, 2),
+        r"raised RuntimeError.*3x4 and 17x2.*CartPole-v1 observes 4 numbers, obs \(4,\)",
+    ),
+    "other actions": (nn.Linear(4, 3), r"takes actions of Discrete\(2\), not an array of shape \(3, 3\)"),
+    "NaN": (lambda obs: np.nan, r"Discrete\(2\), not nan"),
+    "NaN later": (lambda obs: np.full(len(obs), 0 if abs(obs[0][2]) < 0.06 else np.nan), "with a number that is nan"),
+    "no number": (lambda obs: "left", "not 'left'"),
+    "nothing": (lambda obs: None, "not None"),
+    "an error": (lambda obs: 1 // 0, r"raised ZeroDivisionError \(test_own_policies.py, line \d+\): integer div"),
+    "a state": (Recurrent(), "predict returns a state too"),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_what_cannot_act_is_refused_in_a_sentence(name, policy):
+    given, said = WRONG[name]
+    with pytest.raises(lem.UserError, match=said):
+        lem.evaluate(policy.module if given is None else given, env="CartPole-v1", episodes=1)
+
+
+def test_nothing_is_drawn_from_numbers_that_may_be_values():
+    with pytest.raises(lem.UserError, match="a number for each action, from which none is drawn"):
+        lem.evaluate(Net(), env="CartPole-v1", episodes=1, deterministic=False)
+
+
+# Files of weights.
+
+
+def layout(sizes, name="actor_mean"):
+    """A state_dict of linear layers in a Sequential with activations between them."""
+    torch.manual_seed(0)
+    layers = [nn.Linear(*pair) for pair in pairwise(sizes)]
+    named = ((f"{name}.{2 * i}", layer) for i, layer in enumerate(layers))
+    return {f"{key}.{part}": value for key, layer in named for part, value in layer.state_dict().items()}
+
+
+class Agent(nn.Module):
+    """The drone course's, with other widths."""
+
+    def __init__(self, envs):
+        super().__init__()
+        inputs, outputs = (np.prod(space.shape) for space in (envs.single_observation_space, envs.single_action_space))
+        self.actor_mean = nn.Sequential(
+            nn.Linear(inputs, 9), nn.Tanh(), nn.Linear(9, 5), nn.Tanh(), nn.Linear(5, outputs)
+        )
+        self.actor_logstd = nn.Parameter(torch.zeros(1, outputs))
+
+    def action_and_value(self, x, action=None, deterministic=False):
+        mean = self.actor_mean(x)
+        assert deterministic
+        return mean, mean.sum(1), mean.sum(1), mean[:, 0]
+
+
+class Actor(nn.Module):
+    """The DDPG notebook's: the shapes of its buffers are of all environments."""
+
+    def __init__(self, env):
+        super().__init__()
+        self.fc1, self.fc2, self.fc_mu = nn.Linear(3, 8), nn.Linear(8, 8), nn.Linear(8, 1)
+        self.register_buffer("action_scale", torch.tensor((env.action_space.high - env.action_space.low) / 2))
+        self.register_buffer("action_bias", torch.tensor((env.action_space.high + env.action_space.low) / 2))
+
+    def forward(self, x):
+        x = self.fc_mu(self.fc2(self.fc1(x).relu()).relu())
+        return x.tanh() * self.action_scale + self.action_bias
+
+
+@pytest.fixture
+def files(tmp_path, monkeypatch):
+    """A file of each kind for the pendulum."""
+    monkeypatch.chdir(tmp_path)
+    envs = gym.make_vec("Pendulum-v1", 1)
+    weights = {**layout((3, 9, 5, 1)), **layout((3, 64, 1), "critic"), "actor_logstd": torch.zeros(1, 1)}
+    weights["actor_mean.4.weight"] *= 3
+    moments = {"obs_mean": torch.tensor([0.2, -0.1, 1.0]).double(), "obs_var": np.array([0.5, 0.4, 9.0])}
+    torch.save({"model_state_dict": weights, "optim_state_dict": {}, **moments, "obs_count": 9.0}, "course.pt")
+    own = {name: weight for name, weight in weights.items() if "critic" not in name}
+    torch.save({"model_state_dict": own, **moments}, "agent.pt")
+    torch.save(own, "plain.pth")
+    torch.manual_seed(1)
+    actor = Actor(envs)
+    torch.save(actor.state_dict(), "actor.pt")
+    mean, std = moments["obs_mean"].numpy(), np.sqrt(moments["obs_var"] + 1e-8)
+
+    def course(obs, normalized=True):
+        x = torch.as_tensor((obs - mean) / std if normalized else obs).float()
+        for i in (0, 2):
+            x = (weights[f"actor_mean.{i}.weight"] @ x + weights[f"actor_mean.{i}.bias"]).tanh()
+        return (weights["actor_mean.4.weight"] @ x + weights["actor_mean.4.bias"]).numpy()
+
+    return {"course.pt": course, "agent.pt": course, "plain.pth": lambda obs: course(obs, False), "actor.pt": actor}
+
+
+def test_a_file_flies_as_the_agent_that_it_is_of_behind_its_normalizer(files, capsys):
+    how = {"env": "Pendulum-v1", "episodes": 2, "normalized_actions": False}
+    expected = {name: lem.evaluate(agent, **how).returns for name, agent in files.items()}
+    assert expected["course.pt"] != expected["plain.pth"]
+    for name in files:
+        assert lem.evaluate(name, **how).returns == pytest.approx(expected[name], rel=1e-5), name
+    assert (
+        "course.pt: with obs_mean and obs_var, 3-9-5-1; actions are in the environment's units"
+        in capsys.readouterr().err
+    )
+    assert lem.evaluate("agent.pt", **how, agent=Agent).returns == pytest.approx(expected["agent.pt"], rel=1e-5)
+    assert lem.evaluate("actor.pt", **how, agent="test_own_policies:Actor").returns == pytest.approx(
+        expected["actor.pt"], rel=1e-5
+    )
+
+
+def test_the_units_of_a_file_are_what_is_worth_more_which_is_said(files, capsys):
+    how = {"env": "Pendulum-v1", "episodes": 2}
+    both = [lem.evaluate("course.pt", **how, normalized_actions=given).mean_return for given in (False, True)]
+    capsys.readouterr()
+    assert lem.evaluate("course.pt", **how).mean_return == max(both)
+    said = capsys.readouterr().err
+    assert f"worth {max(both):.1f} and not {min(both):.1f}" in said
+    assert "--[no-]normalized-actions" in said
+
+
+def test_a_file_that_does_not_fit_is_refused_in_a_sentence(files, tmp_path):
+    def refused(contents, said, **how):
+        torch.save(contents, tmp_path / "x.pt")
+        with pytest.raises(lem.UserError, match=said):
+            lem.evaluate(tmp_path / "x.pt", **{"env": "Pendulum-v1", **how})
+
+    refused(layout((5, 4, 1)), "x.pt is for 5 observed numbers; Pendulum-v1 observes 3 numbers")
+    refused(
+        {"model_state_dict": layout((3, 4, 1)), "obs_mean": torch.zeros(4), "obs_var": torch.ones(4)}, "for 4 observed"
+    )
+    refused({"model_state_dict": layout((3, 4, 1)), "obs_mean": torch.zeros(3)}, "one of obs_mean and obs_var")
+    refused(layout((3, 4, 2)), "x.pt is for 2 numbers of an action; Pendulum-v1 takes 1")
+    refused(nn.Linear(3, 1).state_dict(), "another layout .*agent=Agent in Python, --agent module:Agent")
+    refused(
+        nn.Linear(3, 1).state_dict(),
+        r"does not fit Linear: weight is \[1, 3\] there and \[1, 2\] here",
+        agent=nn.Linear(2, 1),
+    )
+    refused(nn.Linear(3, 1).state_dict(), "cannot be made .* agent=lambda envs: ", agent=nn.Linear)
+    refused(nn.Linear(3, 1), "cannot be read without running what it holds; save weights alone: torch.save")
+    refused({"epoch": 3}, "has no weights")
+    (tmp_path / "x.pt").write_text("weights")
+    with pytest.raises(lem.UserError, match="cannot be read"):
+        lem.evaluate(tmp_path / "x.pt", env="Pendulum-v1")
+    with pytest.raises(lem.UserError, match=r"absent\.pt does not exist"):
+        lem.evaluate("absent.pt", env="Pendulum-v1")
+    with pytest.raises(lem.UserError, match="named with it, such as env="):
+        lem.evaluate("course.pt")
+
+
+def test_a_file_is_no_folder_of_ours_and_the_other_way_round(files, policy, tmp_path):
+    with pytest.raises(lem.UserError, match=r"lem\.evaluate\('course\.pt', env=…\)"):
+        lem.load("course.pt")
+    for ending in ("pt", "pth", "zip", "safetensors"):
+        with pytest.raises(lem.UserError, match=r"the name of a file, .*lem\.save\(policy, '.*new'\)"):
+            lem.save(policy, tmp_path / f"new.{ending}")
+    assert not list(tmp_path.glob("new*"))
+
+
+def test_the_command_line_flies_a_file_and_what_a_module_has(files, unwritten, capsys):
+    assert (
+        main(["evaluate", "course.pt", "--env", "Pendulum-v1", "--episodes", "1", "--no-normalized-actions", "--json"])
+        == 0
+    )
+    assert '"env_id": "Pendulum-v1"' in capsys.readouterr().out
+    assert main(["watch", "test_own_policies:one", "--env", "CartPole-v1", "--video", "film.gif"]) == 0
+    assert "Recorded in film.gif" in capsys.readouterr().err
+    assert (
+        main(["evaluate", "agent.pt", "--env", "Pendulum-v1", "--episodes", "1", "--agent", "test_own_policies:Agent"])
+        == 0
+    )
+
+
+def test_a_report_of_an_evaluation_has_film_and_scores(tmp_path):
+    lem.evaluate(one, env="CartPole-v1", episodes=8, report=tmp_path / "page")
+    page = (tmp_path / "page" / "plots" / "report.html").read_text()
+    assert "in CartPole-v1" in page
+    assert "data:image/gif" in page
+    assert "8, seed 0" in page
+
+
+def test_flights_are_drawn_as_those_of_ours(tmp_path, unwritten, monkeypatch):
+    """What has a scene is flown by parallel environments, with path and error in pictures."""
+    monkeypatch.setattr("lemniscate.report.flight._frames", lambda tracks, model: ([], "Drawn."))
+    how = {"env": Glider, "backend": "test_flight:Aviary"}
+    scores = lem.evaluate(lambda obs: 0, **how, episodes=3, report=tmp_path)
+    assert scores.episodes == 3
+    assert {file.name for file in (tmp_path / "plots").iterdir()} == {"flight.png", "error.png", "report.html"}
+    assert "data:image/png" in (tmp_path / "plots" / "report.html").read_text()
+    assert Aviary.open == 0
+
+
+def test_a_function_flies_the_drone_from_a_dictionary_or_from_numbers(unwritten, monkeypatch):
+    pytest.importorskip("crazyflow")
+    monkeypatch.setattr("lemniscate.presets.choose", lambda *_: ("small", RunConfig(num_envs=4)))
+    how = {"env": DRONE, "episodes": 2, "env_kwargs": {"max_episode_time": 1.0}}
+    flown = [
+        lem.evaluate(policy, **how)
+        for policy in (
+            lambda obs: [0, 0, 0, 0.32 - 0.1 * obs["vel"][2]],
+            lambda obs: [0, 0, 0, 0.32 - 0.1 * obs[9]],
+            lambda obs: torch.stack([*[torch.zeros(len(obs))] * 3, 0.32 - 0.1 * obs[:, 9]], dim=1),
+        )
+    ]
+    assert flown[0].measures["rmse_mm"] > 0
+    assert flown[0].returns == flown[1].returns == flown[2].returns
