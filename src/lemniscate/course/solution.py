@@ -286,7 +286,9 @@ def owner_of(function: Function) -> tuple[type, str] | None:
         below = set(type.__subclasses__(waiting.pop())) - seen
         seen |= below
         waiting += below
-        for cls in below if is_wrapper else (cls for cls in below if cls.__module__ == function.__module__):
+        for cls in (
+            below if is_wrapper else (cls for cls in below if getattr(cls, "__module__", "") == function.__module__)
+        ):
             for name, held in list(vars(cls).items()):
                 if held is function or getattr(held, "__func__", None) is function:
                     found = cls, name
