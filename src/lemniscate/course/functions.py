@@ -90,7 +90,10 @@ def _early(flags: Tensor) -> Tensor:
 
 def _sums(reward: Tensor, done: Tensor, gamma: float) -> Tensor:
     """The discounted rewards of each episode from row t on."""
-    return reward_to_go(reward, torch.zeros_like(reward), done, done, gamma=gamma)
+    sums, follows = torch.zeros_like(gamma * reward), 0.0 * reward[0]
+    for t in reversed(range(len(reward))):
+        sums[t] = follows = reward[t] + gamma * follows * ~done[t]
+    return sums
 
 
 def _entropy(scores: Tensor) -> Tensor:
