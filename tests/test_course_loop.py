@@ -49,7 +49,7 @@ MISTAKES = {
     "broadcast V": ([("agent.value(x), goal", "agent.value(x)[:, None], goal")], "the mean of all targets"),
     "V's sign": ([("return 0.5 * (value", "return -0.5 * (value")], "the sign of the critic's loss is turned"),
     "no V": ([("value_loss(agent.value(x)", "value_loss(agent.value(x).detach()")], "the last layer of the critic never"),
-    "target": ([("return advantage, advantage + value", "return advantage, advantage")], "V is not added to the target"),
+    "target": ([("return advantage, advantage + value", "return advantage, advantage")], "V(s) is not added to the target"),
     "target, normalized": ([(COLUMNS, f"{COLUMNS}; goal = goal - columns[2].mean()")], "what moves V is off by a constant"),
     "zero_grad": ([("            optimizer.zero_grad()\n", "")], "zero_grad is missing"),
     "zero_grad, late": ([("optimizer.step()", "optimizer.zero_grad(); optimizer.step()")], "set to zero between backward and"),
