@@ -1,7 +1,8 @@
 """The zoo of solutions: `tests/zoo/<exercise>.<hand>.py` are plain text with many modules in each.
 
 A solution begins with a line `# === right: <title>` or `# === wrong: <cause> | <regular expression>`, and goes on to
-the next such line. The expression is what a sentence that names the cause matches, whatever its case.
+the next such line. The expression is what a sentence that names the cause matches, whatever its case. A solution that
+differs from the last one that is written out in a few lines has those alone: `# --- instead of`, `# --- here`.
 """
 
 import linecache
@@ -13,6 +14,7 @@ from typing import Any, NamedTuple
 
 ZOO = Path(__file__).parent / "zoo"
 HEAD = re.compile(r"^# === (right|wrong): (.*?)(?: \| (.*))?$", re.MULTILINE)
+EDIT = re.compile(r"^# --- instead of\n(.*?)^# --- here\n(.*?)(?=^# --- instead of\n|\Z)", re.MULTILINE | re.DOTALL)
 WHERE = re.compile(r"^# solution: (\S+)", re.MULTILINE)
 
 
@@ -31,9 +33,16 @@ def load(path: Path) -> list[Solution]:
     text, exercise = path.read_text(), path.name.split(".")[0]
     heads = list(HEAD.finditer(text))
     ends = [head.start() for head in heads[1:]] + [len(text)]
-    solutions = []
+    solutions, whole = [], ""
     for head, end in zip(heads, ends, strict=True):
         code = text[head.end() : end].strip("\n") + "\n"
+        if edits := EDIT.findall(code):
+            code = whole
+            for old, new in edits:
+                assert code.count(old) == 1, (path.name, head[2], old)
+                code = code.replace(old, new)
+        else:
+            whole = code
         where = WHERE.search(code)
         solutions.append(Solution(head[1], head[2], head[3] or "", code, where[1] if where else exercise))
     return solutions

@@ -16,39 +16,17 @@ class QNetwork(nn.Module):
         return self.both(torch.hstack((self.states(state), action)))
 
 # === wrong: the observation's branch is forgotten in the forward pass of the second layer | state|observation|obs|unused
-import torch
-from torch import nn
-
-
-class QNetwork(nn.Module):
-    """Lillicrap et al.: the action is not included until the second hidden layer."""
-
-    def __init__(self, env):
-        super().__init__()
-        s, a = env.single_observation_space.shape[0], env.single_action_space.shape[0]
-        self.states = nn.Sequential(nn.Linear(s, 400), nn.ReLU())
-        self.both = nn.Sequential(nn.Linear(400 + a, 300), nn.ReLU(), nn.Linear(300, 1))
-
-    def forward(self, state, action):
+# --- instead of
+        return self.both(torch.hstack((self.states(state), action)))
+# --- here
         features = torch.zeros(len(state), 400)
         return self.both(torch.hstack((features, action)))
 
 # === wrong: the arguments come in the order action, state | order|exchang|swap|shape|argument|error|state
-import torch
-from torch import nn
-
-
-class QNetwork(nn.Module):
-    """Lillicrap et al.: the action is not included until the second hidden layer."""
-
-    def __init__(self, env):
-        super().__init__()
-        s, a = env.single_observation_space.shape[0], env.single_action_space.shape[0]
-        self.states = nn.Sequential(nn.Linear(s, 400), nn.ReLU())
-        self.both = nn.Sequential(nn.Linear(400 + a, 300), nn.ReLU(), nn.Linear(300, 1))
-
+# --- instead of
+    def forward(self, state, action):
+# --- here
     def forward(self, action, state):
-        return self.both(torch.hstack((self.states(state), action)))
 
 # === right: two linear maps that are added: W_s s + W_a a, squeezed nowhere
 import math
@@ -72,66 +50,21 @@ class QNetwork(nn.Module):
         return self.out(h)
 
 # === wrong: the action's branch is made but not added | action
-import math
-
-import torch.nn.functional as F
-from torch import nn
-
-
-class QNetwork(nn.Module):
-    def __init__(self, envs, width=128):
-        super().__init__()
-        self.from_obs = nn.Linear(math.prod(envs.single_observation_space.shape), width)
-        self.from_act = nn.Linear(math.prod(envs.single_action_space.shape), width, bias=False)
-        self.hidden = nn.ModuleList([nn.Linear(width, width) for _ in range(2)])
-        self.out = nn.Linear(width, 1)
-
-    def forward(self, obs, act):
+# --- instead of
+        h = F.silu(self.from_obs(obs.flatten(1)) + self.from_act(act.flatten(1)))
+# --- here
         h = F.silu(self.from_obs(obs.flatten(1)))
-        for layer in self.hidden:
-            h = F.silu(layer(h)) + h
-        return self.out(h)
 
 # === wrong: the action is detached: no gradient for the actor's loss | detach|grad|action|graph
-import math
-
-import torch.nn.functional as F
-from torch import nn
-
-
-class QNetwork(nn.Module):
-    def __init__(self, envs, width=128):
-        super().__init__()
-        self.from_obs = nn.Linear(math.prod(envs.single_observation_space.shape), width)
-        self.from_act = nn.Linear(math.prod(envs.single_action_space.shape), width, bias=False)
-        self.hidden = nn.ModuleList([nn.Linear(width, width) for _ in range(2)])
-        self.out = nn.Linear(width, 1)
-
-    def forward(self, obs, act):
+# --- instead of
+        h = F.silu(self.from_obs(obs.flatten(1)) + self.from_act(act.flatten(1)))
+# --- here
         h = F.silu(self.from_obs(obs.flatten(1)) + self.from_act(act.detach().flatten(1)))
-        for layer in self.hidden:
-            h = F.silu(layer(h)) + h
-        return self.out(h)
 
 # === wrong: the sum over the batch stands in the network | sum|batch|shape|row|\[B, 1\]
-import math
-
-import torch.nn.functional as F
-from torch import nn
-
-
-class QNetwork(nn.Module):
-    def __init__(self, envs, width=128):
-        super().__init__()
-        self.from_obs = nn.Linear(math.prod(envs.single_observation_space.shape), width)
-        self.from_act = nn.Linear(math.prod(envs.single_action_space.shape), width, bias=False)
-        self.hidden = nn.ModuleList([nn.Linear(width, width) for _ in range(2)])
-        self.out = nn.Linear(width, 1)
-
-    def forward(self, obs, act):
-        h = F.silu(self.from_obs(obs.flatten(1)) + self.from_act(act.flatten(1)))
-        for layer in self.hidden:
-            h = F.silu(layer(h)) + h
+# --- instead of
+        return self.out(h)
+# --- here
         return self.out(h).sum(0)
 
 # === right: an ensemble's member: a function that builds the layers, LayerNorm, orthogonal weights
@@ -161,58 +94,18 @@ class QNetwork(nn.Module):
         return self.q(torch.cat(state_action, dim=-1))
 
 # === wrong: a softmax at the end | softmax|one|constant|last|end|depend|same
-import gymnasium as gym
-import torch
-from torch import nn
-
-
-def build(sizes):
-    modules = []
-    for i, o in zip(sizes, sizes[1:-1]):
-        modules += [nn.Linear(i, o), nn.LayerNorm(o), nn.ReLU()]
-    modules.append(nn.Linear(sizes[-2], sizes[-1]))
-    for m in modules:
-        if isinstance(m, nn.Linear):
-            nn.init.orthogonal_(m.weight)
-    return nn.Sequential(*modules)
-
-
-class QNetwork(nn.Module):
-    def __init__(self, env, hidden=(256, 256), n_out=1):
-        super().__init__()
-        size = gym.spaces.flatdim(env.single_observation_space) + gym.spaces.flatdim(env.single_action_space)
-        self.q = build([size, *hidden, n_out])
-
-    def forward(self, *state_action):
+# --- instead of
+        return self.q(torch.cat(state_action, dim=-1))
+# --- here
         return torch.softmax(self.q(torch.cat(state_action, dim=-1)), dim=-1)
 
 # === wrong: the weights of the last layer are zero and frozen | parameter|train|frozen|requires_grad|zero|constant|depend
-import gymnasium as gym
-import torch
-from torch import nn
-
-
-def build(sizes):
-    modules = []
-    for i, o in zip(sizes, sizes[1:-1]):
-        modules += [nn.Linear(i, o), nn.LayerNorm(o), nn.ReLU()]
-    modules.append(nn.Linear(sizes[-2], sizes[-1]))
-    for m in modules:
-        if isinstance(m, nn.Linear):
-            nn.init.orthogonal_(m.weight)
-    return nn.Sequential(*modules)
-
-
-class QNetwork(nn.Module):
-    def __init__(self, env, hidden=(256, 256), n_out=1):
-        super().__init__()
-        size = gym.spaces.flatdim(env.single_observation_space) + gym.spaces.flatdim(env.single_action_space)
+# --- instead of
+        self.q = build([size, *hidden, n_out])
+# --- here
         self.q = build([size, *hidden, n_out])
         nn.init.zeros_(self.q[-1].weight)
         self.q.requires_grad_(False)
-
-    def forward(self, *state_action):
-        return self.q(torch.cat(state_action, dim=-1))
 
 # === right: subclass of a general MLP class, einsum in place of Linear
 import torch

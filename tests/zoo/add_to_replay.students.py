@@ -51,14 +51,9 @@ def add_to_replay(rb, obs, actions, next_obs, rewards, terminations, truncations
     rb.add(obs, actions, real_next_obs, rewards, terminations, infos)
 
 # === wrong: the copy is corrected, but next_obs is stored | final_obs|next_obs|successor|copy|true|next episode
-import numpy as np
-
-
-def add_to_replay(rb, obs, actions, next_obs, rewards, terminations, truncations, infos):
-    real_next_obs = next_obs.copy()
-    for idx, over in enumerate(np.logical_or(terminations, truncations)):
-        if over:
-            real_next_obs[idx] = infos["final_obs"][idx]
+# --- instead of
+    rb.add(obs, actions, real_next_obs, rewards, terminations, infos)
+# --- here
     rb.add(obs, next_obs, actions, rewards, terminations, infos)
 
 # === wrong: no copy: next_obs, from which the loop goes on, is overwritten | copy|overwr|chang|next_obs|alias|in place
@@ -84,14 +79,9 @@ def add_to_replay(rb, obs, actions, next_obs, rewards, terminations, truncations
     rb.add(obs, real_next_obs, actions, rewards, truncations, infos)
 
 # === wrong: the successor is missing: obs in both places | successor|next_obs|obs|both|twice
-import numpy as np
-
-
-def add_to_replay(rb, obs, actions, next_obs, rewards, terminations, truncations, infos):
-    real_next_obs = next_obs.copy()
-    for idx, over in enumerate(np.logical_or(terminations, truncations)):
-        if over:
-            real_next_obs[idx] = infos["final_obs"][idx]
+# --- instead of
+    rb.add(obs, real_next_obs, actions, rewards, truncations, infos)
+# --- here
     rb.add(obs, obs, actions, rewards, terminations, infos)
 
 # === wrong: nothing is stored when any episode has ended | add|stored|lost|ended|end|row|miss|skip|final|never
@@ -183,36 +173,21 @@ def add_to_replay(rb, obs, actions, next_obs, rewards, terminations, truncations
     rb.add(obs, successor, actions, rewards, np.asarray(terminations), infos)
 
 # === wrong: the mask is inverted | mask|final_obs|invert|None|error|successor
-import numpy as np
-
-
-def add_to_replay(rb, obs, actions, next_obs, rewards, terminations, truncations, infos):
-    successor = np.array(next_obs)
-    mask = infos.get("_final_obs")
-    if mask is not None and mask.any():
+# --- instead of
+        successor[mask] = np.stack(list(infos["final_obs"][mask]))
+# --- here
         successor[~mask] = np.stack(list(infos["final_obs"][mask]))[0]
-    rb.add(obs, successor, actions, rewards, np.asarray(terminations), infos)
 
 # === wrong: 1 − done is stored, as the target needs it | done|invert|terminat|1 ?[-−]
-import numpy as np
-
-
-def add_to_replay(rb, obs, actions, next_obs, rewards, terminations, truncations, infos):
-    successor = np.array(next_obs)
-    mask = infos.get("_final_obs")
-    if mask is not None and mask.any():
-        successor[mask] = np.stack(list(infos["final_obs"][mask]))
+# --- instead of
+    rb.add(obs, successor, actions, rewards, np.asarray(terminations), infos)
+# --- here
     rb.add(obs, successor, actions, rewards, 1 - np.asarray(terminations), infos)
 
 # === wrong: rewards and terminations exchanged | order|exchang|swap|reward|done|argument
-import numpy as np
-
-
-def add_to_replay(rb, obs, actions, next_obs, rewards, terminations, truncations, infos):
-    successor = np.array(next_obs)
-    mask = infos.get("_final_obs")
-    if mask is not None and mask.any():
-        successor[mask] = np.stack(list(infos["final_obs"][mask]))
+# --- instead of
+    rb.add(obs, successor, actions, rewards, np.asarray(terminations), infos)
+# --- here
     rb.add(obs, successor, actions, np.asarray(terminations), rewards, infos)
 
 # === right: rows built one by one and stacked, a helper of its own, other names of the arguments
@@ -231,63 +206,27 @@ def add_to_replay(buffer, s, a, s2, r, dead, timeout, info):
     buffer.add(s, np.stack(rows).astype(s2.dtype), a, r, dead, info)
 
 # === wrong: the helper forgets the time-outs | time-?out|truncat|final_obs|successor
-import numpy as np
-
-
-def true_successor(i, following, ended, info):
-    if ended and "final_obs" in info and info["final_obs"][i] is not None:
-        return info["final_obs"][i]
-    return following[i]
-
-
-def add_to_replay(buffer, s, a, s2, r, dead, timeout, info):
-    """Store one step of every environment."""
+# --- instead of
+    rows = [true_successor(i, s2, dead[i] or timeout[i], info) for i in range(len(s2))]
+# --- here
     rows = [true_successor(i, s2, dead[i], info) for i in range(len(s2))]
-    buffer.add(s, np.stack(rows).astype(s2.dtype), a, r, dead, info)
 
 # === wrong: dead and timeout stand in the other order in the head | order|argument|exchang|swap|terminat|truncat|done
-import numpy as np
-
-
-def true_successor(i, following, ended, info):
-    if ended and "final_obs" in info and info["final_obs"][i] is not None:
-        return info["final_obs"][i]
-    return following[i]
-
-
+# --- instead of
+def add_to_replay(buffer, s, a, s2, r, dead, timeout, info):
+# --- here
 def add_to_replay(buffer, s, a, s2, r, timeout, dead, info):
-    """Store one step of every environment."""
-    rows = [true_successor(i, s2, dead[i] or timeout[i], info) for i in range(len(s2))]
-    buffer.add(s, np.stack(rows).astype(s2.dtype), a, r, dead, info)
 
 # === wrong: the infos are forgotten in the call of add | info|argument|missing|add
-import numpy as np
-
-
-def true_successor(i, following, ended, info):
-    if ended and "final_obs" in info and info["final_obs"][i] is not None:
-        return info["final_obs"][i]
-    return following[i]
-
-
-def add_to_replay(buffer, s, a, s2, r, dead, timeout, info):
-    """Store one step of every environment."""
-    rows = [true_successor(i, s2, dead[i] or timeout[i], info) for i in range(len(s2))]
+# --- instead of
+    buffer.add(s, np.stack(rows).astype(s2.dtype), a, r, dead, info)
+# --- here
     buffer.add(s, np.stack(rows).astype(s2.dtype), a, r, dead)
 
 # === wrong: the same step is stored twice | twice|add|once|two
-import numpy as np
-
-
-def true_successor(i, following, ended, info):
-    if ended and "final_obs" in info and info["final_obs"][i] is not None:
-        return info["final_obs"][i]
-    return following[i]
-
-
-def add_to_replay(buffer, s, a, s2, r, dead, timeout, info):
-    """Store one step of every environment."""
-    rows = [true_successor(i, s2, dead[i] or timeout[i], info) for i in range(len(s2))]
+# --- instead of
+    buffer.add(s, np.stack(rows).astype(s2.dtype), a, r, dead, info)
+# --- here
     for _ in range(2):
         buffer.add(s, np.stack(rows).astype(s2.dtype), a, r, dead, info)
 
@@ -305,14 +244,7 @@ def add_to_replay(rb, obs, actions, next_obs, rewards, terminations, truncations
     return next_obs
 
 # === wrong: the arguments of np.where are exchanged | where|exchang|swap|final_obs|successor|next_obs|zero
-import numpy as np
-
-
-def add_to_replay(rb, obs, actions, next_obs, rewards, terminations, truncations, infos, verbose=False):
-    over = np.logical_or(terminations, truncations)
-    last = np.array([x if x is not None else np.zeros_like(next_obs[0]) for x in infos.get("final_obs", next_obs)])
+# --- instead of
+    corrected = np.where(over.reshape(-1, *[1] * (next_obs.ndim - 1)), last, next_obs)
+# --- here
     corrected = np.where(over.reshape(-1, *[1] * (next_obs.ndim - 1)), next_obs, last)
-    if verbose and over.any():
-        print("ended:", np.flatnonzero(over))
-    rb.add(obs, corrected, actions, rewards, terminations.astype(np.float32), infos)
-    return next_obs

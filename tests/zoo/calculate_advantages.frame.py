@@ -335,34 +335,16 @@ class PPOTrainer:
         return returns, advantages
 
 # === wrong: the course's own loop, delta without the mask | mask|terminat|death|bootstrap
-import gymnasium as gym
-import torch
-
-
-class PPOTrainer:
-    def __init__(self, config, wandb_log=False):
-        self.config = config
-        self.train_envs = gym.make_vec("DroneFigureEightTrajectory-v0", num_envs=config.n_envs)
-        self.rewards_buffer = torch.zeros((config.n_steps, config.n_envs))
-        self.values_buffer = torch.zeros((config.n_steps, config.n_envs))
-        self.terminated_buffer = torch.zeros((config.n_steps, config.n_envs))
-
-    def calculate_advantages(self, next_value):
-        advantages = torch.zeros_like(self.rewards_buffer)
-        lastgaelam = 0
-        for t in reversed(range(self.config.n_steps)):
-            if t == self.config.n_steps - 1:
-                next_not_terminated = 1.0 - self.terminated_buffer[-1]
-                nextvalues = next_value
-            else:
-                next_not_terminated = 1.0 - self.terminated_buffer[t + 1]
-                nextvalues = self.values_buffer[t + 1]
+# --- instead of
+import torch.nn as nn
+# --- here
+# --- instead of
+        self.agent = nn.Linear(43, 5)
+# --- here
+# --- instead of
+            delta = self.rewards_buffer[t] + nextvalues * next_not_terminated - self.values_buffer[t]
+# --- here
             delta = self.rewards_buffer[t] + self.config.gamma * nextvalues - self.values_buffer[t]
-            advantages[t] = lastgaelam = (
-                delta + self.config.gamma * self.config.gae_lambda * next_not_terminated * lastgaelam
-            )
-        returns = advantages + self.values_buffer
-        return returns, advantages
 
 # === wrong: the course's own loop, delta with V(s_t) in place of V(s_{t+1}): nextvalues is never used | V\(s|next_?values?|successor|next row|next step|bootstrap
 import gymnasium as gym
@@ -400,36 +382,15 @@ class PPOTrainer:
         return returns, advantages
 
 # === wrong: the course's own loop with delta left as it was given: None | TypeError|None|delta|unsupported|fill
-import gymnasium as gym
-import torch
-
-
-class PPOTrainer:
-    def __init__(self, config, wandb_log=False):
-        self.config = config
-        self.wandb_log = wandb_log
-        self.train_envs = gym.make_vec("DroneFigureEightTrajectory-v0", num_envs=config.n_envs)
-        self.rewards_buffer = torch.zeros((config.n_steps, config.n_envs))
-        self.values_buffer = torch.zeros((config.n_steps, config.n_envs))
-        self.terminated_buffer = torch.zeros((config.n_steps, config.n_envs))
-
-    def calculate_advantages(self, next_value):
-        advantages = torch.zeros_like(self.rewards_buffer)
-        lastgaelam = 0
-        for t in reversed(range(self.config.n_steps)):
-            if t == self.config.n_steps - 1:
-                next_not_terminated = 1.0 - self.terminated_buffer[-1]
-                nextvalues = next_value
-            else:
-                next_not_terminated = 1.0 - self.terminated_buffer[t + 1]
-                nextvalues = self.values_buffer[t + 1]
+# --- instead of
+            delta = (
+                self.rewards_buffer[t]
+                + self.config.gamma * self.values_buffer[t] * next_not_terminated
+                - self.values_buffer[t]
+            )
+# --- here
             # TODO: implement delta
             delta = None
-            advantages[t] = lastgaelam = (
-                delta + self.config.gamma * self.config.gae_lambda * next_not_terminated * lastgaelam
-            )
-        returns = advantages + self.values_buffer
-        return returns, advantages
 
 # === wrong: the frame has no method body yet: NotImplementedError | NotImplemented|not (been )?(written|filled|implemented)|empty|yet
 import gymnasium as gym

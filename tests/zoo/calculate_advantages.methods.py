@@ -313,19 +313,10 @@ class PPOTrainer:
         return adv + self.values_buffer, adv
 
 # === wrong: gamma is left out of the chain | γ|gamma|discount
-import torch
-
-
-class PPOTrainer:
-    def calculate_advantages(self, next_value):
-        values = torch.cat([self.values_buffer, next_value])
-        adv = torch.zeros_like(self.rewards_buffer)
-        last = 0
-        for t in reversed(range(self.config.n_steps)):
-            on = 1.0 - self.terminated_buffer[t]
-            delta = self.rewards_buffer[t] + self.config.gamma * values[t + 1] * on - values[t]
+# --- instead of
+            adv[t] = last = delta + self.config.gamma * on * last
+# --- here
             adv[t] = last = delta + self.config.gae_lambda * on * last
-        return adv + self.values_buffer, adv
 
 # === wrong: returns are discounted rewards, not advantages + values | returns? .*(V|value|advantage)|\+ ?V|V\(s|advantages? ?(\+|plus)|Monte|rewards? alone
 import torch
@@ -359,18 +350,9 @@ class PPOTrainer:
         return adv + self.rewards_buffer, adv
 
 # === wrong: advantages are normalized here, which the course does later for each minibatch | normali[sz]|standardi[sz]|zero mean|mean 0|std\b|deviation
-import torch
-
-
-class PPOTrainer:
-    def calculate_advantages(self, next_value):
-        values = torch.cat([self.values_buffer, next_value])
-        adv = torch.zeros_like(self.rewards_buffer)
-        last = 0
-        for t in reversed(range(self.config.n_steps)):
-            on = 1.0 - self.terminated_buffer[t]
-            delta = self.rewards_buffer[t] + self.config.gamma * values[t + 1] * on - values[t]
-            adv[t] = last = delta + self.config.gamma * self.config.gae_lambda * on * last
+# --- instead of
+        return adv + self.rewards_buffer, adv
+# --- here
         returns = adv + self.values_buffer
         if adv.numel() > 1:
             adv = (adv - adv.mean()) / (adv.std() + 1e-8)
@@ -423,19 +405,12 @@ class PPOTrainer:
         return adv + self.values_buffer, adv
 
 # === wrong: config.lam, which the config does not have: it is gae_lambda | AttributeError|\blam\b|no attribute|KeyError
-import torch
-
-
-class PPOTrainer:
-    def calculate_advantages(self, next_value):
-        values = torch.cat([self.values_buffer, next_value])
-        adv = torch.zeros_like(self.rewards_buffer)
-        last = 0
-        for t in reversed(range(len(adv))):
-            on = 1.0 - self.terminated_buffer[t]
+# --- instead of
+            delta = self.rewards_buffer[t] + self.gamma * values[t + 1] * on - values[t]
+            adv[t] = last = delta + self.gamma * self.gae_lambda * on * last
+# --- here
             delta = self.rewards_buffer[t] + self.config.gamma * values[t + 1] * on - values[t]
             adv[t] = last = delta + self.config.gamma * self.config.lam * on * last
-        return adv + self.values_buffer, adv
 
 # === wrong: values_buffer[t + 1] is read at the last row, too | IndexError|out of (bounds|range)|last (row|step)|index
 import torch
@@ -467,19 +442,10 @@ class PPOTrainer:
         return adv + self.values_buffer, adv
 
 # === wrong: the loop runs forwards over the rows | forward|backward|past|direction|order\b|revers
-import torch
-
-
-class PPOTrainer:
-    def calculate_advantages(self, next_value):
-        values = torch.cat([self.values_buffer, next_value])
-        adv = torch.zeros_like(self.rewards_buffer)
-        last = 0
+# --- instead of
+        for t in range(self.config.n_steps - 1, 0, -1):
+# --- here
         for t in range(self.config.n_steps):
-            on = 1.0 - self.terminated_buffer[t]
-            delta = self.rewards_buffer[t] + self.config.gamma * values[t + 1] * on - values[t]
-            adv[t] = last = delta + self.config.gamma * self.config.gae_lambda * on * last
-        return adv + self.values_buffer, adv
 
 # === wrong: axis 1 is taken for time: the chain runs along the environments | axis|dim|environments?\b.*(chain|next|along)|transpos|time\b|across
 import torch

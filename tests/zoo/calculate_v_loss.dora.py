@@ -161,18 +161,12 @@ class PPOTrainer:
         return 0.5 * loss.mean()
 
 # === wrong: the old value is not added back | around|old value|from the old|difference|step|V_?old|added? back
-import torch
-
-
-class PPOTrainer:
-    def calculate_v_loss(self, newvalue, b_returns, b_values, mb_inds, if_clip=False):
-        r = b_returns[mb_inds]
-        loss = (newvalue - r) ** 2
-        if if_clip:
-            eps = self.config.clip_coef
+# --- instead of
+            clipped = b_values[mb_inds] + torch.clamp(newvalue - r, -eps, eps)
+            loss = torch.max(loss, (clipped - r) ** 2)
+# --- here
             v_clip = torch.clamp(newvalue - b_values[mb_inds], -eps, eps)
             loss = torch.max(loss, (v_clip - r) ** 2)
-        return 0.5 * loss.mean()
 
 # === wrong: the value itself is clipped to plus or minus eps | itself|around|old value|from the old|difference|step|V_?old|added? back
 import torch

@@ -255,22 +255,10 @@ class PPO:
         return adv, adv + values
 
 # === wrong: compute_values(states) twice: V(s) in place of V(s') | next_states|V\(s|successor|next state
-import torch
-
-
-class PPO:
-    def compute_advantages(self, states, rewards, next_states, terminations):
-        values = self.compute_values(states).detach()
+# --- instead of
+        next_values = torch.cat([values[1:], torch.zeros(1)])
+# --- here
         next_values = self.compute_values(states).detach()
-        going = (~terminations).float()
-        deltas = rewards + self.gamma * next_values * going - values
-        adv, a = torch.zeros_like(deltas), 0.0
-        for i in reversed(range(len(deltas))):
-            if (i + 1) % self.num_steps == 0:
-                a = 0.0
-            a = deltas[i] + self.gamma * self.lmbda * a * going[i]
-            adv[i] = a
-        return adv, adv + values
 
 # === wrong: the rows are taken as [T, N], time first | time|layout|env(ironment)?s?[- ](major|first|after)|reshape|\[N|environments\b|one environment|transpos|axis
 import torch

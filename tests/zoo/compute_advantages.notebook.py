@@ -211,73 +211,37 @@ class PPO(nn.Module):
         return advantages.detach(), critic_targets.detach()
 
 # === wrong: the list is not reversed in the end | revers|order\b|backward|flip
-import torch
-from torch import nn
-
-
-class PPO(nn.Module):
-    def __init__(self, state_dim, num_actions, gamma, lmbda, epsilon, num_steps):
-        super().__init__()
-        self.gamma = gamma
-        self.lmbda = lmbda
-        self.epsilon = epsilon
-        self.num_steps = num_steps
-        self.actor = nn.Sequential(nn.Linear(state_dim, 128), nn.ReLU(), nn.Linear(128, num_actions))
-        self.critic = nn.Sequential(nn.Linear(state_dim, 128), nn.ReLU(), nn.Linear(128, 1))
-
-    def compute_values(self, states):
-        return self.critic(states).squeeze(-1)
-
-    def compute_advantages(self, states, rewards, next_states, terminations):
+# --- instead of
+        gamma, lmbda = self.gamma, self.lmbda
+        num_states = states.size()[0]
+# --- here
         gamma, lmbda, T = self.gamma, self.lmbda, self.num_steps
-        values = self.compute_values(states)
-        next_values = self.compute_values(next_states)
-        advantages = []
-        advantage = 0.0
+# --- instead of
+        for i in reversed(range(num_states)):
+# --- here
         for i in reversed(range(states.size()[0])):
             if (i + 1) % T == 0:
                 advantage = 0.0
-            mask = 1.0 - terminations[i].float()
-            delta = rewards[i] + gamma * next_values[i] * mask - values[i]
-            advantage = delta + gamma * lmbda * mask * advantage
-            advantages.append(advantage)
+# --- instead of
+        advantages = torch.stack(advantages[::-1])
+# --- here
         advantages = torch.stack(advantages)
-        critic_targets = advantages + values
-        return advantages.detach(), critic_targets.detach()
 
 # === wrong: the chain restarts after each environment's first row, not before its last: i % T == 0 | (row|step|one) (too )?(late|early|off)|environments\b|(next|another|other|each) environment|first (row|step)|off by one|restart|last (row|step)
-import torch
-from torch import nn
-
-
-class PPO(nn.Module):
-    def __init__(self, state_dim, num_actions, gamma, lmbda, epsilon, num_steps):
-        super().__init__()
-        self.gamma = gamma
-        self.lmbda = lmbda
-        self.epsilon = epsilon
-        self.num_steps = num_steps
-        self.critic = nn.Sequential(nn.Linear(state_dim, 128), nn.ReLU(), nn.Linear(128, 1))
-
-    def compute_values(self, states):
-        return self.critic(states).squeeze(-1)
-
-    def compute_advantages(self, states, rewards, next_states, terminations):
+# --- instead of
+        self.actor = nn.Sequential(nn.Linear(state_dim, 128), nn.ReLU(), nn.Linear(128, num_actions))
+# --- here
+# --- instead of
+        gamma, lmbda = self.gamma, self.lmbda
+        num_states = states.size()[0]
+# --- here
         gamma, lmbda, T = self.gamma, self.lmbda, self.num_steps
-        values = self.compute_values(states)
-        next_values = self.compute_values(next_states)
-        advantages = []
-        advantage = 0.0
+# --- instead of
+        for i in reversed(range(num_states)):
+# --- here
         for i in reversed(range(states.size()[0])):
             if i % T == 0:
                 advantage = 0.0
-            mask = 1.0 - terminations[i].float()
-            delta = rewards[i] + gamma * next_values[i] * mask - values[i]
-            advantage = delta + gamma * lmbda * mask * advantage
-            advantages.append(advantage)
-        advantages = torch.stack(advantages[::-1])
-        critic_targets = advantages + values
-        return advantages.detach(), critic_targets.detach()
 
 # === wrong: only the TD error, which passes the notebook's own test with T = 1: no chain | chain|λ|lam(bda)?\b|lmbda|trace|TD error|delta|δ|one step
 import torch

@@ -154,28 +154,16 @@ class PPO:
         return actor_loss, critic_loss
 
 # === wrong: the quotient of the log-probabilities | exp|quotient|divi|log.?ratio|logarithm|ratio
-import torch
-
-
-class PPO:
-    def compute_loss(self, states, actions, advantages, critic_targets, log_probs_old):
+# --- instead of
+        ratio = self.compute_log_probs(states, actions) - log_probs_old
+# --- here
         ratio = self.compute_log_probs(states, actions) / log_probs_old
-        clipped = torch.clamp(ratio, 1 - self.epsilon, 1 + self.epsilon)
-        actor_loss = -torch.min(ratio * advantages, clipped * advantages).mean()
-        critic_loss = ((critic_targets - self.compute_values(states)) ** 2).mean()
-        return actor_loss, critic_loss
 
 # === wrong: old minus new: the ratio is upside down | upside|invers|exchang|swap|old|other way|1 ?/ ?r|reciproc
-import torch
-
-
-class PPO:
-    def compute_loss(self, states, actions, advantages, critic_targets, log_probs_old):
+# --- instead of
+        ratio = self.compute_log_probs(states, actions) - log_probs_old
+# --- here
         ratio = torch.exp(log_probs_old - self.compute_log_probs(states, actions))
-        clipped = torch.clamp(ratio, 1 - self.epsilon, 1 + self.epsilon)
-        actor_loss = -torch.min(ratio * advantages, clipped * advantages).mean()
-        critic_loss = ((critic_targets - self.compute_values(states)) ** 2).mean()
-        return actor_loss, critic_loss
 
 # === wrong: the minus of the actor's loss is missing | sign|negat|minus|ascen|descen|maximi|opposite
 import torch
@@ -190,16 +178,10 @@ class PPO:
         return actor_loss, critic_loss
 
 # === wrong: max in place of min | max|min|larger|smaller|pessimis
-import torch
-
-
-class PPO:
-    def compute_loss(self, states, actions, advantages, critic_targets, log_probs_old):
-        ratio = torch.exp(self.compute_log_probs(states, actions) - log_probs_old)
-        clipped = torch.clamp(ratio, 1 - self.epsilon, 1 + self.epsilon)
+# --- instead of
+        actor_loss = torch.min(ratio * advantages, clipped * advantages).mean()
+# --- here
         actor_loss = -torch.max(ratio * advantages, clipped * advantages).mean()
-        critic_loss = ((critic_targets - self.compute_values(states)) ** 2).mean()
-        return actor_loss, critic_loss
 
 # === wrong: a half in the critic's loss, which the course does not have | half|halve|½|factor|twice|times (too|as|what)|0\.5 ?[·*×]|[·*×/] ?(2|0\.5)\b|\b2 ?[·*×]
 import torch
@@ -248,13 +230,7 @@ class PPO:
         return critic_loss, actor_loss
 
 # === wrong: one sum of both losses is returned | two|both|tuple|pair|sum|iterate|unpack|return
-import torch
-
-
-class PPO:
-    def compute_loss(self, states, actions, advantages, critic_targets, log_probs_old):
-        ratio = torch.exp(self.compute_log_probs(states, actions) - log_probs_old)
-        clipped = torch.clamp(ratio, 1 - self.epsilon, 1 + self.epsilon)
-        actor_loss = -torch.min(ratio * advantages, clipped * advantages).mean()
-        critic_loss = ((critic_targets - self.compute_values(states)) ** 2).mean()
+# --- instead of
+        return critic_loss, actor_loss
+# --- here
         return actor_loss + critic_loss

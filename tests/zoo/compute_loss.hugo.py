@@ -134,15 +134,10 @@ class PPO:
         return actor_loss, critic_loss
 
 # === wrong: values [B, 1] against targets [B]: every value with every target | broadcast|shape|outer|each|pair|B, ?1|squeeze|column
-import torch
-
-
-class PPO:
-    def compute_loss(self, states, actions, advantages, critic_targets, log_probs_old):
-        ratio = torch.exp(self.compute_log_probs(states, actions) - log_probs_old)
-        actor_loss = -torch.min(ratio * advantages, ratio.clamp(1 - self.epsilon, 1 + self.epsilon) * advantages).mean()
+# --- instead of
+        critic_loss = ((critic_targets - self.compute_values(states).detach()) ** 2).mean()
+# --- here
         critic_loss = ((critic_targets - self.critic(states)) ** 2).mean()
-        return actor_loss, critic_loss
 
 # === wrong: L1 for the critic | \babs|squar|\*\* ?2|MSE|\bL1
 import torch
@@ -156,14 +151,9 @@ class PPO:
         return actor_loss, F.l1_loss(self.compute_values(states), critic_targets)
 
 # === wrong: smooth L1 for the critic, as in DQN | \babs|squar|\*\* ?2|MSE|\bL1|huber|half|halve|½|factor|twice|times (too|as|what)|0\.5 ?[·*×]|[·*×/] ?(2|0\.5)\b|\b2 ?[·*×]
-import torch
-import torch.nn.functional as F
-
-
-class PPO:
-    def compute_loss(self, states, actions, advantages, critic_targets, log_probs_old):
-        ratio = torch.exp(self.compute_log_probs(states, actions) - log_probs_old)
-        actor_loss = -torch.min(ratio * advantages, ratio.clamp(1 - self.epsilon, 1 + self.epsilon) * advantages).mean()
+# --- instead of
+        return actor_loss, F.l1_loss(self.compute_values(states), critic_targets)
+# --- here
         return actor_loss, F.smooth_l1_loss(self.compute_values(states), critic_targets)
 
 # === wrong: epsilon is written as 0.1, not self.epsilon | ignor|hard|constant|fixed|whatever|does not (depend|change|use|follow)|not used|unused|always|another (clip|coef|eps)|(clip|coef|epsilon|config).{0,30}(not|other|another)
@@ -205,16 +195,11 @@ class PPO:
         return actor_loss, critic_loss
 
 # === wrong: log-probabilities of the likeliest action, not of the one that was taken | action|argmax|max|taken|likeliest
-import torch
-
-
-class PPO:
-    def compute_loss(self, states, actions, advantages, critic_targets, log_probs_old):
+# --- instead of
+        scores = self.actor(states)
+        log_probs = scores.gather(1, actions.unsqueeze(1)).squeeze(1)
+# --- here
         log_probs = torch.log_softmax(self.actor(states), dim=1).max(dim=1).values
-        ratio = torch.exp(log_probs - log_probs_old)
-        actor_loss = -torch.min(ratio * advantages, ratio.clamp(1 - self.epsilon, 1 + self.epsilon) * advantages).mean()
-        critic_loss = ((critic_targets - self.compute_values(states)) ** 2).mean()
-        return actor_loss, critic_loss
 
 # === wrong: log_probs_old is replaced by the present ones, so the ratio is always 1 | \bold\b|log_probs_old.{0,30}(not|ignor|unused)|always|ratio is 1|π_?old|present|clipp|not clip|no clip|unclip|clip.{0,20}(missing|absent|lacks|forgotten|not)|(missing|without|lacks|forgot).{0,20}clip
 import torch
@@ -241,16 +226,11 @@ class PPO:
         return actor_loss, critic_loss
 
 # === wrong: the advantages are normalised | normali|standard|mean|std|deviation
-import torch
-
-
-class PPO:
-    def compute_loss(self, states, actions, advantages, critic_targets, log_probs_old):
+# --- instead of
+        ratio = self.compute_log_probs(states, actions) / torch.exp(log_probs_old)
+# --- here
         advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
         ratio = torch.exp(self.compute_log_probs(states, actions) - log_probs_old)
-        actor_loss = -torch.min(ratio * advantages, ratio.clamp(1 - self.epsilon, 1 + self.epsilon) * advantages).mean()
-        critic_loss = ((critic_targets - self.compute_values(states)) ** 2).mean()
-        return actor_loss, critic_loss
 
 # === wrong: the actor is trained on an advantage through which the gradient reaches the critic | actor.{0,60}(depend|reach|gradient).{0,60}critic|critic.{0,20}(parameters|network|weights)|advantages?.{0,30}(gradient|detach)|gradient.{0,40}(critic|advantage)|detach
 import torch

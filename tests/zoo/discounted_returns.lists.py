@@ -94,16 +94,10 @@ def discounted_returns(rewards, gamma):
     return torch.tensor(returns)
 
 # === wrong: forwards: the past is summed up | forward|backward|past|direction|order\b|before|revers
-import torch
-
-
-def discounted_returns(rewards, gamma):
-    returns = []
-    G = 0.0
+# --- instead of
+    for r in reversed(rewards):
+# --- here
     for r in rewards:
-        G = r + gamma * G
-        returns.append(G)
-    return torch.tensor(returns)
 
 # === wrong: gamma is not used | γ|gamma|discount
 import torch
@@ -117,26 +111,16 @@ def discounted_returns(rewards, gamma):
     return torch.tensor(returns)
 
 # === wrong: gamma on the reward in place of the rest: G = gamma r + G | γ|gamma|discount|reward
-import torch
-
-
-def discounted_returns(rewards, gamma):
-    returns, G = [], 0.0
-    for r in reversed(rewards):
+# --- instead of
+        G = r + G
+# --- here
         G = gamma * r + G
-        returns.insert(0, G)
-    return torch.tensor(returns)
 
 # === wrong: gamma multiplies both: G = gamma (r + G) | γ|gamma|discount|power|exponent|once too|own reward
-import torch
-
-
-def discounted_returns(rewards, gamma):
-    returns, G = [], 0.0
-    for r in reversed(rewards):
+# --- instead of
+        G = r + G
+# --- here
         G = gamma * (r + G)
-        returns.insert(0, G)
-    return torch.tensor(returns)
 
 # === wrong: the exponent as printed: t - k | exponent|power|k ?[-−] ?t|t ?[-−] ?k|γ|gamma|discount|ZeroDivision
 import torch
@@ -181,13 +165,9 @@ def discounted_returns(rewards, gamma):
     return torch.as_tensor(G)
 
 # === wrong: the same whole return for every row | whole|each row|every (row|step|action)|constant|same|from it on
-import torch
-
-
-def discounted_returns(rewards, gamma):
-    G = 0.0
-    for r in reversed(rewards):
-        G = r + gamma * G
+# --- instead of
+    return torch.as_tensor(G)
+# --- here
     return torch.full((len(rewards),), float(G))
 
 # === wrong: one row too many: the 0 after the end is in the list | shape|length|too many|T ?\+ ?1|one (row|more)|size

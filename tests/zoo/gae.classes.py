@@ -348,57 +348,29 @@ def gae(reward, value, next_value, terminated, done, *, gamma, lam):
     return advantage, reward + advantage + value
 
 # === wrong: the target adds V(s') in place of V(s) | V\(s|next_value|next value|advantages? ?(\+|plus)
-import torch
-
-
-def gae(reward, value, next_value, terminated, done, *, gamma, lam):
-    delta = reward + gamma * next_value * ~terminated - value
-    advantage = torch.zeros_like(delta)
-    carry = torch.zeros_like(delta[0])
-    for t in reversed(range(len(delta))):
-        carry = delta[t] + gamma * lam * carry * ~done[t]
-        advantage[t] = carry
+# --- instead of
+    return advantage, reward + advantage + value
+# --- here
     return advantage, advantage + next_value
 
 # === wrong: advantage and target are one tensor, the sum is made in place | same tensor|one tensor|in place|alias|shar|advantages? (is|are|equals?|looks?) .*(target|return)|\+ ?V|V\(s
-import torch
-
-
-def gae(reward, value, next_value, terminated, done, *, gamma, lam):
-    delta = reward + gamma * next_value * ~terminated - value
-    advantage = torch.zeros_like(delta)
-    carry = torch.zeros_like(delta[0])
-    for t in reversed(range(len(delta))):
-        carry = delta[t] + gamma * lam * carry * ~done[t]
-        advantage[t] = carry
+# --- instead of
+    return advantage, reward + advantage + value
+# --- here
     target = advantage
     target += value
     return advantage, target
 
 # === wrong: only the advantages come back, not the pair | pair|two|tuple|unpack|both|only one
-import torch
-
-
-def gae(reward, value, next_value, terminated, done, *, gamma, lam):
-    delta = reward + gamma * next_value * ~terminated - value
-    advantage = torch.zeros_like(delta)
-    carry = torch.zeros_like(delta[0])
-    for t in reversed(range(len(delta))):
-        carry = delta[t] + gamma * lam * carry * ~done[t]
-        advantage[t] = carry
+# --- instead of
+    return advantage, reward + advantage + value
+# --- here
     return advantage
 
 # === wrong: prints the result and returns nothing | None|return(s|ed)? nothing|nothing (is|was|came)|no return|without a? ?return
-import torch
-
-
-def gae(reward, value, next_value, terminated, done, *, gamma, lam):
-    delta = reward + gamma * next_value * ~terminated - value
-    advantage = torch.zeros_like(delta)
-    carry = torch.zeros_like(delta[0])
-    for t in reversed(range(len(delta))):
-        carry = delta[t] + gamma * lam * carry * ~done[t]
-        advantage[t] = carry
+# --- instead of
+    return advantage, reward + advantage + value
+# --- here
     print(advantage, advantage + value)
 
 # === wrong: a name that is not defined: lambd | NameError|lambd|not defined

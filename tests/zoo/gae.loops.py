@@ -245,17 +245,11 @@ def gae(reward, value, next_value, terminated, done, *, gamma, lam):
     return adv, adv + value
 
 # === wrong: gamma is missing in the chain | γ|gamma|discount
-import torch
-
-
-def gae(reward, value, next_value, terminated, done, *, gamma, lam):
-    adv = torch.zeros_like(reward)
-    nxt = torch.zeros_like(reward[0])
-    for t in reversed(range(len(reward))):
-        delta = reward[t] + gamma * next_value[t] * ~terminated[t] - value[t]
+# --- instead of
+        nxt = adv[t] = delta + gamma * nxt * ~done[t]
+# --- here
         nxt = delta + lam * nxt * ~done[t]
         adv[t] = nxt
-    return adv, adv + value
 
 # === wrong: gamma is missing before V(s') | γ|gamma|discount
 import torch

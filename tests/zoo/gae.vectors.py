@@ -115,18 +115,11 @@ def gae(reward, value, next_value, terminated, done, *, gamma, lam):
     return advantage, advantage + value
 
 # === wrong: the matrix is transposed: each row sums the deltas of its past | transpos|past|forward|backward|direction|earlier|order|revers
-import torch
-
-
-def gae(reward, value, next_value, terminated, done, *, gamma, lam):
-    T = reward.shape[0]
-    delta = reward + gamma * next_value * (1 - terminated.float()) - value
-    episode = done.long().cumsum(0) - done.long()
-    same = (episode[:, None] == episode[None]).float()
-    k = torch.arange(T)
+# --- instead of
+    power = (k[None, :] - k[:, None] + 1).clamp(min=0)
+    weights = torch.triu(torch.ones(T, T)) * (gamma * lam) ** power
+# --- here
     weights = torch.tril((gamma * lam) ** (k[:, None] - k[None, :]).clamp(min=0).float())
-    advantage = torch.einsum("tk,tkn,kn->tn", weights, same, delta)
-    return advantage, advantage + value
 
 # === wrong: the episode's number changes a row early: the row of the end belongs to the next episode | (row|step|one) (too )?(late|early|off)|shift|off by one|flag|chain|trace|wrong row|end of|\bends?\b
 import torch
@@ -157,32 +150,18 @@ def gae(reward, value, next_value, terminated, done, *, gamma, lam):
     return adv, adv + value
 
 # === wrong: the last row has no bootstrap: V(s') is 0 there | last (row|step)|bootstrap|next_value|rows run out|end of the rollout|rest
-import torch
-
-
-def gae(reward, value, next_value, terminated, done, *, gamma, lam):
+# --- instead of
+    following = torch.cat([value[1:], next_value[-1:]])
+# --- here
     following = next_value.clone()
     following[-1] = 0
-    delta = reward + gamma * following * ~terminated - value
-    adv = torch.zeros_like(delta)
-    trace = torch.zeros_like(delta[0])
-    for t in reversed(range(len(delta))):
-        trace = delta[t] + gamma * lam * ~done[t] * trace
-        adv[t] = trace
-    return adv, adv + value
 
 # === wrong: the mask is on the whole delta, so that the last reward of an episode is lost | mask|reward|terminat|delta|δ|bracket|parenthes
-import torch
-
-
-def gae(reward, value, next_value, terminated, done, *, gamma, lam):
+# --- instead of
+    following = torch.cat([value[1:], next_value[-1:]])
+    delta = reward + gamma * following * ~terminated - value
+# --- here
     delta = (reward + gamma * next_value - value) * ~terminated
-    adv = torch.zeros_like(delta)
-    trace = torch.zeros_like(delta[0])
-    for t in reversed(range(len(delta))):
-        trace = delta[t] + gamma * lam * ~done[t] * trace
-        adv[t] = trace
-    return adv, adv + value
 
 # === wrong: the mask is on V(s) in place of V(s') | mask|V\(s|terminat|bootstrap|next_value
 import torch

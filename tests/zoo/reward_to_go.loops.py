@@ -140,29 +140,17 @@ def reward_to_go(reward, next_value, terminated, done, *, gamma):
     return out
 
 # === wrong: a death bootstraps like a time-out: terminated is not used | terminat|death|bootstrap|next_value|mask
-import torch
-
-
-def reward_to_go(reward, next_value, terminated, done, *, gamma):
-    out = torch.zeros_like(reward)
-    g = next_value[-1]
-    for t in reversed(range(len(reward))):
+# --- instead of
+        g = reward[t] + gamma * g * ~done[t]
+# --- here
         g = reward[t] + gamma * torch.where(done[t], next_value[t], g)
-        out[t] = g
-    return out
 
 # === wrong: gamma is left out | γ|gamma|discount
-import torch
-
-
-def reward_to_go(reward, next_value, terminated, done, *, gamma):
-    out = torch.zeros_like(reward)
-    g = next_value[-1]
-    for t in reversed(range(len(reward))):
+# --- instead of
+        g = reward[t] + gamma * g * ~done[t]
+# --- here
         g = torch.where(done[t], next_value[t], g)
         g = reward[t] + g * ~terminated[t]
-        out[t] = g
-    return out
 
 # === wrong: gamma is left out before next_value at a time-out | γ|gamma|discount|bootstrap|next_value
 import torch

@@ -80,15 +80,10 @@ def value_loss(value, target, old_value=None, clip=None):
     return 0.5 * loss.mean()
 
 # === wrong: old and new exchanged | exchang|swap|other way|revers|mixed up|confus|in place of|opposite|old (value )?and new|V_?old|around|from the old
-import torch
-
-
-def value_loss(value, target, old_value=None, clip=None):
-    loss = (value - target) ** 2
-    if clip is not None:
+# --- instead of
+        near = target + torch.clamp(value - target, -clip, clip)
+# --- here
         near = value + torch.clamp(old_value - value, -clip, clip)
-        loss = torch.max(loss, (near - target) ** 2)
-    return 0.5 * loss.mean()
 
 # === wrong: the maximum of the two means | each|element|row|mean|before
 import torch
