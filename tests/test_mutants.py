@@ -1190,8 +1190,8 @@ MUTANTS = [
     (
         "evaluation takes training's starts",
         "run/evaluate.py",
-        "first = derive(seed, EVALUATION, 0)",
-        "first = derive(seed, 0, 0)",
+        "env.restart(derive(seed, EVALUATION, 0))",
+        "env.restart(derive(seed, 0, 0))",
         "run/test_evaluate.py::test_starts_of_an_evaluation_are_never_those_of_training",
     ),
     (

@@ -10,9 +10,7 @@ from torch import nn
 
 import environments
 import lemniscate as lem
-from lemniscate.api import agents
 from lemniscate.cli import main
-from lemniscate.envs import registry
 from lemniscate.envs.conversion import flatten_observation, unflatten_observation
 from lemniscate.envs.spaces import observation_parts
 from lemniscate.run.config import RunConfig
@@ -179,25 +177,6 @@ def test_what_remembers_plays_in_one_environment_at_a_time(capsys):
     assert "one environment at a time" in capsys.readouterr().err
     lem.evaluate(lambda obs: np.random.randint(2), **how)  # noqa: NPY002
     assert capsys.readouterr().err == ""
-
-
-def test_one_environment_begins_where_the_first_of_many_do():
-    class Start(gym.Env):
-        observation_space, action_space = gym.spaces.Box(-1, 1, (1,)), gym.spaces.Discrete(2)
-
-        def reset(self, *, seed=None, options=None):
-            super().reset(seed=seed)
-            self.start = self.np_random.uniform()
-            return np.zeros(1, np.float32), {}
-
-        def step(self, action):
-            return np.zeros(1, np.float32), self.start, True, False, {}
-
-    many = registry.make(Start, 4)
-    expected = list(
-        agents.evaluate(agents.Agent(lambda obs: np.zeros(len(obs), int), many.spec, True, False), many, 4, 5).returns
-    )
-    assert lem.evaluate(lambda obs: 0, env=Start, episodes=4, seed=5).returns == expected
 
 
 def test_draws_come_from_the_seed_and_the_callers_generators_stay_as_they_were():

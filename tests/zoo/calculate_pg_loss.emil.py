@@ -299,6 +299,7 @@ class PPOTrainer:
         return torch.max(-mb_advantages * ratio, -clipped * ratio).mean()
 
 # === right: another order of its arguments, told by their names
+# call: f(ratio, mb_advantages)
 import torch
 
 

@@ -193,6 +193,7 @@ class PPOTrainer:
         return 0.5 * err.mean()
 
 # === right: another order of its arguments, told by their names
+# call: f(newvalue, b_values, b_returns, mb_inds, if_clip)
 import torch
 
 

@@ -3,7 +3,6 @@
 import copy
 import math
 import pickle
-import random
 import re
 import traceback
 from collections.abc import Callable, Iterator
@@ -32,6 +31,7 @@ from lemniscate.hub import repository as hub
 from lemniscate.maths import Deterministic
 from lemniscate.nn.policies import Policy
 from lemniscate.run.evaluate import evaluate
+from lemniscate.run.run import globals_undisturbed
 from lemniscate.run.seeding import seed_globals
 from lemniscate.run.warm_start import difference
 from lemniscate.spec import Box, Discrete, MultiDiscrete, Spec
@@ -50,7 +50,7 @@ for _made in _makers:
 
 
 def observed(spec: Spec) -> str:
-    """What an environment observes, in a sentence."""
+    """A clause on the size of an environment's observation and its parts."""
     parts = ", ".join(f"{part.name} {part.own_shape or part.shape}" for part in spec.observation_parts)
     return f"{spec.env_id} observes {spec.observation_size} numbers, {parts}"
 
@@ -167,7 +167,7 @@ METHODS = (
 
 
 def find(policy: Any, *, checkpoint: str | int | None = None, trust: bool = False) -> Any:
-    """What is to act: the policy of a run, an object of the user's own, or the path of a file of weights.
+    """The policy that a name or a path stands for: of a run, of the user's own, or the path of a file of weights.
 
     Raises `UserError` as `load`, and for what cannot act.
     """
@@ -186,7 +186,7 @@ def find(policy: Any, *, checkpoint: str | int | None = None, trust: bool = Fals
 
 
 def function_of(policy: Any) -> Callable[..., Any]:
-    """What takes observations: the policy's method of a known name, or itself. Raises `UserError` for neither."""
+    """The method of a known name that a policy acts by, or itself. Raises `UserError` where it has neither."""
     if isinstance(policy, type):
         raise UserError(f"{policy.__name__} is a class: give an object of it, with the weights that are to act.")
     if isinstance(policy, Policy):
@@ -363,7 +363,7 @@ def _has_network(policy: Any) -> bool:
 
 
 def _memory(policy: Any) -> bytes:
-    """What an object, the object of a method, or a function in another one holds; nothing where that cannot be told."""
+    """The pickled attributes of an object or a method's, and a function's closure; empty where pickle refuses."""
     cells = getattr(policy, "__closure__", None) or ()
     try:
         return pickle.dumps((vars(getattr(policy, "__self__", policy)), [cell.cell_contents for cell in cells]))
@@ -396,7 +396,7 @@ class _Normalized(nn.Module):
         self._agent, self._moments, self._function = agent, moments, _function(agent, deterministic)
 
     def forward(self, obs: Tensor) -> Any:
-        """What the agent returns for flat observations [B, O]."""
+        """The agent's answer to flat observations [B, O], after normalization."""
         if self._moments:
             obs = ((obs - self._moments[0]) / (self._moments[1] + 1e-8).sqrt()).to(obs.dtype)
         return self._function(obs)
@@ -418,21 +418,18 @@ def playing(
         policy = _Normalized(made, moments, deterministic)
     player = Agent(policy, vec.spec, deterministic, bool(normalized))
     modes = {module: module.training for module in (policy.modules() if isinstance(policy, nn.Module) else ())}
-    python, numpy, pytorch = random.getstate(), np.random.get_state(), torch.get_rng_state()  # noqa: NPY002
     try:
-        for module in modes:
-            module.training = False
-        player.look(vec.restart(seed).numpy())
-        if file:
-            say(f"{said}; {_choose_units(player, vec, seed, normalized)}.")
-        seed_globals(seed)
-        yield player
+        with globals_undisturbed():
+            for module in modes:
+                module.training = False
+            player.look(vec.restart(seed).numpy())
+            if file:
+                say(f"{said}; {_choose_units(player, vec, seed, normalized)}.")
+            seed_globals(seed)
+            yield player
     finally:
         for module, mode in modes.items():
             module.training = mode
-        random.setstate(python)
-        np.random.set_state(numpy)  # noqa: NPY002
-        torch.set_rng_state(pytorch)
 
 
 def _choose_units(player: Agent, vec: VecEnv, seed: int, normalized: bool | None) -> str:

@@ -117,15 +117,13 @@ def play_episodes(
     """Play `episodes` whole episodes; yields (obs, action, step, the mask [N] of the environments that still count).
 
     Every environment has its own share of the episodes, fixed beforehand: taking the first that end would favour short
-    ones. A single environment begins its episodes where several would begin their first. Without a policy, actions are
-    uniformly random. Raises `UserError` when an episode of an environment without a
+    ones. Without a policy, actions are uniformly random. Raises `UserError` when an episode of an environment without a
     time limit takes more than 20,000 steps.
     """
     rng = generator(seed, env.device, EVALUATION, 1)
     numbers = torch.arange(env.num_envs, device=env.device)
     left = episodes // env.num_envs + (numbers < episodes % env.num_envs).int()
-    first = derive(seed, EVALUATION, 0)
-    env.restart(first)
+    env.restart(derive(seed, EVALUATION, 0))
     age = torch.zeros_like(left)
     while (left > 0).any():
         env.require_end(int(age.max()))
@@ -135,8 +133,6 @@ def play_episodes(
         yield obs, action, step, (left > 0) & step.valid
         done = (step.terminated | step.truncated) & step.valid
         left, age = left - done.int(), (age + 1) * (~done & (left > 0))
-        if env.num_envs == 1 and done.any() and left.any():
-            env.restart(first + episodes - int(left))
 
 
 def _act(policy: Policy | Baseline | None, deterministic: bool, env: VecEnv, rng: Generator) -> Tensor:
