@@ -40,7 +40,7 @@ class Judged(NamedTuple):
 
 
 def judged(exercise: str, solution: zoo_files.Solution) -> Judged:
-    """What the check says of a solution, which may print, and may not even be a program."""
+    """The finding on a solution; a file that is no program is wrong."""
     with (
         warnings.catch_warnings(),
         contextlib.redirect_stdout(io.StringIO()),

@@ -268,7 +268,7 @@ def _film(video: str | Path | None) -> Path | None:
 def _environments(
     chosen: Any, env: str | Callable[..., Any] | None, own: Mapping[str, Any], how: dict[str, Any], **elsewhere: Any
 ) -> Iterator[tuple[Any, VecEnv, dict[str, Any]]]:
-    """Who plays, the environments of an evaluation, and the arguments of a single one.
+    """The player, the environments of an evaluation, and the arguments of a single one.
 
     Raises `UserError` for other spaces than those of a policy, and for one of the user's own without `env`.
     """

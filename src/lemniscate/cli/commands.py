@@ -255,12 +255,12 @@ def _episodes(given: argparse.Namespace) -> dict[str, Any]:
 
 
 def _policy(given: argparse.Namespace) -> dict[str, Any]:
-    """Which policy of a run or an address it is."""
+    """The options that choose a policy of a run or an address."""
     return {"checkpoint": given.checkpoint and number(given.checkpoint), "trust": given.trust}
 
 
 def _own(given: argparse.Namespace) -> dict[str, Any]:
-    """What is said of a policy that was not trained here."""
+    """The options of a policy that was not trained here."""
     return {"agent": given.agent, "normalized_actions": given.normalized_actions}
 
 

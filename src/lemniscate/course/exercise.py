@@ -174,7 +174,7 @@ class EndedError(Exception):
 
 
 class Seen(dict):
-    """What was seen of a solution, by name, in the order in which it was looked at."""
+    """The observations of a solution by name, in the order in which they were made."""
 
     def __missing__(self, name: str) -> Any:
         raise EndedError(name)
@@ -261,7 +261,7 @@ class Exercise:
         return Finding(name, True, f"{right}.{''.join(notes)}")
 
     def answer(self, function: Function, case: Case, change: Callable[[Values], Values] | None = None) -> Answer:
-        """What the reference, or a known mistake, returns in a case; with other arguments after a change of them."""
+        """The results of the reference, or of a known mistake, in a case; of other arguments after a change."""
         args, options = list(copy.deepcopy(case.args)), dict(case.options)
         networks = [[nn.Parameter(tensor) for tensor in arg] for arg in args if isinstance(arg, list)]
         args[: len(networks)] = networks
@@ -290,7 +290,7 @@ class Exercise:
         return [name for name in inspect.signature(self.right).parameters if name != "self"]
 
     def _in_case(self, called: Solution, case: Case) -> dict[str, Any]:
-        """What a solution returned, as the first of the kinds of arguments that it takes without an exception."""
+        """The results of a solution in a case, with the first kind of arguments that it takes without an exception."""
         first: dict[str, Any] = {}
         for note, convert in PARAMETERS if self.in_place else KINDS if self.gradient_in is None else KINDS[:1]:
             try:
@@ -373,7 +373,7 @@ class Exercise:
         return ""
 
     def _changed(self) -> Iterator[tuple[str, Callable[[Case], Answer]]]:
-        """What the reference answers if its arguments, or its results, are changed, by what the change is called."""
+        """The reference with changed arguments or changed results, by the words for the change."""
         last = self.cases[-1]
         for words, change in of_arguments({**dict(zip(self.arguments, last.args, strict=False)), **last.options}):
             yield words, partial(self.answer, self.right, change=change)

@@ -46,7 +46,7 @@ UNREADABLE = (SyntaxError, ValueError, LookupError, TypeError, RecursionError, M
 
 
 class Missing:
-    """What an import that failed was to bind: raises the reason once it is called."""
+    """A placeholder for what a failed import was to bind: it raises the reason once it is called."""
 
     def __init__(self, reason: str) -> None:
         self._reason = reason
@@ -240,7 +240,7 @@ def _exit_code(pid: int, seconds: float) -> int | None:
 
 
 def ending(code: int | None) -> str:
-    """How a process has ended, in words."""
+    """The end of a process, in words."""
     known = {None: "it did not end in time", -9: "it was killed, most likely for memory", -11: "it crashed (SIGSEGV)"}
     return known.get(code, f"it ended the process (exit code {code})")
 

@@ -158,7 +158,7 @@ class Probe(VectorView):
             self.events.append(event)
 
     def noted(self) -> dict[str, Any]:
-        """What was seen, in plain tensors and numbers.
+        """The notes, in plain tensors and numbers.
 
         `steps` in columns [S, N]; `events`; and `stays`, of linear layers: K, whether the weight stays as it was, and
         whether it has had a gradient, but stands in no optimizer that made a step.
@@ -172,7 +172,7 @@ class Probe(VectorView):
 
 
 def watched(start: Callable[[VectorView], Any], names: Mapping[str, Any]) -> dict[str, Any]:
-    """What a training loop does on the probe, as `Probe.noted` says; the loop is stopped when that is enough.
+    """The notes on a training loop on the probe (`Probe.noted`); the loop is stopped when they are enough.
 
     Args:
         start: starts the loop.
@@ -417,7 +417,7 @@ class Verdict(NamedTuple):
 
 
 def judged(seen: Mapping[str, Any]) -> Verdict:
-    """What is certain of what `watched` saw."""
+    """The verdict on the notes of `watched`: only what is certain."""
     is_proved, them = True, list[Update]()
     with suppress(Exception):
         them = list(updates(seen))
@@ -431,7 +431,7 @@ def judged(seen: Mapping[str, Any]) -> Verdict:
 
 
 def of_optimizers(seen: Mapping[str, Any], them: list[Update]) -> str | None:
-    """What takes steps, with which gradients."""
+    """Parameters that no step reaches, and gradients that a step takes twice."""
     graded = {one["out"].shape[1] for one in seen["events"] if "grad" in one and one["grad"].any()}
     has_steps = any("out" not in event for event in seen["events"])
     for k, name in (
@@ -464,7 +464,7 @@ def of_optimizers(seen: Mapping[str, Any], them: list[Update]) -> str | None:
 
 
 def of_rows(seen: Mapping[str, Any], them: list[Update]) -> str | None:
-    """Which rows are trained on; what came before the first rollout is left out, and what may have been cut off."""
+    """Rows that are not trained on; the first rollout and one that may have been cut off do not count."""
     used = [torch.cat([step.rows for step in each.policy]).unique() + each.places[0] for each in them if each.policy]
     if not used:
         raise UnclearError

@@ -1,4 +1,4 @@
-"""What a student is given, notebooks and a training loop with gaps, and the judgement of a training loop.
+"""The notebooks and the training loop with gaps that a student is given, and the judgement of a training loop.
 
 First a look inside (`inside.py`): gradients and steps against the equations. What that does not understand is judged by
 small worlds: in each the better of two actions is known, and one mistake makes the other one look better; one more
@@ -20,6 +20,7 @@ import gymnasium as gym
 import numpy as np
 import torch
 
+from lemniscate.api.agents import METHODS
 from lemniscate.course import inside
 from lemniscate.course.exercise import TEMPLATES, Note, raised
 from lemniscate.course.solution import Function
@@ -214,7 +215,7 @@ def _worlds(verdict: inside.Verdict) -> list[World]:
 
 
 def train(seen: Mapping[str, Any]) -> Iterator[str]:
-    """What is wrong with a training loop that was observed: inside it first, by its returns last."""
+    """Sentences on an observed training loop: on its inside first, on its returns last."""
     verdict = inside.judged(seen["inside"])
     if verdict.sentence:
         yield verdict.sentence
@@ -266,13 +267,12 @@ def _called(function: Function, envs: VectorView, steps: int) -> Any:
 
 
 def acting(made: Any, envs: VectorView) -> Callable[[np.ndarray], np.ndarray]:
-    """What a training loop has returned, as a function from observations [N, O] to actions, for `envs.step`.
+    """The agent of a training loop as a function from observations [N, O] to actions, for `envs.step`.
 
     Raises:
         TypeError: nothing acts.
     """
-    methods = ("act", "predict", "get_action", "select_action", "select_actions", "get_action_and_value")
-    method = next((getattr(made, name) for name in methods if hasattr(made, name)), made)
+    method = next((getattr(made, name) for name in METHODS if hasattr(made, name)), made)
     if not callable(method):
         raise TypeError(f"train returned {type(made).__name__}; it should return an agent with act(obs), or a function")
 

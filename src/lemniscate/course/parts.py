@@ -118,7 +118,7 @@ def _reach(made: Any, output: Callable[[], Tensor]) -> Tensor:
 
 
 def _bend(function: Callable[[Tensor], Tensor], x: Tensor) -> float:
-    """How far a function is from a linear one, relative to its values; rounding alone is less than 1e-4."""
+    """The distance of a function from a linear one, relative to its values; rounding alone is less than 1e-4."""
     x, y = 5 * x, 5 * x.roll(1, 0)
     values = torch.stack([function(rows).detach() for rows in (x + y, torch.zeros_like(x), x, y)])
     apart = values[0] + values[1] - values[2] - values[3]
@@ -614,7 +614,7 @@ ENDS = {"row within an episode": (0, 0), "death": (1, 0), "time-out": (0, 1), "d
 
 
 def _replayed(function: Function, end: str, kind: type) -> dict[str, Any]:
-    """What is added when two of three environments end; their last observations are in an array of that kind."""
+    """The rows added when two of three environments end; their last observations are in an array of that kind."""
     stored: list[dict[str, Any]] = []
 
     def add(*args: Any, **named: Any) -> None:

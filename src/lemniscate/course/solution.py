@@ -1,4 +1,4 @@
-"""How a reader's solution is called, whatever its style: its names and order of arguments, a method, NumPy.
+"""The call of a reader's solution, whatever its style: names and order of arguments, methods, NumPy.
 
 A method gets an object of its own class. What the course's constructor sets is put there; the reader's own constructor
 runs only where the method asks for more, and as far as it comes.
@@ -75,7 +75,7 @@ LIMIT = 15.0
 
 
 def standard(name: str, among: Mapping[str, Any]) -> str | None:
-    """Which of some names of arguments another name stands for; None if for none of them."""
+    """The name among those of the exercise that another name stands for; None if there is none."""
     name = name.lower().strip("_")
     if name in among:
         return name
@@ -111,7 +111,7 @@ class MisfitError(TypeError):
 
 
 class Held(dict):
-    """What an object has besides options, where the exercise is a method."""
+    """Attributes of an object besides options, where the exercise is a method."""
 
 
 class TooLong(BaseException):
@@ -265,7 +265,7 @@ def _signature(function: Function) -> inspect.Signature:
 
 
 def first_that_works(*attempts: Callable[[], Any]) -> Any:
-    """What the first of several attempts returns that raises no error; if all do, the error of the first."""
+    """The result of the first attempt that raises no error; if all do, the error of the first is raised."""
     errors: list[Exception] = []
     for attempt in attempts:
         try:
@@ -385,7 +385,7 @@ class Solution:
         return False
 
     def _blank(self) -> Any:
-        """What a method is called on, before anything is set: a copy, or an object that was not constructed."""
+        """The object of a method before anything is set: a copy of a bound one, or one that was not constructed."""
         if isinstance(self._bound, type):
             return self._class
         if self._bound is not None:
@@ -446,7 +446,7 @@ def _fields(value: Any) -> dict[str, Any]:
 def _in_place_of(
     name: str, value: Any, known: OwnSettings, attributes: Mapping[str, Any], has_numbers: bool
 ) -> Any | None:
-    """What a case has for an attribute of the reader's: a configuration, a number, a network; None if nothing."""
+    """The case's value for an attribute of the reader's: a configuration, a number, a network; None if it has none."""
     if name.lower() in SETTINGS:
         return OwnSettings({**_fields(value), **known})
     if isinstance(value, nn.Module):
@@ -483,7 +483,7 @@ def _constants(function: Function, options: Mapping[str, Any]) -> Iterator[None]
 
 
 def numbers(value: Any) -> Tensor | None:
-    """What a solution returned as a tensor, if it is one or can be made one: an array, a number, a list of them."""
+    """A result as a tensor: a tensor, an array, a number, or a list of them; None for anything else."""
     if isinstance(value, Tensor):
         return value.as_subclass(Tensor)
     with suppress(Exception):

@@ -1,4 +1,4 @@
-"""What runs have logged, drawn: learning curves, metrics of updates, the bias of Q, a search, a curve in training."""
+"""Pictures of logged numbers: learning curves, metrics of updates, the bias of Q, a search, a curve in training."""
 
 import io
 import math
