@@ -11,6 +11,7 @@ COUNT = Counter()
 """over the exercises judged so far"""
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # broken off within a callback of gc
 @pytest.mark.parametrize(
     "exercise", [name if name != "train" else pytest.param(name, marks=pytest.mark.long) for name in course.EXERCISES]
 )

@@ -273,10 +273,15 @@ def _fenced(work: Path) -> bool:
         if libc.unshare(user_and_net) == 0:
             return True
 
+    connect = socket.socket.connect
+
     def refuse(*_args: Any, **_options: Any) -> NoReturn:
         raise OSError("there is no network where this is graded")
 
-    socket.socket.connect = socket.socket.connect_ex = socket.getaddrinfo = refuse
+    def connect_here(self: socket.socket, address: Any) -> None:
+        connect(self, address) if isinstance(address, str | bytes) else refuse()  # multiprocessing needs Unix's own
+
+    socket.socket.connect, socket.socket.connect_ex, socket.getaddrinfo = connect_here, refuse, refuse
     return False
 
 
