@@ -56,13 +56,10 @@ def limit_axis(axes: Axes) -> None:
         return
     values = np.concatenate([y for _, _, y in lines])
     low, high = robust_range(values)
-    margin, said = 0.05 * (high - low), []
-    if values.max() > high:
-        axes.set_ylim(top=high + margin)
-        said.append(f"▲ to {values.max():,.3g}")
-    if values.min() < low:
-        axes.set_ylim(bottom=low - margin)
-        said.append(f"▼ to {values.min():,.3g}")
+    margin = 0.05 * (high - low)
+    said = [f"▲ to {values.max():,.3g}"] * (values.max() > high) + [f"▼ to {values.min():,.3g}"] * (values.min() < low)
+    if said:  # both ends: the margin of one that is left as it is would be a share of the outliers
+        axes.set_ylim(low - margin, high + margin)
     for color, x, y in lines:
         for beyond, edge, marker in ((y > high, 1, "^"), (y < low, 0, "v")):
             if beyond.any():  # an empty line would upset the layout
