@@ -57,7 +57,8 @@ def limit_axis(axes: Axes) -> None:
     values = np.concatenate([y for _, _, y in lines])
     low, high = robust_range(values)
     margin = 0.05 * (high - low)
-    said = [f"▲ to {values.max():,.3g}"] * (values.max() > high) + [f"▼ to {values.min():,.3g}"] * (values.min() < low)
+    said = [f"▲ to {values.max():,.3g}"] if values.max() > high else []
+    said += [f"▼ to {values.min():,.3g}"] if values.min() < low else []
     if said:  # both ends: the margin of one that is left as it is would be a share of the outliers
         axes.set_ylim(low - margin, high + margin)
     for color, x, y in lines:
