@@ -237,9 +237,10 @@ def test_without_a_namespace_python_refuses_the_network(tmp_path):
         "assert handin._fenced(Path(sys.argv[1])) is False\n"
         "import multiprocessing\n"
         "with multiprocessing.Manager() as manager: assert list(manager.list([1])) == [1]\n"  # by a socket of Unix
-        "try: socket.create_connection(('127.0.0.1', 9))\n"
-        "except OSError as error: assert 'no network' in str(error)\n"
-        "else: sys.exit(3)\n"
+        "for connect in (socket.create_connection, socket.socket().connect):\n"
+        "    try: connect(('127.0.0.1', 9))\n"
+        "    except OSError as error: assert 'no network' in str(error)\n"
+        "    else: sys.exit(3)\n"
     )
     assert subprocess.run([sys.executable, "-c", code, tmp_path]).returncode == 0
 

@@ -273,16 +273,23 @@ def _fenced(work: Path) -> bool:
         if libc.unshare(user_and_net) == 0:
             return True
 
+    _refuse_network()
+    return False
+
+
+def _refuse_network() -> None:
+    """Let Python connect to sockets of Unix alone, which lead nowhere else, and which multiprocessing needs."""
     connect = socket.socket.connect
 
     def refuse(*_args: Any, **_options: Any) -> NoReturn:
         raise OSError("there is no network where this is graded")
 
     def connect_here(self: socket.socket, address: Any) -> None:
-        connect(self, address) if isinstance(address, str | bytes) else refuse()  # multiprocessing needs Unix's own
+        if not isinstance(address, str | bytes):
+            refuse()
+        connect(self, address)
 
     socket.socket.connect, socket.socket.connect_ex, socket.getaddrinfo = connect_here, refuse, refuse
-    return False
 
 
 def end_family(pid: int) -> None:
