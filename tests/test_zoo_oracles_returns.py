@@ -191,7 +191,7 @@ def within(seconds):
         raise Late
 
     before = signal.signal(signal.SIGALRM, late)
-    signal.setitimer(signal.ITIMER_REAL, seconds)
+    signal.setitimer(signal.ITIMER_REAL, seconds, 0.5)  # again: what is raised within a callback of gc is lost
     try:
         yield
     finally:

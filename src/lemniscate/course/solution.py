@@ -12,6 +12,7 @@ import inspect
 import sys
 import textwrap
 import threading
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
@@ -120,15 +121,23 @@ class TooLong(BaseException):
 
 @contextmanager
 def limited(seconds: float) -> Iterator[None]:
-    """Raise `TooLong` in this thread, and again every half second, once the time is over; also in an endless loop."""
-    thread, over, sent = ctypes.c_ulong(threading.get_ident()), threading.Event(), threading.Event()
+    """Raise `TooLong` in this thread, and again every half second, once the time is over; also in an endless loop.
+
+    The seconds are those of the processor, so that a busy machine is no fault of the solution; one that waits has
+    four times as many by the clock. An import is not broken off in its first seconds, which a slow disk may need.
+    """
+    thread, over, sent = threading.get_ident(), threading.Event(), threading.Event()
+    clock = time.monotonic
+    if hasattr(time, "pthread_getcpuclockid"):
+        clock = partial(time.clock_gettime, time.pthread_getcpuclockid(thread))
+    start, end = clock(), time.monotonic() + 4 * seconds
 
     def interrupt() -> None:
-        wait = seconds
+        wait = min(seconds, 0.5)
         while not over.wait(wait):
-            sent.set()
-            ctypes.pythonapi.PyThreadState_SetAsyncExc(thread, ctypes.py_object(TooLong))
-            wait = 0.5
+            if time.monotonic() >= end or (clock() - start >= seconds and not _is_importing(thread)):
+                sent.set()
+                ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread), ctypes.py_object(TooLong))
 
     watch = threading.Thread(target=interrupt, daemon=True)
     watch.start()
@@ -138,8 +147,15 @@ def limited(seconds: float) -> Iterator[None]:
         over.set()
         watch.join()
         if sent.is_set():  # with nothing to take back, Python 3.11 hangs where a trace function is set
-            ctypes.pythonapi.PyThreadState_SetAsyncExc(thread, None)
+            ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread), None)
             _forget_halves()
+
+
+def _is_importing(thread: int) -> bool:
+    frame = sys._current_frames().get(thread)
+    while frame and frame.f_globals.get("__name__") != "importlib._bootstrap":
+        frame = frame.f_back
+    return frame is not None
 
 
 def _forget_halves() -> None:
