@@ -11,7 +11,7 @@ import torch
 
 import toy
 from forks import Forks
-from lemniscate.algos import ppo, reinforce, reppo, sac, trpo
+from lemniscate.algos import ppo, pqn, reinforce, reppo, sac, trpo
 from lemniscate.data.replay import interact
 from lemniscate.data.rollout import collect
 from lemniscate.envs.gymnasium import GymnasiumBackend
@@ -101,7 +101,7 @@ def vectorize(env, num_envs=4, **kwargs):
 def small(algo, env="Countdown-v0", **fields):
     """A Config of an on-policy algorithm that takes an update in a moment."""
     defaults = {"env": env, "num_envs": 4, "num_steps": 8, "total_steps": 100_000, "hidden": (16,)}
-    defaults |= {"minibatch_size": 16} if algo in (ppo, reppo) else {}
+    defaults |= {"minibatch_size": 16} if algo in (ppo, pqn, reppo) else {}
     fields = {**defaults, **fields}
     if algo in (trpo, reinforce):  # one minibatch, as far as the rows go
         fields = {"critic_minibatch_size": min(128, fields["num_envs"] * fields["num_steps"]), **fields}

@@ -27,6 +27,10 @@ MISTAKES = {
     "only clipped": ([(f"torch.min(ratio * advantage, {CLIPPED})", f"({CLIPPED})")], "only the clipped ratio counts"),
     "no clip": ([(CLIPPED, "ratio * advantage")], "is not clipped where it is far below 1 and above 1"),
     "half a clip": ([("clamp(1 - clip, 1 + clip)", "clamp(max=1 + clip)")], "the ratio is not clipped where it is far below 1"),
+    "clip around 0": ([("clamp(1 - clip, 1 + clip)", "clamp(-clip, clip)")], "the limits of the clip are not 1 − ε and 1 + ε"),
+    "mean added": ([("(adv - adv.mean())", "(adv + adv.mean())")], "the mean of the advantages is added"),
+    "softmax twice": ([("Categorical(logits=out)", "Categorical(logits=out.softmax(-1))")], "a softmax of a softmax"),
+    "reset": ([("        rollout, obs = collect", "        obs, _ = envs.reset()\n        rollout, obs = collect")], "reset before each rollout"),
     "chain": ([("trace = delta + gamma * lam * trace * ~done[t]", "trace = delta")], "there is no chain"),
     "no λ": ([("gamma * lam * trace", "gamma * trace")], "λ is left out"),
     "death": ([("next_value[t] * ~terminated[t]", "next_value[t]")], "a value follows a death"),
@@ -52,6 +56,10 @@ MISTAKES = {
     "target": ([("return advantage, advantage + value", "return advantage, advantage")], "V(s) is not added to the target"),
     "target, normalized": ([(COLUMNS, f"{COLUMNS}; goal = goal - columns[2].mean()")], "what moves V is off by a constant"),
     "zero_grad": ([("            optimizer.zero_grad()\n", "")], "zero_grad is missing"),
+    "zero_grad of V alone": (
+        [("optimizer.zero_grad()", "[p.grad.zero_() for p in agent.actor.parameters() if p.grad is not None]")],
+        "zero_grad is missing",
+    ),
     "zero_grad, late": ([("optimizer.step()", "optimizer.zero_grad(); optimizer.step()")], "set to zero between backward and"),
     "no step": ([("            optimizer.step()\n", "")], "no optimizer makes a step"),
     "no backward": ([("            loss.backward()\n", "")], "backward() is not called"),
@@ -112,7 +120,7 @@ def inside_of(train, seed=1):
     return inside.judged(inside.watched(lambda envs: train(envs, 60_000, seed), train.__globals__))
 
 
-QUICK = ("no exponential", "upside down", "half a clip", "death", "time-out", "final_obs", "old, again", "broadcast",
+QUICK = ("no exponential", "upside down", "half a clip", "death", "clip around 0", "time-out", "final_obs", "old, again", "broadcast",
          "target", "zero_grad", "half an optimizer", "one minibatch", "entropy")  # fmt: skip
 """one of each kind; the long tests take all"""
 

@@ -10,9 +10,9 @@ from forks import Forks
 
 ROOT = Path(__file__).parents[1]
 
-ON, OFF, REINFORCE, PPO, TRPO, REPPO, DDPG, TD3, SAC = (
+ON, OFF, REINFORCE, PPO, TRPO, REPPO, PQN, DDPG, TD3, SAC = (
     f"algos/test_{name}.py::test_"
-    for name in ("on_policy", "off_policy", "reinforce", "ppo", "trpo", "reppo", "ddpg", "td3", "sac")
+    for name in ("on_policy", "off_policy", "reinforce", "ppo", "trpo", "reppo", "pqn", "ddpg", "td3", "sac")
 )
 INTERACT, ROLLOUT = (f"data/test_{name}.py::test_" for name in ("interact", "rollout"))
 
@@ -668,6 +668,62 @@ MUTANTS = [
         "state.networks.multipliers().detach()",
         "state.networks.multipliers()",
         REPPO + "the_policys_loss_moves_neither_q_nor_the_multipliers",
+    ),
+    (
+        "λ runs on into the next episode",
+        "maths/returns.py",
+        "lam * (~done[t]).to(follows.dtype)",
+        "lam",
+        "maths/test_soft_q.py::test_the_return_of_q_learning_is_the_mixture_of_n_step_returns",
+    ),
+    (
+        "a death is followed by a value in Q-learning",
+        "maths/returns.py",
+        "gamma * ahead * ~terminated[t]",
+        "gamma * ahead",
+        "maths/test_soft_q.py::test_the_return_of_q_learning_is_the_mixture_of_n_step_returns",
+    ),
+    (
+        "exploration draws what is masked",
+        "maths/discrete.py",
+        "permitted = (self.values > -5e8)",
+        "permitted = (self.values > -5e18)",
+        PQN + "actions_that_are_masked_are_never_drawn_and_never_the_maximum",
+    ),
+    (
+        "the maximum is of the action taken",
+        "nn/action_values.py",
+        "self.policy(next_obs).values.amax(-1)",
+        "self.q(next_obs, action)",
+        PQN + "the_target_is_the_return_of_the_best_next_action",
+    ),
+    (
+        "the maximum is of the state before",
+        "nn/action_values.py",
+        "self.policy(next_obs).values.amax(-1)",
+        "self.policy(obs).values.amax(-1)",
+        PQN + "the_target_is_the_return_of_the_best_next_action",
+    ),
+    (
+        "epsilon falls over the whole run",
+        "algos/pqn.py",
+        "progress / config.exploration if config.exploration else 1.0",
+        "progress",
+        PQN + "epsilon_falls_linearly_from_one_and_stays",
+    ),
+    (
+        "Q learns from the first action",
+        "nn/action_values.py",
+        "gather(-1, action.unsqueeze(-1))",
+        "gather(-1, 0 * action.unsqueeze(-1))",
+        PQN + "the_loss_is_half_the_squared_error_of_the_actions_taken",
+    ),
+    (
+        "PQN forgets lambda",
+        "algos/pqn.py",
+        "gamma=gamma, lam=lam",
+        "gamma=gamma, lam=0.0",
+        PQN + "the_target_is_the_return_of_the_best_next_action",
     ),
     (
         "the action hardly matters to Q",

@@ -11,6 +11,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import lemniscate as lem
+from lemniscate import algos
 from lemniscate.api import plots
 from lemniscate.cli import parse
 from lemniscate.report import advice, curves, pages, style
@@ -365,7 +366,7 @@ def test_each_rule_speaks_of_what_it_measures_and_is_silent_otherwise(rule, fire
         assert rule(given) is None
 
 
-@pytest.mark.parametrize("algorithm", ["reinforce", "a2c", "trpo", "ppo", "reppo", "ddpg", "td3", "sac"])
+@pytest.mark.parametrize("algorithm", algos.ALGORITHMS)
 def test_no_rule_names_a_flag_that_the_algorithm_does_not_have(algorithm):
     lines = logged(
         approx_kl=[9.0] * 9, clip_fraction=[1.0] * 9, explained_variance=[0.0] * 9, gradient_norm=[1e9] * 9,

@@ -28,6 +28,7 @@ def settings_of(algorithm):
         settings = settings | {"env": "Pendulum-v1"}
     minibatch = {
         "reppo": "minibatch_size",
+        "pqn": "minibatch_size",
         "ppo": "minibatch_size",
         "trpo": "critic_minibatch_size",
         "reinforce": "critic_minibatch_size",

@@ -79,12 +79,24 @@ FIELDS = {
         "value_range": 5.0,
         "network": "layer_norm",
     },
+    "pqn": {
+        **ON_POLICY,
+        "epochs": 2,
+        "minibatch_size": 16,
+        "learning_rate": 1e-3,
+        "final_learning_rate": 0.5,
+        "max_grad_norm": 0.5,
+        "td_lambda": 0.9,
+        "final_epsilon": 0.1,
+        "exploration": 0.5,
+        "network": "layer_norm",
+    },
     "ddpg": {**OFF_POLICY, "policy_delay": 1},
     "td3": {**OFF_POLICY, "policy_delay": 2},
     "sac": {**OFF_POLICY, "policy_delay": 1, "initial_temperature": 0.5},
 }
-CASES = [f"{algorithm}-box" for algorithm in FIELDS]
-CASES += [f"{algorithm}-discrete" for algorithm in ("reinforce", "a2c", "trpo", "ppo")]
+CASES = [f"{algorithm}-box" for algorithm in FIELDS if algorithm != "pqn"]
+CASES += [f"{algorithm}-discrete" for algorithm in ("reinforce", "a2c", "trpo", "ppo", "pqn")]
 
 
 @pytest.fixture(autouse=True)

@@ -25,6 +25,7 @@ FIELDS = {
     "trpo": ("trpo", "CartPole-v1", ON_POLICY["trpo"] | {"total_steps": 640}),
     "trpo-sync": ("trpo", "Pendulum-v1", ON_POLICY["trpo"] | {"backend": "gymnasium", "total_steps": 640}),
     "reppo": ("reppo", "Pendulum-v1", ON_POLICY["reppo"]),
+    "pqn": ("pqn", "CartPole-v1", ON_POLICY["pqn"]),
     "ddpg": ("ddpg", "Pendulum-v1", OFF_POLICY["ddpg"]),
     "ddpg-sync": ("ddpg", "Pendulum-v1", OFF_POLICY["ddpg-pink"] | {"backend": "gymnasium"}),
     "ddpg-compiled": ("ddpg", "Pendulum-v1", OFF_POLICY["ddpg"] | {"compile": "on"}),

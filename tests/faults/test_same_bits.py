@@ -13,7 +13,7 @@ from forks import LEMNISCATE, Forks, command
 from lemniscate.run import checkpoint
 from run.test_run import OFF_POLICY, ON_POLICY, final_hashes, history, words_for
 
-ALGORITHMS = ("reinforce", "a2c", "trpo", "ppo", "reppo", "ddpg", "td3", "sac")
+ALGORITHMS = ("reinforce", "a2c", "trpo", "ppo", "reppo", "pqn", "ddpg", "td3", "sac")
 DRAWING = """
 import sys, types
 import matplotlib.pyplot as plt, numpy, random, torch

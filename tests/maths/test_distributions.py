@@ -9,6 +9,7 @@ from torch import distributions
 from lemniscate.maths import (
     Bernoulli,
     Categorical,
+    EpsilonGreedy,
     Deterministic,
     Gaussian,
     MultiCategorical,
@@ -74,6 +75,28 @@ def test_the_ends_of_the_noise_never_choose_what_is_impossible(masked):
     sample = ours.sample(torch.tensor([0.0, 1 - 2**-24]))
     assert sample.tolist() == [[0, 1][masked == 0], [3, 2][masked == 3]]
     assert torch.isfinite(ours.entropy()).all()
+
+
+@pytest.mark.parametrize("epsilon", [0.0, 0.3, 1.0])
+def test_epsilon_greedy_samples_have_its_frequencies(epsilon, rng):
+    """(1 − ε) for the best, and ε shared by all that are permitted; by hand."""
+    values = torch.tensor([0.5, -7.0, -1e9, 2.0])
+    expected = torch.tensor([epsilon / 3, epsilon / 3, 0.0, 1 - epsilon + epsilon / 3])
+    ours = EpsilonGreedy(values.expand(200_000, 4), torch.tensor(epsilon))
+    torch.testing.assert_close(ours.probabilities[0], expected)
+    sample = ours.sample(torch.rand(200_000, generator=rng))
+    frequency = torch.bincount(sample, minlength=4) / len(sample)
+    torch.testing.assert_close(frequency, expected, atol=0.005, rtol=0)
+    assert frequency[2] == 0
+    assert (ours.mode() == 3).all()
+
+
+@pytest.mark.parametrize("masked", range(4))
+def test_the_ends_of_the_noise_never_explore_what_is_impossible(masked):
+    values = torch.arange(4.0).expand(2, 4).clone()
+    values[:, masked] = -1e9
+    sample = EpsilonGreedy(values, torch.ones(())).sample(torch.tensor([0.0, 1 - 2**-24]))
+    assert sample.tolist() == [[0, 1][masked == 0], [3, 2][masked == 3]]
 
 
 def test_multi_categorical(rng):

@@ -8,7 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lemniscate.maths import cross_entropy, gae, hl_gauss, soft_lambda_return, td_target
+from lemniscate.maths import cross_entropy, gae, hl_gauss, q_lambda, soft_lambda_return, td_target
 from maths.test_returns import rollouts
 
 
@@ -52,6 +52,14 @@ def test_without_a_bonus_the_soft_return_is_the_target_of_gae(rollout, gamma, la
     _, target = gae(reward, value, next_value, terminated, done, gamma=gamma, lam=lam)
     found = soft_lambda_return(reward, next_value, torch.zeros_like(reward), terminated, done, gamma=gamma, lam=lam)
     torch.testing.assert_close(found, target, rtol=1e-10, atol=1e-10)
+
+
+@given(rollouts(), st.floats(0, 1), st.floats(0, 1))
+def test_the_return_of_q_learning_is_the_mixture_of_n_step_returns(rollout, gamma, lam):
+    reward, _, next_value, terminated, done = rollout
+    found = q_lambda(reward, next_value, terminated, done, gamma=gamma, lam=lam)
+    expected = mixture(reward, next_value, torch.zeros_like(reward), terminated, done, gamma, lam)
+    torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-10)
 
 
 def test_hl_gauss_is_the_mass_of_a_normal_in_each_bin(rng):

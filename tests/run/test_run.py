@@ -65,6 +65,7 @@ ON_POLICY = {
     "a2c": {"gae_lambda": 0.9, "entropy_coef": "0.1>0"},
     "trpo": {"final_critic_learning_rate": 0.1, "critic_minibatch_size": 32},
     "reppo": {"epochs": 2, "minibatch_size": 16},
+    "pqn": {"epochs": 2, "minibatch_size": 16},
 }
 
 

@@ -29,14 +29,14 @@ from lemniscate.nn.normalizer import RewardScale
 from lemniscate.nn.policies import Policy
 from lemniscate.optim.adam import Adam, linear
 from lemniscate.run.config import Count, Fraction, LogStd, NonNegative, NumEnvs, Positive, Range, Repeats, Scheduled
-from lemniscate.run.on_policy import OnPolicyConfig, OnPolicyState
+from lemniscate.run.on_policy import ActorCriticConfig, OnPolicyState
 from lemniscate.run.run import Run
 from lemniscate.spec import Spec
 from lemniscate.types import Batch, Loss, Metrics, Rollout
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(OnPolicyConfig):
+class Config(ActorCriticConfig):
     """The settings of REINFORCE."""
 
     num_envs: NumEnvs = 8

@@ -74,15 +74,16 @@ class ProbeEnv(gym.Env):
 class Probe(VectorView):
     """The environments, a note of each step, and what the hooks see until it is enough.
 
-    `events`, in their order: {t, rows [M], out [M, K], grad [M, K]} for a pass through a last layer, t steps of the
+    `events`, in their order: {t, rows [M], out [M, K], grad [M, K], own} for a pass through a last layer, t steps of the
     environments before it, of the observations `rows`, with the gradient if there was one; {t, taken} for a step of an
-    optimizer, with the gradient [K] of the bias of the policy's last layer.
+    optimizer, with the gradient [K · H] of the weight of each last layer, by K; `own` is a pass's part of it.
     """
 
     def __init__(self) -> None:
         super().__init__(make_vec(ProbeEnv, NUM_ENVS).env)
         self.numbers: dict[bytes, int] = {}  # of each observation
         self.steps: list[dict[str, Tensor]] = []
+        self.restarts: set[int] = set()  # the numbers of steps before each reset
         self.events: list[dict[str, Any]] = []
         self.counts = dict.fromkeys(MOST, 0)
         self.layers: dict[nn.Linear, tuple[int, Tensor]] = {}  # K if it is a last one, 0 if not, and its first weight
@@ -94,6 +95,7 @@ class Probe(VectorView):
         """That of `VectorView`, noted."""
         obs, info = super().reset(**options)
         self.obs = self._numbered(obs)
+        self.restarts.add(len(self.steps))
         return obs, info
 
     def step(self, actions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
@@ -137,21 +139,23 @@ class Probe(VectorView):
                 event = {"t": len(self.steps), "rows": self.known, "out": out.detach().reshape(-1, size).clone()}
                 self.events.append(event)
                 if out.requires_grad:
-                    out.register_hook(lambda grad: self._add(event, grad.detach().reshape(-1, size)))
+                    x = inputs[0].detach().reshape(-1, before)
+                    out.register_hook(lambda grad: self._add(event, grad.detach().reshape(-1, size), x))
 
-    def _add(self, event: dict[str, Any], grad: Tensor) -> None:
+    def _add(self, event: dict[str, Any], grad: Tensor, x: Tensor) -> None:
         event["grad"] = grad + event.get("grad", 0)
+        event["own"] = (grad.T @ x).flatten().double() + event.get("own", 0)
         self._count("gradients")
         self._count("rows", more=len(grad))
 
     def optimize(self, optimizer: torch.optim.Optimizer, *_: Any) -> None:
         """Before a step of an optimizer."""
         with suppress(Exception):
-            event: dict[str, Any] = {"t": len(self.steps)}
+            event: dict[str, Any] = {"t": len(self.steps), "taken": {}}
             mine = {id(p) for group in optimizer.param_groups for p in group["params"]}
             for layer, (size, _was) in self.layers.items():
-                if size == ACTIONS and id(layer.bias) in mine and layer.bias.grad is not None:
-                    event["taken"] = layer.bias.grad.detach().clone()
+                if size and id(layer.weight) in mine and layer.weight.grad is not None:
+                    event["taken"][size] = layer.weight.grad.detach().flatten().double()
             self.moved |= mine
             self.reached |= {id(layer.weight) for layer in self.layers if layer.weight.grad is not None}
             self.counts["updates"] += not any("out" not in e and e["t"] == event["t"] for e in self.events[-99:])
@@ -160,15 +164,16 @@ class Probe(VectorView):
     def noted(self) -> dict[str, Any]:
         """The notes, in plain tensors and numbers.
 
-        `steps` in columns [S, N]; `events`; and `stays`, of linear layers: K, whether the weight stays as it was, and
-        whether it has had a gradient, but stands in no optimizer that made a step.
+        `steps` in columns [S, N]; `events`; `restarts`, the numbers of steps before each reset; and `stays`, of linear
+        layers: K, whether the weight stays as it was, and whether it has had a gradient, but no optimizer that
+        made a step has it.
         """
         stays = [
             (k, layer.weight.equal(was), id(layer.weight) in self.reached and id(layer.weight) not in self.moved)
             for layer, (k, was) in self.layers.items()
         ]
         columns = {name: torch.stack([step[name] for step in self.steps]) for name in (self.steps or [{}])[0]}
-        return {"steps": columns, "events": self.events, "stays": stays}
+        return {"steps": columns, "events": self.events, "stays": stays, "restarts": sorted(self.restarts)}
 
 
 def watched(start: Callable[[VectorView], Any], names: Mapping[str, Any]) -> dict[str, Any]:
@@ -445,22 +450,32 @@ def of_optimizers(seen: Mapping[str, Any], them: list[Update]) -> str | None:
             why = "not_in_optimizer" if [True, True] in its else "zeroed" if k in graded else "no_gradient"
             why = why if graded and has_steps else "no_step" if graded else "no_backward"
             return f"{name} never changes. Likely: {SAYS[why]}."
-    before, apart = None, []
-    takes = iter(event["taken"].double() for event in seen["events"] if "taken" in event)
-    for taken, passes in zip(takes, (one for group in grouped(seen["events"]).values() for one in group), strict=False):
-        own = sum(one["grad"].double().sum(0) for one in passes if "grad" in one and one["out"].shape[1] == ACTIONS)
-        if before is not None and torch.is_tensor(own):
-            columns = torch.stack([own, before], 1)
-            apart.append(
-                [float(fitted(taken, columns[:, :n])[0].norm() / taken.norm().clamp(min=1e-12)) for n in (1, 2)]
-            )
-        before = taken
-    alone, together = torch.tensor(apart).reshape(-1, 2).T
-    if len(apart) and ((alone > FAILS) & (together < FAILS / 2)).double().mean() > 0.7:
+    if any(_is_added_up(seen["events"], k) for k in (ACTIONS, 1)):
         return SAYS["zero_grad"]
-    if not has_steps or (alone > FAILS).any():
+    if not has_steps:
         raise UnclearError
     return None
+
+
+def _is_added_up(events: list[dict[str, Any]], k: int) -> bool:
+    """Whether steps take the gradients of a last layer of K outputs again. Raises `UnclearError` if others than its."""
+    steps = [passes for group in grouped(events).values() for passes in group]
+    owns = [[one["own"] for one in passes if "grad" in one and one["out"].shape[1] == k] for passes in steps]
+    owns = [torch.stack(own).sum(0) for own in owns if own]
+    takes = [event["taken"][k] for event in events if k in event.get("taken", {})]
+    apart = [
+        [float(fitted(taken, columns[:, :n])[0].norm() / taken.norm().clamp(min=1e-12)) for n in (1, 2)]
+        for columns, taken in (
+            (torch.stack([own, before], 1), taken)
+            for before, taken, own in zip(takes, takes[1:], owns[1:], strict=False)
+        )
+    ]
+    alone, together = torch.tensor(apart).reshape(-1, 2).T
+    if len(apart) and ((alone > FAILS) & (together < FAILS / 2)).double().mean() > 0.7:
+        return True
+    if (alone > FAILS).any():
+        raise UnclearError
+    return False
 
 
 def of_rows(seen: Mapping[str, Any], them: list[Update]) -> str | None:
@@ -476,6 +491,9 @@ def of_rows(seen: Mapping[str, Any], them: list[Update]) -> str | None:
         return f"one minibatch of the {count} rows of a rollout is trained on, once."
     if share <= 0.6:
         raise UnclearError
+    begins = {t for t in grouped(seen["events"]) if t > 0}
+    if len(begins) > 2 and begins - {max(begins)} <= set(seen["restarts"]):
+        return SAYS["restart"]
     return None
 
 
@@ -484,6 +502,8 @@ def of_policy(seen: Mapping[str, Any], them: list[Update]) -> str | None:
     steps = [(update, step, update.env["action"].flatten()[step.rows]) for update in them for step in update.policy]
     if any(_is_of_others(step, action) for _, step, action in steps):
         return SAYS["actions"]
+    if _are_twice(steps):
+        return SAYS["twice"]
     weights = [(update, step, *coefficients(step, action)) for update, step, action in steps]
     firsts = {id(update): _sample(update, step, c) for update, step, c, _ in reversed(weights)}
     samples = [sample for sample in reversed(firsts.values()) if len(sample.rows) >= 16]
@@ -515,6 +535,18 @@ def _is_of_others(step: Step, action: Tensor) -> bool:
     along = (toward * step.grad[:, None]).sum(-1, keepdim=True) / toward.square().sum(-1, keepdim=True)
     rest, likely = ((step.grad[:, None] - along * toward).norm(dim=-1) / step.grad.norm(dim=1, keepdim=True)).min(1)
     return bool(rest.max() < FAILS and (likely != action).double().mean() > 0.25)
+
+
+def _are_twice(steps: list[tuple[Update, Step, Tensor]]) -> bool:
+    """Whether each row's gradient is that of log π, π = softmax(softmax(out)), and not of softmax(out)."""
+    apart = []
+    for _, step, action in steps:
+        p = step.out.softmax(1)
+        once, twice = (torch.eye(ACTIONS).double()[action] - q for q in (p, p.softmax(1)))
+        for toward in (once, p * (twice - (p * twice).sum(1, keepdim=True))):
+            along = (step.grad * toward).sum(1) / toward.square().sum(1)
+            apart.append((step.grad - along[:, None] * toward).norm() / step.grad.norm().clamp(min=1e-12))
+    return any(x > FAILS for x in apart[::2]) and all(x < FITS for x in apart[1::2])
 
 
 def _of_advantages(samples: list[Sample], right: Fit) -> str | None:
@@ -569,6 +601,8 @@ class Weight(NamedTuple):
 def _of_ratio(weights: list[tuple[Update, Step, Tensor, float]], samples: list[Sample], fit: Fit) -> str | None:
     """The ratio, its clip and the sign of the policy's loss, where the advantages are known."""
     kinds = list(_known_weights(weights, samples, fit))
+    if not kinds and list(_known_weights(weights, samples, fit, -1.0)):
+        return SAYS["mean_added"]
     for kind in kinds:
         beyond, far = _edges(kind)
         if _misfit(clipped_surrogate, kind, beyond) < 5 * FITS:
@@ -580,11 +614,16 @@ def _of_ratio(weights: list[tuple[Update, Step, Tensor, float]], samples: list[S
         again = [each._replace(log_ratio=each.to_latest) for each in kind if not each.to_latest.isnan().any()]
         if len(again) == len(kind) and _misfit(clipped_surrogate, again, _edges(again)[0], 0.9) < 5 * FITS:
             return SAYS["again"]
+    if any(map(_is_one_sided, kinds)):
+        return SAYS["one_sided"]
     raise UnclearError
 
 
-def _known_weights(weights: list[Any], samples: list[Sample], fit: Fit) -> Iterator[list[Weight]]:
-    """The minibatches, for each m that agrees with the first ones: 0, the rollout's mean, or the minibatch's."""
+def _known_weights(weights: list[Any], samples: list[Sample], fit: Fit, sign: float = 1.0) -> Iterator[list[Weight]]:
+    """The minibatches, for each m that agrees with the first ones: 0, the rollout's mean, or the minibatch's.
+
+    With `sign` −1, m is the negative of one of these means.
+    """
     gamma, lam = torch.tensor([[fit.gamma], [fit.lam]]).double()
     advantages, possible = {}, [True] * 3
     for sample in samples:
@@ -594,7 +633,7 @@ def _known_weights(weights: list[Any], samples: list[Sample], fit: Fit) -> Itera
             raise UnclearError  # a γ of each update, …
         a, m = both @ torch.stack(scales) * scales[0].sign(), -shift * scales[0].sign()
         advantages[id(sample.update)] = a
-        means = (0, a.mean(), a[sample.update.policy[0].rows].mean())
+        means = (0, sign * a.mean(), sign * a[sample.update.policy[0].rows].mean())
         possible = [was and bool(abs(mean - m) < 0.02 * a.std()) for was, mean in zip(possible, means, strict=True)]
     for kind in np.flatnonzero(possible):
         its = []
@@ -605,6 +644,15 @@ def _known_weights(weights: list[Any], samples: list[Sample], fit: Fit) -> Itera
                 mean = (0, a.mean(), a[step.rows].mean())[kind]
                 its.append(Weight(c, a[step.rows] - mean, now - first, now - latest))
         yield its
+
+
+def _is_one_sided(weights: list[Weight]) -> bool:
+    """Whether rows whose ratio is 1 have no gradient where the advantage is above some number, or where it is below."""
+    c, a, log_ratio, _ = map(torch.cat, zip(*weights, strict=True))
+    counts = (log_ratio.abs() < 0.01) & (a.abs() > 0.1 * a.std())
+    has = c[counts].abs() > 1e-6 * c.abs().max()
+    without, beside = a[counts][~has], a[counts][has]
+    return min(len(without), len(beside)) > 8 and bool(without.min() >= beside.max() or without.max() <= beside.min())
 
 
 def _edges(weights: list[Weight]) -> tuple[tuple[float, float], str]:

@@ -1,4 +1,4 @@
-"""Whole episodes, which REINFORCE learns from, and the rows of REPPO."""
+"""Whole episodes, which REINFORCE learns from, and the rows that a Q learns from."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -40,13 +40,19 @@ def collect_episodes(env: VecEnv, policy: Policy, episodes: int, generator: Gene
 
 
 @dataclass(frozen=True)
-class SoftBatch(Record):
-    """The rows of a rollout with Q(s, a), its target, and the policy's μ and log σ at collection, [B, …]."""
+class QBatch(Record):
+    """The rows of a rollout with Q(s, a) and its target, [B, …]."""
 
     obs: Tensor
     action: Tensor
     value: Tensor
     target: Tensor
+
+
+@dataclass(frozen=True)
+class SoftBatch(QBatch):
+    """The rows of a rollout with Q(s, a), its target, and the policy's μ and log σ at collection, [B, …]."""
+
     mean: Tensor
     log_std: Tensor
 

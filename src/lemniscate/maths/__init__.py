@@ -1,11 +1,11 @@
 """The mathematics: pure functions on tensors, each with its equation and a test against brute force."""
 
 from lemniscate.maths.bounded import Deterministic, SquashedGaussian, mean_and_std
-from lemniscate.maths.discrete import Bernoulli, Categorical, MultiCategorical
+from lemniscate.maths.discrete import Bernoulli, Categorical, EpsilonGreedy, MultiCategorical
 from lemniscate.maths.distributions import Distribution, Gaussian, tanh
 from lemniscate.maths.losses import clipped_surrogate, policy_gradient, surrogate, value_loss
 from lemniscate.maths.noise import coloured, ornstein_uhlenbeck, uniform
-from lemniscate.maths.returns import episode_return, gae, reward_to_go
+from lemniscate.maths.returns import episode_return, gae, q_lambda, reward_to_go
 from lemniscate.maths.soft_q import cross_entropy, hl_gauss, soft_lambda_return
 from lemniscate.maths.stats import (
     clip_fraction,
@@ -26,6 +26,7 @@ __all__ = [
     "Categorical",
     "Deterministic",
     "Distribution",
+    "EpsilonGreedy",
     "Gaussian",
     "MultiCategorical",
     "SquashedGaussian",
@@ -50,6 +51,7 @@ __all__ = [
     "ornstein_uhlenbeck",
     "policy_gradient",
     "polyak",
+    "q_lambda",
     "ratio_statistics",
     "reward_to_go",
     "soft_lambda_return",

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import binary_cross_entropy_with_logits, logsigmoid
+from torch.nn.functional import binary_cross_entropy_with_logits, logsigmoid, one_hot
 
 
 @dataclass(frozen=True)
@@ -15,8 +15,7 @@ class Categorical:
 
     def sample(self, noise: Tensor) -> Tensor:
         """[B] int64, from noise [B] uniform in [0, 1): the first action at which Σ π exceeds it."""
-        cumulative = self.logits.softmax(-1).cumsum(-1)
-        return (cumulative <= noise.unsqueeze(-1) * cumulative[..., -1:]).sum(-1)
+        return _first_beyond(self.logits.softmax(-1), noise)
 
     def mode(self) -> Tensor:
         """[B] int64."""
@@ -95,6 +94,39 @@ class Bernoulli:
         on, off = logsigmoid(self.logits), logsigmoid(-self.logits)
         its_on, its_off = logsigmoid(other.logits), logsigmoid(-other.logits)
         return (on.exp() * (on - its_on) + off.exp() * (off - its_off)).sum(-1)
+
+
+@dataclass(frozen=True)
+class EpsilonGreedy:
+    """The action of the largest Q with probability 1 − ε, else any permitted one: Sutton & Barto 2018, section 2.2.
+
+        π(a|s) = (1 − ε) 1[a = argmax Q(s, ·)] + ε / |A(s)|
+
+    `values` are Q(s, ·), [B, n], at most −5·10⁸ where an action is not permitted; `epsilon` is a scalar.
+    """
+
+    values: Tensor
+    epsilon: Tensor
+
+    @property
+    def probabilities(self) -> Tensor:
+        """π(·|s), [B, n]."""
+        permitted = (self.values > -5e8).to(self.values.dtype)
+        best = one_hot(self.mode(), self.values.shape[-1]).to(self.values.dtype)
+        return torch.lerp(best, permitted / permitted.sum(-1, keepdim=True), self.epsilon)
+
+    def sample(self, noise: Tensor) -> Tensor:
+        """[B] int64, from noise [B] uniform in [0, 1): the first action at which Σ π exceeds it."""
+        return _first_beyond(self.probabilities, noise)
+
+    def mode(self) -> Tensor:
+        """[B] int64."""
+        return self.values.argmax(-1)
+
+
+def _first_beyond(probabilities: Tensor, noise: Tensor) -> Tensor:
+    cumulative = probabilities.cumsum(-1)
+    return (cumulative <= noise.unsqueeze(-1) * cumulative[..., -1:]).sum(-1)
 
 
 for kind in (Categorical, MultiCategorical, Bernoulli):

@@ -46,6 +46,38 @@ def gae(
     return advantage, advantage + value
 
 
+def q_lambda(
+    reward: Float[Tensor, "T N"],
+    next_value: Float[Tensor, "T N"],
+    terminated: Bool[Tensor, "T N"],
+    done: Bool[Tensor, "T N"],
+    *,
+    gamma: float = 0.99,
+    lam: float = 0.65,
+) -> Float[Tensor, "T N"]:
+    """The λ-return of Q-learning: Gallici et al. 2025, arXiv:2407.04811, section 4, which is Peng's Q(λ).
+
+        G_t = r_t + γ (λ G_{t+1} + (1 − λ) max_a Q(s_{t+1}, a))
+
+    r_t alone after a termination. Where the chain ends, at a time-out and in the last row, the maximum stands for
+    G_{t+1}. An exploratory action does not end it, as it would in Watkins's Q(λ).
+
+    Args:
+        reward: r_t.
+        next_value: max_a Q(s_{t+1}, a) at the true successor, before any reset.
+        terminated: the episode ended by its own rules at row t.
+        done: the episode ended at row t for any reason.
+        gamma: discount γ in [0, 1].
+        lam: trace decay λ in [0, 1]; 0 is the target of one-step Q-learning.
+    """
+    target = torch.empty_like(reward)
+    follows = next_value[-1]
+    for t in reversed(range(len(reward))):
+        ahead = torch.lerp(next_value[t], follows, lam * (~done[t]).to(follows.dtype))
+        target[t] = follows = reward[t] + gamma * ahead * ~terminated[t]
+    return target
+
+
 def reward_to_go(
     reward: Float[Tensor, "T N"],
     next_value: Float[Tensor, "T N"],

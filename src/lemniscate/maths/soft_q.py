@@ -4,6 +4,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from lemniscate.maths.returns import q_lambda
+
 
 def soft_lambda_return(
     reward: Float[Tensor, "T N"],
@@ -32,12 +34,8 @@ def soft_lambda_return(
         gamma: discount γ in [0, 1].
         lam: trace decay λ in [0, 1].
     """
-    target = torch.empty_like(reward)
-    follows = next_value[-1]
-    for t in reversed(range(len(reward))):
-        ahead = torch.lerp(next_value[t], follows, lam * (~done[t]).to(follows.dtype))
-        target[t] = follows = reward[t] + gamma * (next_bonus[t] + ahead) * ~terminated[t]
-    return target
+    reward = reward + gamma * next_bonus * ~terminated
+    return q_lambda(reward, next_value, terminated, done, gamma=gamma, lam=lam)
 
 
 def hl_gauss(target: Float[Tensor, " B"], edges: Float[Tensor, " E"], width: float = 0.75) -> Float[Tensor, "B K"]:

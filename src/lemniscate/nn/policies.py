@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import torch
 from torch import Generator, Tensor, nn
 
-from lemniscate.maths import Bernoulli, Categorical, Distribution, Gaussian, MultiCategorical
+from lemniscate.maths import Bernoulli, Categorical, Distribution, EpsilonGreedy, Gaussian, MultiCategorical
 from lemniscate.nn.normalizer import NoNorm
 from lemniscate.spec import Box, Discrete, MultiDiscrete
 
@@ -76,6 +76,28 @@ class CategoricalPolicy(Policy):
     def draw_noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
         """Uniform in [0, 1), [*shape]."""
         return torch.rand(*shape, generator=generator, device=generator.device)
+
+
+class EpsilonGreedyPolicy(Policy):
+    """Whose `net` is Q(s, ·): the best of n permitted actions, or with probability `epsilon` any of them."""
+
+    epsilon: Tensor
+    """ε, a scalar; 1 at first, and saved with the policy"""
+
+    def __init__(self, normalizer: NoNorm, net: nn.Module, action: Discrete) -> None:
+        super().__init__(normalizer, net)
+        self.action = action
+        self.register_buffer("epsilon", torch.ones(()))
+
+    def forward(self, obs: Tensor) -> EpsilonGreedy:
+        """[B, O] to Q(s, ·), [B, n], with −10⁹ for actions that are not permitted."""
+        return EpsilonGreedy(_permitted(self.net(self.normalizer(obs)), obs, self.action), self.epsilon)
+
+    draw_noise = CategoricalPolicy.draw_noise
+
+    def metrics(self) -> dict[str, Tensor]:
+        """ε."""
+        return {"epsilon": self.epsilon.clone()}
 
 
 class MultiCategoricalPolicy(Policy):

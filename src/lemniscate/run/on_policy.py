@@ -22,14 +22,10 @@ class OnPolicyConfig(RunConfig):
     """discount factor γ; usually 0.9 to 0.999"""
     hidden: tuple[Width, ...] = (64, 64)
     """widths of the policy's hidden layers"""
-    critic_hidden: tuple[Width, ...] | None = None
-    """those of the value, or of Q; usually as wide or wider; none: as hidden"""
     activation: Activation = "tanh"
     """activation function between the layers"""
     network: str = "mlp"
     """mlp, layer_norm (the same with layer normalization), simba (residual blocks of one width), or module:Class"""
-    initial_log_std: LogStd = -0.5
-    """initial log σ of a Gaussian policy, in units of half the action range; usually -1 to 0"""
     normalize_observations: bool = True
     """normalize observations by their running mean and standard deviation, inside the policy"""
     scale_rewards: bool = True
@@ -37,25 +33,17 @@ class OnPolicyConfig(RunConfig):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for layers in self.network_settings[:2]:
-            layers.check()
-
-    def networks(self, spec: Spec) -> Any:
-        """New networks for the spaces in `spec`: the policy and V(s)."""
-        layers, critic_layers, normalize = self.network_settings
-        return ActorCritic(spec, layers, self.initial_log_std, normalize, critic_layers=critic_layers)
+        self.layers.check()
 
     def memory(self, spec: Spec) -> dict[str, int]:
         """The bytes of a rollout, and of its rows in the widest layer."""
-        rows = 4 * self.num_rows * max((*self.hidden, *(self.critic_hidden or ())), default=0)
+        rows = 4 * self.num_rows * max((*self.hidden, *(getattr(self, "critic_hidden", None) or ())), default=0)
         return {"num_steps": rows + rollout_bytes(spec, self.num_steps, self.num_envs)}
 
     @property
-    def network_settings(self) -> tuple[Layers, Layers, bool]:
-        """The hidden layers of the policy and of the value, and whether observations are normalized."""
-        layers = Layers(self.hidden, self.activation, self.network)
-        critic_hidden = self.hidden if self.critic_hidden is None else self.critic_hidden
-        return layers, replace(layers, hidden=critic_hidden), self.normalize_observations
+    def layers(self) -> Layers:
+        """The hidden layers of the policy."""
+        return Layers(self.hidden, self.activation, self.network)
 
     @property
     def num_rows(self) -> int:
@@ -84,6 +72,31 @@ class OnPolicyConfig(RunConfig):
         """Raise `UserError` if `field`, which standardizes, would have a single row to do it with."""
         if rows == 1 and getattr(self, field):
             raise UserError(f"{field} needs batches of 2 rows or more; these have 1.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ActorCriticConfig(OnPolicyConfig):
+    """The settings of those that learn a policy and, beside it, a value."""
+
+    critic_hidden: tuple[Width, ...] | None = None
+    """widths of the value's hidden layers, or of Q's; usually as wide or wider; none: as hidden"""
+    initial_log_std: LogStd = -0.5
+    """initial log σ of a Gaussian policy, in units of half the action range; usually -1 to 0"""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.network_settings[1].check()
+
+    def networks(self, spec: Spec) -> Any:
+        """New networks for the spaces in `spec`: the policy and V(s)."""
+        layers, critic_layers, normalize = self.network_settings
+        return ActorCritic(spec, layers, self.initial_log_std, normalize, critic_layers=critic_layers)
+
+    @property
+    def network_settings(self) -> tuple[Layers, Layers, bool]:
+        """The hidden layers of the policy and of the value, and whether observations are normalized."""
+        critic_hidden = self.hidden if self.critic_hidden is None else self.critic_hidden
+        return self.layers, replace(self.layers, hidden=critic_hidden), self.normalize_observations
 
 
 @dataclass(kw_only=True)
