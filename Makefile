@@ -60,7 +60,7 @@ bench: .venv/.peers  ## the drone in docs/results.md, and the tables of docs/spe
 	$(BIN)/python benchmarks/speed.py
 
 bench-returns: setup  ## the tables of docs/results.md, seed by seed: a day; returns.py takes some of them too
-	$(BIN)/python benchmarks/returns.py reinforce a2c trpo ppo reppo ddpg td3 sac
+	$(BIN)/python benchmarks/returns.py reinforce a2c trpo ppo reppo pqn ddpg td3 sac
 
 .venv/.peers: .venv/.ready
 	$(BIN)/python -m pip install --quiet --constraint requirements.lock --no-build-isolation --editable '.[bench]'

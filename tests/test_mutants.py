@@ -657,7 +657,7 @@ MUTANTS = [
     ),
     (
         "the floor of the temperature is a ceiling",
-        "nn/actor_categorical_q.py",
+        "nn/categorical_q.py",
         "clamp_(min=math.log(least)",
         "clamp_(max=math.log(least)",
         REPPO + "the_temperature_stops_at_its_least_and_can_grow_again",
@@ -692,14 +692,14 @@ MUTANTS = [
     ),
     (
         "the maximum is of the action taken",
-        "nn/action_values.py",
+        "nn/actor_critic.py",
         "self.policy(next_obs).values.amax(-1)",
         "self.q(next_obs, action)",
         PQN + "the_target_is_the_return_of_the_best_next_action",
     ),
     (
         "the maximum is of the state before",
-        "nn/action_values.py",
+        "nn/actor_critic.py",
         "self.policy(next_obs).values.amax(-1)",
         "self.policy(obs).values.amax(-1)",
         PQN + "the_target_is_the_return_of_the_best_next_action",
@@ -713,7 +713,7 @@ MUTANTS = [
     ),
     (
         "Q learns from the first action",
-        "nn/action_values.py",
+        "nn/actor_critic.py",
         "gather(-1, action.unsqueeze(-1))",
         "gather(-1, 0 * action.unsqueeze(-1))",
         PQN + "the_loss_is_half_the_squared_error_of_the_actions_taken",

@@ -26,7 +26,6 @@ ON_POLICY = {
     "gamma": 0.9,
     "normalize_observations": True,
     "scale_rewards": True,
-    "initial_log_std": -0.5,
     "seed": 3,
 }
 OFF_POLICY = {
@@ -50,12 +49,21 @@ OFF_POLICY = {
     "seed": 3,
 }
 VALUE = {"critic_epochs": 2, "critic_minibatch_size": 16, "critic_learning_rate": 1e-3}
+WIDTH = {"initial_log_std": -0.5}
 FIELDS = {
-    "reinforce": {**ON_POLICY, **VALUE, "learning_rate": 3e-3, "entropy_coef": 0.01},
-    "a2c": {**ON_POLICY, "learning_rate": 1e-3, "gae_lambda": 0.95, "entropy_coef": 0.01, "max_grad_norm": 0.5},
-    "trpo": {**ON_POLICY, **VALUE, "max_kl": 0.01, "gae_lambda": 0.95, "final_critic_learning_rate": 0.5},
+    "reinforce": {**ON_POLICY, **WIDTH, **VALUE, "learning_rate": 3e-3, "entropy_coef": 0.01},
+    "a2c": {
+        **ON_POLICY,
+        **WIDTH,
+        "learning_rate": 1e-3,
+        "gae_lambda": 0.95,
+        "entropy_coef": 0.01,
+        "max_grad_norm": 0.5,
+    },
+    "trpo": {**ON_POLICY, **WIDTH, **VALUE, "max_kl": 0.01, "gae_lambda": 0.95, "final_critic_learning_rate": 0.5},
     "ppo": {
         **ON_POLICY,
+        **WIDTH,
         "epochs": 2,
         "minibatch_size": 16,
         "learning_rate": 1e-3,
@@ -69,6 +77,7 @@ FIELDS = {
     },
     "reppo": {
         **ON_POLICY,
+        **WIDTH,
         "epochs": 2,
         "minibatch_size": 16,
         "learning_rate": 1e-3,

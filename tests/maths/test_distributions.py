@@ -9,8 +9,8 @@ from torch import distributions
 from lemniscate.maths import (
     Bernoulli,
     Categorical,
-    EpsilonGreedy,
     Deterministic,
+    EpsilonGreedy,
     Gaussian,
     MultiCategorical,
     SquashedGaussian,

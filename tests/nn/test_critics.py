@@ -7,11 +7,10 @@ import pytest
 import torch
 
 from helpers import spec_of
-from lemniscate.nn.actor_categorical_q import ActorCategoricalQ
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.actor_q import ActorQ
 from lemniscate.nn.bounded import Temperature
-from lemniscate.nn.categorical_q import normalize_units
+from lemniscate.nn.categorical_q import ActorCategoricalQ, normalize_units
 from lemniscate.nn.networks import Layers
 
 

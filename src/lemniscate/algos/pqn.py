@@ -13,7 +13,7 @@ from torch import Tensor
 from lemniscate.data.batches import QBatch
 from lemniscate.data.rollout import collect, epoch_minibatches
 from lemniscate.maths import explained_variance, means, q_lambda, value_loss
-from lemniscate.nn.action_values import ActionValues
+from lemniscate.nn.actor_critic import ActionValues
 from lemniscate.nn.networks import Activation
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.optim.adam import Adam, linear

@@ -13,8 +13,7 @@ from torch import Tensor
 from lemniscate.data.batches import SoftBatch
 from lemniscate.data.rollout import collect, epoch_minibatches
 from lemniscate.maths import cross_entropy, explained_variance, hl_gauss, means, soft_lambda_return
-from lemniscate.nn.actor_categorical_q import ActorCategoricalQ, Multipliers
-from lemniscate.nn.categorical_q import CategoricalQ
+from lemniscate.nn.categorical_q import ActorCategoricalQ, CategoricalQ, Multipliers
 from lemniscate.nn.networks import Activation
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.nn.policies import Policy

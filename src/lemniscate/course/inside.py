@@ -74,9 +74,9 @@ class ProbeEnv(gym.Env):
 class Probe(VectorView):
     """The environments, a note of each step, and what the hooks see until it is enough.
 
-    `events`, in their order: {t, rows [M], out [M, K], grad [M, K], own} for a pass through a last layer, t steps of the
-    environments before it, of the observations `rows`, with the gradient if there was one; {t, taken} for a step of an
-    optimizer, with the gradient [K · H] of the weight of each last layer, by K; `own` is a pass's part of it.
+    `events`, in their order: {t, rows [M], out [M, K], grad [M, K], own} for a pass through a last layer, t steps of
+    the environments before it, of the observations `rows`, with the gradient if there was one; {t, taken} for a step of
+    an optimizer, with the gradient [K · H] of the weight of each last layer, by K; `own` is a pass's part of it.
     """
 
     def __init__(self) -> None:

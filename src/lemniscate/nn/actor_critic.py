@@ -1,10 +1,18 @@
-"""A policy and V(s) for the spaces of an environment: separate networks behind one normalizer."""
+"""A policy for the spaces of an environment, and V(s): separate networks behind one normalizer; or Q alone."""
 
 from torch import Tensor, nn
 
+from lemniscate.errors import UserError
 from lemniscate.nn.networks import ImageEncoder, Layers, PartsEncoder
 from lemniscate.nn.normalizer import NoNorm, NormByPart, RunningNorm, ScaleBytes, with_privileged
-from lemniscate.nn.policies import BernoulliPolicy, CategoricalPolicy, GaussianPolicy, MultiCategoricalPolicy, Policy
+from lemniscate.nn.policies import (
+    BernoulliPolicy,
+    CategoricalPolicy,
+    EpsilonGreedyPolicy,
+    GaussianPolicy,
+    MultiCategoricalPolicy,
+    Policy,
+)
 from lemniscate.spec import Action, Box, Discrete, MultiDiscrete, Spec
 
 
@@ -43,6 +51,29 @@ class ActorCritic(nn.Module):
     def estimates(self, obs: Tensor, next_obs: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """V(s), V(s') and log π(a|s) of rows […, …], […] each."""
         return self.value(obs), self.value(next_obs), self.policy(obs).log_prob(action)
+
+
+class ActionValues(nn.Module):
+    """An ε-greedy policy; its network is Q(s, ·).
+
+    Raises:
+        UserError: actions of another kind than Discrete.
+    """
+
+    def __init__(self, spec: Spec, layers: Layers, normalize_observations: bool) -> None:
+        super().__init__()
+        if not isinstance(spec.action, Discrete):
+            raise UserError(f"{spec.env_id} has actions {spec.action}, and Q has one output for each Discrete action.")
+        net = network_of(spec, layers, spec.action.n, last_gain=0.01)
+        self.policy = EpsilonGreedyPolicy(normalizer_of(spec, normalize_observations), net, spec.action)
+
+    def q(self, obs: Tensor, action: Tensor) -> Tensor:
+        """Q(s, a) of rows […, O] and […], […]."""
+        return self.policy(obs).values.gather(-1, action.unsqueeze(-1)).squeeze(-1)
+
+    def estimates(self, obs: Tensor, next_obs: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Q(s, a) and max_a Q(s', a) of rows […, O], […, O] and […], […] each."""
+        return self.q(obs, action), self.policy(next_obs).values.amax(-1)
 
 
 def normalizer_of(spec: Spec, normalize_observations: bool) -> NoNorm:
