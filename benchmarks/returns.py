@@ -50,7 +50,7 @@ RUNS = {
         "Walker2d-v5": ((MILLION,), 10),
         "Ant-v5": ((4_500_000,), 5),
     },
-    "pqn": {"CartPole-v1": ((200_000,), 10), "Acrobot-v1": ((200_000,), 10), "LunarLander-v3": ((400_000,), 10)},
+    "pqn": {"CartPole-v1": ((200_000,), 10), "Acrobot-v1": ((400_000,), 10), "LunarLander-v3": ((400_000,), 10)},
     "ddpg": {
         "MountainCarContinuous-v0": ((30_000,), 10),
         "Pendulum-v1": ((20_000,), 5),

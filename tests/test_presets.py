@@ -26,8 +26,8 @@ def test_each_environment_gets_its_own_unless_another_is_named(algorithm):
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_an_unknown_environment_gets_the_defaults_of_the_config(algorithm):
     for name in (None, "default"):
-        config = find(algorithm).Config(env="Acrobot-v1")
-        assert presets.choose(algorithm, "Acrobot-v1", name) == ("default", config)
+        config = find(algorithm).Config(env="MountainCar-v0")
+        assert presets.choose(algorithm, "MountainCar-v0", name) == ("default", config)
     assert presets.names(algorithm)[0] == "default"
 
 
@@ -86,7 +86,7 @@ def test_a_stored_preset_is_chosen_by_its_file(tmp_path):
     file = tmp_path / "preset.json"
     Preset("mine", config, "by hand", "2026-11").write(file, "ppo")
     assert presets.choose("ppo", None, str(file))[1] == config
-    assert presets.choose("ppo", "Acrobot-v1", str(file))[1] == config.replace(env="Acrobot-v1")
+    assert presets.choose("ppo", "MountainCar-v0", str(file))[1] == config.replace(env="MountainCar-v0")
     with pytest.raises(UserError, match="is a preset of ppo, not of sac"):
         presets.choose("sac", None, str(file))
     with pytest.raises(UserError, match=r"There is no preset: .*elsewhere\.json does not exist"):

@@ -42,7 +42,7 @@ class Config(OnPolicyConfig):
     """final learning rate as a fraction of the initial one, annealed linearly; 1: constant"""
     max_grad_norm: Positive | None = 10.0
     """gradient clipping by global norm, usually 1 to 10; none: no clipping"""
-    td_lambda: Fraction = 0.95
+    td_lambda: Fraction = 0.8
     """trace decay λ of the return, usually 0.65 to 0.95; 0 is one-step Q-learning, 1 Monte Carlo"""
     final_epsilon: Fraction = 0.05
     """ε after exploration, the share of random actions; usually 0.01 to 0.2"""

@@ -79,7 +79,7 @@ class ActorCriticConfig(OnPolicyConfig):
     """The settings of those that learn a policy and, beside it, a value."""
 
     critic_hidden: tuple[Width, ...] | None = None
-    """widths of the value's hidden layers, or of Q's; usually as wide or wider; none: as hidden"""
+    """widths for the value, or for Q; usually as wide or wider; none: as hidden"""
     initial_log_std: LogStd = -0.5
     """initial log σ of a Gaussian policy, in units of half the action range; usually -1 to 0"""
 
