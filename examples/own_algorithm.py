@@ -24,14 +24,14 @@ from lemniscate.nn.normalizer import RewardScale
 from lemniscate.optim.adam import Adam
 from lemniscate.presets import Preset
 from lemniscate.run.config import Count, Fraction, NonNegative, Positive
-from lemniscate.run.on_policy import OnPolicyConfig, OnPolicyState
+from lemniscate.run.on_policy import ActorCriticConfig, OnPolicyState
 from lemniscate.run.run import Run
 from lemniscate.spec import Spec
 from lemniscate.types import Batch, Loss, Metrics, Rollout
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(OnPolicyConfig):
+class Config(ActorCriticConfig):
     """The settings of PPO with a KL penalty."""
 
     beta: NonNegative = 3.0

@@ -16,7 +16,7 @@ printf '%s\\n' "${COMPREPLY[@]}"
 
 CASES = [
     (["lemniscate", "tr"], ["train"]),
-    (["lemniscate", "train", "p"], ["ppo"]),
+    (["lemniscate", "train", "p"], ["ppo", "pqn"]),
     (["lemniscate", "train", "ppo", "--minibatch"], ["--minibatch-size"]),
     (["lemniscate", "train", "sac", "--tau"], ["--tau"]),
     (["lemniscate", "train", "sac", "--clip"], []),

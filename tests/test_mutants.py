@@ -594,14 +594,14 @@ MUTANTS = [
     ),
     (
         "a time-out ends the soft return",
-        "maths/soft_q.py",
-        "(next_bonus[t] + ahead) * ~terminated[t]",
-        "(next_bonus[t] + ahead) * ~done[t]",
+        "maths/returns.py",
+        "gamma * ahead * ~terminated[t]",
+        "gamma * ahead * ~done[t]",
         "maths/test_soft_q.py::test_the_soft_return_is_the_mixture_of_n_step_returns",
     ),
     (
         "the soft return runs on into the next episode",
-        "maths/soft_q.py",
+        "maths/returns.py",
         "lam * (~done[t]).to(follows.dtype)",
         "lam * (~terminated[t]).to(follows.dtype)",
         "maths/test_soft_q.py::test_the_soft_return_is_the_mixture_of_n_step_returns",
@@ -609,8 +609,8 @@ MUTANTS = [
     (
         "entropy is paid for after a death",
         "maths/soft_q.py",
-        "gamma * (next_bonus[t] + ahead) * ~terminated[t]",
-        "gamma * (next_bonus[t] + ahead * ~terminated[t])",
+        "reward + gamma * next_bonus * ~terminated",
+        "reward + gamma * next_bonus",
         "maths/test_soft_q.py::test_the_soft_return_is_the_mixture_of_n_step_returns",
     ),
     (

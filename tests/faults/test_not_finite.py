@@ -166,7 +166,7 @@ def test_parameters_that_overflow_are_neither_acted_with_nor_saved(tmp_path, alg
     for number, fields in enumerate(itertools.islice(rates(algorithm), 0, None, every)):
         if algorithm == "ppo":
             fields["desired_kl"] = None
-        box = {"box": needs_box(algorithm) or number % 2 == 0}
+        box = {"box": needs_box(algorithm) or (number % 2 == 0 and algorithm != "pqn")}
         how = ending(tmp_path / str(number), algorithm, env_kwargs=box, **fields)
         assert how == "finished" or "step" in how, how
         counts["finished" if how == "finished" else "named"] += 1

@@ -63,7 +63,8 @@ class ActionValues(nn.Module):
     def __init__(self, spec: Spec, layers: Layers, normalize_observations: bool) -> None:
         super().__init__()
         if not isinstance(spec.action, Discrete):
-            raise UserError(f"{spec.env_id} has actions {spec.action}, and Q has one output for each Discrete action.")
+            kind = type(spec.action).__name__
+            raise UserError(f"{spec.env_id} has actions of kind {kind}; Q has an output for each one of n, Discrete.")
         net = network_of(spec, layers, spec.action.n, last_gain=0.01)
         self.policy = EpsilonGreedyPolicy(normalizer_of(spec, normalize_observations), net, spec.action)
 
