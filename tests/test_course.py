@@ -3,6 +3,7 @@
 import importlib
 import re
 import sys
+import time
 from functools import partial
 
 import pytest
@@ -212,6 +213,18 @@ def test_an_import_that_was_broken_off_can_be_made_again(tmp_path, monkeypatch):
         importlib.import_module("slow_package")
     monkeypatch.setattr(sys, "no_hurry", True, raising=False)
     assert importlib.import_module("slow_package").part
+
+
+def test_the_time_of_a_solution_is_the_processors_and_an_import_may_take_longer(tmp_path, monkeypatch):
+    text = "import time\nend = time.thread_time() + 0.5\nwhile time.thread_time() < end: pass\n"
+    (tmp_path / "late_package.py").write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    with limited(0.3):
+        importlib.import_module("late_package")
+    with limited(0.3):
+        time.sleep(0.6)
+    with pytest.raises(TooLong), limited(0.1):
+        [time.sleep(0.01) for _ in range(1000)]
 
 
 @pytest.mark.parametrize(

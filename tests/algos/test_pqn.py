@@ -8,12 +8,14 @@ import pytest
 import torch
 
 import helpers
+import lemniscate as lem
 import toy
 from helpers import CPU, begin, slope, spec_of, vectorize
 from lemniscate.algos import pqn
 from lemniscate.data.rollout import collect
 from lemniscate.errors import UserError
 from lemniscate.maths import q_lambda
+from lemniscate.run.metrics import read_metrics
 from lemniscate.spec import Discrete
 
 
@@ -73,6 +75,22 @@ def test_epsilon_falls_linearly_from_one_and_stays():
         [1, 0.55, 0.1, 0.1, 0.1, 0.1]
     )
     assert pqn.epsilon(config.replace(exploration=0.0), 0) == pytest.approx(0.1)
+
+
+def test_a_run_explores_less_and_less_also_where_it_was_resumed(tmp_path):
+    fields = {
+        "num_envs": 4,
+        "num_steps": 8,
+        "minibatch_size": 16,
+        "hidden": (8,),
+        "exploration": 0.5,
+        "progress": False,
+    }
+    stop = [lambda step, *_: step >= 96]
+    lem.train("pqn", "CartPole-v1", run=tmp_path / "r", total_steps=256, final_epsilon=0.1, callbacks=stop, **fields)
+    lem.resume(tmp_path / "r", progress=False)
+    found = [line["epsilon"] for line in read_metrics(tmp_path / "r") if "epsilon" in line]
+    assert found == pytest.approx([1, 0.775, 0.55, 0.325, 0.1, 0.1, 0.1, 0.1])
 
 
 def test_the_policy_that_is_evaluated_does_not_explore(rng):

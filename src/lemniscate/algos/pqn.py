@@ -48,8 +48,6 @@ class Config(OnPolicyConfig):
     """ε after exploration, the share of random actions; usually 0.01 to 0.2"""
     exploration: Fraction = 0.2
     """share of the run in which ε falls linearly from 1 to final_epsilon; usually 0.1 to 0.5"""
-    recompute_targets: bool = True
-    """estimate the λ-returns again before each epoch, with the present Q"""
     hidden: tuple[Width, ...] = (128, 128)
     """widths of Q's hidden layers; usually 2 of 128 to 512"""
     activation: Activation = "relu"
@@ -126,7 +124,7 @@ def update(config: Config, state: State, rollout: Rollout) -> dict[str, Tensor |
     batch = collected = targets(config, state.networks, rollout)
     rows, metrics = rollout.valid_rows, []
     for epoch in range(config.epochs):
-        if config.recompute_targets and epoch > 0:
+        if epoch > 0:
             batch = targets(config, state.networks, rollout)
         minibatches = epoch_minibatches(rows, rollout.num_rows, config.minibatch_size, state.rng.minibatch)
         metrics.append(means(state.learn(config, state, batch, minibatches)))

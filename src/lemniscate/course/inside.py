@@ -463,13 +463,10 @@ def _is_added_up(events: list[dict[str, Any]], k: int) -> bool:
     owns = [[one["own"] for one in passes if "grad" in one and one["out"].shape[1] == k] for passes in steps]
     owns = [torch.stack(own).sum(0) for own in owns if own]
     takes = [event["taken"][k] for event in events if k in event.get("taken", {})]
-    apart = [
-        [float(fitted(taken, columns[:, :n])[0].norm() / taken.norm().clamp(min=1e-12)) for n in (1, 2)]
-        for columns, taken in (
-            (torch.stack([own, before], 1), taken)
-            for before, taken, own in zip(takes, takes[1:], owns[1:], strict=False)
-        )
-    ]
+    apart = []
+    for before, taken, own in zip(takes, takes[1:], owns[1:], strict=False):
+        columns, size = torch.stack([own, before], 1), taken.norm().clamp(min=1e-12)
+        apart.append([float(fitted(taken, columns[:, :n])[0].norm() / size) for n in (1, 2)])
     alone, together = torch.tensor(apart).reshape(-1, 2).T
     if len(apart) and ((alone > FAILS) & (together < FAILS / 2)).double().mean() > 0.7:
         return True

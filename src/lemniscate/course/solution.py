@@ -124,7 +124,7 @@ def limited(seconds: float) -> Iterator[None]:
     """Raise `TooLong` in this thread, and again every half second, once the time is over; also in an endless loop.
 
     The seconds are those of the processor, so that a busy machine is no fault of the solution; one that waits has
-    four times as many by the clock. An import is not broken off in its first seconds, which a slow disk may need.
+    four times as many by the clock, and so has an import, which a slow disk may hold up.
     """
     thread, over, sent = threading.get_ident(), threading.Event(), threading.Event()
     clock = time.monotonic

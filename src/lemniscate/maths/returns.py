@@ -53,7 +53,7 @@ def q_lambda(
     done: Bool[Tensor, "T N"],
     *,
     gamma: float = 0.99,
-    lam: float = 0.65,
+    lam: float = 0.8,
 ) -> Float[Tensor, "T N"]:
     """The λ-return of Q-learning: Gallici et al. 2025, arXiv:2407.04811, section 4, which is Peng's Q(λ).
 

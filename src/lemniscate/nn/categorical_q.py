@@ -1,4 +1,4 @@
-"""Q(s, a) as a distribution over bins, and weights of length 1: what helps a small Q to learn more from each step."""
+"""Q(s, a) as a distribution over bins, and weights of length 1, of SAC and REPPO; and all networks of REPPO."""
 
 import math
 from collections.abc import Sequence

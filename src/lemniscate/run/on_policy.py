@@ -37,8 +37,13 @@ class OnPolicyConfig(RunConfig):
 
     def memory(self, spec: Spec) -> dict[str, int]:
         """The bytes of a rollout, and of its rows in the widest layer."""
-        rows = 4 * self.num_rows * max((*self.hidden, *(getattr(self, "critic_hidden", None) or ())), default=0)
+        rows = 4 * self.num_rows * max(self.widths, default=0)
         return {"num_steps": rows + rollout_bytes(spec, self.num_steps, self.num_envs)}
+
+    @property
+    def widths(self) -> tuple[int, ...]:
+        """The widths of all hidden layers."""
+        return self.hidden
 
     @property
     def layers(self) -> Layers:
@@ -91,6 +96,11 @@ class ActorCriticConfig(OnPolicyConfig):
         """New networks for the spaces in `spec`: the policy and V(s)."""
         layers, critic_layers, normalize = self.network_settings
         return ActorCritic(spec, layers, self.initial_log_std, normalize, critic_layers=critic_layers)
+
+    @property
+    def widths(self) -> tuple[int, ...]:
+        """The widths of all hidden layers."""
+        return (*self.hidden, *(self.critic_hidden or ()))
 
     @property
     def network_settings(self) -> tuple[Layers, Layers, bool]:
