@@ -626,6 +626,8 @@ def _draw_fault(draw, plan):
         plan.wrong, plan.spoiled = kind, draw(st.sampled_from(WRONG_VALUES[kind]))
         if kind == "observation" and isinstance(plan.spoiled, dict):
             plan.spoiled = None if isinstance(plan.observation, spaces.Dict) else plan.spoiled
+        if plan.spoiled is list:  # of which Gymnasium's own wrappers would make a tuple
+            plan.limit, plan.wrappers = None, ()
     else:
         _draw_subtle_fault(draw, plan, kind)
 
