@@ -119,10 +119,10 @@ def update(config: Config, state: State, rollout: Rollout) -> dict[str, Tensor |
         rollout = state.reward_scale.scale(rollout)
     batch = advantages(config, networks, rollout)
     valid_rows = rollout.valid_rows
-    rows = one_minibatch(valid_rows, rollout.num_rows)
+    rows = one_minibatch(state.rows(rollout), rollout.num_rows)
     advantage = batch.advantage[rows]
     if config.normalize_advantage:
-        advantage = standardize(advantage)
+        advantage = standardize(advantage.flatten(1)).view_as(advantage)
     metrics = means(state.learn(config, state, batch, rows, advantage))
     networks.policy.observe(rollout.obs, rollout.valid)  # last: the actions were drawn through the normalizer before
     state.step += config.num_steps * config.num_envs

@@ -145,15 +145,15 @@ def update(config: Config, state: State, rollout: Rollout) -> dict[str, Tensor |
     if config.scale_rewards:
         rollout = state.reward_scale.scale(rollout)
     batch = collected = advantages(config, state.networks, rollout)
-    valid_rows = rollout.valid_rows
+    valid_rows, rows = rollout.valid_rows, state.rows(rollout)
     metrics: list[Metrics] = []
     for epoch in range(config.epochs):
         if config.recompute_advantages and epoch > 0:
             batch = replace(advantages(config, state.networks, rollout), log_prob=collected.log_prob)
-        minibatches = epoch_minibatches(valid_rows, rollout.num_rows, config.minibatch_size, state.rng.minibatch)
+        minibatches = epoch_minibatches(rows, rollout.num_rows, config.minibatch_size, state.rng.minibatch)
         advantage = batch.advantage[minibatches]
         if config.normalize_advantage:
-            advantage = standardize(advantage)
+            advantage = standardize(advantage.flatten(1)).view_as(advantage)
         state.optimizer.learning_rate = state.learning_rate
         metrics.append(means(state.learn(config, state, batch, minibatches, advantage)))
         kl = metrics[-1]["approx_kl"].item()

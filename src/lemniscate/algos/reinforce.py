@@ -82,6 +82,11 @@ class Config(ActorCriticConfig):
             self._require_rows("standardize", self.num_rows)
 
     @property
+    def piece_length(self) -> int:
+        """None: it has no pieces, and learns with no memory."""
+        return 0
+
+    @property
     def gradient_steps(self) -> int:
         """The number of gradient steps of the whole run; 0 where batches differ in size and cannot be compiled for."""
         critic_steps = self.critic_epochs * -(-self.num_rows // self.critic_minibatch_size)

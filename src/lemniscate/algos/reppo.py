@@ -62,7 +62,7 @@ class Config(ActorCriticConfig):
     activation: Activation = "silu"
     """activation function between the layers"""
     network: str = "layer_norm"
-    """mlp, layer_norm (the same with layer normalization), simba (residual blocks of one width), or module:Class"""
+    """mlp, layer_norm (with layer normalization), simba (residual blocks), gru (with a memory), or module:Class"""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -70,7 +70,8 @@ class Config(ActorCriticConfig):
 
     def networks(self, spec: Spec) -> ActorCategoricalQ:
         """New networks for the spaces in `spec`: π, Q, α and β."""
-        return ActorCategoricalQ(spec, *self.network_settings, self.initial_log_std, self.value_range)
+        memory = self.piece_length, self.shared_memory
+        return ActorCategoricalQ(spec, *self.network_settings, self.initial_log_std, self.value_range, *memory)
 
     @property
     def gradient_steps(self) -> int:
@@ -159,14 +160,15 @@ def update(config: Config, state: State, rollout: Rollout) -> dict[str, Tensor |
         optimizer.learning_rate = rate
     if config.scale_rewards:
         rollout = state.reward_scale.scale(rollout)
-    batch, rows, metrics = targets(config, state, rollout), rollout.valid_rows, []
+    batch, rows, metrics = targets(config, state, rollout), state.rows(rollout), []
     for _ in range(config.epochs):
         minibatches = epoch_minibatches(rows, rollout.num_rows, config.minibatch_size, state.rng.minibatch)
         noise = state.policy.draw_noise(minibatches.shape, state.rng.action)  # [K, M, A]
         metrics.append(means(state.learn(config, state, batch, minibatches, noise)))
     state.policy.observe(rollout.obs, rollout.valid)  # last: the KL compares policies behind the same normalizer
     state.step += config.num_steps * config.num_envs
-    explained = explained_variance(batch.value[rows], batch.target[rows])
+    valid_rows = rollout.valid_rows
+    explained = explained_variance(batch.value[valid_rows], batch.target[valid_rows])
     return {**means(metrics), "explained_variance": explained, "learning_rate": rate}
 
 

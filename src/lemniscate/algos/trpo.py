@@ -115,7 +115,7 @@ def improve(config: Config, state: State, batch: Batch, fisher_obs: Tensor) -> d
     """
     here, pi = state.parameters.vector.clone(), state.parameters.at
     if config.normalize_advantage:
-        batch = replace(batch, advantage=standardize(batch.advantage))
+        batch = replace(batch, advantage=standardize(batch.advantage.flatten()).view_as(batch.advantage))
 
     def loss(theta: Tensor) -> Tensor:
         return surrogate(pi(theta, batch.obs).log_prob(batch.action) - batch.log_prob, batch.advantage)
@@ -150,15 +150,16 @@ def update(config: Config, state: State, rollout: Rollout) -> dict[str, Tensor |
     state.critic_optimizer.learning_rate = rate
     if config.scale_rewards:
         rollout = state.reward_scale.scale(rollout)
-    batch, valid_rows = advantages(config, state.networks, rollout), rollout.valid_rows
-    same_size = one_minibatch(valid_rows, rollout.num_rows)[0]  # in every update, since the product is compiled
-    metrics = improve(config, state, batch[valid_rows], batch.obs[same_size])
+    batch, rows = advantages(config, state.networks, rollout), state.rows(rollout)
+    same_size = one_minibatch(rows, rollout.num_rows)[0]  # in every update, since the product is compiled
+    metrics = improve(config, state, batch[rows], batch.obs[same_size])
     size = config.critic_minibatch_size
     for _ in range(config.critic_epochs):
-        minibatches = epoch_minibatches(valid_rows, rollout.num_rows, size, state.rng.minibatch)
+        minibatches = epoch_minibatches(rows, rollout.num_rows, size, state.rng.minibatch)
         metrics |= means(state.learn(config, state, batch, minibatches))
     state.networks.policy.observe(rollout.obs, rollout.valid)  # last: old and new probabilities share a normalizer
     state.step += config.num_steps * config.num_envs
+    valid_rows = rollout.valid_rows
     explained = explained_variance(batch.value[valid_rows], batch.target[valid_rows])
     return {**metrics, **state.networks.policy.metrics(), "explained_variance": explained, "learning_rate": rate}
 

@@ -33,6 +33,19 @@ def rollout_bytes(spec: Spec, num_steps: int, num_envs: int) -> int:
     return num_steps * (num_envs * (3 * obs + 2 * (4 * action + 7)) + 1_000)
 
 
+def pieces(rollout: Rollout, length: int) -> Tensor:
+    """The rows of a rollout [T, N, …] as pieces of L = `length` steps of one environment: indices [N · T / L, L].
+
+    The place of a row whose action was ignored has the first valid row of its piece, which starts from its own memory
+    wherever it stands.
+    """
+    steps, envs = rollout.valid.shape
+    rows = torch.arange(steps * envs, device=rollout.valid.device).view(-1, length, envs).movedim(-1, 1).flatten(0, 1)
+    valid = rollout.valid.flatten()[rows]
+    first = rows.gather(1, valid.int().argmax(1, keepdim=True))
+    return torch.where(valid, rows, first)
+
+
 def one_minibatch(rows: Tensor, num_rows: int) -> Tensor:
     """All valid rows [B] as one minibatch, in their order: indices [1, num_rows]; see `epoch_minibatches`."""
     return _cut(rows, num_rows, num_rows)
@@ -45,7 +58,8 @@ def epoch_minibatches(rows: Tensor, num_rows: int, size: int, generator: Generat
     one shape. Where rows are missing, the first ones of the order are repeated.
 
     Args:
-        rows: the indices of the rows to learn from, [B] int64.
+        rows: the indices of the rows to learn from, [B] int64; or `pieces` of L rows, [B / L, L], which stay whole: the
+            minibatches are then [K, M / L, L].
         num_rows: the number of rows of a rollout, at least B.
         size: M; a rollout with fewer rows is one minibatch.
         generator: of the order.
@@ -60,5 +74,7 @@ def epoch_minibatches(rows: Tensor, num_rows: int, size: int, generator: Generat
 def _cut(rows: Tensor, num_rows: int, size: int) -> Tensor:
     if not len(rows):
         raise UserError("No valid transition in the whole rollout; increase num_steps.")
-    total = math.ceil(num_rows / size) * size
-    return rows.repeat(math.ceil(total / len(rows)))[:total].view(-1, size)
+    length, *piece = rows[0].numel(), *rows.shape[1:]
+    total = math.ceil(num_rows / size) * size // length
+    repeated = rows.repeat(math.ceil(total / len(rows)), *(1 for _ in piece))
+    return repeated[:total].view(-1, size // length, *piece)

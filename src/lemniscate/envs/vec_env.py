@@ -3,6 +3,7 @@
 import math
 import time
 from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -16,6 +17,18 @@ from lemniscate.types import Step, wide_float
 
 PATIENCE = 20_000
 """steps that an episode may take in an environment without a time limit, where whole ones are wanted"""
+
+
+
+class Carrier(Protocol):
+    """Carries what a policy remembers from step to step, as further columns of the observations: `nn.memory`."""
+
+    def begin(self, obs: Tensor) -> Tensor:
+        """The observations [N, …] with no memory, where all episodes begin."""
+
+    def follow(self, rows: Tensor, step: Step) -> Step:
+        """The step with the memory after `rows` [N, …], the observations before it."""
+
 
 LOG_ROWS = 1024
 """steps after which the logged ones are summed up"""
@@ -39,6 +52,8 @@ class VecEnv:
         self.device = backend.device
         self.summaries, self.scene, self.baseline = backend.summaries, backend.scene, backend.baseline
         self.obs = torch.empty(0)
+        self.carrier: Carrier | None = None
+        """appends what a policy remembers to the observations"""
         self.collecting = Stopwatch()
         """seconds that the functions of `data` spend acting and stepping"""
         self.steps = 0
@@ -53,6 +68,8 @@ class VecEnv:
         self._actions = _action_layout(self.spec, self.num_envs)
         self._require_finite(observation=mine)
         self.obs = self._world.gather(mine)
+        if self.carrier:
+            self.obs = self.carrier.begin(self.obs)
         return self.obs
 
     def step(self, action: Tensor) -> Step:
@@ -75,6 +92,8 @@ class VecEnv:
             self._require_finite(observation=step.obs)
         if self._world.size > 1:
             step, counts = self._of_all(step, counts)
+        if self.carrier:
+            step = self.carrier.follow(self.obs, step)
         self.obs = step.obs
         self.steps += self.num_envs
         self._statistics.log(step, counts, measures, valid)

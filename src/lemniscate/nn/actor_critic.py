@@ -1,8 +1,12 @@
 """A policy for the spaces of an environment, and V(s): separate networks behind one normalizer; or Q alone."""
 
+from dataclasses import replace
+
+import torch
 from torch import Tensor, nn
 
 from lemniscate.errors import UserError
+from lemniscate.nn.memory import Columns, Remembering, give_memory, remember, remembered_by
 from lemniscate.nn.networks import ImageEncoder, Layers, PartsEncoder
 from lemniscate.nn.normalizer import NoNorm, NormByPart, RunningNorm, ScaleBytes, with_privileged
 from lemniscate.nn.policies import (
@@ -27,12 +31,19 @@ class Value(nn.Module):
 
     def forward(self, obs: Tensor) -> Tensor:
         """[…, O + P] to […]."""
-        seen = with_privileged(self.normalizer(obs), obs, self.normalizer.size, self.privileged)
-        return self.net(seen).squeeze(-1)
+        return self.net(self.inputs(obs)).squeeze(-1)
+
+    def inputs(self, obs: Tensor) -> Tensor:
+        """What the network sees of […, O + P]."""
+        return with_privileged(self.normalizer(obs), obs, self.normalizer.size, self.privileged)
 
 
 class ActorCritic(nn.Module):
-    """A policy for any actions, and V(s), with `critic_layers` if they are not as those of the policy."""
+    """A policy for any actions, and V(s), with `critic_layers` if they are not as those of the policy.
+
+    Networks that remember learn from pieces of `length` steps. With `shared_memory` V(s) sees what the policy
+    remembers, in the place of a memory of its own.
+    """
 
     def __init__(
         self,
@@ -42,15 +53,27 @@ class ActorCritic(nn.Module):
         normalize_observations: bool = False,
         *,
         critic_layers: Layers | None = None,
+        length: int = 0,
+        shared_memory: bool = False,
     ) -> None:
         super().__init__()
-        self.policy = _policy(normalizer_of(spec, normalize_observations), spec, layers, initial_log_std)
-        net = network_of(spec, critic_layers or layers, 1, last_gain=1.0, more=spec.privileged)
-        self.value = Value(self.policy.normalizer, net, spec.privileged)
+        net = network_of(spec, layers, _outputs(spec.action), last_gain=0.01, remembers=length > 0)
+        size = remembered_by(net)
+        self.policy = _policy(normalizer_of(spec, normalize_observations, size), net, spec, initial_log_std)
+        more = {"privileged": spec.privileged, "policy": size, "remembers": not shared_memory}
+        critic = network_of(spec, critic_layers or layers, 1, last_gain=1.0, **more)
+        self.value = Value(self.policy.normalizer, critic, spec.privileged + remembered_by(critic))
+        self.memory = give_memory(self.policy, critic, spec, length)
 
     def estimates(self, obs: Tensor, next_obs: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """V(s), V(s') and log π(a|s) of rows […, …], […] each."""
-        return self.value(obs), self.value(next_obs), self.policy(obs).log_prob(action)
+        """V(s), V(s') and log π(a|s) of rows [T, N, …], [T, N] each."""
+        shape, obs = obs.shape[:2], obs.flatten(0, 1)  # rows, not pieces
+        rows = self.value(obs), self.value(next_obs.flatten(0, 1)), self.policy(obs).log_prob(action.flatten(0, 1))
+        return rows[0].view(shape), rows[1].view(shape), rows[2].view(shape)
+
+    def remember(self, obs: Tensor) -> Tensor:
+        """What policy and critic remember after rows [N, …], [N, policy + critic]."""
+        return torch.cat([self.policy.remember(obs), remember(self.value.net, self.value.inputs(obs))], dim=-1)
 
 
 class ActionValues(nn.Module):
@@ -59,6 +82,9 @@ class ActionValues(nn.Module):
     Raises:
         UserError: actions of another kind than Discrete.
     """
+
+    memory = None
+    """it has none"""
 
     def __init__(self, spec: Spec, layers: Layers, normalize_observations: bool) -> None:
         super().__init__()
@@ -77,17 +103,18 @@ class ActionValues(nn.Module):
         return self.q(obs, action), self.policy(next_obs).values.amax(-1)
 
 
-def normalizer_of(spec: Spec, normalize_observations: bool) -> NoNorm:
-    """The normalizer of observations: pixels are scaled, numbers normalized or as they are."""
+def normalizer_of(spec: Spec, normalize_observations: bool, remembered: int = 0) -> NoNorm:
+    """The normalizer of observations: pixels are scaled, numbers normalized or as they are, as a memory always is."""
     numbers, parts = RunningNorm if normalize_observations else NoNorm, spec.observation_parts
     if spec.has_images and not spec.image:
-        return NormByPart((ScaleBytes if part.image else numbers)(part.size) for part in parts)
-    return (ScaleBytes if spec.image else numbers)(spec.observation_size)
+        own: NoNorm = NormByPart((ScaleBytes if part.image else numbers)(part.size) for part in parts)
+    else:
+        own = (ScaleBytes if spec.image else numbers)(spec.observation_size)
+    return NormByPart((own, NoNorm(remembered))) if remembered else own
 
 
-def _policy(normalizer: NoNorm, spec: Spec, layers: Layers, initial_log_std: float) -> Policy:
+def _policy(normalizer: NoNorm, net: nn.Module, spec: Spec, initial_log_std: float) -> Policy:
     action = spec.action
-    net = network_of(spec, layers, _outputs(action), last_gain=0.01)
     if isinstance(action, Box):
         return GaussianPolicy(normalizer, net, action, initial_log_std)
     if isinstance(action, Discrete):
@@ -113,8 +140,39 @@ def encoder_of(spec: Spec) -> tuple[nn.Module, int]:
     return encoder, encoder.size
 
 
-def network_of(spec: Spec, layers: Layers, outputs: int, last_gain: float, more: int = 0) -> nn.Module:
-    """A network from normalized observations, with an encoder before it where these are images, and `more` inputs."""
+def network_of(
+    spec: Spec,
+    layers: Layers,
+    outputs: int,
+    last_gain: float,
+    *,
+    privileged: int = 0,
+    actions: int = 0,
+    policy: int = 0,
+    remembers: bool = False,
+) -> nn.Module:
+    """A network from normalized observations, with an encoder before it where these are images.
+
+    Args:
+        spec: of the environment.
+        layers: of the network.
+        outputs: their number.
+        last_gain: of the last layer.
+        privileged: numbers behind the observation.
+        actions: numbers behind these.
+        policy: the columns that a policy remembers, behind the observation; a critic sees them if it has no memory.
+        remembers: whether it may have one.
+
+    Raises:
+        UserError: layers with a memory, for a network without.
+    """
     encoder, features = encoder_of(spec)
-    net = layers.network(features + more, outputs, last_gain)
+    inputs, size = features + privileged, spec.observation_size
+    if remembers and layers.remembers:
+        cell = layers.cell(inputs, layers.hidden[-1] if actions else outputs)
+        return Remembering(encoder, cell, layers.head(cell, actions, outputs, last_gain), (size, policy, privileged))
+    if policy:
+        net = replace(layers, kind="mlp").network(inputs + policy - 1 + actions, outputs, last_gain)
+        return nn.Sequential(Columns(encoder, (size, 1)), net)
+    net = layers.network(inputs + actions, outputs, last_gain)
     return nn.Sequential(encoder, net) if spec.has_images else net

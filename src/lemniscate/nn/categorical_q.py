@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from lemniscate.maths import cross_entropy, hl_gauss
 from lemniscate.nn.actor_critic import encoder_of, network_of, normalizer_of
 from lemniscate.nn.bounded import QValue, SquashedGaussianPolicy
+from lemniscate.nn.memory import give_memory, remember, remembered_by
 from lemniscate.nn.networks import Layers
 from lemniscate.nn.normalizer import NoNorm, RewardScale, WideBuffers
 from lemniscate.spec import Spec
@@ -131,6 +132,8 @@ class ActorCategoricalQ(nn.Module):
         normalize_observations: put a running normalizer in front of both.
         initial_log_std: log σ of the policy before the tanh, at first.
         value_range: of the critic's bins.
+        length: steps of the pieces that networks with a memory learn from.
+        shared_memory: let the critic see what the policy remembers, in the place of a memory of its own.
 
     Raises:
         UserError: actions that are not continuous, or without bounds.
@@ -144,25 +147,40 @@ class ActorCategoricalQ(nn.Module):
         normalize_observations: bool,
         initial_log_std: float,
         value_range: float,
+        length: int = 0,
+        shared_memory: bool = False,
     ) -> None:
         super().__init__()
-        size = spec.bounded_box().size
-        normalizer = normalizer_of(spec, normalize_observations)
-        net = network_of(spec, actor_layers, 2 * size, last_gain=0.01)
+        size, privileged = spec.bounded_box().size, spec.privileged
+        net = network_of(spec, actor_layers, 2 * size, last_gain=0.01, remembers=length > 0)
+        kept = remembered_by(net)
+        normalizer = normalizer_of(spec, normalize_observations, kept)
         self.policy = SquashedGaussianPolicy(normalizer, net, size, initial_log_std)
         encoder, features = encoder_of(spec)
-        critic = critic_layers.network(features + spec.privileged + size, BINS, last_gain=0.01)
-        gain = ((features + spec.privileged) / size) ** 0.5  # of two parts of the input, neither drowns the other
-        self.critic = CategoricalQ(normalizer, encoder, critic, Bins(value_range), gain, spec.privileged)
+        if kept:
+            more = {"privileged": privileged, "actions": size, "policy": kept, "remembers": not shared_memory}
+            encoder, critic = nn.Identity(), network_of(spec, critic_layers, BINS, last_gain=0.01, **more)
+        else:
+            critic = critic_layers.network(features + privileged + size, BINS, last_gain=0.01)
+        gain = ((features + privileged) / size) ** 0.5  # of two parts of the input, neither drowns the other
+        privileged += remembered_by(critic)
+        self.critic = CategoricalQ(normalizer, encoder, critic, Bins(value_range), gain, privileged)
         self.multipliers = Multipliers([INITIAL_MULTIPLIER] * 2)
+        self.memory = give_memory(self.policy, critic, spec, length)
 
     def q(self, obs: Tensor, action: Tensor) -> Tensor:
         """[B, O] and [B, A] to Q(s, a), [B]."""
         return self.critic(obs, action)
 
     def estimates(self, obs: Tensor, next_obs: Tensor, action: Tensor, noise: Tensor) -> tuple[Tensor, ...]:
-        """Q(s, a), Q(s', a') and log π(a'|s') of an a' drawn with `noise`, μ and log σ of π(·|s): of rows […, …]."""
+        """Q(s, a), Q(s', a') and log π(a'|s') of an a' drawn with `noise`, μ and log σ of π(·|s): of rows [T, N, …]."""
+        shape = obs.shape[:2]
+        obs, next_obs, action, noise = (x.flatten(0, 1) for x in (obs, next_obs, action, noise))  # rows, not pieces
         policy = self.policy(obs)
         next_action, next_log_prob = self.policy(next_obs).sample_with_log_prob(noise)
         values = self.critic(obs, action), self.critic(next_obs, next_action)
-        return *values, next_log_prob, policy.mean, policy.log_std
+        return tuple(x.unflatten(0, shape) for x in (*values, next_log_prob, policy.mean, policy.log_std))
+
+    def remember(self, obs: Tensor) -> Tensor:
+        """What policy and critic remember after rows [N, …], [N, policy + critic]."""
+        return torch.cat([self.policy.remember(obs), remember(self.critic.net, self.critic.features(obs))], dim=-1)

@@ -1,7 +1,8 @@
 """Networks: perceptrons, residual blocks, modules of one's own; and the encoder of images."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 from typing import Literal
 
@@ -47,8 +48,9 @@ class Layers:
     Args:
         hidden: widths of the hidden layers.
         activation: between the layers.
-        kind: a name in `NETWORKS`, or one's own as `module:Class` or `module:Class(key=value, …)`: called with the
-            numbers of inputs and outputs it makes a module that takes [B, inputs] to [B, outputs].
+        kind: a name in `NETWORKS`, gru, or one's own as `module:Class` or `module:Class(key=value, …)`: called with the
+            numbers of inputs and outputs it makes a module that takes [B, inputs] to [B, outputs]. Where the class has
+            a `memory_size` K, the module takes [B, inputs] and [B, K] to [B, outputs] and the next [B, K].
         matmul: precision of the products between hidden layers.
     """
 
@@ -59,8 +61,10 @@ class Layers:
 
     def check(self) -> None:
         """Raise `UserError` if no network can have these layers."""
-        if self.kind not in NETWORKS and ":" not in self.kind:
-            raise unknown_name("network", self.kind, [*NETWORKS, "module:Class"])
+        if self.kind not in (*NETWORKS, "gru") and ":" not in self.kind:
+            raise unknown_name("network", self.kind, [*NETWORKS, "gru", "module:Class"])
+        if self.kind == "gru" and not self.hidden:
+            raise UserError("A gru needs a width, the numbers that it remembers, such as (64, 64).")
         if self.kind == "simba" and len(set(self.hidden)) != 1:
             raise UserError(f"SimBa's blocks have one width, such as (256, 256), not {self.hidden}.")
 
@@ -70,10 +74,35 @@ class Layers:
         The last layer has gain `last_gain`: 0.01 for a policy, so that it starts near the centre of its range whatever
         it observes (Andrychowicz et al. 2021, arXiv:2006.05990, section 3.2), 1 for a value; the others have √2.
         """
+        if self.remembers:
+            raise UserError(f"{self.kind} has a memory, with which a2c, ppo, trpo and reppo learn.")
         if self.kind not in NETWORKS:
             return OwnNetwork(self.kind, inputs, outputs)
         layers, width = NETWORKS[self.kind](self, inputs)
         return nn.Sequential(*layers, orthogonal(nn.Linear(width, outputs), last_gain))
+
+    @cached_property
+    def remembers(self) -> bool:
+        """Whether a network of these layers has a memory. Raises `UserError` for one of one's own that is not found."""
+        if ":" not in self.kind:
+            return self.kind == "gru"
+        made_by = find_callable(self.kind)
+        return bool(getattr(getattr(made_by, "func", made_by), "memory_size", 0))
+
+    def cell(self, inputs: int, outputs: int) -> "GRU | OwnCell":
+        """The part of a network that remembers, for layers that do; only one's own needs the number of its outputs."""
+        if self.kind != "gru":
+            return OwnCell(self.kind, inputs, outputs)
+        layers, width = _mlp(replace(self, hidden=self.hidden[:-1]), inputs)
+        return GRU(nn.Sequential(*layers), width, self.hidden[-1])
+
+    def head(self, cell: "GRU | OwnCell", actions: int, outputs: int, last_gain: float) -> nn.Module:
+        """From the outputs of a cell, and actions, to those of the network."""
+        if actions:
+            return replace(self, kind="layer_norm", hidden=self.hidden[-1:]).network(
+                cell.outputs + actions, outputs, last_gain
+            )
+        return nn.Identity() if isinstance(cell, OwnCell) else orthogonal(nn.Linear(cell.outputs, outputs), last_gain)
 
     @property
     def linear(self) -> type[nn.Linear]:
@@ -119,14 +148,14 @@ class OwnNetwork(nn.Module):
     def __init__(self, name: str, inputs: int, outputs: int) -> None:
         super().__init__()
         self.name, self.least, rows = name, 1, torch.randn(64, inputs, generator=torch.Generator().manual_seed(0))
-        wanted = f"{name}({inputs}, {outputs}) must make a module that takes [B, {inputs}] to [B, {outputs}]"
+        wanted = f"{name}({inputs}, {outputs}) must make a module that takes {self._taken(inputs, outputs)}"
         try:
             self.module = find_callable(name)(inputs, outputs)
             before = self._tensors()
             with torch.enable_grad():
-                out = self.module(rows)
+                out = self._call(rows)
             with torch.no_grad():  # last, so that nothing that the module keeps has a graph, which could not be copied
-                again = self.module(rows)
+                again = self._call(rows)
             changed = [key for key, tensor in self._tensors().items() if not _equal(before.get(key, tensor), tensor)]
             lost = [key for key, tensor in self.state_dict().items() if not tensor.isfinite().all()]
         except UserError:
@@ -150,9 +179,17 @@ class OwnNetwork(nn.Module):
             raise UserError(f"{name} has {kinds}; it must have some of torch.float32 that its outputs depend on.")
         try:
             with torch.no_grad():
-                self.module(rows[:1])
+                self._call(rows[:1])
         except ValueError:  # of batch normalization, by the statistics of the rows themselves
             self.least = 2
+
+    def _taken(self, inputs: int, outputs: int) -> str:
+        """The shapes that the module is to take and return, in words."""
+        return f"[B, {inputs}] to [B, {outputs}]"
+
+    def _call(self, rows: Tensor) -> Tensor:
+        """The outputs at rows [B, inputs] for the checks above."""
+        return self.module(rows)
 
     def forward(self, x: Tensor) -> Tensor:
         """[…, inputs] to […, outputs]."""
@@ -166,6 +203,62 @@ class OwnNetwork(nn.Module):
         """Copies of all parameters and buffers, but of those that get their shape in the first call."""
         named = (*self.named_parameters(), *self.named_buffers())
         return {name: tensor.detach().clone() for name, tensor in named if not is_lazy(tensor)}
+
+
+class OwnCell(OwnNetwork):
+    """A module of one's own with a memory of `size` numbers: [B, inputs], [B, size] to [B, outputs], [B, size]."""
+
+    def __init__(self, name: str, inputs: int, outputs: int) -> None:
+        super().__init__(name, inputs, outputs)
+        self.outputs, self.size = outputs, int(self.module.memory_size)
+
+    def prepare(self, x: Tensor) -> Tensor:
+        """The inputs as they are."""
+        return x
+
+    def step(self, prepared: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """[B, inputs] and [B, size] to the outputs [B, outputs], and the next memory."""
+        return self.module(prepared, memory)
+
+    def _taken(self, inputs: int, outputs: int) -> str:
+        return f"[B, {inputs}] and memory_size numbers, [B, K], to [B, {outputs}] and the next [B, K]"
+
+    def _call(self, rows: Tensor) -> Tensor:
+        memory = rows.new_zeros(len(rows), self.module.memory_size)
+        out, after = self.module(rows, memory)
+        if (after.shape, after.dtype) != (memory.shape, memory.dtype):
+            raise ValueError(f"the next memory is {list(after.shape)} of {after.dtype}")
+        out, _ = self.module(rows, after)  # on from there, so that what the memory is for takes part
+        return out
+
+
+class GRU(nn.Module):
+    """Gated recurrent units behind the layers before them: Cho et al. 2014, arXiv:1406.1078, eq. 5 to 8.
+
+    As in torch, the reset gate acts on the product, r ⊙ (W h + b), and z is what the memory keeps of itself.
+    """
+
+    def __init__(self, layers: nn.Module, inputs: int, size: int) -> None:
+        super().__init__()
+        self.size = self.outputs = size
+        self.layers = layers
+        self.input, self.state = nn.Linear(inputs, 3 * size), nn.Linear(size, 3 * size)
+        for layer in (self.input, self.state):
+            for block in layer.weight.data.split(size):
+                nn.init.orthogonal_(block)
+            nn.init.zeros_(layer.bias)
+
+    def prepare(self, x: Tensor) -> Tensor:
+        """What does not depend on the memory: […, inputs] to […, 3 size]."""
+        return self.input(self.layers(x))
+
+    def step(self, prepared: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """[B, 3 size] and h [B, size] to the output, which is h', and h'."""
+        reset_x, keep_x, new_x = prepared.chunk(3, dim=-1)
+        reset_h, keep_h, new_h = self.state(memory).chunk(3, dim=-1)
+        new = torch.tanh(new_x + torch.sigmoid(reset_x + reset_h) * new_h)
+        after = new + torch.sigmoid(keep_x + keep_h) * (memory - new)
+        return after, after
 
 
 def _equal(one: Tensor, other: Tensor) -> bool:

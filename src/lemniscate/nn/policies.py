@@ -1,4 +1,4 @@
-"""Policies. A policy is stateless and returns a distribution over actions."""
+"""Policies. A policy returns a distribution over actions; what it remembers is part of the observation: `memory`."""
 
 from collections.abc import Sequence
 
@@ -6,6 +6,7 @@ import torch
 from torch import Generator, Tensor, nn
 
 from lemniscate.maths import Bernoulli, Categorical, Distribution, EpsilonGreedy, Gaussian, MultiCategorical
+from lemniscate.nn.memory import Memory, remember
 from lemniscate.nn.normalizer import NoNorm
 from lemniscate.spec import Box, Discrete, MultiDiscrete
 
@@ -17,6 +18,12 @@ class Policy(nn.Module):
         super().__init__()
         self.normalizer = normalizer
         self.net = net
+        self.memory: Memory | None = None
+        """the columns of what it remembers, if it has a memory"""
+
+    def remember(self, obs: Tensor) -> Tensor:
+        """What a policy with a memory remembers after rows [N, …], as the columns of its memory."""
+        return remember(self.net, self.normalizer(obs))
 
     def act(self, obs: Tensor, noise: Tensor) -> Tensor:
         """An action at each observation [B, O], drawn with the random numbers `noise` of `draw_noise`."""

@@ -1,15 +1,19 @@
 """Settings and training state of the algorithms that learn from their newest rollout."""
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
-from lemniscate.data.rollout import rollout_bytes
+import torch
+from torch import Tensor
+
+from lemniscate.data.rollout import pieces, rollout_bytes
 from lemniscate.errors import UserError
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.networks import Activation, Layers
-from lemniscate.run.config import Count, Fraction, LogStd, RunConfig, Width
+from lemniscate.run.config import Count, Fraction, LogStd, Range, RunConfig, Width
 from lemniscate.run.state import Networks, ScaledState
 from lemniscate.spec import Spec
+from lemniscate.types import Rollout
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,6 +91,12 @@ class ActorCriticConfig(OnPolicyConfig):
     """widths for the value, or for Q; usually as wide or wider; none: as hidden"""
     initial_log_std: LogStd = -0.5
     """initial log σ of a Gaussian policy, in units of half the action range; usually -1 to 0"""
+    network: str = "mlp"
+    """mlp, layer_norm (with layer normalization), simba (residual blocks), gru (with a memory), or module:Class"""
+    sequence_length: Annotated[int, Range(2)] = 16
+    """steps through which gradients go back in a memory, L; divides num_steps; usually 8 to 64"""
+    shared_memory: bool = False
+    """let the value see what the policy remembers, in the place of a memory of its own"""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -95,7 +105,15 @@ class ActorCriticConfig(OnPolicyConfig):
     def networks(self, spec: Spec) -> Any:
         """New networks for the spaces in `spec`: the policy and V(s)."""
         layers, critic_layers, normalize = self.network_settings
-        return ActorCritic(spec, layers, self.initial_log_std, normalize, critic_layers=critic_layers)
+        own = {"critic_layers": critic_layers, "length": self.piece_length, "shared_memory": self.shared_memory}
+        return ActorCritic(spec, layers, self.initial_log_std, normalize, **own)
+
+    def make_networks(self, spec: Spec, device: torch.device) -> Any:
+        """New networks, seeded. Raises `UserError` where those with a memory cannot have whole pieces of a rollout."""
+        networks = super().make_networks(spec, device)
+        if networks.memory:
+            self._require_pieces()
+        return networks
 
     @property
     def widths(self) -> tuple[int, ...]:
@@ -108,11 +126,31 @@ class ActorCriticConfig(OnPolicyConfig):
         critic_hidden = self.hidden if self.critic_hidden is None else self.critic_hidden
         return self.layers, replace(self.layers, hidden=critic_hidden), self.normalize_observations
 
+    @property
+    def piece_length(self) -> int:
+        """The steps of a piece of a rollout, L, where the networks have a memory."""
+        return min(self.sequence_length, self.num_steps)
+
+    def _require_pieces(self) -> None:
+        """Raise `UserError` where the steps of a rollout or the rows of a minibatch are no whole number of pieces."""
+        length = self.piece_length
+        for name in ("num_steps", "minibatch_size", "critic_minibatch_size"):
+            share = self.shards if name != "num_steps" else 1
+            if (rows := getattr(self, name, 0)) % (length * share):
+                of = f" for each of {share} shards" if share > 1 else ""
+                raise UserError(f"{name} {rows:,} is no multiple of sequence_length {length}{of}.")
+
 
 @dataclass(kw_only=True)
 class OnPolicyState(ScaledState[Networks]):
     """The training state of the algorithms that learn from their newest rollout."""
 
+    def rows(self, rollout: Rollout) -> Tensor:
+        """The rows to learn from: the valid ones [B], or pieces [B / L, L] where the networks have a memory."""
+        memory = self.networks.memory
+        return pieces(rollout, memory.length) if memory else rollout.valid_rows
+
     def per_step_methods(self) -> list[tuple[object, str]]:
-        """The methods of every algorithm, and the estimates on a rollout."""
-        return [*super().per_step_methods(), (self.networks, "estimates")]
+        """The methods of every algorithm, the estimates on a rollout, and the memory where there is one."""
+        memory = [(self.networks, "remember")] if self.networks.memory else []
+        return [*super().per_step_methods(), (self.networks, "estimates"), *memory]

@@ -24,6 +24,7 @@ import torch
 
 from lemniscate.envs.vec_env import Episodes, VecEnv
 from lemniscate.errors import NonFiniteError, NotStoredError, UserError, resume_line, shown
+from lemniscate.nn.memory import Carrier
 from lemniscate.optim.compiled import Compiler
 from lemniscate.run.config import RunConfig, plain
 from lemniscate.run.directory import Saver
@@ -283,6 +284,8 @@ class Run:
     def _restart(self, state: TrainState) -> None:
         seed = derive(self.config.seed, TRAINING, state.step)
         seed_globals(seed)  # nothing here draws from them, but a user's environment may
+        if memory := getattr(state.networks, "memory", None):
+            self.env.carrier = Carrier(memory, state.networks.remember)
         self.env.restart(seed, state.step)
         state.on_restart()
 
