@@ -2,7 +2,7 @@
 
 import sys
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from os import PathLike
 from pathlib import Path
@@ -18,6 +18,7 @@ from lemniscate.envs.spaces import read_mask, read_observation
 from lemniscate.errors import UserError, prefix_errors, shown
 from lemniscate.hub import repository as hub
 from lemniscate.maths import mean_and_std
+from lemniscate.nn.memory import Recall
 from lemniscate.nn.policies import Policy
 from lemniscate.run import checkpoint
 from lemniscate.run.config import RunConfig
@@ -57,6 +58,12 @@ class TrainedPolicy:
     def __init__(self, networks: Any, spec: Spec, config: RunConfig, step: int, path: Path | None = None) -> None:
         self.networks = networks.eval()
         self.spec, self.config, self.step, self.path = spec, config, step, path
+        self._recall: Recall | None = None
+        """what it remembers of the episodes that `act` plays, where it has a memory"""
+        if self.module.memory:
+            own = spec.privileged > 0  # what the critic remembers depends on numbers that no observation has
+            memory = replace(self.module.memory, privileged=0) if own else networks.memory
+            self._recall = Recall(memory, self.module.remember if own else networks.remember)
 
     @cached_property
     def _noise(self) -> torch.Generator:
@@ -77,6 +84,9 @@ class TrainedPolicy:
     def act(self, obs: Any, deterministic: bool = True, action_mask: Any = None) -> np.ndarray:
         """The action at one raw observation, or at each of a batch; ready for `env.step`.
 
+        A policy with a memory remembers the observation, so each is to be given once, in order; `reset` at the end of
+        an episode.
+
         Args:
             obs: as the environment returns it: an array, a number, or a dictionary or tuple of these; or the flat
                 observation [O] or [B, O].
@@ -89,7 +99,7 @@ class TrainedPolicy:
 
         Raises:
             UserError: an observation or a mask of another shape, or that is not finite; a mask where the environment
-                of training gave none.
+                of training gave none; another B, of a policy with a memory, without `reset`.
         """
         flat, batched = self._read(obs, action_mask)
         distribution = self.module(flat)
@@ -97,8 +107,22 @@ class TrainedPolicy:
             action = distribution.mode()
         else:
             action = distribution.sample(self.module.draw_noise((len(flat),), self._noise))
+        if self._recall:
+            self._recall.advance(flat)
         physical = physical_action(action.numpy(), self.spec.action)
         return physical if batched else physical[0]
+
+    def reset(self, done: Any = None) -> None:
+        """Forget what a policy with a memory remembers: at the end of an episode, before the next observation.
+
+        Args:
+            done: of a batch, whose episodes are over, [B] bool; by default all are.
+
+        Raises:
+            UserError: `done` of another shape.
+        """
+        if self._recall:
+            self._recall.reset(None if done is None else torch.as_tensor(done, dtype=torch.bool))
 
     @torch_defaults(grad=False)
     def distribution(self, obs: Any, action_mask: Any = None) -> ActionDistribution:
@@ -150,7 +174,8 @@ class TrainedPolicy:
         if self.is_masked:
             mask = read_mask(action_mask, self.spec, flat)
             flat = np.concatenate([flat, mask.astype(flat.dtype)], axis=-1)
-        return torch.from_numpy(flat), batched
+        rows = torch.from_numpy(flat)
+        return self._recall.rows(rows) if self._recall else rows, batched
 
     def _read_for(self, critic: str, obs: Any) -> tuple[Tensor, bool]:
         """The observations of `_read` for a critic, "value" or "q". Raises `UserError` where none has been learned."""

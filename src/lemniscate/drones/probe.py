@@ -15,7 +15,7 @@ import torch
 from lemniscate.drones.crazyflow import make_drones, spec_of
 from lemniscate.drones.drones import Drones, compile_side_by_side
 from lemniscate.drones.vehicle import CONDITIONS, TABLES, read_ranges
-from lemniscate.envs.probe import Act, Axis, Flown, Tally
+from lemniscate.envs.probe import Axis, Begin, Flown, Tally
 
 MOST_FLIGHTS = 1024
 """flights side by side: as many as a cache holds, and few enough that batches of crashed drones end early"""
@@ -79,23 +79,23 @@ class DroneProbe:
         pairs = zip(every, compiled[::2], compiled[1::2], strict=True)
         return {one.dynamics: _Programs(one, points, restart, step) for (one, points), restart, step in pairs}
 
-    def fly(self, act: Act, seed: int) -> tuple[Flown, dict[str, list[Flown]]]:
+    def fly(self, begin: Begin, seed: int) -> tuple[Flown, dict[str, list[Flown]]]:
         """All flights, see `Probe.fly`; those that are nominal with their actions."""
         (_, programs), *others = self._programs.items()
-        nominal, *flown = self._batches(programs, act, seed)
+        nominal, *flown = self._batches(programs, begin, seed)
         at = dict(zip(self._points, flown, strict=False))  # the last batch has more
         given = np.array(list(self._given.values()), np.float32).reshape(1, -1, 2)
-        at |= {("dynamics", name): one.fly(act, seed, given)[0] for name, one in others}
+        at |= {("dynamics", name): one.fly(begin, seed, given)[0] for name, one in others}
         return nominal, {a.name: [at.get((a.name, value), nominal) for value in a.values] for a in self.axes}
 
-    def _batches(self, programs: _Programs, act: Act, seed: int) -> Iterator[Flown]:
+    def _batches(self, programs: _Programs, begin: Begin, seed: int) -> Iterator[Flown]:
         """The nominal flights, then those of each point, batch by batch; the last is filled up with nominal ones."""
         names = list(self._drones.air.ranges)
         ends = np.tile(self._ends, (math.ceil((1 + len(self._points)) / self._size) * self._size, 1, 1))
         for row, (name, value) in enumerate(self._points, 1):
             ends[row, names.index(name)] = value
-        for begin in range(0, len(ends), self._size):
-            yield from programs.fly(act, seed, ends[begin : begin + self._size], keep_first=begin == 0)
+        for first in range(0, len(ends), self._size):
+            yield from programs.fly(begin, seed, ends[first : first + self._size], keep_first=first == 0)
 
 
 class _Programs:
@@ -104,13 +104,13 @@ class _Programs:
     def __init__(self, drones: Drones, points: int, restart: Callable, step: Callable) -> None:
         self._drones, self._points, self._restart, self._step = drones, points, restart, step
 
-    def fly(self, act: Act, seed: int, ends: np.ndarray, keep_first: bool = False) -> list[Flown]:
+    def fly(self, begin: Begin, seed: int, ends: np.ndarray, keep_first: bool = False) -> list[Flown]:
         """The flights of each copy, with the ends [P, K, 2] of its ranges; `keep_first` the actions of the first.
 
         A drone whose state is not finite has crashed.
         """
         starts, kept = self._drones.num_envs, list[torch.Tensor]()
-        tally = Tally(self._points * starts)
+        tally, act = Tally(self._points * starts), begin()
         state, obs = self._restart(np.uint32(seed), ends)
         for _ in range(self._drones.episode_steps):
             action = act(torch.nan_to_num(torch.from_dlpack(obs))).clamp(-1, 1)

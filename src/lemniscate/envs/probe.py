@@ -98,6 +98,8 @@ class Flown:
 
 Act = Callable[[Tensor], Tensor]
 """flat observations [N, O] to actions [N, …] as `VecEnv.step` takes them"""
+Begin = Callable[[], Act]
+"""a policy at the beginning of N episodes, which remembers nothing yet"""
 
 
 class Probe(Protocol):
@@ -115,7 +117,7 @@ class Probe(Protocol):
     period: float | None
     ends_by_failure: bool
 
-    def fly(self, act: Act, seed: int) -> tuple[Flown, Mapping[str, list[Flown]]]:
+    def fly(self, begin: Begin, seed: int) -> tuple[Flown, Mapping[str, list[Flown]]]:
         """The nominal episodes; then those at each value of each axis, by its name. The nominal value repeats them."""
         ...
 

@@ -19,7 +19,6 @@ PATIENCE = 20_000
 """steps that an episode may take in an environment without a time limit, where whole ones are wanted"""
 
 
-
 class Carrier(Protocol):
     """Carries what a policy remembers from step to step, as further columns of the observations: `nn.memory`."""
 

@@ -46,8 +46,8 @@ def c_files(
     Args:
         program: the policy.
         action: its kind of actions.
-        observations: of the self-test, [S, O].
-        actions: the true actions at these observations, [S, A].
+        observations: rows of the self-test, [S, O + K].
+        actions: the true rows at these, [S, A + K].
         title: what the policy is for.
         origin: where the observations are from.
         period: seconds between two actions, where known.
@@ -66,10 +66,12 @@ def c_files(
         "masked": _masked(action),
         "safe": safe_action(action),
         "safe_sentence": safe_sentence(action),
-        "observations": observations,
-        "actions": actions,
+        "observations": observations[:, : program.obs.size],
+        "memories": observations[:, program.obs.size :],
+        "actions": actions[:, : program.action.size],
+        "afters": actions[:, program.action.size :],
         "bound": "0.05F" if program.is_rounded else "1e-4F",  # ten times the effect of another order of sums
-        "units": difference_units(action, actions),
+        "units": difference_units(action, actions)[: program.action.size],
         "wrappers": wrappers,
         "constants": body.constants,
         "scratch": max(scratch, 1),
@@ -132,10 +134,16 @@ class Body:
         self.statements: list[str] = []
         self.sizes: dict[str, int] = {}
         self._results = {program.obs: Numbers("obs[#]", "obs")}
+        if program.memory:
+            self._results[program.memory] = Numbers("memory[#]", "memory")
         self._uses = Counter(x for operation in program.operations for x in operation.inputs if isinstance(x, Value))
         for operation in program.operations:
             self._add(operation)
+        if program.after:
+            self._array(program.after)  # whole, before the memory that it comes from is replaced
         self._write(program.action, "action")
+        if program.after:
+            self._write(program.after, "memory")
 
     def places(self) -> tuple[dict[str, int], int]:
         """The place of each array in the scratch memory, and the size of that.

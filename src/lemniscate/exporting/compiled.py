@@ -47,14 +47,15 @@ class HostPolicy:
             run_tool(command, folder)
             self._library = ctypes.CDLL(str(folder / "policy.so"))
         self._library.policy_self_test.restype = ctypes.c_float
-        self.actions = int(re.findall(r"^#define POLICY_ACTIONS (\d+)$", files["policy.h"], re.MULTILINE)[0])
-        """A"""
+        sizes = re.findall(r"^#define POLICY_(?:ACTIONS|MEMORY) (\d+)$", files["policy.h"], re.MULTILINE)
+        self.columns = sum(map(int, sizes))
+        """A + K, of rows of actions"""
         self.compiler = Path(compiler).name
 
     def act(self, obs: np.ndarray) -> np.ndarray:
-        """The actions [R, A] at raw observations [R, O] float32; `flags` counts those that are not finite."""
+        """Rows of actions [R, A + K] at raw observations [R, O + K]; `flags` counts those that are not finite."""
         obs = np.ascontiguousarray(obs, dtype=np.float32)
-        action = np.empty((len(obs), self.actions), dtype=np.float32)
+        action = np.empty((len(obs), self.columns), dtype=np.float32)
         pointers = obs.ctypes.data_as(POINTER), action.ctypes.data_as(POINTER)
         self.flags = self._library.policy_act_rows(*pointers, len(obs))
         return action
@@ -109,8 +110,8 @@ def target_sizes(files: Mapping[str, str]) -> dict[str, int]:
     }
 
 
-def simulate(files: Mapping[str, str], obs: np.ndarray, actions: int) -> tuple[np.ndarray, float, int]:
-    """The simulated core's actions [R, A] at observations [R, O], its self-test, and the instructions of an action.
+def simulate(files: Mapping[str, str], obs: np.ndarray, columns: int) -> tuple[np.ndarray, float, int]:
+    """The simulated core's actions [R, A + K] at observations, its self-test, and the instructions of an action.
 
     Raises:
         UserError: compiler or emulator fails.
@@ -122,7 +123,7 @@ def simulate(files: Mapping[str, str], obs: np.ndarray, actions: int) -> tuple[n
         machine = ["-M", "mps2-an386", "-cpu", "cortex-m4", "-display", "none", "-serial", "none", "-monitor", "none"]
         clock = ["-icount", "shift=0", "-semihosting-config", "enable=on,target=native"]
         run_tool([EMULATOR, *machine, *clock, "-kernel", "runner.elf"], folder, seconds=300)
-        done = np.fromfile(folder / "actions.bin", dtype="<f4").reshape(-1, actions)
+        done = np.fromfile(folder / "actions.bin", dtype="<f4").reshape(-1, columns)
         self_test, instructions = np.fromfile(folder / "figures.bin", dtype="<f4")
     return done, float(self_test), round(float(instructions))
 

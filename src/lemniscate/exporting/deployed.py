@@ -1,10 +1,12 @@
 """A policy from the raw observation to the action for `env.step`: as a module, and as a function of rows of numbers.
 
 Exported policies take and give rows: observations [R, O] and actions [R, A], float32, where A counts the numbers of an
-action of any shape. These actions are in the environment's units, unlike those of `VecEnv.step`.
+action of any shape. These actions are in the environment's units, unlike those of `VecEnv.step`. Of a policy with a
+memory of K numbers, these are further columns of both: what it remembers before, [R, O + K], and after, [R, A + K].
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -22,7 +24,7 @@ class Deployed(nn.Module):
     """The most probable action in the environment's own units: [B, O] raw observations to [B, …] actions.
 
     Normalizer, clip, network, squash and the scale to the bounds are inside. An action mask, where there is one, is the
-    end of the observation.
+    end of the observation. A policy with a memory takes that too, [B, K], and returns the next one beside the action.
     """
 
     low: Tensor
@@ -35,15 +37,23 @@ class Deployed(nn.Module):
         super().__init__()
         self.policy = policy.module
         self.kind = policy.spec.action
+        self.memory = policy.module.memory and replace(policy.module.memory, privileged=0)
         if isinstance(self.kind, Box):
             for name, numbers in zip(("low", "high", "middle", "half_width"), scale_of(self.kind), strict=True):
                 self.register_buffer(name, torch.tensor(numbers, dtype=torch.float32))
         elif isinstance(self.kind, MultiDiscrete):
             self.register_buffer("start", torch.tensor(self.kind.start))
 
-    def forward(self, obs: Tensor) -> Tensor:
+    def forward(self, obs: Tensor, before: Tensor | None = None) -> Tensor | tuple[Tensor, Tensor]:
         """[B, O] to [B, A], or to [B, …] in the environment's own shape; [B] for Discrete."""
-        action = self.policy(obs).mode()
+        if not self.memory or before is None:
+            return self.act(obs)
+        rows = self.memory.join(obs, torch.cat([torch.zeros_like(before[:, :1]), before], dim=-1))
+        return self.act(rows), self.policy.remember(rows)[:, 1:]
+
+    def act(self, rows: Tensor) -> Tensor:
+        """The action at rows of the policy's, [B, …]."""
+        action = self.policy(rows).mode()
         if isinstance(self.kind, Box):
             action = torch.minimum(torch.maximum(self.middle + self.half_width * action, self.low), self.high)
         elif isinstance(self.kind, Discrete):
@@ -56,6 +66,11 @@ class Deployed(nn.Module):
 def input_size(spec: Spec) -> int:
     """The length of a policy's input: the flat observation, and the action mask where there is one."""
     return spec.observation_size + spec.action.mask_size
+
+
+def memory_size(policy: TrainedPolicy) -> int:
+    """K, the numbers that a policy remembers; 0 without a memory."""
+    return policy.module.memory.policy - 1 if policy.module.memory else 0
 
 
 def safe_action(action: Action) -> np.ndarray:
@@ -91,18 +106,43 @@ def difference_units(action: Action, true: np.ndarray) -> np.ndarray:
     low, high, _, half = scale_of(action)
     bounded = np.isfinite(low) & np.isfinite(high)
     spacing = np.spacing(np.where(bounded, np.maximum(np.abs(low), np.abs(high)), 1).astype(np.float32))
-    return np.where(bounded, np.maximum(half, spacing / 1e-5), np.maximum(1, np.abs(true).max(0)))
+    largest, memory = np.abs(true).max(0), np.ones(true.shape[1] - len(half))
+    units = np.where(bounded, np.maximum(half, spacing / 1e-5), np.maximum(1, largest[: len(half)]))
+    return np.concatenate([units, memory])
 
 
 def act_with(policy: TrainedPolicy) -> Act:
     """The policy itself as a function of rows; every export is compared with it."""
+    size, memory = input_size(policy.spec), Deployed(policy).memory
 
     @torch.no_grad()
     def act(obs: np.ndarray) -> np.ndarray:
-        action = policy.module(torch.from_numpy(obs)).mode().numpy()
-        return as_rows(physical_action(action, policy.spec.action))
+        rows, after = torch.from_numpy(obs), np.empty((len(obs), 0), np.float32)
+        if memory:
+            rows = memory.join(rows[:, :size], nn.functional.pad(rows[:, size:], (1, 0)))
+            after = policy.module.remember(rows)[:, 1:].numpy()
+        action = policy.module(rows).mode().numpy()
+        return np.hstack([as_rows(physical_action(action, policy.spec.action)), after])
 
     return act
+
+
+def carried(act: Act, memory: int) -> Callable[..., np.ndarray]:
+    """A function of rows that carries its memory of K = `memory` numbers itself: [R, O] to [R, A], call by call.
+
+    It begins with zeros; where the second argument, [R] bool, is true, again.
+    """
+    kept = np.zeros((1, memory), np.float32)
+
+    def acts(obs: np.ndarray, begins: np.ndarray | None = None) -> np.ndarray:
+        nonlocal kept
+        before = np.broadcast_to(kept, (len(obs), memory))
+        before = before if begins is None else np.where(begins[:, None], np.float32(0), before)
+        rows = act(np.hstack([obs, before]))
+        kept = rows[:, rows.shape[1] - memory :]
+        return rows[:, : rows.shape[1] - memory]
+
+    return acts
 
 
 def as_rows(action: np.ndarray) -> np.ndarray:

@@ -17,7 +17,7 @@ from lemniscate.errors import UserError, is_installed
 from lemniscate.exporting.c_code import c_files
 from lemniscate.exporting.compiled import HostPolicy, host_compiler
 from lemniscate.exporting.crazyflie import crazyflie_files
-from lemniscate.exporting.deployed import Act, Deployed, act_with, input_size, safe_action, safe_sentence
+from lemniscate.exporting.deployed import Act, Deployed, act_with, input_size, memory_size, safe_action, safe_sentence
 from lemniscate.exporting.onnx_model import onnx_act, onnx_model
 from lemniscate.exporting.parity import TESTS, fly, parity, self_tests, sentences
 from lemniscate.exporting.translation import Program, translate
@@ -67,7 +67,7 @@ def export(
         raise UserError(f"A policy for {policy.spec.env_id} looks at images; what can be exported looks at vectors.")
     if isinstance(policy.spec.action, Box) and not policy.spec.action.dtype.startswith("float"):
         raise UserError(f"{policy.spec.env_id} takes a Box of whole numbers; what can be exported acts by fractions.")
-    program = translate(Deployed(policy).eval(), input_size(policy.spec))
+    program = translate(Deployed(policy).eval(), input_size(policy.spec), memory_size(policy))
     contents, record, said = _contents(policy, program)
     try:
         with replace_directory(folder) as aside:
@@ -107,13 +107,13 @@ def _contents(policy: TrainedPolicy, program: Program) -> tuple[dict[str, bytes]
     facts = {"title": named, "environment": policy.spec.env_id, "wrappers": wrappers, "step": policy.step}
     model = onnx_model(program, facts) if is_installed("onnx") else None
     acting, act = _actor(policy, program, model, compiler)
-    obs, interface = fly(policy, act)
-    tests = self_tests(policy, obs)
+    flights, interface = fly(policy, act)
+    tests = self_tests(policy, flights.rows(true, program.memory_size))
     edges = f", and {len(tests) - TESTS} with one number far outside of them" if len(tests) > TESTS else ""
     origin = f"{TESTS} of episodes of {policy.spec.env_id}{edges}"
     about = {"title": named, "origin": origin, "period": interface.period, "wrappers": wrappers}
     texts = c_files(program, action, tests, true(tests), **about)
-    found = parity(program, action, true, obs, texts, model, HostPolicy(texts, compiler) if compiler else None)
+    found = parity(program, action, true, flights, texts, model, HostPolicy(texts, compiler) if compiler else None)
     record = {"environment": policy.spec.env_id, "acting": acting, "reference": "torch", **found}
     said, vehicle = sentences(record), dict[str, str]()
     if wrappers:
@@ -129,14 +129,15 @@ def _contents(policy: TrainedPolicy, program: Program) -> tuple[dict[str, bytes]
     contents |= {name: text.encode() for name, text in texts.items()}
     contents |= {f"{CRAZYFLIE}/{name}": text.encode() for name, text in vehicle.items()}
     contents[PARITY] = (json.dumps(record, indent=1, allow_nan=False) + "\n").encode()
-    return contents, _manifest(policy, program, interface, obs, contents), said
+    seen = flights.obs.reshape(-1, program.obs.size)
+    return contents, _manifest(policy, program, interface, seen, contents), said
 
 
 def _actor(policy: TrainedPolicy, program: Program, model: bytes | None, compiler: str | None) -> tuple[str, Act]:
     """The copy that acts here, by its name: the C code, or else ONNX, or else the policy itself."""
     if compiler:
         # what the self-test stores is seen on this flight, so the C that flies has an empty one
-        untested = np.zeros((1, program.obs.size)), np.zeros((1, program.action.size))
+        untested = [np.zeros((1, x.size + program.memory_size)) for x in (program.obs, program.action)]
         files = c_files(program, policy.spec.action, *untested, title="", origin="")
         return "policy.c", HostPolicy(files, compiler).act
     if model and is_installed("onnxruntime"):
@@ -181,6 +182,7 @@ def _manifest(
             {"index": i, **vars(quantity), "range": ends}
             for i, (quantity, ends) in enumerate(zip(acted(action, interface), ranges(action), strict=True))
         ],
+        "memory": program.memory_size,
         "safe_action": safe_action(action).tolist(),
         "safe_action_is": f"where an observation is not finite, policy.c writes {safe_sentence(action)}, and returns 1",
         "licence": LICENCE,

@@ -17,18 +17,24 @@ OPSET, IR = 18, 10
 def onnx_model(program: Program, facts: Mapping[str, Any]) -> bytes:
     """A model with the input `obs` [batch, O] float32 and the output `action` [batch, …], checked.
 
+    Of a policy with a memory it has the input `memory` [batch, K] too, zeros where an episode begins, and the output
+    `next_memory`.
+
     Its metadata are the `facts`, each as JSON.
     """
     writer = _Writer()
     helper, checker = writer.onnx.helper, writer.onnx.checker
     for operation in program.operations:
         writer.add(operation)
-    writer.node("Identity", [program.action.name], "action")
-    obs, action = (
-        helper.make_tensor_value_info(name, writer.types[value.kind], ["batch", *value.shape])
-        for name, value in (("obs", program.obs), ("action", program.action))
+    given = {"obs": program.obs} | ({"memory": program.memory} if program.memory else {})
+    results = {"action": program.action} | ({"next_memory": program.after} if program.after else {})
+    for name, value in results.items():
+        writer.node("Identity", [value.name], name)
+    inputs, outputs = (
+        [helper.make_tensor_value_info(name, writer.types[v.kind], ["batch", *v.shape]) for name, v in values.items()]
+        for values in (given, results)
     )
-    graph = helper.make_graph(writer.nodes, "policy", [obs], [action], initializer=writer.initializers)
+    graph = helper.make_graph(writer.nodes, "policy", inputs, outputs, initializer=writer.initializers)
     opset = helper.make_opsetid("", OPSET)
     model = helper.make_model(graph, opset_imports=[opset], ir_version=IR, producer_name="lemniscate")
     model.producer_version = version()
@@ -45,7 +51,15 @@ def onnx_act(model: bytes) -> tuple[Act, str]:
     options.intra_op_num_threads = 1
     options.log_severity_level = 3
     session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
-    return lambda obs: as_rows(np.asarray(session.run(None, {"obs": obs})[0])), onnxruntime.__version__
+    inputs = session.get_inputs()
+    ends = np.cumsum([given.shape[1] for given in inputs])[:-1]
+
+    def act(obs: np.ndarray) -> np.ndarray:
+        parts = zip(inputs, np.split(obs, ends, axis=1), strict=True)
+        results = session.run(None, {given.name: part for given, part in parts})
+        return np.hstack([as_rows(np.asarray(result)) for result in results])
+
+    return act, onnxruntime.__version__
 
 
 class _Writer:

@@ -3,6 +3,7 @@
 import platform
 import timeit
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -14,11 +15,20 @@ from lemniscate.envs.backend import Interface
 from lemniscate.errors import UserError, is_installed, missing_extra
 from lemniscate.exporting import compiled
 from lemniscate.exporting.compiled import CORE, EMULATOR, TARGET_COMPILER, HostPolicy
-from lemniscate.exporting.deployed import Act, act_with, difference_units, for_policy, input_size
+from lemniscate.exporting.deployed import (
+    Act,
+    act_with,
+    carried,
+    difference_units,
+    for_policy,
+    input_size,
+    memory_size,
+    safe_action,
+)
 from lemniscate.exporting.onnx_model import onnx_act
 from lemniscate.exporting.translation import Program
 from lemniscate.maths import Deterministic
-from lemniscate.nn.normalizer import RunningNorm
+from lemniscate.nn.normalizer import NormByPart, RunningNorm
 from lemniscate.run.environments import evaluation_env
 from lemniscate.run.evaluate import play_episodes
 from lemniscate.spec import Action, Box
@@ -33,37 +43,63 @@ INSTRUCTIONS = 10**9
 """of a simulation of the target, at most: it takes some ten seconds"""
 
 
-def fly(policy: TrainedPolicy, act: Act, rows: int = ROWS, seed: int = 0) -> tuple[np.ndarray, Interface]:
+@dataclass(frozen=True)
+class Flights:
+    """What was seen: rows [T, N, O] float32, and whether each begins an episode, [T, N]."""
+
+    obs: np.ndarray
+    begins: np.ndarray
+
+    def actions(self, act: Act, memory: int) -> np.ndarray:
+        """The actions at all rows in their order, [T · N, A], of a policy that carries its own memory, of K numbers."""
+        acts = carried(act, memory)
+        return np.concatenate([acts(*step) for step in zip(self.obs, self.begins, strict=True)])
+
+    def rows(self, act: Act, memory: int) -> np.ndarray:
+        """Each row with what `act` remembers there, [T · N, O + K]."""
+        seen = list[np.ndarray]()
+
+        def watched(rows: np.ndarray) -> np.ndarray:
+            seen.append(rows)
+            return act(rows)
+
+        self.actions(watched, memory)
+        return np.concatenate(seen)
+
+
+def fly(policy: TrainedPolicy, act: Act, rows: int = ROWS, seed: int = 0) -> tuple[Flights, Interface]:
     """Let `act` act in the environment of a policy's training until it has seen `rows` observations.
 
     Returns:
-        The observations [R, O] float32, and the meaning of the environment's numbers.
+        The observations, and the meaning of the environment's numbers.
 
     Raises:
         UserError: the environment cannot be made, or has other spaces now.
     """
     env = evaluation_env(policy.config, ENVIRONMENTS)
-    size, seen = input_size(policy.spec), list[np.ndarray]()
+    size, seen, begun = input_size(policy.spec), list[np.ndarray](), [np.ones(env.num_envs, bool)]
     stride = max(1, env.num_envs // ENVIRONMENTS)  # of many, all would be seen in the same few steps
+    acts = carried(act, memory_size(policy))
 
     def driver(obs: Tensor) -> Deterministic:
         given = np.ascontiguousarray(obs[:, :size].numpy())  # without what is privileged
-        return Deterministic(for_policy(act(given), policy.spec.action))
+        return Deterministic(for_policy(acts(given, begun[-1]), policy.spec.action))
 
     try:
         if not env.spec.fits(policy.spec):
             raise UserError(f"{policy.spec.env_id} has other spaces here than in training.")
-        for obs, _, _, counts in play_episodes(driver, env, episodes=10**9, seed=seed):
-            seen.append(obs[counts][::stride, :size].numpy().copy())
+        for obs, _, step, _ in play_episodes(driver, env, episodes=10**9, seed=seed):
+            seen.append(obs[::stride, :size].numpy().copy())
             if sum(map(len, seen)) >= rows:
                 break
-        return np.concatenate(seen), env.backend.interface
+            begun.append((step.terminated | step.truncated | ~step.valid).numpy())
+        return Flights(np.stack(seen), np.stack(begun)[:, ::stride]), env.backend.interface
     finally:
         env.close()
 
 
 def self_tests(policy: TrainedPolicy, obs: np.ndarray) -> np.ndarray:
-    """The observations of the self-test, [S, O]: `TESTS` from all over the flights, then `EDGES` for the clips.
+    """The rows of the self-test, [S, O + K]: `TESTS` from all over the flights, then `EDGES` for the clips.
 
     Each of the latter is a real one with one number far outside of what was seen, so that a forgotten clip shows. There
     are none where nothing is clipped. With discrete actions, observations at which rounding could decide are left out.
@@ -72,6 +108,8 @@ def self_tests(policy: TrainedPolicy, obs: np.ndarray) -> np.ndarray:
     real = obs[np.linspace(0, len(obs) - 1, TESTS).round().astype(int)]
     normalizer, action = policy.module.normalizer, policy.spec.action
     size = policy.spec.observation_size
+    if isinstance(normalizer, NormByPart) and memory_size(policy):
+        normalizer = normalizer.parts[0]
     if isinstance(normalizer, RunningNorm):
         mean, std = normalizer.mean.numpy(), normalizer.var.numpy() ** 0.5
         far = 3 * normalizer.clip * (std + 1e-4)
@@ -87,8 +125,8 @@ def self_tests(policy: TrainedPolicy, obs: np.ndarray) -> np.ndarray:
 
 def _clear(policy: TrainedPolicy, obs: np.ndarray) -> np.ndarray:
     """[R], whether a slightly different observation has the same action; all where that holds for none."""
-    act = act_with(policy)
-    same = [(act(obs * np.float32(factor)) == act(obs)).all(1) for factor in (0.99999, 1.00001)]
+    act, actions = act_with(policy), len(safe_action(policy.spec.action))
+    same = [(act(obs * np.float32(f)) == act(obs))[:, :actions].all(1) for f in (0.99999, 1.00001)]
     clear = np.logical_and(*same)
     return clear if clear.any() else ~clear
 
@@ -97,33 +135,42 @@ def parity(
     program: Program,
     action: Action,
     act: Act,
-    obs: np.ndarray,
+    flights: Flights,
     files: Mapping[str, str],
     model: bytes | None,
     host: HostPolicy | None,
 ) -> dict[str, Any]:
     """The record; `missing` has a sentence for everything that could not be compared.
 
-    Compared with `act`, the policy itself with its kind of actions, at the observations `obs` [R, O]: `model`, which is
-    `policy.onnx`, and the C in `files`, which is compiled here as `host`.
+    Compared with `act`, the policy itself with its kind of actions, at the observations of `flights`: `model`, which is
+    `policy.onnx`, and the C in `files`, which is compiled here as `host`. Of a policy with a memory, each carries its
+    own through the flights too, `over_episodes`.
     """
+    obs = flights.rows(act, program.memory_size)
     true, tolerance = act(obs), BFLOAT16_TOLERANCE if program.is_rounded else TOLERANCE
     units = difference_units(action, true)
     compared_with = partial(compare, units=units, tolerance=tolerance)
     costs: dict[str, float | None] = {"c": None, "onnxruntime": None, "torch": nanoseconds(lambda: act(obs[:1]))}
     record: dict[str, Any] = {"observations": len(obs), "tolerance": tolerance, "difference_units": units.tolist()}
     record |= {"onnx": None, "c_host": None}
+
+    def carries(copy: Act) -> dict[str, Any]:
+        if not program.memory:
+            return {}
+        own, its = (flights.actions(each, program.memory_size) for each in (act, copy))
+        return {"over_episodes": compare(its, own, units[: own.shape[1]], tolerance)["max_difference"]}
+
     left_out = {"onnx": "policy.onnx is left out", "onnxruntime": "policy.onnx is not compared"}
     missing = [f"{missing_extra(name, 'export')}; {what}." for name, what in left_out.items() if not is_installed(name)]
     if model is not None and is_installed("onnxruntime"):
         run, version = onnx_act(model)
-        record["onnx"] = {**compared_with(run(obs), true), "onnxruntime": version}
+        record["onnx"] = {**compared_with(run(obs), true), **carries(run), "onnxruntime": version}
         costs["onnxruntime"] = nanoseconds(lambda: run(obs[:1]))
     if host is None:
         missing.append("There is no C compiler here (cc, gcc, clang or CC): policy.c is not compared on this machine.")
     else:
         compared = compared_with(host.act(obs), true)
-        record["c_host"] = {**compared, "self_test": host.self_test(), "compiler": host.compiler}
+        record["c_host"] = {**compared, **carries(host.act), "self_test": host.self_test(), "compiler": host.compiler}
         costs["c"] = nanoseconds(lambda: host.act(obs)) / len(obs)
     record["c_cortex_m4f"], said = _on_target(program, files, obs, true, compared_with)
     record["multiplications"] = program.multiplications
@@ -181,6 +228,8 @@ def sentences(record: Mapping[str, Any]) -> list[str]:
         largest = each["max_difference"]
         distance = f"differs from the policy by at most {largest:.1e}{share}" if largest else "is exact"
         said.append(f"{name} {distance} at {each['observations']:,} observations.")
+        if "over_episodes" in each:
+            said.append(f"With a memory of its own over whole episodes, {name} differs by {each['over_episodes']:.1e}.")
     if sizes := record["c_cortex_m4f"]:
         instructions = sizes.get("instructions_per_call")
         said.append(

@@ -72,11 +72,21 @@ class Operation:
 
 @dataclass(frozen=True, eq=False)
 class Program:
-    """Operations in their order, from the flat observation to the action for `env.step`."""
+    """Operations in their order, from the flat observation to the action for `env.step`.
+
+    Of a policy with a memory also from what it remembers before, `memory`, to the next one, `after`.
+    """
 
     obs: Value
     operations: tuple[Operation, ...]
     action: Value
+    memory: Value | None = None
+    after: Value | None = None
+
+    @property
+    def memory_size(self) -> int:
+        """K, the numbers that the policy remembers; 0 without a memory."""
+        return self.memory.size if self.memory else 0
 
     @property
     def multiplications(self) -> int:
@@ -133,6 +143,8 @@ class Walk(Interpreter):
         super().__init__(graph)
         self.extra_traceback = False  # torch would put the node in front of an error's message
         self.operations: list[Operation] = []
+        self._known: dict[Any, Value] = {}
+        """the results so far, by what they are computed from: nothing is computed twice"""
         self.batch = batch
 
     def run_node(self, n: Node) -> Any:
@@ -183,9 +195,12 @@ class Walk(Interpreter):
             if isinstance(operand, np.ndarray) and operand.ndim > rank and operand.shape[0] == 1:
                 operand = operand[0]
             operands.append(operand)
-        value = Value(f"v{len(self.operations)}", shape, kind)
-        self.operations.append(Operation(name, tuple(operands), value, settings))
-        return value
+        same = [x if isinstance(x, Value) else (x.dtype.str, x.shape, x.tobytes()) for x in operands]
+        key = name, *same, shape, kind, *settings.items()
+        if key not in self._known:
+            self._known[key] = Value(f"v{len(self.operations)}", shape, kind)
+            self.operations.append(Operation(name, tuple(operands), self._known[key], settings))
+        return self._known[key]
 
     def as_kind(self, operand: Any, kind: Kind) -> Any:
         """The operand with numbers of another kind."""
@@ -251,6 +266,10 @@ def _power(walk: Walk, x: Any, exponent: Any) -> Value:
 def _where(walk: Walk, condition: Any, a: Any, b: Any) -> Value:
     chosen = (walk.as_kind(condition, "bool"), walk.as_kind(a, walk.kind), walk.as_kind(b, walk.kind))
     return walk.add("Where", *chosen, kind=walk.kind)
+
+
+def _lerp(walk: Walk, a: Value, b: Value, weight: Value) -> Value:
+    return walk.add("Add", a, walk.add("Mul", weight, walk.add("Sub", b, a)))
 
 
 def _linear(walk: Walk, x: Value, weight: Any, bias: Any = None) -> Value:
@@ -402,7 +421,10 @@ TRANSLATIONS: dict[str, Translation] = {
     "permute": _permute,
     **dict.fromkeys(("view", "_unsafe_view", "reshape", "unsqueeze", "squeeze"), _shaped("Reshape")),
     "expand": _shaped("Expand"),
-    **dict.fromkeys(("full", "full_like", "zeros"), _full),
+    **dict.fromkeys(("full", "full_like", "zeros", "zeros_like"), _full),
+    "ones_like": lambda walk, x, **_: _full(walk, x, 1.0),
+    "lerp": _lerp,
+    "addcmul": lambda walk, x, a, b: walk.add("Add", x, walk.add("Mul", a, b)),
     "sym_size": lambda walk, *_: BATCH,
     **dict.fromkeys(("alias", "clone", "detach", "contiguous"), lambda walk, x, *_, **__: x),
     "getitem": lambda walk, parts, index: parts[index],
@@ -410,31 +432,37 @@ TRANSLATIONS: dict[str, Translation] = {
 """by the name of torch's operation; what is not here has no translation"""
 
 
-def translate(module: nn.Module, inputs: int) -> Program:
+def translate(module: nn.Module, inputs: int, memory: int = 0) -> Program:
     """The operations of a module from [B, inputs] to [B, …], for any B.
+
+    With `memory` K, also from [B, K] to the next [B, K].
 
     Raises:
         UserError: an operation that has no translation, or a result that depends on more than one row.
     """
-    exported = _exported(module, inputs)
+    exported = _exported(module, [inputs, memory] if memory else [inputs])
     signature, constants = exported.graph_signature, {**exported.state_dict, **exported.constants}
-    (given,) = (node for node in exported.graph.nodes if node.name in signature.user_inputs)
-    batch, *shape = given.meta["val"].shape
-    obs, walk = Value("obs", tuple(shape)), Walk(exported.graph_module, str(batch))
+    nodes = [node for node in exported.graph.nodes if node.name in signature.user_inputs]
+    values = [Value(name, tuple(n.meta["val"].shape[1:])) for name, n in zip(("obs", "memory"), nodes, strict=False)]
+    walk, given = Walk(exported.graph_module, str(nodes[0].meta["val"].shape[0])), iter(values)
     specs = signature.input_specs
-    places = [obs if spec.kind is InputKind.USER_INPUT else constants.get(spec.target or "") for spec in specs]
-    (action,) = walk.run(*places, enable_io_processing=False)
-    if not isinstance(action, Value):
-        raise UntranslatableError("its actions do not depend on the observation")
-    return Program(obs, _needed(walk.operations, action), action)
+    places = [next(given) if spec.kind is InputKind.USER_INPUT else constants.get(spec.target or "") for spec in specs]
+    results = walk.run(*places, enable_io_processing=False)
+    for name, result in zip(("actions", "next memory"), results, strict=False):
+        if not isinstance(result, Value):
+            raise UntranslatableError(f"its {name} do not depend on the observation")
+    (obs, *before), (action, *after) = values, results
+    return Program(obs, _needed(walk.operations, *results), action, *before, *after)
 
 
-def _exported(module: nn.Module, inputs: int) -> torch.export.ExportedProgram:
+def _exported(module: nn.Module, inputs: list[int]) -> torch.export.ExportedProgram:
     batch = {0: torch.export.Dim("batch", min=2)}  # a batch of 1 would be taken for a constant
     try:
         with warnings.catch_warnings(), torch.no_grad():
             warnings.simplefilter("ignore")  # torch warns of its own parts
-            exported = torch.export.export(module, (torch.zeros(3, inputs),), dynamic_shapes=(batch,))
+            exported = torch.export.export(
+                module, tuple(torch.zeros(3, n) for n in inputs), dynamic_shapes=(batch,) * len(inputs)
+            )
             names = {_name_of(node) for node in exported.graph.nodes if node.op == "call_function"}
             # taking operations apart needs a second, and most networks here do without it
             if names <= {*TRANSLATIONS, *CHECKS}:
@@ -457,9 +485,9 @@ def _name_of(node: Node) -> str:
     return "getitem" if node.target is operator.getitem else parts[min(1, len(parts) - 1)]
 
 
-def _needed(operations: list[Operation], action: Value) -> tuple[Operation, ...]:
-    """The operations that the action depends on, in their order; the mode needs no standard deviation, for example."""
-    values, kept = {action}, list[Operation]()
+def _needed(operations: list[Operation], *results: Value) -> tuple[Operation, ...]:
+    """The operations that the results depend on, in their order; the mode needs no standard deviation, for example."""
+    values, kept = set(results), list[Operation]()
     for operation in reversed(operations):
         if operation.output in values:
             values.update(operand for operand in operation.inputs if isinstance(operand, Value))

@@ -2,17 +2,18 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import torch
 
 from lemniscate.api.policy import Trained, TrainedPolicy, load, path_of
+from lemniscate.envs import probe as probes
 from lemniscate.envs import registry
-from lemniscate.envs.probe import Act, Probe
 from lemniscate.errors import UserError
 from lemniscate.exporting.compiled import HostPolicy, host_compiler
-from lemniscate.exporting.deployed import for_policy
+from lemniscate.exporting.deployed import Act, act_with, carried, for_policy, memory_size
 from lemniscate.exporting.export import MANIFEST, commit
 from lemniscate.margins.presentation import FAILS, FALLS_SHORT, draw, rows, sentences, smoothness_sentence
 from lemniscate.margins.record import AxisMargins, margins_of, smoothness, worst_accepted
@@ -107,13 +108,13 @@ def preflight(
     folder = path_of(run)
     read_config(folder)
     policy = load(run, trust=trust)
-    act = _compiled(policy, folder) if compiled else lambda obs: policy.module(obs).mode()
+    act = _compiled(policy, folder) if compiled else None
     probe = _probe(policy, episodes, given)
     threads = torch.get_num_threads()
     # several threads wait for each other longer than a small network takes, if simulators run too
     torch.set_num_threads(1)
     try:
-        nominal, flown = probe.fly(act, derive(seed, EVALUATION, 0))
+        nominal, flown = probe.fly(partial(_begin, policy, act), derive(seed, EVALUATION, 0))
     finally:
         torch.set_num_threads(threads)
     least = None if probe.ends_by_failure else worst_accepted(nominal)
@@ -164,16 +165,23 @@ def _compiled(policy: TrainedPolicy, run: Path) -> Act:
         raise UserError(f"There is no whole export of {run}: lemniscate export {run}") from None
     if step != policy.step:
         raise UserError(f"{folder} is of step {step:,}, the policy of step {policy.step:,}: lemniscate export {run}")
-    host, kind = HostPolicy(files, compiler), policy.spec.action
-    return lambda obs: for_policy(host.act(obs.numpy()), kind)
+    return HostPolicy(files, compiler).act
 
 
-def _probe(policy: TrainedPolicy, episodes: int, given: Mapping[str, Any]) -> Probe:
+def _begin(policy: TrainedPolicy, act: Act | None) -> probes.Act:
+    """The policy, or its C where `act` is that, at the beginning of episodes."""
+    if not act and not memory_size(policy):
+        return lambda obs: policy.module(obs).mode()
+    acts = carried(act or act_with(policy), memory_size(policy))
+    return lambda obs: for_policy(acts(obs.numpy()), policy.spec.action)
+
+
+def _probe(policy: TrainedPolicy, episodes: int, given: Mapping[str, Any]) -> probes.Probe:
     """The environment. Raises `UserError` where it is another than in training, or has no axis."""
     arguments = env_arguments(policy.config)
     backend = arguments["backend"] or registry.backend_for(arguments["env"], arguments["wrappers"])
     own = registry.backend_class(backend)
-    probe: Probe | None = own.probe(arguments["env"], episodes, policy.config.env_kwargs, given)
+    probe: probes.Probe | None = own.probe(arguments["env"], episodes, policy.config.env_kwargs, given)
     if probe is None:
         arguments["kwargs"] |= given
         probe = VectorProbe(starts=episodes, **arguments)

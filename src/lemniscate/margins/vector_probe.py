@@ -15,7 +15,7 @@ from torch import Tensor
 
 from lemniscate.envs import registry
 from lemniscate.envs.factory import make_one, maker_of, makes_vector
-from lemniscate.envs.probe import CHANNEL_AXES, MODEL_AXES, Act, Axis, Flown, Tally, Value
+from lemniscate.envs.probe import CHANNEL_AXES, MODEL_AXES, Act, Axis, Begin, Flown, Tally, Value
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.exporting.deployed import input_size
 from lemniscate.run.seeding import derive, generator
@@ -117,15 +117,15 @@ class VectorProbe:
         single = own and not makes_vector(maker_of(env))
         self.axes = _axes(self.spec, single and has_model(env, kwargs))
 
-    def fly(self, act: Act, seed: int) -> tuple[Flown, dict[str, list[Flown]]]:
+    def fly(self, begin: Begin, seed: int) -> tuple[Flown, dict[str, list[Flown]]]:
         """All episodes, see `Probe.fly`; afterwards the environments are closed."""
         numbers, seen = _is_number(self.spec), list[Tensor]()
         try:
-            nominal = _fly(self._env, act, seed, seen if numbers.any() else None)
+            nominal = _fly(self._env, begin(), seed, seen if numbers.any() else None)
             scale = torch.cat(seen).std(0, correction=0) * numbers if seen else None
             points: dict[str, list[Flown]] = {}
             for axis in self.axes:
-                flown = (nominal if v == axis.nominal else self._at(axis, v, scale, act, seed) for v in axis.values)
+                flown = (nominal if v == axis.nominal else self._at(axis, v, scale, begin(), seed) for v in axis.values)
                 points[axis.name] = list(flown)
             return nominal, points
         finally:

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from lemniscate.errors import UserError
-from lemniscate.nn.memory import Columns, Remembering, give_memory, remember, remembered_by
+from lemniscate.nn.memory import Columns, Remembering, cell_of, give_memory, head_of, remember, remembered_by
 from lemniscate.nn.networks import ImageEncoder, Layers, PartsEncoder
 from lemniscate.nn.normalizer import NoNorm, NormByPart, RunningNorm, ScaleBytes, with_privileged
 from lemniscate.nn.policies import (
@@ -169,8 +169,9 @@ def network_of(
     encoder, features = encoder_of(spec)
     inputs, size = features + privileged, spec.observation_size
     if remembers and layers.remembers:
-        cell = layers.cell(inputs, layers.hidden[-1] if actions else outputs)
-        return Remembering(encoder, cell, layers.head(cell, actions, outputs, last_gain), (size, policy, privileged))
+        cell = cell_of(layers, inputs, layers.hidden[-1] if actions else outputs)
+        head = head_of(layers, cell, actions, outputs, last_gain)
+        return Remembering(encoder, cell, head, (size, policy, privileged))
     if policy:
         net = replace(layers, kind="mlp").network(inputs + policy - 1 + actions, outputs, last_gain)
         return nn.Sequential(Columns(encoder, (size, 1)), net)

@@ -8,12 +8,13 @@ are [O | policy's | P | critic's | mask], O the observation, P what is privilege
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
 
-from lemniscate.nn.networks import GRU, OwnCell
+from lemniscate.errors import UserError
+from lemniscate.nn.networks import NETWORKS, Layers, OwnNetwork, orthogonal
 from lemniscate.spec import Spec
 from lemniscate.types import Step
 
@@ -72,6 +73,43 @@ class Carrier:
         return replace(step, obs=self._memory.join(step.obs, going_on), next_obs=self._memory.join(step.next_obs, kept))
 
 
+class Recall:
+    """What is remembered of the episodes that someone plays call by call: of one, or of a batch of B.
+
+    Args:
+        memory: the columns.
+        remember: as that of `Carrier`.
+    """
+
+    def __init__(self, memory: Memory, remember: Callable[[Tensor], Tensor]) -> None:
+        self._memory, self._remember = memory, remember
+        self._kept: Tensor | None = None
+
+    def rows(self, obs: Tensor) -> Tensor:
+        """Observations [B, …] with their memory. Raises `UserError` for another B than before, without `reset`."""
+        if self._kept is None:
+            self._kept = obs.new_zeros(len(obs), self._memory.policy + self._memory.critic)
+        if len(obs) != len(self._kept):
+            raise UserError(
+                f"This policy remembers {len(self._kept)} episodes, and is given {len(obs)} observations:"
+                " policy.reset() forgets them, for new ones."
+            )
+        return self._memory.join(obs, self._kept)
+
+    def advance(self, rows: Tensor) -> None:
+        """Remember these rows too."""
+        self._kept = self._remember(rows)
+
+    def reset(self, done: Tensor | None = None) -> None:
+        """Forget the episodes that are over, `done` [B]; without it all of them."""
+        if done is None:
+            self._kept = None
+        elif self._kept is not None:
+            if done.shape != self._kept.shape[:1]:
+                raise UserError(f"done has the shape {tuple(done.shape)}, of {len(self._kept)} episodes.")
+            self._kept = self._kept.masked_fill(done[:, None], 0)
+
+
 class Columns(nn.Module):
     """The inputs of a network that remembers nothing, from rows of one that does.
 
@@ -86,6 +124,141 @@ class Columns(nn.Module):
         """[…, the columns] to […, features and the others]."""
         obs, _, others = _split(x, self.sizes)
         return torch.cat([self.encoder(obs), others], dim=-1)
+
+
+class OwnCell(OwnNetwork):
+    """A module of one's own with a memory of `size` numbers: [B, inputs], [B, size] to [B, outputs], [B, size]."""
+
+    def __init__(self, name: str, inputs: int, outputs: int) -> None:
+        super().__init__(name, inputs, outputs)
+        self.outputs, self.size = outputs, int(self.module.memory_size)
+
+    def prepare(self, x: Tensor) -> Tensor:
+        """The inputs as they are."""
+        return x
+
+    def step(self, prepared: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """[B, inputs] and [B, size] to the outputs [B, outputs], and the next memory."""
+        return self.module(prepared, memory)
+
+    def over(self, prepared: Tensor, goes_on: Tensor, memory: Tensor) -> Tensor:
+        """Of pieces, [P, L, inputs], [P, L, 1] and [P, L, size], to the outputs [P, L, outputs]; as `Remembering`."""
+        rows, after = [], memory[:, 0]
+        for t in range(prepared.shape[1]):
+            row, after = self.step(prepared[:, t], torch.where(goes_on[:, t], after, memory[:, t]) if t else after)
+            rows.append(row)
+        return torch.stack(rows, dim=1)
+
+    def _taken(self, inputs: int, outputs: int) -> str:
+        return f"[B, {inputs}] and memory_size numbers, [B, K], to [B, {outputs}] and the next [B, K]"
+
+    def _call(self, rows: Tensor) -> Tensor:
+        memory = rows.new_zeros(len(rows), self.module.memory_size)
+        out, after = self.module(rows, memory)
+        if (after.shape, after.dtype) != (memory.shape, memory.dtype):
+            raise ValueError(f"the next memory is {list(after.shape)} of {after.dtype}")
+        out, _ = self.module(rows, after)  # on from there, so that what the memory is for takes part
+        return out
+
+
+class GRU(nn.Module):
+    """Gated recurrent units behind the layers before them: Cho et al. 2014, arXiv:1406.1078, eq. 5 to 8.
+
+    As in torch, the reset gate acts on the product, r ⊙ (W h + b), and z is what the memory keeps of itself.
+    """
+
+    def __init__(self, layers: nn.Module, inputs: int, size: int) -> None:
+        super().__init__()
+        self.size = self.outputs = size
+        self.layers = layers
+        self.input, self.state = nn.Linear(inputs, 3 * size), nn.Linear(size, 3 * size)
+        for layer in (self.input, self.state):
+            for block in layer.weight.data.split(size):
+                nn.init.orthogonal_(block)
+            nn.init.zeros_(layer.bias)
+
+    def prepare(self, x: Tensor) -> Tensor:
+        """What does not depend on the memory: […, inputs] to […, 3 size]."""
+        return self.input(self.layers(x))
+
+    def step(self, prepared: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """[B, 3 size] and h [B, size] to the output, which is h', and h'."""
+        _, keep, _, new = _gates(prepared, self.state(memory))
+        after = torch.lerp(new, memory, keep)
+        return after, after
+
+    def over(self, prepared: Tensor, goes_on: Tensor, memory: Tensor) -> Tensor:
+        """Of pieces, [P, L, 3 size], [P, L, 1] and [P, L, size], to the outputs [P, L, size]; as `Remembering`."""
+        by_time = prepared.movedim(1, 0), goes_on.movedim(1, 0), memory.movedim(1, 0)
+        return _Pieces.apply(*by_time, self.state.weight, self.state.bias).movedim(0, 1)
+
+
+def _gates(prepared: Tensor, state: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """r, z, the new memory's part in the product, and the candidate n, from both products […, 3 size]."""
+    sizes = [2 * state.shape[-1] // 3, state.shape[-1] // 3]
+    (gates_x, new_x), (gates_h, new_h) = prepared.split(sizes, dim=-1), state.split(sizes, dim=-1)
+    reset, keep = torch.sigmoid(gates_x + gates_h).chunk(2, dim=-1)
+    return reset, keep, new_h, torch.tanh(torch.addcmul(new_x, reset, new_h))
+
+
+class _Pieces(torch.autograd.Function):
+    """`GRU.over`, with its own backward pass: of the operations that depend on the next step, each step has four.
+
+    What does not, the gates and their derivatives, is computed of all steps at once, from the inputs and outputs alone;
+    so derivatives of the derivative, as in a Fisher product, are exact too. The memory in the rows is constant.
+    """
+
+    @staticmethod
+    def forward(prepared: Tensor, goes_on: Tensor, memory: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        h, outs, transposed = memory[0], [], weight.T
+        for t, x in enumerate(prepared.unbind()):
+            h = torch.where(goes_on[t], h, memory[t]) if t else h
+            _, keep, _, new = _gates(x, torch.addmm(bias, h, transposed))
+            h = torch.lerp(new, h, keep)
+            outs.append(h)
+        return torch.stack(outs)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
+        ctx.save_for_backward(*inputs, output)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> Any:
+        prepared, goes_on, memory, weight, bias, out = ctx.saved_tensors
+        (by_out,) = gradients
+        before = torch.cat([memory[:1], torch.where(goes_on[1:], out[:-1], memory[1:])])
+        reset, keep, new_h, new = _gates(prepared, before @ weight.T + bias)
+        by_new = (1 - keep) * (1 - new * new)
+        by_reset, by_keep = by_new * new_h * reset * (1 - reset), (before - new) * keep * (1 - keep)
+        by_state = torch.stack([by_reset, by_keep, by_new * reset], dim=2)  # ∂h'/∂ of each product, [L, P, 3, size]
+        keep, states = keep * goes_on, (by_state * goes_on[..., None]).unbind()
+        total = by_out[-1]
+        totals = [total]
+        for t in range(len(out) - 1, 0, -1):
+            back = (states[t] * total[:, None]).flatten(1) @ weight
+            total = by_out[t - 1] + torch.addcmul(back, keep[t], total)
+            totals.append(total)
+        by_after = torch.stack(totals[::-1])
+        state = (by_state * by_after[:, :, None]).flatten(2)
+        by_prepared = torch.cat([state[..., : 2 * len(weight) // 3], by_after * by_new], dim=-1)
+        by_weight = state.flatten(0, 1).T @ before.flatten(0, 1)
+        return by_prepared, None, None, by_weight, state.sum((0, 1))
+
+
+def cell_of(layers: Layers, inputs: int, outputs: int) -> GRU | OwnCell:
+    """The part of a network that remembers, for layers that do; only one's own needs the number of its outputs."""
+    if layers.kind != "gru":
+        return OwnCell(layers.kind, inputs, outputs)
+    before, width = NETWORKS["mlp"](replace(layers, hidden=layers.hidden[:-1]), inputs)
+    return GRU(nn.Sequential(*before), width, layers.hidden[-1])
+
+
+def head_of(layers: Layers, cell: GRU | OwnCell, actions: int, outputs: int, last_gain: float) -> nn.Module:
+    """From the outputs of a cell, and actions, to those of the network."""
+    if actions:
+        own = replace(layers, kind="layer_norm", hidden=layers.hidden[-1:])
+        return own.network(cell.outputs + actions, outputs, last_gain)
+    return nn.Identity() if isinstance(cell, OwnCell) else orthogonal(nn.Linear(cell.outputs, outputs), last_gain)
 
 
 class Remembering(nn.Module):
@@ -113,12 +286,8 @@ class Remembering(nn.Module):
         if x.dim() < 3:
             out, _ = self.cell.step(prepared, memory)
             return self.head(torch.cat([out, action], dim=-1))
-        rows, after = [], memory[:, 0]
-        for t in range(x.shape[1]):
-            before = torch.where(goes_on[:, t] == 1, after, memory[:, t]) if t else after
-            row, after = self.cell.step(prepared[:, t], before)
-            rows.append(row)
-        return self.head(torch.cat([torch.stack(rows, dim=1), action], dim=-1))
+        out = self.cell.over(prepared, goes_on == 1, memory)
+        return self.head(torch.cat([out, action], dim=-1))
 
     def remember(self, x: Tensor) -> Tensor:
         """The memory after rows [B, I], with a 1 in front: [B, 1 + size]."""
@@ -149,7 +318,7 @@ def remember(net: nn.Module, inputs: Tensor) -> Tensor:
 
 
 def give_memory(policy: "Policy", critic: nn.Module, spec: Spec, length: int) -> Memory | None:
-    """The columns of a policy's and a critic's network, which the policy gets for its own; None where they have none."""
+    """The columns of a policy's and a critic's network, None where they have none; the policy gets its own."""
     if size := remembered_by(policy.net):
         policy.memory = Memory(spec.observation_size, size, spec.privileged, 0, length)
         return replace(policy.memory, critic=remembered_by(critic))

@@ -1,7 +1,7 @@
 """Networks: perceptrons, residual blocks, modules of one's own; and the encoder of images."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 from typing import Literal
@@ -88,21 +88,6 @@ class Layers:
             return self.kind == "gru"
         made_by = find_callable(self.kind)
         return bool(getattr(getattr(made_by, "func", made_by), "memory_size", 0))
-
-    def cell(self, inputs: int, outputs: int) -> "GRU | OwnCell":
-        """The part of a network that remembers, for layers that do; only one's own needs the number of its outputs."""
-        if self.kind != "gru":
-            return OwnCell(self.kind, inputs, outputs)
-        layers, width = _mlp(replace(self, hidden=self.hidden[:-1]), inputs)
-        return GRU(nn.Sequential(*layers), width, self.hidden[-1])
-
-    def head(self, cell: "GRU | OwnCell", actions: int, outputs: int, last_gain: float) -> nn.Module:
-        """From the outputs of a cell, and actions, to those of the network."""
-        if actions:
-            return replace(self, kind="layer_norm", hidden=self.hidden[-1:]).network(
-                cell.outputs + actions, outputs, last_gain
-            )
-        return nn.Identity() if isinstance(cell, OwnCell) else orthogonal(nn.Linear(cell.outputs, outputs), last_gain)
 
     @property
     def linear(self) -> type[nn.Linear]:
@@ -203,62 +188,6 @@ class OwnNetwork(nn.Module):
         """Copies of all parameters and buffers, but of those that get their shape in the first call."""
         named = (*self.named_parameters(), *self.named_buffers())
         return {name: tensor.detach().clone() for name, tensor in named if not is_lazy(tensor)}
-
-
-class OwnCell(OwnNetwork):
-    """A module of one's own with a memory of `size` numbers: [B, inputs], [B, size] to [B, outputs], [B, size]."""
-
-    def __init__(self, name: str, inputs: int, outputs: int) -> None:
-        super().__init__(name, inputs, outputs)
-        self.outputs, self.size = outputs, int(self.module.memory_size)
-
-    def prepare(self, x: Tensor) -> Tensor:
-        """The inputs as they are."""
-        return x
-
-    def step(self, prepared: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """[B, inputs] and [B, size] to the outputs [B, outputs], and the next memory."""
-        return self.module(prepared, memory)
-
-    def _taken(self, inputs: int, outputs: int) -> str:
-        return f"[B, {inputs}] and memory_size numbers, [B, K], to [B, {outputs}] and the next [B, K]"
-
-    def _call(self, rows: Tensor) -> Tensor:
-        memory = rows.new_zeros(len(rows), self.module.memory_size)
-        out, after = self.module(rows, memory)
-        if (after.shape, after.dtype) != (memory.shape, memory.dtype):
-            raise ValueError(f"the next memory is {list(after.shape)} of {after.dtype}")
-        out, _ = self.module(rows, after)  # on from there, so that what the memory is for takes part
-        return out
-
-
-class GRU(nn.Module):
-    """Gated recurrent units behind the layers before them: Cho et al. 2014, arXiv:1406.1078, eq. 5 to 8.
-
-    As in torch, the reset gate acts on the product, r ⊙ (W h + b), and z is what the memory keeps of itself.
-    """
-
-    def __init__(self, layers: nn.Module, inputs: int, size: int) -> None:
-        super().__init__()
-        self.size = self.outputs = size
-        self.layers = layers
-        self.input, self.state = nn.Linear(inputs, 3 * size), nn.Linear(size, 3 * size)
-        for layer in (self.input, self.state):
-            for block in layer.weight.data.split(size):
-                nn.init.orthogonal_(block)
-            nn.init.zeros_(layer.bias)
-
-    def prepare(self, x: Tensor) -> Tensor:
-        """What does not depend on the memory: […, inputs] to […, 3 size]."""
-        return self.input(self.layers(x))
-
-    def step(self, prepared: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
-        """[B, 3 size] and h [B, size] to the output, which is h', and h'."""
-        reset_x, keep_x, new_x = prepared.chunk(3, dim=-1)
-        reset_h, keep_h, new_h = self.state(memory).chunk(3, dim=-1)
-        new = torch.tanh(new_x + torch.sigmoid(reset_x + reset_h) * new_h)
-        after = new + torch.sigmoid(keep_x + keep_h) * (memory - new)
-        return after, after
 
 
 def _equal(one: Tensor, other: Tensor) -> bool:

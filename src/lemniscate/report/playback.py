@@ -49,13 +49,19 @@ NOTEBOOK_FPS = 25
 
 
 def show_episodes(
-    act: Act | None, arguments: dict[str, Any], episodes: int, seed: int, video: Path | None = None, tell: Tell = say
+    act: Act | None,
+    arguments: dict[str, Any],
+    episodes: int,
+    seed: int,
+    video: Path | None = None,
+    tell: Tell = say,
+    begin: Callable[[], None] = lambda: None,
 ) -> Evaluation:
     """Play episodes one after the other in a rendered environment of Gymnasium's interface.
 
     It is made with the `arguments` that `env_arguments` returns. The episodes are shown in the notebook that asks, in a
-    window elsewhere, or recorded into `video`. Without `act`, actions are uniformly random. The first 16 starts are
-    those that `evaluate` plays from in the gymnasium backend.
+    window elsewhere, or recorded into `video`. Without `act`, actions are uniformly random. `begin` is called before
+    each episode. The first 16 starts are those that `evaluate` plays from in the gymnasium backend.
 
     Raises:
         UserError: an environment that cannot be made or renders no pictures; an episode without an end.
@@ -63,7 +69,7 @@ def show_episodes(
     in_window = video is None and not in_notebook()
     table, name = EpisodeTable(1, torch.device("cpu")), arguments["env"]
     with _quiet_sdl(in_window), closing(_rendered(arguments, "human" if in_window else "rgb_array")) as env:
-        played = _play(env, act or _random(env, seed), name, episodes, seed, table, tell)
+        played = _play(env, act or _random(env, seed), name, episodes, seed, table, tell, begin)
         if in_window:
             deque(played, maxlen=0)  # Gymnasium draws at each step
         else:
@@ -100,7 +106,14 @@ def sentence(number: int, episode_return: float, length: int) -> str:
 
 
 def _play(
-    env: gym.Env, act: Act, name: str, episodes: int, seed: int, table: EpisodeTable, tell: Tell
+    env: gym.Env,
+    act: Act,
+    name: str,
+    episodes: int,
+    seed: int,
+    table: EpisodeTable,
+    tell: Tell,
+    begin: Callable[[], None],
 ) -> Iterator[None]:
     """Reset and step through the episodes, counted in `table`.
 
@@ -111,6 +124,7 @@ def _play(
     limit = env.spec.max_episode_steps if env.spec else None
     for number in range(episodes):
         obs, info = env.reset(seed=first + number)
+        begin()
         yield
         total, length, done = 0.0, 0, False
         while not done:

@@ -21,8 +21,19 @@ static int is_finite(float x)
     return (bits & 0x7F800000U) != 0x7F800000U;
 }
 
+{% if program.memory %}
+void policy_reset(policy_state *state)
+{
+    memset(state, 0, sizeof *state);
+}
+
+int policy_act(policy_state *state, const float obs[POLICY_OBSERVATIONS], float action[POLICY_ACTIONS])
+{
+    float *const memory = state->memory;
+{% else %}
 int policy_act(const float obs[POLICY_OBSERVATIONS], float action[POLICY_ACTIONS])
 {
+{% endif %}
     int i;
 {% for name, place in places.items() %}
     float *const {{ name }} = scratch + {{ place }};
@@ -61,20 +72,52 @@ static const float self_test_actions[POLICY_SELF_TESTS][POLICY_ACTIONS] = {
 };
 
 static const float self_test_units[POLICY_ACTIONS] = {{ units | braces }};
+{% if program.memory %}
+
+static const float self_test_memories[POLICY_SELF_TESTS][POLICY_MEMORY] = { /* before */
+{% for row in memories %}
+    {{ row | braces }},
+{% endfor %}
+};
+
+static const float self_test_afters[POLICY_SELF_TESTS][POLICY_MEMORY] = {
+{% for row in afters %}
+    {{ row | braces }},
+{% endfor %}
+};
+{% endif %}
+
+static float further(float largest, float one, float other, float unit)
+{
+    float difference = (one - other) / unit;
+    difference = difference < 0.0F ? -difference : difference;
+    if (!is_finite(difference)) {
+        return 3.402823466e+38F;
+    }
+    return difference > largest ? difference : largest;
+}
 
 float policy_self_test(void)
 {
-    float action[POLICY_ACTIONS], difference, largest = 0.0F;
+    float action[POLICY_ACTIONS], largest = 0.0F;
     int test, i;
     for (test = 0; test < POLICY_SELF_TESTS; ++test) {
-        const int flag = policy_act(self_test_observations[test], action);
+{% if program.memory %}
+        policy_state state;
+        memcpy(state.memory, self_test_memories[test], sizeof state.memory);
+        if (policy_act(&state, self_test_observations[test], action)) {
+            return 3.402823466e+38F;
+        }
+        for (i = 0; i < POLICY_MEMORY; ++i) {
+            largest = further(largest, state.memory[i], self_test_afters[test][i], 1.0F);
+        }
+{% else %}
+        if (policy_act(self_test_observations[test], action)) {
+            return 3.402823466e+38F;
+        }
+{% endif %}
         for (i = 0; i < POLICY_ACTIONS; ++i) {
-            difference = (action[i] - self_test_actions[test][i]) / self_test_units[i];
-            difference = difference < 0.0F ? -difference : difference;
-            if (flag || !is_finite(difference)) {
-                return 3.402823466e+38F;
-            }
-            largest = difference > largest ? difference : largest;
+            largest = further(largest, action[i], self_test_actions[test][i], self_test_units[i]);
         }
     }
     return largest;

@@ -11,6 +11,9 @@ extern "C" {
 
 #define POLICY_OBSERVATIONS {{ program.obs.size }}
 #define POLICY_ACTIONS {{ program.action.size }}
+{% if program.memory %}
+#define POLICY_MEMORY {{ program.memory.size }}
+{% endif %}
 {% if period %}
 #define POLICY_PERIOD {{ period }}F /* seconds between two actions */
 {% endif %}
@@ -22,13 +25,23 @@ extern "C" {
  * `obs` is what the last of them returns, and `action` goes into it; what they do is to be done around policy_act. */
 
 {% endif %}
+{% if program.memory %}
+/* What the policy remembers of an episode; several may be under way at once. */
+typedef struct {
+    float memory[POLICY_MEMORY];
+} policy_state;
+
+/* Forgets: before the first observation of each episode. */
+void policy_reset(policy_state *state);
+
+{% endif %}
 /* Acts at one raw observation, in the manifest's order; `action` is in the units of the environment. Returns 0, or 1
  * where an observation is NaN or infinite: the action is then the safe one,
- * {{ safe_sentence }}.
+ * {{ safe_sentence }}{% if program.memory %}, and the memory stays as it is{% endif %}.
  * Takes the same time at every finite observation. Not reentrant: it has one static array of scratch. */
-int policy_act(const float obs[POLICY_OBSERVATIONS], float action[POLICY_ACTIONS]);
+int policy_act({% if program.memory %}policy_state *state, {% endif %}const float obs[POLICY_OBSERVATIONS], float action[POLICY_ACTIONS]);
 
-/* The largest difference from the actions of training's own policy, at POLICY_SELF_TESTS observations that are stored
+/* The largest difference from the actions{% if program.memory %} and memories{% endif %} of training's own policy, at POLICY_SELF_TESTS observations that are stored
  * beside the weights: {{ origin | comment }}.
 {% if is_box %}
  * Differences are shares of half the range of each action; where a bound is infinite, of its unit, or of its largest

@@ -56,14 +56,32 @@ void reset(void)
     leave((uint32_t)main());
 }
 
+#ifndef POLICY_MEMORY
+#define POLICY_MEMORY 0
+#endif
+
+static float obs[POLICY_OBSERVATIONS + POLICY_MEMORY], action[POLICY_ACTIONS + POLICY_MEMORY];
+
+static void act(void)
+{
+#if POLICY_MEMORY
+    static policy_state state;
+    memcpy(state.memory, obs + POLICY_OBSERVATIONS, sizeof state.memory);
+    policy_act(&state, obs, action);
+    memcpy(action + POLICY_ACTIONS, state.memory, sizeof state.memory);
+#else
+    policy_act(obs, action);
+#endif
+}
+
 int main(void)
 {
-    static float obs[POLICY_OBSERVATIONS], action[POLICY_ACTIONS], figures[2];
+    static float figures[2];
     volatile uint32_t *const control = (volatile uint32_t *)0xE000E010, *const value = (volatile uint32_t *)0xE000E018;
     const uint32_t in = open_file("observations.bin", 1), out = open_file("actions.bin", 5);
     uint32_t before, call;
     while (!transfer(0x06, in, obs, sizeof obs)) {
-        policy_act(obs, action);
+        act();
         transfer(0x05, out, action, sizeof action);
     }
     figures[0] = policy_self_test();
@@ -72,7 +90,7 @@ int main(void)
     *control = 5;
     before = *value;
     for (call = 0; call < 8; ++call) {
-        policy_act(obs, action);
+        act();
     }
     figures[1] = (float)((before - *value) & 0xFFFFFF) * (40.0F / 8.0F);
     transfer(0x05, open_file("figures.bin", 5), figures, sizeof figures);

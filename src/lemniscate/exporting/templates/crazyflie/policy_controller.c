@@ -48,6 +48,9 @@ static const uint32_t ahead[REFERENCE_SAMPLES] = { {{- reference.offsets | join(
 static uint8_t on;
 static uint8_t fault;
 static bool acting;
+{% if remembers %}
+static policy_state remembered;
+{% endif %}
 {% if reference %}
 static uint32_t step; /* the point of the curve */
 {% endif %}
@@ -165,7 +168,14 @@ void controllerOutOfTree(control_t *control, const setpoint_t *setpoint, const s
 {% if history %}
         recall(obs);
 {% endif %}
+{% if remembers %}
+        if (!acting) {
+            policy_reset(&remembered);
+        }
+        fault = policy_act(&remembered, obs, action) != 0;
+{% else %}
         fault = policy_act(obs, action) != 0;
+{% endif %}
 {% if history %}
         remember(obs, action);
 {% endif %}
