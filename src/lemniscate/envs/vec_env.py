@@ -24,9 +24,11 @@ class Carrier(Protocol):
 
     def begin(self, obs: Tensor) -> Tensor:
         """The observations [N, …] with no memory, where all episodes begin."""
+        ...
 
     def follow(self, rows: Tensor, step: Step) -> Step:
         """The step with the memory after `rows` [N, …], the observations before it."""
+        ...
 
 
 LOG_ROWS = 1024

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 
-def policy_gradient(log_prob: Float[Tensor, " B"], weight: Float[Tensor, " B"]) -> Float[Tensor, ""]:
+def policy_gradient(log_prob: Float[Tensor, " *B"], weight: Float[Tensor, " *B"]) -> Float[Tensor, ""]:
     """A scalar whose gradient is the policy gradient, negated: Williams 1992, theorem 1; arXiv:1602.01783, section 4.
 
         −E[ log π(a|s) Ψ ]      ∇J = E[ ∇log π(a|s) Ψ ]
@@ -24,7 +24,7 @@ def policy_gradient(log_prob: Float[Tensor, " B"], weight: Float[Tensor, " B"]) 
     return -(log_prob * weight).mean()
 
 
-def surrogate(log_ratio: Float[Tensor, " B"], advantage: Float[Tensor, " B"]) -> Float[Tensor, ""]:
+def surrogate(log_ratio: Float[Tensor, " *B"], advantage: Float[Tensor, " *B"]) -> Float[Tensor, ""]:
     """TRPO's surrogate, negated: Schulman et al. 2015, arXiv:1502.05477, eq. 14 with advantages for Q.
 
         L = E[ r A ],   r = exp(log_ratio) = π(a|s) / π_old(a|s)
@@ -42,7 +42,7 @@ def surrogate(log_ratio: Float[Tensor, " B"], advantage: Float[Tensor, " B"]) ->
 
 
 def clipped_surrogate(
-    log_ratio: Float[Tensor, " B"], advantage: Float[Tensor, " B"], clip: Any = 0.2
+    log_ratio: Float[Tensor, " *B"], advantage: Float[Tensor, " *B"], clip: Any = 0.2
 ) -> Float[Tensor, ""]:
     """PPO's clipped surrogate, negated: Schulman et al. 2017, arXiv:1707.06347, eq. 7.
 
@@ -64,9 +64,9 @@ def clipped_surrogate(
 
 
 def value_loss(
-    value: Float[Tensor, " B"],
-    target: Float[Tensor, " B"],
-    old_value: Float[Tensor, " B"] | None = None,
+    value: Float[Tensor, " *B"],
+    target: Float[Tensor, " *B"],
+    old_value: Float[Tensor, " *B"] | None = None,
     clip: Any = None,
 ) -> Float[Tensor, ""]:
     """The critic's loss, L^VF of arXiv:1707.06347, eq. 9, with the conventional half: ½ E[(V − target)²].

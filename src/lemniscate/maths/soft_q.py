@@ -38,7 +38,7 @@ def soft_lambda_return(
     return q_lambda(reward, next_value, terminated, done, gamma=gamma, lam=lam)
 
 
-def hl_gauss(target: Float[Tensor, " B"], edges: Float[Tensor, " E"], width: float = 0.75) -> Float[Tensor, "B K"]:
+def hl_gauss(target: Float[Tensor, " *B"], edges: Float[Tensor, " E"], width: float = 0.75) -> Float[Tensor, "*B K"]:
     """A number as probabilities of K bins: Farebrother et al. 2024, arXiv:2403.03950, "HL-Gauss".
 
         p_i = (Φ((e_{i+1} − y) / σ) − Φ((e_i − y) / σ)) / (Φ((e_K − y) / σ) − Φ((e_0 − y) / σ))
@@ -49,11 +49,11 @@ def hl_gauss(target: Float[Tensor, " B"], edges: Float[Tensor, " E"], width: flo
         width: σ in units of a bin's width.
     """
     sigma = width * (edges[1] - edges[0])
-    below = torch.erf((edges - target.clamp(edges[0], edges[-1])[:, None]) / (sigma * 2**0.5))
-    return below.diff() / (below[:, -1:] - below[:, :1])
+    below = torch.erf((edges - target.clamp(edges[0], edges[-1])[..., None]) / (sigma * 2**0.5))
+    return below.diff() / (below[..., -1:] - below[..., :1])
 
 
-def cross_entropy(logits: Float[Tensor, "B K"], target: Float[Tensor, "B K"]) -> Float[Tensor, ""]:
+def cross_entropy(logits: Float[Tensor, "*B K"], target: Float[Tensor, "*B K"]) -> Float[Tensor, ""]:
     """−E[ Σ_i p_i log q_i ]: the loss of a distribution over K bins, arXiv:2403.03950, section 2.
 
     Args:

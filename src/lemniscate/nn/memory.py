@@ -190,7 +190,8 @@ class GRU(nn.Module):
     def over(self, prepared: Tensor, goes_on: Tensor, memory: Tensor) -> Tensor:
         """Of pieces, [P, L, 3 size], [P, L, 1] and [P, L, size], to the outputs [P, L, size]; as `Remembering`."""
         by_time = prepared.movedim(1, 0), goes_on.movedim(1, 0), memory.movedim(1, 0)
-        return _Pieces.apply(*by_time, self.state.weight, self.state.bias).movedim(0, 1)
+        kind = _Pieces if torch.compiler.is_compiling() else _PiecesForward
+        return kind.apply(*by_time, self.state.weight, self.state.bias).movedim(0, 1)
 
 
 def _gates(prepared: Tensor, state: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -202,10 +203,10 @@ def _gates(prepared: Tensor, state: Tensor) -> tuple[Tensor, Tensor, Tensor, Ten
 
 
 class _Pieces(torch.autograd.Function):
-    """`GRU.over`, with its own backward pass: of the operations that depend on the next step, each step has four.
+    """`GRU.over`, with its own derivatives: each step has a few operations that depend on the step beside it.
 
-    What does not, the gates and their derivatives, is computed of all steps at once, from the inputs and outputs alone;
-    so derivatives of the derivative, as in a Fisher product, are exact too. The memory in the rows is constant.
+    What does not, the gates and what they change with, is computed of all steps at once, from the inputs and outputs
+    alone; so derivatives of the derivative are exact too. The memory in the rows is constant.
     """
 
     @staticmethod
@@ -221,28 +222,49 @@ class _Pieces(torch.autograd.Function):
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
         ctx.save_for_backward(*inputs, output)
+        ctx.save_for_forward(*inputs, output)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> Any:
-        prepared, goes_on, memory, weight, bias, out = ctx.saved_tensors
+        weight, goes_on, before, keep, by_input, by_state = _changes(*ctx.saved_tensors)
         (by_out,) = gradients
-        before = torch.cat([memory[:1], torch.where(goes_on[1:], out[:-1], memory[1:])])
-        reset, keep, new_h, new = _gates(prepared, before @ weight.T + bias)
-        by_new = (1 - keep) * (1 - new * new)
-        by_reset, by_keep = by_new * new_h * reset * (1 - reset), (before - new) * keep * (1 - keep)
-        by_state = torch.stack([by_reset, by_keep, by_new * reset], dim=2)  # ∂h'/∂ of each product, [L, P, 3, size]
-        keep, states = keep * goes_on, (by_state * goes_on[..., None]).unbind()
-        total = by_out[-1]
+        kept, states, total = keep * goes_on, (by_state * goes_on[..., None]).unbind(), by_out[-1]
         totals = [total]
-        for t in range(len(out) - 1, 0, -1):
+        for t in range(len(by_out) - 1, 0, -1):
             back = (states[t] * total[:, None]).flatten(1) @ weight
-            total = by_out[t - 1] + torch.addcmul(back, keep[t], total)
+            total = by_out[t - 1] + torch.addcmul(back, kept[t], total)
             totals.append(total)
-        by_after = torch.stack(totals[::-1])
-        state = (by_state * by_after[:, :, None]).flatten(2)
-        by_prepared = torch.cat([state[..., : 2 * len(weight) // 3], by_after * by_new], dim=-1)
+        by_after = torch.stack(totals[::-1])[:, :, None]
+        state = (by_state * by_after).flatten(2)
         by_weight = state.flatten(0, 1).T @ before.flatten(0, 1)
-        return by_prepared, None, None, by_weight, state.sum((0, 1))
+        return (by_input * by_after).flatten(2), None, None, by_weight, state.sum((0, 1))
+
+
+class _PiecesForward(_Pieces):
+    """With derivatives in forward mode, which a compiled function cannot have."""
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Any) -> Any:
+        weight, goes_on, before, keep, by_input, by_state = _changes(*ctx.saved_tensors)
+        prepared, _, _, weight_tangent, bias_tangent = tangents
+        state = before @ weight_tangent.T + bias_tangent
+        own = (by_input * prepared.unflatten(-1, (3, -1)) + by_state * state.unflatten(-1, (3, -1))).sum(2)
+        tangent, outs = own[0], [own[0]]
+        for t in range(1, len(own)):
+            h = goes_on[t] * tangent
+            tangent = own[t] + keep[t] * h + (by_state[t] * (h @ weight.T).unflatten(-1, (3, -1))).sum(1)
+            outs.append(tangent)
+        return torch.stack(outs)
+
+
+def _changes(prepared: Tensor, goes_on: Tensor, memory: Tensor, weight: Tensor, bias: Tensor, out: Tensor) -> Any:
+    """W, the 1 or 0, h, z, and ∂h'/∂ of each third of both products, [L, P, 3, size]."""
+    before = torch.cat([memory[:1], torch.where(goes_on[1:], out[:-1], memory[1:])])
+    reset, keep, new_h, new = _gates(prepared, before @ weight.T + bias)
+    by_new = (1 - keep) * (1 - new * new)
+    by_reset, by_keep = by_new * new_h * reset * (1 - reset), (before - new) * keep * (1 - keep)
+    by_input = torch.stack([by_reset, by_keep, by_new], dim=2)
+    return weight, goes_on, before, keep, by_input, torch.stack([by_reset, by_keep, by_new * reset], dim=2)
 
 
 def cell_of(layers: Layers, inputs: int, outputs: int) -> GRU | OwnCell:

@@ -6,7 +6,7 @@ import torch
 from torch import Generator, Tensor, nn
 
 from lemniscate.maths import Bernoulli, Categorical, Distribution, EpsilonGreedy, Gaussian, MultiCategorical
-from lemniscate.nn.memory import Memory, remember
+from lemniscate.nn.memory import Carrier, Memory, remember
 from lemniscate.nn.normalizer import NoNorm
 from lemniscate.spec import Box, Discrete, MultiDiscrete
 
@@ -24,6 +24,10 @@ class Policy(nn.Module):
     def remember(self, obs: Tensor) -> Tensor:
         """What a policy with a memory remembers after rows [N, …], as the columns of its memory."""
         return remember(self.net, self.normalizer(obs))
+
+    def carrier(self) -> Carrier | None:
+        """What carries its memory from step to step, if it has one."""
+        return Carrier(self.memory, self.remember) if self.memory else None
 
     def act(self, obs: Tensor, noise: Tensor) -> Tensor:
         """An action at each observation [B, O], drawn with the random numbers `noise` of `draw_noise`."""

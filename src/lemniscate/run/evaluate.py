@@ -15,7 +15,6 @@ from lemniscate.envs.backend import Baseline, Summary
 from lemniscate.envs.spaces import random_action
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.nn.actor_q import ActorQ
-from lemniscate.nn.memory import Carrier
 from lemniscate.nn.policies import Policy
 from lemniscate.run.config import RunConfig
 from lemniscate.run.off_policy import OffPolicyConfig
@@ -124,8 +123,7 @@ def play_episodes(
     rng = generator(seed, env.device, EVALUATION, 1)
     numbers = torch.arange(env.num_envs, device=env.device)
     left = episodes // env.num_envs + (numbers < episodes % env.num_envs).int()
-    memory = getattr(policy, "memory", None)
-    env.carrier = Carrier(memory, policy.remember) if memory else None
+    env.carrier = policy.carrier() if isinstance(policy, Policy) else None
     env.restart(derive(seed, EVALUATION, 0))
     age = torch.zeros_like(left)
     while (left > 0).any():

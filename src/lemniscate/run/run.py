@@ -415,8 +415,13 @@ def require_finite(state: TrainState, numbers: Mapping[str, float]) -> None:
 
 
 def is_compiled(config: RunConfig) -> bool:
-    """Whether a run is compiled: as configured; with "auto", if it is long enough to repay the compilation."""
-    return config.compile == "on" or (config.compile == "auto" and config.gradient_steps >= WORTH_COMPILING)
+    """Whether a run is compiled: as configured; with "auto", if it is long enough to repay the compilation.
+
+    A loop over the steps of a piece takes many minutes to compile, so networks with a memory are not, by themselves.
+    """
+    layers = getattr(config, "layers", None)
+    repays = config.gradient_steps >= WORTH_COMPILING and not (layers and layers.remembers)
+    return config.compile == "on" or (config.compile == "auto" and repays)
 
 
 def _passed(every: int, before: int, after: int) -> bool:

@@ -39,10 +39,17 @@ void policy_reset(policy_state *state);
  * where an observation is NaN or infinite: the action is then the safe one,
  * {{ safe_sentence }}{% if program.memory %}, and the memory stays as it is{% endif %}.
  * Takes the same time at every finite observation. Not reentrant: it has one static array of scratch. */
-int policy_act({% if program.memory %}policy_state *state, {% endif %}const float obs[POLICY_OBSERVATIONS], float action[POLICY_ACTIONS]);
+{% if program.memory %}
+int policy_act(policy_state *state, const float obs[POLICY_OBSERVATIONS], float action[POLICY_ACTIONS]);
+{% else %}
+int policy_act(const float obs[POLICY_OBSERVATIONS], float action[POLICY_ACTIONS]);
+{% endif %}
 
-/* The largest difference from the actions{% if program.memory %} and memories{% endif %} of training's own policy, at POLICY_SELF_TESTS observations that are stored
+/* The largest difference from the actions of training's own policy, at POLICY_SELF_TESTS observations that are stored
  * beside the weights: {{ origin | comment }}.
+{% if program.memory %}
+ * So are memories before and after each, whose differences count too.
+{% endif %}
 {% if is_box %}
  * Differences are shares of half the range of each action; where a bound is infinite, of its unit, or of its largest
  * value above 1.
