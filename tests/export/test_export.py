@@ -200,7 +200,8 @@ def test_in_closed_loop_the_c_does_what_the_policy_does(kind):
     program = translate(Deployed(policy).eval(), input_size(env.spec))
     zero = np.zeros((1, program.obs.size)), np.zeros((1, program.action.size))
     host = HostPolicy(c_files(program, env.spec.action, *zero, title="", origin=""), host_compiler(), ("-O0",))
-    (flown, interface), (true, _) = (fly(policy, act, rows=300) for act in (host.act, act_with(policy)))
+    (flights, interface), (true, _) = (fly(policy, act, rows=300) for act in (host.act, act_with(policy)))
+    flown, true = (each.obs.reshape(-1, program.obs.size) for each in (flights, true))
     assert len(flown) >= 300
     assert np.allclose(flown, true, atol=1e-4)
     assert np.abs(host.act(flown) - act_with(policy)(flown)).max() <= 1e-5

@@ -56,7 +56,7 @@ def seen_by(act):
 @pytest.fixture(scope="module")
 def flights(two_axes):
     acts, seen = seen_by(follow)
-    return *two_axes.fly(acts, 3), seen
+    return *two_axes.fly(lambda: acts, 3), seen
 
 
 def test_every_point_has_the_same_starts_and_its_own_condition(two_axes, flights):
@@ -96,7 +96,7 @@ def test_drones_that_fall_are_dead_and_their_batch_ends_early(two_axes, monkeypa
 
     acts, seen = seen_by(fall)
     monkeypatch.setattr(two_axes._drones, "episode_steps", 500)
-    nominal, at = two_axes.fly(acts, 3)
+    nominal, at = two_axes.fly(lambda: acts, 3)
     assert nominal.terminated.all()
     assert all(one.terminated.all() for one in at["mass"])
     assert len(seen) < 150
@@ -113,7 +113,7 @@ def test_a_drone_whose_state_is_not_finite_has_crashed(two_axes):
             action[::STARTS] = torch.nan
         return action
 
-    nominal, _ = two_axes.fly(act, 3)
+    nominal, _ = two_axes.fly(lambda: act, 3)
     assert nominal.terminated[0]
     assert nominal.returns.isfinite().all()
 

@@ -41,7 +41,7 @@ def repeat(obs):
 
 def flown(act=repeat, env="Follow-v0", starts=8, wrappers=(), **kwargs):
     probe = VectorProbe(env, starts, kwargs, wrappers, None)
-    nominal, points = probe.fly(act, 3)
+    nominal, points = probe.fly(lambda: act, 3)
     least = worst_accepted(nominal)
     return {axis.name: margins_of(axis, points[axis.name], least) for axis in probe.axes}, nominal, points
 

@@ -55,7 +55,7 @@ def crazyflie_files(
         "title": title,
         "version": version(),
         "rate": rate,
-        "remembers": "POLICY_MEMORY" in c_files["policy.h"],
+        "remembers": "POLICY_MEMORY" in c_files.get("policy.h", ""),
         "action": action,
         "interface": interface,
         "reference": interface.reference,
