@@ -142,7 +142,7 @@ def test_gradients_of_pieces_are_differences():
 
     gru.forward = gru.over
     inputs = prepared, gru.state.weight, gru.state.bias
-    assert torch.autograd.gradcheck(over, inputs, check_forward_ad=True, fast_mode=True)
+    assert torch.autograd.gradcheck(over, inputs, check_forward_ad=True, fast_mode=True, raise_exception=False)
 
 
 def test_a_row_with_a_zero_in_front_starts_from_its_own_memory():
@@ -194,7 +194,8 @@ def test_the_memory_goes_on_from_one_rollout_to_the_next():
 def test_in_pieces_the_policy_says_what_it_said_when_it_acted(algo):
     """So every probability ratio is 1 at first; where pieces are as many as environments, to the last bit."""
     _, state, env = begin(algo, num_envs=8)
-    rollout = collect(env, state.policy, 8, state.rng.action)
+    rollout = collect(env, state.policy, 40, state.rng.action)
+    assert rollout.done.any()
     networks, rows = state.networks, state.rows(rollout)
     value, _, log_prob = networks.estimates(rollout.obs, rollout.next_obs, rollout.action)
     flat = rollout.obs.flatten(0, 1)

@@ -14,6 +14,7 @@ ON, OFF, REINFORCE, PPO, TRPO, REPPO, PQN, DDPG, TD3, SAC = (
     f"algos/test_{name}.py::test_"
     for name in ("on_policy", "off_policy", "reinforce", "ppo", "trpo", "reppo", "pqn", "ddpg", "td3", "sac")
 )
+MEMORY = "test_memory.py::test_"
 INTERACT, ROLLOUT = (f"data/test_{name}.py::test_" for name in ("interact", "rollout"))
 
 MUTANTS = [
@@ -724,6 +725,83 @@ MUTANTS = [
         "gamma=gamma, lam=lam",
         "gamma=gamma, lam=0.0",
         PQN + "the_target_is_the_return_of_the_best_next_action",
+    ),
+    (
+        "an episode remembers the one before",
+        "nn/memory.py",
+        "going_on = kept.masked_fill(ended[:, None], 0)",
+        "going_on = kept",
+        MEMORY + "what_is_carried_is_what_the_episode_says_alone",
+    ),
+    (
+        "V of the last row remembers nothing",
+        "nn/memory.py",
+        "next_obs=self._memory.join(step.next_obs, kept)",
+        "next_obs=self._memory.join(step.next_obs, going_on)",
+        MEMORY + "what_is_carried_is_what_the_episode_says_alone",
+    ),
+    (
+        "a piece goes on from the one before",
+        "nn/memory.py",
+        "if self._steps % self._memory.length == 0:",
+        "if False:",
+        MEMORY + "what_is_carried_is_what_the_episode_says_alone",
+    ),
+    (
+        "an end inside of a piece is not seen",
+        "nn/memory.py",
+        "out = self.cell.over(prepared, goes_on == 1, memory)",
+        "out = self.cell.over(prepared, goes_on >= 0, memory)",
+        MEMORY + "in_pieces_the_policy_says_what_it_said_when_it_acted",
+    ),
+    (
+        "the gradient forgets the step before",
+        "nn/memory.py",
+        "total = by_out[t - 1] + torch.addcmul(back, kept[t], total)",
+        "total = by_out[t - 1] + back",
+        MEMORY + "pieces_are_the_steps_one_after_the_other",
+    ),
+    (
+        "the tangent goes over an end",
+        "nn/memory.py",
+        "h = goes_on[t] * tangent",
+        "h = tangent",
+        MEMORY + "gradients_of_pieces_are_differences",
+    ),
+    (
+        "the reset gate acts on the memory",
+        "nn/memory.py",
+        "torch.addcmul(new_x, reset, new_h)",
+        "new_x + new_h",
+        MEMORY + "a_gru_is_torchs",
+    ),
+    (
+        "rows are shuffled, not pieces",
+        "data/rollout.py",
+        "return torch.where(valid, rows, first)",
+        "return torch.where(valid, rows, first).T.reshape(rows.shape)",
+        MEMORY + "pieces_are_whole_steps_of_one_environment",
+    ),
+    (
+        "act forgets what it saw",
+        "api/policy.py",
+        "self._recall.advance(flat)",
+        "self._recall.reset()",
+        MEMORY + "act_remembers_and_reset_forgets",
+    ),
+    (
+        "reset forgets the others",
+        "nn/memory.py",
+        "self._kept = self._kept.masked_fill(done[:, None], 0)",
+        "self._kept = self._kept.masked_fill(~done[:, None], 0)",
+        MEMORY + "act_remembers_and_reset_forgets",
+    ),
+    (
+        "what is remembered is what was remembered before",
+        "nn/memory.py",
+        "torch.cat([torch.ones_like(after[:, :1]), after], dim=-1)",
+        "torch.cat([torch.ones_like(after[:, :1]), memory], dim=-1)",
+        MEMORY + "what_is_carried_is_what_the_episode_says_alone",
     ),
     (
         "the action hardly matters to Q",

@@ -14,14 +14,14 @@ import pytest
 import torch
 
 from lemniscate import course
-from lemniscate.algos import a2c, ddpg, ppo, reinforce
+from lemniscate.algos import a2c, ddpg, ppo, pqn, reinforce
 from lemniscate.api import results
 from lemniscate.cli import main
 from lemniscate.course import loop
 from lemniscate.errors import UserError
 
 PROGRAMS = sorted(loop.NOTEBOOKS.glob("*.py.txt"))
-NAMES = ["1_policy_gradients", "2_lunar_lander", "3_ddpg_hopper", "4_drone", "5_ant"]
+NAMES = ["1_policy_gradients", "2_lunar_lander", "3_ddpg_hopper", "4_drone", "5_ant", "6_q_learning"]
 SMALLER = {
     r"^STEPS = [\d_]+$": "STEPS = 3_000",
     r"\bepisodes=\d+": "episodes=2",
@@ -33,7 +33,7 @@ OPEN = 'raise NotImplementedError("to be written")'
 each = pytest.mark.parametrize("name", NAMES)
 
 
-def test_there_are_five():
+def test_there_are_six():
     assert [file.name for file in PROGRAMS] == [f"{name}.py.txt" for name in NAMES]
 
 
@@ -110,7 +110,7 @@ def judged(name, version, capsys):
 
 @each
 def test_a_gap_left_open_is_a_finding_and_leaves_the_librarys_in_its_place(name, capsys):
-    before = {module: dict(vars(module)) for module in (a2c, ddpg, ppo, reinforce)}
+    before = {module: dict(vars(module)) for module in (a2c, ddpg, ppo, pqn, reinforce)}
     lines = judged(name, loop.GAPS, capsys)
     gaps = {line.split(":")[0].removeprefix("✗ ") for line in lines}
     assert all("it raised NotImplementedError: to be written, in " in line for line in lines)
@@ -128,12 +128,13 @@ def test_the_solution_of_every_gap_passes(name, capsys, library):
 @pytest.fixture
 def library(monkeypatch):
     """The library, put back afterwards."""
-    for module in (a2c, ddpg, ppo, reinforce):
+    for module in (a2c, ddpg, ppo, pqn, reinforce):
         for name in (
             "gae",
             "clipped_surrogate",
             "value_loss",
             "td_target",
+            "q_lambda",
             "polyak",
             "reward_to_go",
             "policy_gradient",

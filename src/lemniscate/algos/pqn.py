@@ -36,7 +36,7 @@ class Config(OnPolicyConfig):
     """passes over each rollout; usually 2 to 4"""
     minibatch_size: Count = 128
     """rows of each gradient step, M; at most N · T, usually 64 to 256"""
-    learning_rate: Scheduled[Positive] = 1e-3
+    learning_rate: Scheduled[Positive] = 5e-4
     """Adam's initial step size; usually 1e-4 to 1e-3"""
     final_learning_rate: Fraction = 0.0
     """final learning rate as a fraction of the initial one, annealed linearly; 1: constant"""

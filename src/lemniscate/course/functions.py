@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from lemniscate import maths
 from lemniscate.course.exercise import TEMPLATES, Case, Exercise, normalised  # noqa: F401  (an edit may call it)
 from lemniscate.course.solution import Function, Held, Settings
-from lemniscate.maths import clipped_surrogate, gae, reward_to_go, value_loss
+from lemniscate.maths import clipped_surrogate, gae, q_lambda, reward_to_go, value_loss
 
 # --- the forms of the courses ---
 
@@ -237,6 +237,12 @@ CASES: dict[str, list[Case]] = {
         Case("a time-out at row 1", (R, N, NEVER, AT_1), GAMMA),
         Case("two environments, ends of both kinds", (TWO_R, TWO_V + 1, TWO_ENDS, TWO_DONE), GAMMA),
     ],
+    "q_lambda": [
+        Case("no end", (R, N, NEVER, NEVER), DISCOUNTS),
+        Case("a death at row 1", (R, N, AT_1, AT_1), DISCOUNTS),
+        Case("a time-out at row 1", (R, N, NEVER, AT_1), DISCOUNTS),
+        Case("two environments, ends of both kinds", (TWO_R, TWO_V + 1, TWO_ENDS, TWO_DONE), DISCOUNTS),
+    ],
     "discounted_returns": [
         Case("one step", (torch.tensor([2.0]),), GAMMA),
         Case("five steps", (_drawn(5) + 1,), GAMMA),
@@ -348,6 +354,7 @@ EXERCISES: dict[str, Exercise] = {
     "calculate_advantages": _exercise(gae, calculate_advantages, outputs=("returns", "advantages")),
     "compute_advantages": _exercise(gae, compute_advantages, outputs=("advantages", "critic_targets"), detached=True),
     "reward_to_go": _exercise(reward_to_go, outputs=("return",)),
+    "q_lambda": _exercise(q_lambda, outputs=("target",)),
     "discounted_returns": _exercise(reward_to_go, discounted_returns, outputs=("returns",)),
     "td_target": _exercise(maths.td_target, outputs=("target",)),
     "policy_gradient": _exercise(maths.policy_gradient, outputs=("loss",), gradient_in=0, value_is_free=True),

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 BACKENDS = {
     "crazyflow": "lemniscate.drones.crazyflow:CrazyflowBackend",
     "envpool": "lemniscate.envs.envpool:EnvpoolBackend",
+    "minatar": "lemniscate.envs.minatar:MinatarBackend",
     "gymnasium": "lemniscate.envs.gymnasium:GymnasiumBackend",
     "gymnasium-async": "lemniscate.envs.gymnasium:AsyncGymnasiumBackend",
 }
@@ -25,6 +26,7 @@ BACKENDS = {
 
 BEGINNINGS = {
     "crazyflow": ("Drone",),
+    "minatar": ("MinAtar/",),
     "envpool": (
         "EnvPool/",
         "Ant-v5",

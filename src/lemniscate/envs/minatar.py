@@ -1,0 +1,101 @@
+"""MinAtar: five games on 10 × 10 fields, a channel for each kind of thing (Young & Tian 2019, arXiv:1903.03176)."""
+
+import logging
+from collections.abc import Collection
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from lemniscate.envs.gymnasium import GymnasiumBackend
+from lemniscate.envs.registry import BEGINNINGS
+from lemniscate.errors import is_installed, missing_extra
+
+(PREFIX,) = BEGINNINGS["minatar"]
+GAMES = {"Asterix": "asterix", "Breakout": "breakout", "Freeway": "freeway", "Seaquest": "seaquest"}
+GAMES |= {"SpaceInvaders": "space_invaders"}
+LIMIT = 10_000
+"""steps of an episode at most, which the games have not"""
+PIXELS = 20
+"""the side of a field in a film"""
+
+
+class MinAtar(gym.Env):
+    """A game with the actions that have an effect in it; observations are images of bytes, 0 or 255.
+
+    Args:
+        game: the name of its module.
+        render_mode: none, or rgb_array.
+        sticky_action_prob: the probability that the action before is repeated.
+        difficulty_ramping: whether a game becomes harder.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012
+
+    def __init__(
+        self,
+        game: str,
+        render_mode: str | None = None,
+        sticky_action_prob: float = 0.1,
+        difficulty_ramping: bool = True,
+    ) -> None:
+        if not is_installed("minatar"):
+            raise missing_extra("minatar", "minatar")
+        logging.disable(logging.WARNING)  # that seaborn is not there, which draws their own windows
+        try:
+            from minatar import Environment
+        finally:
+            logging.disable(logging.NOTSET)
+        self.render_mode, self._game = render_mode, Environment(game, sticky_action_prob, difficulty_ramping)
+        self._actions = self._game.minimal_action_set()
+        self.action_space = gym.spaces.Discrete(len(self._actions))
+        self.observation_space = gym.spaces.Box(0, 255, self._game.state_shape(), np.uint8)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """A new game."""
+        self._game.seed(seed)
+        self._game.reset()
+        self._game.last_action = 0
+        return self._show(), {}
+
+    def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """The game's, without a time limit."""
+        reward, over = self._game.act(self._actions[action])
+        return self._show(), float(reward), bool(over), False, {}
+
+    def render(self) -> np.ndarray:
+        """The field, each kind of thing in a grey of its own; [H, W, 3]."""
+        state = self._game.state()
+        shade = (state * np.linspace(80, 255, state.shape[-1])).max(-1).astype(np.uint8)
+        return np.repeat(shade.repeat(PIXELS, 0).repeat(PIXELS, 1)[..., None], 3, axis=-1)
+
+    def _show(self) -> np.ndarray:
+        return 255 * self._game.state().astype(np.uint8)
+
+
+for _name, _game in GAMES.items():
+    gym.register(
+        f"{PREFIX}{_name}-v1",
+        entry_point="lemniscate.envs.minatar:MinAtar",
+        max_episode_steps=LIMIT,
+        kwargs={"game": _game},
+    )
+
+
+class MinatarBackend(GymnasiumBackend):
+    """MinAtar's games by their own ids, as environments of Gymnasium's."""
+
+    @classmethod
+    def ids(cls) -> Collection[str]:
+        """The five games, where the package is installed."""
+        return [f"{PREFIX}{name}-v1" for name in GAMES] if is_installed("minatar") else []
+
+    @classmethod
+    def serves(cls, env: str) -> bool:
+        """Whether it is one of the five, by the name."""
+        return env.removeprefix(PREFIX).removesuffix("-v1") in GAMES
+
+    @classmethod
+    def exists_once(cls, env: str, num_envs: int) -> bool:
+        """There can be many."""
+        return False
