@@ -1,4 +1,4 @@
-"""Environments that say too little at each step, for policies with a memory: `--env hidden:cart_pole` in this folder."""
+"""Environments that say too little at each step, for policies with a memory: here, `--env hidden:cart_pole`."""
 
 import gymnasium as gym
 import numpy as np

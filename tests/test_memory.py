@@ -16,7 +16,7 @@ from conftest import tiny_fields
 from helpers import long
 from lemniscate.algos import a2c, ppo, reppo, trpo
 from lemniscate.api.policy import TrainedPolicy
-from lemniscate.data.rollout import collect, epoch_minibatches, pieces
+from lemniscate.data.rollout import collect, epoch_minibatches, rows_of
 from lemniscate.envs import registry
 from lemniscate.errors import UserError
 from lemniscate.exporting import compiled, parity
@@ -196,7 +196,7 @@ def test_in_pieces_the_policy_says_what_it_said_when_it_acted(algo):
     _, state, env = begin(algo, num_envs=8)
     rollout = collect(env, state.policy, 40, state.rng.action)
     assert rollout.done.any()
-    networks, rows = state.networks, state.rows(rollout)
+    networks, rows = state.networks, rows_of(rollout, L)
     value, _, log_prob = networks.estimates(rollout.obs, rollout.next_obs, rollout.action)
     flat = rollout.obs.flatten(0, 1)
     valid = rollout.valid.flatten()[rows]
@@ -208,7 +208,7 @@ def test_in_pieces_the_policy_says_what_it_said_when_it_acted(algo):
 def test_pieces_are_whole_steps_of_one_environment():
     _, state, env = begin(ppo)
     rollout = collect(env, state.policy, 8, state.rng.action)
-    rows = pieces(rollout, L)
+    rows = rows_of(rollout, L)
     assert rows.shape == (8, L)
     assert torch.equal(rows % 4, rows[:, :1].expand(-1, L) % 4)
     assert sorted(rows.flatten().tolist()) == list(range(32))
@@ -221,7 +221,7 @@ def test_pieces_are_whole_steps_of_one_environment():
 def test_a_piece_with_a_reset_row_has_its_first_valid_row_in_the_place():
     _, state, env = begin(ppo, "toy:Countdown-v0")
     rollout = collect(env, state.policy, 40, state.rng.action)
-    rows = pieces(rollout, L)
+    rows = rows_of(rollout, L)
     assert rollout.valid.flatten()[rows].all()
     assert (rollout.valid.all()) == (sorted(rows.flatten().tolist()) == list(range(rows.numel())))
 

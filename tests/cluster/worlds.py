@@ -14,7 +14,11 @@ KINDS = {
     # kind of run: algorithm, environment, fields; without "total_steps" it takes 1,600
     "ppo-toy": ("ppo", "toy:Matching-v0", {"minibatch_size": 16, "evaluate_every": 512}),
     "ppo": ("ppo", "CartPole-v1", {"epochs": 3, "minibatch_size": 16, "evaluate_every": 512}),
-    "ppo-gru": ("ppo", "CartPole-v1", {"network": "gru", "sequence_length": 4, "minibatch_size": 32, "evaluate_every": 512}),
+    "ppo-gru": (
+        "ppo",
+        "CartPole-v1",
+        {"network": "gru", "sequence_length": 4, "minibatch_size": 32, "evaluate_every": 512},
+    ),
     "ppo-sync": ("ppo", "CartPole-v1", {"backend": "gymnasium", "minibatch_size": 16}),
     "ppo-async": ("ppo", "CartPole-v1", {"backend": "gymnasium-async", "minibatch_size": 16}),
     "ppo-cheetah": ("ppo", "HalfCheetah-v5", {"minibatch_size": 32, "evaluate_every": 800}),

@@ -10,7 +10,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from lemniscate.data.rollout import collect, one_minibatch
+from lemniscate.data.rollout import collect, one_minibatch, rows_of
 from lemniscate.maths import explained_variance, gae, means, policy_gradient, standardize, value_loss
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.normalizer import RewardScale
@@ -119,7 +119,7 @@ def update(config: Config, state: State, rollout: Rollout) -> dict[str, Tensor |
         rollout = state.reward_scale.scale(rollout)
     batch = advantages(config, networks, rollout)
     valid_rows = rollout.valid_rows
-    rows = one_minibatch(state.rows(rollout), rollout.num_rows)
+    rows = one_minibatch(rows_of(rollout, networks.piece_length), rollout.num_rows)
     advantage = batch.advantage[rows]
     if config.normalize_advantage:
         advantage = standardize(advantage.flatten(1)).view_as(advantage)

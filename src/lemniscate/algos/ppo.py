@@ -11,7 +11,7 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from lemniscate.data.rollout import collect, epoch_minibatches
+from lemniscate.data.rollout import collect, epoch_minibatches, rows_of
 from lemniscate.maths import (
     clipped_surrogate,
     explained_variance,
@@ -145,7 +145,7 @@ def update(config: Config, state: State, rollout: Rollout) -> dict[str, Tensor |
     if config.scale_rewards:
         rollout = state.reward_scale.scale(rollout)
     batch = collected = advantages(config, state.networks, rollout)
-    valid_rows, rows = rollout.valid_rows, state.rows(rollout)
+    valid_rows, rows = rollout.valid_rows, rows_of(rollout, state.networks.piece_length)
     metrics: list[Metrics] = []
     for epoch in range(config.epochs):
         if config.recompute_advantages and epoch > 0:

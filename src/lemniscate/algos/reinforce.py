@@ -39,6 +39,7 @@ from lemniscate.types import Batch, Loss, Metrics, Rollout
 class Config(ActorCriticConfig):
     """The settings of REINFORCE."""
 
+    in_pieces = False
     num_envs: NumEnvs = 8
     """number of parallel environments, N; usually 8 to 64"""
     num_steps: Count = 256
@@ -82,11 +83,6 @@ class Config(ActorCriticConfig):
             self._require_rows("standardize", self.num_rows)
 
     @property
-    def piece_length(self) -> int:
-        """None: it has no pieces, and learns with no memory."""
-        return 0
-
-    @property
     def gradient_steps(self) -> int:
         """The number of gradient steps of the whole run; 0 where batches differ in size and cannot be compiled for."""
         critic_steps = self.critic_epochs * -(-self.num_rows // self.critic_minibatch_size)
@@ -121,9 +117,8 @@ def weights(config: Config, networks: ActorCritic, rollout: Rollout) -> Batch:
     if config.baseline != "value":
         value, next_value = torch.zeros_like(value), torch.zeros_like(value)
     to_go = reward_to_go(rollout.reward, next_value, rollout.terminated, rollout.done, gamma=config.gamma)
-    weight = to_go
-    if config.returns == "episode":
-        weight = episode_return(to_go, rollout.reward, rollout.done | ~rollout.valid, gamma=config.gamma)
+    ended = rollout.done | ~rollout.valid
+    weight = to_go if config.returns == "to_go" else episode_return(to_go, rollout.reward, ended, gamma=config.gamma)
     baseline = weight[rollout.valid].mean() if config.baseline == "mean" else value
     return Batch(rollout.obs, rollout.action, log_prob, value, weight - baseline, to_go).flatten()
 

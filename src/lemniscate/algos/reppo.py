@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from lemniscate.data.batches import SoftBatch
-from lemniscate.data.rollout import collect, epoch_minibatches
+from lemniscate.data.rollout import collect, epoch_minibatches, rows_of
 from lemniscate.maths import cross_entropy, explained_variance, hl_gauss, means, soft_lambda_return
 from lemniscate.nn.categorical_q import ActorCategoricalQ, CategoricalQ, Multipliers
 from lemniscate.nn.networks import Activation
@@ -160,15 +160,14 @@ def update(config: Config, state: State, rollout: Rollout) -> dict[str, Tensor |
         optimizer.learning_rate = rate
     if config.scale_rewards:
         rollout = state.reward_scale.scale(rollout)
-    batch, rows, metrics = targets(config, state, rollout), state.rows(rollout), []
+    batch, rows, metrics = targets(config, state, rollout), rows_of(rollout, state.networks.piece_length), []
     for _ in range(config.epochs):
         minibatches = epoch_minibatches(rows, rollout.num_rows, config.minibatch_size, state.rng.minibatch)
         noise = state.policy.draw_noise(minibatches.shape, state.rng.action)  # [K, M, A]
         metrics.append(means(state.learn(config, state, batch, minibatches, noise)))
     state.policy.observe(rollout.obs, rollout.valid)  # last: the KL compares policies behind the same normalizer
     state.step += config.num_steps * config.num_envs
-    valid_rows = rollout.valid_rows
-    explained = explained_variance(batch.value[valid_rows], batch.target[valid_rows])
+    explained = explained_variance(batch.value[rollout.valid_rows], batch.target[rollout.valid_rows])
     return {**means(metrics), "explained_variance": explained, "learning_rate": rate}
 
 

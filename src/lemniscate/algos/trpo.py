@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.func import grad
 
-from lemniscate.data.rollout import collect, epoch_minibatches, one_minibatch
+from lemniscate.data.rollout import collect, epoch_minibatches, one_minibatch, rows_of
 from lemniscate.maths import backtrack, explained_variance, gae, means, natural_step, standardize, surrogate, value_loss
 from lemniscate.nn.actor_critic import ActorCritic, Value
 from lemniscate.nn.normalizer import RewardScale
@@ -150,7 +150,7 @@ def update(config: Config, state: State, rollout: Rollout) -> dict[str, Tensor |
     state.critic_optimizer.learning_rate = rate
     if config.scale_rewards:
         rollout = state.reward_scale.scale(rollout)
-    batch, rows = advantages(config, state.networks, rollout), state.rows(rollout)
+    batch, rows = advantages(config, state.networks, rollout), rows_of(rollout, state.networks.piece_length)
     same_size = one_minibatch(rows, rollout.num_rows)[0]  # in every update, since the product is compiled
     metrics = improve(config, state, batch[rows], batch.obs[same_size])
     size = config.critic_minibatch_size

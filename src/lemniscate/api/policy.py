@@ -58,12 +58,15 @@ class TrainedPolicy:
     def __init__(self, networks: Any, spec: Spec, config: RunConfig, step: int, path: Path | None = None) -> None:
         self.networks = networks.eval()
         self.spec, self.config, self.step, self.path = spec, config, step, path
-        self._recall: Recall | None = None
-        """what it remembers of the episodes that `act` plays, where it has a memory"""
-        if self.module.memory:
-            own = spec.privileged > 0  # what the critic remembers depends on numbers that no observation has
-            memory = replace(self.module.memory, privileged=0) if own else networks.memory
-            self._recall = Recall(memory, self.module.remember if own else networks.remember)
+
+    @cached_property
+    def _recall(self) -> Recall | None:
+        """What it remembers of the episodes that `act` plays, where it has a memory."""
+        if not self.module.memory:
+            return None
+        if self.spec.privileged:  # what the critic remembers depends on numbers that no observation has
+            return Recall(replace(self.module.memory, privileged=0), self.module.remember)
+        return Recall(self.networks.memory, self.networks.remember)
 
     @cached_property
     def _noise(self) -> torch.Generator:

@@ -33,12 +33,14 @@ def rollout_bytes(spec: Spec, num_steps: int, num_envs: int) -> int:
     return num_steps * (num_envs * (3 * obs + 2 * (4 * action + 7)) + 1_000)
 
 
-def pieces(rollout: Rollout, length: int) -> Tensor:
-    """The rows of a rollout [T, N, …] as pieces of L = `length` steps of one environment: indices [N · T / L, L].
+def rows_of(rollout: Rollout, length: int) -> Tensor:
+    """The valid rows of a rollout [T, N, …], [B]; with L = `length`, pieces of L steps to learn from, [N · T / L, L].
 
-    The place of a row whose action was ignored has the first valid row of its piece, which starts from its own memory
-    wherever it stands.
+    A piece is of one environment. The place of a row whose action was ignored has the first valid row of its piece,
+    which starts from its own memory wherever it stands.
     """
+    if not length:
+        return rollout.valid_rows
     steps, envs = rollout.valid.shape
     rows = torch.arange(steps * envs, device=rollout.valid.device).view(-1, length, envs).movedim(-1, 1).flatten(0, 1)
     valid = rollout.valid.flatten()[rows]
@@ -47,34 +49,31 @@ def pieces(rollout: Rollout, length: int) -> Tensor:
 
 
 def one_minibatch(rows: Tensor, num_rows: int) -> Tensor:
-    """All valid rows [B] as one minibatch, in their order: indices [1, num_rows]; see `epoch_minibatches`."""
-    return _cut(rows, num_rows, num_rows)
+    """All rows [B] or pieces as one minibatch, in their order: indices [1, num_rows]; see `epoch_minibatches`."""
+    return epoch_minibatches(rows, num_rows, num_rows, None)
 
 
-def epoch_minibatches(rows: Tensor, num_rows: int, size: int, generator: Generator) -> Tensor:
-    """The valid rows in a new random order, cut into the minibatches of one epoch: indices [K, M].
+def epoch_minibatches(rows: Tensor, num_rows: int, size: int, generator: Generator | None) -> Tensor:
+    """The rows in a new random order, cut into the minibatches of one epoch: indices [K, M].
 
     K and M are the same in every epoch of a run, whatever the number of valid rows, since compiled programs are for
     one shape. Where rows are missing, the first ones of the order are repeated.
 
     Args:
-        rows: the indices of the rows to learn from, [B] int64; or `pieces` of L rows, [B / L, L], which stay whole: the
-            minibatches are then [K, M / L, L].
+        rows: of `rows_of`, [B] int64; or pieces of L rows, [B / L, L], which stay whole: the minibatches are then
+            [K, M / L, L].
         num_rows: the number of rows of a rollout, at least B.
         size: M; a rollout with fewer rows is one minibatch.
-        generator: of the order.
+        generator: of the order; None leaves it.
 
     Raises:
         UserError: there is no valid row.
     """
-    order = torch.randperm(len(rows), generator=generator, device=generator.device)
-    return _cut(rows[order], num_rows, min(size, num_rows))
-
-
-def _cut(rows: Tensor, num_rows: int, size: int) -> Tensor:
     if not len(rows):
         raise UserError("No valid transition in the whole rollout; increase num_steps.")
-    length, *piece = rows[0].numel(), *rows.shape[1:]
+    if generator:
+        rows = rows[torch.randperm(len(rows), generator=generator, device=generator.device)]
+    size, length, piece = min(size, num_rows), rows[0].numel(), rows.shape[1:]
     total = math.ceil(num_rows / size) * size // length
-    repeated = rows.repeat(math.ceil(total / len(rows)), *(1 for _ in piece))
+    repeated = rows.repeat(math.ceil(total / len(rows)), *[1] * len(piece))
     return repeated[:total].view(-1, size // length, *piece)

@@ -43,7 +43,7 @@ class MinAtar(gym.Env):
             raise missing_extra("minatar", "minatar")
         logging.disable(logging.WARNING)  # that seaborn is not there, which draws their own windows
         try:
-            from minatar import Environment
+            from minatar import Environment  # pyright: ignore[reportMissingImports]
         finally:
             logging.disable(logging.NOTSET)
         self.render_mode, self._game = render_mode, Environment(game, sticky_action_prob, difficulty_ramping)
@@ -74,6 +74,7 @@ class MinAtar(gym.Env):
 
 
 for _name, _game in GAMES.items():
+    gym.registry.pop(f"{PREFIX}{_name}-v1", None)  # the package's own, whose observations are no bytes
     gym.register(
         f"{PREFIX}{_name}-v1",
         entry_point="lemniscate.envs.minatar:MinAtar",

@@ -6,7 +6,6 @@ from lemniscate.maths.distributions import Distribution, Gaussian, tanh
 from lemniscate.maths.losses import clipped_surrogate, policy_gradient, surrogate, value_loss
 from lemniscate.maths.noise import coloured, ornstein_uhlenbeck, uniform
 from lemniscate.maths.returns import episode_return, gae, q_lambda, reward_to_go
-from lemniscate.maths.soft_q import cross_entropy, hl_gauss, soft_lambda_return
 from lemniscate.maths.stats import (
     clip_fraction,
     explained_variance,
@@ -18,7 +17,7 @@ from lemniscate.maths.stats import (
     ratio_statistics,
     standardize,
 )
-from lemniscate.maths.targets import polyak, td_target
+from lemniscate.maths.targets import cross_entropy, hl_gauss, polyak, soft_lambda_return, td_target
 from lemniscate.maths.trust_region import backtrack, conjugate_gradient, fisher_product, natural_step
 
 __all__ = [

@@ -1,10 +1,12 @@
-"""The targets of Q for a transition, and the target networks."""
+"""The targets of Q, for a transition and for a rollout, as numbers and over bins; and the target networks."""
 
 from collections.abc import Iterable
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+
+from lemniscate.maths.returns import q_lambda
 
 
 def td_target(
@@ -44,3 +46,62 @@ def polyak(target: Iterable[Tensor], online: Iterable[Tensor], tau: float) -> No
     for mine, theirs in zip(target, online, strict=True):
         if mine.is_floating_point():  # whole numbers do not learn
             mine.lerp_(theirs, tau)
+
+
+def soft_lambda_return(
+    reward: Float[Tensor, "T N"],
+    next_value: Float[Tensor, "T N"],
+    next_bonus: Float[Tensor, "T N"],
+    terminated: Bool[Tensor, "T N"],
+    done: Bool[Tensor, "T N"],
+    *,
+    gamma: float = 0.99,
+    lam: float = 0.95,
+) -> Float[Tensor, "T N"]:
+    """The TD(λ) return of Q(s, a) where entropy is rewarded: Voelcker et al. 2025, arXiv:2507.11019.
+
+        G_t = r_t + γ (b_{t+1} + (1 − λ) Q(s_{t+1}, a') + λ G_{t+1})
+        a' ~ π(·|s_{t+1}),   b_{t+1} = −α log π(a'|s_{t+1})
+
+    r_t alone after a termination. Where the chain ends, at a time-out and in the last row, Q(s_{t+1}, a') stands for
+    G_{t+1}. At λ = 0 it is SAC's target, arXiv:1812.05905, eq. 3.
+
+    Args:
+        reward: r_t.
+        next_value: Q(s_{t+1}, a') at the true successor, before any reset.
+        next_bonus: b_{t+1}, of the same action.
+        terminated: the episode ended by its own rules at row t.
+        done: the episode ended at row t for any reason.
+        gamma: discount γ in [0, 1].
+        lam: trace decay λ in [0, 1].
+    """
+    reward = reward + gamma * next_bonus * ~terminated
+    return q_lambda(reward, next_value, terminated, done, gamma=gamma, lam=lam)
+
+
+def hl_gauss(target: Float[Tensor, " *B"], edges: Float[Tensor, " E"], width: float = 0.75) -> Float[Tensor, "*B K"]:
+    """A number as probabilities of K bins: Farebrother et al. 2024, arXiv:2403.03950, "HL-Gauss".
+
+        p_i = (Φ((e_{i+1} − y) / σ) − Φ((e_i − y) / σ)) / (Φ((e_K − y) / σ) − Φ((e_0 − y) / σ))
+
+    Args:
+        target: y, which is clamped to [e_0, e_K].
+        edges: e_0 < … < e_K, at equal distances; E = K + 1.
+        width: σ in units of a bin's width.
+    """
+    sigma = width * (edges[1] - edges[0])
+    below = torch.erf((edges - target.clamp(edges[0], edges[-1])[..., None]) / (sigma * 2**0.5))
+    return below.diff() / (below[..., -1:] - below[..., :1])
+
+
+def cross_entropy(logits: Float[Tensor, "*B K"], target: Float[Tensor, "*B K"]) -> Float[Tensor, ""]:
+    """−E[ Σ_i p_i log q_i ]: the loss of a distribution over K bins, arXiv:2403.03950, section 2.
+
+    Args:
+        logits: of q.
+        target: p, no gradient.
+
+    Returns:
+        A scalar.
+    """
+    return -(target * logits.log_softmax(-1)).sum(-1).mean()

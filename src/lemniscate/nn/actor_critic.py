@@ -31,11 +31,12 @@ class Value(nn.Module):
 
     def forward(self, obs: Tensor) -> Tensor:
         """[…, O + P] to […]."""
-        return self.net(self.inputs(obs)).squeeze(-1)
+        inputs = with_privileged(self.normalizer(obs), obs, self.normalizer.size, self.privileged)
+        return self.net(inputs).squeeze(-1)
 
-    def inputs(self, obs: Tensor) -> Tensor:
-        """What the network sees of […, O + P]."""
-        return with_privileged(self.normalizer(obs), obs, self.normalizer.size, self.privileged)
+    def remember(self, obs: Tensor) -> Tensor:
+        """What it remembers after rows [N, O + P]."""
+        return remember(self.net, with_privileged(self.normalizer(obs), obs, self.normalizer.size, self.privileged))
 
 
 class ActorCritic(nn.Module):
@@ -64,6 +65,7 @@ class ActorCritic(nn.Module):
         critic = network_of(spec, critic_layers or layers, 1, last_gain=1.0, **more)
         self.value = Value(self.policy.normalizer, critic, spec.privileged + remembered_by(critic))
         self.memory = give_memory(self.policy, critic, spec, length)
+        self.piece_length = length if self.memory else 0
 
     def estimates(self, obs: Tensor, next_obs: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """V(s), V(s') and log π(a|s) of rows [T, N, …], [T, N] each."""
@@ -73,7 +75,7 @@ class ActorCritic(nn.Module):
 
     def remember(self, obs: Tensor) -> Tensor:
         """What policy and critic remember after rows [N, …], [N, policy + critic]."""
-        return torch.cat([self.policy.remember(obs), remember(self.value.net, self.value.inputs(obs))], dim=-1)
+        return torch.cat([self.policy.remember(obs), self.value.remember(obs)], dim=-1)
 
 
 class ActionValues(nn.Module):

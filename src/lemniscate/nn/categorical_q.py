@@ -167,6 +167,7 @@ class ActorCategoricalQ(nn.Module):
         self.critic = CategoricalQ(normalizer, encoder, critic, Bins(value_range), gain, privileged)
         self.multipliers = Multipliers([INITIAL_MULTIPLIER] * 2)
         self.memory = give_memory(self.policy, critic, spec, length)
+        self.piece_length = length if self.memory else 0
 
     def q(self, obs: Tensor, action: Tensor) -> Tensor:
         """[B, O] and [B, A] to Q(s, a), [B]."""

@@ -1,19 +1,17 @@
 """Settings and training state of the algorithms that learn from their newest rollout."""
 
 from dataclasses import dataclass, replace
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import torch
-from torch import Tensor
 
-from lemniscate.data.rollout import pieces, rollout_bytes
+from lemniscate.data.rollout import rollout_bytes
 from lemniscate.errors import UserError
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.networks import Activation, Layers
 from lemniscate.run.config import Count, Fraction, LogStd, Range, RunConfig, Width
 from lemniscate.run.state import Networks, ScaledState
 from lemniscate.spec import Spec
-from lemniscate.types import Rollout
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,6 +85,8 @@ class OnPolicyConfig(RunConfig):
 class ActorCriticConfig(OnPolicyConfig):
     """The settings of those that learn a policy and, beside it, a value."""
 
+    in_pieces: ClassVar[bool] = True
+    """whether they learn from pieces of a rollout, and so with a memory"""
     critic_hidden: tuple[Width, ...] | None = None
     """widths for the value, or for Q; usually as wide or wider; none: as hidden"""
     initial_log_std: LogStd = -0.5
@@ -129,7 +129,7 @@ class ActorCriticConfig(OnPolicyConfig):
     @property
     def piece_length(self) -> int:
         """The steps of a piece of a rollout, L, where the networks have a memory."""
-        return min(self.sequence_length, self.num_steps)
+        return min(self.sequence_length, self.num_steps) if self.in_pieces else 0
 
     def _require_pieces(self) -> None:
         """Raise `UserError` where the steps of a rollout or the rows of a minibatch are no whole number of pieces."""
@@ -144,11 +144,6 @@ class ActorCriticConfig(OnPolicyConfig):
 @dataclass(kw_only=True)
 class OnPolicyState(ScaledState[Networks]):
     """The training state of the algorithms that learn from their newest rollout."""
-
-    def rows(self, rollout: Rollout) -> Tensor:
-        """The rows to learn from: the valid ones [B], or pieces [B / L, L] where the networks have a memory."""
-        memory = self.networks.memory
-        return pieces(rollout, memory.length) if memory else rollout.valid_rows
 
     def per_step_methods(self) -> list[tuple[object, str]]:
         """The methods of every algorithm, the estimates on a rollout, and the memory where there is one."""
