@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 import torch
+from test_contract import play
 
 from lemniscate.envs import registry
 from lemniscate.errors import UserError, is_installed
-from test_contract import play
 
 GAMES = ["Asterix", "Breakout", "Freeway", "Seaquest", "SpaceInvaders"]
 here = pytest.mark.skipif(not is_installed("minatar"), reason="the extra minatar is not installed")
