@@ -22,12 +22,13 @@ from common import append, provenance, rows
 
 import lemniscate as lem
 
+SHARED = {"minibatch_size": 512, "learning_rate": 1e-3, "hidden": (64,)}
 ENVS = {
-    # environment: (steps, what is asked for, settings of ppo)
-    "cart_pole": (100_000, "500", {"hidden": (64,), "gae_lambda": 0.95}),
-    "pendulum": (300_000, "≥ −200", {"gamma": 0.95}),
-    "RepeatFirst": (400_000, "1", {"sequence_length": 64, "hidden": (64,)}),
-    "lunar_lander": (2_000_000, "≥ 200", {"gamma": 0.995}),
+    # environment: (steps, what is asked for, settings of ppo, found on seeds 101 to 103)
+    "cart_pole": (60_000, "500", SHARED),
+    "pendulum": (400_000, "≥ −200", SHARED | {"gamma": 0.95}),
+    "RepeatFirst": (300_000, "1", SHARED | {"sequence_length": 64}),
+    "lunar_lander": (2_000_000, "≥ 200", SHARED | {"gamma": 0.995}),
 }
 
 

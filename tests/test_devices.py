@@ -12,9 +12,8 @@ import torch
 import lemniscate as lem
 from conftest import tiny, tiny_fields, tiny_off_policy
 from lemniscate import algos
-from lemniscate.data.batches import collect_episodes
 from lemniscate.data.replay import interact
-from lemniscate.data.rollout import collect
+from lemniscate.data.rollout import collect, collect_episodes
 from lemniscate.envs.backend import Backend
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError
@@ -205,7 +204,7 @@ MUTANTS = [
     ("the networks stay on the CPU", "algos/trpo.py", "config.make_networks(spec, device)", "config.networks(spec)", "trpo box"),
     ("Adam's scalars stay on the CPU", "optim/adam.py", ".log().to(device, wide_float(device))", ".log()", "a2c box"),
     ("the first GPU, whichever was asked for", "run/seeding.py", "torch.Generator(device)", "torch.Generator(device.type)", "ppo box"),
-    ("what ended is counted on the CPU", "data/batches.py", "dtype=torch.int64, device=env.device)", "dtype=torch.int64)", "reinforce episodes"),
+    ("what ended is counted on the CPU", "data/rollout.py", "dtype=torch.int64, device=env.device)", "dtype=torch.int64)", "reinforce episodes"),
     ("frequencies on the CPU", "maths/noise.py", ", dtype=normal.dtype, device=normal.device)", ", dtype=normal.dtype)", "td3 box"),
     ("float64 on mps", "types.py", 'device.type == "mps"', "False", "a2c box"),
 ]  # fmt: skip

@@ -441,14 +441,14 @@ MUTANTS = [
     ),
     (
         "fragments among whole episodes",
-        "data/batches.py",
+        "data/rollout.py",
         "(ended >= 1) & ",
         "",
         ROLLOUT + "whole_episodes_are_whole_and_as_many_from_each_environment",
     ),
     (
         "short episodes give more of them",
-        "data/batches.py",
+        "data/rollout.py",
         " & (ended <= episodes)",
         "",
         ROLLOUT + "whole_episodes_are_whole_and_as_many_from_each_environment",
@@ -637,7 +637,7 @@ MUTANTS = [
     ),
     (
         "REPPO's KL is the other way round",
-        "data/batches.py",
+        "data/rollout.py",
         "Gaussian(self.mean, self.log_std).kl(Gaussian(policy.mean, policy.log_std))",
         "Gaussian(policy.mean, policy.log_std).kl(Gaussian(self.mean, self.log_std))",
         REPPO + "rows_within_the_bound_climb_and_the_others_come_back",

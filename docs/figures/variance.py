@@ -15,8 +15,7 @@ import torch
 from matplotlib.figure import Figure
 
 from lemniscate.algos import reinforce
-from lemniscate.data.batches import collect_episodes
-from lemniscate.data.rollout import collect
+from lemniscate.data.rollout import collect, collect_episodes
 from lemniscate.envs.registry import make
 from lemniscate.maths import policy_gradient
 

@@ -8,8 +8,7 @@ import torch
 
 from helpers import MODES, ONE_MODE, begin, learned_with, one_rollout, slope, small
 from lemniscate.algos import reinforce
-from lemniscate.data.batches import collect_episodes
-from lemniscate.data.rollout import epoch_minibatches
+from lemniscate.data.rollout import collect_episodes, epoch_minibatches
 from lemniscate.errors import UserError
 
 

@@ -10,8 +10,7 @@ import environments  # noqa: F401  (registers Copy-box-v0)
 import helpers
 from helpers import CPU, ONE_MODE, begin, copy_of, equal, slope, spec_of, vectorize
 from lemniscate.algos import reppo
-from lemniscate.data.batches import SoftBatch
-from lemniscate.data.rollout import collect
+from lemniscate.data.rollout import SoftBatch, collect
 from lemniscate.errors import UserError
 from lemniscate.maths import Gaussian, hl_gauss, soft_lambda_return
 

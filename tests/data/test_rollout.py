@@ -6,8 +6,7 @@ import torch
 
 from helpers import CPU, MODES, vectorize
 from lemniscate.algos import reinforce
-from lemniscate.data.batches import collect_episodes
-from lemniscate.data.rollout import collect, epoch_minibatches, one_minibatch
+from lemniscate.data.rollout import collect, collect_episodes, epoch_minibatches, one_minibatch
 from lemniscate.errors import UserError
 from lemniscate.types import Rollout
 

@@ -9,8 +9,7 @@ import torch
 
 from helpers import begin, begin_off_policy, numbers, small, small_networks, small_off_policy, spec_of
 from lemniscate.algos import a2c, ppo, reinforce, reppo, sac, trpo
-from lemniscate.data.batches import SoftBatch
-from lemniscate.data.rollout import collect
+from lemniscate.data.rollout import SoftBatch, collect
 from lemniscate.maths import standardize
 from lemniscate.optim.adam import Adam
 from lemniscate.optim.shards import EstimatesOverShards, GradientOverShards

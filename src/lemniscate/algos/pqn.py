@@ -10,8 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from lemniscate.data.batches import QBatch
-from lemniscate.data.rollout import collect, epoch_minibatches
+from lemniscate.data.rollout import QBatch, collect, epoch_minibatches
 from lemniscate.maths import explained_variance, means, q_lambda, value_loss
 from lemniscate.nn.actor_critic import ActionValues
 from lemniscate.nn.networks import Activation

@@ -11,8 +11,7 @@ from typing import Annotated, Literal
 import torch
 from torch import Tensor
 
-from lemniscate.data.batches import collect_episodes
-from lemniscate.data.rollout import collect, epoch_minibatches, one_minibatch
+from lemniscate.data.rollout import collect, collect_episodes, epoch_minibatches, one_minibatch
 from lemniscate.errors import UserError
 from lemniscate.maths import (
     episode_return,

@@ -10,8 +10,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from lemniscate.data.batches import SoftBatch
-from lemniscate.data.rollout import collect, epoch_minibatches, rows_of
+from lemniscate.data.rollout import SoftBatch, collect, epoch_minibatches, rows_of
 from lemniscate.maths import cross_entropy, explained_variance, hl_gauss, means, soft_lambda_return
 from lemniscate.nn.categorical_q import ActorCategoricalQ, CategoricalQ, Multipliers
 from lemniscate.nn.networks import Activation

@@ -57,6 +57,8 @@ def choose_config(
     """The algorithm's name, the preset's and the Config of `config_for`; raises as that."""
     if isinstance(env, RunConfig) or "config" in fields:
         raise UserError("A Config knows its algorithm and takes its place: lem.train(config).")
+    if hasattr(env, registry.SPOKEN) and hasattr(env, "num_envs"):
+        fields = {"num_envs": getattr(env, "num_envs", None), **fields}
     env = None if env is None else registry.name_of(env)
     if isinstance(algorithm, RunConfig):
         if preset is not None:

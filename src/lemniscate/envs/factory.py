@@ -17,6 +17,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 
 from lemniscate.envs.conversion import SingleEnv
+from lemniscate.envs.registry import SPOKEN
 from lemniscate.envs.returns import CheckedVector
 from lemniscate.envs.workers import WatchedVectorEnv, Worker
 from lemniscate.errors import UserError, shown
@@ -86,9 +87,15 @@ def make_one(maker: Maker, wrappers: Sequence[Callable[..., Any]] = (), **kwargs
     for wrap in wrappers:
         env = wrap(env)
     if not isinstance(env, gym.Env):
-        kind = type(env).__name__
-        raise TypeError(f"it makes {'an' if kind[0] in 'aeiouAEIOU' else 'a'} {kind}, not a gymnasium.Env")
+        raise _other(env, "gymnasium.Env")
     return SingleEnv(env)
+
+
+def _other(made: object, wanted: str) -> TypeError:
+    """The words on something else than what is wanted."""
+    kind = type(made).__name__
+    instead = "; what speaks rsl_rl's VecEnv is of the backend rsl_rl" if hasattr(made, SPOKEN) else ""
+    return TypeError(f"it makes {'an' if kind[0] in 'aeiouAEIOU' else 'a'} {kind}, not a {wanted}{instead}")
 
 
 def make_vector(
@@ -98,7 +105,10 @@ def make_vector(
     makers = [partial(make_one, maker, wrappers, **kwargs)] * num_envs
     if makes_vector(maker):
         make = partial(gym.make_vec, maker) if isinstance(maker, EnvSpec) else maker
-        envs = one = CheckedVector(make(num_envs=num_envs, **kwargs))
+        made = make(num_envs=num_envs, **kwargs)
+        if not isinstance(made, VectorEnv):
+            raise _other(made, "gymnasium.vector.VectorEnv")
+        envs = one = CheckedVector(made)
     elif workers:
         multiprocessing.get_context("forkserver").set_forkserver_preload([__name__])  # imported once, for all
         one = makers[0]()

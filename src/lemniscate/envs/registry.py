@@ -21,6 +21,7 @@ BACKENDS = {
     "minatar": "lemniscate.envs.minatar:MinatarBackend",
     "gymnasium": "lemniscate.envs.gymnasium:GymnasiumBackend",
     "gymnasium-async": "lemniscate.envs.gymnasium:AsyncGymnasiumBackend",
+    "rsl_rl": "lemniscate.envs.rsl_rl:RslRlBackend",
 }
 """each is imported when it is used; the first that serves an id runs it"""
 
@@ -50,6 +51,9 @@ ARGUMENTS_OF_MAKE = {
 }
 """arguments of `gym.make` and its kin, and what takes their place; one's own environment may have all but two"""
 
+SPOKEN = "get_observations"
+"""the method by which a vector of environments that speaks rsl_rl's `VecEnv` is known"""
+
 MOST_ENVS = 1_000_000
 """parallel environments that may be asked for"""
 
@@ -65,6 +69,8 @@ def backend_for(env: str, wrappers: Sequence[str] = ()) -> str:
     It is the first that serves it and can put wrappers around it; the first that serves it where none can. Raises
     `UserError` with the nearest names if there is none.
     """
+    if _is_spoken(env):
+        return "rsl_rl"
     serving = None
     for name in BACKENDS:
         if env.startswith(BEGINNINGS.get(name, "")) and backend_class(name).serves(env):
@@ -74,6 +80,14 @@ def backend_for(env: str, wrappers: Sequence[str] = ()) -> str:
     if serving is None:
         raise unknown_env(env)
     return serving
+
+
+def _is_spoken(env: str) -> bool:
+    """Whether it is an object, or a class of one's own, that speaks rsl_rl's `VecEnv`."""
+    try:
+        return ":" in env and hasattr(named.find(env), SPOKEN)
+    except UserError:  # an id behind a module that registers it, or nothing
+        return False
 
 
 def unknown_env(env: str) -> UserError:
@@ -129,6 +143,8 @@ def for_evaluation(backend: str | None) -> str | None:
 def name_of(env: object) -> str:
     """The name of an environment for a Config: an id or `module:Class` as it is, or that of a class or a callable.
 
+    What speaks rsl_rl's `VecEnv` is N environments already, and has a name too.
+
     What can be imported by that name can be used again from a file; a lambda or a local class in this process only.
 
     Raises:
@@ -136,7 +152,7 @@ def name_of(env: object) -> str:
     """
     if isinstance(env, str):
         return env
-    if not callable(env):
+    if not callable(env) and not hasattr(env, SPOKEN):
         what = "an environment that is made already" if hasattr(env, "step") else shown(env)
         raise UserError(f"env is {what}; give its class, its id, or a function that makes it: several are needed.")
     return named.name_of(env)

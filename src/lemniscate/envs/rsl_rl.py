@@ -1,0 +1,210 @@
+"""The door to big simulators: environments that speak rsl_rl's `VecEnv`, as Isaac Lab's do; and ours as one.
+
+Neither needs rsl_rl; ours as one needs tensordict.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lemniscate.envs import registry
+from lemniscate.envs.backend import Backend
+from lemniscate.errors import UserError
+from lemniscate.spec import Box, ObservationPart, Spec
+from lemniscate.system import named
+from lemniscate.types import Step
+
+ACTOR, CRITIC = ("actor", "policy"), "critic"
+"""groups of observations: the first of these that is there is what a policy sees; what a critic sees besides"""
+FINAL = ("final_obs", "final_observation", "terminal_observation")
+"""names in `extras` of the true final observations, in the form of the others"""
+
+_made: dict[tuple[str, str], Any] = {}
+"""what makers have made, by name and arguments: a process has one simulator"""
+
+
+class RslRlBackend(Backend):
+    """N environments in one object that speaks rsl_rl's `VecEnv`: passed as `env`, or made by `module:function`.
+
+    A process has one such object, so evaluation uses that of training. Actions are the environment's own, [N, A],
+    without bounds. The critic sees the group `critic` behind the policy's. Numbers in `extras["log"]` are measures.
+
+    An episode that has ended is reset in the same step. Where `extras` has the true final observations (`final_obs`),
+    values at time-outs are exact; else the observation before stands for them, as in rsl_rl.
+    """
+
+    @classmethod
+    def serves(cls, env: str) -> bool:
+        """An object that speaks it, or a function of one's own, which may make one."""
+        return ":" in env and (speaks(found := named.find(env)) or callable(found))
+
+    @classmethod
+    def exists_once(cls, env: str, num_envs: int) -> bool:
+        """There is one in a process."""
+        return True
+
+    def __init__(
+        self,
+        env: str,
+        num_envs: int,
+        device: torch.device,
+        *,
+        stagger: bool = False,
+        kwargs: Mapping[str, Any] | None = None,
+        wrappers: Sequence[str] = (),
+    ) -> None:
+        self._env, self.num_envs, self.device = _made_once(env, num_envs, kwargs or {}), num_envs, device
+        if self._env.num_envs != num_envs:
+            raise UserError(
+                f"{env} has {self._env.num_envs:,} environments, not {num_envs:,}: num_envs={self._env.num_envs}."
+            )
+        obs = self._env.get_observations()
+        self._group = next((name for name in ACTOR if name in obs.keys()), None)  # noqa: SIM118  (of a TensorDict)
+        if self._group is None:
+            raise UserError(
+                f"{env} has the groups of observations {', '.join(obs.keys())}; one must be actor or policy."
+            )
+        size, limit = obs[self._group].flatten(1).shape[1], self._env.max_episode_length
+        self._privileged = obs[CRITIC].flatten(1).shape[1] if CRITIC in obs.keys() else 0  # noqa: SIM118
+        free = (float("inf"),) * self._env.num_actions
+        action = Box(tuple(-bound for bound in free), free)
+        steps = int(limit.max()) if isinstance(limit, Tensor) else int(limit)
+        self.spec = Spec(env, (ObservationPart((), (size,)),), action, steps, self._privileged)
+        self.counts = torch.ones(num_envs, dtype=torch.bool, device=device)
+        self.notices = []
+
+    def restart(self, seed: int, first: int = 0) -> Tensor:
+        """Seed and reset it, where it has `seed` and `reset`; else it goes on from where it is, which is said."""
+        if hasattr(self._env, "seed"):
+            self._env.seed(seed + first)
+        can = hasattr(self._env, "reset")
+        if can:
+            self._env.reset()
+        else:
+            self._note(f"{self.spec.env_id} has no reset: episodes go on where they are, and no run can be repeated.")
+        self._obs = self._rows(self._env.get_observations())
+        return self._obs
+
+    def step(self, action: Tensor) -> Step:
+        """Act; the rows of time-outs have the true final observation, or else the one before."""
+        obs, reward, dones, extras = self._env.step(action.to(self._env.device))
+        done = dones.to(self.device).bool()
+        late = extras.get("time_outs")
+        truncated = done & late.to(self.device).bool() if late is not None else torch.zeros_like(done)
+        before, self._obs = self._obs, self._rows(obs)
+        final = next((extras[name] for name in FINAL if name in extras), None)
+        if final is None and truncated.any():
+            self._note(
+                f"{self.spec.env_id} hides final observations (no extras['final_obs']): at time-outs the value of the"
+                " observation before stands for what follows."
+            )
+        last = before if final is None else self._rows(final)
+        return Step(
+            obs=self._obs,
+            next_obs=torch.where(done[:, None], last, self._obs),
+            reward=reward.to(self.device, torch.float32),
+            terminated=done & ~truncated,
+            truncated=truncated,
+            valid=torch.ones_like(done),
+            measures=self._logged(extras.get("log") or extras.get("episode") or {}),
+        )
+
+    def close(self) -> None:
+        """Nothing: the object is used again, and is its owner's."""
+
+    def _rows(self, obs: Any) -> Tensor:
+        """[N, O + P] of groups [N, …]; clones, since a simulator may write over its own."""
+        groups = [obs[self._group], *([obs[CRITIC]] if self._privileged else [])]
+        return torch.cat([group.flatten(1).to(self.device, torch.float32) for group in groups], dim=-1)
+
+    def _logged(self, log: Mapping[str, Any]) -> dict[str, Tensor]:
+        """The numbers of a log, each the same in all rows."""
+        means = {name: torch.as_tensor(value, dtype=torch.float32).mean().item() for name, value in log.items()}
+        rows = self.counts.float()
+        return {f"info/{name.strip('/')}": torch.full_like(rows, mean) for name, mean in means.items()}
+
+    def _note(self, sentence: str) -> None:
+        if sentence not in self.notices:
+            self.notices = [*self.notices, sentence]
+
+
+def speaks(thing: object) -> bool:
+    """Whether an object has what rsl_rl's `VecEnv` has."""
+    needed = ("num_envs", "num_actions", "max_episode_length", "get_observations", "step")
+    return not isinstance(thing, type) and all(hasattr(thing, name) for name in needed)
+
+
+def _made_once(env: str, num_envs: int, kwargs: Mapping[str, Any]) -> Any:
+    """The object of that name: as it was passed, or made by its maker, once in a process."""
+    found = named.find(env)
+    if speaks(found):
+        return found
+    key = env, repr(sorted(kwargs.items()))
+    if key not in _made or _made[key].num_envs != num_envs:
+        try:
+            _made[key] = found(num_envs=num_envs, **kwargs)
+        except TypeError as error:
+            raise UserError(f"{env} cannot be made: {error}. It is called with num_envs and the env_kwargs.") from None
+        if not speaks(_made[key]):
+            kind = type(_made.pop(key)).__name__
+            raise UserError(f"{env} makes a {kind}, which does not speak rsl_rl's VecEnv: no get_observations.")
+    return _made[key]
+
+
+class RslRlVecEnv:
+    """Environments of lemniscate's as a `VecEnv` of rsl_rl's, for its runner: of continuous actions.
+
+    Observations have the group `policy` and, where something is privileged, `critic`, which has both. Actions are in
+    units of half the range, clipped to [-1, 1]. `extras` has `time_outs`, and true final observations as `final_obs`.
+
+    Args:
+        env: as `lemniscate.train` takes it.
+        num_envs: N.
+        seed: of the environments.
+        device: of the tensors.
+        **options: `kwargs`, `wrappers` and `backend` of `lemniscate.envs.registry.make`.
+
+    Raises:
+        UserError: an environment that cannot be made, has other actions, or resets in a step of its own.
+    """
+
+    def __init__(self, env: Any, num_envs: int, *, seed: int = 0, device: str = "cpu", **options: Any) -> None:
+        self._env = registry.make(env, num_envs, device=device, stagger=True, **options)
+        spec = self._env.spec
+        if not isinstance(spec.action, Box):
+            raise UserError(f"{spec.env_id} has no continuous actions, which rsl_rl needs.")
+        self.num_envs, self.num_actions, self.device, self.cfg = num_envs, spec.action.size, self._env.device, {}
+        self.max_episode_length = spec.max_episode_steps or 10**9
+        self.episode_length_buf = torch.zeros(num_envs, dtype=torch.int64, device=self._env.device)
+        self._size, self._privileged = spec.observation_size, spec.privileged
+        self._env.restart(seed)
+
+    def get_observations(self) -> Any:
+        """The present observations, a TensorDict."""
+        return self._groups(self._env.obs)
+
+    def step(self, actions: Tensor) -> tuple[Any, Tensor, Tensor, dict[str, Any]]:
+        """Act; what has ended is reset in the same step."""
+        step = self._env.step(actions)
+        if not step.valid.all():
+            raise UserError(
+                f"{self._env.spec.env_id} resets in a step of its own, which rsl_rl's runner would learn from."
+            )
+        done = step.terminated | step.truncated
+        self.episode_length_buf = (self.episode_length_buf + 1) * ~done
+        extras = {"time_outs": step.truncated, "final_obs": self._groups(step.next_obs), "log": {}}
+        for name, values in step.measures.items():
+            extras["log"][f"/{name}"] = values[~values.isnan()].mean() if (~values.isnan()).any() else 0.0
+        return self._groups(step.obs), step.reward, done, extras
+
+    def close(self) -> None:
+        """Give back processes and windows."""
+        self._env.close()
+
+    def _groups(self, obs: Tensor) -> Any:
+        from tensordict import TensorDict  # pyright: ignore[reportMissingImports]
+
+        groups = {"policy": obs[:, : self._size]} | ({CRITIC: obs} if self._privileged else {})
+        return TensorDict(groups, batch_size=[self.num_envs])

@@ -1,0 +1,205 @@
+"""The door to rsl_rl's `VecEnv`, in both directions: rows that join up, and rsl_rl's own runner."""
+
+import sys
+
+import pytest
+import torch
+
+import environments  # noqa: F401  (registers Copy)
+import lemniscate as lem
+from conftest import tiny_fields
+from helpers import CPU
+from lemniscate.algos import ppo
+from lemniscate.data.rollout import collect
+from lemniscate.envs import registry
+from lemniscate.envs.rsl_rl import RslRlBackend, RslRlVecEnv
+from lemniscate.errors import UserError
+
+pytest.importorskip("tensordict")
+runners = pytest.importorskip("rsl_rl.runners")
+from rsl_rl.env import VecEnv
+from tensordict import TensorDict
+
+LIMIT = 10
+
+
+class Cart(VecEnv):
+    """N carts on a line that are to be brought to 0: a simulator of rsl_rl's kind. One beyond 2 has died.
+
+    `gives` says which of `final_obs`, `critic`, `reset` and `seed` it has.
+    """
+
+    def __init__(self, num_envs=8, gives=("final_obs", "critic", "reset", "seed"), writes_over=True):
+        self.num_envs, self.num_actions, self.max_episode_length = num_envs, 1, LIMIT
+        self.device, self.cfg, self.gives = "cpu", {}, gives
+        self.rng = torch.Generator().manual_seed(0)
+        self.x, self.episode_length_buf = torch.zeros(num_envs, 1), torch.zeros(num_envs, dtype=torch.int64)
+        self.buffer = torch.zeros(num_envs, 2) if writes_over else None
+        if "reset" in gives:
+            self.reset = self._reset
+        if "seed" in gives:
+            self.seed = lambda seed: self.rng.manual_seed(seed)
+        self._begin(torch.ones(num_envs, dtype=torch.bool))
+
+    def _reset(self):
+        self._begin(torch.ones(self.num_envs, dtype=torch.bool))
+        return self.get_observations(), {}
+
+    def _begin(self, which):
+        self.x = torch.where(which[:, None], torch.empty_like(self.x).uniform_(-1, 1, generator=self.rng), self.x)
+        self.episode_length_buf = self.episode_length_buf * ~which
+
+    def get_observations(self):
+        obs = torch.cat([self.x, self.episode_length_buf[:, None] / LIMIT], dim=1)
+        obs = obs if self.buffer is None else self.buffer.copy_(obs)
+        groups = {"policy": obs} | ({"critic": 2 * obs} if "critic" in self.gives else {})
+        return TensorDict(groups, batch_size=[self.num_envs])
+
+    def step(self, actions):
+        self.x = self.x + 0.5 * actions.clamp(-1, 1)
+        self.episode_length_buf = self.episode_length_buf + 1
+        died, late = self.x.abs()[:, 0] > 2, self.episode_length_buf >= LIMIT
+        reward, dones = 1 - self.x[:, 0].abs(), died | late
+        extras = {"time_outs": late & ~died, "log": {"/cart/distance": self.x.abs().mean(), "count": 3}}
+        if "final_obs" in self.gives:
+            extras["final_obs"] = self.get_observations().clone()
+        self._begin(dones)
+        return self.get_observations(), reward, dones.long(), extras
+
+
+def rollout_of(env, steps=40, seed=3):
+    env.restart(seed)
+    torch.manual_seed(0)
+    config = ppo.Config(env="x", hidden=(4,), num_envs=env.num_envs, minibatch_size=8)
+    policy = ppo.init(config, env.spec, CPU).policy
+    return collect(env, policy, steps, torch.Generator().manual_seed(seed))
+
+
+@pytest.mark.parametrize("final", [True, False])
+def test_rows_join_up_and_time_outs_have_what_is_known(final):
+    cart = Cart(gives=("critic", "reset", "seed", *["final_obs"] * final))
+    env = registry.make(cart, 8)
+    rollout = rollout_of(env)
+    assert env.spec.privileged == 2
+    assert rollout.obs.shape == (40, 8, 4)
+    assert torch.equal(rollout.obs[..., 2:], 2 * rollout.obs[..., :2])
+    done = rollout.done
+    assert rollout.truncated.any()
+    assert rollout.terminated.any()
+    assert not (rollout.truncated & rollout.terminated).any()
+    assert torch.equal(rollout.next_obs[:-1][~done[:-1]], rollout.obs[1:][~done[:-1]])
+    assert not torch.equal(rollout.next_obs[:-1][done[:-1]], rollout.obs[1:][done[:-1]])
+    late = rollout.next_obs[rollout.truncated]
+    assert torch.equal(late[:, 1], torch.full_like(late[:, 1], 1.0 if final else (LIMIT - 1) / LIMIT))
+    assert any("hides final observations" in said for said in env.backend.notices) != final
+    torch.testing.assert_close(
+        rollout.reward, 1 - (rollout.obs[..., 0] + 0.5 * rollout.action[..., 0].clamp(-1, 1)).abs()
+    )
+    again = rollout_of(env)
+    assert torch.equal(again.obs, rollout.obs)
+
+
+def test_what_has_no_reset_says_so():
+    env = registry.make(Cart(gives=("final_obs",)), 8)
+    rollout_of(env)
+    assert env.spec.privileged == 0
+    assert any("has no reset" in said for said in env.backend.notices)
+
+
+@pytest.mark.parametrize("env_id", ["Pendulum-v1", "Copy-box-v0"])
+def test_ours_as_theirs_as_ours_gives_the_same_rows(env_id):
+    """Through both doors: observations, rewards, flags and true successors are those of the environment itself."""
+    direct = registry.make(env_id, 4, stagger=True)
+    outer = RslRlVecEnv(env_id, 4, seed=7)
+    inner = registry.make(outer, 4)
+    direct.restart(7)
+    rng = torch.Generator().manual_seed(0)
+    inner.restart(7)
+    assert torch.equal(direct.obs, inner.obs)
+    for _ in range(250):
+        action = torch.empty(4, direct.spec.action.size).uniform_(-1, 1, generator=rng)
+        mine, theirs = direct.step(action), inner.step(action)
+        for name in ("obs", "reward", "terminated", "truncated"):
+            assert torch.equal(getattr(mine, name), getattr(theirs, name)), name
+        assert torch.equal(mine.next_obs, theirs.next_obs)
+    assert outer.episode_length_buf.shape == (4,)
+
+
+def test_ppo_learns_in_a_simulator_that_was_passed(tmp_path):
+    fields = tiny_fields("x", num_steps=16, total_steps=16_384, minibatch_size=64, learning_rate=1e-2, epochs=4)
+    fields |= {"evaluate_every": 8192, "checkpoint_every": 4096}
+    del fields["num_envs"]
+    cart = Cart(16)
+    run = lem.train("ppo", cart, run=tmp_path / "r", progress=False, **fields)
+    assert run.policy.config.num_envs == 16
+    assert run.policy.config.backend == "rsl_rl"
+    scores = lem.evaluate(run.policy, env=cart, episodes=32, seed=0)
+    assert scores.mean_return > 8
+    assert "info/cart/distance" in scores.measures
+    assert scores.terminated == 0
+
+
+def test_a_maker_of_ones_own_is_named_on_the_command_line(tmp_path, monkeypatch, capsys):
+    from lemniscate.cli import main
+
+    monkeypatch.setitem(sys.modules, "own_simulator", sys.modules[__name__])
+    words = ["train", "ppo", "--env", "own_simulator:Cart", "--num-envs", "8", "--num-steps", "8"]
+    words += ["--minibatch-size", "16", "--total-steps", "128", "--run", str(tmp_path / "r")]
+    assert main(words) == 0
+    assert main(["evaluate", str(tmp_path / "r"), "--episodes", "4"]) == 0
+    assert "return over 4 episodes" in capsys.readouterr().err
+    monkeypatch.setattr(sys.modules[__name__], "make", lambda num_envs: Cart(num_envs), raising=False)
+    words = [word.replace("Cart", "make") for word in words[:-1]] + [str(tmp_path / "s")]
+    assert main(words) == 2
+    assert "what speaks rsl_rl's VecEnv is of the backend rsl_rl" in capsys.readouterr().err
+    assert main([*words, "--backend", "rsl_rl"]) == 0
+
+
+def test_rsl_rls_runner_trains_in_ours(tmp_path):
+    model = {"class_name": "rsl_rl.models:MLPModel", "hidden_dims": [32], "activation": "elu"}
+    gaussian = {"class_name": "rsl_rl.modules.distribution:GaussianDistribution", "init_std": 1.0}
+    config = {
+        "num_steps_per_env": 16,
+        "save_interval": 100,
+        "obs_groups": {"actor": ["policy"], "critic": ["policy"]},
+        "actor": model | {"distribution_cfg": gaussian},
+        "critic": dict(model),
+        "algorithm": {"class_name": "rsl_rl.algorithms:PPO", "num_learning_epochs": 4, "num_mini_batches": 4},
+        "logger": "tensorboard",
+    }
+    env = RslRlVecEnv("Pendulum-v1", 16, seed=0)
+    runner = runners.OnPolicyRunner(env, config, log_dir=None, device="cpu")
+    before = [parameter.clone() for parameter in runner.alg.actor.parameters()]
+    runner.learn(3)
+    after = list(runner.alg.actor.parameters())
+    assert any(not torch.equal(one, other) for one, other in zip(before, after, strict=True))
+    assert all(parameter.isfinite().all() for parameter in after)
+
+
+@pytest.mark.parametrize(
+    ("made", "said"),
+    [
+        (lambda: registry.make(Cart(8), 4), r"has 8 environments, not 4: num_envs=8\."),
+        (lambda: registry.make(lambda num_envs: 3, 4, backend="rsl_rl"), "makes a int, which does not speak"),
+        (lambda: registry.make(lambda: Cart(), 4, backend="rsl_rl"), "It is called with num_envs and the env_kwargs"),
+        (lambda: RslRlVecEnv("CartPole-v1", 2), "CartPole-v1 has no continuous actions, which rsl_rl needs"),
+        (lambda: registry.make(lambda: Cart(), 4), "backend rsl_rl"),
+    ],
+)
+def test_what_does_not_fit_is_refused_in_a_sentence(made, said):
+    with pytest.raises(UserError, match=said):
+        made()
+
+
+def test_groups_without_a_policys_are_refused():
+    class Odd(Cart):
+        def get_observations(self):
+            return TensorDict({"camera": torch.zeros(self.num_envs, 2)}, batch_size=[self.num_envs])
+
+    with pytest.raises(UserError, match="has the groups of observations camera; one must be actor or policy"):
+        registry.make(Odd(), 8)
+
+
+def test_it_serves_what_speaks_it():
+    assert RslRlBackend.serves(registry.name_of(Cart()))
+    assert not RslRlBackend.serves("CartPole-v1")
