@@ -169,8 +169,8 @@ MUTANTS = [
     (
         "the normalizer moves before the update",
         "algos/ppo.py",
-        "    valid_rows = rollout.valid_rows\n    metrics: list",
-        "    state.networks.policy.observe(rollout.obs[rollout.valid])\n    valid_rows = rollout.valid_rows\n    metrics: list",
+        "rows_of(rollout, state.networks.piece_length)\n    metrics: list",
+        "rows_of(rollout, state.networks.piece_length)\n    state.networks.policy.observe(rollout.obs[rollout.valid])\n    metrics: list",
         PPO + "the_first_gradient_step_of_every_update_has_ratios_of_one",
     ),
     (
@@ -624,7 +624,7 @@ MUTANTS = [
     (
         "HL-Gauss loses what lies outside",
         "maths/targets.py",
-        "below.diff() / (below[:, -1:] - below[:, :1])",
+        "below.diff() / (below[..., -1:] - below[..., :1])",
         "below.diff() / 2",
         "maths/test_targets.py::test_hl_gauss_is_the_mass_of_a_normal_in_each_bin",
     ),
@@ -759,7 +759,7 @@ MUTANTS = [
         "nn/memory.py",
         "total = by_out[t - 1] + torch.addcmul(back, kept[t], total)",
         "total = by_out[t - 1] + back",
-        MEMORY + "pieces_are_the_steps_one_after_the_other",
+        MEMORY + "pieces_are_the_steps_one_after_the_other_and_so_are_their_derivatives",
     ),
     (
         "the tangent goes over an end",

@@ -400,7 +400,7 @@ def test_critics_are_told_what_policies_are_not(algorithm, tmp_path):
     values = [critic(obs) if algorithm == "ppo" else critic(obs, torch.zeros(5, 4)) for obs in (known, other)]
     assert not (values[0] == values[1]).any()
     assert lem.evaluate(run.policy, episodes=2).returns == lem.evaluate(lem.load(run.path), episodes=2).returns
-    assert fly(run.policy, act_with(run.policy), rows=20)[0].shape[1] == size
+    assert fly(run.policy, act_with(run.policy), rows=20)[0].obs.shape[-1] == size
     flat = run.policy.act(np.zeros(size, np.float32))
     assert flat.shape == (4,)
 

@@ -61,7 +61,7 @@ class Config(ActorCriticConfig):
     activation: Activation = "silu"
     """activation function between the layers"""
     network: str = "layer_norm"
-    """mlp, layer_norm (with layer normalization), simba (residual blocks), gru (with a memory), or module:Class"""
+    """mlp, layer_norm, simba, gru (with a memory), or module:Class"""
 
     def __post_init__(self) -> None:
         super().__post_init__()

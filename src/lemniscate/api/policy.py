@@ -58,6 +58,7 @@ class TrainedPolicy:
     def __init__(self, networks: Any, spec: Spec, config: RunConfig, step: int, path: Path | None = None) -> None:
         self.networks = networks.eval()
         self.spec, self.config, self.step, self.path = spec, config, step, path
+        self.reset()  # to act is to change nothing, where there is no memory
 
     @cached_property
     def _recall(self) -> Recall | None:

@@ -166,8 +166,7 @@ class RunConfig:
     total_steps: Count = 1_000_000
     """environment steps of the whole run, of all environments; the update that reaches them is the last"""
     device: str = "cpu"
-    """device of the networks, and of simulators that can use it: cpu, cuda, cuda:N (GPU N, from 0) or mps; auto takes
-    cuda if there is one"""
+    """device of networks and simulators: cpu, cuda, cuda:N, mps; auto is cuda if there is one"""
     threads: Annotated[int, Range(1, 256)] = 1
     """CPU threads for torch; results differ in rounding between thread counts"""
     shards: Annotated[int, Range(1, 4096)] = 1

@@ -92,11 +92,11 @@ class ActorCriticConfig(OnPolicyConfig):
     initial_log_std: LogStd = -0.5
     """initial log σ of a Gaussian policy, in units of half the action range; usually -1 to 0"""
     network: str = "mlp"
-    """mlp, layer_norm (with layer normalization), simba (residual blocks), gru (with a memory), or module:Class"""
+    """mlp, layer_norm, simba, gru (with a memory), or module:Class"""
     sequence_length: Annotated[int, Range(2)] = 16
-    """steps through which gradients go back in a memory, L; divides num_steps; usually 8 to 64"""
+    """steps of gradients in a memory, L; 8 to 64"""
     shared_memory: bool = False
-    """let the value see what the policy remembers, in the place of a memory of its own"""
+    """the value sees the policy's memory"""
 
     def __post_init__(self) -> None:
         super().__post_init__()
