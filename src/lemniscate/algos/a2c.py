@@ -16,14 +16,14 @@ from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.optim.adam import Adam, linear
 from lemniscate.run.config import Count, Epsilon, Fraction, LogStd, NonNegative, Positive, Scheduled
-from lemniscate.run.on_policy import ActorCriticConfig, OnPolicyState
+from lemniscate.run.on_policy import OnPolicyState, RecurrentConfig
 from lemniscate.run.run import Run
 from lemniscate.spec import Spec
 from lemniscate.types import Batch, Loss, Metrics, Rollout
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(ActorCriticConfig):
+class Config(RecurrentConfig):
     """The settings of A2C."""
 
     num_steps: Count = 16

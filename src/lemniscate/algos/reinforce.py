@@ -38,7 +38,6 @@ from lemniscate.types import Batch, Loss, Metrics, Rollout
 class Config(ActorCriticConfig):
     """The settings of REINFORCE."""
 
-    in_pieces = False
     num_envs: NumEnvs = 8
     """number of parallel environments, N; usually 8 to 64"""
     num_steps: Count = 256

@@ -18,14 +18,14 @@ from lemniscate.nn.normalizer import RewardScale
 from lemniscate.nn.policies import Policy
 from lemniscate.optim.adam import Adam, linear
 from lemniscate.run.config import Count, Finite, Fraction, NumEnvs, Positive, Repeats, Scheduled, SquashedLogStd, Width
-from lemniscate.run.on_policy import ActorCriticConfig, OnPolicyState
+from lemniscate.run.on_policy import OnPolicyState, RecurrentConfig
 from lemniscate.run.run import Run
 from lemniscate.spec import Spec
 from lemniscate.types import Loss, Metrics, Rollout
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(ActorCriticConfig):
+class Config(RecurrentConfig):
     """The settings of REPPO."""
 
     num_envs: NumEnvs = 64

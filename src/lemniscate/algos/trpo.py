@@ -18,14 +18,14 @@ from lemniscate.nn.normalizer import RewardScale
 from lemniscate.optim.adam import Adam, linear
 from lemniscate.optim.vector import PolicyVector
 from lemniscate.run.config import Count, Fraction, NonNegative, Positive, Range, Repeats, Scheduled
-from lemniscate.run.on_policy import ActorCriticConfig, OnPolicyState
+from lemniscate.run.on_policy import OnPolicyState, RecurrentConfig
 from lemniscate.run.run import Run
 from lemniscate.spec import Spec
 from lemniscate.types import Batch, Loss, Metrics, Rollout
 
 
 @dataclass(frozen=True, kw_only=True)
-class Config(ActorCriticConfig):
+class Config(RecurrentConfig):
     """The settings of TRPO."""
 
     num_steps: Count = 64

@@ -58,11 +58,11 @@ class TrainedPolicy:
     def __init__(self, networks: Any, spec: Spec, config: RunConfig, step: int, path: Path | None = None) -> None:
         self.networks = networks.eval()
         self.spec, self.config, self.step, self.path = spec, config, step, path
-        self.reset()  # to act is to change nothing, where there is no memory
+        self.reset()  # makes `_recall` now: what changes when it acts is taken for a policy with a memory
 
     @cached_property
     def _recall(self) -> Recall | None:
-        """What it remembers of the episodes that `act` plays, where it has a memory."""
+        """The memory of the episodes that `act` plays, for a policy that has one."""
         if not self.module.memory:
             return None
         if self.spec.privileged:  # what the critic remembers depends on numbers that no observation has

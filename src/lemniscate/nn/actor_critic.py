@@ -35,7 +35,7 @@ class Value(nn.Module):
         return self.net(inputs).squeeze(-1)
 
     def remember(self, obs: Tensor) -> Tensor:
-        """What it remembers after rows [N, O + P]."""
+        """The memory of its network after rows [N, O + P]."""
         return remember(self.net, with_privileged(self.normalizer(obs), obs, self.normalizer.size, self.privileged))
 
 
@@ -74,7 +74,7 @@ class ActorCritic(nn.Module):
         return rows[0].view(shape), rows[1].view(shape), rows[2].view(shape)
 
     def remember(self, obs: Tensor) -> Tensor:
-        """What policy and critic remember after rows [N, …], [N, policy + critic]."""
+        """The memories of policy and critic after rows [N, …], [N, policy + critic]."""
         return torch.cat([self.policy.remember(obs), self.value.remember(obs)], dim=-1)
 
 
@@ -86,7 +86,7 @@ class ActionValues(nn.Module):
     """
 
     memory = None
-    """it has none"""
+    """no columns: Q learns without a memory"""
 
     def __init__(self, spec: Spec, layers: Layers, normalize_observations: bool) -> None:
         super().__init__()

@@ -183,5 +183,5 @@ class ActorCategoricalQ(nn.Module):
         return tuple(x.unflatten(0, shape) for x in (*values, next_log_prob, policy.mean, policy.log_std))
 
     def remember(self, obs: Tensor) -> Tensor:
-        """What policy and critic remember after rows [N, …], [N, policy + critic]."""
+        """The memories of policy and critic after rows [N, …], [N, policy + critic]."""
         return torch.cat([self.policy.remember(obs), remember(self.critic.net, self.critic.features(obs))], dim=-1)

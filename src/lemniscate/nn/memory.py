@@ -142,7 +142,7 @@ class OwnCell(OwnNetwork):
         return self.module(prepared, memory)
 
     def over(self, prepared: Tensor, goes_on: Tensor, memory: Tensor) -> Tensor:
-        """Of pieces, [P, L, inputs], [P, L, 1] and [P, L, size], to the outputs [P, L, outputs]; as `Remembering`."""
+        """The outputs [P, L, outputs] of pieces, [P, L, inputs], [P, L, 1] and [P, L, size]; see `Remembering`."""
         rows, after = [], memory[:, 0]
         for t in range(prepared.shape[1]):
             row, after = self.step(prepared[:, t], torch.where(goes_on[:, t], after, memory[:, t]) if t else after)
@@ -178,7 +178,7 @@ class GRU(nn.Module):
             nn.init.zeros_(layer.bias)
 
     def prepare(self, x: Tensor) -> Tensor:
-        """What does not depend on the memory: […, inputs] to […, 3 size]."""
+        """The products that do not depend on the memory, […, inputs] to […, 3 size]."""
         return self.input(self.layers(x))
 
     def step(self, prepared: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
@@ -188,7 +188,7 @@ class GRU(nn.Module):
         return after, after
 
     def over(self, prepared: Tensor, goes_on: Tensor, memory: Tensor) -> Tensor:
-        """Of pieces, [P, L, 3 size], [P, L, 1] and [P, L, size], to the outputs [P, L, size]; as `Remembering`."""
+        """The outputs [P, L, size] of pieces, [P, L, 3 size], [P, L, 1] and [P, L, size]; see `Remembering`."""
         by_time = prepared.movedim(1, 0), goes_on.movedim(1, 0), memory.movedim(1, 0)
         kind = _Pieces if torch.compiler.is_compiling() else _PiecesForward
         return kind.apply(*by_time, self.state.weight, self.state.bias).movedim(0, 1)
@@ -305,10 +305,8 @@ class Remembering(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """[B, I] or [B, L, I] to [B, outputs] or [B, L, outputs]."""
         prepared, goes_on, memory, action = self._parts(x)
-        if x.dim() < 3:
-            out, _ = self.cell.step(prepared, memory)
-            return self.head(torch.cat([out, action], dim=-1))
-        out = self.cell.over(prepared, goes_on == 1, memory)
+        in_pieces = x.dim() > 2
+        out = self.cell.over(prepared, goes_on == 1, memory) if in_pieces else self.cell.step(prepared, memory)[0]
         return self.head(torch.cat([out, action], dim=-1))
 
     def remember(self, x: Tensor) -> Tensor:

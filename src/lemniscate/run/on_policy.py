@@ -1,7 +1,7 @@
 """Settings and training state of the algorithms that learn from their newest rollout."""
 
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 import torch
 
@@ -85,22 +85,42 @@ class OnPolicyConfig(RunConfig):
 class ActorCriticConfig(OnPolicyConfig):
     """The settings of those that learn a policy and, beside it, a value."""
 
-    in_pieces: ClassVar[bool] = True
-    """whether they learn from pieces of a rollout, and so with a memory"""
     critic_hidden: tuple[Width, ...] | None = None
     """widths for the value, or for Q; usually as wide or wider; none: as hidden"""
     initial_log_std: LogStd = -0.5
     """initial log σ of a Gaussian policy, in units of half the action range; usually -1 to 0"""
-    network: str = "mlp"
-    """mlp, layer_norm, simba, gru (with a memory), or module:Class"""
-    sequence_length: Annotated[int, Range(2)] = 16
-    """steps of gradients in a memory, L; 8 to 64"""
-    shared_memory: bool = False
-    """the value sees the policy's memory"""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self.network_settings[1].check()
+
+    def networks(self, spec: Spec) -> Any:
+        """New networks for the spaces in `spec`: the policy and V(s)."""
+        layers, critic_layers, normalize = self.network_settings
+        return ActorCritic(spec, layers, self.initial_log_std, normalize, critic_layers=critic_layers)
+
+    @property
+    def widths(self) -> tuple[int, ...]:
+        """The widths of all hidden layers."""
+        return (*self.hidden, *(self.critic_hidden or ()))
+
+    @property
+    def network_settings(self) -> tuple[Layers, Layers, bool]:
+        """The hidden layers of the policy and of the value, and whether observations are normalized."""
+        critic_hidden = self.hidden if self.critic_hidden is None else self.critic_hidden
+        return self.layers, replace(self.layers, hidden=critic_hidden), self.normalize_observations
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecurrentConfig(ActorCriticConfig):
+    """The settings of those that learn from pieces of a rollout too, and so with a memory."""
+
+    network: str = "mlp"
+    """mlp, layer_norm, simba, gru (with a memory), or module:Class"""
+    sequence_length: Annotated[int, Range(2)] = 16
+    """steps of back-propagation through time, L"""
+    shared_memory: bool = False
+    """the value sees the policy's memory"""
 
     def networks(self, spec: Spec) -> Any:
         """New networks for the spaces in `spec`: the policy and V(s)."""
@@ -116,20 +136,9 @@ class ActorCriticConfig(OnPolicyConfig):
         return networks
 
     @property
-    def widths(self) -> tuple[int, ...]:
-        """The widths of all hidden layers."""
-        return (*self.hidden, *(self.critic_hidden or ()))
-
-    @property
-    def network_settings(self) -> tuple[Layers, Layers, bool]:
-        """The hidden layers of the policy and of the value, and whether observations are normalized."""
-        critic_hidden = self.hidden if self.critic_hidden is None else self.critic_hidden
-        return self.layers, replace(self.layers, hidden=critic_hidden), self.normalize_observations
-
-    @property
     def piece_length(self) -> int:
         """The steps of a piece of a rollout, L, where the networks have a memory."""
-        return min(self.sequence_length, self.num_steps) if self.in_pieces else 0
+        return min(self.sequence_length, self.num_steps)
 
     def _require_pieces(self) -> None:
         """Raise `UserError` where the steps of a rollout or the rows of a minibatch are no whole number of pieces."""
