@@ -232,3 +232,41 @@ def harder(step, metrics):
     """A level that grows with the step, and with what was reached."""
     assert not any(name.startswith("time/") for name in metrics)
     return {"set_level": np.float64(1 + step // 32 + min(metrics.get("episode/return", 0.0), 64.0) / 128)}
+
+
+class Walk(gym.Env):
+    """A walk to a goal on a line, in a plane or in space, at most 1 m a step: reward 0 within 0.5 m of it, else −1.
+
+    It ends at the goal where `ends`; at more than `edge` from the beginning it falls off, and ends too.
+    """
+
+    def __init__(self, ends=True, edge=100.0, limit=12, axes=1):
+        place = gym.spaces.Box(-1_000, 1_000, (axes,), np.float64)
+        clock = gym.spaces.Box(0, 10_000, (1,), np.float64)
+        self.observation_space = gym.spaces.Dict({"achieved_goal": place, "desired_goal": place, "observation": clock})
+        self.action_space = gym.spaces.Box(-1, 1, (axes,))
+        self.edge, self.limit = edge, limit
+        if ends:
+            self.compute_terminated = lambda achieved, desired, info: bool(np.linalg.norm(achieved - desired) < 0.5)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.x, self.t = np.zeros(self.action_space.shape), 0
+        self.goal = self.np_random.uniform(-8, 8, self.x.shape)
+        return self._see(), {}
+
+    def step(self, action):
+        self.x, self.t = self.x + action, self.t + 1
+        reward = self.compute_reward(self.x, self.goal, {})
+        ended = np.linalg.norm(self.x) > self.edge or (reward == 0 and hasattr(self, "compute_terminated"))
+        return self._see(), reward, bool(ended), self.t >= self.limit, {"is_success": reward == 0}
+
+    def compute_reward(self, achieved_goal, desired_goal, info):
+        return 0.0 if np.linalg.norm(achieved_goal - desired_goal) < 0.5 else -1.0
+
+    def _see(self):
+        return {
+            "observation": np.array([float(self.t)]),
+            "achieved_goal": self.x.copy(),
+            "desired_goal": self.goal.copy(),
+        }

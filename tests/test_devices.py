@@ -115,7 +115,7 @@ def train_twice(case, device, directory):
     path = checkpoint.write(directory, state.saved(), state.step, record, keep=1)
     for _ in range(2):
         env.restart(2)
-        state.on_restart()
+        state.on_restart(env)
         rows += [_update(module, config, env, state) for _ in range(2)]
         state = module.init(config, env.spec, device)
         checkpoint.read(path).restore(state)

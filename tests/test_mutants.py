@@ -322,14 +322,14 @@ MUTANTS = [
     ),
     (
         "no correction for the squashing",
-        "maths/bounded.py",
+        "maths/distributions.py",
         "(normal - _log_slope(u))",
         "(normal)",
         "maths/test_distributions.py",
     ),
     (
         "a slope that is half as steep",
-        "maths/bounded.py",
+        "maths/distributions.py",
         "return 2 * (math.log(2)",
         "return (math.log(2)",
         "maths/test_distributions.py",

@@ -71,7 +71,7 @@ def test_bins_follow_the_spread_of_the_returns_and_the_targets_share_them():
     torch.testing.assert_close(state.networks.bins.edges, torch.linspace(-4, 4, 102) * spread)
     play(config, state, env)
     assert state.reward_scale.running.any()
-    state.on_restart()
+    state.on_restart(env)
     assert not state.reward_scale.running.any()
 
 

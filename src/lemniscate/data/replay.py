@@ -1,6 +1,7 @@
 """Replay (Lin 1992; Mnih et al. 2015): a ring buffer of transitions, the steps that fill it, and their noise."""
 
 import math
+from collections.abc import Callable
 from typing import Literal
 
 import torch
@@ -13,6 +14,8 @@ from lemniscate.spec import Spec
 from lemniscate.types import Step, Transition
 
 Kind = Literal["white", "ou", "coloured"]
+Judge = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
+"""what an environment makes of achieved and desired goals, [B, G] each: the rewards [B], and whether an episode ends"""
 
 
 class ReplayBuffer:
@@ -45,6 +48,9 @@ class ReplayBuffer:
             if count > room:
                 ring[: count - room] = new[room:]
         self._written += count
+
+    def on_restart(self, judge: Judge) -> None:
+        """The environments have been restarted; `judge` is theirs, for buffers that tell episodes anew."""
 
     def sample_indices(self, minibatches: int, size: int, generator: Generator) -> Tensor:
         """Rows of `transitions`, drawn uniformly with replacement: [minibatches, size] int64."""

@@ -202,6 +202,13 @@ class Backend(ABC):
         cannot = f"{type(self).__name__} calls no methods of its environments, so there can be no curriculum"
         raise UserError(f"{cannot}; --backend gymnasium does, where it serves {self.spec.env_id}.")
 
+    def judge_goals(self, achieved: Tensor, desired: Tensor) -> tuple[Tensor, Tensor]:
+        """What the environment makes of goals [B, G]: the rewards float32 [B], and whether an episode ends bool [B].
+
+        Raises `UserError` where nothing in it says so.
+        """
+        raise UserError(f"{self.spec.env_id} judges no goals in the backend {type(self).__name__}, which replay needs.")
+
     @classmethod
     def ids(cls) -> Collection[str]:
         """The ids that it serves where no backend is named, for lists; may import heavy packages."""
@@ -292,6 +299,10 @@ class Joined(Backend):
         """Call methods of all of them; see `Backend.call`."""
         for backend in self._backends:
             backend.call(calls)
+
+    def judge_goals(self, achieved: Tensor, desired: Tensor) -> tuple[Tensor, Tensor]:
+        """The judgement of the first; see `Backend.judge_goals`."""
+        return self._backends[0].judge_goals(achieved, desired)
 
     def close(self) -> None:
         """Close them all."""

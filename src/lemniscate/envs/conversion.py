@@ -84,6 +84,25 @@ class SingleEnv(gym.Wrapper):
         flags = type(terminated) is bool and type(truncated) is bool
         return flags and isinstance(reward, float) and type(info) is dict
 
+    def judge_goals(self, achieved: np.ndarray, desired: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The reward [B] of having achieved goals where others were desired, [B, G] each; whether an episode ends [B].
+
+        Asked row by row, as `step` asks. Without `compute_terminated` no goal ends an episode. There is no info.
+        """
+        space: Any = self.observation_space
+        kind, shape = space["desired_goal"].dtype, space["desired_goal"].shape
+        pairs = [goals.astype(kind).reshape(-1, *shape) for goals in (achieved, desired)]
+        answers = np.zeros((2, len(achieved)), dtype=np.float32)
+        for row, name in zip(answers, ("compute_reward", "compute_terminated"), strict=True):
+            if name == "compute_reward" or self.has_wrapper_attr(name):
+                try:
+                    judge = self.get_wrapper_attr(name)
+                    row[:] = [float(judge(*pair, {})) for pair in zip(*pairs, strict=True)]
+                except (AttributeError, TypeError, ValueError, KeyError) as error:
+                    said = f"{type(error).__name__}: {error}"
+                    raise UserError(f"{name}(achieved_goal, desired_goal, {{}}) raised {said}.") from error
+        return answers[0], answers[1].astype(bool)
+
     def close(self) -> None:
         """Gymnasium's. An exception in it is said, and costs nothing that was learned."""
         try:

@@ -12,7 +12,14 @@ from torch import Tensor
 
 from lemniscate.envs import spaces
 from lemniscate.envs.backend import Backend
-from lemniscate.envs.conversion import flatten_observation, measured, measures_of, physical_action, row_of
+from lemniscate.envs.conversion import (
+    SingleEnv,
+    flatten_observation,
+    measured,
+    measures_of,
+    physical_action,
+    row_of,
+)
 from lemniscate.envs.factory import is_own, make_one, make_vector, maker_of, makes_vector, sentences
 from lemniscate.envs.returns import mask_in
 from lemniscate.envs.vec_env import Stagger
@@ -92,6 +99,7 @@ class GymnasiumBackend(Backend):
             raise UserError(f"{env} makes {num_envs} environments at once, so there is none for a process of its own.")
         wraps = tuple(map(find_callable, wrappers))
         self._build = partial(make_vector, maker, num_envs, dict(kwargs or {}), wraps, self.workers)
+        self._make_judge, self._judge = partial(make_one, maker, wraps, **(kwargs or {})), cast(SingleEnv | None, None)
         with sentences(env, kwargs, wrappers):
             self._envs, limit = self._build()
         mode = self._envs.metadata.get("autoreset_mode")
@@ -165,9 +173,25 @@ class GymnasiumBackend(Backend):
                 for env in self._envs.envs if isinstance(self._envs, SyncVectorEnv) else [cast(Any, self._envs).env]:
                     call_method(env, name, argument)
 
+    def judge_goals(self, achieved: Tensor, desired: Tensor) -> tuple[Tensor, Tensor]:
+        """By the environment's own `compute_reward` and `compute_terminated`, row by row, as they are called in a step.
+
+        Of environments in processes of their own, one more is made here to judge.
+        """
+        if isinstance(self._envs, SyncVectorEnv):
+            judge = cast(SingleEnv, self._envs.envs[0])
+        elif self.wraps(self.spec.env_id):
+            judge = self._judge = self._judge or self._make_judge()
+        else:
+            raise UserError(f"{self.spec.env_id} makes {self.num_envs} environments at once; goals are judged by one.")
+        reward, ended = judge.judge_goals(achieved.cpu().numpy(), desired.cpu().numpy())
+        return torch.from_numpy(reward).to(self.device), torch.from_numpy(ended).to(self.device)
+
     def close(self) -> None:
         """Close the environments and their workers."""
         self._envs.close()
+        if self._judge:
+            self._judge.close()
 
     def _with_final(self, obs: np.ndarray, info: dict, done: np.ndarray) -> np.ndarray:
         if not done.any():

@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 BACKENDS = {
     "crazyflow": "lemniscate.drones.crazyflow:CrazyflowBackend",
     "envpool": "lemniscate.envs.envpool:EnvpoolBackend",
-    "minatar": "lemniscate.envs.minatar:MinatarBackend",
+    "minatar": "lemniscate.envs.packages:MinatarBackend",
+    "robotics": "lemniscate.envs.packages:RoboticsBackend",
     "gymnasium": "lemniscate.envs.gymnasium:GymnasiumBackend",
     "gymnasium-async": "lemniscate.envs.gymnasium:AsyncGymnasiumBackend",
     "rsl_rl": "lemniscate.envs.rsl_rl:RslRlBackend",
@@ -28,6 +29,7 @@ BACKENDS = {
 BEGINNINGS = {
     "crazyflow": ("Drone",),
     "minatar": ("MinAtar/",),
+    "robotics": ("AdroitHand", "AntMaze_", "Fetch", "FrankaKitchen", "HandManipulate", "HandReach", "PointMaze_"),
     "envpool": (
         "EnvPool/",
         "Ant-v5",

@@ -1,8 +1,14 @@
 """The mathematics: pure functions on tensors, each with its equation and a test against brute force."""
 
-from lemniscate.maths.bounded import Deterministic, SquashedGaussian, mean_and_std
 from lemniscate.maths.discrete import Bernoulli, Categorical, EpsilonGreedy, MultiCategorical
-from lemniscate.maths.distributions import Distribution, Gaussian, tanh
+from lemniscate.maths.distributions import (
+    Deterministic,
+    Distribution,
+    Gaussian,
+    SquashedGaussian,
+    mean_and_std,
+    tanh,
+)
 from lemniscate.maths.losses import clipped_surrogate, policy_gradient, surrogate, value_loss
 from lemniscate.maths.noise import coloured, ornstein_uhlenbeck, uniform
 from lemniscate.maths.returns import episode_return, gae, q_lambda, reward_to_go

@@ -1,11 +1,13 @@
 """Settings and training state of the algorithms that learn from a replay buffer."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import torch
 
+from lemniscate.data.hindsight import HindsightReplay
 from lemniscate.data.replay import ActionNoise, Kind, ReplayBuffer, bytes_per_transition
+from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError
 from lemniscate.nn.networks import Activation, Layers, Matmul
 from lemniscate.run.config import Count, Fraction, Natural, NonNegative, NumEnvs, Positive, RunConfig, Scheduled, Width
@@ -21,6 +23,10 @@ class OffPolicyConfig(RunConfig):
     """parallel environments, N; usually 1 to 8"""
     gamma: Fraction = 0.99
     """discount factor γ; usually 0.95 to 0.999"""
+    replay: Literal["uniform", "hindsight"] = "uniform"
+    """uniform: transitions as they were; hindsight: also copies whose goals were reached, for sparse rewards"""
+    hindsight_goals: Count = 4
+    """copies of each transition that hindsight stores, k; usually 4 to 8"""
     buffer_size: Count = 1_000_000
     """transitions in the replay buffer; the oldest are replaced"""
     batch_size: Count = 256
@@ -77,7 +83,7 @@ class OffPolicyConfig(RunConfig):
                 f" each environment takes {self.steps_per_env - self.learning_starts // self.num_envs:,} steps."
             )
         self._require_divisible("batch_size")
-        for name in ("batch_size", "num_envs"):
+        for name in ("batch_size", "num_envs", *["hindsight_goals"] * (self.replay == "hindsight")):
             if self.capacity < (rows := getattr(self, name)):
                 raise UserError(
                     f"The replay buffer must hold a batch, and a step of every environment: the smaller of buffer_size"
@@ -117,7 +123,8 @@ class OffPolicyConfig(RunConfig):
     @property
     def capacity(self) -> int:
         """The rows of the replay buffer: no more than the run can fill."""
-        return min(self.buffer_size, self.num_envs * self.steps_per_env)
+        rows_per_step = 1 + self.hindsight_goals * (self.replay == "hindsight")
+        return min(self.buffer_size, self.num_envs * self.steps_per_env * rows_per_step)
 
     @property
     def steps_per_env(self) -> int:
@@ -131,8 +138,11 @@ class OffPolicyConfig(RunConfig):
         return self.num_updates * (updates - self.learning_starts // self.num_envs // self.update_every)
 
     def make_replay(self, spec: Spec, device: torch.device) -> ReplayBuffer:
-        """An empty replay buffer."""
-        return ReplayBuffer(spec, self.capacity, device)
+        """An empty replay buffer. Raises `UserError` for hindsight where there are no goals."""
+        if self.replay == "uniform":
+            return ReplayBuffer(spec, self.capacity, device)
+        copies = {"num_envs": self.num_envs, "goals": self.hindsight_goals, "seed": self.seed}
+        return HindsightReplay(spec, self.capacity, device, **copies)
 
     def make_action_noise(self, spec: Spec, device: torch.device) -> ActionNoise:
         """Action noise for the environments of a run; a sequence is as long as an episode may be."""
@@ -151,10 +161,11 @@ class OffPolicyState(TrainState[Networks]):
     updates: int = 0
     """gradient steps of the critics taken"""
 
-    def on_restart(self) -> None:
-        """Begin new sequences of action noise."""
-        super().on_restart()
+    def on_restart(self, env: VecEnv) -> None:
+        """Begin new sequences of action noise, and new episodes in the replay buffer."""
+        super().on_restart(env)
         self.action_noise.on_restart()
+        self.replay.on_restart(env.backend.judge_goals)
 
     def on_warm_start(self) -> None:
         """Copy the loaded networks into the targets."""

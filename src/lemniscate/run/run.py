@@ -287,7 +287,7 @@ class Run:
         if memory := getattr(state.networks, "memory", None):
             self.env.carrier = Carrier(memory, state.networks.remember)
         self.env.restart(seed, state.step)
-        state.on_restart()
+        state.on_restart(self.env)
 
     def _begin(self, state: TrainState) -> None:
         """Do what is done before step 0: load the networks of a warm start, and ask the curriculum."""

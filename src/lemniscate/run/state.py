@@ -9,6 +9,7 @@ from zlib import crc32
 
 import torch
 
+from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import RankError
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.nn.policies import Policy
@@ -63,7 +64,7 @@ class TrainState(Generic[Networks]):
             object.__setattr__(now, name, torch.tensor(schedule.at(progress), device=device))
         return now
 
-    def on_restart(self) -> None:
+    def on_restart(self, env: VecEnv) -> None:
         """Forget the running episodes: the environments have been restarted."""
 
     def on_warm_start(self) -> None:
@@ -98,9 +99,9 @@ class ScaledState(TrainState[Networks]):
 
     reward_scale: RewardScale
 
-    def on_restart(self) -> None:
+    def on_restart(self, env: VecEnv) -> None:
         """Forget the running returns."""
-        super().on_restart()
+        super().on_restart(env)
         self.reward_scale.on_restart()
 
 

@@ -1,7 +1,11 @@
-"""MinAtar: five games on 10 × 10 fields, a channel for each kind of thing (Young & Tian 2019, arXiv:1903.03176)."""
+"""Environments of packages that Gymnasium does not find by itself: MinAtar's games, and Gymnasium-Robotics."""
 
 import logging
 from collections.abc import Collection
+from contextlib import redirect_stderr
+from functools import cache
+from io import StringIO
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -21,7 +25,9 @@ PIXELS = 20
 
 
 class MinAtar(gym.Env):
-    """A game with the actions that have an effect in it; observations are images of bytes, 0 or 255.
+    """A game on 10 × 10 fields (Young & Tian 2019, arXiv:1903.03176), with the actions that have an effect in it.
+
+    Observations are images of bytes, 0 or 255, with a channel for each kind of thing.
 
     Args:
         game: the name of its module.
@@ -77,7 +83,7 @@ for _name, _game in GAMES.items():
     gym.registry.pop(f"{PREFIX}{_name}-v1", None)  # the package's own, whose observations are no bytes
     gym.register(
         f"{PREFIX}{_name}-v1",
-        entry_point="lemniscate.envs.minatar:MinAtar",
+        entry_point="lemniscate.envs.packages:MinAtar",
         max_episode_steps=LIMIT,
         kwargs={"game": _game},
     )
@@ -100,3 +106,34 @@ class MinatarBackend(GymnasiumBackend):
     def exists_once(cls, env: str, num_envs: int) -> bool:
         """There can be many."""
         return False
+
+
+class RoboticsBackend(GymnasiumBackend):
+    """Gymnasium-Robotics by its own ids: arms and hands with goals (Plappert et al. 2018, arXiv:1802.09464), mazes."""
+
+    @classmethod
+    def ids(cls) -> Collection[str]:
+        """Those that need no older MuJoCo, where the package is installed."""
+        return _robotics() if is_installed("gymnasium_robotics") else []
+
+    @classmethod
+    def serves(cls, env: str) -> bool:
+        """Its ids. Raises `UserError` where the package is not installed."""
+        if not is_installed("gymnasium_robotics"):
+            raise missing_extra("gymnasium_robotics", "robotics")
+        return env in _robotics()
+
+
+@cache
+def _robotics() -> list[str]:
+    """The ids of the package, which registers them when it is imported.
+
+    It compares kinds of joints with numbers in an order that MuJoCo 4 no longer knows; it is given the bare numbers.
+    """
+    with redirect_stderr(StringIO()):  # its news, at every start
+        import mujoco
+        from gymnasium_robotics.utils import mujoco_utils  # pyright: ignore[reportMissingImports]
+    joints = SimpleNamespace(**{name: int(kind) for name, kind in vars(mujoco)["mjtJoint"].__members__.items()})
+    mujoco_utils.mujoco = SimpleNamespace(**{**vars(mujoco), "mjtJoint": joints})
+    points = {name: str(spec.entry_point) for name, spec in gym.registry.items()}
+    return [name for name, point in points.items() if point.startswith("gymnasium_robotics.") and "Py" not in point]

@@ -1,0 +1,234 @@
+"""Hindsight replay: every copy is a step that was taken, with a goal that was reached later, judged by its environment."""
+
+from functools import partial
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch
+
+import lemniscate as lem
+from environments import Walk
+from lemniscate.algos import ddpg, sac, td3
+from lemniscate.data.hindsight import HindsightReplay, goal_columns
+from lemniscate.envs import registry
+from lemniscate.errors import UserError, is_installed
+from lemniscate.testing import check_resume
+
+CPU = torch.device("cpu")
+ACHIEVED, DESIRED, TIME = 0, 1, 2  # the columns of `Walk`, whose keys Gymnasium sorts
+SMALL = {
+    "replay": "hindsight",
+    "num_envs": 2,
+    "total_steps": 512,
+    "log_every": 64,
+    "learning_starts": 64,
+    "batch_size": 16,
+    "hidden": (16,),
+    "critic_hidden": (16,),
+    "evaluate_episodes": 2,
+}
+
+
+def played(env, steps, num_envs=3, goals=4, capacity=20_000, backend=None, **kwargs):
+    """A buffer after so many random steps, and every step that was taken: rows of (environment, obs, …, ended)."""
+    made = registry.make(env, num_envs, kwargs=kwargs, backend=backend)
+    replay = HindsightReplay(made.spec, capacity, CPU, num_envs=num_envs, goals=goals, seed=3)
+    made.restart(5)
+    replay.on_restart(made.backend.judge_goals)
+    generator, taken = torch.Generator().manual_seed(0), []
+    for _ in range(steps):
+        obs, action = made.obs, torch.rand(num_envs, 1, generator=generator) * 2 - 1
+        step = made.step(action)
+        replay.add(obs, action, step)
+        taken.append((obs, action, step))
+    made.close()
+    return replay, taken
+
+
+def episodes_of(taken, num_envs):
+    """The whole episodes in the order of their ends: lists of (obs, action, reward, next_obs, terminated)."""
+    under_way, whole = [[] for _ in range(num_envs)], []
+    for obs, action, step in taken:
+        for i in range(num_envs):
+            row = obs[i], action[i], step.reward[i], step.next_obs[i], step.terminated[i]
+            under_way[i].append(row)
+            if step.terminated[i] or step.truncated[i]:
+                whole.append(under_way[i])
+                under_way[i] = []
+    return whole
+
+
+@pytest.mark.parametrize("backend", [None, "gymnasium-async"])
+@pytest.mark.parametrize(("ends", "edge"), [(True, 100.0), (False, 100.0), (True, 2.0), (False, 2.0)])
+def test_each_episode_is_stored_as_it_was_and_with_goals_that_were_reached_later(ends, edge, backend):
+    """By brute force: rewards and ends of the copies from the rules that `Walk` is described by."""
+    replay, taken = played("environments:Walk", 60, ends=ends, edge=edge, limit=12, backend=backend)
+    rows, at = replay.transitions, 0
+    episodes = episodes_of(taken, 3)
+    assert len(episodes) > 12
+    for episode in episodes:
+        for name, column in zip(vars(rows), zip(*episode, strict=True), strict=True):
+            assert torch.equal(getattr(rows, name)[at : at + len(episode)], torch.stack(column))
+        at += len(episode)
+        reached = [float(row[3][ACHIEVED]) for row in episode]
+        for t, (obs, action, _, next_obs, _) in enumerate(episode):
+            for copy in range(at, at + 4):
+                goal = float(rows.obs[copy, DESIRED])
+                assert goal in reached[t:]
+                assert float(rows.next_obs[copy, DESIRED]) == goal
+                for was, now in ((obs, rows.obs[copy]), (next_obs, rows.next_obs[copy])):
+                    assert torch.equal(was[[ACHIEVED, TIME]], now[[ACHIEVED, TIME]])
+                assert torch.equal(action, rows.action[copy])
+                x = float(next_obs[ACHIEVED])
+                there = abs(x - goal) < 0.5
+                assert float(rows.reward[copy]) == (0.0 if there else -1.0)
+                assert bool(rows.terminated[copy]) == ((ends and there) or abs(x) > edge)
+            at += 4
+    assert at == len(replay)
+
+
+def test_the_goals_are_drawn_uniformly_from_the_rest_of_the_episode():
+    replay, taken = played("environments:Walk", 2_000, num_envs=1, goals=8, capacity=200_000, ends=False, limit=4)
+    counts, at = np.zeros((4, 4)), 0
+    for episode in episodes_of(taken, 1):
+        reached = [float(row[3][ACHIEVED]) for row in episode]
+        for t in range(len(episode)):
+            for copy in range(8):
+                goal = float(replay.transitions.obs[at + len(episode) + 8 * t + copy, DESIRED])
+                counts[t, reached.index(goal)] += len(episode) == 4
+        at += 9 * len(episode)
+    shares = counts / counts.sum(1, keepdims=True)
+    assert not np.tril(counts, -1).any()
+    for t in range(4):
+        expected = 1 / (4 - t)
+        assert np.abs(shares[t, t:] - expected).max() < 5 * np.sqrt(expected / counts[t].sum())
+
+
+def test_without_a_time_limit_a_piece_is_stored_after_a_thousand_steps():
+    replay, _ = played("environments:Walk", 1_001, num_envs=1, goals=1, ends=False, limit=10_000)
+    assert len(replay) == 2_000
+
+
+def test_a_restart_drops_the_episodes_under_way():
+    replay, taken = played("environments:Walk", 11, ends=False)
+    assert len(replay) == 0
+    replay.on_restart(lambda achieved, desired: pytest.fail("nothing has ended"))
+    obs, action, step = taken[0]
+    replay.add(obs, action, step)
+    assert [len(episode) for episode in replay._episodes] == [1, 1, 1]
+
+
+@pytest.mark.parametrize("algo", ["ddpg", "td3", "sac"])
+def test_a_resumed_run_ends_in_the_bits_of_one_that_was_not_stopped(algo, tmp_path):
+    check_resume(algo, tmp_path, env="environments:Walk", **SMALL, checkpoint_every=128)
+
+
+@pytest.mark.parametrize("algo", [ddpg, td3, sac], ids=["ddpg", "td3", "sac"])
+def test_each_algorithm_that_learns_from_replay_has_it(algo):
+    spec = registry.make("environments:Walk", 2).spec
+    config = algo.Config(env="environments:Walk", **SMALL)
+    replay = algo.init(config, spec, CPU).replay
+    assert isinstance(replay, HindsightReplay)
+    assert replay.capacity == config.capacity == 5 * 512
+    assert (
+        config.memory(spec)["buffer_size"]
+        == 5 * algo.Config(env="x", **SMALL | {"replay": "uniform"}).memory(spec)["buffer_size"]
+    )
+
+
+def test_a_goal_that_chance_never_meets_is_learned_with_hindsight_and_not_without(tmp_path):
+    fields = {
+        "env_kwargs": {"limit": 16, "axes": 2},
+        "total_steps": 2_500,
+        "learning_starts": 200,
+        "log_every": 100,
+        "gamma": 0.9,
+        "tau": 0.02,
+        "batch_size": 64,
+        "hidden": (32, 32),
+        "critic_hidden": (32, 32),
+        "actor_learning_rate": 1e-3,
+        "critic_learning_rate": 1e-3,
+        "initial_temperature": 0.1,
+        "num_envs": 2,
+        "evaluate_episodes": 32,
+        "progress": False,
+    }
+    success = {}
+    for replay in ("hindsight", "uniform"):
+        run = lem.train("sac", Walk, run=tmp_path / replay, replay=replay, **fields)
+        success[replay] = lem.evaluate(run, episodes=64).measures["is_success_at_end"]
+    assert success["hindsight"] > 0.9, success
+    assert success["uniform"] < 0.3, success
+
+
+def other(compute_reward):
+    """`Walk` with another function, or none, which a step does not ask."""
+    step = lambda self, action: (self._see(), -1.0, False, True, {})  # noqa: E731
+    return type("Other", (Walk,), {"compute_reward": compute_reward, "step": step})
+
+
+class Silent(gym.Env):
+    """Goals without rewards."""
+
+    observation_space = gym.spaces.Dict(dict.fromkeys(("achieved_goal", "desired_goal"), gym.spaces.Box(-1, 1, (2,))))
+    action_space = gym.spaces.Box(-1, 1, (1,))
+
+    def reset(self, *, seed=None, options=None):
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        return self.observation_space.sample(), 0.0, True, False, {}
+
+
+@pytest.mark.parametrize(
+    ("env", "sentence"),
+    [
+        ("Pendulum-v1", "replay is hindsight, which needs goals, and Pendulum-v1 has none"),
+        (Silent, r"compute_reward\(achieved_goal, desired_goal, \{\}\) raised .* no attribute 'compute_reward'"),
+        (other(lambda self, achieved, desired: -1.0), "takes 3 positional arguments but 4 were given"),
+        (other(lambda self, achieved, desired, info: info["distance"]), "KeyError: 'distance'"),
+        (other(lambda self, achieved, desired, info: abs(achieved - desired) * np.ones(2)), "compute_reward"),
+    ],
+)
+def test_what_has_no_goals_or_judges_them_otherwise_than_in_a_step_is_said(env, sentence, tmp_path):
+    with pytest.raises(UserError, match=sentence):
+        lem.train("sac", env, run=tmp_path / "r", progress=False, **SMALL)
+
+
+def test_a_wrapper_that_changes_rewards_is_found_out(tmp_path):
+    double = partial(gym.wrappers.TransformReward, func=lambda reward: 2 * reward)
+    with pytest.raises(UserError, match=r"the reward of .* is -2, and its compute_reward says -1: hindsight needs"):
+        lem.train("sac", Walk, run=tmp_path / "r", wrappers=[double], progress=False, **SMALL)
+
+
+def test_flattened_observations_have_no_goals(tmp_path):
+    with pytest.raises(UserError, match="which needs goals"):
+        lem.train("sac", Walk, run=tmp_path / "r", wrappers=[gym.wrappers.FlattenObservation], progress=False, **SMALL)
+
+
+def test_a_buffer_that_holds_no_episode_with_its_copies_holds_pieces(tmp_path):
+    replay, taken = played("environments:Walk", 12, num_envs=1, goals=4, capacity=19, ends=False)
+    obs = torch.cat([obs for obs, _, _ in taken])
+    assert len(replay) == 19
+    for row in replay.transitions.obs:
+        assert (row[[ACHIEVED, TIME]] == obs[:, [ACHIEVED, TIME]]).all(1).any()
+    with pytest.raises(UserError, match="is below hindsight_goals 32"):
+        lem.train("sac", Walk, run=tmp_path / "r", buffer_size=31, hindsight_goals=32, progress=False, **SMALL)
+
+
+@pytest.mark.skipif(not is_installed("gymnasium_robotics"), reason="the extra robotics is not installed")
+@pytest.mark.parametrize("env", ["FetchReach-v4", "FetchPush-v4", "HandReach-v3", "PointMaze_UMaze-v3"])
+def test_gymnasium_robotics_judges_goals_as_in_a_step(env):
+    made = registry.make(env, 2)
+    obs = made.restart(0)
+    achieved, desired = goal_columns(made.spec)
+    for _ in range(12):
+        step = made.step(torch.rand(2, made.spec.action.size) * 2 - 1)
+        reward, ends = made.backend.judge_goals(step.next_obs[:, achieved], step.next_obs[:, desired])
+        torch.testing.assert_close(reward, step.reward, rtol=1e-4, atol=1e-5)
+        assert torch.equal(ends, step.terminated)
+    reward, _ = made.backend.judge_goals(obs[:, achieved], obs[:, achieved])
+    assert (reward == (0.0 if "Maze" not in env else 1.0)).all()
+    made.close()
