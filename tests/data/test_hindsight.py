@@ -13,7 +13,9 @@ from lemniscate.algos import ddpg, sac, td3
 from lemniscate.data.hindsight import HindsightReplay, goal_columns
 from lemniscate.envs import registry
 from lemniscate.errors import UserError, is_installed
+from lemniscate.spec import Box, ObservationPart, Spec
 from lemniscate.testing import check_resume
+from lemniscate.types import Step
 
 CPU = torch.device("cpu")
 ACHIEVED, DESIRED, TIME = 0, 1, 2  # the columns of `Walk`, whose keys Gymnasium sorts
@@ -117,6 +119,29 @@ def test_a_restart_drops_the_episodes_under_way():
     obs, action, step = taken[0]
     replay.add(obs, action, step)
     assert [len(episode) for episode in replay._episodes] == [1, 1, 1]
+
+
+def test_reset_rows_belong_to_no_episode():
+    parts = tuple(ObservationPart((name,), (1,)) for name in ("achieved_goal", "desired_goal"))
+    replay = HindsightReplay(Spec("x", parts, Box((-1.0,), (1.0,)), 3), 100, CPU, num_envs=1, goals=1, seed=0)
+    replay.on_restart(lambda achieved, desired: (torch.zeros(len(achieved)), torch.zeros(len(achieved)) > 0))
+    for t in range(8):  # NEXT_STEP: after two steps and an end, an action is ignored
+        at, reward = torch.full((1, 2), float(t)), torch.full((1,), 100.0 * (t % 3 == 2))
+        flags = torch.tensor([False]), torch.tensor([t % 3 == 1]), torch.tensor([t % 3 != 2])
+        replay.add(at, torch.zeros(1, 1), Step(at + 1, at + 1, reward, *flags))
+    assert replay.transitions.obs[: len(replay), 0].tolist() == [0, 1, 0, 1, 3, 4, 3, 4, 6, 7, 6, 7]
+
+
+def test_a_vector_environment_judges_no_goals():
+    backend = registry.make("toy:Countdown", 2).backend
+    with pytest.raises(UserError, match="makes 2 environments at once; goals are judged by one"):
+        backend.judge_goals(torch.zeros(1, 1), torch.zeros(1, 1))
+
+
+def test_a_backend_without_single_environments_judges_no_goals():
+    backend = registry.make("CartPole-v1", 2, backend="envpool").backend
+    with pytest.raises(UserError, match=r"CartPole-v1 judges no goals in the backend EnvpoolBackend"):
+        backend.judge_goals(torch.zeros(1, 1), torch.zeros(1, 1))
 
 
 @pytest.mark.parametrize("algo", ["ddpg", "td3", "sac"])
