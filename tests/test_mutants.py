@@ -16,6 +16,7 @@ ON, OFF, REINFORCE, PPO, TRPO, REPPO, PQN, DDPG, TD3, SAC = (
 )
 MEMORY = "test_memory.py::test_"
 INTERACT, ROLLOUT = (f"data/test_{name}.py::test_" for name in ("interact", "rollout"))
+HINDSIGHT = "data/test_hindsight.py::test_"
 
 MUTANTS = [
     # what goes wrong, file, the right line, the wrong line, the tests that must notice
@@ -886,6 +887,69 @@ MUTANTS = [
         "(state.updates + k) % config.policy_delay == 0",
         "True",
         OFF + "policy_and_targets_move_at_every_dth_step_of_the_critics",
+    ),
+    (
+        "goals that were reached before",
+        "data/hindsight.py",
+        ".integers(times, length)",
+        ".integers(0, times + 1)",
+        HINDSIGHT + "each_episode_is_stored_as_it_was_and_with_goals_that_were_reached_later",
+    ),
+    (
+        "the last goal of the episode alone",
+        "data/hindsight.py",
+        ".integers(times, length)",
+        ".integers(np.full_like(times, length - 1), length)",
+        HINDSIGHT + "the_goals_are_drawn_uniformly_from_the_rest_of_the_episode",
+    ),
+    (
+        "the reward of the goal that was missed",
+        "data/hindsight.py",
+        "reward=reward, ",
+        "",
+        HINDSIGHT + "each_episode_is_stored_as_it_was_and_with_goals_that_were_reached_later",
+    ),
+    (
+        "a fall is forgotten with the goal",
+        "data/hindsight.py",
+        "terminated=ends | fell[torch.from_numpy(times)]",
+        "terminated=ends",
+        HINDSIGHT + "each_episode_is_stored_as_it_was_and_with_goals_that_were_reached_later",
+    ),
+    (
+        "a goal reached before ends the copies too",
+        "data/hindsight.py",
+        "& ~ends\n",
+        "\n",
+        HINDSIGHT + "each_episode_is_stored_as_it_was_and_with_goals_that_were_reached_later",
+    ),
+    (
+        "the successor keeps the goal that was missed",
+        "data/hindsight.py",
+        "for obs in (copies.obs, copies.next_obs):",
+        "for obs in (copies.obs,):",
+        HINDSIGHT + "each_episode_is_stored_as_it_was_and_with_goals_that_were_reached_later",
+    ),
+    (
+        "reset rows in episodes",
+        "data/hindsight.py",
+        "step.valid.nonzero()",
+        "(step.valid | True).nonzero()",
+        HINDSIGHT + "reset_rows_belong_to_no_episode",
+    ),
+    (
+        "half an episode before a restart is joined to one after it",
+        "data/hindsight.py",
+        "            episode.clear()\n\n    def add",
+        "            pass\n\n    def add",
+        HINDSIGHT + "a_restart_drops_the_episodes_under_way",
+    ),
+    (
+        "rewards that a wrapper changes go unnoticed",
+        "data/hindsight.py",
+        "if len(wrong):",
+        "if False:",
+        HINDSIGHT + "a_wrapper_that_changes_rewards_is_found_out",
     ),
     (
         "the ring tears rows apart",

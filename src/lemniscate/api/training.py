@@ -28,6 +28,7 @@ from lemniscate.run.state import TrainState
 from lemniscate.system import named
 from lemniscate.system.console import say
 from lemniscate.system.files import make_directory, parsing
+from lemniscate.system.machine import keep_freed_memory
 from lemniscate.system.world import CLUSTER, World
 
 if TYPE_CHECKING:
@@ -286,6 +287,7 @@ def _train_here(
     progress = options.progress and world.is_first
     set_seeds(config.seed)  # before JAX starts, which reads its flags then
     torch.set_num_threads(config.threads)
+    keep_freed_memory()
     envs = envs_of(config, world)
     spec = envs[0].spec
 

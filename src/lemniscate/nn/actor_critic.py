@@ -19,6 +19,9 @@ from lemniscate.nn.policies import (
 )
 from lemniscate.spec import Action, Box, Discrete, MultiDiscrete, Spec
 
+CHUNK = 4096
+"""rows that a network takes at once where all are given: what comes of more does not stay in a processor's cache"""
+
 
 class Value(nn.Module):
     """V(s), behind the policy's observation normalizer; it sees the P = `privileged` numbers too, as they are."""
@@ -69,9 +72,13 @@ class ActorCritic(nn.Module):
 
     def estimates(self, obs: Tensor, next_obs: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """V(s), V(s') and log π(a|s) of rows [T, N, …], [T, N] each."""
-        shape, obs = obs.shape[:2], obs.flatten(0, 1)  # rows, not pieces
-        rows = self.value(obs), self.value(next_obs.flatten(0, 1)), self.policy(obs).log_prob(action.flatten(0, 1))
-        return rows[0].view(shape), rows[1].view(shape), rows[2].view(shape)
+        s, after, a = obs.flatten(0, 1), next_obs.flatten(0, 1), action.flatten(0, 1)  # rows, not pieces
+        parts = []
+        for begin in range(0, len(s), CHUNK):
+            rows = slice(begin, begin + CHUNK)
+            parts.append((self.value(s[rows]), self.value(after[rows]), self.policy(s[rows]).log_prob(a[rows])))
+        value, next_value, log_prob = map(torch.cat, zip(*parts, strict=True))
+        return value.view(obs.shape[:2]), next_value.view(obs.shape[:2]), log_prob.view(obs.shape[:2])
 
     def remember(self, obs: Tensor) -> Tensor:
         """The memories of policy and critic after rows [N, …], [N, policy + critic]."""
