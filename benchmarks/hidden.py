@@ -1,7 +1,17 @@
-"""Environments that say too little at each step, for policies with a memory: here, `--env hidden:cart_pole`."""
+"""Environments that say too little at each step, for policies with a memory: here, `--env hidden:cart_pole`.
+
+And the drones without velocities: `--env DroneFigureEightTrajectory-v0 --backend hidden:SlowEyes`.
+"""
+
+from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
+import torch
+from torch import Tensor
+
+from lemniscate.drones.crazyflow import CrazyflowBackend
+from lemniscate.types import Step
 
 
 class Without(gym.ObservationWrapper):
@@ -64,3 +74,26 @@ class RepeatFirst(gym.Env):
 
     def _show(self, suit: int) -> np.ndarray:
         return np.append(np.eye(4)[suit], self.t == 0).astype(np.float32)
+
+
+class SlowEyes(CrazyflowBackend):
+    """Crazyflow's drones, which see neither their velocity nor their angular velocity."""
+
+    def __init__(self, *args, **kwargs) -> None:
+        super().__init__(*args, **kwargs)
+        parts, places = self.spec.observation_parts, torch.arange(self.spec.observation_size)
+        pieces = dict(zip(parts, places.split([part.size for part in parts]), strict=True))
+        seen = [part for part in parts if part.name not in ("vel", "ang_vel")]
+        self._seen = torch.cat([pieces[part] for part in seen])
+        self.spec = replace(self.spec, observation_parts=tuple(seen))
+        self.baseline = self.scene = None
+
+    def restart(self, seed: int, first: int = 0) -> Tensor:
+        """Without velocities."""
+        return super().restart(seed, first)[:, self._seen]
+
+    def step(self, action: Tensor) -> Step:
+        """Without velocities."""
+        step = super().step(action)
+        obs, next_obs = (rows[:, self._seen].contiguous() for rows in (step.obs, step.next_obs))
+        return replace(step, obs=next_obs if step.obs is step.next_obs else obs, next_obs=next_obs)

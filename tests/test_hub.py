@@ -98,6 +98,19 @@ def test_what_is_uploaded_is_loaded_again_bit_for_bit(run, pushed, server):
     assert lem.evaluate(ADDRESS, episodes=3).returns == lem.evaluate(run, episodes=3).returns
 
 
+def test_a_policy_that_remembers_plays_the_same_episode_from_the_hub(server, tmp_path):
+    fields = {"network": "gru", "sequence_length": 8, "num_steps": 16}
+    run = lem.train(
+        "ppo", "CartPole-v1", run=tmp_path / "gru", progress=False, **{**tiny_fields("CartPole-v1"), **fields}
+    )
+    lem.push(run, "anna/gru")
+    policy = lem.load("hf://anna/gru")
+    states = np.random.default_rng(0).normal(size=(30, 4)).astype(np.float32)
+    played = [[one.act(obs) for obs in states] for one in (policy, run.policy)]
+    assert played[0] == played[1]
+    assert lem.evaluate(policy, episodes=3).returns == lem.evaluate(run, episodes=3).returns
+
+
 def test_all_is_in_one_commit_that_has_no_path_token_or_pickle(run, pushed):
     shown = {"README.md", "final.json", "plots/learning_curve.png", "videos/my flight.gif"}
     export = {"export/policy.onnx", "export/c/policy.c"}
