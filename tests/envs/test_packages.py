@@ -1,4 +1,4 @@
-"""MinAtar's games: their ids, their pictures as bytes, and what is said where the package is missing."""
+"""MinAtar's games and Gymnasium-Robotics: ids, observations, and what is said where a package is missing."""
 
 import numpy as np
 import pytest
@@ -57,3 +57,23 @@ def test_a_field_can_be_drawn():
     picture = env.render()
     assert picture.shape == (200, 200, 3)
     assert len(np.unique(picture)) > 2
+
+
+@pytest.mark.skipif(not is_installed("gymnasium_robotics"), reason="the extra robotics is not installed")
+@pytest.mark.parametrize("env", ["FetchReach-v4", "HandReach-v3", "AntMaze_UMaze-v5", "AdroitHandDoor-v1"])
+def test_robots_are_served_by_their_ids_and_repeat_themselves(env, capfd):
+    assert registry.backend_for(env) == "robotics"
+    made = registry.make(env, 2)
+    torch.manual_seed(0)
+    first = play(made, 20)
+    torch.manual_seed(0)
+    assert torch.equal(first.obs, play(made, 20).obs)
+    assert not torch.equal(first.obs[:, 0], first.obs[:, 1])
+    made.close()
+    assert "v1 reproducibility" not in capfd.readouterr().err
+
+
+def test_where_the_robots_are_missing_the_extra_is_named(monkeypatch):
+    monkeypatch.setattr("lemniscate.envs.packages.is_installed", lambda package: False)
+    with pytest.raises(UserError, match="gymnasium_robotics is not installed; it comes with the extra robotics"):
+        registry.make("FetchReach-v4", 1)
