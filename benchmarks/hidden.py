@@ -77,23 +77,25 @@ class RepeatFirst(gym.Env):
 
 
 class SlowEyes(CrazyflowBackend):
-    """Crazyflow's drones, which see neither their velocity nor their angular velocity."""
+    """Crazyflow's drones, whose policy sees neither velocity nor angular velocity; its critic does, as privileged."""
 
     def __init__(self, *args, **kwargs) -> None:
         super().__init__(*args, **kwargs)
         parts, places = self.spec.observation_parts, torch.arange(self.spec.observation_size)
-        pieces = dict(zip(parts, places.split([part.size for part in parts]), strict=True))
-        seen = [part for part in parts if part.name not in ("vel", "ang_vel")]
-        self._seen = torch.cat([pieces[part] for part in seen])
-        self.spec = replace(self.spec, observation_parts=tuple(seen))
+        seen, hidden = [], []
+        for part, columns in zip(parts, places.split([part.size for part in parts]), strict=True):
+            (hidden if part.name in ("vel", "ang_vel") else seen).append((part, columns))
+        self._order = torch.cat([columns for _, columns in (*seen, *hidden)])
+        size = sum(part.size for part, _ in hidden)
+        self.spec = replace(self.spec, observation_parts=tuple(part for part, _ in seen), privileged=size)
         self.baseline = self.scene = None
 
     def restart(self, seed: int, first: int = 0) -> Tensor:
-        """Without velocities."""
-        return super().restart(seed, first)[:, self._seen]
+        """With the velocities behind the observation."""
+        return super().restart(seed, first)[:, self._order]
 
     def step(self, action: Tensor) -> Step:
-        """Without velocities."""
+        """With the velocities behind the observation."""
         step = super().step(action)
-        obs, next_obs = (rows[:, self._seen].contiguous() for rows in (step.obs, step.next_obs))
-        return replace(step, obs=next_obs if step.obs is step.next_obs else obs, next_obs=next_obs)
+        next_obs = step.next_obs[:, self._order]
+        return replace(step, obs=next_obs if step.obs is step.next_obs else step.obs[:, self._order], next_obs=next_obs)
