@@ -208,8 +208,8 @@ class Backend(ABC):
         Raises `UserError` where nothing in it says so.
         """
         raise UserError(
-            f"{self.spec.env_id} judges no goals in the backend {type(self).__name__}; hindsight is for single environments"
-            " of Gymnasium's interface, which have compute_reward. --replay uniform learns from any."
+            f"{self.spec.env_id} judges no goals in the backend {type(self).__name__}; hindsight is for single"
+            " environments of Gymnasium's interface with compute_reward. --replay uniform learns from any."
         )
 
     @classmethod
