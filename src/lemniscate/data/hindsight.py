@@ -22,8 +22,8 @@ class HindsightReplay(ReplayBuffer):
     """A replay buffer of whole episodes, with copies whose goals were achieved later in the same episode.
 
     Algorithm 1 with the strategy "future" (section 4.5). An episode is stored when it ends; one that a checkpoint cuts
-    is dropped. The rewards and ends of the copies are the environment's own answers: an end that the first goal does
-    not explain, such as a fall, stays one.
+    is dropped. The rewards and ends of the copies are the environment's own answers; an episode that was terminated,
+    by its goal or by a fall, ends with its last step in any case.
 
     Args:
         spec: of an environment whose observation is a Dict with `achieved_goal` and `desired_goal`.
@@ -73,17 +73,16 @@ class HindsightReplay(ReplayBuffer):
         """Each transition t k times, with goals achieved after steps drawn uniformly from t, …, T − 1; [k · T] rows."""
         assert self._judge is not None
         length = len(episode.reward)
-        reward, ends = self._judge(episode.next_obs[:, self._achieved], episode.next_obs[:, self._desired])
         if not self._trusted:
+            reward, _ = self._judge(episode.next_obs[:, self._achieved], episode.next_obs[:, self._desired])
             self._compare(episode.reward, reward)
-        fell = episode.terminated & ~ends
         times = np.repeat(np.arange(length), self._goals)
         later = np.random.default_rng((self._seed, self._written)).integers(times, length)
         copies, goal = episode[torch.from_numpy(times)], episode.next_obs[torch.from_numpy(later), self._achieved]
         reward, ends = self._judge(copies.next_obs[:, self._achieved], goal)
         for obs in (copies.obs, copies.next_obs):
             obs[:, self._desired] = goal
-        return replace(copies, reward=reward, terminated=ends | fell[torch.from_numpy(times)])
+        return replace(copies, reward=reward, terminated=ends | copies.terminated)  # the last step has no later goal
 
     def _compare(self, given: Tensor, judged: Tensor) -> None:
         """Raise `UserError` where the judge does not give the rewards that an episode had."""
