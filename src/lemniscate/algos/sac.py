@@ -34,7 +34,7 @@ class Config(OffPolicyConfig):
     initial_temperature: Positive = 1.0
     """initial α; it is learned with actor_learning_rate"""
     target_entropy: Finite | None = None
-    """H̄ in nats, the entropy that the temperature aims at, over actions in [-1, 1]^A; none: −A"""
+    """H̄ in nats, at which the temperature aims, over actions in [-1, 1]^A; none: −A"""
     value_range: Positive | None = None
     """bins of Q reach so many std of the return, usually 5 to 20; none: Q is a number"""
     unit_weights: bool = False

@@ -130,9 +130,11 @@ def _robotics() -> list[str]:
 
     It compares kinds of joints with numbers in an order that MuJoCo 4 no longer knows; it is given the bare numbers.
     """
+    before = dict(gym.registry)
     with redirect_stderr(StringIO()):  # its news, at every start
         import mujoco
         from gymnasium_robotics.utils import mujoco_utils  # pyright: ignore[reportMissingImports]
+    gym.registry.update(before)  # it takes over ids of Gymnasium's that need an older MuJoCo
     joints = SimpleNamespace(**{name: int(kind) for name, kind in vars(mujoco)["mjtJoint"].__members__.items()})
     mujoco_utils.mujoco = SimpleNamespace(**{**vars(mujoco), "mjtJoint": joints})
     points = {name: str(spec.entry_point) for name, spec in gym.registry.items()}

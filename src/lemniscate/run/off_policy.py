@@ -24,9 +24,9 @@ class OffPolicyConfig(RunConfig):
     gamma: Fraction = 0.99
     """discount factor γ; usually 0.95 to 0.999"""
     replay: Literal["uniform", "hindsight"] = "uniform"
-    """uniform: transitions as they were; hindsight: also copies whose goals were reached, for sparse rewards"""
+    """hindsight: also with goals that were reached"""
     hindsight_goals: Count = 4
-    """copies of each transition that hindsight stores, k; usually 4 to 8"""
+    """goals for each transition, k; usually 4 to 8"""
     buffer_size: Count = 1_000_000
     """transitions in the replay buffer; the oldest are replaced"""
     batch_size: Count = 256
@@ -44,15 +44,15 @@ class OffPolicyConfig(RunConfig):
     critic_learning_rate: Scheduled[Positive] = 3e-4
     """step size of the critics' Adam; usually 1e-4 to 1e-3"""
     final_learning_rate: Fraction = 1.0
-    """final value of both as a fraction of the initial one, annealed linearly; 1: constant"""
+    """final value of both as a share of the initial one, linearly; 1: constant"""
     tau: Fraction = 0.005
     """τ, the share by which the target networks move at each update; usually 0.001 to 0.02"""
     policy_delay: Count = 1
-    """gradient steps of the critics for each of the policy and the target networks; usually 1 or 2"""
+    """gradient steps of the critics for each of the policy and the targets; usually 1 or 2"""
     action_noise: Kind = "white"
     """noise of actions in training: white, ou (Ornstein–Uhlenbeck) or coloured"""
     noise_time: Positive = 6.7
-    """correlation time of Ornstein–Uhlenbeck noise in steps; θ = 0.15 of DDPG's paper is 1 / 0.15"""
+    """correlation time of Ornstein–Uhlenbeck noise in steps; in DDPG's paper 1 / 0.15"""
     noise_exponent: NonNegative = 1.0
     """β of coloured noise, whose power falls as f^(−β); 1 is pink"""
     hidden: tuple[Width, ...] = (256, 256)
