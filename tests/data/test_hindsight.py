@@ -126,7 +126,7 @@ def test_reset_rows_belong_to_no_episode():
     replay = HindsightReplay(Spec("x", parts, Box((-1.0,), (1.0,)), 3), 100, CPU, num_envs=1, goals=1, seed=0)
     replay.on_restart(lambda achieved, desired: (torch.zeros(len(achieved)), torch.zeros(len(achieved)) > 0))
     for t in range(8):  # NEXT_STEP: after two steps and an end, an action is ignored
-        at, reward = torch.full((1, 2), float(t)), torch.full((1,), 100.0 * (t % 3 == 2))
+        at, reward = torch.full((1, 2), float(t)), torch.zeros(1)
         flags = torch.tensor([False]), torch.tensor([t % 3 == 1]), torch.tensor([t % 3 != 2])
         replay.add(at, torch.zeros(1, 1), Step(at + 1, at + 1, reward, *flags))
     assert replay.transitions.obs[: len(replay), 0].tolist() == [0, 1, 0, 1, 3, 4, 3, 4, 6, 7, 6, 7]
