@@ -1,6 +1,6 @@
 """Environments that say too little at each step, for policies with a memory: here, `--env hidden:cart_pole`.
 
-And the drones without velocities: `--env DroneFigureEightTrajectory-v0 --backend hidden:SlowEyes`.
+And the drones without velocities: `--env DroneFigureEightTrajectory-v0 --backend hidden:DroneWithoutVelocities`.
 """
 
 from dataclasses import replace
@@ -76,7 +76,7 @@ class RepeatFirst(gym.Env):
         return np.append(np.eye(4)[suit], self.t == 0).astype(np.float32)
 
 
-class SlowEyes(CrazyflowBackend):
+class DroneWithoutVelocities(CrazyflowBackend):
     """Crazyflow's drones, whose policy sees neither velocity nor angular velocity; its critic does, as privileged."""
 
     def __init__(self, *args, **kwargs) -> None:

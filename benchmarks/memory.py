@@ -4,6 +4,7 @@
     .venv/bin/python benchmarks/memory.py mlp                            the same settings, without a memory
     .venv/bin/python benchmarks/memory.py sb3                            needs sb3-contrib
     .venv/bin/python benchmarks/memory.py --table
+    .venv/bin/python benchmarks/memory.py --cost                         an iteration with a memory, beside one without
 
 Each row of `benchmarks/results/memory.jsonl` is one final policy: 100 episodes, deterministic; and the seconds of its
 training, on one thread.
@@ -21,6 +22,7 @@ import torch
 from common import append, provenance, rows
 
 import lemniscate as lem
+from lemniscate.run.metrics import read_metrics
 
 SHARED = {"minibatch_size": 512, "learning_rate": 1e-3, "hidden": (64,)}
 ENVS = {
@@ -58,6 +60,15 @@ def theirs(env: str, seed: int, steps: int, _: dict) -> tuple[list[float], float
     return returns, seconds
 
 
+def iteration(env: str, network: str, steps: int) -> float:
+    """Seconds of an iteration of PPO by its preset, acting and learning: the median of all but the first two."""
+    with tempfile.TemporaryDirectory() as scratch:
+        fields = {"total_steps": steps, "evaluate_every": 0, "compile": "off", "progress": False}
+        run = lem.train("ppo", env, run=f"{scratch}/run", network=network, **fields)
+        lines = [line for line in read_metrics(run.path) if "time/learn" in line]
+    return float(np.median([line["time/collect"] + line["time/learn"] for line in lines[2:]]))
+
+
 def table() -> str:
     """Mean and worst of the seeds, of every policy."""
     said = ["| what is hidden | steps | asked for | gru | mlp | RecurrentPPO |", "|---|---|---|---|---|---|"]
@@ -82,6 +93,7 @@ if __name__ == "__main__":
     parser.add_argument("--steps", type=int)
     parser.add_argument("--try", action="store_true", dest="trial", help="print, and store nothing")
     parser.add_argument("--table", action="store_true")
+    parser.add_argument("--cost", action="store_true")
     given = parser.parse_args()
     sys.path.insert(0, str(Path(__file__).parent))
     torch.set_num_threads(1)
@@ -96,5 +108,8 @@ if __name__ == "__main__":
                 row = {"env": env, "network": given.network, "steps": steps, "seed": seed}
                 append("memory", row | {"returns": list(map(float, returns)), "seconds": seconds, **provenance()})
         print(env, steps, given.settings, f"{np.mean([f[0] for f in found]):.1f}", found, flush=True)
+    for env, steps in (("CartPole-v1", 25_000), ("HalfCheetah-v5", 100_000)) if given.cost else ():
+        ratios = [iteration(env, "gru", steps) / iteration(env, "mlp", steps) for _ in range(5)]
+        print(f"{env}: {np.median(ratios):.2f} ×, {min(ratios):.2f} to {max(ratios):.2f}", flush=True)
     if given.table:
         print(table())

@@ -108,6 +108,7 @@ def test_a_policy_that_remembers_plays_the_same_episode_from_the_hub(server, tmp
     states = np.random.default_rng(0).normal(size=(30, 4)).astype(np.float32)
     played = [[one.act(obs) for obs in states] for one in (policy, run.policy)]
     assert played[0] == played[1]
+    assert len(set(played[0])) == 2
     assert lem.evaluate(policy, episodes=3).returns == lem.evaluate(run, episodes=3).returns
 
 

@@ -73,6 +73,14 @@ def test_robots_are_served_by_their_ids_and_repeat_themselves(env, capfd):
     assert "v1 reproducibility" not in capfd.readouterr().err
 
 
+@pytest.mark.skipif(not is_installed("gymnasium_robotics"), reason="the extra robotics is not installed")
+@pytest.mark.parametrize("backend", ["gymnasium", "gymnasium-async"])
+def test_robots_are_made_by_the_name_of_their_package_too_and_in_workers(backend):
+    made = registry.make("gymnasium_robotics:FetchReach-v4", 2, backend=backend)
+    assert play(made, 5).reward.unique().tolist() == [-1.0]
+    made.close()
+
+
 def test_where_the_robots_are_missing_the_extra_is_named(monkeypatch):
     monkeypatch.setattr("lemniscate.envs.packages.is_installed", lambda package: False)
     with pytest.raises(UserError, match="gymnasium_robotics is not installed; it comes with the extra robotics"):

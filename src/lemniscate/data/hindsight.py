@@ -1,6 +1,6 @@
 """Hindsight experience replay: Andrychowicz et al. 2017, arXiv:1707.01495.
 
-Where a goal was missed, something else was reached: each episode is stored a second time as if that had been the goal.
+Episodes are stored again with goals that were reached in them, in place of the one that was desired.
 """
 
 from dataclasses import replace

@@ -15,7 +15,7 @@ from lemniscate.types import Step, Transition
 
 Kind = Literal["white", "ou", "coloured"]
 Judge = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
-"""what an environment makes of achieved and desired goals, [B, G] each: the rewards [B], and whether an episode ends"""
+"""from achieved and desired goals, [B, G] each, to the rewards [B], and whether an episode ends [B]"""
 
 
 class ReplayBuffer:
@@ -50,7 +50,7 @@ class ReplayBuffer:
         self._written += count
 
     def on_restart(self, judge: Judge) -> None:
-        """The environments have been restarted; `judge` is theirs, for buffers that tell episodes anew."""
+        """Nothing here: rows need no episode. The environments have been restarted, and `judge` is theirs."""
 
     def sample_indices(self, minibatches: int, size: int, generator: Generator) -> Tensor:
         """Rows of `transitions`, drawn uniformly with replacement: [minibatches, size] int64."""

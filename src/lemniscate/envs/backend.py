@@ -203,7 +203,9 @@ class Backend(ABC):
         raise UserError(f"{cannot}; --backend gymnasium does, where it serves {self.spec.env_id}.")
 
     def judge_goals(self, achieved: Tensor, desired: Tensor) -> tuple[Tensor, Tensor]:
-        """What the environment makes of goals [B, G]: the rewards float32 [B], and whether an episode ends bool [B].
+        """The rewards of having achieved goals where others were desired, [B, G] each; whether an episode ends there.
+
+        Float32 [B] and bool [B], the environment's own answers.
 
         Raises `UserError` where nothing in it says so.
         """

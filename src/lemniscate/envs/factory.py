@@ -10,6 +10,7 @@ from contextlib import contextmanager, nullcontext
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -80,8 +81,10 @@ class ResetOptions(gym.Wrapper):
 
 def make_one(maker: Maker, wrappers: Sequence[Callable[..., Any]] = (), **kwargs: Any) -> SingleEnv:
     """One environment, by its maker: a worker process may not know the id."""
-    theirs = "gymnasium.envs.mujoco" in str(getattr(maker, "entry_point", ""))
-    with model_warnings_off() if theirs else nullcontext():
+    point = str(getattr(maker, "entry_point", ""))
+    if point.startswith("gymnasium_robotics."):
+        give_numbers_of_joints()
+    with model_warnings_off() if "gymnasium.envs.mujoco" in point else nullcontext():
         # Gymnasium's own checker would speak first, in warnings and asserts; `SingleEnv` checks every step.
         env = gym.make(maker, disable_env_checker=True, **kwargs) if isinstance(maker, EnvSpec) else maker(**kwargs)
     for wrap in wrappers:
@@ -151,6 +154,15 @@ def _is_running(value: object) -> bool:
     """Whether it is a running mean and variance, as `RunningMeanStd` is; of an array or a table these are methods."""
     names = set(dir(value))
     return {"mean", "var"} <= names and bool({"update", "count"} & names) and not callable(getattr(value, "mean", len))
+
+
+def give_numbers_of_joints() -> None:
+    """Give Gymnasium-Robotics the kinds of joints as numbers, which it compares as MuJoCo 4 no longer can."""
+    import mujoco
+    from gymnasium_robotics.utils import mujoco_utils  # pyright: ignore[reportMissingImports]
+
+    joints = SimpleNamespace(**{name: int(kind) for name, kind in vars(mujoco)["mjtJoint"].__members__.items()})
+    mujoco_utils.mujoco = SimpleNamespace(**{**vars(mujoco), "mjtJoint": joints})
 
 
 @contextmanager

@@ -5,7 +5,6 @@ from collections.abc import Collection
 from contextlib import redirect_stderr
 from functools import cache
 from io import StringIO
-from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -104,7 +103,7 @@ class MinatarBackend(GymnasiumBackend):
 
     @classmethod
     def exists_once(cls, env: str, num_envs: int) -> bool:
-        """There can be many."""
+        """Never: there can be many."""
         return False
 
 
@@ -126,16 +125,10 @@ class RoboticsBackend(GymnasiumBackend):
 
 @cache
 def _robotics() -> list[str]:
-    """The ids of the package, which registers them when it is imported.
-
-    It compares kinds of joints with numbers in an order that MuJoCo 4 no longer knows; it is given the bare numbers.
-    """
+    """The ids of the package, which registers them when it is imported."""
     before = dict(gym.registry)
     with redirect_stderr(StringIO()):  # its news, at every start
-        import mujoco
-        from gymnasium_robotics.utils import mujoco_utils  # pyright: ignore[reportMissingImports]
+        import gymnasium_robotics  # noqa: F401  # pyright: ignore[reportMissingImports]
     gym.registry.update(before)  # it takes over ids of Gymnasium's that need an older MuJoCo
-    joints = SimpleNamespace(**{name: int(kind) for name, kind in vars(mujoco)["mjtJoint"].__members__.items()})
-    mujoco_utils.mujoco = SimpleNamespace(**{**vars(mujoco), "mjtJoint": joints})
     points = {name: str(spec.entry_point) for name, spec in gym.registry.items()}
     return [name for name, point in points.items() if point.startswith("gymnasium_robotics.") and "Py" not in point]

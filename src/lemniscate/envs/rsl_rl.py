@@ -42,7 +42,7 @@ class RslRlBackend(Backend):
 
     @classmethod
     def exists_once(cls, env: str, num_envs: int) -> bool:
-        """There is one in a process."""
+        """Always: a process has one such simulator."""
         return True
 
     def __init__(

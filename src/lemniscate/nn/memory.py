@@ -74,7 +74,7 @@ class Carrier:
 
 
 class Recall:
-    """What is remembered of the episodes that someone plays call by call: of one, or of a batch of B.
+    """The memory of the episodes that someone plays call by call: of one, or of a batch of B.
 
     Args:
         memory: the columns.
@@ -322,7 +322,7 @@ class Remembering(nn.Module):
         return torch.cat([torch.ones_like(after[:, :1]), after], dim=-1)
 
     def _parts(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Of […, I]: the cell's prepared inputs, the 1 or 0, the memory, the actions."""
+        """The cell's prepared inputs, the 1 or 0, the memory and the actions of rows […, I]."""
         obs, _, privileged, goes_on, memory, action = _split(x, self.columns)
         inputs = torch.cat([self.encoder(obs), privileged], dim=-1)
         return self.cell.prepare(inputs), goes_on, memory, action

@@ -22,11 +22,11 @@ class Policy(nn.Module):
         """the columns of what it remembers, if it has a memory"""
 
     def remember(self, obs: Tensor) -> Tensor:
-        """What a policy with a memory remembers after rows [N, …], as the columns of its memory."""
+        """The memory of a policy that has one after rows [N, …], as the columns of that memory."""
         return remember(self.net, self.normalizer(obs))
 
     def carrier(self) -> Carrier | None:
-        """What carries its memory from step to step, if it has one."""
+        """The carrier of its memory from step to step, if it has one."""
         return Carrier(self.memory, self.remember) if self.memory else None
 
     def act(self, obs: Tensor, noise: Tensor) -> Tensor:

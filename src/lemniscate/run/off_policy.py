@@ -24,9 +24,9 @@ class OffPolicyConfig(RunConfig):
     gamma: Fraction = 0.99
     """discount factor γ; usually 0.95 to 0.999"""
     replay: Literal["uniform", "hindsight"] = "uniform"
-    """hindsight: also with goals that were reached"""
+    """hindsight stores steps again, with goals that were reached"""
     hindsight_goals: Count = 4
-    """goals for each transition, k; usually 4 to 8"""
+    """further goals of each step, k; usually 4 to 8"""
     buffer_size: Count = 1_000_000
     """transitions in the replay buffer; the oldest are replaced"""
     batch_size: Count = 256
