@@ -106,7 +106,7 @@ def bounds():
 
 def gains(trials):
     """Random search, then steps from the best, by the mean return over three seeds of 64 starts each."""
-    from lemniscate.drones.pd import GAINS
+    from lemniscate.drones.vehicle import GAINS
     from lemniscate.envs import registry
     from lemniscate.run.evaluate import evaluate
 

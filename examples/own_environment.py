@@ -1,7 +1,7 @@
 r"""An environment of one's own with arguments, and a wrapper around it.
 
 cd examples
-lemniscate check own_environment:Balance
+lemniscate doctor own_environment:Balance
 lemniscate train sac --env own_environment:Balance --env-args '{"wind": 0.5}' \
         --wrappers 'own_environment:scaled(factor=0.1)' --total-steps 10_000
 python own_environment.py

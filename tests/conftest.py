@@ -1,6 +1,7 @@
 """Shared fixtures. Everything is small: one thread, few environments, float64 where an oracle is compared."""
 
 import os
+from collections import Counter
 from pathlib import Path
 
 os.environ.setdefault("MPLBACKEND", "Agg")
@@ -20,6 +21,16 @@ import toy  # noqa: F401  (registers Countdown-v0 and Matching-v0)
 
 settings.register_profile("lemniscate", deadline=None, report_multiple_bugs=False)  # no test waits for a clock
 settings.load_profile("lemniscate")
+
+
+def pytest_collection_modifyitems(items):
+    """Of the cases of a test that is marked `one_in(n)`, all but the first of each n stand beside one of their kind."""
+    seen = Counter()
+    for item in items:
+        if mark := item.get_closest_marker("one_in"):
+            if seen[item.function] % mark.args[0]:
+                item.add_marker(pytest.mark.long)
+            seen[item.function] += 1
 
 
 @pytest.fixture(autouse=True)

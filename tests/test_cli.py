@@ -195,7 +195,7 @@ def test_the_home_folder_is_meant_wherever_a_path_is_taken(run, tmp_path, monkey
     lem.train("ppo", env="CartPole-v1", run="~/b", warm_start="~/a", **small)
     assert lem.load("~/b").path == tmp_path / "b"
     assert lem.resume("~/b", progress=False).path == tmp_path / "b"
-    for command in ("evaluate --episodes 1", "watch --video=~/film.gif", "plot", "check"):
+    for command in ("evaluate --episodes 1", "watch --video=~/film.gif", "plot", "doctor"):
         assert main([*command.split(), "~/b"]) == 0
     lem.save(lem.load("~/b"), "~/policy")
     assert (tmp_path / "film.gif").exists()
@@ -275,7 +275,7 @@ def test_bare_is_help_and_help_names_every_command(capsys):
     bare = capsys.readouterr().out
     assert main(["--help"]) == 0
     assert capsys.readouterr().out == bare
-    for command in ("train", "resume", "evaluate", "watch", "plot", "push", "envs", "check"):
+    for command in ("train", "resume", "evaluate", "watch", "plot", "push", "envs", "doctor"):
         assert f"\n    {command} " in bare
 
 

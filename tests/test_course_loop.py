@@ -126,6 +126,7 @@ QUICK = ("no exponential", "upside down", "half a clip", "death", "clip around 0
 
 
 @pytest.mark.parametrize("name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.long) for n in MISTAKES])
+@pytest.mark.one_in(2)
 def test_a_mistake_is_seen_inside(name):
     changes, words = MISTAKES[name]
     assert words in inside_of(program(changes)).sentence
@@ -180,6 +181,7 @@ def better_action(train, number, steps=2_048):
 
 @pytest.mark.parametrize(("name", "number"), [("sign", 0), ("chain", 1), ("death", 2), ("uncut", 3), ("cut at deaths", 4),
                                               ("time-out", 5), ("final_obs", 6)])  # fmt: skip
+@pytest.mark.one_in(3)
 def test_a_mistake_shows_in_the_world_that_is_made_for_it(name, number):
     assert not better_action(program(MISTAKES[name][0]), number, 1_024)
 
@@ -207,6 +209,7 @@ def of_box(changes, monkeypatch):
     return next(loop.train(seen), None)
 
 
+@pytest.mark.long
 def test_a_loop_is_judged_with_box_actions_too(monkeypatch):
     assert of_box((), monkeypatch) is None
     one_each = [("Independent(Normal(out, self.log_std.exp()), 1)", "Normal(out, self.log_std.exp())")]

@@ -33,6 +33,7 @@ def done(process):
 
 
 @pytest.mark.parametrize("name", sorted(path.name for path in EXAMPLES.glob("*.py") if path.name != "own_logger.py"))
+@pytest.mark.one_in(2)
 def test_a_program_runs(name, tmp_path):
     assert program(name, tmp_path).strip()
 
@@ -45,6 +46,7 @@ def test_an_algorithm_of_ones_own_has_the_command_line_and_its_presets(tmp_path)
     assert "--beta" in lemniscate("train", "own_algorithm", "--help")[0]
 
 
+@pytest.mark.long
 def test_a_network_and_a_logger_of_ones_own(tmp_path):
     own = ["--network", "own_network:Fourier", "--track", "own_logger:Csv"]
     path = tmp_path / "run"

@@ -210,6 +210,7 @@ def found_in(work, demanded=(), **files):
     return json.loads(done.stdout.splitlines()[-1])
 
 
+@pytest.mark.long
 def test_an_agent_and_a_train_of_another_course_are_not_meant(tmp_path):
     """The skeleton's agent has other methods than the drone's; every module of torch has a `train`."""
     from lemniscate.course import loop
@@ -245,6 +246,7 @@ def test_without_a_namespace_python_refuses_the_network(tmp_path):
     assert subprocess.run([sys.executable, "-c", code, tmp_path]).returncode == 0
 
 
+@pytest.mark.long
 def test_a_script_needs_no_guard(tmp_path):
     (tmp_path / "in").mkdir()
     (tmp_path / "in" / "a.py").write_text(hand_ins.IMPORTS + hand_ins.RIGHT["polyak"])
@@ -263,6 +265,7 @@ def wait_for(condition, seconds=120):
 
 
 @pytest.mark.parametrize("signum", [signal.SIGINT, signal.SIGKILL])
+@pytest.mark.long
 def test_stopped_or_killed_it_goes_on(tmp_path, signum):
     folder, to = tmp_path / "in", tmp_path / "in-grades"
     folder.mkdir()

@@ -362,6 +362,7 @@ def test_a_directory_is_not_an_address(capsys, words):
     assert f"{ADDRESS} is on the Hub, and no run directory" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_the_commands_speak_with_the_hub_that_the_environment_names(run, server, tmp_path):
     names = {"HF_ENDPOINT": server.endpoint, "HF_HOME": str(tmp_path), "HF_HUB_DISABLE_XET": "1"}
     forks = Forks(LEMNISCATE, HF_TOKEN=hub_server.WRITER, **names)

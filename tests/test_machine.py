@@ -80,6 +80,7 @@ sys.exit(codes != [0, 0, 0, 0, 2])
 """
 
 
+@pytest.mark.long
 def test_without_the_modules_and_signals_of_unix_everything_works_but_processes(tmp_path):
     """As on Windows, with text files of another encoding unless one is named: train, resume, look, export, check."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}

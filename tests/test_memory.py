@@ -431,6 +431,7 @@ def test_a_stored_policy_and_a_warm_start_have_the_same_memory(trained, tmp_path
         ("reppo", "Pendulum-v1", "gru"),
     ],
 )
+@pytest.mark.one_in(2)
 def test_exports_carry_the_memory_over_whole_episodes(algorithm, env, network, tmp_path, monkeypatch):
     monkeypatch.setattr(exporting, "fly", partial(fly, rows=500))
     monkeypatch.setattr(parity, "nanoseconds", lambda call: call() is None or 1.0)

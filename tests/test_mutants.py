@@ -1442,6 +1442,7 @@ def server():
 
 
 @pytest.mark.parametrize("mutant", MUTANTS, ids=[mutant[0].replace(" ", "-") for mutant in MUTANTS])
+@pytest.mark.one_in(4)
 def test_the_suite_kills(server, tmp_path, mutant):
     _, name, right, wrong, tests = mutant
     shutil.copytree(ROOT / "src" / "lemniscate", tmp_path / "lemniscate")

@@ -294,6 +294,7 @@ def has_egl():
     return subprocess.run([sys.executable, "-c", code], capture_output=True).returncode == 0
 
 
+@pytest.mark.long
 def test_a_report_has_a_film_of_ones_own_model_without_a_display_or_says_why_not(tmp_path):
     """MuJoCo draws by EGL of itself; where MUJOCO_GL names what is not there, the sentence names that variable."""
     pytest.importorskip("mujoco")

@@ -88,6 +88,7 @@ def test_every_run_of_a_sweep_calls_the_callbacks(trained):
 
 
 @pytest.mark.parametrize(("algorithm", "seed"), [("ppo", 2), ("ddpg", 1)])
+@pytest.mark.one_in(2)
 def test_each_run_of_a_sweep_ends_in_the_bits_of_a_run_alone(trained, tmp_path, algorithm, seed):
     path, _ = trained
     alone = lem.train(algorithm, ENV, seed=seed, run=tmp_path / "alone", progress=False, **SHARED)
@@ -122,6 +123,7 @@ def test_what_needs_one_run_says_so_of_a_sweep(trained, capsys):
     assert f"--total-steps is for one run, and {path} is a set of them" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_resuming_a_sweep_goes_on_begins_and_leaves_alone(trained, tmp_path, capsys):
     path, _ = trained
     copy = shutil.copytree(path, tmp_path / "copy")
@@ -230,6 +232,7 @@ def test_ctrl_c_stops_every_run_and_the_sweep_goes_on_to_the_same_bits(tmp_path)
         assert final_hash(path / f"ppo-{seed}") == final_hash(alone.path)
 
 
+@pytest.mark.long
 def test_runs_that_fail_are_named_and_the_others_are_trained_side_by_side(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(places, "at_once", lambda threads: 2)
     most = []

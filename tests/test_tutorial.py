@@ -195,6 +195,7 @@ VERSIONS = {"solved": loop.SOLVED, "open": loop.GAPS}
     ],
 )
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # a fork beside another test's JAX
+@pytest.mark.one_in(2)
 def test_it_runs_to_its_end_with_every_gap_solved_and_with_every_gap_open(
     name, gaps, tmp_path, monkeypatch, capsys, library
 ):

@@ -80,6 +80,7 @@ def same(a, b):
     ids=lambda x: x if isinstance(x, str) and len(x) < 99 else "",
 )
 @pytest.mark.filterwarnings("ignore")
+@pytest.mark.one_in(5)
 def test_a_mistake_changes_what_is_computed(path: Path, kind, title, regex, code, name):
     for box in (True, False):
         right, mine = of_the_right_one(path, box), told(code, title, name, box)

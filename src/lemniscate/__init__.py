@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from lemniscate.api.policy import load as load
     from lemniscate.api.policy import save as save
     from lemniscate.api.results import check as check
+    from lemniscate.api.results import diagnose as diagnose
     from lemniscate.api.results import evaluate as evaluate
     from lemniscate.api.results import push as push
     from lemniscate.api.results import watch as watch
@@ -44,7 +45,7 @@ if TYPE_CHECKING:
 MODULES = {
     "api.plots": ("plot",),
     "api.policy": ("TrainedPolicy", "TrainedRun", "load", "save"),
-    "api.results": ("check", "evaluate", "push", "watch"),
+    "api.results": ("check", "diagnose", "evaluate", "push", "watch"),
     "api.training": ("config_for", "resume", "train"),
     "envs.vector_view": ("make_vec",),
     "errors": ("NonFiniteError", "NotStoredError", "SweepError", "UserError"),

@@ -52,6 +52,7 @@ TRAINS_OFTEN = ("check_seeds", "check_resume")
         for check in ALGORITHM_CONTRACT
     ],
 )
+@pytest.mark.one_in(2)
 def test_the_contract_holds(check, algorithm, tmp_path):
     settings = settings_of(algorithm)
     check(algorithm, tmp_path, **settings, checkpoint_every=settings["total_steps"] // 4, evaluate_episodes=2)
@@ -83,6 +84,7 @@ class Pretrained(nn.Module):
         *(pytest.param(algorithm, "on", marks=pytest.mark.long) for algorithm in ("ppo", "trpo", "sac")),
     ],
 )
+@pytest.mark.one_in(3)
 def test_in_a_network_of_ones_own_what_is_frozen_stays_and_the_rest_learns(algorithm, compile, tmp_path, capsys):
     settings = settings_of(algorithm) | {"network": Pretrained, "compile": compile, "progress": False, "shards": 2}
     every = settings["total_steps"] // 4

@@ -184,6 +184,7 @@ def test_the_entropy_reaches_its_target():
     assert rollout.reward.mean() > 0.4
 
 
+@pytest.mark.long
 def test_the_policy_stays_within_its_bound():
     """After an update the KL is about what is allowed, however much the rewards ask for."""
     config = small(

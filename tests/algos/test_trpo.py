@@ -14,6 +14,7 @@ from lemniscate.errors import UserError
 
 @pytest.mark.parametrize("env", ["Pendulum-v1", "Matching-v0"])
 @pytest.mark.parametrize("max_kl", [1e-4, 0.01, 0.3])
+@pytest.mark.one_in(2)
 def test_the_kl_stays_within_its_bound_at_every_update(env, max_kl):
     """Of continuous and of discrete actions; a sixth of Matching's rows are resets, which no mean counts."""
     config = small(trpo, env, max_kl=max_kl, num_steps=32, critic_epochs=1, normalize_observations=False)

@@ -162,6 +162,7 @@ def test_each_algorithm_that_learns_from_replay_has_it(algo):
     )
 
 
+@pytest.mark.long
 def test_a_goal_that_chance_never_meets_is_learned_with_hindsight_and_not_without(tmp_path):
     fields = {
         "env_kwargs": {"limit": 16, "axes": 2},

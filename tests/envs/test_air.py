@@ -119,6 +119,7 @@ def test_conditions_that_change_nothing_are_none():
     assert read_ranges({"mass": [1, 1], "wind": 0.0, "jitter": [0, 0.2]}) == {"jitter": (0.0, 0.2)}
 
 
+@pytest.mark.long
 def test_nominal_conditions_change_no_flight():
     """Every path of the code is taken, and what is simulated is what the environment as it is simulates."""
     env, plan = registry.make(ENV, N), actions(12)

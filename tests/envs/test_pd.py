@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import lemniscate as lem
-from lemniscate.drones.pd import GAINS, GRAVITY, PD
+from lemniscate.drones.vehicle import GAINS, GRAVITY, PD
 from lemniscate.envs import registry
 from lemniscate.run.evaluate import evaluate
 from lemniscate.spec import Box
@@ -58,6 +58,7 @@ def test_it_knows_velocity_and_acceleration_of_a_parabola():
     assert command(points, velocity=(0.3, 0.0, 0.0))[1] == pytest.approx(math.atan2(0.5, GRAVITY), rel=1e-5)
 
 
+@pytest.mark.long
 def test_it_flies_the_figure_eight_and_its_gains_matter():
     pytest.importorskip("crazyflow")
     env = registry.make("DroneFigureEightTrajectory-v0", 8)

@@ -276,6 +276,7 @@ run = lem.train("ppo", env=Told, num_envs=2, num_steps=8, minibatch_size=8, tota
 """
 
 
+@pytest.mark.long
 def test_a_script_without_a_guard_is_told_of_it(tmp_path):
     file = tmp_path / "script.py"
     file.write_text(SCRIPT.replace("RUN", repr(str(tmp_path / "run"))))

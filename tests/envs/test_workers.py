@@ -59,6 +59,7 @@ env.step(torch.zeros(2, dtype=torch.int64))
 """
 
 
+@pytest.mark.long
 def test_workers_end_with_their_owner_also_in_an_endless_loop(tmp_path):
     owner = forks().start(OWNER, tmp_path)
     while not (tmp_path / "workers").exists():

@@ -12,8 +12,8 @@ from exported import exported, needs_compiler, policy_for
 
 from lemniscate.drones.vehicle import PARTS, interface_of
 from lemniscate.errors import UserError
+from lemniscate.exporting.c_code import crazyflie_files
 from lemniscate.exporting.compiled import CORE, TARGET_COMPILER, host_compiler, run_tool
-from lemniscate.exporting.crazyflie import crazyflie_files
 from lemniscate.spec import Box
 
 pytestmark = needs_compiler

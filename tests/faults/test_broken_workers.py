@@ -78,6 +78,7 @@ def test_a_worker_that_breaks_is_named_in_time(monkeypatch, tmp_path, capfd, way
         for place in PLACES
     ],
 )
+@pytest.mark.long
 def test_ctrl_c_ends_training_while_a_worker_blocks(tmp_path, way, place):
     kwargs = json.dumps({"way": way, "place": place, "told": str(tmp_path / "broken")})
     given = ["--env-args", kwargs, "--backend", "gymnasium-async", "--num-envs", "2", "--run", tmp_path / "r"]

@@ -134,6 +134,7 @@ SCALES = (0.0, 1e-38, 1e15, 1e30, 1e37)
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 @pytest.mark.parametrize("every", [pytest.param(1, marks=pytest.mark.faults), 15])
+@pytest.mark.one_in(2)
 def test_huge_and_constant_numbers_are_learned_from_or_named(tmp_path, algorithm, every):
     counts, off_policy = Counter(), is_off_policy(algorithm)
     scaling = [{}, {"normalize_observations": not off_policy}, {"normalize_observations": off_policy}]

@@ -56,6 +56,7 @@ def test_a_directory_that_is_deleted_in_training_ends_in_a_sentence(tmp_path, ti
 
 
 @pytest.mark.parametrize("verb", ["resume", "plot", "evaluate"])
+@pytest.mark.one_in(3)
 def test_a_disk_that_can_only_be_read_is_named(trials, tmp_path, verb):
     path = fresh(tmp_path / "disk") / "r"
     code, said = trials.run("", *TRAIN, path)

@@ -53,6 +53,7 @@ def reading(path, bytes_free, updates):
 
 
 @pytest.mark.parametrize("ignored", [False, pytest.param(True, marks=pytest.mark.faults)])
+@pytest.mark.long
 def test_when_the_terminal_is_closed_a_run_is_saved_and_with_nohup_it_goes_on(whole, tmp_path, ignored):
     path = tmp_path / "r"
     process, terminal = in_a_terminal(path, ignored)

@@ -82,6 +82,7 @@ def schedules_act():
     assert compiled.calls == [3]
 
 
+@pytest.mark.long
 def test_a_schedule_acts_in_a_compiled_step():
     require_in_own_process(__name__, "schedules_act()")
 

@@ -242,6 +242,7 @@ def test_outside_a_notebook_no_live_curve_is_drawn(tmp_path, monkeypatch):
     train(tmp_path / "r", callbacks=[curves.LiveCurve(seconds=0)])
 
 
+@pytest.mark.long
 def test_the_live_curve_grows_in_one_place_below_the_cell(tmp_path):
     """A real kernel runs the cell of a real notebook."""
     cell = textwrap.dedent(

@@ -9,9 +9,8 @@ import pytest
 
 from lemniscate.envs.vec_env import Episodes
 from lemniscate.report.curves import episode_returns
-from lemniscate.run.loggers import JsonLines, TensorBoard
+from lemniscate.run.loggers import JsonLines, TensorBoard, WeightsAndBiases
 from lemniscate.run.metrics import damage, read_metrics, to_line
-from lemniscate.run.wandb_logger import WeightsAndBiases
 
 
 def test_a_resumed_log_drops_what_it_will_write_again(tmp_path):

@@ -223,6 +223,7 @@ def test_training_and_evaluation_are_separate_and_differently_seeded():
 
 
 @pytest.mark.parametrize("env", ["CartPole-v1", *OFF_POLICY, *ON_POLICY])
+@pytest.mark.one_in(2)
 def test_a_run_resumed_from_any_checkpoint_ends_in_the_same_bits(tmp_path, env):
     fields = {"checkpoint_every": 64, "keep_checkpoints": 10}
     train(tmp_path / "whole", env, **fields)
@@ -547,6 +548,7 @@ def test_a_compiled_run_goes_on_to_the_same_bits(tmp_path):
     assert history(half) == history(whole)
 
 
+@pytest.mark.long
 def test_ctrl_c_at_a_terminal_reaches_the_workers_too_and_harms_nothing(tmp_path):
     path = tmp_path / "r"
     arguments = [*long_run(path, "CartPole-v1", updates=3000), "--backend", "gymnasium-async"]
@@ -586,6 +588,7 @@ def test_stopped_and_resumed_it_ends_in_the_same_bits(tmp_path):
     assert history(path) == history(whole)
 
 
+@pytest.mark.long
 def test_many_steps_between_two_lines_are_stopped_amid_and_resumed_to_the_same_bits(tmp_path):
     fields = {**OFF_POLICY["sac"], "log_every": 500, "total_steps": 2_000, "checkpoint_every": 1000, "compile": "off"}
     words = [word for name, value in tiny_off_policy(**fields).items() for word in words_for(name, value)]

@@ -107,6 +107,7 @@ def test_each_run_of_a_trial_ends_in_the_bits_of_a_run_alone(tuned, tmp_path):
     assert final_hash(alone.path) == final_hash(path / "trials" / f"{number:03d}" / "ppo-102")
 
 
+@pytest.mark.long
 def test_an_interrupted_search_goes_on_with_every_trial_exact(tuned, tmp_path):
     path = tmp_path / "search"
     words = ["tune", "ppo", *FLAGS, *SEARCH, "--seeds", "101", "--trials", "2", "--run", path]

@@ -72,7 +72,11 @@ class PolicySnapshot(TrainedPolicy):
 
 
 def call_callbacks(
-    functions: Sequence[Callback], copy_networks: Callable[[TrainState], Any], spec: Spec, config: RunConfig
+    functions: Sequence[Callback],
+    copy_networks: Callable[[TrainState], Any],
+    spec: Spec,
+    config: RunConfig,
+    attend: Callable[[int, Mapping[str, float]], None] | None,
 ) -> Observer:
     """The function that a run calls after each logged line: every callback in turn, each with a policy of its own.
 
@@ -81,10 +85,14 @@ def call_callbacks(
         copy_networks: networks on the CPU that share nothing with those of the state.
         spec: of the policy.
         config: of the run.
+        attend: called before them with the step and the metrics of each line that has signals.
     """
 
     def observe(lines: Sequence[tuple[int, Mapping[str, float]]], state: TrainState) -> bool:
         stop = False
+        for step, metrics in lines:
+            if attend and "reward/largest" in metrics:
+                attend(step, metrics)
         for (step, metrics), function in product(lines, functions):
             policy = PolicySnapshot(lambda: copy_networks(state), spec, config, step)
             said = function(step, MappingProxyType(dict(metrics)), policy)

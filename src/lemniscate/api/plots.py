@@ -4,7 +4,7 @@ from contextlib import closing
 from pathlib import Path
 
 from lemniscate.api.policy import TrainedPolicy, TrainedRun, load, path_of
-from lemniscate.api.results import film_or_say, final_return, final_scores
+from lemniscate.api.results import diagnose, film_or_say, final_return, final_scores
 from lemniscate.errors import UserError, unknown_name
 from lemniscate.report import compare, curves, flight, pages
 from lemniscate.report.seeds import group
@@ -98,7 +98,12 @@ def draw_run(run: str | Path | TrainedRun, by: str = "step", *, film: bool = Fal
     if scores and "q_bias" in scores:
         files.append(curves.draw_q_bias(pages.q_bias(scores), path, folder / "q.png"))
     files += flights
-    return [*files, pages.write_run(path, _pictures(files), scores)]
+    try:
+        found = diagnose(path)
+    except UserError as error:
+        say(f"{path} is drawn without a diagnosis: {error}")
+        found = []
+    return [*files, pages.write_run(path, _pictures(files), scores, found)]
 
 
 def _pictures(files: list[Path]) -> list[Path]:

@@ -10,10 +10,13 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from lemniscate import presets
+import torch
+
+from lemniscate import algos, doctor, presets
 from lemniscate.algos import RECOMMENDED
 from lemniscate.api import agents
 from lemniscate.api.policy import Trained, TrainedPolicy, TrainedRun, algorithm_of, load, own_code, path_of, save
+from lemniscate.doctor import Diagnosis
 from lemniscate.envs import check as env_check
 from lemniscate.envs import registry
 from lemniscate.envs.check import Finding
@@ -25,10 +28,11 @@ from lemniscate.run import check as run_check
 from lemniscate.run import checkpoint
 from lemniscate.run.checkpoint import list_steps
 from lemniscate.run.config import Episodes, Natural, RunConfig, checked
-from lemniscate.run.directory import CONFIG, FINAL
+from lemniscate.run.directory import CONFIG, FINAL, read_config
 from lemniscate.run.environments import env_arguments, evaluation_env
 from lemniscate.run.evaluate import Evaluation, critic_of
 from lemniscate.run.evaluate import evaluate as evaluate_policy
+from lemniscate.run.places import is_sweep, read_sweep
 from lemniscate.run.seeding import torch_defaults
 from lemniscate.system.console import say
 from lemniscate.system.files import DamagedFileError, at_home, make_directory, read_json, write_json
@@ -208,10 +212,55 @@ def each_finding(
     return env_check.each_finding(what, backend, env_kwargs, wrappers)
 
 
+def runs_in(what: str) -> list[Path]:
+    """The runs that a path stands for: itself, or those of a sweep; none for an environment."""
+    path = at_home(what)
+    if not run_check.is_stored(path):
+        return []
+    return [run for run in read_sweep(path).runs if (run / CONFIG).exists()] if is_sweep(path) else [path]
+
+
 def verdict(what: str, found: list[Finding]) -> str:
     """The conclusion from the findings, in a sentence or two."""
     path = at_home(what)
     return run_check.verdict(path, found) if run_check.is_stored(path) else env_check.verdict(what, found)
+
+
+def diagnose(run: "Trained") -> list[Diagnosis]:
+    """What is wrong with a run, in words: each finding with what was seen, what it means, and what to change.
+
+    Its settings, its lines of metrics and its final scores are looked at, and whether its environment keeps to a seed.
+    Nothing is trained, and nothing is changed.
+
+    Args:
+        run: its directory, what `train` returned, or a policy of it.
+
+    Returns:
+        The findings, causes before consequences, which are left out beside a cause; none where no rule applies.
+
+    Raises:
+        UserError: no run, or one of another version.
+    """
+    path = path_of(run)
+    algorithm, fields = read_config(path)
+    kind = algos.find(algorithm).Config
+    config = kind.from_json(fields)
+    own = [preset.config for preset in presets.of(algorithm) if preset.config.env == config.env]
+    scores = _known_scores(path / FINAL)
+    return doctor.diagnose(doctor.evidence_of(path, config, [*own, kind()], scores, _repeats(config)))
+
+
+def _repeats(config: RunConfig) -> bool | None:
+    """Whether a run's environment begins alike from one seed; None where that is not found out in a moment."""
+    arguments = env_arguments(config)
+    try:
+        cls = registry.backend_class(arguments["backend"] or registry.backend_for(config.env, config.all_wrappers))
+        if cls.compiled or cls.exists_once(config.env, 2):
+            return None
+        with closing(registry.make(num_envs=2, **arguments)) as env:
+            return torch.equal(env.restart(1).clone(), env.restart(1))
+    except Exception:  # whatever an environment raises that is no longer as it was in training
+        return None
 
 
 def scores_of(policy: TrainedPolicy) -> dict[str, Any]:

@@ -15,6 +15,7 @@ import torch
 from lemniscate import algos, presets
 from lemniscate.api.options import Callback, RunOptions, call_callbacks, require_importable, train_in_processes
 from lemniscate.api.policy import TrainedPolicy, TrainedRun, load, path_of
+from lemniscate.doctor import Attendance
 from lemniscate.envs import registry
 from lemniscate.errors import NotStoredError, UserError, is_installed
 from lemniscate.hub.repository import local_path
@@ -299,7 +300,8 @@ def _train_here(
     def film(state: TrainState) -> None:
         _film(TrainedPolicy(copy_networks(state), spec, config, state.step), path)
 
-    observer = call_callbacks(callbacks, copy_networks, spec, config) if callbacks and world.is_first else None
+    attend = Attendance(config) if progress else None
+    observer = call_callbacks(callbacks, copy_networks, spec, config, attend) if world.is_first else None
     surroundings = {"loggers": loggers, "progress": progress, "film": film, "observer": observer}
     run = Run(path, algorithm, config, envs, world=world, locate=local_path, **surroundings)
     pictures: list[Path] = []

@@ -179,18 +179,28 @@ def _family(env_id: str) -> str:
     return f"Gymnasium {place[2]}" if place[:2] == ["gymnasium", "envs"] else place[0]
 
 
-def check(given: argparse.Namespace) -> None:
-    """Say what was found about an environment or the files of a run, as a list; what is bad there is an error."""
-    from lemniscate.api.results import each_finding, verdict
+def doctor(given: argparse.Namespace) -> None:
+    """Say what was found about an environment, or a run and its files, as a list; what is bad there is an error."""
+    from lemniscate.api.results import diagnose, each_finding, runs_in, verdict
     from lemniscate.envs.check import BAD
 
     found, wrappers = [], read("wrappers", tuple[str, ...], given.wrappers)
+    width = min(get_terminal_size((112, 24)).columns, 120)
     for finding in each_finding(given.what, given.backend, _env_args(given), wrappers):
         found.append(finding)
-        say(finding.listed(min(get_terminal_size((112, 24)).columns, 120)))
+        say(finding.listed(width))
     if any(finding.grade == BAD for finding in found):
         raise UserError(verdict(given.what, found))
     say(verdict(given.what, found))
+    diagnoses = {str(run): diagnose(run) for run in runs_in(given.what)}
+    for run, of_run in diagnoses.items():
+        names = ", ".join(one.name for one in of_run if one.sure != "hint")
+        say(f"{run}: {names or 'no rule finds a fault'}.")
+        for one in of_run:
+            say(one.listed(width))
+    if given.json:
+        runs = {run: [vars(one) for one in of_run] for run, of_run in diagnoses.items()}
+        print(json.dumps({"checked": [vars(one) for one in found], "runs": runs}))
 
 
 def course(given: argparse.Namespace) -> None:

@@ -1,11 +1,8 @@
 """The options of `lemniscate train ALGORITHM` and `tune`, one for each field of the algorithm's Config."""
 
 import argparse
-import ast
-import inspect
 from contextlib import nullcontext
-from itertools import pairwise
-from textwrap import dedent, fill
+from textwrap import fill
 from types import NoneType
 from typing import Any, Literal, get_type_hints
 
@@ -13,8 +10,7 @@ from lemniscate.algos import find
 from lemniscate.cli.parsers import Parser, parser_of, unknown_argument
 from lemniscate.errors import UserError, prefix_errors, unknown_name
 from lemniscate.presets import names
-from lemniscate.run.config import RunConfig
-from lemniscate.run.fields import flag, kinds_of, read, unknown_field
+from lemniscate.run.fields import field_help, flag, kinds_of, read, unknown_field
 
 GROUPS: dict[str, tuple[str, ...]] = {
     "run": ("seed", "total_steps", "device", "threads", "shards", "compile", "matmul", "warm_start", "freeze"),
@@ -105,21 +101,6 @@ def explain(parser: Parser, algorithm: str) -> None:
     bracket = "[…] is the default, where neither --preset nor the environment's own preset says otherwise."
     schedule = "Learning rates, clips, entropy_coef, noise_std: also '3e-4>1e-5' in quotes, linear over total_steps."
     parser.epilog = fill(f"presets: {', '.join(names(algorithm))}", 110) + f"\n{schedule}\n{bracket}"
-
-
-def field_help(config: type[RunConfig]) -> dict[str, str]:
-    """The docstring below each field, read from the source of the Config and of those it inherits from."""
-    found: dict[str, str] = {}
-    for kind in reversed(config.__mro__[:-1]):
-        try:
-            (tree,) = ast.parse(dedent(inspect.getsource(kind))).body
-        except (OSError, TypeError):  # typed into an interpreter, say
-            continue
-        for field, below in pairwise(tree.body if isinstance(tree, ast.ClassDef) else []):
-            match field, below:
-                case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(text))):
-                    found[name] = " ".join(text.split())
-    return found
 
 
 def _switch(word: str, hints: dict[str, Any]) -> str:

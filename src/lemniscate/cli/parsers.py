@@ -12,6 +12,9 @@ from lemniscate.algos import ALGORITHMS, RECOMMENDED
 from lemniscate.errors import UserError, is_installed, unknown_name
 from lemniscate.system.files import at_home
 
+EARLIER = {"check": "doctor"}
+"""names that commands had, which still work"""
+
 SHELLS = ("bash", "zsh", "fish")
 
 COMMANDS = {
@@ -25,7 +28,7 @@ COMMANDS = {
     "plot": "Draw the curves of a run and its report.html, or compare several, grouped by all but the seed.",
     "push": "Upload the policy of a run to the Hugging Face Hub, with a page about it.",
     "envs": "List the environments, their backends, and the preset that fits.",
-    "check": "Check that an environment is suitable for training, or that the files of a run are whole.",
+    "doctor": "Say what is wrong with a run, or with an environment before training, and what to change.",
     "course": "Lay out the course: notebooks with gaps to fill in and their checks, and a page on the order.",
     "grade": "Judge a folder of students' hand-ins: a table, every finding, a page for each.",
     "completion": "Print the script with which a shell completes; its first line says where to write it.",
@@ -86,7 +89,7 @@ OPTIONS: list[tuple[str, str, str, Any]] = [
     ("grade", "--exercises LIST", "those that are asked for: gae,Agent [those that are found]", ""),
     ("grade", "--to DIR", "where findings, pages and results go [FOLDER-grades]", None),
     ("grade", "--csv", "print the table as CSV on standard output", False),
-    ("evaluate grade", "--json", "print one JSON object on standard output", False),
+    ("evaluate grade doctor", "--json", "print one JSON object on standard output", False),
     ("watch", "--sample", argparse.SUPPRESS, False),
     ("watch", "--random", "act uniformly at random", False),
     ("watch", "--video FILE", ".gif, .webp or .mp4 instead of a window", None),
@@ -98,10 +101,10 @@ OPTIONS: list[tuple[str, str, str, Any]] = [
     ("push", "--private", "make a new repository private", False),
     ("push", "--license NAME", "licence on the page, as the Hub abbreviates it: mit [none]", None),
     ("envs", "filter [FILTER]", "a part of the id", ""),
-    ("check", "what ENV|RUN", "an id, module:Class of your own, a run or a sweep", None),
-    ("check", "--env-args JSON", "arguments of the environment", None),
-    ("check", "--wrappers NAME …", "wrappers, as in training", []),
-    ("check", "--backend NAME", "simulation backend [chosen from the id]", None),
+    ("doctor", "what RUN|ENV", "a run, a sweep, an id, or module:Class of your own", None),
+    ("doctor", "--env-args JSON", "arguments of the environment", None),
+    ("doctor", "--wrappers NAME …", "wrappers, as in training", []),
+    ("doctor", "--backend NAME", "simulation backend [chosen from the id]", None),
     ("course", "action start", "lay it out", None),
     ("course", "folder DIR", "where to; no file is overwritten", None),
     ("course", "--solutions", "the solutions too, in DIR/solutions", False),
@@ -157,7 +160,7 @@ class _Help(argparse.RawDescriptionHelpFormatter):
 def parse(arguments: Sequence[str]) -> argparse.Namespace:
     """The command and its options. Raises `UserError` with one sentence on what is not understood."""
     words = _normalized(arguments) or ["--help"]
-    command = words[0]
+    command = EARLIER.get(words[0], words[0])
     if command.startswith("-"):
         return _parse_none(words)
     if command not in COMMANDS:

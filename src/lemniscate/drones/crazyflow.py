@@ -21,8 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lemniscate.drones.pd import GAINS, PD
-from lemniscate.drones.vehicle import CONDITIONS, DYNAMICS, Ranges, interface_of, read_ranges
+from lemniscate.drones.vehicle import CONDITIONS, DYNAMICS, GAINS, PD, Ranges, interface_of, read_ranges
 from lemniscate.envs.backend import Backend, Scene, Summary
 from lemniscate.envs.factory import model_warnings_off, sentences
 from lemniscate.envs.spaces import action_kind

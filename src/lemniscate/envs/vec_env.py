@@ -2,6 +2,7 @@
 
 import math
 import time
+from collections import deque
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
@@ -13,7 +14,7 @@ from lemniscate.envs.backend import Backend
 from lemniscate.errors import NonFiniteError, UserError, wrong_action
 from lemniscate.spec import Box, Discrete, MultiBinary, Spec
 from lemniscate.system.world import ALONE, World
-from lemniscate.types import Step, wide_float
+from lemniscate.types import Rollout, Step, wide_float
 
 PATIENCE = 20_000
 """steps that an episode may take in an environment without a time limit, where whole ones are wanted"""
@@ -31,6 +32,8 @@ class Carrier(Protocol):
         ...
 
 
+RECENT_ROWS, RECENT_BYTES = 1024, 2**23
+"""the newest rows that are kept, and the bytes of their observations: whichever is less"""
 LOG_ROWS = 1024
 """steps after which the logged ones are summed up"""
 
@@ -58,12 +61,16 @@ class VecEnv:
         self.collecting = Stopwatch()
         """seconds that the functions of `data` spend acting and stepping"""
         self.steps = 0
+        size = (1 if self.spec.image else 4) * max(1, self.spec.observation_size)
+        kept = min(RECENT_ROWS, RECENT_BYTES // size) // self.num_envs
+        self._recent: deque[tuple[Tensor, Tensor, Step]] = deque(maxlen=max(4, kept))
         self._statistics = EpisodeStatistics(self.num_envs, self.device)
         self._actions: tuple[torch.Size, torch.dtype] | None = None  # before it is restarted, none is right
 
     def restart(self, seed: int, steps: int = 0) -> Tensor:
         """Begin again from a seed; also stored as `obs`, [N, O]. `steps` is what the run has taken."""
         self.steps = steps
+        self._recent.clear()
         self._statistics = EpisodeStatistics(self.num_envs, self.device)
         mine = self.backend.restart(seed, self._first)
         self._actions = _action_layout(self.spec, self.num_envs)
@@ -95,6 +102,7 @@ class VecEnv:
             step, counts = self._of_all(step, counts)
         if self.carrier:
             step = self.carrier.follow(self.obs, step)
+        self._recent.append((self.obs, action, step))
         self.obs = step.obs
         self.steps += self.num_envs
         self._statistics.log(step, counts, measures, valid)
@@ -118,6 +126,14 @@ class VecEnv:
     def require_end(self, age: int) -> None:
         """Raise `UserError` where an episode of `age` steps has had its chance to end, and there is no time limit."""
         require_end(self.spec.env_id, age, self.spec.max_episode_steps)
+
+    def recent(self) -> Rollout | None:
+        """The newest rows since the last restart, [T, N, …], some thousand; None before the first step."""
+        rows = [
+            Rollout(obs, action, step.reward, step.next_obs, step.terminated, step.truncated, step.valid)
+            for obs, action, step in self._recent
+        ]
+        return Rollout.stack(rows) if rows else None
 
     def take_episodes(self) -> "Episodes":
         """The whole episodes that ended since the last call, and the means of all measures over its steps."""

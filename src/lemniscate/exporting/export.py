@@ -14,9 +14,8 @@ import numpy as np
 from lemniscate.api.policy import Trained, TrainedPolicy, algorithm_of, load, path_of
 from lemniscate.envs.backend import Interface, Quantity
 from lemniscate.errors import UserError, is_installed
-from lemniscate.exporting.c_code import c_files
+from lemniscate.exporting.c_code import c_files, crazyflie_files
 from lemniscate.exporting.compiled import HostPolicy, host_compiler
-from lemniscate.exporting.crazyflie import crazyflie_files
 from lemniscate.exporting.deployed import Act, Deployed, act_with, input_size, memory_size, safe_action, safe_sentence
 from lemniscate.exporting.onnx_model import onnx_act, onnx_model
 from lemniscate.exporting.parity import TESTS, fly, parity, self_tests, sentences

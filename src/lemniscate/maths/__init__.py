@@ -14,6 +14,7 @@ from lemniscate.maths.noise import coloured, ornstein_uhlenbeck, uniform
 from lemniscate.maths.returns import episode_return, gae, q_lambda, reward_to_go
 from lemniscate.maths.stats import (
     clip_fraction,
+    explained_by,
     explained_variance,
     kl_k1,
     kl_k3,
@@ -42,6 +43,7 @@ __all__ = [
     "conjugate_gradient",
     "cross_entropy",
     "episode_return",
+    "explained_by",
     "explained_variance",
     "fisher_product",
     "gae",

@@ -42,6 +42,36 @@ def explained_variance(prediction: Tensor, target: Tensor) -> Tensor:
     return 1 - moments(target - prediction)[1] / moments(target)[1]
 
 
+def explained_by(features: Tensor, targets: Tensor, beside: Tensor) -> Tensor:
+    """The share of the targets' variance that a line in `features` explains beyond one in `beside`, less chance.
+
+    The adjusted coefficient of partial determination, 1 − (RSS₁ / (B − p₁)) / (RSS₀ / (B − p₀)): about 0, and sometimes
+    below, for features that have nothing to do with the targets.
+
+    Args:
+        features: [B, F], float64.
+        targets: [B, K].
+        beside: [B, G]; G may be 0.
+
+    Returns:
+        [K]; 0 where `beside` leaves nothing to explain, NaN where there are no more rows than columns.
+    """
+    few = features.new_full((), len(targets) - beside.shape[1] - 1)
+    many = few - features.shape[1]
+    left, after = (_residual(columns, targets) for columns in (beside, torch.cat([beside, features], dim=-1)))
+    share = 1 - (after / many) / (left / few)
+    share = torch.where(left > 1e-9 * targets.square().sum(0), share, 0.0)
+    return share if many > 0 else share * torch.nan
+
+
+def _residual(columns: Tensor, targets: Tensor) -> Tensor:
+    """The sum of squares [K] that a line in `columns`, with an intercept, leaves of the targets."""
+    x, y = columns - columns.mean(0), targets - targets.mean(0)
+    x = x / (x.square().sum(0).sqrt() + 1e-12)
+    ridge = 1e-9 * torch.eye(x.shape[1], dtype=x.dtype, device=x.device)  # columns may be multiples of each other
+    return (y - x @ torch.linalg.solve(x.T @ x + ridge, x.T @ y)).square().sum(0)
+
+
 def kl_k1(log_ratio: Tensor) -> Tensor:
     """The estimate E_old[−log r] of KL(π_old ‖ π): unbiased, of high variance, sometimes negative.
 

@@ -20,8 +20,10 @@ from typing import Any
 import numpy as np
 
 from lemniscate import algos
+from lemniscate.doctor import Diagnosis
+from lemniscate.doctor.rules import seeds_differ
 from lemniscate.errors import UserError, resume_line
-from lemniscate.report import advice, curves
+from lemniscate.report import curves
 from lemniscate.report.playback import FILMS
 from lemniscate.report.seeds import Group, Scores, differing
 from lemniscate.run.config import RunConfig
@@ -48,8 +50,8 @@ TASK = "reinforcement-learning"
 """the name of the field on the Hub"""
 
 
-def write_run(run: Path, pictures: Sequence[Path], scores: Evaluated | None) -> Path:
-    """Write the page of a run: curves, film, evaluation, settings, commands, what to try next."""
+def write_run(run: Path, pictures: Sequence[Path], scores: Evaluated | None, found: Sequence[Diagnosis]) -> Path:
+    """Write the page of a run: curves, film, evaluation, settings, commands, and what the doctor has found."""
     algorithm, config = read_config(run)
     log = read_metrics(run)
     taken, total = (log[-1]["step"] if log else 0), config.get("total_steps", 0)
@@ -62,7 +64,7 @@ def write_run(run: Path, pictures: Sequence[Path], scores: Evaluated | None) -> 
         title=f"{algorithm.upper()} on {config.get('env')}",
         subtitle=f"{run} · seed {config.get('seed')} · {progress}",
         minutes=curves.training_minutes(run)[1][-1],
-        advice=[*advice.sentences(advice.Evidence(config, log, scores or {})), advice.ONE_SEED],
+        found=found,
         pictures=pictures,
         film=newest_film(run),
         embedded_bytes=MOST_BYTES,
@@ -124,7 +126,7 @@ def comparison_part(
 
     Links in it lead from the `page` that it is for.
     """
-    spread = [(one.label, advice.seeds_differ(one.finals(scores))) for one in groups]
+    spread = [(one.label, seeds_differ(one.finals(scores))) for one in groups]
     kinds = [{"algorithm": one.algorithm, **one.config} for one in groups]
     seeds = {run: str(read_config(run)[1].get("seed")) for one in groups for run in one.runs}
     return {

@@ -3,12 +3,16 @@
 Unknown names are looked up in the table fields.md, which docs/glossary.md shows.
 """
 
+import ast
+import inspect
 import json
 import re
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
+from textwrap import dedent
 from types import NoneType, UnionType
 from typing import Annotated, Any, Union, get_args, get_origin
 
@@ -40,6 +44,26 @@ def kinds_of(hint: Any) -> dict[Any, tuple[Any, ...]]:
 def flag(name: str) -> str:
     """The flag of a field on the command line."""
     return "--env-args" if name == "env_kwargs" else f"--{name.replace('_', '-')}"
+
+
+def field_help(config: type) -> dict[str, str]:
+    """The docstring below each field, read from the source of the Config and of those it inherits from."""
+    found: dict[str, str] = {}
+    for kind in reversed(config.__mro__[:-1]):
+        try:
+            (tree,) = ast.parse(dedent(inspect.getsource(kind))).body
+        except (OSError, TypeError):  # typed into an interpreter, say
+            continue
+        for field, below in pairwise(tree.body if isinstance(tree, ast.ClassDef) else []):
+            match field, below:
+                case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(text))):
+                    found[name] = " ".join(text.split())
+    return found
+
+
+def field_of(flag: str) -> str:
+    """The field of a flag on the command line."""
+    return "env_kwargs" if flag == "--env-args" else flag.removeprefix("--").replace("-", "_")
 
 
 def read(name: str, hint: Any, text: Any) -> Any:

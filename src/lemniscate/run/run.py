@@ -32,6 +32,7 @@ from lemniscate.run.evaluate import critic_of, evaluate
 from lemniscate.run.loggers import NO_EPISODES, JsonLines, Logger, LoggerClass, TensorBoard
 from lemniscate.run.metrics import read_metrics
 from lemniscate.run.seeding import derive, seed_globals
+from lemniscate.run.signals import LOOKS, signals
 from lemniscate.run.state import TrainState, require_agreement
 from lemniscate.run.stopping import Stopped, StopRequest
 from lemniscate.run.warm_start import load_networks
@@ -87,6 +88,8 @@ class Run:
         """logged lines that callbacks have not seen"""
         self._episodes, self._episodes_before = 0, 0
         """whole training episodes so far, and before the present body of the loop"""
+        self._lines = 0
+        """lines logged by the loop"""
         self._logged, self._told = 0, 0
         """the step of the last line of metrics, and how many notices of the environments have been said"""
         self._cut_short = False
@@ -121,6 +124,7 @@ class Run:
         self._loggers += [make(self.path, record, state.step) for make in self._logger_classes]
         lines = read_metrics(self.path) if self.world.is_first else []
         self._episodes = sum(len(line.get("episode/returns", ())) for line in lines)
+        self._lines = sum("time/collect" in line for line in lines)
         self._logged = max((line["step"] for line in lines), default=0)
         return state
 
@@ -173,6 +177,11 @@ class Run:
             self._recent_returns = (self._recent_returns + episodes.returns)[-100:]
             numbers["episode/return"] = sum(episodes.returns) / len(episodes.returns)
             numbers["episode/length"] = sum(episodes.lengths) / len(episodes.lengths)
+        # Some LOOKS lines of a run have signals, of a short one a fourth of them: more would cost more than 1 %.
+        every = max(4, -(-self.config.total_steps // (LOOKS * max(1, state.step - self._line_step))))
+        if self.world.is_first and self._lines % every == 0:
+            numbers |= signals(state, self.config, self.spec, self.env.recent())
+        self._lines += 1
         numbers |= {f"info/{name.removeprefix('info/')}": mean for name, mean in episodes.measures.items()}
         self._write(state.step, numbers | self._times(state.step), episodes)
         notices = self.env.backend.notices if self.world.is_first else ()

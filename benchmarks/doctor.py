@@ -1,0 +1,210 @@
+"""How often the doctor is right: runs with injected faults, and healthy runs.
+
+    .venv/bin/python benchmarks/doctor.py faults --half even --seeds 101      of these the thresholds are chosen
+    .venv/bin/python benchmarks/doctor.py faults --half odd --seeds 1 2 3     the half of the table
+    .venv/bin/python benchmarks/doctor.py healthy
+    .venv/bin/python benchmarks/doctor.py table
+    … --runs DIR           keep the runs there; one that is there is not trained again, only diagnosed
+
+A fault counts as named first where the first finding is one of its names, hints left out. Each row of
+`benchmarks/results/doctor.jsonl` is one run. The faults are those of `faulty.py`, and settings.
+"""
+
+import argparse
+import shutil
+import tempfile
+from collections import defaultdict
+from collections.abc import Mapping
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any
+
+import faulty
+from common import append, provenance, rows
+
+import lemniscate as lem
+from lemniscate import presets
+from lemniscate.algos import ALGORITHMS
+from lemniscate.errors import NonFiniteError, UserError
+
+ON = {"CartPole-v1": 50_000, "LunarLander-v3": 120_000, "HalfCheetah-v5": 120_000}
+"""environments of faults under PPO, with the steps of a run"""
+OFF = {"Pendulum-v1": 6_000, "Reacher-v5": 6_000, "InvertedPendulum-v5": 6_000}
+"""environments of faults under SAC"""
+BOX = {"HalfCheetah-v5": 120_000, "Pendulum-v1": 60_000, "InvertedPendulum-v5": 60_000}
+"""environments of faults under PPO that continuous actions have"""
+QUICK = {"learning_starts": 1_000, "log_every": 100}
+
+FAULTS: dict[str, tuple[str, Mapping[str, int], Mapping[str, Any], tuple[str, ...]]] = {
+    # fault: algorithm, environments, fields or the name of a change in `faulty.LEARNERS`, names that are right
+    "reward never nonzero": ("ppo", ON, {"wrappers": ("faulty:NoReward",)}, ("reward-zero",)),
+    "rewards too large": ("ppo", ON, {"wrappers": ("faulty:ScaledReward(scale=10000)",)}, ("reward-large",)),
+    "rewards too small": ("ppo", ON, {"wrappers": ("faulty:ScaledReward(scale=0.0001)",)}, ("reward-small",)),
+    "rewards of noise": ("ppo", ON, {"wrappers": ("faulty:NoisyReward",)}, ("reward-unexplained",)),
+    "rewards that tell the time": ("ppo", ON, {"wrappers": ("faulty:TimedReward",)}, ("reward-by-time",)),
+    "one return for all": ("ppo", ON, {"wrappers": ("faulty:SameReturn",)}, ("every-return-alike",)),
+    "constant observations": ("ppo", ON, {"wrappers": ("faulty:Frozen",)}, ("constant-observation",)),
+    "exploding observations": ("ppo", ON, {"wrappers": ("faulty:Drifting",)}, ("exploding-observation",)),
+    "observations in another unit": (
+        "ppo", ON, {"wrappers": ("faulty:Degrees",), "normalize_observations": False}, ("large-observation",)
+    ),
+    "actions without effect": ("ppo", ON, {"wrappers": ("faulty:Deaf",)}, ("action-without-effect",)),
+    "a limit as a termination": ("ppo", ON, {"wrappers": ("faulty:LimitAsEnd",)}, ("limit-as-termination",)),
+    "ends that are not reported": ("ppo", ON, {"wrappers": ("faulty:Endless",)}, ("no-episode",)),
+    "episodes of one step": ("ppo", ON, {"wrappers": ("faulty:OneStep",)}, ("short-episodes",)),
+    "a seed without effect": ("ppo", ON, {"wrappers": ("faulty:Seedless",)}, ("seed-ignored",)),
+    "learning rate too high": (
+        "ppo", ON, {"learning_rate": 0.03, "desired_kl": None}, ("setting-learning-rate", "kl-too-large")
+    ),
+    "learning rate too low": (
+        "ppo", ON, {"learning_rate": 3e-6, "desired_kl": None}, ("setting-learning-rate", "policy-still")
+    ),
+    "γ too small": ("ppo", ON, {"gamma": 0.5}, ("setting-gamma",)),
+    "entropy bonus too large": ("ppo", ON, {"entropy_coef": 0.3}, ("setting-entropy-coef",)),
+    "clip too small": ("ppo", ON, {"clip": 0.001}, ("setting-clip",)),
+    "too many epochs": ("ppo", ON, {"epochs": 60, "desired_kl": None}, ("setting-epochs", "kl-too-large")),
+    "minibatches too small": ("ppo", ON, {"minibatch_size": 16, "epochs": 4}, ("setting-minibatch-size",)),
+    "rollouts too short": (
+        "ppo", ON, {"num_envs": 2, "num_steps": 32, "minibatch_size": 64}, ("setting-rollout-rows",)
+    ),
+    "λ of one step": ("ppo", ON, {"gae_lambda": 0.2}, ("setting-gae-lambda",)),
+    "value without weight": ("ppo", ON, {"value_coef": 1e-4}, ("setting-value-coef",)),
+    "gradient cut to nothing": ("ppo", ON, {"max_grad_norm": 1e-4}, ("setting-max-grad-norm",)),
+    "advantages not normalized": (
+        "ppo", ON, {"normalize_advantage": False, "scale_rewards": False}, ("advantage-not-normalized",)
+    ),
+    "σ collapsed": ("ppo", BOX, {"initial_log_std": -6.0}, ("setting-initial-log-std",)),
+    "σ exploded": ("ppo", BOX, {"initial_log_std": 2.5}, ("setting-initial-log-std",)),
+    "a ratio that is not 1": ("ppo", ON, "another log-probability", ("ratio-not-one",)),
+    "a frozen normalizer": ("ppo", ON, "a normalizer that stops", ("normalizer-frozen",)),
+    "a policy that is frozen": ("ppo", ON, {"freeze": ("policy",)}, ("policy-still",)),
+    "the sign of the advantage": ("ppo", ON, "the sign of the advantage", ("gets-worse",)),
+    "a value of other rows": ("ppo", ON, "targets of other rows", ("value-explains-nothing",)),
+    "dead units": ("ppo", ON, "weights that are too large", ("units-inactive",)),
+    "no target networks": ("sac", OFF, QUICK | {"tau": 1.0}, ("setting-tau",)),
+    "targets that stand still": ("sac", OFF, QUICK | {"tau": 1e-5}, ("setting-tau",)),
+    "replay ratio too high": (
+        "sac", OFF, QUICK | {"num_updates": 16, "total_steps": 3_000}, ("setting-replay-ratio", "critic-overfits")
+    ),
+    "replay ratio too low": ("sac", OFF, QUICK | {"update_every": 20}, ("setting-replay-ratio",)),
+    "replay buffer too small": ("sac", OFF, QUICK | {"buffer_size": 300}, ("setting-buffer-size",)),
+    "mostly at random": ("sac", OFF, QUICK | {"learning_starts": 5_800}, ("mostly-random",)),
+    "temperature too high": ("sac", OFF, QUICK | {"initial_temperature": 100.0}, ("setting-initial-temperature",)),
+    "entropy asked for too high": ("sac", OFF, QUICK | {"target_entropy": 5.0}, ("entropy-unreachable",)),
+    "critic's rate too high": (
+        "sac", OFF, QUICK | {"critic_learning_rate": 0.1}, ("setting-critic-learning-rate",)
+    ),
+    "policy's rate too high": ("sac", OFF, QUICK | {"actor_learning_rate": 0.1}, ("setting-actor-learning-rate",)),
+    "batches too small": ("sac", OFF, QUICK | {"batch_size": 4}, ("setting-batch-size",)),
+}  # fmt: skip
+
+HEALTHY = ("CartPole-v1", "Acrobot-v1", "LunarLander-v3", "Pendulum-v1", "MountainCarContinuous-v0", "HalfCheetah-v5",
+           "Hopper-v5", "Walker2d-v5", "Ant-v5", "Swimmer-v5", "InvertedPendulum-v5", "Reacher-v5")  # fmt: skip
+MOST = {"sac": 8_000, "td3": 8_000, "ddpg": 8_000}
+"""steps of a healthy run at most; of other algorithms 150,000"""
+
+
+def trained(path: Path, algorithm: str, env: str, fault: str | None = None, **fields: Any) -> Path:
+    """The directory of a run, which is trained if it is not there; a loss that is not finite ends it."""
+    if not (path / "metrics.jsonl").exists():
+        shutil.rmtree(path, ignore_errors=True)
+        with faulty.learner(fault) if fault else nullcontext():
+            try:
+                lem.train(algorithm, env, run=path, progress=False, **fields)
+            except NonFiniteError as error:
+                print(error)
+        shutil.rmtree(path / "checkpoints", ignore_errors=True)
+    return path
+
+
+def one_fault(name: str, env: str, seed: int, folder: Path) -> list[str]:
+    """The names of the findings on a run with a fault, in their order."""
+    algorithm, steps, change, _ = FAULTS[name]
+    fields = {"preset": "default", "seed": seed, "total_steps": steps[env], "checkpoint_every": 10_000_000}
+    fault = change if isinstance(change, str) else None
+    fields |= {} if fault else change
+    path = folder / f"{name}-{env}-{seed}".replace(" ", "_").replace("/", "_")
+    found = lem.diagnose(trained(path, algorithm, env, fault, **fields))
+    return [one.name for one in found if one.sure != "hint"]
+
+
+def healthy_runs() -> list[tuple[str, str, str, int]]:
+    """(algorithm, environment, preset, seed): all presets of these environments, and the defaults elsewhere."""
+    found = []
+    for algorithm in ALGORITHMS:
+        own = {(preset.config.env, preset.name) for preset in presets.of(algorithm)}
+        for env in HEALTHY:
+            names = sorted(name for its, name in own if its == env) or ["default"]
+            found += [(algorithm, env, name, 1) for name in names]
+    return found
+
+
+def one_healthy(algorithm: str, env: str, preset: str, seed: int, folder: Path) -> list[str] | None:
+    """The names of the findings on a healthy run; None where the algorithm cannot learn the environment."""
+    path = folder / f"{algorithm}-{env}-{preset}-{seed}"
+    try:
+        config = lem.config_for(algorithm, env, preset)
+        steps = min(config.total_steps, MOST.get(algorithm, 150_000))
+        fields = {"preset": preset, "seed": seed, "total_steps": steps, "compile": "off"}
+        if algorithm in MOST:
+            fields["learning_starts"] = min(config.learning_starts, steps // 4)
+            fields["log_every"] = 100
+        found = lem.diagnose(trained(path, algorithm, env, **fields))
+    except UserError as error:
+        print(algorithm, env, preset, error)
+        return None
+    return [one.name for one in found if one.sure != "hint"]
+
+
+def table() -> None:
+    """The shares of faults that are named, by fault, and the false alarms."""
+    judged = {(row["fault"], row["env"], row["seed"]): row["found"] for row in rows("doctor") if "fault" in row}
+    by_fault = defaultdict(list)
+    for (fault, _, seed), found in judged.items():
+        if seed < 100:
+            right = FAULTS[fault][3]
+            by_fault[fault].append((found[:1] and found[0] in right, any(name in right for name in found[:3])))
+    for fault, each in by_fault.items():
+        first, third = (sum(map(bool, column)) for column in zip(*each, strict=True))
+        print(f"| {fault} | {', '.join(FAULTS[fault][3])} | {first} of {len(each)} | {third} of {len(each)} |")
+    every = [pair for each in by_fault.values() for pair in each]
+    if every:
+        first, third = (sum(map(bool, column)) / len(every) for column in zip(*every, strict=True))
+        print(f"| all | | {first:.1%} | {third:.1%} |")
+    fine = {
+        (row["algorithm"], row["env"], row["preset"], row["seed"]): row["found"]
+        for row in rows("doctor")
+        if "preset" in row
+    }
+    alarms = {key: found for key, found in fine.items() if found}
+    print(f"false alarms: {len(alarms)} of {len(fine)}", alarms)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=["faults", "healthy", "table"])
+    parser.add_argument("--half", choices=["even", "odd"])
+    parser.add_argument("--only", nargs="+", help="these faults, or algorithms of healthy runs")
+    parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3])
+    parser.add_argument("--runs", type=Path)
+    given = parser.parse_args()
+    with nullcontext(given.runs) if given.runs else tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        names = [name for i, name in enumerate(FAULTS) if given.half in (None, ("even", "odd")[i % 2])]
+        for name in names if given.what == "faults" else []:
+            for env in FAULTS[name][1] if not given.only or name in given.only else ():
+                for seed in given.seeds:
+                    found = one_fault(name, env, seed, folder)
+                    append("doctor", {"fault": name, "env": env, "seed": seed, "found": found, **provenance()})
+                    right = found[:1] and found[0] in FAULTS[name][3]
+                    print("✓" if right else "✗", name, env, seed, found, flush=True)
+        for algorithm, env, preset, seed in healthy_runs() if given.what == "healthy" else ():
+            if given.only and algorithm not in given.only:
+                continue
+            found = one_healthy(algorithm, env, preset, seed, folder)
+            if found is not None:
+                row = {"algorithm": algorithm, "env": env, "preset": preset, "seed": seed, "found": found}
+                append("doctor", row | provenance())
+                print("✗" if found else "✓", algorithm, env, preset, found, flush=True)
+        if given.what == "table":
+            table()

@@ -1,0 +1,124 @@
+"""The doctor: what is wrong with a run, in words. `rules` is a table of faults; `evidence` is what they look at."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from textwrap import wrap
+from typing import Any
+
+import numpy as np
+
+from lemniscate.doctor.evidence import Evidence, usual_ranges, with_ratios
+from lemniscate.doctor.rules import CERTAIN, HINT, LIKELY, RULES, SETTINGS, SYMPTOM, Rule, settings_far_out
+from lemniscate.run.config import RunConfig
+from lemniscate.run.fields import field_help
+from lemniscate.run.metrics import read_metrics
+from lemniscate.system.console import say
+
+PAGE = "docs/doctor.md"
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """A finding about a run.
+
+    Attributes:
+        name: of the fault, its anchor in `docs/doctor.md`.
+        sure: "certain", "likely" or "possible"; a "hint" is no fault, but what to do next.
+        seen: what was seen, with numbers.
+        means: what it means.
+        remedy: what to change.
+        source: where that is known from.
+        metric: what is drawn beside it, with its `steps` and `values`.
+    """
+
+    name: str
+    sure: str
+    seen: str
+    means: str
+    remedy: str
+    source: str
+    metric: str
+    steps: list[int]
+    values: list[float]
+
+    def __str__(self) -> str:
+        return self.listed(112)
+
+    def listed(self, width: int) -> str:
+        """The finding in a few lines, wrapped at `width` columns."""
+        said = f"{self.seen} {self.means}", f"→ {self.remedy}.", f"{self.sure}; {PAGE}#{self.name}; {self.source}"
+        lines = [line for part in said for line in wrap(part, width - 2, break_long_words=False)]
+        return "\n  ".join(lines)
+
+
+def diagnose(evidence: Evidence) -> list[Diagnosis]:
+    """The findings of all rules, causes first: beside a cause that is certain or likely no symptom is named."""
+    found = [(rule, seen) for rule in RULES if (seen := rule.sees(evidence))] + [*settings_far_out(evidence)]
+    caused = any(rule.kind <= SETTINGS and rule.sure in (CERTAIN, LIKELY) for rule, _ in found)
+    faulty = any(rule.sure != HINT for rule, _ in found)
+    left = [
+        (rule, seen)
+        for rule, seen in found
+        if not (caused and rule.kind == SYMPTOM) and not (faulty and rule.name == "does-not-learn")
+    ]
+    return [_diagnosis(evidence, rule, seen) for rule, seen in sorted(left, key=_order)]
+
+
+def _order(found: tuple[Rule, str]) -> tuple[bool, int, bool]:
+    rule, _ = found
+    return rule.sure == HINT, rule.kind, rule.sure != CERTAIN
+
+
+def _diagnosis(evidence: Evidence, rule: Rule, seen: str) -> Diagnosis:
+    lines = [line for line in evidence.log if rule.metric in line]
+    chosen = [lines[i] for i in np.linspace(0, len(lines) - 1, min(100, len(lines))).astype(int)]
+    steps, values = [line["step"] for line in chosen], [line[rule.metric] for line in chosen]
+    remedy = rule.remedy_for(evidence.config)
+    return Diagnosis(rule.name, rule.sure, seen, rule.means, remedy, rule.source, rule.metric, steps, values)
+
+
+class Attendance:
+    """Says, while a run is trained, what is certainly wrong with it: a line for each finding, once.
+
+    It is called with the step and the metrics of each line that has signals.
+    """
+
+    def __init__(self, config: RunConfig) -> None:
+        self._config = config.to_json()
+        self._looks = list[dict[str, Any]]()
+        self._said = set[str]()
+
+    def __call__(self, step: int, metrics: Mapping[str, float]) -> None:
+        """Speak of what the lines so far show; three of them are too few."""
+        self._looks.append({"step": step, **metrics})
+        if len(self._looks) <= 3:
+            return
+        evidence = Evidence(self._config, {}, {}, {}, self._looks, {})
+        for rule in RULES:
+            seen = rule.sees(evidence) if rule.sure == CERTAIN and rule.name not in self._said else None
+            if seen:
+                self._said.add(rule.name)
+                say(f"{seen} {rule.means} {rule.remedy_for(self._config)}.")
+
+
+def evidence_of(
+    run: Path,
+    config: RunConfig,
+    recommended: Sequence[RunConfig],
+    scores: Mapping[str, Any] | None = None,
+    repeats: bool | None = None,
+) -> Evidence:
+    """The evidence on the run in a directory.
+
+    Args:
+        run: the directory.
+        config: its settings.
+        recommended: the Configs that are known to learn its environment, the best first.
+        scores: of its final evaluation.
+        repeats: whether its environment begins alike from one seed.
+    """
+    known = [with_ratios(one.to_json()) for one in recommended]
+    tried = {name: {str(one.get(name)) for one in known} for name in known[0]}
+    usual = usual_ranges(field_help(type(config)))
+    return Evidence(with_ratios(config.to_json()), known[0], tried, usual, read_metrics(run), scores or {}, repeats)

@@ -1,0 +1,130 @@
+"""The evidence on a run: its settings beside the recommended ones, its lines of metrics, its final scores."""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from lemniscate.run.fields import number
+
+HORIZONS = ("gamma", "gae_lambda", "td_lambda")
+"""fields whose size is that of 1 / (1 − x)"""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """The input of the rules.
+
+    Attributes:
+        config: the fields of the run's Config.
+        recommended: those of the preset for its environment, or of the algorithm's defaults.
+        tried: for each field the values, as texts, of all presets for its environment and of the defaults.
+        usual: the usual range of each field that has one, from its help.
+        log: the lines of its metrics.
+        scores: of its final evaluation; empty where there is none.
+        repeats: whether its environment begins alike from one seed; None where that was not tried.
+    """
+
+    config: Mapping[str, Any]
+    recommended: Mapping[str, Any]
+    tried: Mapping[str, set[str]]
+    usual: Mapping[str, tuple[float, float]]
+    log: Sequence[Mapping[str, Any]]
+    scores: Mapping[str, Any]
+    repeats: bool | None = None
+
+    @cached_property
+    def returns(self) -> np.ndarray:
+        """The return of every whole training episode, in order: [episodes]."""
+        return np.array([ret for line in self.log for ret in line.get("episode/returns", [])], dtype=np.float64)
+
+    @cached_property
+    def lengths(self) -> np.ndarray:
+        """The length of every whole training episode, in order: [episodes]."""
+        return np.array([n for line in self.log for n in line.get("episode/lengths", [])], dtype=np.float64)
+
+    def values(self, name: str) -> np.ndarray:
+        """A metric of every line that has it, in order."""
+        return np.array([line[name] for line in self.log if name in line], dtype=np.float64)
+
+    def late(self, name: str) -> float:
+        """The median of a metric in the last half of its lines; NaN, of which no rule speaks, if there is none."""
+        values = self.values(name)
+        return float(np.median(values[len(values) // 2 :])) if len(values) else np.nan
+
+    def early(self, name: str) -> float:
+        """The first value of a metric; NaN if there is none."""
+        return float(next(iter(self.values(name)), np.nan))
+
+    def greatest(self, name: str) -> float:
+        """The greatest value of a metric; NaN if there is none."""
+        return float(self.values(name).max(initial=-np.inf)) if len(self.values(name)) else np.nan
+
+    @property
+    def sees_nothing(self) -> bool:
+        """Whether no number of the observation ever changes."""
+        return self.late("observation/constant") == 1
+
+    @cached_property
+    def rose(self) -> bool:
+        """Whether the last fifth of the episodes is better than the first, by three standard errors."""
+        return self.gain > 3
+
+    @cached_property
+    def gain(self) -> float:
+        """The difference between the last fifth of the episodes and the first, in standard errors; 0 for under ten."""
+        first, last = self.ends
+        if len(last) < 2:
+            return 0.0
+        error = np.hypot(first.std(), last.std()) / np.sqrt(len(last))
+        return float((last.mean() - first.mean()) / max(error, 1e-9))
+
+    @cached_property
+    def ends(self) -> tuple[np.ndarray, np.ndarray]:
+        """The returns of the first and of the last fifth of the episodes."""
+        fifth = len(self.returns) // 5
+        return self.returns[:fifth], self.returns[len(self.returns) - fifth :]
+
+    def beyond(self, field: str, low: float, high: float) -> float:
+        """How far a field is outside its usual range: the factor, negative below it; 0 inside, or of a known value."""
+        value = first_number(self.config.get(field))
+        if value is None or str(self.config[field]) in self.tried.get(field, ()):
+            return 0.0
+        if field in HORIZONS:
+            value, low, high = (1 / max(1 - x, 1e-4) for x in (value, low, high))
+        elif field == "initial_log_std":
+            value, low, high = np.exp((value, low, high))
+        if value < low:
+            return -low / value if value > 0 else -np.inf
+        return value / high if value > high else 0.0
+
+
+def with_ratios(config: Mapping[str, Any]) -> dict[str, Any]:
+    """A Config with the numbers that are made of several fields: updates for each step, and rows of a rollout."""
+    found, envs = dict(config), config.get("num_envs", 1)
+    if "num_updates" in config:
+        found["replay_ratio"] = config["num_updates"] / (envs * config["update_every"])
+        if config["buffer_size"] >= config["total_steps"]:
+            found["buffer_size"] = None  # all of the run, whatever the number is
+    if "num_steps" in config:
+        found["rollout_rows"] = envs * config["num_steps"]
+    return found
+
+
+def first_number(value: Any) -> float | None:
+    """A number of a Config as it is, the first of a schedule "FIRST>LAST"; None for anything else."""
+    value = number(value.partition(">")[0]) if isinstance(value, str) else value
+    return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
+
+
+def usual_ranges(texts: Mapping[str, str]) -> dict[str, tuple[float, float]]:
+    """The usual range of each field whose help says one, as "usually 0.9 to 0.999"."""
+    said = {name: re.search(r"usually (-?[\d.,e-]+) to (-?[\d.,e-]*\d)", text) for name, text in texts.items()}
+    return {
+        name: (float(found[1].replace(",", "")), float(found[2].replace(",", "")))
+        for name, found in said.items()
+        if found
+    }

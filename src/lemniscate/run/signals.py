@@ -1,0 +1,142 @@
+"""Signals: measurements of a run's newest rows and of its networks, from which `lemniscate doctor` reads what is wrong.
+
+They are taken some thirty times in a run, and cost less than a hundredth of it. Nothing learns from them.
+"""
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import one_hot
+
+from lemniscate.maths import explained_by, moments, td_target
+from lemniscate.nn.networks import ACTIVATIONS
+from lemniscate.nn.normalizer import RunningNorm
+from lemniscate.run.config import RunConfig
+from lemniscate.spec import Action, Box, Discrete, MultiDiscrete, Spec
+from lemniscate.types import Rollout, Transition
+
+LOOKS = 32
+"""how often in a run the signals are measured"""
+SEEN = 256
+"""rows that the networks are asked about"""
+MOST_NUMBERS = 32
+"""numbers of an observation up to which lines are fitted to them; for more there are too few rows"""
+UNITS = (*ACTIVATIONS.values(), nn.Tanh, nn.GELU, nn.LeakyReLU)
+"""the modules whose outputs are hidden units; the last three are those of networks of one's own"""
+
+
+@torch.no_grad()
+def signals(state: Any, config: RunConfig, spec: Spec, rows: Rollout | None) -> dict[str, float]:
+    """The signals of a training state and of the newest rows [T, N, …] of its environments, by the glossary's names."""
+    if rows is None or rows.valid.sum() < 2:
+        return {}
+    chosen = rows[rows.valid]
+    found = of_rows(chosen, spec) | of_networks(state, chosen) | of_critics(state, config, chosen)
+    found["reward/by_time"] = by_time(rows)
+    if not spec.has_images and spec.observation_size <= MOST_NUMBERS:
+        found |= of_effects(chosen, spec)
+    return {name: float(value) for name, value in found.items()}
+
+
+def of_rows(rows: Rollout, spec: Spec) -> dict[str, Tensor]:
+    """Sizes of rewards and observations, and shares, of rows [B, …].
+
+    These are of numbers that never change, of actions at their bounds, and of ends that are terminations.
+    """
+    obs, ends = rows.obs[:, : spec.observation_size].float(), rows.done.sum()
+    found = {
+        "reward/mean": rows.reward.mean(),
+        "reward/std": moments(rows.reward)[1].sqrt(),
+        "reward/largest": rows.reward.abs().max(),
+        "observation/largest": obs.abs().max(),
+        "observation/constant": (obs == obs[0]).all(0).float().mean(),
+    }
+    if isinstance(spec.action, Box):
+        found["action/at_bounds"] = (rows.action.abs() > 0.99).float().mean()
+    return found | ({"episode/terminated": rows.terminated.sum() / ends} if ends else {})
+
+
+def by_time(rows: Rollout) -> Tensor:
+    """The share of the rewards' variance within episodes that a line over time explains, of rows [T, N, …]."""
+    steps, envs = rows.done.shape
+    before = torch.cat([torch.zeros_like(rows.done[:1]), rows.done[:-1]]).cumsum(0)  # episodes that ended so far
+    episode = (before * envs + torch.arange(envs, device=before.device))[rows.valid].cpu()
+    time = torch.arange(steps).double()[:, None].expand(steps, envs)[rows.valid.cpu()]
+    count = torch.bincount(episode).clamp(min=1)
+    time, reward = (
+        x - (torch.bincount(episode, weights=x) / count)[episode]
+        for x in (time, rows.reward[rows.valid].cpu().double())
+    )
+    size = time.square().sum() * reward.square().sum()
+    return (time * reward).sum().square() / size if size > 1e-12 else torch.zeros(())
+
+
+def of_effects(rows: Rollout, spec: Spec) -> dict[str, Tensor]:
+    """The shares of the observations' changes that actions explain, and of the rewards that all of a row explains.
+
+    Actions explain what a line fitted to them explains beyond one fitted to the observations alone, in that number of
+    the observation of which it is most. A reward may be a square too, of a distance or of an action.
+    """
+    obs, after = (x[:, : spec.observation_size].cpu().double() for x in (rows.obs, rows.next_obs))
+    action, inside = _numbers(rows.action.cpu(), spec.action), ~rows.done.cpu()
+    everything = torch.cat([obs, obs.square(), action, action.square(), after, after.square()], dim=-1)
+    return {
+        "action/effect": explained_by(action[inside], (after - obs)[inside], obs[inside]).max(),
+        "reward/explained": explained_by(everything, rows.reward[:, None].cpu().double(), obs[:, :0]).max(),
+    }
+
+
+def _numbers(action: Tensor, kind: Action) -> Tensor:
+    """Actions as numbers, a choice as one of n: [B, A]."""
+    if isinstance(kind, Discrete):
+        return one_hot(action, kind.n).double()
+    if isinstance(kind, MultiDiscrete):
+        return torch.cat([one_hot(x, n) for x, n in zip(action.unbind(-1), kind.nvec, strict=True)], dim=-1).double()
+    return action.double()
+
+
+def of_networks(state: Any, rows: Rollout) -> dict[str, Tensor]:
+    """The share of the policy's hidden units that are the same at all rows, its rank, and what its normalizer knows.
+
+    Inactive is a unit whose standard deviation over rows is below a fortieth of its layer's mean, as the dormant units
+    of Sokar et al. 2023, arXiv:2302.12902, definition 3.1; a unit at a bound of tanh counts too. The rank is the
+    effective one, δ = 0.01, of Kumar et al. 2021, arXiv:2010.14498, section 3, as a share of the last features.
+    """
+    obs, layers = rows.obs[-SEEN:], list[Tensor]()
+    modules = [module for module in state.policy.modules() if isinstance(module, UNITS)]
+    hooks = [module.register_forward_hook(lambda _module, _inputs, output: layers.append(output)) for module in modules]
+    try:
+        state.policy(obs)
+    finally:
+        for hook in hooks:
+            hook.remove()
+    found = dict[str, Tensor]()
+    if units := [layer.flatten(1).float() for layer in layers if layer.ndim > 1 and len(layer) == len(obs)]:
+        spread = [layer.std(0) for layer in units]
+        inactive = [std < (std.mean() / 40).clamp(min=1e-3) for std in spread]
+        sizes = torch.linalg.svdvals(units[-1]).cumsum(0)
+        found["network/inactive"] = torch.cat(inactive).float().mean()
+        found["network/rank"] = ((sizes < 0.99 * sizes[-1]).sum() + 1) / min(units[-1].shape)
+    if isinstance(normalizer := state.policy.normalizer, RunningNorm):
+        found["normalizer/count"] = normalizer.count
+        found["normalizer/offset"] = normalizer(rows.obs).mean(0).abs().max()
+    return found
+
+
+def of_critics(state: Any, config: RunConfig, rows: Rollout) -> dict[str, Tensor]:
+    """The mean squared error of Q over one step, of the newest rows and of sampled ones, where Q learns from replay."""
+    replay, updates = getattr(state, "replay", None), getattr(state, "updates", 0)
+    if replay is None or not updates or not hasattr(state.networks, "critics"):
+        return {}
+    generator = torch.Generator(replay.transitions.reward.device).manual_seed(updates)  # none of the run's own
+    columns = rows.obs, rows.action, rows.reward, rows.next_obs, rows.terminated
+    sampled = replay.transitions[replay.sample_indices(1, SEEN, generator)[0]]
+    critics, targets = state.networks.critics, getattr(state.targets, "critics", state.targets)
+
+    def error(batch: Transition) -> Tensor:
+        value = targets(batch.next_obs, state.policy(batch.next_obs).mode()).amin(0)
+        target = td_target(batch.reward, value, batch.terminated, gamma=getattr(config, "gamma", 1.0))
+        return (critics(batch.obs, batch.action)[0] - target).square().mean()
+
+    return {"td_error/newest": error(Transition(*columns)[-SEEN:]), "td_error/sampled": error(sampled)}

@@ -1,0 +1,283 @@
+"""The doctor: each rule fires at its fault and is silent elsewhere; causes come before consequences; remedies exist."""
+
+import json
+import re
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import lemniscate as lem
+from conftest import tiny_fields, tiny_off_policy
+from lemniscate import algos
+from lemniscate.cli import main
+from lemniscate.doctor import Evidence, diagnose
+from lemniscate.doctor.evidence import usual_ranges, with_ratios
+from lemniscate.doctor.rules import HINT, RULES, seeds_differ, settings_far_out
+from lemniscate.run.fields import field_help
+
+PAGE = (Path(__file__).parents[2] / "docs" / "doctor.md").read_text()
+NOISE = np.random.default_rng(0).normal(size=400)
+RISES = list(np.arange(400) + NOISE)
+FLAT = list(NOISE)
+
+
+def evidence(
+    algorithm="ppo", returns=FLAT, lengths=None, scores=None, repeats=None, steps=4_000, changed=(), **metrics
+):
+    """Evidence with a line for each value of the metrics, and the same returns in equal parts."""
+    kind = algos.find(algorithm).Config
+    config, usual = with_ratios(kind().to_json()), usual_ranges(field_help(kind))
+    count = max([8, *map(len, metrics.values())])
+    lines = [{"step": steps * (i + 1) // count} for i in range(count)]
+    for name, values in metrics.items():
+        for line, value in zip(lines, values, strict=False):
+            line[name.replace("__", "/")] = value
+    lengths = [50 + i % 7 for i in range(len(returns))] if lengths is None else lengths
+    for line, part, its in zip(lines, np.array_split(returns, count), np.array_split(lengths, count), strict=True):
+        line |= {"episode/returns": list(part), "episode/lengths": list(its)}
+    tried = {name: {str(value)} for name, value in config.items()}
+    given = with_ratios({**kind().to_json(), "total_steps": steps, **dict(changed)})
+    return Evidence(given, config, tried, usual, lines, scores or {}, repeats)
+
+
+def names(*args, **kwargs):
+    return [one.name for one in diagnose(evidence(*args, **kwargs)) if one.sure != HINT]
+
+
+CASES = {
+    # rule: evidence in which it fires, evidence just beside it
+    "seed-ignored": ({"repeats": False}, {"repeats": True}),
+    "constant-observation": ({"observation__constant": [1.0] * 8}, {"observation__constant": [0.99] * 8}),
+    "exploding-observation": (
+        {"observation__largest": [1.0, 10.0, 1e3, 1e3, 1e4, 1e4, 1e5, 1e5]},
+        {"observation__largest": [1.0, 5.0, 200.0, 200.0, 250.0, 290.0, 250.0, 250.0]},
+    ),
+    "large-observation": (
+        {"observation__largest": [900.0] * 8, "changed": {"normalize_observations": False}},
+        {"observation__largest": [900.0] * 8},
+    ),
+    "action-without-effect": ({"action__effect": [0.01, -0.01] * 4}, {"action__effect": [0.5] + [0.0] * 7}),
+    "reward-zero": ({"reward__largest": [0.0] * 8, "returns": [0.0] * 400}, {"reward__largest": [0.0] * 7 + [1.0]}),
+    "reward-by-time": ({"reward__by_time": [0.95] * 8}, {"reward__by_time": [0.95] * 3 + [0.1] * 5}),
+    "reward-unexplained": (
+        {"reward__explained": [0.0] * 8, "reward__std": [1.0] * 8},
+        {"reward__explained": [0.1] * 8, "reward__std": [1.0] * 8},
+    ),
+    "every-return-alike": ({"returns": [7.0] * 400}, {"returns": [7.0] * 399 + [8.0]}),
+    "limit-as-termination": (
+        {"lengths": [50] * 400, "episode__terminated": [1.0] * 8},
+        {"lengths": [50] * 400, "episode__terminated": [0.0] * 8},
+    ),
+    "short-episodes": ({"lengths": [1] * 400}, {"lengths": [3] * 400}),
+    "reward-large": ({"reward__largest": [5e3] * 8}, {"reward__largest": [100.0] * 8}),
+    "reward-small": ({"reward__largest": [1e-3] * 8}, {"reward__largest": [1e-3] * 7 + [1.0]}),
+    "ratio-not-one": ({"first_kl": [0.02] * 8}, {"first_kl": [1e-9] * 8}),
+    "normalizer-frozen": (
+        {"normalizer__count": [500.0] * 8},
+        {"normalizer__count": list(np.linspace(500.0, 4_000.0, 8))},
+    ),
+    "normalizer-stale": ({"normalizer__offset": [6.0] * 8}, {"normalizer__offset": [6.0] * 3 + [1.0] * 5}),
+    "advantage-not-normalized": (
+        {"changed": {"normalize_advantage": False, "scale_rewards": False}},
+        {"changed": {"normalize_advantage": False}},
+    ),
+    "mostly-random": (
+        {"algorithm": "sac", "changed": {"learning_starts": 3_900}},
+        {"algorithm": "sac", "changed": {"learning_starts": 1_000}},
+    ),
+    "entropy-unreachable": (
+        {"algorithm": "sac", "changed": {"target_entropy": 5.0}, "temperature": [1.0, 9.0]},
+        {"algorithm": "sac", "changed": {"target_entropy": -5.0}, "temperature": [1.0, 9.0]},
+    ),
+    "kl-too-large": ({"approx_kl": [0.05] * 8}, {"approx_kl": [0.05] * 3 + [0.015] * 5}),
+    "ratios-clipped": ({"clip_fraction": [0.5] * 8}, {"clip_fraction": [0.3] * 8}),
+    "policy-still": ({"approx_kl": [1e-9] * 8}, {"approx_kl": [1e-9] * 8, "returns": RISES}),
+    "entropy-collapsed": (
+        {"losses__entropy": [1.0] + [0.01] * 8},
+        {"losses__entropy": [1.0, 0.8, 0.6, 0.4] + [0.01] * 5},
+    ),
+    "std-exploded": ({"policy_std": [0.6] + [4.0] * 8}, {"policy_std": [0.6] + [1.5] * 8}),
+    "actions-at-bounds": ({"action__at_bounds": [0.95] * 8}, {"action__at_bounds": [0.5] * 8}),
+    "value-explains-nothing": ({"explained_variance": [0.02] * 8}, {"explained_variance": [0.4] * 8}),
+    "gradient-clipped": ({"gradient_norm": [90.0] * 8}, {"gradient_norm": [20.0] * 8}),
+    "units-inactive": ({"network__inactive": [0.8] * 8}, {"network__inactive": [0.3] * 8}),
+    "plasticity-lost": (
+        {"network__inactive": [0.1] * 3 + [0.5] * 5, "returns": [*range(300), *[20] * 100]},
+        {"network__inactive": [0.1] * 3 + [0.5] * 5, "returns": RISES},
+    ),
+    "q-biased": ({"scores": {"q_bias": {"bias": 0.8}}}, {"scores": {"q_bias": {"bias": 0.3}}}),
+    "critic-overfits": (
+        {"algorithm": "sac", "td_error__newest": [20.0] * 8, "td_error__sampled": [1.0] * 8},
+        {"algorithm": "sac", "td_error__newest": [3.0] * 8, "td_error__sampled": [1.0] * 8},
+    ),
+    "gets-worse": ({"returns": RISES[::-1]}, {"returns": RISES}),
+    "no-episode": ({"returns": [], "lengths": []}, {}),
+    "evaluated-otherwise": (
+        {"returns": RISES, "scores": {"mean_return": 20.0, "returns": [20.0] * 100}},
+        {"returns": RISES, "scores": {"mean_return": 380.0, "returns": [380.0] * 100}},
+    ),
+    "does-not-learn": ({}, {"returns": RISES}),
+    "fell-back": ({"returns": [*range(300), *[20] * 100]}, {"returns": RISES}),
+    "still-rising": ({"returns": RISES}, {"returns": list(np.minimum(np.arange(400), 200) + NOISE)}),
+    "few-episodes": ({"scores": {"returns": [1.0, 2.0]}}, {"scores": {"returns": [1.0] * 100}}),
+}
+
+
+def test_every_rule_has_a_case():
+    assert CASES.keys() == {rule.name for rule in RULES}
+
+
+@pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.name)
+def test_a_rule_fires_at_its_fault_and_is_silent_beside_it_and_without_metrics(rule):
+    fires, silent = CASES[rule.name]
+    found = {one.name: one for one in diagnose(evidence(**fires))}
+    assert rule.name in found
+    assert found[rule.name].sure == rule.sure
+    assert rule.name not in {one.name for one in diagnose(evidence(**silent))}
+    assert rule.name in {"does-not-learn"} or rule.name not in {one.name for one in diagnose(evidence())}
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "changed", "name"),
+    [
+        ("ppo", {"learning_rate": 0.01}, "setting-learning-rate"),
+        ("ppo", {"learning_rate": "1e-5>0"}, "setting-learning-rate"),
+        ("ppo", {"gamma": 0.5}, "setting-gamma"),
+        ("ppo", {"gae_lambda": 0.5}, "setting-gae-lambda"),
+        ("ppo", {"entropy_coef": 0.1}, "setting-entropy-coef"),
+        ("ppo", {"initial_log_std": -4.0}, "setting-initial-log-std"),
+        ("ppo", {"num_envs": 1}, "setting-rollout-rows"),
+        ("sac", {"tau": 1.0}, "setting-tau"),
+        ("sac", {"num_updates": 20}, "setting-replay-ratio"),
+        ("sac", {"buffer_size": 1_000}, "setting-buffer-size"),
+        ("sac", {"batch_size": 4}, "setting-batch-size"),
+        ("trpo", {"max_kl": 1.0}, "setting-max-kl"),
+        ("pqn", {"final_epsilon": 1.0}, "setting-final-epsilon"),
+    ],
+)
+def test_a_setting_far_outside_its_usual_range_is_named_first(algorithm, changed, name):
+    assert names(algorithm, changed=changed)[0] == name
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "changed"),
+    [
+        ("ppo", {"learning_rate": 1e-3}),
+        ("ppo", {"gamma": 0.9, "clip": 0.1, "epochs": 15}),
+        ("ppo", {"num_envs": 64, "num_steps": 64}),
+        ("ppo", {"desired_kl": None, "max_grad_norm": None, "target_kl": None}),
+        ("sac", {"buffer_size": 10_000}),  # all of the run
+        ("sac", {"num_envs": 8, "num_updates": 8}),
+    ],
+)
+def test_a_usual_setting_is_not_named(algorithm, changed):
+    assert not settings_far_out(evidence(algorithm, changed=changed))
+
+
+@pytest.mark.parametrize("algorithm", algos.ALGORITHMS)
+def test_the_defaults_and_all_presets_are_never_named(algorithm):
+    for preset in [None, *lem.presets.of(algorithm)]:
+        changed = preset.config.to_json() if preset else {}
+        e = evidence(algorithm, changed=changed, steps=changed.get("total_steps", 4_000))
+        tried = {name: {*e.tried.get(name, ()), str(value)} for name, value in e.config.items()}
+        assert not settings_far_out(Evidence(e.config, e.recommended, tried, e.usual, e.log, {}))
+
+
+def test_beside_a_cause_its_consequences_are_not_named():
+    symptoms = {"approx_kl": [0.5] * 8, "clip_fraction": [0.9] * 8, "explained_variance": [0.0] * 8}
+    assert names(**symptoms) == ["kl-too-large", "ratios-clipped", "value-explains-nothing"]
+    assert names(**symptoms, repeats=False) == ["seed-ignored"]
+    assert names(**symptoms, changed={"learning_rate": 0.1}) == ["setting-learning-rate"]
+
+
+@pytest.mark.parametrize("algorithm", algos.ALGORITHMS)
+def test_no_remedy_names_a_flag_that_the_algorithm_does_not_have(algorithm):
+    config = algos.find(algorithm).Config().to_json()
+    known = {*config, "episodes", "stochastic", "env_args"}
+    for rule in RULES:
+        remedy = rule.remedy_for(config)
+        assert remedy[0].isupper() or remedy.startswith("--")
+        assert {flag.replace("-", "_") for flag in re.findall(r"--([a-z-]+)", remedy)} <= known
+
+
+def test_the_page_has_a_paragraph_for_each_rule_and_no_other():
+    anchors = re.findall(r"^### ([a-z-]+)$", PAGE, re.MULTILINE)
+    assert set(anchors) == {rule.name for rule in RULES} | {"setting"}
+    for rule in RULES:
+        for part in (rule.means, rule.source, rule.remedy.split("; ")[0]):
+            assert part in " ".join(PAGE.split())
+
+
+def test_seeds_that_differ_are_pointed_at():
+    assert "from 100 to 200" in seeds_differ([100.0, 200.0])
+    assert seeds_differ([100.0, 101.0]) is None
+    assert seeds_differ([100.0]) is None
+
+
+def test_the_verb_and_the_command_agree_on_a_run(tmp_path, capsys):
+    run = lem.train("ppo", "Countdown-v0", run=tmp_path / "r", progress=False, **tiny_fields(gamma=0.3, num_steps=64))
+    found = lem.diagnose(run)
+    assert "setting-gamma" in [one.name for one in found]
+    assert lem.diagnose(str(run.path)) == lem.diagnose(run.policy) == found
+    main(["doctor", str(run.path), "--json"])
+    out, err = capsys.readouterr()
+    assert [one["name"] for one in json.loads(out)["runs"][str(run.path)]] == [one.name for one in found]
+    assert "--gamma 0.99, as recommended" in err
+    main(["check", str(run.path)])  # its earlier name
+    assert capsys.readouterr().err == err
+
+
+def test_a_sweep_is_each_of_its_runs(tmp_path, capsys):
+    fields = tiny_fields(entropy_coef=0.5, num_steps=64, total_steps=512)
+    del fields["seed"]
+    sweep = lem.train_sweep(["ppo"], "toy:Matching-v0", seeds=[1, 2], run=tmp_path / "s", progress=False, **fields)
+    main(["doctor", str(sweep.path), "--json"])
+    runs = json.loads(capsys.readouterr().out)["runs"]
+    assert len(runs) == 2
+    assert {found[0]["name"] for found in runs.values()} == {"setting-entropy-coef"}
+
+
+def test_a_run_of_replay_is_diagnosed(tmp_path):
+    run = lem.train("sac", "Pendulum-v1", run=tmp_path / "r", progress=False, **tiny_off_policy(tau=1.0))
+    assert "setting-tau" in [one.name for one in lem.diagnose(run)]
+
+
+def test_what_is_no_run_is_a_sentence(tmp_path):
+    with pytest.raises(lem.UserError, match=r"config\.json"):
+        lem.diagnose(tmp_path)
+
+
+def test_an_environment_that_is_gone_costs_a_rule_and_no_more(tmp_path):
+    run = lem.train("ppo", "Countdown-v0", run=tmp_path / "r", progress=False, **tiny_fields())
+    record = json.loads((run.path / "config.json").read_text())
+    assert "seed-ignored" not in [one.name for one in lem.diagnose(run)]
+    record["config"]["env"] = "nowhere:Env"
+    from lemniscate.system.files import write_json
+
+    write_json(run.path / "config.json", {name: value for name, value in record.items() if name != "crc32"})
+    assert "seed-ignored" not in [one.name for one in lem.diagnose(run.path)]
+
+
+class Zeros(gym.ObservationWrapper):
+    """Of the observation, only zeros."""
+
+    def observation(self, observation):
+        return 0 * observation
+
+
+def test_what_is_certain_is_said_once_while_a_run_is_trained(tmp_path, capsys):
+    fields = tiny_fields("CartPole-v1", total_steps=32 * 20, wrappers=(f"{__name__}:Zeros",))
+    lem.train("ppo", "CartPole-v1", run=tmp_path / "r", **fields)
+    said = [line for line in capsys.readouterr().err.splitlines() if "The policy sees nothing" in line]
+    assert len(said) == 1
+    assert "lemniscate doctor ENV" in said[0]
+    lem.train("ppo", "CartPole-v1", run=tmp_path / "quiet", progress=False, **fields)
+    assert "sees nothing" not in capsys.readouterr().err
+    assert lem.diagnose(tmp_path / "quiet")[0].name == "constant-observation"
+
+
+def test_of_a_healthy_run_nothing_is_said(tmp_path, capsys):
+    lem.train("ppo", "Matching-v0", run=tmp_path / "r", **tiny_fields("Matching-v0", total_steps=32 * 20))
+    assert "→" not in capsys.readouterr().err

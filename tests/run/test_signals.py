@@ -1,0 +1,211 @@
+"""The signals of a run: oracles for what is measured, and that measuring changes nothing."""
+
+from itertools import pairwise
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+import lemniscate as lem
+from conftest import tiny_fields, tiny_off_policy
+from lemniscate.maths import explained_by
+from lemniscate.nn.normalizer import NoNorm, RunningNorm
+from lemniscate.run.metrics import read_metrics
+from lemniscate.run.signals import LOOKS, by_time, of_effects, of_networks, of_rows, signals
+from lemniscate.spec import Box, Discrete, ObservationPart, Spec
+from lemniscate.types import Rollout
+
+B, O, A = 400, 3, 2
+
+
+def numbers(*shape, seed=0):
+    return torch.from_numpy(np.random.default_rng(seed).normal(size=shape))
+
+
+def spec_of(action=None):
+    return Spec("x", (ObservationPart((), (O,)),), action or Box((-1.0,) * A, (1.0,) * A))
+
+
+def rows(**changed):
+    flags = torch.zeros(B, dtype=torch.bool)
+    given = {
+        "obs": numbers(B, O).float(), "action": numbers(B, A, seed=1).float(), "reward": numbers(B, seed=2).float(),
+        "next_obs": numbers(B, O, seed=3).float(), "terminated": flags, "truncated": flags, "valid": ~flags,
+    }  # fmt: skip
+    return Rollout(**{**given, **changed})
+
+
+@pytest.mark.parametrize("beside", [0, 2])
+def test_what_features_explain_is_the_partial_coefficient_of_determination(beside):
+    x, z = numbers(B, 3), numbers(B, beside, seed=1)
+    y = x @ numbers(3, 2, seed=2) + 0.3 * numbers(B, 2, seed=3) + z.sum(1, keepdim=True)
+
+    def rss(*columns):
+        design = np.concatenate([np.ones((B, 1)), *columns], axis=1)
+        return ((y.numpy() - design @ np.linalg.lstsq(design, y.numpy(), rcond=None)[0]) ** 2).sum(0)
+
+    few, many = B - beside - 1, B - beside - 1 - 3
+    expected = 1 - (rss(z, x) / many) / (rss(z) / few)
+    assert np.allclose(explained_by(x, y, z), expected, atol=1e-6)
+
+
+def test_noise_explains_nothing_and_too_few_rows_are_not_a_number():
+    shares = [explained_by(numbers(B, 5, seed=s), numbers(B, 1, seed=99 + s), numbers(B, 0)).item() for s in range(50)]
+    assert abs(np.mean(shares)) < 0.005
+    assert torch.isnan(explained_by(numbers(4, 5), numbers(4, 1), numbers(4, 0))).all()
+    assert explained_by(numbers(B, 2), torch.ones(B, 1, dtype=torch.float64), numbers(B, 0)).item() == 0
+
+
+def test_columns_that_are_multiples_of_each_other_change_nothing():
+    x, y = numbers(B, 2), numbers(B, 1, seed=1) + numbers(B, 2)[:, :1]
+    twice = torch.cat([x, 3 * x, torch.zeros(B, 1)], dim=1)
+    share, again = (explained_by(each, y, x[:, :0]).item() for each in (x, twice))
+    assert share == pytest.approx(again, abs=0.01)
+
+
+def test_rewards_that_tell_the_time_do_so_within_each_episode():
+    steps, envs = 40, 3
+    done = torch.zeros(steps, envs, dtype=torch.bool)
+    done[9::10] = True
+    age = torch.arange(steps) % 10
+    reward = (age[:, None] + 100.0 * torch.arange(envs)).float()  # another level in each environment
+    shape = {"terminated": done, "truncated": ~done & done, "valid": torch.ones_like(done), "reward": reward}
+    assert by_time(SimpleNamespace(done=done, **shape)).item() == pytest.approx(1)
+    noise = numbers(steps, envs).float()
+    assert by_time(SimpleNamespace(done=done, **{**shape, "reward": noise})).item() < 0.1
+    assert by_time(SimpleNamespace(done=done, **{**shape, "reward": torch.ones_like(reward)})).item() == 0
+
+
+def test_actions_explain_what_they_do():
+    obs, action = numbers(B, O).float(), numbers(B, A, seed=1).float()
+    moved = obs.clone()
+    moved[:, 1] += action[:, 0]
+    pays = action.square().sum(1)
+    found = of_effects(rows(obs=obs, action=action, next_obs=moved, reward=pays), spec_of())
+    assert found["action/effect"] == pytest.approx(1)
+    assert found["reward/explained"] == pytest.approx(1)
+    still = of_effects(rows(obs=obs, action=action, next_obs=obs + 0.1 * numbers(B, O, seed=5).float()), spec_of())
+    assert still["action/effect"] < 0.05
+    assert abs(still["reward/explained"]) < 0.1
+
+
+def test_choices_explain_what_they_do():
+    obs, action = numbers(B, O).float(), torch.arange(B) % 4
+    moved = obs + torch.tensor([0.0, 5.0, -1.0, 2.0])[action][:, None]
+    found = of_effects(rows(obs=obs, action=action, next_obs=moved), spec_of(Discrete(4)))
+    assert found["action/effect"] == pytest.approx(1)
+
+
+def test_sizes_and_shares():
+    obs = numbers(B, O).float()
+    obs[:, 2] = 7
+    ends = torch.arange(B) % 10 == 9
+    action = torch.where(torch.arange(B)[:, None] % 4 == 0, 1.0, 0.5).expand(B, A)
+    truncated = ends & (torch.arange(B) % 20 == 19)
+    found = of_rows(rows(obs=obs, action=action, terminated=ends & ~truncated, truncated=truncated), spec_of())
+    assert found["observation/constant"] == pytest.approx(1 / 3)
+    assert found["observation/largest"] == 7
+    assert found["action/at_bounds"] == 0.25
+    assert found["episode/terminated"] == 0.5
+    assert "action/at_bounds" not in of_rows(rows(action=torch.zeros(B, dtype=torch.int64)), spec_of(Discrete(2)))
+
+
+def stop_at(at):
+    return lambda step, _metrics, _policy: step >= at
+
+
+class Policy(nn.Module):
+    def __init__(self, net, normalizer):
+        super().__init__()
+        self.net, self.normalizer = net, normalizer
+
+    def forward(self, obs):
+        return self.net(self.normalizer(obs))
+
+
+@pytest.mark.parametrize("kind", [nn.ReLU, nn.Tanh])
+def test_inactive_units_are_counted(kind):
+    layer = nn.Linear(O, 8)
+    with torch.no_grad():
+        layer.bias[:6] = -50.0  # of ReLU zero, of tanh at its bound
+    found = of_networks(SimpleNamespace(policy=Policy(nn.Sequential(layer, kind()), NoNorm(O))), rows())
+    assert found["network/inactive"] == 0.75
+    assert found["network/rank"] <= 3 / 8
+    assert "normalizer/count" not in found
+
+
+def test_the_rank_is_that_of_the_features():
+    layer = nn.Linear(O, 8)
+    with torch.no_grad():
+        layer.weight.copy_(1e-4 * torch.outer(torch.arange(1.0, 9), torch.tensor([1.0, 2, 3])))
+        layer.bias.zero_()
+    found = of_networks(SimpleNamespace(policy=Policy(nn.Sequential(layer, nn.Tanh()), NoNorm(O))), rows())
+    assert found["network/rank"] == 1 / 8
+
+
+def test_a_normalizer_that_is_behind_shows_its_offset():
+    normalizer = RunningNorm(O)
+    normalizer.update(numbers(B, O, seed=7).float())
+    policy = Policy(nn.Identity(), normalizer)
+    assert of_networks(SimpleNamespace(policy=policy), rows())["normalizer/offset"] < 0.2
+    found = of_networks(SimpleNamespace(policy=policy), rows(obs=numbers(B, O).float() + 5))
+    assert found["normalizer/offset"] == pytest.approx(5, abs=0.5)
+    assert found["normalizer/count"] == B
+
+
+def test_there_are_signals_some_thirty_times_in_a_run_and_in_its_first_line(tmp_path):
+    fields = tiny_fields(total_steps=32 * 200)
+    run = lem.train("ppo", "Countdown-v0", run=tmp_path / "r", progress=False, **fields)
+    lines = read_metrics(run.path)
+    looked = [line["step"] for line in lines if "reward/largest" in line]
+    assert len(lines) == 200
+    assert LOOKS - 4 <= len(looked) <= LOOKS + 1
+    assert looked[0] == lines[0]["step"]
+    assert len({after - before for before, after in pairwise(looked)}) == 1
+    assert {"first_kl", "normalizer/count", "network/inactive", "action/effect"} <= lines[0].keys()
+    assert lines[0]["first_kl"] < 1e-9
+
+
+@pytest.mark.parametrize("algorithm", ["ppo", "sac", "pqn", "reinforce"])
+def test_measuring_changes_no_bit_of_a_run(tmp_path, monkeypatch, algorithm):
+    env = "Pendulum-v1" if algorithm == "sac" else "Matching-v0"
+    fields = tiny_off_policy() if algorithm == "sac" else {"num_envs": 2, "num_steps": 8, "total_steps": 128}
+    fields |= {
+        "ppo": {"minibatch_size": 8},
+        "pqn": {"minibatch_size": 8},
+        "reinforce": {"critic_minibatch_size": 8},
+    }.get(algorithm, {})
+    looking = lem.train(algorithm, env, run=tmp_path / "a", progress=False, **fields)
+    monkeypatch.setattr("lemniscate.run.run.signals", lambda *_: {})
+    blind = lem.train(algorithm, env, run=tmp_path / "b", progress=False, **fields)
+    assert "reward/mean" in read_metrics(looking.path)[0]
+    assert "reward/mean" not in read_metrics(blind.path)[0]
+    one, other = (run.policy.networks.state_dict() for run in (looking, blind))
+    assert all(torch.equal(one[name], other[name]) for name in other)
+
+
+def test_of_replay_the_errors_of_new_and_of_sampled_transitions_stand_side_by_side(tmp_path):
+    run = lem.train("td3", "Pendulum-v1", run=tmp_path / "r", progress=False, **tiny_off_policy())
+    last = [line for line in read_metrics(run.path) if "td_error/newest" in line][-1]
+    assert last["td_error/newest"] > 0
+    assert last["td_error/sampled"] > 0
+
+
+def test_a_resumed_run_has_signals_where_the_uninterrupted_one_has_them(tmp_path):
+    fields = tiny_fields(total_steps=32 * 30, checkpoint_every=32 * 5)
+
+    def looked(path):
+        return [line["step"] for line in read_metrics(path) if "reward/mean" in line]
+
+    whole = lem.train("ppo", "Countdown-v0", run=tmp_path / "a", progress=False, **fields)
+    lem.train("ppo", "Countdown-v0", run=tmp_path / "b", progress=False, callbacks=[stop_at(32 * 17)], **fields)
+    lem.resume(tmp_path / "b", progress=False)
+    assert looked(whole.path) == looked(tmp_path / "b")
+
+
+def test_before_there_are_rows_there_are_no_signals():
+    assert signals(None, None, spec_of(), None) == {}  # pyright: ignore[reportArgumentType]
+    none = torch.zeros(4, 2, dtype=torch.bool)
+    assert signals(None, None, spec_of(), SimpleNamespace(valid=none)) == {}  # pyright: ignore[reportArgumentType]
