@@ -205,8 +205,20 @@ def _large_weights() -> Any:
     return patch.object(networks, "orthogonal", wrong)
 
 
+def _no_bootstrap() -> Any:
+    from lemniscate.algos import ppo
+
+    right = ppo.gae
+
+    def wrong(reward: Any, value: Any, next_value: Any, terminated: Any, done: Any, **options: Any) -> Any:
+        return right(reward, value, next_value, done, done, **options)
+
+    return patch.object(ppo, "gae", wrong)
+
+
 LEARNERS: dict[str, Callable[[], Any]] = {
     "another log-probability": _other_log_prob,
+    "no bootstrap at time limits": _no_bootstrap,
     "a normalizer that stops": _frozen_normalizer,
     "the sign of the advantage": _other_sign,
     "targets of other rows": _shuffled_targets,

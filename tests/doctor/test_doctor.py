@@ -3,6 +3,7 @@
 import json
 import re
 from pathlib import Path
+from typing import get_type_hints
 
 import gymnasium as gym
 import numpy as np
@@ -15,7 +16,7 @@ from lemniscate.cli import main
 from lemniscate.doctor import Evidence, diagnose
 from lemniscate.doctor.evidence import usual_ranges, with_ratios
 from lemniscate.doctor.rules import HINT, RULES, seeds_differ, settings_far_out
-from lemniscate.run.fields import field_help
+from lemniscate.run.fields import field_help, read
 
 PAGE = (Path(__file__).parents[2] / "docs" / "doctor.md").read_text()
 NOISE = np.random.default_rng(0).normal(size=400)
@@ -79,6 +80,10 @@ CASES = {
         {"normalizer__count": list(np.linspace(500.0, 4_000.0, 8))},
     ),
     "normalizer-stale": ({"normalizer__offset": [6.0] * 8}, {"normalizer__offset": [6.0] * 3 + [1.0] * 5}),
+    "missing-bootstrap": (
+        {"value__missing": [2.0] + [0.4] * 8, "episode__terminated": [0.0] * 8},
+        {"value__missing": [2.0, 0.4, 0.4] + [0.05] * 6, "episode__terminated": [0.0] * 8},
+    ),
     "advantage-not-normalized": (
         {"changed": {"normalize_advantage": False, "scale_rewards": False}},
         {"changed": {"normalize_advantage": False}},
@@ -157,8 +162,18 @@ def test_a_rule_fires_at_its_fault_and_is_silent_beside_it_and_without_metrics(r
         ("pqn", {"final_epsilon": 1.0}, "setting-final-epsilon"),
     ],
 )
-def test_a_setting_far_outside_its_usual_range_is_named_first(algorithm, changed, name):
-    assert names(algorithm, changed=changed)[0] == name
+def test_a_setting_far_outside_its_usual_range_is_named_first_and_its_remedy_is_the_recommended_run(
+    algorithm, changed, name
+):
+    first = diagnose(evidence(algorithm, changed=changed))[0]
+    assert first.name == name
+    flags = dict(re.findall(r"--([a-z-]+) ([^ ,]+)", first.remedy))
+    config = algos.find(algorithm).Config()
+    hints = get_type_hints(type(config), include_extras=True)
+    cure = {
+        field: read(field, hints[field], value) for field, value in ((k.replace("-", "_"), v) for k, v in flags.items())
+    }
+    assert config.replace(**{**changed, **cure}) == config
 
 
 @pytest.mark.parametrize(

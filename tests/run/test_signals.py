@@ -13,7 +13,7 @@ from conftest import tiny_fields, tiny_off_policy
 from lemniscate.maths import explained_by
 from lemniscate.nn.normalizer import NoNorm, RunningNorm
 from lemniscate.run.metrics import read_metrics
-from lemniscate.run.signals import LOOKS, by_time, of_effects, of_networks, of_rows, signals
+from lemniscate.run.signals import LOOKS, by_time, of_effects, of_networks, of_rows, of_values, signals
 from lemniscate.spec import Box, Discrete, ObservationPart, Spec
 from lemniscate.types import Rollout
 
@@ -203,6 +203,24 @@ def test_a_resumed_run_has_signals_where_the_uninterrupted_one_has_them(tmp_path
     lem.train("ppo", "Countdown-v0", run=tmp_path / "b", progress=False, callbacks=[stop_at(32 * 17)], **fields)
     lem.resume(tmp_path / "b", progress=False)
     assert looked(whole.path) == looked(tmp_path / "b")
+
+
+class Steady(nn.Module):
+    """V of every state is `size`."""
+
+    def __init__(self, size):
+        super().__init__()
+        self.value = lambda obs: torch.full(obs.shape[:-1], size)
+
+
+@pytest.mark.parametrize(
+    ("size", "reward", "missing"), [(10.0, 1.0, 0.0), (4.0, 1.0, 1.5), (-4.0, -1.0, 1.5), (20.0, 1.0, -0.5)]
+)
+def test_the_share_of_the_value_that_is_missing(size, reward, missing):
+    state, config = SimpleNamespace(networks=Steady(size)), SimpleNamespace(gamma=0.9)
+    found = of_values(state, config, rows(reward=torch.full((B,), reward)))
+    assert found["value/missing"] == pytest.approx(missing, abs=1e-5)  # (V of the policy, 10, less V) / |V|
+    assert of_values(state, SimpleNamespace(gamma=1.0), rows()) == {}
 
 
 def test_before_there_are_rows_there_are_no_signals():

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lemniscate.doctor.evidence import Evidence, usual_ranges, with_ratios
-from lemniscate.doctor.rules import CERTAIN, HINT, LIKELY, RULES, SETTINGS, SYMPTOM, Rule, settings_far_out
+from lemniscate.doctor.rules import CAUSES, CERTAIN, HINT, KINDS, LIKELY, RULES, Rule, settings_far_out
 from lemniscate.run.config import RunConfig
 from lemniscate.run.fields import field_help
 from lemniscate.run.metrics import read_metrics
@@ -55,19 +55,19 @@ class Diagnosis:
 def diagnose(evidence: Evidence) -> list[Diagnosis]:
     """The findings of all rules, causes first: beside a cause that is certain or likely no symptom is named."""
     found = [(rule, seen) for rule in RULES if (seen := rule.sees(evidence))] + [*settings_far_out(evidence)]
-    caused = any(rule.kind <= SETTINGS and rule.sure in (CERTAIN, LIKELY) for rule, _ in found)
+    caused = any(rule.kind in CAUSES and rule.sure in (CERTAIN, LIKELY) for rule, _ in found)
     faulty = any(rule.sure != HINT for rule, _ in found)
     left = [
         (rule, seen)
         for rule, seen in found
-        if not (caused and rule.kind == SYMPTOM) and not (faulty and rule.name == "does-not-learn")
+        if not (caused and rule.kind == "symptom") and not (faulty and rule.name == "does-not-learn")
     ]
     return [_diagnosis(evidence, rule, seen) for rule, seen in sorted(left, key=_order)]
 
 
 def _order(found: tuple[Rule, str]) -> tuple[bool, int, bool]:
     rule, _ = found
-    return rule.sure == HINT, rule.kind, rule.sure != CERTAIN
+    return rule.sure == HINT, KINDS.index(rule.kind), rule.sure != CERTAIN
 
 
 def _diagnosis(evidence: Evidence, rule: Rule, seen: str) -> Diagnosis:

@@ -93,6 +93,8 @@ class Evidence:
         value = first_number(self.config.get(field))
         if value is None or str(self.config[field]) in self.tried.get(field, ()):
             return 0.0
+        if field == "buffer_size" and value >= self.config["total_steps"]:  # all of the run
+            return 0.0
         if field in HORIZONS:
             value, low, high = (1 / max(1 - x, 1e-4) for x in (value, low, high))
         elif field == "initial_log_std":
@@ -107,8 +109,6 @@ def with_ratios(config: Mapping[str, Any]) -> dict[str, Any]:
     found, envs = dict(config), config.get("num_envs", 1)
     if "num_updates" in config:
         found["replay_ratio"] = config["num_updates"] / (envs * config["update_every"])
-        if config["buffer_size"] >= config["total_steps"]:
-            found["buffer_size"] = None  # all of the run, whatever the number is
     if "num_steps" in config:
         found["rollout_rows"] = envs * config["num_steps"]
     return found

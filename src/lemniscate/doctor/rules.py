@@ -1,9 +1,9 @@
-"""What can be wrong with a run: a table of faults, each with what shows it, what it means, its remedy and its source.
+"""What can be wrong with a run: faults, each with what shows it and what that means.
 
 A rule is a function of the `Evidence` that answers with what it saw, in words with numbers, or with nothing; its
-docstring says what that means. The thresholds were chosen on one half of the runs with injected faults of
-`benchmarks/doctor.py`, and are judged on the other half; where a source has a number, it is that. Settings far outside
-their usual range, which is in their help, are in `settings.toml`. `docs/doctor.md` has how often all this is right.
+docstring says what that means. Its remedy and its source are in `rules.toml`; settings far outside their usual range,
+which is in their help, are in `settings.toml`. The thresholds were chosen on one half of the runs with injected faults
+of `benchmarks/doctor.py`, and are judged on the other half: `docs/doctor.md` has how often all this is right.
 """
 
 import re
@@ -11,19 +11,26 @@ import tomllib
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from lemniscate.doctor.evidence import HORIZONS, Evidence, first_number
-from lemniscate.run.fields import field_of, flag
+from lemniscate.run.fields import field_of, flag, shown
 
 Sees = Callable[[Evidence], str | None]
 
 CERTAIN, LIKELY, POSSIBLE, HINT = "certain", "likely", "possible", "hint"
 """how sure a finding is; a hint is no fault, but what to do next"""
 
-ENVIRONMENT, LEARNER, SETTINGS, SYMPTOM, JUDGEMENT = range(5)
-"""causes before consequences: where a finding of the first three kinds is certain or likely, symptoms are its own"""
+CAUSES = ("environment", "learner", "settings")
+KINDS = (*CAUSES, "symptom", "judgement")
+"""causes before consequences: where a finding of a cause is certain or likely, symptoms are its own"""
+
+
+def read(name: str) -> dict[str, dict[str, Any]]:
+    """The tables of a file of TOML beside this one."""
+    return tomllib.loads(Path(__file__).with_name(name).read_text("utf-8"))
 
 
 @dataclass(frozen=True)
@@ -32,23 +39,23 @@ class Rule:
 
     Attributes:
         name: its anchor in `docs/doctor.md`.
-        kind: `ENVIRONMENT`, `LEARNER`, `SETTINGS`, `SYMPTOM` or `JUDGEMENT`.
-        sure: how sure a finding of it is.
         sees: what shows it, a sentence with numbers; None where nothing does.
         means: what that means.
+        kind: one of `KINDS`.
+        sure: how sure a finding of it is.
         remedy: what to change: alternatives, of which those are named whose flags the algorithm has.
         source: where that is known from.
         metric: the metric to draw beside it.
     """
 
     name: str
-    kind: int
-    sure: str
     sees: Sees
     means: str
+    kind: str
+    sure: str
     remedy: str
     source: str
-    metric: str
+    metric: str = "episode/return"
 
     def remedy_for(self, fields: Collection[str]) -> str:
         """The alternatives whose flags are among the fields of a Config, or of no Config."""
@@ -64,41 +71,27 @@ class Rule:
 OF_COMMANDS = ("episodes", "stochastic", "env_kwargs")
 """options that are no fields"""
 
+TABLE = read("rules.toml")
 RULES: list[Rule] = []
 
 
-def rule(kind: int, sure: str, *, remedy: str, source: str, metric: str = "episode/return") -> Callable[[Sees], Sees]:
+def rule(sees: Sees) -> Sees:
     """Enter a function of the evidence among the rules; its docstring is what its finding means."""
-
-    def enter(sees: Sees) -> Sees:
-        name, means = sees.__name__.replace("_", "-"), " ".join((sees.__doc__ or "").split())
-        RULES.append(Rule(name, kind, sure, sees, means, remedy, source, metric))
-        return sees
-
-    return enter
+    name, means = sees.__name__.replace("_", "-"), " ".join((sees.__doc__ or "").split())
+    RULES.append(Rule(name, sees, means, **TABLE[name]))
+    return sees
 
 
 # --- of the environment ---------------------------------------------------------------------------------------------
 
 
-@rule(
-    ENVIRONMENT,
-    CERTAIN,
-    remedy="In reset(), call super().reset(seed=seed) and draw from self.np_random alone",
-    source="Gymnasium, Env.reset",
-)
+@rule
 def seed_ignored(e: Evidence) -> str | None:
     """The environment does not use the seed of reset(): no run of it can be repeated, nor resumed to the same bits."""
     return "Two resets with the same seed began with different observations." if e.repeats is False else None
 
 
-@rule(
-    ENVIRONMENT,
-    CERTAIN,
-    remedy="Look at what step() returns with `lemniscate doctor ENV`: it is often an array that is never written",
-    source="IsaacGymEnvs#261",
-    metric="observation/largest",
-)
+@rule
 def constant_observation(e: Evidence) -> str | None:
     """The policy sees nothing, and can learn no more than one action for all time."""
     if not e.sees_nothing:
@@ -106,13 +99,7 @@ def constant_observation(e: Evidence) -> str | None:
     return "Every number of the observation was the same in all of the newest rows, each time that they were looked at."
 
 
-@rule(
-    ENVIRONMENT,
-    LIKELY,
-    remedy="End the episode where the state leaves its range, and bound the observation in the environment",
-    source="Gymnasium, environment checker",
-    metric="observation/largest",
-)
+@rule
 def exploding_observation(e: Evidence) -> str | None:
     """A sensor drifts, or a simulation has become unstable: nothing that was learned at its beginning holds later."""
     first, late = e.early("observation/largest"), e.late("observation/largest")
@@ -121,13 +108,7 @@ def exploding_observation(e: Evidence) -> str | None:
     return f"Observations reached {late:.3g} in the last half of the run, and {first:.3g} at its beginning."
 
 
-@rule(
-    ENVIRONMENT,
-    LIKELY,
-    remedy="Look whether step() uses its argument, and whether actions are scaled twice",
-    source="partial R² of the changes, adjusted",
-    metric="action/effect",
-)
+@rule
 def action_without_effect(e: Evidence) -> str | None:
     """The environment does not use its actions, or too little to be seen: nothing can be learned."""
     effects = e.values("action/effect")
@@ -136,13 +117,7 @@ def action_without_effect(e: Evidence) -> str | None:
     return f"Actions explain {max(0.0, effects.max()):.1%} of how observations change."
 
 
-@rule(
-    ENVIRONMENT,
-    CERTAIN,
-    remedy="Reward the way to the goal too, or begin nearer to it; --replay hindsight, if there are goals",
-    source="Andrychowicz et al. 2017, section 3.1",
-    metric="reward/largest",
-)
+@rule
 def reward_zero(e: Evidence) -> str | None:
     """No reward was ever met, so that every action is as good as any other."""
     if e.greatest("reward/largest") != 0 or (len(e.returns) and np.abs(e.returns).max() > 0):
@@ -150,26 +125,14 @@ def reward_zero(e: Evidence) -> str | None:
     return "Every reward was 0."
 
 
-@rule(
-    ENVIRONMENT,
-    LIKELY,
-    remedy="Take the time out of the reward, or pay a constant for each step",
-    source="Pardo et al. 2018, arXiv:1712.00378",
-    metric="reward/by_time",
-)
+@rule
 def reward_by_time(e: Evidence) -> str | None:
     """The reward tells the time, and not what was done."""
     share = e.late("reward/by_time")
     return f"Time alone explains {share:.0%} of the rewards within an episode." if share > 0.8 else None
 
 
-@rule(
-    ENVIRONMENT,
-    LIKELY,
-    remedy="Compute the reward from the state and the action of its own step, and observe what it depends on",
-    source="adjusted R² of the rewards",
-    metric="reward/explained",
-)
+@rule
 def reward_unexplained(e: Evidence) -> str | None:
     """The reward does not depend on the action, nor on what is observed: it is noise to the learner."""
     explained = e.values("reward/explained")
@@ -184,13 +147,7 @@ def reward_unexplained(e: Evidence) -> str | None:
     return f"Observations and actions explain {max(0.0, float(np.median(explained))):.1%} of the rewards' variance."
 
 
-@rule(
-    ENVIRONMENT,
-    LIKELY,
-    remedy="Look at the condition of terminated in step(), and at the state that reset() begins in",
-    source="Jones 2021, andyljones.com/posts/rl-debugging",
-    metric="episode/length",
-)
+@rule
 def short_episodes(e: Evidence) -> str | None:
     """Episodes end before anything can be done."""
     if len(e.lengths) < 20 or np.percentile(e.lengths, 90) > 2:
@@ -198,12 +155,7 @@ def short_episodes(e: Evidence) -> str | None:
     return f"Nine of ten episodes took no more than {np.percentile(e.lengths, 90):.0f} steps."
 
 
-@rule(
-    ENVIRONMENT,
-    LIKELY,
-    remedy="Let the return depend on what is done: reward progress, and end the episode where it has failed",
-    source="Jones 2021, andyljones.com/posts/rl-debugging",
-)
+@rule
 def every_return_alike(e: Evidence) -> str | None:
     """Nothing that the policy did changed its return: the reward is constant, or an end is never reached."""
     alike = len(e.returns) >= 10 and np.ptp(e.returns) <= 1e-6 * (1 + abs(e.returns[0]))
@@ -212,13 +164,7 @@ def every_return_alike(e: Evidence) -> str | None:
     return f"All {len(e.returns):,} episodes had the same return, {e.returns[0]:,.4g}, whatever was done."
 
 
-@rule(
-    ENVIRONMENT,
-    CERTAIN,
-    remedy="Return truncated=True at the limit, and terminated=False",
-    source="Pardo et al. 2018, arXiv:1712.00378",
-    metric="episode/terminated",
-)
+@rule
 def limit_as_termination(e: Evidence) -> str | None:
     """A time limit is reported as a termination: learning takes the value there to be 0."""
     late = e.lengths[len(e.lengths) // 2 :]
@@ -227,39 +173,21 @@ def limit_as_termination(e: Evidence) -> str | None:
     return f"Each of the last {len(late):,} episodes terminated after exactly {late[0]:,.0f} steps."
 
 
-@rule(
-    ENVIRONMENT,
-    LIKELY,
-    remedy="Divide the reward in the environment until it is about 1; --scale-rewards",
-    source="Henderson et al. 2018, arXiv:1709.06560, section 4",
-    metric="reward/largest",
-)
+@rule
 def reward_large(e: Evidence) -> str | None:
     """The first errors of the value are so large that the policy and the value do not learn at one rate."""
     largest = e.greatest("reward/largest")
     return f"Rewards reach {largest:,.3g}." if largest > 1000 else None
 
 
-@rule(
-    ENVIRONMENT,
-    LIKELY,
-    remedy="Multiply the reward in the environment until it is about 1; --scale-rewards",
-    source="Henderson et al. 2018, arXiv:1709.06560, section 4",
-    metric="reward/largest",
-)
+@rule
 def reward_small(e: Evidence) -> str | None:
     """The reward is lost beside entropy and the error of a new value."""
     largest = e.greatest("reward/largest")
     return f"No reward is larger than {largest:.2g}." if 0 < largest < 0.03 else None
 
 
-@rule(
-    ENVIRONMENT,
-    LIKELY,
-    remedy="--normalize-observations; bring observations to about 1 in the environment",
-    source="Andrychowicz et al. 2021, arXiv:2006.05990, section 3.3",
-    metric="observation/largest",
-)
+@rule
 def large_observation(e: Evidence) -> str | None:
     """Units of the first layer are at their bounds at every observation."""
     late = e.late("observation/largest")
@@ -271,26 +199,14 @@ def large_observation(e: Evidence) -> str | None:
 # --- of the learner -------------------------------------------------------------------------------------------------
 
 
-@rule(
-    LEARNER,
-    CERTAIN,
-    remedy="Update the normalizer after the gradient steps, and take log π_old from the networks before them",
-    source="Huang et al. 2022, the 37 implementation details of PPO",
-    metric="first_kl",
-)
+@rule
 def ratio_not_one(e: Evidence) -> str | None:
     """The policy that learns is not the one that acted: a normalizer, dropout or a stale log-probability is between."""
     kl = e.late("first_kl")
     return f"In the first minibatch of an update the KL divergence is {kl:.2g}, and must be 0." if kl > 1e-4 else None
 
 
-@rule(
-    LEARNER,
-    CERTAIN,
-    remedy="Call policy.observe with every rollout; after a warm start, train the normalizer too",
-    source="SB3#1556",
-    metric="normalizer/count",
-)
+@rule
 def normalizer_frozen(e: Evidence) -> str | None:
     """Observations are normalized with the statistics of other ones."""
     count, steps = e.values("normalizer/count"), [line["step"] for line in e.log if "normalizer/count" in line]
@@ -299,13 +215,7 @@ def normalizer_frozen(e: Evidence) -> str | None:
     return f"The normalizer has seen {count[-1]:,.0f} observations of {steps[-1]:,} steps."
 
 
-@rule(
-    LEARNER,
-    LIKELY,
-    remedy="Observe differences in place of sums, or begin without the warm start's normalizer",
-    source="SB3#1556",
-    metric="normalizer/offset",
-)
+@rule
 def normalizer_stale(e: Evidence) -> str | None:
     """The observations have moved away from what the normalizer knows: a drift, or statistics of another task."""
     offset = e.late("normalizer/offset")
@@ -314,13 +224,19 @@ def normalizer_stale(e: Evidence) -> str | None:
     )
 
 
-@rule(
-    LEARNER,
-    LIKELY,
-    remedy="--normalize-advantage, as recommended",
-    source="Andrychowicz et al. 2021, arXiv:2006.05990, section 3.5",
-    metric="gradient_norm",
-)
+@rule
+def missing_bootstrap(e: Evidence) -> str | None:
+    """The value ends where the time limit does, as if nothing followed: the bootstrap of truncated steps is missing."""
+    missing = e.values("value/missing")
+    late = missing[len(missing) // 2 :]
+    if len(missing) < 4 or not (np.median(late) > 0.2 and np.percentile(late, 25) > 0.1):
+        return None
+    if not e.late("episode/terminated") < 0.5:
+        return None
+    return f"{np.median(late):.0%} of the value that follows is missing, and most episodes end at a time limit."
+
+
+@rule
 def advantage_not_normalized(e: Evidence) -> str | None:
     """The size of a step hangs on that of the rewards."""
     given, usual = (config.get("normalize_advantage") for config in (e.config, e.recommended))
@@ -329,12 +245,7 @@ def advantage_not_normalized(e: Evidence) -> str | None:
     return "Neither advantages nor rewards are normalized."
 
 
-@rule(
-    SETTINGS,
-    LIKELY,
-    remedy="Lower --learning-starts, or raise --total-steps",
-    source="Fujimoto et al. 2018, section 6.1",
-)
+@rule
 def mostly_random(e: Evidence) -> str | None:
     """Most of what was collected is random play."""
     starts, total = e.config.get("learning_starts"), e.config.get("total_steps")
@@ -343,13 +254,7 @@ def mostly_random(e: Evidence) -> str | None:
     return f"The first {starts:,} of {total:,} steps are at random, without an update."
 
 
-@rule(
-    SETTINGS,
-    LIKELY,
-    remedy="--target-entropy none, which is −A",
-    source="Haarnoja et al. 2018, section 5",
-    metric="temperature",
-)
+@rule
 def entropy_unreachable(e: Evidence) -> str | None:
     """More entropy is asked for than actions within their bounds can have: the temperature rises without an end."""
     given = first_number(e.config.get("target_entropy"))
@@ -361,13 +266,7 @@ def entropy_unreachable(e: Evidence) -> str | None:
 # --- symptoms -------------------------------------------------------------------------------------------------------
 
 
-@rule(
-    SYMPTOM,
-    LIKELY,
-    remedy="Lower --learning-rate; lower --max-kl; take fewer --epochs",
-    source="Schulman et al. 2017, section 4",
-    metric="approx_kl",
-)
+@rule
 def kl_too_large(e: Evidence) -> str | None:
     """Each update takes the policy so far that what was collected says little about where it arrives."""
     kl = e.late("approx_kl")
@@ -378,26 +277,14 @@ def kl_too_large(e: Evidence) -> str | None:
     return f"The KL divergence of the late updates is {kl:.2g}, {beside}."
 
 
-@rule(
-    SYMPTOM,
-    POSSIBLE,
-    remedy="Lower --learning-rate; take fewer --epochs",
-    source="docs/notes/ppo.md, metrics",
-    metric="clip_fraction",
-)
+@rule
 def ratios_clipped(e: Evidence) -> str | None:
     """Most of the gradient is cut off by the clip."""
     share = e.late("clip_fraction")
     return f"{share:.0%} of the late probability ratios are clipped." if share > 0.4 else None
 
 
-@rule(
-    SYMPTOM,
-    LIKELY,
-    remedy="Raise --learning-rate; look whether advantages are all zero, and whether --freeze holds the policy",
-    source="docs/notes/ppo.md, metrics",
-    metric="approx_kl",
-)
+@rule
 def policy_still(e: Evidence) -> str | None:
     """The gradient does not reach the policy, or its step is too small."""
     kl = e.late("approx_kl")
@@ -408,13 +295,7 @@ def policy_still(e: Evidence) -> str | None:
     )
 
 
-@rule(
-    SYMPTOM,
-    POSSIBLE,
-    remedy="Raise --entropy-coef to 0.01; lower --learning-rate; lower --max-kl",
-    source="SB3#1593; Schulman et al. 2017, eq. 9",
-    metric="losses/entropy",
-)
+@rule
 def entropy_collapsed(e: Evidence) -> str | None:
     """The policy has stopped exploring before it has learned."""
     std, entropy = e.values("policy_std"), e.values("losses/entropy")
@@ -429,13 +310,7 @@ def entropy_collapsed(e: Evidence) -> str | None:
     )
 
 
-@rule(
-    SYMPTOM,
-    LIKELY,
-    remedy="Lower --entropy-coef to 0; lower --initial-log-std",
-    source="rsl_rl#190",
-    metric="policy_std",
-)
+@rule
 def std_exploded(e: Evidence) -> str | None:
     """The entropy bonus is worth more than the reward, and actions are cut at their bounds."""
     first, late = e.early("policy_std"), e.late("policy_std")
@@ -444,26 +319,14 @@ def std_exploded(e: Evidence) -> str | None:
     return f"The policy's standard deviation rose from {first:.2g} to {late:.2g}, in units of half the action range."
 
 
-@rule(
-    SYMPTOM,
-    POSSIBLE,
-    remedy="Lower --learning-rate; lower --actor-learning-rate; train sac, whose entropy keeps it away from the bounds",
-    source="IsaacLab#2636",
-    metric="action/at_bounds",
-)
+@rule
 def actions_at_bounds(e: Evidence) -> str | None:
     """The policy knows full force in one direction or the other alone, where its gradient is cut off."""
     share = e.late("action/at_bounds")
     return f"{share:.0%} of the actions lie at or beyond a bound." if share > 0.9 and not e.rose else None
 
 
-@rule(
-    SYMPTOM,
-    POSSIBLE,
-    remedy="Lower --critic-learning-rate; train td3 or sac, which believe the lesser of two critics",
-    source="Fujimoto et al. 2018, section 4",
-    metric="q",
-)
+@rule
 def q_biased(e: Evidence) -> str | None:
     """The policy follows the errors of Q."""
     bias = (e.scores.get("q_bias") or {}).get("bias", np.nan)
@@ -472,13 +335,7 @@ def q_biased(e: Evidence) -> str | None:
     return f"Q {'over' if bias > 0 else 'under'}-estimates the return by {abs(bias):.0%}."
 
 
-@rule(
-    SYMPTOM,
-    LIKELY,
-    remedy="Take fewer --num-updates; raise --num-envs",
-    source="Nikishin et al. 2022, arXiv:2205.07802",
-    metric="td_error/newest",
-)
+@rule
 def critic_overfits(e: Evidence) -> str | None:
     """Q knows what is in the replay buffer by heart, and not what happens now."""
     newest, sampled = e.values("td_error/newest"), e.values("td_error/sampled")
@@ -489,13 +346,7 @@ def critic_overfits(e: Evidence) -> str | None:
     return f"The error of Q at the newest transitions is {times:.0f} times that at sampled ones."
 
 
-@rule(
-    SYMPTOM,
-    POSSIBLE,
-    remedy="--network layer_norm; a lower learning rate",
-    source="Lyle et al. 2023, arXiv:2303.01486",
-    metric="network/inactive",
-)
+@rule
 def plasticity_lost(e: Evidence) -> str | None:
     """Ever fewer units learn."""
     first, late = e.early("network/inactive"), e.late("network/inactive")
@@ -504,26 +355,14 @@ def plasticity_lost(e: Evidence) -> str | None:
     return f"Inactive units rose from {first:.0%} to {late:.0%} while returns fell."
 
 
-@rule(
-    SYMPTOM,
-    POSSIBLE,
-    remedy="A lower learning rate; --activation tanh; --network layer_norm",
-    source="Sokar et al. 2023, arXiv:2302.12902",
-    metric="network/inactive",
-)
+@rule
 def units_inactive(e: Evidence) -> str | None:
     """Most of the network has no part in what the policy does."""
     share = e.late("network/inactive")
     return f"{share:.0%} of the policy's hidden units are the same at every observation." if share > 0.6 else None
 
 
-@rule(
-    SYMPTOM,
-    POSSIBLE,
-    remedy="--scale-rewards; lower --value-coef; divide the reward in the environment",
-    source="docs/notes/ppo.md, metrics",
-    metric="gradient_norm",
-)
+@rule
 def gradient_clipped(e: Evidence) -> str | None:
     """Every step has the length of the clip, usually because the value's loss is large."""
     norm, limit = e.late("gradient_norm"), first_number(e.config.get("max_grad_norm"))
@@ -532,29 +371,19 @@ def gradient_clipped(e: Evidence) -> str | None:
     return f"The late gradient has a norm of {norm:.3g}, and is clipped to 1/{norm / limit:.0f} of it."
 
 
-@rule(
-    SYMPTOM,
-    POSSIBLE,
-    remedy="Take more --epochs; take more --critic-epochs; lower --gae-lambda; observe what decides the return",
-    source="SB3#324",
-    metric="explained_variance",
-)
+@rule
 def value_explains_nothing(e: Evidence) -> str | None:
     """The baseline takes no variance away; the observations may not hold what decides the return."""
-    explained, late = e.late("explained_variance"), e.returns[len(e.returns) // 2 :]
-    if not explained < 0.05 or (len(late) and late.std() <= 0.02 * abs(late.mean())):
+    explained, late = e.late("explained_variance"), e.ends[1]
+    settled = len(late) > 0 and late.std() <= 0.05 * abs(late.mean())  # there is nothing left to explain
+    if not explained < 0.05 or settled or "gae_lambda" not in e.config:  # a weak baseline of REINFORCE does no harm
         return None
     return (
         f"The value explains {max(0.0, explained):.0%} of the variance of its targets, no more than a constant would."
     )
 
 
-@rule(
-    SYMPTOM,
-    LIKELY,
-    remedy="Look at the signs first: the notes of each algorithm have its losses with their sign",
-    source="docs/notes/reinforce.md",
-)
+@rule
 def gets_worse(e: Evidence) -> str | None:
     """The policy learns the opposite: usually the sign of a loss, of the advantage or of the reward."""
     if not e.gain < -5:
@@ -568,24 +397,13 @@ def gets_worse(e: Evidence) -> str | None:
 # --- of the judgement -----------------------------------------------------------------------------------------------
 
 
-@rule(
-    JUDGEMENT,
-    LIKELY,
-    remedy="Take more --total-steps; fewer --num-envs; give the environment a time limit",
-    source="docs/faq.md, an episode does not end",
-    metric="episode/length",
-)
+@rule
 def no_episode(e: Evidence) -> str | None:
     """There is no return to judge by."""
     return "No whole episode ended in training." if e.log and not len(e.returns) else None
 
 
-@rule(
-    JUDGEMENT,
-    POSSIBLE,
-    remedy="Evaluate with --stochastic too, and compare the wrappers and --env-args of both",
-    source="cleanrl#310, SB3#1480",
-)
+@rule
 def evaluated_otherwise(e: Evidence) -> str | None:
     """The policy needs its noise, or the evaluation is of another environment."""
     fifth, mean = len(e.returns) // 5, e.scores.get("mean_return")
@@ -598,12 +416,7 @@ def evaluated_otherwise(e: Evidence) -> str | None:
     return f"Training ends at {last.mean():,.4g}, and the deterministic policy has {mean:,.4g} in the evaluation."
 
 
-@rule(
-    JUDGEMENT,
-    HINT,
-    remedy="Train longer, or the algorithm that docs/which_algorithm.md recommends for this kind of environment",
-    source="docs/which_algorithm.md",
-)
+@rule
 def does_not_learn(e: Evidence) -> str | None:
     """Nothing was learned in so many steps, and no rule says why."""
     first, last = e.ends
@@ -614,12 +427,7 @@ def does_not_learn(e: Evidence) -> str | None:
     )
 
 
-@rule(
-    JUDGEMENT,
-    HINT,
-    remedy="--keep-best --evaluate-every 20_000 keeps the best; --final-learning-rate 0 lets the steps become small",
-    source="docs/notes/ppo.md",
-)
+@rule
 def fell_back(e: Evidence) -> str | None:
     """The final policy is not the best one."""
     window = max(10, len(e.returns) // 20)
@@ -632,7 +440,7 @@ def fell_back(e: Evidence) -> str | None:
     return f"Returns fell from {averages.max():,.4g} to {averages[-1]:,.4g} before the end."
 
 
-@rule(JUDGEMENT, HINT, remedy="Train longer: raise --total-steps", source="Henderson et al. 2018, arXiv:1709.06560")
+@rule
 def still_rising(e: Evidence) -> str | None:
     """The run ended before it had learned what it can."""
     fifth = len(e.returns) // 5
@@ -645,9 +453,7 @@ def still_rising(e: Evidence) -> str | None:
     return f"Returns were still rising, from {before.mean():,.4g} to {last.mean():,.4g} in the last two fifths."
 
 
-@rule(
-    JUDGEMENT, HINT, remedy="Evaluate over 100 episodes: --episodes 100", source="Agarwal et al. 2021, arXiv:2108.13264"
-)
+@rule
 def few_episodes(e: Evidence) -> str | None:
     """Another set of starts would give another mean."""
     returns = e.scores.get("returns", ())
@@ -661,14 +467,14 @@ def few_episodes(e: Evidence) -> str | None:
 FAR = 3.0
 """the factor outside of its usual range from which on a setting is named"""
 
-OF_RATIOS = {"rollout_rows": "num_steps", "replay_ratio": "num_updates"}
-"""what is made of several fields: the one to change"""
+OF_RATIOS = {"rollout_rows": ("num_envs", "num_steps"), "replay_ratio": ("num_updates", "update_every", "num_envs")}
+"""what is made of several fields: these"""
 
 
 def settings_far_out(e: Evidence) -> Sequence[tuple[Rule, str]]:
     """A finding for each setting far outside its usual range that is not as recommended, the farthest first."""
     found = list[tuple[float, Rule, str]]()
-    for field, known in tomllib.loads(Path(__file__).with_name("settings.toml").read_text("utf-8")).items():
+    for field, known in read("settings.toml").items():
         low, high = known.get("usual") or e.usual.get(field, (0.0, np.inf))
         if times := known.get("times_recommended"):
             low, high = (e.recommended.get(field, 0) * each for each in times)
@@ -677,12 +483,13 @@ def settings_far_out(e: Evidence) -> Sequence[tuple[Rule, str]]:
         if abs(factor) < FAR or not means:
             continue
         size = "far" if field in HORIZONS or np.isinf(factor) else f"{abs(factor):,.0f} times"
-        side, change = "below" if factor < 0 else "above", OF_RATIOS.get(field, field)
+        side = "below" if factor < 0 else "above"
+        change = [name for name in OF_RATIOS.get(field, (field,)) if e.config[name] != e.recommended.get(name)]
         seen = f"{field} is {e.config[field]}, {size} {side} its usual range, {low:g} to {high:g}."
-        remedy = f"{flag(change)} {e.recommended.get(change)}, as recommended"
+        remedy = f"{' '.join(f'{flag(name)} {shown(e.recommended.get(name))}' for name in change)}, as recommended"
         sure = POSSIBLE if e.rose else LIKELY
-        named = f"setting-{field}".replace("_", "-"), SETTINGS, sure, lambda _: None, means, remedy, known["source"]
-        found.append((abs(factor), Rule(*named, "episode/return"), seen))
+        name = f"setting-{field}".replace("_", "-")
+        found.append((abs(factor), Rule(name, lambda _: None, means, "settings", sure, remedy, known["source"]), seen))
     return [(rule, seen) for _, rule, seen in sorted(found, key=lambda each: -each[0])]
 
 

@@ -66,6 +66,11 @@ def field_of(flag: str) -> str:
     return "env_kwargs" if flag == "--env-args" else flag.removeprefix("--").replace("-", "_")
 
 
+def shown(value: Any) -> str:
+    """A value of a field as the command line takes it."""
+    return "none" if value is None else str(value)
+
+
 def read(name: str, hint: Any, text: Any) -> Any:
     """The value that `text` (of a tuple, several texts) stands for; what cannot be read as `hint` says stays as it is.
 

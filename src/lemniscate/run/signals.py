@@ -33,6 +33,7 @@ def signals(state: Any, config: RunConfig, spec: Spec, rows: Rollout | None) -> 
         return {}
     chosen = rows[rows.valid]
     found = of_rows(chosen, spec) | of_networks(state, chosen) | of_critics(state, config, chosen)
+    found |= of_values(state, config, chosen)
     found["reward/by_time"] = by_time(rows)
     if not spec.has_images and spec.observation_size <= MOST_NUMBERS:
         found |= of_effects(chosen, spec)
@@ -124,8 +125,30 @@ def of_networks(state: Any, rows: Rollout) -> dict[str, Tensor]:
     return found
 
 
+def of_values(state: Any, config: RunConfig, rows: Rollout) -> dict[str, Tensor]:
+    """The share of V that is missing: the mean of r + γ V(s') − V(s) over (1 − γ) |V|, positive where V is too near to 0.
+
+    That mean is 1 − γ times the difference of the policy's value and V. Where learning takes the value behind a time
+    limit for 0, the share is that of the discounted steps which the limit cuts off.
+    """
+    gamma = getattr(config, "gamma", 1.0)
+    if not hasattr(state.networks, "value") or gamma == 1:
+        return {}
+    scaled = getattr(config, "scale_rewards", False) and hasattr(state, "reward_scale")
+    reward = state.reward_scale(rows.reward) if scaled else rows.reward
+    value, after = state.networks.value(rows.obs), state.networks.value(rows.next_obs)
+    return {"value/missing": _missing(td_target(reward, after, rows.terminated, gamma=gamma), value, gamma)}
+
+
+def _missing(target: Tensor, value: Tensor, gamma: float) -> Tensor:
+    return (target - value).mean() * value.mean().sign() / ((1 - gamma) * value.abs().mean())
+
+
 def of_critics(state: Any, config: RunConfig, rows: Rollout) -> dict[str, Tensor]:
-    """The mean squared error of Q over one step, of the newest rows and of sampled ones, where Q learns from replay."""
+    """The mean squared error of Q over one step, of the newest rows and of sampled ones, and the share that is missing.
+
+    For algorithms that learn Q from replay.
+    """
     replay, updates = getattr(state, "replay", None), getattr(state, "updates", 0)
     if replay is None or not updates or not hasattr(state.networks, "critics"):
         return {}
@@ -133,10 +156,16 @@ def of_critics(state: Any, config: RunConfig, rows: Rollout) -> dict[str, Tensor
     columns = rows.obs, rows.action, rows.reward, rows.next_obs, rows.terminated
     sampled = replay.transitions[replay.sample_indices(1, SEEN, generator)[0]]
     critics, targets = state.networks.critics, getattr(state.targets, "critics", state.targets)
+    gamma = getattr(config, "gamma", 1.0)
 
-    def error(batch: Transition) -> Tensor:
+    def estimates(batch: Transition) -> tuple[Tensor, Tensor]:
         value = targets(batch.next_obs, state.policy(batch.next_obs).mode()).amin(0)
-        target = td_target(batch.reward, value, batch.terminated, gamma=getattr(config, "gamma", 1.0))
-        return (critics(batch.obs, batch.action)[0] - target).square().mean()
+        value = value + state.networks.entropy_bonus(batch.next_obs, generator)
+        return td_target(batch.reward, value, batch.terminated, gamma=gamma), critics(batch.obs, batch.action)[0]
 
-    return {"td_error/newest": error(Transition(*columns)[-SEEN:]), "td_error/sampled": error(sampled)}
+    (target, q), (other_target, other_q) = map(estimates, (Transition(*columns)[-SEEN:], sampled))
+    found = {
+        "td_error/newest": (q - target).square().mean(),
+        "td_error/sampled": (other_q - other_target).square().mean(),
+    }
+    return found | ({"value/missing": _missing(target, q, gamma)} if gamma < 1 else {})
