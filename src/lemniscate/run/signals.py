@@ -126,7 +126,7 @@ def of_networks(state: Any, rows: Rollout) -> dict[str, Tensor]:
 
 
 def of_values(state: Any, config: RunConfig, rows: Rollout) -> dict[str, Tensor]:
-    """The share of V that is missing: the mean of r + γ V(s') − V(s) over (1 − γ) |V|, positive where V is too near to 0.
+    """The share of V that is missing: the mean of r + γ V(s') − V(s) over (1 − γ) |V|; above 0 where V is too small.
 
     That mean is 1 − γ times the difference of the policy's value and V. Where learning takes the value behind a time
     limit for 0, the share is that of the discounted steps which the limit cuts off.
