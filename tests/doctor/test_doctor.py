@@ -72,7 +72,10 @@ CASES = {
         {"lengths": [50] * 400, "episode__terminated": [0.0] * 8},
     ),
     "short-episodes": ({"lengths": [1] * 400}, {"lengths": [3] * 400}),
-    "reward-large": ({"reward__largest": [5e3] * 8}, {"reward__largest": [100.0] * 8}),
+    "reward-large": (
+        {"reward__largest": [300.0] * 8, "changed": {"scale_rewards": False}},
+        {"reward__largest": [300.0] * 8},
+    ),
     "reward-small": ({"reward__largest": [1e-3] * 8}, {"reward__largest": [1e-3] * 7 + [1.0]}),
     "ratio-not-one": ({"first_kl": [0.02] * 8}, {"first_kl": [1e-9] * 8}),
     "normalizer-frozen": (
@@ -91,6 +94,10 @@ CASES = {
     "mostly-random": (
         {"algorithm": "sac", "changed": {"learning_starts": 3_900}},
         {"algorithm": "sac", "changed": {"learning_starts": 1_000}},
+    ),
+    "horizon-short": (
+        {"changed": {"gamma": 0.9}, "lengths": [1_000] * 400},
+        {"changed": {"gamma": 0.9}, "lengths": [200] * 400},
     ),
     "entropy-unreachable": (
         {"algorithm": "sac", "changed": {"target_entropy": 5.0}, "temperature": [1.0, 9.0]},

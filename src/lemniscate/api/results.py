@@ -17,6 +17,7 @@ from lemniscate.algos import RECOMMENDED
 from lemniscate.api import agents
 from lemniscate.api.policy import Trained, TrainedPolicy, TrainedRun, algorithm_of, load, own_code, path_of, save
 from lemniscate.doctor import Diagnosis
+from lemniscate.doctor.rules import seeds_differ
 from lemniscate.envs import check as env_check
 from lemniscate.envs import registry
 from lemniscate.envs.check import Finding
@@ -218,6 +219,16 @@ def runs_in(what: str) -> list[Path]:
     if not run_check.is_stored(path):
         return []
     return [run for run in read_sweep(path).runs if (run / CONFIG).exists()] if is_sweep(path) else [path]
+
+
+def spread_of(what: str) -> str | None:
+    """How far the final returns of a sweep's seeds differ, of those that are known, where that is far."""
+    finals = dict[str, list[float]]()
+    for run in runs_in(what):
+        if "mean_return" in (scores := _known_scores(run / FINAL)):
+            finals.setdefault(read_config(run)[0], []).append(scores["mean_return"])
+    said = {name: sentence for name, each in finals.items() if (sentence := seeds_differ(each))}
+    return "\n".join(f"{name}: {sentence}" for name, sentence in said.items()) or None
 
 
 def verdict(what: str, found: list[Finding]) -> str:

@@ -181,7 +181,7 @@ def _family(env_id: str) -> str:
 
 def doctor(given: argparse.Namespace) -> None:
     """Say what was found about an environment, or a run and its files, as a list; what is bad there is an error."""
-    from lemniscate.api.results import diagnose, each_finding, runs_in, verdict
+    from lemniscate.api.results import diagnose, each_finding, runs_in, spread_of, verdict
     from lemniscate.envs.check import BAD
 
     found, wrappers = [], read("wrappers", tuple[str, ...], given.wrappers)
@@ -198,6 +198,8 @@ def doctor(given: argparse.Namespace) -> None:
         say(f"{run}: {names or 'no rule finds a fault'}.")
         for one in of_run:
             say(one.listed(width))
+    if spread := spread_of(given.what):
+        say(spread)
     if given.json:
         runs = {run: [vars(one) for one in of_run] for run, of_run in diagnoses.items()}
         print(json.dumps({"checked": [vars(one) for one in found], "runs": runs}))

@@ -55,6 +55,10 @@ class Evidence:
         values = self.values(name)
         return float(np.median(values[len(values) // 2 :])) if len(values) else np.nan
 
+    def last(self, name: str) -> float:
+        """The last value of a metric; NaN if there is none."""
+        return float(next(iter(self.values(name)[::-1]), np.nan))
+
     def early(self, name: str) -> float:
         """The first value of a metric; NaN if there is none."""
         return float(next(iter(self.values(name)), np.nan))

@@ -176,8 +176,10 @@ def limit_as_termination(e: Evidence) -> str | None:
 @rule
 def reward_large(e: Evidence) -> str | None:
     """The first errors of the value are so large that the policy and the value do not learn at one rate."""
-    largest = e.greatest("reward/largest")
-    return f"Rewards reach {largest:,.3g}." if largest > 1000 else None
+    largest, scaled = e.greatest("reward/largest"), e.config.get("scale_rewards", False)
+    if not largest > (1000 if scaled else 150):  # LunarLander, which is learned unscaled too, has 100
+        return None
+    return f"Rewards reach {largest:,.3g}{'' if scaled else ', and are not scaled'}."
 
 
 @rule
@@ -249,9 +251,23 @@ def advantage_not_normalized(e: Evidence) -> str | None:
 def mostly_random(e: Evidence) -> str | None:
     """Most of what was collected is random play."""
     starts, total = e.config.get("learning_starts"), e.config.get("total_steps")
-    if starts is None or total is None or str(starts) in e.tried["learning_starts"] or starts < total / 2:
+    if starts is None or total is None or str(starts) in e.tried["learning_starts"] or starts <= total / 2:
         return None
     return f"The first {starts:,} of {total:,} steps are at random, without an update."
+
+
+@rule
+def horizon_short(e: Evidence) -> str | None:
+    """The policy sees a small part of its episode ahead."""
+    gamma, recommended = (first_number(config.get("gamma")) for config in (e.config, e.recommended))
+    if gamma is None or recommended is None or str(e.config["gamma"]) in e.tried["gamma"] or gamma >= recommended:
+        return None
+    if e.beyond("gamma", *e.usual.get("gamma", (0.0, 1.0))):  # a setting far out is named as such
+        return None
+    ahead, length = 1 / (1 - gamma), np.median(e.lengths) if len(e.lengths) else 0
+    if not length > 25 * ahead:
+        return None
+    return f"With gamma {gamma:g} some {ahead:.0f} steps ahead count, and episodes last {length:,.0f}."
 
 
 @rule
@@ -329,7 +345,7 @@ def actions_at_bounds(e: Evidence) -> str | None:
 @rule
 def q_biased(e: Evidence) -> str | None:
     """The policy follows the errors of Q."""
-    bias = (e.scores.get("q_bias") or {}).get("bias", np.nan)
+    bias = (e.scores.get("q_bias") or {}).get("bias", e.late("evaluation/q_bias"))
     if not abs(bias) > 0.5 or e.rose:
         return None
     return f"Q {'over' if bias > 0 else 'under'}-estimates the return by {abs(bias):.0%}."
@@ -406,12 +422,11 @@ def no_episode(e: Evidence) -> str | None:
 @rule
 def evaluated_otherwise(e: Evidence) -> str | None:
     """The policy needs its noise, or the evaluation is of another environment."""
-    fifth, mean = len(e.returns) // 5, e.scores.get("mean_return")
-    if mean is None or fifth < 10:
+    last, mean = e.ends[1], e.scores.get("mean_return", e.last("evaluation/return"))
+    if len(last) < 10:
         return None
-    last = e.returns[-fifth:]
     gap, spread = last.mean() - mean, np.ptp(e.returns)
-    if not gap > max(0.3 * spread, 3 * last.std() / np.sqrt(fifth)):
+    if not gap > max(0.3 * spread, 3 * last.std() / np.sqrt(len(last))):
         return None
     return f"Training ends at {last.mean():,.4g}, and the deterministic policy has {mean:,.4g} in the evaluation."
 
