@@ -3,6 +3,7 @@
     .venv/bin/python benchmarks/doctor.py faults --half even --seeds 101      of these the thresholds are chosen
     .venv/bin/python benchmarks/doctor.py faults --half odd --seeds 1 2 3     the half of the table
     .venv/bin/python benchmarks/doctor.py healthy
+    .venv/bin/python benchmarks/doctor.py remedies --only "observations in another unit"
     .venv/bin/python benchmarks/doctor.py table
     … --runs DIR           keep the runs there; one that is there is not trained again, only diagnosed
 
@@ -11,6 +12,7 @@ A fault counts as named first where the first finding is one of its names, hints
 """
 
 import argparse
+import re
 import shutil
 import tempfile
 from collections import defaultdict
@@ -104,7 +106,7 @@ FAULTS: dict[str, tuple[str, Mapping[str, int], Mapping[str, Any], tuple[str, ..
 HEALTHY = ("CartPole-v1", "Acrobot-v1", "LunarLander-v3", "Pendulum-v1", "MountainCarContinuous-v0", "HalfCheetah-v5",
            "Hopper-v5", "Walker2d-v5", "Ant-v5", "Swimmer-v5", "InvertedPendulum-v5", "Reacher-v5")  # fmt: skip
 MOST = {"sac": 4_000, "td3": 4_000, "ddpg": 4_000}
-"""steps of a healthy run at most; of other algorithms 150,000"""
+"""steps of a healthy run at most; of other algorithms 60,000"""
 
 
 def trained(path: Path, algorithm: str, env: str, fault: str | None = None, **fields: Any) -> Path:
@@ -147,7 +149,7 @@ def one_healthy(algorithm: str, env: str, preset: str, seed: int, folder: Path) 
     path = folder / f"{algorithm}-{env}-{preset}-{seed}"
     try:
         config = lem.config_for(algorithm, env, preset)
-        steps = min(config.total_steps, MOST.get(algorithm, 150_000))
+        steps = min(config.total_steps, MOST.get(algorithm, 60_000))
         fields = {"preset": preset, "seed": seed, "total_steps": steps, "compile": "off"}
         if algorithm in MOST:
             fields["learning_starts"] = min(config.learning_starts, steps // 4)
@@ -157,6 +159,23 @@ def one_healthy(algorithm: str, env: str, preset: str, seed: int, folder: Path) 
         print(algorithm, env, preset, error)
         return None
     return [one.name for one in found if one.sure != "hint"]
+
+
+def cured(name: str, env: str, seed: int) -> tuple[float, float, float]:
+    """Mean returns of the final policy: with the fault, with the flags of the first finding's remedy, and without it."""
+    algorithm, steps, change, _ = FAULTS[name]
+    shared = {"preset": "default", "seed": seed, "total_steps": steps[env], "progress": False}
+    returns = []
+    with tempfile.TemporaryDirectory() as scratch:
+        fields = dict(change) if isinstance(change, Mapping) else {}
+        for kind in ("fault", "cure", "healthy"):
+            run = lem.train(algorithm, env, run=f"{scratch}/{kind}", **shared, **fields)
+            returns.append(lem.evaluate(run.policy, episodes=20).mean_return)
+            remedy = lem.diagnose(run)[0].remedy if kind == "fault" else ""
+            flags = re.findall(r"--([a-z-]+)(?: ([\d.e-]+|none))?", remedy)
+            cure = {flag.replace("-", "_"): {"": True, "none": None}.get(value, value) for flag, value in flags}
+            fields = {**fields, **{k: float(v) if isinstance(v, str) else v for k, v in cure.items()}} if cure else {}
+    return tuple(returns)
 
 
 def table() -> None:
@@ -185,7 +204,7 @@ def table() -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["faults", "healthy", "table"])
+    parser.add_argument("what", choices=["faults", "healthy", "remedies", "table"])
     parser.add_argument("--half", choices=["even", "odd"])
     parser.add_argument("--only", nargs="+", help="these faults, or algorithms of healthy runs")
     parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3])
@@ -209,5 +228,9 @@ if __name__ == "__main__":
                 row = {"algorithm": algorithm, "env": env, "preset": preset, "seed": seed, "found": found}
                 append("doctor", row | provenance())
                 print("✗" if found else "✓", algorithm, env, preset, found, flush=True)
+        for name in (given.only or FAULTS) if given.what == "remedies" else ():
+            for env in FAULTS[name][1]:
+                for seed in given.seeds:
+                    print(name, env, seed, *(f"{value:.1f}" for value in cured(name, env, seed)), flush=True)
         if given.what == "table":
             table()
