@@ -162,7 +162,7 @@ def one_healthy(algorithm: str, env: str, preset: str, seed: int, folder: Path) 
 
 
 def cured(name: str, env: str, seed: int) -> tuple[float, float, float]:
-    """Mean returns of the final policy: with the fault, with the flags of the first finding's remedy, and without it."""
+    """Mean returns of the final policies: with the fault, with the remedy of the first finding, and without it."""
     algorithm, steps, change, _ = FAULTS[name]
     shared = {"preset": "default", "seed": seed, "total_steps": steps[env], "progress": False}
     returns = []
