@@ -1427,6 +1427,62 @@ MUTANTS = [
         "(self._steps_left == -2) & ~terminated",
         "envs/test_episodes.py::test_first_episodes_are_cut_at_all_steps_up_to_the_limit_and_later_ones_are_not",
     ),
+    (
+        "columns of chance explain",
+        "maths/stats.py",
+        "share = 1 - (after / many) / (left / few)",
+        "share = 1 - after / left",
+        "run/test_signals.py::test_noise_explains_nothing_and_too_few_rows_are_not_a_number",
+    ),
+    (
+        "time runs on through the ends of episodes",
+        "run/signals.py",
+        "(before * envs + torch.arange(",
+        "(0 * before + torch.arange(",
+        "run/test_signals.py::test_rewards_that_tell_the_time_do_so_within_each_episode",
+    ),
+    (
+        "no unit is ever inactive",
+        "run/signals.py",
+        ".clamp(min=1e-3)",
+        "* 0",
+        "run/test_signals.py::test_inactive_units_are_counted",
+    ),
+    (
+        "the missing value is that of one step",
+        "run/signals.py",
+        "/ ((1 - gamma) * value.abs().mean())",
+        "/ value.abs().mean()",
+        "run/test_signals.py::test_the_share_of_the_value_that_is_missing",
+    ),
+    (
+        "every line has signals",
+        "run/run.py",
+        "self._lines % every == 0",
+        "every",
+        "run/test_signals.py::test_there_are_signals_some_thirty_times_in_a_run_and_in_its_first_line",
+    ),
+    (
+        "consequences stand beside their cause",
+        "doctor/__init__.py",
+        """(caused and rule.kind == "symptom")""",
+        "False",
+        "doctor/test_doctor.py::test_beside_a_cause_its_consequences_are_not_named",
+    ),
+    (
+        "presets are blamed for their settings",
+        "doctor/evidence.py",
+        "if value is None or str(self.config[field]) in self.tried.get(field, ()):",
+        "if value is None:",
+        "doctor/test_doctor.py::test_the_defaults_and_all_presets_are_never_named",
+    ),
+    (
+        "what is certain is said again and again",
+        "doctor/__init__.py",
+        "self._said.add(rule.name)",
+        "pass",
+        "doctor/test_doctor.py::test_what_is_certain_is_said_once_while_a_run_is_trained",
+    ),
 ]
 
 

@@ -151,7 +151,6 @@ def test_actions_are_random_before_learning_starts_and_those_of_the_policy_after
         {"num_envs": 4, "num_updates": 3, "update_every": 2},
     ],
 )
-@pytest.mark.one_in(3)
 def test_as_many_gradient_steps_are_taken_as_the_config_says(tmp_path, algo, rhythm):
     fields = tiny_off_policy(**{"num_envs": 1, "evaluate_episodes": 1, **rhythm})
     name = algo.__name__.rpartition(".")[2]
