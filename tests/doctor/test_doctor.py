@@ -77,7 +77,10 @@ CASES = {
         {"reward__largest": [300.0] * 8},
     ),
     "reward-small": ({"reward__largest": [1e-3] * 8}, {"reward__largest": [1e-3] * 7 + [1.0]}),
-    "ratio-not-one": ({"first_kl": [0.02] * 8}, {"first_kl": [1e-9] * 8}),
+    "ratio-not-one": (
+        {"approx_kl": [0.02] * 8, "learning_rate": [1e-4] * 2 + [1e-6] * 7},
+        {"approx_kl": [0.02] * 8, "learning_rate": [1e-4] * 8},
+    ),
     "normalizer-frozen": (
         {"normalizer__count": [500.0] * 8},
         {"normalizer__count": list(np.linspace(500.0, 4_000.0, 8))},

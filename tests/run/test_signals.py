@@ -164,8 +164,7 @@ def test_there_are_signals_some_thirty_times_in_a_run_and_in_its_first_line(tmp_
     assert LOOKS - 4 <= len(looked) <= LOOKS + 1
     assert looked[0] == lines[0]["step"]
     assert len({after - before for before, after in pairwise(looked)}) == 1
-    assert {"first_kl", "normalizer/count", "network/inactive", "action/effect"} <= lines[0].keys()
-    assert lines[0]["first_kl"] < 1e-9
+    assert {"normalizer/count", "network/inactive", "action/effect", "value/missing"} <= lines[0].keys()
 
 
 @pytest.mark.parametrize("algorithm", ["ppo", "sac", "pqn", "reinforce"])

@@ -108,7 +108,8 @@ def advantages(config: Config, networks: ActorCritic, rollout: Rollout) -> Batch
     value, next_value, log_prob = networks.estimates(rollout.obs, rollout.next_obs, rollout.action)
     gamma, lam = config.gamma, config.gae_lambda
     advantage, target = gae(rollout.reward, value, next_value, rollout.terminated, rollout.done, gamma=gamma, lam=lam)
-    return Batch(rollout.obs, rollout.action, log_prob, value, advantage, target).flatten()  # [T, N, …] -> [B, …]
+    batch = Batch(rollout.obs, rollout.action, log_prob, value, advantage, target)
+    return batch.flatten()  # [T, N, …] -> [B, …]
 
 
 def loss(config: Config, networks: ActorCritic, batch: Batch) -> Loss:
@@ -154,8 +155,7 @@ def update(config: Config, state: State, rollout: Rollout) -> dict[str, Tensor |
         if config.normalize_advantage:
             advantage = standardize(advantage.flatten(1)).view_as(advantage)
         state.optimizer.learning_rate = state.learning_rate
-        steps = state.learn(config, state, batch, minibatches, advantage)
-        metrics.append(means(steps) | ({} if epoch else {"first_kl": steps[0]["approx_kl"]}))  # 0: π is still π_old
+        metrics.append(means(state.learn(config, state, batch, minibatches, advantage)))
         kl = metrics[-1]["approx_kl"].item()
         if config.desired_kl is not None:
             state.learning_rate = adapt_to_kl(state.learning_rate, kl, config.desired_kl)

@@ -266,7 +266,7 @@ def _repeats(config: RunConfig) -> bool | None:
     arguments = env_arguments(config)
     try:
         cls = registry.backend_class(arguments["backend"] or registry.backend_for(config.env, config.all_wrappers))
-        if cls.compiled or cls.exists_once(config.env, 2):
+        if cls.compiled or cls.exists_once(config.env, config.num_envs):
             return None
         with closing(registry.make(num_envs=2, **arguments)) as env:
             return torch.equal(env.restart(1).clone(), env.restart(1))

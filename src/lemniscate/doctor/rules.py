@@ -204,8 +204,10 @@ def large_observation(e: Evidence) -> str | None:
 @rule
 def ratio_not_one(e: Evidence) -> str | None:
     """The policy that learns is not the one that acted: a normalizer, dropout or a stale log-probability is between."""
-    kl = e.late("first_kl")
-    return f"In the first minibatch of an update the KL divergence is {kl:.2g}, and must be 0." if kl > 1e-4 else None
+    kl, rate = e.late("approx_kl"), e.late("learning_rate")
+    if e.config.get("desired_kl") is None or not (rate < 3e-6 and kl > 1e-3):
+        return None
+    return f"The KL divergence is {kl:.2g} although the learning rate has fallen to {rate:.1g}, which moves nothing."
 
 
 @rule
