@@ -388,6 +388,7 @@ def test_what_the_caller_has_set_in_torch_changes_nothing_and_stays(tmp_path):
     assert all(each == found["nothing"] for each in found.values())
 
 
+@pytest.mark.long
 def test_what_the_caller_has_set_in_torch_does_not_reach_what_looks_at_a_policy(cartpole, pendulum, tmp_path):
     """What a policy says of itself, a film, and the check of a whole environment, each under every setting."""
     critic = lem.config_for("ddpg", "Pendulum-v1", hidden=(8,), critic_hidden=(8,))

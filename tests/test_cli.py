@@ -187,6 +187,7 @@ def test_names_are_read_as_python_writes_several():
     assert given.fields["hidden"] == ()
 
 
+@pytest.mark.long
 def test_the_home_folder_is_meant_wherever_a_path_is_taken(run, tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
     monkeypatch.chdir(tmp_path)

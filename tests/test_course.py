@@ -28,6 +28,7 @@ def test_the_library_passes(name, capsys):
 
 
 @pytest.mark.parametrize(("name", "words"), MISTAKES, ids=[f"{name}-{words}" for name, words in MISTAKES])
+@pytest.mark.one_in(3)
 def test_a_known_mistake_is_called_by_its_name(name, words):
     """Alone, or beside one other that the cases do not tell apart; what raises is a sentence of its own."""
     finding = course.check(COMPARED[name].mistakes[words], name)

@@ -64,6 +64,7 @@ def test_an_environment_of_ones_own_with_arguments_and_a_wrapper(tmp_path):
     assert lemniscate("check", "own_environment:Balance")[1]
 
 
+@pytest.mark.long
 def test_the_contract_holds_for_the_algorithm_of_ones_own(tmp_path, monkeypatch):
     from lemniscate.testing import ALGORITHM_CONTRACT
 

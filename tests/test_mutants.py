@@ -1512,7 +1512,7 @@ def test_the_suite_kills(server, tmp_path, mutant):
         "-p",
         "no:cacheprovider",
         "-m",
-        "not long and not faults and not cluster",
+        "not faults and not cluster" if "::" in tests else "not long and not faults and not cluster",
         "-o",
         "addopts=",
     ]  # unshaped: faster

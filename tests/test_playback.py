@@ -131,6 +131,7 @@ class Loud(gym.Env):
         return np.zeros((8, 8, 3), np.uint8)
 
 
+@pytest.mark.long
 def test_pygame_is_quiet_while_a_film_is_made(tmp_path):
     names = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER", "XDG_RUNTIME_DIR", "PYGAME_HIDE_SUPPORT_PROMPT")
     quiet = {name: value for name, value in os.environ.items() if name not in names}

@@ -139,6 +139,7 @@ def test_resuming_a_sweep_goes_on_begins_and_leaves_alone(trained, tmp_path, cap
     assert {file: file.stat().st_mtime_ns for file in untouched} == untouched
 
 
+@pytest.mark.long
 def test_a_finished_sweep_is_resumed_in_no_time(trained, capsys, monkeypatch):
     path, _ = trained
     monkeypatch.setattr(subprocess, "Popen", None)

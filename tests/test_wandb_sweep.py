@@ -42,6 +42,7 @@ def test_the_agent_starts_what_is_understood(page, which):
     assert given.track == "wandb"
 
 
+@pytest.mark.long
 def test_an_agent_on_a_machine_without_a_network_logs_the_metric_that_runs_are_judged_by(tmp_path, monkeypatch):
     fake = FakeWandb(has_key=False, reachable=False)
     monkeypatch.setitem(sys.modules, "wandb", fake)

@@ -444,6 +444,7 @@ def test_what_is_called_right_agrees_with_the_formula(path, solution):
 
 
 @pytest.mark.parametrize(("path", "solution"), WRONG)
+@pytest.mark.one_in(3)
 def test_what_is_called_wrong_differs_or_raises_what_its_cause_says(path, solution):
     error = verdict(solution, path.name.split(".")[0])
     assert error is not None, "the oracle finds nothing wrong"

@@ -338,6 +338,7 @@ def oracle_of(exercise, code):
     ("exercise", "kind", "title", "regex", "code", "name"), BLOCKS, ids=lambda x: x if len(x) < 99 else ""
 )
 @pytest.mark.filterwarnings("ignore")
+@pytest.mark.one_in(3)
 def test_a_solution_is_what_its_title_says(exercise, kind, title, regex, code, name):
     judge = oracle_of(exercise, code)
     if kind == "right":

@@ -211,5 +211,6 @@ def compiled_equals_eager(algo, env, programs):
         pytest.param("reinforce, 'CartPole-v1', programs=4", marks=pytest.mark.long),
     ],
 )
+@pytest.mark.long
 def test_traced_updates_equal_eager_ones(case, compiler):
     require_in_own_process(__name__, f"compiled_equals_eager({case})", compiler)

@@ -164,6 +164,7 @@ def test_values_are_bootstrapped_at_time_limits_and_ignore_reset_rows(mode):
     assert learned_q(mode, length=None, horizon=4) == pytest.approx(10, abs=0.5)
 
 
+@pytest.mark.long
 def test_without_the_bootstrap_the_value_is_wrong():
     assert learned_q(spoil=lambda r: dataclasses.replace(r, terminated=r.truncated), length=None, horizon=4) < 6
 
@@ -202,6 +203,7 @@ def test_the_policy_stays_within_its_bound():
         assert 0.001 < kl.mean() < 0.15
 
 
+@pytest.mark.long
 def test_learns_to_copy_its_observation():
     """Bounds that lie asymmetrically: the policy must be right about the scale."""
     config = small("Copy-box-v0", num_envs=16, num_steps=16, minibatch_size=64, gamma=0.5, learning_rate=3e-3, epochs=8)

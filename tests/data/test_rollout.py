@@ -41,6 +41,7 @@ class Still:
         return torch.zeros(len(obs), dtype=torch.int64)
 
 
+@pytest.mark.long
 def test_an_episode_that_never_ends_is_an_error(rng):
     env = vectorize("Countdown-v0", 1, mode="DISABLED", length=None)
     with pytest.raises(UserError, match=r"Countdown-v0 has not ended after 20,000 steps"):

@@ -254,6 +254,7 @@ def test_the_verb_and_the_command_agree_on_a_run(tmp_path, capsys):
     assert capsys.readouterr().err == err
 
 
+@pytest.mark.long
 def test_a_sweep_is_each_of_its_runs(tmp_path, capsys):
     fields = tiny_fields(entropy_coef=0.5, num_steps=64, total_steps=512)
     del fields["seed"]

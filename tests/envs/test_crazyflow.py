@@ -147,6 +147,7 @@ def test_no_copy_is_made_on_the_way_to_torch(env, monkeypatch):
 
 @pytest.mark.parametrize("env_id", ["DroneReachPos-v0", "DroneReachVel-v0"])
 @pytest.mark.one_in(2)
+@pytest.mark.long
 def test_goals_come_from_the_seed_too(env_id):
     env = registry.make(env_id, 4)
     first, second, again = env.restart(1), env.restart(2), env.restart(1)

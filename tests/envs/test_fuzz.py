@@ -900,8 +900,8 @@ def test_what_was_found_is_answered(name):
 
 
 def test_any_environment_trains_or_is_refused_in_a_sentence():
-    answers = fuzz(1_000, derandomize=True)
-    assert answers[None] > 500
+    answers = fuzz(500, derandomize=True)
+    assert answers[None] > 250
     assert len(answers) > 15, "faults of most kinds are among them"
 
 

@@ -54,6 +54,7 @@ def require_parity(copy, tolerance=1e-5):
 
 
 @pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.one_in(2)
 def test_every_kind_of_actions(kind):
     copy = exported(policy_for(KINDS[kind], normalize_observations=True, spread=0.5))
     require_parity(copy)

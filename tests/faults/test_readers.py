@@ -43,6 +43,7 @@ def test_a_run_can_be_read_at_any_time_while_it_is_trained(tmp_path, capsys, tim
 
 
 @pytest.mark.parametrize("times", [pytest.param(often(20), marks=pytest.mark.faults), 1])
+@pytest.mark.long
 def test_a_directory_that_is_deleted_in_training_ends_in_a_sentence(tmp_path, times):
     for number in range(times):
         path = tmp_path / str(number)

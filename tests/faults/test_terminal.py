@@ -74,6 +74,7 @@ def is_still(path):
     return count and len(read_metrics(path)) == count
 
 
+@pytest.mark.long
 def test_output_that_nobody_reads_any_more_costs_no_step(tmp_path):
     path = tmp_path / "r"
     process, reader = reading(path, 4000, updates=150)

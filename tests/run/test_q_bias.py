@@ -104,6 +104,7 @@ def run(tmp_path_factory):
     return lem.train("td3", "Pendulum-v1", run=path, progress=False, **tiny_off_policy(evaluate_every=128))
 
 
+@pytest.mark.long
 def test_it_is_said_written_and_drawn(run, capsys):
     scores = lem.evaluate(run.policy, episodes=3)
     assert len(scores.q_bias.predicted) == 3

@@ -137,6 +137,7 @@ def test_the_same_seed_gives_the_same_bits_and_another_seed_does_not(tmp_path, e
 
 
 @pytest.mark.parametrize("env", ["CartPole-v1", "ddpg", "trpo"])
+@pytest.mark.one_in(3)
 def test_evaluation_changes_no_bit_of_training(tmp_path, env):
     train(tmp_path / "without", env)
     train(tmp_path / "with", env, evaluate_every=32)
@@ -151,6 +152,7 @@ def test_evaluation_changes_no_bit_of_training(tmp_path, env):
 
 
 @pytest.mark.parametrize("env", ["CartPole-v1", pytest.param("sac", marks=pytest.mark.long)])
+@pytest.mark.long
 def test_recordings_change_no_bit_of_training_and_survive_a_resume(tmp_path, env, monkeypatch):
     monkeypatch.setattr(lem.api.training, "is_installed", lambda name: name != "imageio_ffmpeg")
     train(tmp_path / "without", env, checkpoint_every=64)
@@ -240,6 +242,7 @@ LONG_MEMORY = {"buffer_size": 1000, "final_learning_rate": 1.0}
 
 
 @pytest.mark.parametrize("env", ["CartPole-v1", "sac", "ddpg"])
+@pytest.mark.one_in(3)
 def test_a_run_that_goes_on_beyond_its_end_is_the_longer_run(tmp_path, env):
     """Nothing here is annealed: so it makes no difference when the longer total was asked for. The buffer grows."""
     fields = {"checkpoint_every": 64, "keep_checkpoints": 20, **({} if env == "CartPole-v1" else LONG_MEMORY)}

@@ -168,6 +168,7 @@ def test_there_are_signals_some_thirty_times_in_a_run_and_in_its_first_line(tmp_
 
 
 @pytest.mark.parametrize("algorithm", ["ppo", "sac", "pqn", "reinforce"])
+@pytest.mark.one_in(2)
 def test_measuring_changes_no_bit_of_a_run(tmp_path, monkeypatch, algorithm):
     env = "Pendulum-v1" if algorithm == "sac" else "Matching-v0"
     fields = tiny_off_policy() if algorithm == "sac" else {"num_envs": 2, "num_steps": 8, "total_steps": 128}
