@@ -902,7 +902,7 @@ def test_what_was_found_is_answered(name):
 def test_any_environment_trains_or_is_refused_in_a_sentence():
     answers = fuzz(500, derandomize=True)
     assert answers[None] > 250
-    assert len(answers) > 15, "faults of most kinds are among them"
+    assert len(answers) > 12, "faults of most kinds are among them"
 
 
 @pytest.mark.long
