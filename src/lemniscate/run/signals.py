@@ -116,7 +116,7 @@ def of_networks(state: Any, rows: Rollout) -> dict[str, Tensor]:
     if units := [layer.flatten(1).float() for layer in layers if layer.ndim > 1 and len(layer) == len(obs)]:
         spread = [layer.std(0) for layer in units]
         inactive = [std < (std.mean() / 40).clamp(min=1e-3) for std in spread]
-        sizes = torch.linalg.svdvals(units[-1]).cumsum(0)
+        sizes = torch.linalg.svdvals(units[-1].cpu()).cumsum(0)
         found["network/inactive"] = torch.cat(inactive).float().mean()
         found["network/rank"] = ((sizes < 0.99 * sizes[-1]).sum() + 1) / min(units[-1].shape)
     if isinstance(normalizer := state.policy.normalizer, RunningNorm):
