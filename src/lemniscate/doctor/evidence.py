@@ -74,8 +74,9 @@ class Evidence:
 
     @cached_property
     def rose(self) -> bool:
-        """Whether the last fifth of the episodes is better than the first, by three standard errors."""
-        return self.gain > 3
+        """Whether the last fifth of the episodes is better than the first, by three standard errors and 0.3 std of one."""
+        first, last = self.ends
+        return self.gain > 3 and bool(last.mean() - first.mean() > 0.3 * np.hypot(first.std(), last.std()))
 
     @cached_property
     def gain(self) -> float:

@@ -148,6 +148,12 @@ def reward_unexplained(e: Evidence) -> str | None:
 
 
 @rule
+def no_episode(e: Evidence) -> str | None:
+    """There is no return to judge by."""
+    return "No whole episode ended in training." if e.log and not len(e.returns) else None
+
+
+@rule
 def short_episodes(e: Evidence) -> str | None:
     """Episodes end before anything can be done."""
     if len(e.lengths) < 20 or np.percentile(e.lengths, 90) > 2:
@@ -413,12 +419,6 @@ def gets_worse(e: Evidence) -> str | None:
 
 
 # --- of the judgement -----------------------------------------------------------------------------------------------
-
-
-@rule
-def no_episode(e: Evidence) -> str | None:
-    """There is no return to judge by."""
-    return "No whole episode ended in training." if e.log and not len(e.returns) else None
 
 
 @rule
