@@ -74,7 +74,7 @@ class Evidence:
 
     @cached_property
     def rose(self) -> bool:
-        """Whether the last fifth of the episodes is better than the first, by three standard errors and 0.3 std of one."""
+        """Whether the last fifth of the episodes is better than the first: by three standard errors, and by 0.3 std."""
         first, last = self.ends
         return self.gain > 3 and bool(last.mean() - first.mean() > 0.3 * np.hypot(first.std(), last.std()))
 
