@@ -84,7 +84,7 @@ FAULTS: dict[str, tuple[str, Mapping[str, int], Mapping[str, Any], tuple[str, ..
     "a policy that is frozen": ("ppo", ON, {"freeze": ("policy",)}, ("policy-still",)),
     "the sign of the advantage": ("ppo", ON, "the sign of the advantage", ("gets-worse",)),
     "a value of other rows": ("ppo", ON, "targets of other rows", ("value-explains-nothing",)),
-    "dead units": ("ppo", ON, "weights that are too large", ("units-inactive",)),
+    "saturated units": ("ppo", ON, "weights that are too large", ("units-saturated",)),
     "no target networks": ("sac", OFF, QUICK | {"tau": 1.0}, ("setting-tau",)),
     "targets that stand still": ("sac", OFF, QUICK | {"tau": 1e-5}, ("setting-tau",)),
     "replay ratio too high": (

@@ -117,6 +117,7 @@ CASES = {
     "actions-at-bounds": ({"action__at_bounds": [0.95] * 8}, {"action__at_bounds": [0.5] * 8}),
     "value-explains-nothing": ({"explained_variance": [0.02] * 8}, {"explained_variance": [0.4] * 8}),
     "gradient-clipped": ({"gradient_norm": [90.0] * 8}, {"gradient_norm": [20.0] * 8}),
+    "units-saturated": ({"network__saturated": [0.9] * 8}, {"network__saturated": [0.3] * 8}),
     "units-inactive": ({"network__inactive": [0.8] * 8}, {"network__inactive": [0.3] * 8}),
     "plasticity-lost": (
         {"network__inactive": [0.1] * 3 + [0.5] * 5, "returns": [*range(300), *[20] * 100]},

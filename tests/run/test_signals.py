@@ -133,6 +133,7 @@ def test_inactive_units_are_counted(kind):
     found = of_networks(SimpleNamespace(policy=Policy(nn.Sequential(layer, kind()), NoNorm(O))), rows())
     assert found["network/inactive"] == 0.75
     assert found["network/rank"] <= 3 / 8
+    assert found["network/saturated"] == pytest.approx(0.75 * (kind is nn.Tanh), abs=0.1)
     assert "normalizer/count" not in found
 
 

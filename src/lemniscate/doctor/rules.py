@@ -235,22 +235,10 @@ def normalizer_stale(e: Evidence) -> str | None:
 
 
 @rule
-def missing_bootstrap(e: Evidence) -> str | None:
-    """The value ends where the time limit does, as if nothing followed: the bootstrap of truncated steps is missing."""
-    missing = e.values("value/missing")
-    late = missing[len(missing) // 2 :]
-    if len(missing) < 4 or not (np.median(late) > 0.2 and np.percentile(late, 25) > 0.1):
-        return None
-    if not e.late("episode/terminated") < 0.5:
-        return None
-    return f"{np.median(late):.0%} of the value that follows is missing, and most episodes end at a time limit."
-
-
-@rule
 def advantage_not_normalized(e: Evidence) -> str | None:
     """The size of a step hangs on that of the rewards."""
     given, usual = (config.get("normalize_advantage") for config in (e.config, e.recommended))
-    if given is not False or not usual or e.config.get("scale_rewards"):
+    if given is not False or not usual or e.config.get("scale_rewards") or "False" in e.tried["normalize_advantage"]:
         return None
     return "Neither advantages nor rewards are normalized."
 
@@ -291,6 +279,18 @@ def entropy_unreachable(e: Evidence) -> str | None:
 
 
 @rule
+def missing_bootstrap(e: Evidence) -> str | None:
+    """The value ends where the time limit does, as if nothing followed: the bootstrap of truncated steps is missing."""
+    missing = e.values("value/missing")
+    late = missing[len(missing) // 2 :]
+    if len(missing) < 4 or not (np.median(late) > 0.2 and np.percentile(late, 25) > 0.1):
+        return None
+    if not e.late("episode/terminated") < 0.5 or ("tau" in e.config and e.log[-1]["step"] < 20_000):  # Q comes slowly
+        return None
+    return f"{np.median(late):.0%} of the value that follows is missing, and most episodes end at a time limit."
+
+
+@rule
 def kl_too_large(e: Evidence) -> str | None:
     """Each update takes the policy so far that what was collected says little about where it arrives."""
     kl = e.late("approx_kl")
@@ -324,7 +324,8 @@ def entropy_collapsed(e: Evidence) -> str | None:
     """The policy has stopped exploring before it has learned."""
     std, entropy = e.values("policy_std"), e.values("losses/entropy")
     spread, name = (std, "standard deviation") if len(std) else (entropy, "entropy")
-    if len(spread) < 8 or "initial_temperature" in e.config or spread[0] <= 0 or e.gain > 10:
+    chosen = {"initial_temperature", "min_temperature"} & set(e.config)  # SAC and REPPO choose their entropy
+    if len(spread) < 8 or chosen or spread[0] <= 0 or e.gain > 10:
         return None
     left = spread[len(spread) // 4] / spread[0]
     return (
@@ -387,6 +388,13 @@ def units_inactive(e: Evidence) -> str | None:
 
 
 @rule
+def units_saturated(e: Evidence) -> str | None:
+    """Units at a bound of tanh have no gradient, and say no more than a sign: weights or observations are too large."""
+    share = e.late("network/saturated")
+    return f"{share:.0%} of what the policy's hidden units say is at a bound of tanh." if share > 0.6 else None
+
+
+@rule
 def gradient_clipped(e: Evidence) -> str | None:
     """Every step has the length of the clip, usually because the value's loss is large."""
     norm, limit = e.late("gradient_norm"), first_number(e.config.get("max_grad_norm"))
@@ -399,8 +407,11 @@ def gradient_clipped(e: Evidence) -> str | None:
 def value_explains_nothing(e: Evidence) -> str | None:
     """The baseline takes no variance away; the observations may not hold what decides the return."""
     explained, late = e.late("explained_variance"), e.ends[1]
+    late_half = e.values("explained_variance")[len(e.values("explained_variance")) // 2 :]
     settled = len(late) > 0 and late.std() <= 0.05 * abs(late.mean())  # there is nothing left to explain
-    if not explained < 0.05 or settled or "gae_lambda" not in e.config:  # a weak baseline of REINFORCE does no harm
+    if not -0.3 < explained < 0.05 or settled or np.percentile(late_half, 90) > 0.15:  # below -0.3 targets are constant
+        return None
+    if "gae_lambda" not in e.config:  # a weak baseline of REINFORCE does no harm
         return None
     return (
         f"The value explains {max(0.0, explained):.0%} of the variance of its targets, no more than a constant would."

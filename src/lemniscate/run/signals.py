@@ -98,7 +98,7 @@ def _numbers(action: Tensor, kind: Action) -> Tensor:
 
 
 def of_networks(state: Any, rows: Rollout) -> dict[str, Tensor]:
-    """The share of the policy's hidden units that are the same at all rows, its rank, and what its normalizer knows.
+    """Of the policy: the shares of hidden units that never change and that are at ±1, its rank, its normalizer's state.
 
     Inactive is a unit whose standard deviation over rows is below a fortieth of its layer's mean, as the dormant units
     of Sokar et al. 2023, arXiv:2302.12902, definition 3.1; a unit at a bound of tanh counts too. The rank is the
@@ -117,6 +117,9 @@ def of_networks(state: Any, rows: Rollout) -> dict[str, Tensor]:
         spread = [layer.std(0) for layer in units]
         inactive = [std < (std.mean() / 40).clamp(min=1e-3) for std in spread]
         sizes = torch.linalg.svdvals(units[-1].cpu()).cumsum(0)
+        found["network/saturated"] = (
+            torch.cat([(unit.abs() > 0.97) & (unit.abs() <= 1) for unit in units], 1).float().mean()
+        )
         found["network/inactive"] = torch.cat(inactive).float().mean()
         found["network/rank"] = ((sizes < 0.99 * sizes[-1]).sum() + 1) / min(units[-1].shape)
     if isinstance(normalizer := state.policy.normalizer, RunningNorm):
