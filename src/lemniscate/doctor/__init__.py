@@ -114,11 +114,14 @@ def evidence_of(
     Args:
         run: the directory.
         config: its settings.
-        recommended: the Configs that are known to learn its environment, the best first.
+        recommended: the Configs that are known to learn its environment, the default last. Of these the one that is
+            nearest to the run's is what it is compared with.
         scores: of its final evaluation.
         repeats: whether its environment begins alike from one seed.
     """
+    given = with_ratios(config.to_json())
     known = [with_ratios(one.to_json()) for one in recommended]
-    tried = {name: {str(one.get(name)) for one in known} for name in known[0]}
+    nearest = min(known, key=lambda one: sum(one[name] != value for name, value in given.items()))
+    tried = {name: {str(one[name]) for one in (nearest, known[-1])} for name in nearest}
     usual = usual_ranges(field_help(type(config)))
-    return Evidence(with_ratios(config.to_json()), known[0], tried, usual, read_metrics(run), scores or {}, repeats)
+    return Evidence(given, nearest, tried, usual, read_metrics(run), scores or {}, repeats)

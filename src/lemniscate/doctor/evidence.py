@@ -20,8 +20,8 @@ class Evidence:
 
     Attributes:
         config: the fields of the run's Config.
-        recommended: those of the preset for its environment, or of the algorithm's defaults.
-        tried: for each field the values, as texts, of all presets for its environment and of the defaults.
+        recommended: those of the nearest preset for its environment, or of the algorithm's defaults.
+        tried: for each field the values, as texts, of that preset and of the defaults.
         usual: the usual range of each field that has one, from its help.
         log: the lines of its metrics.
         scores: of its final evaluation; empty where there is none.
