@@ -150,7 +150,7 @@ def one_healthy(algorithm: str, env: str, preset: str, seed: int, folder: Path) 
     try:
         config = lem.config_for(algorithm, env, preset)
         steps = min(config.total_steps, MOST.get(algorithm, 60_000))
-        steps = max(steps, 12 * 1_000 * (algorithm in MOST and config.num_envs > 1))  # so that an episode ends
+        steps = max(steps, 1_100 * config.num_envs)  # so that an episode ends
         fields = {"preset": preset, "seed": seed, "total_steps": steps, "compile": "off"}
         if algorithm in MOST:
             fields["learning_starts"] = min(config.learning_starts, steps // 4)
