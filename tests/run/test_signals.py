@@ -13,7 +13,7 @@ from conftest import tiny_fields, tiny_off_policy
 from lemniscate.maths import explained_by
 from lemniscate.nn.normalizer import NoNorm, RunningNorm
 from lemniscate.run.metrics import read_metrics
-from lemniscate.run.signals import LOOKS, by_time, of_effects, of_networks, of_rows, of_values, signals
+from lemniscate.run.signals import KINDS, LOOKS, by_time, of_effects, of_networks, of_rows, of_values, signals
 from lemniscate.spec import Box, Discrete, ObservationPart, Spec
 from lemniscate.types import Rollout
 
@@ -228,3 +228,20 @@ def test_before_there_are_rows_there_are_no_signals():
     assert signals(None, None, spec_of(), None) == {}  # pyright: ignore[reportArgumentType]
     none = torch.zeros(4, 2, dtype=torch.bool)
     assert signals(None, None, spec_of(), SimpleNamespace(valid=none)) == {}  # pyright: ignore[reportArgumentType]
+
+
+def test_signals_are_drawn_beside_findings_and_not_among_the_diagnostics(tmp_path):
+    from matplotlib import pyplot
+
+    from lemniscate.report import curves
+
+    run = lem.train("ppo", "Countdown-v0", run=tmp_path / "r", progress=False, **tiny_fields())
+    logged = {name for line in read_metrics(run.path) for name in line}
+    signals_of = {name for name in logged if name.startswith(KINDS)}
+    assert len(signals_of) > 8
+    titles = []
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(pyplot.Axes, "set_title", lambda _axes, title, *_args, **_options: titles.append(title))
+        curves.plot_runs([run.path], tmp_path / "plots")
+    assert titles
+    assert not signals_of & set(titles)

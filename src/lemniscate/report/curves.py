@@ -18,6 +18,7 @@ from lemniscate.report.style import COLORS, finish, legend_above, limit_axis, ru
 from lemniscate.run.directory import read_config
 from lemniscate.run.evaluate import QBias
 from lemniscate.run.metrics import read_metrics
+from lemniscate.run.signals import KINDS as SIGNALS
 from lemniscate.system.console import Place, in_notebook
 from lemniscate.system.files import make_directory
 
@@ -39,7 +40,7 @@ TITLES = tomllib.loads((Path(__file__).parent / "templates" / "metrics.toml").re
 APART = ("step", "old_approx_kl", "gradient_norm/temperature")
 """metrics without a panel, beside those in `ELSEWHERE`"""
 
-ELSEWHERE = ("episode/", "evaluation/", "time/")
+ELSEWHERE = ("episode/", "evaluation/", "time/", *SIGNALS)
 """beginnings of the names that are not of an update"""
 
 

@@ -18,6 +18,8 @@ from lemniscate.types import Rollout, Transition
 
 LOOKS = 32
 """how often in a run the signals are measured"""
+KINDS = ("reward/", "observation/", "action/", "network/", "normalizer/", "td_error/", "value/")
+"""how the names of signals begin"""
 SEEN = 256
 """rows that the networks are asked about"""
 MOST_NUMBERS = 32
