@@ -4,6 +4,7 @@
     .venv/bin/python benchmarks/doctor.py faults --half odd --seeds 1 2 3     the half of the table
     .venv/bin/python benchmarks/doctor.py healthy
     .venv/bin/python benchmarks/doctor.py remedies --only "observations in another unit"
+    .venv/bin/python benchmarks/doctor.py cost
     .venv/bin/python benchmarks/doctor.py table
     … --runs DIR           keep the runs there; one that is there is not trained again, only diagnosed
 
@@ -15,6 +16,7 @@ import argparse
 import re
 import shutil
 import tempfile
+import time
 from collections import defaultdict
 from collections.abc import Mapping
 from contextlib import nullcontext
@@ -28,6 +30,7 @@ import lemniscate as lem
 from lemniscate import presets
 from lemniscate.algos import ALGORITHMS
 from lemniscate.errors import NonFiniteError, UserError
+from lemniscate.run import run as loop
 
 ON = {"CartPole-v1": 50_000, "LunarLander-v3": 120_000, "HalfCheetah-v5": 120_000}
 """environments of faults under PPO, with the steps of a run"""
@@ -38,6 +41,7 @@ BOX = {"HalfCheetah-v5": 120_000, "Pendulum-v1": 60_000, "InvertedPendulum-v5": 
 LIMITED = {"Pendulum-v1": 60_000, "Reacher-v5": 60_000, "MountainCar-v0": 60_000}
 """environments whose episodes end at a short time limit"""
 QUICK = {"learning_starts": 1_000, "log_every": 100}
+"""fields of SAC in a short run"""
 
 FAULTS: dict[str, tuple[str, Mapping[str, int], Mapping[str, Any], tuple[str, ...]]] = {
     # fault: algorithm, environments, fields or the name of a change in `faulty.LEARNERS`, names that are right
@@ -179,6 +183,29 @@ def cured(name: str, env: str, seed: int) -> tuple[float, float, float]:
     return tuple(returns)
 
 
+def cost() -> None:
+    """The share of training that the signals take, measured inside the run, one thread."""
+    measure, spent = loop.signals, [0.0]
+
+    def timed(*args: Any) -> dict[str, float]:
+        began = time.perf_counter()
+        found = measure(*args)
+        spent[0] += time.perf_counter() - began
+        return found
+
+    loop.signals = timed
+    for algorithm, env, steps in (
+        ("ppo", "CartPole-v1", 50_000),
+        ("ppo", "HalfCheetah-v5", 200_000),
+        ("sac", "Pendulum-v1", 8_000),
+    ):
+        spent[0] = 0.0
+        with tempfile.TemporaryDirectory() as scratch:
+            fields = {"total_steps": steps, "compile": "off", "progress": False}
+            run = lem.train(algorithm, env, preset="default", run=f"{scratch}/run", **fields)
+        print(f"{algorithm} {env}: {spent[0] / run.seconds:.2%} of {run.seconds:.0f} s", flush=True)
+
+
 def table() -> None:
     """The shares of faults that are named, by fault, and the false alarms."""
     judged = {(row["fault"], row["env"], row["seed"]): row["found"] for row in rows("doctor") if "fault" in row}
@@ -205,7 +232,7 @@ def table() -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["faults", "healthy", "remedies", "table"])
+    parser.add_argument("what", choices=["faults", "healthy", "remedies", "cost", "table"])
     parser.add_argument("--half", choices=["even", "odd"])
     parser.add_argument("--only", nargs="+", help="these faults, or algorithms of healthy runs")
     parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3])
@@ -233,5 +260,7 @@ if __name__ == "__main__":
             for env in FAULTS[name][1]:
                 for seed in given.seeds:
                     print(name, env, seed, *(f"{value:.1f}" for value in cured(name, env, seed)), flush=True)
+        if given.what == "cost":
+            cost()
         if given.what == "table":
             table()

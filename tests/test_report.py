@@ -1,4 +1,4 @@
-"""Pictures and pages of runs: axes, gaps, titles, report.html, and the rules of what to try next."""
+"""Pictures and pages of runs: axes, gaps, titles, and report.html."""
 
 import re
 import shlex

@@ -17,6 +17,7 @@ from lemniscate.doctor import Evidence, diagnose
 from lemniscate.doctor.evidence import usual_ranges, with_ratios
 from lemniscate.doctor.rules import HINT, RULES, seeds_differ, settings_far_out
 from lemniscate.run.fields import field_help, read
+from lemniscate.system.files import write_json
 
 PAGE = (Path(__file__).parents[2] / "docs" / "doctor.md").read_text()
 NOISE = np.random.default_rng(0).normal(size=400)
@@ -281,8 +282,6 @@ def test_an_environment_that_is_gone_costs_a_rule_and_no_more(tmp_path):
     record = json.loads((run.path / "config.json").read_text())
     assert "seed-ignored" not in [one.name for one in lem.diagnose(run)]
     record["config"]["env"] = "nowhere:Env"
-    from lemniscate.system.files import write_json
-
     write_json(run.path / "config.json", {name: value for name, value in record.items() if name != "crc32"})
     assert "seed-ignored" not in [one.name for one in lem.diagnose(run.path)]
 
@@ -307,4 +306,28 @@ def test_what_is_certain_is_said_once_while_a_run_is_trained(tmp_path, capsys):
 
 def test_of_a_healthy_run_nothing_is_said(tmp_path, capsys):
     lem.train("ppo", "Matching-v0", run=tmp_path / "r", **tiny_fields("Matching-v0", total_steps=32 * 20))
-    assert "→" not in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert not [rule.name for rule in RULES if rule.means in said]
+
+
+class Seedless(gym.Wrapper):
+    """Resets that do not use the seed."""
+
+    def reset(self, *, seed=None, options=None):
+        return self.env.reset(options=options)
+
+
+def test_an_environment_that_does_not_use_its_seed_is_found_out(tmp_path):
+    fields = tiny_fields("CartPole-v1", wrappers=(f"{__name__}:Seedless",))
+    run = lem.train("ppo", "CartPole-v1", run=tmp_path / "r", progress=False, **fields)
+    assert lem.diagnose(run)[0].name == "seed-ignored"
+
+
+def test_final_returns_of_a_sweep_that_differ_much_are_pointed_at(tmp_path, capsys):
+    for seed, final in ((1, 10.0), (2, 100.0)):
+        fields = tiny_fields("Matching-v0", seed=seed)
+        run = lem.train("ppo", "Matching-v0", run=tmp_path / f"ppo-{seed}", progress=False, **fields)
+        write_json(run.path / "final.json", {"mean_return": final, "step": 256})
+    write_json(tmp_path / "sweep.json", {"seeds": [1, 2], "configs": {"ppo": run.policy.config.to_json()}})
+    main(["doctor", str(tmp_path)])
+    assert "final returns of its seeds lie from 10 to 100" in capsys.readouterr().err

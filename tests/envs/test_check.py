@@ -1,4 +1,4 @@
-"""`lemniscate check` finds what is wrong, and says it."""
+"""`lemniscate doctor ENV` finds what is wrong, and says it."""
 
 import gymnasium as gym
 import numpy as np

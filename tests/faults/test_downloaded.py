@@ -101,7 +101,7 @@ def edit(path, name, rng):
 
 
 def checked(path):
-    """What `lemniscate check` finds, each in a sentence."""
+    """What `lem.check` finds, each in a sentence."""
     assert all(finding.sentence.endswith(".") for finding in each_finding(path))
 
 

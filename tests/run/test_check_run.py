@@ -1,4 +1,4 @@
-"""`lemniscate check RUN`: every damaged file is named, with what can be done; nothing is changed."""
+"""`lemniscate doctor RUN`: every damaged file is named, with what can be done; nothing is changed."""
 
 import shutil
 

@@ -24,7 +24,7 @@ def plot(*runs: Plotted | list[Plotted], by: str = "step") -> list[Path]:
     """Draw the curves of a run into its `plots/`, or compare several, or a list of them, grouped by all but the seed.
 
     Beside the pictures stands `report.html`, a page with all of them, the final evaluation, the settings, the commands
-    that do it again, and what to try next. In a notebook the pictures are also shown below the cell.
+    that do it again, and what the doctor has found. In a notebook the pictures are also shown below the cell.
 
     Where the environment has a scene, flights are drawn too; where there is a Q, its predictions beside the returns.
 

@@ -25,6 +25,7 @@ from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError, shown
 from lemniscate.hub import repository as hub
 from lemniscate.report import flight, pages, playback
+from lemniscate.report.seeds import group
 from lemniscate.run import check as run_check
 from lemniscate.run import checkpoint
 from lemniscate.run.checkpoint import list_steps
@@ -222,13 +223,11 @@ def runs_in(what: str) -> list[Path]:
 
 
 def spread_of(what: str) -> str | None:
-    """How far the final returns of a sweep's seeds differ, of those that are known, where that is far."""
-    finals = dict[str, list[float]]()
-    for run in runs_in(what):
-        if "mean_return" in (scores := _known_scores(run / FINAL)):
-            finals.setdefault(read_config(run)[0], []).append(scores["mean_return"])
-    said = {name: sentence for name, each in finals.items() if (sentence := seeds_differ(each))}
-    return "\n".join(f"{name}: {sentence}" for name, sentence in said.items()) or None
+    """A sentence for each group of a sweep whose final returns, of the seeds that have one, differ much; else None."""
+    runs = runs_in(what)
+    scores = {run: known["mean_return"] for run in runs if "mean_return" in (known := _known_scores(run / FINAL))}
+    said = [(one.label, seeds_differ(one.finals(scores))) for one in group(runs)]
+    return "\n".join(f"{label}: {sentence}" for label, sentence in said if sentence) or None
 
 
 def verdict(what: str, found: list[Finding]) -> str:
@@ -237,8 +236,8 @@ def verdict(what: str, found: list[Finding]) -> str:
     return run_check.verdict(path, found) if run_check.is_stored(path) else env_check.verdict(what, found)
 
 
-def diagnose(run: "Trained") -> list[Diagnosis]:
-    """What is wrong with a run, in words: each finding with what was seen, what it means, and what to change.
+def diagnose(run: Trained) -> list[Diagnosis]:
+    """The findings about a run, in words: what was seen, what it means, and what to change.
 
     Its settings, its lines of metrics and its final scores are looked at, and whether its environment keeps to a seed.
     Nothing is trained, and nothing is changed.

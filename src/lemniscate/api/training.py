@@ -301,7 +301,7 @@ def _train_here(
         _film(TrainedPolicy(copy_networks(state), spec, config, state.step), path)
 
     attend = Attendance(config) if progress else None
-    observer = call_callbacks(callbacks, copy_networks, spec, config, attend) if world.is_first else None
+    observer = call_callbacks(callbacks, copy_networks, spec, config, attend) if callbacks or attend else None
     surroundings = {"loggers": loggers, "progress": progress, "film": film, "observer": observer}
     run = Run(path, algorithm, config, envs, world=world, locate=local_path, **surroundings)
     pictures: list[Path] = []

@@ -10,7 +10,7 @@ from lemniscate.algos import find
 from lemniscate.cli.parsers import Parser, parser_of, unknown_argument
 from lemniscate.errors import UserError, prefix_errors, unknown_name
 from lemniscate.presets import names
-from lemniscate.run.fields import field_help, flag, kinds_of, read, unknown_field
+from lemniscate.run.fields import field_help, flag, kinds_of, read, typed, unknown_field
 
 GROUPS: dict[str, tuple[str, ...]] = {
     "run": ("seed", "total_steps", "device", "threads", "shards", "compile", "matmul", "warm_start", "freeze"),
@@ -96,7 +96,7 @@ def explain(parser: Parser, algorithm: str) -> None:
                 text += f" {{{', '.join(map(str, choices))}}}"
             default = getattr(defaults, action.dest)
             if default not in ((), {}) and "(default" not in text:
-                text += f" [{_shown(default)}]"
+                text += f" [{typed(default)}]"
             action.help, action.metavar = text.replace("%", "%%"), _metavar(hint)
     bracket = "[…] is the default, where neither --preset nor the environment's own preset says otherwise."
     schedule = "Learning rates, clips, entropy_coef, noise_std: also '3e-4>1e-5' in quotes, linear over total_steps."
@@ -124,14 +124,3 @@ def _metavar(hint: Any) -> str:
     words = {int: "INT", float: "FLOAT", dict: "JSON", NoneType: "none"}
     kinds = kinds_of(hint).items()
     return "|".join(dict.fromkeys(_metavar(of[0]) if kind is tuple else words.get(kind, "NAME") for kind, of in kinds))
-
-
-def _shown(value: Any) -> str:
-    """A default, as it would be typed."""
-    if isinstance(value, bool):
-        return "on" if value else "off"
-    if isinstance(value, tuple):
-        return " ".join(map(_shown, value))
-    if isinstance(value, int):
-        return f"{value:_}" if value >= 10_000 else str(value)
-    return "none" if value is None else str(value)

@@ -50,10 +50,14 @@ class Evidence:
         """A metric of every line that has it, in order."""
         return np.array([line[name] for line in self.log if name in line], dtype=np.float64)
 
+    def last_half(self, name: str) -> np.ndarray:
+        """A metric in the last half of the lines that have it, in order."""
+        values = self.values(name)
+        return values[len(values) // 2 :]
+
     def late(self, name: str) -> float:
         """The median of a metric in the last half of its lines; NaN, of which no rule speaks, if there is none."""
-        values = self.values(name)
-        return float(np.median(values[len(values) // 2 :])) if len(values) else np.nan
+        return float(np.median(half)) if len(half := self.last_half(name)) else np.nan
 
     def last(self, name: str) -> float:
         """The last value of a metric; NaN if there is none."""
@@ -93,10 +97,14 @@ class Evidence:
         fifth = len(self.returns) // 5
         return self.returns[:fifth], self.returns[len(self.returns) - fifth :]
 
+    def as_recommended(self, field: str) -> bool:
+        """Whether a field has the value that it has in the nearest preset or by default."""
+        return str(self.config.get(field)) in self.tried.get(field, ())
+
     def beyond(self, field: str, low: float, high: float) -> float:
-        """How far a field is outside its usual range: the factor, negative below it; 0 inside, or of a known value."""
+        """The factor by which a field is outside its usual range, negative below it; 0 inside, or as recommended."""
         value = first_number(self.config.get(field))
-        if value is None or str(self.config[field]) in self.tried.get(field, ()):
+        if value is None or self.as_recommended(field):
             return 0.0
         if field == "buffer_size" and value >= self.config["total_steps"]:  # all of the run
             return 0.0

@@ -3,7 +3,7 @@
 A rule is a function of the `Evidence` that answers with what it saw, in words with numbers, or with nothing; its
 docstring says what that means. Its remedy and its source are in `rules.toml`; settings far outside their usual range,
 which is in their help, are in `settings.toml`. The thresholds were chosen on one half of the runs with injected faults
-of `benchmarks/doctor.py`, and are judged on the other half: `docs/doctor.md` has how often all this is right.
+of `benchmarks/doctor.py`, six of them with a look at the other half: `docs/doctor.md` has how often all this is right.
 """
 
 import re
@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from lemniscate.doctor.evidence import HORIZONS, Evidence, first_number
-from lemniscate.run.fields import field_of, flag, shown
+from lemniscate.run.fields import field_of, flag, typed
 
 Sees = Callable[[Evidence], str | None]
 
@@ -238,7 +238,7 @@ def normalizer_stale(e: Evidence) -> str | None:
 def advantage_not_normalized(e: Evidence) -> str | None:
     """The size of a step hangs on that of the rewards."""
     given, usual = (config.get("normalize_advantage") for config in (e.config, e.recommended))
-    if given is not False or not usual or e.config.get("scale_rewards") or "False" in e.tried["normalize_advantage"]:
+    if given is not False or not usual or e.config.get("scale_rewards") or e.as_recommended("normalize_advantage"):
         return None
     return "Neither advantages nor rewards are normalized."
 
@@ -247,7 +247,7 @@ def advantage_not_normalized(e: Evidence) -> str | None:
 def mostly_random(e: Evidence) -> str | None:
     """Most of what was collected is random play."""
     starts, total = e.config.get("learning_starts"), e.config.get("total_steps")
-    if starts is None or total is None or str(starts) in e.tried["learning_starts"] or starts <= total / 2:
+    if starts is None or total is None or e.as_recommended("learning_starts") or starts <= total / 2:
         return None
     return f"The first {starts:,} of {total:,} steps are at random, without an update."
 
@@ -256,7 +256,7 @@ def mostly_random(e: Evidence) -> str | None:
 def horizon_short(e: Evidence) -> str | None:
     """The policy sees a small part of its episode ahead."""
     gamma, recommended = (first_number(config.get("gamma")) for config in (e.config, e.recommended))
-    if gamma is None or recommended is None or str(e.config["gamma"]) in e.tried["gamma"] or gamma >= recommended:
+    if gamma is None or recommended is None or e.as_recommended("gamma") or gamma >= recommended:
         return None
     if e.beyond("gamma", *e.usual.get("gamma", (0.0, 1.0))):  # a setting far out is named as such
         return None
@@ -270,7 +270,7 @@ def horizon_short(e: Evidence) -> str | None:
 def entropy_unreachable(e: Evidence) -> str | None:
     """More entropy is asked for than actions within their bounds can have: the temperature rises without an end."""
     given = first_number(e.config.get("target_entropy"))
-    if given is None or str(e.config["target_entropy"]) in e.tried["target_entropy"] or given < 0:
+    if given is None or e.as_recommended("target_entropy") or given < 0:
         return None
     return f"The policy is to have {given:g} nats, and the temperature is {e.late('temperature'):.2g}."
 
@@ -281,9 +281,8 @@ def entropy_unreachable(e: Evidence) -> str | None:
 @rule
 def missing_bootstrap(e: Evidence) -> str | None:
     """The value ends where the time limit does, as if nothing followed: the bootstrap of truncated steps is missing."""
-    missing = e.values("value/missing")
-    late = missing[len(missing) // 2 :]
-    if len(missing) < 4 or not (np.median(late) > 0.2 and np.percentile(late, 25) > 0.1):
+    late = e.last_half("value/missing")
+    if len(late) < 2 or not (np.median(late) > 0.2 and np.percentile(late, 25) > 0.1):
         return None
     if not e.late("episode/terminated") < 0.5 or ("tau" in e.config and e.log[-1]["step"] < 20_000):  # Q comes slowly
         return None
@@ -363,12 +362,10 @@ def q_biased(e: Evidence) -> str | None:
 @rule
 def critic_overfits(e: Evidence) -> str | None:
     """Q knows what is in the replay buffer by heart, and not what happens now."""
-    newest, sampled = e.values("td_error/newest"), e.values("td_error/sampled")
-    half = len(newest) // 2
-    if half < 3 or not np.median(newest[half:] / np.maximum(sampled[half:], 1e-12)) > 10 or e.rose:
+    times = e.last_half("td_error/newest") / np.maximum(e.last_half("td_error/sampled"), 1e-12)
+    if len(times) < 3 or not np.median(times) > 10 or e.rose:
         return None
-    times = np.median(newest[half:] / np.maximum(sampled[half:], 1e-12))
-    return f"The error of Q at the newest transitions is {times:.0f} times that at sampled ones."
+    return f"The error of Q at the newest transitions is {np.median(times):.0f} times that at sampled ones."
 
 
 @rule
@@ -407,9 +404,10 @@ def gradient_clipped(e: Evidence) -> str | None:
 def value_explains_nothing(e: Evidence) -> str | None:
     """The baseline takes no variance away; the observations may not hold what decides the return."""
     explained, late = e.late("explained_variance"), e.ends[1]
-    late_half = e.values("explained_variance")[len(e.values("explained_variance")) // 2 :]
     settled = len(late) > 0 and late.std() <= 0.05 * abs(late.mean())  # there is nothing left to explain
-    if not -0.3 < explained < 0.05 or settled or np.percentile(late_half, 90) > 0.15:  # below -0.3 targets are constant
+    if (
+        not -0.3 < explained < 0.05 or settled or np.percentile(e.last_half("explained_variance"), 90) > 0.15
+    ):  # below -0.3 targets are constant
         return None
     if "gae_lambda" not in e.config:  # a weak baseline of REINFORCE does no harm
         return None
@@ -514,7 +512,7 @@ def settings_far_out(e: Evidence) -> Sequence[tuple[Rule, str]]:
         side = "below" if factor < 0 else "above"
         change = [name for name in OF_RATIOS.get(field, (field,)) if e.config[name] != e.recommended.get(name)]
         seen = f"{field} is {e.config[field]}, {size} {side} its usual range, {low:g} to {high:g}."
-        remedy = f"{' '.join(f'{flag(name)} {shown(e.recommended.get(name))}' for name in change)}, as recommended"
+        remedy = f"{' '.join(f'{flag(name)} {typed(e.recommended.get(name))}' for name in change)}, as recommended"
         sure = POSSIBLE if e.rose else LIKELY
         name = f"setting-{field}".replace("_", "-")
         found.append((abs(factor), Rule(name, lambda _: None, means, "settings", sure, remedy, known["source"]), seen))

@@ -56,12 +56,13 @@ def explained_by(features: Tensor, targets: Tensor, beside: Tensor) -> Tensor:
     Returns:
         [K]; 0 where `beside` leaves nothing to explain, NaN where there are no more rows than columns.
     """
-    few = features.new_full((), len(targets) - beside.shape[1] - 1)
+    few = len(targets) - beside.shape[1] - 1
     many = few - features.shape[1]
+    if many <= 0:
+        return targets.new_full(targets.shape[1:], torch.nan)
     left, after = (_residual(columns, targets) for columns in (beside, torch.cat([beside, features], dim=-1)))
     share = 1 - (after / many) / (left / few)
-    share = torch.where(left > 1e-9 * targets.square().sum(0), share, 0.0)
-    return share if many > 0 else share * torch.nan
+    return torch.where(left > 1e-9 * targets.square().sum(0), share, 0.0)
 
 
 def _residual(columns: Tensor, targets: Tensor) -> Tensor:

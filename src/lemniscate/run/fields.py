@@ -66,8 +66,14 @@ def field_of(flag: str) -> str:
     return "env_kwargs" if flag == "--env-args" else flag.removeprefix("--").replace("-", "_")
 
 
-def shown(value: Any) -> str:
-    """A value of a field as the command line takes it."""
+def typed(value: Any) -> str:
+    """A value of a field as it would be typed."""
+    if isinstance(value, bool):
+        return "on" if value else "off"
+    if isinstance(value, tuple):
+        return " ".join(map(typed, value))
+    if isinstance(value, int):
+        return f"{value:_}" if value >= 10_000 else str(value)
     return "none" if value is None else str(value)
 
 
