@@ -22,6 +22,7 @@ CASES = [
     (["lemniscate", "train", "sac", "--clip"], []),
     (["lemniscate", "train", "ppo", "--env", "LunarLander-"], ["LunarLander-v3"]),
     (["lemniscate", "train", "ppo", "--activation", "t"], ["tanh"]),
+    (["lemniscate", "doctor", "Pendul"], ["Pendulum-v1"]),
     (["lemniscate", "check", "Pendul"], ["Pendulum-v1"]),
     (["lemniscate", "evaluate", "--epi"], ["--episodes"]),
     (["lemniscate", "push", "--pri"], ["--private"]),

@@ -6,7 +6,7 @@ from typing import Literal, get_type_hints
 
 from lemniscate.algos import ALGORITHMS, find
 from lemniscate.cli.fields import algorithm_parser, explain
-from lemniscate.cli.parsers import COMMANDS, SHELLS, Parser, flags_of, parser_of
+from lemniscate.cli.parsers import COMMANDS, EARLIER, SHELLS, Parser, flags_of, parser_of
 from lemniscate.envs import registry
 from lemniscate.errors import unknown_name
 from lemniscate.nn.networks import NETWORKS
@@ -59,7 +59,7 @@ def _fish() -> str:
     lines = [f"set -g {variables[word]} {' '.join(words)}" for word, words in followers.items()]
     begin = "complete -c lemniscate -n"
     lines += [f"{begin} __fish_use_subcommand -f -a {name} -d {quote(text)}" for name, text in COMMANDS.items()]
-    for word in (command for command in COMMANDS if command in followers):
+    for word in (command for command in (*COMMANDS, *EARLIER) if command in followers):
         after = f"test (count (commandline -opc)) = 2; and __fish_seen_subcommand_from {word}"
         lines.append(f"{begin} '{after}' -f -a '${variables[word]}'")
     for name, parser in _parsers().items():
@@ -82,7 +82,7 @@ def _parsers() -> dict[str, Parser]:
 def _followers() -> dict[str, Iterable[str]]:
     """The words that may follow a command or an option, where they are few."""
     ids, presets = registry.known_ids(), {preset: None for name in ALGORITHMS for preset in names(name)}
-    found: dict[str, Iterable[str]] = {"train": ALGORITHMS, "completion": SHELLS, "check": ids, "--env": ids}
+    found: dict[str, Iterable[str]] = {"train": ALGORITHMS, "completion": SHELLS, "doctor": ids, "check": ids, "--env": ids}
     found["course"] = ["start"]
     found |= {"--preset": presets, "--backend": registry.BACKENDS, "--track": TRACKERS, "--network": NETWORKS}
     for name in ALGORITHMS:
