@@ -61,6 +61,29 @@ CASES = {
         {"observation__largest": [900.0] * 8},
     ),
     "action-without-effect": ({"action__effect": [0.01, -0.01] * 4}, {"action__effect": [0.5] + [0.0] * 7}),
+    "action-late": (
+        {"action__late": [0.5] * 8, "action__effect": [0.01] * 8},
+        {"action__late": [0.5] * 8, "action__effect": [0.4] * 8},
+    ),
+    "observation-repeated": ({"observation__repeated": [0.7] * 8}, {"observation__repeated": [0.3] * 8}),
+    "observation-noisy": ({"observation__predicted": [0.1] * 8}, {"observation__predicted": [0.1] * 2 + [0.8] * 6}),
+    "reward-rare": (
+        {"reward__zero": [0.99] * 8, "reward__largest": [5.0] * 8},
+        {"reward__zero": [0.5] * 4 + [0.99] * 4, "reward__largest": [5.0] * 8},
+    ),
+    "ratio-always-one": (
+        {"approx_kl": [0.0] * 8, "losses__entropy": list(np.linspace(1.0, 0.5, 8))},
+        {"approx_kl": [1e-8] * 8, "losses__entropy": list(np.linspace(1.0, 0.5, 8))},
+    ),
+    "gradient-grows": ({"gradient_norm": [10.0**n for n in range(8)]}, {"gradient_norm": [1.0] * 4 + [50.0] * 4}),
+    "ends-early": (
+        {
+            "returns": list(np.linspace(-90.0, -10.0, 400)),
+            "lengths": [90] * 200 + [10] * 200,
+            "episode__terminated": [1.0] * 8,
+        },
+        {"returns": list(np.linspace(-90.0, -10.0, 400)), "lengths": [90] * 400, "episode__terminated": [1.0] * 8},
+    ),
     "reward-zero": ({"reward__largest": [0.0] * 8, "returns": [0.0] * 400}, {"reward__largest": [0.0] * 7 + [1.0]}),
     "reward-by-time": ({"reward__by_time": [0.95] * 8}, {"reward__by_time": [0.95] * 3 + [0.1] * 5}),
     "reward-unexplained": (
@@ -227,6 +250,13 @@ def test_no_remedy_names_a_flag_that_the_algorithm_does_not_have(algorithm):
         remedy = rule.remedy_for(config)
         assert remedy[0].isupper() or remedy.startswith("--")
         assert {flag.replace("-", "_") for flag in re.findall(r"--([a-z-]+)", remedy)} <= known
+
+
+def test_no_remedy_is_to_turn_on_what_is_on():
+    rule = next(rule for rule in RULES if rule.name == "reward-large")
+    config = algos.find("ppo").Config().to_json()
+    assert "--scale-rewards" in rule.remedy_for(config | {"scale_rewards": False})
+    assert "--scale-rewards" not in rule.remedy_for(config | {"scale_rewards": True})
 
 
 def test_the_page_has_a_paragraph_for_each_rule_and_no_other():

@@ -8,7 +8,7 @@ of `benchmarks/doctor.py`, six of them with a look at the other half: `docs/doct
 
 import re
 import tomllib
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -57,15 +57,16 @@ class Rule:
     source: str
     metric: str = "episode/return"
 
-    def remedy_for(self, fields: Collection[str]) -> str:
-        """The alternatives whose flags are among the fields of a Config, or of no Config."""
-        kept = [
-            clause
-            for clause in self.remedy.split("; ")
-            if all(name in fields or name in OF_COMMANDS for name in map(field_of, re.findall(r"--[a-z-]+", clause)))
-        ]
+    def remedy_for(self, config: Mapping[str, object]) -> str:
+        """The alternatives whose flags are fields of the Config, or of no Config, and are not on already."""
+        kept = [clause for clause in self.remedy.split("; ") if _may_help(clause, config)]
         text = " or ".join(kept or ["Look at docs/faq.md"])
         return text[0].upper() + text[1:]
+
+
+def _may_help(clause: str, config: Mapping[str, object]) -> bool:
+    options = [(field_of(option), off) for option, off in re.findall(r"(--[a-z-]+)( off)?", clause)]
+    return all(name in OF_COMMANDS or (name in config and (off or config[name] is not True)) for name, off in options)
 
 
 OF_COMMANDS = ("episodes", "stochastic", "env_kwargs")
@@ -100,6 +101,24 @@ def constant_observation(e: Evidence) -> str | None:
 
 
 @rule
+def observation_repeated(e: Evidence) -> str | None:
+    """Observations stay as they are while the environment moves: they are rounded, old, or of too little."""
+    share = e.early("observation/repeated")
+    if not share > 0.5 or e.sees_nothing:
+        return None
+    return f"After {share:.0%} of the steps the observation was the same as before."
+
+
+@rule
+def observation_noisy(e: Evidence) -> str | None:
+    """Observations are mostly noise: one says little of the next."""
+    share = e.late("observation/predicted")
+    if not share < 0.25 or e.sees_nothing or observation_repeated(e):
+        return None
+    return f"An observation explains {max(0.0, share):.0%} of the next one."
+
+
+@rule
 def exploding_observation(e: Evidence) -> str | None:
     """A sensor drifts, or a simulation has become unstable: nothing that was learned at its beginning holds later."""
     first, late = e.early("observation/largest"), e.late("observation/largest")
@@ -111,10 +130,22 @@ def exploding_observation(e: Evidence) -> str | None:
 @rule
 def action_without_effect(e: Evidence) -> str | None:
     """The environment does not use its actions, or too little to be seen: nothing can be learned."""
-    effects = e.values("action/effect")
-    if len(effects) < 3 or not effects[: max(3, len(effects) // 4)].max() < 0.02 or e.rose or e.sees_nothing:
+    effects, shares = e.values("action/effect"), e.values("action/share")
+    if len(effects) < 3 or e.rose or e.sees_nothing or action_late(e):
         return None
-    return f"Actions explain {max(0.0, effects.max()):.1%} of how observations change."
+    first = slice(max(3, len(effects) // 4))
+    if not (effects[first].max() < 0.02 or (len(shares) and shares[first].max() < 0.001)):
+        return None
+    return f"Actions explain {max(0.0, min([effects.max(), *shares[-1:]])):.2%} of how observations change."
+
+
+@rule
+def action_late(e: Evidence) -> str | None:
+    """An action takes effect some steps after it: what a step brings says nothing of its own action."""
+    now, late = e.early("action/effect"), e.early("action/late")
+    if not (late > 0.15 and late > 3 * max(now, 0.0)):
+        return None
+    return f"Earlier actions explain {late:.0%} of how observations change, and the present one {max(now, 0.0):.0%}."
 
 
 @rule
@@ -123,6 +154,15 @@ def reward_zero(e: Evidence) -> str | None:
     if e.greatest("reward/largest") != 0 or (len(e.returns) and np.abs(e.returns).max() > 0):
         return None
     return "Every reward was 0."
+
+
+@rule
+def reward_rare(e: Evidence) -> str | None:
+    """Nearly every step is without a reward: which of the actions before it has brought it, is hard to learn."""
+    share = e.early("reward/zero")
+    if not 0.9 < share < 1 and not (share == 1 and e.greatest("reward/largest") > 0):
+        return None
+    return f"{share:.1%} of the rewards at the beginning were 0."
 
 
 @rule
@@ -198,8 +238,8 @@ def reward_small(e: Evidence) -> str | None:
 @rule
 def large_observation(e: Evidence) -> str | None:
     """Units of the first layer are at their bounds at every observation."""
-    late = e.late("observation/largest")
-    if e.config.get("normalize_observations", True) or not late > 200:
+    late, most = e.late("observation/largest"), 200 if e.config.get("activation") == "tanh" else 20_000
+    if e.config.get("normalize_observations", True) or not late > most:
         return None
     return f"Observations reach {late:.3g}, and are not normalized."
 
@@ -214,6 +254,29 @@ def ratio_not_one(e: Evidence) -> str | None:
     if e.config.get("desired_kl") is None or not (rate < 3e-6 and kl > 1e-3):
         return None
     return f"The KL divergence is {kl:.2g} although the learning rate has fallen to {rate:.1g}, which moves nothing."
+
+
+@rule
+def ratio_always_one(e: Evidence) -> str | None:
+    """The probability ratio is 1 whatever was learned: log π_old is taken from the policy that learns."""
+    kl, entropy = e.values("approx_kl"), e.values("losses/entropy")
+    if (
+        e.config.get("epochs", 1) < 2
+        or min(len(kl), len(entropy)) < 4
+        or np.abs(kl).max() > 1e-9
+        or np.ptp(entropy) < 1e-3
+    ):
+        return None
+    return f"Every update's KL divergence is 0, though the entropy went from {entropy[0]:.3g} to {entropy[-1]:.3g}."
+
+
+@rule
+def gradient_grows(e: Evidence) -> str | None:
+    """Each gradient step is larger than the one before: gradients add up, as without zero_grad."""
+    norms = e.values("gradient_norm")
+    if len(norms) < 8 or not np.median(norms[len(norms) // 2 :]) > 100 * np.median(norms[: len(norms) // 8 + 1]):
+        return None
+    return f"The norm of the gradient rose from {norms[0]:.3g} to {norms[-1]:.3g}."
 
 
 @rule
@@ -282,7 +345,7 @@ def entropy_unreachable(e: Evidence) -> str | None:
 def missing_bootstrap(e: Evidence) -> str | None:
     """The value ends where the time limit does, as if nothing followed: the bootstrap of truncated steps is missing."""
     late = e.last_half("value/missing")
-    if len(late) < 2 or not (np.median(late) > 0.2 and np.percentile(late, 25) > 0.1):
+    if len(late) < 2 or not (0.2 < np.median(late) < 1.1 and np.percentile(late, 25) > 0.1):  # above: no value at all
         return None
     if not e.late("episode/terminated") < 0.5 or ("tau" in e.config and e.log[-1]["step"] < 20_000):  # Q comes slowly
         return None
@@ -419,9 +482,9 @@ def value_explains_nothing(e: Evidence) -> str | None:
 @rule
 def gets_worse(e: Evidence) -> str | None:
     """The policy learns the opposite: usually the sign of a loss, of the advantage or of the reward."""
-    if not e.gain < -5:
-        return None
     first, last = e.ends
+    if not (e.gain < -5 and first.mean() - last.mean() > 0.25 * abs(first.mean())):
+        return None
     return (
         f"Returns fell from {first.mean():,.4g} in the first fifth of the episodes to {last.mean():,.4g} in the last."
     )
@@ -454,6 +517,16 @@ def does_not_learn(e: Evidence) -> str | None:
 
 
 @rule
+def ends_early(e: Evidence) -> str | None:
+    """A step costs more than it brings, so that the policy learns to end its episodes; right where an end is a goal."""
+    fifth = len(e.lengths) // 5
+    if fifth < 4 or not e.returns[-fifth:].mean() < 0 or not e.gain > 5 or not e.late("episode/terminated") > 0.9:
+        return None
+    first, last = np.median(e.lengths[:fifth]), np.median(e.lengths[-fifth:])
+    return f"Returns rose while episodes went from {first:.0f} steps to {last:.0f}." if last < 0.6 * first else None
+
+
+@rule
 def fell_back(e: Evidence) -> str | None:
     """The final policy is not the best one."""
     window = max(10, len(e.returns) // 20)
@@ -482,7 +555,9 @@ def still_rising(e: Evidence) -> str | None:
 @rule
 def few_episodes(e: Evidence) -> str | None:
     """Another set of starts would give another mean."""
-    returns = e.scores.get("returns", ())
+    returns, each = e.scores.get("returns", ()), e.config.get("evaluate_episodes", 20)
+    if e.config.get("evaluate_every") and each < 10:
+        return f"Each evaluation has {each} {'episode' if each == 1 else 'episodes'}, and the best may be one of luck."
     if not 0 < len(returns) < 20:
         return None
     return f"The evaluation has {len(returns)} episodes, of standard deviation {np.std(returns):,.3g}."

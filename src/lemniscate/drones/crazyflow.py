@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from lemniscate.drones.drones import Drones, Programs
     from lemniscate.drones.probe import DroneProbe
 
-IDS = ("DroneFigureEightTrajectory-v0", "DroneLanding-v0", "DroneReachPos-v0", "DroneReachVel-v0")
+IDS = ("DroneFigureEightTrajectory-v0", "DroneGates-v0", "DroneLanding-v0", "DroneReachPos-v0", "DroneReachVel-v0")
 CONTROL_HZ = 50
 MOST_HISTORY = 50
 OWN = (*CONDITIONS, "history", "privileged", "dynamics")
@@ -162,6 +162,14 @@ class CrazyflowBackend(JaxBackend):
         drones, flown = vectors[0], [one.dynamics for one in vectors]
         self.spec = spec_of(env, drones)
         self.interface = interface_of(drones.env, flown, drones.air.delay, drones.air.history, drones.air.hover)
+        if env == "DroneGates-v0":
+            self.summaries = tuple(
+                Summary(name, name, "last") for name in ("gates_passed", "success", "crashed", "lap_seconds")
+            )
+            self._room_height = float(drones.env.track.room[1, 2])
+            self.scene = Scene(
+                drones.env.sim.mj_model, 1 / drones.env.freq, slice(0, 3), slice(3, 7), boxes=self._boxes
+            )
         if drones.error:
             self.summaries = (
                 Summary("rmse_mm", "tracking_error", "rms", scale=1000),
@@ -172,6 +180,15 @@ class CrazyflowBackend(JaxBackend):
             reference, preview = slice(first, first + 3 * drones.env.n_samples), drones.env.samples_dt
             action = self.spec.bounded_box()
             self.baseline = PD(GAINS[drones.dynamics], drones.mass, action, reference, slice(7, 10), preview)
+
+    def _boxes(self) -> np.ndarray:
+        """What stands on the track of each drone's present episode."""
+        from lemniscate.drones.drones import by_turns
+        from lemniscate.drones.gates import standing
+
+        each = self._state if isinstance(self._state, list) else [self._state]
+        gates, posts = (np.asarray(by_turns(*(arrays[name] for _, arrays, _ in each))) for name in ("_gates", "_posts"))
+        return standing(gates, posts, self._room_height)
 
     @classmethod
     def probe(cls, env: str, starts: int, trained: Mapping[str, Any], given: Mapping[str, Any]) -> DroneProbe:
@@ -196,6 +213,8 @@ def _import() -> None:
     try:
         with contextlib.redirect_stdout(io.StringIO()):  # MJX announces optional packages that it does not find
             import crazyflow  # noqa: F401  (registers the environments)
+
+            import lemniscate.drones.gates  # noqa: F401  (registers the race)
     except ModuleNotFoundError as error:
         raise missing_extra("crazyflow", "drone") from error
 

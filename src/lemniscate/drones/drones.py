@@ -68,7 +68,8 @@ class Drones:
         past = [ObservationPart(("history",), (history, STATE_SIZE + self.action_size))] if history else []
         self.parts = (*(ObservationPart((name,), (sizes[name],)) for name in names), *past)
         """the flat observation: the drone's state first, then the task's own parts, then the history"""
-        self.privileged = self.air.truth_size + 4 + len(DYNAMICS) if privileged else 0
+        own = getattr(env, "truth_size", 0)
+        self.privileged = self.air.truth_size + 4 + len(DYNAMICS) + own if privileged else 0
         """the number of privileged numbers that follow the flat observation"""
         self.error = slice(STATE_SIZE, STATE_SIZE + 3) if REFERENCE in names else None
         self._own_parameters()
@@ -78,7 +79,8 @@ class Drones:
     def _own_parameters(self) -> None:
         """Give each drone parameters of its own, where conditions change them."""
         sim = self.env.sim
-        names = parameter_factors(self.dynamics, dict.fromkeys(self.air.ranges, jnp.ones(1)))
+        names = parameter_factors(self.dynamics, dict.fromkeys(self.air.ranges, jnp.ones(1))).keys()
+        names -= set(getattr(self.env, "own_parameters", ()))
         each = {name: getattr(sim.data.params, name) for name in names}
         each = {name: jnp.tile(value, (self.num_envs, 1, *[1] * value.ndim)) for name, value in each.items()}
         params = sim.data.params.replace(**each)
@@ -125,6 +127,9 @@ class Drones:
             self._apply_conditions(air, mask)
             data = env.sim.data
             pos = data.states.pos
+            if hasattr(env, "begin_ahead"):
+                env.begin_ahead(ahead)
+                data, pos = env.sim.data, env.sim.data.states.pos
             if hasattr(env, "trajectory"):
                 pos = pos + (env.trajectory[steps - 1] - env.trajectory[-1])[:, None]
             speed = jax.random.uniform(turns, (self.num_envs, 1, 1)) * self._turning
@@ -145,7 +150,9 @@ class Drones:
                 data = env.sim.data
                 env.sim.data = data.replace(states=data.states.replace(force=force[:, None]))
             air = self.air.observe(air, self._simulate(air, acting), action)
-            obs, measures = self._observe(air), {}
+            if hasattr(env, "advance"):
+                env.advance(action)
+            obs, measures = self._observe(air), env.measures() if hasattr(env, "measures") else {}
             if self.error:
                 true_way = env.obs()[REFERENCE][:, :3] if self.air.is_blurred else obs[:, self.error]
                 measures = {"tracking_error": jnp.linalg.norm(true_way, axis=-1)}
@@ -204,10 +211,11 @@ class Drones:
         return jnp.concatenate([*observed, self._truth(air)] if self.privileged else observed, axis=-1)
 
     def _truth(self, air: dict[str, Any]) -> jax.Array:
-        """The privileged numbers, [N, P]: the air, the four rotors' speed (1: hovering), the dynamics as one-hot."""
+        """The privileged numbers [N, P]: air, the four rotors' speed (1: hovering), dynamics (one-hot), the task's."""
         rotors = self.env.sim.data.states.rotor_vel[:, 0] / np.where(self._turning > 0, self._turning, 1)
         dynamics = np.eye(len(DYNAMICS), dtype=np.float32)[DYNAMICS.index(self.dynamics)]
         each = [jnp.broadcast_to(part, (self.num_envs, part.shape[-1])) for part in (rotors, dynamics)]
+        each += [self.env.truth()] if hasattr(self.env, "truth") else []
         return jnp.concatenate([self.air.truth(air), *each], axis=-1)
 
 
@@ -233,20 +241,20 @@ class Mixed:
         parts = zip(self.drones, state, self._parts(mask), strict=True)
         every = [one.reset(its, begins, stagger) for one, its, begins in parts]
         states, obs, fragment = zip(*every, strict=True)
-        return list(states), _by_turns(*obs), _by_turns(*fragment)
+        return list(states), by_turns(*obs), by_turns(*fragment)
 
     def step(self, state: State, action: jax.Array) -> tuple[State, Outcome]:
         """One control step of every drone, as `Drones.step`."""
         parts = zip(self.drones, state, self._parts(action), strict=True)
         every = [one.step(its, command) for one, its, command in parts]
         states, outcomes = zip(*every, strict=True)
-        return list(states), jax.tree.map(_by_turns, *outcomes)
+        return list(states), jax.tree.map(by_turns, *outcomes)
 
     def _parts(self, rows: jax.Array) -> list[jax.Array]:
         return [rows[i :: len(self.drones)] for i in range(len(self.drones))]
 
 
-def _by_turns(*parts: jax.Array) -> jax.Array:
+def by_turns(*parts: jax.Array) -> jax.Array:
     """The k arrays [N / k, …] as one [N, …], of which row i is from the array i mod k."""
     stacked = jnp.stack(parts, axis=1)
     return stacked.reshape(-1, *stacked.shape[2:])

@@ -94,6 +94,19 @@ PARTS = {
     "ang_vel": _vector("angular_velocity", "rad/s", BODY),
     "difference_to_goal": _vector("to_goal", "m", WORLD),
     "difference_to_target_vel": _vector("to_goal_velocity", "m/s", WORLD),
+    "gates": tuple(
+        quantity
+        for which in ("next", "second")
+        for quantity in (*_vector(f"to_{which}_gate", "m", WORLD), *_vector(f"{which}_gate_direction", "1", WORLD))
+    )
+    + _vector("position_at_next_gate", "m", "gate: x is flown along, y to the left"),
+    "obstacles": tuple(q for which in ("nearest", "second") for q in _vector(f"to_{which}_obstacle", "m", WORLD)[:2]),
+    "last_action": tuple(Quantity(f"last_action_{i}", "1", "-1 and 1 are the bounds of the action") for i in range(4)),
+    "race": (
+        Quantity("gates_left", "1", "share of all"),
+        Quantity("next_gate_seen", "1", "0 or 1"),
+        Quantity("second_gate_seen", "1", "0 or 1"),
+    ),
 }
 ACTION = (
     *(Quantity(name, "rad", "Euler angles x-y-z, body to world") for name in ("roll", "pitch", "yaw")),

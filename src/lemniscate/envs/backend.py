@@ -35,21 +35,24 @@ class Summary:
 
 @dataclass(frozen=True)
 class Scene:
-    """A body that follows a reference in a MuJoCo model, for drawing: where the observation says how it moves.
+    """A body that moves in a MuJoCo model, for drawing: where the observation says how it moves.
 
     Attributes:
         model: a `mujoco.MjModel` whose first mocap body is the one that moves.
         time_step: seconds between two observations.
         position: x, y, z in metres.
         attitude: a unit quaternion, x, y, z, w.
-        error: from the position to the reference, in metres.
+        error: from the position to the reference, in metres; None where no reference is followed.
+        boxes: a function to what stands in the present episode of each environment, boxes [N, B, 15]: centre (m), half
+            of the sides (m), and the matrix from their frame to the world's, row by row. None where nothing does.
     """
 
     model: Any
     time_step: float
     position: slice
     attitude: slice
-    error: slice
+    error: slice | None = None
+    boxes: Callable[[], np.ndarray] | None = None
 
 
 Baseline: TypeAlias = Callable[[Tensor], Distribution]

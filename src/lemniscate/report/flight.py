@@ -1,15 +1,18 @@
-"""The flight of a body along its reference: the path, the error, a film."""
+"""The flight of a body, along a reference or among what stands there: the path, the error, a film."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from itertools import chain
+from itertools import chain, product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
 
 from lemniscate.envs.backend import Baseline
 from lemniscate.envs.vec_env import VecEnv
@@ -28,25 +31,29 @@ STRIDE = 5
 
 @dataclass(frozen=True)
 class Flight:
-    """M flights of T steps: `position` and `reference` [T, M, 3] in metres, `attitude` [T, M, 4] (xyzw).
+    """M flights of T steps: `position` [T, M, 3] in metres, `attitude` [T, M, 4] (xyzw).
 
-    After the end of a flight that was cut short its rows are NaN.
+    After the end of a flight that was cut short its rows are NaN. What it flies along or among: `reference` [T, M, 3],
+    in metres; and the boxes [M, B, 15] of a `Scene`, none where nothing stands there.
     """
 
     position: np.ndarray
-    reference: np.ndarray
     attitude: np.ndarray
     time_step: float
+    reference: np.ndarray | None
+    boxes: np.ndarray
 
     def one(self, number: int) -> "Flight":
         """One of the flights, from its start to its end."""
         flown, own = ~np.isnan(self.position[:, number, 0]), slice(number, number + 1)
-        return Flight(self.position[flown, own], self.reference[flown, own], self.attitude[flown, own], self.time_step)
+        reference = None if self.reference is None else self.reference[flown, own]
+        return Flight(self.position[flown, own], self.attitude[flown, own], self.time_step, reference, self.boxes[own])
 
     @property
     def track(self) -> dict[str, np.ndarray]:
         """The first of the flights, as `scene` takes it."""
-        return {name: getattr(self, name)[:, 0] for name in ("position", "attitude", "reference")}
+        found = {"position": self.position[:, 0], "attitude": self.attitude[:, 0], "boxes": self.boxes[0]}
+        return found if self.reference is None else {**found, "reference": self.reference[:, 0]}
 
     @property
     def error_mm(self) -> np.ndarray:
@@ -75,7 +82,10 @@ def record(
     scene = env.scene
     assert scene is not None
     rows, first = [], torch.ones(env.num_envs, dtype=torch.bool, device=env.device)
+    boxes = np.zeros((env.num_envs, 0, 15))
     for _, _, step, counts in play_episodes(policy, env, flights, seed, deterministic):
+        if not rows and scene.boxes:
+            boxes = scene.boxes()
         if table:
             table.add(step, counts)
         if (first & counts).any():
@@ -84,7 +94,8 @@ def record(
         first = first & ~((step.terminated | step.truncated) & counts)
     track = np.stack(rows)
     position = track[..., scene.position]
-    return Flight(position, position + track[..., scene.error], track[..., scene.attitude], scene.time_step)
+    reference = position + track[..., scene.error] if scene.error else None
+    return Flight(position, track[..., scene.attitude], scene.time_step, reference, boxes[:flights])
 
 
 def show_flights(
@@ -124,18 +135,56 @@ def show_flights(
 def draw_flights(
     policy: Policy | Baseline, env: VecEnv, run: Path, flights: int, film: bool, seed: int = 0
 ) -> list[Path]:
-    """Path and error of some flights in a scene, into the `plots/` of a run; with `film` one of them into `videos/`.
+    """The paths of some flights in a scene, into the `plots/` of a run; with `film` one of them into `videos/`.
 
-    Returns the files, the film last.
+    Beside a path along a reference, the error. Returns the files, the film last.
     """
     track = record(policy, env, flights, seed)
-    beside = record(env.baseline, env, flights, seed) if env.baseline else None
     folder, video = run / "plots", run / "videos" / "flight.gif"
     if film:
         make_directory(video.parent)
         show_flights(policy, env, 1, seed, video=video, tell=lambda text: None)
-    drawn = [draw_path(track, folder / "flight.png"), draw_error(track, folder / "error.png", beside)]
+    if track.reference is None:
+        drawn = [draw_from_above(track, folder / "flight.png")]
+    else:
+        beside = record(env.baseline, env, flights, seed) if env.baseline else None
+        drawn = [draw_path(track, folder / "flight.png"), draw_error(track, folder / "error.png", beside)]
     return [*drawn, video] if film else drawn
+
+
+def draw_from_above(flight: Flight, file: Path) -> Path:
+    """The first flight from above (x, y), its speed as colour, and what stands there; the others faintly."""
+    figure = Figure(figsize=(7, 4.6), layout="constrained")
+    axes = figure.subplots()
+    for other in range(1, flight.position.shape[1]):
+        axes.plot(*flight.position[:, other, :2].T, color=GREY, linewidth=0.5, alpha=0.4)
+    _draw_boxes(axes, flight.boxes[0])
+    first = flight.one(0)
+    path = first.position[:, 0]
+    speed = np.linalg.norm(np.gradient(path, flight.time_step, axis=0), axis=1)
+    points = LineCollection(np.stack([path[:-1, :2], path[1:, :2]], axis=1), array=speed[1:], linewidths=2.2, zorder=3)
+    axes.add_collection(points)
+    axes.plot(*path[0, :2], "o", color=BLUE, markersize=5, zorder=4)
+    figure.colorbar(points, ax=axes, label="speed / (m/s)", shrink=0.85)
+    axes.set_title(f"One flight of {first.time[-1]:.2f} s, and {flight.position.shape[1] - 1} others", loc="left")
+    axes.set(xlabel="x / m", ylabel="y / m", aspect="equal")
+    finish(axes)
+    return save(figure, file)
+
+
+def _draw_boxes(axes: Axes, boxes: np.ndarray) -> None:
+    """What stands there, seen from above: the outline of each box's shadow."""
+    signs = np.array(list(product((-1, 1), repeat=3)))
+    for box in boxes:
+        corners = box[:3] + (signs * box[3:6]) @ box[6:].reshape(3, 3).T
+        axes.add_patch(Polygon(_around(corners[:, :2]), facecolor=ORANGE, edgecolor=ORANGE, linewidth=0.8, alpha=0.5))
+
+
+def _around(points: np.ndarray) -> np.ndarray:
+    """The corners of the convex hull of points [8, 2]."""
+    from scipy.spatial import ConvexHull
+
+    return points[ConvexHull(points, qhull_options="QJ").vertices]
 
 
 def draw_path(flight: Flight, file: Path) -> Path:
@@ -195,18 +244,25 @@ def _frames(flights: list[Flight], model: Any) -> tuple[Iterable[np.ndarray], st
 
 
 def animate(flight: Flight, every: int) -> list[np.ndarray]:
-    """Frames of the first flight drawn with matplotlib, one each `every` steps: [H, W, 3] uint8."""
+    """Frames of the first flight drawn with matplotlib, one each `every` steps: [H, W, 3] uint8.
+
+    It is seen from the side beside a reference, and else from above.
+    """
     figure = Figure(figsize=(6, 3.6), dpi=90, layout="constrained")
     canvas = FigureCanvasAgg(figure)
     axes = figure.subplots()
-    path, reference = flight.position[:, 0, [0, 2]], flight.reference[:, 0, [0, 2]]
+    across = 1 if flight.reference is None else 2
+    path = flight.position[:, 0, [0, across]]
+    reference = path if flight.reference is None else flight.reference[:, 0, [0, across]]
     axes.plot(*reference.T, color=ORANGE, linewidth=4, alpha=0.3)
+    if flight.reference is None:
+        _draw_boxes(axes, flight.boxes[0])
     both = np.concatenate([path, reference])
     low, high = np.nanmin(both, axis=0), np.nanmax(both, axis=0)
     margin = 0.1 + 0.1 * np.max(high - low)  # metres; the body itself is 0.14 wide
     axes.set_xlim(low[0] - margin, high[0] + margin)
     axes.set_ylim(low[1] - margin, high[1] + margin)
-    axes.set(xlabel="x / m", ylabel="z / m", aspect="equal")
+    axes.set(xlabel="x / m", ylabel=f"{'xyz'[across]} / m", aspect="equal")
     axes.spines[["top", "right"]].set_visible(False)
     canvas.draw()
     background = canvas.copy_from_bbox(figure.bbox)  # the axes are drawn once: text and ticks would take most time
@@ -217,11 +273,14 @@ def animate(flight: Flight, every: int) -> list[np.ndarray]:
     frames = []
     for t in range(0, len(path), every):
         x, y, z, w = flight.attitude[t, 0]
-        body_x = np.array([1 - 2 * (y * y + z * z), 2 * (x * z - y * w)])  # of the body's x axis, in the world's x, z
-        arms.set_data(*np.stack([path[t] - 0.07 * body_x, path[t] + 0.07 * body_x]).T)
+        ahead = np.array([1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)])[[0, across]]
+        arms.set_data(*np.stack([path[t] - 0.07 * ahead, path[t] + 0.07 * ahead]).T)
         trail.set_data(*path[max(0, t - 100) : t + 1].T)
-        goal.set_data(*reference[[t]].T)
-        clock.set_text(f"{flight.time[t]:4.1f} s   {flight.error_mm[t, 0]:5.1f} mm")
+        said = f"{flight.time[t]:4.1f} s"
+        if flight.reference is not None:
+            goal.set_data(*reference[[t]].T)
+            said += f"   {flight.error_mm[t, 0]:5.1f} mm"
+        clock.set_text(said)
         canvas.restore_region(background)
         for artist in (trail, goal, arms, clock):
             axes.draw_artist(artist)

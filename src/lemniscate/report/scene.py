@@ -20,12 +20,14 @@ import mujoco
 import numpy as np
 
 Track = Mapping[str, Any]
-"""the arrays of one flight of T steps: `position` and `reference` [T, 3] in metres, `attitude` [T, 4] (xyzw)"""
+"""the arrays of one flight of T steps: `position` [T, 3] in metres, `attitude` [T, 4] (xyzw), `boxes` [B, 15] of a
+`Scene` and, where one is followed, `reference` [T, 3] in metres"""
 
 SIZE = (360, 600)
 REFERENCE = np.array([0.9, 0.5, 0.1, 0.4], dtype=np.float32)
-CAMERA = ((0, 0, 0.95), 90, -8, 2.3)
-"""where it looks at, azimuth, elevation (degrees), distance (m)"""
+CAMERA, CAMERA_OF_ROOM = ((0, 0, 0.95), 90, -8, 2.3), ((0, 0, 0.6), 90, -40, 4.2)
+"""where it looks at, azimuth, elevation (degrees), distance (m): beside a reference, and where boxes stand"""
+BOX = np.array([0.95, 0.55, 0.15, 1.0], dtype=np.float32)
 TRAIL = np.array([0.2, 0.9, 1.0, 1.0], dtype=np.float32)
 
 
@@ -52,9 +54,8 @@ def show(tracks: Iterable[Track], model: mujoco.MjModel, time_step: float) -> No
     data = mujoco.MjData(model)
     with viewer.launch_passive(model, data, show_left_ui=False, show_right_ui=False) as window:
         assert window.user_scn is not None
-        window.cam.lookat[:], window.cam.azimuth = CAMERA[0], CAMERA[1]
-        window.cam.elevation, window.cam.distance = CAMERA[2], CAMERA[3]
         for track in tracks:
+            _aim(window.cam, track)
             for t in range(len(track["position"])):
                 if not window.is_running():
                     return
@@ -63,6 +64,11 @@ def show(tracks: Iterable[Track], model: mujoco.MjModel, time_step: float) -> No
                 _draw_lines(window.user_scn, track, t)
                 window.sync()
                 time.sleep(time_step)
+
+
+def _aim(camera: Any, track: Track) -> None:
+    looks = CAMERA_OF_ROOM if len(track["boxes"]) else CAMERA
+    camera.lookat[:], camera.azimuth, camera.elevation, camera.distance = looks
 
 
 def _place(model: mujoco.MjModel, data: mujoco.MjData, track: Track, t: int) -> None:
@@ -78,7 +84,7 @@ def _render_here(folder: Path) -> None:
     model.vis.global_.offheight, model.vis.global_.offwidth = SIZE
     data = mujoco.MjData(model)
     camera = mujoco.MjvCamera()
-    camera.lookat[:], camera.azimuth, camera.elevation, camera.distance = CAMERA
+    _aim(camera, track)
     frames = []
     with mujoco.Renderer(model, *SIZE) as renderer:
         for t in range(0, len(track["position"]), int(track["every"])):
@@ -90,13 +96,17 @@ def _render_here(folder: Path) -> None:
 
 
 def _draw_lines(scene: mujoco.MjvScene, track: Track, t: int) -> None:
-    """Add the reference and the last hundred steps that were flown."""
+    """Add the boxes, the reference and the last hundred steps that were flown."""
+    box, line, nothing = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_LINE, np.zeros(3)
+    for centre, half, frame in zip(*np.split(track["boxes"], (3, 6), axis=1), strict=True):
+        mujoco.mjv_initGeom(scene.geoms[scene.ngeom], box, half, centre, frame, BOX)
+        scene.ngeom += 1
     flown = track["position"][: t + 1][-101::2]
-    for points, color, width in ((track["reference"][::5], REFERENCE, 3), (flown, TRAIL, 4)):
+    for points, color, width in ((track.get("reference", ())[::5], REFERENCE, 3), (flown, TRAIL, 4)):
         for start, end in pairwise(points):
             geom = scene.geoms[scene.ngeom]
-            mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_LINE, np.zeros(3), np.zeros(3), np.zeros(9), color)
-            mujoco.mjv_connector(geom, mujoco.mjtGeom.mjGEOM_LINE, width, start, end)
+            mujoco.mjv_initGeom(geom, line, nothing, nothing, np.zeros(9), color)
+            mujoco.mjv_connector(geom, line, width, start, end)
             scene.ngeom += 1
 
 

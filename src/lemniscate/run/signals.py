@@ -20,6 +20,8 @@ LOOKS = 32
 """how often in a run the signals are measured"""
 KINDS = ("reward/", "observation/", "action/", "network/", "normalizer/", "td_error/", "value/")
 """how the names of signals begin"""
+LATEST = 6
+"""steps until an action that is late takes effect, up to which it is looked for"""
 SEEN = 256
 """rows that the networks are asked about"""
 MOST_NUMBERS = 32
@@ -39,22 +41,29 @@ def signals(state: Any, config: RunConfig, spec: Spec, rows: Rollout | None) -> 
     found["reward/by_time"] = by_time(rows)
     if not spec.has_images and spec.observation_size <= MOST_NUMBERS:
         found |= of_effects(chosen, spec)
+        if found["action/effect"] < 0.2:
+            found["action/late"] = late_effect(rows, spec)
     return {name: float(value) for name, value in found.items()}
 
 
 def of_rows(rows: Rollout, spec: Spec) -> dict[str, Tensor]:
     """Sizes of rewards and observations, and shares, of rows [B, …].
 
-    These are of numbers that never change, of actions at their bounds, and of ends that are terminations.
+    These are of rewards that are 0, of numbers that never change, of observations that are as the one before, of
+    actions at their bounds, and of ends that are terminations.
     """
-    obs, ends = rows.obs[:, : spec.observation_size].float(), rows.done.sum()
+    obs, after = (x[:, : spec.observation_size].float() for x in (rows.obs, rows.next_obs))
+    ends = rows.done.sum()
     found = {
         "reward/mean": rows.reward.mean(),
         "reward/std": moments(rows.reward)[1].sqrt(),
         "reward/largest": rows.reward.abs().max(),
+        "reward/zero": (rows.reward == 0).float().mean(),
         "observation/largest": obs.abs().max(),
         "observation/constant": (obs == obs[0]).all(0).float().mean(),
     }
+    if not ((obs == 0) | (obs == 1)).all():  # one of n is often the same
+        found["observation/repeated"] = (obs == after).all(1).float().mean()
     if isinstance(spec.action, Box):
         found["action/at_bounds"] = (rows.action.abs() > 0.99).float().mean()
     return found | ({"episode/terminated": rows.terminated.sum() / ends} if ends else {})
@@ -79,15 +88,37 @@ def of_effects(rows: Rollout, spec: Spec) -> dict[str, Tensor]:
     """The shares of the observations' changes that actions explain, and of the rewards that all of a row explains.
 
     Actions explain what a line fitted to them explains beyond one fitted to the observations alone, in that number of
-    the observation of which it is most. A reward may be a square too, of a distance or of an action.
+    the observation of which it is most: as a share of what those left to explain, and of all. A reward may be a square
+    too, of a distance or of an action. Also the share of the next observations that these explain, on average.
     """
     obs, after = (x[:, : spec.observation_size].cpu().double() for x in (rows.obs, rows.next_obs))
     action, inside = _numbers(rows.action.cpu(), spec.action), ~rows.done.cpu()
     everything = torch.cat([obs, obs.square(), action, action.square(), after, after.square()], dim=-1)
-    return {
-        "action/effect": explained_by(action[inside], (after - obs)[inside], obs[inside]).max(),
-        "reward/explained": explained_by(everything, rows.reward[:, None].cpu().double(), obs[:, :0]).max(),
+    nothing = obs[:, :0]
+    change, effect = (after - obs)[inside], explained_by(action[inside], (after - obs)[inside], obs[inside])
+    found = {
+        "action/effect": effect.max(),
+        "action/share": (effect * (1 - explained_by(obs[inside], change, nothing[inside]))).max(),
+        "reward/explained": explained_by(everything, rows.reward[:, None].cpu().double(), nothing).max(),
     }
+    if not ((obs == 0) | (obs == 1)).all():  # one of n says nothing of the next
+        found["observation/predicted"] = explained_by(obs[inside], after[inside], nothing[inside]).mean()
+    return found
+
+
+def late_effect(rows: Rollout, spec: Spec) -> Tensor:
+    """What an earlier action explains of how observations change, of rows [T, N, …]: the most of up to `LATEST` steps.
+
+    Where an observation tells the state, that is nothing: what an action did is in the observations since.
+    """
+    obs, after = (x[..., : spec.observation_size].cpu().double() for x in (rows.obs, rows.next_obs))
+    action, found = _numbers(rows.action.cpu(), spec.action), [torch.zeros((), dtype=torch.float64)]
+    broken = torch.cat([torch.zeros_like(rows.done[:1]), rows.done[:-1]]).cumsum(0).cpu()  # episodes that ended so far
+    for steps in range(1, min(LATEST, len(obs) - 2) + 1):
+        one = (broken[steps:] == broken[:-steps]) & (rows.valid & ~rows.done).cpu()[steps:]
+        change = (after - obs)[steps:][one]
+        found.append(explained_by(action[:-steps][one], change, obs[steps:][one]).nan_to_num().max())
+    return torch.stack(found).max()
 
 
 def _numbers(action: Tensor, kind: Action) -> Tensor:

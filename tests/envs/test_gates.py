@@ -1,0 +1,372 @@
+"""The race through gates: its rules against numbers worked out by hand, its levels, its contacts against MuJoCo's."""
+
+import json
+import math
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+import lemniscate as lem
+from lemniscate.envs import registry
+from lemniscate.errors import UserError
+
+jax = pytest.importorskip("jax")
+pytest.importorskip("crazyflow")
+
+from lemniscate.drones.crazyflow import _import, make_drones
+
+_import()
+
+from lemniscate.drones import gates
+
+HOVER = torch.tensor([0.0, 0.0, 0.0, -1.0])
+
+
+@pytest.fixture(scope="module")
+def racing():
+    """64 races of a level, made once."""
+    made = {}
+
+    def get(level, **kwargs):
+        key = level, json.dumps(kwargs)
+        if key not in made:
+            made[key] = make_drones("DroneGates-v0", 64, "cpu", {"level": level, **kwargs}, None, {})
+            made[key].restarted = begun(made[key])
+        return made[key]
+
+    return get
+
+
+def begun(drones, seed=0):
+    """The state in which races begin."""
+    import jax.numpy as jnp
+
+    every = jnp.ones(drones.num_envs, bool)
+    return drones.reset(drones.init(jax.random.key(seed)), every, jnp.array(False))[0]
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "passed"),
+    [
+        ((-0.1, 0, 0), (0.1, 0, 0), True),
+        ((0.1, 0, 0), (-0.1, 0, 0), False),  # the wrong way
+        ((-0.2, 0, 0), (-0.1, 0, 0), False),
+        ((-0.1, 0.224, 0), (0.1, 0.224, 0), True),
+        ((-0.1, 0.226, 0), (0.1, 0.226, 0), False),
+        ((-0.1, 0, -0.226), (0.1, 0, -0.226), False),
+        ((-0.1, 0.1, 0), (0.3, 0.5, 0), True),  # the plane is cut at y = 0.2
+        ((-0.3, 0.1, 0), (0.1, 0.3, 0), False),  # at 0.25
+        ((-0.1, 0, 0), (0.0, 0, 0), True),  # a step that ends on the plane
+        ((0.0, 0, 0), (0.1, 0, 0), False),  # counted before
+    ],
+)
+def test_a_gate_is_passed_from_behind_and_near_its_centre(before, now, passed):
+    assert bool(gates.passes(*(np.array(at, np.float32) for at in (before, now)))) is passed
+
+
+def test_the_way_to_a_gate_leads_around_it():
+    way = [
+        float(gates.way_left(np.array(at, np.float32)))
+        for at in ((-2, 0, 0), (-0.3, 0.4, 0), (0.3, 0, 0), (0.3, 0.51, 0))
+    ]
+    corner = math.hypot(0.51, 0.3) + 0.3  # from beside the frame to in front of it, and to the centre
+    assert way == pytest.approx([2, 0.5, math.hypot(0.3, 0.51) + corner, 0.3 + corner], abs=1e-6)
+
+
+def test_gates_are_turned_as_euler_angles_say():
+    rng = np.random.default_rng(0)
+    for roll, pitch, yaw in rng.uniform(-3, 3, (50, 3)):
+        x, y, z = (np.array(rows) for rows in (
+            ((1, 0, 0), (0, math.cos(roll), -math.sin(roll)), (0, math.sin(roll), math.cos(roll))),
+            ((math.cos(pitch), 0, math.sin(pitch)), (0, 1, 0), (-math.sin(pitch), 0, math.cos(pitch))),
+            ((math.cos(yaw), -math.sin(yaw), 0), (math.sin(yaw), math.cos(yaw), 0), (0, 0, 1)),
+        ))  # fmt: skip
+        angles = np.array((roll, pitch, yaw), np.float32)
+        assert np.asarray(gates.rotation(angles)) == pytest.approx(z @ y @ x, abs=1e-5)
+        assert np.asarray(gates.attitude(gates.quaternion(angles))) == pytest.approx(z @ y @ x, abs=1e-5)
+
+
+def distance_in_mujoco(centre, quat, low, high):
+    """The distance between the drone's box and another, which MuJoCo finds."""
+    half, middle = (high - low) / 2, (high + low) / 2
+    model = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody>"
+        f"<geom type='box' size='{' '.join(map(str, half))}' pos='{' '.join(map(str, middle))}'/>"
+        f"<body mocap='true' pos='{' '.join(map(str, centre))}' quat='{' '.join(map(str, np.roll(quat, 1)))}'>"
+        f"<geom type='box' size='{' '.join(map(str, gates.BODY))}'/></body></worldbody></mujoco>"
+    )
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    return mujoco.mj_geomDistance(model, data, 0, 1, 1.0, None)
+
+
+def test_contacts_are_those_that_mujoco_finds():
+    rng, low, high = np.random.default_rng(1), *gates._boxes(1.0)
+    said = found = near = 0
+    for _ in range(1_500):
+        which = rng.integers(5)
+        at = rng.uniform(low[which] - 0.12, high[which] + 0.12).astype(np.float32)
+        quat = rng.normal(size=4)
+        quat /= np.linalg.norm(quat)
+        turned = gates.attitude(np.float32(quat))
+        touches = bool(gates.touches(at, turned, low[which], high[which]))
+        distance = distance_in_mujoco(at, quat, low[which], high[which])
+        said, found = said + touches, found + (distance < 0)
+        if abs(distance) < 1e-4:  # MuJoCo's own precision
+            near += 1
+        else:
+            assert touches == (distance < 0), (which, at, quat, distance)
+    assert 300 < said < 1_200
+    assert 300 < found < 1_200
+    assert near < 30
+
+
+def test_a_gate_is_a_frame_with_an_opening_and_a_stand():
+    low, high = gates._boxes(2.0)
+
+    def inside(*at):
+        return bool(((np.array(at) >= low - 1e-6) & (np.array(at) <= high + 1e-6)).all(1).any())
+
+    assert not inside(0, 0, 0)
+    assert not inside(0, 0.199, 0.199)
+    assert inside(0, 0.201, 0)
+    assert inside(0.009, 0.359, -0.359)
+    assert not inside(0.011, 0.3, 0)
+    assert not inside(0, 0, 0.361)
+    assert inside(0.049, 0.049, -1)
+    assert not inside(0, 0.051, -1)
+
+
+def test_the_course_is_the_laboratorys():
+    track = gates.read_track()
+    assert track.gates[:, [0, 1, 2, 5]].tolist() == pytest.approx(np.float32([
+        [0.5, 0.25, 0.7, -0.78], [1.05, 0.75, 1.2, 2.35], [-1.0, -0.25, 0.7, 3.14], [0.0, -0.75, 1.2, 0.0]
+    ]))  # fmt: skip
+    assert track.obstacles[:, :2].tolist() == [[0, 0.75], [1, 0.25], [-1.5, -0.25], [-0.5, -0.75]]
+    assert track.start.tolist() == pytest.approx([-1.5, 0.75, 0.01])
+    assert track.order.tolist() == [0, 1, 2, 3]
+    assert not track.reverse.any()
+
+
+def test_a_level_draws_what_it_says_and_no_more(racing):
+    drawn = {}
+    for level in range(4):
+        drones = racing(level)
+        states = [begun(drones, seed) for seed in range(12)]
+        parts = {
+            "pos": [data.states.pos[:, 0] for data, _, _ in states],
+            "mass": [data.params.mass.reshape(64, -1) for data, _, _ in states],
+            "inertia": [np.diagonal(data.params.J.reshape(64, 3, 3), axis1=1, axis2=2) for data, _, _ in states],
+            "gates": [arrays["_gates"] - arrays["_expected_gates"] for _, arrays, _ in states],
+            "posts": [arrays["_posts"] - arrays["_expected_posts"] for _, arrays, _ in states],
+            "track": [arrays["_expected_gates"] for _, arrays, _ in states],
+        }
+        drawn[level] = {name: np.concatenate([np.asarray(a) for a in each]) for name, each in parts.items()}
+    start = gates.read_track().start
+    for level, parts in drawn.items():
+        spread = {name: np.ptp(values, axis=0) for name, values in parts.items()}
+        if level == 0:
+            assert all(not each.any() for each in spread.values())
+            continue
+        assert np.abs(parts["mass"] - 0.0434).max() == pytest.approx(0.005, rel=0.02)
+        assert spread["inertia"] == pytest.approx(2e-6, rel=0.02)
+        if level < 3:
+            assert np.abs(parts["pos"] - start)[:, :2].max(0) == pytest.approx(0.1, rel=0.02)
+            assert (parts["pos"] - start)[:, 2].min() >= 0
+            assert (parts["pos"] - start)[:, 2].max() == pytest.approx(0.02, rel=0.02)
+            assert not spread["track"].any()
+        if level == 1:
+            assert not spread["gates"].any()
+            assert not spread["posts"].any()
+        else:
+            most = np.abs(parts["gates"]).max(0)
+            assert most == pytest.approx(np.tile(gates.SPREAD["gate"], (4, 1)), rel=0.03)
+            assert np.abs(parts["posts"]).max(0) == pytest.approx(np.tile(gates.SPREAD["obstacle"], (4, 1)), rel=0.03)
+    assert (spread["track"][:, :2] > 1.5).all()
+    assert not spread["track"][:, 2].any()  # heights stay
+
+
+def test_a_drawn_track_has_room(racing):
+    drones = racing(3)
+    apart = []
+    for seed in range(8):
+        data, arrays, _ = begun(drones, seed)
+        track, posts = np.asarray(arrays["_expected_gates"]), np.asarray(arrays["_expected_posts"])
+        assert (np.abs(track[..., 0]) <= 2.0).all()
+        assert (np.abs(track[..., 1]) <= 1.0).all()
+        centres = track[..., :2]
+        between = np.linalg.norm(centres[:, :, None] - centres[:, None], axis=-1)[:, *np.triu_indices(4, 1)]
+        to_posts = np.linalg.norm(centres[:, :, None] - posts[:, None, :, :2], axis=-1)
+        apart.append(((between.min(1) >= 1.0) & (to_posts.min((1, 2)) >= 0.8)).mean())
+        start = np.asarray(data.states.pos[:, 0])
+        way = centres[:, 0] - (start[:, :2])
+        off = (track[:, 0, 5] - np.arctan2(*way.T[::-1]) + np.pi) % (2 * np.pi) - np.pi
+        assert (np.abs(off) < 0.75 + 0.25).all()  # a drone begins up to 0.14 m from where its track does
+    assert np.mean(apart) > 0.6  # the room is too small for all wishes of some
+
+
+def test_the_true_place_is_known_from_near_and_stays_known(racing):
+    import jax.numpy as jnp
+
+    drones = racing(2)
+    state = drones.restarted
+    seen = np.asarray(state[1]["_gates_seen"])
+    assert not seen.any()
+    gate = np.asarray(state[1]["_gates"])[:, 0]
+    for away, known in ((0.71, False), (0.69, True), (3.0, True)):
+        data, arrays, air = state
+        pos = jnp.asarray(gate[:, :3] + np.float32((away, 0, 0.5)))
+        with drones._at((data.replace(states=data.states.replace(pos=pos[:, None])), arrays, air)) as env:
+            env._look()
+            state = (*drones._take(), air)
+        assert (np.asarray(state[1]["_gates_seen"])[:, 0] == known).all()
+        with drones._at(state) as env:
+            believed = np.asarray(env.obs()["gates"])[:, :3] + np.asarray(pos)
+        expected = gate[:, :3] if known else np.asarray(state[1]["_expected_gates"])[:, 0, :3]
+        assert believed == pytest.approx(expected, abs=1e-5)
+
+
+def test_the_force_is_drawn_for_each_step_of_the_simulator(racing):
+    data = racing(0).restarted[0]
+    seen = []
+
+    def integrate(data):
+        seen.append(np.asarray(data.states.force))
+        return data
+
+    for _ in range(40):
+        data = gates.integrate_pushed(data, integrate)
+    forces = np.stack(seen)
+    assert np.abs(forces).max() == pytest.approx(0.1, rel=0.02)
+    assert forces.std() == pytest.approx(0.1 / math.sqrt(3), rel=0.03)
+    assert np.corrcoef(forces[:-1].ravel(), forces[1:].ravel())[0, 1] == pytest.approx(0, abs=0.05)
+    assert not np.asarray(data.states.force).any()  # a wind is not added up
+
+
+def where(env, pos):
+    """Whether drones at these positions, level, have crashed."""
+    import jax.numpy as jnp
+
+    turned = jnp.broadcast_to(jnp.eye(3), (len(pos), 3, 3))
+    return np.asarray(env._leaves(jnp.asarray(pos, jnp.float32))), np.asarray(
+        env._touches(jnp.asarray(pos, jnp.float32), turned)
+    )
+
+
+def test_a_race_ends_outside_on_the_ground_and_at_what_stands(racing):
+    drones = racing(0)
+    cases = [
+        ((-1.5, 0.75, -0.001), False, False),  # on the ground, at the start
+        ((-1.47, 0.75, -0.001), True, False),  # away from it
+        ((2.49, 0, 1), False, False),
+        ((2.51, 0, 1), True, False),
+        ((0, -1.51, 1), True, False),
+        ((0, 1.0, 2.01), True, False),
+        ((0.5, 0.25, 0.68), False, False),  # the middle of gate 1
+        ((0.5, 0.25, 0.68 - 0.19), False, True),  # its lower beam
+        ((0, 0.75 + 0.08, 1), False, True),  # an obstacle, 1.5 cm thick and 7 cm away
+        ((0, 0.75 + 0.095, 1), False, False),
+        ((0, 0.75, 1.60), False, False),  # above it
+    ]
+    pos = np.array([at for at, _, _ in cases] + [(0, 0, 1)] * (64 - len(cases)), np.float32)
+    with drones._at(drones.restarted) as env:
+        left, touched = where(env, pos)
+    assert left[: len(cases)].tolist() == [case[1] for case in cases]
+    assert touched[: len(cases)].tolist() == [case[2] for case in cases]
+
+
+def test_a_flight_through_all_gates_is_counted():
+    """A drone is put through the gates by hand, one step before and one behind each."""
+    import jax.numpy as jnp
+
+    drones = make_drones("DroneGates-v0", 1, "cpu", {"level": 0}, None, {})
+    state, passed, rewards = begun(drones), [], []
+    for number in range(4):
+        for side in (-0.1, 0.1):
+            data, arrays, air = state
+            with drones._at(state) as env:
+                centre, turned = env._frame(jnp.array([number]), arrays["_gates"])
+                pos = centre + side * turned[:, :, 0] - jnp.array((0, 0, 0.02))
+                env.sim.data = data.replace(states=data.states.replace(pos=pos[:, None]))
+                env.advance(jnp.zeros((1, 4)))
+                rewards.append(float(env.reward()[0]))
+                assert bool(env.terminated()[0]) == (number == 3 and side > 0)
+                measures = {name: float(value[0]) for name, value in env.measures().items()}
+                state = (*drones._take(), air)
+            passed.append(measures["gates_passed"])
+    assert passed == [0, 1, 1, 2, 2, 3, 3, 4]
+    assert measures["success"] == 1
+    assert measures["crashed"] == 0
+    assert all(reward > 3 for reward in rewards[1::2])
+
+
+@pytest.mark.parametrize("control", ["attitude", "body_rate"])
+def test_a_race_trains_and_is_evaluated(control, tmp_path):
+    fields = {"num_envs": 4, "num_steps": 64, "total_steps": 1_024, "minibatch_size": 64, "epochs": 2, "seed": 1}
+    kwargs = {"level": 2, "control": control, "max_episode_time": 2.0}
+    run = lem.train("ppo", "DroneGates-v0", env_kwargs=kwargs, run=tmp_path / "run", progress=False, **fields)
+    found = lem.evaluate(run.policy, episodes=4)
+    assert {"gates_passed", "success", "crashed"} <= found.measures.keys()
+    assert ("lap_seconds" in found.measures) == (found.measures["success"] > 0)
+
+
+def test_body_rates_are_followed():
+    env = registry.make("DroneGates-v0", 2, kwargs={"control": "body_rate"})
+    env.restart(0)
+    action = torch.tensor([[0.2, 0.0, 0.0, 0.6], [0.0, -0.2, 0.0, 0.6]])
+    rates = [env.step(action).next_obs[:, 10:13] for _ in range(6)][-1]
+    assert rates[0, 0] == pytest.approx(2.0, abs=0.7)
+    assert rates[1, 1] == pytest.approx(-2.0, abs=0.7)
+
+
+TRACK = """
+order = [1, -1]
+start = [-1.0, 0.0, 0.5]
+room = { low = [-2, -2, 0], high = [2, 2, 2] }
+[[gates]]
+position = [0.0, 0.0, 1.0]
+"""
+
+
+def test_a_track_of_ones_own_is_read(tmp_path):
+    (tmp_path / "track.toml").write_text(TRACK)
+    track = gates.read_track(tmp_path / "track.toml")
+    assert (track.order.tolist(), track.reverse.tolist()) == ([0, 0], [False, True])
+    env = registry.make("DroneGates-v0", 2, kwargs={"track": str(tmp_path / "track.toml"), "level": 2})
+    obs = env.restart(0)
+    assert obs[:, 16:19] == pytest.approx(torch.tensor([[1.0, 0, 0]] * 2), abs=1e-6)  # the direction of the first
+    assert obs[:, 22:25] == pytest.approx(torch.tensor([[-1.0, 0, 0]] * 2), abs=1e-6)  # and of the same, in reverse
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "said"),
+    [
+        ({"level": 4}, "level of DroneGates-v0 must be 0, 1, 2 or 3, not 4"),
+        ({"level": True}, "level of DroneGates-v0 must be 0, 1, 2 or 3, not True"),
+        ({"control": "thrust"}, "control of DroneGates-v0 must be attitude or body_rate, not 'thrust'"),
+        ({"control": "body_rate", "dynamics": "so_rpy"}, "body_rate needs the dynamics first_principles"),
+        ({"track": "none.toml"}, "none.toml is no track"),
+        ({"levle": 1}, "did you mean level"),
+    ],
+)
+def test_what_is_wrong_is_said(kwargs, said):
+    with pytest.raises(UserError, match=said.replace("?", r"\?")):
+        registry.make("DroneGates-v0", 2, kwargs=kwargs)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (("order = [1, -1]", "order = [2]"), "order names gates from 1 to 1"),
+        (("order = [1, -1]", "order = []"), "order names gates from 1 to 1"),
+        (("position = [0.0, 0.0, 1.0]", "position = [0.0, 1.0]"), "is no track"),
+        (("start = [-1.0, 0.0, 0.5]", ""), "lacks 'start'"),
+        (("[[gates]]", "[gates"), "is no track"),
+    ],
+)
+def test_what_is_wrong_with_a_track_is_said(change, said, tmp_path):
+    (tmp_path / "track.toml").write_text(TRACK.replace(*change))
+    with pytest.raises(UserError, match=said):
+        gates.read_track(tmp_path / "track.toml")
