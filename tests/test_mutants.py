@@ -1058,7 +1058,7 @@ MUTANTS = [
     ),
     (
         "the Fisher product is doubled",
-        "optim/vector.py",
+        "optim/adam.py",
         "return fisher_product(",
         "return 2 * fisher_product(",
         "optim/test_vector.py",

@@ -8,7 +8,7 @@ from torch import nn
 
 from lemniscate.errors import UserError
 from lemniscate.nn.networks import Bfloat16Linear, ImageEncoder, Layers, Tanh
-from lemniscate.optim.vector import ParameterVector
+from lemniscate.optim.adam import ParameterVector
 from lemniscate.system.named import name_of
 
 

@@ -5,7 +5,7 @@ import copy
 import torch
 
 from helpers import copy_of, small_networks
-from lemniscate.optim.vector import ParameterVector, PolicyVector
+from lemniscate.optim.adam import ParameterVector, PolicyVector
 
 
 def test_views_and_join_are_inverse_and_the_module_is_unchanged():

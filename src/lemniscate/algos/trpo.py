@@ -15,8 +15,7 @@ from lemniscate.data.rollout import collect, epoch_minibatches, one_minibatch, r
 from lemniscate.maths import backtrack, explained_variance, gae, means, natural_step, standardize, surrogate, value_loss
 from lemniscate.nn.actor_critic import ActorCritic, Value
 from lemniscate.nn.normalizer import RewardScale
-from lemniscate.optim.adam import Adam, linear
-from lemniscate.optim.vector import PolicyVector
+from lemniscate.optim.adam import Adam, PolicyVector, linear
 from lemniscate.run.config import Count, Fraction, NonNegative, Positive, Range, Repeats, Scheduled
 from lemniscate.run.on_policy import OnPolicyState, RecurrentConfig
 from lemniscate.run.run import Run

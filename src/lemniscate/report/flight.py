@@ -1,6 +1,6 @@
 """The flight of a body, along a reference or among what stands there: the path, the error, a film."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import chain, product
 from pathlib import Path
@@ -29,30 +29,38 @@ STRIDE = 5
 """a film has a frame for every so many-th step"""
 
 
+NO_BOXES = np.zeros((0, 15))
+
+
 @dataclass(frozen=True)
 class Flight:
     """M flights of T steps: `position` [T, M, 3] in metres, `attitude` [T, M, 4] (xyzw).
 
     After the end of a flight that was cut short its rows are NaN. What it flies along or among: `reference` [T, M, 3],
-    in metres; and the boxes [M, B, 15] of a `Scene`, none where nothing stands there.
+    in metres; and for each flight the boxes [B, 15] of a `Scene`.
     """
 
     position: np.ndarray
+    reference: np.ndarray | None
     attitude: np.ndarray
     time_step: float
-    reference: np.ndarray | None
-    boxes: np.ndarray
+    boxes: Sequence[np.ndarray] = ()
 
     def one(self, number: int) -> "Flight":
         """One of the flights, from its start to its end."""
         flown, own = ~np.isnan(self.position[:, number, 0]), slice(number, number + 1)
         reference = None if self.reference is None else self.reference[flown, own]
-        return Flight(self.position[flown, own], self.attitude[flown, own], self.time_step, reference, self.boxes[own])
+        return Flight(self.position[flown, own], reference, self.attitude[flown, own], self.time_step, self.boxes[own])
+
+    @property
+    def standing(self) -> np.ndarray:
+        """The boxes of the first of the flights, [B, 15]."""
+        return self.boxes[0] if len(self.boxes) else NO_BOXES
 
     @property
     def track(self) -> dict[str, np.ndarray]:
         """The first of the flights, as `scene` takes it."""
-        found = {"position": self.position[:, 0], "attitude": self.attitude[:, 0], "boxes": self.boxes[0]}
+        found = {"position": self.position[:, 0], "attitude": self.attitude[:, 0], "boxes": self.standing}
         return found if self.reference is None else {**found, "reference": self.reference[:, 0]}
 
     @property
@@ -82,7 +90,7 @@ def record(
     scene = env.scene
     assert scene is not None
     rows, first = [], torch.ones(env.num_envs, dtype=torch.bool, device=env.device)
-    boxes = np.zeros((env.num_envs, 0, 15))
+    boxes: Sequence[np.ndarray] = ()
     for _, _, step, counts in play_episodes(policy, env, flights, seed, deterministic):
         if not rows and scene.boxes:
             boxes = scene.boxes()
@@ -95,7 +103,7 @@ def record(
     track = np.stack(rows)
     position = track[..., scene.position]
     reference = position + track[..., scene.error] if scene.error else None
-    return Flight(position, track[..., scene.attitude], scene.time_step, reference, boxes[:flights])
+    return Flight(position, reference, track[..., scene.attitude], scene.time_step, boxes[:flights])
 
 
 def show_flights(
@@ -158,7 +166,7 @@ def draw_from_above(flight: Flight, file: Path) -> Path:
     axes = figure.subplots()
     for other in range(1, flight.position.shape[1]):
         axes.plot(*flight.position[:, other, :2].T, color=GREY, linewidth=0.5, alpha=0.4)
-    _draw_boxes(axes, flight.boxes[0])
+    _draw_boxes(axes, flight.standing)
     first = flight.one(0)
     path = first.position[:, 0]
     speed = np.linalg.norm(np.gradient(path, flight.time_step, axis=0), axis=1)
@@ -256,7 +264,7 @@ def animate(flight: Flight, every: int) -> list[np.ndarray]:
     reference = path if flight.reference is None else flight.reference[:, 0, [0, across]]
     axes.plot(*reference.T, color=ORANGE, linewidth=4, alpha=0.3)
     if flight.reference is None:
-        _draw_boxes(axes, flight.boxes[0])
+        _draw_boxes(axes, flight.standing)
     both = np.concatenate([path, reference])
     low, high = np.nanmin(both, axis=0), np.nanmax(both, axis=0)
     margin = 0.1 + 0.1 * np.max(high - low)  # metres; the body itself is 0.14 wide
