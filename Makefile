@@ -4,7 +4,7 @@ BIN := .venv/bin
 ALONE := $(PYTHON) -c 'import fcntl, os, sys; lock = os.open("Makefile", os.O_RDONLY); fcntl.flock(lock, fcntl.LOCK_EX); os.set_inheritable(lock, True); os.execvp(sys.argv[1], sys.argv[1:])'
 export PIP_DISABLE_PIP_VERSION_CHECK = 1
 
-.PHONY: setup fly test test-long test-faults test-cluster test-soak check wheel docs docs-serve bench bench-returns tutorials lock clean
+.PHONY: setup fly race test test-long test-faults test-cluster test-soak check wheel docs docs-serve bench bench-returns tutorials lock clean
 
 setup:  ## .venv; of two at once, one installs and the other waits for it
 	@$(MAKE) --question .venv/.ready 2> /dev/null || $(ALONE) $(MAKE) --silent .venv/.ready
@@ -19,6 +19,9 @@ setup:  ## .venv; of two at once, one installs and the other waits for it
 
 fly: setup  ## train a drone to fly the figure eight, fly it from unseen starts, draw it
 	$(BIN)/lemniscate train ppo --env DroneFigureEightTrajectory-v0 --report
+
+race: setup  ## train a drone to race through gates, race from unseen starts, draw and film it
+	$(BIN)/lemniscate train ppo --env DroneGates-v0 --report
 
 test: setup  ## the whole suite but the long ones
 	$(BIN)/python -m pytest -n auto --dist loadfile -m "not long and not faults and not soak and not cluster"

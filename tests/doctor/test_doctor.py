@@ -75,7 +75,7 @@ CASES = {
         {"approx_kl": [0.0] * 8, "losses__entropy": list(np.linspace(1.0, 0.5, 8))},
         {"approx_kl": [1e-8] * 8, "losses__entropy": list(np.linspace(1.0, 0.5, 8))},
     ),
-    "gradient-grows": ({"gradient_norm": [10.0**n for n in range(8)]}, {"gradient_norm": [1.0] * 4 + [50.0] * 4}),
+    "gradient-grows": ({"gradient_norm": [30.0] + [250.0] * 8}, {"gradient_norm": [30.0] + [140.0] * 8}),
     "ends-early": (
         {
             "returns": list(np.linspace(-90.0, -10.0, 400)),

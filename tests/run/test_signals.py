@@ -13,7 +13,17 @@ from conftest import tiny_fields, tiny_off_policy
 from lemniscate.maths import explained_by
 from lemniscate.nn.normalizer import NoNorm, RunningNorm
 from lemniscate.run.metrics import read_metrics
-from lemniscate.run.signals import KINDS, LOOKS, by_time, of_effects, of_networks, of_rows, of_values, signals
+from lemniscate.run.signals import (
+    KINDS,
+    LOOKS,
+    by_time,
+    late_effect,
+    of_effects,
+    of_networks,
+    of_rows,
+    of_values,
+    signals,
+)
 from lemniscate.spec import Box, Discrete, ObservationPart, Spec
 from lemniscate.types import Rollout
 
@@ -63,6 +73,65 @@ def test_columns_that_are_multiples_of_each_other_change_nothing():
     twice = torch.cat([x, 3 * x, torch.zeros(B, 1)], dim=1)
     share, again = (explained_by(each, y, x[:, :0]).item() for each in (x, twice))
     assert share == pytest.approx(again, abs=0.01)
+
+
+def delayed(late, ends=False):
+    """Rows [T, N, …] of a number that is changed by the action of so many steps before."""
+    steps, envs = 200, 4
+    action, obs = numbers(steps, envs, A).float(), torch.zeros(steps + 1, envs, O)
+    done = torch.zeros(steps, envs, dtype=torch.bool)
+    done[9::10] = ends
+    for t in range(steps):
+        change = 0.01 * numbers(envs, O, seed=t).float()
+        if t >= late:
+            change[:, :A] += action[t - late]
+        obs[t + 1] = 0.9 * obs[t] + change
+    whole = {"obs": obs[:-1], "next_obs": obs[1:], "action": action, "reward": torch.zeros(steps, envs)}
+    return Rollout(**whole, terminated=done, truncated=~done & done, valid=torch.ones_like(done))
+
+
+@pytest.mark.parametrize("late", [1, 3, 6])
+def test_an_action_that_is_late_is_found(late):
+    rows = delayed(late)
+    assert late_effect(rows, spec_of()).item() > 0.9
+    assert of_effects(rows[rows.valid], spec_of())["action/effect"].item() < 0.1
+    assert late_effect(delayed(0), spec_of()).item() < 0.1
+
+
+def test_an_action_that_is_late_is_found_within_episodes():
+    """Where episodes end every three steps, actions of more than two steps before are of another one."""
+    rows = delayed(3)
+    done = torch.zeros_like(rows.terminated)
+    done[2::3] = True
+    rows = Rollout(**{**vars(rows), "terminated": done})
+    assert late_effect(rows, spec_of()).item() < 0.1
+
+
+def test_rewards_of_nothing_and_observations_that_repeat_are_counted():
+    obs = numbers(B, O).float()
+    after = torch.where(torch.arange(B)[:, None] % 4 == 0, obs, obs + 1)
+    reward = (torch.arange(B) % 10 == 0).float()
+    found = of_rows(rows(obs=obs, next_obs=after, reward=reward), spec_of())
+    assert found["reward/zero"].item() == pytest.approx(0.9)
+    assert found["observation/repeated"].item() == pytest.approx(0.25)
+    assert "observation/repeated" not in of_rows(rows(obs=(obs > 0).float()), spec_of())
+
+
+def test_an_observation_of_noise_says_nothing_of_the_next():
+    obs = numbers(B, O).float()
+    still = of_effects(rows(obs=obs, next_obs=obs + 0.1 * numbers(B, O, seed=5).float()), spec_of())
+    noise = of_effects(rows(), spec_of())
+    assert still["observation/predicted"].item() > 0.95
+    assert abs(noise["observation/predicted"].item()) < 0.05
+
+
+def test_a_weak_action_has_a_small_share_of_the_change():
+    obs, action = numbers(B, O), numbers(B, A, seed=1)
+    after = 0.5 * obs
+    after[:, :A] += 0.01 * action
+    found = of_effects(rows(obs=obs.float(), action=action.float(), next_obs=after.float()), spec_of())
+    assert found["action/effect"].item() > 0.99
+    assert found["action/share"].item() == pytest.approx((0.01 / 0.5) ** 2, rel=0.3)
 
 
 def test_rewards_that_tell_the_time_do_so_within_each_episode():

@@ -272,9 +272,12 @@ def ratio_always_one(e: Evidence) -> str | None:
 
 @rule
 def gradient_grows(e: Evidence) -> str | None:
-    """Each gradient step is larger than the one before: gradients add up, as without zero_grad."""
+    """The gradient grows from step to step: gradients add up, as without zero_grad."""
     norms = e.values("gradient_norm")
-    if len(norms) < 8 or not np.median(norms[len(norms) // 2 :]) > 100 * np.median(norms[: len(norms) // 8 + 1]):
+    if len(norms) < 8:
+        return None
+    late = np.median(norms[len(norms) // 2 :])
+    if not late > (5 if late > 100 and e.config.get("scale_rewards", False) else 100) * norms[0]:
         return None
     return f"The norm of the gradient rose from {norms[0]:.3g} to {norms[-1]:.3g}."
 
@@ -522,7 +525,7 @@ def ends_early(e: Evidence) -> str | None:
     fifth = len(e.lengths) // 5
     if fifth < 4 or not e.returns[-fifth:].mean() < 0 or not e.gain > 5 or not e.late("episode/terminated") > 0.9:
         return None
-    first, last = np.median(e.lengths[:fifth]), np.median(e.lengths[-fifth:])
+    first, last = np.median(e.lengths[: max(10, fifth // 10)]), np.median(e.lengths[-fifth:])
     return f"Returns rose while episodes went from {first:.0f} steps to {last:.0f}." if last < 0.6 * first else None
 
 

@@ -41,6 +41,8 @@ AT_START = 0.02
 """the horizontal distance from its start within which a drone may touch the ground, m"""
 ACTION_NOISE, FORCE = 0.001, 0.1
 """standard deviation of the noise of actions (rad, N); the most of the random force, an axis, N"""
+CAREFUL = 2.0
+"""m/s that cost nothing while the true place of the next gate is not known"""
 SPREAD = {
     "mass": 0.005,
     "inertia": 1e-6,
@@ -231,7 +233,8 @@ class DroneGates(DroneEnv):
     place of the next two is known. But for the place, all is along the world's axes, as an attitude is commanded.
 
     The reward of a step is 3 for each metre of the way to the next gate's centre (`way_left`), 3 for a gate, −6 for a
-    crash, less 0.05, 0.0005 |ω|² (rad²/s²) and 0.01 for the squared change of the action.
+    crash; less 0.05, 0.0005 |ω|² (rad²/s²), 0.01 for the squared change of the action and, while at levels 2 and 3 the
+    true place of the next gate is not known, 0.1 for the square of what is above `CAREFUL` of the speed.
 
     Args:
         level: 0, 1, 2 or 3.
@@ -248,6 +251,8 @@ class DroneGates(DroneEnv):
         UserError: a level, a control or a track that is none.
     """
 
+    controls: tuple[str, ...] = ("attitude", "body_rate")
+
     def __init__(
         self,
         level: int = 0,
@@ -263,15 +268,15 @@ class DroneGates(DroneEnv):
     ) -> None:
         if level not in (0, 1, 2, 3) or isinstance(level, bool):
             raise UserError(f"level of DroneGates-v0 must be 0, 1, 2 or 3, not {shown(level)}.")
-        if control not in ("attitude", "body_rate"):
+        if control not in self.controls:
             raise UserError(f"control of DroneGates-v0 must be attitude or body_rate, not {shown(control)}.")
         if control == "body_rate" and dynamics != "first_principles":
             raise UserError(f"control body_rate needs the dynamics first_principles, not {dynamics}.")
         self.level, self.track = level, read_track(track)
         shared = {"num_envs": num_envs, "max_episode_time": max_episode_time, "drone": drone, "freq": freq}
         super().__init__(dynamics=dynamics, device=device, reset_randomization=_as_it_is, **shared)
-        if control == "body_rate":
-            self._command_rates(num_envs, device)
+        if control != "attitude":
+            self._take_control(control, num_envs, device)
         integrate = self.sim.step_pipeline["integration"]
         replace_fn(self.sim.step_pipeline, lambda data: integrate_pushed(data, integrate), name="integration")
         self.sim.build_step_fn()
@@ -282,25 +287,21 @@ class DroneGates(DroneEnv):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self._empty(num_envs)
 
-    def _command_rates(self, num_envs: int, device: str) -> None:
-        """Take body rates in place of attitudes; the controller's attitude terms, which level the drone, are off."""
-        sim = Sim(
-            n_worlds=num_envs,
-            drone=self.sim.drone,
-            device=device,
-            dynamics=self.sim.dynamics,
-            control=Control.body_rate,
-        )
-        rates = sim.data.controls.body_rate
-        own = rates.replace(params={**rates.params, **{name: 0 * rates.params[name] for name in ("kR", "ki_m")}})
-        sim.data = sim.data.replace(controls=sim.data.controls.replace(body_rate=own))
-        sim.build_default_data()
+    def _take_control(self, control: str, num_envs: int, device: str) -> None:
+        """Simulate another control than that of attitudes; body rates without the terms that level the drone."""
+        shared = {"drone": self.sim.drone, "device": device, "dynamics": self.sim.dynamics}
+        sim = Sim(n_worlds=num_envs, control=Control(control), **shared)
+        if (rates := sim.data.controls.body_rate) is not None:
+            own = rates.replace(params={**rates.params, **{name: 0 * rates.params[name] for name in ("kR", "ki_m")}})
+            sim.data = sim.data.replace(controls=sim.data.controls.replace(body_rate=own))
+            sim.build_default_data()
+            low, high = (np.array(bound) for bound in (self.single_action_space.low, self.single_action_space.high))
+            low[:3], high[:3] = -np.array(BODY_RATES), BODY_RATES
+            self.single_action_space = gym.spaces.Box(low, high)
+            self.action_space = batch_space(self.single_action_space, num_envs)
         append_fn(sim.reset_pipeline, _as_it_is, name="reset_randomization")
         sim.build_reset_fn()
-        low, high = (np.array(bound) for bound in (self.single_action_space.low, self.single_action_space.high))
-        low[:3], high[:3] = -np.array(BODY_RATES), BODY_RATES
-        self.sim, self.single_action_space = sim, gym.spaces.Box(low, high)
-        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.sim = sim
 
     own_parameters = ("mass", "J", "J_inv")
     """crazyflow's parameters of which each drone has its own"""
@@ -436,9 +437,16 @@ class DroneGates(DroneEnv):
         return start, poses, tops.at[..., :2].set(jnp.stack(posts, axis=1)) if posts else tops
 
     def begin_ahead(self, mask: jax.Array) -> None:
-        """Let the masked drones begin on their way: behind a gate that they have passed, at some speed."""
-        self._keys, which, where, fast = jax.random.split(self._keys, 4)
+        """Let the masked drones begin on their way: behind a gate that they have passed, at some speed.
+
+        What stands there differs from the track by a random share of what the level says, so that there is something
+        to learn before the hardest races can be won.
+        """
+        self._keys, which, where, fast, easier = jax.random.split(self._keys, 5)
         n = self.num_envs
+        share = jnp.where(mask, jnp.sqrt(jax.random.uniform(easier, (n,))), 1.0)[:, None, None]
+        self._gates = self._expected_gates + share * (self._gates - self._expected_gates)
+        self._posts = self._expected_posts + share * (self._posts - self._expected_posts)
         count = len(self.track.order)
         target = jax.random.randint(which, (n,), 1, max(2, count)) if count > 1 else jnp.zeros(n, jnp.int32)
         place, turned = self._frame(jnp.maximum(target - 1, 0), self._gates)
@@ -476,8 +484,11 @@ class DroneGates(DroneEnv):
         self._before = pos
         self._look()
         rates = jnp.square(states.ang_vel[:, 0]).sum(-1)
+        hurry = jnp.maximum(jnp.linalg.norm(states.vel[:, 0], axis=-1) - CAREFUL, 0.0)
+        hurry = jnp.where(self._sees_next(0) | (self.level < 2), 0.0, hurry)
         change = jnp.square(action - self._last_action).sum(-1)
         self._gain = 3 * progress + 3.0 * passed - 6.0 * self._crashed - 0.05 - 0.0005 * rates - 0.01 * change
+        self._gain -= 0.1 * jnp.square(hurry)
         self._last_action = action
 
     def _look(self) -> None:
@@ -486,12 +497,19 @@ class DroneGates(DroneEnv):
         near = [jnp.linalg.norm(of[..., :2] - here, axis=-1) < SEEN_FROM for of in (self._gates, self._posts)]
         self._gates_seen, self._posts_seen = self._gates_seen | near[0], self._posts_seen | near[1]
 
+    def _number(self, target: jax.Array) -> jax.Array:
+        """Which gates are number `target` in the order, [N]; the last where there are no more."""
+        return jnp.asarray(self.track.order)[jnp.clip(target, 0, len(self.track.order) - 1)]
+
+    def _sees_next(self, ahead: int) -> jax.Array:
+        """Whether the true place of the gate so many after the next is known, [N]."""
+        return jnp.take_along_axis(self._gates_seen, self._number(self._target + ahead)[:, None], axis=1)[:, 0]
+
     def _frame(self, target: jax.Array, gates: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Centre [N, 3] and attitude [N, 3, 3] of the gates number `target` in the order, x in flight's direction."""
-        last = len(self.track.order) - 1
-        number = jnp.clip(target, 0, last)
-        pose = jnp.take_along_axis(gates, jnp.asarray(self.track.order)[number][:, None, None], axis=1)[:, 0]
-        turn = jnp.where(jnp.asarray(self.track.reverse)[number], -1.0, 1.0)
+        pose = jnp.take_along_axis(gates, self._number(target)[:, None, None], axis=1)[:, 0]
+        reverse = jnp.asarray(self.track.reverse)[jnp.clip(target, 0, len(self.track.order) - 1)]
+        turn = jnp.where(reverse, -1.0, 1.0)
         flip = jnp.stack([turn, turn, jnp.ones_like(turn)], axis=-1)
         return pose[:, :3], rotation(pose[:, 3:]) * flip[:, None]
 
@@ -528,16 +546,9 @@ class DroneGates(DroneEnv):
         way = jnp.take_along_axis(way, jnp.stack([first, second], axis=1)[..., None], axis=1)
         parts["obstacles"] = way.reshape(n, -1)
         parts["last_action"] = self._last_action
-        count = len(self.track.order)
-        seen = [
-            jnp.take_along_axis(
-                self._gates_seen,
-                jnp.asarray(self.track.order)[jnp.clip(self._target + a, 0, count - 1)][:, None],
-                axis=1,
-            )
-            for a in (0, 1)
-        ]
-        parts["race"] = jnp.concatenate([1 - self._target[:, None] / count, *seen], axis=1).astype(jnp.float32)
+        seen = [self._sees_next(ahead)[:, None] for ahead in (0, 1)]
+        left = 1 - self._target[:, None] / len(self.track.order)
+        parts["race"] = jnp.concatenate([left, *seen], axis=1).astype(jnp.float32)
         return parts
 
     truth_size = 6
