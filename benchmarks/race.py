@@ -112,24 +112,23 @@ def table() -> None:
 
 def levels(file: Path) -> None:
     """Histograms of what the levels draw, over 2,048 races each."""
-    figure = Figure(figsize=(9, 6.4), layout="constrained")
-    columns = {"mass / g": 0, "start x / m": 1, "gate 1 x / m": 2, "gate 1 yaw / rad": 3}
-    axes = figure.subplots(4, len(columns), sharey="row")
+    figure = Figure(figsize=(9, 6), layout="constrained")
+    ranges = {
+        "mass / g": (37, 50),
+        "start x / m": (-2.2, 2.2),
+        "gate 1 x / m": (-2.3, 2.3),
+        "gate 1 yaw / rad": (-4, 4),
+    }
+    axes = figure.subplots(4, len(ranges), sharex="col")
     for level in range(4):
         drones = make_drones("DroneGates-v0", 2_048, "cpu", {"level": level}, None, {})
         (data, arrays, _), *_ = drones.reset(drones.init(jax.random.key(0)), jnp.ones(2_048, bool), jnp.array(False))
-        drawn = (
-            1e3 * data.params.mass.ravel(),
-            data.states.pos[:, 0, 0],
-            arrays["_gates"][:, 0, 0],
-            arrays["_gates"][:, 0, 5],
-        )
-        for (name, column), values in zip(columns.items(), drawn, strict=True):
-            values = np.asarray(values)
-            axes[level, column].hist(values, bins=40 if np.ptp(values) > 1e-6 else 1, color="#1f5fa8", alpha=0.7)
-            axes[level, column].set_xlabel(name if level == 3 else "")
-            axes[level, column].spines[["top", "right", "left"]].set_visible(False)
-            axes[level, column].set_yticks([])
+        gate = arrays["_gates"][:, 0]
+        drawn = (1e3 * data.params.mass.ravel(), data.states.pos[:, 0, 0], gate[:, 0], gate[:, 5])
+        for axis, (name, ends), values in zip(axes[level], ranges.items(), drawn, strict=True):
+            axis.hist(np.asarray(values), bins=80, range=ends, color="#1f5fa8")
+            axis.set(xlim=ends, yticks=[], xlabel=name if level == 3 else "")
+            axis.spines[["top", "right", "left"]].set_visible(False)
         axes[level, 0].set_ylabel(f"level {level}")
     figure.savefig(file, dpi=110)
 
