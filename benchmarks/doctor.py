@@ -265,12 +265,15 @@ def cost() -> None:
         print(f"{algorithm} {env}: {spent[0] / run.seconds:.2%} of {run.seconds:.0f} s", flush=True)
 
 
-def table() -> None:
-    """The shares of faults that are named, by fault, and the false alarms."""
+HALVES = {name: "unseen" if name in UNSEEN else ("even", "odd")[i % 2] for i, name in enumerate(FAULTS)}
+
+
+def table(half: str | None) -> None:
+    """The shares of faults that are named, by fault, the false alarms, and what remedies gave."""
     judged = {(row["fault"], row["env"], row["seed"]): row["found"] for row in rows("doctor") if "fault" in row}
     by_fault = defaultdict(list)
     for (fault, _, seed), found in judged.items():
-        if seed < 100:
+        if seed < 100 and half in (None, HALVES[fault]):
             right = FAULTS[fault][3]
             by_fault[fault].append((found[:1] and found[0] in right, any(name in right for name in found[:3])))
     for fault, each in by_fault.items():
@@ -287,6 +290,10 @@ def table() -> None:
     }
     alarms = {key: found for key, found in fine.items() if found}
     print(f"false alarms: {len(alarms)} of {len(fine)}", alarms)
+    for name, env, seed, returns in {
+        (row["remedy"], row["env"], row["seed"], tuple(row["returns"])) for row in rows("doctor") if "remedy" in row
+    }:
+        print(f"| {name} | {env} | {seed} | {' | '.join(f'{value:,.0f}' for value in returns)} |")
 
 
 if __name__ == "__main__":
@@ -299,8 +306,7 @@ if __name__ == "__main__":
     given = parser.parse_args()
     with nullcontext(given.runs) if given.runs else tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
-        halves = {name: "unseen" if name in UNSEEN else ("even", "odd")[i % 2] for i, name in enumerate(FAULTS)}
-        names = [name for name, half in halves.items() if given.half in (None, half)]
+        names = [name for name, half in HALVES.items() if given.half in (None, half)]
         for name in names if given.what == "faults" else []:
             for env in FAULTS[name][1] if not given.only or name in given.only else ():
                 for seed in given.seeds:
@@ -326,4 +332,4 @@ if __name__ == "__main__":
         if given.what == "cost":
             cost()
         if given.what == "table":
-            table()
+            table(given.half)

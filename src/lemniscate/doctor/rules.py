@@ -348,7 +348,9 @@ def entropy_unreachable(e: Evidence) -> str | None:
 def missing_bootstrap(e: Evidence) -> str | None:
     """The value ends where the time limit does, as if nothing followed: the bootstrap of truncated steps is missing."""
     late = e.last_half("value/missing")
-    if len(late) < 2 or not (0.2 < np.median(late) < 1.1 and np.percentile(late, 25) > 0.1):  # above: no value at all
+    if len(late) < 2 or not (0.2 < np.median(late) < 1.3 and np.percentile(late, 10) > 0.1):  # above: no value at all
+        return None
+    if late[len(late) // 2 :].mean() < 0.75 * late[: len(late) // 2].mean():  # it is on its way
         return None
     if not e.late("episode/terminated") < 0.5 or ("tau" in e.config and e.log[-1]["step"] < 20_000):  # Q comes slowly
         return None

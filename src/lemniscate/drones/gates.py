@@ -1,4 +1,4 @@
-# pyright: reportAttributeAccessIssue=false, reportIncompatibleMethodOverride=false
+# pyright: reportAttributeAccessIssue=false, reportIncompatibleMethodOverride=false, reportArgumentType=false
 """A race through gates: the course of the laboratory that crazyflow comes from, as one more of crazyflow's tasks.
 
 Geometry, rules and levels are those of its racing course (learnsyslab/lsy_drone_racing). What a policy observes and is
@@ -380,10 +380,8 @@ class DroneGates(DroneEnv):
         """Starts [N, 4] (x, y, z, yaw), gates and obstacles of the level: the same for all, or at level 3 drawn."""
         track, n = self.track, self.num_envs
         if self.level < 3:
-            return tuple(
-                jnp.tile(part, (n, *[1] * part.ndim))
-                for part in (np.append(track.start, 0.0), track.gates, track.obstacles)
-            )
+            first = jnp.tile(np.append(track.start, 0.0), (n, 1))
+            return first, jnp.tile(track.gates, (n, 1, 1)), jnp.tile(track.obstacles, (n, 1, 1))
         low, high = track.room[0, :2] + APART["border"], track.room[1, :2] - APART["border"]
 
         def places(key: jax.Array) -> jax.Array:

@@ -44,7 +44,7 @@ class Flight:
     reference: np.ndarray | None
     attitude: np.ndarray
     time_step: float
-    boxes: Sequence[np.ndarray] = ()
+    boxes: Sequence[np.ndarray] | np.ndarray = ()
 
     def one(self, number: int) -> "Flight":
         """One of the flights, from its start to its end."""
@@ -90,7 +90,7 @@ def record(
     scene = env.scene
     assert scene is not None
     rows, first = [], torch.ones(env.num_envs, dtype=torch.bool, device=env.device)
-    boxes: Sequence[np.ndarray] = ()
+    boxes: Sequence[np.ndarray] | np.ndarray = ()
     for _, _, step, counts in play_episodes(policy, env, flights, seed, deterministic):
         if not rows and scene.boxes:
             boxes = scene.boxes()
@@ -170,7 +170,8 @@ def draw_from_above(flight: Flight, file: Path) -> Path:
     first = flight.one(0)
     path = first.position[:, 0]
     speed = np.linalg.norm(np.gradient(path, flight.time_step, axis=0), axis=1)
-    points = LineCollection(np.stack([path[:-1, :2], path[1:, :2]], axis=1), array=speed[1:], linewidths=2.2, zorder=3)
+    pieces = list(np.stack([path[:-1, :2], path[1:, :2]], axis=1))
+    points = LineCollection(pieces, array=speed[1:], linewidths=2.2, zorder=3)
     axes.add_collection(points)
     axes.plot(*path[0, :2], "o", color=BLUE, markersize=5, zorder=4)
     figure.colorbar(points, ax=axes, label="speed / (m/s)", shrink=0.85)
@@ -197,6 +198,7 @@ def _around(points: np.ndarray) -> np.ndarray:
 
 def draw_path(flight: Flight, file: Path) -> Path:
     """The first flight over the reference, seen from the side (x, z); the others' first second faintly."""
+    assert flight.reference is not None
     figure = Figure(figsize=(7, 4.4), layout="constrained")
     axes = figure.subplots()
     reference, path = flight.reference[:, 0], flight.position[:, 0]
