@@ -41,7 +41,7 @@ AT_START = 0.02
 """the horizontal distance from its start within which a drone may touch the ground, m"""
 ACTION_NOISE, FORCE = 0.001, 0.1
 """standard deviation of the noise of actions (rad, N); the most of the random force, an axis, N"""
-CAREFUL = 2.0
+CAREFUL = 1.5
 """m/s that cost nothing while the true place of the next gate is not known"""
 SPREAD = {
     "mass": 0.005,
@@ -234,7 +234,7 @@ class DroneGates(DroneEnv):
 
     The reward of a step is 3 for each metre of the way to the next gate's centre (`way_left`), 3 for a gate, −6 for a
     crash; less 0.05, 0.0005 |ω|² (rad²/s²), 0.01 for the squared change of the action and, while at levels 2 and 3 the
-    true place of the next gate is not known, 0.1 for the square of what is above `CAREFUL` of the speed.
+    true place of the next gate is not known, 0.2 for the square of what is above `CAREFUL` of the speed.
 
     Args:
         level: 0, 1, 2 or 3.
@@ -486,7 +486,7 @@ class DroneGates(DroneEnv):
         hurry = jnp.where(self._sees_next(0) | (self.level < 2), 0.0, hurry)
         change = jnp.square(action - self._last_action).sum(-1)
         self._gain = 3 * progress + 3.0 * passed - 6.0 * self._crashed - 0.05 - 0.0005 * rates - 0.01 * change
-        self._gain -= 0.1 * jnp.square(hurry)
+        self._gain -= 0.2 * jnp.square(hurry)
         self._last_action = action
 
     def _look(self) -> None:

@@ -213,7 +213,6 @@ class EpisodeTable:
     def measures(self, summaries: Sequence[Summary]) -> dict[str, float]:
         """The mean of every measure over all rows; then the summaries of those that there are."""
         tables = {name: torch.cat(rows, dim=1) for name, rows in self._measured.items()}
-        tables = {name: table for name, table in tables.items() if table.shape[1]}
         means = {name: table[0].mean().item() for name, table in tables.items()}
         return means | {s.name: _summarize(s, *tables[s.measure]) for s in summaries if s.measure in tables}
 
