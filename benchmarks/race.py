@@ -37,7 +37,7 @@ def train(level: int, seed: int) -> None:
     with tempfile.TemporaryDirectory() as scratch:
         run = lem.train("ppo", "DroneGates-v0", preset=PRESETS[level], seed=seed, run=f"{scratch}/run", progress=False)
         found = lem.evaluate(run.policy, episodes=100, seed=1_000 + seed)
-    row = {"level": level, "seed": seed, "seconds": run.seconds, "steps": run.step}
+    row = {"level": level, "seed": seed, "seconds": run.seconds, "steps": run.policy.step}
     append("race", row | {name: found.measures.get(name) for name in NAMES} | provenance())
     print(row, found.measures, flush=True)
 

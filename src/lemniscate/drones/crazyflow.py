@@ -166,7 +166,7 @@ class CrazyflowBackend(JaxBackend):
             self.summaries = tuple(
                 Summary(name, name, "last") for name in ("gates_passed", "success", "crashed", "lap_seconds")
             )
-            self._room_height = float(drones.env.track.room[1, 2])
+            self._stand = drones.env.track.stand
             self.scene = Scene(
                 drones.env.sim.mj_model, 1 / drones.env.freq, slice(0, 3), slice(3, 7), boxes=self._boxes
             )
@@ -188,7 +188,7 @@ class CrazyflowBackend(JaxBackend):
 
         each = self._state if isinstance(self._state, list) else [self._state]
         gates, posts = (np.asarray(by_turns(*(arrays[name] for _, arrays, _ in each))) for name in ("_gates", "_posts"))
-        return standing(gates, posts, self._room_height)
+        return standing(gates, posts, self._stand)
 
     @classmethod
     def probe(cls, env: str, starts: int, trained: Mapping[str, Any], given: Mapping[str, Any]) -> DroneProbe:

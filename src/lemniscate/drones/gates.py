@@ -84,6 +84,11 @@ class Track:
     start: np.ndarray
     room: np.ndarray
 
+    @property
+    def stand(self) -> float:
+        """The height of the stands, by which the highest gate reaches the floor wherever a level moves it, m."""
+        return float(self.gates[:, 2].max()) - FRAME / 2 + SPREAD["gate"][2]
+
 
 def read_track(file: str | Path | None = None) -> Track:
     """A track from a file as `gates.toml`, which is taken by default. Raises `UserError` for one that is none."""
@@ -523,7 +528,7 @@ class DroneGates(DroneEnv):
         frames, half = rotation(self._gates[..., 3:]), np.array((POST / 2, POST / 2, POST_HEIGHT / 2), np.float32)
         local = into(frames, centre[:, None] - self._gates[..., :3])
         own = (frames[..., None] * turned[:, None, :, None]).sum(-3)
-        gates = touches(local[:, :, None], own[:, :, None], *_boxes(float(self.track.room[1, 2])))
+        gates = touches(local[:, :, None], own[:, :, None], *_boxes(self.track.stand))
         posts = touches(centre[:, None] - self._posts + half * (0, 0, 1), turned[:, None], -half, half)
         return gates.any((1, 2)) | posts.any(1)
 
