@@ -21,8 +21,6 @@ _import()
 
 from lemniscate.drones import gates
 
-HOVER = torch.tensor([0.0, 0.0, 0.0, -1.0])
-
 
 @pytest.fixture(scope="module")
 def racing():
@@ -369,3 +367,67 @@ def test_what_is_wrong_with_a_track_is_said(change, said, tmp_path):
     (tmp_path / "track.toml").write_text(TRACK.replace(*change))
     with pytest.raises(UserError, match=said):
         gates.read_track(tmp_path / "track.toml")
+
+
+def test_what_begins_on_its_way_begins_behind_a_gate(racing):
+    import jax.numpy as jnp
+
+    drones = racing(2)
+    every, shares = jnp.ones(64, bool), []
+    (data, arrays, _), _, ahead = drones.reset(drones.init(jax.random.key(3)), every, jnp.array(True))
+    ahead, target = np.asarray(ahead), np.asarray(arrays["_target"])
+    assert 0.5 < ahead.mean() < 0.95
+    assert (target[~ahead] == 0).all()
+    assert set(target[ahead]) == {1, 2, 3}
+    passed = np.asarray(arrays["_gates"])[np.arange(64), np.maximum(target - 1, 0)]
+    direction = np.stack([np.cos(passed[:, 5]), np.sin(passed[:, 5])], axis=1)
+    behind = ((np.asarray(data.states.pos)[:, 0, :2] - passed[:, :2]) * direction).sum(1)
+    assert (behind[ahead] > 0.05).all()
+    for begun_, here in ((arrays["_gates"], arrays["_expected_gates"]), (arrays["_posts"], arrays["_expected_posts"])):
+        shares.append(np.abs(np.asarray(begun_) - np.asarray(here))[ahead].mean())
+    assert 0.03 < shares[0] < 0.07  # two thirds of what the level says
+    assert np.asarray(arrays["_before"]) == pytest.approx(np.asarray(data.states.pos)[:, 0])
+
+
+def test_the_critic_is_told_where_the_gates_are():
+    env = registry.make("DroneGates-v0", 8, kwargs={"level": 2, "privileged": True})
+    obs = env.restart(0)
+    assert env.spec.privileged == 14
+    away = obs[:, -6:]
+    assert (away.abs() > 1e-3).any(1).all()
+    assert (away.abs() <= torch.tensor([0.15, 0.15, 0.1] * 2) + 1e-5).all()
+    assert not registry.make("DroneGates-v0", 8, kwargs={"privileged": True}).restart(0)[:, -6:].any()
+
+
+def test_the_air_of_a_vehicle_is_that_of_a_race():
+    """Late actions, wind, wider starts and several dynamics at once; a wider start is about the track's."""
+    kwargs = {
+        "level": 1,
+        "dynamics": ["first_principles", "so_rpy"],
+        "action_delay": 0.02,
+        "wind": 0.05,
+        "start_spread": 2.0,
+    }
+    env = registry.make("DroneGates-v0", 64, kwargs=kwargs)
+    obs = env.restart(0)
+    aside = (obs[:, :2] - torch.tensor([-1.5, 0.75])).abs()
+    assert 0.15 < aside.max() < 0.201
+    step = env.step(torch.zeros(64, 4))
+    assert torch.isfinite(step.next_obs).all()
+    assert not step.terminated.any()
+
+
+def test_a_race_is_drawn_and_filmed_with_what_stands_there(tmp_path):
+    fields = {"num_envs": 4, "num_steps": 64, "total_steps": 512, "minibatch_size": 64, "epochs": 1, "seed": 1}
+    run = lem.train("ppo", "DroneGates-v0", env_kwargs={"level": 2}, run=tmp_path / "run", progress=False, **fields)
+    files = lem.plot(run)
+    assert "flight.png" in {file.name for file in files}
+    assert "error.png" not in {file.name for file in files}
+    env = registry.make("DroneGates-v0", 2, kwargs={"level": 2})
+    env.restart(0)
+    boxes = env.scene.boxes()
+    assert boxes.shape == (2, 4 * 5 + 4, 15)
+    assert not np.allclose(boxes[0], boxes[1])
+    film = tmp_path / "race.gif"
+    lem.watch(run.policy, episodes=1, video=film)
+    assert film.stat().st_size > 10_000

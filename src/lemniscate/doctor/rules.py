@@ -136,7 +136,8 @@ def action_without_effect(e: Evidence) -> str | None:
     first = slice(max(3, len(effects) // 4))
     if not (effects[first].max() < 0.02 or (len(shares) and shares[first].max() < 0.001)):
         return None
-    return f"Actions explain {max(0.0, min([effects.max(), *shares[-1:]])):.2%} of how observations change."
+    explained = shares if len(shares) else effects
+    return f"Actions explain {max(0.0, explained[first].max()):.2%} of how observations change."
 
 
 @rule
@@ -160,7 +161,7 @@ def reward_zero(e: Evidence) -> str | None:
 def reward_rare(e: Evidence) -> str | None:
     """Nearly every step is without a reward: which of the actions before it has brought it, is hard to learn."""
     share = e.early("reward/zero")
-    if not 0.9 < share < 1 and not (share == 1 and e.greatest("reward/largest") > 0):
+    if not share > 0.9 or not e.greatest("reward/largest") > 0:
         return None
     return f"{share:.1%} of the rewards at the beginning were 0."
 

@@ -138,7 +138,7 @@ class CrazyflowBackend(JaxBackend):
 
     @classmethod
     def ids(cls) -> Collection[str]:
-        """Crazyflow's four tasks."""
+        """Crazyflow's four tasks and the race."""
         return IDS
 
     def __init__(
@@ -162,33 +162,27 @@ class CrazyflowBackend(JaxBackend):
         drones, flown = vectors[0], [one.dynamics for one in vectors]
         self.spec = spec_of(env, drones)
         self.interface = interface_of(drones.env, flown, drones.air.delay, drones.air.history, drones.air.hover)
-        if env == "DroneGates-v0":
-            self.summaries = tuple(
-                Summary(name, name, "last") for name in ("gates_passed", "success", "crashed", "lap_seconds")
-            )
-            self._stand = drones.env.track.stand
-            self.scene = Scene(
-                drones.env.sim.mj_model, 1 / drones.env.freq, slice(0, 3), slice(3, 7), boxes=self._boxes
-            )
+        moves = drones.env.sim.mj_model, 1 / drones.env.freq, slice(0, 3), slice(3, 7)
+        if hasattr(drones.env, "boxes"):
+            self.summaries = tuple(Summary(name, name, "last") for name in drones.env.measured)
+            self.scene = Scene(*moves, boxes=lambda: self._boxes(drones.env))
         if drones.error:
             self.summaries = (
                 Summary("rmse_mm", "tracking_error", "rms", scale=1000),
                 Summary("rmse_after_1s_mm", "tracking_error", "rms", scale=1000, skip=drones.env.freq),
             )
-            self.scene = Scene(drones.env.sim.mj_model, 1 / drones.env.freq, slice(0, 3), slice(3, 7), drones.error)
+            self.scene = Scene(*moves, drones.error)
             first = drones.error.start
             reference, preview = slice(first, first + 3 * drones.env.n_samples), drones.env.samples_dt
             action = self.spec.bounded_box()
             self.baseline = PD(GAINS[drones.dynamics], drones.mass, action, reference, slice(7, 10), preview)
 
-    def _boxes(self) -> np.ndarray:
-        """What stands on the track of each drone's present episode."""
+    def _boxes(self, env: Any) -> np.ndarray:
+        """The boxes of a `Scene`, of each drone's present episode."""
         from lemniscate.drones.drones import by_turns
-        from lemniscate.drones.gates import standing
 
         each = self._state if isinstance(self._state, list) else [self._state]
-        gates, posts = (np.asarray(by_turns(*(arrays[name] for _, arrays, _ in each))) for name in ("_gates", "_posts"))
-        return standing(gates, posts, self._stand)
+        return np.asarray(by_turns(*(env.boxes(arrays) for _, arrays, _ in each)))
 
     @classmethod
     def probe(cls, env: str, starts: int, trained: Mapping[str, Any], given: Mapping[str, Any]) -> DroneProbe:

@@ -127,8 +127,8 @@ class Drones:
             self._apply_conditions(air, mask)
             data = env.sim.data
             pos = data.states.pos
-            if hasattr(env, "begin_ahead"):
-                env.begin_ahead(ahead)
+            if hasattr(env, "begin"):
+                env.begin(mask, ahead)
                 data, pos = env.sim.data, env.sim.data.states.pos
             if hasattr(env, "trajectory"):
                 pos = pos + (env.trajectory[steps - 1] - env.trajectory[-1])[:, None]
@@ -167,7 +167,8 @@ class Drones:
             params[name] = value * jnp.where(mask, factor, 1.0).reshape(-1, *[1] * (value.ndim - 1))
         if "start_spread" in drawn:
             spread = jnp.where(begins, drawn["start_spread"][:, None, None], 1.0)
-            states = states.replace(pos=START + spread * (states.pos - START), vel=spread * states.vel)
+            around = self.env.starts_around[:, None] if hasattr(self.env, "starts_around") else START
+            states = states.replace(pos=around + spread * (states.pos - around), vel=spread * states.vel)
         if "rotors" in drawn:
             turning = drawn["rotors"][:, None, None] * self._turning
             states = states.replace(rotor_vel=jnp.where(begins, turning, states.rotor_vel))

@@ -51,7 +51,7 @@ SPREAD = {
     "gate": (0.15, 0.15, 0.1, 0.05, 0.1, 0.2),
     "obstacle": (0.15, 0.15, 0.05),
 }
-"""the most by which a level changes kg, kg m², m, rad; of gates x, y, z (m), roll, pitch, yaw (rad)"""
+"""the most by which a level changes what it draws: kg, kg m², m, rad; of gates x, y, z (m), roll, pitch, yaw (rad)"""
 BODY_RATES = (10.0, 10.0, 6.0)
 """the most that can be commanded with `control="body_rate"`, rad/s"""
 SPEED_AHEAD = 1.5
@@ -137,7 +137,7 @@ def attitude(quat: jax.Array) -> jax.Array:
 
 
 def standing(gates: np.ndarray, posts: np.ndarray, stand: float) -> np.ndarray:
-    """What stands on tracks with gates [N, G, 6] and obstacles [N, M, 3], as the boxes [N, B, 15] of a `Scene`."""
+    """The boxes [N, B, 15] of a `Scene`, of tracks with gates [N, G, 6] and obstacles [N, M, 3]."""
     low, high = _boxes(stand)
     frames = np.asarray(rotation(jnp.asarray(gates[..., 3:])))[:, :, None]
     centre = gates[:, :, None, :3] + (frames * ((low + high) / 2)[:, None, :]).sum(-1)
@@ -320,9 +320,9 @@ class DroneGates(DroneEnv):
         self.sim.build_default_data()
 
     def _empty(self, n: int) -> None:
-        """What there is beside the simulator's state; every array is a part of the state of the race."""
+        """Set the arrays beside the simulator's state; each is a part of the state of the race."""
         track = self.track
-        self._keys = jax.random.key(0)
+        self._key = jax.random.key(0)
         self._gates = jnp.tile(track.gates, (n, 1, 1))
         """the true gates [N, G, 6], and below what is known of them before they are seen"""
         self._expected_gates = self._gates
@@ -330,7 +330,8 @@ class DroneGates(DroneEnv):
         self._expected_posts = self._posts
         self._gates_seen = jnp.zeros((n, len(track.gates)), bool)
         self._posts_seen = jnp.zeros((n, len(track.obstacles)), bool)
-        self._start = jnp.tile(track.start, (n, 1))
+        self.starts_around = self._start = jnp.tile(track.start, (n, 1))
+        """the start of the track, and where the drone has begun"""
         self._target = jnp.zeros(n, jnp.int32)
         """the number of gates that are passed"""
         self._before = jnp.zeros((n, 3))
@@ -344,7 +345,7 @@ class DroneGates(DroneEnv):
     def _reset(self, mask: jax.Array | None = None, options: Mapping[str, Any] | None = None) -> None:
         mask = jnp.ones(self.num_envs, bool) if mask is None else mask
         self.sim.reset(mask=mask)
-        self._keys, own, layout = jax.random.split(self._keys, 3)
+        self._key, own, layout = jax.random.split(self._key, 3)
         start, *expected = self._layout(layout)
         n, counts = self.num_envs, (3, 3, 1, 3, 6 * len(self.track.gates), 3 * len(self.track.obstacles))
         drawn = jax.random.uniform(own, (n, sum(counts)), minval=-1.0, maxval=1.0)
@@ -372,14 +373,13 @@ class DroneGates(DroneEnv):
         self.sim.data = data.replace(states=states, params=old.replace(**chosen))
         fresh = {
             "_gates": gates, "_posts": posts, "_expected_gates": expected[0], "_expected_posts": expected[1],
-            "_start": pos, "_before": pos, "_target": jnp.zeros(n, jnp.int32), "_crashed": jnp.zeros(n, bool),
+            "starts_around": start[:, :3], "_target": jnp.zeros(n, jnp.int32), "_crashed": jnp.zeros(n, bool),
             "_gates_seen": jnp.zeros_like(self._gates_seen), "_posts_seen": jnp.zeros_like(self._posts_seen),
             "_last_action": jnp.zeros((n, 4)), "_gain": jnp.zeros(n),
         }  # fmt: skip
         for name, value in fresh.items():
             old = getattr(self, name)
             setattr(self, name, jnp.where(mask.reshape(-1, *[1] * (old.ndim - 1)), value, old))
-        self._look()
 
     def _layout(self, key: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Starts [N, 4] (x, y, z, yaw), gates and obstacles of the level: the same for all, or at level 3 drawn."""
@@ -439,36 +439,34 @@ class DroneGates(DroneEnv):
         tops = jnp.tile(track.obstacles, (n, 1, 1))
         return start, poses, tops.at[..., :2].set(jnp.stack(posts, axis=1)) if posts else tops
 
-    def begin_ahead(self, mask: jax.Array) -> None:
-        """Let the masked drones begin on their way: behind a gate that they have passed, at some speed.
+    def begin(self, mask: jax.Array, ahead: jax.Array) -> None:
+        """Let the masked drones begin where they are; those `ahead` on their way, behind a gate that they have passed.
 
-        What stands there differs from the track by a random share of what the level says, so that there is something
-        to learn before the hardest races can be won.
+        Ahead, what stands there differs from the track by a random share of what the level says, so that there is
+        something to learn before the hardest races can be won.
         """
-        self._keys, which, where, fast, easier = jax.random.split(self._keys, 5)
-        n = self.num_envs
-        share = jnp.where(mask, jnp.sqrt(jax.random.uniform(easier, (n,))), 1.0)[:, None, None]
-        self._gates = self._expected_gates + share * (self._gates - self._expected_gates)
-        self._posts = self._expected_posts + share * (self._posts - self._expected_posts)
-        count = len(self.track.order)
-        target = jax.random.randint(which, (n,), 1, max(2, count)) if count > 1 else jnp.zeros(n, jnp.int32)
+        self._key, which, where, fast, easier = jax.random.split(self._key, 5)
+        n, count, data = self.num_envs, len(self.track.order), self.sim.data
+        share = jnp.sqrt(jax.random.uniform(easier, (n, 1, 1)))
+        for true, expected in (("_gates", self._expected_gates), ("_posts", self._expected_posts)):
+            given = getattr(self, true)
+            setattr(self, true, jnp.where(ahead[:, None, None], expected + share * (given - expected), given))
+        target = jax.random.randint(which, (n,), 1, count) if count > 1 else jnp.zeros(n, jnp.int32)
         place, turned = self._frame(jnp.maximum(target - 1, 0), self._gates)
-        offset = jnp.array((0.25, 0.0, 0.0)) + _uniform(where, (n, 3), (0.1, 0.12, 0.12))
-        pos = place + out_of(turned, offset)
+        pos = place + out_of(turned, jnp.array((0.25, 0.0, 0.0)) + _uniform(where, (n, 3), (0.1, 0.12, 0.12)))
         vel = SPEED_AHEAD * turned[:, :, 0] + 0.5 * jax.random.normal(fast, (n, 3))
-        states, begins = self.sim.data.states, mask[:, None, None]
-        states = states.replace(
-            pos=jnp.where(begins, pos[:, None], states.pos), vel=jnp.where(begins, vel[:, None], states.vel)
-        )
-        self.sim.data = self.sim.data.replace(states=states)
-        self._target = jnp.where(mask, target, self._target)
+        pos = jnp.where(ahead[:, None], pos, data.states.pos[:, 0])
+        vel = jnp.where(ahead[:, None], vel, data.states.vel[:, 0])
+        self.sim.data = data.replace(states=data.states.replace(pos=pos[:, None], vel=vel[:, None]))
+        self._target = jnp.where(ahead, target, self._target)
+        self._start = jnp.where(mask[:, None], pos, self._start)
         self._before = jnp.where(mask[:, None], pos, self._before)
         self._look()
 
     # --- a step -----------------------------------------------------------------------------------------------------
 
     def _apply_action(self, action: jax.Array) -> None:
-        noise = jax.random.normal(jax.random.fold_in(self._keys, 1), action.shape)  # one for all of a control step
+        noise = jax.random.normal(jax.random.fold_in(self._key, 1), action.shape)  # one for all of a control step
         noisy = jnp.clip(action, self.single_action_space.low, self.single_action_space.high) + ACTION_NOISE * noise
         send = self.sim.attitude_control if self.sim.control == Control.attitude else self.sim.body_rate_control
         send(noisy[:, None])
@@ -476,7 +474,7 @@ class DroneGates(DroneEnv):
     def advance(self, action: jax.Array) -> None:
         """Take note of what a step with an action [N, 4] in [-1, 1] has brought: contacts, gates, what is seen."""
         states = self.sim.data.states
-        self._keys, _ = jax.random.split(self._keys)
+        self._key = jax.random.split(self._key, 1)[0]
         pos = states.pos[:, 0]
         self._crashed = self._touches(pos, attitude(states.quat[:, 0])) | self._leaves(pos)
         place, turned = self._frame(self._target, self._gates)
@@ -557,7 +555,7 @@ class DroneGates(DroneEnv):
     truth_size = 6
 
     def truth(self) -> jax.Array:
-        """What is privileged: the way from where the next two gates are believed to be to where they are, m, [N, 6]."""
+        """The privileged numbers [N, 6]: the ways from the believed to the true places of the next two gates, m."""
         true = [self._frame(self._target + i, self._gates)[0] for i in (0, 1)]
         known = jnp.where(self._gates_seen[..., None], self._gates, self._expected_gates)
         return jnp.concatenate([at - self._frame(self._target + i, known)[0] for i, at in enumerate(true)], axis=1)
@@ -573,6 +571,12 @@ class DroneGates(DroneEnv):
     @property
     def _finished(self) -> jax.Array:
         return self._target >= len(self.track.order)
+
+    def boxes(self, arrays: Mapping[str, jax.Array]) -> np.ndarray:
+        """The boxes [N, B, 15] of a `Scene`, of races in the state of these arrays."""
+        return standing(np.asarray(arrays["_gates"]), np.asarray(arrays["_posts"]), self.track.stand)
+
+    measured = ("gates_passed", "success", "crashed", "lap_seconds")
 
     def measures(self) -> dict[str, jax.Array]:
         """`gates_passed`, `success`, `crashed`, and `lap_seconds`, not a number until the last gate is passed."""

@@ -114,6 +114,9 @@ ACTION = (
 )
 
 
+RATES = (*_vector("body_rate", "rad/s", BODY), ACTION[-1])
+"""the action where body rates are controlled"""
+
 PAST_ACTION = tuple(Quantity(q.name, "1", "-1 and 1 are the bounds of the action") for q in ACTION)
 
 
@@ -140,7 +143,7 @@ def interface_of(
     drone = str(env.sim.drone)
     return Interface(
         parts=parts,
-        action=ACTION if str(env.sim.control) == "attitude" else (),
+        action={"attitude": ACTION, "body_rate": RATES}.get(str(env.sim.control), ()),
         period=1 / env.freq,
         delay=delay,
         history=history,
