@@ -290,10 +290,13 @@ def test_a_flight_through_all_gates_is_counted():
                 env.advance(jnp.zeros((1, 4)))
                 rewards.append(float(env.reward()[0]))
                 assert bool(env.terminated()[0]) == (number == 3 and side > 0)
+                passed.append(int(env._target[0]))
                 measures = {name: float(value[0]) for name, value in env.measures().items()}
+                assert math.isnan(measures["success"]) == (len(passed) < 8)
                 state = (*drones._take(), air)
-            passed.append(measures["gates_passed"])
     assert passed == [0, 1, 1, 2, 2, 3, 3, 4]
+    assert measures["gates_passed"] == 4
+    assert measures["lap_seconds"] == 0  # the simulator was not asked to step
     assert measures["success"] == 1
     assert measures["crashed"] == 0
     assert all(reward > 3 for reward in rewards[1::2])
@@ -377,6 +380,7 @@ def test_what_begins_on_its_way_begins_behind_a_gate(racing):
     (data, arrays, _), _, ahead = drones.reset(drones.init(jax.random.key(3)), every, jnp.array(True))
     ahead, target = np.asarray(ahead), np.asarray(arrays["_target"])
     assert 0.5 < ahead.mean() < 0.95
+    assert (np.asarray(arrays["_whole"]) == ~ahead).all()  # of the others nothing is measured
     assert (target[~ahead] == 0).all()
     assert set(target[ahead]) == {1, 2, 3}
     passed = np.asarray(arrays["_gates"])[np.arange(64), np.maximum(target - 1, 0)]
@@ -431,3 +435,29 @@ def test_a_race_is_drawn_and_filmed_with_what_stands_there(tmp_path):
     film = tmp_path / "race.gif"
     lem.watch(run.policy, episodes=1, video=film)
     assert film.stat().st_size > 10_000
+
+
+NEAR = """
+order = [1]
+start = [-0.15, 0.0, 1.05]
+room = { low = [-2, -2, 0], high = [2, 2, 2] }
+[[gates]]
+position = [0.0, 0.0, 1.0]
+"""
+
+
+def test_a_preflight_knows_a_finish_from_a_crash(tmp_path):
+    from lemniscate.drones.probe import DroneProbe
+
+    def flown(near):
+        (tmp_path / "track.toml").write_text(NEAR if near else NEAR.replace("[0.0, 0.0, 1.0]", "[0.0, 1.5, 1.0]"))
+        kwargs = {"track": str(tmp_path / "track.toml"), "max_episode_time": 2.0}
+        probe = DroneProbe("DroneGates-v0", 4, kwargs, ("first_principles",))
+        ahead = torch.tensor([0.0, 0.35, 0.0, 0.3]).expand(1024, 4)  # pitched by 0.55 rad
+        nominal, _ = probe.fly(lambda: lambda obs: ahead[: len(obs)], 0)
+        return nominal
+
+    finished, crashed = flown(near=True), flown(near=False)
+    assert not finished.terminated.any()
+    assert (finished.returns > crashed.returns + 3).all()  # what a gate is worth
+    assert crashed.terminated.all()  # it flies on, out of the room

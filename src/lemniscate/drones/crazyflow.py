@@ -164,7 +164,6 @@ class CrazyflowBackend(JaxBackend):
         self.interface = interface_of(drones.env, flown, drones.air.delay, drones.air.history, drones.air.hover)
         moves = drones.env.sim.mj_model, 1 / drones.env.freq, slice(0, 3), slice(3, 7)
         if hasattr(drones.env, "boxes"):
-            self.summaries = tuple(Summary(name, name, "last") for name in drones.env.measured)
             self.scene = Scene(*moves, boxes=lambda: self._boxes(drones.env))
         if drones.error:
             self.summaries = (

@@ -334,6 +334,8 @@ class DroneGates(DroneEnv):
         """the start of the track, and where the drone has begun"""
         self._target = jnp.zeros(n, jnp.int32)
         """the number of gates that are passed"""
+        self._whole = jnp.ones(n, bool)
+        """whether the race began at the start"""
         self._before = jnp.zeros((n, 3))
         self._crashed = jnp.zeros(n, bool)
         self._gain = jnp.zeros(n)
@@ -459,6 +461,7 @@ class DroneGates(DroneEnv):
         vel = jnp.where(ahead[:, None], vel, data.states.vel[:, 0])
         self.sim.data = data.replace(states=data.states.replace(pos=pos[:, None], vel=vel[:, None]))
         self._target = jnp.where(ahead, target, self._target)
+        self._whole = jnp.where(mask, ~ahead, self._whole)
         self._start = jnp.where(mask[:, None], pos, self._start)
         self._before = jnp.where(mask[:, None], pos, self._before)
         self._look()
@@ -576,14 +579,15 @@ class DroneGates(DroneEnv):
         """The boxes [N, B, 15] of a `Scene`, of races in the state of these arrays."""
         return standing(np.asarray(arrays["_gates"]), np.asarray(arrays["_posts"]), self.track.stand)
 
-    measured = ("gates_passed", "success", "crashed", "lap_seconds")
-
     def measures(self) -> dict[str, jax.Array]:
-        """`gates_passed`, `success`, `crashed`, and `lap_seconds`, not a number until the last gate is passed."""
-        finished = self._finished
-        seconds = jnp.where(finished, self.sim.time[:, 0], jnp.nan)
-        flags = {"success": finished, "crashed": self._crashed, "gates_passed": self._target}
-        return {**{name: value.astype(jnp.float32) for name, value in flags.items()}, "lap_seconds": seconds}
+        """`gates_passed`, `success`, `crashed` and `lap_seconds` of races that end here; of others not a number.
+
+        A race that began on its way has none of them, and one that is not finished no `lap_seconds`.
+        """
+        ends = self._whole & (self.terminated() | self.truncated())
+        parts = {"gates_passed": self._target, "success": self._finished, "crashed": self._crashed}
+        found = {name: jnp.where(ends, value.astype(jnp.float32), jnp.nan) for name, value in parts.items()}
+        return found | {"lap_seconds": jnp.where(ends & self._finished, self.sim.time[:, 0], jnp.nan)}
 
 
 def _as_it_is(data: Any, _: Any, mask: jax.Array | None = None) -> Any:

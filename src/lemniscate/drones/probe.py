@@ -116,8 +116,9 @@ class _Programs:
             action = act(torch.nan_to_num(torch.from_dlpack(obs))).clamp(-1, 1)
             if keep_first:
                 kept.append(action[:starts].clone())
-            state, obs, reward, crashed = self._step(state, jax.dlpack.from_dlpack(action.contiguous()))
-            tally.add(torch.nan_to_num(torch.from_dlpack(reward)), torch.from_dlpack(crashed))
+            state, obs, *out = self._step(state, jax.dlpack.from_dlpack(action.contiguous()))
+            reward, crashed, finished = map(torch.from_dlpack, out)
+            tally.add(torch.nan_to_num(reward), crashed, finished)
             if not tally.going.any():
                 break
         pairs = zip(tally.returns.split(starts), tally.terminated.split(starts), strict=True)
@@ -126,7 +127,7 @@ class _Programs:
 
 
 def _lowered(drones: Drones, points: int) -> tuple[Any, Any]:
-    """`restart(seed, ends) -> state, obs` and `step(state, action) -> state, obs, reward, crashed`, traced."""
+    """`restart(seed, ends) -> state, obs`; `step(state, action) -> state, obs, reward, crashed, finished`: traced."""
     drones.env.sim.device = None  # crazyflow places actions on a device, which jax.vmap cannot
     every, calm = jnp.ones(drones.num_envs, dtype=bool), jnp.array(False)
 
@@ -138,10 +139,13 @@ def _lowered(drones: Drones, points: int) -> tuple[Any, Any]:
         state, obs = jax.vmap(one)(ends)
         return state, obs.reshape(-1, obs.shape[-1])
 
-    def step(state: Any, action: jax.Array) -> tuple[Any, jax.Array, jax.Array, jax.Array]:
-        state, (obs, reward, crashed, _, _) = jax.vmap(drones.step)(state, action.reshape(points, drones.num_envs, -1))
-        crashed = crashed | ~jnp.isfinite(obs).all(-1)
-        return state, obs.reshape(-1, obs.shape[-1]), reward.ravel(), crashed.ravel()
+    def step(state: Any, action: jax.Array) -> tuple[Any, ...]:
+        state, (obs, reward, ended, _, measures) = jax.vmap(drones.step)(
+            state, action.reshape(points, drones.num_envs, -1)
+        )
+        finished = measures["success"] == 1 if "success" in measures else jnp.zeros_like(ended)
+        crashed = (ended & ~finished) | ~jnp.isfinite(obs).all(-1)
+        return state, obs.reshape(-1, obs.shape[-1]), reward.ravel(), crashed.ravel(), finished.ravel()
 
     ends = np.zeros((points, len(drones.air.ranges), 2), np.float32)
     action = np.zeros((points * drones.num_envs, drones.action_size), np.float32)
