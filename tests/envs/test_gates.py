@@ -19,6 +19,8 @@ from lemniscate.drones.crazyflow import _import, make_drones
 
 _import()
 
+from scipy.spatial.transform import Rotation
+
 from lemniscate.drones import gates
 
 
@@ -72,17 +74,22 @@ def test_the_way_to_a_gate_leads_around_it():
     assert way == pytest.approx([2, aside, math.hypot(0.3, 0.51) + corner, 0.3 + corner], abs=1e-6)
 
 
-def test_gates_are_turned_as_euler_angles_say():
-    rng = np.random.default_rng(0)
-    for roll, pitch, yaw in rng.uniform(-3, 3, (50, 3)):
+def test_a_gate_is_flown_along_its_x_axis_turned_by_roll_pitch_and_yaw(racing):
+    import jax.numpy as jnp
+
+    angles = np.random.default_rng(0).uniform(-3, 3, (64, 3)).astype(np.float32)
+    drones = racing(0)
+    with drones._at(drones.restarted) as env:
+        poses = jnp.asarray(np.concatenate([np.ones((64, 3)), angles], axis=1))[:, None].repeat(4, axis=1)
+        centre, turned = env._frame(jnp.zeros(64, jnp.int32), poses)
+    assert np.asarray(centre) == pytest.approx(np.ones((64, 3)))
+    for (roll, pitch, yaw), found in zip(angles, np.asarray(turned), strict=True):
         x, y, z = (np.array(rows) for rows in (
             ((1, 0, 0), (0, math.cos(roll), -math.sin(roll)), (0, math.sin(roll), math.cos(roll))),
             ((math.cos(pitch), 0, math.sin(pitch)), (0, 1, 0), (-math.sin(pitch), 0, math.cos(pitch))),
             ((math.cos(yaw), -math.sin(yaw), 0), (math.sin(yaw), math.cos(yaw), 0), (0, 0, 1)),
         ))  # fmt: skip
-        angles = np.array((roll, pitch, yaw), np.float32)
-        assert np.asarray(gates.rotation(angles)) == pytest.approx(z @ y @ x, abs=1e-5)
-        assert np.asarray(gates.attitude(gates.quaternion(angles))) == pytest.approx(z @ y @ x, abs=1e-5)
+        assert found == pytest.approx(z @ y @ x, abs=1e-5)
 
 
 def distance_in_mujoco(centre, quat, low, high):
@@ -107,7 +114,7 @@ def test_contacts_are_those_that_mujoco_finds():
         at = rng.uniform(low[which] - 0.12, high[which] + 0.12).astype(np.float32)
         quat = rng.normal(size=4)
         quat /= np.linalg.norm(quat)
-        turned = gates.attitude(np.float32(quat))
+        turned = Rotation.from_quat(quat).as_matrix().astype(np.float32)
         touches = bool(gates.touches(at, turned, low[which], high[which]))
         distance = distance_in_mujoco(at, quat, low[which], high[which])
         said, found = said + touches, found + (distance < 0)

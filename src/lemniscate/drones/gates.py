@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from crazyflow.envs.drone_env import DroneEnv
 from crazyflow.sim import Sim
 from crazyflow.sim.pipeline import append_fn, replace_fn
 from gymnasium.vector.utils import batch_space
+from scipy.spatial.transform import Rotation
 
 from lemniscate.errors import UserError, shown
 
@@ -114,32 +116,10 @@ def read_track(file: str | Path | None = None) -> Track:
     return Track(gates, posts, np.abs(order) - 1, order < 0, start, room)
 
 
-def rotation(rpy: jax.Array) -> jax.Array:
-    """The matrices [..., 3, 3] of roll, pitch and yaw [..., 3]: from the body's frame to the world's."""
-    (cr, cp, cy), (sr, sp, sy) = (jnp.moveaxis(part, -1, 0) for part in (jnp.cos(rpy), jnp.sin(rpy)))
-    rows = (
-        (cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
-        (sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
-        (-sp, cp * sr, cp * cr),
-    )
-    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
-
-
-def attitude(quat: jax.Array) -> jax.Array:
-    """The matrices [..., 3, 3] of quaternions [..., 4] (xyzw)."""
-    x, y, z, w = jnp.moveaxis(quat, -1, 0)
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
-        (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
-        (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
-    )
-    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
-
-
 def standing(gates: np.ndarray, posts: np.ndarray, stand: float) -> np.ndarray:
     """The boxes [N, B, 15] of a `Scene`, of tracks with gates [N, G, 6] and obstacles [N, M, 3]."""
     low, high = _boxes(stand)
-    frames = np.asarray(rotation(jnp.asarray(gates[..., 3:])))[:, :, None]
+    frames = Rotation.from_euler("xyz", gates[..., 3:]).as_matrix()[:, :, None]
     centre = gates[:, :, None, :3] + (frames * ((low + high) / 2)[:, None, :]).sum(-1)
     parts = [
         centre,
@@ -364,7 +344,7 @@ class DroneGates(DroneEnv):
         data, begins = self.sim.data, mask[:, None]
         states = data.states.replace(
             pos=jnp.where(begins[..., None], pos[:, None], data.states.pos),
-            quat=jnp.where(begins[..., None], quaternion(rpy)[:, None], data.states.quat),
+            quat=jnp.where(begins[..., None], Rotation.from_euler("xyz", rpy).as_quat()[:, None], data.states.quat),
         )
         inverse = np.eye(3) / jnp.where(np.eye(3) > 0, inertia, 1)
         old, new = data.params, {"mass": mass, "J": inertia, "J_inv": inverse}
@@ -390,56 +370,40 @@ class DroneGates(DroneEnv):
             first = jnp.tile(np.append(track.start, 0.0), (n, 1))
             return first, jnp.tile(track.gates, (n, 1, 1)), jnp.tile(track.obstacles, (n, 1, 1))
         low, high = track.room[0, :2] + APART["border"], track.room[1, :2] - APART["border"]
-
-        def places(key: jax.Array) -> jax.Array:
-            return jax.random.uniform(key, (n, CANDIDATES, 2), minval=low, maxval=high)
-
-        def choose(places: jax.Array, room: jax.Array, wish: jax.Array) -> jax.Array:
-            """The first place with room that is wished for, else the first with room, else that with the most room."""
-            score = jnp.where(room > 0, 1.0 + wish, jnp.minimum(room, 0.0))
-            return jnp.take_along_axis(places, score.argmax(1)[:, None, None], axis=1)[:, 0]
-
-        def room(places: jax.Array, objects: list[tuple[jax.Array, float]]) -> jax.Array:
-            return jnp.stack([jnp.linalg.norm(places - at[:, None], axis=-1) - apart for at, apart in objects]).min(0)
-
         key, own, turn = jax.random.split(key, 3)
         at = jax.random.uniform(own, (n, 2), minval=low, maxval=high)
         yaw = jax.random.uniform(turn, (n, 1), minval=-math.pi / 2, maxval=math.pi / 2)
         start = jnp.concatenate([at, jnp.full((n, 1), track.start[2]), yaw], axis=1)
-        gates: list[jax.Array] = []
-        posts: list[jax.Array] = []
-        ways: list[tuple[jax.Array, jax.Array]] = []
+        gates, yaws, posts = list[jax.Array](), list[jax.Array](), list[jax.Array]()
+        ways = list[tuple[jax.Array, jax.Array]]()
+
+        def choose(key: jax.Array, from_gates: float, from_posts: float, wished: Callable) -> jax.Array:
+            """The first place with room that is wished for, else the first with room, else that with the most room."""
+            places = jax.random.uniform(key, (n, CANDIDATES, 2), minval=low, maxval=high)
+            apart = [APART["start"]] + [from_gates] * len(gates) + [from_posts] * len(posts)
+            others = zip([start[:, :2], *gates, *posts], apart, strict=True)
+            room = jnp.stack([jnp.linalg.norm(places - one[:, None], axis=-1) - least for one, least in others]).min(0)
+            score = jnp.where(room > 0, 1.0 + wished(places), jnp.minimum(room, 0.0))
+            return jnp.take_along_axis(places, score.argmax(1)[:, None, None], axis=1)[:, 0]
+
+        def off_the_ways(places: jax.Array) -> Any:
+            return jnp.stack([~_in_corridor(places, *way) for way in ways]).all(0) if ways else True
+
         for i in range(max(len(track.gates), len(track.obstacles))):
             key, one, two, three = jax.random.split(key, 4)
             if i < len(track.gates):
-                found = places(one)
-                objects = [
-                    (start[:, :2], APART["start"]),
-                    *((g[:, :2], APART["gates"]) for g in gates),
-                    *((p, APART["obstacle_gate"]) for p in posts),
-                ]
-                free = [~_in_corridor(found, *way) for way in ways]
-                place = choose(
-                    found, room(found, objects), jnp.stack(free).all(0) if free else jnp.ones(found.shape[:2], bool)
-                )
+                place = choose(one, APART["gates"], APART["obstacle_gate"], off_the_ways)
                 turn = jax.random.uniform(two, (n,), minval=-APART["yaw"], maxval=APART["yaw"])
+                yaws.append(jnp.arctan2(*(place - at).T[::-1]) + turn)
                 ways.append((at, place))
-                heading = jnp.arctan2(*(place - at).T[::-1]) + turn
-                gates.append(jnp.concatenate([place, heading[:, None]], axis=1))
+                gates.append(place)
+                at = place
             if i < len(track.obstacles):
-                found = places(three)
-                objects = [
-                    (start[:, :2], APART["start"]),
-                    *((g[:, :2], APART["obstacle_gate"]) for g in gates),
-                    *((p, APART["obstacles"]) for p in posts),
-                ]
-                posts.append(choose(found, room(found, objects), _in_corridor(found, *ways[-1])))
-            at = gates[-1][:, :2]
-        poses = jnp.tile(track.gates, (n, 1, 1))
-        flat = jnp.stack(gates, axis=1)
-        poses = poses.at[..., :2].set(flat[..., :2]).at[..., 3:5].set(0.0).at[..., 5].set(flat[..., 2])
-        tops = jnp.tile(track.obstacles, (n, 1, 1))
-        return start, poses, tops.at[..., :2].set(jnp.stack(posts, axis=1)) if posts else tops
+                on_the_way = partial(_in_corridor, start=ways[-1][0], end=ways[-1][1])
+                posts.append(choose(three, APART["obstacle_gate"], APART["obstacles"], on_the_way))
+        poses, tops = (jnp.tile(part, (n, 1, 1)) for part in (track.gates, track.obstacles))
+        poses = poses.at[..., :2].set(jnp.stack(gates, 1)).at[..., 3:5].set(0.0).at[..., 5].set(jnp.stack(yaws, 1))
+        return start, poses, tops.at[..., :2].set(jnp.stack(posts, 1)) if posts else tops
 
     def begin(self, mask: jax.Array, ahead: jax.Array) -> None:
         """Let the masked drones begin where they are; those `ahead` on their way, behind a gate that they have passed.
@@ -479,7 +443,7 @@ class DroneGates(DroneEnv):
         states = self.sim.data.states
         self._key = jax.random.split(self._key, 1)[0]
         pos = states.pos[:, 0]
-        self._crashed = self._touches(pos, attitude(states.quat[:, 0])) | self._leaves(pos)
+        self._crashed = self._touches(pos, Rotation.from_quat(states.quat[:, 0]).as_matrix()) | self._leaves(pos)
         place, turned = self._frame(self._target, self._gates)
         before, now = (into(turned, at - place) for at in (self._before, pos))
         passed = passes(before, now) & ~self._crashed
@@ -515,7 +479,7 @@ class DroneGates(DroneEnv):
         reverse = jnp.asarray(self.track.reverse)[jnp.clip(target, 0, len(self.track.order) - 1)]
         turn = jnp.where(reverse, -1.0, 1.0)
         flip = jnp.stack([turn, turn, jnp.ones_like(turn)], axis=-1)
-        return pose[:, :3], rotation(pose[:, 3:]) * flip[:, None]
+        return pose[:, :3], Rotation.from_euler("xyz", pose[:, 3:]).as_matrix() * flip[:, None]
 
     def _leaves(self, pos: jax.Array) -> jax.Array:
         low, high = self.track.room
@@ -526,7 +490,10 @@ class DroneGates(DroneEnv):
     def _touches(self, pos: jax.Array, turned: jax.Array) -> jax.Array:
         """Whether the drone's box touches a gate's frame or stand, or an obstacle."""
         centre = pos + out_of(turned, BODY_CENTRE)
-        frames, half = rotation(self._gates[..., 3:]), np.array((POST / 2, POST / 2, POST_HEIGHT / 2), np.float32)
+        frames, half = (
+            Rotation.from_euler("xyz", self._gates[..., 3:]).as_matrix(),
+            np.array((POST / 2, POST / 2, POST_HEIGHT / 2), np.float32),
+        )
         local = into(frames, centre[:, None] - self._gates[..., :3])
         own = (frames[..., None] * turned[:, None, :, None]).sum(-3)
         gates = touches(local[:, :, None], own[:, :, None], *_boxes(self.track.stand))
@@ -614,18 +581,6 @@ def _in_corridor(places: jax.Array, start: jax.Array, end: jax.Array) -> jax.Arr
     along = (off * way).sum(-1) / jnp.maximum((way * way).sum(-1), 1e-8)
     aside = jnp.linalg.norm(off - along[..., None] * way, axis=-1)
     return (along >= 0) & (along <= 1) & (aside < APART["corridor"])
-
-
-def quaternion(rpy: jax.Array) -> jax.Array:
-    """The quaternions [..., 4] (xyzw) of roll, pitch and yaw [..., 3]."""
-    (cr, cp, cy), (sr, sp, sy) = (jnp.moveaxis(part, -1, 0) for part in (jnp.cos(rpy / 2), jnp.sin(rpy / 2)))
-    parts = (
-        sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy,
-        cr * cp * sy - sr * sp * cy,
-        cr * cp * cy + sr * sp * sy,
-    )
-    return jnp.stack(parts, axis=-1)
 
 
 gym.register(id="DroneGates-v0", vector_entry_point=DroneGates)
