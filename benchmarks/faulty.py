@@ -1,8 +1,7 @@
 # ruff: noqa: D102  (the methods are those of Gymnasium's wrappers)
 """Environments with faults, as wrappers, and learners with faults, as changes of the library: for `doctor.py`."""
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import Any
 from unittest.mock import patch
 
@@ -144,13 +143,6 @@ class Seedless(gym.Wrapper):
 
     def reset(self, *, seed=None, options=None):
         return self.env.reset(seed=int(np.random.SeedSequence().entropy % 2**31), options=options)
-
-
-@contextmanager
-def learner(fault: str) -> Iterator[None]:
-    """The library with a fault in it."""
-    with LEARNERS[fault]():
-        yield
 
 
 def _other_log_prob() -> Any:
