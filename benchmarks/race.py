@@ -57,7 +57,7 @@ WAY = np.array([
     (1.05, 0.75, 1.2), (0.7, 1.05, 1.2), (0.3, 0.9, 1.15), (-0.1, 0.4, 1.0), (-0.55, -0.1, 0.75), (-1.0, -0.25, 0.7),
     (-1.3, -0.5, 0.8), (-1.2, -0.9, 1.0), (-0.6, -1.0, 1.15), (-0.25, -0.8, 1.2), (0.0, -0.75, 1.2), (0.4, -0.75, 1.2),
 ])  # fmt: skip
-"""points of a way through the course's four gates, past its posts, set by hand, m"""
+"""points of a way through the course's four gates, past its obstacles, set by hand, m"""
 
 
 def spline(start: np.ndarray, pace: float) -> CubicSpline:

@@ -1514,7 +1514,7 @@ MUTANTS = [
     (
         "what was seen is forgotten",
         "drones/gates.py",
-        "self._gates_seen | near[0], self._posts_seen | near[1]",
+        "self._gates_seen | near[0], self._obstacles_seen | near[1]",
         "near[0], near[1]",
         "envs/test_gates.py::test_the_true_place_is_known_from_near_and_stays_known",
     ),

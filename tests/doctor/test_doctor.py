@@ -13,7 +13,7 @@ import lemniscate as lem
 from conftest import tiny_fields, tiny_off_policy
 from lemniscate import algos
 from lemniscate.cli import main
-from lemniscate.doctor import Evidence, diagnose
+from lemniscate.doctor import Evidence, diagnose, rules
 from lemniscate.doctor.evidence import usual_ranges, with_ratios
 from lemniscate.doctor.rules import HINT, RULES, seeds_differ, settings_far_out
 from lemniscate.run.fields import field_help, read
@@ -265,6 +265,11 @@ def test_the_page_has_a_paragraph_for_each_rule_and_no_other():
     for rule in RULES:
         for part in (rule.means, rule.source, rule.remedy.split("; ")[0]):
             assert part in " ".join(PAGE.split())
+
+
+def test_the_page_has_a_row_for_each_setting():
+    for name, known in rules.read("settings.toml").items():
+        assert f"| `{name}` | {known.get('small', '–')} | {known.get('large', '–')} | {known['source']} |" in PAGE
 
 
 def test_seeds_that_differ_are_pointed_at():

@@ -164,7 +164,7 @@ def test_a_level_draws_what_it_says_and_no_more(racing):
             "mass": [data.params.mass.reshape(64, -1) for data, _, _ in states],
             "inertia": [np.diagonal(data.params.J.reshape(64, 3, 3), axis1=1, axis2=2) for data, _, _ in states],
             "gates": [arrays["_gates"] - arrays["_expected_gates"] for _, arrays, _ in states],
-            "posts": [arrays["_posts"] - arrays["_expected_posts"] for _, arrays, _ in states],
+            "obstacles": [arrays["_obstacles"] - arrays["_expected_obstacles"] for _, arrays, _ in states],
             "track": [arrays["_expected_gates"] for _, arrays, _ in states],
         }
         drawn[level] = {name: np.concatenate([np.asarray(a) for a in each]) for name, each in parts.items()}
@@ -183,11 +183,13 @@ def test_a_level_draws_what_it_says_and_no_more(racing):
             assert not spread["track"].any()
         if level == 1:
             assert not spread["gates"].any()
-            assert not spread["posts"].any()
+            assert not spread["obstacles"].any()
         else:
             most = np.abs(parts["gates"]).max(0)
             assert most == pytest.approx(np.tile(gates.SPREAD["gate"], (4, 1)), rel=0.03)
-            assert np.abs(parts["posts"]).max(0) == pytest.approx(np.tile(gates.SPREAD["obstacle"], (4, 1)), rel=0.03)
+            assert np.abs(parts["obstacles"]).max(0) == pytest.approx(
+                np.tile(gates.SPREAD["obstacle"], (4, 1)), rel=0.03
+            )
     assert (spread["track"][:, :2] > 1.5).all()
     assert not spread["track"][:, 2].any()  # heights stay
 
@@ -197,13 +199,13 @@ def test_a_drawn_track_has_room(racing):
     apart = []
     for seed in range(8):
         data, arrays, _ = begun(drones, seed)
-        track, posts = np.asarray(arrays["_expected_gates"]), np.asarray(arrays["_expected_posts"])
+        track, obstacles = np.asarray(arrays["_expected_gates"]), np.asarray(arrays["_expected_obstacles"])
         assert (np.abs(track[..., 0]) <= 2.0).all()
         assert (np.abs(track[..., 1]) <= 1.0).all()
         centres = track[..., :2]
         between = np.linalg.norm(centres[:, :, None] - centres[:, None], axis=-1)[:, *np.triu_indices(4, 1)]
-        to_posts = np.linalg.norm(centres[:, :, None] - posts[:, None, :, :2], axis=-1)
-        apart.append(((between.min(1) >= 1.0) & (to_posts.min((1, 2)) >= 0.8)).mean())
+        to_obstacles = np.linalg.norm(centres[:, :, None] - obstacles[:, None, :, :2], axis=-1)
+        apart.append(((between.min(1) >= 1.0) & (to_obstacles.min((1, 2)) >= 0.8)).mean())
         start = np.asarray(data.states.pos[:, 0])
         way = centres[:, 0] - (start[:, :2])
         off = (track[:, 0, 5] - np.arctan2(*way.T[::-1]) + np.pi) % (2 * np.pi) - np.pi
@@ -394,7 +396,10 @@ def test_what_begins_on_its_way_begins_behind_a_gate(racing):
     direction = np.stack([np.cos(passed[:, 5]), np.sin(passed[:, 5])], axis=1)
     behind = ((np.asarray(data.states.pos)[:, 0, :2] - passed[:, :2]) * direction).sum(1)
     assert (behind[ahead] > 0.05).all()
-    for begun_, here in ((arrays["_gates"], arrays["_expected_gates"]), (arrays["_posts"], arrays["_expected_posts"])):
+    for begun_, here in (
+        (arrays["_gates"], arrays["_expected_gates"]),
+        (arrays["_obstacles"], arrays["_expected_obstacles"]),
+    ):
         shares.append(np.abs(np.asarray(begun_) - np.asarray(here))[ahead].mean())
     assert 0.03 < shares[0] < 0.07  # two thirds of what the level says
     assert np.asarray(arrays["_before"]) == pytest.approx(np.asarray(data.states.pos)[:, 0])

@@ -32,7 +32,7 @@ OPENING, FRAME = 0.40, 0.72
 """side of the square opening of a gate, and of its frame outside, m"""
 PASSED = 0.45
 """side of the square about the centre within which a gate is passed, m"""
-THICKNESS, STAND, POST, POST_HEIGHT = 0.02, 0.10, 0.03, 1.5
+THICKNESS, STAND, OBSTACLE, OBSTACLE_HEIGHT = 0.02, 0.10, 0.03, 1.5
 """of a frame; of the square stand below it; of the obstacles, m"""
 BODY = np.array((0.07, 0.07, 0.02), np.float32)
 """half of the sides of the box that touches, m; crazyflow's collision box"""
@@ -100,10 +100,10 @@ def read_track(file: str | Path | None = None) -> Track:
         gates = [
             [*gate["position"], *(gate.get(name, 0.0) for name in ("roll", "pitch", "yaw"))] for gate in table["gates"]
         ]
-        posts = [obstacle["position"] for obstacle in table.get("obstacles", [])]
+        obstacles = [obstacle["position"] for obstacle in table.get("obstacles", [])]
         order, room = np.array(table["order"], int), [table["room"]["low"], table["room"]["high"]]
-        arrays = [np.array(rows, np.float32) for rows in (gates, posts or np.zeros((0, 3)), table["start"], room)]
-        gates, posts, start, room = (
+        arrays = [np.array(rows, np.float32) for rows in (gates, obstacles or np.zeros((0, 3)), table["start"], room)]
+        gates, obstacles, start, room = (
             a.reshape(shape) for a, shape in zip(arrays, ((-1, 6), (-1, 3), (3,), (2, 3)), strict=True)
         )
     except (OSError, tomllib.TOMLDecodeError, KeyError, TypeError, ValueError) as error:
@@ -113,10 +113,10 @@ def read_track(file: str | Path | None = None) -> Track:
         raise UserError(
             f"{path}: order names gates from 1 to {len(gates)}, in reverse with a minus, not {order.tolist()}."
         )
-    return Track(gates, posts, np.abs(order) - 1, order < 0, start, room)
+    return Track(gates, obstacles, np.abs(order) - 1, order < 0, start, room)
 
 
-def standing(gates: np.ndarray, posts: np.ndarray, stand: float) -> np.ndarray:
+def standing(gates: np.ndarray, obstacles: np.ndarray, stand: float) -> np.ndarray:
     """The boxes [N, B, 15] of a `Scene`, of tracks with gates [N, G, 6] and obstacles [N, M, 3]."""
     low, high = _boxes(stand)
     frames = Rotation.from_euler("xyz", gates[..., 3:]).as_matrix()[:, :, None]
@@ -127,11 +127,11 @@ def standing(gates: np.ndarray, posts: np.ndarray, stand: float) -> np.ndarray:
         np.broadcast_to(frames.reshape(*frames.shape[:3], 9), (*centre.shape[:3], 9)),
     ]
     boxes = np.concatenate(parts, axis=-1).reshape(len(gates), -1, 15)
-    half = np.array((POST / 2, POST / 2, POST_HEIGHT / 2), np.float32)
+    half = np.array((OBSTACLE / 2, OBSTACLE / 2, OBSTACLE_HEIGHT / 2), np.float32)
     own = [
-        posts - half * (0, 0, 1),
-        np.broadcast_to(half, posts.shape),
-        np.broadcast_to(np.eye(3).ravel(), (*posts.shape[:2], 9)),
+        obstacles - half * (0, 0, 1),
+        np.broadcast_to(half, obstacles.shape),
+        np.broadcast_to(np.eye(3).ravel(), (*obstacles.shape[:2], 9)),
     ]
     return np.concatenate([boxes, np.concatenate(own, axis=-1)], axis=1)
 
@@ -214,8 +214,8 @@ class DroneGates(DroneEnv):
 
     Observed after the drone's state: `gates` 15, of the next two gates the way from the drone to the centre (m) and
     the direction in which it is flown, then the drone's place in the frame of the next (m); `obstacles` 4, the way to
-    the two nearest posts, x and y (m); `last_action` 4; `race` 3: the share of gates that is left, and whether the true
-    place of the next two is known. But for the place, all is along the world's axes, as an attitude is commanded.
+    the two nearest, x and y (m); `last_action` 4; `race` 3: the share of gates that is left, and whether the true place
+    of the next two is known. But for the place, all is along the world's axes, as an attitude is commanded.
 
     The reward of a step is 3 for each metre of the way to the next gate's centre (`way_left`), 3 for a gate, −6 for a
     crash; less 0.05, 0.0005 |ω|² (rad²/s²), 0.01 for the squared change of the action and, while at levels 2 and 3 the
@@ -306,10 +306,10 @@ class DroneGates(DroneEnv):
         self._gates = jnp.tile(track.gates, (n, 1, 1))
         """the true gates [N, G, 6], and below what is known of them before they are seen"""
         self._expected_gates = self._gates
-        self._posts = jnp.tile(track.obstacles, (n, 1, 1))
-        self._expected_posts = self._posts
+        self._obstacles = jnp.tile(track.obstacles, (n, 1, 1))
+        self._expected_obstacles = self._obstacles
         self._gates_seen = jnp.zeros((n, len(track.gates)), bool)
-        self._posts_seen = jnp.zeros((n, len(track.obstacles)), bool)
+        self._obstacles_seen = jnp.zeros((n, len(track.obstacles)), bool)
         self.starts_around = self._start = jnp.tile(track.start, (n, 1))
         """the start of the track, and where the drone has begun"""
         self._target = jnp.zeros(n, jnp.int32)
@@ -331,10 +331,10 @@ class DroneGates(DroneEnv):
         start, *expected = self._layout(layout)
         n, counts = self.num_envs, (3, 3, 1, 3, 6 * len(self.track.gates), 3 * len(self.track.obstacles))
         drawn = jax.random.uniform(own, (n, sum(counts)), minval=-1.0, maxval=1.0)
-        places, turns, mass, inertia, gates, posts = jnp.split(drawn, np.cumsum(counts)[:-1], axis=1)
+        places, turns, mass, inertia, gates, obstacles = jnp.split(drawn, np.cumsum(counts)[:-1], axis=1)
         varied, moved = float(self.level >= 1), float(self.level >= 2)
         gates = expected[0] + moved * gates.reshape(n, -1, 6) * np.array(SPREAD["gate"])
-        posts = expected[1] + moved * posts.reshape(n, -1, 3) * np.array(SPREAD["obstacle"])
+        obstacles = expected[1] + moved * obstacles.reshape(n, -1, 3) * np.array(SPREAD["obstacle"])
         low, high = np.array(SPREAD["start"])
         pos = start[:, :3] + varied * (low + (places + 1) / 2 * (high - low))
         rpy = (varied * SPREAD["attitude"] * turns).at[:, 2].add(start[:, 3])
@@ -354,9 +354,10 @@ class DroneGates(DroneEnv):
         }
         self.sim.data = data.replace(states=states, params=old.replace(**chosen))
         fresh = {
-            "_gates": gates, "_posts": posts, "_expected_gates": expected[0], "_expected_posts": expected[1],
+            "_gates": gates, "_expected_gates": expected[0],
+            "_obstacles": obstacles, "_expected_obstacles": expected[1],
             "starts_around": start[:, :3], "_target": jnp.zeros(n, jnp.int32), "_crashed": jnp.zeros(n, bool),
-            "_gates_seen": jnp.zeros_like(self._gates_seen), "_posts_seen": jnp.zeros_like(self._posts_seen),
+            "_gates_seen": jnp.zeros_like(self._gates_seen), "_obstacles_seen": jnp.zeros_like(self._obstacles_seen),
             "_last_action": jnp.zeros((n, 4)), "_gain": jnp.zeros(n),
         }  # fmt: skip
         for name, value in fresh.items():
@@ -374,14 +375,14 @@ class DroneGates(DroneEnv):
         at = jax.random.uniform(own, (n, 2), minval=low, maxval=high)
         yaw = jax.random.uniform(turn, (n, 1), minval=-math.pi / 2, maxval=math.pi / 2)
         start = jnp.concatenate([at, jnp.full((n, 1), track.start[2]), yaw], axis=1)
-        gates, yaws, posts = list[jax.Array](), list[jax.Array](), list[jax.Array]()
+        gates, yaws, obstacles = list[jax.Array](), list[jax.Array](), list[jax.Array]()
         ways = list[tuple[jax.Array, jax.Array]]()
 
-        def choose(key: jax.Array, from_gates: float, from_posts: float, wished: Callable) -> jax.Array:
+        def choose(key: jax.Array, from_gates: float, from_obstacles: float, wished: Callable) -> jax.Array:
             """The first place with room that is wished for, else the first with room, else that with the most room."""
             places = jax.random.uniform(key, (n, CANDIDATES, 2), minval=low, maxval=high)
-            apart = [APART["start"]] + [from_gates] * len(gates) + [from_posts] * len(posts)
-            others = zip([start[:, :2], *gates, *posts], apart, strict=True)
+            apart = [APART["start"]] + [from_gates] * len(gates) + [from_obstacles] * len(obstacles)
+            others = zip([start[:, :2], *gates, *obstacles], apart, strict=True)
             room = jnp.stack([jnp.linalg.norm(places - one[:, None], axis=-1) - least for one, least in others]).min(0)
             score = jnp.where(room > 0, 1.0 + wished(places), jnp.minimum(room, 0.0))
             return jnp.take_along_axis(places, score.argmax(1)[:, None, None], axis=1)[:, 0]
@@ -400,10 +401,10 @@ class DroneGates(DroneEnv):
                 at = place
             if i < len(track.obstacles):
                 on_the_way = partial(_in_corridor, start=ways[-1][0], end=ways[-1][1])
-                posts.append(choose(three, APART["obstacle_gate"], APART["obstacles"], on_the_way))
+                obstacles.append(choose(three, APART["obstacle_gate"], APART["obstacles"], on_the_way))
         poses, tops = (jnp.tile(part, (n, 1, 1)) for part in (track.gates, track.obstacles))
         poses = poses.at[..., :2].set(jnp.stack(gates, 1)).at[..., 3:5].set(0.0).at[..., 5].set(jnp.stack(yaws, 1))
-        return start, poses, tops.at[..., :2].set(jnp.stack(posts, 1)) if posts else tops
+        return start, poses, tops.at[..., :2].set(jnp.stack(obstacles, 1)) if obstacles else tops
 
     def begin(self, mask: jax.Array, ahead: jax.Array) -> None:
         """Let the masked drones begin where they are; those `ahead` on their way, behind a gate that they have passed.
@@ -414,7 +415,7 @@ class DroneGates(DroneEnv):
         self._key, which, where, fast, easier = jax.random.split(self._key, 5)
         n, count, data = self.num_envs, len(self.track.order), self.sim.data
         share = jnp.sqrt(jax.random.uniform(easier, (n, 1, 1)))
-        for true, expected in (("_gates", self._expected_gates), ("_posts", self._expected_posts)):
+        for true, expected in (("_gates", self._expected_gates), ("_obstacles", self._expected_obstacles)):
             given = getattr(self, true)
             setattr(self, true, jnp.where(ahead[:, None, None], expected + share * (given - expected), given))
         target = jax.random.randint(which, (n,), 1, count) if count > 1 else jnp.zeros(n, jnp.int32)
@@ -462,8 +463,8 @@ class DroneGates(DroneEnv):
     def _look(self) -> None:
         """Know the true place of what is near."""
         here = self.sim.data.states.pos[:, :, :2]
-        near = [jnp.linalg.norm(of[..., :2] - here, axis=-1) < SEEN_FROM for of in (self._gates, self._posts)]
-        self._gates_seen, self._posts_seen = self._gates_seen | near[0], self._posts_seen | near[1]
+        near = [jnp.linalg.norm(of[..., :2] - here, axis=-1) < SEEN_FROM for of in (self._gates, self._obstacles)]
+        self._gates_seen, self._obstacles_seen = self._gates_seen | near[0], self._obstacles_seen | near[1]
 
     def _number(self, target: jax.Array) -> jax.Array:
         """Which gates are number `target` in the order, [N]; the last where there are no more."""
@@ -492,13 +493,13 @@ class DroneGates(DroneEnv):
         centre = pos + out_of(turned, BODY_CENTRE)
         frames, half = (
             Rotation.from_euler("xyz", self._gates[..., 3:]).as_matrix(),
-            np.array((POST / 2, POST / 2, POST_HEIGHT / 2), np.float32),
+            np.array((OBSTACLE / 2, OBSTACLE / 2, OBSTACLE_HEIGHT / 2), np.float32),
         )
         local = into(frames, centre[:, None] - self._gates[..., :3])
         own = (frames[..., None] * turned[:, None, :, None]).sum(-3)
         gates = touches(local[:, :, None], own[:, :, None], *_boxes(self.track.stand))
-        posts = touches(centre[:, None] - self._posts + half * (0, 0, 1), turned[:, None], -half, half)
-        return gates.any((1, 2)) | posts.any(1)
+        obstacles = touches(centre[:, None] - self._obstacles + half * (0, 0, 1), turned[:, None], -half, half)
+        return gates.any((1, 2)) | obstacles.any(1)
 
     def obs(self) -> dict[str, jax.Array]:
         """The drone's state, then `gates`, `obstacles`, `last_action` and `race`."""
@@ -508,9 +509,9 @@ class DroneGates(DroneEnv):
         ahead = [self._frame(self._target + i, known) for i in (0, 1)]
         seen = [part for at, frame in ahead for part in (at - pos, frame[..., 0])]
         parts["gates"] = jnp.concatenate([*seen, into(ahead[0][1], pos - ahead[0][0])], axis=1)
-        posts = jnp.where(self._posts_seen[..., None], self._posts, self._expected_posts)
+        obstacles = jnp.where(self._obstacles_seen[..., None], self._obstacles, self._expected_obstacles)
         far = jnp.full((n, 2, 2), 5.0)  # where there are fewer than two
-        way = jnp.concatenate([posts[..., :2] - pos[:, None, :2], far], axis=1)
+        way = jnp.concatenate([obstacles[..., :2] - pos[:, None, :2], far], axis=1)
         distance = jnp.linalg.norm(way, axis=-1)
         first = distance.argmin(1)
         second = jnp.where(jnp.arange(distance.shape[1]) == first[:, None], jnp.inf, distance).argmin(1)
@@ -544,7 +545,7 @@ class DroneGates(DroneEnv):
 
     def boxes(self, arrays: Mapping[str, jax.Array]) -> np.ndarray:
         """The boxes [N, B, 15] of a `Scene`, of races in the state of these arrays."""
-        return standing(np.asarray(arrays["_gates"]), np.asarray(arrays["_posts"]), self.track.stand)
+        return standing(np.asarray(arrays["_gates"]), np.asarray(arrays["_obstacles"]), self.track.stand)
 
     def measures(self) -> dict[str, jax.Array]:
         """`gates_passed`, `success`, `crashed` and `lap_seconds` of races that end here; of others not a number.
