@@ -180,7 +180,7 @@ def draw():
     """A picture for each environment: the return in training against minutes, a dot where the final policy is."""
     from matplotlib.figure import Figure
 
-    from lemniscate.report.style import COLORS, finish, save
+    from lemniscate.report.curves import COLORS, finish, save
 
     colors = {name: COLORS[i] for i, name in enumerate(STEPS)}
     for env in [env for env in MINUTES if measured(env)]:

@@ -144,7 +144,7 @@ def draw(algorithm):
     """Training returns, a panel for each environment: the mean of the seeds, a band from the lowest to the highest."""
     from matplotlib.figure import Figure
 
-    from lemniscate.report.style import COLORS, finish, save
+    from lemniscate.report.curves import COLORS, finish, save
 
     lines = {env: measured(algorithm, env, marks[-1]) for env, (marks, _) in RUNS[algorithm].items()}
     shown = [env for env in lines if lines[env]]

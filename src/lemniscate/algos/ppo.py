@@ -43,7 +43,7 @@ class Config(RecurrentConfig):
     """Adam's initial step size; usually 1e-4 to 1e-3"""
     final_learning_rate: Fraction = 0.0
     """final learning rate as a fraction of the initial one, annealed linearly; not used with desired_kl"""
-    desired_kl: Positive | None = 0.01
+    desired_kl: Scheduled[Positive] | None = 0.01
     """adapt the learning rate, by factors of 1.5, to this KL of an epoch; usually 0.005 to 0.02; none: anneal it"""
     adam_eps: Epsilon = 1e-5
     """Adam's ε; usually 1e-8 to 1e-5"""

@@ -13,8 +13,19 @@ from lemniscate.presets import names
 from lemniscate.run.fields import field_help, flag, kinds_of, read, typed, unknown_field
 
 GROUPS: dict[str, tuple[str, ...]] = {
-    "run": ("seed", "total_steps", "device", "threads", "shards", "compile", "matmul", "warm_start", "freeze"),
-    "environment": ("env_kwargs", "reset_options", "wrappers", "curriculum", "backend", "num_envs"),
+    "run": (
+        "seed",
+        "total_steps",
+        "average_last",
+        "device",
+        "threads",
+        "shards",
+        "compile",
+        "matmul",
+        "warm_start",
+        "freeze",
+    ),
+    "environment": ("env_kwargs", "symmetry", "reset_options", "wrappers", "curriculum", "backend", "num_envs"),
     "algorithm": (),
     "networks": ("network", "hidden", "critic_hidden", "activation", "initial_log_std", "normalize_observations"),
     "logging and checkpoints": (

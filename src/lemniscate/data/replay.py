@@ -7,7 +7,7 @@ from typing import Literal
 import torch
 from torch import Generator, Tensor
 
-from lemniscate.envs.vec_env import VecEnv
+from lemniscate.envs.vec_env import Mirror, VecEnv
 from lemniscate.maths import coloured, ornstein_uhlenbeck, uniform
 from lemniscate.nn.policies import Policy
 from lemniscate.spec import Spec
@@ -27,6 +27,8 @@ class ReplayBuffer:
         }
         self.transitions = Transition(**columns)
         self.capacity = capacity
+        self.mirror: Mirror | None = None
+        """the mirror image of transitions, where it is stored too"""
         self._written = 0
         """rows ever added"""
 
@@ -36,7 +38,8 @@ class ReplayBuffer:
     def add(self, obs: Tensor, action: Tensor, step: Step) -> None:
         """Add the transitions of one step of N environments; rows whose action was ignored are left out."""
         rows = Transition(obs, action, step.reward, step.next_obs, step.terminated)
-        self.extend(rows if step.valid.all() else rows[step.valid])
+        rows = rows if step.valid.all() else rows[step.valid]
+        self.extend(self.mirror.both(rows, 0) if self.mirror else rows)
 
     def extend(self, rows: Transition) -> None:
         """Add `rows` [B, …] in the place of the oldest."""

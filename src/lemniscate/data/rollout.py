@@ -17,7 +17,11 @@ from lemniscate.types import Record, Rollout
 
 @torch.no_grad()
 def collect(env: VecEnv, policy: Policy, num_steps: int, generator: Generator) -> Rollout:
-    """Act `num_steps` times in every environment, from where it stands. Returns a rollout [T, N, …]."""
+    """Act `num_steps` times in every environment, from where it stands.
+
+    Returns:
+        A rollout [T, N, …]; [T, 2 N, …] where there is a symmetry: behind them are their mirror images.
+    """
     rows = []
     with env.collecting:
         for noise in policy.draw_noise((num_steps, env.num_envs), generator):
@@ -26,7 +30,8 @@ def collect(env: VecEnv, policy: Policy, num_steps: int, generator: Generator) -
             step = env.step(action)
             ends = step.terminated, step.truncated, step.valid
             rows.append(Rollout(obs, action, step.reward, step.next_obs, *ends))
-        return Rollout.stack(rows)
+        rollout = Rollout.stack(rows)
+        return env.mirror.both(rollout, 1) if env.mirror else rollout
 
 
 @torch.no_grad()
@@ -53,7 +58,8 @@ def collect_episodes(env: VecEnv, policy: Policy, episodes: int, generator: Gene
             rows.append(Rollout(obs, action, step.reward, step.next_obs, step.terminated, step.truncated, whole))
             done = (step.terminated | step.truncated) & step.valid
             ended, age = ended + done.int(), (age + 1) * ~done
-        return Rollout.stack(rows)
+        rollout = Rollout.stack(rows)
+        return env.mirror.both(rollout, 1) if env.mirror else rollout
 
 
 def rollout_bytes(spec: Spec, num_steps: int, num_envs: int) -> int:

@@ -4,7 +4,7 @@ import math
 import time
 from collections import deque
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import numpy as np
 import torch
@@ -14,7 +14,9 @@ from lemniscate.envs.backend import Backend
 from lemniscate.errors import NonFiniteError, UserError, wrong_action
 from lemniscate.spec import Box, Discrete, MultiBinary, Spec
 from lemniscate.system.world import ALONE, World
-from lemniscate.types import Rollout, Step, wide_float
+from lemniscate.types import Record, Rollout, Step, wide_float
+
+R = TypeVar("R", bound=Record)
 
 PATIENCE = 20_000
 """steps that an episode may take in an environment without a time limit, where whole ones are wanted"""
@@ -29,6 +31,14 @@ class Carrier(Protocol):
 
     def follow(self, rows: Tensor, step: Step) -> Step:
         """The step with the memory after `rows` [N, …], the observations before it."""
+        ...
+
+
+class Mirror(Protocol):
+    """Doubles transitions by their mirror images: `envs.symmetry`."""
+
+    def both(self, rows: R, dim: int) -> R:
+        """A record of transitions and, behind them along `dim`, their mirror images."""
         ...
 
 
@@ -58,6 +68,8 @@ class VecEnv:
         self.obs = torch.empty(0)
         self.carrier: Carrier | None = None
         """appends what a policy remembers to the observations"""
+        self.mirror: Mirror | None = None
+        """the mirror image of transitions, where they are learned from too"""
         self.collecting = Stopwatch()
         """seconds that the functions of `data` spend acting and stepping"""
         self.steps = 0

@@ -13,7 +13,7 @@ from matplotlib.ticker import MaxNLocator
 
 from lemniscate.envs.probe import Axis, Value
 from lemniscate.margins.record import AxisMargins
-from lemniscate.report.style import COLORS, finish, legend_above, save
+from lemniscate.report.curves import COLORS, finish, legend_above, save
 
 Words = tuple[str, str]
 FAILS, FALLS_SHORT = ("flies", "crash"), ("holds", "fall short")

@@ -141,6 +141,10 @@ class RewardScale(WideBuffers):
         self.mean, self.var, self.count = merge_moments(self.mean, self.var, self.count, *new)
 
     def scale(self, rollout: Rollout) -> Rollout:
-        """The rollout [T, N] with scaled rewards, after its returns have joined the statistics."""
-        self.update(rollout.reward, rollout.done, rollout.valid)
+        """The rollout [T, N] with scaled rewards, after its returns have joined the statistics.
+
+        Mirror images behind the N have the same rewards.
+        """
+        count = len(self.running)
+        self.update(*(column[:, :count] for column in (rollout.reward, rollout.done, rollout.valid)))
         return replace(rollout, reward=self(rollout.reward))

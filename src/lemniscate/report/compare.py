@@ -16,7 +16,17 @@ from matplotlib.figure import Figure
 
 from lemniscate.envs.registry import file_name
 from lemniscate.report import pages
-from lemniscate.report.curves import episode_returns, moving_average, plot_runs, training_minutes, window_of
+from lemniscate.report.curves import (
+    COLORS,
+    episode_returns,
+    finish,
+    legend_above,
+    moving_average,
+    plot_runs,
+    save,
+    training_minutes,
+    window_of,
+)
 from lemniscate.report.seeds import (
     Group,
     Scores,
@@ -26,7 +36,6 @@ from lemniscate.report.seeds import (
     mean_interval,
     probability_of_improvement,
 )
-from lemniscate.report.style import COLORS, finish, legend_above, save
 from lemniscate.run.directory import is_finished
 from lemniscate.system.console import say
 

@@ -17,8 +17,8 @@ from matplotlib.patches import Polygon
 from lemniscate.envs.backend import Baseline
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.nn.policies import Policy
+from lemniscate.report.curves import finish, save
 from lemniscate.report.playback import Tell, give, sentence
-from lemniscate.report.style import finish, save
 from lemniscate.run.evaluate import EpisodeTable, Evaluation, play_episodes
 from lemniscate.system.console import in_notebook, say
 from lemniscate.system.files import make_directory

@@ -164,15 +164,17 @@ class RunConfig:
     seed: Seed = 1
     """seed of the run, from which all others are derived"""
     total_steps: Count = 1_000_000
-    """environment steps of the whole run, of all environments; the update that reaches them is the last"""
+    """steps of all environments together; the update that reaches them is the last"""
     device: str = "cpu"
     """device of networks and simulators: cpu, cuda, cuda:N, mps; auto is cuda if there is one"""
     threads: Annotated[int, Range(1, 256)] = 1
-    """CPU threads for torch; results differ in rounding between thread counts"""
+    """CPU threads; their number changes rounding"""
     shards: Annotated[int, Range(1, 4096)] = 1
     """equal parts of the environments and of minibatches, S, whose work processes share"""
     compile: Literal["auto", "on", "off"] = "auto"
     """compile the gradient steps and the policy; auto does so in long runs"""
+    average_last: Fraction = 0.0
+    """average the final policy over this last fraction of the run; usually 0.1"""
     checkpoint_every: Natural = 0
     """steps between checkpoints, and restarts; 0: a fifth of the run, or 3 episodes"""
     keep_checkpoints: Count = 3
@@ -193,6 +195,8 @@ class RunConfig:
     """parameters to keep, such as policy.net.0"""
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     """arguments of the environment, as JSON: '{"dynamics": "first_principles"}'"""
+    symmetry: Literal["auto", "on", "off"] = "off"
+    """also learn from mirrored steps; auto: where robots can be mirrored"""
     reset_options: dict[str, Any] = field(default_factory=dict)
     """options of every reset of the environment"""
     curriculum: str | None = None

@@ -1,12 +1,13 @@
 """The environments of a run, for training and for evaluation, and whether there is room for it."""
 
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext, suppress
 from typing import Any
 
 import torch
 
 from lemniscate.envs import registry
+from lemniscate.envs.symmetry import Mirror, find_mirror
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError, shown
 from lemniscate.nn.networks import NETWORKS
@@ -50,8 +51,21 @@ def envs_of(config: RunConfig, world: World) -> tuple[VecEnv, VecEnv | None]:
                 failing.pop_all()
                 return eval_env, eval_env
         env = registry.make(num_envs=config.num_envs, device=str(device), stagger=True, world=world, **arguments)
+        if config.symmetry != "off":
+            with suppress(UserError) if config.symmetry == "auto" else nullcontext():
+                env.mirror = mirror_of(config)
         failing.pop_all()
         return env, eval_env
+
+
+def mirror_of(config: RunConfig) -> Mirror:
+    """The mirror image of a run's transitions. Raises `UserError` where there is none, or where it is of no use."""
+    layers = getattr(config, "layers", None)
+    if layers and layers.remembers:
+        raise UserError(f"symmetry is not for network {layers.kind}: a memory has no mirror image.")
+    if getattr(config, "replay", "uniform") == "hindsight":
+        raise UserError("symmetry is not for replay hindsight: its goals have no mirror image.")
+    return find_mirror(config.env, config.env_kwargs, config.all_wrappers)
 
 
 def evaluation_env(

@@ -123,7 +123,7 @@ class OffPolicyConfig(RunConfig):
     @property
     def capacity(self) -> int:
         """The rows of the replay buffer: no more than the run can fill."""
-        rows_per_step = 1 + self.hindsight_goals * (self.replay == "hindsight")
+        rows_per_step = 1 + self.hindsight_goals * (self.replay == "hindsight") + (self.symmetry != "off")
         return min(self.buffer_size, self.num_envs * self.steps_per_env * rows_per_step)
 
     @property
@@ -165,6 +165,7 @@ class OffPolicyState(TrainState[Networks]):
         """Begin new sequences of action noise, and new episodes in the replay buffer."""
         super().on_restart(env)
         self.action_noise.on_restart()
+        self.replay.mirror = env.mirror
         self.replay.on_restart(env.backend.judge_goals)
 
     def on_warm_start(self) -> None:

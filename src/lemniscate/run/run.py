@@ -223,6 +223,11 @@ class Run:
         What a body that was cut short would have had done, the process does that goes on from the checkpoint before.
         """
         config, step, whole = self.config, state.step, not self._cut_short
+        finished = whole and step >= total_steps
+        if whole and step > (1 - config.average_last) * total_steps:
+            state.mean.add(state.policy)
+            if finished:
+                state.mean.move_to(state.policy)
         if whole and _passed(config.evaluate_every, before, step):
             self._evaluate(state)
         if whole and config.curriculum:
@@ -230,7 +235,6 @@ class Run:
         by_episodes = _passed(config.video_every_episodes, self._episodes_before, self._episodes)
         if whole and (by_episodes or _passed(config.video_every, before, step)):
             self._record(state)
-        finished = whole and step >= total_steps
         planned = finished or (whole and _passed(self._checkpoint_every, before, step))
         if planned:
             with self.world.busy():

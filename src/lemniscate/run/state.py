@@ -1,6 +1,6 @@
 """Training states: what a checkpoint holds, and what a run asks of it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from copy import copy
 from dataclasses import dataclass, field, fields
 from socket import gethostname
@@ -8,6 +8,8 @@ from typing import Any, Generic, TypeVar
 from zlib import crc32
 
 import torch
+from torch import Tensor
+from torch.nn.utils import parameters_to_vector
 
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import RankError
@@ -22,6 +24,37 @@ from lemniscate.system.world import World
 
 Networks = TypeVar("Networks", bound=Any)
 C = TypeVar("C", bound=RunConfig)
+
+
+class PolicyMean:
+    """The mean of a policy's parameters over the last updates of a run: Polyak & Juditsky 1992, doi:10.1137/0330046.
+
+    Single updates of a constant step size jump about a good policy; their mean lies nearer to it than most of them.
+    """
+
+    def __init__(self) -> None:
+        self._count, self._mean = torch.zeros(1), torch.zeros(0)
+
+    def add(self, policy: Policy) -> None:
+        """Take the parameters as they are into the mean."""
+        now = parameters_to_vector(policy.parameters()).detach()
+        self._count += 1
+        self._mean = now if self._count == 1 else self._mean.lerp(now, 1 / self._count.item())
+
+    def move_to(self, policy: Policy) -> None:
+        """Give the mean to the policy, and begin again."""
+        sizes = [parameter.numel() for parameter in policy.parameters()]
+        for parameter, values in zip(policy.parameters(), self._mean.split(sizes), strict=True):
+            parameter.data.copy_(values.view_as(parameter))  # in place: an optimizer has it as a view
+        self.load_state_dict({})
+
+    def state_dict(self) -> dict[str, Tensor]:
+        """The mean [P], and over how many updates it is."""
+        return {"count": self._count, "mean": self._mean}
+
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Restore what `state_dict` returned; a checkpoint from before there was a mean has nothing."""
+        self._count, self._mean = state.get("count", torch.zeros(1)), state.get("mean", torch.zeros(0))
 
 
 @dataclass(kw_only=True)
@@ -39,6 +72,8 @@ class TrainState(Generic[Networks]):
     """the algorithm's gradient steps; in a compiled run, their compiled form"""
     step: int = 0
     """environment steps taken"""
+    mean: PolicyMean = field(default_factory=PolicyMean)
+    """of the policy, where the run is to end with it (`average_last`)"""
 
     @property
     def policy(self) -> Policy:
