@@ -1,6 +1,8 @@
 """The drone behind the contract, held against crazyflow's own step."""
 
 import os
+import subprocess
+import sys
 import warnings
 
 os.environ.setdefault("SCIPY_ARRAY_API", "1")
@@ -163,3 +165,32 @@ def test_on_a_gpu_nothing_leaves_it():
     step = env.step(torch.zeros(N, 4, device="cuda"))
     assert step.obs.is_cuda
     assert step.reward.is_cuda
+
+
+KEEP = """
+import jax, lemniscate.drones.crazyflow as c
+c._keep_programs()
+print(jax.config.jax_compilation_cache_dir)
+if jax.config.jax_compilation_cache_dir:
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+    jax.jit(lambda x: x + 1)(1.0)
+"""
+
+
+@pytest.mark.parametrize(
+    ("variables", "kept"),
+    [
+        ({"XDG_CACHE_HOME": "{}"}, "{}/lemniscate/jax"),
+        ({"HOME": "{}"}, "{}/.cache/lemniscate/jax"),
+        ({"XDG_CACHE_HOME": "/dev/null/x"}, None),
+        ({"XDG_CACHE_HOME": "{}", "JAX_COMPILATION_CACHE_DIR": "{}/own"}, "{}/own"),
+    ],
+)
+def test_compiled_programs_are_kept_in_the_users_cache_or_where_jax_was_told(tmp_path, variables, kept):
+    own = {name: value.format(tmp_path) for name, value in variables.items()}
+    others = {name: value for name, value in os.environ.items() if not name.startswith(("JAX_", "XDG_"))}
+    done = subprocess.run(
+        [sys.executable, "-c", KEEP], env={**others, "JAX_PLATFORMS": "cpu", **own}, capture_output=True, text=True
+    )
+    assert (done.returncode, done.stdout.strip()) == (0, str(kept and kept.format(tmp_path))), done.stderr
+    assert not kept or list((tmp_path / done.stdout.strip()).iterdir())

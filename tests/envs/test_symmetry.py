@@ -67,7 +67,7 @@ class Pole(gym.Env):
 
 
 class WronglyMirrored(Pole):
-    mirror = [-1, 3, 1], [2, 1]
+    mirror = [-2, 3, 1], [2, 1]
 
 
 # of each robot by hand, from its model: what a mirrored position takes, and with which sign; velocities alike
@@ -127,7 +127,7 @@ def test_an_ant_is_mirrored_as_its_model_says():
         ("test_symmetry:OneEyedWalker", "number 3 of its observation is none of those in the mirror."),
         (
             "test_symmetry:WronglyMirrored",
-            r"a part of its attribute mirror is \[-1, 3, 1\]; it must have each of 1 to 3",
+            r"a part of its attribute mirror is \[-2, 3, 1\]; it must have each of 1 to 3",
         ),
         ("CartPole-v1", "it is no MuJoCo environment of Gymnasium's kind, and has no attribute mirror."),
         ("DroneFigureEightTrajectory-v0", "has no symmetry that could be used"),

@@ -14,6 +14,7 @@ import os
 import warnings
 from collections.abc import Collection, Mapping, Sequence
 from functools import lru_cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -210,6 +211,24 @@ def _import() -> None:
             import lemniscate.drones.gates  # noqa: F401  (registers the race)
     except ModuleNotFoundError as error:
         raise missing_extra("crazyflow", "drone") from error
+    _keep_programs()
+
+
+def _keep_programs() -> None:
+    """Keep compiled programs in the user's cache, unless JAX has been told another place.
+
+    Two programs of drones take 5 to 20 s to compile. What they are made of and the processor are part of their names.
+    """
+    import jax
+
+    if jax.config.jax_compilation_cache_dir:
+        return
+    place = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "lemniscate" / "jax"
+    with contextlib.suppress(OSError, RuntimeError):  # no home, or one that cannot be written to
+        place.mkdir(parents=True, exist_ok=True)
+        jax.config.update("jax_compilation_cache_dir", str(place))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+        jax.config.update("jax_persistent_cache_enable_xla_caches", "none")  # those no two processes may share
 
 
 def _check(env_id: str, num_envs: int, kwargs: Mapping[str, Any]) -> None:
