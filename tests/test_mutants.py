@@ -317,8 +317,8 @@ MUTANTS = [
     (
         "a mean that begins at zero",
         "run/state.py",
-        "1 / self._count.item()",
-        "1 / (self._count.item() + 1)",
+        "lerp(now, 1 / self._count)",
+        "lerp(now, 1 / (self._count + 1))",
         "run/test_average.py::test_the_final_policy_is_the_mean_of_the_policies_after_the_last_updates[ppo]",
     ),
     (
@@ -331,7 +331,7 @@ MUTANTS = [
     (
         "a mean that a checkpoint does not have",
         "run/state.py",
-        'return {"count": self._count, "mean": self._mean}',
+        'return {"mean": self._mean, "count": torch.tensor(self._count)} if self._count else {}',
         "return {}",
         "run/test_average.py::test_a_run_resumed_amid_the_mean_ends_in_the_same_bits",
     ),

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 import lemniscate as lem
 from lemniscate.api import plots
 from lemniscate.cli import parse
-from lemniscate.report import curves, pages, style
+from lemniscate.report import curves, pages
 from lemniscate.run.metrics import to_line
 from lemniscate.system.files import read_json, write_json
 from test_compare import without_layout, write_run, write_runs
@@ -41,7 +41,8 @@ def _here(tmp_path, monkeypatch):
 def drawn(monkeypatch, module, draw):
     """The figure that a function saves."""
     figures = []
-    monkeypatch.setattr(module, "save", lambda figure, file: figures.append(figure) or style.save(figure, file))
+    write = curves.save
+    monkeypatch.setattr(module, "save", lambda figure, file: figures.append(figure) or write(figure, file))
     draw()
     return figures[0]
 
@@ -109,11 +110,11 @@ def test_another_axis_is_refused(tmp_path):
 
 def test_one_spike_does_not_flatten_a_panel():
     values = np.array([*np.linspace(1, 2, 50), 1e6])
-    assert style.robust_range(values) == (1.0, 2.0)
-    assert style.robust_range(np.array([3.0, 3.0, 3.0, 9.0])) == (3.0, 9.0)
+    assert curves.robust_range(values) == (1.0, 2.0)
+    assert curves.robust_range(np.array([3.0, 3.0, 3.0, 9.0])) == (3.0, 9.0)
     axes = Figure().subplots()
     axes.plot(np.arange(51), values)
-    style.limit_axis(axes)
+    curves.limit_axis(axes)
     assert axes.get_ylim() == pytest.approx((0.95, 2.05))  # no margin below that is a share of the spike
     assert axes.lines[-1].get_xydata().tolist() == [[50, 1]]  # the triangle at the upper edge
     assert axes.get_title("right") == "▲ to 1e+06"

@@ -5,9 +5,10 @@ import torch
 from torch import nn
 
 import lemniscate as lem
-from lemniscate.algos import ALGORITHMS
+from helpers import long
+from lemniscate.algos import ALGORITHMS, ppo
 from lemniscate.run import checkpoint
-from lemniscate.testing import ALGORITHM_CONTRACT
+from lemniscate.testing import ALGORITHM_CONTRACT, check_learning
 
 ON_POLICY = {"env": "CartPole-v1", "num_envs": 4, "num_steps": 32, "total_steps": 1280, "hidden": (8,)}
 OFF_POLICY = {
@@ -56,6 +57,58 @@ TRAINS_OFTEN = ("check_seeds", "check_resume")
 def test_the_contract_holds(check, algorithm, tmp_path):
     settings = settings_of(algorithm)
     check(algorithm, tmp_path, **settings, checkpoint_every=settings["total_steps"] // 4, evaluate_episodes=2)
+
+
+FAST = {"learning_rate": 3e-3}
+FAST_Q = {
+    "total_steps": 2_000,
+    "actor_learning_rate": 3e-3,
+    "critic_learning_rate": 3e-3,
+    "tau": 0.05,
+    "hidden": (32,),
+    "critic_hidden": (32,),
+    "batch_size": 64,
+}
+LEARNING = {
+    "reinforce": {"total_steps": 10_000, **FAST},
+    "a2c": {"total_steps": 20_000, "learning_rate": 1e-2},
+    "trpo": {"total_steps": 5_000},
+    "ppo": {"total_steps": 5_000},
+    "reppo": {"total_steps": 10_000, "hidden": (32,), "learning_rate": 5e-3},
+    "pqn": {"total_steps": 20_000, "hidden": (32,), "learning_rate": 1e-3},
+    **dict.fromkeys(("ddpg", "td3", "sac"), FAST_Q),
+}
+
+
+def learns(algorithm, folder):
+    settings = {**settings_of(algorithm), **LEARNING[algorithm]}
+    check_learning(algorithm, folder, **settings, gamma=0.9, evaluate_episodes=2)
+
+
+@pytest.mark.parametrize("algorithm", [*long("reinforce", "trpo", "reppo", "pqn", "td3", "sac"), "a2c", "ppo", "ddpg"])
+def test_every_algorithm_learns_what_is_right_and_the_value_beyond_a_cut(algorithm, tmp_path):
+    learns(algorithm, tmp_path)
+
+
+def opposite(surrogate):
+    return lambda *args: -surrogate(*args)
+
+
+def ending(estimate):
+    return lambda reward, value, after, terminated, done, **rest: estimate(reward, value, after, done, done, **rest)
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong", "said"),
+    [
+        ("clipped_surrogate", opposite, "The policy has learned the opposite, a return of 0 of 10: a sign is wrong."),
+        ("gae", ending, "% of the value is missing: where episodes are cut off, that of the last state."),
+    ],
+)
+def test_a_wrong_sign_and_a_missing_bootstrap_are_named(name, wrong, said, tmp_path, monkeypatch):
+    monkeypatch.setattr(ppo, name, wrong(getattr(ppo, name)))
+    with pytest.raises(AssertionError, match=said):
+        learns("ppo", tmp_path)
 
 
 class Pretrained(nn.Module):

@@ -56,8 +56,8 @@ SPREAD = {
 """the most by which a level changes what it draws: kg, kg m², m, rad; of gates x, y, z (m), roll, pitch, yaw (rad)"""
 BODY_RATES = (10.0, 10.0, 6.0)
 """the most that can be commanded with `control="body_rate"`, rad/s"""
-SPEED_AHEAD = 1.5
-"""m/s of an episode that begins on its way"""
+SPEED_AHEAD = 4.0
+"""the most m/s of an episode that begins on its way: as fast as races get to a gate, so that they learn to go on"""
 CANDIDATES = 64
 """places of which the first that fits is taken, where a track is drawn"""
 APART = {
@@ -412,7 +412,7 @@ class DroneGates(DroneEnv):
         Ahead, what stands there differs from the track by a random share of what the level says, so that there is
         something to learn before the hardest races can be won.
         """
-        self._key, which, where, fast, easier = jax.random.split(self._key, 5)
+        self._key, which, where, hurried, fast, easier = jax.random.split(self._key, 6)
         n, count, data = self.num_envs, len(self.track.order), self.sim.data
         share = jnp.sqrt(jax.random.uniform(easier, (n, 1, 1)))
         for true, expected in (("_gates", self._expected_gates), ("_obstacles", self._expected_obstacles)):
@@ -421,7 +421,8 @@ class DroneGates(DroneEnv):
         target = jax.random.randint(which, (n,), 1, count) if count > 1 else jnp.zeros(n, jnp.int32)
         place, turned = self._frame(jnp.maximum(target - 1, 0), self._gates)
         pos = place + out_of(turned, jnp.array((0.25, 0.0, 0.0)) + _uniform(where, (n, 3), (0.1, 0.12, 0.12)))
-        vel = SPEED_AHEAD * turned[:, :, 0] + 0.5 * jax.random.normal(fast, (n, 3))
+        speed = jax.random.uniform(hurried, (n, 1), maxval=SPEED_AHEAD)
+        vel = speed * turned[:, :, 0] + 0.5 * jax.random.normal(fast, (n, 3))
         pos = jnp.where(ahead[:, None], pos, data.states.pos[:, 0])
         vel = jnp.where(ahead[:, None], vel, data.states.vel[:, 0])
         self.sim.data = data.replace(states=data.states.replace(pos=pos[:, None], vel=vel[:, None]))

@@ -146,5 +146,5 @@ class RewardScale(WideBuffers):
         Mirror images behind the N have the same rewards.
         """
         count = len(self.running)
-        self.update(*(column[:, :count] for column in (rollout.reward, rollout.done, rollout.valid)))
+        self.update(rollout.reward[:, :count], rollout.done[:, :count], rollout.valid[:, :count])
         return replace(rollout, reward=self(rollout.reward))

@@ -224,7 +224,7 @@ class Run:
         """
         config, step, whole = self.config, state.step, not self._cut_short
         finished = whole and step >= total_steps
-        if whole and step > (1 - config.average_last) * total_steps:
+        if whole and config.average_last and step > (1 - config.average_last) * total_steps:
             state.mean.add(state.policy)
             if finished:
                 state.mean.move_to(state.policy)

@@ -33,13 +33,13 @@ class PolicyMean:
     """
 
     def __init__(self) -> None:
-        self._count, self._mean = torch.zeros(1), torch.zeros(0)
+        self._count, self._mean = 0, torch.zeros(0)
 
     def add(self, policy: Policy) -> None:
         """Take the parameters as they are into the mean."""
         now = parameters_to_vector(policy.parameters()).detach()
         self._count += 1
-        self._mean = now if self._count == 1 else self._mean.lerp(now, 1 / self._count.item())
+        self._mean = now if self._count == 1 else self._mean.to(now.device).lerp(now, 1 / self._count)
 
     def move_to(self, policy: Policy) -> None:
         """Give the mean to the policy, and begin again."""
@@ -49,12 +49,12 @@ class PolicyMean:
         self.load_state_dict({})
 
     def state_dict(self) -> dict[str, Tensor]:
-        """The mean [P], and over how many updates it is."""
-        return {"count": self._count, "mean": self._mean}
+        """The mean [P], and over how many updates it is; nothing where it has not begun."""
+        return {"mean": self._mean, "count": torch.tensor(self._count)} if self._count else {}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        """Restore what `state_dict` returned; a checkpoint from before there was a mean has nothing."""
-        self._count, self._mean = state.get("count", torch.zeros(1)), state.get("mean", torch.zeros(0))
+        """Restore what `state_dict` returned."""
+        self._count, self._mean = int(state.get("count", 0)), state.get("mean", torch.zeros(0))
 
 
 @dataclass(kw_only=True)
