@@ -204,6 +204,8 @@ class CrazyflowBackend(JaxBackend):
 
 def _import() -> None:
     os.environ.setdefault("SCIPY_ARRAY_API", "1")  # crazyflow insists, and before SciPy is first imported
+    # XLA calls two of its own preferences missing features of the processor, in four lines, when it loads a program.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     try:
         with contextlib.redirect_stdout(io.StringIO()):  # MJX announces optional packages that it does not find
             import crazyflow  # noqa: F401  (registers the environments)
