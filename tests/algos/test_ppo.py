@@ -141,3 +141,15 @@ def test_a_value_out_of_range_is_named(fields, message):
 def test_a_config_survives_json():
     config = tiny(target_kl=0.02, minibatch_size=8, hidden=(8, 8))
     assert ppo.Config.from_json(config.to_json()) == config
+
+
+def test_the_kl_that_the_learning_rate_follows_may_have_a_schedule():
+    """At the beginning every KL is too large for it, at the end every one too small."""
+    rates = []
+    for progress in (0, 0.999):
+        config, state, rollout = one_rollout(desired_kl="1e-12>1e6", epochs=2)
+        state.step = int(progress * config.total_steps)
+        before = state.learning_rate
+        ppo.update(config, state, rollout)
+        rates.append(state.learning_rate / before)
+    assert rates[0] < 1 < rates[1]
