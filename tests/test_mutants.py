@@ -1290,8 +1290,8 @@ MUTANTS = [
     (
         "ignored rows are replayed",
         "data/replay.py",
-        "self.extend(rows if step.valid.all() else rows[step.valid])",
-        "self.extend(rows)",
+        "rows = rows if step.valid.all() else rows[step.valid]",
+        "rows = rows",
         "data/test_interact.py::test_transitions_have_their_true_successors_and_terminations",
     ),
     (
