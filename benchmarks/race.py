@@ -1,7 +1,7 @@
 # ruff: noqa: E402  (JAX is imported after crazyflow's variable of the environment is set)
 """The race through gates: the presets over seeds on unseen tracks, crazyflow's own controller beside them, pictures.
 
-.venv/bin/python benchmarks/race.py train --levels 0 2 3 --seeds 1 2 3 4 5
+.venv/bin/python benchmarks/race.py train --levels 0 2 --seeds 1 2 3 4 5
 .venv/bin/python benchmarks/race.py controller
 .venv/bin/python benchmarks/race.py table
 .venv/bin/python benchmarks/race.py levels          docs/images/gates_levels.png
@@ -28,7 +28,7 @@ from scipy.interpolate import CubicSpline
 from lemniscate.drones import gates
 from lemniscate.drones.drones import Drones
 
-PRESETS = {0: "gates", 1: "gates", 2: "gates-moved", 3: "gates-drawn"}
+PRESETS = {0: "gates", 1: "gates", 2: "gates-moved"}
 NAMES = ("success", "lap_seconds", "gates_passed", "crashed")
 
 

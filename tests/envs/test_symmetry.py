@@ -9,6 +9,7 @@ from gymnasium.envs.mujoco.walker2d_v5 import Walker2dEnv
 
 import lemniscate as lem
 from conftest import tiny_fields, tiny_off_policy
+from lemniscate.algos import find, ppo
 from lemniscate.envs.symmetry import find_mirror
 from lemniscate.errors import UserError
 from lemniscate.run import checkpoint
@@ -70,6 +71,10 @@ class WronglyMirrored(Pole):
     mirror = [-2, 3, 1], [2, 1]
 
 
+class OneList(Pole):
+    mirror = ([1, 2, 3],)
+
+
 # of each robot by hand, from its model: what a mirrored position takes, and with which sign; velocities alike
 ANT = [0, 1, 2, 3, 4, 5, 6, 13, 14, 11, 12, 9, 10, 7, 8], [1, -1, 1, 1, -1, 1, -1, *[-1, 1] * 4]
 ANT_SPEED = [0, 1, 2, 3, 4, 5, 12, 13, 10, 11, 8, 9, 6, 7], [1, -1, 1, -1, 1, -1, *[-1, 1] * 4]
@@ -127,9 +132,11 @@ def test_an_ant_is_mirrored_as_its_model_says():
         ("test_symmetry:OneEyedWalker", "number 3 of its observation is none of those in the mirror."),
         (
             "test_symmetry:WronglyMirrored",
-            r"a part of its attribute mirror is \[-2, 3, 1\]; it must have each of 1 to 3",
+            r"mirror of its observation is \[-2, 3, 1\]; it must have each of 1 to 3 once, in pairs.",
         ),
-        ("CartPole-v1", "it is no MuJoCo environment of Gymnasium's kind, and has no attribute mirror."),
+        ("test_symmetry:OneList", r"its attribute mirror is \(\[1, 2, 3\],\); it must be two lists of whole numbers"),
+        ("CartPole-v1", "its action is not one row of numbers."),
+        ("Pendulum-v1", "it is no MuJoCo environment of Gymnasium's kind, and has no attribute mirror."),
         ("DroneFigureEightTrajectory-v0", "has no symmetry that could be used"),
         ("Nothing-v7", "has no symmetry that could be used"),
     ],
@@ -203,20 +210,26 @@ def test_on_says_where_there_is_none_and_auto_does_without(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("fields", "said"),
+    ("algorithm", "fields", "said"),
     [
-        ({"network": "gru", "num_steps": 16}, "symmetry is not for network gru: a memory has no mirror image."),
+        ("ppo", {"network": "gru"}, "symmetry is not for network gru: a memory has no mirror image."),
+        ("sac", {"replay": "hindsight"}, "symmetry is not for replay hindsight: its goals have no mirror image."),
     ],
 )
-def test_what_has_no_mirror_image_is_refused(tmp_path, fields, said):
+def test_what_has_no_mirror_image_is_refused(algorithm, fields, said):
     with pytest.raises(UserError, match=said):
-        lem.train("ppo", "Walker2d-v5", run=tmp_path / "r", progress=False, **tiny_fields(symmetry="on", **fields))
+        make_envs(find(algorithm).Config(env="Walker2d-v5", symmetry="on", **fields))
+
+
+def test_one_robot_has_its_mirror_too():
+    env, eval_env = make_envs(ppo.Config(env="test_symmetry:Pole", num_envs=1, minibatch_size=64, symmetry="on"))
+    assert env is eval_env
+    assert env.mirror is not None
+    env.close()
 
 
 def test_environments_of_a_run_have_the_mirror_and_those_of_evaluation_do_not():
-    from lemniscate.algos.ppo import Config
-
-    env, eval_env = make_envs(Config(env="Walker2d-v5", num_envs=2, symmetry="on"))
+    env, eval_env = make_envs(ppo.Config(env="Walker2d-v5", num_envs=2, symmetry="on"))
     try:
         assert env.mirror is not None
         assert eval_env.mirror is None

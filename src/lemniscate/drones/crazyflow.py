@@ -225,8 +225,8 @@ def _keep_programs() -> None:
 
     if jax.config.jax_compilation_cache_dir:
         return
-    place = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "lemniscate" / "jax"
     with contextlib.suppress(OSError, RuntimeError):  # no home, or one that cannot be written to
+        place = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "lemniscate" / "jax"
         place.mkdir(parents=True, exist_ok=True)
         jax.config.update("jax_compilation_cache_dir", str(place))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)

@@ -7,8 +7,10 @@ mirrored successor, every transition teaches two.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
+from operator import index
 from typing import Any, TypeVar
 
+import gymnasium as gym
 import numpy as np
 import torch
 from torch import Tensor
@@ -27,7 +29,8 @@ FREE, SLIDE, HINGE = 0, 2, 3
 """MuJoCo's numbers of the kinds of joints"""
 EXACT = 1e-9
 """the largest difference between both, beside 1 or the size of the number itself"""
-MIRRORED = ("obs", "next_obs", "action")
+KINDS = {"obs": "observation", "next_obs": "observation", "action": "action"}
+"""the columns of transitions that have an image, and whose it is"""
 
 
 @dataclass(frozen=True)
@@ -60,11 +63,8 @@ class Mirror:
     def both(self, rows: R, dim: int) -> R:
         """A record of transitions and, behind them along `dim`, their mirror images; rewards and ends are the same."""
         given = vars(rows)
-        images = given | {name: getattr(self, KINDS[name])(given[name]) for name in MIRRORED}
+        images = given | {name: getattr(self, kind)(given[name]) for name, kind in KINDS.items()}
         return type(rows)(*(torch.cat([given[name], images[name]], dim) for name in given))
-
-
-KINDS = {"obs": "observation", "next_obs": "observation", "action": "action"}
 
 
 def find_mirror(env: str, kwargs: Mapping[str, Any], wrappers: Sequence[str]) -> Mirror:
@@ -83,9 +83,10 @@ def find_mirror(env: str, kwargs: Mapping[str, Any], wrappers: Sequence[str]) ->
                 raise UserError("it makes many environments at once.")
             one = make_one(maker, tuple(map(find_callable, wrappers)), **kwargs)
         try:
-            if one.has_wrapper_attr("mirror"):
-                return _given(one)
-            return _derived(one)
+            for name, space in (("observation", one.observation_space), ("action", one.action_space)):
+                if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
+                    raise UserError(f"its {name} is not one row of numbers.")
+            return _given(one) if one.has_wrapper_attr("mirror") else _derived(one)
         finally:
             one.close()
     except UserError as error:
@@ -94,15 +95,20 @@ def find_mirror(env: str, kwargs: Mapping[str, Any], wrappers: Sequence[str]) ->
 
 def _given(env: SingleEnv) -> Mirror:
     """The mirror of the attribute `mirror`. Raises `UserError` where it does not fit, or is not its own inverse."""
-    orders, spaces = [], (env.observation_space, env.action_space)
-    lists = env.get_wrapper_attr("mirror")
-    for numbers, space in zip(lists, spaces, strict=True):
+    given, orders = env.get_wrapper_attr("mirror"), list[Order]()
+    try:
+        lists = [np.array([index(number) for number in numbers]) for numbers in given]
+        spaces = dict(zip(("observation", "action"), (env.observation_space, env.action_space), strict=True))
+        pairs = list(zip(lists, spaces.items(), strict=True))
+    except (TypeError, ValueError):
+        wanted = "two lists of whole numbers, such as ([-1, 3, 2], [2, 1])"
+        raise UserError(f"its attribute mirror is {shown(given)}; it must be {wanted}.") from None
+    for signed, (name, space) in pairs:
         size = int(np.prod(space.shape or ()))
-        signed = np.asarray(numbers, dtype=np.int64)
         order = Order(np.abs(signed) - 1, np.sign(signed).astype(np.float64))
         if sorted(np.abs(signed)) != list(range(1, size + 1)) or not _is_own_inverse(order):
             wanted = f"each of 1 to {size} once, in pairs"
-            raise UserError(f"a part of its attribute mirror is {shown(list(numbers))}; it must have {wanted}.")
+            raise UserError(f"mirror of its {name} is {shown(signed.tolist())}; it must have {wanted}.")
         orders.append(order)
     return Mirror(*orders)
 
@@ -117,8 +123,6 @@ def _derived(env: SingleEnv) -> Mirror:
     bare: Any = env.unwrapped
     if not all(hasattr(bare, name) for name in ("model", "data", "set_state")):
         raise UserError("it is no MuJoCo environment of Gymnasium's kind, and has no attribute mirror.")
-    if env.observation_space.shape is None or len(env.observation_space.shape) != 1:
-        raise UserError("its observation is not one row of numbers.")
     for reflection in np.array([(1.0, -1.0, 1.0), (-1.0, 1.0, 1.0), (1.0, 1.0, 1.0)]):
         orders = _Body(bare.model, reflection).orders()
         if orders and not all(order.is_identity for order in orders):
@@ -197,7 +201,7 @@ class _Body:
 def _proved(env: SingleEnv, pos: Order, vel: Order, controls: Order) -> Mirror:
     """The mirror, with the order of the observation as stepping shows it. Raises `UserError` where both sides differ.
 
-    It steps until no number of the observation could be the image of two, or as often as is worth while.
+    It steps until no number of the observation could be the image of two, from `MOST` starts at most.
     """
     bare: Any = env.unwrapped
     rng, reference = np.random.default_rng(0), bare.model.qpos0  # a mirrored pose is one on the other side of this

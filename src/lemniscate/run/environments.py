@@ -40,6 +40,7 @@ def make_envs(config: RunConfig) -> tuple[VecEnv, VecEnv]:
 def envs_of(config: RunConfig, world: World) -> tuple[VecEnv, VecEnv | None]:
     """The environments of one process of a run; of several, only the first evaluates. Raises as `make_envs`."""
     device, arguments = device_for(config.device), env_arguments(config, backend=config.backend)
+    mirror = mirror_of(config)  # first, and closed again: it makes an environment, and there may be one at a time
     with ExitStack() as failing:
         eval_env = None
         if world.is_first:  # the few, before the many
@@ -48,24 +49,30 @@ def envs_of(config: RunConfig, world: World) -> tuple[VecEnv, VecEnv | None]:
             if world.size == 1:
                 require_memory(config, eval_env.spec, device)
             if eval_env.backend.once:
+                eval_env.mirror = mirror
                 failing.pop_all()
                 return eval_env, eval_env
         env = registry.make(num_envs=config.num_envs, device=str(device), stagger=True, world=world, **arguments)
-        if config.symmetry != "off":
-            with suppress(UserError) if config.symmetry == "auto" else nullcontext():
-                env.mirror = mirror_of(config)
+        env.mirror = mirror
         failing.pop_all()
         return env, eval_env
 
 
-def mirror_of(config: RunConfig) -> Mirror:
-    """The mirror image of a run's transitions. Raises `UserError` where there is none, or where it is of no use."""
-    layers = getattr(config, "layers", None)
-    if layers and layers.remembers:
-        raise UserError(f"symmetry is not for network {layers.kind}: a memory has no mirror image.")
-    if getattr(config, "replay", "uniform") == "hindsight":
-        raise UserError("symmetry is not for replay hindsight: its goals have no mirror image.")
-    return find_mirror(config.env, config.env_kwargs, config.all_wrappers)
+def mirror_of(config: RunConfig) -> Mirror | None:
+    """The mirror image of a run's transitions, where they are to have one.
+
+    Raises `UserError` where there is none and symmetry is on.
+    """
+    if config.symmetry == "off":
+        return None
+    with suppress(UserError) if config.symmetry == "auto" else nullcontext():
+        layers = getattr(config, "layers", None)
+        if layers and layers.remembers:
+            raise UserError(f"symmetry is not for network {layers.kind}: a memory has no mirror image.")
+        if getattr(config, "replay", "uniform") == "hindsight":
+            raise UserError("symmetry is not for replay hindsight: its goals have no mirror image.")
+        return find_mirror(config.env, config.env_kwargs, config.all_wrappers)
+    return None
 
 
 def evaluation_env(
