@@ -312,7 +312,7 @@ MUTANTS = [
         "data/replay.py",
         "self.mirror.both(rows, 0) if self.mirror else rows",
         "rows",
-        "envs/test_symmetry.py::test_every_algorithm_learns_from_both_sides_and_goes_on_to_the_same_bits[sac]",
+        "envs/test_symmetry.py::test_every_algorithm_with_a_q_learns_from_both_sides_and_goes_on_to_the_same_bits[sac]",
     ),
     (
         "a mean that begins at zero",
@@ -1512,10 +1512,17 @@ MUTANTS = [
         "run/test_signals.py::test_the_share_of_the_value_that_is_missing",
     ),
     (
+        "an update is judged by the rows of others too",
+        "run/signals.py",
+        "newest = valid & (",
+        "newest = valid | (",
+        "run/test_signals.py::test_the_correlation_of_advantages_and_of_what_an_update_did_to_the_policy",
+    ),
+    (
         "every line has signals",
         "run/run.py",
-        "self._lines % every == 0",
-        "every",
+        "self._lines % self._look_every == 0",
+        "True",
         "run/test_signals.py::test_there_are_signals_some_thirty_times_in_a_run_and_in_its_first_line",
     ),
     (

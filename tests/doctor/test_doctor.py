@@ -75,6 +75,18 @@ CASES = {
         {"approx_kl": [0.0] * 8, "losses__entropy": list(np.linspace(1.0, 0.5, 8))},
         {"approx_kl": [1e-8] * 8, "losses__entropy": list(np.linspace(1.0, 0.5, 8))},
     ),
+    "advantage-opposed": (
+        {"advantage__followed": [-0.2, -0.1] * 4},
+        {"advantage__followed": [-0.3, 0.2] * 4},
+    ),
+    "advantage-unrelated": (
+        {"advantage__followed": [-0.02, 0.02] * 4, "approx_kl": [0.01] * 8},
+        {"advantage__followed": [0.03, 0.07] * 4, "approx_kl": [0.01] * 8},
+    ),
+    "ends-ignored": (
+        {"value__at_ends": [0.1] * 4 + [0.95, 0.98] * 2},
+        {"value__at_ends": [0.95] * 4 + [0.6, 0.7] * 2},
+    ),
     "gradient-grows": ({"gradient_norm": [30.0] + [250.0] * 8}, {"gradient_norm": [30.0] + [140.0] * 8}),
     "ends-early": (
         {

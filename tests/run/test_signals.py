@@ -2,6 +2,7 @@
 
 from itertools import pairwise
 from types import SimpleNamespace
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -10,12 +11,16 @@ from torch import nn
 
 import lemniscate as lem
 from conftest import tiny_fields, tiny_off_policy
-from lemniscate.maths import explained_by
+from lemniscate.algos import ppo
+from lemniscate.maths import explained_by, gae
+from lemniscate.nn.actor_critic import ActorCritic
+from lemniscate.nn.networks import Layers
 from lemniscate.nn.normalizer import NoNorm, RunningNorm
 from lemniscate.run.metrics import read_metrics
 from lemniscate.run.signals import (
     KINDS,
     LOOKS,
+    acted_with,
     by_time,
     late_effect,
     of_effects,
@@ -234,7 +239,9 @@ def test_there_are_signals_some_thirty_times_in_a_run_and_in_its_first_line(tmp_
     assert LOOKS - 4 <= len(looked) <= LOOKS + 1
     assert looked[0] == lines[0]["step"]
     assert len({after - before for before, after in pairwise(looked)}) == 1
-    assert {"normalizer/count", "network/inactive", "action/effect", "value/missing"} <= lines[0].keys()
+    assert {"normalizer/count", "network/inactive", "action/effect", "value/missing", "advantage/followed"} <= lines[
+        0
+    ].keys()
 
 
 @pytest.mark.parametrize("algorithm", ["ppo", "sac", "pqn", "reinforce"])
@@ -291,6 +298,73 @@ def test_the_share_of_the_value_that_is_missing(size, reward, missing):
     found = of_values(state, config, rows(reward=torch.full((B,), reward)))
     assert found["value/missing"] == pytest.approx(missing, abs=1e-5)  # (V of the policy, 10, less V) / |V|
     assert of_values(state, SimpleNamespace(gamma=1.0), rows()) == {}
+
+
+def test_what_the_value_awaits_beyond_an_end():
+    """V is 4 everywhere, and the last rewards are 1 and 2: 3 and 2 of 4 too much."""
+    reward, terminated = torch.zeros(B), torch.zeros(B, dtype=torch.bool)
+    reward[[5, 9]], terminated[[5, 9]] = torch.tensor([1.0, 2.0]), True
+    state, config = SimpleNamespace(networks=Steady(4.0)), SimpleNamespace(gamma=0.9)
+    assert of_values(state, config, rows(reward=reward, terminated=terminated))["value/at_ends"] == 2.5 / 4
+    assert "value/at_ends" not in of_values(state, config, rows(truncated=terminated))
+
+
+T, N = 16, 4
+
+
+def stateful(action):
+    """A training state with a policy for `action` spaces and V(s), and rows [T, N] of its own actions."""
+    torch.manual_seed(0)
+    networks = ActorCritic(spec_of(action), Layers((8,)), -0.5, normalize_observations=True)
+    obs = numbers(T, N, O).float()
+    acted, flags = (
+        networks.policy(obs).sample(networks.policy.draw_noise((T, N), torch.Generator().manual_seed(1))),
+        torch.zeros(T, N).bool(),
+    )
+    found = {"obs": obs, "action": acted, "reward": numbers(T, N, seed=2).float()}
+    ends = {"terminated": flags.clone(), "truncated": flags.clone(), "valid": ~flags}
+    ends["terminated"][[3, 8], [1, 2]] = ends["truncated"][6, 0] = True
+    ends["valid"][9, 2] = False
+    return SimpleNamespace(networks=networks, policy=networks.policy), Rollout(
+        **found, **ends, next_obs=numbers(T, N, O, seed=3).float()
+    )
+
+
+@pytest.mark.parametrize("action", [None, Discrete(3)])
+def test_the_correlation_of_advantages_and_of_what_an_update_did_to_the_policy(action):
+    state, rows = stateful(action)
+    before = acted_with(state)
+    old = state.policy(rows.obs).log_prob(rows.action).detach()
+    with torch.no_grad():
+        for parameter in state.policy.parameters():
+            parameter.add_(0.1 * torch.randn_like(parameter))
+    state.policy.observe(5 * rows.obs, rows.valid)  # the normalizer is a part of what changed
+    value, after = state.networks.value(rows.obs).detach(), state.networks.value(rows.next_obs).detach()
+    advantage = np.zeros((T, N))
+    for n in range(N):
+        for t in reversed(range(T)):
+            delta = rows.reward[t, n] + 0.9 * after[t, n] * (not rows.terminated[t, n]) - value[t, n]
+            follows = 0.0 if rows.done[t, n] or t == T - 1 else advantage[t + 1, n]
+            advantage[t, n] = delta + 0.9 * 0.95 * follows
+    change = (state.policy(rows.obs).log_prob(rows.action).detach() - old).numpy()
+    newest = rows.valid.numpy() & (np.arange(T) >= T - 12)[:, None]
+    expected = np.corrcoef(advantage[newest], change[newest])[0, 1]
+    config = SimpleNamespace(gamma=0.9, num_steps=12)
+    assert of_values(state, config, rows, before)["advantage/followed"].item() == pytest.approx(expected, abs=1e-4)
+    assert of_values(state, config, rows, acted_with(state))["advantage/followed"] == 0  # nothing has moved
+    assert "advantage/followed" not in of_values(state, config, rows)
+
+
+def test_ppo_follows_its_advantages_and_with_a_wrong_sign_it_does_not(tmp_path):
+    fields = {"num_envs": 4, "num_steps": 64, "total_steps": 4 * 64 * 20, "minibatch_size": 64, "progress": False}
+
+    def followed(path):
+        lines = read_metrics(lem.train("ppo", "CartPole-v1", run=path, **fields).path)
+        return np.mean([line["advantage/followed"] for line in lines if "advantage/followed" in line])
+
+    assert followed(tmp_path / "right") > 0.05
+    with patch.object(ppo, "gae", lambda *a, **options: (lambda found: (-found[0], found[1]))(gae(*a, **options))):
+        assert followed(tmp_path / "wrong") < -0.05
 
 
 def test_before_there_are_rows_there_are_no_signals():

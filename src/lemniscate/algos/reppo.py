@@ -6,6 +6,7 @@ Departures from the paper, and why: docs/notes/reppo.md.
 
 from dataclasses import dataclass
 from functools import partial
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -60,6 +61,8 @@ class Config(RecurrentConfig):
     """initial log σ of the policy before its tanh; usually -1.5 to -0.5"""
     activation: Activation = "silu"
     """activation function between the layers"""
+    symmetry: Literal["auto", "on", "off"] = "off"
+    """also learn from mirrored steps; auto: where robots can be mirrored"""
     network: str = "layer_norm"
     """mlp, layer_norm, simba, gru (with a memory), or module:Class"""
 

@@ -58,8 +58,7 @@ def collect_episodes(env: VecEnv, policy: Policy, episodes: int, generator: Gene
             rows.append(Rollout(obs, action, step.reward, step.next_obs, step.terminated, step.truncated, whole))
             done = (step.terminated | step.truncated) & step.valid
             ended, age = ended + done.int(), (age + 1) * ~done
-        rollout = Rollout.stack(rows)
-        return env.mirror.both(rollout, 1) if env.mirror else rollout
+    return Rollout.stack(rows)
 
 
 def rollout_bytes(spec: Spec, num_steps: int, num_envs: int) -> int:

@@ -272,6 +272,42 @@ def ratio_always_one(e: Evidence) -> str | None:
 
 
 @rule
+def advantage_opposed(e: Evidence) -> str | None:
+    """The policy is led away from what is better: the sign of the loss or of the advantage is wrong."""
+    followed = e.values("advantage/followed")
+    if len(followed) < 4 or not _standard_errors(followed) < -3:
+        return None
+    return f"The probabilities of actions fall with their advantage: the correlation is {followed.mean():.2f}."
+
+
+@rule
+def ends_ignored(e: Evidence) -> str | None:
+    """The value goes on where an episode has terminated: targets add what follows an end, of the next episode even."""
+    late = e.last_half("value/at_ends")
+    if len(late) < 2 or not (0.85 < np.median(late) < 1.15 and np.percentile(late, 10) > 0.7):  # below: it is behind
+        return None
+    return (
+        f"Where episodes terminate, V is as large as elsewhere: {np.median(late):.0%} of that, above the last reward."
+    )
+
+
+@rule
+def advantage_unrelated(e: Evidence) -> str | None:
+    """The policy moves, and not towards what was better: advantages are those of other rows, or of other actions."""
+    followed = e.values("advantage/followed")
+    if len(followed) < 4 or e.rose or ends_ignored(e) or not e.late("approx_kl") > 1e-5:
+        return None
+    if not abs(_standard_errors(followed)) < 2 or not abs(followed.mean()) < 0.04:
+        return None
+    return f"Changes of log π and advantages have a correlation of {followed.mean():.2f}: none."
+
+
+def _standard_errors(values: np.ndarray) -> float:
+    """The mean of some values in its standard errors."""
+    return float(values.mean() / max(values.std(ddof=1) / np.sqrt(len(values)), 1e-9))
+
+
+@rule
 def gradient_grows(e: Evidence) -> str | None:
     """The gradient grows from step to step: gradients add up, as without zero_grad."""
     norms = e.values("gradient_norm")

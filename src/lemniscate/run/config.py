@@ -195,8 +195,6 @@ class RunConfig:
     """parameters to keep, such as policy.net.0"""
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     """arguments of the environment, as JSON: '{"dynamics": "first_principles"}'"""
-    symmetry: Literal["auto", "on", "off"] = "off"
-    """also learn from mirrored steps; auto: where robots can be mirrored"""
     reset_options: dict[str, Any] = field(default_factory=dict)
     """options of every reset of the environment"""
     curriculum: str | None = None

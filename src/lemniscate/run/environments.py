@@ -63,9 +63,10 @@ def mirror_of(config: RunConfig) -> Mirror | None:
 
     Raises `UserError` where there is none and symmetry is on.
     """
-    if config.symmetry == "off":
+    wanted = getattr(config, "symmetry", "off")  # of algorithms that do not ask how likely a mirrored action was
+    if wanted == "off":
         return None
-    with suppress(UserError) if config.symmetry == "auto" else nullcontext():
+    with suppress(UserError) if wanted == "auto" else nullcontext():
         layers = getattr(config, "layers", None)
         if layers and layers.remembers:
             raise UserError(f"symmetry is not for network {layers.kind}: a memory has no mirror image.")

@@ -23,6 +23,8 @@ class OffPolicyConfig(RunConfig):
     """parallel environments, N; usually 1 to 8"""
     gamma: Fraction = 0.99
     """discount factor γ; usually 0.95 to 0.999"""
+    symmetry: Literal["auto", "on", "off"] = "off"
+    """also learn from mirrored steps; auto: where robots can be mirrored"""
     replay: Literal["uniform", "hindsight"] = "uniform"
     """hindsight stores steps again, with goals that were reached"""
     hindsight_goals: Count = 4

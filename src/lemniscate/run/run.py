@@ -32,7 +32,7 @@ from lemniscate.run.evaluate import critic_of, evaluate
 from lemniscate.run.loggers import NO_EPISODES, JsonLines, Logger, LoggerClass, TensorBoard
 from lemniscate.run.metrics import read_metrics
 from lemniscate.run.seeding import derive, seed_globals
-from lemniscate.run.signals import LOOKS, signals
+from lemniscate.run.signals import LOOKS, acted_with, signals
 from lemniscate.run.state import TrainState, require_agreement
 from lemniscate.run.stopping import Stopped, StopRequest
 from lemniscate.run.warm_start import load_networks
@@ -90,6 +90,10 @@ class Run:
         """whole training episodes so far, and before the present body of the loop"""
         self._lines = 0
         """lines logged by the loop"""
+        self._look_every = 1
+        """lines from one with signals to the next"""
+        self._acted: dict[str, torch.Tensor] | None = None
+        """what the policy is made of before an update that will be looked at"""
         self._logged, self._told = 0, 0
         """the step of the last line of metrics, and how many notices of the environments have been said"""
         self._cut_short = False
@@ -146,6 +150,7 @@ class Run:
                 going_on = True
                 while going_on and state.step < total_steps:
                     before, self._episodes_before = state.step, self._episodes
+                    self._acted = acted_with(state) if self._looks else None
                     yield self.env
                     body_ended = time.monotonic()
                     going_on = self._between(state, before, total_steps)
@@ -178,9 +183,9 @@ class Run:
             numbers["episode/return"] = sum(episodes.returns) / len(episodes.returns)
             numbers["episode/length"] = sum(episodes.lengths) / len(episodes.lengths)
         # Some LOOKS lines of a run have signals, of a short one a fourth of them: more would cost more than 1 %.
-        every = max(4, -(-self.config.total_steps // (LOOKS * max(1, state.step - self._line_step))))
-        if self.world.is_first and self._lines % every == 0:
-            numbers |= signals(state, self.config, self.spec, self.env.recent())
+        self._look_every = max(4, -(-self.config.total_steps // (LOOKS * max(1, state.step - self._line_step))))
+        if self._looks:
+            numbers |= signals(state, self.config, self.spec, self.env.recent(), self._acted)
         self._lines += 1
         numbers |= {f"info/{name.removeprefix('info/')}": mean for name, mean in episodes.measures.items()}
         self._write(state.step, numbers | self._times(state.step), episodes)
@@ -190,6 +195,11 @@ class Run:
         self._told = len(notices)
         recent = self._recent_returns
         self._bar.update(state.step, sum(recent) / len(recent) if recent else None, learned=bool(metrics))
+
+    @property
+    def _looks(self) -> bool:
+        """Whether the next line has signals."""
+        return self.world.is_first and self._lines % self._look_every == 0
 
     def require_stored(self) -> None:
         """Raise `NotStoredError` if the disk refused the last checkpoint."""

@@ -3,13 +3,16 @@
 They are taken some thirty times in a run, and cost less than a hundredth of it. Nothing learns from them.
 """
 
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.func import functional_call
 from torch.nn.functional import one_hot
 
-from lemniscate.maths import explained_by, moments, td_target
+from lemniscate.maths import explained_by, gae, moments, td_target
 from lemniscate.nn.networks import ACTIVATIONS
 from lemniscate.nn.normalizer import RunningNorm
 from lemniscate.run.config import RunConfig
@@ -18,7 +21,7 @@ from lemniscate.types import Rollout, Transition
 
 LOOKS = 32
 """how often in a run the signals are measured"""
-KINDS = ("reward/", "observation/", "action/", "network/", "normalizer/", "td_error/", "value/")
+KINDS = ("reward/", "observation/", "action/", "network/", "normalizer/", "td_error/", "value/", "advantage/")
 """how the names of signals begin"""
 LATEST = 6
 """steps until an action that is late takes effect, up to which it is looked for"""
@@ -31,13 +34,18 @@ UNITS = (*ACTIVATIONS.values(), nn.Tanh, nn.GELU, nn.LeakyReLU)
 
 
 @torch.no_grad()
-def signals(state: Any, config: RunConfig, spec: Spec, rows: Rollout | None) -> dict[str, float]:
-    """The signals of a training state and of the newest rows [T, N, …] of its environments, by the glossary's names."""
+def signals(
+    state: Any, config: RunConfig, spec: Spec, rows: Rollout | None, acted: Mapping[str, Tensor] | None = None
+) -> dict[str, float]:
+    """The signals of a training state and of the newest rows [T, N, …] of its environments, by the glossary's names.
+
+    `acted` are the parameters and buffers of the policy before its newest update, where that is known.
+    """
     if rows is None or rows.valid.sum() < 2:
         return {}
     chosen = rows[rows.valid]
     found = of_rows(chosen, spec) | of_networks(state, chosen) | of_critics(state, config, chosen)
-    found |= of_values(state, config, chosen)
+    found |= of_values(state, config, rows, acted)
     found["reward/by_time"] = by_time(rows)
     if not spec.has_images and spec.observation_size <= MOST_NUMBERS:
         found |= of_effects(chosen, spec)
@@ -161,19 +169,44 @@ def of_networks(state: Any, rows: Rollout) -> dict[str, Tensor]:
     return found
 
 
-def of_values(state: Any, config: RunConfig, rows: Rollout) -> dict[str, Tensor]:
-    """The share of V that is missing: the mean of r + γ V(s') − V(s) over (1 − γ) |V|; above 0 where V is too small.
+def of_values(
+    state: Any, config: RunConfig, rows: Rollout, acted: Mapping[str, Tensor] | None = None
+) -> dict[str, Tensor]:
+    """Of V and of the newest update, from rows [T, N, …], for algorithms with a V(s).
 
-    That mean is 1 − γ times the difference of the policy's value and V. Where learning takes the value behind a time
-    limit for 0, the share is that of the discounted steps which the limit cuts off.
+    - value/missing: the mean of r + γ V(s') − V(s) over (1 − γ) |V|, above 0 where V is too small. That mean is 1 − γ
+      times the difference of the policy's value and V. Where learning takes the value behind a time limit for 0, the
+      share is that of the discounted steps which the limit cuts off.
+    - value/at_ends: the mean of V(s) − r over |V| where an episode terminated: what V awaits beyond its end.
+    - advantage/followed: the correlation of A(s, a) and of the change of log π(a|s) in the newest update.
     """
     gamma = getattr(config, "gamma", 1.0)
-    if not hasattr(state.networks, "value") or gamma == 1:
+    if not hasattr(state.networks, "value"):
         return {}
-    scaled = getattr(config, "scale_rewards", False) and hasattr(state, "reward_scale")
-    reward = state.reward_scale(rows.reward) if scaled else rows.reward
+    if getattr(config, "scale_rewards", False) and hasattr(state, "reward_scale"):
+        rows = replace(rows, reward=state.reward_scale(rows.reward))
     value, after = state.networks.value(rows.obs), state.networks.value(rows.next_obs)
-    return {"value/missing": _missing(td_target(reward, after, rows.terminated, gamma=gamma), value, gamma)}
+    found, size, valid, ends = dict[str, Tensor](), value[rows.valid].abs().mean(), rows.valid, rows.terminated
+    if gamma < 1:
+        target = td_target(rows.reward[valid], after[valid], ends[valid], gamma=gamma)
+        found["value/missing"] = _missing(target, value[valid], gamma)
+    if ends.any():
+        found["value/at_ends"] = (value - rows.reward)[ends].mean() / size
+    if acted is not None:
+        advantage, _ = gae(rows.reward, value, after, ends, rows.done, gamma=gamma, lam=0.95)
+        old = functional_call(state.policy, dict(acted), (rows.obs,)).log_prob(rows.action)
+        change = state.policy(rows.obs).log_prob(rows.action) - old
+        steps = getattr(config, "num_steps", len(valid))  # REINFORCE collects whole episodes
+        newest = valid & (torch.arange(len(valid), device=valid.device) >= len(valid) - steps)[:, None]
+        found["advantage/followed"] = torch.corrcoef(torch.stack([advantage, change])[:, newest])[0, 1].nan_to_num()
+    return found
+
+
+def acted_with(state: Any) -> dict[str, Tensor] | None:
+    """Copies of the parameters and buffers of a policy that is learned beside V(s); None for others."""
+    if not hasattr(state.networks, "value"):
+        return None
+    return {name: tensor.clone() for name, tensor in state.policy.state_dict().items()}
 
 
 def _missing(target: Tensor, value: Tensor, gamma: float) -> Tensor:
