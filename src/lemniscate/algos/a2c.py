@@ -51,11 +51,6 @@ class Config(RecurrentConfig):
         super().__post_init__()
         self._require_rows("normalize_advantage", self.num_rows)
 
-    @property
-    def gradient_steps(self) -> int:
-        """The number of gradient steps of the whole run."""
-        return self.num_rollouts
-
 
 @dataclass(kw_only=True)
 class State(OnPolicyState[ActorCritic]):

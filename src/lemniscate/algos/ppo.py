@@ -74,11 +74,6 @@ class Config(RecurrentConfig):
         self._require_rows("normalize_advantage", self.minibatch_size)
         self._require_constant("learning_rate", adapted_by="desired_kl")
 
-    @property
-    def gradient_steps(self) -> int:
-        """The number of gradient steps of the whole run."""
-        return self.num_rollouts * self.epochs * -(-self.num_rows // self.minibatch_size)
-
 
 @dataclass(kw_only=True)
 class State(OnPolicyState[ActorCritic]):

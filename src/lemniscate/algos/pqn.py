@@ -62,11 +62,6 @@ class Config(OnPolicyConfig):
         """New networks for the spaces in `spec`: Q, and the policy that acts by it."""
         return ActionValues(spec, self.layers, self.normalize_observations)
 
-    @property
-    def gradient_steps(self) -> int:
-        """The number of gradient steps of the whole run."""
-        return self.num_rollouts * self.epochs * -(-self.num_rows // self.minibatch_size)
-
 
 @dataclass(kw_only=True)
 class State(OnPolicyState[ActionValues]):

@@ -75,11 +75,6 @@ class Config(RecurrentConfig):
         memory = self.piece_length, self.shared_memory
         return ActorCategoricalQ(spec, *self.network_settings, self.initial_log_std, self.value_range, *memory)
 
-    @property
-    def gradient_steps(self) -> int:
-        """The number of gradient steps of the whole run."""
-        return self.num_rollouts * self.epochs * -(-self.num_rows // self.minibatch_size)
-
 
 @dataclass(kw_only=True)
 class State(OnPolicyState[ActorCategoricalQ]):

@@ -62,6 +62,12 @@ class OnPolicyConfig(RunConfig):
         """The number of rollouts of the whole run."""
         return -(-self.total_steps // self.num_rows)
 
+    @property
+    def gradient_steps(self) -> int:
+        """The number of gradient steps of the whole run: passes over each rollout, in minibatches where it has them."""
+        epochs, size = getattr(self, "epochs", 1), getattr(self, "minibatch_size", self.num_rows)
+        return self.num_rollouts * epochs * -(-self.num_rows // size)
+
     def _require_minibatch(self, field: str) -> None:
         """Raise `UserError` if `field`, the size of minibatches, is above the rows of a rollout."""
         if getattr(self, field) > self.num_rows:
