@@ -93,7 +93,7 @@ FAULTS: dict[str, tuple[str, Mapping[str, int], Mapping[str, Any], tuple[str, ..
     "a ratio that is not 1": ("ppo", ON, "another log-probability", ("ratio-not-one",)),
     "a frozen normalizer": ("ppo", ON, "a normalizer that stops", ("normalizer-frozen",)),
     "a policy that is frozen": ("ppo", ON, {"freeze": ("policy",)}, ("policy-still",)),
-    "the sign of the advantage": ("ppo", ON, "the sign of the advantage", ("gets-worse",)),
+    "the sign of the advantage": ("ppo", ON, "the sign of the advantage", ("advantage-opposed", "gets-worse")),
     "a value of other rows": ("ppo", ON, "targets of other rows", ("value-explains-nothing",)),
     "saturated units": ("ppo", ON, "weights that are too large", ("units-saturated",)),
     "no target networks": ("sac", OFF, QUICK | {"tau": 1.0}, ("setting-tau",)),
@@ -127,12 +127,12 @@ UNSEEN = {
     "many environments, one gradient step": ("setting-replay-ratio",),
     "a policy that waits": ("setting-policy-delay",),
     "old probabilities of the new policy": ("ratio-always-one",),
-    "episodes that run into each other": (),
-    "advantages of other steps": (),
+    "episodes that run into each other": ("ends-ignored",),
+    "advantages of other steps": ("advantage-unrelated",),
     "no zero_grad": ("gradient-grows",),
     "the best of single episodes": ("few-episodes",),
 }
-"""names that are right for the faults of `unseen.py`; two have no rule yet"""
+"""names that are right for the faults of `unseen.py`"""
 FAULTS |= {name: (*unseen.UNSEEN[name][:3], right) for name, right in UNSEEN.items()}
 LEARNERS = faulty.LEARNERS | unseen.LEARNERS
 """the library with a fault in it, as contexts"""

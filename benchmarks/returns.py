@@ -5,6 +5,7 @@
     .venv/bin/python benchmarks/returns.py reppo --envs HalfCheetah-v5 --steps 1_300_000
     .venv/bin/python benchmarks/returns.py ddpg --runs DIR           keep the runs there, and go on with unfinished ones
     .venv/bin/python benchmarks/returns.py ppo trpo --table          the table of what has been run, and the pictures
+    .venv/bin/python benchmarks/returns.py --minutes                 which algorithm after 1, 3, 10 and 30 minutes
 
 Each row of `benchmarks/results/returns.jsonl` is one policy: 100 episodes from starts that training never saw; the
 drone's in crazyflow. Where RUNS has several numbers of steps, one run serves all: nothing in those presets depends on
@@ -170,15 +171,60 @@ def draw(algorithm):
     save(figure, RESULTS / f"returns-{algorithm}.png")
 
 
+ROBOTS = ("HalfCheetah-v5", "Hopper-v5", "Walker2d-v5", "Ant-v5", "Humanoid-v5")
+
+
+def by_minutes():
+    """The algorithms on each robot by the minutes that training took: a picture, and the best after so many."""
+    from matplotlib.figure import Figure
+
+    from lemniscate.report.curves import COLORS, finish, save
+
+    colors = dict(zip(("reppo", "ppo", "trpo", "sac", "td3", "ddpg", "a2c"), COLORS * 2, strict=False))
+    figure = Figure(figsize=(3.2 * len(ROBOTS), 3.6), layout="constrained")
+    for env, axes in zip(ROBOTS, figure.subplots(1, len(ROBOTS)), strict=True):
+        found = {(row["algorithm"], row["steps"]) for row in rows("returns") if row["env"] == env}
+        points = list[tuple[str, float, float, float, int]]()
+        for algorithm, steps in sorted(found):
+            of = measured(algorithm, env, steps)
+            returns, minutes = ([row[name] for row in of] for name in ("mean_return", "training_s"))
+            points.append((algorithm, min(minutes) / 60, np.mean(returns), min(returns), len(of)))  # others had company
+        for algorithm, color in colors.items():
+            mine = sorted(point[1:4] for point in points if point[0] == algorithm)
+            if not mine:
+                continue
+            minutes, means, worst = np.array(mine).T
+            axes.plot(minutes, means, "o-", color=color, linewidth=1.4, label=algorithm.upper())
+            axes.vlines(minutes, worst, means, color=color, linewidth=1, alpha=0.6)
+        axes.set_title(env, loc="left", fontsize=10)
+        axes.set_ylim(bottom=0)
+        axes.legend(frameon=False, fontsize=8, loc="lower right")
+        finish(axes)
+        axes.set(xscale="log", xlim=(0.6, 120), xlabel="minutes of training, the fastest seed")
+        axes.set_xticks((1, 3, 10, 30, 100), ("1", "3", "10", "30", "100"))
+        axes.minorticks_off()
+        cells = []
+        for most in (1, 3, 10, 30):
+            inside = [point for point in points if point[1] < 1.1 * most]
+            algorithm, _, mean, low, seeds = max(inside, key=lambda point: point[2], default=("", 0, 0, 0, 0))
+            cells.append(f"{algorithm.upper()} {mean:,.0f} ({low:,.0f}, {seeds})" if seeds else "")
+        print(f"| {env} | {' | '.join(cells)} |")
+    save(figure, RESULTS / "returns-minutes.png")
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("algorithms", nargs="+", choices=RUNS)
+    parser.add_argument("algorithms", nargs="*", help=", ".join(RUNS))
     parser.add_argument("--envs", nargs="+")
     parser.add_argument("--seeds", nargs="+", type=int)
     parser.add_argument("--steps", nargs="+", type=int, help="instead of those of RUNS")
     parser.add_argument("--runs", type=Path)
     parser.add_argument("--table", action="store_true", help="run nothing")
+    parser.add_argument("--minutes", action="store_true", help="run nothing; which algorithm after how many minutes")
     given = parser.parse_args()
+    if given.minutes:
+        by_minutes()
+        return
     for algorithm in () if given.table else given.algorithms:
         for env in given.envs or RUNS[algorithm]:
             marks, seeds = RUNS[algorithm][env]
