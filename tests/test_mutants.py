@@ -1521,8 +1521,8 @@ MUTANTS = [
     (
         "every line has signals",
         "run/run.py",
-        "self._lines % self._look_every == 0",
-        "True",
+        "self.world.is_first and self._lines % self._look_every == 0",
+        "self.world.is_first",
         "run/test_signals.py::test_there_are_signals_some_thirty_times_in_a_run_and_in_its_first_line",
     ),
     (

@@ -150,7 +150,7 @@ class Run:
                 going_on = True
                 while going_on and state.step < total_steps:
                     before, self._episodes_before = state.step, self._episodes
-                    self._acted = acted_with(state) if self._looks else None
+                    self._acted = acted_with(state) if self._lines % self._look_every == 0 else None
                     yield self.env
                     body_ended = time.monotonic()
                     going_on = self._between(state, before, total_steps)
@@ -184,7 +184,7 @@ class Run:
             numbers["episode/length"] = sum(episodes.lengths) / len(episodes.lengths)
         # Some LOOKS lines of a run have signals, of a short one a fourth of them: more would cost more than 1 %.
         self._look_every = max(4, -(-self.config.total_steps // (LOOKS * max(1, state.step - self._line_step))))
-        if self._looks:
+        if self.world.is_first and self._lines % self._look_every == 0:
             numbers |= signals(state, self.config, self.spec, self.env.recent(), self._acted)
         self._lines += 1
         numbers |= {f"info/{name.removeprefix('info/')}": mean for name, mean in episodes.measures.items()}
@@ -195,11 +195,6 @@ class Run:
         self._told = len(notices)
         recent = self._recent_returns
         self._bar.update(state.step, sum(recent) / len(recent) if recent else None, learned=bool(metrics))
-
-    @property
-    def _looks(self) -> bool:
-        """Whether the next line has signals."""
-        return self.world.is_first and self._lines % self._look_every == 0
 
     def require_stored(self) -> None:
         """Raise `NotStoredError` if the disk refused the last checkpoint."""
