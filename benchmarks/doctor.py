@@ -3,6 +3,7 @@
     .venv/bin/python benchmarks/doctor.py faults --half even --seeds 101      of these the thresholds are chosen
     .venv/bin/python benchmarks/doctor.py faults --half odd --seeds 1 2 3     the half of the table
     .venv/bin/python benchmarks/doctor.py faults --half unseen                faults that nobody had in mind
+    .venv/bin/python benchmarks/doctor.py faults --half unseen-too            and others, after rules for these
     .venv/bin/python benchmarks/doctor.py healthy
     .venv/bin/python benchmarks/doctor.py remedies --seeds 1
     .venv/bin/python benchmarks/doctor.py cost
@@ -26,6 +27,7 @@ from typing import Any, get_type_hints
 
 import faulty
 import unseen
+import unseen_too
 from common import append, provenance, rows
 
 import lemniscate as lem
@@ -133,8 +135,22 @@ UNSEEN = {
     "the best of single episodes": ("few-episodes",),
 }
 """names that are right for the faults of `unseen.py`"""
+UNSEEN_TOO = {
+    "observations at their limits": (),
+    "frames that are shown again": ("observation-repeated",),
+    "bounds in another unit": (),
+    "the same start each time": (),
+    "an entropy out of reach": ("entropy-unreachable",),
+    "bins that are too narrow": ("setting-value-range",),
+    "noise that drowns the policy": ("setting-noise-std", "actions-at-bounds"),
+    "targets that stay": (),
+    "an array with two names": (),
+    "a column times a row": ("policy-still", "advantage-unrelated"),
+}
+"""names that are right for the faults of `unseen_too.py`"""
 FAULTS |= {name: (*unseen.UNSEEN[name][:3], right) for name, right in UNSEEN.items()}
-LEARNERS = faulty.LEARNERS | unseen.LEARNERS
+FAULTS |= {name: (*unseen_too.UNSEEN_TOO[name][:3], right) for name, right in UNSEEN_TOO.items()}
+LEARNERS = faulty.LEARNERS | unseen.LEARNERS | unseen_too.LEARNERS
 """the library with a fault in it, as contexts"""
 
 BY_OPTIONS = {"large-observation", "reward-large", "reward-small", "advantage-not-normalized", "mostly-random",
@@ -266,7 +282,8 @@ def cost() -> None:
         print(f"{algorithm} {env}: {spent[0] / run.seconds:.2%} of {run.seconds:.0f} s", flush=True)
 
 
-HALVES = {name: "unseen" if name in UNSEEN else ("even", "odd")[i % 2] for i, name in enumerate(FAULTS)}
+HALVES = {name: ("even", "odd")[i % 2] for i, name in enumerate(FAULTS)}
+HALVES |= dict.fromkeys(UNSEEN, "unseen") | dict.fromkeys(UNSEEN_TOO, "unseen-too")
 
 
 def table(half: str | None) -> None:
@@ -300,7 +317,7 @@ def table(half: str | None) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=["faults", "healthy", "remedies", "cost", "table"])
-    parser.add_argument("--half", choices=["even", "odd", "unseen"])
+    parser.add_argument("--half", choices=["even", "odd", "unseen", "unseen-too"])
     parser.add_argument("--only", nargs="+", help="these faults, or algorithms of healthy runs")
     parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3])
     parser.add_argument("--runs", type=Path)

@@ -75,6 +75,23 @@ CASES = {
         {"approx_kl": [0.0] * 8, "losses__entropy": list(np.linspace(1.0, 0.5, 8))},
         {"approx_kl": [1e-8] * 8, "losses__entropy": list(np.linspace(1.0, 0.5, 8))},
     ),
+    "observation-clipped": (
+        {"observation__at_limits": [0.9] * 8, "observation__repeated": [0.9] * 8},
+        {"observation__at_limits": [0.9] * 3 + [0.1] * 5},
+    ),
+    "action-by-sign": ({"action__by_sign": [0.9] * 8}, {"action__by_sign": [0.1] + [0.9] * 7}),
+    "replay-repeated": (
+        {"algorithm": "sac", "replay__repeated": [1.0] * 8},
+        {"algorithm": "sac", "replay__repeated": [0.3] * 8},
+    ),
+    "targets-behind": (
+        {"algorithm": "td3", "targets__behind": [0.1, 0.2, 0.5, 0.6]},
+        {"algorithm": "td3", "targets__behind": [0.6, 0.5, 0.1, 0.1]},
+    ),
+    "starts-alike": (
+        {"observation__starts_alike": [1.0] * 8},
+        {"observation__starts_alike": [1.0] * 7 + [0.0]},
+    ),
     "advantage-opposed": (
         {"advantage__followed": [-0.2, -0.1] * 4},
         {"advantage__followed": [-0.3, 0.2] * 4},

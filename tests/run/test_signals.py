@@ -26,6 +26,7 @@ from lemniscate.run.signals import (
     of_effects,
     of_networks,
     of_rows,
+    of_starts,
     of_values,
     signals,
 )
@@ -365,6 +366,52 @@ def test_ppo_follows_its_advantages_and_with_a_wrong_sign_it_does_not(tmp_path):
     assert followed(tmp_path / "right") > 0.05
     with patch.object(ppo, "gae", lambda *a, **options: (lambda found: (-found[0], found[1]))(gae(*a, **options))):
         assert followed(tmp_path / "wrong") < -0.05
+
+
+def test_numbers_that_are_cut_off_stand_at_their_limits():
+    obs = numbers(B, O).float()
+    assert of_rows(rows(obs=obs), spec_of())["observation/at_limits"].item() == pytest.approx(2 / B)
+    cut = torch.cat([(obs[:, :2] * 100).clamp(-1, 1), (obs[:, 2:] > 0).float()], dim=1)  # the last has two values alone
+    expected = (cut[:, :2].abs() == 1).float().mean().item()
+    assert expected > 0.9
+    assert of_rows(rows(obs=cut), spec_of())["observation/at_limits"].item() == pytest.approx(expected)
+    assert "observation/at_limits" not in of_rows(rows(obs=(obs > 0).float()), spec_of())
+
+
+@pytest.mark.parametrize("times", [0.5, 100.0])
+def test_the_signs_of_actions_that_are_cut_off_explain_what_is_left(times):
+    action = numbers(B, A, seed=1).clamp(-1, 1)
+    moved = torch.cat([(times * action).clamp(-1, 1), torch.zeros(B, 1)], dim=1)
+    found = of_effects(rows(action=action.float(), next_obs=(numbers(B, O) + moved).float()), spec_of())
+    assert (found["action/by_sign"] > 0.9) == (times > 1)
+
+
+def test_episodes_that_begin_alike():
+    """Two environments of six steps; in the second, the row of a reset stands between two episodes."""
+    obs = torch.arange(6.0)[:, None, None].repeat(1, 2, O)
+    terminated, valid = torch.zeros(6, 2, dtype=torch.bool), torch.ones(6, 2, dtype=torch.bool)
+    terminated[[1, 3], 0] = terminated[1, 1] = True
+    valid[2, 1] = False
+    obs[[2, 4], 0] = obs[3, 1] = 7.0
+    flags = {"terminated": terminated, "truncated": torch.zeros_like(terminated), "valid": valid}
+    found = {"obs": obs, "next_obs": obs, "action": torch.zeros(6, 2, A), "reward": torch.zeros(6, 2), **flags}
+    assert of_starts(Rollout(**found), spec_of())["observation/starts_alike"] == 1
+    found["obs"][3, 1, 0] = 6.0
+    assert of_starts(Rollout(**found), spec_of())["observation/starts_alike"] == 0
+    terminated[1] = False
+    assert of_starts(Rollout(**found), spec_of()) == {}  # two beginnings say nothing
+
+
+def test_of_targets_the_distance_and_of_replay_what_stands_still(tmp_path):
+    def last(path):
+        lines = read_metrics(lem.train("td3", "Pendulum-v1", run=path, progress=False, **tiny_off_policy()).path)
+        return [line for line in lines if "targets/behind" in line][-1]
+
+    moved = last(tmp_path / "moved")
+    with patch("lemniscate.algos.td3.polyak", lambda *_: None):
+        stayed = last(tmp_path / "stayed")
+    assert 0 < moved["targets/behind"] < stayed["targets/behind"]
+    assert moved["replay/repeated"] == 0
 
 
 def test_before_there_are_rows_there_are_no_signals():

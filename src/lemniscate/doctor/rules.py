@@ -101,10 +101,19 @@ def constant_observation(e: Evidence) -> str | None:
 
 
 @rule
+def observation_clipped(e: Evidence) -> str | None:
+    """Observations are cut off at limits, or were divided by too little: little more than signs is left of them."""
+    share = e.late("observation/at_limits")
+    return (
+        f"{share:.0%} of the numbers observed are the largest or the smallest of their kind." if share > 0.5 else None
+    )
+
+
+@rule
 def observation_repeated(e: Evidence) -> str | None:
     """Observations stay as they are while the environment moves: they are rounded, old, or of too little."""
     share = e.early("observation/repeated")
-    if not share > 0.5 or e.sees_nothing:
+    if not share > 0.5 or e.sees_nothing or observation_clipped(e):
         return None
     return f"After {share:.0%} of the steps the observation was the same as before."
 
@@ -147,6 +156,13 @@ def action_late(e: Evidence) -> str | None:
     if not (late > 0.15 and late > 3 * max(now, 0.0)):
         return None
     return f"Earlier actions explain {late:.0%} of how observations change, and the present one {max(now, 0.0):.0%}."
+
+
+@rule
+def action_by_sign(e: Evidence) -> str | None:
+    """Actions are cut off far inside the bounds that the environment declares: only their signs count."""
+    share = e.early("action/by_sign")
+    return f"The signs of actions explain {share:.0%} of what actions leave to explain." if share > 0.5 else None
 
 
 @rule
@@ -315,6 +331,24 @@ def gradient_grows(e: Evidence) -> str | None:
     if not late > (5 if late > 100 and e.config.get("scale_rewards", False) else 100) * norms[0]:
         return None
     return f"The norm of the gradient rose from {norms[0]:.3g} to {norms[-1]:.3g}."
+
+
+@rule
+def replay_repeated(e: Evidence) -> str | None:
+    """A transition ends where it began: both observations are one array, which has been written to again."""
+    share = e.late("replay/repeated")
+    if not share > 0.9 or observation_repeated(e) or e.sees_nothing:
+        return None
+    return f"In {share:.0%} of the sampled transitions the next observation is the same as the observation."
+
+
+@rule
+def targets_behind(e: Evidence) -> str | None:
+    """The target networks do not follow: Q learns one reward and what was believed at first."""
+    share = e.last("targets/behind")
+    if not share > 0.3 or not e.as_recommended("tau"):  # a setting far out is named as such
+        return None
+    return f"The target networks differ from Q's by {share:.0%} of the length of its weights."
 
 
 @rule
@@ -564,6 +598,13 @@ def ends_early(e: Evidence) -> str | None:
         return None
     first, last = np.median(e.lengths[: max(10, fifth // 10)]), np.median(e.lengths[-fifth:])
     return f"Returns rose while episodes went from {first:.0f} steps to {last:.0f}." if last < 0.6 * first else None
+
+
+@rule
+def starts_alike(e: Evidence) -> str | None:
+    """The policy knows one beginning, and its evaluation asks no other: it may be helpless elsewhere."""
+    alike = e.values("observation/starts_alike")
+    return "Every episode began with the same observation." if len(alike) > 2 and alike.min() == 1 else None
 
 
 @rule

@@ -21,7 +21,10 @@ from lemniscate.types import Rollout, Transition
 
 LOOKS = 32
 """how often in a run the signals are measured"""
-KINDS = ("reward/", "observation/", "action/", "network/", "normalizer/", "td_error/", "value/", "advantage/")
+KINDS = (
+    *("reward/", "observation/", "action/", "value/", "advantage/"),
+    *("network/", "normalizer/", "td_error/", "replay/", "targets/"),
+)
 """how the names of signals begin"""
 LATEST = 6
 """steps until an action that is late takes effect, up to which it is looked for"""
@@ -46,7 +49,7 @@ def signals(
     chosen = rows[rows.valid]
     found = of_rows(chosen, spec) | of_networks(state, chosen) | of_critics(state, config, chosen)
     found |= of_values(state, config, rows, acted)
-    found["reward/by_time"] = by_time(rows)
+    found |= {"reward/by_time": by_time(rows), **of_starts(rows, spec)}
     if not spec.has_images and spec.observation_size <= MOST_NUMBERS:
         found |= of_effects(chosen, spec)
         if found["action/effect"] < 0.2:
@@ -58,7 +61,8 @@ def of_rows(rows: Rollout, spec: Spec) -> dict[str, Tensor]:
     """Sizes of rewards and observations, and shares, of rows [B, …].
 
     These are of rewards that are 0, of numbers that never change, of observations that are as the one before, of
-    actions at their bounds, and of ends that are terminations.
+    numbers that are the largest or the smallest of their column, of actions at their bounds, and of ends that are
+    terminations.
     """
     obs, after = (x[:, : spec.observation_size].float() for x in (rows.obs, rows.next_obs))
     ends = rows.done.sum()
@@ -72,9 +76,20 @@ def of_rows(rows: Rollout, spec: Spec) -> dict[str, Tensor]:
     }
     if not ((obs == 0) | (obs == 1)).all():  # one of n is often the same
         found["observation/repeated"] = (obs == after).all(1).float().mean()
+    low, high = obs.amin(0), obs.amax(0)
+    numbers = ((obs > low) & (obs < high)).any(0)  # not what is 0 or 1
+    if numbers.any() and not spec.has_images:
+        found["observation/at_limits"] = ((obs == low) | (obs == high))[:, numbers].float().mean()
     if isinstance(spec.action, Box):
         found["action/at_bounds"] = (rows.action.abs() > 0.99).float().mean()
     return found | ({"episode/terminated": rows.terminated.sum() / ends} if ends else {})
+
+
+def of_starts(rows: Rollout, spec: Spec) -> dict[str, Tensor]:
+    """Whether episodes begin with the same observation, of rows [T, N, …] with three beginnings or more."""
+    begins = rows.valid[1:] & (rows.done | ~rows.valid)[:-1]
+    first = rows.obs[1:][begins][:, : spec.observation_size]
+    return {"observation/starts_alike": (first == first[:1]).all().float()} if len(first) > 2 else {}
 
 
 def by_time(rows: Rollout) -> Tensor:
@@ -97,7 +112,8 @@ def of_effects(rows: Rollout, spec: Spec) -> dict[str, Tensor]:
 
     Actions explain what a line fitted to them explains beyond one fitted to the observations alone, in that number of
     the observation of which it is most: as a share of what those left to explain, and of all. A reward may be a square
-    too, of a distance or of an action. Also the share of the next observations that these explain, on average.
+    too, of a distance or of an action. Also the share of the next observations that these explain, on average, and
+    what the signs of actions explain beyond all this.
     """
     obs, after = (x[:, : spec.observation_size].cpu().double() for x in (rows.obs, rows.next_obs))
     action, inside = _numbers(rows.action.cpu(), spec.action), ~rows.done.cpu()
@@ -109,6 +125,9 @@ def of_effects(rows: Rollout, spec: Spec) -> dict[str, Tensor]:
         "action/share": (effect * (1 - explained_by(obs[inside], change, nothing[inside]))).max(),
         "reward/explained": explained_by(everything, rows.reward[:, None].cpu().double(), nothing).max(),
     }
+    if isinstance(spec.action, Box):
+        known = torch.cat([obs, action], dim=-1)[inside]
+        found["action/by_sign"] = explained_by(action.sign()[inside], change, known).nan_to_num().max()
     if not ((obs == 0) | (obs == 1)).all():  # one of n says nothing of the next
         found["observation/predicted"] = explained_by(obs[inside], after[inside], nothing[inside]).mean()
     return found
@@ -216,7 +235,8 @@ def _missing(target: Tensor, value: Tensor, gamma: float) -> Tensor:
 def of_critics(state: Any, config: RunConfig, rows: Rollout) -> dict[str, Tensor]:
     """The mean squared error of Q over one step, of the newest rows and of sampled ones, and the share that is missing.
 
-    For algorithms that learn Q from replay.
+    For algorithms that learn Q from replay; with the distance of the target networks, as a share of the length of all
+    weights, and the share of the sampled transitions that end where they began.
     """
     replay, updates = getattr(state, "replay", None), getattr(state, "updates", 0)
     if replay is None or not updates or not hasattr(state.networks, "critics"):
@@ -236,5 +256,8 @@ def of_critics(state: Any, config: RunConfig, rows: Rollout) -> dict[str, Tensor
     found = {
         "td_error/newest": (q - target).square().mean(),
         "td_error/sampled": (other_q - other_target).square().mean(),
+        "replay/repeated": (sampled.obs == sampled.next_obs).flatten(1).all(1).float().mean(),
     }
+    own, behind = (torch.cat([p.flatten() for p in each.parameters()]) for each in (critics, targets))
+    found["targets/behind"] = (own - behind).norm() / own.norm()
     return found | ({"value/missing": _missing(target, q, gamma)} if gamma < 1 else {})
