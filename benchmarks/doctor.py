@@ -136,15 +136,15 @@ UNSEEN = {
 }
 """names that are right for the faults of `unseen.py`"""
 UNSEEN_TOO = {
-    "observations at their limits": (),
+    "observations at their limits": ("observation-clipped",),
     "frames that are shown again": ("observation-repeated",),
-    "bounds in another unit": (),
-    "the same start each time": (),
+    "bounds in another unit": ("action-by-sign",),
+    "the same start each time": ("starts-alike",),
     "an entropy out of reach": ("entropy-unreachable",),
     "bins that are too narrow": ("setting-value-range",),
     "noise that drowns the policy": ("setting-noise-std", "actions-at-bounds"),
-    "targets that stay": (),
-    "an array with two names": (),
+    "targets that stay": ("targets-behind",),
+    "an array with two names": ("replay-repeated",),
     "a column times a row": ("policy-still", "advantage-unrelated"),
 }
 """names that are right for the faults of `unseen_too.py`"""
