@@ -296,9 +296,9 @@ class Steady(nn.Module):
 )
 def test_the_share_of_the_value_that_is_missing(size, reward, missing):
     state, config = SimpleNamespace(networks=Steady(size)), SimpleNamespace(gamma=0.9)
-    found = of_values(state, config, rows(reward=torch.full((B,), reward)))
+    found = of_values(state, config, rows(reward=torch.full((B,), reward))[None])
     assert found["value/missing"] == pytest.approx(missing, abs=1e-5)  # (V of the policy, 10, less V) / |V|
-    assert of_values(state, SimpleNamespace(gamma=1.0), rows()) == {}
+    assert of_values(state, SimpleNamespace(gamma=1.0), rows()[None]) == {}
 
 
 def test_what_the_value_awaits_beyond_an_end():
@@ -306,8 +306,8 @@ def test_what_the_value_awaits_beyond_an_end():
     reward, terminated = torch.zeros(B), torch.zeros(B, dtype=torch.bool)
     reward[[5, 9]], terminated[[5, 9]] = torch.tensor([1.0, 2.0]), True
     state, config = SimpleNamespace(networks=Steady(4.0)), SimpleNamespace(gamma=0.9)
-    assert of_values(state, config, rows(reward=reward, terminated=terminated))["value/at_ends"] == 2.5 / 4
-    assert "value/at_ends" not in of_values(state, config, rows(truncated=terminated))
+    assert of_values(state, config, rows(reward=reward, terminated=terminated)[None])["value/at_ends"] == 2.5 / 4
+    assert "value/at_ends" not in of_values(state, config, rows(truncated=terminated)[None])
 
 
 T, N = 16, 4

@@ -204,7 +204,8 @@ def of_values(
         return {}
     if getattr(config, "scale_rewards", False) and hasattr(state, "reward_scale"):
         rows = replace(rows, reward=state.reward_scale(rows.reward))
-    value, after = state.networks.value(rows.obs), state.networks.value(rows.next_obs)
+    obs, next_obs, action = (x.flatten(0, 1) for x in (rows.obs, rows.next_obs, rows.action))  # as networks know them
+    value, after = (state.networks.value(x).view(rows.done.shape) for x in (obs, next_obs))
     found, size, valid, ends = dict[str, Tensor](), value[rows.valid].abs().mean(), rows.valid, rows.terminated
     if gamma < 1:
         target = td_target(rows.reward[valid], after[valid], ends[valid], gamma=gamma)
@@ -213,8 +214,8 @@ def of_values(
         found["value/at_ends"] = (value - rows.reward)[ends].mean() / size
     if acted is not None:
         advantage, _ = gae(rows.reward, value, after, ends, rows.done, gamma=gamma, lam=0.95)
-        old = functional_call(state.policy, dict(acted), (rows.obs,)).log_prob(rows.action)
-        change = state.policy(rows.obs).log_prob(rows.action) - old
+        old = functional_call(state.policy, dict(acted), (obs,), tie_weights=False).log_prob(action)
+        change = (state.policy(obs).log_prob(action) - old).view(valid.shape)
         steps = getattr(config, "num_steps", len(valid))  # REINFORCE collects whole episodes
         newest = valid & (torch.arange(len(valid), device=valid.device) >= len(valid) - steps)[:, None]
         found["advantage/followed"] = torch.corrcoef(torch.stack([advantage, change])[:, newest])[0, 1].nan_to_num()
