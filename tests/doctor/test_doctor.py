@@ -86,7 +86,7 @@ CASES = {
     ),
     "targets-behind": (
         {"algorithm": "td3", "targets__behind": [0.1, 0.2, 0.5, 0.6]},
-        {"algorithm": "td3", "targets__behind": [0.6, 0.5, 0.1, 0.1]},
+        {"algorithm": "td3", "targets__behind": [0.6, 0.5, 0.55, 0.6]},
     ),
     "starts-alike": (
         {"observation__starts_alike": [1.0] * 8},
@@ -101,8 +101,8 @@ CASES = {
         {"advantage__followed": [0.03, 0.07] * 4, "approx_kl": [0.01] * 8},
     ),
     "ends-ignored": (
-        {"value__at_ends": [0.1] * 4 + [0.95, 0.98] * 2},
-        {"value__at_ends": [0.95] * 4 + [0.6, 0.7] * 2},
+        {"value__at_ends": [0.1] * 4 + [0.95, 0.98] * 2, "episode__terminated": [1.0] * 8},
+        {"value__at_ends": [0.95] * 4 + [0.6, 0.7] * 2, "episode__terminated": [1.0] * 8},
     ),
     "gradient-grows": ({"gradient_norm": [30.0] + [250.0] * 8}, {"gradient_norm": [30.0] + [140.0] * 8}),
     "ends-early": (

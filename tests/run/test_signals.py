@@ -302,11 +302,14 @@ def test_the_share_of_the_value_that_is_missing(size, reward, missing):
 
 
 def test_what_the_value_awaits_beyond_an_end():
-    """V is 4 everywhere, and the last rewards are 1 and 2: 3 and 2 of 4 too much."""
+    """V is 4 everywhere, and the last rewards are 1 and 2: 3 and 2 of 4 too much; it knows nothing of a reward of −9."""
     reward, terminated = torch.zeros(B), torch.zeros(B, dtype=torch.bool)
     reward[[5, 9]], terminated[[5, 9]] = torch.tensor([1.0, 2.0]), True
     state, config = SimpleNamespace(networks=Steady(4.0)), SimpleNamespace(gamma=0.9)
     assert of_values(state, config, rows(reward=reward, terminated=terminated)[None])["value/at_ends"] == 2.5 / 4
+    assert of_values(state, config, rows(reward=reward - 11, terminated=terminated)[None])["value/at_ends"] == 1
+    state = SimpleNamespace(networks=Steady(-4.0))
+    assert of_values(state, config, rows(reward=-reward, terminated=terminated)[None])["value/at_ends"] == 2.5 / 4
     assert "value/at_ends" not in of_values(state, config, rows(truncated=terminated)[None])
 
 

@@ -196,7 +196,8 @@ def of_values(
     - value/missing: the mean of r + γ V(s') − V(s) over (1 − γ) |V|, above 0 where V is too small. That mean is 1 − γ
       times the difference of the policy's value and V. Where learning takes the value behind a time limit for 0, the
       share is that of the discounted steps which the limit cuts off.
-    - value/at_ends: the mean of V(s) − r over |V| where an episode terminated: what V awaits beyond its end.
+    - value/at_ends: the mean of V(s) − r, or of V(s) where that is less, over |V| where an episode terminated: what V
+      awaits beyond its end. Where V knows nothing of a large last reward, V(s) says so.
     - advantage/followed: the correlation of A(s, a) and of the change of log π(a|s) in the newest update.
     """
     gamma = getattr(config, "gamma", 1.0)
@@ -211,7 +212,9 @@ def of_values(
         target = td_target(rows.reward[valid], after[valid], ends[valid], gamma=gamma)
         found["value/missing"] = _missing(target, value[valid], gamma)
     if ends.any():
-        found["value/at_ends"] = (value - rows.reward)[ends].mean() / size
+        last, beyond = value[ends], (value - rows.reward)[ends]
+        awaited = torch.where(last.abs() < beyond.abs(), last, beyond)
+        found["value/at_ends"] = awaited.mean() * value[valid].mean().sign() / size
     if acted is not None:
         advantage, _ = gae(rows.reward, value, after, ends, rows.done, gamma=gamma, lam=0.95)
         old = functional_call(state.policy, dict(acted), (obs,), tie_weights=False).log_prob(action)
