@@ -5,7 +5,7 @@
     .venv/bin/python benchmarks/returns.py reppo --envs HalfCheetah-v5 --steps 1_300_000
     .venv/bin/python benchmarks/returns.py ddpg --runs DIR           keep the runs there, and go on with unfinished ones
     .venv/bin/python benchmarks/returns.py ppo trpo --table          the table of what has been run, and the pictures
-    .venv/bin/python benchmarks/returns.py --minutes                 which algorithm after 1, 3, 10 and 30 minutes
+    .venv/bin/python benchmarks/returns.py minutes                   which algorithm after 1, 3, 10 and 30 minutes
 
 Each row of `benchmarks/results/returns.jsonl` is one policy: 100 episodes from starts that training never saw; the
 drone's in crazyflow. Where RUNS has several numbers of steps, one run serves all: nothing in those presets depends on
@@ -205,7 +205,7 @@ def by_minutes():
         axes.minorticks_off()
         cells = []
         for most in (1, 3, 10, 30):
-            inside = [point for point in points if point[1] < 1.1 * most]
+            inside = [point for point in points if point[1] <= most]
             algorithm, _, mean, low, seeds = max(inside, key=lambda point: point[2], default=("", 0, 0, 0, 0))
             cells.append(f"{algorithm.upper()} {mean:,.0f} ({low:,.0f}, {seeds})" if seeds else "")
         print(f"| {env} | {' | '.join(cells)} |")
@@ -214,15 +214,14 @@ def by_minutes():
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("algorithms", nargs="*", help=", ".join(RUNS))
+    parser.add_argument("algorithms", nargs="+", choices=[*RUNS, "minutes"])
     parser.add_argument("--envs", nargs="+")
     parser.add_argument("--seeds", nargs="+", type=int)
     parser.add_argument("--steps", nargs="+", type=int, help="instead of those of RUNS")
     parser.add_argument("--runs", type=Path)
     parser.add_argument("--table", action="store_true", help="run nothing")
-    parser.add_argument("--minutes", action="store_true", help="run nothing; which algorithm after how many minutes")
     given = parser.parse_args()
-    if given.minutes:
+    if given.algorithms == ["minutes"]:
         by_minutes()
         return
     for algorithm in () if given.table else given.algorithms:

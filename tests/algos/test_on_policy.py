@@ -1,12 +1,14 @@
 """REINFORCE, A2C, TRPO and PPO alike, on environments with known values."""
 
 import dataclasses
+from collections import Counter
 
 import numpy as np
 import pytest
 import torch
 
 import environments
+import lemniscate as lem
 from helpers import (
     COMPILERS,
     ONE_MODE,
@@ -21,6 +23,7 @@ from helpers import (
 from lemniscate.algos import a2c, ppo, reinforce, reppo, trpo  # noqa: F401  (a case names REPPO)
 from lemniscate.data.rollout import collect
 from lemniscate.errors import UserError
+from lemniscate.optim.adam import Adam
 from lemniscate.optim.compiled import Compiler
 from lemniscate.system.world import ALONE
 
@@ -128,6 +131,28 @@ def test_rewards_of_any_size_are_scaled_only_on_request(algo, rng, scaled):
     algo.update(config, state, rollout)
     expected = rollout.reward / rollout.reward.std(correction=0) if scaled else rollout.reward
     torch.testing.assert_close(batches[0].target, expected.flatten())
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "env", "fields"),
+    [
+        ("a2c", "CartPole-v1", {}),
+        ("ppo", "CartPole-v1", {"epochs": 3, "minibatch_size": 20}),
+        ("pqn", "CartPole-v1", {"epochs": 2, "minibatch_size": 16}),
+        ("reppo", "Pendulum-v1", {"epochs": 2, "minibatch_size": 20}),
+    ],
+)
+def test_as_many_gradient_steps_are_taken_as_the_config_says(tmp_path, monkeypatch, algorithm, env, fields):
+    fields = {"num_envs": 4, "num_steps": 8, "total_steps": 100, **fields}  # 4 rollouts of 32 rows
+    taken, step = Counter[Adam](), Adam.step
+
+    def counted(self, *args):
+        taken[self] += 1
+        return step(self, *args)
+
+    monkeypatch.setattr(Adam, "step", counted)
+    lem.train(algorithm, env, run=tmp_path / "r", progress=False, evaluate_episodes=1, **fields)
+    assert set(taken.values()) == {lem.config_for(algorithm, env, **fields).gradient_steps}
 
 
 @EACH

@@ -104,9 +104,7 @@ def constant_observation(e: Evidence) -> str | None:
 def observation_clipped(e: Evidence) -> str | None:
     """Observations are cut off at limits, or were divided by too little: little more than signs is left of them."""
     share = e.late("observation/at_limits")
-    return (
-        f"{share:.0%} of the numbers observed are the largest or the smallest of their kind." if share > 0.5 else None
-    )
+    return f"{share:.0%} of the observed numbers stand at an end of their range." if share > 0.5 else None
 
 
 @rule
@@ -162,7 +160,9 @@ def action_late(e: Evidence) -> str | None:
 def action_by_sign(e: Evidence) -> str | None:
     """Actions are cut off far inside the bounds that the environment declares: only their signs count."""
     share = e.early("action/by_sign")
-    return f"The signs of actions explain {share:.0%} of what actions leave to explain." if share > 0.5 else None
+    if not share > 0.5:
+        return None
+    return f"Of what actions do not explain of how observations change, their signs explain {share:.0%}."
 
 
 @rule
