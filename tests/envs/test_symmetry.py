@@ -211,6 +211,8 @@ def test_on_says_where_there_is_none_and_auto_does_without(tmp_path):
 def test_what_asks_how_likely_an_action_was_has_no_symmetry(algorithm):
     """The mirror image of an action is none that the policy drew."""
     assert "symmetry" not in {field.name for field in dataclasses.fields(find(algorithm).Config)}
+    with pytest.raises(UserError, match=r"where a Q\(s, a\) is learned: sac, td3, ddpg and reppo"):
+        lem.train(algorithm, "Walker2d-v5", symmetry="on")
 
 
 @pytest.mark.parametrize(

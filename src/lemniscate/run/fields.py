@@ -23,8 +23,9 @@ TABLE = Path(__file__).with_suffix(".md")
 
 GONE = {
     "population": "Population-based training has gone: `lemniscate tune` ends the worse trials early (--prune).",
+    "symmetry": "There is a symmetry where a Q(s, a) is learned: sac, td3, ddpg and reppo (docs/notes/symmetry.md).",
 }
-"""names that earlier versions had, and what takes their place"""
+"""names that a Config does not have, or not any more, and what takes their place"""
 
 
 def options_of(hint: Any) -> tuple[Any, ...]:
