@@ -2,6 +2,7 @@
 
     make bench                                            the presets of docs/results.md, seeds 1 to 5
     .venv/bin/python benchmarks/figure_eight.py --presets figure-eight --seeds 1 2 3
+    .venv/bin/python benchmarks/figure_eight.py --algorithm shac --presets figure-eight
 
 Each row of `benchmarks/results/figure_eight.jsonl` says with which commit, versions and machine it was made. Every seed
 flies 64 starts that training never saw.
@@ -20,16 +21,17 @@ from common import append, provenance
 ENV = "DroneFigureEightTrajectory-v0"
 
 
-def one_run(preset, seed, device):
+def one_run(algorithm, preset, seed, device):
     """Train and evaluate here; print one JSON object."""
     import lemniscate as lem
 
     with tempfile.TemporaryDirectory() as folder:
-        run = lem.train("ppo", ENV, preset=preset, seed=seed, device=device, run=f"{folder}/run", progress=False)
+        run = lem.train(algorithm, ENV, preset=preset, seed=seed, device=device, run=f"{folder}/run", progress=False)
         scores = lem.evaluate(run.policy, episodes=64, seed=0)
     print(
         json.dumps(
             {
+                "algorithm": algorithm,
                 "preset": preset,
                 "seed": seed,
                 "mean_return": scores.mean_return,
@@ -47,17 +49,19 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--presets", nargs="+", default=["figure-eight", "course"])
     parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3, 4, 5])
+    parser.add_argument("--algorithm", default="ppo")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--one-run", action="store_true", help="train one preset and seed in this process")
     given = parser.parse_args()
     if given.one_run:
-        return one_run(given.presets[0], given.seeds[0], given.device)
+        return one_run(given.algorithm, given.presets[0], given.seeds[0], given.device)
     stamp, rows = provenance(), []
     for preset in given.presets:
         for seed in given.seeds:
             command = [sys.executable, __file__, "--one-run", "--presets", preset, "--seeds", str(seed)]
             started = time.monotonic()
-            done = subprocess.run([*command, "--device", given.device], stdout=subprocess.PIPE, text=True, check=True)
+            command += ["--algorithm", given.algorithm, "--device", given.device]
+            done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
             row = json.loads(done.stdout.splitlines()[-1]) | {"total_s": time.monotonic() - started} | stamp
             append("figure_eight", row)
             rows.append(row)

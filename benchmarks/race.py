@@ -2,6 +2,7 @@
 """The race through gates: the presets over seeds on unseen tracks, crazyflow's own controller beside them, pictures.
 
 .venv/bin/python benchmarks/race.py train --levels 0 2 --seeds 1 2 3 4 5
+.venv/bin/python benchmarks/race.py train --algorithm shac --levels 0
 .venv/bin/python benchmarks/race.py controller
 .venv/bin/python benchmarks/race.py table
 .venv/bin/python benchmarks/race.py levels          docs/images/gates_levels.png
@@ -32,12 +33,13 @@ PRESETS = {0: "gates", 1: "gates", 2: "gates-moved"}
 NAMES = ("success", "lap_seconds", "gates_passed", "crashed")
 
 
-def train(level: int, seed: int) -> None:
+def train(algorithm: str, level: int, seed: int) -> None:
     """Train the preset of a level, and race a hundred times on tracks that training has not seen."""
     with tempfile.TemporaryDirectory() as scratch:
-        run = lem.train("ppo", "DroneGates-v0", preset=PRESETS[level], seed=seed, run=f"{scratch}/run", progress=False)
+        fields = {"preset": PRESETS[level], "seed": seed, "progress": False}
+        run = lem.train(algorithm, "DroneGates-v0", run=f"{scratch}/run", **fields)
         found = lem.evaluate(run.policy, episodes=100, seed=1_000 + seed)
-    row = {"level": level, "seed": seed, "seconds": run.seconds, "steps": run.policy.step}
+    row = {"algorithm": algorithm, "level": level, "seed": seed, "seconds": run.seconds, "steps": run.policy.step}
     append("race", row | {name: found.measures.get(name) for name in NAMES} | provenance())
     print(row, found.measures, flush=True)
 
@@ -101,13 +103,13 @@ def table() -> None:
     """Means over seeds, and the worst seed."""
     by_level = defaultdict(dict)
     for row in rows("race"):
-        by_level[row["level"]][row["seed"]] = row
-    for level, seeds in sorted(by_level.items()):
+        by_level[row.get("algorithm", "ppo"), row["level"]][row["seed"]] = row
+    for (algorithm, level), seeds in sorted(by_level.items()):
         success, laps = ([row[name] for row in seeds.values()] for name in ("success", "lap_seconds"))
         seconds = np.mean([row["seconds"] for row in seeds.values()])
         laps = [lap for lap in laps if lap is not None]
         reached = f"{np.mean(success):.1%} | {min(success):.0%} | {np.mean(laps):.2f}"
-        print(f"| {level} | {len(seeds)} | {reached} | {seconds:.0f} |")
+        print(f"| {algorithm} | {level} | {len(seeds)} | {reached} | {seconds:.0f} |")
 
 
 def levels(file: Path) -> None:
@@ -138,10 +140,11 @@ if __name__ == "__main__":
     parser.add_argument("what", choices=["train", "controller", "table", "levels"])
     parser.add_argument("--levels", nargs="+", type=int, default=[0, 2, 3])
     parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3, 4, 5])
+    parser.add_argument("--algorithm", default="ppo")
     given = parser.parse_args()
     for level in given.levels if given.what in ("train", "controller") else ():
         for seed in given.seeds if given.what == "train" else ():
-            train(level, seed)
+            train(given.algorithm, level, seed)
         for pace in (0.5, 1.0, 1.5) if given.what == "controller" else ():
             controller(level, pace)
     if given.what == "table":

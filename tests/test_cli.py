@@ -26,7 +26,7 @@ TINY = [
     for part in (f"--{name.replace('_', '-')}", value)
 ]
 
-ALGORITHMS = ("reinforce", "a2c", "trpo", "ppo", "reppo", "pqn", "ddpg", "td3", "sac")
+ALGORITHMS = ("reinforce", "a2c", "trpo", "ppo", "reppo", "pqn", "shac", "ddpg", "td3", "sac")
 
 
 class Broken(gym.Env):

@@ -1,6 +1,6 @@
 """Data records of tensors. Shapes: T time, N environments, B batch, O observation, A action."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Self
 
 import torch
@@ -42,6 +42,10 @@ class Record:
         """[T, N, …] to [T · N, …]."""
         return type(self)(*(tensor.flatten(0, 1) for tensor in vars(self).values()))
 
+    def detach(self) -> Self:
+        """The same, of which nothing can be differentiated."""
+        return type(self)(*(tensor.detach() for tensor in vars(self).values()))
+
     @classmethod
     def stack(cls, rows: list[Self]) -> Self:
         """Stack records along a new first dimension: T records [N, …] become one [T, N, …]."""
@@ -73,6 +77,10 @@ class Step:
     truncated: Tensor
     valid: Tensor
     measures: dict[str, Tensor] = field(default_factory=dict)
+
+    def detach(self) -> Self:
+        """The same, of which nothing can be differentiated."""
+        return replace(self, obs=self.obs.detach(), next_obs=self.next_obs.detach(), reward=self.reward.detach())
 
 
 @dataclass(frozen=True)

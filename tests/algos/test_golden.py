@@ -5,6 +5,7 @@ Renew them, where a change of the mathematics is meant: python tests/algos/test_
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -100,6 +101,15 @@ FIELDS = {
         "exploration": 0.5,
         "network": "layer_norm",
     },
+    "shac": {
+        **ON_POLICY,
+        **WIDTH,
+        **VALUE,
+        "actor_learning_rate": 3e-3,
+        "final_learning_rate": 0.5,
+        "max_grad_norm": 0.1,
+        "td_lambda": 0.9,
+    },
     "ddpg": {**OFF_POLICY, "policy_delay": 1},
     "td3": {**OFF_POLICY, "policy_delay": 2},
     "sac": {**OFF_POLICY, "policy_delay": 1, "initial_temperature": 0.5},
@@ -127,6 +137,13 @@ def rollout(actions, generator):
     action = normal(8, 4, 2) if actions == "box" else torch.randint(3, (8, 4), generator=generator)
     terminated = flags()
     return Rollout(normal(8, 4, 3), action, normal(8, 4), normal(8, 4, 3), terminated, flags() & ~terminated, ~flags())
+
+
+def through(policy, rows, generator):
+    """The rows of a simulator that can be differentiated: its rewards and observations depend on what the policy does."""
+    action = policy(rows.obs).sample(torch.randn(8, 4, 2, generator=generator))
+    reward, next_obs = rows.reward - action.square().sum(-1), rows.next_obs + torch.nn.functional.pad(action, (0, 1))
+    return replace(rows, action=action, reward=reward, next_obs=next_obs, valid=torch.ones_like(rows.valid))
 
 
 def transitions(generator, size=64):
@@ -157,7 +174,10 @@ def five_updates(case):
     rows = []
     for _ in range(5):
         state.step += 100 if off_policy else 0
-        metrics = module.update(config, state) if off_policy else module.update(config, state, rollout(actions, data))
+        given = [] if off_policy else [rollout(actions, data)]
+        if algorithm == "shac":
+            given = [through(state.policy, *given, data)]
+        metrics = module.update(config, state, *given)
         rows.append({name: float(value) for name, value in metrics.items()})
     parameters = {name: [p.sum().item(), p.square().sum().item()] for name, p in state.networks.named_parameters()}
     return {"metrics": rows, "parameters": parameters}

@@ -194,3 +194,58 @@ def test_compiled_programs_are_kept_in_the_users_cache_or_where_jax_was_told(tmp
     )
     assert (done.returncode, done.stdout.strip()) == (0, str(kept and kept.format(tmp_path))), done.stderr
     assert not kept or list((tmp_path / done.stdout.strip()).iterdir())
+
+
+@pytest.mark.parametrize(
+    "kwargs",
+    [
+        {},
+        pytest.param(
+            {"dynamics": ["so_rpy", "first_principles"], "history": 2, "mass": [0.9, 1.1], "action_delay": [0.0, 0.02]},
+            marks=pytest.mark.long,
+        ),
+    ],
+)
+def test_the_derivatives_of_a_flight_are_its_differences(kwargs):
+    env = registry.make(FIGURE_EIGHT, N, stagger=True, kwargs=kwargs)
+    generator = torch.Generator().manual_seed(0)
+    gain = 0.02 * torch.randn(env.spec.observation_size, 4, generator=generator)
+    actions = 0.1 * torch.randn(10, N, 4, generator=generator)
+    directions = torch.randn(3, 10, N, 4, generator=generator)
+
+    def flown(actions):
+        """A number that all rewards and observations take part in, the actions being a feedback."""
+        env.restart(3)
+        env.detach()
+        total = torch.zeros(())
+        for given in actions:
+            step = env.step((given + env.obs @ gain).clamp(-0.9, 0.9))
+            total = total + step.reward.sum() + 0.1 * step.next_obs[:, :7].sum()
+        return total
+
+    asked = actions.clone().requires_grad_()
+    env.backend.prepare_gradient()
+    flown(asked).backward()
+    assert asked.grad is not None
+    size = asked.grad.norm().item()  # a direction's slope has about this size
+    assert size > 0.1
+    for direction in directions:
+        with torch.no_grad():
+            slope = (flown(actions + 3e-3 * direction) - flown(actions - 3e-3 * direction)) / 6e-3
+        assert slope.item() == pytest.approx((asked.grad * direction).sum().item(), abs=0.02 * size)
+
+
+def test_a_gradient_goes_back_to_the_last_detach_and_not_through_a_reset(env):
+    env.restart(1)
+    env.detach()
+    down = torch.tensor([0.0, 0.0, 0.0, -1.0]).expand(N, 4).clone().requires_grad_()
+    steps = [env.step(down * 1.0)]
+    while not steps[-1].terminated.any():
+        steps.append(env.step(down * 1.0))
+    ended = steps[-1].terminated
+    (slope,) = torch.autograd.grad(steps[-1].obs[ended].sum(), down, allow_unused=True)
+    assert slope is None or not slope.any()
+    env.detach()
+    with torch.enable_grad():
+        step = env.step(torch.zeros(N, 4))
+    assert not step.reward.requires_grad

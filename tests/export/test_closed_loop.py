@@ -8,7 +8,7 @@ from exported import needs_compiler
 
 import environments  # noqa: F401  (registers the environments)
 import lemniscate as lem
-from lemniscate.algos import a2c, ddpg, ppo, pqn, reinforce, reppo, sac, td3, trpo
+from lemniscate.algos import a2c, ddpg, ppo, pqn, reinforce, reppo, sac, shac, td3, trpo
 from lemniscate.api.policy import TrainedPolicy
 from lemniscate.envs import registry
 from lemniscate.exporting.compiled import missing_target_tools
@@ -37,7 +37,7 @@ def test_the_figure_eight_fits_and_flies_on_the_target(tmp_path):
         assert record["c_cortex_m4f"]["ram_bytes"] <= 1024
 
 
-ALGORITHMS = [(algo, "Pendulum-v1") for algo in (reinforce, a2c, trpo, ppo, reppo, ddpg, td3, sac)]
+ALGORITHMS = [(algo, "Pendulum-v1") for algo in (reinforce, a2c, trpo, ppo, reppo, shac, ddpg, td3, sac)]
 ALGORITHMS += [(pqn, f"Copy-{kind}-v0") for kind in ("discrete", "masked")]
 KINDS = [(ppo, f"Copy-{kind}-v0") for kind in ("box", "discrete", "multi-discrete", "multi-binary", "tuple", "masked")]
 

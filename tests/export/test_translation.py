@@ -6,7 +6,7 @@ import torch
 from exported import BOX, exported, needs_compiler, observations_for, policy_for
 from torch import nn
 
-from lemniscate.algos import a2c, ddpg, ppo, pqn, reinforce, reppo, sac, td3, trpo
+from lemniscate.algos import a2c, ddpg, ppo, pqn, reinforce, reppo, sac, shac, td3, trpo
 from lemniscate.errors import UserError
 from lemniscate.exporting.deployed import Deployed, act_with, safe_action
 from lemniscate.exporting.translation import translate
@@ -73,7 +73,7 @@ def test_every_kind_of_actions(kind):
 
 
 @pytest.mark.parametrize(
-    "algo", [reinforce, a2c, trpo, ppo, reppo, pqn, ddpg, td3, sac], ids=lambda algo: algo.__name__[16:]
+    "algo", [reinforce, a2c, trpo, ppo, reppo, pqn, shac, ddpg, td3, sac], ids=lambda algo: algo.__name__[16:]
 )
 def test_every_algorithm(algo):
     action = Discrete(3) if algo is pqn else BOX

@@ -74,7 +74,8 @@ def numeric_fields(algorithm):
 
 def base(algorithm):
     """Fields of a run that is made in a moment."""
-    fields = {"num_envs": 2, "hidden": (8,), "evaluate_episodes": 1, "total_steps": 10**5, "backend": "gymnasium"}
+    fields = {"num_envs": 2, "hidden": (8,), "evaluate_episodes": 1, "total_steps": 10**5}
+    fields["backend"] = "own_simulator:Glide" if find(algorithm).Config.differentiates else "gymnasium"
     small = {
         "num_steps": 8,
         "minibatch_size": 16,
@@ -86,6 +87,8 @@ def base(algorithm):
 
 
 def env_of(algorithm):
+    if find(algorithm).Config.differentiates:
+        return "Glide-v0"
     return "Pendulum-v1" if algorithm in ("ddpg", "td3", "sac") else "CartPole-v1"
 
 

@@ -8,7 +8,7 @@ from collections import Counter
 import pytest
 
 import lemniscate as lem
-from faults.absurd import by_fields, by_words, env_of, numeric_fields, systematic, verbs
+from faults.absurd import base, by_fields, by_words, env_of, numeric_fields, systematic, verbs
 from faults.runs import often
 from forks import Forks
 from lemniscate.algos import ALGORITHMS, find
@@ -103,7 +103,13 @@ def test_extreme_numbers_that_are_taken_are_trained_with(tmp_path, algorithm, ev
         name: 8 for name in ("minibatch_size", "critic_minibatch_size") if name in find(algorithm).Config.names()
     }
     small = off_policy if algorithm in ("ddpg", "td3", "sac") else on_policy
-    small |= {"num_envs": 2, "hidden": (8,), "total_steps": 48, "evaluate_episodes": 1, "backend": "gymnasium"}
+    small |= {
+        "num_envs": 2,
+        "hidden": (8,),
+        "total_steps": 48,
+        "evaluate_episodes": 1,
+        "backend": base(algorithm)["backend"],
+    }
     for number, (name, value) in enumerate(itertools.islice(extremes(algorithm), 0, None, every)):
         run = tmp_path / str(number)
         try:

@@ -15,6 +15,8 @@ from helpers import require_in_own_process
 from lemniscate.algos import ALGORITHMS, find
 from lemniscate.cli import main
 
+IN_GYMNASIUM = [name for name in ALGORITHMS if not find(name).Config.differentiates]
+
 pytestmark = [pytest.mark.filterwarnings(f"ignore::{kind}") for kind in ("UserWarning", "RuntimeWarning")]
 """of Gymnasium, on what is injected"""
 
@@ -113,7 +115,7 @@ def injections():
             yield where, name, at
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@pytest.mark.parametrize("algorithm", IN_GYMNASIUM)
 @pytest.mark.parametrize("every", [pytest.param(1, marks=pytest.mark.faults), 37])
 def test_a_number_that_is_not_finite_is_named_with_its_environment_and_step(tmp_path, algorithm, every):
     counts = Counter()
@@ -132,7 +134,7 @@ def test_a_number_that_is_not_finite_is_named_with_its_environment_and_step(tmp_
 SCALES = (0.0, 1e-38, 1e15, 1e30, 1e37)
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@pytest.mark.parametrize("algorithm", IN_GYMNASIUM)
 @pytest.mark.parametrize("every", [pytest.param(1, marks=pytest.mark.faults), 15])
 @pytest.mark.one_in(2)
 def test_huge_and_constant_numbers_are_learned_from_or_named(tmp_path, algorithm, every):
@@ -160,7 +162,7 @@ def rates(algorithm):
     return [{name: rate} for name in names for rate in (1e38, 1e30, 1e19, 1e10)] + [dict.fromkeys(names, 1e38)]
 
 
-@pytest.mark.parametrize("algorithm", ALGORITHMS)
+@pytest.mark.parametrize("algorithm", IN_GYMNASIUM)
 @pytest.mark.parametrize("every", [pytest.param(1, marks=pytest.mark.faults), 8])
 def test_parameters_that_overflow_are_neither_acted_with_nor_saved(tmp_path, algorithm, every):
     counts = Counter()

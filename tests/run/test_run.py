@@ -66,13 +66,14 @@ ON_POLICY = {
     "trpo": {"final_critic_learning_rate": 0.1, "critic_minibatch_size": 32},
     "reppo": {"epochs": 2, "minibatch_size": 16},
     "pqn": {"epochs": 2, "minibatch_size": 16},
+    "shac": {"backend": "own_simulator:Glide", "critic_minibatch_size": 16},
 }
 
 
 def train(path, env="Countdown-v0", **fields):
     if env in ON_POLICY:
         small = {"num_envs": 4, "num_steps": 8, "total_steps": 256, "hidden": (16,), "evaluate_episodes": 4}
-        where = "Pendulum-v1" if env == "reppo" else "CartPole-v1"
+        where = {"reppo": "Pendulum-v1", "shac": "Glide-v0"}.get(env, "CartPole-v1")
         return lem.train(env.split("-")[0], where, run=path, progress=False, **{**small, **ON_POLICY[env], **fields})
     if env in OFF_POLICY:
         fields = tiny_off_policy(**OFF_POLICY[env], **fields)

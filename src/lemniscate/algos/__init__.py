@@ -9,7 +9,7 @@ from typing import Any
 from lemniscate.errors import UserError, shown, unknown_name
 from lemniscate.system import named
 
-ALGORITHMS = ("reinforce", "a2c", "trpo", "ppo", "reppo", "pqn", "ddpg", "td3", "sac")
+ALGORITHMS = ("reinforce", "a2c", "trpo", "ppo", "reppo", "pqn", "shac", "ddpg", "td3", "sac")
 
 RECOMMENDED = "ppo"
 """for who names none: it takes every kind of actions, and mostly needs the fewest minutes (docs/results.md)"""

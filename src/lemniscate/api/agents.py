@@ -30,10 +30,10 @@ from lemniscate.errors import UserError, shown
 from lemniscate.hub import repository as hub
 from lemniscate.maths import Deterministic
 from lemniscate.nn.policies import Policy
+from lemniscate.run.directory import difference
 from lemniscate.run.evaluate import evaluate
 from lemniscate.run.run import globals_undisturbed
 from lemniscate.run.seeding import seed_globals
-from lemniscate.run.warm_start import difference
 from lemniscate.spec import Box, Discrete, MultiDiscrete, Spec
 from lemniscate.system import named
 from lemniscate.system.console import say

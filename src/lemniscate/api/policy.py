@@ -22,9 +22,8 @@ from lemniscate.nn.memory import Recall
 from lemniscate.nn.policies import Policy
 from lemniscate.run import checkpoint
 from lemniscate.run.config import RunConfig
-from lemniscate.run.directory import find_checkpoint
+from lemniscate.run.directory import difference, find_checkpoint
 from lemniscate.run.seeding import generator, torch_defaults
-from lemniscate.run.warm_start import difference
 from lemniscate.spec import Box, Discrete, MultiDiscrete, Spec
 from lemniscate.system.files import at_home, parsing
 

@@ -15,15 +15,20 @@ from lemniscate.spec import Box, Spec
 from lemniscate.types import Record, Rollout
 
 
-@torch.no_grad()
-def collect(env: VecEnv, policy: Policy, num_steps: int, generator: Generator) -> Rollout:
+def collect(
+    env: VecEnv, policy: Policy, num_steps: int, generator: Generator, *, differentiable: bool = False
+) -> Rollout:
     """Act `num_steps` times in every environment, from where it stands.
+
+    Where it is `differentiable`, observations, actions and rewards are functions of the policy's parameters.
 
     Returns:
         A rollout [T, N, …]; [T, 2 N, …] where there is a symmetry: behind them are their mirror images.
     """
     rows = []
-    with env.collecting:
+    if differentiable:
+        env.detach()
+    with env.collecting, torch.set_grad_enabled(differentiable):
         for noise in policy.draw_noise((num_steps, env.num_envs), generator):
             obs = env.obs
             action = policy.act(obs, noise)

@@ -13,7 +13,7 @@ import io
 import os
 import warnings
 from collections.abc import Collection, Mapping, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -80,7 +80,7 @@ def spec_of(env_id: str, drones: Drones) -> Spec:
 class JaxBackend(Backend):
     """N environments that are stepped by compiled programs; what a subclass adds is their making, and the Spec."""
 
-    compiled = True
+    compiled, differentiable = True, True
 
     def __init__(self, programs: Programs, num_envs: int, device: torch.device, *, stagger: bool) -> None:
         import jax
@@ -91,6 +91,7 @@ class JaxBackend(Backend):
         self._put = lambda value: jax.device_put(value, programs.device)
         self._stagger = self._put(np.bool_(stagger))
         self._valid = torch.ones(num_envs, dtype=torch.bool, device=device)
+        self._moving = torch.zeros(programs.moving_size, device=device)
 
     def restart(self, seed: int, first: int = 0) -> Tensor:
         """Begin again from `seed + first`, the seed of this vector."""
@@ -100,16 +101,52 @@ class JaxBackend(Backend):
 
     def step(self, action: Tensor) -> Step:
         """[N, A] actions in [-1, 1]; every row of the answer is real."""
-        command = self._from_dlpack(action.contiguous())
-        self._state, (*out, measures) = self._programs.step(self._state, command, self._stagger)
-        obs, next_obs, reward, flags = map(torch.from_dlpack, out)
+        if torch.is_grad_enabled() and (action.requires_grad or self._moving.requires_grad):
+            self._moving, *out, measures = _Differentiable.apply(self._moving, action, self)
+        else:
+            *out, measures = self._simulate(action)
+        obs, next_obs, reward, flags = out
         terminated, truncated, fragment = flags
         self.counts = (self.counts | terminated | truncated) & ~fragment
         named = {name: torch.from_dlpack(values) for name, values in measures.items()}
         return Step(obs, next_obs, reward, terminated, truncated, self._valid, named)
 
+    def prepare_gradient(self) -> None:
+        """Compile the program of the derivatives."""
+        _ = self._programs.pull
+
+    def detach(self) -> None:
+        """Take the present state as given: gradients go back as far as here."""
+        self._moving = self._moving.detach()
+
+    def _simulate(self, action: Tensor) -> tuple[Any, ...]:
+        """Observation, next observation, reward, flags and measures of a step."""
+        command = self._from_dlpack(action.contiguous())
+        self._state, (*out, measures) = self._programs.step(self._state, command, self._stagger)
+        return *map(torch.from_dlpack, out), measures
+
     def close(self) -> None:
         """Nothing to give back: the programs are shared."""
+
+
+class _Differentiable(torch.autograd.Function):
+    """A step of the simulator, of which JAX computes the derivatives.
+
+    The state stays in JAX. In torch a tensor `moving` [F] stands in for the numbers of it that actions move: its own
+    numbers mean nothing, but derivatives by it are those by the state.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, moving: Tensor, action: Tensor, backend: JaxBackend) -> Any:
+        command = backend._from_dlpack(action.detach().clone())
+        ctx.to_jax = backend._from_dlpack
+        ctx.pull = partial(backend._programs.pull, backend._state, command, backend._stagger)
+        return torch.zeros_like(moving), *backend._simulate(action.detach())
+
+    @staticmethod
+    def backward(ctx: Any, *by: Any) -> Any:
+        by_before, by_action = ctx.pull(tuple(ctx.to_jax(one.contiguous()) for one in by[:4]))
+        return torch.from_dlpack(by_before), torch.from_dlpack(by_action), None
 
 
 def jax_device(device: torch.device) -> str:

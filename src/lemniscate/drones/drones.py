@@ -10,11 +10,14 @@ import contextlib
 import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property
+from itertools import compress
 from typing import Any, TypeAlias
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
 from lemniscate.drones.air import Acting, Air, parameter_factors
 from lemniscate.drones.vehicle import DYNAMICS, STATE_PARTS, STATE_SIZE, Ranges
@@ -229,7 +232,7 @@ class Mixed:
 
     def __init__(self, drones: Sequence[Drones]) -> None:
         self.drones = drones
-        self.num_envs = sum(one.num_envs for one in drones)
+        self.num_envs, self.vector_size = sum(one.num_envs for one in drones), drones[0].num_envs
         self.device, self.action_size = drones[0].device, drones[0].action_size
 
     def init(self, key: jax.Array) -> State:
@@ -291,12 +294,52 @@ class Programs:
             flags = jnp.stack((terminated, truncated, fragment))  # each array costs a conversion
             return state, (obs, next_obs, reward, flags, measures)
 
-        self.device = envs.device
+        self.device, self._step = envs.device, step
         seed, stagger = jax.device_put((np.uint32(0), np.bool_(False)), envs.device)
         action = jax.device_put(np.zeros((envs.num_envs, envs.action_size), np.float32), envs.device)
         begun = jax.jit(restart).lower(seed, stagger)
         stepped = jax.jit(step).lower(begun.out_info[0], action, stagger)
         self.restart, self.step = compile_side_by_side([begun, stepped])
+        self._inputs = begun.out_info[0], action, stagger
+        size = getattr(envs, "vector_size", envs.num_envs)
+        self._moving = [
+            leaf.shape[:1] == (size,) and jnp.issubdtype(leaf.dtype, jnp.floating)
+            for leaf in jax.tree.leaves(self._inputs[0])
+        ]
+        self.moving_size = jax.eval_shape(self._take, self._inputs[0]).size
+        """F, the count of the numbers in a state that actions may move"""
+
+    def _take(self, state: State) -> jax.Array:
+        """The numbers that actions may move, [F]."""
+        return ravel_pytree(list(compress(jax.tree.leaves(state), self._moving)))[0]
+
+    def _put(self, state: State, moving: jax.Array) -> State:
+        """The state with other numbers of those."""
+        leaves, kind = jax.tree.flatten(state)
+        others = iter(ravel_pytree(list(compress(leaves, self._moving)))[1](moving))
+        pairs = zip(leaves, self._moving, strict=True)
+        return jax.tree.unflatten(kind, [next(others) if moves else leaf for leaf, moves in pairs])
+
+    @cached_property
+    def pull(self) -> Callable:
+        """The program of the derivatives of a step, `pull(state, action, stagger, by)`, compiled where it is needed.
+
+        `by` are the derivatives of a number by the [F] of the state after the step, by obs, next_obs and reward; it
+        returns those by the [F] of the state before, and by the action. The step is simulated once more.
+        """
+
+        def pull(state: State, action: jax.Array, stagger: jax.Array, by: Any) -> tuple[jax.Array, jax.Array]:
+            def moved(moving: jax.Array, action: jax.Array) -> tuple[jax.Array, ...]:
+                after, (obs, next_obs, reward, _, _) = self._step(self._put(state, moving), action, stagger)
+                return self._take(after), obs, next_obs, reward
+
+            derivatives = jax.vjp(moved, self._take(state), action)[1]
+            return derivatives(by)
+
+        state, action, stagger = self._inputs
+        after, (obs, next_obs, reward, _, _) = jax.eval_shape(self._step, state, action, stagger)
+        by = jax.eval_shape(self._take, after), obs, next_obs, reward
+        return jax.jit(pull).lower(state, action, stagger, by).compile()
 
 
 def compile_side_by_side(lowered: Sequence[Any]) -> list[Callable]:

@@ -128,6 +128,8 @@ class Backend(ABC):
         scene: what is drawn where a Gymnasium environment would be rendered.
         baseline: a classical controller beside which policies are shown.
         interface: the meaning of the numbers, for policies that are exported.
+        differentiable: where gradients are enabled, `obs`, `next_obs` and `reward` of a step are functions of its
+            action and, through the state, of those before it, back to the last `detach`; every row is `valid`.
         compiled: a step is a program for one number of environments, so evaluation takes as many as training.
         package: what has to be installed, if anything.
         in_process: the name of the backend that evaluates the policies of one that uses other processes.
@@ -144,6 +146,7 @@ class Backend(ABC):
     scene: Scene | None = None
     baseline: Baseline | None = None
     interface: Interface = Interface()
+    differentiable: bool = False
     compiled: bool = False
     package: str | None = None
     in_process: str | None = None
@@ -196,6 +199,22 @@ class Backend(ABC):
     @abstractmethod
     def close(self) -> None:
         """Give back processes and windows."""
+
+    def prepare_gradient(self) -> None:
+        """Get ready for derivatives of steps, before a run that takes some begins.
+
+        Raises `UserError` where steps are not differentiable.
+        """
+        if not self.differentiable:
+            raise UserError(
+                f"{self.spec.env_id} in the backend {type(self).__name__} cannot be differentiated, and this algorithm"
+                " learns by the gradient through its steps: it is for crazyflow's drones, and for backends of one's own"
+                " that are differentiable. ppo learns here."
+            )
+
+    def detach(self) -> None:
+        """Take the present state as given: gradients go back as far as here."""
+        raise NotImplementedError(f"{type(self).__name__} is differentiable, and so needs a method detach")
 
     def call(self, calls: Mapping[str, Any]) -> None:
         """Call methods of every environment, each with its argument: now, and again whenever they are built again.

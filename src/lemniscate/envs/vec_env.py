@@ -114,11 +114,17 @@ class VecEnv:
             step, counts = self._of_all(step, counts)
         if self.carrier:
             step = self.carrier.follow(self.obs, step)
-        self._recent.append((self.obs, action, step))
+        seen = step.detach() if step.reward.requires_grad else step
+        self._recent.append((self.obs.detach(), action.detach(), seen))
         self.obs = step.obs
         self.steps += self.num_envs
-        self._statistics.log(step, counts, measures, valid)
+        self._statistics.log(seen, counts, measures, valid)
         return step
+
+    def detach(self) -> None:
+        """Take the present state and `obs` as given; see `Backend.detach`."""
+        self.obs = self.obs.detach()
+        self.backend.detach()
 
     def _of_all(self, step: Step, counts: Tensor) -> tuple[Step, Tensor]:
         """The step of the environments of all processes, and its counts; without measures, which nobody reads here."""

@@ -10,7 +10,7 @@ from functools import cache, cached_property
 from itertools import islice
 from pathlib import PurePath
 from types import NoneType
-from typing import Annotated, Any, Literal, Self, TypeVar, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar, get_args, get_origin, get_type_hints
 
 import torch
 
@@ -154,6 +154,9 @@ def _hints_of(config: type) -> dict[str, Any]:
 @dataclass(frozen=True, kw_only=True)
 class RunConfig:
     """The fields that every algorithm has. Checked at construction: a value out of range is named in a `UserError`."""
+
+    differentiates: ClassVar[bool] = False
+    """whether it learns by the gradient through the steps of environments"""
 
     env: str = "CartPole-v1"
     """environment id; `lemniscate envs` lists them"""

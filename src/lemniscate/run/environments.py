@@ -54,6 +54,8 @@ def envs_of(config: RunConfig, world: World) -> tuple[VecEnv, VecEnv | None]:
                 return eval_env, eval_env
         env = registry.make(num_envs=config.num_envs, device=str(device), stagger=True, world=world, **arguments)
         env.mirror = mirror
+        if config.differentiates:
+            env.backend.prepare_gradient()
         failing.pop_all()
         return env, eval_env
 

@@ -27,7 +27,7 @@ from lemniscate.errors import NonFiniteError, NotStoredError, UserError, resume_
 from lemniscate.nn.memory import Carrier
 from lemniscate.optim.compiled import Compiler
 from lemniscate.run.config import RunConfig, plain
-from lemniscate.run.directory import Saver
+from lemniscate.run.directory import Saver, load_networks
 from lemniscate.run.evaluate import critic_of, evaluate
 from lemniscate.run.loggers import NO_EPISODES, JsonLines, Logger, LoggerClass, TensorBoard
 from lemniscate.run.metrics import read_metrics
@@ -35,7 +35,6 @@ from lemniscate.run.seeding import derive, seed_globals
 from lemniscate.run.signals import LOOKS, acted_with, signals
 from lemniscate.run.state import TrainState, require_agreement
 from lemniscate.run.stopping import Stopped, StopRequest
-from lemniscate.run.warm_start import load_networks
 from lemniscate.system import named
 from lemniscate.system.console import ProgressBar, say
 from lemniscate.system.world import World

@@ -25,13 +25,12 @@ from lemniscate.envs import registry
 from lemniscate.errors import SweepError, UserError, prefix_errors, resume_line, shown
 from lemniscate.hub.repository import local_path
 from lemniscate.run.config import RunConfig
-from lemniscate.run.directory import is_finished, locked
+from lemniscate.run.directory import is_finished, load_networks, locked
 from lemniscate.run.environments import device_for, env_arguments, require_memory
 from lemniscate.run.metrics import progress_of
 from lemniscate.run.places import LOG, Places, Processes, Sweep, failure_of, read_sweep
 from lemniscate.run.seeding import torch_defaults
 from lemniscate.run.stopping import Stopped, stop_signals_to
-from lemniscate.run.warm_start import load_networks
 from lemniscate.system.console import Line, ProgressBar, pace, say
 
 MOST_SEEDS = 1_000
