@@ -10,9 +10,9 @@ from forks import Forks
 
 ROOT = Path(__file__).parents[1]
 
-ON, OFF, REINFORCE, PPO, TRPO, REPPO, PQN, DDPG, TD3, SAC = (
+ON, OFF, REINFORCE, PPO, TRPO, REPPO, PQN, SHAC, DDPG, TD3, SAC = (
     f"algos/test_{name}.py::test_"
-    for name in ("on_policy", "off_policy", "reinforce", "ppo", "trpo", "reppo", "pqn", "ddpg", "td3", "sac")
+    for name in ("on_policy", "off_policy", "reinforce", "ppo", "trpo", "reppo", "pqn", "shac", "ddpg", "td3", "sac")
 )
 MEMORY = "test_memory.py::test_"
 INTERACT, ROLLOUT = (f"data/test_{name}.py::test_" for name in ("interact", "rollout"))
@@ -782,6 +782,55 @@ MUTANTS = [
         "gamma=gamma, lam=lam",
         "gamma=gamma, lam=0.0",
         PQN + "the_target_is_the_return_of_the_best_next_action",
+    ),
+    (
+        "SHAC climbs down",
+        "algos/shac.py",
+        "loss = -(to_go * begins)",
+        "loss = (to_go * begins)",
+        SHAC + "the_loss_is_the_return_of_every_episode_in_the_rollout",
+    ),
+    (
+        "every row is the beginning of an episode",
+        "algos/shac.py",
+        "-(to_go * begins).sum()",
+        "-to_go.sum()",
+        SHAC + "the_loss_is_the_return_of_every_episode_in_the_rollout",
+    ),
+    (
+        "a rollout has no value behind its end",
+        "algos/shac.py",
+        "reward_to_go(rollout.reward, value(rollout.next_obs)",
+        "reward_to_go(rollout.reward, 0 * value(rollout.next_obs)",
+        SHAC + "the_loss_is_the_return_of_every_episode_in_the_rollout",
+    ),
+    (
+        "the value is one of a single step",
+        "algos/shac.py",
+        "gamma=gamma, lam=lam",
+        "gamma=gamma, lam=0.0",
+        SHAC + "the_value_is_fitted_to_its_lambda_return",
+    ),
+    (
+        "the history of the last rollout is kept",
+        "data/rollout.py",
+        "        env.detach()",
+        "        env.backend",
+        SHAC + "nothing_that_is_kept_can_be_differentiated",
+    ),
+    (
+        "the newest rows keep their history",
+        "envs/vec_env.py",
+        "seen = step.detach() if step.reward.requires_grad else step",
+        "seen = step",
+        SHAC + "nothing_that_is_kept_can_be_differentiated",
+    ),
+    (
+        "a policy is differentiated by its observations alone",
+        "algos/shac.py",
+        "differentiable=True)",
+        "differentiable=False)",
+        SHAC + "a_learned_policy_is_nearly_the_best_there_is",
     ),
     (
         "an episode remembers the one before",

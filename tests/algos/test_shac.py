@@ -37,6 +37,13 @@ class Broken(Glide):
         return replace(step, reward=step.reward + (0 * step.next_obs).square().sum(-1).sqrt())
 
 
+class Cut(Glide):
+    """Whose reward has lost its history."""
+
+    def step(self, action):
+        return super().step(action).detach()
+
+
 def small(**fields):
     """A Config that takes an update in a moment."""
     defaults = {"env": "Glide-v0", "num_envs": 4, "num_steps": 8, "total_steps": 100_000, "hidden": (8,)}
@@ -141,10 +148,11 @@ def test_nothing_that_is_kept_can_be_differentiated():
     assert recent is not None
     assert not any(tensor.requires_grad for tensor in vars(recent).values())
     torch.testing.assert_close(recent[-8:].reward, rollout.reward.detach())
-    shac.update(config, state, rollout)
-    assert env.obs.requires_grad
+    here = env.obs
+    assert here.requires_grad
     again = collect(env, state.policy, 8, state.rng.action, differentiable=True)
-    assert not again.obs[0].grad_fn or not torch.autograd.grad(again.obs[0].sum(), again.action, allow_unused=True)[0]
+    assert torch.autograd.grad(again.reward.sum(), here, allow_unused=True)[0] is None
+    env.detach()
     plain = collect(env, state.policy, 8, state.rng.action)
     assert not any(tensor.requires_grad for tensor in vars(plain).values())
 
@@ -177,6 +185,13 @@ def test_what_cannot_be_differentiated_is_refused_in_a_sentence(tmp_path):
         shac.init(small(), spec_of("discrete"), CPU)
     with pytest.raises(lem.UserError, match="gru has a memory, with which"):
         shac.init(small(network="gru"), Spec("Glide-v0", (ObservationPart((), (4,)),), Box((-1.0,), (1.0,))), CPU)
+
+
+def test_rewards_without_a_history_are_refused_in_a_sentence():
+    config = small()
+    state, env = begin(config, Cut)
+    with pytest.raises(lem.UserError, match="The rewards of Cut have no history of the actions, though it says diff"):
+        loss_at(config, state, env)
 
 
 def test_a_derivative_that_is_not_finite_is_named_and_nothing_is_saved(tmp_path):

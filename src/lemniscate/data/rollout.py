@@ -24,6 +24,9 @@ def collect(
 
     Returns:
         A rollout [T, N, …]; [T, 2 N, …] where there is a symmetry: behind them are their mirror images.
+
+    Raises:
+        UserError: rewards that are to be differentiable, and are not.
     """
     rows = []
     if differentiable:
@@ -36,6 +39,9 @@ def collect(
             ends = step.terminated, step.truncated, step.valid
             rows.append(Rollout(obs, action, step.reward, step.next_obs, *ends))
         rollout = Rollout.stack(rows)
+        if differentiable and not rollout.reward.requires_grad:
+            name = type(env.backend).__name__
+            raise UserError(f"The rewards of {name} have no history of the actions, though it says differentiable.")
         return env.mirror.both(rollout, 1) if env.mirror else rollout
 
 
