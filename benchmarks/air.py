@@ -42,8 +42,10 @@ WAYS = {
         {"dynamics": "first_principles", "history": 5},
         {"total_steps": 8_000_000},
     ),
+    "shac: figure-eight-robust": ("figure-eight-robust", {}, {}),
+    "shac: first principles alone": ("figure-eight-late-rotors", {}, {}),
 }
-"""preset, arguments of the environment, other fields"""
+"""preset, arguments of the environment, other fields; of PPO unless another is named"""
 
 
 def numbers(scores):
@@ -60,10 +62,11 @@ def one_run(way, seed):
     import lemniscate as lem
     from lemniscate.drones.vehicle import CONDITIONS
 
-    preset, kwargs, fields = WAYS[way]
+    (preset, kwargs, fields), algorithm = WAYS[way], "shac" if way.startswith("shac: ") else "ppo"
     with tempfile.TemporaryDirectory() as folder:
         given = fields | ({"env_kwargs": kwargs} if kwargs else {})
-        run = lem.train("ppo", ENV, preset=preset, seed=seed, run=f"{folder}/run", progress=False, **given)
+        run = lem.train(algorithm, ENV, preset=preset, seed=seed, run=f"{folder}/run", progress=False, **given)
+    kwargs = kwargs or run.policy.config.env_kwargs
     nominal = {name: CONDITIONS[name].nominal for name in run.policy.config.env_kwargs if name in CONDITIONS}
 
     def fly(dynamics, baseline=False, **conditions):
@@ -71,11 +74,11 @@ def one_run(way, seed):
         return numbers(lem.evaluate(run.policy, episodes=STARTS, seed=0, env_kwargs=kwargs, baseline=baseline))
 
     found = {"way": way, "seed": seed, "training_s": run.seconds}
-    for dynamics in [kwargs["dynamics"]] if "dynamics" in kwargs else DYNAMICS:
+    for dynamics in [kwargs["dynamics"]] if isinstance(kwargs.get("dynamics"), str) else DYNAMICS:
         found[dynamics] = {"rest": fly(dynamics), "turning": fly(dynamics, rotors=1)}
         if seed == 1:
             found[dynamics] |= {"pd rest": fly(dynamics, True), "pd turning": fly(dynamics, True, rotors=1)}
-        if way == "figure-eight-robust":
+        if way.endswith("figure-eight-robust"):
             found[dynamics]["corners"] = {name: fly(dynamics, **corner) for name, corner in CORNERS.items()}
     print(json.dumps(found))
 
