@@ -43,8 +43,6 @@ AT_START = 0.02
 """the horizontal distance from its start within which a drone may touch the ground, m"""
 ACTION_NOISE, FORCE = 0.001, 0.1
 """standard deviation of the noise of actions (rad, N); the most of the random force, an axis, N"""
-CLEAR = 0.2
-"""the distance from what stands there from which on `clearance` costs, m: half of an opening"""
 CAREFUL = 1.5
 """m/s that cost nothing while the true place of the next gate is not known"""
 SPREAD = {
@@ -195,14 +193,6 @@ def touches(centre: jax.Array, turned: jax.Array, low: np.ndarray, high: np.ndar
     return (jnp.maximum(along_box, along_body).max(-1) < 0) & (across.max((-1, -2)) < 0)
 
 
-def outside(place: jax.Array, half: np.ndarray) -> jax.Array:
-    """The distance of places [..., 3] from a box about the origin, half of whose sides are `half`, [...] (m).
-
-    Inside it is 1e-4, so that it has a derivative everywhere.
-    """
-    return jnp.sqrt(jnp.square(jnp.maximum(jnp.abs(place) - half, 0.0)).sum(-1) + 1e-8)
-
-
 def _boxes(stand: float) -> tuple[np.ndarray, np.ndarray]:
     """The boxes [5, 3] of a gate in its own frame, lower and upper corners: four beams, and a stand of that height."""
     inner, outer, thick, half = OPENING / 2, FRAME / 2, THICKNESS / 2, STAND / 2
@@ -234,8 +224,6 @@ class DroneGates(DroneEnv):
     Args:
         level: 0, 1, 2 or 3.
         track: a file as `gates.toml`; the laboratory's course by default.
-        clearance: what a contact costs besides for each metre that the drone's centre is nearer than `CLEAR` to what it
-            touches: a slope for those who learn by derivatives, which a contact as such has none of.
         control: of what an action is: "attitude" (roll, pitch, yaw) or "body_rate", beside the thrust of all rotors.
         num_envs: N.
         max_episode_time: s.
@@ -255,7 +243,6 @@ class DroneGates(DroneEnv):
         level: int = 0,
         track: str | None = None,
         control: str = "attitude",
-        clearance: float = 0.0,
         *,
         num_envs: int = 1,
         max_episode_time: float = 30.0,
@@ -270,9 +257,7 @@ class DroneGates(DroneEnv):
             raise UserError(f"control of DroneGates-v0 must be attitude or body_rate, not {shown(control)}.")
         if control == "body_rate" and dynamics != "first_principles":
             raise UserError(f"control body_rate needs the dynamics first_principles, not {dynamics}.")
-        if isinstance(clearance, bool) or not isinstance(clearance, int | float) or not 0 <= clearance <= 1_000:
-            raise UserError(f"clearance of DroneGates-v0 must be a number from 0 to 1,000, not {shown(clearance)}.")
-        self.level, self.track, self.clearance = level, read_track(track), clearance
+        self.level, self.track = level, read_track(track)
         shared = {"num_envs": num_envs, "max_episode_time": max_episode_time, "drone": drone, "freq": freq}
         super().__init__(dynamics=dynamics, device=device, reset_randomization=_as_it_is, **shared)
         if control != "attitude":
@@ -474,8 +459,6 @@ class DroneGates(DroneEnv):
         change = jnp.square(action - self._last_action).sum(-1)
         self._gain = 3 * progress + 3.0 * passed - 6.0 * self._crashed - 0.05 - 0.0005 * rates - 0.01 * change
         self._gain -= 0.2 * jnp.square(hurry)
-        if self.clearance:
-            self._gain -= self.clearance * self._crashed * jnp.maximum(CLEAR - self._distance(pos), 0.0)
         self._last_action = action
 
     def _look(self) -> None:
@@ -518,16 +501,6 @@ class DroneGates(DroneEnv):
         gates = touches(local[:, :, None], own[:, :, None], *_boxes(self.track.stand))
         obstacles = touches(centre[:, None] - self._obstacles + half * (0, 0, 1), turned[:, None], -half, half)
         return gates.any((1, 2)) | obstacles.any(1)
-
-    def _distance(self, pos: jax.Array) -> jax.Array:
-        """The distance from the drone's centre to the nearest frame, stand or obstacle, [N] (m)."""
-        frames = Rotation.from_euler("xyz", self._gates[..., 3:]).as_matrix()
-        low, high = _boxes(self.track.stand)
-        place = into(frames, pos[:, None] - self._gates[..., :3])[:, :, None] - (low + high) / 2
-        half = np.array((OBSTACLE / 2, OBSTACLE / 2, OBSTACLE_HEIGHT / 2), np.float32)
-        off = pos[:, None] - self._obstacles + half * (0, 0, 1)
-        gaps = [outside(place, (high - low) / 2).reshape(len(pos), -1), outside(off, half)]
-        return jnp.concatenate(gaps, axis=1).min(1)
 
     def obs(self) -> dict[str, jax.Array]:
         """The drone's state, then `gates`, `obstacles`, `last_action` and `race`."""
