@@ -20,9 +20,10 @@ setup:  ## .venv; of two at once, one installs and the other waits for it
 fly: setup  ## train a drone to fly the figure eight, fly it from unseen starts, draw it
 	$(BIN)/lemniscate train ppo --env DroneFigureEightTrajectory-v0 --report
 
+RACE := runs/race-$(shell date +%Y%m%d-%H%M%S)
 race: setup  ## train a drone to race through gates, race from unseen starts, draw and film it
-	$(BIN)/lemniscate train shac --env DroneGates-v0 --run runs/race
-	$(BIN)/lemniscate train ppo --env DroneGates-v0 --preset gates-finish --warm-start runs/race --report
+	$(BIN)/lemniscate train shac --env DroneGates-v0 --run $(RACE)
+	$(BIN)/lemniscate train ppo --env DroneGates-v0 --preset gates-finish --warm-start $(RACE) --report
 
 test: setup  ## the whole suite but the long ones
 	$(BIN)/python -m pytest -n auto --dist loadfile -m "not long and not faults and not soak and not cluster"
