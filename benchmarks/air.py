@@ -43,7 +43,19 @@ WAYS = {
         {"total_steps": 8_000_000},
     ),
     "shac: figure-eight-robust": ("figure-eight-robust", {}, {}),
-    "shac: first principles alone": ("figure-eight-late-rotors", {}, {}),
+    "shac: first principles alone": (
+        "figure-eight",
+        {"dynamics": "first_principles", "privileged": True, **ALONE},
+        {
+            "num_envs": 64,
+            "num_steps": 16,
+            "total_steps": 820_000,
+            "gamma": 0.95,
+            "actor_learning_rate": 5e-3,
+            "critic_epochs": 4,
+            "checkpoint_every": 250_000,
+        },
+    ),
 }
 """preset, arguments of the environment, other fields; of PPO unless another is named"""
 

@@ -129,7 +129,10 @@ class Alone:
     ("name", "sentence"),
     [
         ("Half", "test_contract:Half lacks restart, step: a backend is derived from lemniscate.envs.backend.Backend"),
-        ("Alone", "test_contract:Alone lacks baseline, call, compiled, divides, exists_once, ids,"),
+        (
+            "Alone",
+            "test_contract:Alone lacks baseline, call, compiled, detach, differentiable, divides, exists_once, ids,",
+        ),
         ("play", "test_contract:play is not a class"),
     ],
 )
