@@ -2,6 +2,7 @@
 
     .venv/bin/python benchmarks/air.py                         5 seeds of figure-eight-robust, and of first principles
     .venv/bin/python benchmarks/air.py --ways figure-eight --seeds 1 2
+    .venv/bin/python benchmarks/air.py --ways "shac: figure-eight-robust" --seeds 1 2
     .venv/bin/python benchmarks/air.py --bounds                what no policy can do
     .venv/bin/python benchmarks/air.py --gains                 a search for the gains of PD, on seeds 101 to 103
     .venv/bin/python benchmarks/air.py --table                 the tables of what has been measured
@@ -78,7 +79,6 @@ def one_run(way, seed):
     with tempfile.TemporaryDirectory() as folder:
         given = fields | ({"env_kwargs": kwargs} if kwargs else {})
         run = lem.train(algorithm, ENV, preset=preset, seed=seed, run=f"{folder}/run", progress=False, **given)
-    kwargs = kwargs or run.policy.config.env_kwargs
     nominal = {name: CONDITIONS[name].nominal for name in run.policy.config.env_kwargs if name in CONDITIONS}
 
     def fly(dynamics, baseline=False, **conditions):
@@ -86,7 +86,7 @@ def one_run(way, seed):
         return numbers(lem.evaluate(run.policy, episodes=STARTS, seed=0, env_kwargs=kwargs, baseline=baseline))
 
     found = {"way": way, "seed": seed, "training_s": run.seconds}
-    for dynamics in [kwargs["dynamics"]] if isinstance(kwargs.get("dynamics"), str) else DYNAMICS:
+    for dynamics in [kwargs["dynamics"]] if "dynamics" in kwargs else DYNAMICS:
         found[dynamics] = {"rest": fly(dynamics), "turning": fly(dynamics, rotors=1)}
         if seed == 1:
             found[dynamics] |= {"pd rest": fly(dynamics, True), "pd turning": fly(dynamics, True, rotors=1)}

@@ -157,7 +157,7 @@ def test_nothing_that_is_kept_can_be_differentiated():
     assert not any(tensor.requires_grad for tensor in vars(plain).values())
 
 
-def best_return(gamma=1.0, steps=50):
+def best_return(steps=50):
     """The mean return of the best linear feedback from the starts of `Glide`: Riccati's recursion, in float64."""
     a = torch.tensor([[1.0, 0.1], [0.0, 1.0]], dtype=torch.float64)
     b = torch.tensor([[0.01], [0.1]], dtype=torch.float64)

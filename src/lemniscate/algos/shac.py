@@ -16,7 +16,6 @@ from lemniscate.data.rollout import QBatch, collect, epoch_minibatches
 from lemniscate.errors import UserError
 from lemniscate.maths import explained_variance, means, q_lambda, reward_to_go, value_loss
 from lemniscate.nn.actor_critic import ActorCritic, Value
-from lemniscate.nn.networks import Activation
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.nn.policies import Policy
 from lemniscate.optim.adam import Adam, linear
@@ -54,19 +53,12 @@ class Config(ActorCriticConfig):
     """rows of each gradient step of the value; usually 64 to 512"""
     initial_log_std: LogStd = -2.0
     """initial log σ of the policy, in units of half the action range; usually -3 to -1"""
-    activation: Activation = "tanh"
-    """activation function between the layers"""
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self._require_minibatch("critic_minibatch_size")
         if self.shards > 1:
             raise UserError("shards must be 1: a gradient through a simulator is not divided among processes.")
-
-    @property
-    def gradient_steps(self) -> int:
-        """The number of gradient steps of the value in the whole run."""
-        return self.num_rollouts * self.critic_epochs * -(-self.num_rows // self.critic_minibatch_size)
 
 
 @dataclass(kw_only=True)

@@ -59,11 +59,6 @@ class Config(RecurrentConfig):
         self._require_minibatch("critic_minibatch_size")
         self._require_rows("normalize_advantage", self.num_rows)
 
-    @property
-    def gradient_steps(self) -> int:
-        """The number of gradient steps of the value in the whole run."""
-        return self.num_rollouts * self.critic_epochs * -(-self.num_rows // self.critic_minibatch_size)
-
 
 @dataclass(kw_only=True)
 class State(OnPolicyState[ActorCritic]):

@@ -104,7 +104,7 @@ class JaxBackend(Backend):
         if torch.is_grad_enabled() and (action.requires_grad or self._moving.requires_grad):
             self._moving, *out, measures = _Differentiable.apply(self._moving, action, self)
         else:
-            *out, measures = self._simulate(action)
+            *out, measures = self._simulate(self._from_dlpack(action.contiguous()))
         obs, next_obs, reward, flags = out
         terminated, truncated, fragment = flags
         self.counts = (self.counts | terminated | truncated) & ~fragment
@@ -119,9 +119,8 @@ class JaxBackend(Backend):
         """Take the present state as given: gradients go back as far as here."""
         self._moving = self._moving.detach()
 
-    def _simulate(self, action: Tensor) -> tuple[Any, ...]:
-        """Observation, next observation, reward, flags and measures of a step."""
-        command = self._from_dlpack(action.contiguous())
+    def _simulate(self, command: Any) -> tuple[Any, ...]:
+        """Observation, next observation, reward, flags and measures of a step; the command is an array of JAX."""
         self._state, (*out, measures) = self._programs.step(self._state, command, self._stagger)
         return *map(torch.from_dlpack, out), measures
 
@@ -141,7 +140,7 @@ class _Differentiable(torch.autograd.Function):
         command = backend._from_dlpack(action.detach().clone())
         ctx.to_jax = backend._from_dlpack
         ctx.pull = partial(backend._programs.pull, backend._state, command, backend._stagger)
-        return torch.zeros_like(moving), *backend._simulate(action.detach())
+        return torch.zeros_like(moving), *backend._simulate(command)
 
     @staticmethod
     def backward(ctx: Any, *by: Any) -> Any:

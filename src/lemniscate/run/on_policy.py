@@ -64,8 +64,12 @@ class OnPolicyConfig(RunConfig):
 
     @property
     def gradient_steps(self) -> int:
-        """The number of gradient steps of the whole run: passes over each rollout, in minibatches where it has them."""
-        epochs, size = getattr(self, "epochs", 1), getattr(self, "minibatch_size", self.num_rows)
+        """The number of gradient steps of the whole run: passes over each rollout, in minibatches where it has them.
+
+        Where the value has passes of its own, it is those.
+        """
+        own = "critic_" if hasattr(self, "critic_epochs") else ""
+        epochs, size = getattr(self, f"{own}epochs", 1), getattr(self, f"{own}minibatch_size", self.num_rows)
         return self.num_rollouts * epochs * -(-self.num_rows // size)
 
     def _require_minibatch(self, field: str) -> None:
