@@ -303,7 +303,7 @@ MUTANTS = [
     (
         "a mirror of three numbers that is not its own inverse",
         "envs/symmetry.py",
-        " or not _is_own_inverse(order)",
+        " or order(signed).tolist() != each",
         "",
         "envs/test_symmetry.py::test_where_there_is_no_mirror_the_reason_is_said",
     ),

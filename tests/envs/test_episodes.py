@@ -30,9 +30,8 @@ def test_the_sums_agree_with_adding_up_one_by_one(rng, every):
     books, returns, lengths = EpisodeStatistics(copies, torch.device("cpu")), [], []
     for t in range(steps):
         nothing = torch.zeros(copies, 1)
-        books.log(
-            Step(nothing, nothing, reward[t], terminated[t], truncated[t], ~ignored[t]), ~fragment[t], {}, ~ignored[t]
-        )
+        step = Step(nothing, nothing, reward[t], terminated[t], truncated[t], ~ignored[t])
+        books.log(step, ~fragment[t], step)
         if t % every == every - 1 or t == steps - 1:
             ended = books.take()
             returns, lengths = returns + ended.returns, lengths + ended.lengths

@@ -96,9 +96,9 @@ def test_alive_is_a_return_that_nominal_episodes_have():
 def test_what_follows_an_end_does_not_count():
     tally = Tally(3)
     tally.add(torch.ones(3), torch.tensor([True, False, False]), torch.tensor([False, True, False]))
-    tally.add(torch.ones(3), torch.tensor([False, True, True]))
-    assert tally.flown().returns.tolist() == [1, 1, 2]
-    assert tally.flown().terminated.tolist() == [True, False, True]
+    tally.add(torch.ones(3), torch.tensor([False, True, True]), torch.zeros(3, dtype=torch.bool))
+    assert tally.returns.tolist() == [1, 1, 2]
+    assert tally.terminated.tolist() == [True, False, True]
     assert not tally.going.any()
 
 

@@ -26,15 +26,12 @@ class HindsightReplay(ReplayBuffer):
     by its goal or by a fall, ends with its last step in any case.
 
     Args:
-        spec: of an environment whose observation is a Dict with `achieved_goal` and `desired_goal`.
+        spec: of an environment whose observation is a Dict with `achieved_goal` and `desired_goal`; else a `UserError`.
         capacity: rows, copies included.
         device: of the rows.
         num_envs: N.
         goals: copies of each transition, k.
         seed: of the choice of goals.
-
-    Raises:
-        UserError: observations without goals.
     """
 
     def __init__(

@@ -7,7 +7,8 @@ from typing import Literal
 import torch
 from torch import Generator, Tensor
 
-from lemniscate.envs.vec_env import Mirror, VecEnv
+from lemniscate.envs.symmetry import Mirror
+from lemniscate.envs.vec_env import VecEnv
 from lemniscate.maths import coloured, ornstein_uhlenbeck, uniform
 from lemniscate.nn.policies import Policy
 from lemniscate.spec import Spec
@@ -22,10 +23,9 @@ class ReplayBuffer:
     """The last `capacity` transitions of all parallel environments, preallocated on `device`."""
 
     def __init__(self, spec: Spec, capacity: int, device: torch.device) -> None:
-        columns = {
-            name: torch.zeros(capacity, *shape, dtype=kind, device=device) for name, shape, kind in _columns(spec)
-        }
-        self.transitions = Transition(**columns)
+        self.transitions = Transition(
+            *(torch.zeros(capacity, *shape, dtype=kind, device=device) for shape, kind in _columns(spec))
+        )
         self.capacity = capacity
         self.mirror: Mirror | None = None
         """the mirror image of transitions, where it is stored too"""
@@ -99,7 +99,13 @@ class ActionNoise:
         """The noise of the next step, [N, A]."""
         due = self._position == self._length
         if due.any():
-            self._sequences[due] = self._new_sequences(int(due.sum()), generator)
+            shape = (int(due.sum()), *self._sequences.shape[1:])
+            new = torch.randn(shape, generator=generator, device=generator.device)
+            if self._kind == "ou":
+                new = ornstein_uhlenbeck(new, self._time)
+            elif self._kind == "coloured":
+                new = coloured(new, self._exponent)
+            self._sequences[due] = new
             self._position[due] = 0
         noise = self._sequences[self._rows, :, self._position]
         self._position += 1
@@ -122,16 +128,6 @@ class ActionNoise:
         self._sequences.copy_(state["sequences"])
         self._position.copy_(state["position"])
 
-    def _new_sequences(self, count: int, generator: Generator) -> Tensor:
-        """[count, A, L]."""
-        shape = (count, *self._sequences.shape[1:])
-        normal = torch.randn(shape, generator=generator, device=generator.device)
-        if self._kind == "white":
-            return normal
-        if self._kind == "ou":
-            return ornstein_uhlenbeck(normal, self._time)
-        return coloured(normal, self._exponent)
-
 
 @torch.no_grad()
 def interact(
@@ -146,15 +142,9 @@ def interact(
 ) -> Step:
     """One step of every parallel environment, [N, …], added to the replay buffer.
 
-    Args:
-        env: the environments.
-        policy: acts with `noise_std` times the noise of the next step.
-        replay: the buffer.
-        action_noise: standard normal noise [N, A], correlated in time or not.
-        generator: of the noise.
-        noise_std: standard deviation of the noise of a deterministic policy, in units of half the action range; 1 for a
-            stochastic policy, which takes standard normal numbers.
-        random: act uniformly in [-1, 1]^A instead.
+    The policy acts with `noise_std` times the standard normal noise [N, A] of the next step: that is the standard
+    deviation for a deterministic policy, in units of half the action range; 1 for a stochastic one, which takes standard
+    normal numbers. With `random`, actions are uniform in [-1, 1]^A instead.
     """
     with env.collecting:
         obs, noise = env.obs, action_noise(generator)
@@ -168,15 +158,11 @@ def interact(
 
 def bytes_per_transition(spec: Spec) -> int:
     """The size of one transition in memory."""
-    return sum(math.prod(shape) * kind.itemsize for _, shape, kind in _columns(spec))
+    return sum(math.prod(shape) * kind.itemsize for shape, kind in _columns(spec))
 
 
-def _columns(spec: Spec) -> list[tuple[str, tuple[int, ...], torch.dtype]]:
-    obs = ((spec.observation_size + spec.privileged,), torch.uint8 if spec.image else torch.float32)
-    return [
-        ("obs", *obs),
-        ("action", (spec.bounded_box().size,), torch.float32),
-        ("reward", (), torch.float32),
-        ("next_obs", *obs),
-        ("terminated", (), torch.bool),
-    ]
+def _columns(spec: Spec) -> list[tuple[tuple[int, ...], torch.dtype]]:
+    """The shape and the type of each column of a transition."""
+    obs = (spec.observation_size + spec.privileged,), torch.uint8 if spec.image else torch.float32
+    action, number = (spec.bounded_box().size,), torch.float32
+    return [obs, (action, number), ((), number), obs, ((), torch.bool)]

@@ -201,10 +201,7 @@ class Backend(ABC):
         """Give back processes and windows."""
 
     def prepare_gradient(self) -> None:
-        """Get ready for derivatives of steps, before a run that takes some begins.
-
-        Raises `UserError` where steps are not differentiable.
-        """
+        """Get ready for derivatives of steps, where a run takes some. Raises `UserError` where there are none."""
         if not self.differentiable:
             raise UserError(
                 f"{self.spec.env_id} in the backend {type(self).__name__} cannot be differentiated, and this algorithm"
@@ -227,9 +224,7 @@ class Backend(ABC):
     def judge_goals(self, achieved: Tensor, desired: Tensor) -> tuple[Tensor, Tensor]:
         """The rewards of having achieved goals where others were desired, [B, G] each; whether an episode ends there.
 
-        Float32 [B] and bool [B], the environment's own answers.
-
-        Raises `UserError` where nothing in it says so.
+        Float32 [B] and bool [B], the environment's own answers. Raises `UserError` where nothing in it says so.
         """
         raise UserError(
             f"{self.spec.env_id} judges no goals in the backend {type(self).__name__}; hindsight is for single"
@@ -293,28 +288,23 @@ class Joined(Backend):
     """
 
     def __init__(self, backends: Sequence[Backend]) -> None:
-        self._backends = backends
-        self.spec, self.device = backends[0].spec, backends[0].device
-        self.num_envs = sum(backend.num_envs for backend in backends)
-        self.summaries, self.scene, self.baseline = backends[0].summaries, backends[0].scene, backends[0].baseline
-
-    @property
-    def notices(self) -> Sequence[str]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Those of the first part: the others observe the same."""
-        return self._backends[0].notices
+        self._backends, one = backends, backends[0]
+        self.num_envs = len(backends) * one.num_envs
+        self.spec, self.device, self.notices = one.spec, one.device, one.notices
+        self.summaries, self.scene, self.baseline = one.summaries, one.scene, one.baseline
 
     def restart(self, seed: int, first: int = 0) -> Tensor:
         """Begin again; see `Backend.restart`."""
         size = self._backends[0].num_envs
         obs = torch.cat([backend.restart(seed, first + i * size) for i, backend in enumerate(self._backends)])
-        self._count()
+        self._look()
         return obs
 
     def step(self, action: Tensor) -> Step:
         """The step of all parts; see `Backend.step`. A measure that some of them lack is NaN there."""
         parts = zip(self._backends, action.chunk(len(self._backends)), strict=True)
         steps = [backend.step(part) for backend, part in parts]
-        self._count()
+        self._look()
         columns = ("obs", "next_obs", "reward", "terminated", "truncated", "valid")
         joined = {name: torch.cat([getattr(step, name) for step in steps]) for name in columns}
         missing = torch.full_like(steps[0].reward, torch.nan)
@@ -336,5 +326,6 @@ class Joined(Backend):
         for backend in self._backends:
             backend.close()
 
-    def _count(self) -> None:
+    def _look(self) -> None:
         self.counts = torch.cat([backend.counts for backend in self._backends])
+        self.notices = self._backends[0].notices  # the others observe the same

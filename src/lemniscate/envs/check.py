@@ -2,7 +2,7 @@
 
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from copy import deepcopy
 from dataclasses import dataclass
@@ -16,7 +16,6 @@ import numpy as np
 import torch
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env, data_equivalence
-from gymnasium.vector import AutoresetMode
 from torch import Tensor
 
 from lemniscate.envs import registry
@@ -32,6 +31,11 @@ from lemniscate.types import Rollout
 
 GOOD, NOTE, BAD = "good", "note", "bad"
 MARKS = {GOOD: "✓", NOTE: "!", BAD: "✗"}
+RESETS = {
+    "SAME_STEP": "Resets in the step that ends an episode, and gives the final observation in its info.",
+    "NEXT_STEP": "Resets in the step after an end; the action of that step is ignored and not learned from.",
+    "DISABLED": "Is reset here, right after an episode's end; the final observation is kept.",
+}
 NUM_ENVS, STEPS = 4, 500
 LARGE_RATIO = 1e4
 """a ratio of sizes of observations from which on a network does not see the small ones"""
@@ -82,11 +86,12 @@ def each_finding(
         yield _raised(error, "It cannot be made")
         return
     try:
-        yield from _spaces(env, served_by)
+        yield good(f"Served by {served_by}; observes {_seen(env.spec)}; acts by {_acts(env.spec.action)}.")
+        yield good(RESETS[env.backend.mode.name])
         if cls.wraps(env_id):
             maker = maker_of(env_id)
-            make = partial(make_one, maker, tuple(map(find_callable, wrappers)), **(env_kwargs or {}))
-            yield from _gymnasium(make, env_id, wrapped=bool(wrappers) or not isinstance(maker, EnvSpec))
+            one = make_one(maker, tuple(map(find_callable, wrappers)), **(env_kwargs or {}))
+            yield from _gymnasium(one, env_id, wrapped=bool(wrappers) or not isinstance(maker, EnvSpec))
         yield from _random_play(env)
     finally:
         env.close()
@@ -105,32 +110,20 @@ def _one_line(message: object) -> str:
     return " ".join(text.split())
 
 
-def _spaces(env: VecEnv, served_by: str) -> Iterator[Finding]:
-    """The findings on observations, actions and the ends of episodes."""
-    spec, mode = env.spec, env.backend.mode
-    yield good(f"Served by {served_by}; observes {_seen(spec)}; acts by {_acts(spec.action)}.")
-    if mode is AutoresetMode.SAME_STEP:
-        yield good("Resets in the step that ends an episode, and gives the final observation in its info.")
-    elif mode is AutoresetMode.NEXT_STEP:
-        yield good("Resets in the step after an end; the action of that step is ignored and not learned from.")
-    else:
-        yield good("Is reset here, right after an episode's end; the final observation is kept.")
-
-
 def _seen(spec: Spec) -> str:
-    numbers = [part for part in spec.observation_parts if not part.image]
-    seen = [_image(part) for part in spec.observation_parts if part.image]
+    seen, numbers = list[str](), list[ObservationPart]()
+    for part in spec.observation_parts:
+        if not part.image:
+            numbers.append(part)
+            continue
+        height, width, channels = part.shape
+        name = f" {part.name}" if part.path else ""
+        how = f"an image{name} of {height} × {width} bytes with {channels} channel{'s' * (channels > 1)}"
+        seen.append(f"{how}, from arrays {part.own_shape}" if part.own_shape else how)
     if numbers:
         size, parts = sum(part.size for part in numbers), ", ".join(f"{part.name} {part.size}" for part in numbers)
         seen.append(f"{size} numbers ({parts})")
     return " and ".join(seen)
-
-
-def _image(part: ObservationPart) -> str:
-    height, width, channels = part.shape
-    name = f" {part.name}" if part.path else ""
-    how = f"an image{name} of {height} × {width} bytes with {channels} channel{'s' * (channels > 1)}"
-    return f"{how}, from arrays {part.own_shape}" if part.own_shape else how
 
 
 def _acts(action: Action) -> str:
@@ -241,14 +234,12 @@ def _sizes(obs: Tensor, spec: Spec) -> Iterator[Finding]:
         )
 
 
-def _gymnasium(make: Callable[[], SingleEnv], env_id: str, wrapped: bool) -> Iterator[Finding]:
+def _gymnasium(env: SingleEnv, env_id: str, wrapped: bool) -> Iterator[Finding]:
     """The result of Gymnasium's checker without its false alarms, and whether observations are copies.
 
-    `wrapped` checks the environment as `make` returns it, with the user's own wrappers; otherwise what is inside of
-    Gymnasium's.
+    `wrapped` checks the environment with its wrappers, the user's own; otherwise what is inside of Gymnasium's.
     """
-    found: list[Finding] = []
-    env = make()
+    found = list[Finding]()
     careful = Careful(env.env if wrapped else env.unwrapped)  # what is looked at are its own returns
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
@@ -302,10 +293,8 @@ class Careful(gym.Env):
     def __init__(self, env: gym.Env) -> None:
         self.env, self.spec, self.metadata = env, env.spec, env.metadata
         self.observation_space, self.action_space = env.observation_space, env.action_space
-        self.reuses = False
-        self._mask: np.ndarray | None = None
-        self._returned: Any = None
-        self._copy: Any = None
+        self.reuses, self._mask = False, None
+        self._returned = self._copy = None
 
     @property
     def _np_random(self) -> np.random.Generator | None:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -323,9 +312,9 @@ class Careful(gym.Env):
         elif mask is not None and isinstance(space, gym.spaces.MultiDiscrete):
             parts = np.split(mask, np.cumsum(space.nvec)[:-1])
             action = space.start + np.reshape([np.argmax(part) for part in parts], space.shape)
-        obs, reward, terminated, truncated, info = self.env.step(action)
+        obs, *rest, info = self.env.step(action)
         obs, info = self._copied(obs, info)
-        return obs, reward, terminated, truncated, info
+        return obs, *rest, info
 
     def _copied(self, obs: Any, info: Any) -> tuple[Any, Any]:
         """A copy of the observation, and the info. Notes the mask, and whether the observation before has changed."""

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from lemniscate.envs.returns import MASKS, Returns, author, flat_mask, kind_of, layers, mask_in, place, scalars
 from lemniscate.errors import UserError
-from lemniscate.spec import Action, Box, Discrete, MultiBinary, MultiDiscrete, ObservationPart
+from lemniscate.spec import Action, Box, Discrete, MultiDiscrete, ObservationPart
 from lemniscate.system.console import say
 
 SUCCESS = ("is_success", "success")
@@ -41,9 +41,8 @@ class SingleEnv(gym.Wrapper):
                 raise UserError(f"{kind} has no {name}: set self.{name} in its __init__, such as a Box.")
         for layer in layers(env):
             taken = signature(layer.reset).parameters
-            if not taken.keys() >= {"seed", "options"} and all(
-                one.kind is not one.VAR_KEYWORD for one in taken.values()
-            ):
+            takes_any = any(one.kind is one.VAR_KEYWORD for one in taken.values())
+            if not takes_any and not taken.keys() >= {"seed", "options"}:
                 right = "reset(self, *, seed=None, options=None)"
                 raise UserError(f"{place(layer, 'reset')} takes no seed or no options; it must be {right}.")
         self._returns = Returns(env, env.observation_space)
@@ -60,11 +59,8 @@ class SingleEnv(gym.Wrapper):
             returned: Any = self.env.reset(seed=seed, options=options)
         except (TypeError, ValueError) as error:
             raise self._returns.in_wrapper("reset", error) from error.__cause__
-        two = type(returned) is tuple and len(returned) == 2
-        if not (two and self._is_usual(returned[0], 0.0, False, False, returned[1])):
-            returned = self._returns.of_reset(returned)
-        obs, info = returned
-        return (obs, self._told("reset", obs, info)) if info or self._masked else returned
+        obs, info = self._returns.of_reset(returned)
+        return obs, self._told("reset", obs, info)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Gymnasium's."""
@@ -78,7 +74,7 @@ class SingleEnv(gym.Wrapper):
         return (obs, *rest, self._told("step", obs, info)) if info or self._masked else returned
 
     def _is_usual(self, obs: Any, reward: Any, terminated: Any, truncated: Any, info: Any) -> bool:
-        """Whether each is of its type already, as mostly, and has to cost nothing."""
+        """Whether each is of its type already, as mostly: this is asked at every step, and `of_step` is slower."""
         if type(obs) is not np.ndarray or obs.shape != self._shape or obs.dtype != self._dtype:
             return False
         flags = type(terminated) is bool and type(truncated) is bool
@@ -111,16 +107,13 @@ class SingleEnv(gym.Wrapper):
             say(f"{author(self.env, 'close')} raised {type(error).__name__}: {error}")
 
     def _told(self, method: str, obs: Any, info: dict[str, Any]) -> dict[str, Any]:
-        numbers: dict[str, Any] = {
-            str(name): float(value) for name, value in info.items() if isinstance(value, float | np.floating)
-        }
-        if len(numbers) == len(info) and not self._masked:
-            return numbers
-        numbers = dict(scalars(info))
+        numbers: dict[str, Any] = dict(scalars(info))
         for name in self._declared:
             if info.get(name) is not None and name not in numbers:
                 what = f"returned {kind_of(info[name])} as info[{name!r}]; a measure is a number"
                 raise self._returns.wrong(method, what)
+        if not self._masked and info.keys().isdisjoint(MASKS):
+            return numbers
         _, mask = mask_in(obs, info)
         mask = self._ask() if mask is None and self._ask else mask
         if mask is not None:
@@ -196,10 +189,9 @@ def unflatten_observation(parts: tuple[ObservationPart, ...], flat: np.ndarray) 
             own = np.stack([digit.argmax(axis=1) for digit in digits], axis=1) + np.array(part.start)
         own = own.reshape(len(flat), *([part.own_shape[axis] for axis in part.axes] or part.shape))
         own = own.transpose(0, *(np.argsort(part.axes) + 1)) if part.axes else own
-        inside = found
-        for key in ("", *part.path[:-1]) if part.path else ():
-            inside = inside.setdefault(key, {})
-        inside[part.path[-1] if part.path else ""] = own.astype(np.uint8) if part.image else own
+        *outer, last = ("", *part.path)
+        inside = reduce(lambda tree, key: tree.setdefault(key, {}), outer, found)
+        inside[last] = own.astype(np.uint8) if part.image else own
     return _with_tuples(found[""])
 
 
@@ -279,12 +271,8 @@ def physical_action(action: np.ndarray, kind: Action) -> np.ndarray:
 
 def normalized_action(action: np.ndarray, kind: Action) -> np.ndarray:
     """The inverse of `physical_action`: actions [N, …] of an environment, as a policy gives them."""
-    if isinstance(kind, Discrete):
-        return (action - kind.start).astype(np.int64)
-    flat = action.reshape(len(action), -1)
-    if isinstance(kind, MultiBinary):
-        return flat.astype(np.int64)
-    if isinstance(kind, MultiDiscrete):
-        return (flat - np.array(kind.start)).astype(np.int64)
-    _, _, middle, half = scale_of(kind)
-    return ((flat - middle) / np.where(half > 0, half, 1)).astype(np.float32)
+    flat = action if isinstance(kind, Discrete) else action.reshape(len(action), -1)
+    if isinstance(kind, Box):
+        _, _, middle, half = scale_of(kind)
+        return ((flat - middle) / np.where(half > 0, half, 1)).astype(np.float32)
+    return (flat - np.array(getattr(kind, "start", 0))).astype(np.int64)

@@ -1,7 +1,7 @@
 """EnvPool: environments in C++, stepped by native threads (Weng et al. 2022, arXiv:2206.10558)."""
 
 import warnings
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -41,9 +41,8 @@ class EnvpoolBackend(Backend):
     """N parallel environments of one of the ids that EnvPool serves.
 
     EnvPool by itself resets in the step after an end and ignores the action of that step. Here an environment that has
-    ended is reset at once, so that every row is real. With `stagger`, first episodes are cut: see `Stagger`.
-
-    Nothing depends on `num_threads` but the speed; by default there is one for each processor that we may use.
+    ended is reset at once, so that every row is real. With `stagger`, first episodes are cut: see `Stagger`. It has a
+    thread for each processor that we may use; nothing depends on their number but the speed.
     """
 
     summaries = SUMMARIES
@@ -84,14 +83,12 @@ class EnvpoolBackend(Backend):
         stagger: bool = False,
         kwargs: Mapping[str, Any] | None = None,
         wrappers: Sequence[str] = (),
-        num_threads: int | None = None,
     ) -> None:
         assert not wrappers, "EnvPool's environments cannot be wrapped"
         self.num_envs, self.device = num_envs, device
         self._valid = torch.ones(num_envs, dtype=torch.bool, device=device)
-        task, threads = env.removeprefix(PREFIX), min(num_envs, num_threads or cores())
-        options = _checked(task, dict(kwargs or {})) | {"num_envs": num_envs, "num_threads": threads}
-        self._build = partial(make_pool, task, options)
+        own = {"num_envs": num_envs, "num_threads": min(num_envs, cores())}
+        self._build = pools(env.removeprefix(PREFIX), kwargs or {}, own)
         self._pool = self._build(0)
         limit = int(self._pool.config["max_episode_steps"])
         self._limit = limit if limit < NO_LIMIT else None
@@ -157,7 +154,7 @@ class SingleEnv(gym.Env):
     """One environment of EnvPool's with Gymnasium's interface, for rendering."""
 
     def __init__(self, task: str, mode: str, kwargs: Mapping[str, Any]) -> None:
-        self._make = partial(make_pool, task, {**_checked(task, dict(kwargs)), "num_envs": 1, "render_mode": mode})
+        self._make = pools(task, kwargs, {"num_envs": 1, "render_mode": mode})
         self._pool = self._make(0)
         self.render_mode = mode
         self.observation_space, self.action_space = self._pool.observation_space, self._pool.action_space
@@ -212,8 +209,11 @@ def refusal(task: str) -> str | None:
     return REFUSED.get(part)
 
 
-def _checked(task: str, options: dict[str, Any]) -> dict[str, Any]:
-    """The options, each of which exists. Raises `UserError` for others, and for a task that is not served."""
+def pools(task: str, options: Mapping[str, Any], own: Mapping[str, Any]) -> Callable[[int], Any]:
+    """From a seed to a pool of a task, with a user's options and our own.
+
+    Raises `UserError` for options that there are not, and for a task that is not served.
+    """
     if not is_installed("envpool"):
         raise missing_extra("envpool", "envpool")
     import envpool
@@ -222,9 +222,7 @@ def _checked(task: str, options: dict[str, Any]) -> dict[str, Any]:
         raise unknown_name("environment of EnvPool", task, envpool.list_all_envs())
     if reason := refusal(task):
         raise UserError(f"{PREFIX}{task} is not served: {reason}")
-    if not options:
-        return options
-    defaults = envpool.make_spec(task).config._asdict()
+    defaults = envpool.make_spec(task).config._asdict() if options else {}
     known = {name: value for name, value in defaults.items() if name not in RESERVED}
     for name, value in options.items():
         if name not in known:
@@ -235,4 +233,4 @@ def _checked(task: str, options: dict[str, Any]) -> dict[str, Any]:
             raise UserError(
                 f"{name} of EnvPool's {task} must be of type {kind}, such as {known[name]!r}, not {value!r}."
             )
-    return options
+    return partial(make_pool, task, {**options, **own})

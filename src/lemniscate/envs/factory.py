@@ -43,7 +43,7 @@ def maker_of(env: str) -> Maker:
     found = named.find(env)
     if isinstance(found, type) and issubclass(found, gym.Env):
         return EnvSpec(found.__name__, entry_point=found)
-    if (isinstance(found, type) and issubclass(found, VectorEnv)) or (callable(found) and not isinstance(found, type)):
+    if issubclass(found, VectorEnv) if isinstance(found, type) else callable(found):
         return found
     raise UserError(f"{env} cannot be made: {name} is neither an environment class, nor a function, nor an id.")
 
@@ -52,8 +52,7 @@ def makes_vector(maker: Maker) -> bool:
     """Whether it makes N environments at once: an id registered so, a `VectorEnv`, or what takes `num_envs`."""
     if isinstance(maker, EnvSpec):
         return maker.entry_point is None
-    is_class = isinstance(maker, type) and issubclass(maker, VectorEnv)
-    return is_class or "num_envs" in inspect.signature(maker).parameters
+    return isinstance(maker, type) or "num_envs" in inspect.signature(maker).parameters  # a class is a `VectorEnv`
 
 
 def is_own(maker: Maker) -> bool:

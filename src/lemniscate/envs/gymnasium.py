@@ -2,7 +2,7 @@
 
 from collections.abc import Collection, Mapping, Sequence
 from functools import partial
-from typing import Any, cast
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -12,14 +12,7 @@ from torch import Tensor
 
 from lemniscate.envs import spaces
 from lemniscate.envs.backend import Backend
-from lemniscate.envs.conversion import (
-    SingleEnv,
-    flatten_observation,
-    measured,
-    measures_of,
-    physical_action,
-    row_of,
-)
+from lemniscate.envs.conversion import flatten_observation, measured, measures_of, physical_action, row_of
 from lemniscate.envs.factory import is_own, make_one, make_vector, maker_of, makes_vector, sentences
 from lemniscate.envs.returns import mask_in
 from lemniscate.envs.vec_env import Stagger
@@ -97,9 +90,9 @@ class GymnasiumBackend(Backend):
         maker = maker_of(env)
         if makes_vector(maker) and self.workers:
             raise UserError(f"{env} makes {num_envs} environments at once, so there is none for a process of its own.")
-        wraps = tuple(map(find_callable, wrappers))
-        self._build = partial(make_vector, maker, num_envs, dict(kwargs or {}), wraps, self.workers)
-        self._make_judge, self._judge = partial(make_one, maker, wraps, **(kwargs or {})), cast(SingleEnv | None, None)
+        wraps, given = tuple(map(find_callable, wrappers)), dict(kwargs or {})
+        self._build = partial(make_vector, maker, num_envs, given, wraps, self.workers)
+        self._make_judge, self._judge = partial(make_one, maker, wraps, **given), None
         with sentences(env, kwargs, wrappers):
             self._envs, limit = self._build()
         mode = self._envs.metadata.get("autoreset_mode")
@@ -156,21 +149,21 @@ class GymnasiumBackend(Backend):
                 self.counts = torch.as_tensor(self._stagger.counts, device=self.device)
         if self._masks:
             self._masks.require_choice(obs, ~self._resetting)
-        there = torch.as_tensor(next_obs, device=self.device)
-        here = there if obs is next_obs else torch.as_tensor(obs, device=self.device)
         tensor = partial(torch.as_tensor, device=self.device)
-        rewards, *flags = map(tensor, (reward.astype(np.float32), terminated, truncated, valid))
+        there, *rest = map(tensor, (next_obs, reward.astype(np.float32), terminated, truncated, valid))
+        here = there if obs is next_obs else tensor(obs)
         measures = measured(info, self._measures, self.num_envs, self.device) if info else {}
-        return Step(here, there, rewards, *flags, measures=measures)
+        return Step(here, there, *rest, measures=measures)
 
     def call(self, calls: Mapping[str, Any]) -> None:
         """Call methods of each environment or of its wrappers; of what is a vector environment by itself, its own."""
         self._calls |= calls
+        vector: Any = self._envs
         for name, argument in calls.items():
-            if isinstance(self._envs, WatchedVectorEnv):
-                self._envs.call_method(name, argument)
+            if isinstance(vector, WatchedVectorEnv):
+                vector.call_method(name, argument)
             else:
-                for env in self._envs.envs if isinstance(self._envs, SyncVectorEnv) else [cast(Any, self._envs).env]:
+                for env in vector.envs if isinstance(vector, SyncVectorEnv) else [vector.env]:
                     call_method(env, name, argument)
 
     def judge_goals(self, achieved: Tensor, desired: Tensor) -> tuple[Tensor, Tensor]:
@@ -179,7 +172,7 @@ class GymnasiumBackend(Backend):
         Of environments in processes of their own, one more is made here to judge.
         """
         if isinstance(self._envs, SyncVectorEnv):
-            judge = cast(SingleEnv, self._envs.envs[0])
+            judge: Any = self._envs.envs[0]
         elif self.wraps(self.spec.env_id):
             judge = self._judge = self._judge or self._make_judge()
         else:
@@ -201,11 +194,10 @@ class GymnasiumBackend(Backend):
                 f"{self.spec.env_id} resets in the same step and hides the final observation (no info['final_obs']), so"
                 " its time-outs cannot be learned from; make it NEXT_STEP, DISABLED, or give final_obs."
             )
-        next_obs, size = obs.copy(), self.spec.observation_size
+        next_obs, size, final_info = obs.copy(), self.spec.observation_size, info.get("final_info", {})
         for row in np.flatnonzero(done):
             final = row_of(info["final_obs"], int(row))
             next_obs[row, :size] = flatten_observation(self.spec.observation_parts, final, image=self.spec.image)
-            final_info = info.get("final_info", {})
             name, mask = mask_in(final, final_info)
             if self._masks and mask is not None and final_info.get(f"_{name}", done)[row]:
                 next_obs[row, size:] = self._masks.of_row(row_of(mask, int(row)) if name else mask, int(row))

@@ -9,14 +9,13 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 
 from lemniscate.envs.gymnasium import GymnasiumBackend
-from lemniscate.envs.registry import BEGINNINGS
 from lemniscate.errors import is_installed, missing_extra
 
-(PREFIX,) = BEGINNINGS["minatar"]
-GAMES = {"Asterix": "asterix", "Breakout": "breakout", "Freeway": "freeway", "Seaquest": "seaquest"}
-GAMES |= {"SpaceInvaders": "space_invaders"}
+MODULES = ("asterix", "breakout", "freeway", "seaquest", "space_invaders")
+GAMES = {f"MinAtar/{module.title().replace('_', '')}-v1": module for module in MODULES}
 LIMIT = 10_000
 """steps of an episode at most, which the games have not"""
 PIXELS = 20
@@ -72,20 +71,15 @@ class MinAtar(gym.Env):
         """The field, each kind of thing in a grey of its own; [H, W, 3]."""
         state = self._game.state()
         shade = (state * np.linspace(80, 255, state.shape[-1])).max(-1).astype(np.uint8)
-        return np.repeat(shade.repeat(PIXELS, 0).repeat(PIXELS, 1)[..., None], 3, axis=-1)
+        return shade.repeat(PIXELS, 0).repeat(PIXELS, 1)[..., None].repeat(3, 2)
 
     def _show(self) -> np.ndarray:
         return 255 * self._game.state().astype(np.uint8)
 
 
-for _name, _game in GAMES.items():
-    gym.registry.pop(f"{PREFIX}{_name}-v1", None)  # the package's own, whose observations are no bytes
-    gym.register(
-        f"{PREFIX}{_name}-v1",
-        entry_point="lemniscate.envs.packages:MinAtar",
-        max_episode_steps=LIMIT,
-        kwargs={"game": _game},
-    )
+for _id, _game in GAMES.items():  # in the place of the package's own, whose observations are no bytes
+    _point = "lemniscate.envs.packages:MinAtar"
+    gym.registry[_id] = EnvSpec(_id, entry_point=_point, max_episode_steps=LIMIT, kwargs={"game": _game})
 
 
 class MinatarBackend(GymnasiumBackend):
@@ -94,12 +88,12 @@ class MinatarBackend(GymnasiumBackend):
     @classmethod
     def ids(cls) -> Collection[str]:
         """The five games, where the package is installed."""
-        return [f"{PREFIX}{name}-v1" for name in GAMES] if is_installed("minatar") else []
+        return [*GAMES] if is_installed("minatar") else []
 
     @classmethod
     def serves(cls, env: str) -> bool:
         """Whether it is one of the five, by the name."""
-        return env.removeprefix(PREFIX).removesuffix("-v1") in GAMES
+        return env in GAMES
 
     @classmethod
     def exists_once(cls, env: str, num_envs: int) -> bool:

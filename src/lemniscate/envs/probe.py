@@ -131,12 +131,8 @@ class Tally:
         self.going = torch.ones(num_envs, dtype=torch.bool)
         """[N], the episodes that have not ended"""
 
-    def add(self, reward: Tensor, terminated: Tensor, truncated: Tensor | None = None) -> None:
+    def add(self, reward: Tensor, terminated: Tensor, truncated: Tensor) -> None:
         """One step of every environment, [N] each."""
         self.returns += torch.where(self.going, reward.double(), 0.0)
         self.terminated |= terminated & self.going
-        self.going &= ~terminated if truncated is None else ~(terminated | truncated)
-
-    def flown(self, actions: Tensor | None = None) -> Flown:
-        """The episodes."""
-        return Flown(self.returns, self.terminated, actions)
+        self.going &= ~(terminated | truncated)

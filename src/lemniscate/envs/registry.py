@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
 
@@ -71,8 +72,9 @@ def backend_for(env: str, wrappers: Sequence[str] = ()) -> str:
     It is the first that serves it and can put wrappers around it; the first that serves it where none can. Raises
     `UserError` with the nearest names if there is none.
     """
-    if _is_spoken(env):
-        return "rsl_rl"
+    with suppress(UserError):  # an id behind a module that registers it, or nothing
+        if ":" in env and hasattr(named.find(env), SPOKEN):
+            return "rsl_rl"
     serving = None
     for name in BACKENDS:
         if env.startswith(BEGINNINGS.get(name, "")) and backend_class(name).serves(env):
@@ -82,14 +84,6 @@ def backend_for(env: str, wrappers: Sequence[str] = ()) -> str:
     if serving is None:
         raise unknown_env(env)
     return serving
-
-
-def _is_spoken(env: str) -> bool:
-    """Whether it is an object, or a class of one's own, that speaks rsl_rl's `VecEnv`."""
-    try:
-        return ":" in env and hasattr(named.find(env), SPOKEN)
-    except UserError:  # an id behind a module that registers it, or nothing
-        return False
 
 
 def unknown_env(env: str) -> UserError:
@@ -145,12 +139,10 @@ def for_evaluation(backend: str | None) -> str | None:
 def name_of(env: object) -> str:
     """The name of an environment for a Config: an id or `module:Class` as it is, or that of a class or a callable.
 
-    What speaks rsl_rl's `VecEnv` is N environments already, and has a name too.
+    What speaks rsl_rl's `VecEnv` is N environments already, and has a name too. What can be imported by its name can be
+    used again from a file; a lambda or a local class in this process only.
 
-    What can be imported by that name can be used again from a file; a lambda or a local class in this process only.
-
-    Raises:
-        UserError: an environment that is made already, or something else that cannot be called.
+    Raises `UserError` for an environment that is made already, or something else that cannot be called.
     """
     if isinstance(env, str):
         return env
@@ -165,14 +157,6 @@ def names_of(wrappers: "Sequence[str | Callable[..., Any]]") -> tuple[str, ...]:
     if not isinstance(wrappers, list | tuple):
         raise UserError(f"wrappers must be several, such as [MyWrapper], not {shown(wrappers)}.")
     return tuple(map(named.name_of, wrappers))
-
-
-def _checked_count(num_envs: Any) -> int:
-    """The number of environments as an int. Raises `UserError` unless it is a whole number that makes sense."""
-    number = getattr(num_envs, "tolist", lambda: num_envs)()  # of NumPy's and torch's scalars
-    if type(number) not in (int, float) or not 1 <= number <= MOST_ENVS or number % 1:
-        raise UserError(f"num_envs must be a whole number from 1 to {MOST_ENVS:,}, not {shown(num_envs)}.")
-    return int(number)
 
 
 def require_room(env: str, num_envs: int, backend: str) -> None:
@@ -241,7 +225,10 @@ def make(
     from lemniscate.envs.vec_env import VecEnv
     from lemniscate.system.world import ALONE
 
-    name, wraps, num_envs = name_of(env), names_of(wrappers), _checked_count(num_envs)
+    name, wraps = name_of(env), names_of(wrappers)
+    number = getattr(num_envs, "tolist", lambda: num_envs)()  # of NumPy's and torch's scalars
+    if type(number) not in (int, float) or not 1 <= number <= MOST_ENVS or number % 1:
+        raise UserError(f"num_envs must be a whole number from 1 to {MOST_ENVS:,}, not {shown(num_envs)}.")
     if kwargs is not None and not isinstance(kwargs, Mapping):
         raise UserError(f"The arguments of an environment are a dictionary, such as {{'x': 1}}, not {kwargs!r}.")
     for argument, instead in ARGUMENTS_OF_MAKE.items():
@@ -259,10 +246,10 @@ def make(
             " gymnasium backend."
         )
     world = world or ALONE
-    mine = num_envs // world.size
+    mine = int(number) // world.size
     require_room(name, mine, chosen)
     vectors = 1 if cls.divides(name) else len(world.held)
-    once = cls.exists_once(name, num_envs)
+    once = cls.exists_once(name, int(number))
     options = {"stagger": stagger and not once, "kwargs": kwargs, "wrappers": wraps}
     made = [cls(name, mine // vectors, torch.device(device), **options) for _ in range(vectors)]
     made[0].once = once

@@ -24,10 +24,7 @@ VALUES = {"reset": "2 values, (observation, info)", "step": "5 values, (obs, rew
 class Returns:
     """The values that `reset` and `step` return, checked; where they are not as they must be, a `UserError` says so.
 
-    Args:
-        env: one environment, or a vector environment.
-        space: of one observation.
-        lead: () for one environment, (N,) for a vector of N.
+    `space` is that of one observation; `lead` is () for one environment, (N,) for a vector environment of N.
     """
 
     def __init__(self, env: Any, space: gym.Space, lead: tuple[int, ...] = ()) -> None:
@@ -41,12 +38,8 @@ class Returns:
     def of_step(self, returned: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """The observation, in the types of its space; the reward, the flags and the info."""
         obs, reward, terminated, truncated, info = self._several("step", returned, 5)
-        if self._lead or type(reward) is not float:
-            reward = self._numbers("reward", reward, float)
-        if self._lead or type(terminated) is not bool:
-            terminated = self._numbers("terminated", terminated, bool)
-        if self._lead or type(truncated) is not bool:
-            truncated = self._numbers("truncated", truncated, bool)
+        reward = self._numbers("reward", reward, float)
+        terminated, truncated = self._numbers("terminated", terminated), self._numbers("truncated", truncated)
         return self._observation("step", obs), reward, terminated, truncated, self._info("step", info)
 
     def in_wrapper(self, method: str, error: Exception) -> Exception:
@@ -77,8 +70,10 @@ class Returns:
             raise self.wrong(method, f"returned {kind_of(info)} as info; it must be a dictionary, such as {{}}")
         return info
 
-    def _numbers(self, name: str, value: Any, kind: type) -> Any:
+    def _numbers(self, name: str, value: Any, kind: type = bool) -> Any:
         """A number or a flag of one environment, or a new array [N] of them."""
+        if type(value) is kind and not self._lead:
+            return value
         array = as_array(value)
         fits = array.dtype.kind in "biuf" and (array.shape == self._lead or (array.size == 1 and not self._lead))
         if not fits or (kind is bool and not ((array == 0) | (array == 1)).all()):
@@ -221,7 +216,7 @@ def _row(mask: Any) -> np.ndarray:
 def scalars(info: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, float]]:
     """Every number in `info`, an array of one too, and those of its dictionaries, by "outer/inner"."""
     for key, value in info.items():
-        if isinstance(value, float):
+        if isinstance(value, float | np.floating):
             yield f"{prefix}{key}", float(value)
         elif isinstance(value, Mapping):
             yield from scalars(value, f"{prefix}{key}/")

@@ -3,6 +3,7 @@
 Neither needs rsl_rl; ours as one needs tensordict.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -61,15 +62,14 @@ class RslRlBackend(Backend):
                 f"{env} has {self._env.num_envs:,} environments, not {num_envs:,}: num_envs={self._env.num_envs}."
             )
         obs = self._env.get_observations()
-        self._group = next((name for name in ACTOR if name in obs.keys()), None)  # noqa: SIM118  (of a TensorDict)
+        groups = [*obs.keys()]
+        self._group = next((name for name in ACTOR if name in groups), None)
         if self._group is None:
-            raise UserError(
-                f"{env} has the groups of observations {', '.join(obs.keys())}; one must be actor or policy."
-            )
+            given = ", ".join(groups)
+            raise UserError(f"{env} has the groups of observations {given}; one must be actor or policy.")
         size, limit = obs[self._group].flatten(1).shape[1], self._env.max_episode_length
-        self._privileged = obs[CRITIC].flatten(1).shape[1] if CRITIC in obs.keys() else 0  # noqa: SIM118
-        free = (float("inf"),) * self._env.num_actions
-        action = Box(tuple(-bound for bound in free), free)
+        self._privileged = obs[CRITIC].flatten(1).shape[1] if CRITIC in groups else 0
+        action = Box((-math.inf,) * self._env.num_actions, (math.inf,) * self._env.num_actions)
         steps = int(limit.max()) if isinstance(limit, Tensor) else int(limit)
         self.spec = Spec(env, (ObservationPart((), (size,)),), action, steps, self._privileged)
         self.counts = torch.ones(num_envs, dtype=torch.bool, device=device)
@@ -79,8 +79,7 @@ class RslRlBackend(Backend):
         """Seed and reset it, where it has `seed` and `reset`; else it goes on from where it is, which is said."""
         if hasattr(self._env, "seed"):
             self._env.seed(seed + first)
-        can = hasattr(self._env, "reset")
-        if can:
+        if hasattr(self._env, "reset"):
             self._env.reset()
         else:
             self._note(f"{self.spec.env_id} has no reset: episodes go on where they are, and no run can be repeated.")

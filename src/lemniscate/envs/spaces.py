@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import reduce
 from operator import getitem
-from typing import Any, cast
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -57,7 +57,12 @@ def observation_parts(space: gym.Space, env_id: str) -> tuple[ObservationPart, .
 
 def _parts(space: gym.Space, env_id: str, path: tuple[str | int, ...]) -> tuple[ObservationPart, ...]:
     if is_image(space):
-        return (image_part(path, tuple(map(int, space.shape or ()))),)
+        own = tuple(map(int, space.shape or ()))
+        axes = _image_axes(own)
+        height, width, *channels = (own[axis] for axis in axes)
+        shape = (height, width, math.prod(channels))
+        layout: dict[str, Any] = {} if own == shape else {"own_shape": own, "axes": axes}
+        return (ObservationPart(path, shape, **layout, image=True),)
     if isinstance(space, spaces.Box | spaces.MultiBinary):
         return (ObservationPart(path, tuple(map(int, space.shape))),)
     if isinstance(space, spaces.Discrete):
@@ -92,15 +97,6 @@ def _image_axes(shape: tuple[int, ...]) -> tuple[int, ...]:
     if len(shape) != 3 or min(shape[0], shape[2]) > IMAGE_CHANNELS:
         return ()
     return (0, 1, 2) if shape[2] <= shape[0] else (1, 2, 0)
-
-
-def image_part(path: tuple[str | int, ...], own: tuple[int, ...]) -> ObservationPart:
-    """The part of an observation that is an image of the shape `own`, laid out height × width × channels."""
-    axes = _image_axes(own)
-    height, width, *channels = (own[axis] for axis in axes)
-    shape = (height, width, math.prod(channels))
-    layout: dict[str, Any] = {} if own == shape else {"own_shape": own, "axes": axes}
-    return ObservationPart(path, shape, **layout, image=True)
 
 
 def action_kind(space: gym.Space, env_id: str) -> Action:
@@ -177,11 +173,7 @@ def notices(spec: Spec) -> list[str]:
 
 
 class LostDigits:
-    """A look at the first observations of 64 bits, and at whole numbers: what float32 takes from them.
-
-    Args:
-        spec: of the environment.
-    """
+    """A look at the first observations of 64 bits, and at whole numbers: what float32 takes from them."""
 
     STEPS, ENVS = 200, 8
 
@@ -264,9 +256,8 @@ def masked(action: Action, obs: Any, info: Mapping[str, Any]) -> Action:
 
 def late_mask(spec: Spec) -> UserError:
     """The sentence on an action mask that cannot be followed, since the first observation came without one."""
-    if isinstance(spec.action, Discrete | MultiDiscrete):
-        remedy = "give one with reset() too, of ones where all is permitted."
-    else:
+    remedy = "give one with reset() too, of ones where all is permitted."
+    if not isinstance(spec.action, Discrete | MultiDiscrete):
         remedy = "masks are for Discrete and MultiDiscrete actions."
     return UserError(f"{spec.env_id} gives an action mask in step() that reset() did not give: {remedy}")
 
@@ -312,18 +303,12 @@ def read_observation(spec: Spec, obs: Any) -> tuple[np.ndarray, bool]:
         UserError: another shape than the environment's, or a number that is not finite; for an image, numbers that are
             not whole or not from 0 to 255.
     """
+    parts = spec.observation_parts
     try:
         if not isinstance(obs, dict | tuple) and _is_flat(spec, np.asarray(obs)):
-            if spec.image:
-                _require_bytes(np.asarray(obs))
-            flat = np.asarray(obs, dtype=np.uint8 if spec.image else np.float32)
-            flat, batched = flat.reshape(-1, spec.observation_size), flat.ndim == 2
-        else:
-            batched = _is_batch(spec, obs)
-            for part in spec.observation_parts:
-                if part.image:
-                    _require_bytes(np.asarray(reduce(getitem, part.path, cast(Any, obs))))
-            flat = flatten_observation(spec.observation_parts, obs, image=spec.image)
+            parts = (ObservationPart((), (spec.observation_size,), image=spec.image),)
+        batched = _is_batch(parts, obs)
+        flat = flatten_observation(parts, obs, image=spec.image)
     except (KeyError, IndexError, TypeError, ValueError) as error:
         raise _unreadable(spec, obs, error) from None
     if not np.isfinite(flat).all():
@@ -349,15 +334,17 @@ def _is_flat(spec: Spec, obs: np.ndarray) -> bool:
     return right_size and obs.shape != first.shape and not counted
 
 
-def _is_batch(spec: Spec, obs: Any) -> bool:
+def _is_batch(parts: tuple[ObservationPart, ...], obs: Any) -> bool:
     """Whether each part has one dimension more than the environment gives it; `ValueError` for any other shape."""
     sizes: set[tuple[int, ...]] = set()
-    for part in spec.observation_parts:
-        shape, own = np.shape(reduce(getitem, part.path, obs)), part.own_shape or part.shape
-        extra = len(shape) - len(own)
-        if extra not in (0, 1) or shape[extra:] != own:
-            raise ValueError(f"{part.name} has the shape {shape}")
-        sizes.add(shape[:extra])
+    for part in parts:
+        given, own = np.asarray(reduce(getitem, part.path, obs)), part.own_shape or part.shape
+        extra = given.ndim - len(own)
+        if extra not in (0, 1) or given.shape[extra:] != own:
+            raise ValueError(f"{part.name} has the shape {given.shape}")
+        if part.image:
+            _require_bytes(given)
+        sizes.add(given.shape[:extra])
     if len(sizes) > 1:
         raise ValueError(f"its parts are batches of different sizes, {sizes}")
     return sizes != {()}

@@ -83,39 +83,35 @@ def find_mirror(env: str, kwargs: Mapping[str, Any], wrappers: Sequence[str]) ->
                 raise UserError("it makes many environments at once.")
             one = make_one(maker, tuple(map(find_callable, wrappers)), **kwargs)
         try:
+            sizes = dict[str, int]()
             for name, space in (("observation", one.observation_space), ("action", one.action_space)):
                 if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
                     raise UserError(f"its {name} is not one row of numbers.")
-            return _given(one) if one.has_wrapper_attr("mirror") else _derived(one)
+                sizes[name] = space.shape[0]
+            given = one.has_wrapper_attr("mirror")
+            return _given(one.get_wrapper_attr("mirror"), sizes) if given else _derived(one)
         finally:
             one.close()
     except UserError as error:
         raise UserError(f"{env} has no symmetry that could be used: {error}") from None
 
 
-def _given(env: SingleEnv) -> Mirror:
-    """The mirror of the attribute `mirror`. Raises `UserError` where it does not fit, or is not its own inverse."""
-    given, orders = env.get_wrapper_attr("mirror"), list[Order]()
+def _given(given: Any, sizes: Mapping[str, int]) -> Mirror:
+    """The mirror of an attribute `mirror`. Raises `UserError` where it does not fit, or is not its own inverse."""
+    orders = list[Order]()
     try:
         lists = [np.array([index(number) for number in numbers]) for numbers in given]
-        spaces = dict(zip(("observation", "action"), (env.observation_space, env.action_space), strict=True))
-        pairs = list(zip(lists, spaces.items(), strict=True))
+        pairs = list(zip(lists, sizes.items(), strict=True))
     except (TypeError, ValueError):
         wanted = "two lists of whole numbers, such as ([-1, 3, 2], [2, 1])"
         raise UserError(f"its attribute mirror is {shown(given)}; it must be {wanted}.") from None
-    for signed, (name, space) in pairs:
-        size = int(np.prod(space.shape or ()))
-        order = Order(np.abs(signed) - 1, np.sign(signed).astype(np.float64))
-        if sorted(np.abs(signed)) != list(range(1, size + 1)) or not _is_own_inverse(order):
+    for signed, (name, size) in pairs:
+        order, each = Order(np.abs(signed) - 1, np.sign(signed).astype(np.float64)), list(range(1, size + 1))
+        if sorted(np.abs(signed)) != each or order(signed).tolist() != each:
             wanted = f"each of 1 to {size} once, in pairs"
             raise UserError(f"mirror of its {name} is {shown(signed.tolist())}; it must have {wanted}.")
         orders.append(order)
     return Mirror(*orders)
-
-
-def _is_own_inverse(order: Order) -> bool:
-    twice = order(order(np.arange(1.0, len(order.source) + 1)))
-    return bool((twice == np.arange(1.0, len(order.source) + 1)).all())
 
 
 def _derived(env: SingleEnv) -> Mirror:

@@ -4,44 +4,21 @@ import math
 import time
 from collections import deque
 from dataclasses import dataclass, field, replace
-from typing import Protocol, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from lemniscate.envs.backend import Backend
+from lemniscate.envs.symmetry import Mirror
 from lemniscate.errors import NonFiniteError, UserError, wrong_action
 from lemniscate.spec import Box, Discrete, MultiBinary, Spec
 from lemniscate.system.world import ALONE, World
-from lemniscate.types import Record, Rollout, Step, wide_float
-
-R = TypeVar("R", bound=Record)
+from lemniscate.types import Rollout, Step, wide_float
 
 PATIENCE = 20_000
 """steps that an episode may take in an environment without a time limit, where whole ones are wanted"""
-
-
-class Carrier(Protocol):
-    """Carries what a policy remembers from step to step, as further columns of the observations: `nn.memory`."""
-
-    def begin(self, obs: Tensor) -> Tensor:
-        """The observations [N, …] with no memory, where all episodes begin."""
-        ...
-
-    def follow(self, rows: Tensor, step: Step) -> Step:
-        """The step with the memory after `rows` [N, …], the observations before it."""
-        ...
-
-
-class Mirror(Protocol):
-    """Doubles transitions by their mirror images: `envs.symmetry`."""
-
-    def both(self, rows: R, dim: int) -> R:
-        """A record of transitions and, behind them along `dim`, their mirror images."""
-        ...
-
-
 RECENT_ROWS, RECENT_BYTES = 1024, 2**23
 """the newest rows that are kept, and the bytes of their observations: whichever is less"""
 LOG_ROWS = 1024
@@ -51,11 +28,8 @@ LOG_ROWS = 1024
 class VecEnv:
     """N parallel environments with their current observation and the statistics of their episodes.
 
-    Where several processes share them, each steps its own and all learn what came of every one.
-
-    Args:
-        backend: the environments that this process steps, N / W of them.
-        world: the processes that share the environments.
+    Where the W processes of a world share them, each steps its own `backend` of N / W, and all learn what came of every
+    one.
     """
 
     def __init__(self, backend: Backend, world: World = ALONE) -> None:
@@ -66,8 +40,8 @@ class VecEnv:
         self.device = backend.device
         self.summaries, self.scene, self.baseline = backend.summaries, backend.scene, backend.baseline
         self.obs = torch.empty(0)
-        self.carrier: Carrier | None = None
-        """appends what a policy remembers to the observations"""
+        self.carrier: Any = None
+        """the `Carrier` of `nn.memory` that appends what a policy remembers to the observations"""
         self.mirror: Mirror | None = None
         """the mirror image of transitions, where they are learned from too"""
         self.collecting = Stopwatch()
@@ -101,24 +75,23 @@ class VecEnv:
         """
         if not isinstance(action, Tensor) or (action.shape, action.dtype) != self._actions:
             raise wrong_action(f"{self.num_envs} × {self.spec.env_id}", action, self._actions)
-        if action.is_floating_point():
-            self._require_finite(action=action)
+        self._require_finite(action=action)
         mine = action if self._world.size == 1 else action[self._first : self._first + self.backend.num_envs]
         counts = self.backend.counts
         step = self.backend.step(mine.clone())  # an environment may write into the action that it was given
         self._require_finite(observation=step.next_obs, reward=step.reward)
-        measures, valid = step.measures, step.valid
         if step.obs is not step.next_obs:
             self._require_finite(observation=step.obs)
+        own = step
         if self._world.size > 1:
-            step, counts = self._of_all(step, counts)
+            step, counts = self._of_all(own, counts)
         if self.carrier:
             step = self.carrier.follow(self.obs, step)
         seen = step.detach() if step.reward.requires_grad else step
         self._recent.append((self.obs.detach(), action.detach(), seen))
         self.obs = step.obs
         self.steps += self.num_envs
-        self._statistics.log(seen, counts, measures, valid)
+        self._statistics.log(seen, counts, own)
         return step
 
     def detach(self) -> None:
@@ -134,7 +107,7 @@ class VecEnv:
 
     def _require_finite(self, **quantities: Tensor) -> None:
         for name, values in quantities.items():
-            if values.dtype is torch.uint8 or math.isfinite(values.sum().item()):  # a NaN shows in the sum
+            if not values.is_floating_point() or math.isfinite(values.sum().item()):  # a NaN shows in the sum
                 continue
             bad = torch.nonzero(~torch.isfinite(values))
             if len(bad):
@@ -223,14 +196,14 @@ class EpisodeStatistics:
         self._sums: dict[str, Tensor] = {}
         """by name: [2, N], the sum of each environment, and how many numbers it has"""
 
-    def log(self, step: Step, counts: Tensor, measures: dict[str, Tensor], valid: Tensor) -> None:
+    def log(self, step: Step, counts: Tensor, own: Step) -> None:
         """One step of every environment; `counts` [N] is False where the episode is a fragment.
 
-        Of several processes, each has the `measures` of its own environments, and where these are `valid`.
+        `own` is that of the environments of this process, which alone have measures here.
         """
         self._log.append((step.reward, step.terminated, step.truncated, step.valid, counts))
-        if measures:
-            self._measured.append((measures, valid))
+        if own.measures:
+            self._measured.append((own.measures, own.valid))
         if len(self._log) == LOG_ROWS:
             self._sum_up()
 
@@ -249,11 +222,8 @@ class EpisodeStatistics:
         running = episode_sums(torch.stack([reward * valid, valid]).to(self._running.dtype), done, self._running)
         self._ended.append(running[:, done & counts])  # by time, then by environment
         self._running = running[:, -1] * ~done[-1]
-        columns: dict[str, list[tuple[Tensor, Tensor]]] = {}
-        for measures, valid in self._measured:
-            for name, values in measures.items():
-                columns.setdefault(name, []).append((values, valid))
-        for name, rows in columns.items():
+        for name in dict.fromkeys(name for measures, _ in self._measured for name in measures):
+            rows = [(measures[name], valid) for measures, valid in self._measured if name in measures]
             values, valid = map(torch.stack, zip(*rows, strict=True))
             counted = values.isfinite() & valid
             sums = torch.stack([values.where(counted, 0), counted]).to(self._running.dtype).sum(1)
@@ -290,15 +260,10 @@ def episode_sums(rows: Tensor, done: Tensor, carried: Tensor) -> Tensor:
 
 
 class Stagger:
-    """The first episode of each environment is cut after a random number of steps, uniform up to the time limit.
+    """The first episode of each of N environments is cut after a random number of steps, uniform up to the time limit.
 
-    A cut counts as a truncation. Without a limit there are no cuts, and every episode is whole.
-
-    Args:
-        num_envs: number of environments.
-        limit: the time limit in steps; None for no cuts.
-        seed: of the run's environments.
-        first: the number of the first of these in the run: all are drawn for, so that each is cut alike in any process.
+    A cut counts as a truncation. Without a `limit`, in steps, there are no cuts, and every episode is whole. `first` is
+    the number of the first of these in the run: all are drawn for, so that each is cut alike in any process.
     """
 
     def __init__(self, num_envs: int, limit: int | None, seed: int, first: int = 0) -> None:

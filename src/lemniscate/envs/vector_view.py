@@ -57,8 +57,7 @@ class VectorView(VectorEnv):
     def __init__(self, env: VecEnv) -> None:
         self.env, self.num_envs = env, env.num_envs
         self._next_step = env.backend.mode is AutoresetMode.NEXT_STEP
-        mode = AutoresetMode.NEXT_STEP if self._next_step else AutoresetMode.SAME_STEP
-        self.metadata = {"autoreset_mode": mode}
+        self.metadata = {"autoreset_mode": env.backend.mode if self._next_step else AutoresetMode.SAME_STEP}
         self.single_observation_space = observation_space(env.spec)
         self.single_action_space = action_space(env.spec.action)
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
@@ -102,17 +101,14 @@ class VectorView(VectorEnv):
 
     def _info(self, step: Step) -> dict[str, Any]:
         """The `info` of Gymnasium's layout: the entries of an ended episode are under `final_info`."""
-        done = (step.terminated | step.truncated).numpy().copy()
+        reset = (step.terminated | step.truncated).numpy() & (not self._next_step)
         info = self._masks(step.obs)
         measures = {name.removeprefix("info/"): values.numpy().copy() for name, values in step.measures.items()}
         given = {name: ~np.isnan(values) for name, values in measures.items()}
-        running = ~done if not self._next_step else np.ones_like(done)
         for name, values in measures.items():
-            info |= {name: values, f"_{name}": given[name] & running}
-        if self._next_step:
-            return info
+            info |= {name: values, f"_{name}": given[name] & ~reset}
         last = self._shaped(step.next_obs)
-        for row in np.flatnonzero(done):
+        for row in np.flatnonzero(reset):
             final = {name: values[row] for name, values in measures.items() if given[name][row]}
             info = self._add_info(info, {"final_obs": last[row], "final_info": final}, int(row))
         return info

@@ -21,8 +21,6 @@ from lemniscate.system.watchdog import end_when_closed
 
 CLOSING_SECONDS = 2.0
 """how long workers may take to close their environments before they are killed"""
-
-
 MOST_LETTERS = 500
 """of what an exception says"""
 
@@ -31,16 +29,12 @@ class RaisedInWorkerError(RuntimeError):
     """An exception of an environment, as a sentence: the exception itself may not pass through a pipe."""
 
 
-class RefusedInWorkerError(RaisedInWorkerError):
-    """A `UserError` on what an environment returned."""
-
-
 class Unmade(gym.Env):
     """The place of an environment whose constructor raised; reading its `metadata` raises the same."""
 
     observation_space = action_space = gym.spaces.Discrete(1)
 
-    def __init__(self, error: RaisedInWorkerError) -> None:
+    def __init__(self, error: Exception) -> None:
         self._error = error
 
     @property
@@ -62,7 +56,7 @@ class Worker(gym.Wrapper):
             end_when_closed(process.sentinel)
             try:
                 super().__init__(_told(make))
-            except RaisedInWorkerError as error:
+            except (RaisedInWorkerError, UserError) as error:
                 super().__init__(Unmade(error))
         else:  # the owner makes one, too, to look at its spaces
             super().__init__(make())
@@ -76,7 +70,7 @@ class Worker(gym.Wrapper):
         return _told(self.env.step, action)
 
     def call_method(self, name: str, argument: Any) -> str | None:
-        """The sentence of the `UserError` that the function `call_method` raises here, if it does."""
+        """The sentence of the `UserError` that the function `call_method` raises, which would end this process."""
         try:
             call_method(self.env, name, argument)
         except UserError as error:
@@ -100,7 +94,7 @@ def _told(call: Callable[..., Any], *args: Any, **options: Any) -> Any:
     try:
         return call(*args, **options)
     except UserError as error:
-        raise RefusedInWorkerError(str(error)) from None
+        raise UserError(str(error)) from None
     except BaseException as error:  # also what ends a process: this one ends with its owner
         place = traceback.extract_tb(error.__traceback__)[-1]
         raise RaisedInWorkerError(f"{_words_of(error)} ({Path(place.filename).name}, line {place.lineno})") from None
@@ -158,8 +152,8 @@ class WatchedVectorEnv(AsyncVectorEnv):
             said = f"Environment {failed[0]} failed"
             with suppress(queue.Empty):
                 index, kind, error, _ = self.error_queue.get(timeout=1.0)
-                if issubclass(kind, RefusedInWorkerError):
-                    raise UserError(str(error))
+                if issubclass(kind, UserError):
+                    raise error
                 said = f"Environment {index} raised {error}"
             raise WorkerError(f"{said}.")
 

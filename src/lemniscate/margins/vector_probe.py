@@ -168,4 +168,4 @@ def _fly(env: VecEnv, act: Act, seed: int, seen: list[Tensor] | None = None) -> 
         step = env.step(act(env.obs))
         tally.add(step.reward, step.terminated, step.truncated)
         age += 1
-    return tally.flown()
+    return Flown(tally.returns, tally.terminated)
