@@ -142,9 +142,9 @@ def interact(
 ) -> Step:
     """One step of every parallel environment, [N, …], added to the replay buffer.
 
-    The policy acts with `noise_std` times the standard normal noise [N, A] of the next step: that is the standard
-    deviation for a deterministic policy, in units of half the action range; 1 for a stochastic one, which takes standard
-    normal numbers. With `random`, actions are uniform in [-1, 1]^A instead.
+    The policy acts with `noise_std` times the noise [N, A] of the next step, whose standard deviation is 1: for a
+    deterministic policy in units of half the action range; of a stochastic one `noise_std` is 1. With `random`, it acts
+    uniformly in [-1, 1]^A instead.
     """
     with env.collecting:
         obs, noise = env.obs, action_noise(generator)

@@ -59,8 +59,11 @@ class SingleEnv(gym.Wrapper):
             returned: Any = self.env.reset(seed=seed, options=options)
         except (TypeError, ValueError) as error:
             raise self._returns.in_wrapper("reset", error) from error.__cause__
-        obs, info = self._returns.of_reset(returned)
-        return obs, self._told("reset", obs, info)
+        two = type(returned) is tuple and len(returned) == 2
+        if not (two and self._is_usual(returned[0], 0.0, False, False, returned[1])):
+            returned = self._returns.of_reset(returned)
+        obs, info = returned
+        return (obs, self._told("reset", obs, info)) if info or self._masked else returned
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Gymnasium's."""

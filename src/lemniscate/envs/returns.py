@@ -196,13 +196,12 @@ def flat_mask(mask: Any, action: gym.Space | Action) -> np.ndarray:
 
     Raises `ValueError`, with the rest of a sentence, for another size, and for actions that are no choices.
     """
-    counts = getattr(action, "nvec", None)
-    counts = np.ravel(getattr(action, "n", 0) if counts is None else counts)
     if not isinstance(action, spaces.Discrete | spaces.MultiDiscrete | Discrete | MultiDiscrete):
         raise ValueError("that cannot be followed: masks are for Discrete and MultiDiscrete actions")
+    choices = np.sum(action.n if isinstance(action, spaces.Discrete | Discrete) else action.nvec)
     row = _row(mask)
-    if len(row) != counts.sum() or not ((row == 0) | (row == 1)).all():
-        raise ValueError(f"of {len(row)} numbers, {shown(row.tolist())}; it must have {counts.sum()}, of 1 and 0")
+    if len(row) != choices or not ((row == 0) | (row == 1)).all():
+        raise ValueError(f"of {len(row)} numbers, {shown(row.tolist())}; it must have {choices}, of 1 and 0")
     return row.astype(bool)
 
 

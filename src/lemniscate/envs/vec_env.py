@@ -191,8 +191,8 @@ class EpisodeStatistics:
         self._log: list[tuple[Tensor, ...]] = []
         self._running = torch.zeros(2, num_envs, dtype=wide_float(device), device=device)
         self._ended: list[Tensor] = []
-        self._measured: list[tuple[dict[str, Tensor], Tensor]] = []
-        """the measures of each logged step, and where they count, [N]"""
+        self._measured: dict[str, list[tuple[Tensor, Tensor]]] = {}
+        """by name: a measure in each logged step, and where it counts, [N] each"""
         self._sums: dict[str, Tensor] = {}
         """by name: [2, N], the sum of each environment, and how many numbers it has"""
 
@@ -202,8 +202,8 @@ class EpisodeStatistics:
         `own` is that of the environments of this process, which alone have measures here.
         """
         self._log.append((step.reward, step.terminated, step.truncated, step.valid, counts))
-        if own.measures:
-            self._measured.append((own.measures, own.valid))
+        for name, values in own.measures.items():
+            self._measured.setdefault(name, []).append((values, own.valid))
         if len(self._log) == LOG_ROWS:
             self._sum_up()
 
@@ -222,13 +222,12 @@ class EpisodeStatistics:
         running = episode_sums(torch.stack([reward * valid, valid]).to(self._running.dtype), done, self._running)
         self._ended.append(running[:, done & counts])  # by time, then by environment
         self._running = running[:, -1] * ~done[-1]
-        for name in dict.fromkeys(name for measures, _ in self._measured for name in measures):
-            rows = [(measures[name], valid) for measures, valid in self._measured if name in measures]
+        for name, rows in self._measured.items():
             values, valid = map(torch.stack, zip(*rows, strict=True))
             counted = values.isfinite() & valid
             sums = torch.stack([values.where(counted, 0), counted]).to(self._running.dtype).sum(1)
             self._sums[name] = self._sums[name] + sums if name in self._sums else sums
-        self._log, self._measured = [], []
+        self._log, self._measured = [], {}
 
     def _means(self, world: World) -> dict[str, float]:
         """The mean of each measure, summed up over the environments in their order, whichever process has them."""
@@ -271,7 +270,7 @@ class Stagger:
         if limit is not None:
             drawn = np.random.default_rng(seed).integers(1, limit, first + num_envs, endpoint=True)
             self._steps_left = drawn[first:]
-        self.counts = np.full(num_envs, limit is None)
+        self.counts = self._steps_left < 0
         """[N] bool: the environment's present episode began at its beginning and is not to be cut"""
 
     def apply(self, terminated: np.ndarray, truncated: np.ndarray) -> np.ndarray:
@@ -280,7 +279,6 @@ class Stagger:
             return truncated
         self._steps_left -= 1
         truncated = truncated | ((self._steps_left == 0) & ~terminated)
-        done = terminated | truncated
-        self._steps_left[done] = -1
-        self.counts = self.counts | done
+        self._steps_left[terminated | truncated] = -1
+        self.counts = self._steps_left < 0
         return truncated
