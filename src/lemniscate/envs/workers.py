@@ -62,11 +62,11 @@ class Worker(gym.Wrapper):
             super().__init__(make())
 
     def reset(self, **options: Any) -> Any:
-        """The environment's. Raises `RaisedInWorkerError` for whatever it raises."""
+        """The environment's. Raises `RaisedInWorkerError` for whatever it raises but a `UserError`."""
         return _told(self.env.reset, **options)
 
     def step(self, action: Any) -> Any:
-        """The environment's. Raises `RaisedInWorkerError` for whatever it raises."""
+        """The environment's. Raises `RaisedInWorkerError` for whatever it raises but a `UserError`."""
         return _told(self.env.step, action)
 
     def call_method(self, name: str, argument: Any) -> str | None:
