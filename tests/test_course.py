@@ -16,7 +16,7 @@ from lemniscate.course.loop import solution as solved
 from lemniscate.course.solution import TooLong, limited
 
 COMPARED = {name: exercise for name, exercise in course.EXERCISES.items() if isinstance(exercise, Exercise)}
-MISTAKES = [(name, words) for name, exercise in COMPARED.items() for words in exercise.wrong]
+MISTAKES = [(name, words) for name, exercise in COMPARED.items() for words in exercise.mistakes]
 
 
 @pytest.mark.parametrize("name", COMPARED)

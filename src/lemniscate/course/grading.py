@@ -30,7 +30,7 @@ from rich.cells import cell_len, set_cell_size
 
 from lemniscate import course
 from lemniscate.course import handin
-from lemniscate.course.exercise import TEMPLATES, Seen
+from lemniscate.course.exercise import TEMPLATES
 from lemniscate.errors import UserError, unknown_name
 from lemniscate.run.stopping import Stopped
 from lemniscate.system.console import Line, ProgressBar, clock, say
@@ -125,7 +125,7 @@ class Trial:
         right, sentence = False, "what was seen of it is not what was asked for."
         with suppress(Exception):  # a hand-in may have put there what it likes
             if seen := self._content(f"seen/{name}.pt"):
-                finding = course.EXERCISES[name].judge(name, Seen(torch.load(io.BytesIO(seen), weights_only=True)))
+                finding = course.EXERCISES[name].judge(name, torch.load(io.BytesIO(seen), weights_only=True))
                 right, sentence = finding.right, finding.sentence
             else:
                 sentence = self._content(f"seen/{name}.txt").decode() or "it was not tried in time."
