@@ -67,10 +67,8 @@ class Trial:
             shutil.copyfile(file, copy)
         forks = "forkserver" in multiprocessing.get_all_start_methods()
         context: Any = multiprocessing.get_context("forkserver" if forks else "spawn")
-        if forks:
-            context.set_forkserver_preload(
-                [handin.__name__, "gymnasium.wrappers.vector", "torch._dynamo"]
-            )  # imported once, for all
+        if forks:  # these are imported once, for all
+            context.set_forkserver_preload([handin.__name__, "gymnasium.wrappers.vector", "torch._dynamo"])
         self.process = context.Process(target=handin.run, args=(self._work, demanded))
         main = sys.modules["__main__"]
         sys.modules["__main__"] = ModuleType("__main__")  # else a child would run the caller's script once more

@@ -2,7 +2,7 @@
 
 import os
 import random
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -153,12 +153,8 @@ def _setting(steps: int, wrappers: int = 1) -> tuple[nn.Module, torch.optim.Opti
     return agent, optimizer, envs
 
 
-def _for_any_wrappers(attempt: Callable[[int, type], Any]) -> Any:
-    """An attempt with one wrapper around the normalizer, or two for a solution that counts on that; never with none.
-
-    The path is a text, or else a `Path`.
-    """
-    return first_that_works(attempt, (1, str), (1, Path), (2, str), (2, Path))
+WRAPPERS = (1, str), (1, Path), (2, str), (2, Path)
+"""what is tried: one wrapper around the normalizer, or two for a solution that counts on that; a path as text or not"""
 
 
 def _statistics(envs: Any) -> dict[str, Tensor]:
@@ -201,7 +197,7 @@ def see_sync_envs(function: Function, seen: Seen) -> None:
         call_by_name(function, {CHECKPOINT[2]: train, "eval_envs test_envs": evaluation})
         return [train, evaluation]
 
-    both = _for_any_wrappers(attempt)
+    both = first_that_works(attempt, *WRAPPERS)
     seen["after"] = [_statistics(envs) for envs in both]
     for name, envs in zip(("trained", "evaluated"), both, strict=True):
         envs.reset(seed=9)
@@ -253,7 +249,7 @@ def see_save_model(function: Function, seen: Seen) -> None:
                 call_by_name(function, dict(zip(CHECKPOINT, (*setting, kind(path)), strict=True)), {"-": True})
             seen["moves"] = moves.count
 
-        _for_any_wrappers(attempt)
+        first_that_works(attempt, *WRAPPERS)
         seen["is_there"] = path.exists()
         seen["opens"] = {}
         for safe in (True, False):
@@ -375,7 +371,7 @@ def see_load_model(function: Function, seen: Seen) -> None:
             call_by_name(function, given, {"device map_location": "cpu"})
             seen["mine"] = _learned(*setting)
 
-        _for_any_wrappers(attempt)
+        first_that_works(attempt, *WRAPPERS)
 
 
 def load_model(seen: Seen) -> Iterator[str]:
