@@ -167,6 +167,7 @@ class Case:
 
     about: str
     args: tuple[Any, ...]
+    """tensors and numbers; a list is of the parameters of a network, which are to be changed in place"""
     options: Mapping[str, Any] = field(default_factory=dict)
     """for a function: keyword arguments; for a method: attributes of its `self`, and of `self.config`"""
     attributes: Mapping[str, Any] | None = None
@@ -206,8 +207,6 @@ class Exercise:
     """by note: a function that differs from the reference, but is what a course asks for"""
     gradient_in: int | None = None
     """the argument in which the gradient of the outputs counts too"""
-    in_place: bool = False
-    """it changes the parameters of two networks in place, and returns nothing"""
     value_is_free: bool = False
     """only the gradient of what it returns counts"""
     detached: bool = False
@@ -262,7 +261,8 @@ class Exercise:
     def _in_case(self, called: Solution, case: Case) -> Results:
         """The results of a solution in a case, with the first kind of arguments that it takes without an exception."""
         first: Results = {}
-        kinds = [("", convert) for convert in PARAMETERS] if self.in_place else [*KINDS.items()]
+        moves = isinstance(case.args[0], list)
+        kinds = [("", convert) for convert in PARAMETERS] if moves else [*KINDS.items()]
         for note, convert in kinds if self.gradient_in is None else kinds[:1]:
             try:
                 return self._results(called.call, case, partial(self._converted, convert)) | {"note": note}

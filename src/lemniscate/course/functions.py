@@ -355,7 +355,6 @@ EXERCISES: dict[str, Exercise] = {
     "polyak": _exercise(
         maths.polyak,
         outputs=tuple(f"{network}[{i}]" for network in ("target", "online") for i in range(3)),
-        in_place=True,
     ),
     "select_at_index": _exercise(select_at_index, outputs=("result",), gradient_in=0),
 }

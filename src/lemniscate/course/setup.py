@@ -217,7 +217,7 @@ def sync_envs(seen: Seen) -> Iterator[str]:
         yield Note("both now share one object: the statistics of evaluation follow training without another call.")
 
 
-CHECKPOINT = (
+CHECKPOINT: tuple[str, ...] = (
     "agent model net network policy actor_critic module",
     "optimizer optim opt optimiser",
     "train_envs envs env vec_env venv training_envs",
