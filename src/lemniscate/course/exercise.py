@@ -365,7 +365,7 @@ class Exercise:
     def _with_results(self, change: Callable[[list[Tensor], int], list[Tensor]], case: Case) -> Results:
         """The reference's results after a change of them; their gradient, if it counts, after the same."""
         right, rows = self.answer(self.right, case), len(case.args[0])
-        factor = change([torch.ones(())], rows)[0] if len(self.outputs) == 1 else 1
+        factor = change([torch.ones(())], rows)[0] if right["gradient"] and len(self.outputs) == 1 else 1
         return {"outputs": change(right["outputs"], rows), "gradient": [each * factor for each in right["gradient"]]}
 
 

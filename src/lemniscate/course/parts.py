@@ -668,7 +668,7 @@ def _stored(columns: dict[str, list[float]], end: str) -> Iterator[str]:
     """Sentences where the ends or the successors are wrong."""
     ended, next_obs = [bool(done) for done in columns["done"]], columns["next_obs"]
     if any(ended) and end == "time-out":
-        yield "a time-out is stored as done, so it has no bootstrap. Likely: done is not terminated alone."
+        yield "a time-out is stored as done. Likely: terminated | truncated; done is terminated alone."
     if ended != [False, *[bool(ENDS[end][0])] * 2]:
         yield f"a {end} is stored with done = {ended[-1]}, and a row within an episode with {ended[0]}."
     if next_obs[2:] != np.ravel(LAST).tolist():
