@@ -240,7 +240,7 @@ def test_what_a_loop_returns_may_act_in_several_ways():
                 assert player(obs).mode().tolist() == right
         with pytest.raises(TypeError, match="train returned None; it should return an agent"):
             loop.acting(None, envs)
-        with pytest.raises(UserError, match="A policy is a run, a function, .*; not 3"), loop.acting(3, envs):
+        with pytest.raises(UserError, match=r"A policy is a run, a function, .*; not 3"), loop.acting(3, envs):
             pass
 
 
