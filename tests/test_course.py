@@ -16,7 +16,7 @@ from lemniscate.course.loop import solution as solved
 from lemniscate.course.solution import TooLong, limited
 
 COMPARED = {name: exercise for name, exercise in course.EXERCISES.items() if isinstance(exercise, Exercise)}
-MISTAKES = [(name, words) for name, exercise in COMPARED.items() for words in exercise.wrong]
+MISTAKES = [(name, words) for name, exercise in COMPARED.items() for words in exercise.mistakes]
 
 
 @pytest.mark.parametrize("name", COMPARED)
@@ -92,6 +92,16 @@ def test_the_return_of_one_environment_is_not_ended_by_another(ends, wrong):
         return out
 
     says(reward_to_go, "reward_to_go", f"case 4 of 4, two environments, ends of both kinds: {wrong}")
+
+
+def test_a_row_of_the_result_that_is_left_out_is_the_cause_that_is_named():
+    """A change of the result alone, in an exercise whose gradient does not count."""
+
+    def reward_to_go(*args, **options):
+        out = maths.reward_to_go(*args, **options)
+        return torch.cat([torch.zeros_like(out[:1]), out[1:]])
+
+    says(reward_to_go, "reward_to_go", "Likely: the first row of return is left out.")
 
 
 def test_the_value_loss_is_given_an_old_value_without_a_clip_as_the_algorithm_gives_it():

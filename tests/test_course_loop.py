@@ -176,7 +176,7 @@ def test_the_hooks_are_gone_afterwards_whatever_happens():
 def better_action(train, number, steps=2_048):
     """Whether a loop takes the better action of a small world."""
     with closing(make_vec(loop.WorldEnv, loop.NUM_ENVS, env_kwargs={"world": number})) as envs:
-        return loop._mean_action(train, envs, loop.WORLDS[number].obs(0), steps) < 0.5
+        return loop._mean_action(train, envs, steps) < 0.5
 
 
 @pytest.mark.parametrize(("name", "number"), [("sign", 0), ("chain", 1), ("death", 2), ("uncut", 3), ("cut at deaths", 4),
@@ -194,7 +194,7 @@ def test_the_solution_finds_the_better_action_of_the_hardest_worlds(number):
 def test_what_is_not_understood_inside_is_judged_by_worlds_and_by_returns():
     unclear = {"inside": {"steps": {}, "events": [], "stays": []}}
     worlds = {f"world {number}": 0.0 for number in range(len(loop.WORLDS))}
-    assert loop.WORLDS[2].mistake in next(loop.train(unclear | worlds | {"world 2": 1.0}))
+    assert loop.WORLDS[2]["mistake"] in next(loop.train(unclear | worlds | {"world 2": 1.0}))
     few = unclear | worlds | {"box": [0.5, -0.5], "return": 20.0}
     assert "the mean return after 60,000 steps is 20" in next(loop.train(few))
     assert next(loop.train(few | {"return": 500.0}), None) is None
@@ -228,17 +228,20 @@ def test_a_loop_for_discrete_actions_alone_is_right_with_a_note(monkeypatch):
 
 def test_what_a_loop_returns_may_act_in_several_ways():
     with closing(make_vec("CartPole-v1", 3)) as envs:
-        obs, right = np.zeros((3, 4), np.float32), [1, 1, 1]
+        obs, right = torch.zeros(3, 4), [1, 1, 1]
         network = torch.nn.Linear(4, 2)
         network.bias.data.copy_(torch.tensor([-9.0, 9.0]))
         predicts, draws = (
             type("P", (), {"predict": lambda self, obs: (np.ones(len(obs), int), None)})(),
             type("D", (), {"get_action": lambda self, obs: torch.ones(len(obs.float()), dtype=torch.int64)})(),
         )
-        for made in (predicts, draws, network, lambda obs: np.ones((3, 1), int)):
-            assert loop.acting(made, envs)(obs).tolist() == right
-        with pytest.raises(TypeError, match="train returned NoneType; it should return an agent"):
+        for made in (predicts, draws, network, lambda obs: np.ones((len(obs), 1), int)):
+            with loop.acting(made, envs) as player:
+                assert player(obs).mode().tolist() == right
+        with pytest.raises(TypeError, match="train returned None; it should return an agent"):
             loop.acting(None, envs)
+        with pytest.raises(UserError, match=r"A policy is a run, a function, .*; not 3"), loop.acting(3, envs):
+            pass
 
 
 def test_a_loop_is_called_by_what_its_parameters_mean():

@@ -12,7 +12,6 @@ is judged by what it does; a whole training loop (`skeleton`) by what it learns.
 """
 
 from importlib.machinery import SourceFileLoader
-from importlib.util import module_from_spec, spec_from_loader
 from types import FunctionType, ModuleType
 
 from lemniscate.course import functions, loop, parts, setup
@@ -83,8 +82,7 @@ def __getattr__(name: str) -> ModuleType:
     if name != "ppo_from_scratch":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}", name=name)
     loader = SourceFileLoader(f"{__name__}.{name}", str(TEMPLATES / "ppo.py.txt"))
-    spec = spec_from_loader(loader.name, loader)
-    assert spec is not None
-    module = module_from_spec(spec)
+    module = ModuleType(loader.name)
+    module.__file__ = loader.path
     loader.exec_module(module)
     return module

@@ -11,7 +11,7 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import partial
 from itertools import combinations
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,19 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from lemniscate.course.solution import (
-    KINDS,
-    LIMIT,
-    PARAMETERS,
-    Function,
-    Held,
-    MisfitError,
-    Solution,
-    TooLong,
-    bound,
-    limited,
-    numbers,
-)
+from lemniscate.course.solution import LIMIT, Function, MisfitError, Solution, TooLong, bound, limited, numbers
 from lemniscate.run.run import globals_undisturbed
 from lemniscate.run.seeding import seed_globals
 
@@ -169,15 +157,8 @@ SCRATCH: tuple[str, ...] = ("newvalue", "ratio", "log_ratio", "mb_advantages", "
 """arguments that a training loop computes for this call alone, so that they may be changed in place"""
 
 
-class EndedError(Exception):
-    """The solution raised before something could be seen."""
-
-
-class Seen(dict):
-    """The observations of a solution by name, in the order in which they were made."""
-
-    def __missing__(self, name: str) -> Any:
-        raise EndedError(name)
+Seen = dict[str, Any]
+"""the observations of a solution by name, in the order in which they were made"""
 
 
 @dataclass(frozen=True)
@@ -186,18 +167,30 @@ class Case:
 
     about: str
     args: tuple[Any, ...]
+    """tensors and numbers; a list is of the parameters of a network, which are to be changed in place"""
     options: Mapping[str, Any] = field(default_factory=dict)
     """for a function: keyword arguments; for a method: attributes of its `self`, and of `self.config`"""
-    attributes: Mapping[str, Any] = field(default_factory=dict)
-    """more attributes of a method's `self`"""
+    attributes: Mapping[str, Any] | None = None
+    """more attributes of a method's `self`; None where the exercise is no method of a course"""
 
 
-@dataclass(frozen=True)
-class Answer:
-    """The outputs of a reference in one case, and the gradient of their sum in the argument where it counts, if any."""
+KINDS: Mapping[str, Change] = {
+    "": lambda value: value,
+    "it takes arrays of NumPy alone": lambda value: value.numpy() if isinstance(value, Tensor) else value,
+}
+"""what a solution may want its arguments to be, by what is then said of it"""
+PARAMETERS: Sequence[Change] = (
+    # Iterators, which can be gone through once, since that is what `module.parameters()` returns.
+    lambda value: iter(value) if isinstance(value, list) else value,
+    lambda value: value,
+    lambda value: nn.ParameterList(value) if isinstance(value, list) else value,
+)
+"""what a solution that moves parameters may want: an iterator, a list, or a module"""
 
-    outputs: tuple[Tensor, ...]
-    gradient: Tensor | None = None
+Results = dict[str, Any]
+"""what a function returned in one case: see `Exercise._results`"""
+Pairs = Sequence[tuple[Case, Results]]
+"""cases, each with what a solution returned in it"""
 
 
 @dataclass(frozen=True)
@@ -208,93 +201,71 @@ class Exercise:
     outputs: tuple[str, ...]
     """names of what it returns"""
     cases: Sequence[Case]
-    edited: Callable[[Sequence[str]], Function]
-    """makes another function of the reference's text"""
-    wrong: Mapping[str, Sequence[str]]
-    """by description: the edits of a well-known mistake"""
-    noted: Mapping[str, Sequence[str]] = field(default_factory=dict)
-    """by note: the edits of what differs from the reference, but is what a course asks for"""
+    mistakes: Mapping[str, Function]
+    """by description: a function that makes a well-known mistake"""
+    accepted: Mapping[str, Function] = field(default_factory=dict)
+    """by note: a function that differs from the reference, but is what a course asks for"""
     gradient_in: int | None = None
     """the argument in which the gradient of the outputs counts too"""
-    in_place: bool = False
-    """it changes the parameters of two networks in place, and returns nothing"""
     value_is_free: bool = False
     """only the gradient of what it returns counts"""
     detached: bool = False
     """what it returns has no gradient, though it is computed by networks"""
 
-    @cached_property
-    def mistakes(self) -> dict[str, Function]:
-        """By description: a function that makes the mistake."""
-        return {words: self.edited(edits) for words, edits in self.wrong.items()}
-
     def observe(self, solution: Function) -> Seen:
         """Call a solution in every case: what it returned, or the sentence on what it raised."""
-        seen = Seen(cases=[])
+        seen: Seen = {"cases": []}
         try:
             with limited(LIMIT):
-                called = Solution(solution, isinstance(self.cases[0].attributes, Held))
+                called = Solution(solution, self.cases[0].attributes is not None)
                 for case in self.cases:
                     seen["cases"].append(self._in_case(called, case))
         except TooLong as error:
-            seen["cases"].append({"raised": f"it did not end within {LIMIT:g} seconds{place(error)}"})
+            seen["cases"].append({"raised": raised(error, LIMIT)})
         return seen
 
     def judge(self, name: str, seen: Seen) -> Finding:
         """Compare what was seen with the reference, in the cases whose arguments the solution takes."""
-        pairs = [pair for pair in zip(self.cases, seen["cases"], strict=False) if not pair[1].get("misfit")]
-        for number, (case, got) in enumerate(pairs or zip(self.cases, seen["cases"], strict=False), start=1):
-            if complaint := self._complaint(case, got, seen["cases"]):
-                accepted = ((words, partial(self.answer, self.edited(edits))) for words, edits in self.noted.items())
-                if notes := [
-                    words
-                    for words, answer in accepted
-                    if _agree([*zip(self.cases, seen["cases"], strict=False)], answer)
-                ]:
-                    return Finding(name, True, f"right. Note: {notes[0]}.")
+        every = [*zip(self.cases, seen["cases"], strict=False)]
+        pairs = [pair for pair in every if not pair[1].get("misfit")]
+        for number, (case, got) in enumerate(pairs or every, start=1):
+            if complaint := self._complaint(case, got, pairs):
+                for words, other in self.accepted.items():
+                    if _agree(every, partial(self.answer, other)):
+                        return Finding(name, True, f"right. Note: {words}.")
                 return Finding(name, False, f"case {number} of {len(self.cases)}, {case.about}: {complaint}")
-        right, notes = "right", sorted({f" Note: {got['note']}." for _, got in pairs if "note" in got})
+        right, note = "right", next((f" Note: {got['note']}." for _, got in pairs if got.get("note")), "")
         if len(pairs) < len(self.cases):
             right = f"right in {len(pairs)} of {len(self.cases)} cases; the others give it more arguments"
         elif len(pairs) > 1:
             right = f"right in all {len(pairs)} cases"
-        return Finding(name, True, f"{right}.{''.join(notes)}")
+        return Finding(name, True, f"{right}.{note}")
 
-    def answer(self, function: Function, case: Case, change: Callable[[Values], Values] | None = None) -> Answer:
+    def answer(self, function: Function, case: Case, change: Callable[[Values], Values] = dict) -> Results:
         """The results of the reference, or of a known mistake, in a case; of other arguments after a change."""
-        args, options = list(copy.deepcopy(case.args)), dict(case.options)
-        networks = [[nn.Parameter(tensor) for tensor in arg] for arg in args if isinstance(arg, list)]
-        args[: len(networks)] = networks
-        leaf = None if self.gradient_in is None else args[self.gradient_in].requires_grad_()
-        if change:
-            values = dict(zip(self.arguments, args, strict=False)) | options
-            values |= change(values)
-            args, options = list(values.values())[: len(args)], {name: values[name] for name in options}
-        if "self" in inspect.signature(function).parameters:
-            held = {**options, **case.attributes}
-            if "config" in held:
-                held["config"] = SimpleNamespace(**{**held["config"], **options})
-            function, options = partial(function, SimpleNamespace(**held)), {}
-        returned = function(*args, **options)
-        if self.in_place:
-            return Answer(tuple(parameter.detach() for network in networks for parameter in network))
-        outputs = returned if isinstance(returned, tuple) else (returned,)
-        gradient = (
-            None if leaf is None else torch.autograd.grad(torch.stack([each.sum() for each in outputs]).sum(), leaf)[0]
-        )
-        return Answer(tuple(output.detach() for output in outputs), gradient)
+
+        def call(given: Values, options: Values, attributes: Values) -> Any:
+            if "self" not in inspect.signature(function).parameters:
+                return function(*given.values(), **options)
+            if "config" in attributes:
+                attributes["config"].update(options)
+            return function(SimpleNamespace(**options, **attributes), *given.values())
+
+        return self._results(call, case, change)
 
     @property
     def arguments(self) -> list[str]:
-        """The names of its arguments, those that are options left out."""
+        """The names of its arguments, those that are options among them."""
         return [name for name in inspect.signature(self.right).parameters if name != "self"]
 
-    def _in_case(self, called: Solution, case: Case) -> dict[str, Any]:
+    def _in_case(self, called: Solution, case: Case) -> Results:
         """The results of a solution in a case, with the first kind of arguments that it takes without an exception."""
-        first: dict[str, Any] = {}
-        for note, convert in PARAMETERS if self.in_place else KINDS if self.gradient_in is None else KINDS[:1]:
+        first: Results = {}
+        moves = isinstance(case.args[0], list)
+        kinds = [("", convert) for convert in PARAMETERS] if moves else [*KINDS.items()]
+        for note, convert in kinds if self.gradient_in is None else kinds[:1]:
             try:
-                return self._returned(called, case, convert) | ({"note": note} if note else {})
+                return self._results(called.call, case, partial(self._converted, convert)) | {"note": note}
             except (Exception, SystemExit) as error:  # what the solution raises is a finding too
                 misfit = isinstance(error, MisfitError)
                 first = first or {"raised": f"{error}." if misfit else raised(error), "misfit": misfit}
@@ -302,36 +273,48 @@ class Exercise:
                     break
         return first
 
-    def _returned(self, called: Solution, case: Case, convert: Callable[[Any], Any]) -> dict[str, Any]:
-        args, leaf = copy.deepcopy(case.args), None
+    def _converted(self, convert: Change, values: Values) -> Values:
+        return {name: convert(value) for name, value in values.items() if name in self.arguments}
+
+    def _results(self, call: Function, case: Case, change: Callable[[Values], Values]) -> Results:
+        """What a function returns in a case: `outputs`, and, where it counts, the `gradient` of their sum.
+
+        Also whether they are `attached` to a graph, and the name of an argument that was `changed`; where it returns
+        something else, `kinds` alone.
+        """
+        values: dict[str, Any] = dict(zip(self.arguments, copy.deepcopy(case.args), strict=False))
+        values |= {name: [*map(nn.Parameter, value)] for name, value in values.items() if isinstance(value, list)}
+        networks, leaf = [value for value in values.values() if isinstance(value, list)], None
         if self.gradient_in is not None:
-            leaf = args[self.gradient_in].requires_grad_()
-            # As from a network: what is no leaf may be changed in place.
-            args = tuple(arg * 1 if arg is leaf else arg for arg in args)
-        networks = [[nn.Parameter(tensor) for tensor in arg] for arg in args if self.in_place and isinstance(arg, list)]
-        given = dict(zip(self.arguments, map(convert, [*networks, *args[len(networks) :]]), strict=False))
-        options = copy.deepcopy(dict(case.options))
-        kept = {name: value for name, value in (given | options).items() if isinstance(value, Tensor)}
-        before = {name: value.detach().clone() for name, value in kept.items()}
-        returned = called.call(given, options, copy.deepcopy(case.attributes))
+            name = self.arguments[self.gradient_in]
+            leaf = values[name].requires_grad_()
+            values[name] = leaf * 1  # as from a network: what is no leaf may be changed in place
+        values |= copy.deepcopy(dict(case.options))
+        values |= change(values)
+        before = {name: value.detach().clone() for name, value in values.items() if isinstance(value, Tensor)}
+        options = {name: values[name] for name in case.options}
+        given = {name: value for name, value in values.items() if name not in options}
+        returned = call(given, options, copy.deepcopy(case.attributes))
         if networks:
-            return {"outputs": [parameter.detach() for network in networks for parameter in network]}
+            return {"outputs": [parameter.detach() for network in networks for parameter in network], "gradient": []}
         several = isinstance(returned, tuple) or (isinstance(returned, list) and len(self.outputs) > 1)
         outputs = list(returned) if several else [returned]
         tensors = [tensor for output in outputs if (tensor := numbers(output)) is not None]
         if not len(tensors) == len(outputs) == len(self.outputs):
             return {"kinds": ", ".join(type(output).__name__ for output in outputs)}
-        seen: dict[str, Any] = {"outputs": [tensor.detach().clone() for tensor in tensors]}
-        if leaf is not None and all(tensor.requires_grad for tensor in tensors):
+        seen: Results = {"outputs": [tensor.detach().clone() for tensor in tensors]}
+        if leaf is None:
+            seen["gradient"] = []
+        elif all(tensor.requires_grad for tensor in tensors):
             total = torch.stack([tensor.sum() for tensor in tensors]).sum()
             slope = torch.autograd.grad(total, leaf, allow_unused=True)[0]
-            seen["gradient"] = torch.zeros_like(leaf) if slope is None else slope
+            seen["gradient"] = [torch.zeros_like(leaf) if slope is None else slope]
         seen["attached"] = any(tensor.requires_grad for tensor in tensors)
-        if changed := [name for name, value in before.items() if not close(value, kept[name])]:
+        if changed := [name for name, value in before.items() if not close(value, values[name])]:
             seen["changed"] = changed[0]
         return seen
 
-    def _complaint(self, case: Case, got: Mapping[str, Any], cases: Sequence[Mapping[str, Any]]) -> str | None:
+    def _complaint(self, case: Case, got: Results, pairs: Pairs) -> str | None:
         """A sentence on the first difference, and one on its likely cause; None if there is none."""
         if "raised" in got:
             return got["raised"]
@@ -339,32 +322,31 @@ class Exercise:
             wanted = " and ".join(self.outputs) + (", a tensor" if len(self.outputs) == 1 else ", tensors")
             return f"it should return {'both ' * (len(self.outputs) == 2)}{wanted}; it returned {got['kinds']}."
         if difference := self._difference(got, self.answer(self.right, case)):
-            return difference + self._cause(cases, case)
+            return difference + self._cause(case, pairs)
         if "changed" in got and got["changed"] not in SCRATCH:
             return f"it changes {got['changed']}, which it was given, in place; the next use of it sees other numbers."
         return None
 
-    def _difference(self, got: Mapping[str, Any], right: Answer) -> str | None:
+    def _difference(self, got: Results, right: Results) -> str | None:
         """A sentence on the first difference between what was seen and what is right."""
-        for what, output, wanted in zip(self.outputs, got["outputs"], right.outputs, strict=True):
+        for what, output, wanted in zip(self.outputs, got["outputs"], right["outputs"], strict=True):
             if output.shape != wanted.shape:
                 return f"{what} has shape {list(output.shape)}; it should be {list(wanted.shape)}."
-            if right.gradient is not None and "gradient" not in got:
+            if "gradient" not in got:
                 return f"{what} has no gradient; was something detached, or computed under no_grad?"
             if self.detached and got["attached"]:
                 return f"{what} has a gradient, which would flow into the critic; .detach() is missing."
             if not close(output, wanted) and not self.value_is_free:
                 return _apart(what, output, wanted)
-        if right.gradient is not None and not close(got["gradient"], right.gradient):
+        if not all(map(close, got["gradient"], right["gradient"])):
             return "its gradient is wrong." if self.value_is_free else "the value is right, but its gradient is not."
         return None
 
-    def _cause(self, cases: Sequence[Mapping[str, Any]], case: Case) -> str:
+    def _cause(self, case: Case, pairs: Pairs) -> str:
         """The well-known mistakes, or else changes of arguments or results, that answer the same in every case.
 
         Where there are none, those that do in the first case that differs: a solution may have a second mistake.
         """
-        pairs = [pair for pair in zip(self.cases, cases, strict=False) if not pair[1].get("misfit")]
         for tried in (pairs, [pair for pair in pairs if pair[0] is case]):
             known = ((words, partial(self.answer, wrong)) for words, wrong in self.mistakes.items())
             for answers in (known, self._changed()):
@@ -372,7 +354,7 @@ class Exercise:
                     return f" Likely: {', or '.join(likely[:3])}."
         return ""
 
-    def _changed(self) -> Iterator[tuple[str, Callable[[Case], Answer]]]:
+    def _changed(self) -> Iterator[tuple[str, Callable[[Case], Results]]]:
         """The reference with changed arguments or changed results, by the words for the change."""
         last = self.cases[-1]
         for words, change in of_arguments({**dict(zip(self.arguments, last.args, strict=False)), **last.options}):
@@ -380,13 +362,11 @@ class Exercise:
         for words, change in of_results(self.outputs):
             yield words, partial(self._with_results, change)
 
-    def _with_results(self, change: Callable[[list[Tensor], int], list[Tensor]], case: Case) -> Answer:
+    def _with_results(self, change: Callable[[list[Tensor], int], list[Tensor]], case: Case) -> Results:
         """The reference's results after a change of them; their gradient, if it counts, after the same."""
         right, rows = self.answer(self.right, case), len(case.args[0])
-        gradient = None
-        if right.gradient is not None:
-            gradient = right.gradient * (change([torch.ones(())], rows)[0] if len(self.outputs) == 1 else 1)
-        return Answer(tuple(change(list(right.outputs), rows)), gradient)
+        factor = change([torch.ones(())], rows)[0] if right["gradient"] and len(self.outputs) == 1 else 1
+        return {"outputs": change(right["outputs"], rows), "gradient": [each * factor for each in right["gradient"]]}
 
 
 class Note(str):
@@ -406,46 +386,42 @@ class Inspection:
 
     def observe(self, solution: Function) -> Seen:
         """Try a solution until it raises; the global random generators are left as they were."""
-        seen = Seen()
+        seen: Seen = {}
         try:
             with globals_undisturbed(), limited(self.limit):
                 seed_globals(0)
                 self.look(bound(solution), seen)
-        except TooLong as error:
-            seen["raised"] = f"it did not end within {self.limit:g} seconds{place(error)}"
-        except (Exception, SystemExit) as error:  # what the solution raises is a finding too
-            seen["raised"] = raised(error)
+        except (Exception, SystemExit, TooLong) as error:  # what the solution raises is a finding too
+            seen["raised"] = raised(error, self.limit)
         return seen
 
     def judge(self, name: str, seen: Seen) -> Finding:
         """Look for the first point that is wrong; what came before an exception is said before it."""
         notes: list[str] = []
         try:
-            for sentence in self.points(Seen(seen)):
+            for sentence in self.points(seen):
                 if not isinstance(sentence, Note):
                     return Finding(name, False, sentence)
                 notes.append(f" Note: {sentence}")
-        except EndedError as missing:
-            return Finding(name, False, seen.get("raised", f"{missing} was not seen."))
-        except Exception as error:  # what a solution returns may be anything
-            return Finding(name, False, f"what it does cannot be judged: {error}.")
+        except (
+            Exception
+        ) as error:  # of what was not seen, as the solution raised before; what it returns may be anything
+            return Finding(name, False, seen.get("raised", f"what it does cannot be judged: {error}."))
         if "raised" in seen:
             return Finding(name, False, seen["raised"])
         return Finding(name, True, f"right.{''.join(notes)}")
 
 
-def raised(error: BaseException) -> str:
+def raised(error: BaseException, limit: float = LIMIT) -> str:
     """The exception of a solution, and the reader's line that raised it; in a cell of a notebook the line alone."""
-    return f"it raised {type(error).__name__}: {error}{place(error)}"
-
-
-def place(error: BaseException) -> str:
-    """The reader's line in which an exception was raised, after a comma; nothing where it is none of theirs."""
+    said = f"it raised {type(error).__name__}: {error}"
+    if isinstance(error, TooLong):
+        said = f"it did not end within {limit:g} seconds"
     own = [frame for frame in traceback.extract_tb(error.__traceback__) if not frame.filename.startswith(LIBRARIES)]
     if not own:
-        return ""
+        return said
     file, line = Path(own[-1].filename), own[-1].lineno
-    return f", in {own[-1].name} ({f'{file.name}:{line}' if file.is_file() else f'line {line}'})"
+    return f"{said}, in {own[-1].name} ({f'{file.name}:{line}' if file.is_file() else f'line {line}'})"
 
 
 def close(mine: Any, right: Any, rtol: float = RTOL, atol: float = ATOL) -> bool:
@@ -458,29 +434,22 @@ def close(mine: Any, right: Any, rtol: float = RTOL, atol: float = ATOL) -> bool
     return False
 
 
-def _flat(tensor: Any) -> list[float]:
-    return [float(number) for number in tensor.reshape(-1).tolist()]
-
-
 def _apart(what: str, mine: Tensor, right: Tensor) -> str:
     """A sentence on the first element that differs."""
-    for flat, (one, other) in enumerate(zip(_flat(mine), _flat(right), strict=True)):
+    elements = zip(np.ndindex(*right.shape), mine.flatten().tolist(), right.flatten().tolist(), strict=True)
+    for index, one, other in elements:
         if not abs(one - other) <= ATOL + RTOL * abs(other):
-            index = [int(number) for number in np.unravel_index(flat, tuple(right.shape))] if right.dim() else ""
-            return f"{what}{index} is {one:.4g}; it should be {other:.4g}."
+            return f"{what}{list(index) or ''} is {one:.4g}; it should be {other:.4g}."
     raise AssertionError("nothing differs")
 
 
-def _agree(pairs: Sequence[tuple[Case, Mapping[str, Any]]], answer: Callable[[Case], Answer]) -> bool:
-    """Whether what was seen in each of some cases is what another function answers."""
+def _agree(pairs: Pairs, answer: Callable[[Case], Results]) -> bool:
+    """Whether what was seen in each of some cases is what another function answers, with NaN in the same places."""
     with suppress(Exception):  # one that fails in a later case is none of the known mistakes
-        return all(_same(got, answer(case)) for case, got in pairs)
+        both = (zip(_tensors(got), _tensors(answer(case)), strict=True) for case, got in pairs)
+        return all(close(mine, its) for tensors in both for mine, its in tensors)
     return False
 
 
-def _same(got: Mapping[str, Any], other: Answer) -> bool:
-    """Whether both have the same numbers, and NaN in the same places."""
-    pairs = [*zip(got["outputs"], other.outputs, strict=True)]
-    if other.gradient is not None:
-        pairs.append((got["gradient"], other.gradient))
-    return all(close(mine.nan_to_num(1e9), its.nan_to_num(1e9)) for mine, its in pairs)
+def _tensors(got: Results) -> list[Tensor]:
+    return [tensor.nan_to_num(1e9) for tensor in got["outputs"] + got["gradient"]]

@@ -7,7 +7,7 @@ course: a method, with other names, another layout or other outputs. A mistake i
 import inspect
 import tomllib
 from collections.abc import Sequence
-from functools import cache, partial
+from functools import cache
 from typing import Any
 
 import torch
@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from lemniscate import maths
 from lemniscate.course.exercise import TEMPLATES, Case, Exercise, normalised  # noqa: F401  (an edit may call it)
-from lemniscate.course.solution import Function, Held, Settings
+from lemniscate.course.solution import Function, Settings
 from lemniscate.maths import clipped_surrogate, gae, q_lambda, reward_to_go, value_loss
 
 # --- the forms of the courses ---
@@ -151,7 +151,7 @@ TRAIN_CONFIG = Settings(
     }
 )
 """the configuration of the drone's course, with fewer environments"""
-TRAINER = Held(config=TRAIN_CONFIG)
+TRAINER = {"config": TRAIN_CONFIG}
 FOUR = (torch.ones(4, 1), _column(0.5, 0.6, 0.7, 0.8))
 """rewards and V(s) of the drone's course"""
 FOUR_VALUES = (torch.tensor([2.5, 1.5, 3.0, 4.5]), torch.tensor([3.0, 1, 2, 5]), torch.tensor([2.0, 1, 2.5, 4]))
@@ -161,19 +161,14 @@ INDS = torch.tensor([4, 1, 13, 5, 0, 7, 11, 9, 2, 14, 8, 3])
 SHUFFLED = (_drawn(12), _drawn(15, seed=2), torch.zeros(15).index_put((INDS,), OLD), INDS)
 
 
-def _drone_case(
-    about: str, next_value: Tensor, rewards: Tensor, values: Tensor, ended: Tensor, done: Tensor | None = None
-) -> Case:
-    buffers = {"rewards_buffer": rewards, "values_buffer": values, "terminated_buffer": ended.float()}
-    done = ended if done is None else done
-    more = Held(
-        config=TRAIN_CONFIG,
-        dones_buffer=done.float(),
-        truncated_buffer=done.float() - ended.float(),
-        n_envs=rewards.shape[1],
-    )
-    held = {**buffers, "n_steps": len(rewards), "gamma": 0.99, "gae_lambda": 0.95}
-    return Case(about, (next_value,), held, more)
+def _drone_case(about: str, *given: Tensor, done: Tensor | None = None) -> Case:
+    """Given are next_value, rewards, values and flags of deaths; those of all ends where there are others."""
+    next_value, rewards, values, ended = given
+    done = (ended if done is None else done).float()
+    held = {"rewards_buffer": rewards, "values_buffer": values, "terminated_buffer": ended.float()}
+    held |= {"n_steps": len(rewards), "gamma": 0.99, "gae_lambda": 0.95}
+    more = {"dones_buffer": done, "truncated_buffer": done - ended.float(), "n_envs": rewards.shape[1]}
+    return Case(about, (next_value,), held, TRAINER | more)
 
 
 def _values(states: Tensor) -> Tensor:
@@ -191,9 +186,8 @@ def _layer(columns: Tensor) -> nn.Linear:
     return made
 
 
-NETWORKS = Held(
-    actor=_layer(torch.tensor([[1.0, 0.0], [-1.0, 0.5], [0.5, 1.0]])), critic=_layer(_column(0.5, -1.0, 0.25))
-)
+ACTOR = _layer(torch.tensor([[1.0, 0.0], [-1.0, 0.5], [0.5, 1.0]]))
+NETWORKS = {"actor": ACTOR, "critic": _layer(_column(0.5, -1.0, 0.25))}
 
 
 def _lander_case(about: str, num_envs: int, steps: int, *ends: int) -> Case:
@@ -203,6 +197,15 @@ def _lander_case(about: str, num_envs: int, steps: int, *ends: int) -> Case:
     states, last = _drawn(rows, 3), torch.arange(1, rows + 1) % steps == 0
     following = torch.where((ended | last)[:, None], _drawn(rows, 3, seed=1), states.roll(-1, 0))
     return Case(about, (states, _drawn(rows), following, ended), held, NETWORKS)
+
+
+def _of_tails(options: dict[str, float]) -> list[Case]:
+    return [
+        Case("no end", (R, N, NEVER, NEVER), options),
+        Case("a death at row 1", (R, N, AT_1, AT_1), options),
+        Case("a time-out at row 1", (R, N, NEVER, AT_1), options),
+        Case("two environments, ends of both kinds", (TWO_R, TWO_V + 1, TWO_ENDS, TWO_DONE), options),
+    ]
 
 
 ROWS, MANY = _drawn(24, 3), torch.arange(24) % 2
@@ -222,7 +225,7 @@ CASES: dict[str, list[Case]] = {
         _drone_case("no end", _column(0.9), *FOUR, NEVER),
         _drone_case("a death at the last row", _column(0.0), *FOUR, AT_3),
         _drone_case("two environments", _drawn(1, 2), _drawn(5, 2), _drawn(5, 2, seed=1), TWO_ENDS),
-        _drone_case("a time-out, which the loop does not look at", _column(0.9), *FOUR, NEVER, AT_1),
+        _drone_case("a time-out, which the loop does not look at", _column(0.9), *FOUR, NEVER, done=AT_1),
     ],
     "compute_advantages": [
         _lander_case("one step of three environments", 3, 1, 1),
@@ -231,18 +234,8 @@ CASES: dict[str, list[Case]] = {
         _lander_case("two environments of three steps", 2, 3),
         _lander_case("two environments, a death at a border", 2, 3, 2, 4),
     ],
-    "reward_to_go": [
-        Case("no end", (R, N, NEVER, NEVER), GAMMA),
-        Case("a death at row 1", (R, N, AT_1, AT_1), GAMMA),
-        Case("a time-out at row 1", (R, N, NEVER, AT_1), GAMMA),
-        Case("two environments, ends of both kinds", (TWO_R, TWO_V + 1, TWO_ENDS, TWO_DONE), GAMMA),
-    ],
-    "q_lambda": [
-        Case("no end", (R, N, NEVER, NEVER), DISCOUNTS),
-        Case("a death at row 1", (R, N, AT_1, AT_1), DISCOUNTS),
-        Case("a time-out at row 1", (R, N, NEVER, AT_1), DISCOUNTS),
-        Case("two environments, ends of both kinds", (TWO_R, TWO_V + 1, TWO_ENDS, TWO_DONE), DISCOUNTS),
-    ],
+    "reward_to_go": _of_tails(GAMMA),
+    "q_lambda": _of_tails(DISCOUNTS),
     "discounted_returns": [
         Case("one step", (torch.tensor([2.0]),), GAMMA),
         Case("five steps", (_drawn(5) + 1,), GAMMA),
@@ -332,21 +325,17 @@ def edited(functions: Sequence[Function], edits: Sequence[str]) -> Function:
 def _exercise(*functions: Function, outputs: tuple[str, ...], **options: Any) -> Exercise:
     """The exercise whose reference is the last of these functions, each of which may call those before it."""
     name = functions[-1].__name__
-    table = dict(TABLES[name])
     edits = {
         before + words: pairs
-        for shared, before in table.pop("extends", {}).items()
+        for shared, before in {**TABLES[name].get("extends", {}), name: ""}.items()
         for words, pairs in TABLES[shared].items()
+        if words != "extends"
     }
-    return Exercise(
-        functions[-1],
-        outputs,
-        CASES[name],
-        partial(edited, functions),
-        edits | table,
-        TABLES["accepted"].get(name, {}),
-        **options,
+    mistakes, accepted = (
+        {words: edited(functions, pairs) for words, pairs in table.items()}
+        for table in (edits, TABLES["accepted"].get(name, {}))
     )
+    return Exercise(functions[-1], outputs, CASES[name], mistakes, accepted, **options)
 
 
 EXERCISES: dict[str, Exercise] = {
@@ -360,18 +349,12 @@ EXERCISES: dict[str, Exercise] = {
     "policy_gradient": _exercise(maths.policy_gradient, outputs=("loss",), gradient_in=0, value_is_free=True),
     "clipped_surrogate": _exercise(clipped_surrogate, outputs=("loss",), gradient_in=0),
     "calculate_pg_loss": _exercise(clipped_surrogate, calculate_pg_loss, outputs=("pg_loss",), gradient_in=1),
-    "compute_loss": _exercise(
-        clipped_surrogate,
-        compute_loss,
-        outputs=("actor_loss", "critic_loss"),
-        gradient_in=0,
-    ),
+    "compute_loss": _exercise(clipped_surrogate, compute_loss, outputs=("actor_loss", "critic_loss"), gradient_in=0),
     "value_loss": _exercise(value_loss, outputs=("loss",), gradient_in=0),
     "calculate_v_loss": _exercise(value_loss, calculate_v_loss, outputs=("v_loss",), gradient_in=0),
     "polyak": _exercise(
         maths.polyak,
         outputs=tuple(f"{network}[{i}]" for network in ("target", "online") for i in range(3)),
-        in_place=True,
     ),
     "select_at_index": _exercise(select_at_index, outputs=("result",), gradient_in=0),
 }

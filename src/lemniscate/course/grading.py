@@ -30,7 +30,7 @@ from rich.cells import cell_len, set_cell_size
 
 from lemniscate import course
 from lemniscate.course import handin
-from lemniscate.course.exercise import TEMPLATES, Seen
+from lemniscate.course.exercise import TEMPLATES
 from lemniscate.errors import UserError, unknown_name
 from lemniscate.run.stopping import Stopped
 from lemniscate.system.console import Line, ProgressBar, clock, say
@@ -67,10 +67,8 @@ class Trial:
             shutil.copyfile(file, copy)
         forks = "forkserver" in multiprocessing.get_all_start_methods()
         context: Any = multiprocessing.get_context("forkserver" if forks else "spawn")
-        if forks:
-            context.set_forkserver_preload(
-                [handin.__name__, "gymnasium.wrappers.vector", "torch._dynamo"]
-            )  # imported once, for all
+        if forks:  # these are imported once, for all
+            context.set_forkserver_preload([handin.__name__, "gymnasium.wrappers.vector", "torch._dynamo"])
         self.process = context.Process(target=handin.run, args=(self._work, demanded))
         main = sys.modules["__main__"]
         sys.modules["__main__"] = ModuleType("__main__")  # else a child would run the caller's script once more
@@ -125,7 +123,7 @@ class Trial:
         right, sentence = False, "what was seen of it is not what was asked for."
         with suppress(Exception):  # a hand-in may have put there what it likes
             if seen := self._content(f"seen/{name}.pt"):
-                finding = course.EXERCISES[name].judge(name, Seen(torch.load(io.BytesIO(seen), weights_only=True)))
+                finding = course.EXERCISES[name].judge(name, torch.load(io.BytesIO(seen), weights_only=True))
                 right, sentence = finding.right, finding.sentence
             else:
                 sentence = self._content(f"seen/{name}.txt").decode() or "it was not tried in time."

@@ -9,9 +9,8 @@ import inspect
 import json
 import re
 import tomllib
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager, closing
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,12 +19,13 @@ import gymnasium as gym
 import numpy as np
 import torch
 
-from lemniscate.api.agents import METHODS
+from lemniscate.api.agents import Agent, playing
 from lemniscate.course import inside
 from lemniscate.course.exercise import TEMPLATES, Note, raised
 from lemniscate.course.solution import Function
 from lemniscate.envs.vector_view import VectorView, make_vec
 from lemniscate.errors import UserError, unknown_name
+from lemniscate.run.evaluate import evaluate
 from lemniscate.system.console import say
 
 SKELETONS = ("ppo",)
@@ -38,7 +38,7 @@ NOTEBOOKS = Path(__file__).parent / "notebooks"
 STEPS, NUM_ENVS = 2_048, 8
 LEARNED = 0.25
 """the least that each of two actions has moved where it pays, in the small world of Box actions; 0.7 is usual"""
-CARTPOLE_STEPS, CARTPOLE_RETURN, EPISODES_EACH = 60_000, 150, 3
+CARTPOLE_STEPS, CARTPOLE_RETURN, EPISODES = 60_000, 150, 24
 
 
 def skeleton(name: str = "ppo", path: str | Path | None = None) -> Path:
@@ -117,26 +117,13 @@ def notebook(program: str) -> str:
     return json.dumps(whole, indent=1, ensure_ascii=False) + "\n"
 
 
-@dataclass(frozen=True)
-class World:
-    """A small world in which action 0 is better than action 1 in state 0."""
-
-    moves: list[list[dict[str, Any]]]
-    """by state and action: its effect, as `worlds.toml` says"""
-    starts: list[float]
-    """by state: the probability that an episode begins there"""
-    mistake: str
-    """a sentence on what action 1 in state 0 reveals"""
-    seen: Sequence[int] = range(6)
-    """by state: the state that it looks like"""
-
-    def obs(self, state: int) -> np.ndarray:
-        """The observation of a state: a one-hot vector [6]."""
-        return np.eye(6, dtype=np.float32)[self.seen[state]]
+def seen_in(state: int) -> np.ndarray:
+    """The observation of a state of a small world: a one-hot vector [6]."""
+    return np.eye(6, dtype=np.float32)[state]
 
 
 class WorldEnv(gym.Env):
-    """A world as an environment."""
+    """A small world of `worlds.toml`, in which action 0 is better than action 1 in state 0."""
 
     def __init__(self, world: int) -> None:
         self.world = WORLDS[world]
@@ -147,15 +134,18 @@ class WorldEnv(gym.Env):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
         """A state to begin in."""
         super().reset(seed=seed)
-        self._state = int(self.np_random.choice(len(self.world.starts), p=self.world.starts))
-        return self.world.obs(self._state), {}
+        self._state = int(self.np_random.choice(len(self.world["starts"]), p=self.world["starts"]))
+        return self._obs(), {}
 
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict]:
         """The move of that action."""
-        move = self.world.moves[self._state][int(action)]
+        move = self.world["moves"][self._state][int(action)]
         reward, end = move["reward"] + self._bonus, move.get("end")
         self._bonus, self._state = move.get("next_bonus", 0.0), move["to"]
-        return self.world.obs(self._state), reward, end == "death", end == "time-out", {}
+        return self._obs(), reward, end == "death", end == "time-out", {}
+
+    def _obs(self) -> np.ndarray:
+        return seen_in(self.world.get("seen", range(6))[self._state])
 
 
 class BoxEnv(WorldEnv):
@@ -170,10 +160,10 @@ class BoxEnv(WorldEnv):
     def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict]:
         """A death after one action."""
         self.taken.append(action)
-        return self.world.obs(0), float(action[0] - action[1]), True, False, {}
+        return seen_in(0), float(action[0] - action[1]), True, False, {}
 
 
-WORLDS = [World(**world) for world in tomllib.loads((TEMPLATES / "worlds.toml").read_text("utf-8"))["world"]]
+WORLDS: list[dict[str, Any]] = tomllib.loads((TEMPLATES / "worlds.toml").read_text("utf-8"))["world"]
 
 
 def observe_train(function: Function, seen: dict[str, Any]) -> None:
@@ -189,9 +179,9 @@ def observe_train(function: Function, seen: dict[str, Any]) -> None:
     verdict = inside.judged(seen["inside"])
     for number in range(len(_worlds(verdict))):
         with closing(make_vec(WorldEnv, NUM_ENVS, env_kwargs={"world": number})) as envs:
-            action = _mean_action(function, envs, WORLDS[number].obs(0), STEPS)
+            action = _mean_action(function, envs, STEPS)
             if action > 0.5:  # a right loop may only be slow
-                action = _mean_action(function, envs, WORLDS[number].obs(0), 4 * STEPS)
+                action = _mean_action(function, envs, 4 * STEPS)
         seen[f"world {number}"] = float(action)
         if action > 0.5:
             return
@@ -200,18 +190,21 @@ def observe_train(function: Function, seen: dict[str, Any]) -> None:
     taken: list[np.ndarray] = []
     with closing(make_vec(partial(BoxEnv, taken), NUM_ENVS)) as envs:
         try:
-            first, second = _mean_action(function, envs, WORLDS[0].obs(0), STEPS)
+            first, second = _mean_action(function, envs, STEPS)
             if min(first, -second) < LEARNED:
-                first, second = _mean_action(function, envs, WORLDS[0].obs(0), 4 * STEPS)
+                first, second = _mean_action(function, envs, 4 * STEPS)
             seen["box"] = [float(first), float(second)]
         except Exception as error:  # what it raises is a finding, which has to say that it is not of Discrete actions
             seen["box raised"] = {"sentence": raised(error), "steps": len(taken)}
     if not verdict.is_proved:
-        with closing(make_vec("CartPole-v1", NUM_ENVS, backend="gymnasium")) as envs:
-            seen["return"] = _mean_return(acting(started(function, envs, CARTPOLE_STEPS), envs), envs)
+        with (
+            closing(make_vec("CartPole-v1", NUM_ENVS, backend="gymnasium")) as envs,
+            acting(started(function, envs, CARTPOLE_STEPS), envs) as player,
+        ):
+            seen["return"] = evaluate(player, envs.env, EPISODES, 12_345).mean_return
 
 
-def _worlds(verdict: inside.Verdict) -> list[World]:
+def _worlds(verdict: inside.Verdict) -> list[dict[str, Any]]:
     """The worlds in which a loop with that verdict is trained."""
     return [] if verdict.sentence else WORLDS[:1] if verdict.is_proved else WORLDS
 
@@ -223,7 +216,7 @@ def train(seen: Mapping[str, Any]) -> Iterator[str]:
         yield verdict.sentence
     for number, world in enumerate(_worlds(verdict)):
         if seen[f"world {number}"] > 0.5:
-            yield f"small world {number + 1} of {len(WORLDS) + 1}: {world.mistake}."
+            yield f"small world {number + 1} of {len(WORLDS) + 1}: {world['mistake']}."
     if "box raised" in seen:
         sentence = f"in the small world with Box actions {seen['box raised']['sentence']}"
         yield sentence if seen["box raised"]["steps"] else Note(f"it is for Discrete actions; {sentence}.")
@@ -268,46 +261,19 @@ def _called(function: Function, envs: VectorView, steps: int) -> Any:
     return function(**known)
 
 
-def acting(made: Any, envs: VectorView) -> Callable[[np.ndarray], np.ndarray]:
-    """The agent of a training loop as a function from observations [N, O] to actions, for `envs.step`.
+def _mean_action(function: Function, envs: VectorView, steps: int) -> np.ndarray:
+    """In state 0 of a small world, after training; over many rows, since a policy may draw its actions."""
+    with acting(started(function, envs, steps), envs) as player:
+        return player(torch.from_numpy(seen_in(0)).repeat(64, 1)).mode().double().mean(0).numpy()
+
+
+def acting(made: Any, envs: VectorView) -> AbstractContextManager[Agent]:
+    """What a training loop has trained, as a function from observations [N, O] to actions in [-1, 1], or choices.
 
     Raises:
-        TypeError: nothing acts.
+        TypeError: there is nothing.
+        UserError: it does not act.
     """
-    method = next((getattr(made, name) for name in METHODS if hasattr(made, name)), made)
-    if not callable(method):
-        raise TypeError(f"train returned {type(made).__name__}; it should return an agent with act(obs), or a function")
-
-    def act(obs: np.ndarray) -> np.ndarray:
-        try:
-            action = method(obs)
-        except (TypeError, AttributeError, RuntimeError):  # a function of tensors
-            action = method(torch.as_tensor(obs))
-        action = action[0] if isinstance(action, tuple) else action
-        action = action.detach().cpu().numpy() if isinstance(action, torch.Tensor) else np.asarray(action)
-        is_scores = (
-            isinstance(envs.single_action_space, gym.spaces.Discrete) and action.ndim == 2 and action.shape[1] > 1
-        )
-        return action.argmax(1) if is_scores else action.reshape(envs.action_space.shape)
-
-    return act
-
-
-def _mean_action(function: Function, envs: VectorView, obs: np.ndarray, steps: int) -> np.ndarray:
-    """At one observation, after training; over several calls, since a policy may draw its actions."""
-    act = acting(started(function, envs, steps), envs)
-    return np.mean([act(np.tile(obs, (envs.num_envs, 1))) for _ in range(8)], (0, 1))
-
-
-def _mean_return(act: Callable[[np.ndarray], Any], envs: VectorView) -> float:
-    """Over the first episodes that end, from unseen starts; each environment plays equally many."""
-    obs, _ = envs.reset(seed=12_345)
-    running, returns = np.zeros(envs.num_envs), [[] for _ in range(envs.num_envs)]
-    while min(map(len, returns)) < EPISODES_EACH:
-        obs, reward, terminated, truncated, _ = envs.step(np.asarray(act(obs)))
-        running += reward
-        for i in np.flatnonzero(terminated | truncated):
-            returns[i].append(running[i])
-            running[i] = 0.0
-    # The first ones of each alone: of all that ended, short episodes would be more than their share.
-    return float(np.mean([episode for row in returns for episode in row[:EPISODES_EACH]]))
+    if made is None:
+        raise TypeError("train returned None; it should return an agent with act(obs), or a function")
+    return playing(made, envs.env, 12_345, None, normalized=False, deterministic=True)

@@ -5,7 +5,6 @@ import math
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import suppress
-from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -56,7 +55,7 @@ def _for_one(network: Function, trial: Callable[[Any], Any], seen: Seen) -> Any:
         seen["is_vector"] = is_vector
         return made
 
-    return first_that_works(partial(attempt, True), partial(attempt, False))
+    return first_that_works(attempt, (True,), (False,))
 
 
 def _obs(made: Any, rows: int = B, size: int = O) -> Tensor:
@@ -72,9 +71,9 @@ def _shape(what: str, value: Any, *right: tuple[int, ...], likely: str = "") -> 
         yield f"{what} has shape {list(value.shape)}; it should be {list(right[0])}.{likely}"
 
 
-def _likely(found: Any, causes: Mapping[str, Any], otherwise: str = "") -> str:
+def _likely(found: Any, causes: Mapping[str, Any], otherwise: str = "", atol: float = 1e-2) -> str:
     """The cause that gives what was found."""
-    words = next((words for words, value in causes.items() if close(found, value, 1e-2, 1e-2)), otherwise)
+    words = next((words for words, value in causes.items() if close(found, value, 1e-2, atol)), otherwise)
     return f" Likely: {words}." if words else ""
 
 
@@ -102,10 +101,9 @@ def _unbounded(what: str, seen: Seen) -> Iterator[str]:
 
 
 def _redraw(made: Any, std: float) -> None:
-    with torch.no_grad():
-        for parameter in made.parameters():
-            if parameter.requires_grad:
-                parameter.normal_(0, std)
+    for parameter in made.parameters():
+        if parameter.requires_grad:
+            nn.init.normal_(parameter, 0, std)
 
 
 def _reach(made: Any, output: Callable[[], Tensor]) -> Tensor:
@@ -150,8 +148,7 @@ def see_agent(network: Function, seen: Seen) -> None:
     seen["of_sample"] = plain([answer[1], act(obs, answer[0].detach())[1]])
     seen["rows"] = plain([mean(obs)[:2], mean(obs[:2]), made.value(obs)[:2], made.value(obs[:2])])
     outputs = {"critic": made.value(obs), "joint": of_given[3], "actor": of_given[1], "sigma": of_given[2]}
-    for what, output in outputs.items():
-        seen[what] = _used(made, output)
+    seen |= {what: _used(made, output) for what, output in outputs.items()}
     seen["parameters"] = {name: plain(parameter) for name, parameter in made.named_parameters()}
     weights = {name: parameter.detach() for name, parameter in made.named_parameters() if parameter.dim() == 2}
     seen["gains"] = {name: torch.linalg.svdvals(weight.float()).tolist() for name, weight in weights.items()}
@@ -430,12 +427,11 @@ def sample_categorical(seen: Seen) -> Iterator[str]:
     shares, powers = [counts[index] / 12000 for index in range(3)], [math.exp(share) for share in PROBS]
     causes = {
         "the probabilities are not used": [1 / 3] * 3,
-        "they are exchanged, as by a comparison the wrong way round": PROBS[::-1],
+        "they are exchanged, as by a comparison the wrong way round": [*PROBS[::-1]],
         "softmax once too often": [power / sum(powers) for power in powers],
     }
     if not close(shares, list(PROBS), 0, 0.025):
-        near = [words for words, right in causes.items() if close(shares, list(right), 0, 0.025)]
-        likely = f" Likely: {near[0]}." if near else ""
+        likely = _likely(shares, causes, atol=0.02)
         yield f"with probabilities {', '.join(map(str, PROBS))} the shares are {_shown(shares)}.{likely}"
     if close(drawn, seen["again"]):
         yield "a second call draws the same. Likely: a seed is set in it."
@@ -491,7 +487,7 @@ def _sampled(buffer: Any, rows: int, times: int) -> dict[str, Tensor]:
 def see_replay_buffer(buffer: Function, seen: Seen) -> None:
     """`ReplayBuffer(buffer_size, observation_space, action_space)` with `add` and `sample`."""
     # A vector environment gives one dictionary; Stable-Baselines3 asks for a list of them.
-    first_that_works(*(partial(_see_replay_buffer, buffer, seen, infos) for infos in ({}, [{}])))
+    first_that_works(_see_replay_buffer, (buffer, seen, {}), (buffer, seen, [{}]))
 
 
 def _see_replay_buffer(buffer: Function, seen: Seen, infos: Any) -> None:
@@ -606,7 +602,7 @@ def see_add_to_replay(function: Function, seen: Seen) -> None:
     The environments are SAME_STEP: where one has ended, `next_obs` is the first of the next episode.
     """
     for end in ENDS:
-        seen[end] = first_that_works(*(partial(_replayed, function, end, kind) for kind in (object, float)))
+        seen[end] = first_that_works(_replayed, (function, end, object), (function, end, float))
 
 
 GOING_ON, FIRST_OF_NEXT, LAST = [[5.0, 5.0]], [[7.0, 7.0], [8.0, 8.0]], [[3.0, 3.0], [4.0, 4.0]]
@@ -672,10 +668,7 @@ def _stored(columns: dict[str, list[float]], end: str) -> Iterator[str]:
     """Sentences where the ends or the successors are wrong."""
     ended, next_obs = [bool(done) for done in columns["done"]], columns["next_obs"]
     if any(ended) and end == "time-out":
-        yield (
-            "a time-out is stored as done, so nothing is bootstrapped from it. Likely: terminated | truncated; done is"
-            " terminated alone."
-        )
+        yield "a time-out is stored as done. Likely: terminated | truncated; done is terminated alone."
     if ended != [False, *[bool(ENDS[end][0])] * 2]:
         yield f"a {end} is stored with done = {ended[-1]}, and a row within an episode with {ended[0]}."
     if next_obs[2:] != np.ravel(LAST).tolist():

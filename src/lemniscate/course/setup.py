@@ -2,9 +2,8 @@
 
 import os
 import random
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, suppress
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -73,8 +72,7 @@ def see_make_envs(function: Function, seen: Seen) -> None:
         others = {"train_device device": "cpu", "env_name env_id env id task": env_id, "seed": 0}
         return call_by_name(function, numbers, others)
 
-    ids = ("CartPole-v1", "Pendulum-v1", "DroneFigureEightTrajectory-v0")
-    made = first_that_works(*(partial(attempt, env_id) for env_id in ids))
+    made = first_that_works(attempt, ("CartPole-v1",), ("Pendulum-v1",), ("DroneFigureEightTrajectory-v0",))
     pair = made if isinstance(made, tuple | list) else [made]
     seen["made"] = [hasattr(envs, "num_envs") for envs in pair]
     try:
@@ -127,9 +125,7 @@ def _normalized(are_rewards: bool, train: bool | None, evaluation: bool | None) 
     if train is None and are_rewards:
         yield "rewards are normalized, also in evaluation. Likely: NormalizeReward in place of NormalizeObservation."
     if train is None:
-        yield Note(
-            "neither normalizes observations; save_model and sync_envs of the drone's course need NormalizeObservation."
-        )
+        yield Note("neither normalizes observations; save_model and sync_envs need NormalizeObservation.")
 
 
 def normalizer(envs: Any, of: str = "obs_rms") -> Any:
@@ -157,18 +153,21 @@ def _setting(steps: int, wrappers: int = 1) -> tuple[nn.Module, torch.optim.Opti
     return agent, optimizer, envs
 
 
-def _for_any_wrappers(attempt: Callable[[int, type], Any]) -> Any:
-    """An attempt with one wrapper around the normalizer, or two for a solution that counts on that; never with none.
-
-    The path is a text, or else a `Path`.
-    """
-    return first_that_works(*(partial(attempt, wrappers, kind) for wrappers in (1, 2) for kind in (str, Path)))
+WRAPPERS = (1, str), (1, Path), (2, str), (2, Path)
+"""what is tried: one wrapper around the normalizer, or two for a solution that counts on that; a path as text or not"""
 
 
-def _statistics(envs: Any) -> dict[str, Any]:
+def _statistics(envs: Any) -> dict[str, Tensor]:
     """Mean, variance and number of the observations; copies."""
     statistics = normalizer(envs).obs_rms
     return {name: torch.tensor(np.ravel(getattr(statistics, name))) for name in ("mean", "var", "count")}
+
+
+def _learned(agent: nn.Module, optimizer: torch.optim.Optimizer, envs: Any) -> list[dict[str, Tensor]]:
+    """What a checkpoint is to hold: weights, learning rate and moments, statistics of the observations; copies."""
+    flat = dict(_flat(plain(optimizer.state_dict())))
+    moments = {path[1:]: torch.as_tensor(flat[path]) for path in flat if "state" in path or path.endswith(".lr")}
+    return [plain(agent.state_dict()), moments, _statistics(envs)]
 
 
 def _same_statistics(mine: Any, right: Any, whose: str, whence: str) -> Iterator[str]:
@@ -195,10 +194,10 @@ def see_sync_envs(function: Function, seen: Seen) -> None:
         train, evaluation = _setting(5, wrappers)[2], _setting(1, wrappers)[2]
         normalizer(evaluation).update_running_mean = False
         seen["before"] = [_statistics(train), _statistics(evaluation)]
-        call_by_name(function, {f"train_envs {ENVS}": train, "eval_envs test_envs": evaluation})
+        call_by_name(function, {CHECKPOINT[2]: train, "eval_envs test_envs": evaluation})
         return [train, evaluation]
 
-    both = _for_any_wrappers(attempt)
+    both = first_that_works(attempt, *WRAPPERS)
     seen["after"] = [_statistics(envs) for envs in both]
     for name, envs in zip(("trained", "evaluated"), both, strict=True):
         envs.reset(seed=9)
@@ -218,10 +217,13 @@ def sync_envs(seen: Seen) -> Iterator[str]:
         yield Note("both now share one object: the statistics of evaluation follow training without another call.")
 
 
-AGENT = "agent model net network policy actor_critic module"
-OPTIMIZER = "optimizer optim opt optimiser"
-ENVS = "envs env vec_env venv training_envs"
-PATH = "path pfad datei file filename filepath file_path checkpoint_path ckpt_path model_path save_path load_path"
+CHECKPOINT: tuple[str, ...] = (
+    "agent model net network policy actor_critic module",
+    "optimizer optim opt optimiser",
+    "train_envs envs env vec_env venv training_envs",
+    "path pfad datei file filename filepath file_path checkpoint_path ckpt_path model_path save_path load_path",
+)
+"""the names of what `save_model` and `load_model` are given"""
 
 
 class _Moves(TorchFunctionMode):
@@ -241,14 +243,13 @@ def see_save_model(function: Function, seen: Seen) -> None:
         path = Path(folder) / "checkpoint.pt"
 
         def attempt(wrappers: int, kind: type) -> None:
-            agent, optimizer, envs = _setting(5, wrappers)
-            seen["right"] = plain([agent.state_dict(), _moments(optimizer), _statistics(envs)])
-            given = {AGENT: agent, OPTIMIZER: optimizer, f"train_envs {ENVS}": envs, PATH: kind(path)}
-            with _Moves() as moves:
-                call_by_name(function, given, {"-": True})  # `save`, where it has no default
+            setting = _setting(5, wrappers)
+            seen["right"] = _learned(*setting)
+            with _Moves() as moves:  # `save` is called so where it has no default
+                call_by_name(function, dict(zip(CHECKPOINT, (*setting, kind(path)), strict=True)), {"-": True})
             seen["moves"] = moves.count
 
-        _for_any_wrappers(attempt)
+        first_that_works(attempt, *WRAPPERS)
         seen["is_there"] = path.exists()
         seen["opens"] = {}
         for safe in (True, False):
@@ -277,14 +278,11 @@ def save_model(seen: Seen) -> Iterator[str]:
     if opens["whole"]:
         yield "the agent or the optimizer is pickled whole, with its code. Likely: .state_dict() is missing."
     if not opens["safe"]:
-        yield Note(
-            "the file opens with weights_only=False alone, which runs what is in it; a tensor in place of each"
-            " NumPy array (torch.as_tensor) mends it."
-        )
+        yield Note("the file needs weights_only=False, which runs its code; torch.as_tensor(array) mends that.")
     if not isinstance(saved, dict):
         yield f"the file holds a {type(saved).__name__}; it should hold a dictionary."
     flat = dict(_flat(saved))
-    yield from _learned(flat, agent, moments)
+    yield from _weights(flat, agent, moments)
     yield from _observed(flat, statistics)
     if seen["moves"] < len(agent) + len(moments) - 1:  # the learning rate is a number
         yield Note(
@@ -293,7 +291,7 @@ def save_model(seen: Seen) -> Iterator[str]:
         )
 
 
-def _learned(flat: Mapping[str, Any], agent: Mapping[str, Tensor], moments: Mapping[str, Tensor]) -> Iterator[str]:
+def _weights(flat: Mapping[str, Any], agent: Mapping[str, Tensor], moments: Mapping[str, Tensor]) -> Iterator[str]:
     """Sentences where the weights or the state of the optimizer are not there."""
     missing = [name for name in agent if not any(path.endswith(f".{name}") for path in flat)]
     if len(missing) == len(agent):
@@ -303,10 +301,7 @@ def _learned(flat: Mapping[str, Any], agent: Mapping[str, Tensor], moments: Mapp
     if not _holds(flat, agent):
         yield "the weights in the file are not those of the agent."
     if not any(path.endswith(".param_groups.0.lr") for path in flat):
-        yield (
-            "the optimizer is not in the file: a resumed run would begin with empty moments. Likely:"
-            " optimizer.state_dict() is missing."
-        )
+        yield "the optimizer is not in the file: moments are lost. Likely: optimizer.state_dict() is missing."
     if not _holds(flat, moments):
         yield "the optimizer's moments in the file are not those of the optimizer."
 
@@ -332,12 +327,6 @@ def _holds(flat: Mapping[str, Any], wanted: Mapping[str, Tensor]) -> bool:
     )
 
 
-def _moments(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
-    """The learning rate and the tensors in the state of an optimizer, by parameter and name."""
-    flat = dict(_flat(plain(optimizer.state_dict())))
-    return {path[1:]: torch.as_tensor(flat[path]) for path in flat if "state" in path or path.endswith(".lr")}
-
-
 def _observed(flat: Mapping[str, Any], statistics: Mapping[str, Any]) -> Iterator[str]:
     """Sentences where mean, variance or number of the observations are not there."""
 
@@ -350,20 +339,14 @@ def _observed(flat: Mapping[str, Any], statistics: Mapping[str, Any]) -> Iterato
     if names and all("var" in name and "mean" not in name for name in names):
         yield f"{names[0]} in the file is the mean of the observations. Likely: mean and variance are exchanged."
     if not names:
-        yield (
-            "the mean of the observations is not in the file: the policy would see other numbers than it was trained"
-            " on."
-        )
+        yield "the mean of the observations is not in the file: the policy would see other numbers than before."
     if not where(statistics["var"]):
         paths = where(statistics["var"].sqrt())
         likely = " Likely: it is the standard deviation." if paths else ""
         said = f"the variance of the observations is not in the file.{likely}"
         yield Note(said) if any("std" in path for path in paths) else said
     if not where(statistics["count"]):
-        yield Note(
-            "without the number of observations behind mean and variance (obs_rms.count) a resumed run would forget"
-            " them with its first batch."
-        )
+        yield Note("without obs_rms.count a resumed run would forget mean and variance with its first batch.")
 
 
 def see_load_model(function: Function, seen: Seen) -> None:
@@ -377,19 +360,18 @@ def see_load_model(function: Function, seen: Seen) -> None:
         "obs_var": torch.as_tensor(statistics.var),
         "obs_count": float(statistics.count),
     }
-    seen["right"] = plain([agent.state_dict(), _moments(optimizer), _statistics(envs)])
-
+    seen["right"] = _learned(agent, optimizer, envs)
     with TemporaryDirectory() as folder:
         path = Path(folder) / "checkpoint.pt"
         torch.save(checkpoint, path)
 
         def attempt(wrappers: int, kind: type) -> None:
-            agent, optimizer, envs = _setting(1, wrappers)
-            given = {AGENT: agent, OPTIMIZER: optimizer, f"train_envs {ENVS}": envs, PATH: kind(path)}
+            setting = _setting(1, wrappers)
+            given = dict(zip(CHECKPOINT, (*setting, kind(path)), strict=True))
             call_by_name(function, given, {"device map_location": "cpu"})
-            seen["mine"] = plain([agent.state_dict(), _moments(optimizer), _statistics(envs)])
+            seen["mine"] = _learned(*setting)
 
-        _for_any_wrappers(attempt)
+        first_that_works(attempt, *WRAPPERS)
 
 
 def load_model(seen: Seen) -> Iterator[str]:

@@ -13,7 +13,7 @@ import sys
 import textwrap
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import partial
 from itertools import accumulate, takewhile
@@ -26,49 +26,42 @@ from torch import Tensor, nn
 
 Function = Callable[..., Any]
 
-NAMES = {
-    "reward": ("rewards", "r", "rew", "rews", "rs"),
-    "value": ("values", "v", "val", "vals", "vs", "v_s", "state_values", "new_value", "newvalue", "new_values", "pred"),
-    "next_value": ("next_values", "nv", "next_v", "v_next", "values_next", "next_vals", "v_prime", "vp", "v_s_next"),
-    "terminated": ("terminations", "terminateds", "term", "terms", "terminal", "terminals", "death", "deaths", "te"),
-    "done": ("dones", "d", "ended", "ends", "end", "over", "episode_over", "finished"),
-    "gamma": ("discount", "discount_factor", "g", "γ"),
-    "lam": ("lambda", "lmbda", "gae_lambda", "lambd", "lamda", "gae_lam", "l", "λ"),
-    "gae_lambda": ("lambda", "lmbda", "lam", "lambd", "lamda", "gae_lam", "l", "λ"),
-    "lmbda": ("lambda", "lam", "gae_lambda", "lambd", "lamda", "gae_lam", "l", "λ"),
-    "clip": ("clip_coef", "epsilon", "eps", "clip_eps", "clip_range", "clip_ratio", "clip_epsilon", "clip_param", "ε"),
-    "clip_coef": ("clip", "epsilon", "eps", "clip_eps", "clip_range", "clip_ratio", "clip_epsilon", "clip_param", "ε"),
-    "epsilon": ("clip", "clip_coef", "eps", "clip_eps", "clip_range", "clip_ratio", "clip_epsilon", "clip_param", "ε"),
-    "num_steps": ("n_steps", "t_max", "num_collection_steps", "horizon", "rollout_length", "steps"),
-    "n_steps": ("num_steps", "rollout_length", "horizon", "steps"),
-    "rewards": ("reward", "r", "rew", "rews", "rs"),
-    "states": ("state", "s", "obs", "observations"),
-    "actions": ("action", "a", "acts"),
-    "next_states": ("next_state", "s_next", "next_obs", "next_observations", "s_prime", "s2"),
-    "ended": ("terminations", "terminated", "terminals", "dones", "done", "term"),
-    "advantages": ("advantage", "adv", "advs", "advantage_estimates"),
-    "advantage": ("advantages", "adv", "advs", "a_hat", "mb_advantages", "advantage_estimates"),
-    "mb_advantages": ("advantages", "advantage", "adv", "advs", "mb_adv", "minibatch_advantages"),
-    "targets": ("critic_targets", "target", "returns", "value_targets", "v_target", "v_targets"),
-    "target": ("targets", "returns", "return_", "ret", "value_target", "v_target", "b_returns"),
-    "old": ("log_probs_old", "old_log_probs", "log_prob_old", "old_log_prob", "logp_old", "old_logp"),
-    "ratio": ("ratios", "r_t", "rt", "prob_ratio", "rho", "importance_ratio"),
-    "log_ratio": ("logratio", "log_ratios", "logratios", "log_r", "logr", "lr"),
-    "newvalue": ("new_value", "newvalues", "new_values", "values", "value", "mb_values", "pred"),
-    "b_returns": ("returns", "batch_returns", "targets"),
-    "b_values": ("old_values", "batch_values", "values_old"),
-    "mb_inds": ("inds", "indices", "idx", "mb_idx", "mb_indices", "rows"),
-    "if_clip": ("clip_vloss", "use_clip", "clip_value_loss", "do_clip", "clipped"),
-    "old_value": ("old_values", "value_old", "values_old", "v_old", "old_v", "old"),
-    "log_prob": ("log_probs", "logprob", "logprobs", "logp", "log_pi", "log_p"),
-    "weight": ("weights", "advantage", "advantages", "adv", "returns", "psi", "ψ", "w"),
-    "online": ("source", "params", "parameters", "main", "local", "online_params", "net", "model", "src"),
-    "x": ("values", "input", "matrix", "q", "q_values", "logits", "scores"),
-    "indices": ("index", "idx", "inds", "actions", "action", "i"),
-    "probs": ("p", "probabilities", "prob", "pi", "π"),
-    "tau": ("polyak", "polyak_coef", "rho", "alpha", "t", "τ"),
+_NAMES = {
+    "reward rewards": "r rew rews rs",
+    "value": "values v val vals vs v_s state_values new_value newvalue new_values pred",
+    "next_value": "next_values nv next_v v_next values_next next_vals v_prime vp v_s_next",
+    "terminated": "terminations terminateds term terms terminal terminals death deaths te",
+    "done": "dones d ended ends end over episode_over finished",
+    "ended": "terminations terminated terminals dones done term",
+    "gamma": "discount discount_factor g γ",
+    "lam gae_lambda lmbda": "lambda lambd lamda gae_lam l λ",
+    "clip clip_coef epsilon": "eps clip_eps clip_range clip_ratio clip_epsilon clip_param ε",
+    "num_steps n_steps": "t_max num_collection_steps horizon rollout_length steps",
+    "states": "state s obs observations",
+    "actions": "action a acts",
+    "next_states": "next_state s_next next_obs next_observations s_prime s2",
+    "advantage advantages mb_advantages": "adv advs a_hat mb_adv minibatch_advantages advantage_estimates",
+    "targets": "critic_targets target returns value_targets v_target v_targets",
+    "target": "targets returns return_ ret value_target v_target b_returns",
+    "old": "log_probs_old old_log_probs log_prob_old old_log_prob logp_old old_logp",
+    "ratio": "ratios r_t rt prob_ratio rho importance_ratio",
+    "log_ratio": "logratio log_ratios logratios log_r logr lr",
+    "newvalue": "new_value newvalues new_values values value mb_values pred",
+    "b_returns": "returns batch_returns targets",
+    "b_values": "old_values batch_values values_old",
+    "mb_inds": "inds indices idx mb_idx mb_indices rows",
+    "if_clip": "clip_vloss use_clip clip_value_loss do_clip clipped",
+    "old_value": "old_values value_old values_old v_old old_v old",
+    "log_prob": "log_probs logprob logprobs logp log_pi log_p",
+    "weight": "weights advantage advantages adv returns psi ψ w",
+    "online": "source params parameters main local online_params net model src",
+    "x": "values input matrix q q_values logits scores",
+    "indices": "index idx inds actions action i",
+    "probs": "p probabilities prob pi π",
+    "tau": "polyak polyak_coef rho alpha t τ",
 }
-"""other names of an argument, by its name in the exercise"""
+NAMES = {name: f"{names} {others}".split() for names, others in _NAMES.items() for name in names.split()}
+"""all names of an argument, by its name in the exercise"""
 SETTINGS = ("config", "cfg", "conf", "args", "hp", "hparams", "hyperparameters", "params", "settings", "train_config")
 """names of what holds a reader's settings"""
 LIMIT = 15.0
@@ -109,10 +102,6 @@ class OwnSettings(Settings):
 
 class MisfitError(TypeError):
     """A solution takes fewer arguments than a case has."""
-
-
-class Held(dict):
-    """Attributes of an object besides options, where the exercise is a method."""
 
 
 class TooLong(BaseException):
@@ -280,12 +269,12 @@ def _signature(function: Function) -> inspect.Signature:
     return signature
 
 
-def first_that_works(*attempts: Callable[[], Any]) -> Any:
-    """The result of the first attempt that raises no error; if all do, the error of the first is raised."""
+def first_that_works(attempt: Callable[..., Any], *arguments: tuple[Any, ...]) -> Any:
+    """The result of an attempt with the first arguments that raise no error; if all do, the first error is raised."""
     errors: list[Exception] = []
-    for attempt in attempts:
+    for given in arguments:
         try:
-            return attempt()
+            return attempt(*given)
         except Exception as error:  # an error of the solution, which the next attempt may not meet
             errors.append(error)
     raise errors[0]
@@ -318,10 +307,10 @@ class Solution:
 
     Args:
         function: what was given to the check.
-        takes_self: whether its first argument is an object, where that cannot be seen from a class.
+        is_method: whether the exercise is a method, so that its first argument may be an object though it has no class.
     """
 
-    def __init__(self, function: Function, takes_self: bool = False) -> None:
+    def __init__(self, function: Function, is_method: bool = False) -> None:
         self._bound = getattr(function, "__self__", None) if inspect.ismethod(function) else None
         self._function = plain = getattr(function, "__func__", function)
         owner = None if self._bound is not None or not isinstance(plain, FunctionType) else owner_of(plain)
@@ -329,37 +318,34 @@ class Solution:
         if isinstance(self._bound, type):  # a class method
             self._class = type(self._bound.__name__, (self._bound,), {})
         static = owner is not None and isinstance(inspect.getattr_static(*owner), staticmethod)
-        named = takes_self and isinstance(plain, FunctionType) and _has_one_more(plain)
+        named = is_method and isinstance(plain, FunctionType) and _has_one_more(plain)
         self._takes_self = self._bound is not None or (owner is not None and not static) or named
         self._endless = set[int]()
         """statements of the constructor that take too long here"""
 
-    def call(self, given: Mapping[str, Any], options: Mapping[str, Any], attributes: Mapping[str, Any]) -> Any:
+    def call(self, given: Mapping[str, Any], options: Mapping[str, Any], attributes: Mapping[str, Any] | None) -> Any:
         """Call it with the arguments of a case; a method with an object that has options and attributes.
 
         Raises:
             Exception: what the solution raises.
         """
-        if not self._takes_self:
-            args, named = arranged(self._function, given, options)
-            taken = {id(value) for value in [*args, *named.values()]}
-            with _constants(self._function, {name: each for name, each in options.items() if id(each) not in taken}):
-                return self._function(*args, **named)
-        args, named = arranged(partial(self._function, None), given, options, are_held=True)
+        function = partial(self._function, None) if self._takes_self else self._function
+        args, named = arranged(function, given, options, are_held=self._takes_self)
         taken = {id(value) for value in [*args, *named.values()]}
-        if not isinstance(attributes, Held):
-            options = {name: each for name, each in options.items() if id(each) not in taken}
-        return self._function(self._object(options, attributes), *args, **named)
+        others = {name: each for name, each in options.items() if id(each) not in taken}
+        if not self._takes_self:
+            with _constants(self._function, others):
+                return self._function(*args, **named)
+        return self._function(self._object(others if attributes is None else options, attributes), *args, **named)
 
-    def _object(self, options: Mapping[str, Any], attributes: Mapping[str, Any]) -> Any:
-        """An object of the class: after the reader's constructor, with what the course's sets."""
-        config = attributes.get("config")
-        held = {**attributes, **options, "device": torch.device("cpu")}
+    def _object(self, options: Mapping[str, Any], attributes: Mapping[str, Any] | None) -> Any:
+        """An object of the class: after the reader's constructor, with what the course's sets, if it is of one."""
+        config, held = None, {}
+        if attributes is not None:
+            config, held = attributes.get("config"), {**attributes, **options, "device": torch.device("cpu")}
         if config is not None:  # the course's trainer has numbers in its configuration alone
             config.update(options)
             held = {name: each for name, each in held.items() if not isinstance(each, int | float) or name == "n_envs"}
-        if not isinstance(attributes, Held):  # it is of no course: its own constructor sets what there is
-            held = {}
         if self._class is None:
             return SimpleNamespace(**held)
         made, known = self._blank(), OwnSettings({**options, **(config or {})})
@@ -369,7 +355,7 @@ class Solution:
                 _set(made, name, value)
         has_numbers = constructed and config is not None
         for name, value in [*_members(made)]:
-            if name not in held and (mine := _in_place_of(name, value, known, attributes, has_numbers)) is not None:
+            if name not in held and (mine := _in_place_of(name, value, known, held, has_numbers)) is not None:
                 _set(made, name, mine)
         return made
 
@@ -419,7 +405,7 @@ def bound(function: Function) -> Function:
     solution = Solution(function)
     if inspect.ismethod(function) or not solution._takes_self:
         return function
-    return MethodType(function, solution._object({}, Held()))
+    return MethodType(function, solution._object({}, {}))
 
 
 def _has_one_more(function: Function) -> bool:
@@ -459,15 +445,13 @@ def _fields(value: Any) -> dict[str, Any]:
     return dict(getattr(value, "__dict__", {}))
 
 
-def _in_place_of(
-    name: str, value: Any, known: OwnSettings, attributes: Mapping[str, Any], has_numbers: bool
-) -> Any | None:
+def _in_place_of(name: str, value: Any, known: OwnSettings, held: Mapping[str, Any], has_numbers: bool) -> Any | None:
     """The case's value for an attribute of the reader's: a configuration, a number, a network; None if it has none."""
     if name.lower() in SETTINGS:
         return OwnSettings({**_fields(value), **known})
     if isinstance(value, nn.Module):
         layers = [module for module in value.modules() if isinstance(module, nn.Linear)]
-        ours = [other for other in attributes.values() if isinstance(other, nn.Linear)]
+        ours = [other for other in held.values() if isinstance(other, nn.Linear)]
         return next((other for other in ours if layers and layers[-1].out_features == other.out_features), None)
     if _is_setting(value) and not has_numbers:
         return known.get(name)
@@ -478,15 +462,13 @@ def _in_place_of(
 def _constants(function: Function, options: Mapping[str, Any]) -> Iterator[None]:
     """The options in place of the constants of the reader's file that are called like them, such as GAMMA."""
     names: dict[str, Any] = getattr(inspect.unwrap(function), "__globals__", {})
-    found = {name: value for name, value in names.items() if len(name) > 1 and not name.startswith("__")}
+    known = OwnSettings(options)
     ours = {
-        name: options[known]
-        for name, value in found.items()
-        if _is_setting(value) and (known := standard(name, options))
+        name: mine
+        for name, value in names.items()
+        if options and len(name) > 1 and not name.startswith("__") and not isinstance(value, type | FunctionType)
+        if (mine := _in_place_of(name, value, known, {}, False)) is not None
     }
-    for name, value in found.items():
-        if name.lower() in SETTINGS and options and not isinstance(value, type | FunctionType):
-            ours[name] = Settings({**_fields(value), **options})
     before = {name: names[name] for name in ours}
     names.update(ours)
     try:
@@ -508,28 +490,6 @@ def numbers(value: Any) -> Tensor | None:
         array = np.asarray(value)
         return torch.from_numpy(array.copy()) if array.dtype.kind in "fiub" else None
     return None
-
-
-def _as_given(value: Any) -> Any:
-    return value
-
-
-def _as_array(value: Any) -> Any:
-    return value.numpy() if isinstance(value, Tensor) else value
-
-
-KINDS: Sequence[tuple[str, Callable[[Any], Any]]] = (
-    ("", _as_given),
-    ("it takes arrays of NumPy alone", _as_array),
-)
-"""what a solution may want its arguments to be, and what is then said of it"""
-PARAMETERS: Sequence[tuple[str, Callable[[Any], Any]]] = (
-    # Iterators, which can be gone through once, since that is what `module.parameters()` returns.
-    ("", lambda value: iter(value) if isinstance(value, list) else value),
-    ("", _as_given),
-    ("", lambda value: nn.ParameterList(value) if isinstance(value, list) else value),
-)
-"""what a solution that moves parameters may want: an iterator, a list, or a module"""
 
 
 def plain(value: Any) -> Any:
