@@ -5,8 +5,8 @@ from shlex import quote
 from typing import Literal, get_type_hints
 
 from lemniscate.algos import ALGORITHMS, find
+from lemniscate.cli import COMMANDS, EARLIER, SHELLS, Parser, flags_of, parser_of
 from lemniscate.cli.fields import algorithm_parser, explain
-from lemniscate.cli.parsers import COMMANDS, EARLIER, SHELLS, Parser, flags_of, parser_of
 from lemniscate.envs import registry
 from lemniscate.errors import unknown_name
 from lemniscate.nn.networks import NETWORKS
