@@ -8,7 +8,6 @@ from typing import Any
 
 from lemniscate.algos import ALGORITHMS
 from lemniscate.api import training
-from lemniscate.api.options import RunOptions
 from lemniscate.api.policy import TrainedRun
 from lemniscate.envs import registry
 from lemniscate.errors import UserError, is_installed, missing_extra, unknown_name
@@ -41,7 +40,7 @@ def train(
         registry.backend_class(str(config.backend))  # refuses one that is not there
         what = f"{name} on {config.num_envs} × {config.env}, backend {config.backend}"
         tell(f"{what}: preset {preset}, seed {config.seed}, {'compiled' if is_compiled(config) else 'not compiled'}")
-        trained = training.begin(name, config, run, RunOptions(**options))
+        trained = training.begin(name, config, run, options)
         if score:
             _say_score(trained)
         tell(f"Trained in {trained.seconds:.1f} s. Everything is in {trained.path}")
@@ -81,7 +80,7 @@ def resume(run: Path, total_steps: float | None, score: bool, **options: Any) ->
         resume_sweep(run, **{name: value for name, value in options.items() if name not in OF_ONE_RUN})
     else:
         changes = {} if total_steps is None else {"total_steps": total_steps}
-        trained = training.go_on(training.path_of(run), RunOptions(**options), changes)
+        trained = training.go_on(run, options, changes)
         if score:
             _say_score(trained)
         if not trained.seconds:  # it was finished, which has been said

@@ -58,7 +58,8 @@ def algorithm_parser(command: str, algorithm: str) -> Parser:
         group = parser.add_argument_group(title)
         own = [name for name in config.names() if name not in grouped] if title == "algorithm" else members.split()
         for name in filter(hints.__contains__, own):
-            kinds, kind = kinds_of(hints[name]), {"action": Read, "hint": hints[name]}
+            kinds = kinds_of(hints[name])
+            kind: dict[str, Any] = {"action": Read, "hint": hints[name]}
             if bool in kinds:
                 kind = {"action": argparse.BooleanOptionalAction}
             elif tuple in kinds:

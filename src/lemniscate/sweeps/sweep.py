@@ -17,7 +17,7 @@ from typing import Any
 
 from lemniscate.algos import ALGORITHMS, name_of
 from lemniscate.api import plots, training
-from lemniscate.api.options import RunOptions, require_importable
+from lemniscate.api.options import RunOptions, own_names, require_importable
 from lemniscate.api.policy import path_of
 from lemniscate.api.results import final_return
 from lemniscate.cluster.connection import Cluster
@@ -91,7 +91,7 @@ def train_sweep(
     if len({config.env for config in configs.values()}) > 1:
         raise UserError("These presets are for different environments; name the one of the whole sweep with env.")
     options = RunOptions(track, callbacks, report, progress, cluster=cluster, workers=workers)
-    there, words = options.find_cluster(), _words(options)
+    options.shared()
     require_trainable(configs, numbers)
     stem = f"{'-'.join(names)}-{len(numbers)}-seeds"
     path = path_of(run) if run is not None else training.fresh_directory(next(iter(configs.values())).env, stem)
@@ -99,7 +99,7 @@ def train_sweep(
     but_seed = {name: {k: v for k, v in record.items() if k != "seed"} for name, record in records.items()}
     runs = Sweep(path, numbers, but_seed)
     runs.create()
-    return _train(runs, words, progress, there)
+    return _train(runs, options)
 
 
 def resume_sweep(
@@ -114,20 +114,13 @@ def resume_sweep(
 ) -> TrainedSweep:
     """Resume an interrupted sweep: train the runs that are not finished or have not begun. See `resume`."""
     options = RunOptions(track, callbacks, report, progress, cluster=cluster, workers=workers)
-    return _train(read_sweep(path_of(path)), _words(options), progress, options.find_cluster())
+    return _train(read_sweep(path_of(path)), options)
 
 
-def _words(options: RunOptions) -> list[str]:
-    """The options of each run's process. Raises `UserError` for a tracker or a callback that it could not find."""
-    options.loggers()
-    options.functions()
-    return options.words()
-
-
-def _train(runs: Sweep, options: list[str], progress: bool, cluster: Cluster | None) -> TrainedSweep:
+def _train(runs: Sweep, options: RunOptions) -> TrainedSweep:
     with locked(runs.path):
         runs.create_runs()
-        failed = _Training(runs, options, progress, cluster).train()
+        failed = _Training(runs, options).train()
     if any(map(is_finished, runs.runs)):
         for picture in plots.plot(runs.path):
             say(picture)
@@ -222,15 +215,15 @@ class SetOfRuns(ABC):
 class _Training(SetOfRuns):
     """The runs of a sweep that are to be trained, and the sentences of those that failed."""
 
-    def __init__(self, runs: Sweep, options: list[str], progress: bool, cluster: Cluster | None) -> None:
-        super().__init__(runs.path, runs.configs.values(), cluster)
-        self._options = ["--score", *options]
+    def __init__(self, runs: Sweep, options: RunOptions) -> None:
+        super().__init__(runs.path, runs.configs.values(), options.cluster)
+        self._options = ["--score", *options.words()]
         self._waiting = [run for run in runs.runs if not is_finished(run)]
         self._failed: dict[str, str] = {}
         self._totals = {run: record["config"]["total_steps"] for run, record in runs.runs.items()}
         self._steps = {run: min(progress_of(run)[0], total) for run, total in self._totals.items()}
         self._ended = len(self._totals) - len(self._waiting)
-        self._bar = ProgressBar(sum(self._totals.values()), sum(self._steps.values()), progress)
+        self._bar = ProgressBar(sum(self._totals.values()), sum(self._steps.values()), options.progress)
 
     def train(self) -> dict[str, str]:
         """Train every run to its end; returns the sentences of those that failed. Raises `Stopped` after a signal."""
@@ -312,7 +305,7 @@ def seeds_of(seeds: str | int | Iterable[int]) -> list[int]:
 def require_trainable(configs: dict[str, RunConfig], seeds: list[int]) -> None:
     """Raise `UserError` where a run could not begin: one sentence now, instead of one from each run."""
     for name, config in configs.items():
-        require_importable(config)
+        require_importable(*own_names(config))
         device = device_for(config.device)
         for seed in seeds:
             config.replace(seed=seed)
