@@ -8,7 +8,7 @@ each of its runs ends in the same bits as if it had been trained alone. A search
 import re
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -158,6 +158,8 @@ class SetOfRuns(ABC):
         self._places = places_on(cluster, configs)
         self._stop_signal, self._told = 0, False
         """the signal that asked to stop, if one has; whether this was said"""
+        self._say: Callable[[str], object] = say
+        """says a line, if progress is shown"""
 
     @abstractmethod
     def _begin_runs(self) -> bool:
@@ -170,10 +172,6 @@ class SetOfRuns(ABC):
     @abstractmethod
     def _is_finished(self) -> bool:
         """Whether nothing is left to be done."""
-
-    @abstractmethod
-    def _say(self, text: str) -> None:
-        """Say a line, if progress is shown."""
 
     def _train_all(self) -> None:
         """Train the runs to their ends. Raises `Stopped` after a signal."""
@@ -224,6 +222,7 @@ class _Training(SetOfRuns):
         self._steps = {run: min(progress_of(run)[0], total) for run, total in self._totals.items()}
         self._ended = len(self._totals) - len(self._waiting)
         self._bar = ProgressBar(sum(self._totals.values()), sum(self._steps.values()), options.progress)
+        self._say = self._bar.say
 
     def train(self) -> dict[str, str]:
         """Train every run to its end; returns the sentences of those that failed. Raises `Stopped` after a signal."""
@@ -269,9 +268,6 @@ class _Training(SetOfRuns):
         else:
             sentence = self._failed[run.name] = failure_of(run, code)
         self._say(f"{run.name}: {sentence}")
-
-    def _say(self, text: str) -> None:
-        self._bar.say(text)
 
 
 def algorithms_of(names: str | Iterable[str]) -> list[str]:
