@@ -102,7 +102,7 @@ def evaluate(
                 raise UserError(f"{vec.spec.env_id} has no baseline to compare with.")
             return evaluate_policy(vec.baseline, vec, episodes, seed)
         if file:
-            scores = _show(player, vec, arguments, **how, video=file, tell=_nothing)
+            scores = _show(player, vec, arguments, **how, video=file, tell=str)
         elif isinstance(player, TrainedPolicy):
             critic = critic_of(player.networks, player.config)
             scores = evaluate_policy(player.module, vec, episodes, seed, deterministic, critic)
@@ -375,14 +375,10 @@ def _draw(player: Any, vec: VecEnv, arguments: dict[str, Any], how: dict[str, An
         return flight.draw_flights(act, vec, folder, how["episodes"], film=True, seed=how["seed"])[:-1]
     try:
         film = folder / "videos" / "episode.gif"
-        _show(player, vec, arguments, **{**how, "episodes": 1}, video=film, tell=_nothing)
+        _show(player, vec, arguments, **{**how, "episodes": 1}, video=film, tell=str)
     except Exception as error:  # whatever a renderer raises
         say(f"No film: {error}")
     return []
-
-
-def _nothing(_text: str) -> None:
-    """Say nothing."""
 
 
 def push(run: Trained, name: str, *, private: bool = False, license: str | None = None, trust: bool = False) -> str:

@@ -65,6 +65,7 @@ USAGES = {
 }
 """of the commands whose usage says more than argparse would"""
 
+POLICY = "a run, a checkpoint or hf://user/name; or a .pt file or module:policy, with --env"
 OPTIONS: list[tuple[str, str, str, Any]] = [
     ("train tune", "--env ID", "environment id, or module:Class of your own", None),
     ("train", "--run DIR", "run directory; must not exist [runs/…]", None),
@@ -91,18 +92,8 @@ OPTIONS: list[tuple[str, str, str, Any]] = [
     ("evaluate watch export", "--trust", "import the code (module:name) that a policy from hf:// names", False),
     ("evaluate watch export", "--checkpoint STEP", "best (see --keep-best), or a step [the newest]", None),
     ("export", "run RUN", "a run, a checkpoint or hf://user/name", None),
-    (
-        "evaluate",
-        "policy RUN",
-        "a run, a checkpoint or hf://user/name; or a .pt file or module:policy, with --env",
-        None,
-    ),
-    (
-        "watch",
-        "policy [RUN]",
-        "a run, a checkpoint or hf://user/name; or a .pt file or module:policy, with --env",
-        None,
-    ),
+    ("evaluate", "policy RUN", POLICY, None),
+    ("watch", "policy [RUN]", POLICY, None),
     ("evaluate watch", "--agent NAME", "module:Class that the weights of a .pt file are of [a course's]", None),
     ("evaluate watch", "--[no-]normalized-actions", "a .pt file acts in [-1, 1] [as it flies better]", None),
     ("preflight", "run RUN", "a run", None),

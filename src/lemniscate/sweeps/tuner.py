@@ -40,7 +40,6 @@ from lemniscate.system.console import say
 if TYPE_CHECKING:
     import optuna
 
-Trials = Annotated[int, Range(1, 10_000)]
 SEEDS = "101-103"
 """of a search, none of which any result of this project was evaluated with"""
 EPISODES = 50
@@ -93,7 +92,7 @@ def tune(
         raise UserError(f"{name} follows from the search: at the end of each part of a run trials are compared.")
     algorithm = name_of(algorithm)
     config = training.config_for(algorithm, env, preset, **fields)
-    trials = checked("trials", trials, Trials)
+    trials = checked("trials", trials, Annotated[int, Range(1, 10_000)])
     config = config.replace(
         checkpoint_every=-(-config.total_steps // NINTHS),
         evaluate_every=config.total_steps,
