@@ -66,8 +66,7 @@ def read_weights(file: Path, spec: Spec, agent: Any = None) -> tuple[Any, list[T
         agent: what takes the weights: a class that is made with the environments or without arguments, a function, or
             a module; its name; or None, for the layouts of the courses, whose widths and depths the weights tell.
 
-    Raises:
-        UserError: a file that cannot be read, of another layout, or for other sizes.
+    Raises `UserError` for a file that cannot be read, of another layout, or for other sizes.
     """
     try:
         with torch.serialization.safe_globals(ARRAYS):
@@ -212,9 +211,6 @@ class Agent:
         flat: some observations [N, O], by which it is found out how the policy is called, and whether it remembers.
         deterministic: passed on where it is taken; of a distribution the mode, else a sample.
         normalized: whether its actions are in [-1, 1] between the bounds, or else in the environment's units.
-
-    Raises:
-        UserError: nothing works.
     """
 
     def __init__(self, policy: Any, spec: Spec, flat: np.ndarray, deterministic: bool, normalized: bool) -> None:

@@ -52,38 +52,37 @@ class PolicySnapshot(TrainedPolicy):
     A callback may keep a policy that it has used. One that it has not used raises `UserError` later.
     """
 
-    def __init__(self, copy_networks: Callable[[], Any], spec: Spec, config: RunConfig, step: int) -> None:
+    def __init__(self, state: TrainState, spec: Spec, config: RunConfig, step: int) -> None:
         self.spec, self.config, self.step = spec, config, step
-        self._copy_networks = copy_networks
+        self._state: TrainState | None = state
 
     @cached_property
     def networks(self) -> Any:
-        """The copy."""
-        return self._copy_networks().eval()
+        """The copy, on the CPU."""
+        if self._state is None:
+            why = "was not used while its callback ran, and the run has changed since"
+            raise UserError(f"This policy {why}; use it there.")
+        networks = self.config.networks(self.spec)
+        networks.load_state_dict(self._state.networks.state_dict())
+        return networks.eval()
 
-    def __getstate__(self) -> dict[str, Any]:  # of a copy: a function of this process cannot be pickled
-        return {**vars(self), "networks": self.networks, "_copy_networks": _too_late}
+    def __getstate__(self) -> dict[str, Any]:  # of a copy: the run goes on with the state
+        return {**vars(self), "networks": self.networks, "_state": None}
 
     def expire(self) -> None:
         """Refuse to copy the weights from now on: the run goes on to change them."""
-        self._copy_networks = _too_late
+        self._state = None
 
 
 def call_callbacks(
     functions: Sequence[Callback],
-    copy_networks: Callable[[TrainState], Any],
     spec: Spec,
     config: RunConfig,
     attend: Callable[[int, Mapping[str, float]], None] | None,
 ) -> Observer:
     """The function that a run calls after each logged line: every callback in turn, each with a policy of its own.
 
-    Args:
-        functions: the callbacks.
-        copy_networks: networks on the CPU that share nothing with those of the state.
-        spec: of the policy.
-        config: of the run.
-        attend: called before them with the step and the metrics of each line that has signals.
+    Before them `attend` gets the step and the metrics of a line that has signals.
     """
 
     def observe(lines: Sequence[tuple[int, Mapping[str, float]]], state: TrainState) -> bool:
@@ -92,7 +91,7 @@ def call_callbacks(
             if attend and "reward/largest" in metrics:
                 attend(step, metrics)
             for function in functions:
-                policy = PolicySnapshot(lambda: copy_networks(state), spec, config, step)
+                policy = PolicySnapshot(state, spec, config, step)
                 said = function(step, MappingProxyType(dict(metrics)), policy)
                 if not isinstance(said, bool | np.bool_ | None):
                     raise UserError(
@@ -105,10 +104,6 @@ def call_callbacks(
     return observe
 
 
-def _too_late() -> Any:
-    raise UserError("This policy was not used while its callback ran, and the run has changed since; use it there.")
-
-
 SECONDS_TO_END = 10
 """that the processes have to end by themselves, once one has ended or the launcher was asked to stop"""
 
@@ -116,8 +111,7 @@ SECONDS_TO_END = 10
 class RunOptions:
     """The arguments of `train` and `resume` that are not saved with the run, which describes them; made at the door.
 
-    Raises:
-        UserError: a tracker, a callback or a cluster that is not there, or what is none.
+    Raises `UserError` for a tracker, a callback or a cluster that is not there, or what is none.
     """
 
     def __init__(

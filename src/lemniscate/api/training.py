@@ -15,6 +15,7 @@ import torch
 from lemniscate import algos, presets
 from lemniscate.api.options import (
     Callback,
+    PolicySnapshot,
     RunOptions,
     call_callbacks,
     own_names,
@@ -277,20 +278,15 @@ def _train(world: World, path: Path, algorithm: str, config: RunConfig, options:
     envs = envs_of(config, world)
     spec = envs[0].spec
 
-    def copy_networks(state: TrainState) -> Any:
-        networks = config.networks(spec)
-        networks.load_state_dict(state.networks.state_dict())
-        return networks
-
     def film(state: TrainState) -> None:
         from lemniscate.api.results import evaluate
 
         file = path / "videos" / f"step-{state.step}.{'mp4' if is_installed('imageio_ffmpeg') else 'gif'}"
         make_directory(file.parent)
-        evaluate(TrainedPolicy(copy_networks(state), spec, config, state.step), episodes=1, video=file)
+        evaluate(PolicySnapshot(state, spec, config, state.step), episodes=1, video=file)
 
     attend, callbacks = Attendance(config) if progress else None, options.callbacks
-    observer = call_callbacks(callbacks, copy_networks, spec, config, attend) if callbacks or attend else None
+    observer = call_callbacks(callbacks, spec, config, attend) if callbacks or attend else None
     surroundings = {"loggers": options.loggers, "progress": progress, "film": film, "observer": observer}
     run = Run(path, algorithm, config, envs, world=world, locate=local_path, **surroundings)
     pictures: list[Path] = []

@@ -151,21 +151,22 @@ PATHS = ("RUN", "RUN …", "DIR", "FILE", "FOLDER")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
     atexit.register(gc.freeze)  # else the interpreter spends a second on looking through torch for what to free
-    given = argparse.Namespace(command=None)
+    command = None
     if "RANK" in os.environ:  # torch has whole pages to say of a connection that ends
         os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "ERROR")
     try:
-        given = parse(sys.argv[1:] if arguments is None else arguments)
+        options = vars(parse(sys.argv[1:] if arguments is None else arguments))
+        command = options.pop("command")
         from lemniscate.cli import commands  # imports torch
 
-        getattr(commands, given.command)(**{name: value for name, value in vars(given).items() if name != "command"})
+        getattr(commands, command)(**options)
     except SystemExit as done:  # argparse has printed help, or the version
         return int(done.code or 0)
     except BaseException as error:
         code = exit_code(error)
         if code is None:
             raise
-        say(sentence(error, given.command))
+        say(sentence(error, command))
         return code
     return 0
 

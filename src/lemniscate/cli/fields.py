@@ -26,8 +26,7 @@ GROUPS = {
 def parse_fields(command: str, algorithms: list[str], words: list[str]) -> argparse.Namespace:
     """The options in `words`, for all of `algorithms`; the fields of their Configs as a dictionary `fields`.
 
-    Raises:
-        UserError: a flag that one of the algorithms does not have, or a value that cannot be read.
+    Raises `UserError` for a flag that one of the algorithms does not have, or a value that cannot be read.
     """
     fields: dict[str, Any] = {}
     options: dict[str, Any] = {}

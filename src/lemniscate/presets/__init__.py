@@ -88,11 +88,7 @@ def choose(algorithm: str, env_id: str | None, name: str | None) -> tuple[str, R
 
 
 def read_preset(file: Path, algorithm: str) -> Preset:
-    """The preset that `Preset.write` has stored.
-
-    Raises:
-        UserError: no such file, or that of another algorithm.
-    """
+    """The preset that `Preset.write` has stored. Raises `UserError` for no such file, or that of another algorithm."""
     try:
         record = read_json(file)
     except DamagedFileError as error:

@@ -107,11 +107,7 @@ def read_texts(search: object) -> dict[str, str]:
 
 
 def read_space(texts: Mapping[str, str], config: RunConfig) -> Space:
-    """The ranges that the texts stand for.
-
-    Raises:
-        UserError: a field that the Config does not have or a search cannot change, or a range that it has no room for.
-    """
+    """The ranges that the texts stand for. Raises `UserError` for what a search cannot change, or has no room for."""
     hints, space = get_type_hints(type(config), include_extras=True), Space()
     for name, text in texts.items():
         if name not in hints:
