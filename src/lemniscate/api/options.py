@@ -132,8 +132,8 @@ class RunOptions:
 
             self.cluster = find_cluster(cluster, workers, storage)
         self.loggers = (JsonLines, TensorBoard, *([] if track is None else [_tracker(track)]))
-        several = callbacks if isinstance(callbacks, list | tuple) else [callbacks] if callbacks else []
-        self._names = list[Any](several)
+        several: Any = callbacks if isinstance(callbacks, list | tuple) else [callbacks] if callbacks else []
+        self._names = list(several)
         self.callbacks: list[Callback] = [_by_name(one) if isinstance(one, str) else one for one in several]
         for function in self.callbacks:
             if not named.takes(function, 3):
@@ -213,7 +213,7 @@ def train_in_processes(path: Path, algorithm: str, config: RunConfig, options: R
     from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 
     logging.disable(logging.ERROR)
-    config = LaunchConfig(
+    launched = LaunchConfig(
         min_nodes=1,
         max_nodes=1,
         nproc_per_node=processes,
@@ -228,7 +228,7 @@ def train_in_processes(path: Path, algorithm: str, config: RunConfig, options: R
     os.environ[OWNED] = f"/proc/{os.getpid()}/fd/{reading}"
     os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))
     try:
-        elastic_launch(config, sys.executable)("-m", "lemniscate", *words)
+        elastic_launch(launched, sys.executable)("-m", "lemniscate", *words)
     except SignalException as stopped:
         raise Stopped("", stopped.sigval) from None
     except ChildFailedError as failed:

@@ -84,7 +84,7 @@ OPTIONS: list[tuple[str, str, str, Any]] = [
     ("train resume", "--processes INT", "processes of this machine for one run [1]", 1),
     ("train resume tune", "--cluster ray[=ADDRESS]", "train on Ray: --workers INT [--storage DIR]", None),
     ("train resume tune", "--workers INT", argparse.SUPPRESS, None),
-    ("train resume", "--storage NAME", argparse.SUPPRESS, None),
+    ("train resume tune", "--storage NAME", argparse.SUPPRESS, None),
     ("train resume tune", "--quiet", "no progress on standard error", True),
     ("train resume", "--report", "evaluate the policy, draw plots and videos", False),
     ("train resume", "--score", "store the final return over 100 episodes", False),
@@ -139,12 +139,11 @@ OPTIONS: list[tuple[str, str, str, Any]] = [
 A flag whose default is True turns that off. What an option is called here or in `KEYWORDS` is the argument in Python.
 """
 
-KEYWORDS = {"--env-args": "env_kwargs", "--quiet": "progress"}
-KEYWORDS |= dict.fromkeys(("--stochastic", "--sample"), "deterministic")
+KEYWORDS = dict.fromkeys(("--stochastic", "--sample"), "deterministic")
+KEYWORDS |= {"--env-args": "env_kwargs", "--quiet": "progress"}
 
-KINDS: dict[str, Any] = dict.fromkeys(("INT", "STEP"), int) | {"JSON": dict, "NAME …": tuple[str, ...]}
-KINDS["FUNCTION …"] = tuple[str, ...]
-PATHS = ("RUN", "RUN …", "DIR", "FILE", "FOLDER")
+KINDS = {"INT": int, "STEP": int, "JSON": dict}
+PATHS = ("RUN", "DIR", "FILE", "FOLDER")
 """what stands for a path; Ray's storage may also be the address of one in a cloud"""
 
 
@@ -222,11 +221,14 @@ class Parser(argparse.ArgumentParser):
             action = argparse.BooleanOptionalAction if "[no-]" in name else switch
             self.add_argument(name.replace("[no-]", ""), action=action, **shared)
             return
-        kind = metavar.strip("[]")
-        if kind != metavar or metavar.endswith("…"):
-            shared["nargs"] = "+" if kind == metavar else "?"
-        shared |= {"type": at_home} if kind in PATHS else {"action": Read, "hint": KINDS.get(kind, str)}
-        self.add_argument(name, metavar=kind.removesuffix(" …"), **shared)
+        kind, several = metavar.removesuffix(" …"), metavar.endswith(" …")
+        if metavar.startswith("["):
+            kind, shared["nargs"] = metavar.strip("[]"), "?"
+        elif several:
+            shared["nargs"] = "+"
+        hint = tuple[str, ...] if several else KINDS.get(kind, str)
+        shared |= {"type": at_home} if kind in PATHS else {"action": Read, "hint": hint}
+        self.add_argument(name, metavar=kind, **shared)
 
 
 class Read(argparse.Action):

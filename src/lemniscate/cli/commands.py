@@ -61,7 +61,7 @@ def tune(algorithm: str, env: str | None, search: str | None, fields: dict[str, 
 
     if search is None:
         raise UserError("Search what? Name fields with their ranges: --search 'learning_rate=log:1e-4:1e-2'.")
-    options.pop("unnamed")
+    del options["unnamed"], options["storage"]
     tell(f"Everything is in {tune(algorithm, env, search=search, **options, **fields).path}")
 
 
