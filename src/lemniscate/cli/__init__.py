@@ -33,9 +33,6 @@ from lemniscate.run.fields import read
 from lemniscate.system.console import say, talks
 from lemniscate.system.files import at_home
 
-FAILURES = (NonFiniteError, WorkerError, NotStoredError, RankError, SweepError, MemoryError)
-"""what training ends with that is neither the user's mistake nor ours"""
-
 EARLIER = {"check": "doctor"}
 """names that commands had, which still work"""
 
@@ -162,39 +159,35 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except SystemExit as done:  # argparse has printed help, or the version
         return int(done.code or 0)
     except BaseException as error:
-        code = exit_code(error)
-        if code is None:
+        ended = ending(error, command)
+        if ended is None:
             raise
-        say(sentence(error, command))
+        code, sentence = ended
+        say(sentence)
         return code
     return 0
 
 
-def exit_code(error: BaseException) -> int | None:
-    """The exit code for what ended a command; None for a mistake of our own."""
-    if isinstance(error, KeyboardInterrupt):
-        return 128 + getattr(error, "signum", 2)
+def ending(error: BaseException, command: str | None) -> tuple[int, str] | None:
+    """The exit code and the sentence for what ended a command; None for a mistake of our own.
+
+    The sentence is empty where another process of the run says it.
+    """
     if isinstance(error, BrokenPipeError):  # whoever read the output has read enough
-        return 141
+        return 141, ""
     if isinstance(error, UserError):
-        return 2
-    return 1 if isinstance(error, FAILURES) or (isinstance(error, OSError) and error.errno is not None) else None
-
-
-def sentence(error: BaseException, command: str | None) -> str:
-    """The message of an error; empty if another process of the run prints it."""
-    if isinstance(error, BrokenPipeError) or (isinstance(error, UserError) and not talks()):
-        return ""
-    ended = isinstance(error, NonFiniteError | WorkerError | RankError) and command in ("train", "resume")
-    if ended and str(error):
-        return f"{error} Training stopped; the last checkpoint is as it was."
+        return 2, str(error) if talks() else ""
     if isinstance(error, KeyboardInterrupt):  # a run that was asked to stop has a sentence of its own
-        return str(error) or ("" if hasattr(error, "signum") else "Interrupted.")
+        signum = getattr(error, "signum", None)
+        return 128 + (signum or 2), str(error) or ("Interrupted." if signum is None else "")
     if isinstance(error, MemoryError):
-        return str(error) or "The memory is full: choose smaller numbers."
-    if isinstance(error, OSError):  # a disk that is full, a folder that cannot be written
-        return f"{error.filename or 'A file could not be written'}: {error.strerror}."
-    return str(error)
+        return 1, str(error) or "The memory is full: choose smaller numbers."
+    if isinstance(error, OSError) and error.errno is not None:  # a disk that is full, a folder that cannot be written
+        return 1, f"{error.filename or 'A file could not be written'}: {error.strerror}."
+    if isinstance(error, NonFiniteError | WorkerError | RankError):
+        stopped = " Training stopped; the last checkpoint is as it was." if command in ("train", "resume") else ""
+        return 1, f"{error}{stopped}" if str(error) else ""
+    return (1, str(error)) if isinstance(error, NotStoredError | SweepError) else None
 
 
 class Parser(argparse.ArgumentParser):
