@@ -214,8 +214,8 @@ class _Training(SetOfRuns):
     """The runs of a sweep that are to be trained, and the sentences of those that failed."""
 
     def __init__(self, runs: Sweep, options: RunOptions) -> None:
-        super().__init__(runs.path, runs.configs.values(), options.cluster)
         self._options = ["--score", *options.words()]
+        super().__init__(runs.path, runs.configs.values(), options.cluster)
         self._waiting = [run for run in runs.runs if not is_finished(run)]
         self._failed: dict[str, str] = {}
         self._totals = {run: record["config"]["total_steps"] for run, record in runs.runs.items()}
