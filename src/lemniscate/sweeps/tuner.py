@@ -179,9 +179,8 @@ class _Tuner(SetOfRuns):
     def _queue(self, trial: _Trial) -> None:
         """Let the runs of a trial wait for a place, in which they go on to its next rung, or to their end."""
         until = self._search.rungs[trial.rung]
-        trial.waiting = [
-            run for run in trial.sweep.runs if not (progress_of(run)[0] >= until if until else is_finished(run))
-        ]
+        has_come = is_finished if until is None else lambda run: progress_of(run)[0] >= until
+        trial.waiting = [run for run in trial.sweep.runs if not has_come(run)]
 
     def _begin_runs(self) -> bool:
         """Compare the trials that have come to a rung, then start runs: those of the trials that are furthest first."""
