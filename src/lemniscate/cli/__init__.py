@@ -136,8 +136,8 @@ OPTIONS: list[tuple[str, str, str, Any]] = [
 A flag whose default is True turns that off. What an option is called here or in `KEYWORDS` is the argument in Python.
 """
 
-KEYWORDS = dict.fromkeys(("--stochastic", "--sample"), "deterministic")
-KEYWORDS |= {"--env-args": "env_kwargs", "--quiet": "progress"}
+KEYWORDS = {"--env-args": "env_kwargs", "--quiet": "progress"}
+KEYWORDS |= {"--stochastic": "deterministic", "--sample": "deterministic"}
 
 KINDS = {"INT": int, "STEP": int, "JSON": dict}
 PATHS = ("RUN", "DIR", "FILE", "FOLDER")
