@@ -332,7 +332,9 @@ def _parse_algorithm(command: str, words: list[str]) -> argparse.Namespace:
     from lemniscate.cli.fields import parse_fields  # imports torch
 
     given = parse_fields(command, names, words[1:])
-    given.unnamed = unnamed
+    if unnamed and talks():
+        why = "takes every kind of actions and, mostly, needs the fewest minutes"
+        say(f"No algorithm is named: {RECOMMENDED} {why}.")
     return given
 
 

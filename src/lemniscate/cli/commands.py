@@ -28,13 +28,9 @@ def train(
     fields: dict[str, Any],
     seeds: str | None,
     score: bool,
-    unnamed: bool,
     **options: Any,
 ) -> None:
     """Train one policy, or with --seeds one for each algorithm and seed, and compare them."""
-    if unnamed:
-        why = "takes every kind of actions and, mostly, needs the fewest minutes"
-        tell(f"No algorithm is named: {algorithm} {why}.")
     if seeds is None and "," not in algorithm:
         name, preset, config = training.choose_config(algorithm, env, preset, fields)
         registry.backend_class(str(config.backend))  # refuses one that is not there
@@ -61,7 +57,7 @@ def tune(algorithm: str, env: str | None, search: str | None, fields: dict[str, 
 
     if search is None:
         raise UserError("Search what? Name fields with their ranges: --search 'learning_rate=log:1e-4:1e-2'.")
-    del options["unnamed"], options["storage"]
+    del options["storage"]  # the runs of a set come back to where it was begun
     tell(f"Everything is in {tune(algorithm, env, search=search, **options, **fields).path}")
 
 
