@@ -13,8 +13,7 @@ from PIL import Image
 import lemniscate as lem
 from conftest import tiny_fields
 from lemniscate.algos import find
-from lemniscate.cli import main, parse
-from lemniscate.cli.parsers import algorithms
+from lemniscate.cli import algorithms, main, parse
 from lemniscate.envs import registry
 from lemniscate.errors import UserError
 from lemniscate.run.fields import read
@@ -228,7 +227,7 @@ def test_stochastic_means_the_same_in_evaluate_and_watch(run, capsys):
         returns.append(json.loads(capsys.readouterr().out)["returns"])
     assert returns[0] != returns[1]
     given = [parse(["watch", "r", *words]) for words in ([], ["--stochastic"], ["--sample"])]
-    assert [one.stochastic or one.sample for one in given] == [False, True, True]
+    assert [one.deterministic for one in given] == [True, False, False]
 
 
 @pytest.mark.parametrize(

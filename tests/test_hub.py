@@ -152,7 +152,7 @@ def test_the_card_shows_files_that_are_there_and_lines_that_work(run, pushed, se
     scope = {}
     exec(load, scope)
     assert scope["policy"].step == run.policy.step
-    assert parse(evaluate.split()[1:]).run.as_posix() == "hf:/" + NAME
+    assert parse(evaluate.split()[1:]).policy.as_posix() == "hf:/" + NAME
     again = parse(train.split()[1:])
     assert lem.config_for(again.algorithm, again.env, again.preset, **again.fields) == run.policy.config
 

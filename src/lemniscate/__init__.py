@@ -3,6 +3,8 @@
 Names are imported at their first use, so that `import lemniscate` and `lemniscate --help` do not wait for torch.
 """
 
+# ruff: noqa: F401 (type checkers look for the names here)
+
 from importlib import import_module
 from importlib.util import find_spec
 from typing import TYPE_CHECKING
@@ -10,37 +12,20 @@ from typing import TYPE_CHECKING
 __version__ = "0.2.0"
 
 if TYPE_CHECKING:
-    from lemniscate.api.plots import plot as plot
-    from lemniscate.api.policy import TrainedPolicy as TrainedPolicy
-    from lemniscate.api.policy import TrainedRun as TrainedRun
-    from lemniscate.api.policy import load as load
-    from lemniscate.api.policy import save as save
-    from lemniscate.api.results import check as check
-    from lemniscate.api.results import diagnose as diagnose
-    from lemniscate.api.results import evaluate as evaluate
-    from lemniscate.api.results import push as push
-    from lemniscate.api.results import watch as watch
-    from lemniscate.api.training import config_for as config_for
-    from lemniscate.api.training import resume as resume
-    from lemniscate.api.training import train as train
-    from lemniscate.envs.vector_view import make_vec as make_vec
-    from lemniscate.errors import NonFiniteError as NonFiniteError
-    from lemniscate.errors import NotStoredError as NotStoredError
-    from lemniscate.errors import SweepError as SweepError
-    from lemniscate.errors import UserError as UserError
-    from lemniscate.exporting.export import export as export
-    from lemniscate.margins.preflight import Preflight as Preflight
-    from lemniscate.margins.preflight import preflight as preflight
-    from lemniscate.run.environments import make_envs as make_envs
-    from lemniscate.run.evaluate import Evaluation as Evaluation
-    from lemniscate.run.seeding import set_seeds as set_seeds
-    from lemniscate.run.stopping import Stopped as Stopped
-    from lemniscate.sweeps.sweep import TrainedSweep as TrainedSweep
-    from lemniscate.sweeps.sweep import resume_sweep as resume_sweep
-    from lemniscate.sweeps.sweep import train_sweep as train_sweep
-    from lemniscate.sweeps.tuner import Tuned as Tuned
-    from lemniscate.sweeps.tuner import resume_tuning as resume_tuning
-    from lemniscate.sweeps.tuner import tune as tune
+    from lemniscate.api.plots import plot
+    from lemniscate.api.policy import TrainedPolicy, TrainedRun, load, save
+    from lemniscate.api.results import check, diagnose, evaluate, push, watch
+    from lemniscate.api.training import config_for, resume, train
+    from lemniscate.envs.vector_view import make_vec
+    from lemniscate.errors import NonFiniteError, NotStoredError, SweepError, UserError
+    from lemniscate.exporting.export import export
+    from lemniscate.margins.preflight import Preflight, preflight
+    from lemniscate.run.environments import make_envs
+    from lemniscate.run.evaluate import Evaluation
+    from lemniscate.run.seeding import set_seeds
+    from lemniscate.run.stopping import Stopped
+    from lemniscate.sweeps.sweep import TrainedSweep, resume_sweep, train_sweep
+    from lemniscate.sweeps.tuner import Tuned, resume_tuning, tune
 
 MODULES = {
     "api.plots": ("plot",),

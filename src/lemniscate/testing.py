@@ -70,9 +70,9 @@ def check_seeds(algorithm: str | ModuleType, folder: Path, **settings: Any) -> N
     """The seed determines the run: the same one gives the same bits, another one others."""
     again = {"seed": 1, **settings}
     runs = [training.train(algorithm, run=folder / f"run-{i}", progress=False, **again).path for i in range(2)]
-    assert _same(*map(_last_checkpoint, runs)), "Two runs with the same seed end in different bits."
+    assert not _difference(*map(_last_checkpoint, runs)), "Two runs with the same seed end in different bits."
     other = training.train(algorithm, run=folder / "other", progress=False, **{**again, "seed": again["seed"] + 1}).path
-    assert not _same(_last_checkpoint(runs[0]), _last_checkpoint(other)), "Another seed ends in the same bits."
+    assert _difference(_last_checkpoint(runs[0]), _last_checkpoint(other)), "Another seed ends in the same bits."
 
 
 def check_resume(algorithm: str | ModuleType, folder: Path, **settings: Any) -> None:
@@ -151,10 +151,6 @@ ALGORITHM_CONTRACT = (check_names, check_training, check_seeds, check_resume)
 def _last_checkpoint(path: Path) -> checkpoint.Checkpoint:
     last = checkpoint.list_steps(path / "checkpoints")[-1]
     return checkpoint.read(path / "checkpoints" / f"step-{last}")
-
-
-def _same(one: checkpoint.Checkpoint, other: checkpoint.Checkpoint) -> bool:
-    return _difference(one, other) is None
 
 
 def _difference(one: checkpoint.Checkpoint, other: checkpoint.Checkpoint) -> str | None:

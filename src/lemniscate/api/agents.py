@@ -6,7 +6,7 @@ import pickle
 import re
 import traceback
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from inspect import signature
 from itertools import product
@@ -66,8 +66,7 @@ def read_weights(file: Path, spec: Spec, agent: Any = None) -> tuple[Any, list[T
         agent: what takes the weights: a class that is made with the environments or without arguments, a function, or
             a module; its name; or None, for the layouts of the courses, whose widths and depths the weights tell.
 
-    Raises:
-        UserError: a file that cannot be read, of another layout, or for other sizes.
+    Raises `UserError` for a file that cannot be read, of another layout, or for other sizes.
     """
     try:
         with torch.serialization.safe_globals(ARRAYS):
@@ -154,15 +153,8 @@ def _remedy(size: int, spec: Spec) -> str:
     return f"; --env-args '{{\"n_samples\": {points + more}}}' fits" if fits else ""
 
 
-METHODS = (
-    "act",
-    "predict",
-    "get_action",
-    "select_actions",
-    "select_action",
-    "action_and_value",
-    "get_action_and_value",
-)
+METHODS = ("act", "predict", "get_action", "select_actions", "select_action")
+METHODS += ("action_and_value", "get_action_and_value")
 """what libraries and courses call the method from observations to actions"""
 
 
@@ -185,8 +177,11 @@ def find(policy: Any, *, checkpoint: str | int | None = None, trust: bool = Fals
     return policy
 
 
-def function_of(policy: Any) -> Callable[..., Any]:
-    """The method of a known name that a policy acts by, or itself. Raises `UserError` where it has neither."""
+def function_of(policy: Any, deterministic: bool = True) -> partial[Any]:
+    """The method of a known name that a policy acts by, or itself; it is told `deterministic` where it takes that.
+
+    Raises `UserError` where it has neither.
+    """
     if isinstance(policy, type):
         raise UserError(f"{policy.__name__} is a class: give an object of it, with the weights that are to act.")
     if isinstance(policy, Policy):
@@ -197,17 +192,10 @@ def function_of(policy: Any) -> Callable[..., Any]:
         raise UserError(f"A policy is {what}; not {shown(policy)}.")
     if not named.takes(function, 1):
         raise UserError(f"A policy that is a function takes one observation; {shown(policy)} does not.")
-    return function
-
-
-def _function(policy: Any, deterministic: bool) -> partial[Any]:
-    """`function_of` a policy, which is told `deterministic` where it takes that."""
-    function = function_of(policy)
-    try:
-        takes = "deterministic" in signature(function).parameters
-    except ValueError:  # a function that is not written in Python
-        takes = False
-    return partial(function, **({"deterministic": deterministic} if takes else {}))
+    with suppress(ValueError):  # a function that is not written in Python
+        if "deterministic" in signature(function).parameters:
+            return partial(function, deterministic=deterministic)
+    return partial(function)
 
 
 class Agent:
@@ -220,23 +208,23 @@ class Agent:
     Args:
         policy: as `find` returns it.
         spec: of the environment.
+        flat: some observations [N, O], by which it is found out how the policy is called, and whether it remembers.
         deterministic: passed on where it is taken; of a distribution the mode, else a sample.
         normalized: whether its actions are in [-1, 1] between the bounds, or else in the environment's units.
     """
 
-    def __init__(self, policy: Any, spec: Spec, deterministic: bool, normalized: bool) -> None:
+    def __init__(self, policy: Any, spec: Spec, flat: np.ndarray, deterministic: bool, normalized: bool) -> None:
         self.normalized, self.remembers = normalized, False
         self._policy, self._spec, self._deterministic = policy, spec, deterministic
         self._space: Any = action_space(spec.action)
-        self._form: Callable[[np.ndarray], Any] = self._flat
-        self._batched = True
-        self._function = _function(policy, deterministic)
+        self._function = function_of(policy, deterministic)
+        self._look(flat)
 
     def __call__(self, obs: Tensor) -> Deterministic:
         """The action at each flat observation, [N, O] or more. Raises `UserError` for what is no action."""
-        action, count = self._answers(self._form(obs.numpy()), len(obs)), len(obs)
+        action = self._answers(self._form(obs.numpy()), len(obs))
         if self.normalized and isinstance(self._spec.action, Box):
-            return Deterministic(torch.from_numpy(action.reshape(count, -1).astype(np.float32)))
+            return Deterministic(torch.from_numpy(action.reshape(len(obs), -1).astype(np.float32)))
         return Deterministic(torch.from_numpy(normalized_action(action, self._spec.action)))
 
     def act(self, obs: Any, action_mask: Any = None) -> np.ndarray:
@@ -250,13 +238,14 @@ class Agent:
             return self._answer(rows, (count,))
         return np.stack([self._answer(row_of(rows, i), ()) for i in range(count)])
 
-    def look(self, flat: np.ndarray) -> None:
-        """Find out how the policy is called, by some of the observations [N, O], and whether it remembers.
+    def _look(self, flat: np.ndarray) -> None:
+        """Find out how the policy is called.
 
         A batch has a size that is in no shape of the spaces, so what has that size is an answer to a batch. What has no
-        network gets one at a time first: a batch might spoil what it remembers. Raises `UserError` where nothing works.
+        network gets one at a time first: a batch might spoil what it remembers.
         """
-        parts, network = self._spec.observation_parts, _has_network(self._policy)
+        parts, holder = self._spec.observation_parts, getattr(self._policy, "__self__", self._policy)
+        network = any(isinstance(part, nn.Module) for part in (holder, *getattr(holder, "__dict__", {}).values()))
         sizes = {self._spec.observation_size, len(parts), getattr(self._space, "n", 0), *self._space.shape}
         sizes |= {length for part in parts for length in part.own_shape + part.shape}
         size = next(number for number in range(3, 1000, 2) if number not in sizes)
@@ -269,8 +258,8 @@ class Agent:
                 self.remembers = (
                     again is None or not np.array_equal(first, again) or before != (before and _memory(self._policy))
                 )
-                if isinstance(self._spec.action, Box) and not (batched or self.remembers):  # that would have shown
-                    self._batched = True
+                if isinstance(self._spec.action, Box) and not (batched or self.remembers):
+                    self._batched = True  # it would have shown that it remembers
                     together = self._try(some, failures)
                     self._batched = together is not None and np.allclose(together[0], first[0], rtol=1e-3, atol=1e-5)
                 return
@@ -291,14 +280,9 @@ class Agent:
         if isinstance(self._policy, nn.Module):
             tensors = (*self._policy.parameters(), *self._policy.buffers())
             kinds.insert(0, next((tensor for tensor in tensors if tensor.is_floating_point()), torch.zeros(0)))
-        for layout, kind in product((self._own, self._flat), kinds):
+        own = partial(unflatten_observation, self._spec.observation_parts)
+        for layout, kind in product((own, lambda flat: flat[:, : self._spec.observation_size]), kinds):
             yield lambda flat, layout=layout, kind=kind: _copied(layout(flat), kind)
-
-    def _own(self, flat: np.ndarray) -> Any:
-        return unflatten_observation(self._spec.observation_parts, flat)
-
-    def _flat(self, flat: np.ndarray) -> np.ndarray:
-        return flat[:, : self._spec.observation_size]
 
     def _answer(self, rows: Any, leads: tuple[int, ...]) -> np.ndarray:
         """The actions at observations [*leads, …], float64. Raises `UserError` with what the policy raised."""
@@ -306,10 +290,9 @@ class Agent:
             with torch.set_grad_enabled(not isinstance(self._policy, nn.Module)):  # a function may plan by gradients
                 returned = self._function(rows)
         except Exception as error:
-            frames = [
-                one for one in traceback.extract_tb(error.__traceback__)[1:] if "site-packages" not in one.filename
-            ]
-            where = f" ({Path(frames[-1].filename).name}, line {frames[-1].lineno})" if frames else ""
+            frames = traceback.extract_tb(error.__traceback__)[1:]
+            own = [frame for frame in frames if "site-packages" not in frame.filename]
+            where = f" ({Path(own[-1].filename).name}, line {own[-1].lineno})" if own else ""
             what = str(error).strip().splitlines() or [""]
             said = f"The policy raised {type(error).__name__}{where}: {what[0]}"
             raise UserError(f"{said}; {observed(self._spec)}.") from error
@@ -333,12 +316,10 @@ class Agent:
             array = array.reshape(*leads, kind.n).argmax(-1) + kind.start  # of logits, probabilities and Q alike
         if array.dtype.kind in "biuf":
             array = array.astype(np.float64)
+            flattened = (*leads, self._space.shape and np.prod(self._space.shape))
             if not np.isfinite(array).all():
                 why = f", with a number that is {array[~np.isfinite(array)][0]}"
-            elif _alike(array.shape, shape) or array.shape == (
-                *leads,
-                self._space.shape and np.prod(self._space.shape),
-            ):
+            elif _alike(array.shape, shape) or array.shape == flattened:
                 array = array.reshape(shape)
                 if isinstance(kind, Box) or self._are_choices(array):
                     return array
@@ -353,13 +334,6 @@ class Agent:
         kind, start = self._spec.action, getattr(self._space, "start", 0)
         count = self._space.nvec if isinstance(kind, MultiDiscrete) else kind.n if isinstance(kind, Discrete) else 2
         return bool(((array == np.rint(array)) & (array >= start) & (array < start + count)).all())
-
-
-def _has_network(policy: Any) -> bool:
-    """Whether it is a torch module, or an object that has one or a method of it: these take a batch."""
-    holder = getattr(policy, "__self__", policy)
-    inside = (holder, *getattr(holder, "__dict__", {}).values())
-    return any(isinstance(part, nn.Module) for part in inside)
 
 
 def _memory(policy: Any) -> bytes:
@@ -393,7 +367,7 @@ class _Normalized(nn.Module):
 
     def __init__(self, agent: Any, moments: list[Tensor], deterministic: bool) -> None:
         super().__init__()
-        self._agent, self._moments, self._function = agent, moments, _function(agent, deterministic)
+        self._agent, self._moments, self._function = agent, moments, function_of(agent, deterministic)
 
     def forward(self, obs: Tensor) -> Any:
         """The agent's answer to flat observations [B, O], after normalization."""
@@ -416,13 +390,12 @@ def playing(
         made, moments, scales, said = read_weights(policy, vec.spec, agent)
         normalized = False if scales and normalized is None else normalized
         policy = _Normalized(made, moments, deterministic)
-    player = Agent(policy, vec.spec, deterministic, bool(normalized))
     modes = {module: module.training for module in (policy.modules() if isinstance(policy, nn.Module) else ())}
     try:
         with globals_undisturbed():
             for module in modes:
                 module.training = False
-            player.look(vec.restart(seed).numpy())
+            player = Agent(policy, vec.spec, vec.restart(seed).numpy(), deterministic, bool(normalized))
             if file:
                 say(f"{said}; {_choose_units(player, vec, seed, normalized)}.")
             seed_globals(seed)

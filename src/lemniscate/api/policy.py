@@ -1,7 +1,7 @@
 """Trained policies, for those who have NumPy and an environment of their own; `load` and `save`."""
 
 import sys
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from os import PathLike
@@ -70,7 +70,6 @@ class TrainedPolicy:
 
     @cached_property
     def _noise(self) -> torch.Generator:
-        """The generator of the noise of sampled actions."""
         return generator(self.config.seed, torch.device("cpu"), 4)
 
     @property
@@ -183,17 +182,13 @@ class TrainedPolicy:
     def _read_for(self, critic: str, obs: Any) -> tuple[Tensor, bool]:
         """The observations of `_read` for a critic, "value" or "q". Raises `UserError` where none has been learned."""
         verbs = {"value": "policy.value(obs)", "q": "policy.q_value(obs, action)"}
-        own = [name for name in verbs if hasattr(self.networks, name)]
-        here = [
-            verbs[name] for name in own if getattr(self.config, "baseline", name) == name
-        ]  # REINFORCE's, if learned
-        if verbs[critic] not in here:
-            there = f"; it has {here[0]}" if here else ""
+        own = getattr(self.config, "baseline", None)  # REINFORCE's, which may have learned another
+        here = [name for name in verbs if hasattr(self.networks, name) and own in (None, name)]
+        if critic not in here:
+            there = f"; it has {verbs[here[0]]}" if here else ""
             raise UserError(f"This policy of {algorithm_of(self)} has learned no {verbs[critic]}{there}.")
-        if self.spec.privileged:
-            raise UserError(
-                f"{verbs[critic]} takes {self.spec.privileged} privileged numbers, which no observation has."
-            )
+        if numbers := self.spec.privileged:
+            raise UserError(f"{verbs[critic]} takes {numbers} privileged numbers, which no observation has.")
         return self._read(obs)
 
 
@@ -310,7 +305,10 @@ def save(policy: Any, path: str | Path) -> Path:
             f" lem.save(policy, {str(path.with_suffix(''))!r}). Its weights alone:"
             f" torch.save(policy.networks.state_dict(), {path.name!r})."
         )
-    if path.exists() and not _is_stored(path):
+    stored = False  # what a run has saved is not to be replaced
+    with suppress(UserError):
+        stored = checkpoint.read(path).record.get("stored", False)
+    if path.exists() and not stored:
         raise UserError(f"{path} exists already, and is not a stored policy; choose another path.")
     record = {"algorithm": algorithm_of(policy), "config": policy.config.to_json()}
     record |= {"spec": checkpoint.spec_to_json(policy.spec), "planned": False, "stored": True}
@@ -319,14 +317,6 @@ def save(policy: Any, path: str | Path) -> Path:
     except OSError as error:
         raise UserError(f"{path} cannot be written: {error}.") from error
     return path
-
-
-def _is_stored(path: Path) -> bool:
-    """Whether `save` has written what is at `path`: a checkpoint of a run is not to be replaced."""
-    try:
-        return bool(checkpoint.read(path).record.get("stored"))
-    except UserError:
-        return False
 
 
 def algorithm_of(policy: TrainedPolicy) -> str:

@@ -97,23 +97,21 @@ def evaluate(
     how: dict[str, Any] = {"episodes": episodes, "seed": seed, "deterministic": deterministic}
     own = {"agent": agent, "normalized": normalized_actions}
     with _environments(chosen, env, own, how, env_kwargs=kwargs, backend=backend) as (player, vec, arguments):
-        if baseline and vec.baseline is None:
-            raise UserError(f"{vec.spec.env_id} has no baseline to compare with.")
-        if baseline and vec.baseline:
+        if baseline:
+            if vec.baseline is None:
+                raise UserError(f"{vec.spec.env_id} has no baseline to compare with.")
             return evaluate_policy(vec.baseline, vec, episodes, seed)
         if file:
-            scores = _show(player, vec, arguments, **how, video=file, tell=_nothing)
+            scores = _show(player, vec, arguments, **how, video=file, tell=str)
         elif isinstance(player, TrainedPolicy):
             critic = critic_of(player.networks, player.config)
             scores = evaluate_policy(player.module, vec, episodes, seed, deterministic, critic)
         else:
             scores = evaluate_policy(player, vec, episodes, seed)
         if report:
-            pictures = _draw(
-                player, vec, arguments, {**how, "episodes": min(episodes, vec.num_envs, 20)}, path_of(report)
-            )
-            page = pages.write_evaluation(path_of(report), str(policy), pictures, scores, seed)
-            for made in (*pictures, page):
+            how["episodes"], folder = min(episodes, vec.num_envs, 20), path_of(report)
+            pictures = _draw(player, vec, arguments, how, folder)
+            for made in (*pictures, pages.write_evaluation(folder, str(policy), pictures, scores, seed)):
                 say(made)
         return scores
 
@@ -199,8 +197,7 @@ def check(
     Raises:
         UserError: no such environment, backend or wrapper.
     """
-    what = what.path if isinstance(what, TrainedRun) else what
-    name = str(what) if isinstance(what, Path) else registry.name_of(what)
+    name = str(path_of(what)) if isinstance(what, Path | TrainedRun) else registry.name_of(what)
     return list(each_finding(name, backend, env_kwargs, registry.names_of(wrappers)))
 
 
@@ -256,8 +253,8 @@ def diagnose(run: Trained) -> list[Diagnosis]:
     kind = algos.find(algorithm).Config
     config = kind.from_json(fields)
     own = [preset.config for preset in presets.of(algorithm) if preset.config.env == config.env]
-    scores = _known_scores(path / FINAL)
-    return doctor.diagnose(doctor.evidence_of(path, config, [*own, kind()], scores, _repeats(config)))
+    known = _known_scores(path / FINAL)
+    return doctor.diagnose(doctor.evidence_of(path, config, [*own, kind()], known, _repeats(config)))
 
 
 def _repeats(config: RunConfig) -> bool | None:
@@ -275,8 +272,8 @@ def _repeats(config: RunConfig) -> bool | None:
 
 def scores_of(policy: TrainedPolicy) -> dict[str, Any]:
     """Scores of a policy over 100 episodes: `Evaluation.to_json`, with its `step` and the `seed` of the starts."""
-    scores = evaluate(policy, episodes=FINAL_EPISODES, seed=0)
-    return {"step": policy.step, "seed": 0, **scores.to_json()}
+    say(f"Evaluating {policy.path or 'the policy'}: {FINAL_EPISODES} episodes.")
+    return {"step": policy.step, "seed": 0, **evaluate(policy, episodes=FINAL_EPISODES, seed=0).to_json()}
 
 
 def final_return(run: str | Path | TrainedRun) -> float:
@@ -287,12 +284,10 @@ def final_return(run: str | Path | TrainedRun) -> float:
 def final_scores(run: str | Path | TrainedRun) -> dict[str, Any]:
     """The `scores_of` a run's newest policy; kept in `final.json` until there is a newer policy."""
     path = path_of(run)
-    file = path / FINAL
-    known = _known_scores(file)
+    known = _known_scores(path / FINAL)
     if known.get("step") not in list_steps(path / "checkpoints")[-1:]:
-        say(f"Evaluating {path}: {FINAL_EPISODES} episodes.")
         known = scores_of(load(run))
-        write_json(file, known)
+        write_json(path / FINAL, known)
     return known
 
 
@@ -317,10 +312,10 @@ def _film(video: str | Path | None) -> Path | None:
     """The file of a film. Raises `UserError` for one that could not be written."""
     if not isinstance(video, str | PathLike | None):
         raise UserError(f"video must be a path, such as 'film.gif', not {shown(video)}.")
-    if video is None:
-        return None
-    playback.check_film(at_home(video))
-    return at_home(video)
+    file = None if video is None else at_home(video)
+    if file:
+        playback.check_film(file)
+    return file
 
 
 @contextmanager
@@ -340,7 +335,6 @@ def _environments(
         compiled = registry.backend_class(elsewhere.get("backend") or registry.backend_for(name)).compiled
         usual = presets.choose(RECOMMENDED, name, None)[1].num_envs  # of which the starts are those of most runs
         config = RunConfig(env=name, num_envs=usual if compiled else 1)
-    arguments = env_arguments(config, env=env, **elsewhere)
     with ExitStack() as stack:
         vec = stack.enter_context(closing(evaluation_env(config, how["episodes"], env=env, **elsewhere)))
         player = chosen
@@ -349,15 +343,14 @@ def _environments(
                 ours, theirs = chosen.spec.env_id, vec.spec.env_id
                 raise UserError(f"A policy for {ours} cannot act in {theirs}: observation or action spaces differ.")
         elif chosen is not None:
-            player = stack.enter_context(
-                agents.playing(chosen, vec, how["seed"], deterministic=how["deterministic"], **own)
-            )
+            playing = agents.playing(chosen, vec, how["seed"], deterministic=how["deterministic"], **own)
+            player = stack.enter_context(playing)
             if player.remembers and vec.num_envs > 1:
                 say("This policy remembers what it was called with, so it plays in one environment at a time.")
                 vec.close()
                 one = evaluation_env(config.replace(num_envs=1), 1, env=env, **elsewhere)
                 vec = stack.enter_context(closing(one))
-        yield player, vec, arguments
+        yield player, vec, env_arguments(config, env=env, **elsewhere)
 
 
 def _show(player: Any, vec: VecEnv, arguments: dict[str, Any], *, deterministic: bool, **how: Any) -> Evaluation:
@@ -382,14 +375,10 @@ def _draw(player: Any, vec: VecEnv, arguments: dict[str, Any], how: dict[str, An
         return flight.draw_flights(act, vec, folder, how["episodes"], film=True, seed=how["seed"])[:-1]
     try:
         film = folder / "videos" / "episode.gif"
-        _show(player, vec, arguments, **{**how, "episodes": 1}, video=film, tell=_nothing)
+        _show(player, vec, arguments, **{**how, "episodes": 1}, video=film, tell=str)
     except Exception as error:  # whatever a renderer raises
         say(f"No film: {error}")
     return []
-
-
-def _nothing(_text: str) -> None:
-    """Say nothing."""
 
 
 def push(run: Trained, name: str, *, private: bool = False, license: str | None = None, trust: bool = False) -> str:
@@ -427,9 +416,12 @@ def push(run: Trained, name: str, *, private: bool = False, license: str | None 
             shutil.copyfile(file, folder / place)
         if not (path and pages.newest_film(path)):
             film_or_say(policy, folder / "videos" / "episode.gif")
-        scores = _scores(policy, path)
-        if scores:
+        scores: dict[str, Any] | None = None
+        try:
+            scores = final_scores(path) if path else scores_of(policy)
             write_json(folder / FINAL, scores)
+        except UserError as error:
+            say(f"No scores: {error}")
         own = {"step": policy.step, "scores": scores, "license": license, "code": code}
         pages.write_card(folder, name, algorithm_of(policy), policy.config, **own)
         return hub.upload(folder, name, private)
@@ -449,15 +441,3 @@ def _shown(run: Path) -> dict[str, Path]:
     if film := pages.newest_film(run):
         shown["replay.mp4" if film.suffix == ".mp4" else f"videos/{film.name}"] = film
     return shown
-
-
-def _scores(policy: TrainedPolicy, run: Path | None) -> dict[str, Any] | None:
-    """The final scores of a run, or those of a policy without one; none where it cannot be evaluated here."""
-    try:
-        if run:
-            return final_scores(run)
-        say(f"Evaluating the policy: {FINAL_EPISODES} episodes.")
-        return scores_of(policy)
-    except UserError as error:
-        say(f"No scores: {error}")
-        return None

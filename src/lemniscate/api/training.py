@@ -8,12 +8,20 @@ from contextlib import AbstractContextManager, nullcontext
 from itertools import count
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 
 from lemniscate import algos, presets
-from lemniscate.api.options import Callback, RunOptions, call_callbacks, require_importable, train_in_processes
+from lemniscate.api.options import (
+    Callback,
+    PolicySnapshot,
+    RunOptions,
+    call_callbacks,
+    own_names,
+    require_importable,
+    train_in_processes,
+)
 from lemniscate.api.policy import TrainedPolicy, TrainedRun, load, path_of
 from lemniscate.doctor import Attendance
 from lemniscate.envs import registry
@@ -31,9 +39,6 @@ from lemniscate.system.console import say
 from lemniscate.system.files import make_directory, parsing
 from lemniscate.system.machine import keep_freed_memory
 from lemniscate.system.world import CLUSTER, World
-
-if TYPE_CHECKING:
-    from lemniscate.cluster.connection import Cluster
 
 
 def config_for(
@@ -135,27 +140,24 @@ def train(
         WorkerError: the process of an environment died.
         Stopped: Ctrl-C or SIGTERM, when the run has saved itself; go on with `resume`.
     """
-    options = RunOptions(track, callbacks, report, progress, processes, cluster, workers, storage)
     name, _, config = choose_config(algorithm, env, preset, fields)
+    options = {"track": track, "callbacks": callbacks, "report": report, "progress": progress}
+    options |= {"processes": processes, "cluster": cluster, "workers": workers, "storage": storage}
     return begin(name, config, run, options)
 
 
 @torch_defaults()
-def begin(algorithm: str, config: RunConfig, run: str | Path | None, options: RunOptions) -> TrainedRun:
-    """Train by a Config that is chosen: in this process, in several, or on a cluster. Raises as `train`."""
-    there = options.find_cluster()
+def begin(algorithm: str, config: RunConfig, run: str | Path | None, arguments: Mapping[str, Any]) -> TrainedRun:
+    """Train by a Config that is chosen, with the `arguments` of `RunOptions`. Raises as `train`."""
     with together() as world:
+        options = RunOptions(**arguments)
         path = path_of(run) if run is not None else fresh_directory(config.env, f"{algorithm}-{config.seed}")
-        loggers, callbacks = options.loggers(), options.functions()
         if world.is_first:
             require_absent(path)
-        if there is not None or options.processes > 1:
-            return _train_elsewhere(path, algorithm, config, options, there)
         if config.shards == 1:  # each process has one, unless more are asked for
             config = config.replace(shards=world.size)
         world.divide(config.shards)
-        path = world.from_first(path)
-        return _train_here(world, path, algorithm, config, loggers, callbacks, options)
+        return _train(world, world.from_first(path), algorithm, config, options)
 
 
 def resume(
@@ -199,32 +201,35 @@ def resume(
         WorkerError: the process of an environment died.
         Stopped: Ctrl-C or SIGTERM, when the run has saved itself.
     """
-    options = RunOptions(track, callbacks, report, progress, processes, cluster, workers, storage)
+    options = {"track": track, "callbacks": callbacks, "report": report, "progress": progress}
+    options |= {"processes": processes, "cluster": cluster, "workers": workers, "storage": storage}
     again = {"total_steps": total_steps, "env": env, "wrappers": wrappers}
     again |= {"network": network, "curriculum": curriculum}
-    return go_on(path_of(run), options, {name: name_in_config(x) for name, x in again.items() if x is not None})
+    return go_on(run, options, {name: name_in_config(x) for name, x in again.items() if x is not None})
 
 
 @torch_defaults()
-def go_on(path: Path, options: RunOptions, changes: Mapping[str, object]) -> TrainedRun:
-    """Go on with the run in a directory; `changes` are `total_steps` and objects passed again. Raises as `resume`."""
-    there = options.find_cluster()
+def go_on(run: object, arguments: Mapping[str, Any], changes: Mapping[str, object]) -> TrainedRun:
+    """Go on with a run; `changes` are `total_steps` and objects passed again. Raises as `resume`."""
     with together() as world:
+        options, path = RunOptions(**arguments), path_of(run)
         record = world.from_first(read_record(path) if world.is_first else {})
         with parsing(path):
             algorithm, fields = record["algorithm"], record["config"]
         config = algos.find(algorithm).Config.from_json(fields).replace(**changes)
         world.divide(config.shards)
-        loggers, callbacks = options.loggers(), options.functions()
         if "total_steps" in changes and world.is_first:
             extend(path, config.total_steps)
             if options.progress and (names := _annealed(config)):
                 say(f"Over the new total of {config.total_steps:,} steps from here on: {', '.join(names)}.")
-        if world.from_first(world.is_first and is_finished(path)):
-            return _leave(path, options, world)
-        if there is not None or (options.processes > 1 and world.size == 1):
-            return _train_elsewhere(path, algorithm, config, options, there)
-        return _train_here(world, path, algorithm, config, loggers, callbacks, options)
+        if not world.from_first(world.is_first and is_finished(path)):
+            return _train(world, path, algorithm, config, options)
+        trained = TrainedRun(path, load(path), 0.0)
+        if options.progress and world.is_first:
+            say(f"{path} is finished, at step {trained.policy.step:,}: there is nothing to resume.")
+        if options.report and world.is_first:
+            _report_on(trained)
+        return trained
 
 
 def _annealed(config: RunConfig) -> list[str]:
@@ -233,16 +238,6 @@ def _annealed(config: RunConfig) -> list[str]:
     annealed = [name for name in fractions if name.removeprefix("final_") not in config.schedules]
     fields = {**config.schedules, **{name: getattr(config, name, 1.0) for name in annealed}}
     return [f"{name} {value}" for name, value in fields.items() if value != 1]
-
-
-def _leave(path: Path, options: RunOptions, world: World) -> TrainedRun:
-    """A run that has taken all its steps, as it is; with `report` it is evaluated and drawn again."""
-    run = TrainedRun(path, load(path), 0.0)
-    if options.progress and world.is_first:
-        say(f"{path} is finished, at step {run.policy.step:,}: there is nothing to resume.")
-    if options.report and world.is_first:
-        _report_on(run)
-    return run
 
 
 def together() -> AbstractContextManager[World]:
@@ -256,35 +251,26 @@ def together() -> AbstractContextManager[World]:
     return together()
 
 
-def _train_elsewhere(
-    path: Path, algorithm: str, config: RunConfig, options: RunOptions, there: "Cluster | None"
-) -> TrainedRun:
+def _train_elsewhere(path: Path, algorithm: str, config: RunConfig, options: RunOptions) -> TrainedRun:
     """Train in other processes, of this machine or of a cluster; each resumes the run, which begins if it is new."""
-    require_importable(config)
+    require_importable(*own_names(config))
     began = time.monotonic()
-    if there is None:
+    if options.cluster is None:
         train_in_processes(path, algorithm, config, options)
     else:
         from lemniscate.cluster.job import train_on_ray
 
-        shared = {"track": options.track, "callbacks": options.names(), "progress": options.progress}
-        train_on_ray(path, algorithm, config, there, f"{__name__}:resume", shared)
+        train_on_ray(path, algorithm, config, options.cluster, f"{__name__}:resume", options.shared())
     trained = TrainedRun(path, load(path), time.monotonic() - began)
-    if there is not None and options.reports:  # processes of this machine get --report, and do it themselves
+    if options.cluster is not None and options.reports:  # processes of this machine get --report, and do it themselves
         _report_on(trained)
     return trained
 
 
-def _train_here(
-    world: World,
-    path: Path,
-    algorithm: str,
-    config: RunConfig,
-    loggers: Sequence[LoggerClass],
-    callbacks: Sequence[Callback],
-    options: RunOptions,
-) -> TrainedRun:
-    """Train in this process; of several, the first alone writes, reports and talks."""
+def _train(world: World, path: Path, algorithm: str, config: RunConfig, options: RunOptions) -> TrainedRun:
+    """Train in this process, of several the first alone writes, reports and talks; or where the options say."""
+    if options.cluster is not None or (options.processes > 1 and world.size == 1):
+        return _train_elsewhere(path, algorithm, config, options)
     progress = options.progress and world.is_first
     set_seeds(config.seed)  # before JAX starts, which reads its flags then
     torch.set_num_threads(config.threads)
@@ -292,17 +278,16 @@ def _train_here(
     envs = envs_of(config, world)
     spec = envs[0].spec
 
-    def copy_networks(state: TrainState) -> Any:
-        networks = config.networks(spec)
-        networks.load_state_dict(state.networks.state_dict())
-        return networks
-
     def film(state: TrainState) -> None:
-        _film(TrainedPolicy(copy_networks(state), spec, config, state.step), path)
+        from lemniscate.api.results import evaluate
 
-    attend = Attendance(config) if progress else None
-    observer = call_callbacks(callbacks, copy_networks, spec, config, attend) if callbacks or attend else None
-    surroundings = {"loggers": loggers, "progress": progress, "film": film, "observer": observer}
+        file = path / "videos" / f"step-{state.step}.{'mp4' if is_installed('imageio_ffmpeg') else 'gif'}"
+        make_directory(file.parent)
+        evaluate(PolicySnapshot(state, spec, config, state.step), episodes=1, video=file)
+
+    attend, callbacks = Attendance(config) if progress else None, options.callbacks
+    observer = call_callbacks(callbacks, spec, config, attend) if callbacks or attend else None
+    surroundings = {"loggers": options.loggers, "progress": progress, "film": film, "observer": observer}
     run = Run(path, algorithm, config, envs, world=world, locate=local_path, **surroundings)
     pictures: list[Path] = []
     try:
@@ -326,15 +311,6 @@ def _train_here(
         error.run = trained
         raise
     return trained
-
-
-def _film(policy: TrainedPolicy, path: Path) -> None:
-    """Record an episode into the `videos/` of a run."""
-    from lemniscate.api.results import evaluate
-
-    kind = "mp4" if is_installed("imageio_ffmpeg") else "gif"
-    make_directory(path / "videos")
-    evaluate(policy, episodes=1, video=path / "videos" / f"step-{policy.step}.{kind}")
 
 
 def _report_on(run: TrainedRun) -> list[Path]:

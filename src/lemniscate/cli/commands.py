@@ -1,152 +1,146 @@
 """The work of each command: each takes what `parse` understood, and imports what it alone needs."""
 
-import argparse
-import json
+import json as notation
 from itertools import groupby
+from pathlib import Path
 from shutil import get_terminal_size
 from typing import Any
 
 from lemniscate.algos import ALGORITHMS
 from lemniscate.api import training
-from lemniscate.api.options import RunOptions
 from lemniscate.api.policy import TrainedRun
 from lemniscate.envs import registry
 from lemniscate.errors import UserError, is_installed, missing_extra, unknown_name
 from lemniscate.run.directory import SWEEP, TUNE
-from lemniscate.run.fields import number, read, read_json
 from lemniscate.run.run import is_compiled
 from lemniscate.system.console import say, talks
 from lemniscate.system.watchdog import end_with_owner
 
+OF_ONE_RUN = ("processes", "storage")
+"""options that the runs of a sweep do not have"""
 
-def train(given: argparse.Namespace) -> None:
-    """Train one policy, or with --seeds one for each algorithm and seed."""
-    if given.unnamed:
-        why = "takes every kind of actions and, mostly, needs the fewest minutes"
-        tell(f"No algorithm is named: {given.algorithm} {why}.")
-    if given.seeds is not None or "," in given.algorithm:
-        train_sweep(given)
+
+def train(
+    algorithm: str,
+    env: str | None,
+    preset: str | None,
+    run: Path | None,
+    fields: dict[str, Any],
+    seeds: str | None,
+    score: bool,
+    **options: Any,
+) -> None:
+    """Train one policy, or with --seeds one for each algorithm and seed, and compare them."""
+    if seeds is None and "," not in algorithm:
+        name, preset, config = training.choose_config(algorithm, env, preset, fields)
+        registry.backend_class(str(config.backend))  # refuses one that is not there
+        what = f"{name} on {config.num_envs} × {config.env}, backend {config.backend}"
+        tell(f"{what}: preset {preset}, seed {config.seed}, {'compiled' if is_compiled(config) else 'not compiled'}")
+        trained = training.begin(name, config, run, options)
+        if score:
+            _say_score(trained)
+        tell(f"Trained in {trained.seconds:.1f} s. Everything is in {trained.path}")
         return
-    name, preset, config = training.choose_config(given.algorithm, given.env, given.preset, given.fields)
-    registry.backend_class(str(config.backend))  # refuses one that is not there
-    what = f"{name} on {config.num_envs} × {config.env}, backend {config.backend}"
-    tell(f"{what}: preset {preset}, seed {config.seed}, {'compiled' if is_compiled(config) else 'not compiled'}")
-    run = training.begin(name, config, given.run, _options(given))
-    if given.score:
-        _say_score(run)
-    tell(f"Trained in {run.seconds:.1f} s. Everything is in {run.path}")
-
-
-def train_sweep(given: argparse.Namespace) -> None:
-    """Train one policy for each algorithm and seed, and compare them."""
     from lemniscate.sweeps.sweep import train_sweep
 
-    if "seed" in given.fields:
+    if "seed" in fields:
         raise UserError("Several runs have several seeds: --seeds 1-5, not --seed.")
-    if given.seeds is None:
+    if seeds is None:
         raise UserError("Algorithms are compared over several seeds: add --seeds 1-5.")
-    shared = {"run": given.run, "preset": given.preset, **given.fields, **_of_several(given)}
-    runs = train_sweep(given.algorithm, given.env, given.seeds, **shared)
-    tell(f"Everything is in {runs.path}")
+    shared = {name: value for name, value in options.items() if name not in OF_ONE_RUN}
+    tell(f"Everything is in {train_sweep(algorithm, env, seeds, run=run, preset=preset, **fields, **shared).path}")
 
 
-def tune(given: argparse.Namespace) -> None:
+def tune(algorithm: str, env: str | None, search: str | None, fields: dict[str, Any], **options: Any) -> None:
     """Search for the best settings."""
     from lemniscate.sweeps.tuner import tune
 
-    if given.search is None:
+    if search is None:
         raise UserError("Search what? Name fields with their ranges: --search 'learning_rate=log:1e-4:1e-2'.")
-    fields = {"run": given.run, "preset": given.preset, "seeds": given.seeds, "prune": given.prune, **given.fields}
-    fields |= {**_cluster(given), "trials": number(given.trials), "progress": not given.quiet}
-    tuned = tune(given.algorithm, given.env, search=given.search, **fields)
-    tell(f"Everything is in {tuned.path}")
+    del options["storage"]  # the runs of a set come back to where it was begun
+    tell(f"Everything is in {tune(algorithm, env, search=search, **options, **fields).path}")
 
 
-def resume(given: argparse.Namespace) -> None:
+def resume(run: Path, total_steps: float | None, score: bool, **options: Any) -> None:
     """Continue an interrupted run, sweep or search. The runs of the latter two are begun by this command, too."""
     owned = end_with_owner()
-    changes = {} if given.total_steps is None else {"total_steps": number(given.total_steps)}
-    if changes and ((given.run / TUNE).exists() or (given.run / SWEEP).exists()):
-        raise UserError(f"--total-steps is for one run, and {given.run} is a set of them: name one of its runs.")
-    if (given.run / TUNE).exists():
+    if total_steps is not None and ((run / TUNE).exists() or (run / SWEEP).exists()):
+        raise UserError(f"--total-steps is for one run, and {run} is a set of them: name one of its runs.")
+    if (run / TUNE).exists():
         from lemniscate.sweeps.tuner import resume_tuning
 
-        run = resume_tuning(given.run, **_cluster(given), progress=not given.quiet)
-    elif (given.run / SWEEP).exists():
+        resume_tuning(run, **{name: options[name] for name in ("cluster", "workers", "progress")})
+    elif (run / SWEEP).exists():
         from lemniscate.sweeps.sweep import resume_sweep
 
-        run = resume_sweep(given.run, **_of_several(given))
+        resume_sweep(run, **{name: value for name, value in options.items() if name not in OF_ONE_RUN})
     else:
-        run = training.go_on(training.path_of(given.run), _options(given), changes)
-        if given.score:
-            _say_score(run)
-        if not run.seconds:  # it was finished, which has been said
+        changes = {} if total_steps is None else {"total_steps": total_steps}
+        trained = training.go_on(run, options, changes)
+        if score:
+            _say_score(trained)
+        if not trained.seconds:  # it was finished, which has been said
             return
     if not owned:
-        tell(f"Done. Everything is in {run.path}")
+        tell(f"Done. Everything is in {run}")
 
 
-def evaluate(given: argparse.Namespace) -> None:
+def evaluate(json: bool, **options: Any) -> None:
     """Play whole episodes: scores as JSON on standard output, or as a sentence."""
     from lemniscate.api import results
     from lemniscate.report import pages
 
-    own = {"backend": given.backend, "baseline": given.baseline, "video": given.video, "report": given.report}
-    own |= {"deterministic": not given.stochastic, **_own(given)}
-    scores = results.evaluate(given.run, given.env, **_episodes(given), **own, **_policy(given))
-    if given.json:
-        print(json.dumps(scores.to_json(), allow_nan=False))
+    scores = results.evaluate(**options).to_json()
+    if json:
+        print(notation.dumps(scores, allow_nan=False))
     else:
-        say(pages.sentence(scores.to_json()))
+        say(pages.sentence(scores))
 
 
-def watch(given: argparse.Namespace) -> None:
+def watch(policy: Path | None, env: str | None, random: bool, **options: Any) -> None:
     """Show episodes in a window, or record them."""
     from lemniscate.api import results
 
-    if not given.run and not (given.random and given.env):
+    if not policy and not (random and env):
         raise UserError("Watch what? lemniscate watch RUN; before training, lemniscate watch --random --env ID.")
-    own = {"random": given.random, "video": given.video, "deterministic": not (given.stochastic or given.sample)}
-    own |= _own(given)
-    results.watch(given.run, given.env, **_episodes(given), **own, **_policy(given))
+    results.watch(policy, env, random=random, **options)
 
 
-def export(given: argparse.Namespace) -> None:
+def export(run: Path, **options: Any) -> None:
     """Write a policy as C and ONNX, and say how far these are from it."""
     from lemniscate.exporting.export import export
 
-    say(f"Everything is in {export(given.run, given.to, **_policy(given))}")
+    say(f"Everything is in {export(run, **options)}")
 
 
-def preflight(given: argparse.Namespace) -> None:
+def preflight(run: Path, **options: Any) -> None:
     """Measure the margins of a policy, and name the files."""
     from lemniscate.margins.preflight import preflight
 
-    preflight(given.run, given.compiled, **_episodes(given))
-    say(f"Everything is in {given.run / 'preflight.json'} and {given.run / 'plots' / 'preflight.png'}")
+    preflight(run, **options)
+    say(f"Everything is in {run / 'preflight.json'} and {run / 'plots' / 'preflight.png'}")
 
 
-def plot(given: argparse.Namespace) -> None:
+def plot(runs: list[Path], by: str) -> None:
     """Draw the curves of one run, or compare several, grouped by all but the seed."""
     from lemniscate.api.plots import plot
 
-    for file in plot(*given.runs, by=given.by):
+    for file in plot(*runs, by=by):
         say(file)
 
 
-def push(given: argparse.Namespace) -> None:
+def push(run: Path, name: str, **options: Any) -> None:
     """Upload the policy of a run to the Hub."""
     from lemniscate.api.results import push
 
-    page = push(given.run, given.name, private=given.private, license=given.license)
-    say(f"Uploaded: {page}. It is loaded from hf://{given.name}.")
+    say(f"Uploaded: {push(run, name, **options)}. It is loaded from hf://{name}.")
 
 
-def envs(given: argparse.Namespace) -> None:
+def envs(filter: str) -> None:
     """List the families of environments; those of one, each with its backend and the presets that fit."""
     from lemniscate.presets import best
 
-    ids, wanted = registry.known_ids(), given.filter.lower()
+    ids, wanted = registry.known_ids(), filter.lower()
     if not wanted:
         for family, found in groupby(sorted(ids, key=_family), _family):
             first, *rest = found
@@ -158,7 +152,7 @@ def envs(given: argparse.Namespace) -> None:
         return
     found = [env_id for env_id in ids if wanted in env_id.lower() or wanted in _family(env_id).lower()]
     if not found:
-        raise registry.unknown_env(given.filter)
+        raise registry.unknown_env(filter)
     for env_id in found:
         presets = ((algorithm, best(algorithm, env_id)) for algorithm in ALGORITHMS)
         fitting = ", ".join(f"{algorithm}: {preset}" for algorithm, preset in presets if preset != "default")
@@ -179,57 +173,57 @@ def _family(env_id: str) -> str:
     return f"Gymnasium {place[2]}" if place[:2] == ["gymnasium", "envs"] else place[0]
 
 
-def doctor(given: argparse.Namespace) -> None:
+def doctor(what: str, json: bool, **options: Any) -> None:
     """Say what was found about an environment, or a run and its files, as a list; what is bad there is an error."""
     from lemniscate.api.results import diagnose, each_finding, runs_in, spread_of, verdict
     from lemniscate.envs.check import BAD
 
-    found, wrappers = [], read("wrappers", tuple[str, ...], given.wrappers)
+    found = []
     width = min(get_terminal_size((112, 24)).columns, 120)
-    for finding in each_finding(given.what, given.backend, _env_args(given), wrappers):
+    for finding in each_finding(what, **options):
         found.append(finding)
         say(finding.listed(width))
     if any(finding.grade == BAD for finding in found):
-        raise UserError(verdict(given.what, found))
-    say(verdict(given.what, found))
-    diagnoses = {str(run): diagnose(run) for run in runs_in(given.what)}
+        raise UserError(verdict(what, found))
+    say(verdict(what, found))
+    diagnoses = {str(run): diagnose(run) for run in runs_in(what)}
     for run, of_run in diagnoses.items():
         names = ", ".join(one.name for one in of_run if one.sure != "hint")
         say(f"{run}: {names or 'no rule finds a fault'}.")
         for one in of_run:
             say(one.listed(width))
-    if spread := spread_of(given.what):
+    if spread := spread_of(what):
         say(spread)
-    if given.json:
+    if json:
         runs = {run: [vars(one) for one in of_run] for run, of_run in diagnoses.items()}
-        print(json.dumps({"checked": [vars(one) for one in found], "runs": runs}))
+        print(notation.dumps({"checked": [vars(one) for one in found], "runs": runs}))
 
 
-def course(given: argparse.Namespace) -> None:
+def course(action: str, folder: Path, solutions: bool) -> None:
     """Lay out the course, and name the page to begin with."""
     from lemniscate.course import start
 
-    if given.action != "start":
-        raise unknown_name("word after `course`", given.action, ("start",))
-    say(f"Begin with {start(given.folder, solutions=given.solutions)}")
+    if action != "start":
+        raise unknown_name("word after `course`", action, ("start",))
+    say(f"Begin with {start(folder, solutions=solutions)}")
 
 
-def grade(given: argparse.Namespace) -> None:
+def grade(json: bool, csv: bool, **options: Any) -> None:
     """Judge hand-ins: a table, and on standard output what a program reads."""
     from lemniscate.course.grading import as_csv, grade
 
-    grades = grade(given.folder, given.exercises, to=given.to)
-    if given.json:
-        print(json.dumps(grades))
-    if given.csv:
+    grades = grade(**options)
+    if json:
+        print(notation.dumps(grades))
+    if csv:
         print(as_csv(grades), end="")
 
 
-def completion(given: argparse.Namespace) -> None:
+def completion(shell: str) -> None:
     """Print the script with which a shell completes."""
     from lemniscate.cli.completion import script
 
-    print(script(given.shell), end="")
+    print(script(shell), end="")
 
 
 def tell(text: str) -> None:
@@ -243,38 +237,3 @@ def _say_score(run: TrainedRun) -> None:
 
     if talks():
         say(f"Final return {final_return(run):.1f} over {FINAL_EPISODES} episodes.")
-
-
-def _options(given: argparse.Namespace) -> RunOptions:
-    return RunOptions(processes=number(given.processes), storage=given.storage, **_of_several(given))
-
-
-def _of_several(given: argparse.Namespace) -> dict[str, Any]:
-    """The options that the runs of a sweep have too."""
-    callbacks = [name for word in given.callbacks or () for name in word.split(",")]
-    shared = {"track": given.track, "callbacks": callbacks, "report": given.report, "progress": not given.quiet}
-    return {**shared, **_cluster(given)}
-
-
-def _cluster(given: argparse.Namespace) -> dict[str, Any]:
-    return {"cluster": given.cluster, "workers": given.workers and number(given.workers)}
-
-
-def _episodes(given: argparse.Namespace) -> dict[str, Any]:
-    """The episodes that are to be played."""
-    numbers = {"episodes": number(given.episodes), "seed": number(given.seed)}
-    return {**numbers, "env_kwargs": _env_args(given)}
-
-
-def _policy(given: argparse.Namespace) -> dict[str, Any]:
-    """The options that choose a policy of a run or an address."""
-    return {"checkpoint": given.checkpoint and number(given.checkpoint), "trust": given.trust}
-
-
-def _own(given: argparse.Namespace) -> dict[str, Any]:
-    """The options of a policy that was not trained here."""
-    return {"agent": given.agent, "normalized_actions": given.normalized_actions}
-
-
-def _env_args(given: argparse.Namespace) -> dict[str, Any] | None:
-    return None if given.env_args is None else read_json("--env-args", given.env_args)

@@ -5,8 +5,8 @@ from shlex import quote
 from typing import Literal, get_type_hints
 
 from lemniscate.algos import ALGORITHMS, find
+from lemniscate.cli import COMMANDS, EARLIER, SHELLS, Parser, flags_of, parser_of
 from lemniscate.cli.fields import algorithm_parser, explain
-from lemniscate.cli.parsers import COMMANDS, EARLIER, SHELLS, Parser, flags_of, parser_of
 from lemniscate.envs import registry
 from lemniscate.errors import unknown_name
 from lemniscate.nn.networks import NETWORKS
@@ -82,9 +82,8 @@ def _parsers() -> dict[str, Parser]:
 def _followers() -> dict[str, Iterable[str]]:
     """The words that may follow a command or an option, where they are few."""
     ids, presets = registry.known_ids(), {preset: None for name in ALGORITHMS for preset in names(name)}
-    found: dict[str, Iterable[str]] = {"train": ALGORITHMS, "completion": SHELLS}
+    found: dict[str, Iterable[str]] = {"train": ALGORITHMS, "completion": SHELLS, "course": ["start"]}
     found |= dict.fromkeys(("doctor", "check", "--env"), ids)
-    found["course"] = ["start"]
     found |= {"--preset": presets, "--backend": registry.BACKENDS, "--track": TRACKERS, "--network": NETWORKS}
     for name in ALGORITHMS:
         for field, hint in get_type_hints(find(name).Config).items():

@@ -7,37 +7,18 @@ from types import NoneType
 from typing import Any, Literal, get_type_hints
 
 from lemniscate.algos import find
-from lemniscate.cli.parsers import Parser, parser_of, unknown_argument
+from lemniscate.cli import Parser, Read, parser_of, unknown_argument
 from lemniscate.errors import UserError, prefix_errors, unknown_name
 from lemniscate.presets import names
-from lemniscate.run.fields import field_help, flag, kinds_of, read, typed, unknown_field
+from lemniscate.run.fields import field_help, flag, kinds_of, typed, unknown_field
 
-GROUPS: dict[str, tuple[str, ...]] = {
-    "run": (
-        "seed",
-        "total_steps",
-        "average_last",
-        "device",
-        "threads",
-        "shards",
-        "compile",
-        "matmul",
-        "warm_start",
-        "freeze",
-    ),
-    "environment": ("env_kwargs", "symmetry", "reset_options", "wrappers", "curriculum", "backend", "num_envs"),
-    "algorithm": (),
-    "networks": ("network", "hidden", "critic_hidden", "activation", "initial_log_std", "normalize_observations"),
-    "logging and checkpoints": (
-        "log_every",
-        "checkpoint_every",
-        "keep_checkpoints",
-        "evaluate_every",
-        "evaluate_episodes",
-        "keep_best",
-        "video_every",
-        "video_every_episodes",
-    ),
+GROUPS = {
+    "run": "seed total_steps average_last device threads shards compile matmul warm_start freeze",
+    "environment": "env_kwargs symmetry reset_options wrappers curriculum backend num_envs",
+    "algorithm": "",
+    "networks": "network hidden critic_hidden activation initial_log_std normalize_observations",
+    "logging and checkpoints": "log_every checkpoint_every keep_checkpoints evaluate_every evaluate_episodes keep_best"
+    " video_every video_every_episodes",
 }
 """the fields under each heading of the help; those that are not named here are the algorithm's"""
 
@@ -45,30 +26,23 @@ GROUPS: dict[str, tuple[str, ...]] = {
 def parse_fields(command: str, algorithms: list[str], words: list[str]) -> argparse.Namespace:
     """The options in `words`, for all of `algorithms`; the fields of their Configs as a dictionary `fields`.
 
-    Raises:
-        UserError: a flag that one of the algorithms does not have, or a value that cannot be read.
+    Raises `UserError` for a flag that one of the algorithms does not have, or a value that cannot be read.
     """
     fields: dict[str, Any] = {}
-    given = argparse.Namespace()
+    options: dict[str, Any] = {}
     for algorithm in algorithms:
         with prefix_errors(algorithm) if len(algorithms) > 1 else nullcontext():
-            given, own = _parse(command, algorithm, words)
-            fields |= own
-    given.command, given.algorithm, given.fields = command, ",".join(algorithms), fields
-    return given
-
-
-def _parse(command: str, algorithm: str, words: list[str]) -> tuple[argparse.Namespace, dict[str, Any]]:
-    hints = get_type_hints(find(algorithm).Config, include_extras=True)
-    parser = algorithm_parser(command, algorithm)
-    if {"-h", "--help"} & set(words):
-        explain(parser, algorithm)
-    given, rest = parser.parse_known_args([_switch(word, hints) for word in words])
-    if rest:
-        known = [action.dest for action in parser._actions]
-        raise unknown_argument(rest, lambda word: _unknown_flag(word, known))
-    values = {name: value for name, value in vars(given).items() if name in hints and name != "env"}
-    return given, {name: read(name, hints[name], value) for name, value in values.items()}
+            parser = algorithm_parser(command, algorithm)
+            hints = get_type_hints(find(algorithm).Config, include_extras=True)
+            if {"-h", "--help"} & set(words):
+                explain(parser, algorithm)
+            given, rest = parser.parse_known_args([_switch(word, hints) for word in words])
+            if rest:
+                known = [action.dest for action in parser._actions]
+                raise unknown_argument(rest, lambda word, known=known: _unknown_flag(word, known))
+            for name, value in vars(given).items():
+                (fields if name in hints and name != "env" else options)[name] = value
+    return argparse.Namespace(command=command, algorithm=",".join(algorithms), fields=fields, **options)
 
 
 def algorithm_parser(command: str, algorithm: str) -> Parser:
@@ -78,22 +52,20 @@ def algorithm_parser(command: str, algorithm: str) -> Parser:
     parser.description = None  # the help of an algorithm is to fit on two pages
     parser.usage = f"{parser.prog} --env ID [--run DIR] [--preset NAME] [--FIELD VALUE …]"
     hints = get_type_hints(config, include_extras=True)
-    grouped = {name for members in GROUPS.values() for name in members} | {"env"}
+    grouped = {"env", *" ".join(GROUPS.values()).split()}
     for title, members in GROUPS.items():
         group = parser.add_argument_group(title)
-        own = [name for name in config.names() if name not in grouped] if title == "algorithm" else members
-        for name in own:
-            if name in hints:
-                flags = dict.fromkeys([flag(name), f"--{name.replace('_', '-')}"])
-                group.add_argument(*flags, dest=name, default=argparse.SUPPRESS, **_kind(hints[name]))
+        own = [name for name in config.names() if name not in grouped] if title == "algorithm" else members.split()
+        for name in filter(hints.__contains__, own):
+            kinds = kinds_of(hints[name])
+            kind: dict[str, Any] = {"action": Read, "hint": hints[name]}
+            if bool in kinds:
+                kind = {"action": argparse.BooleanOptionalAction}
+            elif tuple in kinds:
+                kind["nargs"] = "+"
+            flags = dict.fromkeys([flag(name), f"--{name.replace('_', '-')}"])
+            group.add_argument(*flags, dest=name, default=argparse.SUPPRESS, **kind)
     return parser
-
-
-def _kind(hint: Any) -> dict[str, Any]:
-    """The arguments of `add_argument` for a field of this type: a switch, several words or one."""
-    if bool in kinds_of(hint):
-        return {"action": argparse.BooleanOptionalAction}
-    return {"nargs": "+"} if tuple in kinds_of(hint) else {}
 
 
 def explain(parser: Parser, algorithm: str) -> None:

@@ -48,8 +48,7 @@ class Cluster:
 def find_cluster(cluster: object, workers: object = None, storage: object = None) -> Cluster | None:
     """The cluster that a user names as `ray` or `ray=ADDRESS`; None if nothing is named.
 
-    Raises:
-        UserError: another name, or a number that is none; Ray is not installed; nobody listens at the address.
+    Raises `UserError` for another name, or a number that is none; without Ray; where nobody listens at the address.
     """
     if cluster is None:
         for name, value in (("workers", workers), ("storage", storage)):

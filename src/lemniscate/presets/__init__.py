@@ -76,12 +76,11 @@ def choose(algorithm: str, env_id: str | None, name: str | None) -> tuple[str, R
     name = best(algorithm, env_id) if name is None else name
     if not isinstance(name, str):
         raise unknown_name("preset", name, names(algorithm))
-    if name.endswith(".json"):
-        config = read_preset(at_home(name), algorithm).config
-        return Path(name).stem, config if env_id is None else config.replace(env=env_id)
     named = [preset.config for preset in of(algorithm) if preset.name == name]
     if name == "default":
         named = [find(algorithm).Config()]
+    elif name.endswith(".json"):
+        name, named = Path(name).stem, [read_preset(at_home(name), algorithm).config]
     if not named:
         raise unknown_name("preset", name, names(algorithm))
     config = next((config for config in named if config.env == env_id), named[0])
@@ -89,11 +88,7 @@ def choose(algorithm: str, env_id: str | None, name: str | None) -> tuple[str, R
 
 
 def read_preset(file: Path, algorithm: str) -> Preset:
-    """The preset that `Preset.write` has stored.
-
-    Raises:
-        UserError: no such file, or that of another algorithm.
-    """
+    """The preset that `Preset.write` has stored. Raises `UserError` for no such file, or that of another algorithm."""
     try:
         record = read_json(file)
     except DamagedFileError as error:

@@ -26,7 +26,7 @@ from lemniscate.errors import UserError, is_installed, missing_extra, shown
 from lemniscate.presets import Preset
 from lemniscate.report.seeds import iqm
 from lemniscate.run.config import RunConfig
-from lemniscate.run.directory import TUNE, create_directory, is_finished
+from lemniscate.run.directory import TUNE, create_directory
 from lemniscate.run.fields import kinds_of, read, unknown_field
 from lemniscate.run.metrics import read_metrics
 from lemniscate.run.places import Sweep
@@ -91,23 +91,23 @@ Space = dict[str, Interval | Choice]
 
 def read_texts(search: object) -> dict[str, str]:
     """The text of each range by its field, in "learning_rate=log:1e-4:1e-2, gamma=.9:.999" or a dictionary of them."""
-    if isinstance(search, Mapping):
-        pairs = [(str(name), str(text)) for name, text in search.items()]
-    elif isinstance(search, str):
-        pairs = [_pair(field) for field in re.split(r",\s*(?=[\w-]+\s*=)", search.strip(" ,")) if field]
-    else:
+    if not isinstance(search, str | Mapping):
         raise UserError(f"search must be a text such as 'gamma=.9:.999', or a dictionary, not {shown(search)}.")
+    if isinstance(search, Mapping):
+        pairs = [(str(name), "=", str(text)) for name, text in search.items()]
+    else:
+        pairs = [field.partition("=") for field in re.split(r",\s*(?=[\w-]+\s*=)", search.strip(" ,")) if field]
+    for pair in pairs:
+        if not all(map(str.strip, pair)):
+            written = "".join(pair).strip()
+            raise UserError(f"A search is written as field=low:high, field=log:low:high or field=a|b, not {written!r}.")
     if not pairs:
         raise UserError("Search what? Name fields with their ranges, such as learning_rate=log:1e-4:1e-2.")
-    return {name.strip().lstrip("-").replace("-", "_"): text.strip() for name, text in pairs}
+    return {name.strip().lstrip("-").replace("-", "_"): text.strip() for name, _, text in pairs}
 
 
 def read_space(texts: Mapping[str, str], config: RunConfig) -> Space:
-    """The ranges that the texts stand for.
-
-    Raises:
-        UserError: a field that the Config does not have or a search cannot change, or a range that it has no room for.
-    """
+    """The ranges that the texts stand for. Raises `UserError` for what a search cannot change, or has no room for."""
     hints, space = get_type_hints(type(config), include_extras=True), Space()
     for name, text in texts.items():
         if name not in hints:
@@ -121,15 +121,6 @@ def read_space(texts: Mapping[str, str], config: RunConfig) -> Space:
 def draw(space: Space, trial: Any) -> dict[str, Any]:
     """The fields of a new trial, by name."""
     return {name: values.draw(trial, name) for name, values in space.items()}
-
-
-def _pair(field: str) -> tuple[str, str]:
-    name, equals, text = field.partition("=")
-    if not (name.strip() and equals and text.strip()):
-        raise UserError(
-            f"A search is written as field=low:high, field=log:low:high or field=a|b, not {field.strip()!r}."
-        )
-    return name, text
 
 
 def _range(name: str, text: str, hint: Any, config: RunConfig) -> Interval | Choice:
@@ -265,31 +256,11 @@ def read_search(path: Path) -> Search:
         return Search(path, algorithm, config, search, seeds, int(record["trials"]), bool(record["prune"]))
 
 
-def has_come(run: Path, step: int | None) -> bool:
-    """Whether a run has come to this step, or, without one, to its end."""
-    if step is None:
-        return is_finished(run)
-    lines = read_metrics(run)
-    return bool(lines) and lines[-1]["step"] >= step
-
-
 def score_at(runs: Iterable[Path], step: int) -> float | None:
-    """The interquartile mean over seeds of the newest training episodes' returns; None if a run has had none."""
-    of = [[ret for line in read_metrics(run) for ret in _returns(line, step)][-RETURNS:] for run in runs]
+    """The interquartile mean over seeds of the newest training episodes' returns; None if a run has had none.
+
+    Lines of the metrics that were written long after `step`, as in a resumed run, do not count.
+    """
+    lines = [[line for line in read_metrics(run) if line["step"] <= step + step // 2] for run in runs]
+    of = [[ret for line in known for ret in line.get("episode/returns", [])][-RETURNS:] for known in lines]
     return float(iqm([float(np.mean(episodes)) for episodes in of])) if all(of) else None
-
-
-def _returns(line: Mapping[str, Any], step: int) -> list[float]:
-    """The episode returns of a line of the metrics; none if it was written long after `step`, as in a resumed run."""
-    return line.get("episode/returns", []) if line["step"] <= step + step // 2 else []
-
-
-def final_score(runs: Iterable[Path]) -> float:
-    """The interquartile mean over seeds of the final policies' returns."""
-    return float(iqm([read_metrics(run)[-1]["evaluation/return"] for run in runs]))
-
-
-def as_text(params: Mapping[str, Any]) -> str:
-    """Optuna's values of a trial as a line says them."""
-    shown = {name: f"{value:.3g}" if isinstance(value, float) else value for name, value in params.items()}
-    return ", ".join(f"{name} {value}" for name, value in shown.items())

@@ -8,7 +8,7 @@ each of its runs ends in the same bits as if it had been trained alone. A search
 import re
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -17,7 +17,7 @@ from typing import Any
 
 from lemniscate.algos import ALGORITHMS, name_of
 from lemniscate.api import plots, training
-from lemniscate.api.options import RunOptions, require_importable
+from lemniscate.api.options import RunOptions, own_names, require_importable
 from lemniscate.api.policy import path_of
 from lemniscate.api.results import final_return
 from lemniscate.cluster.connection import Cluster
@@ -91,7 +91,7 @@ def train_sweep(
     if len({config.env for config in configs.values()}) > 1:
         raise UserError("These presets are for different environments; name the one of the whole sweep with env.")
     options = RunOptions(track, callbacks, report, progress, cluster=cluster, workers=workers)
-    there, words = options.find_cluster(), _words(options)
+    options.shared()
     require_trainable(configs, numbers)
     stem = f"{'-'.join(names)}-{len(numbers)}-seeds"
     path = path_of(run) if run is not None else training.fresh_directory(next(iter(configs.values())).env, stem)
@@ -99,7 +99,7 @@ def train_sweep(
     but_seed = {name: {k: v for k, v in record.items() if k != "seed"} for name, record in records.items()}
     runs = Sweep(path, numbers, but_seed)
     runs.create()
-    return _train(runs, words, progress, there)
+    return _train(runs, options)
 
 
 def resume_sweep(
@@ -114,20 +114,13 @@ def resume_sweep(
 ) -> TrainedSweep:
     """Resume an interrupted sweep: train the runs that are not finished or have not begun. See `resume`."""
     options = RunOptions(track, callbacks, report, progress, cluster=cluster, workers=workers)
-    return _train(read_sweep(path_of(path)), _words(options), progress, options.find_cluster())
+    return _train(read_sweep(path_of(path)), options)
 
 
-def _words(options: RunOptions) -> list[str]:
-    """The options of each run's process. Raises `UserError` for a tracker or a callback that it could not find."""
-    options.loggers()
-    options.functions()
-    return options.words()
-
-
-def _train(runs: Sweep, options: list[str], progress: bool, cluster: Cluster | None) -> TrainedSweep:
+def _train(runs: Sweep, options: RunOptions) -> TrainedSweep:
     with locked(runs.path):
         runs.create_runs()
-        failed = _Training(runs, options, progress, cluster).train()
+        failed = _Training(runs, options).train()
     if any(map(is_finished, runs.runs)):
         for picture in plots.plot(runs.path):
             say(picture)
@@ -165,6 +158,8 @@ class SetOfRuns(ABC):
         self._places = places_on(cluster, configs)
         self._stop_signal, self._told = 0, False
         """the signal that asked to stop, if one has; whether this was said"""
+        self._say: Callable[[str], object] = say
+        """says a line, if progress is shown"""
 
     @abstractmethod
     def _begin_runs(self) -> bool:
@@ -177,10 +172,6 @@ class SetOfRuns(ABC):
     @abstractmethod
     def _is_finished(self) -> bool:
         """Whether nothing is left to be done."""
-
-    @abstractmethod
-    def _say(self, text: str) -> None:
-        """Say a line, if progress is shown."""
 
     def _train_all(self) -> None:
         """Train the runs to their ends. Raises `Stopped` after a signal."""
@@ -222,15 +213,16 @@ class SetOfRuns(ABC):
 class _Training(SetOfRuns):
     """The runs of a sweep that are to be trained, and the sentences of those that failed."""
 
-    def __init__(self, runs: Sweep, options: list[str], progress: bool, cluster: Cluster | None) -> None:
-        super().__init__(runs.path, runs.configs.values(), cluster)
-        self._options = ["--score", *options]
+    def __init__(self, runs: Sweep, options: RunOptions) -> None:
+        self._options = ["--score", *options.words()]
+        super().__init__(runs.path, runs.configs.values(), options.cluster)
         self._waiting = [run for run in runs.runs if not is_finished(run)]
         self._failed: dict[str, str] = {}
         self._totals = {run: record["config"]["total_steps"] for run, record in runs.runs.items()}
         self._steps = {run: min(progress_of(run)[0], total) for run, total in self._totals.items()}
         self._ended = len(self._totals) - len(self._waiting)
-        self._bar = ProgressBar(sum(self._totals.values()), sum(self._steps.values()), progress)
+        self._bar = ProgressBar(sum(self._totals.values()), sum(self._steps.values()), options.progress)
+        self._say = self._bar.say
 
     def train(self) -> dict[str, str]:
         """Train every run to its end; returns the sentences of those that failed. Raises `Stopped` after a signal."""
@@ -277,9 +269,6 @@ class _Training(SetOfRuns):
             sentence = self._failed[run.name] = failure_of(run, code)
         self._say(f"{run.name}: {sentence}")
 
-    def _say(self, text: str) -> None:
-        self._bar.say(text)
-
 
 def algorithms_of(names: str | Iterable[str]) -> list[str]:
     """The names in "ppo,sac" or in a list, each once. Raises `UserError` for one that is unknown."""
@@ -312,7 +301,7 @@ def seeds_of(seeds: str | int | Iterable[int]) -> list[int]:
 def require_trainable(configs: dict[str, RunConfig], seeds: list[int]) -> None:
     """Raise `UserError` where a run could not begin: one sentence now, instead of one from each run."""
     for name, config in configs.items():
-        require_importable(config)
+        require_importable(*own_names(config))
         device = device_for(config.device)
         for seed in seeds:
             config.replace(seed=seed)

@@ -16,8 +16,10 @@ from lemniscate.api.policy import path_of
 from lemniscate.cluster.connection import Cluster, find_cluster
 from lemniscate.errors import SweepError, UserError
 from lemniscate.report import curves
+from lemniscate.report.seeds import iqm
 from lemniscate.run.config import Range, checked
-from lemniscate.run.directory import locked
+from lemniscate.run.directory import is_finished, locked
+from lemniscate.run.metrics import progress_of, read_metrics
 from lemniscate.run.places import LOG, Sweep, failure_of, is_sweep
 from lemniscate.sweeps.search import (
     NINTHS,
@@ -25,10 +27,7 @@ from lemniscate.sweeps.search import (
     RUNGS,
     Search,
     Tuned,
-    as_text,
     draw,
-    final_score,
-    has_come,
     import_optuna,
     read_search,
     read_space,
@@ -41,7 +40,6 @@ from lemniscate.system.console import say
 if TYPE_CHECKING:
     import optuna
 
-Trials = Annotated[int, Range(1, 10_000)]
 SEEDS = "101-103"
 """of a search, none of which any result of this project was evaluated with"""
 EPISODES = 50
@@ -94,7 +92,7 @@ def tune(
         raise UserError(f"{name} follows from the search: at the end of each part of a run trials are compared.")
     algorithm = name_of(algorithm)
     config = training.config_for(algorithm, env, preset, **fields)
-    trials = checked("trials", trials, Trials)
+    trials = checked("trials", trials, Annotated[int, Range(1, 10_000)])
     config = config.replace(
         checkpoint_every=-(-config.total_steps // NINTHS),
         evaluate_every=config.total_steps,
@@ -106,7 +104,8 @@ def tune(
     path = path_of(run) if run is not None else training.fresh_directory(config.env, f"{algorithm}-tune")
     what = Search(path, algorithm, config, texts, numbers, trials, prune)
     what.create()
-    return _tune(what, progress, there)
+    with locked(path):
+        return _Tuner(what, progress, there).tune()
 
 
 def resume_tuning(
@@ -117,12 +116,9 @@ def resume_tuning(
     workers: int | None = None,
 ) -> Tuned:
     """Go on with an interrupted search. Each run of each trial ends in the same bits as if it had not been stopped."""
-    return _tune(read_search(path_of(path)), progress, find_cluster(cluster, workers))
-
-
-def _tune(search: Search, progress: bool, cluster: Cluster | None) -> Tuned:
+    search, there = read_search(path_of(path)), find_cluster(cluster, workers)
     with locked(search.path):
-        return _Tuner(search, progress, cluster).tune()
+        return _Tuner(search, progress, there).tune()
 
 
 @dataclass
@@ -143,7 +139,7 @@ class _Tuner(SetOfRuns):
 
     def __init__(self, search: Search, progress: bool, cluster: Cluster | None) -> None:
         super().__init__(search.path, [search.config.to_json()], cluster)
-        self._search, self._progress = search, progress
+        self._search, self._say = search, say if progress else lambda _text: None
         self._space, self._study = search.space, search.study()
         self._trials: list[_Trial] = []
 
@@ -183,7 +179,8 @@ class _Tuner(SetOfRuns):
     def _queue(self, trial: _Trial) -> None:
         """Let the runs of a trial wait for a place, in which they go on to its next rung, or to their end."""
         until = self._search.rungs[trial.rung]
-        trial.waiting = [run for run in trial.sweep.runs if not has_come(run, until)]
+        has_come = is_finished if until is None else lambda run: progress_of(run)[0] >= until
+        trial.waiting = [run for run in trial.sweep.runs if not has_come(run)]
 
     def _begin_runs(self) -> bool:
         """Compare the trials that have come to a rung, then start runs: those of the trials that are furthest first."""
@@ -219,7 +216,7 @@ class _Tuner(SetOfRuns):
         if trial.failure:
             self._end(trial, f"failed, {trial.failure}", state="FAIL")
         elif until is None:
-            score = final_score(trial.sweep.runs)
+            score = float(iqm([read_metrics(run)[-1]["evaluation/return"] for run in trial.sweep.runs]))
             self._end(trial, f"score {score:,.1f}", score)
             if self._study.best_trial.number == trial.asked.number:
                 self._search.write_preset(self._study.best_trial)
@@ -237,7 +234,8 @@ class _Tuner(SetOfRuns):
     def _end(self, trial: _Trial, sentence: str, score: float | None = None, state: str = "") -> None:
         self._study.tell(trial.asked, score, import_optuna().trial.TrialState[state] if state else None)
         self._trials.remove(trial)
-        self._say(f"trial {trial.asked.number}: {sentence}; {as_text(trial.asked.params)}")
+        shown = {name: f"{x:.3g}" if isinstance(x, float) else x for name, x in trial.asked.params.items()}
+        self._say(f"trial {trial.asked.number}: {sentence}; {', '.join(f'{name} {x}' for name, x in shown.items())}")
 
     def _result(self) -> Tuned:
         """The best trial, and pictures of all."""
@@ -257,7 +255,3 @@ class _Tuner(SetOfRuns):
         )
         records = [{"number": t.number, "state": t.state.name, "score": t.value, **t.params} for t in trials]
         return Tuned(path, preset, best.value, records)
-
-    def _say(self, text: str) -> None:
-        if self._progress:
-            say(text)
