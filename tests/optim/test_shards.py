@@ -163,7 +163,7 @@ def rebuilt(algo, config, state, dtype):
     torch.manual_seed(0)
     for name, value in vars(state).items():
         if isinstance(value, Adam):
-            fresh = Adam(value.module.networks, max_grad_norm=getattr(config, "max_grad_norm", None))
+            fresh = Adam(value.networks, max_grad_norm=getattr(config, "max_grad_norm", None))
             fresh.learning_rate = 0.01
             setattr(state, name, fresh)
     if algo is trpo:
