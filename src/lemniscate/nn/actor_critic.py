@@ -130,7 +130,7 @@ def _policy(normalizer: NoNorm, net: nn.Module, spec: Spec, initial_log_std: flo
         return CategoricalPolicy(normalizer, net, action)
     if isinstance(action, MultiDiscrete):
         return MultiCategoricalPolicy(normalizer, net, action)
-    return BernoulliPolicy(normalizer, net, action.n)
+    return BernoulliPolicy(normalizer, net, action)
 
 
 def _outputs(action: Action) -> int:

@@ -147,6 +147,8 @@ class Adam(ParameterVector):
             g ← g · min(1, c / ‖g‖)
             m ← β₁ m + (1 − β₁) g        v ← β₂ v + (1 − β₂) g²
             θ ← θ − α m̂ / (√v̂ + ε),      m̂ = m / (1 − β₁ᵗ),  v̂ = v / (1 − β₂ᵗ)
+
+        α is the learning rate, c `max_grad_norm`.
         """
         self._count.add_(1)
         bias = 1 - (self._log_betas * self._count).exp()  # as a power, βᵗ would be computed for each parameter
