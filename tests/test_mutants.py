@@ -1437,8 +1437,8 @@ MUTANTS = [
     (
         "a component's mask is the next one's",
         "nn/policies.py",
-        "obs[..., -size :] == 0",
-        "obs[..., -size :].roll(1, -1) == 0",
+        "obs[..., -size:] == 0",
+        "obs[..., -size:].roll(1, -1) == 0",
         "envs/test_masks.py::test_a_mask_is_obeyed_wherever_it_stands",
     ),
     (

@@ -8,7 +8,7 @@ import torch
 from torch import Generator, Tensor, nn
 
 from lemniscate.nn.actor_critic import encoder_of, network_of, normalizer_of
-from lemniscate.nn.critics import BINS, Bins, CategoricalQ, Critics, QValue
+from lemniscate.nn.critics import BINS, Bins, CategoricalQ, Critics, QValue, Temperature
 from lemniscate.nn.memory import give_memory, remember, remembered_by
 from lemniscate.nn.networks import Layers
 from lemniscate.nn.policies import DeterministicPolicy, Policy, SquashedGaussianPolicy
@@ -78,18 +78,6 @@ class ActorQ(nn.Module):
         return copy.deepcopy(self.followed(), shared).requires_grad_(False)
 
 
-class Temperature(nn.Module):
-    """α > 0, the weight of the entropy in SAC; log α is the parameter."""
-
-    def __init__(self, initial: float) -> None:
-        super().__init__()
-        self.log_alpha = nn.Parameter(torch.tensor(math.log(initial)))
-
-    def forward(self) -> Tensor:
-        """α, a scalar."""
-        return self.log_alpha.exp()
-
-
 class SoftActorQ(ActorQ):
     """A stochastic policy for bounded continuous actions, C critics, and the temperature α of its entropy."""
 
@@ -130,7 +118,9 @@ class Multipliers(nn.Module):
 class ActorCategoricalQ(nn.Module):
     """A stochastic policy for bounded continuous actions, Q(s, a) as a distribution, and the multipliers α and β.
 
-    Args (the others are those of `ActorQ`):
+    The first arguments are those of `ActorQ`.
+
+    Args:
         initial_log_std: log σ of the policy before the tanh, at first.
         value_range: of the critic's bins.
         length: steps of the pieces that networks with a memory learn from.

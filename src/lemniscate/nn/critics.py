@@ -1,5 +1,6 @@
-"""Q(s, a), as a number or as a distribution over bins, behind the observation normalizer of a policy."""
+"""Q(s, a), as a number or as a distribution over bins, and the temperature of the entropy that it counts."""
 
+import math
 from collections.abc import Iterable, Sequence
 
 import torch
@@ -47,6 +48,18 @@ class Critics(nn.Module):
     def first(self, obs: Tensor, action: Tensor) -> Tensor:
         """Q₁(s, a) alone: […, O] and […, A] to […]."""
         return self.members[0](obs, action)
+
+
+class Temperature(nn.Module):
+    """α > 0, the weight of the entropy in SAC; log α is the parameter."""
+
+    def __init__(self, initial: float) -> None:
+        super().__init__()
+        self.log_alpha = nn.Parameter(torch.tensor(math.log(initial)))
+
+    def forward(self) -> Tensor:
+        """α, a scalar."""
+        return self.log_alpha.exp()
 
 
 BINS = 101

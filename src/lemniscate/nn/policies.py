@@ -26,9 +26,13 @@ class Policy(nn.Module):
 
     def __init__(self, normalizer: NoNorm, net: nn.Module, action: Action) -> None:
         super().__init__()
-        self.normalizer, self.net, self.action = normalizer, net, action
+        self.normalizer = normalizer
+        self.net = net
+        self.action = action
         self.memory: Memory | None = None
         """the columns of what it remembers, if it has a memory"""
+        self._draw = torch.randn if isinstance(action, Box) else torch.rand
+        self._shape = _shape_of(action)
 
     def remember(self, obs: Tensor) -> Tensor:
         """The memory of a policy that has one after rows [N, …], as the columns of that memory."""
@@ -51,8 +55,7 @@ class Policy(nn.Module):
 
         One for each number of an action: standard normal for a continuous one, else uniform in [0, 1).
         """
-        draw = torch.randn if isinstance(self.action, Box) else torch.rand
-        return draw(*shape, *_shape_of(self.action), generator=generator, device=generator.device)
+        return self._draw(*shape, *self._shape, generator=generator, device=generator.device)
 
     def metrics(self) -> dict[str, Tensor]:
         """Extra metrics of the policy, each a scalar."""
@@ -67,7 +70,8 @@ class Policy(nn.Module):
 
     def _permitted(self, obs: Tensor) -> Tensor:
         """The network's outputs at [B, O], those of actions that the mask at the end of `obs` rules out at −10⁹."""
-        outputs, size = self.net(self.normalizer(obs)), self.action.mask_size
+        outputs = self.net(self.normalizer(obs))
+        size = self.action.mask_size
         return outputs.masked_fill(obs[..., -size:] == 0, -1e9) if size else outputs
 
 
@@ -150,7 +154,7 @@ class DeterministicPolicy(Policy):
 
     def draw_noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
         """Zeros, [*shape, A]: the policy has no randomness of its own."""
-        return torch.zeros(*shape, *_shape_of(self.action), device=generator.device)
+        return torch.zeros(*shape, *self._shape, device=generator.device)
 
 
 class SquashedGaussianPolicy(Policy):

@@ -95,8 +95,10 @@ class Adam(ParameterVector):
         name: str | None = None,
     ) -> None:
         super().__init__(Function(lambda loss, *args: loss(networks, *args), [networks]))
-        self.networks, self._betas, self._eps, self._limit = networks, betas, eps, max_grad_norm or math.inf
-        self._gradient, self._mean, self._square = (torch.zeros_like(self.vector) for _ in range(3))
+        self.networks = networks
+        self._betas, self._eps, self._limit = betas, eps, max_grad_norm or math.inf
+        self._gradient = torch.zeros_like(self.vector)
+        self._mean, self._square = torch.zeros_like(self.vector), torch.zeros_like(self.vector)
         device = self.vector.device
         self._log_betas = torch.tensor(betas, dtype=torch.float64).log().to(device, wide_float(device))
         self._rates, self._powers = self._log_betas.new_ones(2), self._log_betas.new_tensor([-1, -0.5])
