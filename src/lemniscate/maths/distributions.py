@@ -16,9 +16,11 @@ class Distribution(Protocol):
 
     def sample(self, noise: Tensor) -> Tensor:
         """One action each, a function of `noise`."""
+        ...
 
     def mode(self) -> Tensor:
         """The most probable action each."""
+        ...
 
 
 @dataclass(frozen=True)
