@@ -638,14 +638,14 @@ MUTANTS = [
     ),
     (
         "units are normalized by column",
-        "nn/categorical_q.py",
+        "nn/critics.py",
         "vector_norm(layer.weight, dim=1, keepdim=True)",
         "vector_norm(layer.weight, dim=0, keepdim=True)",
         SAC + "the_weights_of_each_unit_of_q_have_length_one_after_an_update",
     ),
     (
         "a distribution is fitted to a target in other units",
-        "nn/categorical_q.py",
+        "nn/critics.py",
         "hl_gauss(target, self.bins.edges)",
         "hl_gauss(target, self.bins.unit)",
         SAC + "a_q_that_is_a_distribution_learns_the_probabilities_of_the_same_target",
@@ -715,7 +715,7 @@ MUTANTS = [
     ),
     (
         "the floor of the temperature is a ceiling",
-        "nn/categorical_q.py",
+        "nn/actor_q.py",
         "clamp_(min=math.log(least)",
         "clamp_(max=math.log(least)",
         REPPO + "the_temperature_stops_at_its_least_and_can_grow_again",
@@ -911,7 +911,7 @@ MUTANTS = [
     ),
     (
         "the action hardly matters to Q",
-        "nn/categorical_q.py",
+        "nn/critics.py",
         "self.action_gain * action",
         "action",
         REPPO + "q_is_the_mean_of_its_distribution",
@@ -1437,8 +1437,8 @@ MUTANTS = [
     (
         "a component's mask is the next one's",
         "nn/policies.py",
-        "obs[..., -action.mask_size :] == 0",
-        "obs[..., -action.mask_size :].roll(1, -1) == 0",
+        "obs[..., -size:] == 0",
+        "obs[..., -size:].roll(1, -1) == 0",
         "envs/test_masks.py::test_a_mask_is_obeyed_wherever_it_stands",
     ),
     (

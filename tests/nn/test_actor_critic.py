@@ -7,9 +7,9 @@ from helpers import equal, spec_of
 from lemniscate.errors import UserError
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.actor_q import ActorQ, SoftActorQ
-from lemniscate.nn.bounded import DeterministicPolicy, SquashedGaussianPolicy
 from lemniscate.nn.networks import ImageEncoder, Layers
 from lemniscate.nn.normalizer import NoNorm, RunningNorm
+from lemniscate.nn.policies import DeterministicPolicy, SquashedGaussianPolicy
 from lemniscate.spec import Box, ObservationPart, Spec
 
 SMALL = Layers((8,))

@@ -8,9 +8,8 @@ import torch
 
 from helpers import spec_of
 from lemniscate.nn.actor_critic import ActorCritic
-from lemniscate.nn.actor_q import ActorQ
-from lemniscate.nn.bounded import Temperature
-from lemniscate.nn.categorical_q import ActorCategoricalQ, normalize_units
+from lemniscate.nn.actor_q import ActorCategoricalQ, ActorQ
+from lemniscate.nn.critics import Temperature, normalize_units
 from lemniscate.nn.networks import Layers
 
 

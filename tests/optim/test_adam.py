@@ -45,9 +45,9 @@ def test_the_parameters_are_views_of_the_vector():
     assert all(not torch.equal(p, before[name]) for name, p in networks.named_parameters())
     networks.load_state_dict({**networks.state_dict(), **before})
     assert torch.equal(optimizer.vector, torch.cat([p.flatten() for p in before.values()]))
-    named = [name.removeprefix("networks.") for name in optimizer.views()]
+    named = [name.removeprefix("networks.0.") for name in optimizer.views(optimizer.vector)]
     assert named == list(before)
-    assert all(equal(optimizer.views().values(), networks.parameters()))
+    assert all(equal(optimizer.views(optimizer.vector).values(), networks.parameters()))
 
 
 def test_only_its_own_parameters_move():

@@ -12,7 +12,7 @@ from lemniscate.algos import a2c, ppo, reinforce, reppo, sac, trpo
 from lemniscate.data.rollout import SoftBatch, collect
 from lemniscate.maths import standardize
 from lemniscate.optim.adam import Adam
-from lemniscate.optim.shards import EstimatesOverShards, GradientOverShards
+from lemniscate.optim.shards import GradientOverShards, estimates_over_shards
 from lemniscate.system.world import World
 from lemniscate.types import Batch, Rollout, Transition
 from threads import in_world
@@ -108,7 +108,7 @@ def test_estimates_are_those_of_all_rows_in_every_process(size, rng):
 
     rows = torch.randn(3, 8, 5, generator=rng), torch.randn(3, 8, generator=rng)
     expected = function(*rows)
-    for found in in_world(4, size, lambda world: EstimatesOverShards(function, world)(*rows)):
+    for found in in_world(4, size, lambda world: estimates_over_shards(function, world)(*rows)):
         assert all(map(torch.equal, found, expected))
 
 
@@ -163,7 +163,7 @@ def rebuilt(algo, config, state, dtype):
     torch.manual_seed(0)
     for name, value in vars(state).items():
         if isinstance(value, Adam):
-            fresh = Adam(value.module.networks, max_grad_norm=getattr(config, "max_grad_norm", None))
+            fresh = Adam(value.networks, max_grad_norm=getattr(config, "max_grad_norm", None))
             fresh.learning_rate = 0.01
             setattr(state, name, fresh)
     if algo is trpo:

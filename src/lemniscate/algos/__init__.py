@@ -14,9 +14,6 @@ ALGORITHMS = ("reinforce", "a2c", "trpo", "ppo", "reppo", "pqn", "shac", "ddpg",
 RECOMMENDED = "ppo"
 """for who names none: it takes every kind of actions, and mostly needs the fewest minutes (docs/results.md)"""
 
-REQUIRED = ("Config", "train")
-"""names that a module needs to be an algorithm; `lemniscate.testing` checks the rest"""
-
 
 def find(algorithm: str | ModuleType) -> Any:
     """The module of an algorithm: one in `ALGORITHMS`, one's own by its name `module` or `module:name`, or itself.
@@ -29,7 +26,7 @@ def find(algorithm: str | ModuleType) -> Any:
     if isinstance(algorithm, str) and algorithm in ALGORITHMS:
         return import_module(f"{__name__}.{algorithm}")
     own = _import(algorithm) if isinstance(algorithm, str) else algorithm
-    missing = [name for name in REQUIRED if not hasattr(own, name)]
+    missing = [name for name in ("Config", "train") if not hasattr(own, name)]  # `testing` checks the rest
     if missing:
         name = algorithm if isinstance(algorithm, str) else getattr(own, "__name__", shown(own))
         raise UserError(f"{name} is not an algorithm: it has no {' and no '.join(missing)}.")

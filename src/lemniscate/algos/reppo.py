@@ -13,7 +13,8 @@ from torch import Tensor
 
 from lemniscate.data.rollout import SoftBatch, collect, epoch_minibatches, rows_of
 from lemniscate.maths import cross_entropy, explained_variance, hl_gauss, means, soft_lambda_return
-from lemniscate.nn.categorical_q import ActorCategoricalQ, CategoricalQ, Multipliers
+from lemniscate.nn.actor_q import ActorCategoricalQ, Multipliers
+from lemniscate.nn.critics import CategoricalQ
 from lemniscate.nn.networks import Activation
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.nn.policies import Policy

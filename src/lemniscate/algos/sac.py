@@ -14,8 +14,7 @@ from lemniscate.data.replay import interact
 from lemniscate.errors import UserError
 from lemniscate.maths import means, polyak, td_target
 from lemniscate.nn.actor_q import SoftActorQ
-from lemniscate.nn.bounded import Critics, Temperature
-from lemniscate.nn.categorical_q import Bins, normalize_units
+from lemniscate.nn.critics import Bins, Critics, Temperature, normalize_units
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.nn.policies import Policy
 from lemniscate.optim.adam import Adam, linear

@@ -13,7 +13,7 @@ from torch import Tensor
 from lemniscate.data.replay import interact
 from lemniscate.maths import means, polyak, td_target, value_loss
 from lemniscate.nn.actor_q import ActorQ
-from lemniscate.nn.bounded import Critics
+from lemniscate.nn.critics import Critics
 from lemniscate.nn.policies import Policy
 from lemniscate.optim.adam import Adam, linear
 from lemniscate.run.config import Count, NonNegative, Scheduled

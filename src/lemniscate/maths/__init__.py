@@ -1,5 +1,7 @@
 """The mathematics: pure functions on tensors, each with its equation and a test against brute force."""
 
+# ruff: noqa: F401  all that is imported here is offered
+
 from lemniscate.maths.discrete import Bernoulli, Categorical, EpsilonGreedy, MultiCategorical
 from lemniscate.maths.distributions import (
     Deterministic,
@@ -27,45 +29,4 @@ from lemniscate.maths.stats import (
 from lemniscate.maths.targets import cross_entropy, hl_gauss, polyak, soft_lambda_return, td_target
 from lemniscate.maths.trust_region import backtrack, conjugate_gradient, fisher_product, natural_step
 
-__all__ = [
-    "Bernoulli",
-    "Categorical",
-    "Deterministic",
-    "Distribution",
-    "EpsilonGreedy",
-    "Gaussian",
-    "MultiCategorical",
-    "SquashedGaussian",
-    "backtrack",
-    "clip_fraction",
-    "clipped_surrogate",
-    "coloured",
-    "conjugate_gradient",
-    "cross_entropy",
-    "episode_return",
-    "explained_by",
-    "explained_variance",
-    "fisher_product",
-    "gae",
-    "hl_gauss",
-    "kl_k1",
-    "kl_k3",
-    "mean_and_std",
-    "means",
-    "merge_moments",
-    "moments",
-    "natural_step",
-    "ornstein_uhlenbeck",
-    "policy_gradient",
-    "polyak",
-    "q_lambda",
-    "ratio_statistics",
-    "reward_to_go",
-    "soft_lambda_return",
-    "standardize",
-    "surrogate",
-    "tanh",
-    "td_target",
-    "uniform",
-    "value_loss",
-]
+__all__ = sorted(name for name, value in vars().items() if callable(value))  # pyright: ignore[reportUnsupportedDunderAll]

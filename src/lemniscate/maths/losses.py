@@ -17,9 +17,6 @@ def policy_gradient(log_prob: Float[Tensor, " *B"], weight: Float[Tensor, " *B"]
     Args:
         log_prob: log π(a|s).
         weight: Ψ, no gradient: a return, a reward-to-go, an advantage (arXiv:1506.02438, eq. 1).
-
-    Returns:
-        A scalar.
     """
     return -(log_prob * weight).mean()
 
@@ -34,9 +31,6 @@ def surrogate(log_ratio: Float[Tensor, " *B"], advantage: Float[Tensor, " *B"]) 
     Args:
         log_ratio: log π(a|s) − log π_old(a|s).
         advantage: A, no gradient.
-
-    Returns:
-        −L, a scalar.
     """
     return -(log_ratio.exp() * advantage).mean()
 
@@ -55,9 +49,6 @@ def clipped_surrogate(
         log_ratio: log π(a|s) − log π_old(a|s).
         advantage: A, no gradient.
         clip: ε > 0, a number or a scalar tensor.
-
-    Returns:
-        −L^CLIP, a scalar.
     """
     ratio = log_ratio.exp()
     return -torch.min(ratio * advantage, ratio.clamp(1 - clip, 1 + clip) * advantage).mean()
@@ -81,9 +72,6 @@ def value_loss(
         target: what it should be, no gradient.
         old_value: V(s) at collection; needed with `clip`.
         clip: ε > 0, a number or a scalar tensor; None for the plain loss.
-
-    Returns:
-        A scalar.
 
     Raises:
         ValueError: `clip` without `old_value`.

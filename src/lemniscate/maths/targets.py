@@ -100,8 +100,5 @@ def cross_entropy(logits: Float[Tensor, "*B K"], target: Float[Tensor, "*B K"]) 
     Args:
         logits: of q.
         target: p, no gradient.
-
-    Returns:
-        A scalar.
     """
     return -(target * logits.log_softmax(-1)).sum(-1).mean()

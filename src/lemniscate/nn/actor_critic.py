@@ -130,7 +130,7 @@ def _policy(normalizer: NoNorm, net: nn.Module, spec: Spec, initial_log_std: flo
         return CategoricalPolicy(normalizer, net, action)
     if isinstance(action, MultiDiscrete):
         return MultiCategoricalPolicy(normalizer, net, action)
-    return BernoulliPolicy(normalizer, net, action.n)
+    return BernoulliPolicy(normalizer, net, action)
 
 
 def _outputs(action: Action) -> int:
@@ -162,15 +162,8 @@ def network_of(
 ) -> nn.Module:
     """A network from normalized observations, with an encoder before it where these are images.
 
-    Args:
-        spec: of the environment.
-        layers: of the network.
-        outputs: their number.
-        last_gain: of the last layer.
-        privileged: numbers behind the observation.
-        actions: numbers behind these.
-        policy: the columns that a policy remembers, behind the observation; a critic sees them if it has no memory.
-        remembers: whether it may have one.
+    Behind the observation stand `privileged` numbers, and behind these `actions`. Of a critic, `policy` are the columns
+    that a policy remembers, which it sees if it has no memory; `remembers` says whether it may have one.
 
     Raises:
         UserError: layers with a memory, for a network without.

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import pairwise
 from typing import Literal
 
@@ -104,10 +104,6 @@ def _mlp(layers: Layers, inputs: int, normalized: bool = False) -> tuple[list[nn
     return modules, layers.hidden[-1] if layers.hidden else inputs
 
 
-def _layer_norm(layers: Layers, inputs: int) -> tuple[list[nn.Module], int]:
-    return _mlp(layers, inputs, normalized=True)
-
-
 def _simba(layers: Layers, inputs: int) -> tuple[list[nn.Module], int]:
     width = layers.hidden[-1]
     blocks = (Residual(width, layers.linear) for _ in layers.hidden)
@@ -116,7 +112,7 @@ def _simba(layers: Layers, inputs: int) -> tuple[list[nn.Module], int]:
 
 NETWORKS: dict[str, Callable[[Layers, int], tuple[list[nn.Module], int]]] = {
     "mlp": _mlp,
-    "layer_norm": _layer_norm,
+    "layer_norm": partial(_mlp, normalized=True),
     "simba": _simba,
 }
 """The layers before the last one, and the number of their outputs."""

@@ -1,25 +1,38 @@
 """Policies. A policy returns a distribution over actions; what it remembers is part of the observation: `memory`."""
 
+import math
 from collections.abc import Sequence
 
 import torch
 from torch import Generator, Tensor, nn
 
-from lemniscate.maths import Bernoulli, Categorical, Distribution, EpsilonGreedy, Gaussian, MultiCategorical
+from lemniscate.maths import (
+    Bernoulli,
+    Categorical,
+    Deterministic,
+    Distribution,
+    EpsilonGreedy,
+    Gaussian,
+    MultiCategorical,
+    SquashedGaussian,
+)
 from lemniscate.nn.memory import Carrier, Memory, remember
 from lemniscate.nn.normalizer import NoNorm
-from lemniscate.spec import Box, Discrete, MultiDiscrete
+from lemniscate.spec import Action, Box, Discrete, MultiDiscrete
 
 
 class Policy(nn.Module):
-    """Base of all policies: `normalizer`, `net`, then `forward(obs [B, O]) -> Distribution`."""
+    """Base of all policies: `normalizer`, `net`, then `forward(obs [B, O]) -> Distribution` over an `action`."""
 
-    def __init__(self, normalizer: NoNorm, net: nn.Module) -> None:
+    def __init__(self, normalizer: NoNorm, net: nn.Module, action: Action) -> None:
         super().__init__()
         self.normalizer = normalizer
         self.net = net
+        self.action = action
         self.memory: Memory | None = None
         """the columns of what it remembers, if it has a memory"""
+        self._draw = torch.randn if isinstance(action, Box) else torch.rand
+        self._shape = _shape_of(action)
 
     def remember(self, obs: Tensor) -> Tensor:
         """The memory of a policy that has one after rows [N, …], as the columns of that memory."""
@@ -38,8 +51,11 @@ class Policy(nn.Module):
         raise NotImplementedError
 
     def draw_noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
-        """The random numbers that `Distribution.sample` needs for actions at observations [*shape, O]."""
-        raise NotImplementedError
+        """The random numbers that `Distribution.sample` needs for actions at observations [*shape, O].
+
+        One for each number of an action: standard normal for a continuous one, else uniform in [0, 1).
+        """
+        return self._draw(*shape, *self._shape, generator=generator, device=generator.device)
 
     def metrics(self) -> dict[str, Tensor]:
         """Extra metrics of the policy, each a scalar."""
@@ -52,21 +68,32 @@ class Policy(nn.Module):
         """
         self.normalizer.update(obs, valid)
 
+    def _permitted(self, obs: Tensor) -> Tensor:
+        """The network's outputs at [B, O], those of actions that the mask at the end of `obs` rules out at −10⁹."""
+        outputs = self.net(self.normalizer(obs))
+        size = self.action.mask_size
+        return outputs.masked_fill(obs[..., -size:] == 0, -1e9) if size else outputs
+
+
+def _shape_of(action: Action) -> tuple[int, ...]:
+    """The shape of one action."""
+    if isinstance(action, Discrete):
+        return ()
+    if isinstance(action, MultiDiscrete):
+        return (len(action.nvec),)
+    return (action.size if isinstance(action, Box) else action.n,)
+
 
 class GaussianPolicy(Policy):
     """N(μ(s), σ²) in normalized action units, σ one learned number per coordinate, the same in every state."""
 
     def __init__(self, normalizer: NoNorm, net: nn.Module, action: Box, initial_log_std: float) -> None:
-        super().__init__(normalizer, net)
+        super().__init__(normalizer, net, action)
         self.log_std = nn.Parameter(torch.full((action.size,), initial_log_std))
 
     def forward(self, obs: Tensor) -> Gaussian:
         """[B, O] to N(μ [B, A], σ [A])."""
         return Gaussian(self.net(self.normalizer(obs)), self.log_std)
-
-    def draw_noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
-        """Standard normal, [*shape, A]."""
-        return torch.randn(*shape, *self.log_std.shape, generator=generator, device=generator.device)
 
     def metrics(self) -> dict[str, Tensor]:
         """The mean of σ over coordinates."""
@@ -76,17 +103,9 @@ class GaussianPolicy(Policy):
 class CategoricalPolicy(Policy):
     """A softmax over n actions; those that the observation's mask rules out get probability zero."""
 
-    def __init__(self, normalizer: NoNorm, net: nn.Module, action: Discrete) -> None:
-        super().__init__(normalizer, net)
-        self.action = action
-
     def forward(self, obs: Tensor) -> Categorical:
         """[B, O] to logits [B, n]."""
-        return Categorical(_permitted(self.net(self.normalizer(obs)), obs, self.action))
-
-    def draw_noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
-        """Uniform in [0, 1), [*shape]."""
-        return torch.rand(*shape, generator=generator, device=generator.device)
+        return Categorical(self._permitted(obs))
 
 
 class EpsilonGreedyPolicy(Policy):
@@ -96,15 +115,12 @@ class EpsilonGreedyPolicy(Policy):
     """ε, a scalar; 1 at first, and saved with the policy"""
 
     def __init__(self, normalizer: NoNorm, net: nn.Module, action: Discrete) -> None:
-        super().__init__(normalizer, net)
-        self.action = action
+        super().__init__(normalizer, net, action)
         self.register_buffer("epsilon", torch.ones(()))
 
     def forward(self, obs: Tensor) -> EpsilonGreedy:
         """[B, O] to Q(s, ·), [B, n], with −10⁹ for actions that are not permitted."""
-        return EpsilonGreedy(_permitted(self.net(self.normalizer(obs)), obs, self.action), self.epsilon)
-
-    draw_noise = CategoricalPolicy.draw_noise
+        return EpsilonGreedy(self._permitted(obs), self.epsilon)
 
     def metrics(self) -> dict[str, Tensor]:
         """ε."""
@@ -114,36 +130,48 @@ class EpsilonGreedyPolicy(Policy):
 class MultiCategoricalPolicy(Policy):
     """K independent softmaxes over n_k actions each; those that the mask rules out get probability zero."""
 
-    def __init__(self, normalizer: NoNorm, net: nn.Module, action: MultiDiscrete) -> None:
-        super().__init__(normalizer, net)
-        self.action = action
+    action: MultiDiscrete
 
     def forward(self, obs: Tensor) -> MultiCategorical:
         """[B, O] to logits [B, n_k] for each of K."""
-        logits = _permitted(self.net(self.normalizer(obs)), obs, self.action).split(self.action.nvec, dim=-1)
-        return MultiCategorical(tuple(Categorical(part) for part in logits))
-
-    def draw_noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
-        """Uniform in [0, 1), [*shape, K]."""
-        return torch.rand(*shape, len(self.action.nvec), generator=generator, device=generator.device)
-
-
-def _permitted(logits: Tensor, obs: Tensor, action: Discrete | MultiDiscrete) -> Tensor:
-    """The logits [B, n], those of actions that the mask at the end of `obs` rules out at −10⁹."""
-    return logits.masked_fill(obs[..., -action.mask_size :] == 0, -1e9) if action.masked else logits
+        return MultiCategorical(tuple(map(Categorical, self._permitted(obs).split(self.action.nvec, dim=-1))))
 
 
 class BernoulliPolicy(Policy):
     """n independent binary components."""
 
-    def __init__(self, normalizer: NoNorm, net: nn.Module, n: int) -> None:
-        super().__init__(normalizer, net)
-        self.n = n
-
     def forward(self, obs: Tensor) -> Bernoulli:
         """[B, O] to logits [B, n]."""
         return Bernoulli(self.net(self.normalizer(obs)))
 
+
+class DeterministicPolicy(Policy):
+    """One action at each observation, tanh of a network: in [-1, 1]^A, which the env floor maps onto its bounds."""
+
+    def forward(self, obs: Tensor) -> Deterministic:
+        """[B, O] to [B, A]."""
+        return Deterministic(torch.tanh(self.net(self.normalizer(obs))))
+
     def draw_noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
-        """Uniform in [0, 1), [*shape, n]."""
-        return torch.rand(*shape, self.n, generator=generator, device=generator.device)
+        """Zeros, [*shape, A]: the policy has no randomness of its own."""
+        return torch.zeros(*shape, *self._shape, device=generator.device)
+
+
+class SquashedGaussianPolicy(Policy):
+    """tanh(u), u ~ N(μ(s), σ(s)²); log σ is kept in [-5, 2], softly, as tanh moves from one end to the other.
+
+    Args:
+        normalizer: of observations.
+        net: from normalized observations to μ and what log σ is made of, [B, 2 A].
+        action: of A coordinates.
+        initial_log_std: log σ, inside (-5, 2), where the network says 0, as it does at first.
+    """
+
+    def __init__(self, normalizer: NoNorm, net: nn.Module, action: Box, initial_log_std: float = -1.5) -> None:
+        super().__init__(normalizer, net, action)
+        self._offset = math.atanh((initial_log_std + 5) / 3.5 - 1)
+
+    def forward(self, obs: Tensor) -> SquashedGaussian:
+        """[B, O] to μ and log σ, [B, A] each."""
+        mean, log_std = self.net(self.normalizer(obs)).chunk(2, dim=-1)
+        return SquashedGaussian(mean, -5 + 3.5 * (torch.tanh(log_std + self._offset) + 1))

@@ -6,7 +6,7 @@ that of a pure function of the vector; elsewhere it comes from autograd. Both ag
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from typing import Any
 
@@ -22,6 +22,19 @@ LossFunction = Callable[..., Loss]
 """loss(networks, *args)"""
 
 
+class Function(nn.Module):
+    """A function as a module, so that `functional_call` can replace the parameters of the networks that it uses."""
+
+    def __init__(self, function: Callable[..., Any], networks: Iterable[nn.Module]) -> None:
+        super().__init__()
+        self.networks = nn.ModuleList(networks)
+        self._function = function
+
+    def forward(self, *args: Any, **flags: Any) -> Any:
+        """The function's result."""
+        return self._function(*args, **flags)
+
+
 class ParameterVector:
     """The parameters of a module in one vector [P], of which they become views; those that need no gradient stay apart.
 
@@ -32,80 +45,37 @@ class ParameterVector:
         named = {name: parameter for name, parameter in module.named_parameters() if parameter.requires_grad}
         if not named:
             raise UserError("There is nothing to learn: of one of the networks every parameter is frozen.")
-        self.parameters = list(named.values())
-        self._names = list(named)
-        self._shapes = [parameter.shape for parameter in named.values()]
-        self._sizes = [parameter.numel() for parameter in named.values()]
-        self.vector = torch.cat([parameter.detach().flatten() for parameter in named.values()])
-        for parameter, view in zip(named.values(), self.views(self.vector).values(), strict=True):
+        self.module, self.parameters = module, list(named.values())
+        self._shapes = {name: parameter.shape for name, parameter in named.items()}
+        self._sizes = [parameter.numel() for parameter in self.parameters]
+        self.vector = self.join({name: parameter.detach() for name, parameter in named.items()})
+        for parameter, view in zip(self.parameters, self.views(self.vector).values(), strict=True):
             parameter.data = view
 
     def views(self, vector: Tensor) -> dict[str, Tensor]:
         """Any vector [P] as views with the names and shapes of the parameters."""
-        views = zip(self._names, vector.split(self._sizes), self._shapes, strict=True)
-        return {name: view.view(shape) for name, view, shape in views}
+        views = zip(self._shapes.items(), vector.split(self._sizes), strict=True)
+        return {name: view.view(shape) for (name, shape), view in views}
 
     def join(self, tensors: dict[str, Tensor]) -> Tensor:
         """The inverse of `views`: tensors with the names of the parameters, as one vector [P]."""
-        return torch.cat([tensors[name].flatten() for name in self._names])
+        return torch.cat([tensors[name].flatten() for name in self._shapes])
 
 
 class PolicyVector(ParameterVector):
     """A policy as a function of one vector of parameters θ, and the curvature of its distributions there."""
 
-    def __init__(self, policy: nn.Module) -> None:
-        super().__init__(policy)
-        self._policy = policy
-
     def at(self, theta: Tensor, obs: Tensor) -> Any:
         """The distribution π_θ(·|s) at observations [B, O]."""
-        return functional_call(self._policy, self.views(theta), (obs,))
+        return functional_call(self.module, self.views(theta), (obs,))
 
     def fisher(self, vector: Tensor, obs: Tensor) -> Tensor:
         """F v [P], where F is the Fisher matrix at the present θ, averaged over observations [B, O]."""
         return fisher_product(lambda theta: self.at(theta, obs), self.vector, vector)
 
 
-def adam(
-    parameters: Tensor,
-    gradient: Tensor,
-    mean: Tensor,
-    square: Tensor,
-    scales: Tensor,
-    *,
-    betas: tuple[float, float],
-    eps: float,
-    max_grad_norm: float,
-) -> Tensor:
-    """Clipping of the gradient's norm, then one step of Adam, in place: Kingma & Ba 2015, algorithm 1.
-
-        g ← g · min(1, c / ‖g‖)
-        m ← β₁ m + (1 − β₁) g        v ← β₂ v + (1 − β₂) g²
-        θ ← θ − α m̂ / (√v̂ + ε),      m̂ = m / (1 − β₁ᵗ),  v̂ = v / (1 − β₂ᵗ)
-
-    Args:
-        parameters: θ [P], changed.
-        gradient: g [P].
-        mean: m [P], changed.
-        square: v [P], changed.
-        scales: α / (1 − β₁ᵗ) and 1 / √(1 − β₂ᵗ), which differ from step to step, [2].
-        betas: β₁ and β₂.
-        eps: ε.
-        max_grad_norm: c, which may be infinite.
-
-    Returns:
-        ‖g‖ before the clip, a scalar.
-    """
-    norm = gradient.square().sum().sqrt()
-    gradient = gradient * (max_grad_norm / (norm + 1e-6)).clamp(max=1)
-    mean.lerp_(gradient, 1 - betas[0])
-    square.lerp_(gradient.square(), 1 - betas[1])
-    parameters.sub_(scales[0] * mean / (square.sqrt() * scales[1] + eps))
-    return norm
-
-
-class Adam:
-    """Adam for the parameters of `networks` that need a gradient, which become views of one vector (`ParameterVector`).
+class Adam(ParameterVector):
+    """Clipping, and Adam, for the parameters of `networks` that need a gradient: Kingma & Ba 2015, algorithm 1.
 
     Args:
         networks: the module whose parameters move, already on its device. Other networks may take part in a loss.
@@ -124,12 +94,11 @@ class Adam:
         max_grad_norm: float | None = None,
         name: str | None = None,
     ) -> None:
-        self.module = _Networks(networks)
-        self._parameters = ParameterVector(self.module)
-        self.vector = self._parameters.vector
+        super().__init__(Function(lambda loss, *args: loss(networks, *args), [networks]))
+        self.networks = networks
+        self._betas, self._eps, self._limit = betas, eps, max_grad_norm or math.inf
         self._gradient = torch.zeros_like(self.vector)
         self._mean, self._square = torch.zeros_like(self.vector), torch.zeros_like(self.vector)
-        self._adam = partial(adam, betas=betas, eps=eps, max_grad_norm=max_grad_norm or math.inf)
         device = self.vector.device
         self._log_betas = torch.tensor(betas, dtype=torch.float64).log().to(device, wide_float(device))
         self._rates, self._powers = self._log_betas.new_ones(2), self._log_betas.new_tensor([-1, -0.5])
@@ -137,8 +106,7 @@ class Adam:
         self._norm_name = f"gradient_norm/{name}" if name else "gradient_norm"
         self.over_shards: Callable[..., tuple[Tensor, Metrics]] | None = None
         """takes the place of `gradient` where there are several shards: `optim.shards`"""
-        self._inputs = self._parameters.parameters
-        for parameter, gradient in zip(self._inputs, self._parameters.views(self._gradient).values(), strict=True):
+        for parameter, gradient in zip(self.parameters, self.views(self._gradient).values(), strict=True):
             parameter.grad = gradient
 
     @property
@@ -167,24 +135,32 @@ class Adam:
         """The gradient [P] of `loss(networks, *args)`, valid until the next call, and the metrics of the loss."""
         if torch.compiler.is_compiling():
             differentiate = grad_and_value(partial(functional_call, self.module, args=(loss, *args)), has_aux=True)
-            gradients, (_, metrics) = differentiate(self.views())
-            return self._parameters.join(gradients), metrics
-        total, metrics = self.module(loss, *args)
+            gradients, (_, metrics) = differentiate(self.views(self.vector))
+            return self.join(gradients), metrics
+        total, metrics = loss(self.networks, *args)
         self._gradient.zero_()
-        total.backward(inputs=self._inputs)
+        total.backward(inputs=self.parameters)
         return self._gradient, metrics
 
+    @torch.no_grad()
     def descend(self, gradient: Tensor) -> Tensor:
-        """One step down a gradient [P]; returns its norm."""
-        with torch.no_grad():
-            self._count.add_(1)
-            bias = 1 - (self._log_betas * self._count).exp()  # as a power, βᵗ would be computed for each parameter
-            scales = (self._rates * bias**self._powers).to(gradient)
-            return self._adam(self.vector, gradient, self._mean, self._square, scales)
+        """One step down a gradient g [P], clipped to a norm of c; returns ‖g‖ before the clip.
 
-    def views(self) -> dict[str, Tensor]:
-        """The parameters of `module` by name, views of the vector as it is now."""
-        return self._parameters.views(self.vector)
+            g ← g · min(1, c / ‖g‖)
+            m ← β₁ m + (1 − β₁) g        v ← β₂ v + (1 − β₂) g²
+            θ ← θ − α m̂ / (√v̂ + ε),      m̂ = m / (1 − β₁ᵗ),  v̂ = v / (1 − β₂ᵗ)
+
+        α is the learning rate, c `max_grad_norm`.
+        """
+        self._count.add_(1)
+        bias = 1 - (self._log_betas * self._count).exp()  # as a power, βᵗ would be computed for each parameter
+        rate, scale = (self._rates * bias**self._powers).to(gradient)  # α / (1 − β₁ᵗ) and 1 / √(1 − β₂ᵗ)
+        norm = gradient.square().sum().sqrt()
+        gradient = gradient * (self._limit / (norm + 1e-6)).clamp(max=1)
+        self._mean.lerp_(gradient, 1 - self._betas[0])
+        self._square.lerp_(gradient.square(), 1 - self._betas[1])
+        self.vector.sub_(rate * self._mean / (self._square.sqrt() * scale + self._eps))
+        return norm
 
     def state_dict(self) -> dict[str, Tensor]:
         """Adam's two moments and its count; the parameters belong to the networks."""
@@ -212,14 +188,3 @@ def adapt_to_kl(learning_rate: float, kl: float, desired_kl: float) -> float:
     """
     factor = 1 / 1.5 if kl > 2 * desired_kl else 1.5 if kl < desired_kl / 2 else 1.0
     return min(max(learning_rate * factor, 1e-6), 1e-2)
-
-
-class _Networks(nn.Module):
-    """A loss as a method of a module, so that `functional_call` can replace the parameters of its networks."""
-
-    def __init__(self, networks: nn.Module) -> None:
-        super().__init__()
-        self.networks = networks
-
-    def forward(self, loss: LossFunction, *args: Any) -> Loss:
-        return loss(self.networks, *args)

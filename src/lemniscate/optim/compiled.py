@@ -8,11 +8,11 @@ from types import FunctionType, MethodType
 from typing import Any, Generic, ParamSpec, TypeVar
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.func import functional_call
 
 from lemniscate.maths import means
-from lemniscate.optim.adam import Adam
+from lemniscate.optim.adam import Adam, Function
 from lemniscate.types import Metrics
 
 P = ParamSpec("P")
@@ -111,7 +111,7 @@ class Learner:
 
     def __init__(self, learn: Learn, optimizers: Sequence[Adam], compiler: Compiler) -> None:
         self._learn, self._optimizers, self._compiler = learn, optimizers, compiler
-        self._module = _LearnModule(learn, [optimizer.module for optimizer in optimizers])
+        self._module = Function(learn, [optimizer.module for optimizer in optimizers])
         self._programs: dict[Any, Compiled[..., Metrics]] = {}
 
     def __call__(self, config: Any, state: Any, data: Any, *by_step: Tensor, **flags: Any) -> list[Metrics]:
@@ -133,19 +133,7 @@ class Learner:
 
     def _functional(self, *args: Any, **flags: Any) -> Metrics:
         """`learn`, while every network that an optimizer moves is made of views of that optimizer's vector."""
-        owned = enumerate(optimizer.views() for optimizer in self._optimizers)
-        views = {f"modules_of.{i}.{name}": view for i, parameters in owned for name, view in parameters.items()}
+        owned = enumerate(optimizer.views(optimizer.vector) for optimizer in self._optimizers)
+        views = {f"networks.{i}.{name}": view for i, parameters in owned for name, view in parameters.items()}
         with torch.no_grad():  # of networks that only take part in a loss; `grad_and_value` differentiates all the same
             return means(functional_call(self._module, views, args, flags))
-
-
-class _LearnModule(nn.Module):
-    """`learn` as a module, so that `functional_call` can replace the parameters of all networks at once."""
-
-    def __init__(self, learn: Learn, modules: list[nn.Module]) -> None:
-        super().__init__()
-        self.modules_of = nn.ModuleList(modules)
-        self._learn = learn
-
-    def forward(self, *args: Any, **flags: Any) -> list[Metrics]:
-        return self._learn(*args, **flags)

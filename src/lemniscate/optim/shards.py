@@ -60,20 +60,13 @@ class GradientOverShards:
         return arg.chunk(shards)[held.start : held.stop] if isinstance(arg, Tensor) and arg.ndim else [arg] * len(held)
 
 
-class EstimatesOverShards:
-    """A function of rows [T, N, …], computed of an equal part of the N environments for each shard.
+def estimates_over_shards(function: Callable[..., Sequence[Tensor]], world: World) -> Callable[..., list[Tensor]]:
+    """A function of tensors [T, N, …] to tensors [T, N], computed of an equal part of the N for each shard."""
+    shards, held = world.shards, world.held
 
-    Args:
-        function: tensors [T, N, …] to tensors [T, N].
-        world: the processes that share the shards.
-    """
-
-    def __init__(self, function: Callable[..., Sequence[Tensor]], world: World) -> None:
-        self._function, self._world = function, world
-
-    def __call__(self, *rows: Tensor) -> list[Tensor]:
-        """The values of all rows, in every process."""
-        shards, held = self._world.shards, self._world.held
+    def estimates(*rows: Tensor) -> list[Tensor]:
         parts = zip(*(x.chunk(shards, 1)[held.start : held.stop] for x in rows), strict=True)
-        columns = zip(*(self._function(*(x.contiguous() for x in part)) for part in parts), strict=True)
-        return [torch.cat(list(self._world.gather(torch.stack(column))), dim=1) for column in columns]
+        columns = zip(*(function(*(x.contiguous() for x in part)) for part in parts), strict=True)
+        return [torch.cat(list(world.gather(torch.stack(column))), dim=1) for column in columns]
+
+    return estimates

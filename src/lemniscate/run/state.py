@@ -17,7 +17,7 @@ from lemniscate.nn.normalizer import RewardScale
 from lemniscate.nn.policies import Policy
 from lemniscate.optim.adam import Adam
 from lemniscate.optim.compiled import Compiled, Compiler, Learner
-from lemniscate.optim.shards import EstimatesOverShards, GradientOverShards
+from lemniscate.optim.shards import GradientOverShards, estimates_over_shards
 from lemniscate.run.config import RunConfig
 from lemniscate.run.seeding import Generators
 from lemniscate.system.world import World
@@ -123,7 +123,7 @@ class TrainState(Generic[Networks]):
             for optimizer in self.optimizers():
                 optimizer.over_shards = GradientOverShards(optimizer, world, compiler)
             if hasattr(self.networks, "estimates"):
-                self.networks.estimates = EstimatesOverShards(self.networks.estimates, world)
+                self.networks.estimates = estimates_over_shards(self.networks.estimates, world)
         elif compiler:
             self.learn = Learner(self.learn, self.optimizers(), compiler)
 
