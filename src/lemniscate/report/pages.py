@@ -25,7 +25,7 @@ from lemniscate.doctor.rules import seeds_differ
 from lemniscate.errors import UserError, resume_line
 from lemniscate.report import curves
 from lemniscate.report.playback import FILMS
-from lemniscate.report.seeds import Group, Scores, differing
+from lemniscate.report.seeds import Group, Scores, differing, written
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import is_finished, read_config
 from lemniscate.run.evaluate import Evaluation, QBias
@@ -71,8 +71,8 @@ def write_run(run: Path, pictures: Sequence[Path], scores: Evaluated | None, fou
         scores=scores,
         rows=score_rows(scores) if scores else [],
         histogram=_histogram(scores["returns"]) if scores else None,
-        changed=[(name, *map(_shown, values)) for name, values in changed.items()],
-        unchanged=[(name, _shown(value)) for name, value in config.items() if name not in changed],
+        changed=[(name, written(value, " "), written(default, " ")) for name, (value, default) in changed.items()],
+        unchanged=[(name, written(value, " ")) for name, value in config.items() if name not in changed],
         commands=(train_command(algorithm, config), resume_line(run), evaluate),
     )
 
@@ -136,7 +136,7 @@ def comparison_part(
         "remarks": [*remarks, *(f"{label}: {sentence}" for label, sentence in spread if sentence)],
         "pictures": pictures,
         "differences": [
-            [name, *(_shown(kind[name]) if name in kind else "–" for kind in kinds)] for name in differing(kinds)
+            [name, *(written(kind[name], " ") if name in kind else "–" for kind in kinds)] for name in differing(kinds)
         ],
         "runs": [
             {
@@ -294,17 +294,6 @@ def _option(name: str, value: Any) -> list[str]:
     if isinstance(value, dict):
         return [flag(name), json.dumps(value)]
     return [flag(name), "none" if value is None else str(value)]
-
-
-def _shown(value: Any) -> str:
-    """The value of a field, as a person would write it."""
-    if isinstance(value, list):
-        return " ".join(map(_shown, value)) or "none"
-    if isinstance(value, bool):
-        return "on" if value else "off"
-    if isinstance(value, int):
-        return f"{value:,}"
-    return "none" if value in (None, "", {}) else str(value)
 
 
 def _embedded(file: Path) -> str:
