@@ -370,7 +370,7 @@ def _show(player: Any, vec: VecEnv, arguments: dict[str, Any], *, deterministic:
         drawn = TrainedPolicy(player.networks, player.spec, player.config.replace(seed=how["seed"]), player.step)
         act = partial(drawn.act, deterministic=deterministic)
         how["begin"] = drawn.reset
-        return playback.show_episodes(act if drawn.is_masked else playback.act_by(act), arguments, **how)
+        return playback.show_episodes(act if drawn.is_masked else lambda obs, action_mask: act(obs), arguments, **how)
     return playback.show_episodes(player and player.act, arguments, **how)
 
 
