@@ -97,7 +97,10 @@ def of_observations(e: Evidence) -> Seen:
             " at.",
         )
     elif repeated > 0.5 and not cut > 0.5:
-        yield "observation-repeated", f"After {repeated:.0%} of the steps the observation was the same as before."
+        yield (
+            "observation-repeated",
+            f"After {repeated:.0%} of the steps the observation was the same as before.",
+        )
     else:
         if predicted < 0.25:
             yield "observation-noisy", f"An observation explains {max(0.0, predicted):.0%} of the next one."
@@ -110,7 +113,8 @@ def of_observations(e: Evidence) -> Seen:
 
 def of_normalization(e: Evidence) -> Seen:
     """The size of observations, and the normalizer."""
-    first, late, offset = e.early("observation/largest"), e.late("observation/largest"), e.late("normalizer/offset")
+    first, late = e.early("observation/largest"), e.late("observation/largest")
+    offset = e.late("normalizer/offset")
     count, normalized = e.last("normalizer/count"), e.config.get("normalize_observations", True)
     steps = max((line["step"] for line in e.log if "normalizer/count" in line), default=0)
     if late > 1e5 or late > 300 * max(first, 1.0):
@@ -143,7 +147,10 @@ def of_actions(e: Evidence) -> Seen:
     elif len(effects) >= 3 and not e.rose and not e.sees_nothing:
         explained = (shares if len(shares) else effects)[first].max()
         if effects[first].max() < 0.02 or (len(shares) and explained < 0.001):
-            yield "action-without-effect", f"Actions explain {max(0.0, explained):.2%} of how observations change."
+            yield (
+                "action-without-effect",
+                f"Actions explain {max(0.0, explained):.2%} of how observations change.",
+            )
     if by_sign > 0.5:
         yield (
             "action-by-sign",
@@ -187,7 +194,10 @@ def of_episodes(e: Evidence) -> Seen:
     if e.log and not len(e.returns):
         yield "no-episode", "No whole episode ended in training."
     if short:
-        yield "short-episodes", f"Nine of ten episodes took no more than {np.percentile(e.lengths, 90):.0f} steps."
+        yield (
+            "short-episodes",
+            f"Nine of ten episodes took no more than {np.percentile(e.lengths, 90):.0f} steps.",
+        )
     elif alike and e.returns.any():
         yield (
             "every-return-alike",
@@ -206,10 +216,10 @@ def of_horizon(e: Evidence) -> Seen:
     """How far ahead the policy looks, and how far its episodes go."""
     gamma, recommended = (first_number(config.get("gamma")) for config in (e.config, e.recommended))
     fifth = len(e.lengths) // 5
-    if gamma is not None and recommended is not None and gamma < recommended and not e.as_recommended("gamma"):
+    if gamma is not None and recommended is not None and gamma < recommended:
         ahead, length = 1 / (1 - gamma), np.median(e.lengths) if len(e.lengths) else 0
-        # A setting far out is named as such.
-        if length > 25 * ahead and not e.beyond("gamma", *e.usual.get("gamma", (0.0, 1.0))):
+        named = e.beyond("gamma", *e.usual.get("gamma", (0.0, 1.0)))  # a setting far out is named as such
+        if length > 25 * ahead and not named and not e.as_recommended("gamma"):
             yield (
                 "horizon-short",
                 f"With gamma {gamma:g} some {ahead:.0f} steps ahead count, and episodes last {length:,.0f}.",
@@ -283,7 +293,10 @@ def of_advantages(e: Evidence) -> Seen:
     errors = _standard_errors(followed) if len(followed) >= 4 else np.nan
     ignored = 0.8 < awaited < 1.2  # below, V is only behind; above, it has no scale yet
     if ignored:
-        yield "ends-ignored", f"Where episodes terminate, V still awaits {awaited:.0%} of what it awaits elsewhere."
+        yield (
+            "ends-ignored",
+            f"Where episodes terminate, V still awaits {awaited:.0%} of what it awaits elsewhere.",
+        )
     if errors < -3:
         yield (
             "advantage-opposed",
@@ -294,7 +307,8 @@ def of_advantages(e: Evidence) -> Seen:
             "advantage-unrelated",
             f"Changes of log π and advantages have a correlation of {followed.mean():.2f}: none.",
         )
-    if given is False and usual and not e.config.get("scale_rewards") and not e.as_recommended("normalize_advantage"):
+    neither = given is False and usual and not e.config.get("scale_rewards")
+    if neither and not e.as_recommended("normalize_advantage"):
         yield "advantage-not-normalized", "Neither advantages nor rewards are normalized."
 
 
@@ -340,18 +354,27 @@ def of_values(e: Evidence) -> Seen:
 def _is_missing(late: np.ndarray) -> bool:
     """Whether a share of the value is missing, and not on its way; above 1.3 there is no value at all."""
     first, last = np.split(late, [len(late) // 2])
-    return 0.2 < np.median(late) < 1.3 and np.percentile(late, 10) > 0.1 and last.mean() >= 0.75 * first.mean()
+    some = 0.2 < np.median(late) < 1.3 and np.percentile(late, 10) > 0.1
+    return bool(some and last.mean() >= 0.75 * first.mean())
 
 
 def of_networks(e: Evidence) -> Seen:
     """Units and gradients."""
     inactive, saturated = e.late("network/inactive"), e.late("network/saturated")
-    norms, norm, limit = e.values("gradient_norm"), e.late("gradient_norm"), first_number(e.config.get("max_grad_norm"))
+    norms, norm = e.values("gradient_norm"), e.late("gradient_norm")
+    limit = first_number(e.config.get("max_grad_norm"))
+    times = 5 if norm > 100 and e.config.get("scale_rewards", False) else 100
     if inactive > 0.6:
-        yield "units-inactive", f"{inactive:.0%} of the policy's hidden units are the same at every observation."
+        yield (
+            "units-inactive",
+            f"{inactive:.0%} of the policy's hidden units are the same at every observation.",
+        )
     if saturated > 0.6:
-        yield "units-saturated", f"{saturated:.0%} of what the policy's hidden units say is at a bound of tanh."
-    if len(norms) >= 8 and norm > (5 if norm > 100 and e.config.get("scale_rewards", False) else 100) * norms[0]:
+        yield (
+            "units-saturated",
+            f"{saturated:.0%} of what the policy's hidden units say is at a bound of tanh.",
+        )
+    if len(norms) >= 8 and norm > times * norms[0]:
         yield "gradient-grows", f"The norm of the gradient rose from {norms[0]:.3g} to {norms[-1]:.3g}."
     if limit and norm > 30 * limit:
         yield (
@@ -405,7 +428,8 @@ def of_evaluations(e: Evidence) -> Seen:
     last, mean = e.ends[1], e.scores.get("mean_return", e.last("evaluation/return"))
     returns, each = e.scores.get("returns", ()), e.config.get("evaluate_episodes", 20)
     bias = (e.scores.get("q_bias") or {}).get("bias", e.late("evaluation/q_bias"))
-    if len(last) >= 10 and last.mean() - mean > max(0.3 * np.ptp(e.returns), 3 * last.std() / np.sqrt(len(last))):
+    enough = len(last) >= 10
+    if enough and last.mean() - mean > max(0.3 * np.ptp(e.returns), 3 * last.std() / np.sqrt(len(last))):
         yield (
             "evaluated-otherwise",
             f"Training ends at {last.mean():,.4g}, and the deterministic policy has {mean:,.4g} in the evaluation.",

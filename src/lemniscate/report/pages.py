@@ -70,8 +70,8 @@ def write_run(run: Path, pictures: Sequence[Path], scores: Evaluated | None, fou
         scores=scores,
         rows=score_rows(scores) if scores else [],
         histogram=_histogram(scores["returns"]) if scores else None,
-        changed=[(name, written(value, " "), written(default, " ")) for name, (value, default) in changed.items()],
-        unchanged=[(name, written(value, " ")) for name, value in config.items() if name not in changed],
+        changed=[(name, *map(_shown, values)) for name, values in changed.items()],
+        unchanged=[(name, _shown(value)) for name, value in config.items() if name not in changed],
         commands=(train_command(algorithm, config), resume_line(run), evaluate),
     )
 
@@ -112,6 +112,10 @@ def write_comparison(page: Path, parts: Sequence[Mapping[str, Any]]) -> Path:
     return write_page(page, "comparison.html.j2", title=title, subtitle=str(page), parts=parts)
 
 
+def _shown(value: Any) -> str:
+    return written(value, " ")
+
+
 def comparison_part(
     page: Path,
     groups: Sequence[Group],
@@ -134,7 +138,7 @@ def comparison_part(
         "remarks": [*remarks, *(f"{label}: {sentence}" for label, sentence in spread if sentence)],
         "pictures": pictures,
         "differences": [
-            [name, *(written(kind[name], " ") if name in kind else "–" for kind in kinds)] for name in differing(kinds)
+            [name, *(_shown(kind[name]) if name in kind else "–" for kind in kinds)] for name in differing(kinds)
         ],
         "runs": [
             {

@@ -118,7 +118,7 @@ def probability_of_improvement(x: ArrayLike, y: ArrayLike) -> np.ndarray:
     return (1 + np.sign(difference).mean(axis=(-2, -1))) / 2
 
 
-def interval(statistic: Callable[..., np.ndarray], *groups: ArrayLike, resamples: int = RESAMPLES) -> np.ndarray:
+def interval(statistic: Callable[..., Any], *groups: ArrayLike, resamples: int = RESAMPLES) -> np.ndarray:
     """95 % interval of a statistic of one group [seeds, …] or several, over resampled seeds of each: [2, …].
 
     The `statistic` takes an array [resamples, seeds, …] for each group, and returns [resamples, …].
