@@ -115,14 +115,14 @@ def measured(algorithm, env, steps):
 
 def summary(algorithm):
     """The rows of docs/results.md of what has been run."""
-    from lemniscate.report.seeds import bootstrap_interval, iqm
+    from lemniscate.report.seeds import interval, iqm
 
     for env in RUNS[algorithm]:
         found = [row["steps"] for row in rows("returns") if (row["algorithm"], row["env"]) == (algorithm, env)]
         for mark in sorted(set(found)):
             of = measured(algorithm, env, mark)
             means = [row["mean_return"] for row in of]
-            low, high = bootstrap_interval(means)
+            low, high = interval(iqm, means)
             seconds = np.median([row["training_s"] for row in of])
             digits = 1 if abs(np.mean(means)) < 200 else 0
             numbers = (np.mean(means), np.std(means), iqm(means), low, high, min(means))

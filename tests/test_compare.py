@@ -9,7 +9,7 @@ import pytest
 import lemniscate as lem
 from lemniscate.report import compare, curves
 from lemniscate.report.curves import training_minutes
-from lemniscate.report.seeds import bootstrap_interval, group, improvement_interval, iqm
+from lemniscate.report.seeds import group, interval, iqm, probability_of_improvement
 from lemniscate.run import checkpoint
 from lemniscate.run.metrics import to_line
 from lemniscate.system.files import write_json
@@ -177,11 +177,11 @@ def test_seeds_enough_are_ranked(tmp_path, monkeypatch, capsys):
     (better,) = figure.axes[3].lines[-1].get_xdata()
     assert better == 0  # 101 to 103 against 104 and 105
     finals = [np.array([101.0, 102.0, 103.0]), np.array([104.0, 105.0])]
-    for i, (seeds, interval, middle) in enumerate(zip(*[iter(figure.axes[2].lines)] * 3, strict=True)):
+    for i, (seeds, ends, middle) in enumerate(zip(*[iter(figure.axes[2].lines)] * 3, strict=True)):
         assert list(seeds.get_xdata()) == pytest.approx(list(finals[i]))
-        assert list(interval.get_xdata()) == pytest.approx(bootstrap_interval(finals[i]))
+        assert list(ends.get_xdata()) == pytest.approx(interval(iqm, finals[i]))
         assert list(middle.get_xdata()) == pytest.approx([iqm(finals[i])])
-    assert list(figure.axes[3].lines[1].get_xdata()) == pytest.approx(improvement_interval(*finals))
+    assert list(figure.axes[3].lines[1].get_xdata()) == pytest.approx(interval(probability_of_improvement, *finals))
     assert [len(axes.collections) for axes in figure.axes[:2]] == [2, 2]  # a band for each group
     assert compare.ONE_SEED not in capsys.readouterr().err
 

@@ -70,7 +70,7 @@ def test_more_flights_than_environments_are_evaluated_as_without_a_film(run, dra
     assert filmed.returns == plain.returns
     assert filmed.episodes == 5
     (tracks,) = drawn
-    assert [track.position.shape for track in tracks] == [(5, 1, 3)] * 2  # one of each environment, to its end
+    assert [track.position.shape for track in tracks] == [(5, 3)] * 2  # one of each environment, to its end
     assert not any(np.isnan(track.position).any() for track in tracks)
     assert "2 of the 5 flights are shown" in capsys.readouterr().err
 
@@ -94,8 +94,9 @@ def test_the_film_of_a_report_is_named_before_its_page(run, drawn, monkeypatch):
 
 def test_a_flight_is_drawn_wherever_it_is():
     """Far from the origin too."""
-    there = np.array([[[10 + 0.1 * t, 0.0, 5.0]] for t in range(5)])
-    attitude = np.tile([0.0, 0.0, 0.0, 1.0], (5, 1, 1))
-    last = flight.animate(flight.Flight(there, there + np.array([0, 0, 0.2]), attitude, 0.1), every=1)[-1]
+    there = np.array([[10 + 0.1 * t, 0.0, 5.0] for t in range(5)])
+    attitude = np.tile([0.0, 0.0, 0.0, 1.0], (5, 1))
+    beside = there + np.array([0, 0, 0.2])
+    last = flight.animate(flight.Flight(there, beside, attitude, 0.1, np.zeros((0, 15))), every=1)[-1]
     blue = np.array([0x1F, 0x5F, 0xA8])
     assert (np.abs(last.astype(int) - blue).max(axis=-1) < 40).any()

@@ -194,6 +194,15 @@ CASES = {
 }
 
 
+def test_what_is_certain_is_named_first_of_its_kind_and_hints_last():
+    order = [(rule.sure == HINT, rules.KINDS.index(rule.kind), rule.sure != rules.CERTAIN) for rule in RULES]
+    assert order == sorted(order)
+
+
+def test_one_of_two_metrics_that_are_compared_is_no_evidence():
+    assert "critic-overfits" not in names("sac", td_error__newest=[20.0] * 8)
+
+
 def test_every_rule_has_a_case():
     assert CASES.keys() == {rule.name for rule in RULES}
 

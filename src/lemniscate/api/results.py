@@ -361,9 +361,9 @@ def _show(player: Any, vec: VecEnv, arguments: dict[str, Any], *, deterministic:
     vec.close()  # of some environments there can be one at a time
     if trained:
         drawn = TrainedPolicy(player.networks, player.spec, player.config.replace(seed=how["seed"]), player.step)
-        act = partial(drawn.act, deterministic=deterministic)
-        how["begin"] = drawn.reset
-        return playback.show_episodes(act if drawn.is_masked else playback.act_by(act), arguments, **how)
+        masked = partial(drawn.act, deterministic=deterministic)
+        act = masked if drawn.is_masked else lambda obs, action_mask: masked(obs)
+        return playback.show_episodes(act, arguments, begin=drawn.reset, **how)
     return playback.show_episodes(player and player.act, arguments, **how)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lemniscate.doctor.evidence import Evidence, usual_ranges, with_ratios
-from lemniscate.doctor.rules import CAUSES, CERTAIN, HINT, KINDS, LIKELY, RULES, Rule, settings_far_out
+from lemniscate.doctor.rules import CAUSES, CERTAIN, HINT, KINDS, LIKELY, Rule, findings, settings_far_out
 from lemniscate.run.config import RunConfig
 from lemniscate.run.fields import field_help
 from lemniscate.run.metrics import read_metrics
@@ -54,20 +54,15 @@ class Diagnosis:
 
 def diagnose(evidence: Evidence) -> list[Diagnosis]:
     """The findings of all rules, causes first: beside a cause that is certain or likely no symptom is named."""
-    found = [(rule, seen) for rule in RULES if (seen := rule.sees(evidence))] + [*settings_far_out(evidence)]
+    both = [*findings(evidence), *settings_far_out(evidence)]
+    found = sorted(both, key=lambda each: KINDS.index(each[0].kind))
     caused = any(rule.kind in CAUSES and rule.sure in (CERTAIN, LIKELY) for rule, _ in found)
     faulty = any(rule.sure != HINT for rule, _ in found)
-    left = [
-        (rule, seen)
+    return [
+        _diagnosis(evidence, rule, seen)
         for rule, seen in found
         if not (caused and rule.kind == "symptom") and not (faulty and rule.name == "does-not-learn")
     ]
-    return [_diagnosis(evidence, rule, seen) for rule, seen in sorted(left, key=_order)]
-
-
-def _order(found: tuple[Rule, str]) -> tuple[bool, int, bool]:
-    rule, _ = found
-    return rule.sure == HINT, KINDS.index(rule.kind), rule.sure != CERTAIN
 
 
 def _diagnosis(evidence: Evidence, rule: Rule, seen: str) -> Diagnosis:
@@ -94,10 +89,8 @@ class Attendance:
         self._looks.append({"step": step, **metrics})
         if len(self._looks) <= 3:
             return
-        evidence = Evidence(self._config, {}, {}, {}, self._looks, {})
-        for rule in RULES:
-            seen = rule.sees(evidence) if rule.sure == CERTAIN and rule.name not in self._said else None
-            if seen:
+        for rule, seen in findings(Evidence(self._config, {}, {}, {}, self._looks, {})):
+            if rule.sure == CERTAIN and rule.name not in self._said:
                 self._said.add(rule.name)
                 say(f"{seen} {rule.means} {rule.remedy_for(self._config)}.")
 
@@ -106,8 +99,8 @@ def evidence_of(
     run: Path,
     config: RunConfig,
     recommended: Sequence[RunConfig],
-    scores: Mapping[str, Any] | None = None,
-    repeats: bool | None = None,
+    scores: Mapping[str, Any],
+    repeats: bool | None,
 ) -> Evidence:
     """The evidence on the run in a directory.
 
@@ -116,12 +109,12 @@ def evidence_of(
         config: its settings.
         recommended: the Configs that are known to learn its environment, the default last. Of these the one that is
             nearest to the run's is what it is compared with.
-        scores: of its final evaluation.
-        repeats: whether its environment begins alike from one seed.
+        scores: of its final evaluation; empty where there is none.
+        repeats: whether its environment begins alike from one seed; None where that was not tried.
     """
     given = with_ratios(config.to_json())
     known = [with_ratios(one.to_json()) for one in recommended]
     nearest = min(known, key=lambda one: sum(one[name] != value for name, value in given.items()))
     tried = {name: {str(one[name]) for one in (nearest, known[-1])} for name in nearest}
     usual = usual_ranges(field_help(type(config)))
-    return Evidence(given, nearest, tried, usual, read_metrics(run), scores or {}, repeats)
+    return Evidence(given, nearest, tried, usual, read_metrics(run), scores, repeats)

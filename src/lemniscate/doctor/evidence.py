@@ -135,9 +135,9 @@ def first_number(value: Any) -> float | None:
 
 def usual_ranges(texts: Mapping[str, str]) -> dict[str, tuple[float, float]]:
     """The usual range of each field whose help says one, as "usually 0.9 to 0.999"."""
-    said = {name: re.search(r"usually (-?[\d.,e-]+) to (-?[\d.,e-]*\d)", text) for name, text in texts.items()}
+    said = re.compile(r"usually (-?[\d.,e-]+) to (-?[\d.,e-]*\d)")
     return {
         name: (float(found[1].replace(",", "")), float(found[2].replace(",", "")))
-        for name, found in said.items()
-        if found
+        for name, text in texts.items()
+        if (found := said.search(text))
     }

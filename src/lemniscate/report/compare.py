@@ -27,15 +27,7 @@ from lemniscate.report.curves import (
     training_minutes,
     window_of,
 )
-from lemniscate.report.seeds import (
-    Group,
-    Scores,
-    bootstrap_interval,
-    improvement_interval,
-    iqm,
-    mean_interval,
-    probability_of_improvement,
-)
+from lemniscate.report.seeds import Group, Scores, interval, iqm, probability_of_improvement
 from lemniscate.run.directory import is_finished
 from lemniscate.system.console import say
 
@@ -95,13 +87,13 @@ def _cells(one: Group, scores: Scores, digits: int) -> list[str]:
     seeds = str(len(finals)) if len(finals) == len(one.runs) else f"{len(finals)} of {len(one.runs)}"
     if not finals:
         return [seeds, "–", "–", "–", "–"]
-    mean, interval = f"{np.mean(finals):,.{digits}f}", "–"
+    mean, middle = f"{np.mean(finals):,.{digits}f}", "–"
     if len(finals) > 1:
-        low, high = bootstrap_interval(finals)
+        low, high = interval(iqm, finals)
         mean += f" ± {np.std(finals):,.{digits}f}"
-        interval = f"{iqm(finals):,.{digits}f} [{low:,.{digits}f}, {high:,.{digits}f}]"
+        middle = f"{iqm(finals):,.{digits}f} [{low:,.{digits}f}, {high:,.{digits}f}]"
     minutes = np.median([training_minutes(run)[1][-1] for run in one.runs if run in scores])
-    return [seeds, mean, interval, f"{min(finals):,.{digits}f}", f"{minutes:.1f}"]
+    return [seeds, mean, middle, f"{min(finals):,.{digits}f}", f"{minutes:.1f}"]
 
 
 def remarks(groups: list[Group], scores: Scores) -> list[str]:
@@ -126,7 +118,7 @@ def _improvement(one: Group, other: Group, scores: Scores) -> str:
     x, y = one.finals(scores), other.finals(scores)
     if probability_of_improvement(x, y) < 0.5:
         one, other, x, y = other, one, y, x
-    low, high = improvement_interval(x, y)
+    low, high = interval(probability_of_improvement, x, y)
     share = f"{probability_of_improvement(x, y):.0%} [95 %: {low:.0%} to {high:.0%}]"
     return f"{one.label} is better than {other.label} in {share} of the pairs of a seed of each."
 
@@ -201,14 +193,15 @@ def _band(axes: Axes, curves: list[tuple[np.ndarray, np.ndarray]], color: object
     values = np.stack([np.interp(grid, x, y) for x, y in curves])
     axes.plot(grid, values.mean(axis=0), color=color, linewidth=1.5)
     if len(curves) > 1:
-        axes.fill_between(grid, *mean_interval(values), color=color, alpha=0.2, linewidth=0)
+        low, high = interval(lambda drawn: drawn.mean(axis=1), values, resamples=2_000)
+        axes.fill_between(grid, low, high, color=color, alpha=0.2, linewidth=0)
 
 
 def _draw_finals(axes: Axes, groups: list[Group], scores: Scores) -> None:
     for i, one in enumerate(groups):
         finals, color = one.finals(scores), COLORS[i % 10]
         axes.plot(finals, [i - 0.25] * len(finals), "o", color=color, alpha=0.5, markersize=5, markeredgewidth=0)
-        axes.plot(bootstrap_interval(finals), [i, i], color=color, linewidth=4, alpha=0.5, solid_capstyle="butt")
+        axes.plot(interval(iqm, finals), [i, i], color=color, linewidth=4, alpha=0.5, solid_capstyle="butt")
         axes.plot(iqm(finals), i, "|", color=color, markersize=14, markeredgewidth=3)
     axes.set_title("final return: each seed; IQM and its 95 %", loc="left", fontsize=10)
     axes.xaxis.set_major_formatter("{x:,g}")
@@ -219,7 +212,8 @@ def _draw_pairs(axes: Axes, groups: list[Group], pairs: list[tuple[int, int]], s
     axes.axvline(0.5, color="grey", linewidth=1)
     for row, (a, b) in enumerate(pairs):
         x, y = groups[a].finals(scores), groups[b].finals(scores)
-        axes.plot(improvement_interval(x, y), [row, row], color="grey", linewidth=4, alpha=0.5, solid_capstyle="butt")
+        ends = interval(probability_of_improvement, x, y)
+        axes.plot(ends, [row, row], color="grey", linewidth=4, alpha=0.5, solid_capstyle="butt")
         axes.plot(probability_of_improvement(x, y), row, "|", color="black", markersize=14, markeredgewidth=3)
     axes.set_title("probability that the left one is better than the right one", loc="left", fontsize=10)
     axes.set_xlim(-0.02, 1.02)

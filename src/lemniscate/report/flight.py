@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from itertools import chain, product
+from itertools import chain, product, zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -29,43 +29,23 @@ STRIDE = 5
 """a film has a frame for every so many-th step"""
 
 
-NO_BOXES = np.zeros((0, 15))
-
-
 @dataclass(frozen=True)
 class Flight:
-    """M flights of T steps: `position` [T, M, 3] in metres, `attitude` [T, M, 4] (xyzw).
+    """A flight of T steps: `position` [T, 3] in metres, `attitude` [T, 4] (xyzw).
 
-    After the end of a flight that was cut short its rows are NaN. What it flies along or among: `reference` [T, M, 3],
-    in metres; and for each flight the boxes [B, 15] of a `Scene`.
+    What it flies along or among: `reference` [T, 3] in metres, [0, 3] where none is followed; the boxes [B, 15] of a
+    `Scene`.
     """
 
     position: np.ndarray
-    reference: np.ndarray | None
+    reference: np.ndarray
     attitude: np.ndarray
     time_step: float
-    boxes: Sequence[np.ndarray] | np.ndarray = ()
-
-    def one(self, number: int) -> "Flight":
-        """One of the flights, from its start to its end."""
-        flown, own = ~np.isnan(self.position[:, number, 0]), slice(number, number + 1)
-        reference = None if self.reference is None else self.reference[flown, own]
-        return Flight(self.position[flown, own], reference, self.attitude[flown, own], self.time_step, self.boxes[own])
-
-    @property
-    def standing(self) -> np.ndarray:
-        """The boxes of the first of the flights, [B, 15]."""
-        return self.boxes[0] if len(self.boxes) else NO_BOXES
-
-    @property
-    def track(self) -> dict[str, np.ndarray]:
-        """The first of the flights, as `scene` takes it."""
-        found = {"position": self.position[:, 0], "attitude": self.attitude[:, 0], "boxes": self.standing}
-        return found if self.reference is None else {**found, "reference": self.reference[:, 0]}
+    boxes: np.ndarray
 
     @property
     def error_mm(self) -> np.ndarray:
-        """Distance to the reference, [T, M]."""
+        """Distance to the reference, [T]."""
         return 1000 * np.linalg.norm(self.position - self.reference, axis=-1)
 
     @property
@@ -81,7 +61,7 @@ def record(
     seed: int,
     deterministic: bool = True,
     table: EpisodeTable | None = None,
-) -> Flight:
+) -> list[Flight]:
     """Play what `evaluate` plays, and keep the tracks; in `table` also what `evaluate` keeps.
 
     Of more flights than there are environments, the track of each environment's first is kept. Without a policy,
@@ -90,7 +70,7 @@ def record(
     scene = env.scene
     assert scene is not None
     rows, first = [], torch.ones(env.num_envs, dtype=torch.bool, device=env.device)
-    boxes: Sequence[np.ndarray] | np.ndarray = ()
+    boxes = np.zeros((env.num_envs, 0, 15))
     for _, _, step, counts in play_episodes(policy, env, flights, seed, deterministic):
         if not rows and scene.boxes:
             boxes = scene.boxes()
@@ -100,10 +80,13 @@ def record(
             row = torch.where((first & counts)[:, None], step.next_obs, torch.nan)[:flights]
             rows.append(row.cpu().numpy())
         first = first & ~((step.terminated | step.truncated) & counts)
-    track = np.stack(rows)
-    position = track[..., scene.position]
-    reference = position + track[..., scene.error] if scene.error else None
-    return Flight(position, reference, track[..., scene.attitude], scene.time_step, boxes[:flights])
+    found = []
+    for flown, standing in zip(np.stack(rows, axis=1), boxes, strict=False):
+        track = flown[~np.isnan(flown[:, 0])]
+        position = track[:, scene.position]
+        reference = position + track[:, scene.error] if scene.error else position[:0]
+        found.append(Flight(position, reference, track[:, scene.attitude], scene.time_step, standing))
+    return found
 
 
 def show_flights(
@@ -121,21 +104,20 @@ def show_flights(
     each is shown.
     """
     table = EpisodeTable(env.num_envs, env.device)
-    track = record(policy, env, episodes, seed, deterministic, table)
+    flights = record(policy, env, episodes, seed, deterministic, table)
     scores = table.evaluation(env.spec.env_id, env.summaries)
     if episodes > env.num_envs:
         say(f"{env.num_envs} of the {episodes} flights are shown, the first of each environment.")
     for number, of_episode in enumerate(zip(scores.returns, scores.lengths, strict=True), start=1):
         tell(sentence(number, *of_episode))
     assert env.scene is not None
-    flights, model = [track.one(number) for number in range(track.position.shape[1])], env.scene.model
     if video is None and not in_notebook():
         from lemniscate.report import scene
 
-        scene.show([one.track for one in flights], model, track.time_step)
+        scene.show(map(vars, flights), env.scene.model)
     else:
-        frames, how = _frames(flights, model)
-        give(frames, 1 / (STRIDE * track.time_step), video)
+        frames, how = _frames(flights, env.scene.model)
+        give(frames, 1 / (STRIDE * env.scene.time_step), video)
         tell(how)
     return scores
 
@@ -147,35 +129,35 @@ def draw_flights(
 
     Beside a path along a reference, the error. Returns the files, the film last.
     """
-    track = record(policy, env, flights, seed)
+    flown = record(policy, env, flights, seed)
     folder, video = run / "plots", run / "videos" / "flight.gif"
     if film:
         make_directory(video.parent)
         show_flights(policy, env, 1, seed, video=video, tell=lambda text: None)
-    if track.reference is None:
-        drawn = [draw_from_above(track, folder / "flight.png")]
+    if len(flown[0].reference):
+        beside = record(env.baseline, env, flights, seed) if env.baseline else []
+        drawn = [draw_path(flown, folder / "flight.png"), draw_error(flown, folder / "error.png", beside)]
     else:
-        beside = record(env.baseline, env, flights, seed) if env.baseline else None
-        drawn = [draw_path(track, folder / "flight.png"), draw_error(track, folder / "error.png", beside)]
+        drawn = [draw_from_above(flown, folder / "flight.png")]
     return [*drawn, video] if film else drawn
 
 
-def draw_from_above(flight: Flight, file: Path) -> Path:
+def draw_from_above(flights: Sequence[Flight], file: Path) -> Path:
     """The first flight from above (x, y), its speed as colour, and what stands there; the others faintly."""
     figure = Figure(figsize=(7, 4.6), layout="constrained")
     axes = figure.subplots()
-    for other in range(1, flight.position.shape[1]):
-        axes.plot(*flight.position[:, other, :2].T, color=GREY, linewidth=0.5, alpha=0.4)
-    _draw_boxes(axes, flight.standing)
-    first = flight.one(0)
-    path = first.position[:, 0]
-    speed = np.linalg.norm(np.gradient(path, flight.time_step, axis=0), axis=1)
+    first, *others = flights
+    for other in others:
+        axes.plot(*other.position[:, :2].T, color=GREY, linewidth=0.5, alpha=0.4)
+    _draw_boxes(axes, first.boxes)
+    path = first.position
+    speed = np.linalg.norm(np.gradient(path, first.time_step, axis=0), axis=1)
     pieces = list(np.stack([path[:-1, :2], path[1:, :2]], axis=1))
     points = LineCollection(pieces, array=speed[1:], linewidths=2.2, zorder=3)
     axes.add_collection(points)
     axes.plot(*path[0, :2], "o", color=BLUE, markersize=5, zorder=4)
     figure.colorbar(points, ax=axes, label="speed / (m/s)", shrink=0.85)
-    axes.set_title(f"One flight of {first.time[-1]:.2f} s, and {flight.position.shape[1] - 1} others", loc="left")
+    axes.set_title(f"One flight of {first.time[-1]:.2f} s, and {len(others)} others", loc="left")
     axes.set(xlabel="x / m", ylabel="y / m", aspect="equal")
     finish(axes)
     return save(figure, file)
@@ -183,65 +165,67 @@ def draw_from_above(flight: Flight, file: Path) -> Path:
 
 def _draw_boxes(axes: Axes, boxes: np.ndarray) -> None:
     """What stands there, seen from above: the outline of each box's shadow."""
-    signs = np.array(list(product((-1, 1), repeat=3)))
-    for box in boxes:
-        corners = box[:3] + (signs * box[3:6]) @ box[6:].reshape(3, 3).T
-        axes.add_patch(Polygon(_around(corners[:, :2]), facecolor=ORANGE, edgecolor=ORANGE, linewidth=0.8, alpha=0.5))
-
-
-def _around(points: np.ndarray) -> np.ndarray:
-    """The corners of the convex hull of points [8, 2]."""
     from scipy.spatial import ConvexHull
 
-    return points[ConvexHull(points, qhull_options="QJ").vertices]
+    signs = np.array(list(product((-1, 1), repeat=3)))
+    for box in boxes:
+        corners = (box[:3] + (signs * box[3:6]) @ box[6:].reshape(3, 3).T)[:, :2]
+        outline = corners[ConvexHull(corners, qhull_options="QJ").vertices]
+        axes.add_patch(Polygon(outline, facecolor=ORANGE, edgecolor=ORANGE, linewidth=0.8, alpha=0.5))
 
 
-def draw_path(flight: Flight, file: Path) -> Path:
+def draw_path(flights: Sequence[Flight], file: Path) -> Path:
     """The first flight over the reference, seen from the side (x, z); the others' first second faintly."""
-    assert flight.reference is not None
     figure = Figure(figsize=(7, 4.4), layout="constrained")
     axes = figure.subplots()
-    reference, path = flight.reference[:, 0], flight.position[:, 0]
-    late = flight.time > 1
-    axes.plot(*reference[:, [0, 2]].T, color=ORANGE, linewidth=5, alpha=0.35, label="reference")
-    for other in range(1, flight.position.shape[1]):
-        axes.plot(*flight.position[~late, other][:, [0, 2]].T, color=GREY, linewidth=0.6, alpha=0.6)
-    axes.plot([], [], color=GREY, linewidth=0.8, label=f"first second of {flight.position.shape[1] - 1} other starts")
-    axes.plot(*path[:, [0, 2]].T, color=BLUE, linewidth=1.2, label="flown")
-    axes.plot(*path[0, [0, 2]], "o", color=BLUE, markersize=5)
-    counted, when = (late, " after the first second") if late.any() else (slice(None), "")
-    rms = np.sqrt(np.nanmean(np.square(flight.error_mm[counted])))
-    axes.set_title(f"Tracking error{when}: {rms:.1f} mm", loc="left")
+    first, *others = flights
+    axes.plot(*first.reference[:, [0, 2]].T, color=ORANGE, linewidth=5, alpha=0.35, label="reference")
+    for other in others:
+        axes.plot(*other.position[other.time <= 1][:, [0, 2]].T, color=GREY, linewidth=0.6, alpha=0.6)
+    axes.plot([], [], color=GREY, linewidth=0.8, label=f"first second of {len(others)} other starts")
+    axes.plot(*first.position[:, [0, 2]].T, color=BLUE, linewidth=1.2, label="flown")
+    axes.plot(*first.position[0, [0, 2]], "o", color=BLUE, markersize=5)
+    errors = np.concatenate([one.error_mm for one in flights])
+    late = np.concatenate([one.time for one in flights]) > 1
+    counted, when = (errors[late], " after the first second") if late.any() else (errors, "")
+    axes.set_title(f"Tracking error{when}: {np.sqrt(np.mean(np.square(counted))):.1f} mm", loc="left")
     axes.set(xlabel="x / m", ylabel="z / m", aspect="equal")
     finish(axes)
     axes.legend(frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=3)
     return save(figure, file)
 
 
-def draw_error(flight: Flight, file: Path, baseline: Flight | None = None) -> Path:
+def draw_error(flights: Sequence[Flight], file: Path, baseline: Sequence[Flight] = ()) -> Path:
     """Distance to the reference over time: median, 10 % to 90 %, and the worst flight; a baseline's median beside."""
     figure = Figure(figsize=(7, 3.6), layout="constrained")
     axes = figure.subplots()
-    error = flight.error_mm
+    time, error = _errors(flights)
     low, middle, high = np.nanpercentile(error, [10, 50, 90], axis=1)
-    axes.fill_between(flight.time, low, high, color=BLUE, alpha=0.25, linewidth=0, label="10 % to 90 %")
-    axes.plot(flight.time, middle, color=BLUE, label="median")
-    axes.plot(flight.time, np.nanmax(error, axis=1), color=GREY, linewidth=0.8, label="worst")
-    if baseline is not None:
-        its = np.nanmedian(baseline.error_mm, axis=1)
-        axes.plot(baseline.time, its, color=ORANGE, linewidth=1.2, label="median of the baseline")
-    axes.set(xlabel="time / s", ylabel="tracking error / mm", yscale="log", xlim=(0, flight.time[-1]))
-    axes.set_title(f"{error.shape[1]} flights from unseen starts", loc="left")
+    axes.fill_between(time, low, high, color=BLUE, alpha=0.25, linewidth=0, label="10 % to 90 %")
+    axes.plot(time, middle, color=BLUE, label="median")
+    axes.plot(time, np.nanmax(error, axis=1), color=GREY, linewidth=0.8, label="worst")
+    if baseline:
+        its_time, its_error = _errors(baseline)
+        its_median = np.nanmedian(its_error, axis=1)
+        axes.plot(its_time, its_median, color=ORANGE, linewidth=1.2, label="median of the baseline")
+    axes.set(xlabel="time / s", ylabel="tracking error / mm", yscale="log", xlim=(0, time[-1]))
+    axes.set_title(f"{len(flights)} flights from unseen starts", loc="left")
     finish(axes)
     axes.legend(frameon=False, ncols=4, fontsize=9)
     return save(figure, file)
+
+
+def _errors(flights: Sequence[Flight]) -> tuple[np.ndarray, np.ndarray]:
+    """(seconds [T], errors [T, M] in mm) of M flights, NaN after the end of one that is shorter than others."""
+    longest = max(flights, key=lambda one: len(one.position))
+    return longest.time, np.array(list(zip_longest(*(one.error_mm for one in flights), fillvalue=np.nan)))
 
 
 def _frames(flights: list[Flight], model: Any) -> tuple[Iterable[np.ndarray], str]:
     """Frames of flights, one after the other, and how they are drawn."""
     from lemniscate.report import scene
 
-    rendered = (scene.render(one.track, model, STRIDE) for one in flights)
+    rendered = (scene.render(vars(one), model, STRIDE) for one in flights)
     first = next(rendered)
     if first is not None:
         more = chain.from_iterable(frames for frames in rendered if frames is not None)
@@ -254,21 +238,22 @@ def _frames(flights: list[Flight], model: Any) -> tuple[Iterable[np.ndarray], st
 
 
 def animate(flight: Flight, every: int) -> list[np.ndarray]:
-    """Frames of the first flight drawn with matplotlib, one each `every` steps: [H, W, 3] uint8.
+    """Frames of a flight drawn with matplotlib, one each `every` steps: [H, W, 3] uint8.
 
     It is seen from the side beside a reference, and else from above.
     """
     figure = Figure(figsize=(6, 3.6), dpi=90, layout="constrained")
     canvas = FigureCanvasAgg(figure)
     axes = figure.subplots()
-    across = 1 if flight.reference is None else 2
-    path = flight.position[:, 0, [0, across]]
-    reference = path if flight.reference is None else flight.reference[:, 0, [0, across]]
+    follows = len(flight.reference) > 0
+    across = 2 if follows else 1
+    path = flight.position[:, [0, across]]
+    reference = flight.reference[:, [0, across]] if follows else path
     axes.plot(*reference.T, color=ORANGE, linewidth=4, alpha=0.3)
-    if flight.reference is None:
-        _draw_boxes(axes, flight.standing)
+    if not follows:
+        _draw_boxes(axes, flight.boxes)
     both = np.concatenate([path, reference])
-    low, high = np.nanmin(both, axis=0), np.nanmax(both, axis=0)
+    low, high = both.min(axis=0), both.max(axis=0)
     margin = 0.1 + 0.1 * np.max(high - low)  # metres; the body itself is 0.14 wide
     axes.set_xlim(low[0] - margin, high[0] + margin)
     axes.set_ylim(low[1] - margin, high[1] + margin)
@@ -282,14 +267,14 @@ def animate(flight: Flight, every: int) -> list[np.ndarray]:
     clock = axes.text(0.01, 0.95, "", transform=axes.transAxes)
     frames = []
     for t in range(0, len(path), every):
-        x, y, z, w = flight.attitude[t, 0]
+        x, y, z, w = flight.attitude[t]
         ahead = np.array([1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)])[[0, across]]
         arms.set_data(*np.stack([path[t] - 0.07 * ahead, path[t] + 0.07 * ahead]).T)
         trail.set_data(*path[max(0, t - 100) : t + 1].T)
         said = f"{flight.time[t]:4.1f} s"
-        if flight.reference is not None:
+        if follows:
             goal.set_data(*reference[[t]].T)
-            said += f"   {flight.error_mm[t, 0]:5.1f} mm"
+            said += f"   {flight.error_mm[t]:5.1f} mm"
         clock.set_text(said)
         canvas.restore_region(background)
         for artist in (trail, goal, arms, clock):

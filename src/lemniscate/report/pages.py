@@ -4,7 +4,6 @@ A page is one file, `plots/report.html`: no script, nothing from a network, for 
 templates stand in `templates/`; Jinja escapes whatever is put into a page, so nothing in a run's files becomes markup.
 """
 
-import base64
 import json
 import math
 import os
@@ -24,8 +23,8 @@ from lemniscate.doctor import Diagnosis
 from lemniscate.doctor.rules import seeds_differ
 from lemniscate.errors import UserError, resume_line
 from lemniscate.report import curves
-from lemniscate.report.playback import FILMS
-from lemniscate.report.seeds import Group, Scores, differing
+from lemniscate.report.playback import FILMS, embedded
+from lemniscate.report.seeds import Group, Scores, differing, written
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import is_finished, read_config
 from lemniscate.run.evaluate import Evaluation, QBias
@@ -36,8 +35,6 @@ from lemniscate.system.files import filled, replace_file
 MOST_BYTES = 5_000_000
 """the largest film that is embedded; a larger one is linked"""
 
-KINDS = {".png": "image/png", ".gif": "image/gif", ".webp": "image/webp", ".mp4": "video/mp4"}
-
 NOT_MEASURES = {field.name for field in fields(Evaluation)} | {"step", "seed"}
 """names among scores that are not measures of the environment"""
 
@@ -45,6 +42,9 @@ Evaluated = Mapping[str, Any]
 """what `Evaluation.to_json` returns; of a run's policy also its `step`, and the `seed` of the starts"""
 
 TEMPLATES = Path(__file__).parent / "templates"
+
+FILTERS = {"embedded": embedded}
+"""the functions that templates call"""
 
 TASK = "reinforcement-learning"
 """the name of the field on the Hub"""
@@ -67,7 +67,6 @@ def write_run(run: Path, pictures: Sequence[Path], scores: Evaluated | None, fou
         found=found,
         pictures=pictures,
         film=newest_film(run),
-        embedded_bytes=MOST_BYTES,
         scores=scores,
         rows=score_rows(scores) if scores else [],
         histogram=_histogram(scores["returns"]) if scores else None,
@@ -86,7 +85,6 @@ def write_evaluation(folder: Path, name: str, pictures: Sequence[Path], scores: 
         subtitle=f"{scores.episodes:,} episodes · seed {seed}",
         pictures=pictures,
         film=newest_film(folder),
-        embedded_bytes=MOST_BYTES,
         rows=score_rows({**scores.to_json(), "seed": seed}),
         histogram=_histogram(scores.returns),
     )
@@ -112,6 +110,10 @@ def write_comparison(page: Path, parts: Sequence[Mapping[str, Any]]) -> Path:
     """Write the page of a comparison from what `comparison_part` returned for each environment."""
     title = f"Comparison on {', '.join(part['env'] for part in parts)}"
     return write_page(page, "comparison.html.j2", title=title, subtitle=str(page), parts=parts)
+
+
+def _shown(value: Any) -> str:
+    return written(value, " ")
 
 
 def comparison_part(
@@ -199,7 +201,7 @@ def _metadata(name: str, algorithm: str, config: RunConfig, scores: Evaluated | 
     """
     from huggingface_hub import EvalResult, ModelCardData
 
-    results = []
+    results = None
     if scores:
         result = EvalResult(
             task_type=TASK,
@@ -211,14 +213,14 @@ def _metadata(name: str, algorithm: str, config: RunConfig, scores: Evaluated | 
             metric_value=f"{scores['mean_return']:.2f} +/- {scores['std_return']:.2f}",
             metric_args={"episodes": scores["episodes"], "seed": scores["seed"], "training_seeds": [config.seed]},
         )
-        results.append(result)
+        results = [result]
     data = ModelCardData(
         library_name="lemniscate",
         pipeline_tag=TASK,
         license=license,
         tags=[TASK, "lemniscate", config.env, algorithm],
         model_name=name,
-        eval_results=results or None,
+        eval_results=results,
     )
     return data.to_yaml()
 
@@ -296,32 +298,13 @@ def _option(name: str, value: Any) -> list[str]:
     return [flag(name), "none" if value is None else str(value)]
 
 
-def _shown(value: Any) -> str:
-    """The value of a field, as a person would write it."""
-    if isinstance(value, list):
-        return " ".join(map(_shown, value)) or "none"
-    if isinstance(value, bool):
-        return "on" if value else "off"
-    if isinstance(value, int):
-        return f"{value:,}"
-    return "none" if value in (None, "", {}) else str(value)
-
-
-def _embedded(file: Path) -> str:
-    return f"data:{KINDS[file.suffix]};base64,{base64.b64encode(file.read_bytes()).decode()}"
-
-
 def write_page(file: Path, template: str, **context: Any) -> Path:
     """Fill a template, and say at its end by which versions that was done."""
     versions = [f"{package} {version(package)}" for package in ("torch", "numpy", "gymnasium")]
     machine = f"Python {platform.python_version()} on {platform.system()} {platform.machine()}"
     date = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
-    written = f"Written on {date} by lemniscate {version('lemniscate')}, {', '.join(versions)}, {machine}."
-    page = filled(TEMPLATES / template, FILTERS, written=written, **context)
+    written_on = f"Written on {date} by lemniscate {version('lemniscate')}, {', '.join(versions)}, {machine}."
+    page = filled(TEMPLATES / template, FILTERS, written=written_on, embedded_bytes=MOST_BYTES, **context)
     file.parent.mkdir(parents=True, exist_ok=True)
     replace_file(file, page.encode("utf-8", errors="xmlcharrefreplace"))
     return file
-
-
-FILTERS = {"embedded": _embedded}
-"""the functions that templates call"""

@@ -39,8 +39,8 @@ Tell = Callable[[str], object]
 
 ONE = torch.ones(1, dtype=torch.bool)
 
-FILMS = (".gif", ".webp", ".mp4")
-"""the endings of a film's file"""
+FILMS = {".gif": "image/gif", ".webp": "image/webp", ".mp4": "video/mp4"}
+"""the endings of a film's file, and what it is to a browser"""
 
 PICTURE_FPS = 50
 """frames a second that an animated picture has at most: browsers show one with shorter delays far too slowly"""
@@ -75,11 +75,6 @@ def show_episodes(
         else:
             give((_picture(env, name) for _ in played), float((env.metadata or {}).get("render_fps") or 30), video)
     return table.evaluation(name, SUMMARIES)
-
-
-def act_by(function: Callable[[Any], Any]) -> Act:
-    """A function of the observation alone, as an `Act`."""
-    return lambda obs, action_mask=None: function(obs)
 
 
 def require_pictures(config: RunConfig, env: VecEnv) -> None:
@@ -290,6 +285,9 @@ def show_film(file: str | Path) -> None:
     """Show an animated picture (.gif, .webp) below the cell; the notebook then holds it without the file."""
     from IPython.display import HTML, display
 
-    path = Path(file)
-    data = b64encode(path.read_bytes()).decode()
-    display(HTML(f'<img src="data:image/{path.suffix[1:]};base64,{data}">'))  # few viewers know image/webp as an output
+    display(HTML(f'<img src="{embedded(Path(file))}">'))  # few viewers know image/webp as an output
+
+
+def embedded(file: Path) -> str:
+    """A picture or a film as an address that holds all of it, for a page that stands alone."""
+    return f"data:{FILMS.get(file.suffix, 'image/png')};base64,{b64encode(file.read_bytes()).decode()}"

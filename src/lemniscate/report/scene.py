@@ -20,8 +20,7 @@ import mujoco
 import numpy as np
 
 Track = Mapping[str, Any]
-"""the arrays of one flight of T steps: `position` [T, 3] in metres, `attitude` [T, 4] (xyzw), `boxes` [B, 15] of a
-`Scene` and, where one is followed, `reference` [T, 3] in metres"""
+"""the fields of a `Flight`"""
 
 SIZE = (360, 600)
 REFERENCE = np.array([0.9, 0.5, 0.1, 0.4], dtype=np.float32)
@@ -47,7 +46,7 @@ def render(track: Track, model: mujoco.MjModel, every: int) -> np.ndarray | None
     return None
 
 
-def show(tracks: Iterable[Track], model: mujoco.MjModel, time_step: float) -> None:
+def show(tracks: Iterable[Track], model: mujoco.MjModel) -> None:
     """Play the flights one by one in MuJoCo's window, at their own speed, until they end or the window is closed."""
     from mujoco import viewer
 
@@ -63,7 +62,7 @@ def show(tracks: Iterable[Track], model: mujoco.MjModel, time_step: float) -> No
                 window.user_scn.ngeom = 0
                 _draw_lines(window.user_scn, track, t)
                 window.sync()
-                time.sleep(time_step)
+                time.sleep(track["time_step"])
 
 
 def _aim(camera: Any, track: Track) -> None:
@@ -102,7 +101,7 @@ def _draw_lines(scene: mujoco.MjvScene, track: Track, t: int) -> None:
         mujoco.mjv_initGeom(scene.geoms[scene.ngeom], box, half, centre, frame, BOX)
         scene.ngeom += 1
     flown = track["position"][: t + 1][-101::2]
-    for points, color, width in ((track.get("reference", ())[::5], REFERENCE, 3), (flown, TRAIL, 4)):
+    for points, color, width in ((track["reference"][::5], REFERENCE, 3), (flown, TRAIL, 4)):
         for start, end in pairwise(points):
             geom = scene.geoms[scene.ngeom]
             mujoco.mjv_initGeom(geom, line, nothing, nothing, np.zeros(9), color)

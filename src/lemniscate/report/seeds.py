@@ -6,12 +6,13 @@ The random generator has a fixed seed, so the same scores give the same interval
 
 import json
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lemniscate.run.directory import read_config
 from lemniscate.run.places import is_sweep
@@ -81,43 +82,33 @@ def _label(kind: dict[str, Any], kinds: list[dict[str, Any]]) -> str:
     rivals = [other for other in kinds if all(other[name] == kind[name] for name in ("algorithm", "env"))]
     differ = differing(rivals)
     few = differ[:FIELDS]
-    if len({tuple(_word(rival.get(name)) for name in few) for rival in rivals}) < len(rivals):
+    if len({tuple(written(rival.get(name)) for name in few) for rival in rivals}) < len(rivals):
         few = differ
     more = [f"and {len(differ) - len(few)} more"] if len(differ) > len(few) else []
-    return ", ".join([kind["algorithm"].upper(), *(f"{name} {_word(kind.get(name))}" for name in few), *more])
+    return ", ".join([kind["algorithm"].upper(), *(f"{name} {written(kind.get(name))}" for name in few), *more])
 
 
-def _word(value: Any) -> str:
+def written(value: Any, between: str = "×") -> str:
+    """The value of a field, as a person would write it; `between` stands between several."""
     if isinstance(value, list):
-        return "×".join(map(str, value))
-    if isinstance(value, int) and not isinstance(value, bool):
-        return f"{value:,}"
-    return "none" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
+        return between.join(written(one) for one in value) or "none"
+    if isinstance(value, bool):
+        return "on" if value else "off"
+    if isinstance(value, int | float):
+        return f"{value:,}" if isinstance(value, int) else f"{value:.12g}"
+    return "none" if value in (None, "", {}) else str(value)
 
 
-def iqm(scores: Sequence[float] | np.ndarray, axis: int = -1) -> np.ndarray:
-    """Interquartile mean: the mean of the middle half, cut points weighted by the part of them that is inside."""
-    ordered = np.sort(np.asarray(scores, dtype=np.float64), axis=axis)
-    n = ordered.shape[axis]
+def iqm(scores: ArrayLike) -> np.ndarray:
+    """Interquartile mean of [..., n]: that of the middle half, cut points weighted by the part of them inside."""
+    ordered = np.sort(np.asarray(scores, dtype=np.float64), axis=-1)
+    n = ordered.shape[-1]
     rank = np.arange(n)
     weight = np.clip(np.minimum(rank + 1, 0.75 * n) - np.maximum(rank, 0.25 * n), 0, None)
-    return np.moveaxis(ordered, axis, -1) @ (weight / weight.sum())
+    return ordered @ (weight / weight.sum())
 
 
-def bootstrap_interval(scores: Sequence[float], resamples: int = RESAMPLES) -> tuple[float, float]:
-    """95 % interval of the IQM over resampled seeds."""
-    drawn = _drawn_again(np.asarray(scores, dtype=np.float64), np.random.default_rng(0), resamples)
-    low, high = _percentiles(iqm(drawn))
-    return float(low), float(high)
-
-
-def mean_interval(curves: np.ndarray, resamples: int = 2_000) -> np.ndarray:
-    """95 % interval of the mean over resampled seeds at each point of `curves` [seeds, points]: [2, points]."""
-    means = _drawn_again(curves, np.random.default_rng(0), resamples).mean(axis=1)
-    return _percentiles(means)
-
-
-def probability_of_improvement(x: Sequence[float] | np.ndarray, y: Sequence[float] | np.ndarray) -> np.ndarray:
+def probability_of_improvement(x: ArrayLike, y: ArrayLike) -> np.ndarray:
     """P(X > Y): the share of pairs, a run of x [..., n] and one of y [..., m], in which x is higher; a tie is half.
 
     1/(nm) Σᵢ Σⱼ S(xᵢ, yⱼ) with S = 1, ½, 0 for more, equal, less: the paper's probability of improvement on one task,
@@ -127,19 +118,12 @@ def probability_of_improvement(x: Sequence[float] | np.ndarray, y: Sequence[floa
     return (1 + np.sign(difference).mean(axis=(-2, -1))) / 2
 
 
-def improvement_interval(x: Sequence[float], y: Sequence[float], resamples: int = RESAMPLES) -> tuple[float, float]:
-    """95 % interval of P(X > Y) over resampled seeds of both."""
+def interval(statistic: Callable[..., Any], *groups: ArrayLike, resamples: int = RESAMPLES) -> np.ndarray:
+    """95 % interval of a statistic of one group [seeds, …] or several, over resampled seeds of each: [2, …].
+
+    The `statistic` takes an array [resamples, seeds, …] for each group, and returns [resamples, …].
+    """
     rng = np.random.default_rng(0)
-    drawn = [_drawn_again(np.asarray(scores, dtype=np.float64), rng, resamples) for scores in (x, y)]
-    low, high = _percentiles(probability_of_improvement(*drawn))
-    return float(low), float(high)
-
-
-def _drawn_again(scores: np.ndarray, rng: np.random.Generator, resamples: int) -> np.ndarray:
-    """[resamples, seeds, …]: as many seeds as there are, each drawn from all of them."""
-    return rng.choice(scores, (resamples, len(scores)))
-
-
-def _percentiles(resampled: np.ndarray) -> np.ndarray:
-    """The ends of the middle 95 % of resampled values, along their first dimension."""
-    return np.quantile(resampled, [0.025, 0.975], axis=0)
+    scores = [np.asarray(one, dtype=np.float64) for one in groups]
+    drawn = [rng.choice(one, (resamples, len(one))) for one in scores]
+    return np.quantile(statistic(*drawn), [0.025, 0.975], axis=0)
