@@ -67,10 +67,8 @@ SquashedLogStd = Annotated[float, Range(-4.9, 1.9)]  # of a `SquashedGaussianPol
 def checked(name: str, value: Any, hint: Any) -> Any:
     """`value` as the field `name` holds it.
 
-    NumPy's scalars and arrays become Python's, 1e6 a whole number where one is wanted, lists tuples.
-
-    Raises:
-        UserError: a value that no option of `hint` has room for.
+    NumPy's scalars and arrays become Python's, 1e6 a whole number where one is wanted, lists tuples. Raises `UserError`
+    for a value that no option of `hint` has room for.
     """
     value, options = plain(value), options_of(hint)
     if value is None and NoneType in options:

@@ -224,12 +224,12 @@ class Saver:
         self._held = ExitStack()
         self.last_planned = 0
         """the step that `resume` would go on from"""
-        self.planned_at = 0
-        """the step of the last planned checkpoint, stored or not"""
         self.failure: OSError | None = None
         """why the last checkpoint could not be written, if it could not"""
         self._best = -math.inf
         """the mean return of the evaluation that the checkpoint `best` was kept for"""
+        self.logged = 0
+        """the step of the last line of metrics"""
         self.calls = dict[str, Any]()
         """the latest calls of a curriculum, as methods and arguments; part of every checkpoint"""
 
@@ -257,7 +257,7 @@ class Saver:
         if found:
             self._require_same_spaces(found)
             found.restore(state)
-            self.last_planned = self.planned_at = state.step
+            self.last_planned = state.step
             self.calls = dict(found.record.get("calls", {}))
         if not self._world.is_first:
             return found is not None
@@ -301,10 +301,8 @@ class Saver:
                 sentence += f" It is kept as {kept}."
             say(sentence)
 
-    def save(self, state: TrainState, planned: bool, logged: int) -> None:
+    def save(self, state: TrainState, planned: bool) -> None:
         """Write a checkpoint, and have the disk store the metrics up to it. What fails costs only this checkpoint.
-
-        `logged` is the step of the last line of metrics.
 
         Raises `NonFiniteError` where the state has a NaN or an infinity; the checkpoints before are untouched.
         """
@@ -312,26 +310,23 @@ class Saver:
         # planned one, at which its environments restart.
         keep = self._config.keep_checkpoints + (not planned)
         self.failure = None
-        fields = state.saved()
-        if planned:
-            self.planned_at = state.step
         if not self._world.is_first:
             return
         try:
             if (self.path / METRICS).exists():
                 sync(self.path / METRICS)  # before the checkpoint, which says up to which step they are whole
-            record = {**self._record, "planned": planned, "logged": logged, "calls": self.calls}
-            checkpoint.write(self._checkpoints, fields, state.step, record, keep)
+            record = {**self._record, "planned": planned, "logged": self.logged, "calls": self.calls}
+            checkpoint.write(self._checkpoints, state.saved(), state.step, record, keep)
             self.last_planned = state.step if planned else self.last_planned
         except OSError as error:
             self.failure = error
             say(f"The checkpoint at step {state.step:,} could not be written: {error}.")
 
-    def save_if_best(self, state: TrainState, mean_return: float, logged: int) -> None:
+    def save_if_best(self, state: TrainState, mean_return: float) -> None:
         """Keep the state as the checkpoint `best` where no evaluation before had so high a mean return."""
         if mean_return <= self._best:
             return
-        record = {**self._record, "planned": False, "logged": logged, "return": mean_return}
+        record = {**self._record, "planned": False, "logged": self.logged, "return": mean_return}
         try:
             checkpoint.write_fields(self._checkpoints / BEST, state.saved(), record)
             self._best = mean_return

@@ -86,10 +86,7 @@ class Place:
 class ProgressBar:
     """The progress of one run, or of several: live bars in a terminal, live lines in a notebook, else ten lines.
 
-    Args:
-        total: steps to take, of all runs together.
-        done: those that were taken before.
-        visible: whether anything is shown.
+    `done` of the `total` steps of all runs together were taken before.
     """
 
     def __init__(self, total: int, done: int, visible: bool = True) -> None:

@@ -41,13 +41,8 @@ class SharedMemory:
     A process writes into its place and tells the others so; when all have told it, it reads all places. What they say
     next goes into the other places, so nobody overwrites what somebody still reads.
 
-    Args:
-        folder: on this machine, of all processes; whoever made it may remove it once all are connected.
-        rank: of this process.
-        size: number of processes.
-
-    Raises:
-        OSError: a process of another machine, or too little memory.
+    The `folder` is on this machine, of all processes; whoever made it may remove it once all are connected. Raises
+    `OSError` for a process of another machine, or too little memory.
     """
 
     def __init__(self, folder: Path, rank: int, size: int) -> None:
