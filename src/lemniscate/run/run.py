@@ -140,8 +140,7 @@ class Run:
     def until(self, total_steps: int, state: TrainState) -> Iterator[VecEnv]:
         """The environments, once for each update, until `total_steps` are taken or a callback stops the run.
 
-        Raises:
-            Stopped: after a signal, when the current update is done and saved.
+        Raises `Stopped` after a signal, when the current update is done and saved.
         """
         self._bar = ProgressBar(total_steps, state.step, self._visible)
         started = time.monotonic()
@@ -182,8 +181,7 @@ class Run:
     def log(self, state: TrainState, metrics: Mapping[str, torch.Tensor | float], episodes: Episodes) -> None:
         """Write one line of metrics.
 
-        Raises:
-            NonFiniteError: a loss, the gradient or a parameter is NaN or infinite; the last checkpoint is untouched.
+        Raises `NonFiniteError` where a loss, the gradient or a parameter is NaN or infinite; no checkpoint is touched.
         """
         numbers = {name: float(value) for name, value in metrics.items()}
         require_finite(state, numbers)
@@ -252,10 +250,9 @@ class Run:
         return planned
 
     def _stopped(self, state: TrainState, planned: bool) -> bool:
-        """Whether a callback or a signal stops the run here. The state is saved then, and where a callback fails.
+        """Whether a callback stops the run here; the state is saved then, and where a callback fails.
 
-        Raises:
-            Stopped: by a signal.
+        Raises `Stopped` where a signal does, after the same.
         """
         stop = self._observer is not None
         try:
@@ -394,16 +391,14 @@ def decide(curriculum: Callable[..., Any], step: int, metrics: Mapping[str, floa
 @contextmanager
 def globals_undisturbed() -> Iterator[None]:
     """Restore the global generators afterwards: Python's, NumPy's legacy one, torch's on the CPU and on every GPU."""
-    states = random.getstate(), np.random.get_state(), torch.get_rng_state()  # noqa: NPY002
-    gpus = torch.cuda.get_rng_state_all() if torch.cuda.is_initialized() else []
+    python, numpy = random.getstate(), np.random.get_state()  # noqa: NPY002
+    gpus = range(torch.cuda.device_count()) if torch.cuda.is_initialized() else ()
     try:
-        yield
+        with torch.random.fork_rng(gpus):
+            yield
     finally:
-        random.setstate(states[0])
-        np.random.set_state(states[1])  # noqa: NPY002
-        torch.set_rng_state(states[2])
-        if gpus:
-            torch.cuda.set_rng_state_all(gpus)
+        random.setstate(python)
+        np.random.set_state(numpy)  # noqa: NPY002
 
 
 def require_finite(state: TrainState, numbers: Mapping[str, float]) -> None:

@@ -56,11 +56,6 @@ class SharedMemory:
         self._listener.bind(str(folder / str(rank)))
         self._listener.listen(size)
 
-    @staticmethod
-    def new_folder() -> Path:
-        """A new folder, in memory where the system has one there."""
-        return Path(tempfile.mkdtemp(prefix="lemniscate-", dir="/dev/shm" if Path("/dev/shm").is_dir() else None))
-
     def connect(self, folder: Path) -> Self:
         """Connect to the other processes, once all listen: those of lower rank are called, the others call."""
         size = self._places.shape[1]
@@ -201,7 +196,8 @@ class Processes(World):
 
     def _shared_memory(self) -> SharedMemory | None:
         """The memory shared by all processes of one machine; None if it is too small, or a process is elsewhere."""
-        folder = self.from_first(SharedMemory.new_folder() if self.is_first else None)
+        in_memory = "/dev/shm" if Path("/dev/shm").is_dir() else None
+        folder = Path(self.from_first(tempfile.mkdtemp(prefix="lemniscate-", dir=in_memory) if self.is_first else ""))
         memory = None
         try:
             with suppress(OSError, AttributeError):  # macOS cannot reserve a file's memory
