@@ -31,7 +31,7 @@ from lemniscate.optim.compiled import Compiler
 from lemniscate.run.config import RunConfig, plain
 from lemniscate.run.directory import Saver, load_networks
 from lemniscate.run.evaluate import critic_of, evaluate
-from lemniscate.run.loggers import NO_EPISODES, JsonLines, Logger, LoggerClass, TensorBoard
+from lemniscate.run.loggers import NO_EPISODES, Logger, LoggerClass
 from lemniscate.run.metrics import read_metrics
 from lemniscate.run.seeding import derive, seed_globals
 from lemniscate.run.signals import LOOKS, acted_with, signals
@@ -79,23 +79,21 @@ class Run:
         config: RunConfig,
         envs: tuple[VecEnv, VecEnv | None],
         *,
-        world: World | None = None,
-        loggers: Sequence[LoggerClass] = (JsonLines, TensorBoard),
-        progress: bool = True,
-        film: Callable[[TrainState], None] | None = None,
-        observer: Observer | None = None,
-        locate: Callable[[str], Path] = Path,
+        world: World,
+        loggers: Sequence[LoggerClass],
+        progress: bool,
+        film: Callable[[TrainState], None],
+        observer: Observer | None,
+        locate: Callable[[str], Path],
     ) -> None:
         self.path, self.algorithm, self.config = path, algorithm, config
-        self.world = world = world or World(config.shards)
-        self.env, self.eval_env = envs
+        self.world, (self.env, self.eval_env) = world, envs
         self.spec = self.env.spec
         self.seconds = 0.0
         """how long the training loop took"""
         self._saver = Saver(path, algorithm, config, self.spec, world)
         self._logger_classes, self._loggers = loggers if world.is_first else (), list[Logger]()
         self._visible, self._film, self._observer, self._locate = progress, film, observer, locate
-        self._bar = ProgressBar(config.total_steps, 0, visible=False)
         self._compiler = Compiler(world.busy)
         self._stop = StopRequest(world.size > 1, self._how_to_go_on, self._compiler.stopping)
         self._body, self._lines, self._episodes = Body(), 0, 0
@@ -217,11 +215,11 @@ class Run:
                 f" {resume_line(self.path)}; it resumes at step {self._saver.last_planned:,}."
             )
 
-    def close(self, pictures: list[Path] | None = None) -> None:
-        """Close the loggers and the environments, and unlock the directory."""
+    def close(self, pictures: list[Path]) -> None:
+        """Close the loggers, which may take the pictures, and the environments; unlock the directory."""
         self._stop.end()
         for logger in self._loggers:
-            logger.close(pictures or [])
+            logger.close(pictures)
         for env in (self.env, self.eval_env):
             if env:
                 env.close()
@@ -347,7 +345,7 @@ class Run:
                 self._restart(state)
 
     def _record(self, state: TrainState) -> None:
-        if self._film and self.world.is_first:
+        if self.world.is_first:
             with self._aside("recording", state):
                 if self.env.backend.once:
                     self.env.close()

@@ -67,10 +67,6 @@ class SharedMemory:
             self._others += [self._listener.accept()[0] for _ in range(self._rank + 1, size)]
         return self
 
-    def holds(self, mine: Tensor) -> bool:
-        """Whether a tensor can be sent so."""
-        return mine.device.type == "cpu" and mine.nbytes <= CAPACITY
-
     def gather(self, mine: Tensor) -> Tensor:
         """The values of all processes in the order of their ranks, [W · n, …], from [n, …] of each.
 
@@ -124,7 +120,7 @@ class Processes(World):
     def gather(self, mine: Tensor) -> Tensor:
         """The rows of all processes in the order of their ranks, [W · n, …], from [n, …] of each."""
         with self._together():
-            if self._memory and self._memory.holds(mine):
+            if self._memory and mine.device.type == "cpu" and mine.nbytes <= CAPACITY:
                 return self._memory.gather(mine)
             parts = [torch.empty_like(mine, memory_format=torch.contiguous_format) for _ in range(self.size)]
             dist.all_gather(parts, mine.contiguous())
