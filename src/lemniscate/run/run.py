@@ -305,7 +305,7 @@ class Run:
             self._advance_curriculum([(0, {})])
 
     @cached_property
-    def _curriculum(self) -> Callable[..., Any] | None:
+    def _curriculum(self) -> Any:
         """The function that the Config names, if it does. Raises `UserError` for one that cannot be found or called."""
         function = named.find_callable(self.config.curriculum) if self.config.curriculum else None
         if function and not named.takes(function, 2):
@@ -315,7 +315,7 @@ class Run:
     def _advance_curriculum(self, lines: Sequence[tuple[int, Mapping[str, float]]]) -> None:
         """Make the calls that the curriculum decides on at each new line; those of rank 0, in every process."""
         decided = list[dict[str, Any]]()
-        if self.world.is_first and self._curriculum:
+        if self.world.is_first:
             with globals_undisturbed():
                 decided = [decide(self._curriculum, step, metrics) for step, metrics in lines]
         for calls in self.world.from_first(decided):
