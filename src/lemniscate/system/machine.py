@@ -45,10 +45,11 @@ def require_free(what: str, parts: Mapping[str, int], fields: Mapping[str, Any],
     value = fields[most]
     limit = (free - total + parts[most]) * value // parts[most] if isinstance(value, int) else 0
     advice = f"choose {most} at most {limit:,}" if limit > 0 else f"choose a smaller {most}"
-    needed = f"{total // 10**6:,} MB"
-    if len(parts) > 1:
-        needed = f"{total // 10**6:,} MB, of which {parts[most] // 10**6:,} MB are for {most} {value}"
-    raise UserError(f"{what} {needed}; {free // 10**6:,} MB are free: {advice}.")
+    needed, there = f"{total // 10**6:,}", f"{free // 10**6:,}"
+    if len(parts) == 1:
+        raise UserError(f"{what} {needed} MB; {there} MB are free: {advice}.")
+    share = f"{parts[most] // 10**6:,}"
+    raise UserError(f"{what} {needed} MB, of which {share} MB are for {most} {value}; {there} MB are free: {advice}.")
 
 
 def require_files(what: str, count: int, each: int) -> None:
