@@ -184,8 +184,8 @@ MUTANTS = [
     (
         "the environments go on over a checkpoint",
         "run/run.py",
-        "if planned:\n            self._restart(state)",
-        "if False:\n            self._restart(state)",
+        "if planned and going_on:",
+        "if False:",
         "run/test_run.py::test_what_follows_episodes_is_restarted_with_the_environments",
     ),
     (
@@ -1570,7 +1570,7 @@ MUTANTS = [
     (
         "every line has signals",
         "run/run.py",
-        "self.world.is_first and self._lines % self._look_every == 0",
+        "self.world.is_first and self._lines % every == 0",
         "self.world.is_first",
         "run/test_signals.py::test_there_are_signals_some_thirty_times_in_a_run_and_in_its_first_line",
     ),

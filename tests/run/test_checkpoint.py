@@ -8,6 +8,7 @@ import random
 import resource
 import shutil
 import signal
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -188,7 +189,7 @@ def test_tensors_of_every_type_and_shape_come_back(tmp_path):
     tensors = {"part": vector[:5], "rest": vector[5:], "number": torch.tensor(3), "none": torch.zeros(0, 4)}
     tensors |= {str(dtype): torch.ones(3, 1).to(dtype) for dtype in TYPES} | {"turned": torch.arange(6.0).view(2, 3).T}
     tensors |= {"again": tensors["part"], "whole": vector, "gradient": vector.clone().requires_grad_()}
-    checkpoint.write_fields(tmp_path / "step-1", {"x": tensors}, {})
+    checkpoint.write_fields(tmp_path / "step-1", {"x": SimpleNamespace(state_dict=lambda: tensors)}, {})
     found = checkpoint.read(tmp_path / "step-1").tensors_of("x")
     assert found.keys() == tensors.keys()
     assert all(torch.equal(found[name], tensors[name]) and found[name].dtype == tensors[name].dtype for name in tensors)
@@ -207,7 +208,7 @@ def test_the_error_of_a_full_disk_is_that_of_the_system(tmp_path):
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, (3000, before[1]))
         with pytest.raises(OSError, match="File too large") as raised:
-            checkpoint.write(tmp_path, {"x": {"tensor": torch.zeros(1000)}}, 1, {}, 3)
+            checkpoint.write(tmp_path, {"x": torch.nn.Linear(100, 10)}, 1, {}, 3)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
         signal.signal(signal.SIGXFSZ, ignored)

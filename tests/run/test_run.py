@@ -297,9 +297,7 @@ def test_a_run_goes_on_to_a_step_above_the_one_where_it_stands(tmp_path, capsys)
 def test_the_best_checkpoint_is_kept_and_the_final_one_stays_the_policy_of_the_run(tmp_path, monkeypatch):
     scores = {32: 1.0, 64: 5.0, 96: 2.0, 128: 4.0, 160: 7.0, 192: 3.0, 224: 7.0, 256: 6.0, 288: 1.0}
     save = Saver.save_if_best
-    monkeypatch.setattr(
-        Saver, "save_if_best", lambda self, state, _, logged: save(self, state, scores[state.step], logged)
-    )
+    monkeypatch.setattr(Saver, "save_if_best", lambda self, state, _: save(self, state, scores[state.step]))
     every = {"evaluate_every": 32, "checkpoint_every": 96, "keep_checkpoints": 1}
     fields = {**tiny_fields("CartPole-v1", keep_best=True, **every), "env": "CartPole-v1", "progress": False}
     whole = lem.train("ppo", run=tmp_path / "whole", **fields).path

@@ -67,22 +67,16 @@ def _of_run(path: Path) -> Iterator[Finding]:
 
 
 def _checkpoints(path: Path) -> tuple[list[checkpoint.Checkpoint], list[Finding]]:
-    """The checkpoints that are whole, the oldest first, and what is wrong with the others."""
+    """The checkpoints that are whole, the best before those by step, and what is wrong with the others."""
     whole, broken = [], []
     folders = [path / "checkpoints" / f"step-{step}" for step in checkpoint.list_steps(path / "checkpoints")]
-    for folder in [*folders, path / "checkpoints" / BEST]:
+    for folder in [path / "checkpoints" / BEST, *folders]:
         try:
             if folder.is_dir():
                 whole.append(checkpoint.read(folder))
         except UserError as error:
             broken.append(Finding(BAD, str(error)))
-    return sorted(whole, key=_step), broken
-
-
-def _step(found: checkpoint.Checkpoint) -> int:
-    """The step of a checkpoint; 0 where its file has something else there."""
-    step = found.numbers.get("step")
-    return step if isinstance(step, int) else 0
+    return whole, broken
 
 
 def _config(path: Path, whole: list[checkpoint.Checkpoint]) -> Finding:

@@ -24,16 +24,8 @@ from torch import Tensor
 from lemniscate.errors import NonFiniteError, UserError
 from lemniscate.run.state import TrainState
 from lemniscate.spec import Action, ObservationPart, Spec
-from lemniscate.system.files import (
-    DamagedFileError,
-    open_regular,
-    parsing,
-    read_json,
-    remove,
-    replace_directory,
-    sync,
-    write_json,
-)
+from lemniscate.system import files
+from lemniscate.system.files import DamagedFileError, parsing
 
 FORMAT = 5
 TENSORS, STATE, MANIFEST = "tensors.safetensors", "state.json", "manifest.json"
@@ -65,7 +57,7 @@ class Checkpoint:
 
 
 def write(directory: Path, fields: Mapping[str, Any], step: int, record: dict[str, Any], keep: int) -> Path:
-    """Write `directory/step-N` with the fields of a State, as of `whole`, and delete all but the newest `keep`.
+    """Write `directory/step-N` with the fields of a State, as of `saved`, and delete all but the newest `keep`.
 
     `record` is any JSON that a reader needs beside the state.
 
@@ -78,7 +70,7 @@ def write(directory: Path, fields: Mapping[str, Any], step: int, record: dict[st
     write_fields(final, fields, record)
     for path in [*stale, *(directory / f"step-{old}" for old in list_steps(directory)[:-keep])]:
         with suppress(OSError):  # the next one tries again
-            remove(path)
+            files.remove(path)
     return final
 
 
@@ -87,18 +79,17 @@ def write_fields(final: Path, fields: Mapping[str, Any], record: dict[str, Any])
     tensors: dict[str, Tensor] = {}
     numbers: dict[str, Any] = {}
     for name, value in fields.items():
-        if hasattr(value, "state_dict") or isinstance(value, Mapping):
-            entries = value if isinstance(value, Mapping) else value.state_dict()
-            tensors |= {f"{name}.{key}": t for key, t in entries.items()}
+        if hasattr(value, "state_dict"):
+            tensors |= {f"{name}.{key}": t for key, t in value.state_dict().items()}
         else:
             numbers[name] = value
     if name := _not_finite(tensors):
         raise NonFiniteError(f"{name} has a value that is not finite; {final} is not written.")
-    with replace_directory(final) as folder:
-        write_json(folder / STATE, {"numbers": numbers, "record": record})
+    with files.replace_directory(final) as folder:
+        files.write_json(folder / STATE, {"numbers": numbers, "record": record})
         _write_tensors(folder / TENSORS, tensors, mode=(folder / STATE).stat().st_mode)
         hashes = {name: _sha256(folder / name) for name in FILES}
-        write_json(folder / MANIFEST, {"format": FORMAT, "files": hashes})
+        files.write_json(folder / MANIFEST, {"format": FORMAT, "files": hashes})
 
 
 def _write_tensors(path: Path, tensors: Mapping[str, Tensor], mode: int) -> None:
@@ -118,15 +109,11 @@ def _write_tensors(path: Path, tensors: Mapping[str, Tensor], mode: int) -> None
             raise
         raise OSError(int(number[1]), os.strerror(int(number[1])), str(path)) from error
     path.chmod(mode)  # the library makes files that only their owner can read
-    sync(path)
+    files.sync(path)
 
 
 def read(path: Path) -> Checkpoint:
-    """Read one checkpoint directory and check every byte of it.
-
-    Raises:
-        DamagedFileError: naming the file and what is wrong with it.
-    """
+    """A checkpoint directory, of which every byte is checked. Raises `DamagedFileError`, naming what is wrong where."""
     _verify(path)
     try:
         tensors = load_file(path / TENSORS)
@@ -134,7 +121,7 @@ def read(path: Path) -> Checkpoint:
         raise DamagedFileError(f"{path / TENSORS} cannot be read: {error}.") from error
     if name := _not_finite(tensors):
         raise DamagedFileError(f"{path / TENSORS} has a value that is not finite in {name}.")
-    state = read_json(path / STATE)
+    state = files.read_json(path / STATE)
     with parsing(path / STATE):
         return Checkpoint(path, tensors, dict(state["numbers"]), dict(state["record"]))
 
@@ -163,18 +150,17 @@ def spec_to_json(spec: Spec) -> dict[str, Any]:
 
 def spec_from_json(record: dict[str, Any]) -> Spec:
     """The Spec that `spec_to_json` came from."""
-    action = _tuples(record["action"])
+    record = _tuples(record)
+    action = record["action"]
     kind = {k.__name__: k for k in get_args(Action)}[action.pop("kind")]
-    parts = tuple(ObservationPart(**_tuples(part)) for part in record["observation_parts"])
-    return Spec(**{**_tuples(record), "action": kind(**action), "observation_parts": parts})
+    parts = tuple(ObservationPart(**part) for part in record["observation_parts"])
+    return Spec(**{**record, "action": kind(**action), "observation_parts": parts})
 
 
-def _tuples(record: dict[str, Any]) -> dict[str, Any]:
-    return {name: _tuple(value) for name, value in record.items()}
-
-
-def _tuple(value: Any) -> Any:
-    return tuple(map(_tuple, value)) if isinstance(value, list) else value
+def _tuples(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _tuples(inner) for name, inner in value.items()}
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value
 
 
 def _not_finite(tensors: Mapping[str, Tensor]) -> str | None:
@@ -184,7 +170,7 @@ def _not_finite(tensors: Mapping[str, Tensor]) -> str | None:
 
 
 def _verify(path: Path) -> None:
-    manifest = read_json(path / MANIFEST)
+    manifest = files.read_json(path / MANIFEST)
     if manifest.get("format") != FORMAT:
         raise UserError(f"{path} has format {manifest.get('format')!r}; this version of lemniscate reads {FORMAT}.")
     with parsing(path / MANIFEST):
@@ -195,5 +181,5 @@ def _verify(path: Path) -> None:
 
 
 def _sha256(path: Path) -> str:
-    with open_regular(path) as file:
+    with files.open_regular(path) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

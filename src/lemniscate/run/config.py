@@ -25,6 +25,8 @@ MOST_WHOLE, MOST_REAL = 10**15, 1e38
 """the largest numbers of a field: float64, and so JSON, counts exactly to 9e15; the float32 of networks ends at 3e38"""
 MOST_ITEMS = 1_000
 """the most values of a field that has several"""
+WANTED = {bool: "True or False", str: "a text", dict: "a dictionary, such as {'gravity': -5}", NoneType: "None"}
+"""the basic types of fields that are no numbers, in a sentence"""
 
 T = TypeVar("T")
 
@@ -67,16 +69,11 @@ SquashedLogStd = Annotated[float, Range(-4.9, 1.9)]  # of a `SquashedGaussianPol
 def checked(name: str, value: Any, hint: Any) -> Any:
     """`value` as the field `name` holds it.
 
-    NumPy's scalars and arrays become Python's, 1e6 a whole number where one is wanted, lists tuples.
-
-    Raises:
-        UserError: a value that no option of `hint` has room for.
+    NumPy's scalars and arrays become Python's, 1e6 a whole number where one is wanted, lists tuples. Raises `UserError`
+    for a value that no option of `hint` has room for.
     """
-    value, options = plain(value), options_of(hint)
-    if value is None and NoneType in options:
-        return None
-    wanted: list[str] = []
-    for option in options:
+    value, wanted = plain(value), list[str]()
+    for option in options_of(hint):
         if get_origin(option) is tuple and isinstance(value, Iterable) and not isinstance(value, str | Mapping):
             items = list(islice(value, MOST_ITEMS + 1))
             if len(items) > MOST_ITEMS:
@@ -96,16 +93,13 @@ def _convert(value: Any, option: Any) -> Any:
         basic, *marks = get_args(option) if kind is Annotated else (kind,)
         read = _number_or_schedule if Schedule in marks else _number
         return read(value, basic, *(mark for mark in marks if isinstance(mark, Range)))
-    if kind is NoneType:
-        raise ValueError("None")
     if kind is Literal and value not in get_args(option):
         raise ValueError(f"one of {', '.join(map(str, get_args(option)))}")
     if kind is tuple:
         several = "names, such as ('module:name',)" if get_args(option)[0] is str else "numbers, such as (64, 64)"
         raise ValueError(f"several {several}")
-    for basic, wanted in ((bool, "True or False"), (str, "a text"), (dict, "a dictionary, such as {'gravity': -5}")):
-        if kind is basic and not isinstance(value, basic):
-            raise ValueError(wanted)
+    if kind in WANTED and not isinstance(value, kind):
+        raise ValueError(WANTED[kind])
     if kind is dict:
         try:  # what a run is trained with is what it is evaluated with when it comes back from its file
             return json.loads(json.dumps(value, allow_nan=False, default=plain))

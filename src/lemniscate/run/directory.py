@@ -17,18 +17,9 @@ from lemniscate.run.config import Natural, RunConfig, checked
 from lemniscate.run.metrics import METRICS, damage
 from lemniscate.run.state import TrainState
 from lemniscate.spec import Spec
+from lemniscate.system import files
 from lemniscate.system.console import say
-from lemniscate.system.files import (
-    DamagedFileError,
-    is_whole,
-    make_directory,
-    parsing,
-    read_json,
-    remove,
-    replace_file,
-    sync,
-    write_json,
-)
+from lemniscate.system.files import DamagedFileError, parsing
 from lemniscate.system.world import World
 
 CONFIG, LOCK, FINAL = "config.json", ".lock", "final.json"
@@ -54,8 +45,8 @@ def create_directory(path: Path, name: str, record: dict[str, Any]) -> None:
     """Create a directory with the one file `name` that says what it is. Raises `UserError` if it exists already."""
     require_absent(path)
     try:
-        make_directory(path)
-        write_json(path / name, record)
+        files.make_directory(path)
+        files.write_json(path / name, record)
     except OSError as error:
         raise UserError(f"{path} cannot be created: {error.strerror or error}.") from error
 
@@ -69,7 +60,7 @@ def read_record(path: Path) -> dict[str, Any]:
         runs = sorted(file.parent for file in path.glob(f"*/{CONFIG}"))
         raise UserError(f"{path} is a sweep: name one of its runs, such as {runs[0] if runs else path / '…'}.")
     try:
-        return read_json(path / CONFIG)
+        return files.read_json(path / CONFIG)
     except DamagedFileError as error:
         found = _newest(path, planned_only=False)
         if found is None:
@@ -113,8 +104,8 @@ def extend(path: Path, total_steps: int) -> None:
         with locked(path):
             record = read_record(path)
             with parsing(path / CONFIG):
-                write_json(path / CONFIG, {**record, "config": {**record["config"], "total_steps": total_steps}})
-            remove(path / FINAL)
+                files.write_json(path / CONFIG, {**record, "config": {**record["config"], "total_steps": total_steps}})
+            files.remove(path / FINAL)
     except OSError as error:
         raise UserError(f"{path} cannot be written: {error.strerror or error}.") from error
 
@@ -224,12 +215,12 @@ class Saver:
         self._held = ExitStack()
         self.last_planned = 0
         """the step that `resume` would go on from"""
-        self.planned_at = 0
-        """the step of the last planned checkpoint, stored or not"""
         self.failure: OSError | None = None
         """why the last checkpoint could not be written, if it could not"""
         self._best = -math.inf
         """the mean return of the evaluation that the checkpoint `best` was kept for"""
+        self.logged = 0
+        """the step of the last line of metrics"""
         self.calls = dict[str, Any]()
         """the latest calls of a curriculum, as methods and arguments; part of every checkpoint"""
 
@@ -238,26 +229,29 @@ class Saver:
         if not self._world.is_first:
             return
         try:
-            make_directory(self.path)
+            files.make_directory(self.path)
             self._held.enter_context(locked(self.path))
         except OSError as error:
             raise UserError(f"{self.path} cannot be written: {error.strerror or error}.") from error
         if not self.exists:
             create_directory(self.path, CONFIG, self._identity)
-        elif not is_whole(self.path / CONFIG):
-            write_json(self.path / CONFIG, self._identity)
+        elif not files.is_whole(self.path / CONFIG):
+            files.write_json(self.path / CONFIG, self._identity)
 
     def restore(self, state: TrainState) -> bool:
         """Restore the newest whole planned checkpoint, if there is one, and delete those after it.
 
         Checkpoints beyond the one restored are damaged or unplanned; the run will write them again.
         """
-        found = _newest(self.path, planned_only=True) if self._world.is_first else None
-        found = self._world.from_first(found)
+        found = self._world.from_first(_newest(self.path, planned_only=True) if self._world.is_first else None)
         if found:
-            self._require_same_spaces(found)
+            before, now = found.record["spec"], self._record["spec"]
+            for what in ("observation_parts", "action"):
+                if json.dumps(before[what]) != json.dumps(now[what]):
+                    space = f"another {what.removesuffix('_parts')} space than {now['env_id']} has now"
+                    raise UserError(f"{self.path} was trained with {space}.")
             found.restore(state)
-            self.last_planned = self.planned_at = state.step
+            self.last_planned = state.step
             self.calls = dict(found.record.get("calls", {}))
         if not self._world.is_first:
             return found is not None
@@ -268,27 +262,20 @@ class Saver:
             say(f"{self.path} has no planned checkpoint to go on from; it begins again at step 0.")
         for step in steps:
             if step > state.step:
-                remove(self._checkpoints / f"step-{step}")
+                files.remove(self._checkpoints / f"step-{step}")
         self._restore_best(state.step)
         return found is not None
-
-    def _require_same_spaces(self, found: checkpoint.Checkpoint) -> None:
-        """Raise `UserError` where the environment has other spaces than those that a checkpoint was made in."""
-        before, now = found.record["spec"], self._record["spec"]
-        for what, space in (("observation_parts", "observation"), ("action", "action")):
-            if json.dumps(before[what]) != json.dumps(now[what]):
-                raise UserError(f"{self.path} was trained with another {space} space than {now['env_id']} has now.")
 
     def _restore_best(self, step: int) -> None:
         """Know the best checkpoint again; remove one that is damaged or later: the run comes there again."""
         best = self._checkpoints / BEST
         if checkpoint.is_whole(best):
-            found = read_json(best / checkpoint.STATE)
+            found = files.read_json(best / checkpoint.STATE)
             with parsing(best):
                 if found["numbers"]["step"] <= step:
                     self._best = float(found["record"]["return"])
                     return
-        remove(best)
+        files.remove(best)
 
     def _keep_damaged_metrics(self, logged: int) -> None:
         """Copy metrics that are damaged, before they are written again without what is damaged."""
@@ -297,14 +284,12 @@ class Saver:
             names = (file.with_name(f"metrics.damaged-{n}.jsonl") for n in count(1))
             kept = next(name for name in names if not name.exists())
             if file.is_file() and not file.is_symlink():
-                replace_file(kept, file.read_bytes())
+                files.replace_file(kept, file.read_bytes())
                 sentence += f" It is kept as {kept}."
             say(sentence)
 
-    def save(self, state: TrainState, planned: bool, logged: int) -> None:
+    def save(self, state: TrainState, planned: bool) -> None:
         """Write a checkpoint, and have the disk store the metrics up to it. What fails costs only this checkpoint.
-
-        `logged` is the step of the last line of metrics.
 
         Raises `NonFiniteError` where the state has a NaN or an infinity; the checkpoints before are untouched.
         """
@@ -312,26 +297,23 @@ class Saver:
         # planned one, at which its environments restart.
         keep = self._config.keep_checkpoints + (not planned)
         self.failure = None
-        fields = state.saved()
-        if planned:
-            self.planned_at = state.step
         if not self._world.is_first:
             return
         try:
             if (self.path / METRICS).exists():
-                sync(self.path / METRICS)  # before the checkpoint, which says up to which step they are whole
-            record = {**self._record, "planned": planned, "logged": logged, "calls": self.calls}
-            checkpoint.write(self._checkpoints, fields, state.step, record, keep)
+                files.sync(self.path / METRICS)  # before the checkpoint, which says up to which step they are whole
+            record = {**self._record, "planned": planned, "logged": self.logged, "calls": self.calls}
+            checkpoint.write(self._checkpoints, state.saved(), state.step, record, keep)
             self.last_planned = state.step if planned else self.last_planned
         except OSError as error:
             self.failure = error
             say(f"The checkpoint at step {state.step:,} could not be written: {error}.")
 
-    def save_if_best(self, state: TrainState, mean_return: float, logged: int) -> None:
+    def save_if_best(self, state: TrainState, mean_return: float) -> None:
         """Keep the state as the checkpoint `best` where no evaluation before had so high a mean return."""
         if mean_return <= self._best:
             return
-        record = {**self._record, "planned": False, "logged": logged, "return": mean_return}
+        record = {**self._record, "planned": False, "logged": self.logged, "return": mean_return}
         try:
             checkpoint.write_fields(self._checkpoints / BEST, state.saved(), record)
             self._best = mean_return

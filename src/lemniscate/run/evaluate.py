@@ -226,13 +226,9 @@ def _summarize(summary: Summary, values: Tensor, age: Tensor, last: Tensor) -> f
 
 
 class QBiasMeter:
-    """The measurement of a `QBias`, step by step of an evaluation.
+    """The measurement of a `QBias`, step by step of an evaluation; `gamma` is the discount γ that Q was trained with.
 
-    Args:
-        networks: the policy and the Q that is measured.
-        gamma: the discount γ that Q was trained with.
-        num_envs: parallel environments of the evaluation.
-        generator: of the noise that the entropy of a random policy is sampled with.
+    The `generator` is of the noise that the entropy of a random policy is sampled with.
     """
 
     def __init__(self, networks: ActorQ, gamma: float, num_envs: int, generator: Generator) -> None:

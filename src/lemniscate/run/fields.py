@@ -163,12 +163,9 @@ def ours(name: str, known: Iterable[str]) -> dict[str, str]:
 
 
 def unknown_field(name: str, known: Iterable[str], spell: Callable[[str], str] = str) -> UserError:
-    """The sentence for a field that a Config does not have: ours for another library's word, or the nearest names.
+    """The sentence for a field that is not `known`: ours for another library's word, or the nearest names.
 
-    Args:
-        name: the unknown field.
-        known: the Config's fields.
-        spell: how a name is written in the sentence, such as a flag.
+    `spell` writes a name in the sentence, such as a flag.
     """
     if name in GONE:
         return UserError(GONE[name])

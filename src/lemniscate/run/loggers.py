@@ -23,11 +23,9 @@ class Logger(Protocol):
 
     def write(self, step: int, metrics: Metrics, episodes: Episodes = NO_EPISODES) -> None:
         """Write the metrics of one update, and the whole episodes that ended in it."""
-        ...
 
     def close(self, pictures: list[Path]) -> None:
         """Write what is still pending, and the final pictures of the run where the logger takes pictures."""
-        ...
 
 
 LoggerClass = Callable[[Path, Mapping[str, Any], int], Logger]

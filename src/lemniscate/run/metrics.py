@@ -30,12 +30,9 @@ def from_line(line: bytes) -> dict[str, Any] | None:
 def read_metrics(path: Path, last_bytes: int | None = None) -> list[dict[str, Any]]:
     """The whole lines of a run's metrics; damaged ones, and a last one that a crash cut off, are left out.
 
-    Args:
-        path: the run directory.
-        last_bytes: read only the lines that lie whole within the last so many bytes.
+    With `last_bytes` only of the lines that lie whole within the last so many bytes.
     """
-    lines = _lines(path, last_bytes)
-    return [record for record in map(from_line, lines) if record is not None]
+    return [record for record in map(from_line, _lines(path, last_bytes)) if record is not None]
 
 
 def progress_of(run: Path) -> tuple[int, float | None, float | None]:

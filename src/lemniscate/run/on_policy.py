@@ -39,13 +39,9 @@ class OnPolicyConfig(RunConfig):
 
     def memory(self, spec: Spec) -> dict[str, int]:
         """The bytes of a rollout, and of its rows in the widest layer."""
-        rows = 4 * self.num_rows * max(self.widths, default=0)
+        widths = *self.hidden, *(getattr(self, "critic_hidden", None) or ())
+        rows = 4 * self.num_rows * max(widths, default=0)
         return {"num_steps": rows + rollout_bytes(spec, self.num_steps, self.num_envs)}
-
-    @property
-    def widths(self) -> tuple[int, ...]:
-        """The widths of all hidden layers."""
-        return self.hidden
 
     @property
     def layers(self) -> Layers:
@@ -110,11 +106,6 @@ class ActorCriticConfig(OnPolicyConfig):
         return ActorCritic(spec, layers, self.initial_log_std, normalize, critic_layers=critic_layers)
 
     @property
-    def widths(self) -> tuple[int, ...]:
-        """The widths of all hidden layers."""
-        return (*self.hidden, *(self.critic_hidden or ()))
-
-    @property
     def network_settings(self) -> tuple[Layers, Layers, bool]:
         """The hidden layers of the policy and of the value, and whether observations are normalized."""
         critic_hidden = self.hidden if self.critic_hidden is None else self.critic_hidden
@@ -140,24 +131,18 @@ class RecurrentConfig(ActorCriticConfig):
 
     def make_networks(self, spec: Spec, device: torch.device) -> Any:
         """New networks, seeded. Raises `UserError` where those with a memory cannot have whole pieces of a rollout."""
-        networks = super().make_networks(spec, device)
-        if networks.memory:
-            self._require_pieces()
+        networks, length = super().make_networks(spec, device), self.piece_length
+        for name in ("num_steps", "minibatch_size", "critic_minibatch_size") if networks.memory else ():
+            share = self.shards if name != "num_steps" else 1
+            if (rows := getattr(self, name, 0)) % (length * share):
+                of = f" for each of {share} shards" if share > 1 else ""
+                raise UserError(f"{name} {rows:,} is no multiple of sequence_length {length}{of}.")
         return networks
 
     @property
     def piece_length(self) -> int:
         """The steps of a piece of a rollout, L, where the networks have a memory."""
         return min(self.sequence_length, self.num_steps)
-
-    def _require_pieces(self) -> None:
-        """Raise `UserError` where the steps of a rollout or the rows of a minibatch are no whole number of pieces."""
-        length = self.piece_length
-        for name in ("num_steps", "minibatch_size", "critic_minibatch_size"):
-            share = self.shards if name != "num_steps" else 1
-            if (rows := getattr(self, name, 0)) % (length * share):
-                of = f" for each of {share} shards" if share > 1 else ""
-                raise UserError(f"{name} {rows:,} is no multiple of sequence_length {length}{of}.")
 
 
 @dataclass(kw_only=True)

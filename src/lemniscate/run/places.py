@@ -140,11 +140,7 @@ class Places(ABC):
 
 
 class Processes(Places):
-    """Processes of this machine, as many at a time as have cores.
-
-    Args:
-        threads: of each run.
-    """
+    """Processes of this machine, each of so many threads, as many at a time as have cores."""
 
     def __init__(self, threads: int) -> None:
         super().__init__()

@@ -13,8 +13,10 @@ import json
 import math
 import random
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
@@ -29,7 +31,7 @@ from lemniscate.optim.compiled import Compiler
 from lemniscate.run.config import RunConfig, plain
 from lemniscate.run.directory import Saver, load_networks
 from lemniscate.run.evaluate import critic_of, evaluate
-from lemniscate.run.loggers import NO_EPISODES, JsonLines, Logger, LoggerClass, TensorBoard
+from lemniscate.run.loggers import NO_EPISODES, Logger, LoggerClass
 from lemniscate.run.metrics import read_metrics
 from lemniscate.run.seeding import derive, seed_globals
 from lemniscate.run.signals import LOOKS, acted_with, signals
@@ -53,6 +55,20 @@ Observer = Callable[[Sequence[tuple[int, Mapping[str, float]]], TrainState], boo
 """(step, metrics) of new lines and the state, to whether the run is to stop; it leaves the state as it is"""
 
 
+@dataclass
+class Body:
+    """The present body of the loop: what was so when it began, and whether it is whole."""
+
+    step: int = 0
+    episodes: int = 0
+    """whole training episodes of the run so far"""
+    acted: dict[str, torch.Tensor] | None = None
+    """what the policy was made of, where its update is looked at"""
+    began: float = field(default_factory=time.monotonic)
+    cut_short: bool = False
+    """whether it takes fewer steps than it was to: its state is nobody's to resume from"""
+
+
 class Run:
     """The surroundings of one training loop: run directory, loggers, environments."""
 
@@ -63,44 +79,32 @@ class Run:
         config: RunConfig,
         envs: tuple[VecEnv, VecEnv | None],
         *,
-        world: World | None = None,
-        loggers: Sequence[LoggerClass] = (JsonLines, TensorBoard),
-        progress: bool = True,
-        film: Callable[[TrainState], None] | None = None,
-        observer: Observer | None = None,
-        locate: Callable[[str], Path] = Path,
+        world: World,
+        loggers: Sequence[LoggerClass],
+        progress: bool,
+        film: Callable[[TrainState], None],
+        observer: Observer | None,
+        locate: Callable[[str], Path],
     ) -> None:
         self.path, self.algorithm, self.config = path, algorithm, config
-        self.world = world = world or World(config.shards)
-        self.env, self.eval_env = envs
+        self.world, (self.env, self.eval_env) = world, envs
         self.spec = self.env.spec
         self.seconds = 0.0
         """how long the training loop took"""
         self._saver = Saver(path, algorithm, config, self.spec, world)
         self._logger_classes, self._loggers = loggers if world.is_first else (), list[Logger]()
         self._visible, self._film, self._observer, self._locate = progress, film, observer, locate
-        self._bar = ProgressBar(config.total_steps, 0, visible=False)
         self._compiler = Compiler(world.busy)
         self._stop = StopRequest(world.size > 1, self._how_to_go_on, self._compiler.stopping)
-        self._recent_returns: list[float] = []
+        self._body, self._lines, self._episodes = Body(), 0, 0
+        """the present body of the loop; lines logged by the loop and whole training episodes so far"""
+        self._recent_returns = deque[float](maxlen=100)
         self._unobserved: list[tuple[int, dict[str, float]]] = []
         """logged lines that callbacks have not seen"""
-        self._episodes, self._episodes_before = 0, 0
-        """whole training episodes so far, and before the present body of the loop"""
-        self._lines = 0
-        """lines logged by the loop"""
-        self._look_every = 1
-        """lines from one with signals to the next"""
-        self._acted: dict[str, torch.Tensor] | None = None
-        """what the policy is made of before an update that will be looked at"""
-        self._logged, self._told = 0, 0
-        """the step of the last line of metrics, and how many notices of the environments have been said"""
-        self._cut_short = False
-        """whether the body of the loop took fewer steps than it was to: its state is nobody's to resume from"""
-        self._line_time, self._line_step = 0.0, 0
+        self._told = 0
+        """notices of the environments that have been said"""
+        self._last_line = 0.0, 0
         """when the last line was logged, and at which step"""
-        self._seconds_between = 0.0
-        """since then, spent between the bodies of the loop"""
 
     def restore(self, state: S) -> S:
         """Restore `state` from the newest planned checkpoint, if there is one; then open the loggers.
@@ -116,7 +120,7 @@ class Run:
         if not restored and saver.exists:
             self._begin(state)
         if not restored and self.config.warm_start:
-            saver.save(state, planned=True, logged=0)
+            saver.save(state, planned=True)
         if restored and self._curriculum:
             self.env.backend.call(saver.calls)
         compiled = is_compiled(self.config)
@@ -128,32 +132,35 @@ class Run:
         lines = read_metrics(self.path) if self.world.is_first else []
         self._episodes = sum(len(line.get("episode/returns", ())) for line in lines)
         self._lines = sum("time/collect" in line for line in lines)
-        self._logged = max((line["step"] for line in lines), default=0)
+        saver.logged = max((line["step"] for line in lines), default=0)
         return state
 
     def until(self, total_steps: int, state: TrainState) -> Iterator[VecEnv]:
         """The environments, once for each update, until `total_steps` are taken or a callback stops the run.
 
-        Raises:
-            Stopped: after a signal, when the current update is done and saved.
+        Raises `Stopped` after a signal, when the current update is done and saved.
         """
         self._bar = ProgressBar(total_steps, state.step, self._visible)
         started = time.monotonic()
-        self._line_time, self._line_step = started, state.step
+        self._last_line = started, state.step
         try:
             with self._stop.heard():
                 self.world.begin(lambda: self.env.steps)
                 if state.step == 0 and (self.config.video_every or self.config.video_every_episodes):
                     self._record(state)
                 self._restart(state)
-                going_on = True
-                while going_on and state.step < total_steps:
-                    before, self._episodes_before = state.step, self._episodes
-                    self._acted = acted_with(state) if self._lines % self._look_every == 0 else None
+                going_on = state.step < total_steps
+                while going_on:
+                    # Some LOOKS lines of a run have signals, of a short one a fourth: more would cost more than 1 %.
+                    every = max(4, math.ceil(total_steps * self._lines / (LOOKS * max(1, state.step))))
+                    looks = self.world.is_first and self._lines % every == 0
+                    self._body = Body(state.step, self._episodes, acted_with(state) if looks else None)
                     yield self.env
-                    body_ended = time.monotonic()
-                    going_on = self._between(state, before, total_steps)
-                    self._seconds_between += time.monotonic() - body_ended
+                    # What a body that was cut short would have had done, the process does that resumes the run.
+                    planned = not self._body.cut_short and self._do_what_is_due(state, total_steps)
+                    going_on = not self._stopped(state, planned) and state.step < total_steps
+                    if planned and going_on:
+                        self._restart(state)
         finally:
             self.seconds = time.monotonic() - started
             self._bar.close()
@@ -161,16 +168,18 @@ class Run:
     def steps(self, count: int) -> Iterator[int]:
         """The numbers below `count`, for a body of the loop that takes many steps; asked to stop, it takes fewer."""
         for number in range(count):
-            self._cut_short = self._cut_short or self._is_asked_to_stop(number)
-            if self._cut_short:
+            asked = self._stop.signum > 0
+            if self.world.size > 1:
+                asked = number % AGREED_EVERY == 0 and any(self.world.each(asked))
+            if asked:
+                self._body.cut_short = True
                 return
             yield number
 
     def log(self, state: TrainState, metrics: Mapping[str, torch.Tensor | float], episodes: Episodes) -> None:
         """Write one line of metrics.
 
-        Raises:
-            NonFiniteError: a loss, the gradient or a parameter is NaN or infinite; the last checkpoint is untouched.
+        Raises `NonFiniteError` where a loss, the gradient or a parameter is NaN or infinite; no checkpoint is touched.
         """
         numbers = {name: float(value) for name, value in metrics.items()}
         require_finite(state, numbers)
@@ -178,16 +187,19 @@ class Run:
             require_agreement(self.world, state)
         if episodes.returns:
             self._episodes += len(episodes.returns)
-            self._recent_returns = (self._recent_returns + episodes.returns)[-100:]
+            self._recent_returns.extend(episodes.returns)
             numbers["episode/return"] = sum(episodes.returns) / len(episodes.returns)
             numbers["episode/length"] = sum(episodes.lengths) / len(episodes.lengths)
-        # Some LOOKS lines of a run have signals, of a short one a fourth of them: more would cost more than 1 %.
-        self._look_every = max(4, -(-self.config.total_steps // (LOOKS * max(1, state.step - self._line_step))))
-        if self.world.is_first and self._lines % self._look_every == 0:
-            numbers |= signals(state, self.config, self.spec, self.env.recent(), self._acted)
-        self._lines += 1
+        if self._body.acted is not None:
+            numbers |= signals(state, self.config, self.spec, self.env.recent(), self._body.acted)
         numbers |= {f"info/{name.removeprefix('info/')}": mean for name, mean in episodes.measures.items()}
-        self._write(state.step, numbers | self._times(state.step), episodes)
+        # The speed since the last line, everything included; the seconds of the loop's body by their use.
+        now, (before, step_before), collect = time.monotonic(), self._last_line, self.env.collecting.take()
+        numbers["time/steps_per_second"] = (state.step - step_before) / max(now - before, 1e-9)
+        numbers |= {"time/collect": collect, "time/learn": now - self._body.began - collect}
+        self._last_line = now, state.step
+        self._lines += 1
+        self._write(state.step, numbers, episodes)
         notices = self.env.backend.notices if self.world.is_first else ()
         for notice in notices[self._told :]:
             say(notice)
@@ -203,67 +215,49 @@ class Run:
                 f" {resume_line(self.path)}; it resumes at step {self._saver.last_planned:,}."
             )
 
-    def close(self, pictures: list[Path] | None = None) -> None:
-        """Close the loggers and the environments, and unlock the directory."""
+    def close(self, pictures: list[Path]) -> None:
+        """Close the loggers, which may take the pictures, and the environments; unlock the directory."""
         self._stop.end()
         for logger in self._loggers:
-            logger.close(pictures or [])
+            logger.close(pictures)
         for env in (self.env, self.eval_env):
             if env:
                 env.close()
         self._saver.close()
 
-    def _times(self, step: int) -> dict[str, float]:
-        """The speed since the last line, everything included, and the seconds of the loop's bodies by their use."""
-        now, collect = time.monotonic(), self.env.collecting.take()
-        seconds, steps = max(now - self._line_time, 1e-9), step - self._line_step
-        learn = seconds - self._seconds_between - collect
-        self._line_time, self._line_step, self._seconds_between = now, step, 0.0
-        return {"time/steps_per_second": steps / seconds, "time/collect": collect, "time/learn": learn}
-
-    def _between(self, state: TrainState, before: int, total_steps: int) -> bool:
-        """Do what is due after an update; returns whether the run goes on.
-
-        What a body that was cut short would have had done, the process does that goes on from the checkpoint before.
-        """
-        config, step, whole = self.config, state.step, not self._cut_short
-        finished = whole and step >= total_steps
-        if whole and config.average_last and step > (1 - config.average_last) * total_steps:
+    def _do_what_is_due(self, state: TrainState, total_steps: int) -> bool:
+        """What a whole update is followed by; returns whether that was a planned checkpoint."""
+        config, before, step = self.config, self._body.step, state.step
+        finished = step >= total_steps
+        if config.average_last and step > (1 - config.average_last) * total_steps:
             state.mean.add(state.policy)
             if finished:
                 state.mean.move_to(state.policy)
-        if whole and _passed(config.evaluate_every, before, step):
+        if _passed(config.evaluate_every, before, step):
             self._evaluate(state)
-        if whole and config.curriculum:
+        if config.curriculum:
             self._advance_curriculum(self._unobserved)
-        by_episodes = _passed(config.video_every_episodes, self._episodes_before, self._episodes)
-        if whole and (by_episodes or _passed(config.video_every, before, step)):
+        by_episodes = _passed(config.video_every_episodes, self._body.episodes, self._episodes)
+        if by_episodes or _passed(config.video_every, before, step):
             self._record(state)
-        planned = finished or (whole and _passed(self._checkpoint_every, before, step))
+        planned = finished or _passed(self._checkpoint_every, before, step)
         if planned:
             with self.world.busy():
-                self._saver.save(state, planned=True, logged=self._logged)
+                self._saver.save(state, planned=True)
             self.world.saved(self.path)
-        if self._stopped(state, planned, finished) or finished:
-            return False
-        if planned:
-            self._restart(state)
-        return True
+        return planned
 
-    def _stopped(self, state: TrainState, planned: bool, finished: bool) -> bool:
-        """Whether a callback or a signal stops the run here. The state is saved then, and where a callback fails.
+    def _stopped(self, state: TrainState, planned: bool) -> bool:
+        """Whether a callback stops the run here; the state is saved then, and where a callback fails.
 
-        Raises:
-            Stopped: by a signal.
+        Raises `Stopped` where a signal does, after the same.
         """
-        stop, signum = True, 0
+        stop = self._observer is not None
         try:
             lines, self._unobserved = self._unobserved, []
             if self._observer:
                 with globals_undisturbed():
                     stop = self._observer(lines, state)
-            else:
-                stop = False
             signum = self._stop.signum  # one that comes from here on counts at the next update
             if self.world.size > 1:
                 said = self.world.each((stop, signum))
@@ -272,17 +266,11 @@ class Run:
         finally:
             if stop:
                 self._stop.settle()
-                if not planned and state.step > self._saver.planned_at:
-                    self._saver.save(state, planned=False, logged=self._logged)
-        if stop and not finished:
+                if not planned and state.step > self._saver.last_planned:
+                    self._saver.save(state, planned=False)
+        if stop and not (planned and state.step >= self.config.total_steps):
             self._tell_stop(state.step, signum)
         return stop
-
-    def _is_asked_to_stop(self, number: int) -> bool:
-        """Whether a signal has come; several processes agree on that now and then."""
-        if self.world.size == 1:
-            return self._stop.signum > 0
-        return number % AGREED_EVERY == 0 and any(self.world.each(self._stop.signum > 0))
 
     def _tell_stop(self, step: int, signum: int) -> None:
         saved = "not saved" if self._saver.failure else "saved"
@@ -317,7 +305,7 @@ class Run:
             self._advance_curriculum([(0, {})])
 
     @cached_property
-    def _curriculum(self) -> Callable[..., Any] | None:
+    def _curriculum(self) -> Any:
         """The function that the Config names, if it does. Raises `UserError` for one that cannot be found or called."""
         function = named.find_callable(self.config.curriculum) if self.config.curriculum else None
         if function and not named.takes(function, 2):
@@ -327,7 +315,7 @@ class Run:
     def _advance_curriculum(self, lines: Sequence[tuple[int, Mapping[str, float]]]) -> None:
         """Make the calls that the curriculum decides on at each new line; those of rank 0, in every process."""
         decided = list[dict[str, Any]]()
-        if self.world.is_first and self._curriculum:
+        if self.world.is_first:
             with globals_undisturbed():
                 decided = [decide(self._curriculum, step, metrics) for step, metrics in lines]
         for calls in self.world.from_first(decided):
@@ -344,43 +332,41 @@ class Run:
         fifth = -(-self.config.total_steps // 5)
         return self.config.checkpoint_every or max(fifth, 3 * longest * self.config.num_envs)
 
-    def _record(self, state: TrainState) -> None:
-        if not self.world.is_first:
-            return
+    @contextmanager
+    def _aside(self, what: str, state: TrainState) -> Iterator[None]:
+        """Inside is done what training does not notice; what fails there costs only itself."""
         try:
             with globals_undisturbed(), self.world.busy():
-                if self.env.backend.once:
-                    self.env.close()
-                if self._film:
-                    self._film(state)
-        except (UserError, OSError) as error:  # no display any more, a full disk: it costs this recording, not the run
-            say(f"No recording at step {state.step:,}: {error}")
+                yield
+        except (UserError, OSError) as error:  # no display any more, a full disk, an endless episode
+            say(f"No {what} at step {state.step:,}: {error}")
         finally:
             if self.env.backend.once:
                 self._restart(state)
 
+    def _record(self, state: TrainState) -> None:
+        if self.world.is_first:
+            with self._aside("recording", state):
+                if self.env.backend.once:
+                    self.env.close()
+                self._film(state)
+
     def _evaluate(self, state: TrainState) -> None:
-        if not self.eval_env:
-            return
-        try:
-            with globals_undisturbed(), self.world.busy():
-                config, critic = self.config, critic_of(state.networks, self.config)
+        config, scores = self.config, None
+        if self.eval_env:
+            with self._aside("evaluation", state):
+                critic = critic_of(state.networks, config)
                 scores = evaluate(state.policy, self.eval_env, config.evaluate_episodes, config.seed, critic=critic)
-        except UserError as error:  # an endless episode costs this evaluation, not the run
-            say(f"No evaluation at step {state.step:,}: {error}")
-            return
-        finally:
-            if self.eval_env is self.env:
-                self._restart(state)
-        self._write(state.step, {f"evaluation/{name}": value for name, value in scores.means().items()})
-        if self.config.keep_best:
+        if scores:
+            self._write(state.step, {f"evaluation/{name}": value for name, value in scores.means().items()})
+        if scores and config.keep_best:
             with self.world.busy():
-                self._saver.save_if_best(state, scores.mean_return, self._logged)
+                self._saver.save_if_best(state, scores.mean_return)
 
     def _write(self, step: int, numbers: dict[str, float], episodes: Episodes = NO_EPISODES) -> None:
         for logger in self._loggers:
             logger.write(step, numbers, episodes)
-        self._logged = step
+        self._saver.logged = step
         self._unobserved.append((step, numbers))
 
 
@@ -403,16 +389,14 @@ def decide(curriculum: Callable[..., Any], step: int, metrics: Mapping[str, floa
 @contextmanager
 def globals_undisturbed() -> Iterator[None]:
     """Restore the global generators afterwards: Python's, NumPy's legacy one, torch's on the CPU and on every GPU."""
-    states = random.getstate(), np.random.get_state(), torch.get_rng_state()  # noqa: NPY002
-    gpus = torch.cuda.get_rng_state_all() if torch.cuda.is_initialized() else []
+    python, numpy = random.getstate(), np.random.get_state()  # noqa: NPY002
+    gpus = range(torch.cuda.device_count()) if torch.cuda.is_initialized() else ()
     try:
-        yield
+        with torch.random.fork_rng(gpus):
+            yield
     finally:
-        random.setstate(states[0])
-        np.random.set_state(states[1])  # noqa: NPY002
-        torch.set_rng_state(states[2])
-        if gpus:
-            torch.cuda.set_rng_state_all(gpus)
+        random.setstate(python)
+        np.random.set_state(numpy)  # noqa: NPY002
 
 
 def require_finite(state: TrainState, numbers: Mapping[str, float]) -> None:

@@ -225,11 +225,10 @@ def of_values(
     return found
 
 
-def acted_with(state: Any) -> dict[str, Tensor] | None:
-    """Copies of the parameters and buffers of a policy that is learned beside V(s); None for others."""
-    if not hasattr(state.networks, "value"):
-        return None
-    return {name: tensor.clone() for name, tensor in state.policy.state_dict().items()}
+def acted_with(state: Any) -> dict[str, Tensor]:
+    """Copies of the parameters and buffers of a policy that is learned beside V(s); none for others."""
+    parts = state.policy.state_dict() if hasattr(state.networks, "value") else {}
+    return {name: tensor.clone() for name, tensor in parts.items()}
 
 
 def _missing(target: Tensor, value: Tensor, gamma: float) -> Tensor:

@@ -28,10 +28,8 @@ class Stopped(KeyboardInterrupt):
 class StopRequest:
     """The request of a signal to stop after the present update; where that takes too long, the update is interrupted.
 
-    Args:
-        several: the run has several processes, which agree before they stop.
-        go_on: how the run goes on, in a sentence.
-        stopping: set once the run is asked to stop.
+    The `several` processes of a run agree before they stop; `go_on` says how the run goes on, in a sentence; `stopping`
+    is set once the run is asked to stop.
     """
 
     def __init__(self, several: bool, go_on: Callable[[], str], stopping: threading.Event) -> None:

@@ -86,19 +86,14 @@ class Place:
 class ProgressBar:
     """The progress of one run, or of several: live bars in a terminal, live lines in a notebook, else ten lines.
 
-    Args:
-        total: steps to take, of all runs together.
-        done: those that were taken before.
-        visible: whether anything is shown.
+    `done` of the `total` steps of all runs together were taken before.
     """
 
     def __init__(self, total: int, done: int, visible: bool = True) -> None:
         self._cell = Place() if visible and in_notebook() else None
         self._text, self._shown_at = "", -float("inf")
         """the newest text below the cell, and when one was shown there"""
-        self._bars: Any = _live_bars() if visible and not self._cell else None
-        self._tasks: dict[str, Any] = {}
-        """rich's number of each live bar"""
+        self._bars: Any = _live() if visible and not self._cell else None
         self._visible, self._total, self._tenth = visible, total, 10 * done // total
         self._started = self._updated_at = time.monotonic()
         self._step, self._learned = done, True
@@ -121,7 +116,7 @@ class ProgressBar:
         """Show how far all have come together, and each of the runs that are under way."""
         tenth = 10 * whole.done // self._total
         if self._bars:
-            self._show_bars(whole, runs)
+            self._bars.update(_table(whole, *runs))
         elif self._cell or (self._visible and tenth > self._tenth):
             text = f"{whole.name}  {whole.text}"
             for run in runs:
@@ -155,27 +150,25 @@ class ProgressBar:
         cell.show({"text/plain": self._text}, raw=True)  # no widget, which a saved notebook cannot show
         self._shown_at = time.monotonic()
 
-    def _show_bars(self, whole: Line, runs: Sequence[Line]) -> None:
-        lines = {"": whole, **{run.name: run for run in runs}}  # the name of the whole changes
-        for name in self._tasks.keys() - lines.keys():
-            self._bars.remove_task(self._tasks.pop(name))
-        for name, line in lines.items():
-            shown = {"description": line.name, "completed": line.done, "total": line.total, "text": line.text}
-            if name in self._tasks:
-                self._bars.update(self._tasks[name], **shown)
-            else:
-                self._tasks[name] = self._bars.add_task(**shown)
 
-
-def _live_bars() -> Any:
-    """Rich's display of several bars, started; None where standard error is no terminal."""
+def _live() -> Any:
+    """Rich's display of what changes, begun; None where standard error is no terminal."""
     from rich.console import Console  # here, because commands that train nothing need not wait for it
-    from rich.progress import BarColumn, Progress, TextColumn
+    from rich.live import Live
 
     console = Console(stderr=True)
     if not console.is_terminal:
         return None
-    after = TextColumn("{task.percentage:>3.0f}%  {task.fields[text]}")
-    bars = Progress(TextColumn("{task.description}"), BarColumn(bar_width=20), after, console=console)
-    bars.start()
-    return bars
+    live = Live(console=console, refresh_per_second=10)
+    live.start()
+    return live
+
+
+def _table(*lines: Line) -> Any:
+    from rich.progress_bar import ProgressBar as Bar
+    from rich.table import Column, Table
+
+    table = Table.grid(*[Column(no_wrap=True) for _ in range(3)], padding=(0, 1))
+    for name, done, total, text in lines:
+        table.add_row(name, Bar(total, done, width=20), f"{min(100, 100 * done / total):>3.0f}%  {text}")
+    return table

@@ -42,8 +42,7 @@ def write_json(path: Path, record: Mapping[str, Any]) -> None:
 def read_json(path: Path) -> dict[str, Any]:
     """The object that `write_json` stored.
 
-    Raises:
-        DamagedFileError: the file is missing, is no regular file, or has another content than was written.
+    Raises `DamagedFileError` if the file is missing, is no regular file, or has another content than was written.
     """
     with open_regular(path) as file:
         content = file.read(MAX_JSON_BYTES + 1)
@@ -185,12 +184,9 @@ def _hash_of(record: Mapping[str, Any]) -> str:
 
 
 def filled(template: Path, filters: dict[str, Callable[..., Any]], **context: Any) -> str:
-    """The text of a template of Jinja's; what is put into HTML is escaped, into other texts not.
+    """The text of a template of Jinja's, which names `filters` and the values of the `context`.
 
-    Args:
-        template: its file, beside those that it includes.
-        filters: functions that it calls by these names.
-        context: the values that it names.
+    Beside its file are those that it includes. What is put into HTML is escaped, into other texts not.
     """
     from jinja2 import Environment, FileSystemLoader, StrictUndefined  # a training without a report needs none
 

@@ -36,11 +36,8 @@ def keep_freed_memory() -> None:
 def require_free(what: str, parts: Mapping[str, int], fields: Mapping[str, Any], device: torch.device | None) -> None:
     """Raise `UserError` where something takes more memory than is free, with the field that takes most, and its limit.
 
-    Args:
-        what: subject and verb of the sentence, such as "This run takes at least".
-        parts: the bytes that grow with each field.
-        fields: their values.
-        device: whose memory it takes; of this process if it is None.
+    `what` begins the sentence, such as "This run takes at least"; `parts` are the bytes that grow with each field,
+    `fields` their values. The memory is the device's, or this process's if that is None.
     """
     total, free, most = sum(parts.values()), free_memory(device), max(parts, key=lambda name: parts[name])
     if total <= free:

@@ -63,8 +63,7 @@ def is_passed(name: str) -> bool:
 def find(name: str) -> Any:
     """The object that `name` names.
 
-    Raises:
-        UserError: no such module or object; an object that only the process that was given it can know.
+    Raises `UserError` for no such module or object, and for one that only the process that was given it can know.
     """
     if isinstance(name, PassedName):
         return name.thing

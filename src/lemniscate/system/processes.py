@@ -41,13 +41,8 @@ class SharedMemory:
     A process writes into its place and tells the others so; when all have told it, it reads all places. What they say
     next goes into the other places, so nobody overwrites what somebody still reads.
 
-    Args:
-        folder: on this machine, of all processes; whoever made it may remove it once all are connected.
-        rank: of this process.
-        size: number of processes.
-
-    Raises:
-        OSError: a process of another machine, or too little memory.
+    The `folder` is on this machine, of all processes; whoever made it may remove it once all are connected. Raises
+    `OSError` for a process of another machine, or too little memory.
     """
 
     def __init__(self, folder: Path, rank: int, size: int) -> None:
@@ -61,11 +56,6 @@ class SharedMemory:
         self._listener.bind(str(folder / str(rank)))
         self._listener.listen(size)
 
-    @staticmethod
-    def new_folder() -> Path:
-        """A new folder, in memory where the system has one there."""
-        return Path(tempfile.mkdtemp(prefix="lemniscate-", dir="/dev/shm" if Path("/dev/shm").is_dir() else None))
-
     def connect(self, folder: Path) -> Self:
         """Connect to the other processes, once all listen: those of lower rank are called, the others call."""
         size = self._places.shape[1]
@@ -76,10 +66,6 @@ class SharedMemory:
                 self._others.append(connection)
             self._others += [self._listener.accept()[0] for _ in range(self._rank + 1, size)]
         return self
-
-    def holds(self, mine: Tensor) -> bool:
-        """Whether a tensor can be sent so."""
-        return mine.device.type == "cpu" and mine.nbytes <= CAPACITY
 
     def gather(self, mine: Tensor) -> Tensor:
         """The values of all processes in the order of their ranks, [W · n, …], from [n, …] of each.
@@ -134,7 +120,7 @@ class Processes(World):
     def gather(self, mine: Tensor) -> Tensor:
         """The rows of all processes in the order of their ranks, [W · n, …], from [n, …] of each."""
         with self._together():
-            if self._memory and self._memory.holds(mine):
+            if self._memory and mine.device.type == "cpu" and mine.nbytes <= CAPACITY:
                 return self._memory.gather(mine)
             parts = [torch.empty_like(mine, memory_format=torch.contiguous_format) for _ in range(self.size)]
             dist.all_gather(parts, mine.contiguous())
@@ -206,7 +192,8 @@ class Processes(World):
 
     def _shared_memory(self) -> SharedMemory | None:
         """The memory shared by all processes of one machine; None if it is too small, or a process is elsewhere."""
-        folder = self.from_first(SharedMemory.new_folder() if self.is_first else None)
+        in_memory = "/dev/shm" if Path("/dev/shm").is_dir() else None
+        folder = Path(self.from_first(tempfile.mkdtemp(prefix="lemniscate-", dir=in_memory) if self.is_first else ""))
         memory = None
         try:
             with suppress(OSError, AttributeError):  # macOS cannot reserve a file's memory

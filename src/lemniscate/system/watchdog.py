@@ -44,13 +44,7 @@ class Beat:
 
 
 class Watch:
-    """One process's part of the watch.
-
-    Args:
-        store: a connection of its own to what the processes share.
-        rank: of this process.
-        size: number of processes.
-    """
+    """One process's part of the watch; the `store` is a connection of its own to what the processes share."""
 
     def __init__(self, store: Any, rank: int, size: int) -> None:
         self.steps = 0

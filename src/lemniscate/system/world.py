@@ -21,10 +21,7 @@ CLUSTER = "LEMNISCATE_CLUSTER"
 class World:
     """One process with all shards: nothing is sent. `lemniscate.system.processes.Processes` is a world of several.
 
-    Args:
-        shards: S.
-        rank: of this process, 0 … W − 1.
-        size: W, which divides S.
+    S shards are divided among the W processes, the `size` of the world, which divides S; a rank is 0 … W − 1.
     """
 
     def __init__(self, shards: int = 1, rank: int = 0, size: int = 1) -> None:
