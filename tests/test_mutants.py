@@ -828,9 +828,30 @@ MUTANTS = [
     (
         "a policy is differentiated by its observations alone",
         "algos/shac.py",
-        "differentiable=True)",
-        "differentiable=False)",
+        "through=through)",
+        "through=None)",
         SHAC + "a_learned_policy_is_nearly_the_best_there_is",
+    ),
+    (
+        "actions are led out of their range",
+        "maths/gradients.py",
+        "((action > 1) & (gradient < 0)) | ((action < -1) & (gradient > 0))",
+        "((action > 1) & (gradient > 0)) | ((action < -1) & (gradient < 0))",
+        SHAC + "a_policy_that_is_out_of_range_everywhere_finds_back",
+    ),
+    (
+        "environments without a gradient shorten the others'",
+        "maths/gradients.py",
+        "norm.masked_fill(norm == 0, torch.nan).nanmedian()",
+        "norm.median()",
+        "tests/maths/test_gradients.py::test_what_is_kept_of_a_gradient",
+    ),
+    (
+        "one environment that tumbles decides alone",
+        "maths/gradients.py",
+        "torch.fmin(scale, torch.ones_like(scale))",
+        "torch.ones_like(scale)",
+        "tests/maths/test_gradients.py::test_one_environment_has_no_more_say_than_its_share",
     ),
     (
         "an episode remembers the one before",

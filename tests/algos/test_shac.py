@@ -13,7 +13,7 @@ from helpers import CPU, spec_of
 from lemniscate.algos import shac
 from lemniscate.data.rollout import collect
 from lemniscate.envs.vec_env import VecEnv
-from lemniscate.maths import q_lambda
+from lemniscate.maths import clip_inward, q_lambda
 from lemniscate.spec import Box, ObservationPart, Spec
 
 BACKEND = "own_simulator:Glide"
@@ -65,11 +65,16 @@ def begin(config, kind=Short):
     return state, env
 
 
-def loss_at(config, state, env, seed=3):
+def unchanged(action):
+    """Actions as they are, with their whole gradient."""
+    return action
+
+
+def loss_at(config, state, env, seed=3, through=unchanged):
     """The policy's loss on a rollout from the same starts with the same noise, and the rollout."""
     env.restart(seed)
     env._actions = torch.Size((config.num_envs, 2)), torch.get_default_dtype()
-    rollout = collect(env, state.policy, config.num_steps, torch.Generator().manual_seed(5), differentiable=True)
+    rollout = collect(env, state.policy, config.num_steps, torch.Generator().manual_seed(5), through=through)
     return shac.actor_loss(config, state.networks.value, state.policy, rollout)[0], rollout
 
 
@@ -92,6 +97,19 @@ def test_the_gradient_is_that_of_the_return_through_all_steps_and_ends():
         slope = (ends[0] - ends[1]) / 2e-5
         assert slope == pytest.approx((gradient @ direction).item(), rel=1e-5, abs=1e-9)
         assert abs(slope) > 1e-4
+
+
+def test_a_policy_that_is_out_of_range_everywhere_finds_back():
+    config = small()
+    state, env = begin(config)
+    bias = list(state.policy.parameters())[-1]
+    assert bias.shape == (2,)
+    bias.data += torch.tensor([5.0, -5.0])
+    loss, _ = loss_at(config, state, env)
+    assert torch.autograd.grad(loss, bias)[0].tolist() == [0, 0]
+    loss, _ = loss_at(config, state, env, through=partial(clip_inward, max_ratio=3.0))
+    right, left = torch.autograd.grad(loss, bias)[0]
+    assert right > 0 > left
 
 
 @pytest.mark.usefixtures("_float64")
@@ -150,7 +168,7 @@ def test_nothing_that_is_kept_can_be_differentiated():
     torch.testing.assert_close(recent[-8:].reward, rollout.reward.detach())
     here = env.obs
     assert here.requires_grad
-    again = collect(env, state.policy, 8, state.rng.action, differentiable=True)
+    again = collect(env, state.policy, 8, state.rng.action, through=unchanged)
     assert torch.autograd.grad(again.reward.sum(), here, allow_unused=True)[0] is None
     env.detach()
     plain = collect(env, state.policy, 8, state.rng.action)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from lemniscate.data.rollout import QBatch, collect, epoch_minibatches
 from lemniscate.errors import UserError
-from lemniscate.maths import explained_variance, means, q_lambda, reward_to_go, value_loss
+from lemniscate.maths import clip_inward, explained_variance, means, q_lambda, reward_to_go, value_loss
 from lemniscate.nn.actor_critic import ActorCritic, Value
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.nn.policies import Policy
@@ -45,6 +45,8 @@ class Config(ActorCriticConfig):
     """final value of both as a share of the initial one, linearly; 1: constant"""
     max_grad_norm: Positive | None = 1.0
     """gradient clipping by global norm, usually 0.5 to 1; none: no clipping"""
+    max_grad_ratio: Positive = 3.0
+    """limit of the gradient by one environment's action, in medians over environments; usually 1 to 10"""
     td_lambda: Fraction = 0.95
     """trace decay λ of the return that the value is fitted to; usually 0.9 to 0.99"""
     critic_epochs: Repeats = 4
@@ -142,7 +144,8 @@ def update(config: Config, state: State, rollout: Rollout) -> dict[str, Tensor |
 def train(config: Config, run: Run) -> State:
     """Algorithm 1: act, differentiate, update, repeat."""
     state = run.restore(init(config, run.spec, run.env.device))
+    through = partial(clip_inward, max_ratio=config.max_grad_ratio)
     for env in run.until(config.total_steps, state):
-        rollout = collect(env, state.policy, config.num_steps, state.rng.action, differentiable=True)
+        rollout = collect(env, state.policy, config.num_steps, state.rng.action, through=through)
         run.log(state, update(config, state, rollout), env.take_episodes())
     return state

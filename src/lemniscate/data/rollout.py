@@ -1,6 +1,7 @@
 """Collecting rollouts, cutting them into minibatches, and the rows that a Q learns from."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 
@@ -16,11 +17,17 @@ from lemniscate.types import Record, Rollout
 
 
 def collect(
-    env: VecEnv, policy: Policy, num_steps: int, generator: Generator, *, differentiable: bool = False
+    env: VecEnv,
+    policy: Policy,
+    num_steps: int,
+    generator: Generator,
+    *,
+    through: Callable[[Tensor], Tensor] | None = None,
 ) -> Rollout:
     """Act `num_steps` times in every environment, from where it stands.
 
-    Where it is `differentiable`, observations, actions and rewards are functions of the policy's parameters.
+    Where actions go `through` a function into the environments, observations, actions and rewards are differentiable
+    functions of the policy's parameters.
 
     Returns:
         A rollout [T, N, …]; [T, 2 N, …] where there is a symmetry: behind them are their mirror images.
@@ -29,17 +36,17 @@ def collect(
         UserError: rewards that are to be differentiable, and are not.
     """
     rows = []
-    if differentiable:
+    if through:
         env.detach()
-    with env.collecting, torch.set_grad_enabled(differentiable):
+    with env.collecting, torch.set_grad_enabled(through is not None):
         for noise in policy.draw_noise((num_steps, env.num_envs), generator):
             obs = env.obs
             action = policy.act(obs, noise)
-            step = env.step(action)
+            step = env.step(through(action) if through else action)
             ends = step.terminated, step.truncated, step.valid
             rows.append(Rollout(obs, action, step.reward, step.next_obs, *ends))
         rollout = Rollout.stack(rows)
-        if differentiable and not rollout.reward.requires_grad:
+        if through and not rollout.reward.requires_grad:
             name = type(env.backend).__name__
             raise UserError(f"The rewards of {name} have no history of the actions, though it says differentiable.")
         return env.mirror.both(rollout, 1) if env.mirror else rollout

@@ -11,6 +11,7 @@ from lemniscate.maths.distributions import (
     mean_and_std,
     tanh,
 )
+from lemniscate.maths.gradients import clip_inward
 from lemniscate.maths.losses import clipped_surrogate, policy_gradient, surrogate, value_loss
 from lemniscate.maths.noise import coloured, ornstein_uhlenbeck, uniform
 from lemniscate.maths.returns import episode_return, gae, q_lambda, reward_to_go
