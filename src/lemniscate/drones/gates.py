@@ -173,12 +173,12 @@ def touches(centre: jax.Array, turned: jax.Array, low: np.ndarray, high: np.ndar
     along_box = jnp.abs(way) - half - (size * BODY).sum(-1)
     along_body = jnp.abs(into(turned, way)) - BODY - (size * half[..., None]).sum(-2)
 
-    next_row, next_column = (lambda of, count, axis=axis: jnp.roll(of, -count, axis) for axis in (-2, -1))
+    roll_rows, roll_columns = partial(jnp.roll, axis=-2), partial(jnp.roll, axis=-1)
 
     way, half = way[..., None], half[..., None]
-    across = jnp.abs(next_row(way, 1) * next_row(turned, 2) - next_row(way, 2) * next_row(turned, 1))
-    across -= next_row(half, 1) * next_row(size, 2) + next_row(half, 2) * next_row(size, 1)
-    across -= next_column(BODY, 1) * next_column(size, 2) + next_column(BODY, 2) * next_column(size, 1)
+    across = jnp.abs(roll_rows(way, -1) * roll_rows(turned, -2) - roll_rows(way, -2) * roll_rows(turned, -1))
+    across -= roll_rows(half, -1) * roll_rows(size, -2) + roll_rows(half, -2) * roll_rows(size, -1)
+    across -= roll_columns(BODY, -1) * roll_columns(size, -2) + roll_columns(BODY, -2) * roll_columns(size, -1)
     return (jnp.maximum(along_box, along_body).max(-1) < 0) & (across.max((-1, -2)) < 0)
 
 

@@ -11,15 +11,14 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from lemniscate.envs.backend import Interface, Quantity
 from lemniscate.errors import UserError
-from lemniscate.exporting.deployed import difference_units, safe_action, safe_sentence
+from lemniscate.exporting.deployed import choices, difference_units, safe_action, safe_sentence
 from lemniscate.exporting.translation import Operand, Operation, Program, Value
-from lemniscate.spec import Action, Box, Discrete, MultiBinary
+from lemniscate.spec import Action, Box
 from lemniscate.system.files import filled
 from lemniscate.system.machine import version
 
@@ -64,7 +63,7 @@ def c_files(
         "program": program,
         "action": action,
         "is_box": isinstance(action, Box),
-        "masked": _masked(action),
+        "masked": zip(*choices(action), strict=True) if action.mask_size else (),
         "safe": safe_action(action),
         "safe_sentence": safe_sentence(action),
         "observations": observations,
@@ -76,14 +75,6 @@ def c_files(
     }
     filters = {"braces": braces, "comment": comment, "functions": functions}
     return {name: filled(TEMPLATES / name, filters, **context) for name in ("policy.c", "policy.h")}
-
-
-def _masked(action: Action) -> list[tuple[int, int, int]]:
-    """(number of choices, the first one, the place of its mask in the row of masks) of each component that has one."""
-    if isinstance(action, Box | MultiBinary) or not action.masked:
-        return []
-    counts, firsts = ((action.n,), (action.start,)) if isinstance(action, Discrete) else (action.nvec, action.start)
-    return [(n, first, sum(counts[:k])) for k, (n, first) in enumerate(zip(counts, firsts, strict=True))]
 
 
 def comment(text: str) -> str:
@@ -351,8 +342,6 @@ VECTORS = {
 SENSED = {f"attitude_{axis}": f"state->attitudeQuaternion.{axis}" for axis in "xyzw"}
 SENSED |= {f"{name}_{axis}": text.format(axis) for name, text in VECTORS.items() for axis in "xyz"}
 """the firmware's expression for each quantity, by its name"""
-TO_REFERENCE = re.compile(r"to_reference_in_.*s_[xyz]")
-PAST = re.compile(r"(.+)_(\d+)_steps_ago(_less_now)?")
 
 
 def crazyflie_files(
@@ -371,12 +360,22 @@ def crazyflie_files(
     rate = round(1 / interface.period) if interface.period else 0
     if not rate or LOOP % rate:
         raise UserError(f"its {rate} actions a second do not divide the firmware's {LOOP}")
-    names = [quantity.name for quantity in quantities]
-    references = [name for name in names if interface.reference and TO_REFERENCE.fullmatch(name)]
-    past = [name for name in names if PAST.fullmatch(name)]
-    for name in names:
-        if name not in (*SENSED, *references, *past):
-            raise UserError(f"nothing in the firmware gives {name}")
+    now = {quantity.name: f"obs[{i}]" for i, quantity in enumerate(quantities)}
+    names = list(now)
+    references = [name for name in names if interface.reference and name.startswith("to_reference_in_")]
+    done = {  # between -1 and 1, the ends of the range
+        name: f"(action[{i}] - {literal((low + high) / 2)}) / {literal((high - low) / 2)}"
+        for i, (name, low, high) in enumerate(zip(COMMANDS, action.low, action.high, strict=True))
+    }
+    ago = {name: f"{name}_{{}}_steps_ago{'_less_now' if name in now else ''}" for name in (*now, *done)}
+    kept = [name for name in ago if ago[name].format(1) in now]
+    past = [ago[name].format(steps) for steps in range(1, (interface.history or 0) + 1) for name in kept]
+    first = next((i for i, name in enumerate(names) if name in past), 0)
+    unknown = [name for name in names if name not in (*SENSED, *references, *past)]
+    if past and (names[first : first + len(past)] != past or len(interface.action_before) != len(COMMANDS)):
+        unknown.append(names[first])
+    if unknown:
+        raise UserError(f"nothing in the firmware gives {unknown[0]}")
     context = {
         "title": title,
         "version": version(),
@@ -387,30 +386,8 @@ def crazyflie_files(
         "reference": interface.reference,
         "to_reference": names.index(references[0]) if references else None,
         "sensed": {i: SENSED[name] for i, name in enumerate(names) if name in SENSED},
-        "history": _history(names, past, action, interface.action_before) if past else None,
+        "first": first,
+        "kept": [(now.get(name), done.get(name)) for name in kept],
     }
     folder, filters = TEMPLATES / "crazyflie", {"literal": literal, "comment": comment}
     return {**c_files, **{name: filled(folder / name, filters, **context) for name in CRAZYFLIE_FILES}}
-
-
-def _history(names: list[str], past: list[str], action: Box, before: tuple[float, ...]) -> dict[str, Any]:
-    """The quantities of earlier steps that are given to the policy, the newest first.
-
-    `kept` has the expressions of a quantity: among the observations, where it is one, and among the actions.
-
-    Raises:
-        UserError: a history of other quantities, or in another order.
-    """
-    each = [found[1] for found in map(PAST.fullmatch, past) if found and found[2] == "1"]
-    steps, first = len(past) // max(1, len(each)), names.index(past[0])
-    now = {name: f"obs[{i}]" for i, name in enumerate(names)}
-    done = {  # between -1 and 1, the ends of the range
-        name: f"(action[{i}] - {literal((low + high) / 2)}) / {literal((high - low) / 2)}"
-        for i, (name, low, high) in enumerate(zip(COMMANDS, action.low, action.high, strict=True))
-    }
-    steps_ago = [(ago, name) for ago in range(1, steps + 1) for name in each]
-    expected = [f"{name}_{ago}_steps_ago{'_less_now' if name in now else ''}" for ago, name in steps_ago]
-    if names[first : first + len(past)] != expected or not set(each) <= now.keys() | done or len(before) != len(done):
-        raise UserError(f"nothing in the firmware gives {past[0]}")
-    kept = [(now.get(name), done.get(name)) for name in each]
-    return {"steps": steps, "first": first, "before": before, "kept": kept}

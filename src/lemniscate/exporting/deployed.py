@@ -82,8 +82,14 @@ def safe_action(action: Action) -> np.ndarray:
     if isinstance(action, Box):
         low, high, middle, _ = scale_of(action)
         return np.clip(middle, low, high).astype(np.float32)
-    first = [0] * action.n if isinstance(action, MultiBinary) else action.start
-    return np.ravel(first).astype(np.float32)
+    return np.array(choices(action)[1], dtype=np.float32)
+
+
+def choices(action: Discrete | MultiDiscrete | MultiBinary) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """The number of choices of each component of an action, and the first of each."""
+    if isinstance(action, MultiDiscrete):
+        return action.nvec, action.start
+    return ((action.n,), (action.start,)) if isinstance(action, Discrete) else ((2,) * action.n, (0,) * action.n)
 
 
 def safe_sentence(action: Action) -> str:
@@ -134,13 +140,12 @@ def carried(act: Act, memory: int) -> Callable[..., np.ndarray]:
     """
     kept = np.zeros((1, memory), np.float32)
 
-    def acts(obs: np.ndarray, begins: np.ndarray | None = None) -> np.ndarray:
+    def acts(obs: np.ndarray, begins: np.ndarray | bool = False) -> np.ndarray:
         nonlocal kept
-        before = np.broadcast_to(kept, (len(obs), memory))
-        before = before if begins is None else np.where(begins[:, None], np.float32(0), before)
+        before = np.where(np.broadcast_to(begins, len(obs))[:, None], np.float32(0), kept)
         rows = act(np.hstack([obs, before]))
-        kept = rows[:, rows.shape[1] - memory :]
-        return rows[:, : rows.shape[1] - memory]
+        action, kept = np.split(rows, [rows.shape[1] - memory], axis=1)
+        return action
 
     return acts
 

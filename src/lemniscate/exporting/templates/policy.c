@@ -41,14 +41,16 @@ int policy_act(const float obs[POLICY_OBSERVATIONS], float action[POLICY_ACTIONS
     for (i = 0; i < POLICY_OBSERVATIONS; ++i) {
         if (!is_finite(obs[i])) {
             memcpy(action, safe_action, sizeof safe_action);
-{% for n, first, begin in masked %}
+{% set behind = namespace(size=action.mask_size) %}
+{% for n, first in masked %}
             for (i = 0; i < {{ n }}; ++i) {
-                const float permitted = obs[POLICY_OBSERVATIONS - {{ action.mask_size - begin }} + i];
+                const float permitted = obs[POLICY_OBSERVATIONS - {{ behind.size }} + i];
                 if (is_finite(permitted) && permitted != 0.0F) {
                     action[{{ loop.index0 }}] = (float)(i + {{ first }});
                     break;
                 }
             }
+{% set behind.size = behind.size - n %}
 {% endfor %}
             return 1;
         }
