@@ -351,14 +351,13 @@ class DroneGates(DroneEnv):
         at = jax.random.uniform(own, (n, 2), minval=low, maxval=high)
         yaw = jax.random.uniform(turn, (n, 1), minval=-math.pi / 2, maxval=math.pi / 2)
         start = jnp.concatenate([at, jnp.full((n, 1), track.start[2]), yaw], axis=1)
-        gates, yaws, obstacles = list[jax.Array](), list[jax.Array](), list[jax.Array]()
-        ways = list[tuple[jax.Array, jax.Array]]()
+        yaws, obstacles, ways = list[jax.Array](), list[jax.Array](), list[tuple[jax.Array, jax.Array]]()
 
         def choose(key: jax.Array, from_gates: float, from_obstacles: float, wished: Callable) -> jax.Array:
             """The first place with room that is wished for, else the first with room, else that with the most room."""
             places = jax.random.uniform(key, (n, CANDIDATES, 2), minval=low, maxval=high)
-            apart = [APART["start"]] + [from_gates] * len(gates) + [from_obstacles] * len(obstacles)
-            others = zip([start[:, :2], *gates, *obstacles], apart, strict=True)
+            apart = [APART["start"]] + [from_gates] * len(ways) + [from_obstacles] * len(obstacles)
+            others = zip([start[:, :2], *(gate for _, gate in ways), *obstacles], apart, strict=True)
             room = jnp.stack([jnp.linalg.norm(places - one[:, None], axis=-1) - least for one, least in others]).min(0)
             score = jnp.where(room > 0, 1.0 + wished(places), jnp.minimum(room, 0.0))
             return jnp.take_along_axis(places, score.argmax(1)[:, None, None], axis=1)[:, 0]
@@ -373,13 +372,13 @@ class DroneGates(DroneEnv):
                 turn = jax.random.uniform(two, (n,), minval=-APART["yaw"], maxval=APART["yaw"])
                 yaws.append(jnp.arctan2(*(place - at).T[::-1]) + turn)
                 ways.append((at, place))
-                gates.append(place)
                 at = place
             if i < len(track.obstacles):
                 on_the_way = partial(_in_corridor, start=ways[-1][0], end=ways[-1][1])
                 obstacles.append(choose(three, APART["obstacle_gate"], APART["obstacles"], on_the_way))
         _, poses, tops = course
-        poses = poses.at[..., :2].set(jnp.stack(gates, 1)).at[..., 3:5].set(0.0).at[..., 5].set(jnp.stack(yaws, 1))
+        poses = poses.at[..., :2].set(jnp.stack([gate for _, gate in ways], 1)).at[..., 3:5].set(0.0)
+        poses = poses.at[..., 5].set(jnp.stack(yaws, 1))
         return start, poses, tops.at[..., :2].set(jnp.stack(obstacles, 1)) if obstacles else tops
 
     def begin(self, mask: jax.Array, ahead: jax.Array) -> None:

@@ -63,7 +63,7 @@ def c_files(
         "program": program,
         "action": action,
         "is_box": isinstance(action, Box),
-        "masked": zip(*choices(action), strict=True) if action.mask_size else (),
+        "masked": () if isinstance(action, Box) or not action.mask_size else zip(*choices(action), strict=True),
         "safe": safe_action(action),
         "safe_sentence": safe_sentence(action),
         "observations": observations,

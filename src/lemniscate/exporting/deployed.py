@@ -27,22 +27,16 @@ class Deployed(nn.Module):
     end of the observation. A policy with a memory takes that too, [B, K], and returns the next one beside the action.
     """
 
-    low: Tensor
-    high: Tensor
-    middle: Tensor
-    half_width: Tensor
-    start: Tensor
-
     def __init__(self, policy: TrainedPolicy) -> None:
         super().__init__()
         self.policy = policy.module
         self.kind = policy.spec.action
         self.memory = policy.module.memory and replace(policy.module.memory, privileged=0)
         if isinstance(self.kind, Box):
-            for name, numbers in zip(("low", "high", "middle", "half_width"), scale_of(self.kind), strict=True):
-                self.register_buffer(name, torch.tensor(numbers, dtype=torch.float32))
+            scale = (nn.Buffer(torch.tensor(numbers, dtype=torch.float32)) for numbers in scale_of(self.kind))
+            self.low, self.high, self.middle, self.half_width = scale
         elif isinstance(self.kind, MultiDiscrete):
-            self.register_buffer("start", torch.tensor(self.kind.start))
+            self.start = nn.Buffer(torch.tensor(self.kind.start))
 
     def forward(self, obs: Tensor, before: Tensor | None = None) -> Tensor | tuple[Tensor, Tensor]:
         """[B, O] to [B, A], or to [B, …] in the environment's own shape; [B] for Discrete."""
