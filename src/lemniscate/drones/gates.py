@@ -115,20 +115,6 @@ def read_track(file: str | Path | None = None) -> Track:
     return Track(gates, obstacles, np.abs(order) - 1, order < 0, start, room)
 
 
-def standing(gates: np.ndarray, obstacles: np.ndarray, stand: float) -> np.ndarray:
-    """The boxes [N, B, 15] of a `Scene`, of tracks with gates [N, G, 6] and obstacles [N, M, 3]."""
-    turned = Rotation.from_euler("xyz", gates[..., 3:]).as_matrix()
-    level = np.broadcast_to(np.eye(3, dtype=np.float32), (*obstacles.shape, 3))
-    boxes = list[np.ndarray]()
-    for at, frames, (low, high) in ((gates, turned, _boxes(stand)), (obstacles, level, OBSTACLE[:, None])):
-        frames = frames[:, :, None]
-        centre = at[:, :, None, :3] + (frames * ((low + high) / 2)[:, None]).sum(-1)
-        parts = centre, (high - low) / 2, frames.reshape(*frames.shape[:3], 9)
-        each = [np.broadcast_to(part, (*centre.shape[:3], part.shape[-1])) for part in parts]
-        boxes.append(np.concatenate(each, axis=-1).reshape(len(gates), -1, 15))
-    return np.concatenate(boxes, axis=1)
-
-
 def out_of(matrix: jax.Array, vector: Any) -> jax.Array:
     """Vectors [..., 3] of a frame in the world's; a sum and not a product of matrices, which XLA would not fuse."""
     return (matrix * vector[..., None, :]).sum(-1)
@@ -515,7 +501,17 @@ class DroneGates(DroneEnv):
 
     def boxes(self, arrays: Mapping[str, jax.Array]) -> np.ndarray:
         """The boxes [N, B, 15] of a `Scene`, of races in the state of these arrays."""
-        return standing(np.asarray(arrays["_gates"]), np.asarray(arrays["_obstacles"]), self.track.stand)
+        gates, obstacles = np.asarray(arrays["_gates"]), np.asarray(arrays["_obstacles"])
+        turned = Rotation.from_euler("xyz", gates[..., 3:]).as_matrix()[:, :, None]
+        level = np.broadcast_to(np.eye(3), (*obstacles.shape[:2], 1, 3, 3))
+        standing = (gates, turned, _boxes(self.track.stand)), (obstacles, level, OBSTACLE[:, None])
+        boxes = list[np.ndarray]()
+        for at, frames, (low, high) in standing:
+            centre = at[:, :, None, :3] + (frames * ((low + high) / 2)[:, None]).sum(-1)
+            parts = centre, (high - low) / 2, frames.reshape(*frames.shape[:3], 9)
+            each = [np.broadcast_to(part, (*centre.shape[:3], part.shape[-1])) for part in parts]
+            boxes.append(np.concatenate(each, axis=-1).reshape(len(gates), -1, 15))
+        return np.concatenate(boxes, axis=1)
 
     def measures(self) -> dict[str, jax.Array]:
         """`gates_passed`, `success`, `crashed` and `lap_seconds` of races that end here; of others not a number.

@@ -360,8 +360,8 @@ def crazyflie_files(
     rate = round(1 / interface.period) if interface.period else 0
     if not rate or LOOP % rate:
         raise UserError(f"its {rate} actions a second do not divide the firmware's {LOOP}")
-    now = {quantity.name: f"obs[{i}]" for i, quantity in enumerate(quantities)}
-    names = list(now)
+    names = [quantity.name for quantity in quantities]
+    now = {name: f"obs[{i}]" for i, name in enumerate(names)}
     references = [name for name in names if interface.reference and name.startswith("to_reference_in_")]
     done = {  # between -1 and 1, the ends of the range
         name: f"(action[{i}] - {literal((low + high) / 2)}) / {literal((high - low) / 2)}"
