@@ -321,7 +321,7 @@ def _part(walk: Walk, x: Value, axis: int, start: int, size: int = 1) -> Value:
     """The `size` rows of x from `start` on, along an axis of a batch."""
     own = walk.axis(axis, len(x.shape))
     shape = (*x.shape[:own], size, *x.shape[own + 1 :])
-    return walk.add("Slice", x, shape=shape, kind=x.kind, axis=own, start=start % x.shape[own])
+    return walk.add("Slice", x, shape=shape, kind=x.kind, axis=own, start=start + x.shape[own] * (start < 0))
 
 
 def _index(walk: Walk, x: Value, places: list[Any]) -> Value:
