@@ -1430,8 +1430,8 @@ MUTANTS = [
     (
         "a safe choice is not counted from the first one",
         "exporting/deployed.py",
-        "if isinstance(action, MultiBinary) else action.start",
-        "if isinstance(action, MultiBinary) else 0 * action.start",
+        "np.array(choices(action)[1], dtype=np.float32)",
+        "0 * np.array(choices(action)[1], dtype=np.float32)",
         "export/test_translation.py::test_every_kind_of_actions",
     ),
     (

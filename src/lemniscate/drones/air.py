@@ -123,9 +123,7 @@ class Air:
             air["commands"] = jnp.where(begins, self.hover, air["commands"])
         if self.is_blurred:
             air["states"] = jnp.where(begins, state[:, None], air["states"])
-        if "seen" in air:
-            air, seen = self._measure(air, state)
-            air["seen"] = jnp.where(mask[:, None], seen, air["seen"])
+        air = self._measure(air, state, mask[:, None])
         if self.history:
             action = jnp.broadcast_to(self._hover_action, (self.num_envs, self._hover_action.size))
             first = jnp.concatenate([air["seen"], action], axis=-1)[:, None]
@@ -172,18 +170,10 @@ class Air:
             air["states"] = _push(air["states"], state)
         if self.history:
             air["past"] = _push(air["past"], jnp.concatenate([air["seen"], action], axis=-1))
-        if "seen" in air:
-            air, seen = self._measure(air, state)
-            air["seen"] = seen
-        return air
-
-    @property
-    def truth_size(self) -> int:
-        """The length of `truth`."""
-        return len(self.ranges) + 3 * self.is_windy
+        return self._measure(air, state)
 
     def truth(self, air: dict[str, Any]) -> jax.Array:
-        """The conditions and the force on each drone, of which a vehicle knows nothing, [N, `truth_size`].
+        """The conditions and the force on each drone, of which a vehicle knows nothing, [N, …].
 
         Each condition drawn by its place in its range, from -1 to 1; and the force of the wind and the gust, 1 where
         it is the most that there is on average.
@@ -205,15 +195,17 @@ class Air:
         states, actions = air["past"][..., :STATE_SIZE], air["past"][..., STATE_SIZE:]
         return jnp.concatenate([states - air["seen"][:, None], actions], axis=-1)
 
-    def _measure(self, air: dict[str, Any], state: jax.Array) -> tuple[dict[str, Any], jax.Array]:
-        """States [N, 13] as they are measured: late, biased and noisy."""
-        if not self.is_blurred:
-            return air, state
-        key, own = jax.random.split(air["key"])
-        age, _ = self.steps_behind(air)
-        state = jnp.take_along_axis(air["states"], age[:, None, None], axis=1)[:, 0]
-        noise = self._of(air, "observation_noise")[:, None] * jax.random.normal(own, (self.num_envs, 12))
-        return {**air, "key": key}, disturb(state, air["bias"] + noise)
+    def _measure(self, air: dict[str, Any], state: jax.Array, mask: Any = True) -> dict[str, Any]:
+        """See the masked drones, whose states are [N, 13]: late, biased and noisy."""
+        if "seen" not in air:
+            return air
+        if self.is_blurred:
+            key, own = jax.random.split(air["key"])
+            age, _ = self.steps_behind(air)
+            state = jnp.take_along_axis(air["states"], age[:, None, None], axis=1)[:, 0]
+            noise = self._of(air, "observation_noise")[:, None] * jax.random.normal(own, (self.num_envs, 12))
+            air, state = {**air, "key": key}, disturb(state, air["bias"] + noise)
+        return {**air, "seen": jnp.where(mask, state, air["seen"])}
 
 
 def disturb(state: jax.Array, noise: jax.Array) -> jax.Array:

@@ -229,10 +229,10 @@ class CrazyflowBackend(JaxBackend):
         _import()
         from lemniscate.drones.probe import DroneProbe
 
-        own = {name: value for name, value in trained.items() if name not in (*CONDITIONS, "privileged")}
-        own = {**own, **given}
-        dynamics = (*dynamics_of(own), None)[0]
-        kwargs = {**own, "dynamics": dynamics} if dynamics else own
+        kwargs = {name: value for name, value in trained.items() if name not in (*CONDITIONS, "privileged")}
+        kwargs |= given
+        if several := dynamics_of(kwargs):
+            kwargs["dynamics"] = several[0]
         _check(env, starts, kwargs)
         with sentences(env, kwargs):
             return DroneProbe(env, starts, kwargs, DYNAMICS)
@@ -284,9 +284,8 @@ def _check(env_id: str, num_envs: int, kwargs: Mapping[str, Any]) -> None:
         raise UserError(f"history must be a whole number of steps from 0 to {MOST_HISTORY}, not {history!r}.")
     if not isinstance(kwargs.get("privileged", False), bool):
         raise UserError(f"privileged must be true or false, not {kwargs['privileged']!r}.")
-    for name in several:
-        if name not in DYNAMICS:
-            raise unknown_name("dynamics", str(name), DYNAMICS)
+    if unknown := [name for name in several if name not in DYNAMICS]:
+        raise unknown_name("dynamics", str(unknown[0]), DYNAMICS)
     if several and num_envs % len(several):
         raise UserError(f"{num_envs} drones cannot be divided equally among {len(several)} dynamics.")
     read_ranges(kwargs)

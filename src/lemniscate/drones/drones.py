@@ -71,8 +71,8 @@ class Drones:
         past = [ObservationPart(("history",), (history, STATE_SIZE + self.action_size))] if history else []
         self.parts = (*(ObservationPart((name,), (sizes[name],)) for name in names), *past)
         """the flat observation: the drone's state first, then the task's own parts, then the history"""
-        own = getattr(env, "truth_size", 0)
-        self.privileged = self.air.truth_size + 4 + len(DYNAMICS) + own if privileged else 0
+        truth = jax.eval_shape(lambda: self._truth(self.air.empty(jax.random.key(0))))
+        self.privileged = truth.shape[1] if privileged else 0
         """the number of privileged numbers that follow the flat observation"""
         self.error = slice(STATE_SIZE, STATE_SIZE + 3) if REFERENCE in names else None
         self._own_parameters()
@@ -80,12 +80,10 @@ class Drones:
         self._initial = self._take()
 
     def _own_parameters(self) -> None:
-        """Give each drone parameters of its own, where conditions change them."""
-        sim = self.env.sim
-        names = parameter_factors(self.dynamics, dict.fromkeys(self.air.ranges, jnp.ones(1))).keys()
-        names -= set(getattr(self.env, "own_parameters", ()))
-        each = {name: getattr(sim.data.params, name) for name in names}
-        each = {name: jnp.tile(value, (self.num_envs, 1, *[1] * value.ndim)) for name, value in each.items()}
+        """Give each drone parameters of its own, where conditions or the task change them."""
+        sim, factors = self.env.sim, parameter_factors(self.dynamics, dict.fromkeys(self.air.ranges, jnp.ones(1)))
+        shared = {name: getattr(sim.data.params, name) for name in (*factors, *getattr(self.env, "own_parameters", ()))}
+        each = {name: jnp.tile(value, (self.num_envs, 1, *[1] * value.ndim)) for name, value in shared.items()}
         params = sim.data.params.replace(**each)
         sim.data, sim.default_data = sim.data.replace(params=params), sim.default_data.replace(params=params)
 
@@ -128,11 +126,9 @@ class Drones:
             steps = jax.random.randint(where, (self.num_envs,), 1, self.episode_steps) * ahead
             air = self.air.draw(state[2], mask)
             self._apply_conditions(air, mask)
-            data = env.sim.data
-            pos = data.states.pos
             if hasattr(env, "begin"):
                 env.begin(mask, ahead)
-                data, pos = env.sim.data, env.sim.data.states.pos
+            data, pos = env.sim.data, env.sim.data.states.pos
             if hasattr(env, "trajectory"):
                 pos = pos + (env.trajectory[steps - 1] - env.trajectory[-1])[:, None]
             speed = jax.random.uniform(turns, (self.num_envs, 1, 1)) * self._turning
@@ -163,18 +159,18 @@ class Drones:
 
     def _apply_conditions(self, air: dict[str, Any], mask: jax.Array) -> None:
         """The conditions drawn for the masked drones, in their parameters and states."""
-        drawn, data, begins = air.get("drawn", {}), self.env.sim.data, mask[:, None, None]
+        drawn, data = air.get("drawn", {}), self.env.sim.data
         params, states = {}, data.states
         for name, factor in parameter_factors(self.dynamics, drawn).items():
             value = getattr(data.params, name)
             params[name] = value * jnp.where(mask, factor, 1.0).reshape(-1, *[1] * (value.ndim - 1))
         if "start_spread" in drawn:
-            spread = jnp.where(begins, drawn["start_spread"][:, None, None], 1.0)
+            spread = jnp.where(mask, drawn["start_spread"], 1.0)[:, None, None]
             around = self.env.starts_around[:, None] if hasattr(self.env, "starts_around") else START
             states = states.replace(pos=around + spread * (states.pos - around), vel=spread * states.vel)
         if "rotors" in drawn:
-            turning = drawn["rotors"][:, None, None] * self._turning
-            states = states.replace(rotor_vel=jnp.where(begins, turning, states.rotor_vel))
+            speed = drawn["rotors"][:, None, None] * self._turning
+            states = states.replace(rotor_vel=jnp.where(mask[:, None, None], speed, states.rotor_vel))
         self.env.sim.data = data.replace(params=data.params.replace(**params), states=states)
 
     def _simulate(self, air: dict[str, Any], acting: Acting) -> jax.Array:
@@ -242,20 +238,17 @@ class Mixed:
 
     def reset(self, state: State, mask: jax.Array, stagger: jax.Array) -> tuple[State, jax.Array, jax.Array]:
         """Reset the masked drones, as `Drones.reset`."""
-        parts = zip(self.drones, state, self._parts(mask), strict=True)
-        every = [one.reset(its, begins, stagger) for one, its, begins in parts]
-        states, obs, fragment = zip(*every, strict=True)
-        return list(states), by_turns(*obs), by_turns(*fragment)
+        return self._each(lambda one, its, begins: one.reset(its, begins, stagger), state, mask)
 
     def step(self, state: State, action: jax.Array) -> tuple[State, Outcome]:
         """One control step of every drone, as `Drones.step`."""
-        parts = zip(self.drones, state, self._parts(action), strict=True)
-        every = [one.step(its, command) for one, its, command in parts]
-        states, outcomes = zip(*every, strict=True)
-        return list(states), jax.tree.map(by_turns, *outcomes)
+        return self._each(Drones.step, state, action)
 
-    def _parts(self, rows: jax.Array) -> list[jax.Array]:
-        return [rows[i :: len(self.drones)] for i in range(len(self.drones))]
+    def _each(self, call: Callable, state: State, rows: jax.Array) -> tuple[Any, ...]:
+        """Call a function of each vector, of its state and of its rows; returns the states, and the rest as one."""
+        parts = (rows[i :: len(self.drones)] for i in range(len(self.drones)))
+        states, *others = zip(*map(call, self.drones, state, parts), strict=True)
+        return list(states), *(jax.tree.map(by_turns, *each) for each in others)
 
 
 def by_turns(*parts: jax.Array) -> jax.Array:

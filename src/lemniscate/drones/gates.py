@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -23,7 +23,7 @@ from crazyflow.control import Control
 from crazyflow.envs.drone_env import DroneEnv
 from crazyflow.sim import Sim
 from crazyflow.sim.pipeline import append_fn, replace_fn
-from gymnasium.vector.utils import batch_space
+from crazyflow.utils import leaf_replace
 from scipy.spatial.transform import Rotation
 
 from lemniscate.errors import UserError, shown
@@ -32,8 +32,10 @@ OPENING, FRAME = 0.40, 0.72
 """side of the square opening of a gate, and of its frame outside, m"""
 PASSED = 0.45
 """side of the square about the centre within which a gate is passed, m"""
-THICKNESS, STAND, OBSTACLE, OBSTACLE_HEIGHT = 0.02, 0.10, 0.03, 1.5
-"""of a frame; of the square stand below it; of the obstacles, m"""
+THICKNESS, STAND = 0.02, 0.10
+"""of a frame; side of the square stand below it, m"""
+OBSTACLE = np.array(((-0.015, -0.015, -1.5), (0.015, 0.015, 0.0)), np.float32)
+"""lower and upper corner of an obstacle, a post, about its top, m"""
 BODY = np.array((0.07, 0.07, 0.02), np.float32)
 """half of the sides of the box that touches, m; crazyflow's collision box"""
 BODY_CENTRE = np.array((0.0, 0.0, 0.02), np.float32)
@@ -97,15 +99,12 @@ def read_track(file: str | Path | None = None) -> Track:
     path = Path(file) if file else Path(__file__).with_name("gates.toml")
     try:
         table = tomllib.loads(path.read_text("utf-8"))
-        gates = [
-            [*gate["position"], *(gate.get(name, 0.0) for name in ("roll", "pitch", "yaw"))] for gate in table["gates"]
-        ]
+        angles = [[gate.get(name, 0.0) for name in ("roll", "pitch", "yaw")] for gate in table["gates"]]
+        gates = [[*gate["position"], *own] for gate, own in zip(table["gates"], angles, strict=True)]
         obstacles = [obstacle["position"] for obstacle in table.get("obstacles", [])]
         order, room = np.array(table["order"], int), [table["room"]["low"], table["room"]["high"]]
-        arrays = [np.array(rows, np.float32) for rows in (gates, obstacles or np.zeros((0, 3)), table["start"], room)]
-        gates, obstacles, start, room = (
-            a.reshape(shape) for a, shape in zip(arrays, ((-1, 6), (-1, 3), (3,), (2, 3)), strict=True)
-        )
+        given = (gates, (-1, 6)), (obstacles, (-1, 3)), (table["start"], (3,)), (room, (2, 3))
+        gates, obstacles, start, room = (np.array(rows, np.float32).reshape(shape) for rows, shape in given)
     except (OSError, tomllib.TOMLDecodeError, KeyError, TypeError, ValueError) as error:
         what = f"lacks {error}" if isinstance(error, KeyError) else str(error)
         raise UserError(f"{path} is no track: {what}; one looks as lemniscate/drones/gates.toml does.") from error
@@ -114,26 +113,6 @@ def read_track(file: str | Path | None = None) -> Track:
             f"{path}: order names gates from 1 to {len(gates)}, in reverse with a minus, not {order.tolist()}."
         )
     return Track(gates, obstacles, np.abs(order) - 1, order < 0, start, room)
-
-
-def standing(gates: np.ndarray, obstacles: np.ndarray, stand: float) -> np.ndarray:
-    """The boxes [N, B, 15] of a `Scene`, of tracks with gates [N, G, 6] and obstacles [N, M, 3]."""
-    low, high = _boxes(stand)
-    frames = Rotation.from_euler("xyz", gates[..., 3:]).as_matrix()[:, :, None]
-    centre = gates[:, :, None, :3] + (frames * ((low + high) / 2)[:, None, :]).sum(-1)
-    parts = [
-        centre,
-        np.broadcast_to((high - low) / 2, centre.shape),
-        np.broadcast_to(frames.reshape(*frames.shape[:3], 9), (*centre.shape[:3], 9)),
-    ]
-    boxes = np.concatenate(parts, axis=-1).reshape(len(gates), -1, 15)
-    half = np.array((OBSTACLE / 2, OBSTACLE / 2, OBSTACLE_HEIGHT / 2), np.float32)
-    own = [
-        obstacles - half * (0, 0, 1),
-        np.broadcast_to(half, obstacles.shape),
-        np.broadcast_to(np.eye(3).ravel(), (*obstacles.shape[:2], 9)),
-    ]
-    return np.concatenate([boxes, np.concatenate(own, axis=-1)], axis=1)
 
 
 def out_of(matrix: jax.Array, vector: Any) -> jax.Array:
@@ -180,26 +159,27 @@ def touches(centre: jax.Array, turned: jax.Array, low: np.ndarray, high: np.ndar
     along_box = jnp.abs(way) - half - (size * BODY).sum(-1)
     along_body = jnp.abs(into(turned, way)) - BODY - (size * half[..., None]).sum(-2)
 
-    def next_row(of: Any, count: int) -> Any:
-        return jnp.roll(of, -count, axis=-2)
-
-    def next_column(of: Any, count: int) -> Any:
-        return jnp.roll(of, -count, axis=-1)
+    roll_rows, roll_columns = partial(jnp.roll, axis=-2), partial(jnp.roll, axis=-1)
 
     way, half = way[..., None], half[..., None]
-    across = jnp.abs(next_row(way, 1) * next_row(turned, 2) - next_row(way, 2) * next_row(turned, 1))
-    across -= next_row(half, 1) * next_row(size, 2) + next_row(half, 2) * next_row(size, 1)
-    across -= next_column(BODY, 1) * next_column(size, 2) + next_column(BODY, 2) * next_column(size, 1)
+    across = jnp.abs(roll_rows(way, -1) * roll_rows(turned, -2) - roll_rows(way, -2) * roll_rows(turned, -1))
+    across -= roll_rows(half, -1) * roll_rows(size, -2) + roll_rows(half, -2) * roll_rows(size, -1)
+    across -= roll_columns(BODY, -1) * roll_columns(size, -2) + roll_columns(BODY, -2) * roll_columns(size, -1)
     return (jnp.maximum(along_box, along_body).max(-1) < 0) & (across.max((-1, -2)) < 0)
 
 
 def _boxes(stand: float) -> tuple[np.ndarray, np.ndarray]:
     """The boxes [5, 3] of a gate in its own frame, lower and upper corners: four beams, and a stand of that height."""
     inner, outer, thick, half = OPENING / 2, FRAME / 2, THICKNESS / 2, STAND / 2
-    low = [(-thick, -outer, inner), (-thick, -outer, -outer), (-thick, inner, -outer), (-thick, -outer, -outer)]
-    high = [(thick, outer, outer), (thick, outer, -inner), (thick, outer, outer), (thick, -inner, outer)]
-    corners = [*low, (-half, -half, -outer - stand)], [*high, (half, half, -outer)]
-    return np.array(corners[0], np.float32), np.array(corners[1], np.float32)
+    boxes = [
+        ((-thick, -outer, inner), (thick, outer, outer)),
+        ((-thick, -outer, -outer), (thick, outer, -inner)),
+        ((-thick, inner, -outer), (thick, outer, outer)),
+        ((-thick, -outer, -outer), (thick, -inner, outer)),
+        ((-half, -half, -outer - stand), (half, half, -outer)),
+    ]
+    low, high = np.array(boxes, np.float32).swapaxes(0, 1)
+    return low, high
 
 
 class DroneGates(DroneEnv):
@@ -237,6 +217,8 @@ class DroneGates(DroneEnv):
     """
 
     controls: tuple[str, ...] = ("attitude", "body_rate")
+    own_parameters = ("mass", "J", "J_inv")
+    """crazyflow's parameters of which each drone has its own"""
 
     def __init__(
         self,
@@ -265,12 +247,14 @@ class DroneGates(DroneEnv):
         integrate = self.sim.step_pipeline["integration"]
         replace_fn(self.sim.step_pipeline, lambda data: integrate_pushed(data, integrate), name="integration")
         self.sim.build_step_fn()
-        self._own_parameters()
+        params = self.sim.data.params
+        self._nominal = np.asarray(params.mass), np.diagonal(np.asarray(params.J))
         observed = {"gates": 15, "obstacles": 4, "last_action": 4, "race": 3}
         parts = {name: gym.spaces.Box(-np.inf, np.inf, (size,)) for name, size in observed.items()}
         self.single_observation_space = gym.spaces.Dict({**self.single_observation_space.spaces, **parts})
-        self.observation_space = batch_space(self.single_observation_space, num_envs)
-        self._empty(num_envs)
+        self._key = jax.random.key(0)
+        start, gates, obstacles = self._course()
+        vars(self).update(self._fresh(start[:, :3], (gates, obstacles), (gates, obstacles)))
 
     def _take_control(self, control: str, num_envs: int, device: str) -> None:
         """Simulate another control than that of attitudes; body rates without the terms that level the drone."""
@@ -283,49 +267,42 @@ class DroneGates(DroneEnv):
             low, high = (np.array(bound) for bound in (self.single_action_space.low, self.single_action_space.high))
             low[:3], high[:3] = -np.array(BODY_RATES), BODY_RATES
             self.single_action_space = gym.spaces.Box(low, high)
-            self.action_space = batch_space(self.single_action_space, num_envs)
         append_fn(sim.reset_pipeline, _as_it_is, name="reset_randomization")
         sim.build_reset_fn()
         self.sim = sim
 
-    own_parameters = ("mass", "J", "J_inv")
-    """crazyflow's parameters of which each drone has its own"""
+    def _course(self) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Starts [N, 4] (x, y, z, yaw), gates [N, G, 6] and obstacles [N, M, 3] as the track has them."""
+        parts = np.append(self.track.start, 0.0), self.track.gates, self.track.obstacles
+        start, gates, obstacles = (jnp.tile(part, (self.num_envs, *[1] * part.ndim)) for part in parts)
+        return start, gates, obstacles
 
-    def _own_parameters(self) -> None:
-        params = self.sim.data.params
-        each = {name: getattr(params, name) for name in self.own_parameters}
-        each = {name: jnp.tile(value, (self.num_envs, 1, *[1] * value.ndim)) for name, value in each.items()}
-        self._nominal = {name: np.asarray(getattr(params, name)) for name in ("mass", "J")}
-        self.sim.data = self.sim.data.replace(params=params.replace(**each))
-        self.sim.build_default_data()
+    def _fresh(self, start: jax.Array, true: Sequence[jax.Array], expected: Sequence[jax.Array]) -> dict[str, Any]:
+        """The arrays beside the simulator's state, at the start [N, 3] of a race: they are its state too.
 
-    def _empty(self, n: int) -> None:
-        """Set the arrays beside the simulator's state; each is a part of the state of the race."""
-        track = self.track
-        self._key = jax.random.key(0)
-        self._gates = jnp.tile(track.gates, (n, 1, 1))
-        """the true gates [N, G, 6], and below what is known of them before they are seen"""
-        self._expected_gates = self._gates
-        self._obstacles = jnp.tile(track.obstacles, (n, 1, 1))
-        self._expected_obstacles = self._obstacles
-        self._gates_seen = jnp.zeros((n, len(track.gates)), bool)
-        self._obstacles_seen = jnp.zeros((n, len(track.obstacles)), bool)
-        self.starts_around = self._start = jnp.tile(track.start, (n, 1))
-        """the start of the track, and where the drone has begun"""
-        self._target = jnp.zeros(n, jnp.int32)
-        """the number of gates that are passed"""
-        self._whole = jnp.ones(n, bool)
-        """whether the race began at the start"""
-        self._before = jnp.zeros((n, 3))
-        self._crashed = jnp.zeros(n, bool)
-        self._gain = jnp.zeros(n)
-        """the reward of the step"""
-        self._last_action = jnp.zeros((n, 4))
+        `true` are the gates and obstacles, `expected` what is known of them before they are seen.
+        """
+        n = self.num_envs
+        return {
+            "_gates": true[0],
+            "_expected_gates": expected[0],
+            "_obstacles": true[1],
+            "_expected_obstacles": expected[1],
+            "_gates_seen": jnp.zeros(true[0].shape[:2], bool),
+            "_obstacles_seen": jnp.zeros(true[1].shape[:2], bool),
+            "starts_around": start,
+            "_start": start,  # where the drone itself has begun
+            "_before": start,  # where it was a step ago
+            "_target": jnp.zeros(n, jnp.int32),  # the number of gates that are passed
+            "_whole": jnp.ones(n, bool),  # whether the race began at the start
+            "_crashed": jnp.zeros(n, bool),
+            "_gain": jnp.zeros(n),  # the reward of the step
+            "_last_action": jnp.zeros((n, 4)),
+        }
 
     # --- an episode's beginning -------------------------------------------------------------------------------------
 
-    def _reset(self, mask: jax.Array | None = None, options: Mapping[str, Any] | None = None) -> None:
-        mask = jnp.ones(self.num_envs, bool) if mask is None else mask
+    def _reset(self, mask: jax.Array) -> None:
         self.sim.reset(mask=mask)
         self._key, own, layout = jax.random.split(self._key, 3)
         start, *expected = self._layout(layout)
@@ -338,51 +315,35 @@ class DroneGates(DroneEnv):
         low, high = np.array(SPREAD["start"])
         pos = start[:, :3] + varied * (low + (places + 1) / 2 * (high - low))
         rpy = (varied * SPREAD["attitude"] * turns).at[:, 2].add(start[:, 3])
-        mass = self._nominal["mass"] + varied * SPREAD["mass"] * mass[:, None]
-        inertia = np.diagonal(self._nominal["J"]) + varied * SPREAD["inertia"] * inertia
+        nominal_mass, nominal_inertia = self._nominal
+        mass = nominal_mass + varied * SPREAD["mass"] * mass[:, None]
+        inertia = nominal_inertia + varied * SPREAD["inertia"] * inertia
         inertia = np.eye(3) * inertia[:, None, :, None]
-        data, begins = self.sim.data, mask[:, None]
-        states = data.states.replace(
-            pos=jnp.where(begins[..., None], pos[:, None], data.states.pos),
-            quat=jnp.where(begins[..., None], Rotation.from_euler("xyz", rpy).as_quat()[:, None], data.states.quat),
-        )
         inverse = np.eye(3) / jnp.where(np.eye(3) > 0, inertia, 1)
-        old, new = data.params, {"mass": mass, "J": inertia, "J_inv": inverse}
-        chosen = {
-            name: jnp.where(mask.reshape(-1, *[1] * (value.ndim - 1)), value, getattr(old, name))
-            for name, value in new.items()
-        }
-        self.sim.data = data.replace(states=states, params=old.replace(**chosen))
-        fresh = {
-            "_gates": gates, "_expected_gates": expected[0],
-            "_obstacles": obstacles, "_expected_obstacles": expected[1],
-            "starts_around": start[:, :3], "_target": jnp.zeros(n, jnp.int32), "_crashed": jnp.zeros(n, bool),
-            "_gates_seen": jnp.zeros_like(self._gates_seen), "_obstacles_seen": jnp.zeros_like(self._obstacles_seen),
-            "_last_action": jnp.zeros((n, 4)), "_gain": jnp.zeros(n),
-        }  # fmt: skip
-        for name, value in fresh.items():
-            old = getattr(self, name)
-            setattr(self, name, jnp.where(mask.reshape(-1, *[1] * (old.ndim - 1)), value, old))
+        quat, data = Rotation.from_euler("xyz", rpy).as_quat(), self.sim.data
+        states = leaf_replace(data.states, mask, pos=pos[:, None], quat=quat[:, None])
+        params = leaf_replace(data.params, mask, mass=mass, J=inertia, J_inv=inverse)
+        self.sim.data = data.replace(states=states, params=params)
+        for name, value in self._fresh(start[:, :3], (gates, obstacles), expected).items():
+            setattr(self, name, jnp.where(mask.reshape(-1, *[1] * (value.ndim - 1)), value, getattr(self, name)))
 
     def _layout(self, key: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """Starts [N, 4] (x, y, z, yaw), gates and obstacles of the level: the same for all, or at level 3 drawn."""
-        track, n = self.track, self.num_envs
+        """The course of the level: the same for all, or at level 3 drawn."""
+        track, n, course = self.track, self.num_envs, self._course()
         if self.level < 3:
-            first = jnp.tile(np.append(track.start, 0.0), (n, 1))
-            return first, jnp.tile(track.gates, (n, 1, 1)), jnp.tile(track.obstacles, (n, 1, 1))
+            return course
         low, high = track.room[0, :2] + APART["border"], track.room[1, :2] - APART["border"]
         key, own, turn = jax.random.split(key, 3)
         at = jax.random.uniform(own, (n, 2), minval=low, maxval=high)
         yaw = jax.random.uniform(turn, (n, 1), minval=-math.pi / 2, maxval=math.pi / 2)
         start = jnp.concatenate([at, jnp.full((n, 1), track.start[2]), yaw], axis=1)
-        gates, yaws, obstacles = list[jax.Array](), list[jax.Array](), list[jax.Array]()
-        ways = list[tuple[jax.Array, jax.Array]]()
+        yaws, obstacles, ways = list[jax.Array](), list[jax.Array](), list[tuple[jax.Array, jax.Array]]()
 
         def choose(key: jax.Array, from_gates: float, from_obstacles: float, wished: Callable) -> jax.Array:
             """The first place with room that is wished for, else the first with room, else that with the most room."""
             places = jax.random.uniform(key, (n, CANDIDATES, 2), minval=low, maxval=high)
-            apart = [APART["start"]] + [from_gates] * len(gates) + [from_obstacles] * len(obstacles)
-            others = zip([start[:, :2], *gates, *obstacles], apart, strict=True)
+            apart = [APART["start"]] + [from_gates] * len(ways) + [from_obstacles] * len(obstacles)
+            others = zip([start[:, :2], *(gate for _, gate in ways), *obstacles], apart, strict=True)
             room = jnp.stack([jnp.linalg.norm(places - one[:, None], axis=-1) - least for one, least in others]).min(0)
             score = jnp.where(room > 0, 1.0 + wished(places), jnp.minimum(room, 0.0))
             return jnp.take_along_axis(places, score.argmax(1)[:, None, None], axis=1)[:, 0]
@@ -397,13 +358,13 @@ class DroneGates(DroneEnv):
                 turn = jax.random.uniform(two, (n,), minval=-APART["yaw"], maxval=APART["yaw"])
                 yaws.append(jnp.arctan2(*(place - at).T[::-1]) + turn)
                 ways.append((at, place))
-                gates.append(place)
                 at = place
             if i < len(track.obstacles):
                 on_the_way = partial(_in_corridor, start=ways[-1][0], end=ways[-1][1])
                 obstacles.append(choose(three, APART["obstacle_gate"], APART["obstacles"], on_the_way))
-        poses, tops = (jnp.tile(part, (n, 1, 1)) for part in (track.gates, track.obstacles))
-        poses = poses.at[..., :2].set(jnp.stack(gates, 1)).at[..., 3:5].set(0.0).at[..., 5].set(jnp.stack(yaws, 1))
+        _, poses, tops = course
+        poses = poses.at[..., :2].set(jnp.stack([gate for _, gate in ways], 1)).at[..., 3:5].set(0.0)
+        poses = poses.at[..., 5].set(jnp.stack(yaws, 1))
         return start, poses, tops.at[..., :2].set(jnp.stack(obstacles, 1)) if obstacles else tops
 
     def begin(self, mask: jax.Array, ahead: jax.Array) -> None:
@@ -423,13 +384,12 @@ class DroneGates(DroneEnv):
         pos = place + out_of(turned, jnp.array((0.25, 0.0, 0.0)) + _uniform(where, (n, 3), (0.1, 0.12, 0.12)))
         speed = jax.random.uniform(hurried, (n, 1), maxval=SPEED_AHEAD)
         vel = speed * turned[:, :, 0] + 0.5 * jax.random.normal(fast, (n, 3))
-        pos = jnp.where(ahead[:, None], pos, data.states.pos[:, 0])
-        vel = jnp.where(ahead[:, None], vel, data.states.vel[:, 0])
-        self.sim.data = data.replace(states=data.states.replace(pos=pos[:, None], vel=vel[:, None]))
+        states = leaf_replace(data.states, ahead, pos=pos[:, None], vel=vel[:, None])
+        self.sim.data = data.replace(states=states)
         self._target = jnp.where(ahead, target, self._target)
         self._whole = jnp.where(mask, ~ahead, self._whole)
-        self._start = jnp.where(mask[:, None], pos, self._start)
-        self._before = jnp.where(mask[:, None], pos, self._before)
+        self._start = jnp.where(mask[:, None], states.pos[:, 0], self._start)
+        self._before = jnp.where(mask[:, None], states.pos[:, 0], self._before)
         self._look()
 
     # --- a step -----------------------------------------------------------------------------------------------------
@@ -492,14 +452,11 @@ class DroneGates(DroneEnv):
     def _touches(self, pos: jax.Array, turned: jax.Array) -> jax.Array:
         """Whether the drone's box touches a gate's frame or stand, or an obstacle."""
         centre = pos + out_of(turned, BODY_CENTRE)
-        frames, half = (
-            Rotation.from_euler("xyz", self._gates[..., 3:]).as_matrix(),
-            np.array((OBSTACLE / 2, OBSTACLE / 2, OBSTACLE_HEIGHT / 2), np.float32),
-        )
+        frames = Rotation.from_euler("xyz", self._gates[..., 3:]).as_matrix()
         local = into(frames, centre[:, None] - self._gates[..., :3])
         own = (frames[..., None] * turned[:, None, :, None]).sum(-3)
         gates = touches(local[:, :, None], own[:, :, None], *_boxes(self.track.stand))
-        obstacles = touches(centre[:, None] - self._obstacles + half * (0, 0, 1), turned[:, None], -half, half)
+        obstacles = touches(centre[:, None] - self._obstacles, turned[:, None], *OBSTACLE)
         return gates.any((1, 2)) | obstacles.any(1)
 
     def obs(self) -> dict[str, jax.Array]:
@@ -524,8 +481,6 @@ class DroneGates(DroneEnv):
         parts["race"] = jnp.concatenate([left, *seen], axis=1).astype(jnp.float32)
         return parts
 
-    truth_size = 6
-
     def truth(self) -> jax.Array:
         """The privileged numbers [N, 6]: the ways from the believed to the true places of the next two gates, m."""
         true = [self._frame(self._target + i, self._gates)[0] for i in (0, 1)]
@@ -546,7 +501,17 @@ class DroneGates(DroneEnv):
 
     def boxes(self, arrays: Mapping[str, jax.Array]) -> np.ndarray:
         """The boxes [N, B, 15] of a `Scene`, of races in the state of these arrays."""
-        return standing(np.asarray(arrays["_gates"]), np.asarray(arrays["_obstacles"]), self.track.stand)
+        gates, obstacles = np.asarray(arrays["_gates"]), np.asarray(arrays["_obstacles"])
+        turned = Rotation.from_euler("xyz", gates[..., 3:]).as_matrix()[:, :, None]
+        level = np.broadcast_to(np.eye(3), (*obstacles.shape[:2], 1, 3, 3))
+        standing = (gates, turned, _boxes(self.track.stand)), (obstacles, level, OBSTACLE[:, None])
+        boxes = list[np.ndarray]()
+        for at, frames, (low, high) in standing:
+            centre = at[:, :, None, :3] + (frames * ((low + high) / 2)[:, None]).sum(-1)
+            parts = centre, (high - low) / 2, frames.reshape(*frames.shape[:3], 9)
+            each = [np.broadcast_to(part, (*centre.shape[:3], part.shape[-1])) for part in parts]
+            boxes.append(np.concatenate(each, axis=-1).reshape(len(gates), -1, 15))
+        return np.concatenate(boxes, axis=1)
 
     def measures(self) -> dict[str, jax.Array]:
         """`gates_passed`, `success`, `crashed` and `lap_seconds` of races that end here; of others not a number.

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, partial
+from itertools import chain
 from typing import Any
 
 import jax
@@ -20,14 +21,11 @@ from lemniscate.envs.probe import Axis, Begin, Flown, Tally
 MOST_FLIGHTS = 1024
 """flights side by side: as many as a cache holds, and few enough that batches of crashed drones end early"""
 
-
-def _axis(name: str, values: Sequence[float], shown: tuple[str, float] = ("", 1.0), **words: str) -> Axis:
-    """The axis of a condition in `conditions.toml`."""
-    nominal = CONDITIONS[name].nominal
-    return Axis(name, tuple(sorted({*values, nominal})), nominal, shown=(shown[0], float(shown[1])), **words)
-
-
-CONDITION_AXES = tuple(_axis(name, **row) for name, row in TABLES["axes"].items())
+CONDITION_AXES = tuple(
+    Axis(name, nominal=0.0, **{**row, "shown": tuple(row.get("shown", ("", 1.0)))}).around(CONDITIONS[name].nominal)
+    for name, row in TABLES["axes"].items()
+)
+"""of the conditions in `conditions.toml`"""
 
 
 class DroneProbe:
@@ -67,63 +65,56 @@ class DroneProbe:
         """the points of a batch"""
 
     @cached_property
-    def _programs(self) -> dict[str, _Programs]:
-        """The programs of each of the dynamics by its name: those of a batch, first, and those of a point.
+    def _flights(self) -> dict[str, Callable[..., list[Flown]]]:
+        """`_fly` with the programs of each of the dynamics by its name: those of a batch, first, and those of a point.
 
         Traced one after the other, since tracing may use one object, but compiled side by side.
         """
         axis = self.axes[-1]
         others = [self._make(str(name), self._given) for name in axis.values if name != axis.nominal]
-        every = [(self._drones, self._size), *((one, 1) for one in others)]
-        compiled = compile_side_by_side([program for one, points in every for program in _lowered(one, points)])
-        pairs = zip(every, compiled[::2], compiled[1::2], strict=True)
-        return {one.dynamics: _Programs(one, points, restart, step) for (one, points), restart, step in pairs}
+        every = [self._drones, *others]
+        sizes = [self._size, *[1] * len(others)]
+        lowered = [program for one, points in zip(every, sizes, strict=True) for program in _lowered(one, points)]
+        compiled = compile_side_by_side(lowered)
+        each = zip(every, compiled[::2], compiled[1::2], strict=True)
+        return {one.dynamics: partial(_fly, one, *programs) for one, *programs in each}
 
     def fly(self, begin: Begin, seed: int) -> tuple[Flown, dict[str, list[Flown]]]:
-        """All flights, see `Probe.fly`; those that are nominal with their actions."""
-        (_, programs), *others = self._programs.items()
-        nominal, *flown = self._batches(programs, begin, seed)
-        at = dict(zip(self._points, flown, strict=False))  # the last batch has more
-        given = np.array(list(self._given.values()), np.float32).reshape(1, -1, 2)
-        at |= {("dynamics", name): one.fly(begin, seed, given)[0] for name, one in others}
-        return nominal, {a.name: [at.get((a.name, value), nominal) for value in a.values] for a in self.axes}
+        """All flights, see `Probe.fly`; those that are nominal with their actions.
 
-    def _batches(self, programs: _Programs, begin: Begin, seed: int) -> Iterator[Flown]:
-        """The nominal flights, then those of each point, batch by batch; the last is filled up with nominal ones."""
-        names = list(self._drones.air.ranges)
-        ends = np.tile(self._ends, (math.ceil((1 + len(self._points)) / self._size) * self._size, 1, 1))
+        Those of each point of a condition batch by batch, of which the last is filled up with nominal ones.
+        """
+        (_, fly), *others = self._flights.items()
+        names, count = list(self._drones.air.ranges), 1 + len(self._points)
+        ends = np.tile(self._ends, (math.ceil(count / self._size) * self._size, 1, 1))
         for row, (name, value) in enumerate(self._points, 1):
             ends[row, names.index(name)] = value
-        for first in range(0, len(ends), self._size):
-            yield from programs.fly(begin, seed, ends[first : first + self._size], keep_first=first == 0)
+        batches = [fly(begin, seed, ends[first : first + self._size]) for first in range(0, len(ends), self._size)]
+        nominal, *flown = chain(*batches)
+        at = dict(zip(self._points, flown, strict=False))  # the last batch has more
+        given = np.array(list(self._given.values()), np.float32).reshape(1, -1, 2)
+        at |= {("dynamics", name): one(begin, seed, given)[0] for name, one in others}
+        return nominal, {a.name: [at.get((a.name, value), nominal) for value in a.values] for a in self.axes}
 
 
-class _Programs:
-    """The compiled programs of P copies of E drones: no flight is reset, so what follows a crash means nothing."""
+def _fly(drones: Drones, restart: Callable, step: Callable, begin: Begin, seed: int, ends: np.ndarray) -> list[Flown]:
+    """The flights of P copies of E drones, with the ends [P, K, 2] of their ranges; the first with its actions.
 
-    def __init__(self, drones: Drones, points: int, restart: Callable, step: Callable) -> None:
-        self._drones, self._points, self._restart, self._step = drones, points, restart, step
-
-    def fly(self, begin: Begin, seed: int, ends: np.ndarray, keep_first: bool = False) -> list[Flown]:
-        """The flights of each copy, with the ends [P, K, 2] of its ranges; `keep_first` the actions of the first.
-
-        A drone whose state is not finite has crashed.
-        """
-        starts, kept = self._drones.num_envs, list[torch.Tensor]()
-        tally, act = Tally(self._points * starts), begin()
-        state, obs = self._restart(np.uint32(seed), ends)
-        for _ in range(self._drones.episode_steps):
-            action = act(torch.nan_to_num(torch.from_dlpack(obs))).clamp(-1, 1)
-            if keep_first:
-                kept.append(action[:starts].clone())
-            state, obs, *out = self._step(state, jax.dlpack.from_dlpack(action.contiguous()))
-            reward, crashed, finished = map(torch.from_dlpack, out)
-            tally.add(torch.nan_to_num(reward), crashed, finished)
-            if not tally.going.any():
-                break
-        pairs = zip(tally.returns.split(starts), tally.terminated.split(starts), strict=True)
-        actions = torch.stack(kept) if kept else None
-        return [Flown(*pair, actions if i == 0 else None) for i, pair in enumerate(pairs)]
+    No flight is reset, so what follows a crash means nothing. A drone whose state is not finite has crashed.
+    """
+    starts, kept = drones.num_envs, list[torch.Tensor]()
+    tally, act = Tally(len(ends) * starts), begin()
+    state, obs = restart(np.uint32(seed), ends)
+    for _ in range(drones.episode_steps):
+        action = act(torch.nan_to_num(torch.from_dlpack(obs))).clamp(-1, 1)
+        kept.append(action[:starts].clone())
+        state, obs, *out = step(state, jax.dlpack.from_dlpack(action.contiguous()))
+        reward, crashed, finished = map(torch.from_dlpack, out)
+        tally.add(torch.nan_to_num(reward), crashed, finished)
+        if not tally.going.any():
+            break
+    first, *others = zip(tally.returns.split(starts), tally.terminated.split(starts), strict=True)
+    return [Flown(*first, torch.stack(kept)), *(Flown(*one) for one in others)]
 
 
 def _lowered(drones: Drones, points: int) -> tuple[Any, Any]:

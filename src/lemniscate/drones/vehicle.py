@@ -8,7 +8,7 @@ together are what is called domain randomization (Tobin et al. 2017, arXiv:1703.
 import math
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any
 
@@ -112,11 +112,8 @@ ACTION = (
     *(Quantity(name, "rad", "Euler angles x-y-z, body to world") for name in ("roll", "pitch", "yaw")),
     Quantity("thrust", "N", "body: along z, all rotors together"),
 )
-
-
 RATES = (*_vector("body_rate", "rad/s", BODY), ACTION[-1])
 """the action where body rates are controlled"""
-
 PAST_ACTION = tuple(Quantity(q.name, "1", "-1 and 1 are the bounds of the action") for q in ACTION)
 
 
@@ -177,10 +174,6 @@ class PD:
     reference: slice
     velocity: slice
     preview: float
-
-    def with_gains(self, gains: Sequence[float]) -> "PD":
-        """The same controller with other gains."""
-        return replace(self, gains=gains)
 
     def __call__(self, obs: Tensor) -> Deterministic:
         """The action [N, 4] at each observation [N, O]."""

@@ -11,15 +11,14 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from lemniscate.envs.backend import Interface, Quantity
 from lemniscate.errors import UserError
-from lemniscate.exporting.deployed import difference_units, safe_action, safe_sentence
+from lemniscate.exporting.deployed import choices, difference_units, safe_action, safe_sentence
 from lemniscate.exporting.translation import Operand, Operation, Program, Value
-from lemniscate.spec import Action, Box, Discrete, MultiDiscrete
+from lemniscate.spec import Action, Box
 from lemniscate.system.files import filled
 from lemniscate.system.machine import version
 
@@ -56,8 +55,6 @@ def c_files(
         period: seconds between two actions, where known.
         wrappers: what stands between the environment and the policy in training, and is not in the program.
     """
-    body = Body(program)
-    places, scratch = body.places()
     context = {
         "title": title,
         "origin": origin,
@@ -66,31 +63,18 @@ def c_files(
         "program": program,
         "action": action,
         "is_box": isinstance(action, Box),
-        "masked": _masked(action),
+        "masked": () if isinstance(action, Box) or not action.mask_size else zip(*choices(action), strict=True),
         "safe": safe_action(action),
         "safe_sentence": safe_sentence(action),
-        "observations": observations[:, : program.obs.size],
-        "memories": observations[:, program.obs.size :],
-        "actions": actions[:, : program.action.size],
-        "afters": actions[:, program.action.size :],
+        "observations": observations,
+        "actions": actions,
         "bound": "0.05F" if program.is_rounded else "1e-4F",  # ten times the effect of another order of sums
         "units": difference_units(action, actions)[: program.action.size],
         "wrappers": wrappers,
-        "constants": body.constants,
-        "scratch": max(scratch, 1),
-        "places": {name: places[name] for name in body.sizes},
-        "statements": body.statements,
+        "body": Body(program),
     }
     filters = {"braces": braces, "comment": comment, "functions": functions}
     return {name: filled(TEMPLATES / name, filters, **context) for name in ("policy.c", "policy.h")}
-
-
-def _masked(action: Action) -> list[tuple[int, int, int]]:
-    """(number of choices, the first one, the place of its mask in the row of masks) of each component that has one."""
-    if not isinstance(action, Discrete | MultiDiscrete) or not action.masked:
-        return []
-    counts, firsts = ((action.n,), (action.start,)) if isinstance(action, Discrete) else (action.nvec, action.start)
-    return [(n, first, sum(counts[:k])) for k, (n, first) in enumerate(zip(counts, firsts, strict=True))]
 
 
 def comment(text: str) -> str:
@@ -129,13 +113,14 @@ class Body:
     Attributes:
         constants: the definitions of constant arrays.
         statements: in their order.
-        sizes: of the arrays in the scratch memory, by name.
+        places: of the arrays in the scratch memory, by name.
+        scratch: the size of that memory.
     """
 
     def __init__(self, program: Program) -> None:
         self.constants: list[str] = []
         self.statements: list[str] = []
-        self.sizes: dict[str, int] = {}
+        self._sizes: dict[str, int] = {}
         self._results = {program.obs: Numbers("obs[#]", "obs")}
         if program.memory:
             self._results[program.memory] = Numbers("memory[#]", "memory")
@@ -147,26 +132,24 @@ class Body:
         self._write(program.action, "action")
         if program.after:
             self._write(program.after, "memory")
+        self.places = self._places()
+        self.scratch = max((self.places[name] + size for name, size in self._sizes.items()), default=1)
 
-    def places(self) -> tuple[dict[str, int], int]:
-        """The place of each array in the scratch memory, and the size of that.
-
-        First fit, the largest first; an array lives from the first statement that names it to the last.
-        """
+    def _places(self) -> dict[str, int]:
+        """First fit, the largest first; an array lives from the first statement that names it to the last."""
         words = [set(re.findall(r"\w+", statement)) for statement in self.statements]
-        at = {name: [i for i, named in enumerate(words) if name in named] for name in self.sizes}
+        at = {name: [i for i, named in enumerate(words) if name in named] for name in self._sizes}
         lives = {name: (numbers[0], numbers[-1]) for name, numbers in at.items()}
-        places: dict[str, int] = {}
-        for name, (born, dead) in sorted(lives.items(), key=lambda life: (-self.sizes[life[0]], life[1])):
-            others = [other for other in places if lives[other][0] <= dead and born <= lives[other][1]]
-            taken = sorted((places[other], places[other] + self.sizes[other]) for other in others)
-            place = 0
-            for begin, end in taken:
-                if place + self.sizes[name] <= begin:
+        places = dict.fromkeys(self._sizes, 0)
+        placed = list[str]()
+        for name, (born, dead) in sorted(lives.items(), key=lambda life: (-self._sizes[life[0]], life[1])):
+            others = [other for other in placed if lives[other][0] <= dead and born <= lives[other][1]]
+            for begin, other in sorted((places[other], other) for other in others):
+                if places[name] + self._sizes[name] <= begin:
                     break
-                place = max(place, end)
-            places[name] = place
-        return places, max((places[name] + size for name, size in self.sizes.items()), default=0)
+                places[name] = max(places[name], begin + self._sizes[other])
+            placed.append(name)
+        return places
 
     def _add(self, operation: Operation) -> None:
         """Translate one operation; those that are not named here are computed number by number."""
@@ -195,7 +178,7 @@ class Body:
 
     def _new(self, value: Value) -> Numbers:
         """A new array for a result."""
-        self.sizes[value.name] = value.size
+        self._sizes[value.name] = value.size
         number = f"{value.name}[#]"
         return Numbers(f"({number} != 0.0F)" if value.kind == "bool" else number, value.name)
 
@@ -238,10 +221,7 @@ class Body:
         for operand in operation.inputs:
             if isinstance(operand, Value) and operand.size < output.size:
                 self._array(operand)  # computed once for all numbers that need it, not in the loop
-        inputs = list[str]()
-        for operand in operation.inputs:
-            view = np.broadcast_to(_places(operand.shape), output.shape)
-            inputs.append(self._seen(operand, view).text)
+        inputs = [self._seen(x, np.broadcast_to(_places(x.shape), output.shape)).text for x in operation.inputs]
         if operation.name == "Cast":
             (x,) = operation.inputs
             return Numbers(_cast(inputs[0], x.kind if isinstance(x, Value) else "float", output.kind))
@@ -347,22 +327,21 @@ def literal(number: np.generic | float) -> str:
 
 # --- the folder with which the Crazyflie's firmware takes a policy as its controller ---------------------------------
 
+CRAZYFLIE_FILES = ("policy_controller.c", "README.md", "Makefile", "Kbuild", "app-config")
 COMMANDS = ("roll", "pitch", "yaw", "thrust")
 LOOP = 1000
 """Hz, the rate of the firmware's stabilizer, which the policy's rate has to divide"""
 
+VECTORS = {
+    "position": "state->position.{0}",
+    "velocity": "state->velocity.{0}",
+    "angular_velocity": "sensors->gyro.{0} * RADIANS",
+    "to_goal": "setpoint->position.{0} - state->position.{0}",
+    "to_goal_velocity": "setpoint->velocity.{0} - state->velocity.{0}",
+}
 SENSED = {f"attitude_{axis}": f"state->attitudeQuaternion.{axis}" for axis in "xyzw"}
-for _axis in "xyz":
-    SENSED |= {
-        f"position_{_axis}": f"state->position.{_axis}",
-        f"velocity_{_axis}": f"state->velocity.{_axis}",
-        f"angular_velocity_{_axis}": f"sensors->gyro.{_axis} * RADIANS",
-        f"to_goal_{_axis}": f"setpoint->position.{_axis} - state->position.{_axis}",
-        f"to_goal_velocity_{_axis}": f"setpoint->velocity.{_axis} - state->velocity.{_axis}",
-    }
+SENSED |= {f"{name}_{axis}": text.format(axis) for name, text in VECTORS.items() for axis in "xyz"}
 """the firmware's expression for each quantity, by its name"""
-TO_REFERENCE = re.compile(r"to_reference_in_.*s_[xyz]")
-PAST = re.compile(r"(.+)_(\d+)_steps_ago(_less_now)?")
 
 
 def crazyflie_files(
@@ -382,11 +361,21 @@ def crazyflie_files(
     if not rate or LOOP % rate:
         raise UserError(f"its {rate} actions a second do not divide the firmware's {LOOP}")
     names = [quantity.name for quantity in quantities]
-    references = [name for name in names if interface.reference and TO_REFERENCE.fullmatch(name)]
-    past = [name for name in names if PAST.fullmatch(name)]
-    for name in names:
-        if name not in (*SENSED, *references, *past):
-            raise UserError(f"nothing in the firmware gives {name}")
+    now = {name: f"obs[{i}]" for i, name in enumerate(names)}
+    references = [name for name in names if interface.reference and name.startswith("to_reference_in_")]
+    done = {  # between -1 and 1, the ends of the range
+        name: f"(action[{i}] - {literal((low + high) / 2)}) / {literal((high - low) / 2)}"
+        for i, (name, low, high) in enumerate(zip(COMMANDS, action.low, action.high, strict=True))
+    }
+    ago = {name: f"{name}_{{}}_steps_ago{'_less_now' if name in now else ''}" for name in (*now, *done)}
+    kept = [name for name in ago if ago[name].format(1) in now]
+    past = [ago[name].format(steps) for steps in range(1, (interface.history or 0) + 1) for name in kept]
+    first = next((i for i, name in enumerate(names) if name in past), 0)
+    unknown = [name for name in names if name not in (*SENSED, *references, *past)]
+    if past and (names[first : first + len(past)] != past or len(interface.action_before) != len(COMMANDS)):
+        unknown.append(names[first])
+    if unknown:
+        raise UserError(f"nothing in the firmware gives {unknown[0]}")
     context = {
         "title": title,
         "version": version(),
@@ -397,35 +386,8 @@ def crazyflie_files(
         "reference": interface.reference,
         "to_reference": names.index(references[0]) if references else None,
         "sensed": {i: SENSED[name] for i, name in enumerate(names) if name in SENSED},
-        "history": _history(names, past, action, interface.action_before) if past else None,
+        "first": first,
+        "kept": [(now.get(name), done.get(name)) for name in kept],
     }
     folder, filters = TEMPLATES / "crazyflie", {"literal": literal, "comment": comment}
-    names_of_files = ("policy_controller.c", "README.md", "Makefile", "Kbuild", "app-config")
-    return {**c_files, **{name: filled(folder / name, filters, **context) for name in names_of_files}}
-
-
-def _history(names: list[str], past: list[str], action: Box, before: tuple[float, ...]) -> dict[str, Any]:
-    """The quantities of earlier steps that are given to the policy, the newest first.
-
-    `kept` has the expressions of a quantity: among the observations, where it is one, and among the actions.
-
-    Raises:
-        UserError: a history of other quantities, or in another order.
-    """
-    each = [found[1] for name in past if (found := PAST.fullmatch(name)) and found[2] == "1"]
-    steps = len(past) // max(1, len(each))
-    first, known = names.index(past[0]), (*names, *COMMANDS)
-    steps_ago = [(ago, name) for ago in range(1, steps + 1) for name in each]
-    expected = [f"{name}_{ago}_steps_ago{'_less_now' if name in names else ''}" for ago, name in steps_ago]
-    if names[first : first + len(past)] != expected or not set(each) <= set(known) or len(before) != len(COMMANDS):
-        raise UserError(f"nothing in the firmware gives {past[0]}")
-    now = {name: f"obs[{i}]" for i, name in enumerate(names)}
-    kept = [(now.get(name, ""), "" if name in now else _normalized(name, action)) for name in each]
-    return {"steps": steps, "first": first, "before": before, "kept": kept}
-
-
-def _normalized(command: str, action: Box) -> str:
-    """The C expression of a coordinate of the action between -1 and 1, the ends of its range."""
-    i = COMMANDS.index(command)
-    low, high = action.low[i], action.high[i]
-    return f"(action[{i}] - {literal((low + high) / 2)}) / {literal((high - low) / 2)}"
+    return {**c_files, **{name: filled(folder / name, filters, **context) for name in CRAZYFLIE_FILES}}

@@ -16,7 +16,6 @@ from lemniscate.errors import UserError
 from lemniscate.exporting.c_code import TEMPLATES
 
 FLAGS = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Wconversion", "-Wdouble-promotion", "-Werror")
-POINTER = ctypes.c_void_p
 
 TARGET_COMPILER, EMULATOR = "arm-none-eabi-gcc", "qemu-system-arm"
 CORE = ("-mcpu=cortex-m4", "-mthumb", "-mfpu=fpv4-sp-d16", "-mfloat-abi=hard", "-Os")
@@ -56,8 +55,7 @@ class HostPolicy:
         """Rows of actions [R, A + K] at raw observations [R, O + K]; `flags` counts those that are not finite."""
         obs = np.ascontiguousarray(obs, dtype=np.float32)
         action = np.empty((len(obs), self.columns), dtype=np.float32)
-        pointers = obs.ctypes.data_as(POINTER), action.ctypes.data_as(POINTER)
-        self.flags = self._library.policy_act_rows(*pointers, len(obs))
+        self.flags = self._library.policy_act_rows(obs.ctypes, action.ctypes, len(obs))
         return action
 
     def self_test(self) -> float:

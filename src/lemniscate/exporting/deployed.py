@@ -27,22 +27,16 @@ class Deployed(nn.Module):
     end of the observation. A policy with a memory takes that too, [B, K], and returns the next one beside the action.
     """
 
-    low: Tensor
-    high: Tensor
-    middle: Tensor
-    half_width: Tensor
-    start: Tensor
-
     def __init__(self, policy: TrainedPolicy) -> None:
         super().__init__()
         self.policy = policy.module
         self.kind = policy.spec.action
         self.memory = policy.module.memory and replace(policy.module.memory, privileged=0)
         if isinstance(self.kind, Box):
-            for name, numbers in zip(("low", "high", "middle", "half_width"), scale_of(self.kind), strict=True):
-                self.register_buffer(name, torch.tensor(numbers, dtype=torch.float32))
+            scale = (nn.Buffer(torch.tensor(numbers, dtype=torch.float32)) for numbers in scale_of(self.kind))
+            self.low, self.high, self.middle, self.half_width = scale
         elif isinstance(self.kind, MultiDiscrete):
-            self.register_buffer("start", torch.tensor(self.kind.start))
+            self.start = nn.Buffer(torch.tensor(self.kind.start))
 
     def forward(self, obs: Tensor, before: Tensor | None = None) -> Tensor | tuple[Tensor, Tensor]:
         """[B, O] to [B, A], or to [B, …] in the environment's own shape; [B] for Discrete."""
@@ -82,8 +76,14 @@ def safe_action(action: Action) -> np.ndarray:
     if isinstance(action, Box):
         low, high, middle, _ = scale_of(action)
         return np.clip(middle, low, high).astype(np.float32)
-    first = [0] * action.n if isinstance(action, MultiBinary) else action.start
-    return np.ravel(first).astype(np.float32)
+    return np.array(choices(action)[1], dtype=np.float32)
+
+
+def choices(action: Discrete | MultiDiscrete | MultiBinary) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """The number of choices of each component of an action, and the first of each."""
+    if isinstance(action, MultiDiscrete):
+        return action.nvec, action.start
+    return ((action.n,), (action.start,)) if isinstance(action, Discrete) else ((2,) * action.n, (0,) * action.n)
 
 
 def safe_sentence(action: Action) -> str:
@@ -134,13 +134,12 @@ def carried(act: Act, memory: int) -> Callable[..., np.ndarray]:
     """
     kept = np.zeros((1, memory), np.float32)
 
-    def acts(obs: np.ndarray, begins: np.ndarray | None = None) -> np.ndarray:
+    def acts(obs: np.ndarray, begins: np.ndarray | bool = False) -> np.ndarray:
         nonlocal kept
-        before = np.broadcast_to(kept, (len(obs), memory))
-        before = before if begins is None else np.where(begins[:, None], np.float32(0), before)
+        before = np.where(np.broadcast_to(begins, len(obs))[:, None], np.float32(0), kept)
         rows = act(np.hstack([obs, before]))
-        kept = rows[:, rows.shape[1] - memory :]
-        return rows[:, : rows.shape[1] - memory]
+        action, kept = np.split(rows, [rows.shape[1] - memory], axis=1)
+        return action
 
     return acts
 

@@ -4,7 +4,7 @@ import hashlib
 import json
 import math
 import subprocess
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -16,13 +16,21 @@ from lemniscate.envs.backend import Interface, Quantity
 from lemniscate.errors import UserError, is_installed
 from lemniscate.exporting.c_code import c_files, crazyflie_files
 from lemniscate.exporting.compiled import HostPolicy, host_compiler
-from lemniscate.exporting.deployed import Act, Deployed, act_with, input_size, memory_size, safe_action, safe_sentence
+from lemniscate.exporting.deployed import (
+    Deployed,
+    act_with,
+    choices,
+    input_size,
+    memory_size,
+    safe_action,
+    safe_sentence,
+)
 from lemniscate.exporting.onnx_model import onnx_act, onnx_model
 from lemniscate.exporting.parity import TESTS, fly, parity, self_tests, sentences
 from lemniscate.exporting.translation import Program, translate
 from lemniscate.hub.repository import is_address
 from lemniscate.run.seeding import torch_defaults
-from lemniscate.spec import Action, Box, Discrete, MultiDiscrete, ObservationPart, Spec
+from lemniscate.spec import Action, Box, ObservationPart, Spec
 from lemniscate.system.console import say
 from lemniscate.system.files import DamagedFileError, read_json, replace_directory, replace_file, write_json
 from lemniscate.system.machine import version
@@ -132,7 +140,9 @@ def _contents(policy: TrainedPolicy, program: Program) -> tuple[dict[str, bytes]
     return contents, _manifest(policy, program, interface, seen, contents), said
 
 
-def _actor(policy: TrainedPolicy, program: Program, model: bytes | None, compiler: str | None) -> tuple[str, Act]:
+def _actor(
+    policy: TrainedPolicy, program: Program, model: bytes | None, compiler: str | None
+) -> tuple[str, Callable[..., np.ndarray]]:
     """The copy that acts here, by its name: the C code, or else ONNX, or else the policy itself."""
     if compiler:
         # what the self-test stores is seen on this flight, so the C that flies has an empty one
@@ -212,11 +222,11 @@ def title(policy: TrainedPolicy) -> str:
 
 def observed(spec: Spec, interface: Interface) -> list[Quantity]:
     """The quantities of the whole observation; where the environment says nothing, the names of its parts."""
-    found: list[Quantity] = []
+    found = list[Quantity]()
     for part in spec.observation_parts:
         known = interface.parts.get(part.name, ())
         found += known if len(known) == part.size else map(Quantity, _names(part))
-    return found + [Quantity(f"action_mask[{i}]") for i in range(input_size(spec) - spec.observation_size)]
+    return found + [Quantity(f"action_mask[{i}]") for i in range(spec.action.mask_size)]
 
 
 def _names(part: ObservationPart) -> list[str]:
@@ -230,9 +240,8 @@ def _names(part: ObservationPart) -> list[str]:
 def acted(action: Action, interface: Interface) -> list[Quantity]:
     """The quantities of the action."""
     size = len(ranges(action))
-    if len(interface.action) == size:
-        return list(interface.action)
-    return [Quantity("action" if size == 1 else f"action[{i}]") for i in range(size)]
+    names = ["action"] if size == 1 else [f"action[{i}]" for i in range(size)]
+    return list(interface.action) if len(interface.action) == size else list(map(Quantity, names))
 
 
 def ranges(action: Action) -> list[list[float | None]]:
@@ -240,8 +249,4 @@ def ranges(action: Action) -> list[list[float | None]]:
     if isinstance(action, Box):
         ends = zip(action.low, action.high, strict=True)
         return [[end if math.isfinite(end) else None for end in pair] for pair in ends]
-    if isinstance(action, Discrete):
-        return [[action.start, action.start + action.n - 1]]
-    if isinstance(action, MultiDiscrete):
-        return [[first, first + n - 1] for first, n in zip(action.start, action.nvec, strict=True)]
-    return [[0, 1]] * action.n
+    return [[first, first + n - 1] for n, first in zip(*choices(action), strict=True)]

@@ -15,16 +15,7 @@ from lemniscate.envs.backend import Interface
 from lemniscate.errors import UserError, is_installed, missing_extra
 from lemniscate.exporting import compiled
 from lemniscate.exporting.compiled import CORE, EMULATOR, TARGET_COMPILER, HostPolicy
-from lemniscate.exporting.deployed import (
-    Act,
-    act_with,
-    carried,
-    difference_units,
-    for_policy,
-    input_size,
-    memory_size,
-    safe_action,
-)
+from lemniscate.exporting.deployed import Act, act_with, carried, difference_units, for_policy, input_size, memory_size
 from lemniscate.exporting.onnx_model import onnx_act
 from lemniscate.exporting.translation import Program
 from lemniscate.maths import Deterministic
@@ -125,9 +116,9 @@ def self_tests(policy: TrainedPolicy, obs: np.ndarray) -> np.ndarray:
 
 def _clear(policy: TrainedPolicy, obs: np.ndarray) -> np.ndarray:
     """[R], whether a slightly different observation has the same action; all where that holds for none."""
-    act, actions = act_with(policy), len(safe_action(policy.spec.action))
-    same = [(act(obs * np.float32(f)) == act(obs))[:, :actions].all(1) for f in (0.99999, 1.00001)]
-    clear = np.logical_and(*same)
+    act, memory = act_with(policy), memory_size(policy)
+    same = [act(obs * np.float32(factor)) == act(obs) for factor in (0.99999, 1.00001)]
+    clear = np.logical_and(*same)[:, : same[0].shape[1] - memory].all(1)
     return clear if clear.any() else ~clear
 
 

@@ -184,10 +184,13 @@ class Walk(Interpreter):
         return KINDS[self.fake.dtype]
 
     def add(
-        self, name: str, *inputs: Any, shape: tuple[int, ...] | None = None, kind: Kind = "float", **settings: Any
+        self, name: str, *inputs: Any, shape: tuple[int, ...] | None = None, kind: Kind | None = None, **settings: Any
     ) -> Value:
-        """A new operation; numbers and tensors among its inputs become constants, without a batch axis of length 1."""
-        shape = self.shape if shape is None else shape
+        """A new operation, whose shape and kind are those of the result unless they are given.
+
+        Numbers and tensors among its inputs become constants, without a batch axis of length 1.
+        """
+        shape, kind = self.shape if shape is None else shape, kind or self.kind
         rank = 2 if name == "Linear" else len(shape)  # a weight [1, n] has no batch axis that could be dropped
         operands = list[Operand]()
         for given in inputs:
@@ -202,12 +205,12 @@ class Walk(Interpreter):
             self.operations.append(Operation(name, tuple(operands), self._known[key], settings))
         return self._known[key]
 
-    def as_kind(self, operand: Any, kind: Kind) -> Any:
-        """The operand with numbers of another kind."""
+    def as_kind(self, operand: Any, kind: Kind | None = None) -> Any:
+        """The operand with numbers of a kind, by default that of the result."""
+        kind = kind or self.kind
         if isinstance(operand, Value):
             return operand if operand.kind == kind else self.add("Cast", operand, shape=operand.shape, kind=kind)
-        numbers = {"float": np.float32, "int": np.int64, "bool": np.bool_}[kind]
-        return array(operand).astype(numbers)
+        return array(operand).astype({"float": np.float32, "int": np.int64, "bool": np.bool_}[kind])
 
     def rounded(self, value: Value) -> Value:
         """The value, rounded where torch's result has the type bfloat16."""
@@ -236,40 +239,31 @@ def _elementwise(name: str, kind: Kind | None = None) -> Translation:
     def translation(walk: Walk, *operands: Any, alpha: float = 1, rounding_mode: str | None = None) -> Value:
         if rounding_mode is not None:
             raise UntranslatableError(f"{walk.name} with rounding has no translation")
-        own = [walk.as_kind(operand, kind or walk.kind) for operand in operands]
+        own = [walk.as_kind(operand, kind) for operand in operands]
         if alpha != 1:
-            own[1] = walk.add("Mul", own[1], walk.as_kind(alpha, walk.kind), kind=walk.kind)
-        return walk.rounded(walk.add(name, *own, kind=walk.kind))
+            own[1] = walk.add("Mul", own[1], walk.as_kind(alpha))
+        return walk.rounded(walk.add(name, *own))
 
     return translation
 
 
-def _clamp(walk: Walk, x: Value, low: Any = None, high: Any = None, *, min: Any = None, max: Any = None) -> Value:
-    low, high = min if low is None else low, max if high is None else high
-    for name, bound in (("Max", low), ("Min", high)):
-        x = x if bound is None else walk.add(name, x, walk.as_kind(bound, walk.kind), kind=walk.kind)
+def _clamp(walk: Walk, x: Value, min: Any = None, max: Any = None) -> Value:
+    for name, bound in (("Max", min), ("Min", max)):
+        x = x if bound is None else walk.add(name, x, walk.as_kind(bound))
     return x
 
 
 def _power(walk: Walk, x: Any, exponent: Any) -> Value:
     if not isinstance(x, Value) or exponent not in (1, 2, 3, 4, 0.5, -0.5, -1, -2):
         raise UntranslatableError(f"pow with the exponent {exponent} has no translation")
-    if abs(exponent) == 0.5:
-        y = walk.add("Sqrt", x)
-    else:
-        y = x
-        for _ in range(int(abs(exponent)) - 1):
-            y = walk.add("Mul", y, x)
+    y = walk.add("Sqrt", x) if abs(exponent) == 0.5 else x
+    for _ in range(int(abs(exponent)) - 1):
+        y = walk.add("Mul", y, x)
     return y if exponent > 0 else walk.add("Div", np.float32(1), y)
 
 
 def _where(walk: Walk, condition: Any, a: Any, b: Any) -> Value:
-    chosen = (walk.as_kind(condition, "bool"), walk.as_kind(a, walk.kind), walk.as_kind(b, walk.kind))
-    return walk.add("Where", *chosen, kind=walk.kind)
-
-
-def _lerp(walk: Walk, a: Value, b: Value, weight: Value) -> Value:
-    return walk.add("Add", a, walk.add("Mul", weight, walk.add("Sub", b, a)))
+    return walk.add("Where", walk.as_kind(condition, "bool"), walk.as_kind(a), walk.as_kind(b))
 
 
 def _linear(walk: Walk, x: Value, weight: Any, bias: Any = None) -> Value:
@@ -301,16 +295,16 @@ def _reduction(name: str) -> Translation:
     def translation(walk: Walk, x: Value, axes: Any = None, keepdim: bool = False, **_: Any) -> Value:
         axes = [axes] if isinstance(axes, int) else list(axes or [0])
         _require_last(walk, x, axes)
-        y = walk.add(name, walk.as_kind(x, walk.kind), shape=(*x.shape[:-1], 1), kind=walk.kind)
-        return y if keepdim else walk.add("Reshape", y, kind=walk.kind)
+        y = walk.add(name, walk.as_kind(x), shape=(*x.shape[:-1], 1))
+        return y if keepdim else walk.add("Reshape", y)
 
     return translation
 
 
 def _argmax(walk: Walk, x: Value, axis: int | None = None, keepdim: bool = False) -> Value:
     _require_last(walk, x, [0 if axis is None else axis])
-    y = walk.add("ArgMax", x, shape=x.shape[:-1], kind="int")
-    return walk.add("Reshape", y, kind="int") if keepdim else y
+    y = walk.add("ArgMax", x, shape=x.shape[:-1])
+    return walk.add("Reshape", y) if keepdim else y
 
 
 def _slice(walk: Walk, x: Value, axis: int = 0, start: int | None = None, end: Any = None, step: int = 1) -> Value:
@@ -320,13 +314,14 @@ def _slice(walk: Walk, x: Value, axis: int = 0, start: int | None = None, end: A
         raise UntranslatableError("a slice with steps has no translation")
     own = walk.axis(axis, len(x.shape))
     begin, _, _ = slice(start, None).indices(x.shape[own])
-    return walk.add("Slice", x, kind=x.kind, axis=own, start=begin)
+    return walk.add("Slice", x, axis=own, start=begin)
 
 
-def _part(walk: Walk, x: Value, own: int, start: int, size: int) -> Value:
-    """The `size` rows of x from `start` on, along an axis of one observation."""
+def _part(walk: Walk, x: Value, axis: int, start: int, size: int = 1) -> Value:
+    """The `size` rows of x from `start` on, along an axis of a batch."""
+    own = walk.axis(axis, len(x.shape))
     shape = (*x.shape[:own], size, *x.shape[own + 1 :])
-    return walk.add("Slice", x, shape=shape, kind=x.kind, axis=own, start=start)
+    return walk.add("Slice", x, shape=shape, kind=x.kind, axis=own, start=start + x.shape[own] * (start < 0))
 
 
 def _index(walk: Walk, x: Value, places: list[Any]) -> Value:
@@ -334,45 +329,40 @@ def _index(walk: Walk, x: Value, places: list[Any]) -> Value:
     ((axis, indices), *others) = [(axis, index) for axis, index in enumerate(places) if index is not None]
     if others or isinstance(indices, Value) or indices.ndim != 1 or indices.dtype != torch.int64:
         raise UntranslatableError("index with more than constant places along one axis has no translation")
-    own = walk.axis(axis, len(x.shape))
-    rows = [_part(walk, x, own, index % x.shape[own], 1) for index in indices.tolist()]
-    return walk.add("Concat", *rows, kind=x.kind, axis=own)
-
-
-def _select(walk: Walk, x: Value, axis: int, index: int) -> Value:
-    own = walk.axis(axis, len(x.shape))
-    return walk.add("Reshape", _part(walk, x, own, index % x.shape[own], 1), kind=x.kind)
+    rows = [_part(walk, x, axis, index) for index in indices.tolist()]
+    return walk.add("Concat", *rows, axis=walk.axis(axis, len(x.shape)))
 
 
 def _split(walk: Walk, x: Value, _sizes: Any, axis: int = 0) -> list[Value]:
     own = walk.axis(axis, len(x.shape))
     sizes = [walk.shape_of(fake)[own] for fake in walk.fake]
-    return [_part(walk, x, own, sum(sizes[:i]), size) for i, size in enumerate(sizes)]
+    return [_part(walk, x, axis, sum(sizes[:i]), size) for i, size in enumerate(sizes)]
 
 
 def _shaped(name: str) -> Translation:
-    return lambda walk, x, *_, **__: x if x.shape == walk.shape else walk.add(name, x, kind=x.kind)
+    return lambda walk, x, *_, **__: x if x.shape == walk.shape else walk.add(name, x)
 
 
 def _permute(walk: Walk, x: Value, axes: list[int]) -> Value:
     rank = len(x.shape) + 1
     if axes[0] % rank:
         raise UntranslatableError("permute mixes the observations of a batch")
-    return walk.add("Transpose", x, kind=x.kind, axes=tuple(axis % rank - 1 for axis in axes[1:]))
+    return walk.add("Transpose", x, axes=tuple(axis % rank - 1 for axis in axes[1:]))
 
 
 def _cat(walk: Walk, parts: list[Any], axis: int = 0) -> Value:
     own = walk.axis(axis, len(walk.shape))
     first = next(part for part in parts if isinstance(part, Value))
     rows = [part if isinstance(part, Value) else _in_batch(walk, array(part), first, own) for part in parts]
-    return walk.add("Concat", *(walk.as_kind(row, walk.kind) for row in rows), kind=walk.kind, axis=own)
+    return walk.add("Concat", *map(walk.as_kind, rows), axis=own)
 
 
 def _in_batch(walk: Walk, numbers: np.ndarray, x: Value, own: int) -> Value:
     """Constants as a result: ONNX joins nothing that has no batch axis to something that has one."""
     shape = (*walk.shape[:own], numbers.shape[own - len(walk.shape)], *walk.shape[own + 1 :])
-    one = walk.as_kind(_part(walk, x, own, 0, 1), "float")
-    return walk.add("Add", walk.add("Sub", one, one, shape=one.shape), numbers, shape=shape)
+    one = walk.as_kind(_part(walk, x, own + 1, 0), "float")
+    zero = walk.add("Sub", one, one, shape=one.shape, kind="float")
+    return walk.add("Add", zero, numbers, shape=shape, kind="float")
 
 
 def _full(walk: Walk, _size: Any, number: float = 0.0, **_: Any) -> Tensor:
@@ -380,9 +370,8 @@ def _full(walk: Walk, _size: Any, number: float = 0.0, **_: Any) -> Tensor:
 
 
 TRANSLATIONS: dict[str, Translation] = {
-    **{name: _elementwise(name.capitalize()) for name in ("exp", "log", "sqrt", "sin", "cos", "tanh")},
-    **{name: _elementwise(name.capitalize()) for name in ("sigmoid", "erf", "floor", "neg", "abs")},
-    **{name: _elementwise(name.capitalize()) for name in ("add", "sub", "mul", "div")},
+    **{name: _elementwise(name.capitalize()) for name in ("exp", "log", "sqrt", "sin", "cos", "tanh", "sigmoid")},
+    **{name: _elementwise(name.capitalize()) for name in ("erf", "floor", "neg", "abs", "add", "sub", "mul", "div")},
     "maximum": _elementwise("Max"),
     "minimum": _elementwise("Min"),
     "gt": _elementwise("Greater", "float"),
@@ -390,12 +379,12 @@ TRANSLATIONS: dict[str, Translation] = {
     "lt": _elementwise("Less", "float"),
     "le": _elementwise("LessOrEqual", "float"),
     "eq": _elementwise("Equal", "float"),
-    "ne": lambda walk, a, b: walk.add("Not", _elementwise("Equal", "float")(walk, a, b), kind="bool"),
+    "ne": lambda walk, a, b: walk.add("Not", _elementwise("Equal", "float")(walk, a, b)),
     **dict.fromkeys(("logical_and", "bitwise_and"), _elementwise("And", "bool")),
     **dict.fromkeys(("logical_or", "bitwise_or"), _elementwise("Or", "bool")),
     **dict.fromkeys(("logical_not", "bitwise_not"), _elementwise("Not", "bool")),
     "where": _where,
-    **dict.fromkeys(("_to_copy", "to"), lambda walk, x, *_, **__: walk.rounded(walk.as_kind(x, walk.kind))),
+    **dict.fromkeys(("_to_copy", "to"), lambda walk, x, *_, **__: walk.rounded(walk.as_kind(x))),
     "relu": lambda walk, x: walk.add("Max", x, np.float32(0)),
     "silu": lambda walk, x: walk.add("Mul", x, walk.add("Sigmoid", x)),
     **dict.fromkeys(("clamp", "hardtanh", "clamp_min"), _clamp),
@@ -415,7 +404,7 @@ TRANSLATIONS: dict[str, Translation] = {
     "amin": _reduction("ReduceMin"),
     "argmax": _argmax,
     "slice": _slice,
-    "select": _select,
+    "select": lambda walk, x, axis, index: walk.add("Reshape", _part(walk, x, axis, index)),
     "index": _index,
     **dict.fromkeys(("split", "chunk", "split_with_sizes"), _split),
     "permute": _permute,
@@ -423,7 +412,7 @@ TRANSLATIONS: dict[str, Translation] = {
     "expand": _shaped("Expand"),
     **dict.fromkeys(("full", "full_like", "zeros", "zeros_like"), _full),
     "ones_like": lambda walk, x, **_: _full(walk, x, 1.0),
-    "lerp": _lerp,
+    "lerp": lambda walk, a, b, weight: walk.add("Add", a, walk.add("Mul", weight, walk.add("Sub", b, a))),
     "addcmul": lambda walk, x, a, b: walk.add("Add", x, walk.add("Mul", a, b)),
     "sym_size": lambda walk, *_: BATCH,
     **dict.fromkeys(("alias", "clone", "detach", "contiguous"), lambda walk, x, *_, **__: x),

@@ -37,14 +37,11 @@ class Preflight:
     """The findings of a pre-flight.
 
     Attributes:
-        env_id: of the environment.
         step: of the policy.
-        episodes: E, from as many starts, the same at every point.
-        seed: of the starts.
+        episodes: E, from as many starts, the same at every point; `seed` is theirs.
         compiled: the exported C acted.
         alive_means: the condition of an episode that counts as alive.
         nominal_return: mean return in the environment as it is.
-        axes: the margins.
         smoothness: of the actions in the environment as it is, where the time between them is known: `action_rate`,
             `fast_share`, `saturated_share`, as `lemniscate.margins.record.smoothness` measures them.
         sentences: for people.
@@ -110,13 +107,9 @@ def preflight(
     policy = load(run, trust=trust)
     act = _compiled(policy, folder) if compiled else None
     probe = _probe(policy, episodes, given)
-    threads = torch.get_num_threads()
     # several threads wait for each other longer than a small network takes, if simulators run too
     torch.set_num_threads(1)
-    try:
-        nominal, flown = probe.fly(partial(_begin, policy, act), derive(seed, EVALUATION, 0))
-    finally:
-        torch.set_num_threads(threads)
+    nominal, flown = probe.fly(partial(_begin, policy, act), derive(seed, EVALUATION, 0))
     least = None if probe.ends_by_failure else worst_accepted(nominal)
     axes = tuple(margins_of(axis, flown[axis.name], least) for axis in probe.axes)
     said, smooth = [*sentences(axes, FAILS if least is None else FALLS_SHORT)], None

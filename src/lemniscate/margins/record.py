@@ -1,7 +1,8 @@
 """The findings of a pre-flight as numbers: shares that are alive, margins, and the smoothness of actions."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -40,14 +41,27 @@ class AxisMargins:
         episodes: E, at each value.
         alive: the number of episodes that are alive at each value, [V].
         mean_returns: [V].
-        sides: "below" and "above", where values were tried there; an axis without an order has none.
     """
 
     axis: Axis
     episodes: int
     alive: tuple[int, ...]
     mean_returns: tuple[float, ...]
-    sides: dict[str, Side]
+
+    @cached_property
+    def sides(self) -> dict[str, Side]:
+        """By "below" and "above", where values were tried there; an axis without an order has none."""
+        values, nominal, found = self.axis.values, self.axis.nominal, dict[str, Side]()
+        if isinstance(nominal, str):
+            return found
+        middle = values.index(nominal)
+        for name, places in (("below", range(middle, -1, -1)), ("above", range(middle, len(values)))):
+            flies = [self.alive[place] >= ALIVE * self.episodes for place in places]
+            count = flies.index(False) if False in flies else len(flies)
+            outward = [None, *(values[place] for place in places), None]
+            if len(places) > 1:
+                found[name] = Side(outward[count], outward[count + 1])
+        return found
 
     def lost_at(self, value: Value) -> int:
         """The number of episodes that are not alive at a value."""
@@ -71,25 +85,17 @@ class AxisMargins:
 
     def to_json(self) -> dict[str, Any]:
         """The axis as an object of JSON."""
-        axis = self.axis
-        margin = {name: _deviation(axis, side.last) for name, side in self.sides.items()}
+        nominal: Any = self.axis.nominal
+        lasts: dict[str, Any] = {name: side.last for name, side in self.sides.items()}
+        margin = {name: None if last is None else float(f"{abs(last - nominal):.10g}") for name, last in lasts.items()}
         return {
-            "unit": axis.unit or "factor",
-            "nominal": axis.nominal,
-            "values": list(axis.values),
+            "unit": self.axis.unit or "factor",
+            "nominal": nominal,
+            "values": list(self.axis.values),
             "alive": [alive / self.episodes for alive in self.alive],
             "mean_return": list(self.mean_returns),
             "margin": margin if self.sides else self.within(),
         }
-
-
-def _deviation(axis: Axis, value: Value | None) -> float | None:
-    """The distance of a value from the nominal one."""
-    if value is None:
-        return None
-    assert not isinstance(value, str)
-    assert not isinstance(axis.nominal, str)
-    return float(f"{abs(value - axis.nominal):.10g}")
 
 
 def worst_accepted(nominal: Flown) -> float:
@@ -106,19 +112,7 @@ def margins_of(axis: Axis, flown: Sequence[Flown], least: float | None) -> AxisM
     alive = [one.terminated.logical_not() if least is None else one.returns >= least for one in flown]
     counts, episodes = tuple(int(each.sum()) for each in alive), len(alive[0])
     returns = tuple(float(one.returns.mean()) for one in flown)
-    return AxisMargins(axis, episodes, counts, returns, dict(_sides(axis, counts, episodes)))
-
-
-def _sides(axis: Axis, alive: Sequence[int], episodes: int) -> Iterator[tuple[str, Side]]:
-    if isinstance(axis.nominal, str):
-        return
-    middle = axis.values.index(axis.nominal)
-    for name, places in (("below", range(middle, -1, -1)), ("above", range(middle, len(axis.values)))):
-        if len(places) > 1:
-            flies = [alive[place] >= ALIVE * episodes for place in places]
-            count = flies.index(False) if False in flies else len(flies)
-            outward = [axis.values[place] for place in places]
-            yield name, Side(outward[count - 1] if count else None, outward[count] if count < len(flies) else None)
+    return AxisMargins(axis, episodes, counts, returns)
 
 
 def smoothness(actions: Tensor, period: float) -> dict[str, float]:

@@ -17,7 +17,6 @@ from lemniscate.envs import registry
 from lemniscate.envs.factory import make_one, maker_of, makes_vector
 from lemniscate.envs.probe import CHANNEL_AXES, MODEL_AXES, Act, Axis, Begin, Flown, Tally, Value
 from lemniscate.envs.vec_env import VecEnv
-from lemniscate.exporting.deployed import input_size
 from lemniscate.run.seeding import derive, generator
 from lemniscate.spec import Spec
 
@@ -145,8 +144,7 @@ class VectorProbe:
 
 def _axes(spec: Spec, has_model: bool) -> tuple[Axis, ...]:
     """The axes of an environment: with a mask no action can be late, and only numbers can be noisy."""
-    masked = input_size(spec) > spec.observation_size
-    noisy = bool(_is_number(spec).any())
+    noisy, masked = _is_number(spec).any(), spec.action.mask_size
     channel = (axis for axis in CHANNEL_AXES if (noisy if axis.name == "observation_noise" else not masked))
     return (*channel, *(MODEL_AXES if has_model else ()))
 
@@ -154,7 +152,7 @@ def _axes(spec: Spec, has_model: bool) -> tuple[Axis, ...]:
 def _is_number(spec: Spec) -> Tensor:
     """[O] bool, of the whole observation: numbers, which are no choices, masks or pixels."""
     own = [not part.nvec and not part.image for part in spec.observation_parts for _ in range(part.size)]
-    return torch.tensor([*own, *[False] * (input_size(spec) - len(own))])
+    return torch.tensor([*own, *[False] * spec.action.mask_size])
 
 
 def _fly(env: VecEnv, act: Act, seed: int, seen: list[Tensor] | None = None) -> Flown:

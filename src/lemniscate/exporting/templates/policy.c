@@ -7,13 +7,13 @@
 #include <stdint.h>
 #include <string.h>
 
-{{ constants | join("\n\n") }}
+{{ body.constants | join("\n\n") }}
 
 static const float safe_action[POLICY_ACTIONS] = {{ safe | braces }};
 
-static float scratch[{{ scratch }}];
+static float scratch[{{ body.scratch }}];
 
-{{ statements | join("\n") | functions }}
+{{ body.statements | join("\n") | functions }}
 static int is_finite(float x)
 {
     uint32_t bits;
@@ -35,25 +35,27 @@ int policy_act(const float obs[POLICY_OBSERVATIONS], float action[POLICY_ACTIONS
 {
 {% endif %}
     int i;
-{% for name, place in places.items() %}
+{% for name, place in body.places.items() %}
     float *const {{ name }} = scratch + {{ place }};
 {% endfor %}
     for (i = 0; i < POLICY_OBSERVATIONS; ++i) {
         if (!is_finite(obs[i])) {
             memcpy(action, safe_action, sizeof safe_action);
-{% for n, first, begin in masked %}
+{% set behind = namespace(size=action.mask_size) %}
+{% for n, first in masked %}
             for (i = 0; i < {{ n }}; ++i) {
-                const float permitted = obs[POLICY_OBSERVATIONS - {{ action.mask_size - begin }} + i];
+                const float permitted = obs[POLICY_OBSERVATIONS - {{ behind.size }} + i];
                 if (is_finite(permitted) && permitted != 0.0F) {
                     action[{{ loop.index0 }}] = (float)(i + {{ first }});
                     break;
                 }
             }
+{% set behind.size = behind.size - n %}
 {% endfor %}
             return 1;
         }
     }
-{% for statement in statements %}
+{% for statement in body.statements %}
     {{ statement }}
 {% endfor %}
     return 0;
@@ -61,13 +63,13 @@ int policy_act(const float obs[POLICY_OBSERVATIONS], float action[POLICY_ACTIONS
 
 static const float self_test_observations[POLICY_SELF_TESTS][POLICY_OBSERVATIONS] = {
 {% for row in observations %}
-    {{ row | braces }},
+    {{ row[:program.obs.size] | braces }},
 {% endfor %}
 };
 
 static const float self_test_actions[POLICY_SELF_TESTS][POLICY_ACTIONS] = {
 {% for row in actions %}
-    {{ row | braces }},
+    {{ row[:program.action.size] | braces }},
 {% endfor %}
 };
 
@@ -75,14 +77,14 @@ static const float self_test_units[POLICY_ACTIONS] = {{ units | braces }};
 {% if program.memory %}
 
 static const float self_test_memories[POLICY_SELF_TESTS][POLICY_MEMORY] = { /* before */
-{% for row in memories %}
-    {{ row | braces }},
+{% for row in observations %}
+    {{ row[program.obs.size:] | braces }},
 {% endfor %}
 };
 
 static const float self_test_afters[POLICY_SELF_TESTS][POLICY_MEMORY] = {
-{% for row in afters %}
-    {{ row | braces }},
+{% for row in actions %}
+    {{ row[program.action.size:] | braces }},
 {% endfor %}
 };
 {% endif %}

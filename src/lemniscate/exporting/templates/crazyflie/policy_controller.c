@@ -72,33 +72,33 @@ static void observe(float *obs, const setpoint_t *setpoint, const sensorData_t *
     }
 {% endif %}
 }
-{% if history %}
+{% if kept %}
 
-#define HISTORY {{ history.steps }} /* steps before this one that are observed too */
+#define HISTORY {{ interface.history }} /* steps before this one that are observed too */
 
-static float past[HISTORY][{{ history.kept | length }}]; /* what was observed and done then, the newest first */
+static float past[HISTORY][{{ kept | length }}]; /* what was observed and done then, the newest first */
 
 static void remember(const float *obs, const float *action)
 {
     for (int i = HISTORY - 1; i > 0; --i) {
         memcpy(past[i], past[i - 1], sizeof past[0]);
     }
-{% for now, coordinate in history.kept %}
+{% for now, coordinate in kept %}
     past[0][{{ loop.index0 }}] = {{ now or coordinate }};
 {% endfor %}
 }
 
 static void recall(float *obs)
 {
-    static const float before[POLICY_ACTIONS] = { {{- history.before | map("literal") | join(", ") -}} }; /* as if it had hovered here */
+    static const float before[POLICY_ACTIONS] = { {{- interface.action_before | map("literal") | join(", ") -}} }; /* as if it had hovered here */
     if (!acting) {
         for (int i = 0; i < HISTORY; ++i) {
             remember(obs, before);
         }
     }
     for (int i = 0; i < HISTORY; ++i) {
-        float *const then = obs + {{ history.first }} + {{ history.kept | length }} * i;
-{% for now, _ in history.kept %}
+        float *const then = obs + {{ first }} + {{ kept | length }} * i;
+{% for now, _ in kept %}
         then[{{ loop.index0 }}] = past[i][{{ loop.index0 }}]{{ " - " ~ now if now }};
 {% endfor %}
     }
@@ -165,7 +165,7 @@ void controllerOutOfTree(control_t *control, const setpoint_t *setpoint, const s
         step = acting ? (step + 1) % REFERENCE_STEPS : REFERENCE_STEPS - 1;
 {% endif %}
         observe(obs, setpoint, sensors, state);
-{% if history %}
+{% if kept %}
         recall(obs);
 {% endif %}
 {% if remembers %}
@@ -176,7 +176,7 @@ void controllerOutOfTree(control_t *control, const setpoint_t *setpoint, const s
 {% else %}
         fault = policy_act(obs, action) != 0;
 {% endif %}
-{% if history %}
+{% if kept %}
         remember(obs, action);
 {% endif %}
         acts = !fault;
