@@ -1,6 +1,7 @@
 """The work of each command: each takes what `parse` understood, and imports what it alone needs."""
 
 import json as notation
+from collections.abc import Collection, Mapping
 from itertools import groupby
 from pathlib import Path
 from shutil import get_terminal_size
@@ -12,12 +13,14 @@ from lemniscate.api.policy import TrainedRun
 from lemniscate.envs import registry
 from lemniscate.errors import UserError, is_installed, missing_extra, unknown_name
 from lemniscate.run.directory import SWEEP, TUNE
+from lemniscate.run.fields import flag
 from lemniscate.run.run import is_compiled
 from lemniscate.system.console import say, talks
 from lemniscate.system.watchdog import end_with_owner
 
-OF_ONE_RUN = ("processes", "storage")
-"""options that the runs of a sweep do not have"""
+OF_SWEEPS = ("track", "callbacks", "report", "progress", "cluster", "workers")
+OF_SEARCHES = ("progress", "cluster", "workers")
+"""options that sets of runs have too"""
 
 
 def train(
@@ -47,7 +50,7 @@ def train(
         raise UserError("Several runs have several seeds: --seeds 1-5, not --seed.")
     if seeds is None:
         raise UserError("Algorithms are compared over several seeds: add --seeds 1-5.")
-    shared = {name: value for name, value in options.items() if name not in OF_ONE_RUN}
+    shared = _only(OF_SWEEPS, options, "a sweep")
     tell(f"Everything is in {train_sweep(algorithm, env, seeds, run=run, preset=preset, **fields, **shared).path}")
 
 
@@ -57,8 +60,8 @@ def tune(algorithm: str, env: str | None, search: str | None, fields: dict[str, 
 
     if search is None:
         raise UserError("Search what? Name fields with their ranges: --search 'learning_rate=log:1e-4:1e-2'.")
-    del options["storage"]  # the runs of a set come back to where it was begun
-    tell(f"Everything is in {tune(algorithm, env, search=search, **options, **fields).path}")
+    shared = _only(options.keys() - {"storage"}, options, "a search")
+    tell(f"Everything is in {tune(algorithm, env, search=search, **shared, **fields).path}")
 
 
 def resume(run: Path, total_steps: float | None, score: bool, **options: Any) -> None:
@@ -69,11 +72,11 @@ def resume(run: Path, total_steps: float | None, score: bool, **options: Any) ->
     if (run / TUNE).exists():
         from lemniscate.sweeps.tuner import resume_tuning
 
-        resume_tuning(run, **{name: options[name] for name in ("cluster", "workers", "progress")})
+        resume_tuning(run, **_only(OF_SEARCHES, options, "a search"))
     elif (run / SWEEP).exists():
         from lemniscate.sweeps.sweep import resume_sweep
 
-        resume_sweep(run, **{name: value for name, value in options.items() if name not in OF_ONE_RUN})
+        resume_sweep(run, **_only(OF_SWEEPS, options, "a sweep"))
     else:
         changes = {} if total_steps is None else {"total_steps": total_steps}
         trained = training.go_on(run, options, changes)
@@ -224,6 +227,14 @@ def completion(shell: str) -> None:
     from lemniscate.cli.completion import script
 
     print(script(shell), end="")
+
+
+def _only(names: Collection[str], options: Mapping[str, Any], what: str) -> dict[str, Any]:
+    """The options of these names. Raises `UserError` where another one is given: its runs do not have it."""
+    for name, value in options.items():
+        if name not in names and value and (name, value) != ("processes", 1):
+            raise UserError(f"{flag(name)} is for one run, and not for {what}; leave it out.")
+    return {name: options[name] for name in names}
 
 
 def tell(text: str) -> None:

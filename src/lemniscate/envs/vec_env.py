@@ -111,7 +111,8 @@ class VecEnv:
                 continue
             bad = torch.nonzero(~torch.isfinite(values))
             if len(bad):
-                value, number = values[tuple(bad[0])].item(), self._first + int(bad[0, 0])
+                first = 0 if name == "action" else self._first  # actions are those of all processes
+                value, number = values[tuple(bad[0])].item(), first + int(bad[0, 0])
                 raise NonFiniteError(f"The {name} of environment {number} is {value} in the step after {self.steps:,}.")
 
     def require_end(self, age: int) -> None:
