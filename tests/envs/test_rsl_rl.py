@@ -153,6 +153,10 @@ def test_a_maker_of_ones_own_is_named_on_the_command_line(tmp_path, monkeypatch,
     assert main(words) == 2
     assert "what speaks rsl_rl's VecEnv is of the backend rsl_rl" in capsys.readouterr().err
     assert main([*words, "--backend", "rsl_rl"]) == 0
+    words[-1] = str(tmp_path / "t")
+    assert main([*words, "--backend", "rsl_rl", "--processes", "2"]) == 2
+    assert "exists once at a time, and cannot be divided among 2 processes: train in one." in capsys.readouterr().err
+    assert not (tmp_path / "t").exists()
 
 
 def test_rsl_rls_runner_trains_in_ours(tmp_path):

@@ -29,7 +29,7 @@ from lemniscate.errors import NotStoredError, UserError, is_installed
 from lemniscate.hub.repository import local_path
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import extend, is_finished, read_record, require_absent
-from lemniscate.run.environments import envs_of
+from lemniscate.run.environments import envs_of, require_several
 from lemniscate.run.loggers import LoggerClass
 from lemniscate.run.run import Run
 from lemniscate.run.seeding import set_seeds, torch_defaults
@@ -253,6 +253,7 @@ def together() -> AbstractContextManager[World]:
 
 def _train_elsewhere(path: Path, algorithm: str, config: RunConfig, options: RunOptions) -> TrainedRun:
     """Train in other processes, of this machine or of a cluster; each resumes the run, which begins if it is new."""
+    require_several(config, options.processes)
     require_importable(*own_names(config))
     began = time.monotonic()
     if options.cluster is None:

@@ -39,6 +39,7 @@ def make_envs(config: RunConfig) -> tuple[VecEnv, VecEnv]:
 
 def envs_of(config: RunConfig, world: World) -> tuple[VecEnv, VecEnv | None]:
     """The environments of one process of a run; of several, only the first evaluates. Raises as `make_envs`."""
+    require_several(config, world.size)
     device, arguments = device_for(config.device), env_arguments(config, backend=config.backend)
     mirror = mirror_of(config)  # first, and closed again: it makes an environment, and there may be one at a time
     with ExitStack() as failing:
@@ -58,6 +59,13 @@ def envs_of(config: RunConfig, world: World) -> tuple[VecEnv, VecEnv | None]:
             env.backend.prepare_gradient()
         failing.pop_all()
         return env, eval_env
+
+
+def require_several(config: RunConfig, processes: int) -> None:
+    """Raise `UserError` where environments that exist once at a time are to be divided among processes."""
+    if processes > 1 and registry.backend_class(str(config.backend)).exists_once(config.env, config.num_envs):
+        said = f"{config.env} exists once at a time, and cannot be divided among {processes} processes"
+        raise UserError(f"{said}: train in one.")
 
 
 def mirror_of(config: RunConfig) -> Mirror | None:
