@@ -145,7 +145,7 @@ class RunOptions:
         return self.report or self.track is not None
 
     def shared(self) -> dict[str, Any]:
-        """What other processes are told. Raises `UserError` where they could not import a callback or the tracker."""
+        """The arguments for other processes. Raises `UserError` where a callback or the tracker cannot be imported."""
         require_importable(self.track or "", *self._names)
         return {"track": self.track, "callbacks": self._names, "progress": self.progress}
 

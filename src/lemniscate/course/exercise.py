@@ -277,7 +277,7 @@ class Exercise:
         return {name: convert(value) for name, value in values.items() if name in self.arguments}
 
     def _results(self, call: Function, case: Case, change: Callable[[Values], Values]) -> Results:
-        """What a function returns in a case: `outputs`, and, where it counts, the `gradient` of their sum.
+        """The results of a function in a case: `outputs`, and, where it counts, the `gradient` of their sum.
 
         Also whether they are `attached` to a graph, and the name of an argument that was `changed`; where it returns
         something else, `kinds` alone.
@@ -403,9 +403,8 @@ class Inspection:
                 if not isinstance(sentence, Note):
                     return Finding(name, False, sentence)
                 notes.append(f" Note: {sentence}")
-        except (
-            Exception
-        ) as error:  # of what was not seen, as the solution raised before; what it returns may be anything
+        # Where the solution raised before, a point may miss what was not seen; what a solution returns may be anything.
+        except Exception as error:
             return Finding(name, False, seen.get("raised", f"what it does cannot be judged: {error}."))
         if "raised" in seen:
             return Finding(name, False, seen["raised"])

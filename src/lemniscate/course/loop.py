@@ -268,7 +268,7 @@ def _mean_action(function: Function, envs: VectorView, steps: int) -> np.ndarray
 
 
 def acting(made: Any, envs: VectorView) -> AbstractContextManager[Agent]:
-    """What a training loop has trained, as a function from observations [N, O] to actions in [-1, 1], or choices.
+    """The agent that a training loop returned, from observations [N, O] to actions in [-1, 1], or choices.
 
     Raises:
         TypeError: there is nothing.

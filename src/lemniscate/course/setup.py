@@ -164,7 +164,7 @@ def _statistics(envs: Any) -> dict[str, Tensor]:
 
 
 def _learned(agent: nn.Module, optimizer: torch.optim.Optimizer, envs: Any) -> list[dict[str, Tensor]]:
-    """What a checkpoint is to hold: weights, learning rate and moments, statistics of the observations; copies."""
+    """Copies of all that a checkpoint has to hold: weights, learning rate, moments, statistics of the observations."""
     flat = dict(_flat(plain(optimizer.state_dict())))
     moments = {path[1:]: torch.as_tensor(flat[path]) for path in flat if "state" in path or path.endswith(".lr")}
     return [plain(agent.state_dict()), moments, _statistics(envs)]

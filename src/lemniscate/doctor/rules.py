@@ -85,7 +85,7 @@ def findings(e: Evidence) -> list[tuple[Rule, str]]:
 
 
 def of_observations(e: Evidence) -> Seen:
-    """What the policy sees, and what is kept of it."""
+    """Faults of the observations, and of their copies in the replay buffer."""
     cut, repeated = e.late("observation/at_limits"), e.early("observation/repeated")
     predicted, kept = e.late("observation/predicted"), e.late("replay/repeated")
     if cut > 0.5:
@@ -112,7 +112,7 @@ def of_observations(e: Evidence) -> Seen:
 
 
 def of_normalization(e: Evidence) -> Seen:
-    """The size of observations, and the normalizer."""
+    """Faults of the size of observations, and of the normalizer."""
     first, late = e.early("observation/largest"), e.late("observation/largest")
     offset = e.late("normalizer/offset")
     count, normalized = e.last("normalizer/count"), e.config.get("normalize_observations", True)
@@ -134,7 +134,7 @@ def of_normalization(e: Evidence) -> Seen:
 
 
 def of_actions(e: Evidence) -> Seen:
-    """What actions do."""
+    """Faults of the actions: their effect, their delay and their bounds."""
     effects, shares = e.values("action/effect"), e.values("action/share")
     now, before, by_sign = e.early("action/effect"), e.early("action/late"), e.early("action/by_sign")
     at_bounds, first = e.late("action/at_bounds"), slice(max(3, len(effects) // 4))
@@ -161,7 +161,7 @@ def of_actions(e: Evidence) -> Seen:
 
 
 def of_rewards(e: Evidence) -> Seen:
-    """Their size, and what they depend on."""
+    """Faults of the rewards: their size, and what they depend on."""
     largest, scaled = e.greatest("reward/largest"), e.config.get("scale_rewards", False)
     zero, by_time, explained = e.early("reward/zero"), e.late("reward/by_time"), e.values("reward/explained")
     if largest == 0 and not e.returns.any():
@@ -184,7 +184,7 @@ def of_rewards(e: Evidence) -> Seen:
 
 
 def of_episodes(e: Evidence) -> Seen:
-    """Where they begin, and how they end."""
+    """Faults of the episodes: their starts, lengths and ends."""
     late, terminated = e.lengths[len(e.lengths) // 2 :], e.late("episode/terminated")
     short = len(e.lengths) >= 20 and np.percentile(e.lengths, 90) <= 2
     alike = len(e.returns) >= 10 and np.ptp(e.returns) <= 1e-6 * (1 + abs(e.returns[0]))
@@ -213,7 +213,7 @@ def of_episodes(e: Evidence) -> Seen:
 
 
 def of_horizon(e: Evidence) -> Seen:
-    """How far ahead the policy looks, and how far its episodes go."""
+    """Faults of the horizon: the discount against the length of episodes."""
     gamma, recommended = (first_number(config.get("gamma")) for config in (e.config, e.recommended))
     fifth = len(e.lengths) // 5
     if gamma is not None and recommended is not None and gamma < recommended:
@@ -231,7 +231,7 @@ def of_horizon(e: Evidence) -> Seen:
 
 
 def of_updates(e: Evidence) -> Seen:
-    """How far an update takes the policy."""
+    """Faults of the update's size: KL divergence, ratios and clips."""
     kl, clipped, rate = e.late("approx_kl"), e.late("clip_fraction"), e.late("learning_rate")
     every, entropy = e.values("approx_kl"), e.values("losses/entropy")
     target = next(filter(None, map(first_number, map(e.config.get, ("target_kl", "desired_kl", "max_kl")))), None)
@@ -256,7 +256,7 @@ def of_updates(e: Evidence) -> Seen:
 
 
 def of_exploration(e: Evidence) -> Seen:
-    """The spread of the policy, and random play."""
+    """Faults of exploration: the policy's spread, and random play."""
     std, entropy = e.values("policy_std"), e.values("losses/entropy")
     spread, name = (std, "standard deviation") if len(std) else (entropy, "entropy")
     chosen = {"initial_temperature", "min_temperature"} & set(e.config)  # SAC and REPPO choose their entropy
@@ -285,7 +285,7 @@ def of_exploration(e: Evidence) -> Seen:
 
 
 def of_advantages(e: Evidence) -> Seen:
-    """What the policy follows, and what follows an end."""
+    """Faults of the advantages, and of the value behind an end."""
     followed, ends = e.values("advantage/followed"), e.last_half("value/at_ends")
     often = len(ends) >= 2 and e.late("episode/terminated") > 0.9  # rare ends are learned late
     awaited = np.median(ends) if often else np.nan
@@ -318,7 +318,7 @@ def _standard_errors(values: np.ndarray) -> float:
 
 
 def of_values(e: Evidence) -> Seen:
-    """What V and Q know of what follows."""
+    """Faults of V and Q: bootstraps, explained variance, overfitting, target networks."""
     missing, explained, last = e.last_half("value/missing"), e.late("explained_variance"), e.ends[1]
     behind = e.values("targets/behind")
     newest, sampled = e.last_half("td_error/newest"), e.last_half("td_error/sampled")
@@ -359,7 +359,7 @@ def _is_missing(late: np.ndarray) -> bool:
 
 
 def of_networks(e: Evidence) -> Seen:
-    """Units and gradients."""
+    """Faults of the networks: their units and gradients."""
     inactive, saturated = e.late("network/inactive"), e.late("network/saturated")
     norms, norm = e.values("gradient_norm"), e.late("gradient_norm")
     limit = first_number(e.config.get("max_grad_norm"))
@@ -384,7 +384,7 @@ def of_networks(e: Evidence) -> Seen:
 
 
 def of_returns(e: Evidence) -> Seen:
-    """Where they went."""
+    """Faults of the returns over the whole run."""
     (first, last), fifth = e.ends, len(e.returns) // 5
     if e.gain < -5 and first.mean() - last.mean() > 0.25 * abs(first.mean()):
         yield (
@@ -410,7 +410,7 @@ def of_returns(e: Evidence) -> Seen:
 
 
 def of_falls(e: Evidence) -> Seen:
-    """How far the returns are below the best that there were."""
+    """A fall of the returns below their best."""
     window = max(10, len(e.returns) // 20)
     if len(e.returns) < 3 * window:
         return
@@ -424,7 +424,7 @@ def of_falls(e: Evidence) -> Seen:
 
 
 def of_evaluations(e: Evidence) -> Seen:
-    """How the policy was judged."""
+    """Faults of the evaluation."""
     last, mean = e.ends[1], e.scores.get("mean_return", e.last("evaluation/return"))
     returns, each = e.scores.get("returns", ()), e.config.get("evaluate_episodes", 20)
     bias = (e.scores.get("q_bias") or {}).get("bias", e.late("evaluation/q_bias"))

@@ -10,10 +10,10 @@ from torch import Tensor
 def clip_inward(action: Float[Tensor, "N A"], max_ratio: float) -> Float[Tensor, "N A"]:
     """Actions clipped to [-1, 1], whose gradient g [N, A], of a loss to descend, is made fit for a chain of steps.
 
-        g ← 0 where the action is out of range and −g leads further out: what leads back is kept, beyond a bound too
+        g ← 0 where the action is out of range and −g leads further out; a gradient that leads back is kept
         gᵢ ← gᵢ min(1, k · median ‖gⱼ‖ / ‖gᵢ‖) for each environment i, the median over those j with a gradient
 
-    The first is the zeroing gradients of Hausknecht & Stone 2016, arXiv:1511.04143, section 4, within the step.
+    Hausknecht & Stone 2016, arXiv:1511.04143, call the first zeroing gradients; the limit is our choice.
 
     Args:
         action: of N environments.

@@ -164,7 +164,7 @@ def draw_from_above(flights: Sequence[Flight], file: Path) -> Path:
 
 
 def _draw_boxes(axes: Axes, boxes: np.ndarray) -> None:
-    """What stands there, seen from above: the outline of each box's shadow."""
+    """The obstacles seen from above: the outline of each box's shadow."""
     from scipy.spatial import ConvexHull
 
     signs = np.array(list(product((-1, 1), repeat=3)))

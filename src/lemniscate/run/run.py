@@ -226,7 +226,7 @@ class Run:
         self._saver.close()
 
     def _do_what_is_due(self, state: TrainState, total_steps: int) -> bool:
-        """What a whole update is followed by; returns whether that was a planned checkpoint."""
+        """The work after a whole update; returns whether a planned checkpoint was part of it."""
         config, before, step = self.config, self._body.step, state.step
         finished = step >= total_steps
         if config.average_last and step > (1 - config.average_last) * total_steps:
