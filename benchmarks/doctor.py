@@ -4,6 +4,7 @@
     .venv/bin/python benchmarks/doctor.py faults --half odd --seeds 1 2 3     the half of the table
     .venv/bin/python benchmarks/doctor.py faults --half unseen                faults that nobody had in mind
     .venv/bin/python benchmarks/doctor.py faults --half unseen-too            and others, after rules for these
+    .venv/bin/python benchmarks/doctor.py faults --half elsewhere --seeds 1   under other algorithms, elsewhere
     .venv/bin/python benchmarks/doctor.py healthy
     .venv/bin/python benchmarks/doctor.py remedies --seeds 1
     .venv/bin/python benchmarks/doctor.py cost
@@ -29,6 +30,7 @@ import faulty
 import unseen
 import unseen_too
 from common import append, provenance, rows
+from elsewhere import ELSEWHERE
 
 import lemniscate as lem
 from lemniscate import presets
@@ -150,8 +152,12 @@ UNSEEN_TOO = {
 """names that are right for the faults of `unseen_too.py`"""
 FAULTS |= {name: (*unseen.UNSEEN[name][:3], right) for name, right in UNSEEN.items()}
 FAULTS |= {name: (*unseen_too.UNSEEN_TOO[name][:3], right) for name, right in UNSEEN_TOO.items()}
-LEARNERS = faulty.LEARNERS | unseen.LEARNERS | unseen_too.LEARNERS
-"""the library with a fault in it, as contexts"""
+for name, algorithm, env, steps, change in ELSEWHERE:
+    FAULTS[f"{name}: {algorithm}, {env}"] = (algorithm, {env: steps}, change or FAULTS[name][2], FAULTS[name][3])
+LEARNERS = faulty.LEARNERS | {
+    name: lambda _, change=change: change() for name, change in (unseen.LEARNERS | unseen_too.LEARNERS).items()
+}
+"""the library with a fault in it, as a context, for the name of an algorithm"""
 
 BY_OPTIONS = {"large-observation", "reward-large", "reward-small", "advantage-not-normalized", "mostly-random",
               "entropy-unreachable"}  # fmt: skip
@@ -168,7 +174,7 @@ def trained(path: Path, algorithm: str, env: str, fault: str | None = None, **fi
     """The directory of a run, which is trained if it is not there; a loss that is not finite ends it."""
     if not (path / "metrics.jsonl").exists():
         shutil.rmtree(path, ignore_errors=True)
-        with LEARNERS[fault]() if fault else nullcontext():
+        with LEARNERS[fault](algorithm) if fault else nullcontext():
             try:
                 lem.train(algorithm, env, run=path, progress=False, **fields)
             except NonFiniteError as error:
@@ -282,7 +288,7 @@ def cost() -> None:
         print(f"{algorithm} {env}: {spent[0] / run.seconds:.2%} of {run.seconds:.0f} s", flush=True)
 
 
-HALVES = {name: ("even", "odd")[i % 2] for i, name in enumerate(FAULTS)}
+HALVES = {name: "elsewhere" if ":" in name else ("even", "odd")[i % 2] for i, name in enumerate(FAULTS)}
 HALVES |= dict.fromkeys(UNSEEN, "unseen") | dict.fromkeys(UNSEEN_TOO, "unseen-too")
 
 
@@ -317,7 +323,7 @@ def table(half: str | None) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=["faults", "healthy", "remedies", "cost", "table"])
-    parser.add_argument("--half", choices=["even", "odd", "unseen", "unseen-too"])
+    parser.add_argument("--half", choices=["even", "odd", "unseen", "unseen-too", "elsewhere"])
     parser.add_argument("--only", nargs="+", help="these faults, or algorithms of healthy runs")
     parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3])
     parser.add_argument("--runs", type=Path)

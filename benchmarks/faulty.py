@@ -9,6 +9,8 @@ import gymnasium as gym
 import numpy as np
 import torch
 
+from lemniscate.algos import find
+
 
 class NoReward(gym.RewardWrapper):
     """Every reward is 0."""
@@ -169,21 +171,17 @@ def _frozen_normalizer() -> Any:
     return patch.object(RunningNorm, "update", wrong)
 
 
-def _other_sign() -> Any:
-    from lemniscate.algos import ppo
-
-    return patch.object(ppo, "standardize", lambda x: -torch.nn.functional.layer_norm(x, x.shape[-1:]))
+def _other_sign(algorithm: str) -> Any:
+    return patch.object(find(algorithm), "standardize", lambda x: -torch.nn.functional.layer_norm(x, x.shape[-1:]))
 
 
-def _shuffled_targets() -> Any:
-    from lemniscate.algos import ppo
-
-    right = ppo.value_loss
+def _shuffled_targets(algorithm: str) -> Any:
+    right = find(algorithm).value_loss
 
     def wrong(value: Any, target: Any, *args: Any) -> Any:
         return right(value, target.flip(0), *args)
 
-    return patch.object(ppo, "value_loss", wrong)
+    return patch.object(find(algorithm), "value_loss", wrong)
 
 
 def _large_weights() -> Any:
@@ -197,22 +195,21 @@ def _large_weights() -> Any:
     return patch.object(networks, "orthogonal", wrong)
 
 
-def _no_bootstrap() -> Any:
-    from lemniscate.algos import ppo
-
-    right = ppo.gae
+def _no_bootstrap(algorithm: str) -> Any:
+    right = find(algorithm).gae
 
     def wrong(reward: Any, value: Any, next_value: Any, terminated: Any, done: Any, **options: Any) -> Any:
         return right(reward, value, next_value, done, done, **options)
 
-    return patch.object(ppo, "gae", wrong)
+    return patch.object(find(algorithm), "gae", wrong)
 
 
-LEARNERS: dict[str, Callable[[], Any]] = {
-    "another log-probability": _other_log_prob,
+LEARNERS: dict[str, Callable[[str], Any]] = {
+    "another log-probability": lambda _: _other_log_prob(),
     "no bootstrap at time limits": _no_bootstrap,
-    "a normalizer that stops": _frozen_normalizer,
+    "a normalizer that stops": lambda _: _frozen_normalizer(),
     "the sign of the advantage": _other_sign,
     "targets of other rows": _shuffled_targets,
-    "weights that are too large": _large_weights,
+    "weights that are too large": lambda _: _large_weights(),
 }
+"""the library with a fault in it, as a context, for the name of an algorithm"""

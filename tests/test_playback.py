@@ -211,6 +211,31 @@ def test_an_episode_without_end_leaves_no_film(tmp_path, monkeypatch):
     assert not (tmp_path / "film.gif").exists()
 
 
+class Unshown(Loud):
+    """Cannot be drawn, or is drawn as something else; counts how many are open."""
+
+    open = 0
+
+    def __init__(self, picture=None, render_mode=None):
+        self.picture = picture
+        type(self).open += 1
+
+    def render(self):
+        if self.picture is None:
+            raise RuntimeError("no display")
+        return self.picture
+
+    def close(self):
+        type(self).open -= 1
+
+
+@pytest.mark.parametrize("picture", [None, [[0]]])
+def test_an_environment_that_cannot_be_shown_is_closed(unwritten, picture):
+    with pytest.raises(lem.UserError, match=r"cannot be shown here: no display|renders no pictures"):
+        lem.watch(env=Unshown, random=True, video="film.gif", env_kwargs={"picture": picture})
+    assert Unshown.open == 0
+
+
 def test_a_function_is_a_policy(policy, unwritten, capsys):
     how = {"env": "CartPole-v1", "episodes": 3, "seed": 7}
     scores = lem.evaluate(policy, **how, backend="gymnasium")

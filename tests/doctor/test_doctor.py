@@ -24,6 +24,8 @@ NOISE = np.random.default_rng(0).normal(size=400)
 RISES = list(np.arange(400) + NOISE)
 FLAT = list(NOISE)
 
+OTHER_METRICS = {"approx_kl", "clip_fraction", "learning_rate", "policy_std", "explained_variance", "gradient_norm"}
+
 
 def evidence(
     algorithm="ppo", returns=FLAT, lengths=None, scores=None, repeats=None, steps=4_000, changed=(), **metrics
@@ -203,8 +205,38 @@ def test_one_of_two_metrics_that_are_compared_is_no_evidence():
     assert "critic-overfits" not in names("sac", td_error__newest=[20.0] * 8)
 
 
+def test_returns_that_fall_while_q_begins_are_no_finding():
+    assert "gets-worse" not in names("td3", returns=RISES[::-1], steps=19_000)
+    assert "gets-worse" in names("td3", returns=RISES[::-1], steps=30_000)
+
+
 def test_every_rule_has_a_case():
     assert CASES.keys() == {rule.name for rule in RULES}
+
+
+@pytest.mark.parametrize("seed", range(60))
+def test_no_rule_fails_whatever_there_is_in_a_log(seed):
+    rng = np.random.default_rng(seed)
+    metrics = sorted({name for fires, _ in CASES.values() for name in fires if "__" in name} | OTHER_METRICS)
+    values = np.array([0.0, -1.0, 1e-12, 0.5, 1.0, 150.0, 1e30, np.inf, np.nan])
+    chosen = {
+        name: rng.choice(values, size=rng.integers(1, 12)).tolist() for name in metrics if rng.random() < rng.random()
+    }
+    episodes = rng.integers(0, 60)
+    returns = rng.choice([0.0, 1.0, -3.0, 1e9], size=episodes) * rng.choice([0.0, 1.0, rng.normal()], size=episodes)
+    scores = {"mean_return": float(rng.choice(values)), "returns": [1.0] * rng.integers(0, 30), "q_bias": None}
+    given = evidence(
+        rng.choice(list(algos.ALGORITHMS)),
+        returns=list(returns),
+        lengths=list(rng.integers(1, 4, size=episodes)),
+        scores=rng.choice(np.array([scores, {}])),
+        repeats=None,
+        **chosen,
+    )
+    for one in diagnose(given):
+        assert one.seen
+        assert one.remedy
+        assert len(one.steps) == len(one.values)
 
 
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.name)

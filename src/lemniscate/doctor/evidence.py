@@ -76,6 +76,11 @@ class Evidence:
         """Whether no number of the observation ever changes."""
         return self.late("observation/constant") == 1
 
+    @property
+    def begins(self) -> bool:
+        """Whether Q has hardly begun: with replay it comes slowly, and the first policies are worse than chance."""
+        return "tau" in self.config and bool(self.log) and self.log[-1]["step"] < 20_000
+
     @cached_property
     def rose(self) -> bool:
         """Whether the last fifth of the episodes is better than the first: by three standard errors, and by 0.3 std."""

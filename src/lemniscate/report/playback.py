@@ -9,7 +9,7 @@ import warnings
 from base64 import b64encode
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from importlib import import_module
 from itertools import islice
 from pathlib import Path
@@ -171,22 +171,21 @@ def _choose_opengl() -> None:
 def _rendered(arguments: dict[str, Any], mode: str) -> gym.Env:
     """An environment that has rendered its first picture. Raises `UserError` where it cannot."""
     name = arguments["env"]
-    try:
-        _choose_opengl()
-        env = make_rendered(mode=mode, **arguments)
-        env.reset(seed=0)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # Gymnasium's on pictures, which are looked at below
-            env.render()
-    except Exception as error:  # pygame, GLFW and MuJoCo each have their own
-        hint = " (without a display MuJoCo needs MUJOCO_GL=egl or osmesa)" if "OpenGL" in str(error) else ""
-        raise UserError(f"{name} cannot be shown here: {error}{hint}") from error
-    try:
+    with ExitStack() as failing:
+        try:
+            _choose_opengl()
+            env = make_rendered(mode=mode, **arguments)
+            failing.callback(env.close)
+            env.reset(seed=0)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # Gymnasium's on pictures, which are looked at below
+                env.render()
+        except Exception as error:  # pygame, GLFW and MuJoCo each have their own
+            hint = " (without a display MuJoCo needs MUJOCO_GL=egl or osmesa)" if "OpenGL" in str(error) else ""
+            raise UserError(f"{name} cannot be shown here: {error}{hint}") from error
         if mode == "rgb_array":
             _picture(env, name)
-    except UserError:
-        env.close()
-        raise
+        failing.pop_all()
     return env
 
 
