@@ -205,6 +205,22 @@ def test_one_of_two_metrics_that_are_compared_is_no_evidence():
     assert "critic-overfits" not in names("sac", td_error__newest=[20.0] * 8)
 
 
+def test_a_policy_that_never_moves_is_still_whatever_its_algorithm_logs():
+    assert "policy-still" in names("a2c", policy__moved=[0.0] * 8)
+    assert "policy-still" not in names("a2c", policy__moved=[0.0] * 7 + [1e-6])
+
+
+def test_rounded_observations_are_not_taken_for_noise():
+    noisy = {"observation__predicted": [0.1] * 8}
+    assert names(**noisy, observation__whole=[1.0] * 8) == ["observation-repeated"]
+    assert names(**noisy, observation__whole=[0.5] * 8) == ["observation-noisy"]
+
+
+def test_targets_that_are_behind_by_a_setting_are_no_fault_of_the_learner():
+    behind = {"targets__behind": [0.1, 0.2, 0.5, 0.6]}
+    assert names("td3", **behind, changed={"policy_delay": 100}) == ["setting-policy-delay"]
+
+
 def test_returns_that_fall_while_q_begins_are_no_finding():
     assert "gets-worse" not in names("td3", returns=RISES[::-1], steps=19_000)
     assert "gets-worse" in names("td3", returns=RISES[::-1], steps=30_000)

@@ -355,8 +355,22 @@ def test_the_correlation_of_advantages_and_of_what_an_update_did_to_the_policy(a
     expected = np.corrcoef(advantage[newest], change[newest])[0, 1]
     config = SimpleNamespace(gamma=0.9, num_steps=12)
     assert of_values(state, config, rows, before)["advantage/followed"].item() == pytest.approx(expected, abs=1e-4)
-    assert of_values(state, config, rows, acted_with(state))["advantage/followed"] == 0  # nothing has moved
+    still = of_values(state, config, rows, acted_with(state))
+    assert still["advantage/followed"] == still["policy/moved"] == 0
     assert "advantage/followed" not in of_values(state, config, rows)
+
+
+def test_the_way_of_a_policy_is_that_of_its_parameters_alone():
+    state, rows = stateful(Discrete(3))
+    before = acted_with(state)
+    state.policy.observe(5 * rows.obs, rows.valid)
+    config = SimpleNamespace(gamma=0.9, num_steps=12)
+    assert of_values(state, config, rows, before)["policy/moved"] == 0
+    with torch.no_grad():
+        for parameter in state.policy.parameters():
+            parameter *= 1.25
+    moved = of_values(state, config, rows, before)["policy/moved"]
+    assert moved.item() == pytest.approx(0.2)
 
 
 def test_ppo_follows_its_advantages_and_with_a_wrong_sign_it_does_not(tmp_path):
@@ -374,6 +388,9 @@ def test_ppo_follows_its_advantages_and_with_a_wrong_sign_it_does_not(tmp_path):
 def test_numbers_that_are_cut_off_stand_at_their_limits():
     obs = numbers(B, O).float()
     assert of_rows(rows(obs=obs), spec_of())["observation/at_limits"].item() == pytest.approx(2 / B)
+    assert of_rows(rows(obs=obs), spec_of())["observation/whole"] == 0
+    half = torch.cat([(3 * obs[:, :2]).round(), obs[:, 2:]], dim=1)
+    assert of_rows(rows(obs=half), spec_of())["observation/whole"].item() == pytest.approx(2 / O)
     cut = torch.cat([(obs[:, :2] * 100).clamp(-1, 1), (obs[:, 2:] > 0).float()], dim=1)  # the last has two values alone
     expected = (cut[:, :2].abs() == 1).float().mean().item()
     assert expected > 0.9

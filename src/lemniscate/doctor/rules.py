@@ -88,7 +88,7 @@ def findings(e: Evidence) -> list[tuple[Rule, str]]:
 def of_observations(e: Evidence) -> Seen:
     """Faults of the observations, and of their copies in the replay buffer."""
     cut, repeated = e.late("observation/at_limits"), e.early("observation/repeated")
-    predicted, kept = e.late("observation/predicted"), e.late("replay/repeated")
+    predicted, whole, kept = map(e.late, ("observation/predicted", "observation/whole", "replay/repeated"))
     if cut > 0.5:
         yield "observation-clipped", f"{cut:.0%} of the observed numbers stand at an end of their range."
     if e.sees_nothing:
@@ -101,6 +101,12 @@ def of_observations(e: Evidence) -> Seen:
         yield (
             "observation-repeated",
             f"After {repeated:.0%} of the steps the observation was the same as before.",
+        )
+    elif predicted < 0.25 and whole > 0.95:
+        yield (
+            "observation-repeated",
+            f"{whole:.0%} of the observed numbers are whole, and an observation explains {max(0.0, predicted):.0%}"
+            " of the next one.",
         )
     else:
         if predicted < 0.25:
@@ -253,6 +259,8 @@ def of_updates(e: Evidence) -> Seen:
         yield "kl-too-large", f"The KL divergence of the late updates is {kl:.2g}, {beside}."
     if kl < 1e-6 and not e.rose:
         yield "policy-still", f"The KL divergence of the late updates is {kl:.1g}: the policy hardly moves."
+    elif e.greatest("policy/moved") == 0:
+        yield "policy-still", "No update that was looked at changed a parameter of the policy."
     if clipped > 0.4:
         yield "ratios-clipped", f"{clipped:.0%} of the late probability ratios are clipped."
 
@@ -322,7 +330,7 @@ def _standard_errors(values: np.ndarray) -> float:
 def of_values(e: Evidence) -> Seen:
     """Faults of V and Q: bootstraps, explained variance, overfitting, target networks."""
     missing, explained, last = e.last_half("value/missing"), e.late("explained_variance"), e.ends[1]
-    behind = e.values("targets/behind")
+    behind, own = e.values("targets/behind"), all(map(e.as_recommended, ("tau", "policy_delay")))
     newest, sampled = e.last_half("td_error/newest"), e.last_half("td_error/sampled")
     settled = len(last) > 0 and last.std() <= 0.05 * abs(last.mean())  # there is nothing left to explain
     if len(missing) >= 2 and _is_missing(missing) and e.late("episode/terminated") < 0.5 and not e.begins:
@@ -330,8 +338,8 @@ def of_values(e: Evidence) -> Seen:
             "missing-bootstrap",
             f"{np.median(missing):.0%} of the value that follows is missing, and most episodes end at a time limit.",
         )
-    # Below -0.3 targets are constant; a weak baseline of REINFORCE, which has no λ, does no harm.
-    nothing = -0.3 < explained < 0.05 and np.percentile(e.last_half("explained_variance"), 90) <= 0.15
+    # Below -1 targets are constant; a weak baseline of REINFORCE, which has no λ, does no harm.
+    nothing = -1 < explained < 0.05 and np.percentile(e.last_half("explained_variance"), 90) <= 0.15
     if nothing and not settled and "gae_lambda" in e.config:
         yield (
             "value-explains-nothing",
@@ -345,7 +353,7 @@ def of_values(e: Evidence) -> Seen:
                 "critic-overfits",
                 f"The error of Q at the newest transitions is {times:.0f} times that at sampled ones.",
             )
-    if len(behind) >= 3 and (np.diff(behind) > 0).all() and behind[-1] > 0.15 and e.as_recommended("tau"):
+    if len(behind) >= 3 and (np.diff(behind) > 0).all() and behind[-1] > 0.15 and own:
         yield (
             "targets-behind",
             f"The target networks differ from Q's by {behind[-1]:.0%} of the length of its weights, and ever more.",

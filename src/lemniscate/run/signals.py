@@ -61,8 +61,8 @@ def of_rows(rows: Rollout, spec: Spec) -> dict[str, Tensor]:
     """Sizes of rewards and observations, and shares, of rows [B, …].
 
     These are of rewards that are 0, of numbers that never change, of observations that are as the one before, of
-    numbers that are the largest or the smallest of their column, of actions at their bounds, and of ends that are
-    terminations.
+    numbers that are the largest or the smallest of their column, of whole numbers, of actions at their bounds, and of
+    ends that are terminations.
     """
     obs, after = (x[:, : spec.observation_size].float() for x in (rows.obs, rows.next_obs))
     ends = rows.done.sum()
@@ -80,6 +80,7 @@ def of_rows(rows: Rollout, spec: Spec) -> dict[str, Tensor]:
     numbers = ((obs > low) & (obs < high)).any(0)  # not what is 0 or 1
     if numbers.any() and not spec.has_images:
         found["observation/at_limits"] = ((obs == low) | (obs == high))[:, numbers].float().mean()
+        found["observation/whole"] = (obs == obs.round())[:, numbers].float().mean()
     if isinstance(spec.action, Box):
         found["action/at_bounds"] = (rows.action.abs() > 0.99).float().mean()
     return found | ({"episode/terminated": rows.terminated.sum() / ends} if ends else {})
@@ -199,6 +200,7 @@ def of_values(
     - value/at_ends: the mean of V(s) − r, or of V(s) where that is less, over |V| where an episode terminated: what V
       awaits beyond its end. Where V knows nothing of a large last reward, V(s) says so.
     - advantage/followed: the correlation of A(s, a) and of the change of log π(a|s) in the newest update.
+    - policy/moved: the length of the policy's way in that update, as a share of the length of its parameters.
     """
     gamma = getattr(config, "gamma", 1.0)
     if not hasattr(state.networks, "value"):
@@ -216,6 +218,11 @@ def of_values(
         awaited = torch.where(last.abs() < beyond.abs(), last, beyond)
         found["value/at_ends"] = awaited.mean() * value[valid].mean().sign() / size
     if acted is not None:
+        before, now = (
+            torch.cat([parts[name].flatten() for name, _ in state.policy.named_parameters()])
+            for parts in (acted, state.policy.state_dict())
+        )
+        found["policy/moved"] = (now - before).norm() / now.norm()
         advantage, _ = gae(rows.reward, value, after, ends, rows.done, gamma=gamma, lam=0.95)
         old = functional_call(state.policy, dict(acted), (obs,), tie_weights=False).log_prob(action)
         change = (state.policy(obs).log_prob(action) - old).view(valid.shape)
