@@ -89,6 +89,14 @@ def test_environment_arguments_and_wrappers_reach_training_and_evaluation(tmp_pa
     assert returns == [[0, 0, 0], [7, 7, 7]]
 
 
+def test_arguments_of_a_preset_that_are_left_out_are_named(tmp_path, capsys):
+    train = "train ppo --env DroneGates-v0 --total-steps 64 --num-envs 4 --num-steps 16 --minibatch-size 64".split()
+    assert main([*train, "--env-args", '{"level": 1}', "--run", str(tmp_path / "a")]) == 0
+    assert 'is without {"privileged": true}.' in capsys.readouterr().err
+    assert main([*train, "--env-args", '{"level": 1, "privileged": true}', "--run", str(tmp_path / "b")]) == 0
+    assert "is without" not in capsys.readouterr().err
+
+
 def test_train_with_a_report_leaves_pictures(tmp_path, capsys):
     path = tmp_path / "r"
     assert main(["train", "ppo", "--env", "CartPole-v1", "--run", str(path), "--report", *TINY]) == 0
