@@ -90,7 +90,8 @@ def test_environment_arguments_and_wrappers_reach_training_and_evaluation(tmp_pa
 
 
 def test_arguments_of_a_preset_that_are_left_out_are_named(tmp_path, capsys):
-    train = "train ppo --env DroneGates-v0 --total-steps 64 --num-envs 4 --num-steps 16 --minibatch-size 64".split()
+    sizes = ["--num-envs", "4", "--num-steps", "16", "--minibatch-size", "64", "--total-steps", "64"]
+    train = ["train", "ppo", "--env", "DroneGates-v0", *sizes]
     assert main([*train, "--env-args", '{"level": 1}', "--run", str(tmp_path / "a")]) == 0
     assert 'is without {"privileged": true}.' in capsys.readouterr().err
     assert main([*train, "--env-args", '{"level": 1, "privileged": true}', "--run", str(tmp_path / "b")]) == 0
