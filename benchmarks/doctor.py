@@ -4,6 +4,7 @@
     .venv/bin/python benchmarks/doctor.py faults --half odd --seeds 1 2 3     the half of the table
     .venv/bin/python benchmarks/doctor.py faults --half unseen                faults that nobody had in mind
     .venv/bin/python benchmarks/doctor.py faults --half unseen-too            and others, after rules for these
+    .venv/bin/python benchmarks/doctor.py faults --half unseen-three          and others again
     .venv/bin/python benchmarks/doctor.py faults --half elsewhere --seeds 1   under other algorithms, elsewhere
     .venv/bin/python benchmarks/doctor.py healthy
     .venv/bin/python benchmarks/doctor.py remedies --seeds 1
@@ -28,6 +29,7 @@ from typing import Any, get_type_hints
 
 import faulty
 import unseen
+import unseen_three
 import unseen_too
 from common import append, provenance, rows
 from elsewhere import ELSEWHERE
@@ -150,13 +152,27 @@ UNSEEN_TOO = {
     "a column times a row": ("policy-still", "advantage-unrelated"),
 }
 """names that are right for the faults of `unseen_too.py`"""
-FAULTS |= {name: (*unseen.UNSEEN[name][:3], right) for name, right in UNSEEN.items()}
-FAULTS |= {name: (*unseen_too.UNSEEN_TOO[name][:3], right) for name, right in UNSEEN_TOO.items()}
+UNSEEN_THREE = {
+    "a running total": ("reward-by-time",),
+    "positions without speeds": ("observation-incomplete",),
+    "a battery that is never charged": ("action-fades",),
+    "parts in the order of a set": ("observation-apart",),
+    "a trust region of next to nothing": ("setting-max-kl", "policy-still"),
+    "a decay factor for ε": ("setting-final-epsilon",),
+    "a temperature that cannot fall": ("setting-min-temperature",),
+    "a critic without hidden layers": ("network-small",),
+    "a policy that descends Q": ("advantage-opposed", "gets-worse"),
+    "critics that nobody asks": ("critic-still",),
+    "actions that were not taken": ("advantage-unrelated",),
+    "one target for all actions": ("actions-alike",),
+}
+"""names that are right for the faults of `unseen_three.py`; some are of rules that there are not"""
+SETS = ((UNSEEN, unseen.UNSEEN), (UNSEEN_TOO, unseen_too.UNSEEN_TOO), (UNSEEN_THREE, unseen_three.UNSEEN_THREE))
+FAULTS |= {name: (*faults[name][:3], right) for named, faults in SETS for name, right in named.items()}
 for name, algorithm, env, steps, change in ELSEWHERE:
     FAULTS[f"{name}: {algorithm}, {env}"] = (algorithm, {env: steps}, change or FAULTS[name][2], FAULTS[name][3])
-LEARNERS = faulty.LEARNERS | {
-    name: lambda _, change=change: change() for name, change in (unseen.LEARNERS | unseen_too.LEARNERS).items()
-}
+OF_SETS = unseen.LEARNERS | unseen_too.LEARNERS | unseen_three.LEARNERS
+LEARNERS = faulty.LEARNERS | {name: lambda _, change=change: change() for name, change in OF_SETS.items()}
 """the library with a fault in it, as a context, for the name of an algorithm"""
 
 BY_OPTIONS = {"large-observation", "reward-large", "reward-small", "advantage-not-normalized", "mostly-random",
@@ -290,6 +306,7 @@ def cost() -> None:
 
 HALVES = {name: "elsewhere" if ":" in name else ("even", "odd")[i % 2] for i, name in enumerate(FAULTS)}
 HALVES |= dict.fromkeys(UNSEEN, "unseen") | dict.fromkeys(UNSEEN_TOO, "unseen-too")
+HALVES |= dict.fromkeys(UNSEEN_THREE, "unseen-three")
 
 
 def table(half: str | None) -> None:
@@ -323,7 +340,7 @@ def table(half: str | None) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=["faults", "healthy", "remedies", "cost", "table"])
-    parser.add_argument("--half", choices=["even", "odd", "unseen", "unseen-too", "elsewhere"])
+    parser.add_argument("--half", choices=["even", "odd", "unseen", "unseen-too", "unseen-three", "elsewhere"])
     parser.add_argument("--only", nargs="+", help="these faults, or algorithms of healthy runs")
     parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3])
     parser.add_argument("--runs", type=Path)
