@@ -154,7 +154,7 @@ UNSEEN_TOO = {
 """names that are right for the faults of `unseen_too.py`"""
 UNSEEN_THREE = {
     "a running total": ("reward-by-time",),
-    "positions without speeds": ("observation-incomplete",),
+    "positions without speeds": ("action-late",),
     "a battery that is never charged": ("action-fades",),
     "parts in the order of a set": ("observation-apart",),
     "a trust region of next to nothing": ("setting-max-kl", "policy-still"),

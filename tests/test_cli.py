@@ -16,6 +16,7 @@ from lemniscate.algos import find
 from lemniscate.cli import algorithms, main, parse
 from lemniscate.envs import registry
 from lemniscate.errors import UserError
+from lemniscate.presets import Preset
 from lemniscate.run.fields import read
 
 TINY = [
@@ -90,11 +91,12 @@ def test_environment_arguments_and_wrappers_reach_training_and_evaluation(tmp_pa
 
 
 def test_arguments_of_a_preset_that_are_left_out_are_named(tmp_path, capsys):
-    sizes = ["--num-envs", "4", "--num-steps", "16", "--minibatch-size", "64", "--total-steps", "64"]
-    train = ["train", "ppo", "--env", "DroneGates-v0", *sizes]
-    assert main([*train, "--env-args", '{"level": 1}', "--run", str(tmp_path / "a")]) == 0
-    assert 'is without {"privileged": true}.' in capsys.readouterr().err
-    assert main([*train, "--env-args", '{"level": 1, "privileged": true}', "--run", str(tmp_path / "b")]) == 0
+    config = lem.config_for("ppo", "CartPole-v1", preset="default", env_kwargs={"max_episode_steps": 20})
+    Preset("own", config, "a test", "2026").write(tmp_path / "own.json", "ppo")
+    train = ["train", "ppo", "--env", "CartPole-v1", "--preset", str(tmp_path / "own.json"), *TINY]
+    assert main([*train, "--env-args", "{}", "--run", str(tmp_path / "a")]) == 0
+    assert 'is without {"max_episode_steps": 20}.' in capsys.readouterr().err
+    assert main([*train, "--env-args", '{"max_episode_steps": 20}', "--run", str(tmp_path / "b")]) == 0
     assert "is without" not in capsys.readouterr().err
 
 

@@ -82,6 +82,14 @@ CASES = {
         {"observation__at_limits": [0.9] * 3 + [0.1] * 5},
     ),
     "action-by-sign": ({"action__by_sign": [0.9] * 8}, {"action__by_sign": [0.1] + [0.9] * 7}),
+    "critic-still": (
+        {"algorithm": "sac", "targets__behind": [0.0] * 8},
+        {"algorithm": "sac", "targets__behind": [0.0] * 7 + [0.01]},
+    ),
+    "network-small": (
+        {"algorithm": "ddpg", "changed": {"critic_hidden": []}},
+        {"algorithm": "ddpg", "changed": {"critic_hidden": [64]}},
+    ),
     "replay-repeated": (
         {"algorithm": "sac", "replay__repeated": [1.0] * 8},
         {"algorithm": "sac", "replay__repeated": [0.3] * 8},
@@ -206,8 +214,8 @@ def test_one_of_two_metrics_that_are_compared_is_no_evidence():
 
 
 def test_a_policy_that_never_moves_is_still_whatever_its_algorithm_logs():
-    assert "policy-still" in names("a2c", policy__moved=[0.0] * 8)
-    assert "policy-still" not in names("a2c", policy__moved=[0.0] * 7 + [1e-6])
+    assert "policy-still" in names("a2c", network__moved=[0.0] * 8)
+    assert "policy-still" not in names("a2c", network__moved=[0.0] * 7 + [1e-6])
 
 
 def test_rounded_observations_are_not_taken_for_noise():
@@ -219,6 +227,17 @@ def test_rounded_observations_are_not_taken_for_noise():
 def test_targets_that_are_behind_by_a_setting_are_no_fault_of_the_learner():
     behind = {"targets__behind": [0.1, 0.2, 0.5, 0.6]}
     assert names("td3", **behind, changed={"policy_delay": 100}) == ["setting-policy-delay"]
+
+
+def test_advantages_without_relation_are_seen_where_no_divergence_is_logged():
+    unrelated = {"advantage__followed": [-0.02, 0.02] * 4}
+    assert "advantage-unrelated" in names("a2c", **unrelated, network__moved=[1e-3] * 8)
+    assert "advantage-unrelated" not in names("a2c", **unrelated, network__moved=[0.0] * 8)
+
+
+def test_a_policy_that_descends_q_is_named():
+    assert names("td3", action__preferred=[0.5] * 3 + [0.05] * 5) == ["advantage-opposed"]
+    assert names("td3", action__preferred=[0.05] * 3 + [0.5] * 5) == []
 
 
 def test_returns_that_fall_while_q_begins_are_no_finding():

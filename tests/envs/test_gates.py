@@ -311,20 +311,34 @@ def test_a_flight_through_all_gates_is_counted():
     assert all(reward > 3 for reward in rewards[1::2])
 
 
-@pytest.mark.parametrize("control", ["attitude", "body_rate"])
-def test_a_race_trains_and_is_evaluated(control, tmp_path):
+def raced(path, **kwargs):
+    """A short training of 4 drones at level 2, in episodes of 2 s."""
     fields = {"num_envs": 4, "num_steps": 64, "total_steps": 1_024, "minibatch_size": 64, "epochs": 2, "seed": 1}
-    kwargs = {"level": 2, "control": control, "max_episode_time": 2.0}
-    run = lem.train("ppo", "DroneGates-v0", env_kwargs=kwargs, run=tmp_path / "run", progress=False, **fields)
+    kwargs = {"level": 2, "max_episode_time": 2.0, **kwargs}
+    return lem.train("ppo", "DroneGates-v0", env_kwargs=kwargs, run=path, progress=False, **fields)
+
+
+@pytest.fixture(scope="module")
+def race(tmp_path_factory):
+    """It, with attitudes as actions."""
+    return raced(tmp_path_factory.mktemp("race") / "run")
+
+
+def require_measures(run):
     found = lem.evaluate(run.policy, episodes=4)
     assert {"gates_passed", "success", "crashed"} <= found.measures.keys()
     assert math.isnan(found.measures["lap_seconds"]) == (found.measures["success"] == 0)
 
 
-def test_body_rates_are_followed():
-    env = registry.make("DroneGates-v0", 2, kwargs={"control": "body_rate"})
+def test_a_race_trains_and_is_evaluated(race):
+    require_measures(race)
+
+
+def test_body_rates_are_followed(tmp_path):
+    require_measures(run := raced(tmp_path / "run", control="body_rate"))
+    env = registry.make("DroneGates-v0", 4, kwargs=run.policy.config.env_kwargs)  # a program that there is
     env.restart(0)
-    action = torch.tensor([[0.2, 0.0, 0.0, 0.6], [0.0, -0.2, 0.0, 0.6]])
+    action = torch.tensor([[0.2, 0.0, 0.0, 0.6], [0.0, -0.2, 0.0, 0.6]]).repeat(2, 1)
     rates = [env.step(action).next_obs[:, 10:13] for _ in range(6)][-1]
     assert rates[0, 0] == pytest.approx(2.0, abs=0.7)
     assert rates[1, 1] == pytest.approx(-2.0, abs=0.7)
@@ -433,19 +447,17 @@ def test_the_air_of_a_vehicle_is_that_of_a_race():
     assert not step.terminated.any()
 
 
-def test_a_race_is_drawn_and_filmed_with_what_stands_there(tmp_path):
-    fields = {"num_envs": 4, "num_steps": 64, "total_steps": 512, "minibatch_size": 64, "epochs": 1, "seed": 1}
-    run = lem.train("ppo", "DroneGates-v0", env_kwargs={"level": 2}, run=tmp_path / "run", progress=False, **fields)
-    files = lem.plot(run)
+def test_a_race_is_drawn_and_filmed_with_what_stands_there(race, tmp_path):
+    files = lem.plot(race)
     assert "flight.png" in {file.name for file in files}
     assert "error.png" not in {file.name for file in files}
-    env = registry.make("DroneGates-v0", 2, kwargs={"level": 2})
+    env = registry.make("DroneGates-v0", 4, kwargs=race.policy.config.env_kwargs)
     env.restart(0)
     boxes = env.scene.boxes()
-    assert boxes.shape == (2, 4 * 5 + 4, 15)
+    assert boxes.shape == (4, 4 * 5 + 4, 15)
     assert not np.allclose(boxes[0], boxes[1])
     film = tmp_path / "race.gif"
-    lem.watch(run.policy, episodes=1, video=film)
+    lem.watch(race.policy, episodes=1, video=film)
     assert film.stat().st_size > 10_000
 
 

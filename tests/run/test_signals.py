@@ -12,7 +12,7 @@ from torch import nn
 import lemniscate as lem
 from conftest import tiny_fields, tiny_off_policy
 from lemniscate.algos import ppo
-from lemniscate.maths import explained_by, gae
+from lemniscate.maths import Deterministic, explained_by, gae
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.networks import Layers
 from lemniscate.nn.normalizer import NoNorm, RunningNorm
@@ -23,6 +23,7 @@ from lemniscate.run.signals import (
     acted_with,
     by_time,
     late_effect,
+    of_critics,
     of_effects,
     of_networks,
     of_rows,
@@ -31,7 +32,7 @@ from lemniscate.run.signals import (
     signals,
 )
 from lemniscate.spec import Box, Discrete, ObservationPart, Spec
-from lemniscate.types import Rollout
+from lemniscate.types import Rollout, Transition
 
 B, O, A = 400, 3, 2
 
@@ -356,7 +357,7 @@ def test_the_correlation_of_advantages_and_of_what_an_update_did_to_the_policy(a
     config = SimpleNamespace(gamma=0.9, num_steps=12)
     assert of_values(state, config, rows, before)["advantage/followed"].item() == pytest.approx(expected, abs=1e-4)
     still = of_values(state, config, rows, acted_with(state))
-    assert still["advantage/followed"] == still["policy/moved"] == 0
+    assert still["advantage/followed"] == still["network/moved"] == 0
     assert "advantage/followed" not in of_values(state, config, rows)
 
 
@@ -365,11 +366,11 @@ def test_the_way_of_a_policy_is_that_of_its_parameters_alone():
     before = acted_with(state)
     state.policy.observe(5 * rows.obs, rows.valid)
     config = SimpleNamespace(gamma=0.9, num_steps=12)
-    assert of_values(state, config, rows, before)["policy/moved"] == 0
+    assert of_values(state, config, rows, before)["network/moved"] == 0
     with torch.no_grad():
         for parameter in state.policy.parameters():
             parameter *= 1.25
-    moved = of_values(state, config, rows, before)["policy/moved"]
+    moved = of_values(state, config, rows, before)["network/moved"]
     assert moved.item() == pytest.approx(0.2)
 
 
@@ -432,6 +433,40 @@ def test_of_targets_the_distance_and_of_replay_what_stands_still(tmp_path):
         stayed = last(tmp_path / "stayed")
     assert 0 < moved["targets/behind"] < stayed["targets/behind"]
     assert moved["replay/repeated"] == 0
+
+
+class AtAnEnd(nn.Module):
+    """A policy with one action everywhere."""
+
+    def __init__(self, action):
+        super().__init__()
+        self.action = action
+
+    def forward(self, obs):
+        return Deterministic(torch.full((len(obs), 1), self.action))
+
+
+class QIsTheAction(nn.Module):
+    """Q(s, a) = w a, of one critic."""
+
+    def __init__(self):
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(1))
+
+    def forward(self, obs, action):
+        return self.weight * action.T
+
+
+@pytest.mark.parametrize(("action", "share"), [(1.0, 1.0), (-1.0, 0.0)])
+def test_the_policys_action_stands_beside_one_at_random(action, share):
+    columns = Transition(
+        numbers(B, O).float(), torch.zeros(B, 1), torch.zeros(B), numbers(B, O).float(), torch.zeros(B).bool()
+    )
+    replay = SimpleNamespace(transitions=columns, sample_indices=lambda *_: torch.arange(B)[None])
+    networks = SimpleNamespace(critics=QIsTheAction(), entropy_bonus=lambda *_: 0.0)
+    state = SimpleNamespace(replay=replay, updates=1, networks=networks, targets=QIsTheAction(), policy=AtAnEnd(action))
+    rows = Rollout(**vars(columns), truncated=columns.terminated, valid=~columns.terminated)
+    assert of_critics(state, SimpleNamespace(gamma=0.9), rows)["action/preferred"] == share
 
 
 def test_before_there_are_rows_there_are_no_signals():

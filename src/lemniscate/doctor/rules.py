@@ -259,7 +259,7 @@ def of_updates(e: Evidence) -> Seen:
         yield "kl-too-large", f"The KL divergence of the late updates is {kl:.2g}, {beside}."
     if kl < 1e-6 and not e.rose:
         yield "policy-still", f"The KL divergence of the late updates is {kl:.1g}: the policy hardly moves."
-    elif e.greatest("policy/moved") == 0:
+    elif e.greatest("network/moved") == 0:
         yield "policy-still", "No update that was looked at changed a parameter of the policy."
     if clipped > 0.4:
         yield "ratios-clipped", f"{clipped:.0%} of the late probability ratios are clipped."
@@ -301,6 +301,7 @@ def of_advantages(e: Evidence) -> Seen:
     awaited = np.median(ends) if often else np.nan
     given, usual = (config.get("normalize_advantage") for config in (e.config, e.recommended))
     errors = _standard_errors(followed) if len(followed) >= 4 else np.nan
+    moves = e.late("approx_kl") > 1e-5 or e.late("network/moved") > 1e-6
     ignored = 0.8 < awaited < 1.2  # below, V is only behind; above, it has no scale yet
     if ignored:
         yield (
@@ -312,10 +313,16 @@ def of_advantages(e: Evidence) -> Seen:
             "advantage-opposed",
             f"The probabilities of actions fall with their advantage: the correlation is {followed.mean():.2f}.",
         )
-    elif errors <= 2 and not ignored and followed.mean() <= 0.04 and e.late("approx_kl") > 1e-5:
+    elif errors <= 2 and not ignored and followed.mean() <= 0.04 and moves:
         yield (
             "advantage-unrelated",
             f"Changes of log π and advantages have a correlation of {followed.mean():.2f}: none.",
+        )
+    preferred = e.late("action/preferred")
+    if preferred < 0.2:
+        yield (
+            "advantage-opposed",
+            f"In {preferred:.0%} of the sampled states Q of the policy's action is above that of one at random.",
         )
     neither = given is False and usual and not e.config.get("scale_rewards")
     if neither and not e.as_recommended("normalize_advantage"):
@@ -353,6 +360,8 @@ def of_values(e: Evidence) -> Seen:
                 "critic-overfits",
                 f"The error of Q at the newest transitions is {times:.0f} times that at sampled ones.",
             )
+    if len(behind) >= 3 and not behind.any() and first_number(e.config.get("tau")) != 1:
+        yield "critic-still", "The weights of Q are those of its target networks, each time that they were looked at."
     if len(behind) >= 3 and (np.diff(behind) > 0).all() and behind[-1] > 0.15 and own:
         yield (
             "targets-behind",
@@ -370,6 +379,11 @@ def _is_missing(late: np.ndarray) -> bool:
 def of_networks(e: Evidence) -> Seen:
     """Faults of the networks: their units and gradients."""
     inactive, saturated = e.late("network/inactive"), e.late("network/saturated")
+    for field in ("hidden", "critic_hidden"):
+        given, usual = (config.get(field) for config in (e.config, e.recommended))
+        small = usual and given is not None and 8 * min(given, default=0) <= min(usual)
+        if small and not e.as_recommended(field) and not e.rose:
+            yield "network-small", f"{field} is {typed(given)}, and {typed(usual)} is recommended."
     norms, norm = e.values("gradient_norm"), e.late("gradient_norm")
     limit = first_number(e.config.get("max_grad_norm"))
     times = 5 if norm > 100 and e.config.get("scale_rewards", False) else 100

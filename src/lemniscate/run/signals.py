@@ -200,7 +200,7 @@ def of_values(
     - value/at_ends: the mean of V(s) − r, or of V(s) where that is less, over |V| where an episode terminated: what V
       awaits beyond its end. Where V knows nothing of a large last reward, V(s) says so.
     - advantage/followed: the correlation of A(s, a) and of the change of log π(a|s) in the newest update.
-    - policy/moved: the length of the policy's way in that update, as a share of the length of its parameters.
+    - network/moved: the length of the policy's way in that update, as a share of the length of its parameters.
     """
     gamma = getattr(config, "gamma", 1.0)
     if not hasattr(state.networks, "value"):
@@ -222,7 +222,7 @@ def of_values(
             torch.cat([parts[name].flatten() for name, _ in state.policy.named_parameters()])
             for parts in (acted, state.policy.state_dict())
         )
-        found["policy/moved"] = (now - before).norm() / now.norm()
+        found["network/moved"] = (now - before).norm() / now.norm()
         advantage, _ = gae(rows.reward, value, after, ends, rows.done, gamma=gamma, lam=0.95)
         old = functional_call(state.policy, dict(acted), (obs,), tie_weights=False).log_prob(action)
         change = (state.policy(obs).log_prob(action) - old).view(valid.shape)
@@ -246,7 +246,8 @@ def of_critics(state: Any, config: RunConfig, rows: Rollout) -> dict[str, Tensor
     """The mean squared error of Q over one step, of the newest rows and of sampled ones, and the share that is missing.
 
     For algorithms that learn Q from replay; with the distance of the target networks, as a share of the length of all
-    weights, and the share of the sampled transitions that end where they began.
+    weights, and shares of the sampled transitions: of those that end where they began, and of those in which Q of the
+    policy's action is above that of one at random.
     """
     replay, updates = getattr(state, "replay", None), getattr(state, "updates", 0)
     if replay is None or not updates or not hasattr(state.networks, "critics"):
@@ -263,7 +264,13 @@ def of_critics(state: Any, config: RunConfig, rows: Rollout) -> dict[str, Tensor
         return td_target(batch.reward, value, batch.terminated, gamma=gamma), critics(batch.obs, batch.action)[0]
 
     (target, q), (other_target, other_q) = map(estimates, (Transition(*columns)[-SEEN:], sampled))
+    chosen, chance = (
+        state.policy(sampled.obs).mode(),
+        torch.empty_like(sampled.action).uniform_(-1, 1, generator=generator),
+    )
+    preferred = critics(sampled.obs, chosen)[0] > critics(sampled.obs, chance)[0]
     found = {
+        "action/preferred": preferred.float().mean(),
         "td_error/newest": (q - target).square().mean(),
         "td_error/sampled": (other_q - other_target).square().mean(),
         "replay/repeated": (sampled.obs == sampled.next_obs).flatten(1).all(1).float().mean(),
