@@ -236,7 +236,7 @@ def test_advantages_without_relation_are_seen_where_no_divergence_is_logged():
 
 
 def test_a_policy_that_descends_q_is_named():
-    assert names("td3", action__preferred=[0.5] * 3 + [0.05] * 5) == ["advantage-opposed"]
+    assert names("td3", action__preferred=[0.5] * 3 + [0.2] * 5) == ["advantage-opposed"]
     assert names("td3", action__preferred=[0.05] * 3 + [0.5] * 5) == []
 
 
