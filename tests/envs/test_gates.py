@@ -33,18 +33,18 @@ def racing():
         key = level, json.dumps(kwargs)
         if key not in made:
             made[key] = make_drones("DroneGates-v0", 64, "cpu", {"level": level, **kwargs}, None, {})
-            made[key].restarted = begun(made[key])
+            made[key].restarted, made[key].seen = begun(made[key])
         return made[key]
 
     return get
 
 
 def begun(drones, seed=0):
-    """The state in which races begin."""
+    """The state in which races begin, and what is observed there."""
     import jax.numpy as jnp
 
     every = jnp.ones(drones.num_envs, bool)
-    return drones.reset(drones.init(jax.random.key(seed)), every, jnp.array(False))[0]
+    return drones.reset(drones.init(jax.random.key(seed)), every, jnp.array(False))[:2]
 
 
 @pytest.mark.parametrize(
@@ -158,7 +158,7 @@ def test_a_level_draws_what_it_says_and_no_more(racing):
     drawn = {}
     for level in range(4):
         drones = racing(level)
-        states = [begun(drones, seed) for seed in range(12)]
+        states = [begun(drones, seed)[0] for seed in range(12)]
         parts = {
             "pos": [data.states.pos[:, 0] for data, _, _ in states],
             "mass": [data.params.mass.reshape(64, -1) for data, _, _ in states],
@@ -198,7 +198,7 @@ def test_a_drawn_track_has_room(racing):
     drones = racing(3)
     apart = []
     for seed in range(8):
-        data, arrays, _ = begun(drones, seed)
+        (data, arrays, _), _ = begun(drones, seed)
         track, obstacles = np.asarray(arrays["_expected_gates"]), np.asarray(arrays["_expected_obstacles"])
         assert (np.abs(track[..., 0]) <= 2.0).all()
         assert (np.abs(track[..., 1]) <= 1.0).all()
@@ -288,7 +288,7 @@ def test_a_flight_through_all_gates_is_counted():
     import jax.numpy as jnp
 
     drones = make_drones("DroneGates-v0", 1, "cpu", {"level": 0}, None, {})
-    state, passed, rewards = begun(drones), [], []
+    state, passed, rewards = begun(drones)[0], [], []
     for number in range(4):
         for side in (-0.1, 0.1):
             data, arrays, air = state
@@ -419,14 +419,13 @@ def test_what_begins_on_its_way_begins_behind_a_gate(racing):
     assert np.asarray(arrays["_before"]) == pytest.approx(np.asarray(data.states.pos)[:, 0])
 
 
-def test_the_critic_is_told_where_the_gates_are():
-    env = registry.make("DroneGates-v0", 8, kwargs={"level": 2, "privileged": True})
-    obs = env.restart(0)
-    assert env.spec.privileged == 14
-    away = obs[:, -6:]
-    assert (away.abs() > 1e-3).any(1).all()
-    assert (away.abs() <= torch.tensor([0.15, 0.15, 0.1] * 2) + 1e-5).all()
-    assert not registry.make("DroneGates-v0", 8, kwargs={"privileged": True}).restart(0)[:, -6:].any()
+def test_the_critic_is_told_where_the_gates_are(racing):
+    moved = racing(2, privileged=True)
+    assert moved.privileged == 14
+    away = np.abs(moved.seen[:, -6:])
+    assert (away > 1e-3).any(1).all()
+    assert (away <= np.array([0.15, 0.15, 0.1] * 2) + 1e-5).all()
+    assert not racing(0, privileged=True).seen[:, -6:].any()
 
 
 def test_the_air_of_a_vehicle_is_that_of_a_race():
@@ -470,6 +469,7 @@ position = [0.0, 0.0, 1.0]
 """
 
 
+@pytest.mark.long
 def test_a_preflight_knows_a_finish_from_a_crash(tmp_path):
     from lemniscate.drones.probe import DroneProbe
 
