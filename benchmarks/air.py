@@ -140,7 +140,7 @@ def gains(trials):
 
 
 def table():
-    found = rows("air")
+    found = list({(row["way"], row["seed"]): row for row in rows("air")}.values())  # the newest of each
     for way in dict.fromkeys(row["way"] for row in found):
         of = [row for row in found if row["way"] == way]
         print(f"\n{way}: {len(of)} seeds, {mean(row['training_s'] for row in of):.0f} s of training\n")
