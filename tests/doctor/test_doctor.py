@@ -235,6 +235,11 @@ def test_advantages_without_relation_are_seen_where_no_divergence_is_logged():
     assert "advantage-unrelated" not in names("a2c", **unrelated, network__moved=[0.0] * 8)
 
 
+def test_returns_that_have_arrived_rise_no_more():
+    arrived = [*np.linspace(20, 480, 300), *[500] * 100]
+    assert "still-rising" not in {one.name for one in diagnose(evidence(returns=arrived))}
+
+
 def test_a_policy_that_descends_q_is_named():
     assert names("td3", action__preferred=[0.5] * 3 + [0.2] * 5) == ["advantage-opposed"]
     assert names("td3", action__preferred=[0.05] * 3 + [0.5] * 5) == []
