@@ -3,8 +3,8 @@
 from collections.abc import Mapping
 from typing import Any
 
-QUICK = {"learning_starts": 1_000, "log_every": 100}
-"""fields of DDPG, TD3 and SAC in a short run"""
+from unseen import QUICK
+
 FEW = {"num_envs": 1, "num_steps": 16, "critic_minibatch_size": 16}
 LATE = ("unseen:LateActions(steps=5)",)
 

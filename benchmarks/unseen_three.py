@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import replace
-from types import ModuleType
 from typing import Any
 from unittest.mock import patch
 
@@ -18,6 +17,7 @@ import numpy as np
 import torch
 from faulty import WrongStep
 from unseen import QUICK
+from unseen_too import quick
 
 
 class RunningTotal(WrongStep):
@@ -75,11 +75,6 @@ class OwnOrder(WrongStep):
         return np.asarray(obs, np.float32)[self.order]
 
 
-def _quick(algorithm: ModuleType) -> Any:
-    """`QUICK` as the defaults of an algorithm's fields, since a change of a learner comes without fields."""
-    return patch.dict(algorithm.Config.__init__.__kwdefaults__, QUICK)
-
-
 @contextmanager
 def _down_the_critic() -> Iterator[None]:
     from lemniscate.algos import td3
@@ -90,7 +85,7 @@ def _down_the_critic() -> Iterator[None]:
         loss = -right(state, policy, batch)[0]  # Q itself, which a step then makes smaller
         return loss, {"losses/actor": loss.detach()}
 
-    with _quick(td3), patch.object(td3, "actor_loss", wrong):
+    with quick(td3), patch.object(td3, "actor_loss", wrong):
         yield
 
 
@@ -103,7 +98,7 @@ def _copied_critics() -> Iterator[None]:
     def wrong(networks: Any, **options: Any) -> Any:
         return right(deepcopy(networks) if options["name"] == "critic" else networks, **options)
 
-    with _quick(sac), patch.object(sac, "Adam", wrong):
+    with quick(sac), patch.object(sac, "Adam", wrong):
         yield
 
 

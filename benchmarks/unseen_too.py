@@ -61,7 +61,7 @@ class SameStart(gym.Wrapper):
         return self.env.reset(seed=42, options=options)
 
 
-def _quick(algorithm: ModuleType) -> Any:
+def quick(algorithm: ModuleType) -> Any:
     """`QUICK` as the defaults of an algorithm's fields, since a change of a learner comes without fields."""
     return patch.dict(algorithm.Config.__init__.__kwdefaults__, QUICK)
 
@@ -70,7 +70,7 @@ def _quick(algorithm: ModuleType) -> Any:
 def _targets_stay() -> Iterator[None]:
     from lemniscate.algos import td3
 
-    with _quick(td3), patch.object(td3, "polyak", lambda *_: None):
+    with quick(td3), patch.object(td3, "polyak", lambda *_: None):
         yield
 
 
@@ -84,7 +84,7 @@ def _same_array() -> Iterator[None]:
     def wrong(self: Any, obs: Any, action: Any, step: Any) -> None:
         right(self, obs, action, replace(step, next_obs=obs))  # two names of one array
 
-    with _quick(sac), patch.object(ReplayBuffer, "add", wrong):
+    with quick(sac), patch.object(ReplayBuffer, "add", wrong):
         yield
 
 

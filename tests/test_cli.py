@@ -95,9 +95,9 @@ def test_arguments_of_a_preset_that_are_left_out_are_named(tmp_path, capsys):
     Preset("own", config, "a test", "2026").write(tmp_path / "own.json", "ppo")
     train = ["train", "ppo", "--env", "CartPole-v1", "--preset", str(tmp_path / "own.json"), *TINY]
     assert main([*train, "--env-args", "{}", "--run", str(tmp_path / "a")]) == 0
-    assert 'is without {"max_episode_steps": 20}.' in capsys.readouterr().err
+    assert '{"max_episode_steps": 20} is left out.' in capsys.readouterr().err
     assert main([*train, "--env-args", '{"max_episode_steps": 20}', "--run", str(tmp_path / "b")]) == 0
-    assert "is without" not in capsys.readouterr().err
+    assert "is left out" not in capsys.readouterr().err
 
 
 def test_train_with_a_report_leaves_pictures(tmp_path, capsys):

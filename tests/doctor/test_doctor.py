@@ -235,6 +235,30 @@ def test_advantages_without_relation_are_seen_where_no_divergence_is_logged():
     assert "advantage-unrelated" not in names("a2c", **unrelated, network__moved=[0.0] * 8)
 
 
+def test_what_chance_explains_of_few_rows_is_no_effect():
+    assert names("td3", action__effect=[0.065, 0.014, 0.006, 0.011]) == ["action-without-effect"]
+    assert names("td3", action__effect=[0.15, 0.014, 0.006, 0.011]) == []
+
+
+def test_a_value_that_is_worse_than_a_constant_explains_nothing():
+    assert names("a2c", explained_variance=[-0.5] * 8) == ["value-explains-nothing"]
+    assert names("a2c", explained_variance=[-2.0] * 8) == []  # of targets that are all the same
+
+
+@pytest.mark.parametrize(
+    ("name", "shown"),
+    [
+        ("every-return-alike", {"returns": [-500.0] * 400}),
+        ("action-by-sign", {"action__by_sign": [0.9] * 8}),
+        ("ends-ignored", {"value__at_ends": [0.95] * 8, "episode__terminated": [1.0] * 8}),
+        ("advantage-unrelated", {"advantage__followed": [-0.02, 0.02] * 4, "approx_kl": [0.01] * 8}),
+    ],
+)
+def test_what_a_setting_brings_about_gives_way_to_it(name, shown):
+    assert name in names(**shown)
+    assert names(**shown, changed={"learning_rate": 0.1}) == ["setting-learning-rate"]
+
+
 def test_returns_that_have_arrived_rise_no_more():
     arrived = [*np.linspace(20, 480, 300), *[500] * 100]
     assert "still-rising" not in {one.name for one in diagnose(evidence(returns=arrived))}

@@ -320,7 +320,7 @@ def raced(path, **kwargs):
 
 @pytest.fixture(scope="module")
 def race(tmp_path_factory):
-    """It, with attitudes as actions."""
+    """A short training with attitudes as actions."""
     return raced(tmp_path_factory.mktemp("race") / "run")
 
 
@@ -336,7 +336,9 @@ def test_a_race_trains_and_is_evaluated(race):
 
 def test_body_rates_are_followed(tmp_path):
     require_measures(run := raced(tmp_path / "run", control="body_rate"))
-    env = registry.make("DroneGates-v0", 4, kwargs=run.policy.config.env_kwargs)  # a program that there is
+    env = registry.make(
+        "DroneGates-v0", 4, kwargs=run.policy.config.env_kwargs
+    )  # the training has compiled its program
     env.restart(0)
     action = torch.tensor([[0.2, 0.0, 0.0, 0.6], [0.0, -0.2, 0.0, 0.6]]).repeat(2, 1)
     rates = [env.step(action).next_obs[:, 10:13] for _ in range(6)][-1]

@@ -46,7 +46,7 @@ class Config(ActorCriticConfig):
     max_grad_norm: Positive | None = 1.0
     """gradient clipping by global norm, usually 0.5 to 1; none: no clipping"""
     max_grad_ratio: Positive = 3.0
-    """limit of the gradient by one environment's action, in medians over environments; usually 1 to 10"""
+    """limit of the gradient by one environment's action, in medians over environments; usually 1 to 10, 1000: none"""
     td_lambda: Fraction = 0.95
     """trace decay λ of the return that the value is fitted to; usually 0.9 to 0.99"""
     critic_epochs: Repeats = 4

@@ -35,14 +35,13 @@ def train(
 ) -> None:
     """Train one policy, or with --seeds one for each algorithm and seed, and compare them."""
     if seeds is None and "," not in algorithm:
-        given = preset
-        name, preset, config = training.choose_config(algorithm, env, given, fields)
+        usual = training.choose_config(algorithm, env, preset, {})[2].env_kwargs if "env_kwargs" in fields else {}
+        name, preset, config = training.choose_config(algorithm, env, preset, fields)
         registry.backend_class(str(config.backend))  # refuses one that is not there
         what = f"{name} on {config.num_envs} × {config.env}, backend {config.backend}"
         tell(f"{what}: preset {preset}, seed {config.seed}, {'compiled' if is_compiled(config) else 'not compiled'}")
-        usual = training.choose_config(algorithm, env, given, {})[2].env_kwargs if "env_kwargs" in fields else {}
         if left := {name: value for name, value in usual.items() if name not in config.env_kwargs}:
-            tell(f"--env-args takes the place of the preset's, and is without {notation.dumps(left)}.")
+            tell(f"--env-args takes the place of the preset's, of which {notation.dumps(left)} is left out.")
         trained = training.begin(name, config, run, options)
         if score:
             _say_score(trained)

@@ -337,7 +337,7 @@ def _standard_errors(values: np.ndarray) -> float:
 def of_values(e: Evidence) -> Seen:
     """Faults of V and Q: bootstraps, explained variance, overfitting, target networks."""
     missing, explained, last = e.last_half("value/missing"), e.late("explained_variance"), e.ends[1]
-    behind, own = e.values("targets/behind"), all(map(e.as_recommended, ("tau", "policy_delay")))
+    behind, usual = e.values("targets/behind"), all(map(e.as_recommended, ("tau", "policy_delay")))
     newest, sampled = e.last_half("td_error/newest"), e.last_half("td_error/sampled")
     settled = len(last) > 0 and last.std() <= 0.05 * abs(last.mean())  # there is nothing left to explain
     if len(missing) >= 2 and _is_missing(missing) and e.late("episode/terminated") < 0.5 and not e.begins:
@@ -362,7 +362,7 @@ def of_values(e: Evidence) -> Seen:
             )
     if len(behind) >= 3 and not behind.any() and first_number(e.config.get("tau")) != 1:
         yield "critic-still", "The weights of Q are those of its target networks, each time that they were looked at."
-    if len(behind) >= 3 and (np.diff(behind) > 0).all() and behind[-1] > 0.15 and own:
+    if len(behind) >= 3 and (np.diff(behind) > 0).all() and behind[-1] > 0.15 and usual:
         yield (
             "targets-behind",
             f"The target networks differ from Q's by {behind[-1]:.0%} of the length of its weights, and ever more.",
@@ -425,8 +425,8 @@ def of_returns(e: Evidence) -> Seen:
         )
     before = e.returns[-2 * fifth : -fifth]
     rise, error = last.mean() - before.mean(), np.hypot(last.std(), before.std()) / np.sqrt(fifth)
-    best = last.std() == 0  # as in CartPole, where there is a most
-    if rise > 3 * error and rise > 0.05 * np.ptp(e.returns) and not best:
+    arrived = last.std() == 0  # as in CartPole, whose return has a maximum
+    if rise > 3 * error and rise > 0.05 * np.ptp(e.returns) and not arrived:
         yield (
             "still-rising",
             f"Returns were still rising, from {before.mean():,.4g} to {last.mean():,.4g} in the last two fifths.",
