@@ -26,7 +26,7 @@ race: setup  ## train a drone to race through gates, race from unseen starts, dr
 	$(BIN)/lemniscate train ppo --env DroneGates-v0 --preset gates-finish --warm-start $(RACE) --report
 
 test: setup  ## the whole suite but the long ones
-	$(BIN)/python -m pytest -n auto --dist loadfile -m "not long and not faults and not soak and not cluster"
+	$(BIN)/python -m pytest -n auto --dist worksteal -m "not long and not faults and not soak and not cluster"
 
 test-long: setup  ## the tests that train for minutes, and those beside one of the same kind
 	$(BIN)/python -m pytest -m long

@@ -1649,7 +1649,7 @@ MUTANTS = [
         "drones/gates.py",
         "self._gates_seen | near[0], self._obstacles_seen | near[1]",
         "near[0], near[1]",
-        "envs/test_gates.py::test_the_true_place_is_known_from_near_and_stays_known",
+        "envs/test_gates.py::test_what_was_seen_stays_known_from_afar",
     ),
     (
         "gates move at the first level",

@@ -2,6 +2,7 @@
 
 import json
 import math
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -108,20 +109,21 @@ def distance_in_mujoco(centre, quat, low, high):
 
 def test_contacts_are_those_that_mujoco_finds():
     rng, low, high = np.random.default_rng(1), *gates._boxes(1.0)
-    said = found = near = 0
-    for _ in range(1_500):
-        which = rng.integers(5)
-        at = rng.uniform(low[which] - 0.12, high[which] + 0.12).astype(np.float32)
-        quat = rng.normal(size=4)
-        quat /= np.linalg.norm(quat)
-        turned = Rotation.from_quat(quat).as_matrix().astype(np.float32)
-        touches = bool(gates.touches(at, turned, low[which], high[which]))
-        distance = distance_in_mujoco(at, quat, low[which], high[which])
-        said, found = said + touches, found + (distance < 0)
+    which = rng.integers(5, size=1_500)
+    at = rng.uniform(low[which] - 0.12, high[which] + 0.12).astype(np.float32)
+    quat = rng.normal(size=(1_500, 4))
+    quat /= np.linalg.norm(quat, axis=1, keepdims=True)
+    turned = Rotation.from_quat(quat).as_matrix().astype(np.float32)
+    touching = np.asarray(gates.touches(at, turned, low[which], high[which]))
+    found = near = 0
+    for i, box in enumerate(which):
+        distance = distance_in_mujoco(at[i], quat[i], low[box], high[box])
+        found += distance < 0
         if abs(distance) < 1e-4:  # MuJoCo's own precision
             near += 1
         else:
-            assert touches == (distance < 0), (which, at, quat, distance)
+            assert touching[i] == (distance < 0), (box, at[i], quat[i], distance)
+    said = touching.sum()
     assert 300 < said < 1_200
     assert 300 < found < 1_200
     assert near < 30
@@ -234,6 +236,16 @@ def test_the_true_place_is_known_from_near_and_stays_known(racing):
         assert believed == pytest.approx(expected, abs=1e-5)
 
 
+def test_what_was_seen_stays_known_from_afar():
+    race = SimpleNamespace(_gates=np.zeros((1, 2, 6)), _obstacles=np.zeros((1, 3, 3)))
+    race._gates_seen, race._obstacles_seen = np.zeros((1, 2), bool), np.zeros((1, 3), bool)
+    for x, known in ((1.0, False), (0.4, True), (1.0, True)):
+        race.sim = SimpleNamespace(data=SimpleNamespace(states=SimpleNamespace(pos=np.full((1, 1, 3), x))))
+        gates.DroneGates._look(race)
+        assert (np.asarray(race._gates_seen) == known).all()
+        assert (np.asarray(race._obstacles_seen) == known).all()
+
+
 def test_the_force_is_drawn_for_each_step_of_the_simulator(racing):
     data = racing(0).restarted[0]
     seen = []
@@ -283,20 +295,20 @@ def test_a_race_ends_outside_on_the_ground_and_at_what_stands(racing):
     assert touched[: len(cases)].tolist() == [case[2] for case in cases]
 
 
-def test_a_flight_through_all_gates_is_counted():
-    """A drone is put through the gates by hand, one step before and one behind each."""
+def test_a_flight_through_all_gates_is_counted(racing):
+    """Drones are put through the gates by hand, one step before and one behind each."""
     import jax.numpy as jnp
 
-    drones = make_drones("DroneGates-v0", 1, "cpu", {"level": 0}, None, {})
-    state, passed, rewards = begun(drones)[0], [], []
+    drones = racing(0)
+    state, passed, rewards = drones.restarted, [], []
     for number in range(4):
         for side in (-0.1, 0.1):
             data, arrays, air = state
             with drones._at(state) as env:
-                centre, turned = env._frame(jnp.array([number]), arrays["_gates"])
+                centre, turned = env._frame(jnp.full(64, number), arrays["_gates"])
                 pos = centre + side * turned[:, :, 0] - jnp.array((0, 0, 0.02))
                 env.sim.data = data.replace(states=data.states.replace(pos=pos[:, None]))
-                env.advance(jnp.zeros((1, 4)))
+                env.advance(jnp.zeros((64, 4)))
                 rewards.append(float(env.reward()[0]))
                 assert bool(env.terminated()[0]) == (number == 3 and side > 0)
                 passed.append(int(env._target[0]))
@@ -448,7 +460,7 @@ def test_the_air_of_a_vehicle_is_that_of_a_race():
     assert not step.terminated.any()
 
 
-def test_a_race_is_drawn_and_filmed_with_what_stands_there(race, tmp_path):
+def test_what_stands_there_is_drawn(race):
     files = lem.plot(race)
     assert "flight.png" in {file.name for file in files}
     assert "error.png" not in {file.name for file in files}
@@ -457,6 +469,10 @@ def test_a_race_is_drawn_and_filmed_with_what_stands_there(race, tmp_path):
     boxes = env.scene.boxes()
     assert boxes.shape == (4, 4 * 5 + 4, 15)
     assert not np.allclose(boxes[0], boxes[1])
+
+
+@pytest.mark.long
+def test_a_race_is_filmed(race, tmp_path):
     film = tmp_path / "race.gif"
     lem.watch(race.policy, episodes=1, video=film)
     assert film.stat().st_size > 10_000
