@@ -13,6 +13,8 @@ import pytest
 import lemniscate as lem
 from zoo_files import ZOO, Solution, execute, find, load
 
+pytestmark = pytest.mark.long  # of the zoo itself, which the quick suite takes as it is
+
 
 class World(gym.Env):
     """Deaths and time-outs, both within a few steps; the right action is what is seen."""

@@ -21,7 +21,10 @@ from torch import nn
 
 from zoo_files import ZOO, execute, find, load
 
-pytestmark = pytest.mark.filterwarnings("ignore")  # a student's broadcast is a warning, too
+pytestmark = [
+    pytest.mark.long,  # of the zoo itself, which the quick suite takes as it is
+    pytest.mark.filterwarnings("ignore"),  # a student's broadcast is a warning, too
+]
 
 SECONDS = {"right": 60.0, "wrong": 2.0}  # of the processor: the machine may be busy
 CALLS = {

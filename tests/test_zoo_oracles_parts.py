@@ -22,6 +22,8 @@ from zoo_files import ZOO, Solution, execute, find, load
 
 LOW, HIGH = np.float32([-1, 0, -3]), np.float32([3, 1, 5])
 
+pytestmark = pytest.mark.long  # of the zoo itself, which the quick suite takes as it is
+
 
 def spaces_of(num_envs=1):
     """What a network is told of the environments: 4 observations, 3 actions in bounds that are not symmetric."""

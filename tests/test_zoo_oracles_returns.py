@@ -56,6 +56,8 @@ GENERIC = (  # sentences that name no cause
     "returns[1] is 0.31; it should be 0.85: row 1.",
 )
 
+pytestmark = pytest.mark.long  # of the zoo itself, which the quick suite takes as it is
+
 
 # What is right, in Python floats
 

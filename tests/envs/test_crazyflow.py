@@ -177,6 +177,7 @@ if jax.config.jax_compilation_cache_dir:
 """
 
 
+@pytest.mark.one_in(2)
 @pytest.mark.parametrize(
     ("variables", "kept"),
     [

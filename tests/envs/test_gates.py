@@ -367,14 +367,13 @@ position = [0.0, 0.0, 1.0]
 """
 
 
-def test_a_track_of_ones_own_is_read(tmp_path):
+def test_a_track_of_ones_own_is_read(racing, tmp_path):
     (tmp_path / "track.toml").write_text(TRACK)
     track = gates.read_track(tmp_path / "track.toml")
     assert (track.order.tolist(), track.reverse.tolist()) == ([0, 0], [False, True])
-    env = registry.make("DroneGates-v0", 2, kwargs={"track": str(tmp_path / "track.toml"), "level": 2})
-    obs = env.restart(0)
-    assert obs[:, 16:19] == pytest.approx(torch.tensor([[1.0, 0, 0]] * 2), abs=1e-6)  # the direction of the first
-    assert obs[:, 22:25] == pytest.approx(torch.tensor([[-1.0, 0, 0]] * 2), abs=1e-6)  # and of the same, in reverse
+    obs = np.asarray(racing(0, track=str(tmp_path / "track.toml")).seen)
+    assert obs[:, 16:19] == pytest.approx(np.array([[1.0, 0, 0]] * 64), abs=1e-6)  # the direction of the first
+    assert obs[:, 22:25] == pytest.approx(np.array([[-1.0, 0, 0]] * 64), abs=1e-6)  # and of the same, in reverse
 
 
 @pytest.mark.parametrize(
@@ -460,19 +459,20 @@ def test_the_air_of_a_vehicle_is_that_of_a_race():
     assert not step.terminated.any()
 
 
-def test_what_stands_there_is_drawn(race):
+def test_what_stands_there_is_drawn(racing):
+    boxes = racing(2).env.boxes(racing(2).restarted[1])
+    assert boxes.shape == (64, 4 * 5 + 4, 15)
+    assert not np.allclose(boxes[0], boxes[1])
+
+
+@pytest.mark.long
+def test_a_race_is_drawn_and_filmed(race, tmp_path):
     files = lem.plot(race)
     assert "flight.png" in {file.name for file in files}
     assert "error.png" not in {file.name for file in files}
     env = registry.make("DroneGates-v0", 4, kwargs=race.policy.config.env_kwargs)
     env.restart(0)
-    boxes = env.scene.boxes()
-    assert boxes.shape == (4, 4 * 5 + 4, 15)
-    assert not np.allclose(boxes[0], boxes[1])
-
-
-@pytest.mark.long
-def test_a_race_is_filmed(race, tmp_path):
+    assert env.scene.boxes().shape == (4, 4 * 5 + 4, 15)
     film = tmp_path / "race.gif"
     lem.watch(race.policy, episodes=1, video=film)
     assert film.stat().st_size > 10_000
