@@ -259,6 +259,10 @@ def test_what_a_setting_brings_about_gives_way_to_it(name, shown):
     assert names(**shown, changed={"learning_rate": 0.1}) == ["setting-learning-rate"]
 
 
+def test_where_every_return_is_alike_the_environment_stands_still_and_not_its_observation():
+    assert names(observation__repeated=[0.7] * 8, returns=[50.0] * 400) == ["every-return-alike"]
+
+
 def test_returns_that_have_arrived_rise_no_more():
     arrived = [*np.linspace(20, 480, 300), *[500] * 100]
     assert "still-rising" not in {one.name for one in diagnose(evidence(returns=arrived))}

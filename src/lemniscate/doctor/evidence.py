@@ -77,6 +77,11 @@ class Evidence:
         return self.late("observation/constant") == 1
 
     @property
+    def is_alike(self) -> bool:
+        """Whether all episodes have the same return, of ten or more."""
+        return len(self.returns) >= 10 and bool(np.ptp(self.returns) <= 1e-6 * (1 + abs(self.returns[0])))
+
+    @property
     def begins(self) -> bool:
         """Whether Q has hardly begun: with replay it comes slowly, and the first policies are worse than chance."""
         return "tau" in self.config and bool(self.log) and self.log[-1]["step"] < 20_000

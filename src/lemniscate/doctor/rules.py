@@ -97,7 +97,7 @@ def of_observations(e: Evidence) -> Seen:
             "Every number of the observation was the same in all of the newest rows, each time that they were looked"
             " at.",
         )
-    elif repeated > 0.5 and not cut > 0.5:
+    elif repeated > 0.5 and not cut > 0.5 and not e.is_alike:  # else the environment itself stands still
         yield (
             "observation-repeated",
             f"After {repeated:.0%} of the steps the observation was the same as before.",
@@ -195,7 +195,6 @@ def of_episodes(e: Evidence) -> Seen:
     """Faults of the episodes: their starts, lengths and ends."""
     late, terminated = e.lengths[len(e.lengths) // 2 :], e.late("episode/terminated")
     short = len(e.lengths) >= 20 and np.percentile(e.lengths, 90) <= 2
-    alike = len(e.returns) >= 10 and np.ptp(e.returns) <= 1e-6 * (1 + abs(e.returns[0]))
     starts = e.values("observation/starts_alike")
     if e.repeats is False:
         yield "seed-ignored", "Two resets with the same seed began with different observations."
@@ -206,7 +205,7 @@ def of_episodes(e: Evidence) -> Seen:
             "short-episodes",
             f"Nine of ten episodes took no more than {np.percentile(e.lengths, 90):.0f} steps.",
         )
-    elif alike and e.returns.any():
+    elif e.is_alike and e.returns.any():
         yield (
             "every-return-alike",
             f"All {len(e.returns):,} episodes had the same return, {e.returns[0]:,.4g}, whatever was done.",
