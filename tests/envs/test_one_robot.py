@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import lemniscate as lem
-from lemniscate.api.options import StopAt
+from lemniscate.api.callbacks import StopAt
 from lemniscate.run.metrics import read_metrics
 
 

@@ -22,7 +22,7 @@ import toy
 from conftest import tiny_fields, tiny_off_policy
 from forks import command
 from helpers import long
-from lemniscate.api.options import StopAt
+from lemniscate.api.callbacks import StopAt
 from lemniscate.nn.normalizer import RewardScale
 from lemniscate.run import checkpoint
 from lemniscate.run.directory import Saver

@@ -13,15 +13,8 @@ from typing import Any
 import torch
 
 from lemniscate import algos, presets
-from lemniscate.api.options import (
-    Callback,
-    PolicySnapshot,
-    RunOptions,
-    call_callbacks,
-    own_names,
-    require_importable,
-    train_in_processes,
-)
+from lemniscate.api.callbacks import Callback, PolicySnapshot, call_callbacks
+from lemniscate.api.options import RunOptions, own_names, require_importable, train_in_processes
 from lemniscate.api.policy import TrainedPolicy, TrainedRun, load, path_of
 from lemniscate.doctor import Attendance
 from lemniscate.envs import registry

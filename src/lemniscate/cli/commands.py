@@ -14,7 +14,6 @@ from lemniscate.envs import registry
 from lemniscate.errors import UserError, is_installed, missing_extra, unknown_name
 from lemniscate.run.directory import SWEEP, TUNE
 from lemniscate.run.fields import flag
-from lemniscate.run.run import is_compiled
 from lemniscate.system.console import say, talks
 from lemniscate.system.watchdog import end_with_owner
 
@@ -39,7 +38,7 @@ def train(
         name, preset, config = training.choose_config(algorithm, env, preset, fields)
         registry.backend_class(str(config.backend))  # refuses one that is not there
         what = f"{name} on {config.num_envs} × {config.env}, backend {config.backend}"
-        tell(f"{what}: preset {preset}, seed {config.seed}, {'compiled' if is_compiled(config) else 'not compiled'}")
+        tell(f"{what}: preset {preset}, seed {config.seed}, {'compiled' if config.is_compiled else 'not compiled'}")
         if left := {name: value for name, value in usual.items() if name not in config.env_kwargs}:
             tell(f"--env-args takes the place of the preset's, of which {notation.dumps(left)} is left out.")
         trained = training.begin(name, config, run, options)

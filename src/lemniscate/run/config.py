@@ -23,6 +23,8 @@ from lemniscate.types import Schedule
 
 MOST_WHOLE, MOST_REAL = 10**15, 1e38
 """the largest numbers of a field: float64, and so JSON, counts exactly to 9e15; the float32 of networks ends at 3e38"""
+WORTH_COMPILING = 15_000
+"""gradient steps from which on a run ends sooner if they are compiled"""
 MOST_ITEMS = 1_000
 """the most values of a field that has several"""
 WANTED = {bool: "True or False", str: "a text", dict: "a dictionary, such as {'gravity': -5}", NoneType: "None"}
@@ -231,6 +233,16 @@ class RunConfig:
     def gradient_steps(self) -> int:
         """The number of gradient steps of the whole run."""
         raise NotImplementedError
+
+    @property
+    def is_compiled(self) -> bool:
+        """Whether a run is compiled: as configured; with "auto", if it is long enough to repay the compilation.
+
+        A loop over the steps of a piece takes many minutes to compile: networks with a memory are not, by themselves.
+        """
+        layers = getattr(self, "layers", None)
+        repays = self.gradient_steps >= WORTH_COMPILING and not (layers and layers.remembers)
+        return self.compile == "on" or (self.compile == "auto" and repays)
 
     def generators(self, device: torch.device) -> Generators:
         """New random generators, seeded by the run's seed."""

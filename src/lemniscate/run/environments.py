@@ -1,6 +1,7 @@
-"""The environments of a run, for training and for evaluation, and whether there is room for it."""
+"""The environments of a run, for training and for evaluation, their curriculum, and whether there is room for it."""
 
-from collections.abc import Callable, Mapping
+import json
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, nullcontext, suppress
 from typing import Any
 
@@ -11,8 +12,9 @@ from lemniscate.envs.symmetry import Mirror, find_mirror
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError, shown
 from lemniscate.nn.networks import NETWORKS
-from lemniscate.run.config import RunConfig
+from lemniscate.run.config import RunConfig, plain
 from lemniscate.spec import Spec
+from lemniscate.system import named
 from lemniscate.system.machine import require_free
 from lemniscate.system.world import World
 
@@ -118,6 +120,45 @@ def env_arguments(
     if env is None and backend is None:
         backend = registry.for_evaluation(config.backend)
     return {"env": name, "kwargs": kwargs, "wrappers": config.all_wrappers, "backend": backend}
+
+
+class Curriculum:
+    """The function that a Config names, which decides at new lines of metrics on calls of the environments.
+
+    Args:
+        name: of a function of (step, metrics).
+        world: in every process the calls are those that rank 0 decides on.
+
+    Raises:
+        UserError: one that cannot be found or called.
+    """
+
+    def __init__(self, name: str, world: World) -> None:
+        self._decide, self._world = named.find_callable(name), world
+        if not named.takes(self._decide, 2):
+            raise UserError(f"A curriculum must be a function of (step, metrics), not {shown(self._decide)}.")
+
+    def decide(self, lines: Sequence[tuple[int, Mapping[str, float]]]) -> list[dict[str, Any]]:
+        """The calls of each line, by method."""
+        return self._world.from_first(
+            [decide(self._decide, step, metrics) for step, metrics in lines] if self._world.is_first else []
+        )
+
+
+def decide(curriculum: Callable[..., Any], step: int, metrics: Mapping[str, float]) -> dict[str, Any]:
+    """The calls that a curriculum returns, as JSON holds them, so that they are the same from a checkpoint.
+
+    Raises `UserError` for what it raises, and for what is no such dictionary.
+    """
+    try:  # without the measured times: on them a run would not have the same bits twice
+        calls = curriculum(step, {name: value for name, value in metrics.items() if not name.startswith("time/")})
+    except Exception as error:
+        raise UserError(f"The curriculum raised {type(error).__name__} at step {step:,}: {error}") from error
+    with suppress(TypeError, ValueError, AttributeError, RecursionError):
+        if isinstance(calls, Mapping) and all(isinstance(name, str) for name in calls):
+            return json.loads(json.dumps(dict(calls), allow_nan=False, default=plain))
+    wanted = "a dictionary of methods with an argument each that JSON can hold, such as {'set_level': 1}"
+    raise UserError(f"The curriculum must return {wanted}; at step {step:,} it returned {shown(calls)}.")
 
 
 def device_for(name: str) -> torch.device:

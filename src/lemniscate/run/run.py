@@ -9,27 +9,27 @@ At a planned checkpoint the environments restart from a seed derived from (run s
 one that is resumed. So both end in the same bits, whatever the simulator.
 """
 
-import json
 import math
 import random
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import torch
 
 from lemniscate.envs.vec_env import Episodes, VecEnv
-from lemniscate.errors import NonFiniteError, NotStoredError, UserError, resume_line, shown
+from lemniscate.errors import NonFiniteError, NotStoredError, UserError, resume_line
 from lemniscate.nn.memory import Carrier
 from lemniscate.optim.compiled import Compiler
-from lemniscate.run.config import RunConfig, plain
+from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import Saver, load_networks
+from lemniscate.run.environments import Curriculum
 from lemniscate.run.evaluate import critic_of, evaluate
 from lemniscate.run.loggers import NO_EPISODES, Logger, LoggerClass
 from lemniscate.run.metrics import read_metrics
@@ -37,12 +37,8 @@ from lemniscate.run.seeding import derive, seed_globals
 from lemniscate.run.signals import LOOKS, acted_with, signals
 from lemniscate.run.state import TrainState, require_agreement
 from lemniscate.run.stopping import Stopped, StopRequest
-from lemniscate.system import named
 from lemniscate.system.console import ProgressBar, say
 from lemniscate.system.world import World
-
-WORTH_COMPILING = 15_000
-"""gradient steps from which on a run ends sooner if they are compiled"""
 
 AGREED_EVERY = 16
 """steps of the environments after which several processes ask each other whether one is to stop"""
@@ -123,7 +119,7 @@ class Run:
             saver.save(state, planned=True)
         if restored and self._curriculum:
             self.env.backend.call(saver.calls)
-        compiled = is_compiled(self.config)
+        compiled = self.config.is_compiled
         if compiled and self._visible:
             say("Compiling: up to a minute the first time, 5 to 10 s from then on.")
         state.prepare(self.world, self._compiler if compiled else None)
@@ -235,8 +231,8 @@ class Run:
                 state.mean.move_to(state.policy)
         if _passed(config.evaluate_every, before, step):
             self._evaluate(state)
-        if config.curriculum:
-            self._advance_curriculum(self._unobserved)
+        if self._curriculum:
+            self._advance_curriculum(self._curriculum, self._unobserved)
         by_episodes = _passed(config.video_every_episodes, self._body.episodes, self._episodes)
         if by_episodes or _passed(config.video_every, before, step):
             self._record(state)
@@ -302,23 +298,17 @@ class Run:
             if self._visible:
                 say(sentence)
         if self._curriculum:
-            self._advance_curriculum([(0, {})])
+            self._advance_curriculum(self._curriculum, [(0, {})])
 
     @cached_property
-    def _curriculum(self) -> Any:
-        """The function that the Config names, if it does. Raises `UserError` for one that cannot be found or called."""
-        function = named.find_callable(self.config.curriculum) if self.config.curriculum else None
-        if function and not named.takes(function, 2):
-            raise UserError(f"A curriculum must be a function of (step, metrics), not {shown(function)}.")
-        return function
+    def _curriculum(self) -> Curriculum | None:
+        name = self.config.curriculum
+        return Curriculum(name, self.world) if name else None
 
-    def _advance_curriculum(self, lines: Sequence[tuple[int, Mapping[str, float]]]) -> None:
-        """Make the calls that the curriculum decides on at each new line; those of rank 0, in every process."""
-        decided = list[dict[str, Any]]()
-        if self.world.is_first:
-            with globals_undisturbed():
-                decided = [decide(self._curriculum, step, metrics) for step, metrics in lines]
-        for calls in self.world.from_first(decided):
+    def _advance_curriculum(self, curriculum: Curriculum, lines: Sequence[tuple[int, Mapping[str, float]]]) -> None:
+        with globals_undisturbed():
+            decided = curriculum.decide(lines)
+        for calls in decided:
             self.env.backend.call(calls)
             self._saver.calls |= calls
 
@@ -370,22 +360,6 @@ class Run:
         self._unobserved.append((step, numbers))
 
 
-def decide(curriculum: Callable[..., Any], step: int, metrics: Mapping[str, float]) -> dict[str, Any]:
-    """The calls that a curriculum returns, as JSON holds them, so that they are the same from a checkpoint.
-
-    Raises `UserError` for what it raises, and for what is no such dictionary.
-    """
-    try:  # without the measured times: on them a run would not have the same bits twice
-        calls = curriculum(step, {name: value for name, value in metrics.items() if not name.startswith("time/")})
-    except Exception as error:
-        raise UserError(f"The curriculum raised {type(error).__name__} at step {step:,}: {error}") from error
-    with suppress(TypeError, ValueError, AttributeError, RecursionError):
-        if isinstance(calls, Mapping) and all(isinstance(name, str) for name in calls):
-            return json.loads(json.dumps(dict(calls), allow_nan=False, default=plain))
-    wanted = "a dictionary of methods with an argument each that JSON can hold, such as {'set_level': 1}"
-    raise UserError(f"The curriculum must return {wanted}; at step {step:,} it returned {shown(calls)}.")
-
-
 @contextmanager
 def globals_undisturbed() -> Iterator[None]:
     """Restore the global generators afterwards: Python's, NumPy's legacy one, torch's on the CPU and on every GPU."""
@@ -413,16 +387,6 @@ def require_finite(state: TrainState, numbers: Mapping[str, float]) -> None:
         if len(bad):
             said = f"The parameter {name} is {bad[0].item()} after the update"
             raise NonFiniteError(f"{said} that ends at step {state.step:,}.")
-
-
-def is_compiled(config: RunConfig) -> bool:
-    """Whether a run is compiled: as configured; with "auto", if it is long enough to repay the compilation.
-
-    A loop over the steps of a piece takes many minutes to compile, so networks with a memory are not, by themselves.
-    """
-    layers = getattr(config, "layers", None)
-    repays = config.gradient_steps >= WORTH_COMPILING and not (layers and layers.remembers)
-    return config.compile == "on" or (config.compile == "auto" and repays)
 
 
 def _passed(every: int, before: int, after: int) -> bool:

@@ -193,7 +193,7 @@ class _Tuner(SetOfRuns):
                     break
                 trial = self._take_up(self._search.ask(self._study))
             until = self._search.rungs[trial.rung]
-            options = ["--callbacks", f"lemniscate.api.options:StopAt(steps={until})"] if until else []
+            options = ["--callbacks", f"lemniscate.api.callbacks:StopAt(steps={until})"] if until else []
             run = trial.waiting.pop(0)
             trial.training.add(run)
             self._start(run, options)
