@@ -323,6 +323,19 @@ def test_a_flight_through_all_gates_is_counted(racing):
     assert all(reward > 3 for reward in rewards[1::2])
 
 
+def test_a_crash_costs_what_is_said(racing):
+    import jax.numpy as jnp
+
+    rewards = []
+    for drones in (racing(0), racing(0, crash=20)):
+        data = drones.restarted[0]
+        with drones._at(drones.restarted) as env:
+            env.sim.data = data.replace(states=data.states.replace(pos=jnp.full((64, 1, 3), 9.0)))
+            env.advance(jnp.zeros((64, 4)))
+            rewards.append(np.asarray(env.reward()))
+    assert rewards[0] - rewards[1] == pytest.approx(np.full(64, 14.0), abs=1e-3)
+
+
 def raced(path, **kwargs):
     """A short training of 4 drones at level 2, in episodes of 2 s."""
     fields = {"num_envs": 4, "num_steps": 64, "total_steps": 1_024, "minibatch_size": 64, "epochs": 2, "seed": 1}
@@ -383,6 +396,8 @@ def test_a_track_of_ones_own_is_read(racing, tmp_path):
         ({"level": True}, "level of DroneGates-v0 must be 0, 1, 2 or 3, not True"),
         ({"control": "thrust"}, "control of DroneGates-v0 must be attitude or body_rate, not 'thrust'"),
         ({"control": "body_rate", "dynamics": "so_rpy"}, "body_rate needs the dynamics first_principles"),
+        ({"crash": -1}, "crash of DroneGates-v0 must be a number from 0 on, its cost, not -1"),
+        ({"crash": True}, "crash of DroneGates-v0 must be a number from 0 on, its cost, not True"),
         ({"track": "none.toml"}, "none.toml is no track"),
         ({"levle": 1}, "did you mean level"),
     ],

@@ -197,14 +197,15 @@ class DroneGates(DroneEnv):
     the two nearest, x and y (m); `last_action` 4; `race` 3: the share of gates that is left, and whether the true place
     of the next two is known. But for the place, all is along the world's axes, as an attitude is commanded.
 
-    The reward of a step is 3 for each metre of the way to the next gate's centre (`way_left`), 3 for a gate, −6 for a
-    crash; less 0.05, 0.0005 |ω|² (rad²/s²), 0.01 for the squared change of the action and, while at levels 2 and 3 the
-    true place of the next gate is not known, 0.2 for the square of what is above `CAREFUL` of the speed.
+    The reward of a step is 3 for each metre of the way to the next gate's centre (`way_left`), 3 for a gate, −`crash`
+    for a crash; less 0.05, 0.0005 |ω|² (rad²/s²), 0.01 for the squared change of the action and, while at levels 2 and
+    3 the true place of the next gate is not known, 0.2 for the square of what is above `CAREFUL` of the speed.
 
     Args:
         level: 0, 1, 2 or 3.
         track: a file as `gates.toml`; the laboratory's course by default.
         control: of what an action is: "attitude" (roll, pitch, yaw) or "body_rate", beside the thrust of all rotors.
+        crash: what a crash costs; the more, the slower and the surer it is worth while to fly.
         num_envs: N.
         max_episode_time: s.
         dynamics: crazyflow's; body rates need first_principles.
@@ -213,7 +214,7 @@ class DroneGates(DroneEnv):
         device: of JAX.
 
     Raises:
-        UserError: a level, a control or a track that is none.
+        UserError: a level, a control, a track or a cost that is none.
     """
 
     controls: tuple[str, ...] = ("attitude", "body_rate")
@@ -225,6 +226,7 @@ class DroneGates(DroneEnv):
         level: int = 0,
         track: str | None = None,
         control: str = "attitude",
+        crash: float = 6.0,
         *,
         num_envs: int = 1,
         max_episode_time: float = 30.0,
@@ -239,7 +241,11 @@ class DroneGates(DroneEnv):
             raise UserError(f"control of DroneGates-v0 must be attitude or body_rate, not {shown(control)}.")
         if control == "body_rate" and dynamics != "first_principles":
             raise UserError(f"control body_rate needs the dynamics first_principles, not {dynamics}.")
-        self.level, self.track = level, read_track(track)
+        if isinstance(crash, bool) or not isinstance(crash, int | float) or not 0 <= crash < math.inf:
+            raise UserError(
+                f"crash of DroneGates-v0 must be a number from 0 on, what a crash costs, not {shown(crash)}."
+            )
+        self.level, self.track, self.crash = level, read_track(track), float(crash)
         shared = {"num_envs": num_envs, "max_episode_time": max_episode_time, "drone": drone, "freq": freq}
         super().__init__(dynamics=dynamics, device=device, reset_randomization=_as_it_is, **shared)
         if control != "attitude":
@@ -417,7 +423,7 @@ class DroneGates(DroneEnv):
         hurry = jnp.maximum(jnp.linalg.norm(states.vel[:, 0], axis=-1) - CAREFUL, 0.0)
         hurry = jnp.where(self._sees_next(0) | (self.level < 2), 0.0, hurry)
         change = jnp.square(action - self._last_action).sum(-1)
-        self._gain = 3 * progress + 3.0 * passed - 6.0 * self._crashed - 0.05 - 0.0005 * rates - 0.01 * change
+        self._gain = 3 * progress + 3.0 * passed - self.crash * self._crashed - 0.05 - 0.0005 * rates - 0.01 * change
         self._gain -= 0.2 * jnp.square(hurry)
         self._last_action = action
 
