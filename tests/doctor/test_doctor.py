@@ -271,6 +271,8 @@ def test_returns_that_have_arrived_rise_no_more():
 def test_a_policy_that_descends_q_is_named():
     assert names("td3", action__preferred=[0.5] * 3 + [0.2] * 5) == ["advantage-opposed"]
     assert names("td3", action__preferred=[0.05] * 3 + [0.5] * 5) == []
+    few = {"update_every": 128}
+    assert "advantage-opposed" not in names("td3", action__preferred=[0.1] * 8, steps=3_000, changed=few)
 
 
 def test_returns_that_fall_while_q_begins_are_no_finding():

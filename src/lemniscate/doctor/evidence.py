@@ -86,6 +86,11 @@ class Evidence:
         """Whether Q has hardly begun: with replay it comes slowly, and the first policies are worse than chance."""
         return "tau" in self.config and bool(self.log) and self.log[-1]["step"] < 20_000
 
+    @property
+    def q_steps(self) -> float:
+        """The gradient steps that Q has had, with replay."""
+        return self.config.get("replay_ratio", 0.0) * self.log[-1]["step"] if self.log else 0.0
+
     @cached_property
     def rose(self) -> bool:
         """Whether the last fifth of the episodes is better than the first: by three standard errors, and by 0.3 std."""

@@ -318,7 +318,7 @@ def of_advantages(e: Evidence) -> Seen:
             f"Changes of log π and advantages have a correlation of {followed.mean():.2f}: none.",
         )
     preferred = e.late("action/preferred")
-    if preferred < 0.4:  # healthy runs have 0.7 or more
+    if preferred < 0.4 and e.q_steps >= 500:  # healthy runs have 0.7 or more; a Q of few steps says nothing
         yield (
             "advantage-opposed",
             f"In {preferred:.0%} of the sampled states Q of the policy's action is above that of one at random.",
