@@ -1240,7 +1240,7 @@ MUTANTS = [
     ),
     (
         "every process cuts as the first",
-        "envs/backend.py",
+        "envs/vec_env.py",
         "self._steps_left = drawn[first:]",
         "self._steps_left = drawn[:num_envs]",
         "envs/test_vec_env.py::test_first_episodes_are_cut_alike_in_any_process",
@@ -1548,7 +1548,7 @@ MUTANTS = [
     ),
     (
         "first episodes are never cut",
-        "envs/backend.py",
+        "envs/vec_env.py",
         "(self._steps_left == 0) & ~terminated",
         "(self._steps_left == -2) & ~terminated",
         "envs/test_episodes.py::test_first_episodes_are_cut_at_all_steps_up_to_the_limit_and_later_ones_are_not",

@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from lemniscate.envs.backend import Stagger
-from lemniscate.envs.vec_env import LOG_ROWS, EpisodeStatistics, episode_sums
+from lemniscate.envs.vec_env import LOG_ROWS, EpisodeStatistics, Stagger, episode_sums
 from lemniscate.types import Step
 
 

@@ -329,29 +329,3 @@ class Joined(Backend):
     def _look(self) -> None:
         self.counts = torch.cat([backend.counts for backend in self._backends])
         self.notices = self._backends[0].notices  # the others observe the same
-
-
-class Stagger:
-    """The first episode of each of N environments is cut after a random number of steps, uniform up to the time limit.
-
-    A cut counts as a truncation. Without a `limit`, in steps, there are no cuts, and every episode is whole. `first` is
-    the number of the first of these in the run: all are drawn for, so that each is cut alike in any process.
-    """
-
-    def __init__(self, num_envs: int, limit: int | None, seed: int, first: int = 0) -> None:
-        self._steps_left = np.full(num_envs, -1)
-        if limit is not None:
-            drawn = np.random.default_rng(seed).integers(1, limit, first + num_envs, endpoint=True)
-            self._steps_left = drawn[first:]
-        self.counts = self._steps_left < 0
-        """[N] bool: the environment's present episode began at its beginning and is not to be cut"""
-
-    def apply(self, terminated: np.ndarray, truncated: np.ndarray) -> np.ndarray:
-        """After one more step in every environment: `truncated` [N], with the cuts that are due."""
-        if self.counts.all():
-            return truncated
-        self._steps_left -= 1
-        truncated = truncated | ((self._steps_left == 0) & ~terminated)
-        self._steps_left[terminated | truncated] = -1
-        self.counts = self._steps_left < 0
-        return truncated

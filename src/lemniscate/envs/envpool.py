@@ -10,10 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lemniscate.envs.backend import Backend, Stagger
+from lemniscate.envs.backend import Backend
 from lemniscate.envs.conversion import SUCCESS, flatten_observation, measured, physical_action, row_of
 from lemniscate.envs.registry import BEGINNINGS
 from lemniscate.envs.spaces import SUMMARIES, ActionMasks, action_kind, is_image, masked, observation_parts
+from lemniscate.envs.vec_env import Stagger
 from lemniscate.errors import UserError, is_installed, missing_extra, unknown_name
 from lemniscate.spec import Spec
 from lemniscate.system.machine import cores

@@ -11,10 +11,11 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from torch import Tensor
 
 from lemniscate.envs import spaces
-from lemniscate.envs.backend import Backend, Stagger
+from lemniscate.envs.backend import Backend
 from lemniscate.envs.conversion import flatten_observation, measured, measures_of, physical_action, row_of
 from lemniscate.envs.factory import is_own, make_one, make_vector, maker_of, makes_vector, sentences
 from lemniscate.envs.returns import mask_in
+from lemniscate.envs.vec_env import Stagger
 from lemniscate.envs.workers import WatchedVectorEnv, call_method
 from lemniscate.errors import UserError
 from lemniscate.spec import Discrete, MultiDiscrete, Spec

@@ -6,6 +6,7 @@ from collections import deque
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -256,3 +257,29 @@ def episode_sums(rows: Tensor, done: Tensor, carried: Tensor) -> Tensor:
     after_end = torch.where(done, next_row, 0).cummax(0).values
     first_row = torch.cat([torch.zeros_like(after_end[:1]), after_end[:-1]])  # of the episode at hand, or 0
     return sums[:, 1:] - sums.gather(1, first_row.expand(len(rows), -1, -1))
+
+
+class Stagger:
+    """The first episode of each of N environments is cut after a random number of steps, uniform up to the time limit.
+
+    A cut counts as a truncation. Without a `limit`, in steps, there are no cuts, and every episode is whole. `first` is
+    the number of the first of these in the run: all are drawn for, so that each is cut alike in any process.
+    """
+
+    def __init__(self, num_envs: int, limit: int | None, seed: int, first: int = 0) -> None:
+        self._steps_left = np.full(num_envs, -1)
+        if limit is not None:
+            drawn = np.random.default_rng(seed).integers(1, limit, first + num_envs, endpoint=True)
+            self._steps_left = drawn[first:]
+        self.counts = self._steps_left < 0
+        """[N] bool: the environment's present episode began at its beginning and is not to be cut"""
+
+    def apply(self, terminated: np.ndarray, truncated: np.ndarray) -> np.ndarray:
+        """After one more step in every environment: `truncated` [N], with the cuts that are due."""
+        if self.counts.all():
+            return truncated
+        self._steps_left -= 1
+        truncated = truncated | ((self._steps_left == 0) & ~terminated)
+        self._steps_left[terminated | truncated] = -1
+        self.counts = self._steps_left < 0
+        return truncated
