@@ -3,6 +3,7 @@
 
 .venv/bin/python benchmarks/race.py train --levels 0 2 --seeds 1 2 3 4 5
 .venv/bin/python benchmarks/race.py train --algorithm shac,ppo --levels 0     SHAC, and PPO from there
+.venv/bin/python benchmarks/race.py train --algorithm ppo,ppo --levels 2      PPO, and PPO from there, careful
 .venv/bin/python benchmarks/race.py controller
 .venv/bin/python benchmarks/race.py table
 .venv/bin/python benchmarks/race.py levels          docs/images/gates_levels.png
@@ -29,17 +30,17 @@ from scipy.interpolate import CubicSpline
 from lemniscate.drones import gates
 from lemniscate.drones.drones import Drones
 
-PRESETS = {0: "gates", 1: "gates", 2: "gates-moved"}
+PRESETS = {0: ("gates", "gates-finish"), 1: ("gates", "gates-finish"), 2: ("gates-moved", "gates-moved-finish")}
+"""of each level: the first, and that of an algorithm that goes on from there"""
 NAMES = ("success", "lap_seconds", "gates_passed", "crashed")
 
 
 def train(algorithm: str, level: int, seed: int) -> None:
-    """Train the preset of a level, and race a hundred times on tracks that training has not seen."""
+    """Train the presets of a level, and race a hundred times on tracks that training has not seen."""
     with tempfile.TemporaryDirectory() as scratch:
         seconds, before = 0.0, {}
-        for name in algorithm.split(","):
-            preset = "gates-finish" if before else PRESETS[level]
-            fields = {"preset": preset, "seed": seed, "run": f"{scratch}/{name}", "progress": False, **before}
+        for name, preset in zip(algorithm.split(","), PRESETS[level], strict=False):
+            fields = {"preset": preset, "seed": seed, "run": f"{scratch}/{preset}", "progress": False, **before}
             run = lem.train(name, "DroneGates-v0", **fields)
             seconds, before = seconds + run.seconds, {"warm_start": fields["run"]}
         found = lem.evaluate(run.policy, episodes=100, seed=1_000 + seed)
