@@ -39,7 +39,8 @@ def train(algorithm: str, level: int, seed: int) -> None:
     """Train the presets of a level, and race a hundred times on tracks that training has not seen."""
     with tempfile.TemporaryDirectory() as scratch:
         seconds, before = 0.0, {}
-        for name, preset in zip(algorithm.split(","), PRESETS[level], strict=False):
+        names = algorithm.split(",")
+        for name, preset in zip(names, PRESETS[level][: len(names)], strict=True):
             fields = {"preset": preset, "seed": seed, "run": f"{scratch}/{preset}", "progress": False, **before}
             run = lem.train(name, "DroneGates-v0", **fields)
             seconds, before = seconds + run.seconds, {"warm_start": fields["run"]}

@@ -361,9 +361,8 @@ def test_a_race_trains_and_is_evaluated(race):
 
 def test_body_rates_are_followed(tmp_path):
     require_measures(run := raced(tmp_path / "run", control="body_rate"))
-    env = registry.make(
-        "DroneGates-v0", 4, kwargs=run.policy.config.env_kwargs
-    )  # the training has compiled its program
+    # Of the same size, since the training has compiled its program.
+    env = registry.make("DroneGates-v0", 4, kwargs=run.policy.config.env_kwargs)
     env.restart(0)
     action = torch.tensor([[0.2, 0.0, 0.0, 0.6], [0.0, -0.2, 0.0, 0.6]]).repeat(2, 1)
     rates = [env.step(action).next_obs[:, 10:13] for _ in range(6)][-1]
@@ -472,6 +471,7 @@ def test_the_air_of_a_vehicle_is_that_of_a_race():
     step = env.step(torch.zeros(64, 4))
     assert torch.isfinite(step.next_obs).all()
     assert not step.terminated.any()
+    assert env.scene.boxes().shape == (64, 4 * 5 + 4, 15)
 
 
 def test_what_stands_there_is_drawn(racing):

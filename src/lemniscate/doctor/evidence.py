@@ -77,7 +77,7 @@ class Evidence:
         return self.late("observation/constant") == 1
 
     @property
-    def is_alike(self) -> bool:
+    def returns_alike(self) -> bool:
         """Whether all episodes have the same return, of ten or more."""
         return len(self.returns) >= 10 and bool(np.ptp(self.returns) <= 1e-6 * (1 + abs(self.returns[0])))
 

@@ -97,7 +97,7 @@ def of_observations(e: Evidence) -> Seen:
             "Every number of the observation was the same in all of the newest rows, each time that they were looked"
             " at.",
         )
-    elif repeated > 0.5 and not cut > 0.5 and not e.is_alike:  # else the environment itself stands still
+    elif repeated > 0.5 and not cut > 0.5 and not e.returns_alike:  # else the environment itself stands still
         yield (
             "observation-repeated",
             f"After {repeated:.0%} of the steps the observation was the same as before.",
@@ -205,7 +205,7 @@ def of_episodes(e: Evidence) -> Seen:
             "short-episodes",
             f"Nine of ten episodes took no more than {np.percentile(e.lengths, 90):.0f} steps.",
         )
-    elif e.is_alike and e.returns.any():
+    elif e.returns_alike and e.returns.any():
         yield (
             "every-return-alike",
             f"All {len(e.returns):,} episodes had the same return, {e.returns[0]:,.4g}, whatever was done.",

@@ -205,7 +205,7 @@ class DroneGates(DroneEnv):
         level: 0, 1, 2 or 3.
         track: a file as `gates.toml`; the laboratory's course by default.
         control: of what an action is: "attitude" (roll, pitch, yaw) or "body_rate", beside the thrust of all rotors.
-        crash: what a crash costs; the more, the slower and the surer it is worth while to fly.
+        crash: the cost of a crash; the larger, the slower and surer a policy flies.
         num_envs: N.
         max_episode_time: s.
         dynamics: crazyflow's; body rates need first_principles.

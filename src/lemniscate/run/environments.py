@@ -141,11 +141,11 @@ class Curriculum:
     def decide(self, lines: Sequence[tuple[int, Mapping[str, float]]]) -> list[dict[str, Any]]:
         """The calls of each line, by method."""
         return self._world.from_first(
-            [decide(self._decide, step, metrics) for step, metrics in lines] if self._world.is_first else []
+            [calls_of(self._decide, step, metrics) for step, metrics in lines] if self._world.is_first else []
         )
 
 
-def decide(curriculum: Callable[..., Any], step: int, metrics: Mapping[str, float]) -> dict[str, Any]:
+def calls_of(curriculum: Callable[..., Any], step: int, metrics: Mapping[str, float]) -> dict[str, Any]:
     """The calls that a curriculum returns, as JSON holds them, so that they are the same from a checkpoint.
 
     Raises `UserError` for what it raises, and for what is no such dictionary.
