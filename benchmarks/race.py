@@ -38,14 +38,14 @@ NAMES = ("success", "lap_seconds", "gates_passed", "crashed")
 def train(algorithm: str, level: int, seed: int) -> None:
     """Train the presets of a level, and race a hundred times on tracks that training has not seen."""
     with tempfile.TemporaryDirectory() as scratch:
-        seconds, before = 0.0, {}
+        seconds, steps, before = 0.0, 0, {}
         names = algorithm.split(",")
         for name, preset in zip(names, PRESETS[level][: len(names)], strict=True):
             fields = {"preset": preset, "seed": seed, "run": f"{scratch}/{preset}", "progress": False, **before}
             run = lem.train(name, "DroneGates-v0", **fields)
-            seconds, before = seconds + run.seconds, {"warm_start": fields["run"]}
+            seconds, steps, before = seconds + run.seconds, steps + run.policy.step, {"warm_start": fields["run"]}
         found = lem.evaluate(run.policy, episodes=100, seed=1_000 + seed)
-    row = {"algorithm": algorithm, "level": level, "seed": seed, "seconds": seconds, "steps": run.policy.step}
+    row = {"algorithm": algorithm, "level": level, "seed": seed, "seconds": seconds, "steps": steps}
     append("race", row | {name: found.measures.get(name) for name in NAMES} | provenance())
     print(row, found.measures, flush=True)
 

@@ -2,7 +2,9 @@
 
 import pytest
 import torch
+from gymnasium.vector import AutoresetMode
 
+import toy
 from lemniscate.envs import registry
 from lemniscate.envs.spaces import random_action
 from threads import in_world
@@ -52,3 +54,18 @@ def test_first_episodes_are_cut_alike_in_any_process():
     assert len(set(cuts.tolist())) > 4
     whole.close()
     part.close()
+
+
+def test_the_vectors_of_several_shards_are_described_as_one_is():
+    def described(world):
+        env = registry.make(toy.Countdown, 4, kwargs={"mode": "NEXT_STEP"}, world=world)
+        names = ("mode", "summaries", "scene", "baseline", "interface", "spec", "device")
+        try:
+            return type(env.backend).__name__, [getattr(env.backend, name) for name in names]
+        finally:
+            env.close()
+
+    (one,), (two,) = in_world(1, 1, described), in_world(2, 1, described)
+    assert (one[0], two[0]) == ("GymnasiumBackend", "Joined")
+    assert one[1] == two[1]
+    assert one[1][0] is AutoresetMode.NEXT_STEP

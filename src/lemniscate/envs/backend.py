@@ -290,8 +290,9 @@ class Joined(Backend):
     def __init__(self, backends: Sequence[Backend]) -> None:
         self._backends, one = backends, backends[0]
         self.num_envs = len(backends) * one.num_envs
-        self.spec, self.device, self.notices = one.spec, one.device, one.notices
+        self.spec, self.device, self.mode, self.notices = one.spec, one.device, one.mode, one.notices
         self.summaries, self.scene, self.baseline = one.summaries, one.scene, one.baseline
+        self.interface = one.interface
 
     def restart(self, seed: int, first: int = 0) -> Tensor:
         """Begin again; see `Backend.restart`."""
