@@ -98,9 +98,7 @@ def critic_loss(config: Config, state: State, critics: Critics, batch: Transitio
     next_action, log_prob = state.networks.policy(batch.next_obs).sample_with_log_prob(noise)
     next_value = state.targets(batch.next_obs, next_action).amin(0) - state.networks.temperature() * log_prob
     target = td_target(batch.reward, next_value, batch.terminated, gamma=config.gamma).detach()
-    critic_1, critic_2 = critics.members
-    loss_1, q = critic_1.loss(batch.obs, batch.action, target)
-    loss_2, _ = critic_2.loss(batch.obs, batch.action, target)
+    (loss_1, q), (loss_2, _) = (each.loss(batch.obs, batch.action, target) for each in critics.members)
     loss = loss_1 + loss_2
     return loss, {"losses/critic": loss.detach(), "q": q.detach().mean()}
 
