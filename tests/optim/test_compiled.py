@@ -38,6 +38,16 @@ def test_every_compiled_method_has_code_of_its_own(monkeypatch):
     assert len({id(code) for code in (*codes, Scale.twice.__code__)}) == 3
 
 
+def test_a_decorated_method_would_share_the_code_of_its_decorator_and_is_refused():
+    class Frozen(Scale):
+        @torch.no_grad()
+        def twice(self, x):
+            return 2 * self.factor * x
+
+    with pytest.raises(AssertionError, match="twice is decorated"):
+        Compiled(Frozen(3).twice, CPU, Compiler())
+
+
 def test_methods_keep_their_defaults_and_may_call_super(monkeypatch):
     class Shifted(Scale):
         def twice(self, x, offset=1.0, *, plus=0.5):

@@ -76,10 +76,11 @@ def _with_own_code(method: Callable[P, R]) -> Callable[P, R]:
     """A copy of the method with a code object of its own.
 
     torch.compile caches programs by code object; with the guards off, a shared one could return the program of another
-    object's method.
+    object's method. Nor may it be decorated: what stands around it would be torch's code, and shared again.
     """
     assert isinstance(method, MethodType)
     function = method.__func__
+    assert not hasattr(function, "__wrapped__"), f"{function.__qualname__} is decorated"
     code, names = function.__code__.replace(), function.__globals__
     copied = FunctionType(code, names, function.__name__, function.__defaults__, function.__closure__)
     copied.__kwdefaults__ = function.__kwdefaults__
