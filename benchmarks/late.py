@@ -11,7 +11,6 @@ docs/speed.md has what it gave. It has no checkpoints on the way: the rollout th
 
 from concurrent.futures import ThreadPoolExecutor
 from copy import deepcopy
-from functools import partial
 
 import torch
 
@@ -30,13 +29,10 @@ def train(config, run):
     with ThreadPoolExecutor(1) as second:
         rollout = None
         for env in run.until(config.total_steps, state):
-            ahead = partial(collect, env, acting, config.num_steps, noise)
-            if rollout is None:
-                acting.load_state_dict(state.policy.state_dict())
-                rollout = second.submit(ahead)
-            learned_from, episodes = rollout.result(), env.take_episodes()
             acting.load_state_dict(state.policy.state_dict())
-            rollout = second.submit(ahead)
-            run.log(state, update(config, state, learned_from), episodes)
-        rollout.result()
+            rollout = rollout or collect(env, acting, config.num_steps, noise)
+            episodes = env.take_episodes()
+            ahead = second.submit(collect, env, acting, config.num_steps, noise)
+            metrics, rollout = update(config, state, rollout), ahead.result()
+            run.log(state, metrics, episodes)
     return state

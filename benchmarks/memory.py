@@ -30,7 +30,7 @@ ENVS = {
     "cart_pole": (60_000, "500", SHARED),
     "pendulum": (400_000, "≥ −200", SHARED | {"gamma": 0.95, "sequence_length": 32, "desired_kl": None}),
     "RepeatFirst": (300_000, "1", SHARED | {"sequence_length": 64}),
-    "lunar_lander": (2_000_000, "≥ 200", SHARED | {"gamma": 0.995}),
+    "lunar_lander": (2_000_000, "≥ 200", SHARED | {"gamma": 0.995, "sequence_length": 32, "desired_kl": None}),
 }
 
 

@@ -339,6 +339,22 @@ def test_a_policy_says_the_q_of_an_action_in_the_units_of_the_environment(algori
         policy.value(obs)
 
 
+def test_q_of_a_choice_is_that_of_its_number(tmp_path):
+    config = lem.config_for("pqn", "CartPole-v1", hidden=(8,))
+    env = registry.make("CartPole-v1", 1)
+    policy = lem.TrainedPolicy(config.networks(env.spec), env.spec, config, 0)
+    env.close()
+    obs, action = np.random.default_rng(0).normal(size=(3, 4)).astype(np.float32), np.array([0, 1, 1])
+    with torch.no_grad():
+        values = policy.module(torch.from_numpy(obs)).values.numpy()
+    np.testing.assert_allclose(policy.q_value(obs, action), values[[0, 1, 2], action], rtol=1e-5)
+    assert policy.q_value(obs[0], policy.act(obs[0])) == pytest.approx(values[0].max(), rel=1e-5)
+    with pytest.raises(lem.UserError, match="action must be from 0 to below 2, not 2"):
+        policy.q_value(obs[0], 2)
+    with pytest.raises(lem.UserError, match=r"action must be finite numbers of the shape \(\), not 'left'"):
+        policy.q_value(obs[0], "left")
+
+
 @contextmanager
 def as_default(setter, value, before):
     setter(value)

@@ -309,6 +309,22 @@ def test_a_module_of_ones_own_that_forgets_to_return_its_memory_is_refused():
             )
 
 
+class InPlace(Leaky):
+    def forward(self, x, memory):
+        memory.mul_(0.9).add_(0.1 * torch.tanh(self.features(x)))
+        return self.head(memory), memory
+
+
+def test_a_module_may_write_its_memory_in_place(tmp_path):
+    found = []
+    for name in ("Leaky", "InPlace"):
+        fields = SETTINGS | {"network": f"test_memory:{name}", "minibatch_size": 16, "progress": False}
+        policy = lem.train("ppo", "CartPole-v1", run=tmp_path / name, **fields).policy
+        found.append([p for p in policy.networks.state_dict().values()])
+    for one, other in zip(*found, strict=True):
+        assert torch.equal(one, other)
+
+
 class Forgets(Leaky):
     def forward(self, x, memory):
         return self.head(torch.tanh(self.features(x)))
@@ -383,6 +399,8 @@ def test_act_says_what_is_wrong_with_another_number_of_episodes(trained):
     with pytest.raises(UserError, match=r"done has the shape \(2,\), of 3 episodes"):
         policy.reset([True, False])
     policy.reset()
+    policy.act(np.zeros(4))
+    policy.reset(True)  # of one episode
     assert policy.act(np.zeros(4, np.float32)).shape == ()
 
 

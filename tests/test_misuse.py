@@ -53,6 +53,27 @@ class Unseen(Sized):
         return None if self.picture is None else np.full((4, 4, 3), self.picture)
 
 
+class Several(Unseen):
+    """Two choices at once."""
+
+    action_space = gym.spaces.MultiDiscrete([2, 3])
+
+
+class Blank(Sized):
+    """An environment without `render`."""
+
+    def __init__(self, render_mode=None):
+        super().__init__(2)
+
+
+class Remembers(torch.nn.Linear):
+    """A network that says too late that it has a memory."""
+
+    def __init__(self, inputs, outputs):
+        super().__init__(inputs, outputs)
+        self.memory_size = 3
+
+
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     path = tmp_path_factory.mktemp("a folder") / "cartpole"
@@ -83,7 +104,7 @@ def test_runs_are_plotted_one_by_one_or_in_a_list(run):
     [
         (lambda run: lem.plot(), "nothing to plot: name one run or several"),
         (lambda run: lem.plot([]), "nothing to plot"),
-        (lambda run: lem.plot(lem.TrainedPolicy), "A run is a directory, .* not a type"),
+        (lambda run: lem.plot(lem.TrainedPolicy), "A run is a directory, .* not the class TrainedPolicy"),
         (lambda run: lem.load(None), "A run is a directory, .* not None"),
         (lambda run: lem.resume(3), "A run is a directory, .* not 3"),
         (lambda run: lem.watch(3), "A policy is a run, a function, a torch module, .* not 3"),
@@ -130,6 +151,18 @@ def test_runs_are_plotted_one_by_one_or_in_a_list(run):
         (lambda run: lem.make_vec("CartPole-v1", backend=3), "There is no backend 3"),
         (lambda run: run.policy.act(np.zeros(4), action_mask=[1, 0]), "CartPole-v1 has no action mask"),
         (lambda run: lem.train("ppo", "CartPole-v1", callbacks=[3]), "A callback must be a function of"),
+        (lambda run: lem.load(""), "A run is a directory, .* not ''"),
+        (lambda run: lem.evaluate(run, report=run.path / "config.json"), "report is a directory, .*config.json is a file"),
+        (lambda run: lem.evaluate(run, report=run.path / "config.json/x"), "json/x is a file, or lies in one"),
+        (lambda run: lem.train("ppo", "CartPole-v1", run=run.path / "config.json"), "config.json is a file, and a run is a dir"),
+        (lambda run: lem.train("ppo", "CartPole-v1", run=run.path / "config.json/x"), "config.json is a file, and a run is"),
+        (lambda run: lem.train("ppo", "./here:Env"), "names a file; name its module, without folder and ending, .*: here:Env"),
+        (lambda run: lem.train("ppo", "CartPole-v1", network=torch.nn.Linear(4, 2)), "network is a Linear that is made already"),
+        (lambda run: lem.train("ppo", "CartPole-v1", network=Remembers), "sets its memory_size too late; it must stand in the class"),
+        (lambda run: lem.train("ppo", "CartPole-v1", callbacks=lambda a, b: None), r"\(step, metrics, policy\), not lambda\(a, b\)"),
+        (lambda run: lem.train("pqn", Several), "has actions of kind MultiDiscrete; .* ppo learns here"),
+        (lambda run: lem.evaluate(run, env="Acrobot-v1"), r"cannot act in Acrobot-v1: it observes 4 numbers \(obs 4\) and acts by Discrete\(2\); there it would observe 6 numbers \(obs 6\) and act by Discrete\(3\)"),
+        (lambda run: lem.train("ppo", Blank, video_every=64), r"cannot be shown here: it has no render\(\) that returns a picture"),
         (lambda run: lem.make_envs("CartPole-v1"), "make_envs needs a Config, .* not 'CartPole-v1'"),
     ],
 )  # fmt: skip

@@ -207,7 +207,7 @@ WRONG = {
     "a class": (Net, "Net is a class: give an object of it"),
     "a class by name": ("test_own_policies:Net", "Net is a class"),
     "a number": (3, "A policy is a run, a function, a torch module, or an object with act, predict, .*; not 3"),
-    "two arguments": (two, "takes one observation; a function does not"),
+    "two arguments": (two, r"takes one observation; two\(obs, info\) does not"),
     "our module": (None, "acts in .* give the policy that it is of"),
     "another size": (
         nn.Linear(17, 2),

@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from difflib import get_close_matches
 from importlib.util import find_spec
+from inspect import signature
 from pathlib import Path
 from shlex import quote
 from typing import Any
@@ -76,7 +77,7 @@ def unknown_name(
 def shown(value: object) -> str:
     """A value in a sentence: as it is written if that is short, else its type."""
     try:
-        text = repr(value)
+        text = _signature(value) if callable(value) else repr(value)
     except (ValueError, RecursionError):  # Python writes no whole number of more than 4,300 digits
         text = "<"
     if len(text) <= 60 and not text.startswith("<") and "\n" not in text:
@@ -84,6 +85,16 @@ def shown(value: object) -> str:
     if isinstance(value, int):
         return f"a number of {int(math.log10(abs(value))) + 1:,} digits"
     return f"a {type(value).__name__}"
+
+
+def _signature(function: Any) -> str:
+    """A function in a sentence, by its name and what it takes, or a class."""
+    if isinstance(function, type):
+        return f"the class {function.__name__}"
+    try:
+        return f"{function.__name__}({', '.join(signature(function).parameters)})".replace("<lambda>", "lambda")
+    except (AttributeError, ValueError, TypeError):  # of objects that can be called, and of built-in functions
+        return repr(function)
 
 
 def wrong_action(env: str, action: Any, layout: tuple[Any, Any] | None) -> UserError:

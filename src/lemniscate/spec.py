@@ -1,7 +1,7 @@
 """The description of an environment that a policy needs: its observations, its actions, its time limit."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 from lemniscate.errors import UserError
@@ -38,7 +38,7 @@ class Box:
 
 @dataclass(frozen=True)
 class Discrete:
-    """One of n actions. A policy chooses 0 … n-1; the environment floor adds `start`.
+    """One of n actions. A policy chooses 0 … n-1; the environment floor adds `start`, and gives them as `dtype`.
 
     With `masked`, the environment says at each step which of them are valid, and the observation ends in that mask:
     n numbers, 1 or 0.
@@ -47,6 +47,7 @@ class Discrete:
     n: int
     start: int = 0
     masked: bool = False
+    dtype: str = field(default="int64", compare=False)
 
     @property
     def mask_size(self) -> int:
@@ -65,7 +66,7 @@ class MultiDiscrete:
     start: tuple[int, ...]
     shape: tuple[int, ...] | None = None
     masked: bool = False
-    dtype: str = "int64"
+    dtype: str = field(default="int64", compare=False)
 
     @property
     def mask_size(self) -> int:

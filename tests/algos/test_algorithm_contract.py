@@ -1,6 +1,5 @@
 """Every algorithm passes the contract that `lemniscate.testing` offers for algorithms of one's own."""
 
-import shutil
 import tempfile
 
 import pytest
@@ -140,15 +139,15 @@ def frozen_stays(algorithm, **options):
     settings = settings_of(algorithm) | {"network": Pretrained, "progress": False, **options}
     settings |= {"shards": 2} if algorithm != "shac" else {}
     every = settings["total_steps"] // 4
-    path = lem.train(algorithm, run=f"{tempfile.mkdtemp()}/r", checkpoint_every=every, **settings).path
-    steps = checkpoint.list_steps(path / "checkpoints")
-    first, last = (checkpoint.read(path / "checkpoints" / f"step-{step}").tensors for step in (steps[0], steps[-1]))
+    with tempfile.TemporaryDirectory() as folder:
+        path = lem.train(algorithm, run=f"{folder}/r", checkpoint_every=every, **settings).path / "checkpoints"
+        steps = checkpoint.list_steps(path)
+        first, last = (checkpoint.read(path / f"step-{step}").tensors for step in (steps[0], steps[-1]))
     own = [name for name in first if ".module." in name]
     assert own
     for name in own:
         frozen = name.rpartition(".module.")[2] in ("order", "scale", "encoder.weight", "encoder.bias")
         assert torch.equal(first[name], last[name]) == frozen, name
-    shutil.rmtree(path.parent)
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)

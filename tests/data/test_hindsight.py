@@ -229,6 +229,24 @@ def test_a_wrapper_that_changes_rewards_is_found_out(tmp_path):
         lem.train("sac", Walk, run=tmp_path / "r", wrappers=[double], progress=False, **SMALL)
 
 
+class LateBonus(gym.Wrapper):
+    """Doubles the rewards from the 40th step on."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.steps = 0
+
+    def step(self, action):
+        obs, reward, *rest = self.env.step(action)
+        self.steps += 1
+        return obs, reward if self.steps < 40 else 2 * reward, *rest
+
+
+def test_a_wrapper_that_changes_rewards_later_is_found_out_too(tmp_path):
+    with pytest.raises(UserError, match=r"the reward of .* is -2, and its compute_reward says -1: hindsight needs"):
+        lem.train("sac", Walk, run=tmp_path / "r", wrappers=[LateBonus], progress=False, **SMALL)
+
+
 def test_flattened_observations_have_no_goals(tmp_path):
     with pytest.raises(UserError, match="which needs goals"):
         lem.train("sac", Walk, run=tmp_path / "r", wrappers=[gym.wrappers.FlattenObservation], progress=False, **SMALL)

@@ -144,6 +144,14 @@ class Late(Board):
         return super().reset()[0], {}
 
 
+class Forgetful(Board):
+    """Each second step has no mask."""
+
+    def look(self):
+        obs, info = super().look()
+        return obs, info if self.t % 2 == 0 else {}
+
+
 class Long(Board):
     def look(self):
         return SEEN, {"action_mask": [1, 1, 1]}
@@ -176,6 +184,7 @@ class Pushed(Board):
             Long,
             r"Board.reset\(\) \(test_masks.py, line \d+\) comes with an action mask of 3 numbers, \[1, 1, 1\]; it must have 4",
         ),
+        (Forgetful, "gives an action mask in some steps and none in others: give one with each step"),
         (Single, r"comes with an action mask of 1 numbers, \[1\]; it must have 4, of 1 and 0"),
         (Stuck, r"rules out every action of environment 0: its action_mask is all zero"),
         (
@@ -188,7 +197,8 @@ def test_a_mask_that_cannot_be_followed_is_a_sentence(env, sentence):
     def play():
         made = registry.make(env, 2)
         made.restart(0)
-        made.step(random_action(made.spec, made.obs, torch.Generator()))
+        for _ in range(3):
+            made.step(random_action(made.spec, made.obs, torch.Generator()))
 
     with pytest.raises(UserError, match=sentence):
         play()
@@ -207,3 +217,21 @@ def test_a_mask_by_hand_is_looked_at():
         policy.act(SEEN, action_mask=[1, 1])
     with pytest.raises(UserError, match="permits nothing"):
         policy.act(SEEN, action_mask=([0, 0, 0], [1, 1, 1, 1]))
+
+
+@pytest.mark.parametrize("backend", ["gymnasium", "gymnasium-async"])
+@pytest.mark.parametrize("told", [True, False])
+def test_a_mask_holds_for_the_episode_and_none_permits_everything(told, backend):
+    class Once(Board):
+        def step(self, action):
+            return *super().step(action)[:4], {"action_mask": None} if told else {}
+
+    env = registry.make(Once, 2, backend=backend)
+    env.restart(0)
+    assert env.obs[:, 2:].tolist() == [[0, 1, 1, 1]] * 2
+    for _ in range(4):
+        env.step(random_action(env.spec, env.obs, torch.Generator()))
+        assert env.obs[:, 2:].tolist() == [[1 if told else 0, 1, 1, 1]] * 2
+    env.step(random_action(env.spec, env.obs, torch.Generator()))
+    assert env.obs[:, 2:].tolist() == [[0, 1, 1, 1]] * 2
+    env.close()

@@ -38,10 +38,15 @@ class Told(gym.Env):
         self.told = {"step": after() if step is None else step, "reset": (SEEN, {}) if reset is None else reset}
 
     def reset(self, *, seed=None, options=None):
-        return self.told["reset"]
+        return self.tell("reset")
 
     def step(self, action):
-        return self.told["step"]
+        return self.tell("step")
+
+    def tell(self, method):
+        if isinstance(self.told[method], SystemExit):
+            raise self.told[method]
+        return self.told[method]
 
 
 def played(backend="gymnasium", **told):
@@ -83,6 +88,8 @@ WRONG = {
     "an inner key": ({"reset": ({"a": SEEN, "b": {}}, {}), "space": DICT}, "an observation without c in b"),
     "no dictionary": ({"reset": (SEEN, {}), "space": DICT}, "its space is a Dict with the keys a, b"),
     "a shorter tuple": ({"reset": ((SEEN,), {}), "space": spaces.Tuple([TWO, TWO])}, "its space is a Tuple of 2"),
+    "leaving": ({"step": SystemExit(3)}, r"Told.step\(\) \(test_returned.py, line \d+\) called sys.exit\(3\), which would end"),
+    "leaving at once": ({"reset": SystemExit()}, r"Told.reset\(\) .* called sys.exit\(\), which would end"),
     "a measure of two": ({"step": after(info={"is_success": np.zeros(2)})}, r"returned an array of shape \(2,\).* as info\['is_success'\]; a measure is a number"),
 }  # fmt: skip
 
@@ -305,3 +312,55 @@ def test_the_numbers_of_info_are_curves_of_training_and_evaluation(tmp_path):
     scores = lem.evaluate(run.policy, episodes=2)
     assert scores.measures == {"info/energy": -0.5, "info/length": 4.0}
     assert scores.to_json()["info/energy"] == -0.5
+
+
+def test_spaces_stay_what_they_were():
+    class Growing(Told):
+        def reset(self, *, seed=None, options=None):
+            self.action_space = spaces.Discrete(2 + getattr(self, "resets", 0))
+            self.resets = 1
+            return super().reset(seed=seed, options=options)
+
+    env = registry.make(Growing, 1)
+    with pytest.raises(
+        UserError, match=r"made action_space Discrete\(3\); it was Discrete\(2\), and must stay what __in"
+    ):
+        env.restart(0)
+
+
+@pytest.mark.parametrize("final", [3.0, np.zeros(2), {"x": 1.0}, "text"])
+def test_entries_with_the_names_that_vectors_use_are_taken_for_nothing_else(final):
+    _, step = played(step=after(info={"final_info": final, "_final_info": 2, "final_obs": 1.0, "_x": 1, "height": 2.0}))
+    assert step.measures["info/height"].tolist() == [2]
+
+
+class Unmakable(Told):
+    def __init__(self, error):
+        raise error
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (FileNotFoundError(2, "No such file", "map.xml"), r"FileNotFoundError: \[Errno 2\] No such file: 'map.xml'"),
+        (RuntimeError("no simulator"), "RuntimeError: no simulator"),
+        (SystemExit("no licence"), "SystemExit: no licence"),
+    ],
+)
+@pytest.mark.parametrize("backend", ["gymnasium", "gymnasium-async"])
+def test_what_its_making_raises_is_said_with_the_place(error, said, backend):
+    with pytest.raises(UserError, match=rf"cannot be made: {said} \(test_returned.py, line \d+\)$"):
+        registry.make(lambda: Unmakable(error), 2, backend=backend)
+
+
+@pytest.mark.parametrize("backend", ["gymnasium", "gymnasium-async"])
+def test_copies_with_other_spaces_are_refused(backend):
+    made = count()
+
+    def make():
+        env = Told()
+        env.observation_space = spaces.Box(-1.0, 1.0 + next(made), (2,), np.float32)
+        return env
+
+    with pytest.raises(UserError, match=r"cannot be made: .* spaces are not equivalent"):
+        registry.make(make, 2, backend=backend)

@@ -2,6 +2,7 @@
 
 import sys
 
+import numpy as np
 import pytest
 import torch
 
@@ -14,6 +15,7 @@ from lemniscate.data.rollout import collect
 from lemniscate.envs import registry
 from lemniscate.envs.rsl_rl import RslRlBackend, RslRlVecEnv
 from lemniscate.errors import UserError
+from lemniscate.system import named
 
 pytest.importorskip("tensordict")
 runners = pytest.importorskip("rsl_rl.runners")
@@ -207,3 +209,90 @@ def test_groups_without_a_policys_are_refused():
 def test_it_serves_what_speaks_it():
     assert RslRlBackend.serves(registry.name_of(Cart()))
     assert not RslRlBackend.serves("CartPole-v1")
+
+
+class Columns(Cart):
+    """Its rewards, flags and log in other forms, the rewards in one buffer that it writes over."""
+
+    def step(self, actions):
+        obs, reward, dones, extras = super().step(actions)
+        self.paid = getattr(self, "paid", torch.zeros(self.num_envs, 1)).copy_(reward[:, None])
+        extras["log"] |= {"name": "a text", "none": None, "each": torch.ones(self.num_envs)}
+        return obs, self.paid, dones[:, None], extras | {"time_outs": extras["time_outs"][:, None]}
+
+
+def test_columns_and_buffers_that_are_written_over_are_read_as_they_were():
+    plain, other = (rollout_of(registry.make(kind(8), 8)) for kind in (Cart, Columns))
+    for name in ("obs", "reward", "terminated", "truncated"):
+        assert torch.equal(getattr(plain, name), getattr(other, name)), name
+    env = registry.make(Columns(8), 8)
+    env.restart(0)
+    measures = env.step(torch.zeros(8, 1)).measures
+    assert set(measures) == {"info/cart/distance", "info/count", "info/each"}
+
+
+class Bare(Cart):
+    def step(self, actions):
+        return *super().step(actions)[:3], None
+
+
+def test_nothing_beside_the_rewards_is_needed():
+    rollout = rollout_of(registry.make(Bare(8), 8))
+    assert rollout.terminated.any()
+    assert not rollout.truncated.any()
+
+
+def answering(method, change):
+    """A cart whose `method` returns what `change` makes of its returns."""
+    return type("Answering", (Cart,), {method: lambda self, *args: change(getattr(Cart, method)(self, *args))})(8)
+
+
+@pytest.mark.parametrize(
+    ("method", "change", "said"),
+    [
+        ("get_observations", lambda obs: (obs, {}), "a tuple from get_observations.*must be groups of observations by"),
+        (
+            "get_observations",
+            lambda obs: TensorDict({"policy": TensorDict({"x": obs["policy"]}, batch_size=[8])}, batch_size=[8]),
+            r"as policy; a group must be one Tensor \[8, …\], with its terms concatenated",
+        ),
+        (
+            "get_observations",
+            lambda obs: {"policy": obs["policy"][:3]},
+            r"an array of shape \(3, 2\) .* as policy; a group",
+        ),
+        (
+            "step",
+            lambda step: (*step, {}),
+            r"returns 5 values from step\(\); it must be 4, \(obs, rewards, dones, extras\)",
+        ),
+        ("step", lambda step: (step[0], step[1].numpy(), *step[2:]), r"as rewards; it must be a Tensor \[8\]"),
+        ("step", lambda step: (*step[:2], step[2][:3], step[3]), r"as dones; it must be a Tensor \[8\]"),
+        ("step", lambda step: (*step[:3], {"time_outs": True}), r"gives True as time_outs; it must be a Tensor \[8\]"),
+    ],
+)
+def test_what_is_returned_wrongly_is_said(method, change, said):
+    with pytest.raises(UserError, match=said):
+        rollout_of(registry.make(answering(method, change), 8))
+
+
+def test_what_is_made_already_takes_no_arguments_and_draws_no_film(tmp_path):
+    with pytest.raises(UserError, match="is made already, so env_kwargs such as mass do not reach it"):
+        registry.make(Cart(8), 8, kwargs={"mass": 1})
+    fields = {"num_steps": 8, "minibatch_size": 8, "total_steps": 64, "progress": False, "video_every": 64}
+    with pytest.raises(
+        UserError, match="a simulator of N environments, which draws itself or nothing: leave the video"
+    ):
+        lem.train("ppo", Cart(8), run=tmp_path / "r", **fields)
+
+
+def test_a_run_goes_on_with_the_simulator_passed_again_and_any_policy_plays_in_it(tmp_path, monkeypatch):
+    fields = {"num_steps": 8, "minibatch_size": 8, "total_steps": 64, "progress": False}
+    lem.train("ppo", Cart(8), run=tmp_path / "r", **fields)
+    monkeypatch.setattr(named, "_PASSED", {})  # as in a new process
+    with pytest.raises(UserError, match="pass the object again"):
+        lem.resume(tmp_path / "r", total_steps=128, progress=False)
+    run = lem.resume(tmp_path / "r", env=Cart(8), total_steps=128, progress=False)
+    assert run.policy.step == 128
+    assert len(lem.evaluate(lambda obs: np.zeros(1), env=Cart(8), episodes=16).returns) == 16
+    assert len(lem.evaluate(torch.nn.Linear(2, 1), env=Cart(8), episodes=16).returns) == 16

@@ -8,9 +8,11 @@ from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 
+import lemniscate as lem
 from lemniscate.envs import registry
 from lemniscate.envs.conversion import flatten_observation, physical_action, scale_action
 from lemniscate.envs.spaces import ActionMasks, action_kind, is_image, notices, observation_parts
+from lemniscate.envs.vector_view import action_space
 from lemniscate.errors import UserError
 from lemniscate.spec import Box, Discrete, Spec
 
@@ -165,6 +167,8 @@ def test_a_mask_that_is_given_for_some_environments_is_theirs_alone():
     flat, everyone = np.zeros((3, 1)), np.ones(3, dtype=bool)
     assert masks.append_to(flat, flat, info).tolist() == [[0, 1, 1], [0, 1, 0], [0, 0, 1]]
     assert masks.append_to(flat, flat, {}).tolist() == [[0, 1, 1], [0, 1, 0], [0, 0, 1]], "until another is given"
+    assert masks.append_to(flat, flat, {"action_mask": None}).tolist() == [[0, 1, 1]] * 3, "None permits everything"
+    masks.append_to(flat, flat, info)
     masks.require_choice(masks.append_to(flat, flat, {}), everyone)
     none_left = masks.append_to(flat, flat, {"action_mask": np.array([[1, 1], [1, 1], [0, 0]])})
     masks.require_choice(none_left, np.array([True, True, False]))
@@ -267,3 +271,24 @@ def test_digits_that_float32_loses_are_said(start, by, kind, lost):
     assert all(
         "too large for the digits of float32: 21 different values became" in said for said in env.backend.notices
     )
+
+
+@pytest.mark.parametrize("backend", ["gymnasium", "gymnasium-async"])
+@pytest.mark.parametrize("kind", [np.int64, np.int32, np.uint8])
+def test_a_choice_is_of_the_type_of_its_space(kind, backend):
+    class Strict(gym.Env):
+        observation_space = spaces.Box(-1, 1, (2,), np.float32)
+        action_space = spaces.Discrete(3, start=2, dtype=kind)
+
+        def reset(self, *, seed=None, options=None):
+            return np.zeros(2, np.float32), {}
+
+        def step(self, action):
+            return np.zeros(2, np.float32), float(self.action_space.contains(action)), False, True, {}
+
+    env = registry.make(Strict, 2, backend=backend)
+    env.restart(0)
+    assert env.step(torch.tensor([0, 2])).reward.tolist() == [1, 1]
+    env.close()
+    assert lem.evaluate(lambda obs: 3, Strict, episodes=2).mean_return == 1
+    assert action_space(env.spec.action) == Strict.action_space

@@ -3,6 +3,8 @@
 import multiprocessing
 import os
 import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -112,3 +114,19 @@ def test_one_that_hangs_is_named_and_closing_kills_it(monkeypatch):
     finally:
         env.close()
     assert not any(process.is_alive() for process in processes)
+
+
+UNGUARDED = """
+import lemniscate as lem
+print("once", flush=True)
+env = lem.make_vec("CartPole-v1", 2, backend="gymnasium-async")
+"""
+
+
+def test_a_script_without_a_guard_is_told_in_one_sentence(tmp_path):
+    """A worker imports the script again; nothing in it is done twice, and no worker speaks."""
+    (tmp_path / "script.py").write_text(UNGUARDED)
+    done = subprocess.run([sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 1
+    assert done.stderr.count("Traceback") == 1
+    assert "A script needs `if __name__ == '__main__':` before it." in done.stderr

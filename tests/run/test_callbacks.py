@@ -201,7 +201,7 @@ def test_a_callback_of_a_class_is_named_with_its_arguments(tmp_path):
         ("math:pi", "math:pi is neither a function nor a class"),
         ("test_callbacks:Above", r"test_callbacks:Above cannot be made; .*required positional argument: 'limit'"),
         ("test_callbacks:Above(limits=64)", "unexpected keyword argument 'limits'"),
-        ("math:pow", r"A callback must be a function of \(step, metrics, policy\), not a builtin_function_or_method"),
+        ("math:pow", r"A callback must be a function of \(step, metrics, policy\), not pow\(x, y\)"),
     ],
 )
 def test_a_callback_that_cannot_be_called_is_told_before_anything_is_made(tmp_path, callback, said):

@@ -102,20 +102,21 @@ def test_arguments_are_from_the_beginning_what_they_are_when_the_run_comes_back(
     """So an environment is trained with what it is evaluated with; and what the caller changes later changes no run."""
     given = {
         "pair": (1, 2),
-        3: np.float32(0.5),
+        "half": np.float32(0.5),
         "grid": np.eye(2, dtype=int),
         "model": PurePath("a/b"),
         "deep": {"t": (1,)},
     }
     config = ppo.Config(**{name: given})
     found = getattr(config, name)
-    assert found == {"pair": [1, 2], "3": 0.5, "grid": [[1, 0], [0, 1]], "model": "a/b", "deep": {"t": [1]}}
+    assert found == {"pair": [1, 2], "half": 0.5, "grid": [[1, 0], [0, 1]], "model": "a/b", "deep": {"t": [1]}}
     assert type(found["pair"]) is type(found["deep"]["t"]) is list
     assert ppo.Config.from_json(json.loads(json.dumps(config.to_json()))) == config
     given["deep"]["t"] = 7
     assert found["deep"] == {"t": [1]}
-    with pytest.raises(UserError, match=f"{name} must be a dictionary of what JSON can hold"):
-        ppo.Config(**{name: {"x": object()}})
+    for lost in ({"x": object()}, {3: 0.5}, {"deep": [{None: 1}]}, {"x": float("nan")}):
+        with pytest.raises(UserError, match=f"{name} must be a dictionary of what JSON can hold, with texts as keys"):
+            ppo.Config(**{name: lost})
 
 
 @pytest.mark.parametrize("text", ["0.01>0", " 1e-2 > 0.0", Schedule("0.01>0")])
@@ -153,7 +154,7 @@ def test_every_learning_rate_may_have_a_schedule_with_an_end_of_its_own(algorith
         (
             "arguments",
             {"x": object},
-            "arguments must be a dictionary of what JSON can hold, not {'x': <class 'object'>}.",
+            "arguments must be a dictionary of what JSON can hold, with texts as keys, not {'x': <class 'object'>}.",
         ),
     ],
 )

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from lemniscate import algos
 from lemniscate.envs.conversion import normalized_action, physical_action, scale_of
+from lemniscate.envs.returns import as_array, kind_of
 from lemniscate.envs.spaces import read_mask, read_observation
 from lemniscate.errors import UserError, prefix_errors, shown
 from lemniscate.hub import repository as hub
@@ -156,17 +157,21 @@ class TrainedPolicy:
         """Q(s, a) of one raw observation and action, a scalar array, or of each of a batch, [B]; raises as `value`.
 
         The return is that of `value`, of several critics the smallest; of SAC and REPPO with the entropy that is
-        rewarded on the way. Actions are as `act` returns them; what is outside of the bounds is clipped.
+        rewarded on the way. Actions are as `act` returns them; what is outside of a Box's bounds is clipped.
         """
         flat, batched = self._read_for("q", obs)
-        kind, given = self.spec.bounded_box(), np.asarray(action, dtype=np.float32)
-        wanted = ((len(flat),) if batched else ()) + ((kind.size,) if kind.shape is None else kind.shape)
-        if given.shape != wanted or not np.isfinite(given).all():
+        kind: Any = self.spec.action
+        given, several = as_array(action), (len(flat),) * batched
+        shape = () if isinstance(kind, Discrete) else kind.shape or (kind.size,)
+        if given.shape != several + shape or given.dtype.kind not in "iuf" or not np.isfinite(given).all():
             raise UserError(
-                f"action must be finite numbers of the shape {wanted}, not {given.shape}: as act returns it."
+                f"action must be finite numbers of the shape {several + shape}, not {kind_of(action)}: as act returns"
+                " it."
             )
-        own = torch.from_numpy(normalized_action(given.reshape(len(flat), -1), kind)).clamp(-1, 1)
-        return _rows(self.networks.q(flat, own), batched=batched)
+        own = torch.from_numpy(normalized_action(given.reshape(len(flat), *shape), kind))
+        if isinstance(kind, Discrete) and ((own < 0) | (own >= kind.n)).any():
+            raise UserError(f"action must be from {kind.start} to below {kind.start + kind.n}, not {shown(action)}.")
+        return _rows(self.networks.q(flat, own if isinstance(kind, Discrete) else own.clamp(-1, 1)), batched=batched)
 
     def _read(self, obs: Any, action_mask: Any = None) -> tuple[Tensor, bool]:
         """The flat observations [B, O], with the mask where there is one, and whether they are a batch."""
@@ -218,7 +223,7 @@ def path_of(run: object) -> Path:
         UserError: anything else; a policy on the Hub.
     """
     path = getattr(run, "path", run)
-    if not isinstance(path, str | PathLike):
+    if not isinstance(path, str | PathLike) or not str(path):
         raise UserError(f"A run is a directory, such as 'runs/lander', or what train returned, not {shown(run)}.")
     if Path(path).parts[:1] == (hub.SCHEME,):
         address = hub.read_address(path)

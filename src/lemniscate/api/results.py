@@ -93,7 +93,9 @@ def evaluate(
     """
     chosen = agents.find(policy, checkpoint=checkpoint, trust=trust)
     episodes, seed, file = checked("episodes", episodes, Episodes), checked("seed", seed, Natural), _film(video)
-    kwargs = checked("env_kwargs", env_kwargs, dict | None)
+    kwargs, folder = checked("env_kwargs", env_kwargs, dict | None), None if report is None else path_of(report)
+    if folder and any(place.is_file() for place in (folder, *folder.parents)):
+        raise UserError(f"report is a directory, such as 'runs/upright', and {folder} is a file, or lies in one.")
     how: dict[str, Any] = {"episodes": episodes, "seed": seed, "deterministic": deterministic}
     own = {"agent": agent, "normalized": normalized_actions}
     with _environments(chosen, env, own, how, env_kwargs=kwargs, backend=backend) as (player, vec, arguments):
@@ -108,8 +110,8 @@ def evaluate(
             scores = evaluate_policy(player.module, vec, episodes, seed, deterministic, critic)
         else:
             scores = evaluate_policy(player, vec, episodes, seed)
-        if report:
-            how["episodes"], folder = min(episodes, vec.num_envs, 20), path_of(report)
+        if folder:
+            how["episodes"] = min(episodes, vec.num_envs, 20)
             pictures = _draw(player, vec, arguments, how, folder)
             for made in (*pictures, pages.write_evaluation(folder, str(policy), pictures, scores, seed)):
                 say(made)
@@ -334,14 +336,17 @@ def _environments(
         name = registry.name_of(env)
         compiled = registry.backend_class(elsewhere.get("backend") or registry.backend_for(name)).compiled
         usual = presets.choose(RECOMMENDED, name, None)[1].num_envs  # of which the starts are those of most runs
-        config = RunConfig(env=name, num_envs=usual if compiled else 1)
+        config = RunConfig(env=name, num_envs=registry.count_of(env) or (usual if compiled else 1))
     with ExitStack() as stack:
         vec = stack.enter_context(closing(evaluation_env(config, how["episodes"], env=env, **elsewhere)))
         player = chosen
         if isinstance(chosen, TrainedPolicy):
             if not vec.spec.fits(chosen.spec):
-                ours, theirs = chosen.spec.env_id, vec.spec.env_id
-                raise UserError(f"A policy for {ours} cannot act in {theirs}: observation or action spaces differ.")
+                (seen, acts), (there, acts_there) = map(env_check.spaces_of, (chosen.spec, vec.spec))
+                raise UserError(
+                    f"A policy for {chosen.spec.env_id} cannot act in {vec.spec.env_id}: it observes {seen} and acts by"
+                    f" {acts}; there it would observe {there} and act by {acts_there}."
+                )
         elif chosen is not None:
             playing = agents.playing(chosen, vec, how["seed"], deterministic=how["deterministic"], **own)
             player = stack.enter_context(playing)

@@ -31,6 +31,7 @@ from lemniscate.system import named
 from lemniscate.system.console import say
 from lemniscate.system.files import make_directory, parsing
 from lemniscate.system.machine import keep_freed_memory
+from lemniscate.system.watchdog import leave_if_imported_again
 from lemniscate.system.world import CLUSTER, World
 
 
@@ -57,8 +58,8 @@ def choose_config(
     """The algorithm's name, the preset's and the Config of `config_for`; raises as that."""
     if isinstance(env, RunConfig) or "config" in fields:
         raise UserError("A Config knows its algorithm and takes its place: lem.train(config).")
-    if hasattr(env, registry.SPOKEN) and hasattr(env, "num_envs"):
-        fields = {"num_envs": getattr(env, "num_envs", None), **fields}
+    if count := registry.count_of(env):
+        fields = {"num_envs": count, **fields}
     env = None if env is None else registry.name_of(env)
     if isinstance(algorithm, RunConfig):
         if preset is not None:
@@ -196,7 +197,7 @@ def resume(
     """
     options = {"track": track, "callbacks": callbacks, "report": report, "progress": progress}
     options |= {"processes": processes, "cluster": cluster, "workers": workers, "storage": storage}
-    again = {"total_steps": total_steps, "env": env, "wrappers": wrappers}
+    again = {"total_steps": total_steps, "env": None if env is None else registry.name_of(env), "wrappers": wrappers}
     again |= {"network": network, "curriculum": curriculum}
     return go_on(run, options, {name: name_in_config(x) for name, x in again.items() if x is not None})
 
@@ -235,6 +236,7 @@ def _annealed(config: RunConfig) -> list[str]:
 
 def together() -> AbstractContextManager[World]:
     """The world of this process: of those that `torchrun` or Ray has started, or its own."""
+    leave_if_imported_again()
     if CLUSTER in os.environ:
         from lemniscate.cluster.job import together
     elif "WORLD_SIZE" in os.environ:

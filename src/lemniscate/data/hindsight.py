@@ -44,8 +44,6 @@ class HindsightReplay(ReplayBuffer):
         self._episodes = [list[Transition]() for _ in range(num_envs)]
         """those under way"""
         self._judge: Judge | None = None
-        self._trusted = False
-        """whether the judge has given the rewards of an episode in which they differed"""
 
     def on_restart(self, judge: Judge) -> None:
         """Drop the episodes under way: the environments have been restarted, and `judge` is theirs."""
@@ -70,9 +68,8 @@ class HindsightReplay(ReplayBuffer):
         """Each transition t k times, with goals achieved after steps drawn uniformly from t, …, T − 1; [k · T] rows."""
         assert self._judge is not None
         length = len(episode.reward)
-        if not self._trusted:
-            reward, _ = self._judge(episode.next_obs[:, self._achieved], episode.next_obs[:, self._desired])
-            self._compare(episode.reward, reward)
+        reward, _ = self._judge(episode.next_obs[:, self._achieved], episode.next_obs[:, self._desired])
+        self._compare(episode.reward, reward)
         times = np.repeat(np.arange(length), self._goals)
         later = np.random.default_rng((self._seed, self._written)).integers(times, length)
         copies, goal = episode[torch.from_numpy(times)], episode.next_obs[torch.from_numpy(later), self._achieved]
@@ -91,7 +88,6 @@ class HindsightReplay(ReplayBuffer):
                 f" compute_reward says {judged[step]:g}: hindsight needs rewards that follow from achieved_goal and"
                 " desired_goal alone, without wrappers that change them. --replay uniform learns from any."
             )
-        self._trusted = len(given.unique()) > 1
 
 
 def goal_columns(spec: Spec) -> tuple[slice, slice]:

@@ -21,9 +21,10 @@ from torch import Tensor
 from lemniscate.envs import registry
 from lemniscate.envs.conversion import SingleEnv
 from lemniscate.envs.factory import make_one, maker_of
-from lemniscate.envs.returns import flat_mask, mask_in
+from lemniscate.envs.returns import flat_mask, mask_in, shown_space
 from lemniscate.envs.spaces import observation_parts, random_action
 from lemniscate.envs.vec_env import VecEnv
+from lemniscate.envs.vector_view import action_space
 from lemniscate.errors import NonFiniteError, UserError
 from lemniscate.spec import Action, Box, Discrete, MultiDiscrete, ObservationPart, Spec
 from lemniscate.system.named import find_callable
@@ -108,6 +109,11 @@ def _one_line(message: object) -> str:
     """A message of Gymnasium's or of an exception, without colours and line breaks."""
     text = str(message).replace("\x1b[33m", "").replace("\x1b[0m", "").removeprefix("WARN: ")
     return " ".join(text.split())
+
+
+def spaces_of(spec: Spec) -> tuple[str, str]:
+    """What an environment observes, and its space of actions, for a sentence."""
+    return _seen(spec), shown_space(action_space(spec.action))
 
 
 def _seen(spec: Spec) -> str:

@@ -12,11 +12,23 @@ import torch
 from gymnasium import spaces
 from torch import Tensor
 
-from lemniscate.envs.returns import MASKS, Returns, author, flat_mask, kind_of, layers, mask_in, place, scalars
+from lemniscate.envs.returns import (
+    MASKS,
+    Returns,
+    author,
+    flat_mask,
+    kind_of,
+    layers,
+    mask_in,
+    place,
+    scalars,
+    shown_space,
+)
 from lemniscate.errors import UserError
 from lemniscate.spec import Action, Box, Discrete, MultiDiscrete, ObservationPart
 from lemniscate.system.console import say
 
+SPACES = ("observation_space", "action_space")
 SUCCESS = ("is_success", "success")
 """what robotics environments call their success: 1 or 0, or True and False"""
 
@@ -35,7 +47,7 @@ class SingleEnv(gym.Wrapper):
 
     def __init__(self, env: gym.Env) -> None:
         super().__init__(env)
-        for name in ("observation_space", "action_space"):
+        for name in SPACES:
             if not isinstance(getattr(env, name, None), gym.Space):
                 kind = type(env.unwrapped).__name__
                 raise UserError(f"{kind} has no {name}: set self.{name} in its __init__, such as a Box.")
@@ -45,6 +57,7 @@ class SingleEnv(gym.Wrapper):
             if not takes_any and not taken.keys() >= {"seed", "options"}:
                 right = "reset(self, *, seed=None, options=None)"
                 raise UserError(f"{place(layer, 'reset')} takes no seed or no options; it must be {right}.")
+        self._spaces = {name: getattr(env, name) for name in SPACES}
         self._returns = Returns(env, env.observation_space)
         asked = [env.get_wrapper_attr(name) for name in MASKS if env.has_wrapper_attr(name)]
         self._ask = next(filter(callable, asked), None)
@@ -57,8 +70,13 @@ class SingleEnv(gym.Wrapper):
         """Gymnasium's."""
         try:
             returned: Any = self.env.reset(seed=seed, options=options)
-        except (TypeError, ValueError) as error:
-            raise self._returns.in_wrapper("reset", error) from error.__cause__
+        except (TypeError, ValueError, SystemExit) as error:
+            raise self._returns.explained("reset", error) from error.__cause__
+        for name, space in self._spaces.items():
+            now = getattr(self.env, name)
+            if now is not space and now != space:
+                what = f"made {name} {shown_space(now)}; it was {shown_space(space)}, and must stay what __init__ set"
+                raise self._returns.wrong("reset", what)
         two = type(returned) is tuple and len(returned) == 2
         if not (two and self._is_usual(returned[0], 0.0, False, False, returned[1])):
             returned = self._returns.of_reset(returned)
@@ -69,8 +87,8 @@ class SingleEnv(gym.Wrapper):
         """Gymnasium's."""
         try:
             returned: Any = self.env.step(action)
-        except (TypeError, ValueError) as error:
-            raise self._returns.in_wrapper("step", error) from error.__cause__
+        except (TypeError, ValueError, SystemExit) as error:
+            raise self._returns.explained("step", error) from error.__cause__
         if not (type(returned) is tuple and len(returned) == 5 and self._is_usual(*returned)):
             returned = self._returns.of_step(returned)
         obs, *rest, info = returned
@@ -117,9 +135,10 @@ class SingleEnv(gym.Wrapper):
                 raise self._returns.wrong(method, what)
         if not self._masked and info.keys().isdisjoint(MASKS):
             return numbers
-        _, mask = mask_in(obs, info)
-        mask = self._ask() if mask is None and self._ask else mask
-        if mask is not None:
+        name, mask = mask_in(obs, info)
+        if mask is None and self._ask:
+            name, mask = MASKS[0], self._ask()
+        if mask is not None or (name and isinstance(self.action_space, spaces.Discrete | spaces.MultiDiscrete)):
             try:
                 numbers["action_mask"] = flat_mask(mask, self.action_space)
             except ValueError as error:
@@ -142,7 +161,8 @@ def measured(
     is True. Where an environment was reset in the same step, its true info is in `info["final_info"]`.
     """
     found: dict[str, Tensor] = {}
-    for source in (info, info.get("final_info", {})):
+    final = info.get("final_info")  # of what is no vector environment it may be anything
+    for source in (info, final) if isinstance(final, Mapping) else (info,):
         for key, values, given in _columns(source):
             if values.dtype.kind not in "biuf" or values.size != num_envs:
                 if key in declared:
@@ -264,7 +284,7 @@ def physical_action(action: np.ndarray, kind: Action) -> np.ndarray:
     if isinstance(kind, Box):
         action = scale_action(action, kind)
     elif isinstance(kind, Discrete):
-        return _require_below(kind.n, action) + kind.start
+        return (_require_below(kind.n, action) + kind.start).astype(kind.dtype, copy=False)
     elif isinstance(kind, MultiDiscrete):
         action = (_require_below(np.array(kind.nvec), action) + np.array(kind.start)).astype(kind.dtype)
     else:

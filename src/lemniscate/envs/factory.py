@@ -20,8 +20,8 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, Vecto
 from lemniscate.envs.conversion import SingleEnv
 from lemniscate.envs.registry import SPOKEN
 from lemniscate.envs.returns import CheckedVector
-from lemniscate.envs.workers import WatchedVectorEnv, Worker
-from lemniscate.errors import UserError, shown
+from lemniscate.envs.workers import WatchedVectorEnv, Worker, told_with_place
+from lemniscate.errors import UserError, WorkerError, shown
 from lemniscate.system import named
 
 Maker = EnvSpec | Callable[..., Any]
@@ -184,10 +184,14 @@ def sentences(env: str, kwargs: Mapping[str, Any] | None, wrappers: Sequence[str
     """An error that the making of an environment raises, as a `UserError` that names the arguments and wrappers."""
     try:
         yield
-    except (gym.error.Error, ImportError, TypeError, ValueError, KeyError, AssertionError) as error:
+    except WorkerError:
+        raise
+    except (Exception, SystemExit) as error:
         given = [f"{name}={shown(value)}" for name, value in (kwargs or {}).items()] + list(wrappers)
         with_these = f" with {', '.join(given)}" if given else ""
         said = str(error).partition(" was raised from the environment creator")[0]
+        if not isinstance(error, gym.error.Error | ImportError | TypeError | ValueError | KeyError | AssertionError):
+            said = told_with_place(error)
         if "required positional argument" in said:
             said += "; it is given in env_kwargs (--env-args), or with a wrapper: module:Name(key=value)"
         raise UserError(f"{env} cannot be made{with_these}: {said}") from error

@@ -137,6 +137,8 @@ class GymnasiumBackend(Backend):
         terminated, truncated = terminated.copy(), truncated & ~terminated  # new ones: a vector may write over its own
         obs = next_obs = self._observe(raw, info)
         valid, done = self._valid, terminated | truncated
+        if self._masks:
+            self._masks.require_alike(~self._resetting & ~done)
         if self.mode is AutoresetMode.NEXT_STEP:
             valid, self._resetting = ~self._resetting, done
         elif self.mode is AutoresetMode.SAME_STEP:

@@ -152,6 +152,11 @@ def name_of(env: object) -> str:
     return named.name_of(env)
 
 
+def count_of(env: object) -> int | None:
+    """The number of environments in an object that speaks rsl_rl's `VecEnv`; None of anything else."""
+    return getattr(env, "num_envs", None) if hasattr(env, SPOKEN) else None
+
+
 def names_of(wrappers: "Sequence[str | Callable[..., Any]]") -> tuple[str, ...]:
     """The names of wrappers for a Config. Raises `UserError` for what is not several of them."""
     if not isinstance(wrappers, list | tuple):
@@ -223,8 +228,10 @@ def make(
 
     from lemniscate.envs.backend import Joined
     from lemniscate.envs.vec_env import VecEnv
+    from lemniscate.system.watchdog import leave_if_imported_again
     from lemniscate.system.world import ALONE
 
+    leave_if_imported_again()
     name, wraps = name_of(env), names_of(wrappers)
     number = getattr(num_envs, "tolist", lambda: num_envs)()  # of NumPy's and torch's scalars
     if type(number) not in (int, float) or not 1 <= number <= MOST_ENVS or number % 1:

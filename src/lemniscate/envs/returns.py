@@ -42,8 +42,14 @@ class Returns:
         terminated, truncated = self._numbers("terminated", terminated), self._numbers("truncated", truncated)
         return self._observation("step", obs), reward, terminated, truncated, self._info("step", info)
 
-    def in_wrapper(self, method: str, error: Exception) -> Exception:
-        """The sentence where a wrapper of Gymnasium could not unpack what `method` returned; else the error itself."""
+    def explained(self, method: str, error: BaseException) -> BaseException:
+        """The sentence where a wrapper of Gymnasium could not unpack what `method` returned, or it ended the program.
+
+        Else the error itself.
+        """
+        if isinstance(error, SystemExit):
+            code = "" if error.code is None else shown(error.code)
+            return self.wrong(method, f"called sys.exit({code}), which would end the whole program")
         *_, last = traceback.walk_tb(error.__traceback__)
         if "unpack" not in str(error) or not last[0].f_globals["__name__"].startswith("gymnasium."):
             return error
@@ -92,11 +98,17 @@ class CheckedVector(VectorWrapper):
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Gymnasium's."""
-        return self._returns.of_reset(self.env.reset(seed=seed, options=options))
+        try:
+            return self._returns.of_reset(self.env.reset(seed=seed, options=options))
+        except SystemExit as error:
+            raise self._returns.explained("reset", error) from None
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Gymnasium's."""
-        return self._returns.of_step(self.env.step(actions))
+        try:
+            return self._returns.of_step(self.env.step(actions))
+        except SystemExit as error:
+            raise self._returns.explained("step", error) from None
 
 
 def layers(env: Any) -> Iterator[Any]:
@@ -182,7 +194,7 @@ def shown_space(space: gym.Space) -> str:
 
 
 def mask_in(obs: Any, info: Mapping[str, Any]) -> tuple[str, Any]:
-    """The action mask of an environment, and its name in `info`; ("", None) where there is none."""
+    """The name of an action mask in `info`, or "" of one in the observation, and the mask; ("", None) where none is."""
     for name in MASKS:
         if name in info:
             return name, info[name]
@@ -194,12 +206,13 @@ def mask_in(obs: Any, info: Mapping[str, Any]) -> tuple[str, Any]:
 def flat_mask(mask: Any, action: gym.Space | Action) -> np.ndarray:
     """An action mask as one row, [n] bool; of a MultiDiscrete, those of its components one after the other.
 
-    Raises `ValueError`, with the rest of a sentence, for another size, and for actions that are no choices.
+    None permits everything. Raises `ValueError`, with the rest of a sentence, for another size, and for actions that
+    are no choices.
     """
     if not isinstance(action, spaces.Discrete | spaces.MultiDiscrete | Discrete | MultiDiscrete):
         raise ValueError("that cannot be followed: masks are for Discrete and MultiDiscrete actions")
     choices = np.sum(action.n if isinstance(action, spaces.Discrete | Discrete) else action.nvec)
-    row = _row(mask)
+    row = np.ones(choices) if mask is None else _row(mask)
     if len(row) != choices or not ((row == 0) | (row == 1)).all():
         raise ValueError(f"of {len(row)} numbers, {shown(row.tolist())}; it must have {choices}, of 1 and 0")
     return row.astype(bool)

@@ -5,6 +5,7 @@ Neither needs rsl_rl; ours as one needs tensordict.
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 import torch
@@ -12,6 +13,7 @@ from torch import Tensor
 
 from lemniscate.envs import registry
 from lemniscate.envs.backend import Backend
+from lemniscate.envs.returns import kind_of
 from lemniscate.errors import UserError
 from lemniscate.spec import Box, ObservationPart, Spec
 from lemniscate.system import named
@@ -46,6 +48,11 @@ class RslRlBackend(Backend):
         """Always: a process has one such simulator."""
         return True
 
+    @classmethod
+    def make_rendered(cls, env: str, mode: str, kwargs: Mapping[str, Any], wrappers: Sequence[str]) -> None:
+        """None can be made. Raises `UserError`."""
+        raise UserError(f"{env} is a simulator of N environments, which draws itself or nothing: leave the video out.")
+
     def __init__(
         self,
         env: str,
@@ -62,13 +69,19 @@ class RslRlBackend(Backend):
                 f"{env} has {self._env.num_envs:,} environments, not {num_envs:,}: num_envs={self._env.num_envs}."
             )
         obs = self._env.get_observations()
+        if not hasattr(obs, "keys"):
+            raise UserError(
+                f"{env} returns {kind_of(obs)} from get_observations(); they must be groups of observations by their"
+                " names, such as a TensorDict with policy, as in rsl_rl from version 3 on."
+            )
         groups = [*obs.keys()]
-        self._group = next((name for name in ACTOR if name in groups), None)
-        if self._group is None:
+        group = next((name for name in ACTOR if name in groups), None)
+        if group is None:
             given = ", ".join(groups)
             raise UserError(f"{env} has the groups of observations {given}; one must be actor or policy.")
-        size, limit = obs[self._group].flatten(1).shape[1], self._env.max_episode_length
-        self._privileged = obs[CRITIC].flatten(1).shape[1] if CRITIC in groups else 0
+        self._env_id, self._groups = env, [group, *([CRITIC] if CRITIC in groups else [])]
+        size, *privileged = (part.shape[1] for part in self._parts(obs))
+        limit, self._privileged = self._env.max_episode_length, sum(privileged)
         action = Box((-math.inf,) * self._env.num_actions, (math.inf,) * self._env.num_actions)
         steps = int(limit.max()) if isinstance(limit, Tensor) else int(limit)
         self.spec = Spec(env, (ObservationPart((), (size,)),), action, steps, self._privileged)
@@ -88,10 +101,14 @@ class RslRlBackend(Backend):
 
     def step(self, action: Tensor) -> Step:
         """Act; the rows of time-outs have the true final observation, or else the one before."""
-        obs, reward, dones, extras = self._env.step(action.to(self._env.device))
-        done = dones.to(self.device).bool()
-        late = extras.get("time_outs")
-        truncated = done & late.to(self.device).bool() if late is not None else torch.zeros_like(done)
+        returned = self._env.step(action.to(self._env.device))
+        if not isinstance(returned, tuple) or len(returned) != 4:
+            what = f"{len(returned)} values" if isinstance(returned, tuple) else kind_of(returned)
+            raise UserError(f"{self._env_id} returns {what} from step(); it must be 4, (obs, rewards, dones, extras).")
+        obs, reward, dones, extras = returned
+        extras = extras or {}
+        done, late = self._column("dones", dones, torch.bool), extras.get("time_outs")
+        truncated = torch.zeros_like(done) if late is None else done & self._column("time_outs", late, torch.bool)
         before, self._obs = self._obs, self._rows(obs)
         final = next((extras[name] for name in FINAL if name in extras), None)
         if final is None and truncated.any():
@@ -103,7 +120,7 @@ class RslRlBackend(Backend):
         return Step(
             obs=self._obs,
             next_obs=torch.where(done[:, None], last, self._obs),
-            reward=reward.to(self.device, torch.float32),
+            reward=self._column("rewards", reward, torch.float32),
             terminated=done & ~truncated,
             truncated=truncated,
             valid=torch.ones_like(done),
@@ -115,14 +132,32 @@ class RslRlBackend(Backend):
 
     def _rows(self, obs: Any) -> Tensor:
         """[N, O + P] of groups [N, …]; clones, since a simulator may write over its own."""
-        groups = [obs[self._group], *([obs[CRITIC]] if self._privileged else [])]
-        return torch.cat([group.flatten(1).to(self.device, torch.float32) for group in groups], dim=-1)
+        return torch.cat(self._parts(obs), dim=-1)
+
+    def _parts(self, obs: Any) -> list[Tensor]:
+        """[N, O], and [N, P] where there is a group of the critic's. Raises `UserError` for what is no such group."""
+        for name in self._groups:
+            if not isinstance(obs[name], Tensor) or obs[name].shape[:1] != (self.num_envs,):
+                raise UserError(
+                    f"{self._env_id} observes {kind_of(obs[name])} as {name}; a group must be one Tensor"
+                    f" [{self.num_envs}, …], with its terms concatenated."
+                )
+        return [obs[name].reshape(self.num_envs, -1).to(self.device, torch.float32) for name in self._groups]
+
+    def _column(self, name: str, values: Any, dtype: torch.dtype) -> Tensor:
+        """[N] of one number for each environment, [N] or [N, 1]; a clone, as of observations."""
+        if not isinstance(values, Tensor) or values.numel() != self.num_envs:
+            raise UserError(f"{self._env_id} gives {kind_of(values)} as {name}; it must be a Tensor [{self.num_envs}].")
+        return values.reshape(self.num_envs).to(self.device, dtype, copy=True)
 
     def _logged(self, log: Mapping[str, Any]) -> dict[str, Tensor]:
-        """The numbers of a log, each the same in all rows."""
-        means = {name: torch.as_tensor(value, dtype=torch.float32).mean().item() for name, value in log.items()}
-        rows = self.counts.float()
-        return {f"info/{name.strip('/')}": torch.full_like(rows, mean) for name, mean in means.items()}
+        """The means of what numbers a log has, each the same in all rows."""
+        rows, found = self.counts.float(), {}
+        for name, value in log.items():
+            with suppress(TypeError, ValueError, RuntimeError):  # what is no number is not measured
+                mean = torch.as_tensor(value, dtype=torch.float32).mean().item()
+                found[f"info/{name.strip('/')}"] = torch.full_like(rows, mean)
+        return found
 
     def _note(self, sentence: str) -> None:
         if sentence not in self.notices:
@@ -139,6 +174,8 @@ def _made_once(env: str, num_envs: int, kwargs: Mapping[str, Any]) -> Any:
     """The object of that name: as it was passed, or made by its maker, once in a process."""
     found = named.find(env)
     if speaks(found):
+        if kwargs:
+            raise UserError(f"{env} is made already, so env_kwargs such as {next(iter(kwargs))} do not reach it.")
         return found
     key = env, repr(sorted(kwargs.items()))
     if key not in _made or _made[key].num_envs != num_envs:
@@ -157,6 +194,8 @@ class RslRlVecEnv:
 
     Observations have the group `policy` and, where something is privileged, `critic`, which has both. Actions are in
     units of half the range, clipped to [-1, 1]. `extras` has `time_outs`, and true final observations as `final_obs`.
+    First episodes are cut at random steps, so ends are spread as by the runner's `init_at_random_ep_len`, which sets
+    `episode_length_buf`: here that counts steps and ends nothing.
 
     Args:
         env: as `lemniscate.train` takes it.

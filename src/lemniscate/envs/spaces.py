@@ -110,7 +110,7 @@ def action_kind(space: gym.Space, env_id: str) -> Action:
     if 0 in (space.shape or ()):
         raise UserError(f"{env_id} has no actions: its action_space is {shown_space(space)}.")
     if isinstance(space, spaces.Discrete):
-        return Discrete(int(space.n), int(space.start))
+        return Discrete(int(space.n), int(space.start), dtype=np.dtype(space.dtype).name)
     if isinstance(space, spaces.MultiDiscrete):
         kind = np.dtype(space.dtype).name
         return MultiDiscrete(_whole(space.nvec), _whole(space.start), tuple(space.shape), dtype=kind)
@@ -202,11 +202,13 @@ class LostDigits:
 
 
 class ActionMasks:
-    """The present action mask [n] of each of N environments; all is permitted where none was given."""
+    """The present action mask [n] of each of N environments, which is the last that was given."""
 
     def __init__(self, spec: Spec, num_envs: int) -> None:
         self._spec: Any = spec
         self._masks = np.ones((num_envs, spec.action.mask_size), dtype=bool)
+        self._given, self._known = np.zeros(num_envs, dtype=bool), set[bool]()
+        """[N], whether the newest info had one; and whether those of steps have had one"""
 
     def append_to(
         self, flat: np.ndarray, obs: Any, info: Mapping[str, Any], numbers: np.ndarray | slice = slice(None)
@@ -216,12 +218,25 @@ class ActionMasks:
         With `numbers` [M] the rows are of these environments alone. Raises `UserError` for a mask of another size.
         """
         name, mask = mask_in(obs, info)
-        masks = self._masks[numbers].copy()
-        if mask is not None:
-            for row in np.flatnonzero(info.get(f"_{name}", np.ones(len(flat), dtype=bool))):
-                masks[row] = self.of_row(row_of(mask, int(row)), int(row))
-            self._masks[numbers] = masks
+        masks, given = self._masks[numbers].copy(), np.zeros(len(flat), dtype=bool)
+        if name or mask is not None:
+            given = np.asarray(info.get(f"_{name}", ~given))
+            for row in np.flatnonzero(given):
+                masks[row] = self.of_row(None if mask is None else row_of(mask, int(row)), int(row))
+        self._masks[numbers], self._given[numbers] = masks, given
         return np.concatenate([flat, masks.astype(flat.dtype)], axis=-1)
+
+    def require_alike(self, inside: np.ndarray) -> None:
+        """Raise `UserError` where of the steps `inside` [N] of episodes, the newest and those before, some had no mask.
+
+        Where none has one, that of the reset holds for the whole episode.
+        """
+        self._known.update(self._given[inside].tolist())
+        if len(self._known) > 1:
+            raise UserError(
+                f"{self._spec.env_id} gives an action mask in some steps and none in others: give one with each step(),"
+                " of ones where all is permitted."
+            )
 
     def of_row(self, mask: Any, row: int) -> np.ndarray:
         """The mask that environment `row` gave as [n] bool. Raises `UserError` for another size."""

@@ -113,7 +113,9 @@ class VecEnv:
             if len(bad):
                 first = 0 if name == "action" else self._first  # actions are those of all processes
                 value, number = values[tuple(bad[0])].item(), first + int(bad[0, 0])
-                raise NonFiniteError(f"The {name} of environment {number} is {value} in the step after {self.steps:,}.")
+                why = "" if math.isnan(value) else "; float32 holds numbers up to 3.4e38"
+                what = f"The {name} of environment {number} is {value} in the step after {self.steps:,}{why}."
+                raise NonFiniteError(what)
 
     def require_end(self, age: int) -> None:
         """Raise `UserError` where an episode of `age` steps has had its chance to end, and there is no time limit."""

@@ -137,14 +137,15 @@ def observation_space(spec: Spec) -> spaces.Box:
 def action_space(action: Action) -> spaces.Space:
     """The space that a record of actions was read from."""
     if isinstance(action, Discrete):
-        return spaces.Discrete(action.n, start=action.start)
+        return spaces.Discrete(action.n, start=action.start, dtype=np.dtype(action.dtype).type)
     if isinstance(action, Box):
         low, high = (np.array(bound, dtype=action.dtype) for bound in (action.low, action.high))
         shape = action.shape or low.shape
         return spaces.Box(low.reshape(shape), high.reshape(shape), dtype=np.dtype(action.dtype).type)
     if isinstance(action, MultiDiscrete):
         shape = action.shape or (len(action.nvec),)
-        return spaces.MultiDiscrete(np.reshape(action.nvec, shape), start=np.reshape(action.start, shape))
+        nvec, start = np.reshape(action.nvec, shape), np.reshape(action.start, shape)
+        return spaces.MultiDiscrete(nvec, dtype=np.dtype(action.dtype).type, start=start)
     return spaces.MultiBinary(action.n if action.shape in (None, (action.n,)) else action.shape)
 
 

@@ -96,8 +96,13 @@ def _told(call: Callable[..., Any], *args: Any, **options: Any) -> Any:
     except UserError as error:
         raise UserError(str(error)) from None
     except BaseException as error:  # also what ends a process: this one ends with its owner
-        place = traceback.extract_tb(error.__traceback__)[-1]
-        raise RaisedInWorkerError(f"{_words_of(error)} ({Path(place.filename).name}, line {place.lineno})") from None
+        raise RaisedInWorkerError(told_with_place(error)) from None
+
+
+def told_with_place(error: BaseException) -> str:
+    """What an error says, and where it was raised."""
+    place = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{_words_of(error)} ({Path(place.filename).name}, line {place.lineno})"
 
 
 def _words_of(error: BaseException) -> str:
@@ -142,8 +147,8 @@ class WatchedVectorEnv(AsyncVectorEnv):
         try:
             ask()
             return wait(timeout=self.patience)
-        except (multiprocessing.TimeoutError, EOFError, ConnectionError) as error:
-            raise WorkerError(self._diagnosis()) from error
+        except (multiprocessing.TimeoutError, EOFError, ConnectionError):
+            raise WorkerError(self._diagnosis()) from None
 
     def _raise_if_errors(self, successes: Iterable[bool]) -> None:
         """Gymnasium's, as one sentence that names the environment, and without waiting for a word that never comes."""

@@ -99,7 +99,10 @@ class ActionValues(nn.Module):
         super().__init__()
         if not isinstance(spec.action, Discrete):
             kind = type(spec.action).__name__
-            raise UserError(f"{spec.env_id} has actions of kind {kind}; Q has an output for each one of n, Discrete.")
+            raise UserError(
+                f"{spec.env_id} has actions of kind {kind}; Q has an output for each one of n,"
+                " Discrete. ppo learns here."
+            )
         net = network_of(spec, layers, spec.action.n, last_gain=0.01)
         self.policy = EpsilonGreedyPolicy(normalizer_of(spec, normalize_observations), net, spec.action)
 

@@ -105,6 +105,7 @@ class Recall:
         if done is None:
             self._kept = None
         elif self._kept is not None:
+            done = done.reshape(1) if done.dim() == 0 else done
             if done.shape != self._kept.shape[:1]:
                 raise UserError(f"done has the shape {tuple(done.shape)}, of {len(self._kept)} episodes.")
             self._kept = self._kept.masked_fill(done[:, None], 0)
@@ -139,7 +140,7 @@ class OwnCell(OwnNetwork):
 
     def step(self, prepared: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
         """[B, inputs] and [B, size] to the outputs [B, outputs], and the next memory."""
-        return self.module(prepared, memory)
+        return self.module(prepared, memory.clone())  # it may write into what it is given
 
     def over(self, prepared: Tensor, goes_on: Tensor, memory: Tensor) -> Tensor:
         """The outputs [P, L, outputs] of pieces, [P, L, inputs], [P, L, 1] and [P, L, size]; see `Remembering`."""

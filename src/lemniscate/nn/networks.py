@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import pairwise
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -86,8 +86,7 @@ class Layers:
         """Whether a network of these layers has a memory. Raises `UserError` for one of one's own that is not found."""
         if ":" not in self.kind:
             return self.kind == "gru"
-        made_by = find_callable(self.kind)
-        return bool(getattr(getattr(made_by, "func", made_by), "memory_size", 0))
+        return _memory_size(find_callable(self.kind)) > 0
 
     @property
     def linear(self) -> type[nn.Linear]:
@@ -118,6 +117,11 @@ NETWORKS: dict[str, Callable[[Layers, int], tuple[list[nn.Module], int]]] = {
 """The layers before the last one, and the number of their outputs."""
 
 
+def _memory_size(maker: Callable[..., Any]) -> int:
+    """The numbers that modules of a class remember; 0 where it does not say so."""
+    return getattr(getattr(maker, "func", maker), "memory_size", 0)
+
+
 class OwnNetwork(nn.Module):
     """A module of one's own, which `name` makes: it takes rows [B, inputs] to [B, outputs], whatever dimensions lead.
 
@@ -131,7 +135,7 @@ class OwnNetwork(nn.Module):
         self.name, self.least, rows = name, 1, torch.randn(64, inputs, generator=torch.Generator().manual_seed(0))
         wanted = f"{name}({inputs}, {outputs}) must make a module that takes {self._taken(inputs, outputs)}"
         try:
-            self.module = find_callable(name)(inputs, outputs)
+            self.module = self._made(inputs, outputs)
             before = self._tensors()
             with torch.enable_grad():
                 out = self._call(rows)
@@ -163,6 +167,17 @@ class OwnNetwork(nn.Module):
                 self._call(rows[:1])
         except ValueError:  # of batch normalization, by the statistics of the rows themselves
             self.least = 2
+
+    def _made(self, inputs: int, outputs: int) -> Any:
+        """A new module. Raises `UserError` for one that is made already, or says too late that it has a memory."""
+        maker = find_callable(self.name)
+        if isinstance(maker, nn.Module):
+            kind = type(maker).__name__
+            raise UserError(f"network is a {kind} that is made already: give its class, of which each network is one.")
+        module = maker(inputs, outputs)
+        if hasattr(module, "memory_size") and not _memory_size(maker):
+            raise UserError(f"{self.name} sets its memory_size too late; it must stand in the class: memory_size = 64.")
+        return module
 
     def _taken(self, inputs: int, outputs: int) -> str:
         """The shapes that the module is to take and return, in words."""

@@ -143,6 +143,7 @@ class Adam(ParameterVector):
         total.backward(inputs=self.parameters)
         return self._gradient, metrics
 
+    @torch.no_grad()
     def descend(self, gradient: Tensor) -> Tensor:
         """One step down a gradient g [P], clipped to a norm of c; returns ‖g‖ before the clip.
 
@@ -152,16 +153,15 @@ class Adam(ParameterVector):
 
         α is the learning rate, c `max_grad_norm`.
         """
-        with torch.no_grad():  # a decorator would have dynamo take one program for the descents of all optimizers
-            self._count.add_(1)
-            bias = 1 - (self._log_betas * self._count).exp()  # as a power, βᵗ would be computed for each parameter
-            rate, scale = (self._rates * bias**self._powers).to(gradient)  # α / (1 − β₁ᵗ) and 1 / √(1 − β₂ᵗ)
-            norm = gradient.square().sum().sqrt()
-            gradient = gradient * (self._limit / (norm + 1e-6)).clamp(max=1)
-            self._mean.lerp_(gradient, 1 - self._betas[0])
-            self._square.lerp_(gradient.square(), 1 - self._betas[1])
-            self.vector.sub_(rate * self._mean / (self._square.sqrt() * scale + self._eps))
-            return norm
+        self._count.add_(1)
+        bias = 1 - (self._log_betas * self._count).exp()  # as a power, βᵗ would be computed for each parameter
+        rate, scale = (self._rates * bias**self._powers).to(gradient)  # α / (1 − β₁ᵗ) and 1 / √(1 − β₂ᵗ)
+        norm = gradient.square().sum().sqrt()
+        gradient = gradient * (self._limit / (norm + 1e-6)).clamp(max=1)
+        self._mean.lerp_(gradient, 1 - self._betas[0])
+        self._square.lerp_(gradient.square(), 1 - self._betas[1])
+        self.vector.sub_(rate * self._mean / (self._square.sqrt() * scale + self._eps))
+        return norm
 
     def state_dict(self) -> dict[str, Tensor]:
         """Adam's two moments and its count; the parameters belong to the networks."""

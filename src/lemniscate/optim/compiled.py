@@ -4,7 +4,7 @@ import sys
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from threading import Event
-from types import FunctionType, MethodType
+from types import FunctionType
 from typing import Any, Generic, ParamSpec, TypeVar
 
 import torch
@@ -73,18 +73,16 @@ class Compiled(Generic[P, R]):
 
 
 def _with_own_code(method: Callable[P, R]) -> Callable[P, R]:
-    """A copy of the method with a code object of its own.
+    """A call of the method in a code object of its own.
 
-    torch.compile caches programs by code object; with the guards off, a shared one could return the program of another
-    object's method. Nor may it be decorated: what stands around it would be torch's code, and shared again.
+    torch.compile caches programs by code object; with the guards off, a shared one, of a method or of its decorator,
+    could return the program of another object's method.
     """
-    assert isinstance(method, MethodType)
-    function = method.__func__
-    assert not hasattr(function, "__wrapped__"), f"{function.__qualname__} is decorated"
-    code, names = function.__code__.replace(), function.__globals__
-    copied = FunctionType(code, names, function.__name__, function.__defaults__, function.__closure__)
-    copied.__kwdefaults__ = function.__kwdefaults__
-    return MethodType(copied, method.__self__)
+
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        return method(*args, **kwargs)
+
+    return FunctionType(call.__code__.replace(), call.__globals__, call.__name__, None, call.__closure__)
 
 
 Learn = Callable[..., list[Metrics]]
@@ -136,5 +134,4 @@ class Learner:
         """`learn`, while every network that an optimizer moves is made of views of that optimizer's vector."""
         owned = enumerate(optimizer.views(optimizer.vector) for optimizer in self._optimizers)
         views = {f"networks.{i}.{name}": view for i, parameters in owned for name, view in parameters.items()}
-        with torch.no_grad():  # of networks that only take part in a loss; `grad_and_value` differentiates all the same
-            return means(functional_call(self._module, views, args, flags))
+        return means(functional_call(self._module, views, args, flags))

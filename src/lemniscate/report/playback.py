@@ -174,15 +174,17 @@ def _rendered(arguments: dict[str, Any], mode: str) -> gym.Env:
     with ExitStack() as failing:
         try:
             _choose_opengl()
-            env = make_rendered(mode=mode, **arguments)
-            failing.callback(env.close)
-            env.reset(seed=0)
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # Gymnasium's on pictures, which are looked at below
+                env = make_rendered(mode=mode, **arguments)
+                failing.callback(env.close)
+                env.reset(seed=0)
                 env.render()
         except Exception as error:  # pygame, GLFW and MuJoCo each have their own
             hint = " (without a display MuJoCo needs MUJOCO_GL=egl or osmesa)" if "OpenGL" in str(error) else ""
-            raise UserError(f"{name} cannot be shown here: {error}{hint}") from error
+            none = "it has no render() that returns a picture with render_mode='rgb_array'."
+            said = none if isinstance(error, NotImplementedError) else error
+            raise UserError(f"{name} cannot be shown here: {said}{hint}") from error
         if mode == "rgb_array":
             _picture(env, name)
         failing.pop_all()

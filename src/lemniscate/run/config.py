@@ -104,9 +104,9 @@ def _convert(value: Any, option: Any) -> Any:
         raise ValueError(WANTED[kind])
     if kind is dict:
         try:  # what a run is trained with is what it is evaluated with when it comes back from its file
-            return json.loads(json.dumps(value, allow_nan=False, default=plain))
+            return in_json(value)
         except (TypeError, ValueError, RecursionError):
-            raise ValueError("a dictionary of what JSON can hold") from None
+            raise ValueError("a dictionary of what JSON can hold, with texts as keys") from None
     return value
 
 
@@ -115,6 +115,21 @@ def plain(value: Any) -> Any:
     if hasattr(value, "tolist"):
         return value.tolist()
     return str(value) if isinstance(value, torch.device | PurePath) else value
+
+
+def in_json(value: Any) -> Any:
+    """A value as it comes back from JSON, with arrays and tuples as lists.
+
+    Raises `TypeError`, `ValueError` or `RecursionError` for what JSON cannot hold, such as a key that is no text.
+    """
+    value = plain(value)
+    if isinstance(value, list | tuple):
+        return [in_json(item) for item in value]
+    if not isinstance(value, Mapping):
+        return json.loads(json.dumps(value, allow_nan=False))
+    if strange := [key for key in value if not isinstance(key, str)]:  # `json` would make texts of some
+        raise TypeError(f"the key {strange[0]} is no text")
+    return {str(key): in_json(item) for key, item in value.items()}
 
 
 def _number(value: Any, kind: type, limits: Range = Range()) -> int | float:

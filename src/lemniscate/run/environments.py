@@ -1,6 +1,5 @@
 """The environments of a run, for training and for evaluation, their curriculum, and whether there is room for it."""
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, nullcontext, suppress
 from typing import Any
@@ -12,7 +11,7 @@ from lemniscate.envs.symmetry import Mirror, find_mirror
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError, shown
 from lemniscate.nn.networks import NETWORKS
-from lemniscate.run.config import RunConfig, plain
+from lemniscate.run.config import RunConfig, in_json
 from lemniscate.spec import Spec
 from lemniscate.system import named
 from lemniscate.system.machine import require_free
@@ -155,8 +154,8 @@ def calls_of(curriculum: Callable[..., Any], step: int, metrics: Mapping[str, fl
     except Exception as error:
         raise UserError(f"The curriculum raised {type(error).__name__} at step {step:,}: {error}") from error
     with suppress(TypeError, ValueError, AttributeError, RecursionError):
-        if isinstance(calls, Mapping) and all(isinstance(name, str) for name in calls):
-            return json.loads(json.dumps(dict(calls), allow_nan=False, default=plain))
+        if isinstance(calls, Mapping):
+            return in_json(calls)
     wanted = "a dictionary of methods with an argument each that JSON can hold, such as {'set_level': 1}"
     raise UserError(f"The curriculum must return {wanted}; at step {step:,} it returned {shown(calls)}.")
 

@@ -101,7 +101,7 @@ def module_of(name: str) -> ModuleType:
     module_name, _, qualname = name.rpartition(":")
     if not module_name or not qualname:
         raise UserError(f"{name!r} is no name of an object; it has the form module:name.")
-    if module_name.endswith(".py"):
+    if module_name.endswith(".py") or "/" in module_name:
         module = f"{Path(module_name).stem}:{qualname}"
         raise UserError(f"{name} names a file; name its module, without folder and ending, in that folder: {module}.")
     if "<" in name:
