@@ -203,7 +203,7 @@ class PPO:
         ((gae, "gea"), "There is no exercise 'gea': did you mean gae"),
         ((None,), 'Which exercise is None? Name it: course.check(solution, "gae").'),
         ((partial(gae, lam=1.0),), "Which exercise is functools.partial("),
-        ((lambda x: x,), "Which exercise is a function? Name it"),
+        ((lambda x: x,), "Which exercise is lambda(x)? Name it"),
         ((None, "gae"), "What can be checked is a function or a class, not None."),
         ((PPO,), "PPO is judged by its methods: course.check(PPO.compute_advantages), course.check(PPO.compute_loss)."),
     ],

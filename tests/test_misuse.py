@@ -1,5 +1,7 @@
 """What is asked wrongly is answered in one sentence, in Python as on the command line; what is meant well is taken."""
 
+import os
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -53,6 +55,19 @@ class Unseen(Sized):
         return None if self.picture is None else np.full((4, 4, 3), self.picture)
 
 
+class Closing:
+    """A logger that takes no pictures."""
+
+    def __init__(self, path, config, step):
+        pass
+
+    def write(self, step, metrics, episodes):
+        pass
+
+    def close(self):
+        pass
+
+
 class Several(Unseen):
     """Two choices at once."""
 
@@ -78,6 +93,8 @@ class Remembers(torch.nn.Linear):
 def run(tmp_path_factory):
     path = tmp_path_factory.mktemp("a folder") / "cartpole"
     fields = tiny_fields("CartPole-v1", backend="gymnasium", total_steps=64)
+    path.parent.joinpath("cartpole.gif").touch()
+    path.with_suffix(".mp4").mkdir()
     return lem.train("ppo", "CartPole-v1", run=path, progress=False, **fields)
 
 
@@ -151,6 +168,15 @@ def test_runs_are_plotted_one_by_one_or_in_a_list(run):
         (lambda run: lem.make_vec("CartPole-v1", backend=3), "There is no backend 3"),
         (lambda run: run.policy.act(np.zeros(4), action_mask=[1, 0]), "CartPole-v1 has no action mask"),
         (lambda run: lem.train("ppo", "CartPole-v1", callbacks=[3]), "A callback must be a function of"),
+        (lambda run: lem.evaluate(run, video=run.path.with_suffix(".gif") / "x.gif"), "cannot be written: .*gif is a file"),
+        (lambda run: lem.evaluate(run, video=run.path.with_suffix(".mp4")), "mp4 is a folder; name a file in it"),
+        (lambda run: lem.evaluate(run, video="/proc/none/film.gif"), "/proc/none/film.gif cannot be written"),
+        (lambda run: lem.evaluate(run, deterministic="no"), "deterministic must be True or False, not 'no'"),
+        (lambda run: lem.watch(run, deterministic=1, video="film.gif"), "deterministic must be True or False, not 1"),
+        (lambda run: run.policy.act(np.zeros(4), deterministic="no"), "deterministic must be True or False, not 'no'"),
+        (lambda run: lem.evaluate(run, normalized_actions="yes"), "normalized_actions must be True or False or None, not 'yes'"),
+        (lambda run: lem.train("ppo", "CartPole-v1", track=Closing), "the class Closing is no logger: that has write"),
+        (lambda run: lem.train("ppo", "CartPole-v1", track=lambda path: None), r"track must be made as Class\(path, config, step\), which lambda"),
         (lambda run: lem.load(""), "A run is a directory, .* not ''"),
         (lambda run: lem.evaluate(run, report=run.path / "config.json"), "report is a directory, .*config.json is a file"),
         (lambda run: lem.evaluate(run, report=run.path / "config.json/x"), "json/x is a file, or lies in one"),
@@ -284,3 +310,23 @@ def test_the_install_line_of_an_extra_works_in_a_clone():
 
 def test_values_are_shown_short():
     assert [shown(x) for x in ("3", None, [1], "x" * 99, gym)] == ["'3'", "None", "[1]", "a str", "a module"]
+
+
+def test_a_run_stays_where_it_began_where_the_working_directory_changes(tmp_path, monkeypatch):
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    monkeypatch.chdir(tmp_path)
+    fields = tiny_fields("CartPole-v1", total_steps=128, checkpoint_every=64)
+    trained = lem.train(
+        "ppo", "CartPole-v1", run="r", callbacks=lambda *a: os.chdir(elsewhere), progress=False, **fields
+    )
+    assert not list(elsewhere.iterdir())
+    assert lem.load(trained.path).step == lem.load(tmp_path / "r").step == 128
+
+
+def test_what_lies_beside_a_stored_policy_is_not_lost(run, tmp_path):
+    lem.save(run, tmp_path / "p")
+    lem.save(run, tmp_path / "p")
+    (tmp_path / "p" / "notes.txt").touch()
+    with pytest.raises(UserError, match=r"holds notes\.txt beside a stored policy, which would be lost"):
+        lem.save(run, tmp_path / "p")

@@ -1479,8 +1479,8 @@ MUTANTS = [
     (
         "a mask is of another environment",
         "envs/spaces.py",
-        "self.of_row(row_of(mask, int(row)), int(row))",
-        "self.of_row(row_of(mask, 0), int(row))",
+        "else row_of(mask, int(row)), int(row))",
+        "else row_of(mask, 0), int(row))",
         "envs/test_spaces.py::test_a_mask_that_is_given_for_some_environments_is_theirs_alone",
     ),
     (

@@ -1,5 +1,6 @@
 """Policies that were not trained here, flown: functions, modules, objects, and files of weights."""
 
+from functools import partial
 from itertools import pairwise
 
 import gymnasium as gym
@@ -415,3 +416,74 @@ def test_a_function_flies_the_drone_from_a_dictionary_or_from_numbers(unwritten,
     ]
     assert flown[0].measures["rmse_mm"] > 0
     assert flown[0].returns == flown[1].returns == flown[2].returns
+
+
+ANGLES = []
+
+
+def by_last_angle(obs, before=[0.0]):  # noqa: B006
+    """Pushes against the speed of the pole, which it makes of two angles; remembered in a default."""
+    speed, before[0] = obs[2] - before[0], obs[2]
+    return int(speed + obs[2] > 0)
+
+
+def by_global(obs):
+    global ANGLES
+    ANGLES = [*ANGLES[-1:], obs[2]]
+    return int(2 * ANGLES[-1] - ANGLES[0] > 0)
+
+
+class Slotted:
+    __slots__ = ("before", "hook")
+
+    def __init__(self):
+        self.before, self.hook = 0.0, lambda: None
+
+    def act(self, obs):
+        speed, self.before = obs[2] - self.before, obs[2]
+        return int(speed + obs[2] > 0)
+
+
+class Holding(Slotted):
+    """The same, with a network beside."""
+
+    def __init__(self):
+        super().__init__()
+        self.net = nn.Linear(4, 2)
+
+
+@pytest.mark.parametrize("policy", [by_last_angle, by_global, Slotted(), Holding(), partial(by_last_angle)])
+def test_what_remembers_in_any_way_plays_one_episode_at_a_time(policy, capsys):
+    lem.evaluate(policy, "CartPole-v1", episodes=3)
+    assert "remembers what it was called with" in capsys.readouterr().err
+
+
+class Across(nn.Module):
+    """A softmax over the wrong axis of a batch, which is the right one of a single observation."""
+
+    def __init__(self):
+        super().__init__()
+        self.layer = nn.Linear(4, 2)
+        self.layer.weight.data = torch.tensor([[0.0, 0, -1, -1], [0, 0, 1, 1]])
+        self.layer.bias.data.zero_()
+
+    def forward(self, obs):
+        return self.layer(obs).softmax(0)
+
+
+class Judge:
+    """The same as an object that has a network."""
+
+    def __init__(self):
+        self.net = Across()
+
+    def act(self, obs):
+        return int(self.net(torch.as_tensor(obs)).argmax())
+
+
+@pytest.mark.parametrize("policy", [Across(), Judge()])
+def test_a_batch_is_given_only_where_each_row_has_the_answer_that_it_has_alone(policy):
+    act = policy.act if isinstance(policy, Judge) else lambda obs: int(policy(torch.as_tensor(obs)).argmax())
+    assert (
+        lem.evaluate(policy, "CartPole-v1", episodes=5).returns == lem.evaluate(act, "CartPole-v1", episodes=5).returns
+    )

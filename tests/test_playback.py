@@ -249,7 +249,7 @@ def test_a_function_is_a_policy(policy, unwritten, capsys):
     ("function", "env", "said"),
     [
         (lambda obs: 0, None, "A policy of your own acts in an environment that is named with it"),
-        (lambda: 0, "CartPole-v1", "takes one observation; a function does not"),
+        (lambda: 0, "CartPole-v1", r"takes one observation; lambda\(\) does not"),
         (lambda obs: 7, "CartPole-v1", r"CartPole-v1 takes actions of Discrete\(2\), not 7"),
         (lambda obs: [0.0, 1.0], "Pendulum-v1", r"Pendulum-v1 takes actions of Box.*, not \[0.0, 1.0\]"),
         (lambda obs: [np.nan], "Pendulum-v1", r"Pendulum-v1 takes actions of Box.*, not \[nan\]"),

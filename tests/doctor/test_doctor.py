@@ -209,6 +209,41 @@ def test_what_is_certain_is_named_first_of_its_kind_and_hints_last():
     assert order == sorted(order)
 
 
+def test_a_value_that_has_learned_nothing_or_too_little_ignores_no_ends():
+    shown = {"value__at_ends": [0.95] * 8, "episode__terminated": [1.0] * 8}
+    assert "ends-ignored" in names(**shown, explained_variance=[0.5] * 8, value__missing=[-1.0] * 8)
+    assert "ends-ignored" not in names(**shown, explained_variance=[0.01] * 8, value__missing=[-1.0] * 8)
+    assert "ends-ignored" not in names(**shown, explained_variance=[0.5] * 8, value__missing=[0.6] * 8)
+
+
+def test_a_value_that_no_update_moves_is_named():
+    assert names(value__moved=[0.0] * 4) == ["critic-still"]
+    assert "critic-still" not in names(value__moved=[0.0] * 3 + [0.1])
+
+
+def test_a_value_of_one_reward_lacks_its_bootstrap_and_a_reward_of_noise_does_not():
+    shown = {"explained_variance": [-0.2] * 8, "value__missing": [70.0, 20.0, 90.0, 50.0]}
+    assert names(**shown, reward__explained=[0.5] * 8) == ["missing-bootstrap"]
+    assert names(**shown, reward__explained=[0.05] * 8) == ["value-explains-nothing"]
+    assert names(**(shown | {"value__missing": [70.0, 9.0, 3.0, 1.0]}), reward__explained=[0.5] * 8) == [
+        "value-explains-nothing"
+    ]
+
+
+def test_a_divergence_that_does_not_fall_with_the_learning_rate_is_that_of_another_policy():
+    rates = list(np.linspace(1e-3, 0.0, 40))
+    shown = {"changed": {"desired_kl": None}, "learning_rate": rates}
+    assert "ratio-not-one" in names(approx_kl=[0.05] * 40, **shown)
+    assert "ratio-not-one" not in names(approx_kl=list(np.linspace(0.05, 0.0, 40)), **shown)
+    assert "ratio-not-one" not in names(approx_kl=[0.05] * 40, **(shown | {"learning_rate": [1e-3] * 40}))
+
+
+def test_what_noise_hides_is_not_said_of_actions():
+    shown = {"action__effect": [0.0] * 8}
+    assert names(**shown) == ["action-without-effect"]
+    assert names(**shown, observation__predicted=[0.1] * 8) == ["observation-noisy"]
+
+
 def test_one_of_two_metrics_that_are_compared_is_no_evidence():
     assert "critic-overfits" not in names("sac", td_error__newest=[20.0] * 8)
 

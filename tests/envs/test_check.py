@@ -214,7 +214,7 @@ def test_arguments_and_wrappers_are_checked_too():
         found("Long", env_kwargs={"edge": 0.5}),
         found("Long", env_kwargs={"edge": 1}, wrappers=[limit]),
     )
-    assert next(sentence for grade, sentence in unlimited if grade == "note").startswith("It has no time limit")
+    assert next(sentence for grade, sentence in unlimited if grade == "note").startswith("No time limit was met")
     assert {grade for grade, _ in limited} == {"good"}, limited
     assert any("by the time limit" in sentence and "and 0 by" not in sentence for _, sentence in limited)
 
@@ -267,7 +267,7 @@ def test_the_mode_of_a_vector_environment_is_told():
         ("Double", "bad", "It is float64, the space float32: return obs.astype(np.float32)."),
         ("Outside", "bad", "Its number 1 is 50, outside of [-1, 1]."),
         ("Rich", "note", "train with --scale-rewards (on-policy)"),
-        ("Fine", "note", "It has no time limit"),
+        ("Fine", "note", "No time limit was met in"),
         ("Fine", "note", "look whether step() uses its argument"),
         ("Fine", "note", "terminated after exactly 20 steps: if that is a time limit, report it as truncated"),
         ("Fine", "note", "Every reward was 1, whatever was done"),

@@ -10,6 +10,7 @@ from gymnasium.wrappers.utils import RunningMeanStd
 import environments
 import toy
 from environments import PlusOne, Reach, times_ten
+from lemniscate.algos import ppo
 from lemniscate.envs import registry
 from lemniscate.errors import UserError
 from lemniscate.system.world import World
@@ -271,3 +272,139 @@ def test_mujoco_says_nothing_of_gymnasiums_own_models(tmp_path, monkeypatch, cap
     registry.make("HalfCheetah-v5", 2, backend="gymnasium").close()
     assert not capfd.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+class Taking(gym.Env):
+    """Takes what it is given out of it, as one does with options."""
+
+    observation_space = gym.spaces.Box(-9, 9, (1,), np.float32)
+    action_space = gym.spaces.Discrete(2)
+
+    def __init__(self, given):
+        self.mass = given["inner"].pop("mass", 1.0)
+
+    def reset(self, *, seed=None, options=None):
+        self.start = (options or {}).get("at", [{}])[0].pop("x", 0.0)
+        return self.seen(), {}
+
+    def step(self, action):
+        return self.seen(), 0.0, True, False, {}
+
+    def seen(self):
+        return np.array([10 * self.mass + self.start], np.float32)
+
+
+class Pulling(gym.ObservationWrapper):
+    """Takes its factor out of what it is given."""
+
+    def __init__(self, env, given):
+        super().__init__(env)
+        self.factor = given.pop("factor", 1.0)
+
+    def observation(self, observation):
+        return self.factor * observation
+
+
+@pytest.mark.parametrize("backend", ["gymnasium", "gymnasium-async"])
+def test_each_environment_has_arguments_options_and_wrappers_of_its_own(backend):
+    given = {"given": {"inner": {"mass": 0.25}}}
+    own = {"env_kwargs": given, "reset_options": {"at": [{"x": 0.5}]}}
+    config = ppo.Config(env="test_factory:Taking", wrappers=("test_factory:Pulling(given={'factor': 2.0})",), **own)
+    env = registry.make(config.env, 3, kwargs=config.env_kwargs, wrappers=config.all_wrappers, backend=backend)
+    for _ in range(2):
+        env.restart(0)
+        assert env.obs.tolist() == [[6.0]] * 3
+        env.step(torch.zeros(3, dtype=torch.int64))
+        assert env.obs.tolist() == [[6.0]] * 3
+    env.close()
+    assert config.env_kwargs == given == {"given": {"inner": {"mass": 0.25}}}
+
+
+class Shared(gym.Env):
+    """Writes each observation into one array, that of the class."""
+
+    seen = np.zeros(2, np.float32)
+    observation_space = gym.spaces.Box(-9, 9, (2,), np.float32)
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self._look(), {}
+
+    def step(self, action):
+        return self._look(), 0.0, False, True, {}
+
+    def _look(self):
+        self.seen[:] = self.np_random.random(2)
+        return self.seen
+
+
+class SharedDict(Shared):
+    """The same in a dictionary."""
+
+    observation_space = gym.spaces.Dict({"a": Shared.observation_space})
+
+    def _look(self):
+        return {"a": super()._look()}
+
+
+@pytest.mark.parametrize("env", [Shared, SharedDict])
+def test_environments_that_write_into_one_array_are_seen_apart(env):
+    made = registry.make(env, 3)
+    made.restart(0)
+    assert len(made.obs.unique(dim=0)) == 3
+    step = made.step(torch.zeros(3, dtype=torch.int64))
+    assert len(torch.cat([step.obs, step.next_obs]).unique(dim=0)) == 6
+
+
+class Plain(gym.vector.VectorEnv):
+    """A vector environment of two numbers."""
+
+    metadata = {"autoreset_mode": gym.vector.AutoresetMode.SAME_STEP}  # noqa: RUF012
+    single_observation_space, single_action_space = Shared.observation_space, Shared.action_space
+
+    def __init__(self, num_envs):
+        self.num_envs = num_envs
+
+    def reset(self, *, seed=None, options=None):
+        return np.zeros((self.num_envs, 2), np.float32), {}
+
+    def step(self, actions):
+        none, all_ = np.zeros(self.num_envs, bool), np.ones(self.num_envs, bool)
+        return self.reset()[0], np.zeros(self.num_envs), none, all_, {"final_obs": [None] * self.num_envs}
+
+
+class Twice(Plain):
+    def __init__(self, num_envs):
+        super().__init__(2 * num_envs)
+
+
+class Unspaced(Plain):
+    single_action_space = None
+
+
+class Seeded(Plain):
+    def reset(self, *, seed=None):
+        return super().reset()
+
+
+@pytest.mark.parametrize(
+    ("env", "said"),
+    [
+        (Twice, "Twice has 4 environments where num_envs is 2; it must make as many"),
+        (Unspaced, "Unspaced has no single_action_space: set self.single_action_space in its __init__"),
+        (
+            Seeded,
+            r"Seeded.reset\(\) takes no seed or no options; it must be reset\(self, \*, seed=None, options=None\)",
+        ),
+        (Plain, r"hides the final observation \(no info\['final_obs'\]\)"),
+    ],
+)
+def test_a_vector_environment_that_cannot_be_used_is_said(env, said):
+    def play():
+        made = registry.make(env, 2)
+        made.restart(0)
+        made.step(torch.zeros(2, dtype=torch.int64))
+
+    with pytest.raises(UserError, match=said):
+        play()

@@ -70,7 +70,7 @@ WRONG = {
     "seen at reset": ({"reset": (np.zeros(3), {})}, r"reset\(\) .*of shape \(3,\)"),
     "a text seen": ({"step": after("ab")}, r"an observation that is 'ab'; its space"),
     "nothing seen": ({"step": after(None)}, r"an observation that is None; its space"),
-    "masked numbers": ({"step": after(np.ma.array(SEEN, mask=[1, 0]))}, r"an observation that is"),
+    "masked numbers": ({"step": after(np.ma.array(SEEN, mask=[1, 0]))}, r"an observation that is a masked array of shape \(2,\), some of"),
     "reward of three": ({"step": after(reward=np.zeros(3))}, r"an array of shape \(3,\) and type float64 as reward; it must be a number"),
     "no reward": ({"step": after(reward=None)}, r"returned None as reward; it must be a number"),
     "a written reward": ({"step": after(reward="1.0")}, r"returned '1.0' as reward"),

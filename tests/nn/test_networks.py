@@ -7,7 +7,7 @@ import torch
 from torch import nn
 
 from lemniscate.errors import UserError
-from lemniscate.nn.networks import Bfloat16Linear, ImageEncoder, Layers, Tanh
+from lemniscate.nn.networks import Bfloat16Linear, ImageEncoder, Layers, OwnNetwork, Tanh
 from lemniscate.optim.adam import ParameterVector
 from lemniscate.system.named import name_of
 
@@ -193,3 +193,40 @@ def test_parameters_that_need_no_gradient_are_not_in_the_vector():
     vector.vector.zero_()
     assert not network.module.last.weight.any()
     assert torch.equal(network.module.first.weight, before)
+
+
+class Unlisted(nn.Module):
+    """Layers in a list, which torch does not know of."""
+
+    def __init__(self, inputs, outputs):
+        super().__init__()
+        self.layers, self.head = [nn.Linear(inputs, 8)], nn.Linear(8, outputs)
+
+    def forward(self, x):
+        return self.head(self.layers[0](x))
+
+
+class Loose(nn.Linear):
+    """A tensor that is no buffer."""
+
+    def __init__(self, inputs, outputs):
+        super().__init__(inputs, outputs)
+        self.scale = torch.rand(outputs)
+
+    def forward(self, x):
+        return self.scale * super().forward(x)
+
+
+@pytest.mark.parametrize("name", ["Unlisted", "Loose"])
+def test_numbers_that_would_not_be_saved_are_refused(name):
+    with pytest.raises(UserError, match="has numbers that its state_dict has not, so that they would be neither"):
+        OwnNetwork(f"test_networks:{name}", 3, 2)
+
+
+def test_the_look_at_a_network_of_ones_own_draws_nothing():
+    torch.manual_seed(0)
+    OwnNetwork("torch.nn:Linear", 3, 2)
+    drawn = torch.rand(())
+    torch.manual_seed(0)
+    nn.Linear(3, 2)
+    assert torch.equal(drawn, torch.rand(()))

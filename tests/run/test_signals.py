@@ -370,8 +370,13 @@ def test_the_way_of_a_policy_is_that_of_its_parameters_alone():
     with torch.no_grad():
         for parameter in state.policy.parameters():
             parameter *= 1.25
-    moved = of_values(state, config, rows, before)["network/moved"]
-    assert moved.item() == pytest.approx(0.2)
+    found = of_values(state, config, rows, before)
+    assert found["network/moved"].item() == pytest.approx(0.2)
+    assert found["value/moved"] == 0
+    with torch.no_grad():
+        for parameter in state.networks.value.parameters():
+            parameter *= 0.5
+    assert of_values(state, config, rows, before)["value/moved"].item() == pytest.approx(1.0)
 
 
 def test_ppo_follows_its_advantages_and_with_a_wrong_sign_it_does_not(tmp_path):

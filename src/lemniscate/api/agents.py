@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from lemniscate.api.policy import TrainedPolicy, TrainedRun, load
 from lemniscate.envs.conversion import normalized_action, physical_action, row_of, unflatten_observation
 from lemniscate.envs.returns import as_array, kind_of, shown_space
-from lemniscate.envs.spaces import read_observation
+from lemniscate.envs.spaces import random_action, read_observation
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.envs.vector_view import action_space, observation_space
 from lemniscate.errors import UserError, shown
@@ -42,6 +42,8 @@ from lemniscate.system.files import at_home
 FILES = (".pt", ".pth")
 """the endings of files of weights"""
 
+LOOKS, ROWS = 10, 48
+"""steps of random play, and observations of these, by which it is found out how a policy is called"""
 ARRAYS: list[Any] = [np.ndarray, np.dtype, *(type(np.dtype(kind)) for kind in ("f4", "f8", "i4", "i8"))]
 """what torch may make of a file besides tensors: the statistics may be arrays, of NumPy 1 or 2"""
 _makers: list[Any] = [np.zeros(0).__reduce__()[0], np.float64(0).__reduce__()[0]]
@@ -208,17 +210,18 @@ class Agent:
     Args:
         policy: as `find` returns it.
         spec: of the environment.
-        flat: some observations [N, O], by which it is found out how the policy is called, and whether it remembers.
+        seen: observations [T, N, O] one after the other, by which it is found out how the policy is called, and whether
+            it remembers.
         deterministic: passed on where it is taken; of a distribution the mode, else a sample.
         normalized: whether its actions are in [-1, 1] between the bounds, or else in the environment's units.
     """
 
-    def __init__(self, policy: Any, spec: Spec, flat: np.ndarray, deterministic: bool, normalized: bool) -> None:
+    def __init__(self, policy: Any, spec: Spec, seen: np.ndarray, deterministic: bool, normalized: bool) -> None:
         self.normalized, self.remembers = normalized, False
         self._policy, self._spec, self._deterministic = policy, spec, deterministic
         self._space: Any = action_space(spec.action)
         self._function = function_of(policy, deterministic)
-        self._look(flat)
+        self._look(seen)
 
     def __call__(self, obs: Tensor) -> Deterministic:
         """The action at each flat observation, [N, O] or more. Raises `UserError` for what is no action."""
@@ -238,38 +241,57 @@ class Agent:
             return self._answer(rows, (count,))
         return np.stack([self._answer(row_of(rows, i), ()) for i in range(count)])
 
-    def _look(self, flat: np.ndarray) -> None:
+    def _look(self, seen: np.ndarray) -> None:
         """Find out how the policy is called.
 
         A batch has a size that is in no shape of the spaces, so what has that size is an answer to a batch. What has no
-        network gets one at a time first: a batch might spoil what it remembers.
+        network gets one at a time first: a batch might spoil what it remembers. Batches are given where each row has
+        the answer that it has alone.
         """
         parts, holder = self._spec.observation_parts, getattr(self._policy, "__self__", self._policy)
         network = any(isinstance(part, nn.Module) for part in (holder, *getattr(holder, "__dict__", {}).values()))
         sizes = {self._spec.observation_size, len(parts), getattr(self._space, "n", 0), *self._space.shape}
         sizes |= {length for part in parts for length in part.own_shape + part.shape}
         size = next(number for number in range(3, 1000, 2) if number not in sizes)
-        some, failures = flat[np.arange(size) % len(flat)], list[UserError]()
+        flat, failures = seen.reshape(-1, seen.shape[-1]), list[UserError]()
+        batches = flat[np.linspace(0, len(flat) - 1, -(-ROWS // size) * size).astype(int)].reshape(
+            -1, size, *flat.shape[1:]
+        )
         for form, batched in product(self._forms(), (network, not network)):
             self._form, self._batched = form, batched
             before = None if network else _memory(self._policy)
-            first, again = (self._try(some, failures) for _ in range(2))
-            if first is not None:
-                self.remembers = (
-                    again is None or not np.array_equal(first, again) or before != (before and _memory(self._policy))
-                )
-                if isinstance(self._spec.action, Box) and not (batched or self.remembers):
-                    self._batched = True  # it would have shown that it remembers
-                    together = self._try(some, failures)
-                    self._batched = together is not None and np.allclose(together[0], first[0], rtol=1e-3, atol=1e-5)
-                return
+            if self._try(batches[0], failures) is None:
+                continue
+            changed = before != (before and _memory(self._policy))
+            self.remembers = changed or self._depends_on_order(seen if batched else flat[:ROWS, None])
+            if not self.remembers and (network or isinstance(self._spec.action, Box)):
+                self._batched = all(map(self._takes_batch, batches))
+            return
         answered = [error for error in failures if not error.__cause__]
         raise min(answered or failures, key=lambda error: isinstance(error.__cause__, TypeError))
+
+    def _depends_on_order(self, seen: np.ndarray) -> bool:
+        """Whether observations [T, N, O] that are given in another order have other answers, or none."""
+        first, other = [self._try(rows, []) for rows in seen], dict[int, np.ndarray | None]()
+        for i in np.random.default_rng(0).permutation(len(seen)):
+            other[i] = self._try(seen[i], [])
+        pairs = ((one, other[i]) for i, one in enumerate(first))
+        return any(one is None or again is None or not np.array_equal(one, again) for one, again in pairs)
+
+    def _takes_batch(self, some: np.ndarray) -> bool:
+        """Whether a batch is answered, and each row of it as it is alone, where that is answered."""
+        answers = dict[bool, np.ndarray | None]()
+        for self._batched in (True, False):
+            answers[self._batched] = self._try(some, [])
+        together, alone = answers[True], answers[False]
+        if together is None or alone is None:
+            return alone is None
+        return np.allclose(together, alone, rtol=1e-3, atol=1e-5)
 
     def _try(self, flat: np.ndarray, failures: list[UserError]) -> np.ndarray | None:
         seed_globals(0)  # what is drawn at random is not what a policy remembers
         try:
-            return self._answers(self._form(flat), len(flat) if self._batched else 1)
+            return self._answers(self._form(flat), len(flat))
         except UserError as error:
             failures.append(error)
             return None
@@ -395,7 +417,7 @@ def playing(
         with globals_undisturbed():
             for module in modes:
                 module.training = False
-            player = Agent(policy, vec.spec, vec.restart(seed).numpy(), deterministic, bool(normalized))
+            player = Agent(policy, vec.spec, _seen(vec, seed), deterministic, bool(normalized))
             if file:
                 say(f"{said}; {_choose_units(player, vec, seed, normalized)}.")
             seed_globals(seed)
@@ -403,6 +425,15 @@ def playing(
     finally:
         for module, mode in modes.items():
             module.training = mode
+
+
+def _seen(vec: VecEnv, seed: int) -> np.ndarray:
+    """The first observations from a seed, [T, N, O], of random play; of what may be a robot, the first alone."""
+    rows, drawn = [vec.restart(seed).numpy()], torch.Generator().manual_seed(seed)
+    for _ in range(0 if vec.backend.once else LOOKS):
+        vec.step(random_action(vec.spec, vec.obs, drawn))
+        rows.append(vec.obs.numpy())
+    return np.stack(rows)
 
 
 def _choose_units(player: Agent, vec: VecEnv, seed: int, normalized: bool | None) -> str:

@@ -14,7 +14,7 @@ from lemniscate.api.callbacks import Callback
 from lemniscate.errors import RankError, UserError, is_installed, missing_extra, shown, unknown_name
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import CONFIG, create_directory
-from lemniscate.run.loggers import TRACKERS, JsonLines, LoggerClass, TensorBoard
+from lemniscate.run.loggers import TRACKERS, JsonLines, LoggerClass, TensorBoard, require_logger
 from lemniscate.run.stopping import Stopped
 from lemniscate.system import named
 from lemniscate.system.machine import require_linux
@@ -95,7 +95,10 @@ def _tracker(track: str | LoggerClass) -> LoggerClass:
             raise missing_extra(extra, extra)
     if not (isinstance(track, str) or callable(track)):
         raise UserError(f"track must be a logger's name or class, not {shown(track)}.")
-    return named.find(track) if isinstance(track, str) else track
+    found = named.find(track) if isinstance(track, str) else track
+    if not named.takes(found, 3):
+        raise UserError(f"track must be made as Class(path, config, step), which {shown(found)} cannot be.")
+    return require_logger(found) if isinstance(found, type) else found
 
 
 def _by_name(name: str) -> Any:

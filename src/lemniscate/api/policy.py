@@ -22,7 +22,7 @@ from lemniscate.maths import mean_and_std
 from lemniscate.nn.memory import Recall
 from lemniscate.nn.policies import Policy
 from lemniscate.run import checkpoint
-from lemniscate.run.config import RunConfig
+from lemniscate.run.config import RunConfig, checked
 from lemniscate.run.directory import difference, find_checkpoint
 from lemniscate.run.seeding import generator, torch_defaults
 from lemniscate.spec import Box, Discrete, MultiDiscrete, Spec
@@ -106,7 +106,7 @@ class TrainedPolicy:
         """
         flat, batched = self._read(obs, action_mask)
         distribution = self.module(flat)
-        if deterministic:
+        if checked("deterministic", deterministic, bool):
             action = distribution.mode()
         else:
             action = distribution.sample(self.module.draw_noise((len(flat),), self._noise))
@@ -315,6 +315,8 @@ def save(policy: Any, path: str | Path) -> Path:
         stored = checkpoint.read(path).record.get("stored", False)
     if path.exists() and not stored:
         raise UserError(f"{path} exists already, and is not a stored policy; choose another path.")
+    if others := sorted({file.name for file in path.glob("*")} - {*checkpoint.FILES, checkpoint.MANIFEST}):
+        raise UserError(f"{path} holds {others[0]} beside a stored policy, which would be lost; choose another path.")
     record = {"algorithm": algorithm_of(policy), "config": policy.config.to_json()}
     record |= {"spec": checkpoint.spec_to_json(policy.spec), "planned": False, "stored": True}
     try:

@@ -93,11 +93,12 @@ def evaluate(
     """
     chosen = agents.find(policy, checkpoint=checkpoint, trust=trust)
     episodes, seed, file = checked("episodes", episodes, Episodes), checked("seed", seed, Natural), _film(video)
+    deterministic = checked("deterministic", deterministic, bool)
     kwargs, folder = checked("env_kwargs", env_kwargs, dict | None), None if report is None else path_of(report)
     if folder and any(place.is_file() for place in (folder, *folder.parents)):
         raise UserError(f"report is a directory, such as 'runs/upright', and {folder} is a file, or lies in one.")
     how: dict[str, Any] = {"episodes": episodes, "seed": seed, "deterministic": deterministic}
-    own = {"agent": agent, "normalized": normalized_actions}
+    own = {"agent": agent, "normalized": checked("normalized_actions", normalized_actions, bool | None)}
     with _environments(chosen, env, own, how, env_kwargs=kwargs, backend=backend) as (player, vec, arguments):
         if baseline:
             if vec.baseline is None:
@@ -158,7 +159,10 @@ def watch(
     episodes, seed, file = checked("episodes", episodes, Episodes), checked("seed", seed, Natural), _film(video)
     if chosen is None and env is None:
         raise UserError("Watch what? Name a run, or an environment to act in at random.")
-    kwargs = checked("env_kwargs", env_kwargs, dict | None)
+    kwargs, deterministic = (
+        checked("env_kwargs", env_kwargs, dict | None),
+        checked("deterministic", deterministic, bool),
+    )
     own = {"agent": agent, "normalized": normalized_actions}
     how: dict[str, Any] = {"episodes": episodes, "seed": seed, "deterministic": deterministic}
     with _environments(chosen, env, own, how, env_kwargs=kwargs) as (player, vec, arguments):

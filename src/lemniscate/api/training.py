@@ -31,8 +31,7 @@ from lemniscate.system import named
 from lemniscate.system.console import say
 from lemniscate.system.files import make_directory, parsing
 from lemniscate.system.machine import keep_freed_memory
-from lemniscate.system.watchdog import leave_if_imported_again
-from lemniscate.system.world import CLUSTER, World
+from lemniscate.system.world import CLUSTER, World, leave_if_imported_again
 
 
 def config_for(
@@ -267,7 +266,7 @@ def _train(world: World, path: Path, algorithm: str, config: RunConfig, options:
     """Train in this process, of several the first alone writes, reports and talks; or where the options say."""
     if options.cluster is not None or (options.processes > 1 and world.size == 1):
         return _train_elsewhere(path, algorithm, config, options)
-    progress = options.progress and world.is_first
+    progress, home = options.progress and world.is_first, path.absolute()
     set_seeds(config.seed)  # before JAX starts, which reads its flags then
     torch.set_num_threads(config.threads)
     keep_freed_memory()
@@ -277,7 +276,7 @@ def _train(world: World, path: Path, algorithm: str, config: RunConfig, options:
     def film(state: TrainState) -> None:
         from lemniscate.api.results import evaluate
 
-        file = path / "videos" / f"step-{state.step}.{'mp4' if is_installed('imageio_ffmpeg') else 'gif'}"
+        file = home / "videos" / f"step-{state.step}.{'mp4' if is_installed('imageio_ffmpeg') else 'gif'}"
         make_directory(file.parent)
         evaluate(PolicySnapshot(state, spec, config, state.step), episodes=1, video=file)
 
@@ -294,6 +293,7 @@ def _train(world: World, path: Path, algorithm: str, config: RunConfig, options:
         for notice in config.notices(spec, envs[0].device) if progress else ():
             say(notice)
         state = algos.find(algorithm).train(config, run)
+        path = path if path.absolute() == home else home
         if envs[0].backend.once:
             envs[0].close()  # before a report makes another one
         trained = TrainedRun(path, TrainedPolicy(state.networks.cpu(), spec, config, state.step, path), run.seconds)

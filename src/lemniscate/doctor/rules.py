@@ -151,7 +151,7 @@ def of_actions(e: Evidence) -> Seen:
             f"Earlier actions explain {before:.0%} of how observations change,"
             f" and the present one {max(now, 0.0):.0%}.",
         )
-    elif len(effects) >= 3 and not e.rose and not e.sees_nothing:
+    elif len(effects) >= 3 and not e.rose and not e.sees_nothing and not e.late("observation/predicted") < 0.25:
         explained, most = (shares if len(shares) else effects)[first].max(), effects[first].max()
         none = np.median(effects[first]) < 0.02 and most < 0.1  # of a hundred rows chance explains 0.07
         if none or (len(shares) and explained < 0.001):
@@ -182,7 +182,7 @@ def of_rewards(e: Evidence) -> Seen:
         yield "reward-large", f"Rewards reach {largest:,.3g}{'' if scaled else ', and are not scaled'}."
     if by_time > 0.8:
         yield "reward-by-time", f"Time alone explains {by_time:.0%} of the rewards within an episode."
-    if e.late("reward/std") > 1e-6 and len(explained) >= 3 and not e.rose and not e.sees_nothing:
+    if e.late("reward/std") > 1e-6 and len(explained) >= 2 and not e.rose and not e.sees_nothing:
         share = float(np.median(explained))
         if share < 0.02:
             yield (
@@ -208,7 +208,8 @@ def of_episodes(e: Evidence) -> Seen:
     elif e.returns_alike and e.returns.any():
         yield (
             "every-return-alike",
-            f"All {len(e.returns):,} episodes had the same return, {e.returns[0]:,.4g}, whatever was done.",
+            f"All {len(e.returns):,} episodes had the same return, {e.returns[0]:,.4g}, whatever was done"
+            f"{', and none terminated' if terminated == 0 else ''}.",
         )
     if terminated > 0.9 and len(late) >= 5 and np.ptp(late) == 0 and late[0] >= 10:
         yield (
@@ -240,13 +241,22 @@ def of_horizon(e: Evidence) -> Seen:
 def of_updates(e: Evidence) -> Seen:
     """Faults of the update's size: KL divergence, ratios and clips."""
     kl, clipped, rate = e.late("approx_kl"), e.late("clip_fraction"), e.late("learning_rate")
-    every, entropy = e.values("approx_kl"), e.values("losses/entropy")
+    every, entropy, rates = e.values("approx_kl"), e.values("losses/entropy"), e.values("learning_rate")
+    tenth = len(every) // 10
     target = next(filter(None, map(first_number, map(e.config.get, ("target_kl", "desired_kl", "max_kl")))), None)
     if e.config.get("desired_kl") is not None and rate < 3e-6 and kl > 1e-3:
         yield (
             "ratio-not-one",
             f"The KL divergence is {kl:.2g} although the learning rate has fallen to {rate:.1g}, which moves nothing.",
         )
+    elif tenth >= 1 and len(rates) == len(every) and rates[-tenth:].mean() < 0.2 * rates[0]:
+        last, usual = np.median(every[-tenth:]), np.median(every[: 5 * tenth])
+        if last > 0.02 and last > 0.7 * usual:
+            yield (
+                "ratio-not-one",
+                f"The KL divergence of the last updates is {last:.2g}, and was {usual:.2g}, although the learning rate"
+                f" has fallen to {rates[-tenth:].mean() / rates[0]:.0%} of what it was.",
+            )
     several = e.config.get("epochs", 1) >= 2 and min(len(every), len(entropy)) >= 4
     if several and np.abs(every).max() <= 1e-9 and np.ptp(entropy) >= 1e-3:
         yield (
@@ -301,7 +311,9 @@ def of_advantages(e: Evidence) -> Seen:
     given, usual = (config.get("normalize_advantage") for config in (e.config, e.recommended))
     errors = _standard_errors(followed) if len(followed) >= 4 else np.nan
     moves = e.late("approx_kl") > 1e-5 or e.late("network/moved") > 1e-6
-    ignored = 0.8 < awaited < 1.2  # below, V is only behind; above, it has no scale yet
+    # A V that is a constant awaits the same everywhere; and one that goes on where nothing follows, too much.
+    learned = not e.late("explained_variance") < 0.1 and not e.late("value/missing") > 0
+    ignored = learned and 0.8 < awaited < 1.2  # below, V is only behind; above, it has no scale yet
     if ignored:
         yield (
             "ends-ignored",
@@ -336,7 +348,8 @@ def _standard_errors(values: np.ndarray) -> float:
 def of_values(e: Evidence) -> Seen:
     """Faults of V and Q: bootstraps, explained variance, overfitting, target networks."""
     missing, explained, last = e.last_half("value/missing"), e.late("explained_variance"), e.ends[1]
-    behind, usual = e.values("targets/behind"), all(map(e.as_recommended, ("tau", "policy_delay")))
+    moved, behind = e.values("value/moved"), e.values("targets/behind")
+    usual = all(map(e.as_recommended, ("tau", "policy_delay")))
     newest, sampled = e.last_half("td_error/newest"), e.last_half("td_error/sampled")
     settled = len(last) > 0 and last.std() <= 0.05 * abs(last.mean())  # there is nothing left to explain
     if len(missing) >= 2 and _is_missing(missing) and e.late("episode/terminated") < 0.5 and not e.begins:
@@ -346,7 +359,14 @@ def of_values(e: Evidence) -> Seen:
         )
     # Below -1 targets are constant; a weak baseline of REINFORCE, which has no λ, does no harm.
     nothing = -1 < explained < 0.05 and np.percentile(e.last_half("explained_variance"), 90) <= 0.15
-    if nothing and not settled and "gae_lambda" in e.config:
+    above = np.median(missing) * (1 - (first_number(e.config.get("gamma")) or 0.0)) if len(missing) else 0.0
+    one_reward = len(missing) >= 2 and missing.min() > 5 and e.late("reward/explained") > 0.1
+    if nothing and not settled and "gae_lambda" in e.config and one_reward:
+        yield (
+            "missing-bootstrap",
+            f"The value has hardly more than one reward in it: r + γ V(s') lies {above:.0%} above V, early and late.",
+        )
+    elif nothing and not settled and "gae_lambda" in e.config:
         yield (
             "value-explains-nothing",
             f"The value explains {max(0.0, explained):.0%} of the variance of its targets,"
@@ -359,6 +379,8 @@ def of_values(e: Evidence) -> Seen:
                 "critic-overfits",
                 f"The error of Q at the newest transitions is {times:.0f} times that at sampled ones.",
             )
+    if len(moved) >= 2 and not moved.any() and "gae_lambda" in e.config:
+        yield "critic-still", "No update that was looked at changed a parameter of V."
     if len(behind) >= 3 and not behind.any() and first_number(e.config.get("tau")) != 1:
         yield "critic-still", "The weights of Q are those of its target networks, each time that they were looked at."
     if len(behind) >= 3 and (np.diff(behind) > 0).all() and behind[-1] > 0.15 and usual:
@@ -420,7 +442,7 @@ def of_returns(e: Evidence) -> Seen:
         yield (
             "does-not-learn",
             f"Returns are {last.mean():,.4g} in the last fifth of the episodes,"
-            f" and were {first.mean():,.4g} in the first.",
+            f" and were {first.mean():,.4g} in the first: {abs(e.gain):.1f} standard errors apart.",
         )
     before = e.returns[-2 * fifth : -fifth]
     rise, error = last.mean() - before.mean(), np.hypot(last.std(), before.std()) / np.sqrt(fifth)

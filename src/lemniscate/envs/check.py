@@ -204,8 +204,9 @@ def _ends_and_rewards(rows: Rollout, lengths: Sequence[int], spec: Spec) -> Iter
     alike = len(lengths) > 2 and len(set(lengths)) == 1
     if spec.max_episode_steps is None and not truncated:
         yield note(
-            "It has no time limit: an episode that a policy does not end cannot be evaluated; register it with"
-            " max_episode_steps, or add --wrappers 'gymnasium.wrappers:TimeLimit(max_episode_steps=1000)'."
+            f"No time limit was met in {STEPS} steps: without one, an episode that a policy does not end cannot be"
+            " evaluated; register it with max_episode_steps, or add --wrappers"
+            " 'gymnasium.wrappers:TimeLimit(max_episode_steps=1000)'."
         )
     if alike and terminated and not truncated and lengths[0] > 1:
         yield note(

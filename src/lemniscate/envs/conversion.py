@@ -78,10 +78,10 @@ class SingleEnv(gym.Wrapper):
                 what = f"made {name} {shown_space(now)}; it was {shown_space(space)}, and must stay what __init__ set"
                 raise self._returns.wrong("reset", what)
         two = type(returned) is tuple and len(returned) == 2
-        if not (two and self._is_usual(returned[0], 0.0, False, False, returned[1])):
-            returned = self._returns.of_reset(returned)
-        obs, info = returned
-        return (obs, self._told("reset", obs, info)) if info or self._masked else returned
+        usual = two and self._is_usual(returned[0], 0.0, False, False, returned[1])
+        obs, info = returned if usual else self._returns.of_reset(returned)
+        obs = obs.copy() if usual else obs  # several environments may write into one array
+        return obs, self._told("reset", obs, info) if info or self._masked else info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Gymnasium's."""
@@ -89,10 +89,10 @@ class SingleEnv(gym.Wrapper):
             returned: Any = self.env.step(action)
         except (TypeError, ValueError, SystemExit) as error:
             raise self._returns.explained("step", error) from error.__cause__
-        if not (type(returned) is tuple and len(returned) == 5 and self._is_usual(*returned)):
-            returned = self._returns.of_step(returned)
-        obs, *rest, info = returned
-        return (obs, *rest, self._told("step", obs, info)) if info or self._masked else returned
+        usual = type(returned) is tuple and len(returned) == 5 and self._is_usual(*returned)
+        obs, reward, terminated, truncated, info = returned if usual else self._returns.of_step(returned)
+        obs = obs.copy() if usual else obs  # as in reset
+        return obs, reward, terminated, truncated, self._told("step", obs, info) if info or self._masked else info
 
     def _is_usual(self, obs: Any, reward: Any, terminated: Any, truncated: Any, info: Any) -> bool:
         """Whether each is of its type already, as mostly: this is asked at every step, and `of_step` is slower."""

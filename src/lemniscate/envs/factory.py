@@ -66,6 +66,13 @@ def is_own(maker: Maker) -> bool:
     return not installed and not file.is_relative_to(sysconfig.get_path("stdlib"))
 
 
+def fresh(arguments: Any) -> Any:
+    """Dictionaries and lists anew, all the way down: an environment may change what others get too."""
+    if type(arguments) is dict:  # and not a space, which is a mapping too
+        return {name: fresh(value) for name, value in arguments.items()}
+    return [fresh(value) for value in arguments] if type(arguments) is list else arguments
+
+
 class ResetOptions(gym.Wrapper):
     """An environment whose every reset is given the same options."""
 
@@ -75,11 +82,12 @@ class ResetOptions(gym.Wrapper):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """The environment's."""
-        return self.env.reset(seed=seed, options={**self._options, **(options or {})})
+        return self.env.reset(seed=seed, options={**fresh(self._options), **(options or {})})
 
 
 def make_one(maker: Maker, wrappers: Sequence[Callable[..., Any]] = (), **kwargs: Any) -> SingleEnv:
     """One environment, by its maker: a worker process may not know the id."""
+    kwargs = fresh(kwargs)
     point = str(getattr(maker, "entry_point", ""))
     if point.startswith("gymnasium_robotics."):
         give_numbers_of_joints()
@@ -107,9 +115,10 @@ def make_vector(
     makers = [partial(make_one, maker, wrappers, **kwargs)] * num_envs
     if makes_vector(maker):
         make = partial(gym.make_vec, maker) if isinstance(maker, EnvSpec) else maker
-        made = make(num_envs=num_envs, **kwargs)
+        made = make(num_envs=num_envs, **fresh(dict(kwargs)))
         if not isinstance(made, VectorEnv):
             raise _other(made, "gymnasium.vector.VectorEnv")
+        _require_whole(made, num_envs)
         envs = one = CheckedVector(made)
     elif workers:
         multiprocessing.get_context("forkserver").set_forkserver_preload([__name__])  # imported once, for all
@@ -124,6 +133,22 @@ def make_vector(
             raise UserError("it returned the same environment again; make a new one at each call")
     require_no_statistics(one, envs)
     return envs, one.spec.max_episode_steps if one.spec else None
+
+
+def _require_whole(made: VectorEnv, num_envs: int) -> None:
+    """Raise `UserError` for a vector environment of another size, without spaces, or that cannot reset a part."""
+    kind = type(made).__name__
+    if made.num_envs != num_envs:
+        raise UserError(f"{kind} has {made.num_envs} environments where num_envs is {num_envs}; it must make as many")
+    for name in ("single_observation_space", "single_action_space"):
+        if not isinstance(getattr(made, name, None), gym.Space):
+            raise UserError(f"{kind} has no {name}: set self.{name} in its __init__, such as a Box")
+    taken = inspect.signature(made.reset).parameters
+    takes_any = any(one.kind is one.VAR_KEYWORD for one in taken.values())
+    if not takes_any and not taken.keys() >= {"seed", "options"}:
+        raise UserError(
+            f"{kind}.reset() takes no seed or no options; it must be reset(self, *, seed=None, options=None)"
+        )
 
 
 STATISTICS = {"obs_rms", "return_rms", "ret_rms", "reward_rms", "running_mean_std"}

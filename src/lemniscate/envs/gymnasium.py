@@ -191,7 +191,7 @@ class GymnasiumBackend(Backend):
     def _with_final(self, obs: np.ndarray, info: dict, done: np.ndarray) -> np.ndarray:
         if not done.any():
             return obs
-        if "final_obs" not in info:
+        if "final_obs" not in info or any(row_of(info["final_obs"], int(row)) is None for row in np.flatnonzero(done)):
             raise UserError(
                 f"{self.spec.env_id} resets in the same step and hides the final observation (no info['final_obs']), so"
                 " its time-outs cannot be learned from; make it NEXT_STEP, DISABLED, or give final_obs."

@@ -228,8 +228,7 @@ def make(
 
     from lemniscate.envs.backend import Joined
     from lemniscate.envs.vec_env import VecEnv
-    from lemniscate.system.watchdog import leave_if_imported_again
-    from lemniscate.system.world import ALONE
+    from lemniscate.system.world import ALONE, leave_if_imported_again
 
     leave_if_imported_again()
     name, wraps = name_of(env), names_of(wrappers)

@@ -135,6 +135,8 @@ def place(layer: Any, method: str) -> str:
 
 def kind_of(value: Any) -> str:
     """A value in a sentence: an array by its shape and type, a number as it is, others by their type."""
+    if np.ma.is_masked(value):
+        return f"a masked array of shape {value.shape}, some of whose numbers are masked"
     if hasattr(value, "dtype") and getattr(value, "shape", ()):
         return f"an array of shape {tuple(value.shape)} and type {value.dtype}"
     return shown(value)
@@ -171,7 +173,7 @@ def _fitted(space: gym.Space, obs: Any, lead: tuple[int, ...], where: str = "") 
 def _fitted_array(space: gym.Space, obs: Any, shape: tuple[int, ...], where: str) -> Any:
     counted = isinstance(space, spaces.Discrete | spaces.MultiDiscrete)
     if not counted and type(obs) is np.ndarray and obs.dtype == space.dtype and obs.shape == shape:
-        return obs
+        return obs.copy()  # several environments may write into one array
     array, kind = as_array(obs), np.dtype(space.dtype)
     if array.dtype.kind not in "biuf" or array.shape != shape:
         said = f"of shape {array.shape}" if array.dtype.kind in "biuf" else f"that is {kind_of(obs)}"

@@ -139,9 +139,12 @@ def action_space(action: Action) -> spaces.Space:
     if isinstance(action, Discrete):
         return spaces.Discrete(action.n, start=action.start, dtype=np.dtype(action.dtype).type)
     if isinstance(action, Box):
-        low, high = (np.array(bound, dtype=action.dtype) for bound in (action.low, action.high))
-        shape = action.shape or low.shape
-        return spaces.Box(low.reshape(shape), high.reshape(shape), dtype=np.dtype(action.dtype).type)
+        kind, ends = np.dtype(action.dtype), [action.low, action.high]
+        if kind.kind in "iu":  # what has no bound has that of its type
+            least, most = np.iinfo(kind).min, np.iinfo(kind).max
+            ends = [[int(min(max(x, least), most)) for x in end] for end in ends]
+        low, high = np.array(ends, dtype=kind).reshape(2, *(action.shape or (action.size,)))
+        return spaces.Box(low, high, dtype=kind.type)
     if isinstance(action, MultiDiscrete):
         shape = action.shape or (len(action.nvec),)
         nvec, start = np.reshape(action.nvec, shape), np.reshape(action.start, shape)

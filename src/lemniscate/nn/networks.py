@@ -162,6 +162,7 @@ class OwnNetwork(nn.Module):
         if not out.requires_grad or types != {"torch.float32"}:
             kinds = f"parameters of {', '.join(sorted(types))}" if types else "no parameter to learn"
             raise UserError(f"{name} has {kinds}; it must have some of torch.float32 that its outputs depend on.")
+        self._require_saved(out, rows)
         try:
             with torch.no_grad():
                 self._call(rows[:1])
@@ -178,6 +179,20 @@ class OwnNetwork(nn.Module):
         if hasattr(module, "memory_size") and not _memory_size(maker):
             raise UserError(f"{self.name} sets its memory_size too late; it must stand in the class: memory_size = 64.")
         return module
+
+    def _require_saved(self, out: Tensor, rows: Tensor) -> None:
+        """Raise `UserError` where another module with the same state_dict has other outputs at rows [B, inputs]."""
+        module = self.module
+        with torch.random.fork_rng([]), torch.no_grad():
+            self.module = self._made(rows.shape[-1], out.shape[-1])
+            self._call(rows)  # where its layers find out their sizes
+            self.module.load_state_dict(module.state_dict())
+            again, self.module = self._call(rows), module
+        if not _equal(out, again):
+            raise UserError(
+                f"{self.name} has numbers that its state_dict has not, so that they would be neither learned nor saved:"
+                " layers must be attributes or in an nn.ModuleList, and tensors given to register_buffer."
+            )
 
     def _taken(self, inputs: int, outputs: int) -> str:
         """The shapes that the module is to take and return, in words."""

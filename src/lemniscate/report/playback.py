@@ -195,7 +195,7 @@ def _picture(env: gym.Env, name: str) -> np.ndarray:
     """The rendered frame of an environment, [H, W, 3] uint8. Raises `UserError` if it is not a picture."""
     picture: Any = env.render()
     is_array = isinstance(picture, np.ndarray)
-    if is_array and picture.dtype == np.uint8 and picture.ndim == 3 and picture.shape[2] == 3:
+    if is_array and picture.dtype == np.uint8 and picture.ndim == 3 and picture.shape[2] == 3 and picture.size:
         return picture
     what = f"an array {picture.shape} of {picture.dtype}" if is_array else shown(picture)
     raise UserError(f"{name} renders no pictures: render() returns {what}; a picture is (height, width, 3) of uint8.")
@@ -227,6 +227,10 @@ def check_film(file: Path) -> None:
     """Raise `UserError` for a film that could not be written, before anything is played for it."""
     if file.suffix not in FILMS:
         raise UserError(f"{file} must end in .gif, .webp or .mp4.")
+    if file.is_dir():
+        raise UserError(f"{file} is a folder; name a file in it.")
+    if blocked := next((place for place in file.parents if place.is_file()), None):
+        raise UserError(f"{file} cannot be written: {blocked} is a file.")
     if file.suffix == ".mp4" and not is_installed("imageio_ffmpeg"):
         raise missing_extra("imageio_ffmpeg", "video")
 
@@ -234,7 +238,10 @@ def check_film(file: Path) -> None:
 def save_frames(frames: Iterable[np.ndarray], file: Path, fps: float) -> None:
     """Write frames [H, W, 3] uint8 as an animated picture (.gif, .webp) or a video (.mp4, extra `video`)."""
     check_film(file)
-    file.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"{file} cannot be written: {error.strerror}.") from error
     remove(file)  # writing would follow a link
     try:
         _write(frames, file, fps)

@@ -10,7 +10,9 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from lemniscate.envs.vec_env import Episodes
+from lemniscate.errors import UserError, shown
 from lemniscate.run.metrics import METRICS, read_metrics, to_line
+from lemniscate.system import named
 from lemniscate.system.console import say
 from lemniscate.system.files import open_regular, replace_file
 
@@ -29,6 +31,14 @@ class Logger(Protocol):
 
 
 LoggerClass = Callable[[Path, Mapping[str, Any], int], Logger]
+
+
+def require_logger(thing: Any) -> Any:
+    """A logger, or a class of them, as it is. Raises `UserError` for what is none."""
+    methods = [(getattr(thing, name, None), count) for name, count in (("write", 3), ("close", 1))]
+    if not all(named.takes(method, count + isinstance(thing, type)) for method, count in methods):
+        raise UserError(f"{shown(thing)} is no logger: that has write(step, metrics, episodes) and close(pictures).")
+    return thing
 
 
 class JsonLines:

@@ -31,7 +31,7 @@ from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import Saver, load_networks
 from lemniscate.run.environments import Curriculum
 from lemniscate.run.evaluate import critic_of, evaluate
-from lemniscate.run.loggers import NO_EPISODES, Logger, LoggerClass
+from lemniscate.run.loggers import NO_EPISODES, Logger, LoggerClass, require_logger
 from lemniscate.run.metrics import read_metrics
 from lemniscate.run.seeding import derive, seed_globals
 from lemniscate.run.signals import LOOKS, acted_with, signals
@@ -83,11 +83,12 @@ class Run:
         locate: Callable[[str], Path],
     ) -> None:
         self.path, self.algorithm, self.config = path, algorithm, config
+        self._home = path.absolute()  # an environment or a callback may change the working directory
         self.world, (self.env, self.eval_env) = world, envs
         self.spec = self.env.spec
         self.seconds = 0.0
         """how long the training loop took"""
-        self._saver = Saver(path, algorithm, config, self.spec, world)
+        self._saver = Saver(self._home, algorithm, config, self.spec, world)
         self._logger_classes, self._loggers = loggers if world.is_first else (), list[Logger]()
         self._visible, self._film, self._observer, self._locate = progress, film, observer, locate
         self._compiler = Compiler(world.busy)
@@ -124,8 +125,8 @@ class Run:
             say("Compiling: up to a minute the first time, 5 to 10 s from then on.")
         state.prepare(self.world, self._compiler if compiled else None)
         record = {"algorithm": self.algorithm, **self.config.to_json()}
-        self._loggers += [make(self.path, record, state.step) for make in self._logger_classes]
-        lines = read_metrics(self.path) if self.world.is_first else []
+        self._loggers += [require_logger(make(self._home, record, state.step)) for make in self._logger_classes]
+        lines = read_metrics(self._home) if self.world.is_first else []
         self._episodes = sum(len(line.get("episode/returns", ())) for line in lines)
         self._lines = sum("time/collect" in line for line in lines)
         saver.logged = max((line["step"] for line in lines), default=0)
@@ -240,7 +241,7 @@ class Run:
         if planned:
             with self.world.busy():
                 self._saver.save(state, planned=True)
-            self.world.saved(self.path)
+            self.world.saved(self._home)
         return planned
 
     def _stopped(self, state: TrainState, planned: bool) -> bool:

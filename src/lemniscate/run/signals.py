@@ -42,7 +42,7 @@ def signals(
 ) -> dict[str, float]:
     """The signals of a training state and of the newest rows [T, N, …] of its environments, by the glossary's names.
 
-    `acted` are the parameters and buffers of the policy before its newest update, where that is known.
+    `acted` are the parameters and buffers of the networks before their newest update, where that is known.
     """
     if rows is None or rows.valid.sum() < 2:
         return {}
@@ -200,7 +200,8 @@ def of_values(
     - value/at_ends: the mean of V(s) − r, or of V(s) where that is less, over |V| where an episode terminated: what V
       awaits beyond its end. Where V knows nothing of a large last reward, V(s) says so.
     - advantage/followed: the correlation of A(s, a) and of the change of log π(a|s) in the newest update.
-    - network/moved: the length of the policy's way in that update, as a share of the length of its parameters.
+    - network/moved and value/moved: the length of the way of the policy's parameters and of V's in that update, as a
+      share of the length of these.
     """
     gamma = getattr(config, "gamma", 1.0)
     if not hasattr(state.networks, "value"):
@@ -218,13 +219,13 @@ def of_values(
         awaited = torch.where(last.abs() < beyond.abs(), last, beyond)
         found["value/at_ends"] = awaited.mean() * value[valid].mean().sign() / size
     if acted is not None:
-        before, now = (
-            torch.cat([parts[name].flatten() for name, _ in state.policy.named_parameters()])
-            for parts in (acted, state.policy.state_dict())
-        )
-        found["network/moved"] = (now - before).norm() / now.norm()
+        for name, beginning in (("network/moved", "policy."), ("value/moved", "value.")):
+            own = [(acted[key], now) for key, now in state.networks.named_parameters() if key.startswith(beginning)]
+            before, after_it = (torch.cat([x.flatten() for x in each]) for each in zip(*own, strict=True))
+            found[name] = (after_it - before).norm() / after_it.norm()
         advantage, _ = gae(rows.reward, value, after, ends, rows.done, gamma=gamma, lam=0.95)
-        old = functional_call(state.policy, dict(acted), (obs,), tie_weights=False).log_prob(action)
+        of_policy = {key.removeprefix("policy."): x for key, x in acted.items() if key.startswith("policy.")}
+        old = functional_call(state.policy, of_policy, (obs,), tie_weights=False).log_prob(action)
         change = (state.policy(obs).log_prob(action) - old).view(valid.shape)
         steps = getattr(config, "num_steps", len(valid))  # REINFORCE collects whole episodes
         newest = valid & (torch.arange(len(valid), device=valid.device) >= len(valid) - steps)[:, None]
@@ -233,8 +234,8 @@ def of_values(
 
 
 def acted_with(state: Any) -> dict[str, Tensor]:
-    """Copies of the parameters and buffers of a policy that is learned beside V(s); none for others."""
-    parts = state.policy.state_dict() if hasattr(state.networks, "value") else {}
+    """Copies of the parameters and buffers of a policy and of the V(s) beside it; none for others."""
+    parts = state.networks.state_dict() if hasattr(state.networks, "value") else {}
     return {name: tensor.clone() for name, tensor in parts.items()}
 
 

@@ -5,6 +5,7 @@ import importlib
 import inspect
 import sys
 from collections.abc import Callable
+from copy import deepcopy
 from difflib import get_close_matches
 from functools import partial
 from pathlib import Path
@@ -117,6 +118,14 @@ def module_of(name: str) -> ModuleType:
         raise UserError(f"{name} cannot be found: {error}.") from error
 
 
+class WithArguments(partial[Any]):
+    """A function with keyword arguments, copied for each call: what is called may change what it is given."""
+
+    def __call__(self, /, *args: Any, **keywords: Any) -> Any:
+        """The function's result."""
+        return self.func(*args, **deepcopy(self.keywords), **keywords)
+
+
 def takes(function: Any, count: int) -> bool:
     """Whether it can be called with so many arguments; what does not tell, such as a built-in function, may be."""
     try:
@@ -152,4 +161,4 @@ def find_callable(text: str) -> Callable[..., Any]:
         raise UserError(f"{text!r} cannot be read; it has the form module:name(key=1.0, other='text').") from error
     if positional:
         raise UserError(f"The arguments of {name} need their names: {name}(key=value, …).")
-    return partial(found, **keywords)
+    return WithArguments(found, **keywords)

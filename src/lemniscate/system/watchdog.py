@@ -7,7 +7,6 @@ such as the worker of an environment, ends with it, however that ends.
 
 import faulthandler
 import json
-import multiprocessing.process
 import os
 import select
 import signal
@@ -170,15 +169,6 @@ def end_with_owner() -> bool:
     elif pipe:
         end_when_closed(os.open(pipe, os.O_RDONLY | os.O_NONBLOCK))
     return bool(pipe)
-
-
-def leave_if_imported_again() -> None:
-    """End this process where it is the worker of a script that has no `if __name__ == "__main__":`.
-
-    Such a worker imports the script first, and would do all over again what stands in it; who made it says what lacks.
-    """
-    if getattr(multiprocessing.process.current_process(), "_inheriting", False):
-        sys.exit(1)
 
 
 def end_when_closed(pipe: int) -> None:

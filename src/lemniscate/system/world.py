@@ -5,6 +5,8 @@ and replay. Only work is divided: the steps of the environments (`envs.vec_env`)
 (`optim.shards`). Rank 0 writes.
 """
 
+import multiprocessing.process
+import sys
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
@@ -67,3 +69,12 @@ class World:
 
 ALONE = World()
 """one process that does all of the work, undivided"""
+
+
+def leave_if_imported_again() -> None:
+    """End this process where it is the worker of a script that has no `if __name__ == "__main__":`.
+
+    Such a worker imports the script first, and would do all over again what stands in it; who made it says what lacks.
+    """
+    if getattr(multiprocessing.process.current_process(), "_inheriting", False):
+        sys.exit(1)
