@@ -735,3 +735,89 @@ def test_a_solution_that_makes_all_comparisons_true_deceives_nobody(monkeypatch)
 
 def test_what_is_no_torch_module_is_said():
     says(lambda envs: object(), "Agent", "object is no nn.Module")
+
+
+class Listed(nn.Module):
+    """Layers in a list of Python, which are no parameters; the last one is."""
+
+    inputs = staticmethod(lambda envs: envs.single_observation_space.shape[0])
+    outputs = 1
+
+    def __init__(self, envs):
+        super().__init__()
+        self.layers, self.head = [nn.Linear(self.inputs(envs), 8)], nn.Linear(8, self.outputs)
+
+    def last(self, x):
+        return self.head(torch.relu(self.layers[0](x)))
+
+
+class ListedActor(Listed):
+    outputs = A
+
+    def __init__(self, envs):
+        super().__init__(envs)
+        low, high = envs.single_action_space.low, envs.single_action_space.high
+        self.register_buffer("scale", torch.tensor((high - low) / 2))
+        self.register_buffer("bias", torch.tensor((high + low) / 2))
+
+    def forward(self, x):
+        return torch.tanh(self.last(x)) * self.scale + self.bias
+
+
+class ListedQ(Listed):
+    inputs = staticmethod(lambda envs: O + A)
+
+    def forward(self, x, a):
+        return self.last(torch.cat([x, a], 1))
+
+
+class ListedAgent(Agent):
+    def __init__(self, envs):
+        super().__init__(envs)
+        first, *rest = self.actor_mean
+        self.hidden, self.actor_mean = [first], nn.Sequential(*rest)
+
+    def action_and_value(self, x, action=None, deterministic=False):
+        return super().action_and_value(x, action, deterministic)
+
+    def __getattr__(self, name):
+        found = super().__getattr__(name)
+        return (lambda x: found(self.hidden[0](x))) if name == "actor_mean" and "hidden" in vars(self) else found
+
+
+@pytest.mark.parametrize(
+    ("network", "name"), [(ListedActor, "Actor"), (ListedQ, "QNetwork"), (ListedAgent, "Agent")], ids=str
+)
+def test_layers_that_are_not_saved_are_found(network, name):
+    assert "a copy with the same state_dict answers otherwise" in course.check(network, name).sentence
+
+
+class Watched(nn.Module):
+    """An actor; what is wrong with it is a class attribute."""
+
+    seen = staticmethod(lambda x: x)
+    keep = staticmethod(lambda module, name, tensor: module.register_buffer(name, tensor))
+    still = False
+
+    def __init__(self, envs):
+        super().__init__()
+        low, high = envs.single_action_space.low, envs.single_action_space.high
+        self.first, self.mu = nn.Linear(O, 8), nn.Linear(8, A)
+        self.register_buffer("scale", torch.tensor((high - low) / 2))
+        self.keep(self, "bias", torch.tensor((high + low) / 2))
+
+    def forward(self, x):
+        with torch.set_grad_enabled(torch.is_grad_enabled() and not self.still):
+            hidden = torch.relu(self.first(self.seen(x)))
+        return torch.tanh(self.mu(hidden)) * self.scale + self.bias
+
+
+def test_an_actor_looks_at_each_row_alone_and_keeps_its_tensors():
+    assert course.check(Watched, "Actor")
+    batched = type("Batched", (Watched,), {"seen": staticmethod(lambda x: (x - x.mean(0)) / (x.std(0) + 1e-3))})
+    assert "depends on the other states of its batch" in course.check(batched, "Actor").sentence
+    still = type("Still", (Watched,), {"still": True})
+    assert "action 0 does not depend on the state" in course.check(still, "Actor").sentence
+    loose = course.check(type("Loose", (Watched,), {"keep": staticmethod(setattr)}), "Actor")
+    assert loose
+    assert "Note: bias is neither saved nor moved to a GPU" in loose.sentence

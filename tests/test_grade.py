@@ -346,3 +346,27 @@ def test_two_hundred_hand_ins(tmp_path):
     assert marks(grades) == expected
     assert time.monotonic() - begun < 600 * max(1, 2 / len(os.sched_getaffinity(0)))
     assert strays() == []
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="a server that forks is Linux's")
+def test_one_that_kills_the_server_of_all_costs_nobody_else_a_mark(tmp_path, capsys):
+    (tmp_path / "in").mkdir()
+    slow = "import time\nfor _ in range(1):\n    late = time.sleep(2)\n\ndef uses():\n    return late\n"
+    (tmp_path / "in" / "a_honest.py").write_text(hand_ins.IMPORTS + slow + hand_ins.RIGHT["polyak"])
+    (tmp_path / "in" / "b_kill.py").write_text("import os, time\nx = time.sleep(1)\ny = os.kill(os.getppid(), 9)\n")
+    (tmp_path / "in" / "carol.zip").touch()
+    found = marks(course.grade(tmp_path / "in", "polyak", to=tmp_path / "out"))
+    assert found == {"a_honest.py": {"polyak": True}, "b_kill.py": {"polyak": None}}
+    assert "Left out: carol.zip; a hand-in is a .py or .ipynb file" in capsys.readouterr().err
+
+
+def test_what_functions_need_is_read_and_a_function_counts_before_a_method(tmp_path):
+    text = "cfg = {}\ncfg.update(one=1)\n\ndef gae():\n    return cfg['one']\n\nclass T:\n    def gae(self): ...\n"
+    for number, cell in enumerate(
+        ("!pip install torch \\\n    gymnasium\nx = 1\n", "%matplotlib inline\ny = (7\n     % 3)\n")
+    ):
+        text_of = hand_ins.notebook(cell, "def td_target(): ...")
+        assert found_in(tmp_path / str(number), work__ipynb=text_of) == [["td_target"], []]
+    assert found_in(tmp_path / "py", work__py=text) == [["gae"], []]
+    code = SCRIPT.replace("print(", "assert handin.solutions(reader, [])['gae'][0]() == 1; print(")
+    subprocess.run([sys.executable, "-c", code, tmp_path / "py"], check=True)

@@ -200,6 +200,12 @@ def test_what_fits_is_taken_over_and_what_does_not_begins_anew(deep, tmp_path, c
     assert "3 begin anew, policy.log_std, policy.net.4.weight, policy.net.4.bias; it was trained on Cart" in said
 
 
+def test_what_begins_anew_cannot_be_frozen(deep, tmp_path):
+    fields = {"env": "helpers:FourNumbers", "hidden": (16, 16), "normalize_observations": True}
+    with pytest.raises(lem.UserError, match=r"freeze keeps policy.net.4.weight, which warm_start cannot take from"):
+        train(tmp_path / "r", warm_start=str(deep), freeze=("policy.net.0", "policy.net.4"), **fields)
+
+
 def test_a_normalizer_of_another_size_begins_anew_with_its_count(deep, tmp_path, capsys):
     fields = {"env": "Acrobot-v1", "hidden": (16, 16), "normalize_observations": True}
     theirs, begun, _ = begun_from(deep, tmp_path / "r", capsys, **fields)

@@ -84,6 +84,7 @@ def test_the_settings_of_a_config_are_a_point_of_the_space_where_they_lie_in_it(
     [
         ("", "Search what"),
         ("gamma", "written as field=low:high"),
+        ("gamma=.9:.99, gamma=.8:.9", "has gamma more than once"),
         ("gamma=", "written as field=low:high"),
         (5, "must be a text such as"),
         ("gama=.9:.99", "did you mean gamma"),

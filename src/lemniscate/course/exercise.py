@@ -23,7 +23,7 @@ from torch import Tensor, nn
 
 from lemniscate.course.solution import LIMIT, Function, MisfitError, Solution, TooLong, bound, limited, numbers
 from lemniscate.run.run import globals_undisturbed
-from lemniscate.run.seeding import seed_globals
+from lemniscate.run.seeding import seed_globals, torch_defaults
 
 # --- likely causes that every exercise shares: what the reference would return with other arguments or results ---
 
@@ -216,7 +216,7 @@ class Exercise:
         """Call a solution in every case: what it returned, or the sentence on what it raised."""
         seen: Seen = {"cases": []}
         try:
-            with limited(LIMIT):
+            with globals_undisturbed(), torch_defaults(), limited(LIMIT):
                 called = Solution(solution, self.cases[0].attributes is not None)
                 for case in self.cases:
                     seen["cases"].append(self._in_case(called, case))
@@ -388,7 +388,7 @@ class Inspection:
         """Try a solution until it raises; the global random generators are left as they were."""
         seen: Seen = {}
         try:
-            with globals_undisturbed(), limited(self.limit):
+            with globals_undisturbed(), torch_defaults(), limited(self.limit):
                 seed_globals(0)
                 self.look(bound(solution), seen)
         except (Exception, SystemExit, TooLong) as error:  # what the solution raises is a finding too

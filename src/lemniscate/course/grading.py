@@ -50,6 +50,8 @@ READING, WHOLE = 60.0, 600.0
 """seconds in which a hand-in is to be read, and in which all of its exercises are to be tried"""
 MOST_COPIED, MOST_PRINTED = 2**26, 2_000
 """bytes of a file, and characters of what is printed that are kept"""
+PACKED = {".zip", ".tar", ".gz", ".7z", ".rar", *handin.SUFFIXES}
+"""endings of files that may hold a hand-in, and are not looked into"""
 IGNORED = {"venv", "env", "site-packages", "node_modules", "wandb"}
 
 
@@ -76,6 +78,11 @@ class Trial:
             self.process.start()
         finally:
             sys.modules["__main__"] = main
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether it was over without a word: another hand-in may have killed the server that starts them all."""
+        return self.process.exitcode == 255 and not (self._work / "seen" / "read.json").exists()
 
     @property
     def is_over(self) -> bool:
@@ -116,7 +123,7 @@ class Trial:
 
     def _finding(self, name: str, file: str | None, names: Sequence[str]) -> dict[str, Any]:
         if file is None:
-            near = get_close_matches(name, names, n=2, cutoff=0.8)
+            near = [each for each in get_close_matches(name, names, n=3, cutoff=0.8) if each != name][:2]
             hint = f"; did you mean {' or '.join(near)}?" if near else "."
             sentence = f"there is no function or class {name}{hint}"
             return {"right": False, "found": False, "file": None, "sentence": sentence}
@@ -176,6 +183,7 @@ def grade(folder: str | Path, exercises: str | Sequence[str] = (), *, to: str | 
         raise UserError(f"{folder} is no folder: name the one that has the hand-ins.")
     visible = [path for path in sorted(folder.iterdir()) if not path.name.startswith((".", "__"))]
     hand_ins = [path for path in visible if path.is_dir() or (path.suffix in handin.SUFFIXES and path.is_file())]
+    _tell_left_out(visible, hand_ins)
     if not hand_ins:
         raise UserError(f"{folder} has no hand-in: a .py file, a .ipynb file or a folder for each.")
     path = at_home(to) if to else folder.resolve().with_name(f"{folder.resolve().name}-grades")
@@ -200,6 +208,12 @@ def grade(folder: str | Path, exercises: str | Sequence[str] = (), *, to: str | 
     say(filled(TEMPLATES / "grades.txt.j2", FILTERS, **grades, columns=columns))
     say(f"Everything is in {path}")
     return grades
+
+
+def _tell_left_out(visible: Sequence[Path], hand_ins: Sequence[Path]) -> None:
+    """Say which files that may hold a hand-in are not looked into."""
+    if packed := [path.name for path in visible if path.suffix.lower() in PACKED and path not in hand_ins]:
+        say(f"Left out: {', '.join(packed)}; a hand-in is a .py or .ipynb file, or a folder with several.")
 
 
 def marks(record: Mapping[str, Any], names: Sequence[str]) -> list[str]:
@@ -236,13 +250,19 @@ def _records(hand_ins: list[Path], demanded: list[str], to: Path) -> Iterator[di
                 continue
         waiting.append(path)
     begun, total, done = time.monotonic(), len(hand_ins), len(hand_ins) - len(waiting)
-    running, before, bar = list[Trial](), done, ProgressBar(total, done)
+    running, before, bar, again = list[Trial](), done, ProgressBar(total, done), set[Path]()
     try:
         while waiting or running:
-            while waiting and len(running) < cores():
+            while waiting and len(running) < (1 if again else cores()):
                 running.append(Trial(waiting.pop(0), demanded))
             wait([trial.process.sentinel for trial in running], timeout=0.5)
             for trial in [trial for trial in running if trial.is_over]:
+                if trial.is_lost and trial.path not in again:  # once more, behind all others and alone
+                    again.add(trial.path)
+                    waiting.append(trial.path)
+                    running.remove(trial)
+                    trial.end()
+                    continue
                 record = trial.record()
                 running.remove(trial)
                 trial.end()

@@ -40,8 +40,10 @@ IMPORTING, ASSIGNING, GRACE = 30.0, 3.0, 5.0
 LIMITS = {"RLIMIT_DATA": 4 * 2**30, "RLIMIT_FSIZE": 2**28, "RLIMIT_CORE": 0}
 """bytes of memory, and of a file"""
 LEFT_OUT = (ast.For, ast.While, ast.With, ast.Expr, ast.Assert, ast.Raise, ast.AsyncFor, ast.AsyncWith, ast.Match)
-MAGIC = re.compile(r"^(\s*)(?:[%!?].*|[\w.]+\?+|[\w, ]+=\s*[%!].*)$", re.MULTILINE)
-"""a line of a notebook that is not Python"""
+MAGIC = re.compile(
+    r"^(\s*)(?:(?:%{1,2}[A-Za-z_]|!(?!=)|\?)(?:.*\\\n)*.*|[\w.]+\?+|[\w, ]+=\s*(?:%[A-Za-z_]|!(?!=)).*)$", re.MULTILINE
+)
+"""a line of a notebook that is not Python, with those that a backslash adds to it"""
 UNREADABLE = (SyntaxError, ValueError, LookupError, TypeError, RecursionError, MemoryError)
 
 
@@ -94,7 +96,7 @@ class Reader:
         for code, node in parsed:
             if isinstance(node, ast.ImportFrom) and node.module == "__future__":
                 flags |= sum(getattr(__future__, each.name).compiler_flag for each in node.names)
-            if not isinstance(node, LEFT_OUT) or _bound(node) & used:
+            if not isinstance(node, LEFT_OUT) or (_bound(node) | _filled(node)) & used:
                 self._run(node, code, flags, module.__dict__)
                 self.defined |= {each: {**self.defined.get(each, {}), file.name: module} for each in _bound(node)}
 
@@ -152,6 +154,14 @@ def _bound(node: ast.AST) -> set[str]:
     return own.union(*map(_bound, ast.iter_child_nodes(node)))
 
 
+def _filled(node: ast.AST) -> set[str]:
+    """The name of what a bare expression puts something into, as `config.update(gamma=0.9)` does."""
+    match node:
+        case ast.Expr(ast.Call(ast.Attribute(ast.Name(name), "update" | "setdefault" | "append" | "extend" | "add"))):
+            return {name}
+    return set()
+
+
 def _free(function: ast.AST) -> set[str]:
     """The names that a function or a class uses and nothing in it assigns."""
     names = [node for node in ast.walk(function) if isinstance(node, ast.Name)]
@@ -168,6 +178,8 @@ def solutions(reader: Reader, demanded: list[str]) -> dict[str, tuple[Any, str]]
         methods = {each: getattr(thing, each) for each in vars(thing)} if isinstance(thing, type) else {}
         for each, answer in {**methods, name: thing}.items():
             if each not in course.EXERCISES or not callable(answer) or isinstance(answer, Missing):
+                continue
+            if each in methods and callable(module.__dict__.get(each)):  # a method that calls the function
                 continue
             if str(getattr(answer, "__module__", "")).startswith("lemniscate."):
                 reader.notes.append(f"{file}: {each} is lemniscate's own, so there is nothing to judge.")

@@ -90,6 +90,32 @@ def _used(made: Any, output: Tensor) -> list[str]:
     return [name for name, slope in zip(parameters, slopes, strict=True) if slope is not None]
 
 
+def _slope(output: Tensor, x: Tensor) -> Tensor:
+    """The derivative of a number in x; 0 where it does not depend on it."""
+    if not output.requires_grad:
+        return torch.zeros_like(x)
+    (found,) = torch.autograd.grad(output, x, retain_graph=True, allow_unused=True)
+    return torch.zeros_like(x) if found is None else found
+
+
+def _saved(network: Function, made: Any, envs: Any, answer: Callable[[Any], Tensor]) -> bool:
+    """Whether another network that is made alike answers the same, with all that this one has to save."""
+    with suppress(Exception), torch.random.fork_rng([]), torch.no_grad():  # what raises is seen elsewhere
+        torch.manual_seed(1)
+        twin = _made(network, envs)
+        twin.load_state_dict(made.state_dict())
+        return close(answer(made), plain(answer(twin)))
+    return True
+
+
+def _all_saved(seen: Seen) -> Iterator[str]:
+    if not seen["saved"]:
+        yield (
+            "a copy with the same state_dict answers otherwise: some of its numbers are neither trained nor saved."
+            " Likely: layers in a list of Python; nn.ModuleList, or attributes of their own, make them its parameters."
+        )
+
+
 def _gradient(what: str, used: Collection[str]) -> Iterator[str]:
     if not used:
         yield f"{what} has no gradient in the parameters of a network. Likely: detach, or no_grad."
@@ -125,7 +151,7 @@ def _bend(function: Callable[[Tensor], Tensor], x: Tensor) -> float:
 
 def see_agent(network: Function, seen: Seen) -> None:
     """`Agent(envs)` with `value(x)` and `action_and_value(x, action=None, deterministic=False)`."""
-    made = _made(network, _envs(2, -np.ones(A, np.float32), np.ones(A, np.float32)))
+    made = _made(network, envs := _envs(2, -np.ones(A, np.float32), np.ones(A, np.float32)))
     obs, rows = _obs(made), _obs(made, 2000)
 
     def act(x: Tensor, action: Tensor | None = None, deterministic: bool = False) -> Any:
@@ -134,7 +160,12 @@ def see_agent(network: Function, seen: Seen) -> None:
     def mean(x: Tensor) -> Tensor:
         return act(x, deterministic=True)[0].detach()
 
+    def answers(agent: Any) -> Tensor:
+        mean, _, entropy, value = call_by_name(agent.action_and_value, {STATE: obs, ACTION: None, GREEDY: True})
+        return torch.cat([mean.flatten(), entropy.flatten(), value.flatten()])
+
     seen["widths"] = [size for parameter in made.parameters() for size in parameter.shape]
+    seen["saved"] = _saved(network, made, envs, answers)
     answer = act(obs)
     seen["answer"] = plain(answer)
     seen["value"] = plain(made.value(obs))
@@ -170,6 +201,7 @@ def agent(seen: Seen) -> Iterator[str]:
         )
     yield from _answers(seen)
     yield from _distribution(seen)
+    yield from _all_saved(seen)
     for what, tensors in (("mean", seen["rows"][:2]), ("value", seen["rows"][2:])):
         if not close(*tensors):
             yield f"the {what} of a row depends on the other rows of its batch."
@@ -281,6 +313,8 @@ def see_actor(network: Function, seen: Seen) -> None:
     """`Actor(env)` of DDPG: μ(s) between the bounds of the actions."""
     made = _for_one(network, lambda made: made(_obs(made)), seen)
     obs = _obs(made, 100)
+    seen["saved"] = _saved(network, made, _envs(1, LOW, HIGH, seen["is_vector"]), lambda actor: actor(obs))
+    seen["rows"] = plain([made(obs)[:2], made(obs[:2])])
     seen["action"], seen["again"] = plain(made(obs)), plain(made(obs))
     seen["used"] = _used(made, made(obs))
     seen["trained"] = [plain(parameter) for parameter in made.parameters() if parameter.requires_grad]
@@ -289,7 +323,7 @@ def see_actor(network: Function, seen: Seen) -> None:
     seen["middle"] = plain(made(obs).mean(0))
     _redraw(made, 0.05)
     moved = obs.clone().requires_grad_()
-    slopes = [torch.autograd.grad(column.sum(), moved, retain_graph=True)[0] for column in made(moved).unbind(1)]
+    slopes = [_slope(column.sum(), moved) for column in made(moved).unbind(1)]
     seen["moves"] = [bool(slope.any()) for slope in slopes]
     low, high = torch.from_numpy(LOW), torch.from_numpy(HIGH)
 
@@ -308,6 +342,9 @@ def actor(seen: Seen) -> Iterator[str]:
     yield from _shape("for 100 observations the action", seen["action"], (100, A))
     if not close(seen["action"], seen["again"]):
         yield "for one state the action differs each time. Likely: noise for exploration, which the loop adds."
+    yield from _all_saved(seen)
+    if not close(*seen["rows"]):
+        yield "the action of a state depends on the other states of its batch."
     yield from _gradient("the action", seen["used"])
     yield from _bounds(seen)
     if not all(seen["moves"]):
@@ -316,8 +353,9 @@ def actor(seen: Seen) -> Iterator[str]:
         yield "all actions are one share of their range. Likely: the last layer has one output, not one for each."
     if seen["bend"] < 1e-4:
         yield "without tanh the actions are linear in the state. Likely: there are no activations between the layers."
-    if seen["loose"] and not seen["buffers"]:
-        yield f"{seen['loose'][0]} is neither saved nor moved to a GPU with it. Likely: it is no register_buffer."
+    if seen["loose"]:
+        said = f"{seen['loose'][0]} is neither saved nor moved to a GPU with it. Likely: it is no register_buffer."
+        yield Note(said) if seen["buffers"] else said
     if batched := [name for name, shape in seen["buffers"].items() if shape == [1, A]]:
         yield Note(
             f"{batched[0]} has shape [1, {A}], from the action space of all environments; with more of them a"
@@ -372,12 +410,12 @@ def see_q_network(network: Function, seen: Seen) -> None:
 
     made = _for_one(network, lambda made: q(made, _obs(made, size=O + A)), seen)
     pairs = _obs(made, size=O + A).requires_grad_()
+    seen["saved"] = _saved(network, made, _envs(1, LOW, HIGH, seen["is_vector"]), lambda network: q(network, pairs))
     seen["q"] = plain(q(made, pairs))
     seen["used"] = _used(made, q(made, pairs))
     _redraw(made, 0.05)
     values = q(made, pairs)
-    seen["slopes"] = plain(torch.autograd.grad(values.sum(), pairs, retain_graph=True)[0])
-    seen["of_first"] = plain(torch.autograd.grad(values[0].sum(), pairs)[0])
+    seen["slopes"], seen["of_first"] = (plain(_slope(output, pairs)) for output in (values.sum(), values[0].sum()))
     seen["bend"] = _bend(lambda rows: q(made, rows), pairs.detach())
     seen["reach"] = plain(_reach(made, lambda: q(made, pairs).reshape(B)))
 
@@ -385,6 +423,7 @@ def see_q_network(network: Function, seen: Seen) -> None:
 def q_network(seen: Seen) -> Iterator[str]:
     """Sentences on a Q network: shape, dependence on state and action, range."""
     yield from _shape(f"Q of {B} pairs", seen["q"], (B, 1), (B,))
+    yield from _all_saved(seen)
     yield from _gradient("Q", seen["used"])
     slopes = seen["slopes"].abs().sum(0).tolist()
     for what, parts in (("state", slopes[:O]), ("action", slopes[O:])):

@@ -29,7 +29,8 @@ Function = Callable[..., Any]
 _NAMES = {
     "reward rewards": "r rew rews rs",
     "value": "values v val vals vs v_s state_values new_value newvalue new_values pred",
-    "next_value": "next_values nv next_v v_next values_next next_vals v_prime vp v_s_next",
+    "next_value": "next_values nv next_v v_next values_next next_vals v_prime vp v_s_next next_q next_qs q_next"
+    " next_q_value next_q_values q_next_values next_state_value next_state_values target_q target_qs",
     "terminated": "terminations terminateds term terms terminal terminals death deaths te",
     "done": "dones d ended ends end over episode_over finished",
     "ended": "terminations terminated terminals dones done term",
@@ -42,7 +43,8 @@ _NAMES = {
     "next_states": "next_state s_next next_obs next_observations s_prime s2",
     "advantage advantages mb_advantages": "adv advs a_hat mb_adv minibatch_advantages advantage_estimates",
     "targets": "critic_targets target returns value_targets v_target v_targets",
-    "target": "targets returns return_ ret value_target v_target b_returns",
+    "target": "targets returns return_ ret value_target v_target b_returns target_model target_net target_network"
+    " target_params target_critic target_actor q_target critic_target actor_target policy_target",
     "old": "log_probs_old old_log_probs log_prob_old old_log_prob logp_old old_logp",
     "ratio": "ratios r_t rt prob_ratio rho importance_ratio",
     "log_ratio": "logratio log_ratios logratios log_r logr lr",
@@ -54,12 +56,15 @@ _NAMES = {
     "old_value": "old_values value_old values_old v_old old_v old",
     "log_prob": "log_probs logprob logprobs logp log_pi log_p",
     "weight": "weights advantage advantages adv returns psi ψ w",
-    "online": "source params parameters main local online_params net model src",
+    "online": "source params parameters main local online_params net model src online_net online_model local_model"
+    " main_net source_net policy policy_net q_net q_network q critic actor current current_net",
     "x": "values input matrix q q_values logits scores",
     "indices": "index idx inds actions action i",
     "probs": "p probabilities prob pi π",
     "tau": "polyak polyak_coef rho alpha t τ",
 }
+LAST = {"terminated": ["done", "dones", "d", "ended", "over"]}
+"""names that an argument has where no other is meant by them"""
 NAMES = {name: f"{names} {others}".split() for names, others in _NAMES.items() for name in names.split()}
 """all names of an argument, by its name in the exercise"""
 SETTINGS = ("config", "cfg", "conf", "args", "hp", "hparams", "hyperparameters", "params", "settings", "train_config")
@@ -68,12 +73,12 @@ LIMIT = 15.0
 """seconds that a function may take for all its cases; what is right takes milliseconds"""
 
 
-def standard(name: str, among: Mapping[str, Any]) -> str | None:
+def standard(name: str, among: Mapping[str, Any], names: Mapping[str, list[str]] = NAMES) -> str | None:
     """The name among those of the exercise that another name stands for; None if there is none."""
     name = name.lower().strip("_")
     if name in among:
         return name
-    return next((known for known in among if name in NAMES.get(known, ())), None)
+    return next((known for known in among if name in names.get(known, ())), None)
 
 
 class Settings(dict):
@@ -201,9 +206,10 @@ def arranged(
 def _chosen(named: Mapping[str, inspect.Parameter], left: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     """The values of parameters, and what is left of those that there are."""
     chosen = {name: left.pop(name) for name in named if name in left}  # before those that another name may mean
-    for name in named:
-        if name not in chosen and (known := standard(name, left)):
-            chosen[name] = left.pop(known)
+    for names in (NAMES, LAST):
+        for name in named:
+            if name not in chosen and (known := standard(name, left, names)):
+                chosen[name] = left.pop(known)
     for name, each in named.items():
         if name in chosen or not left or name.lower() in SETTINGS:
             continue

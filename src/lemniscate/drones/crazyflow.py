@@ -284,6 +284,8 @@ def _check(env_id: str, num_envs: int, kwargs: Mapping[str, Any]) -> None:
         raise UserError(f"history must be a whole number of steps from 0 to {MOST_HISTORY}, not {history!r}.")
     if not isinstance(kwargs.get("privileged", False), bool):
         raise UserError(f"privileged must be true or false, not {kwargs['privileged']!r}.")
+    if kwargs.get("dynamics") in ([], (), ""):
+        raise UserError(f"dynamics of {env_id} must be one or several of {', '.join(DYNAMICS)}.")
     if unknown := [name for name in several if name not in DYNAMICS]:
         raise unknown_name("dynamics", str(unknown[0]), DYNAMICS)
     if several and num_envs % len(several):

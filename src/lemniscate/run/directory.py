@@ -188,6 +188,10 @@ def load_networks(networks: nn.Module, config: RunConfig, spec: Spec, locate: Ca
     named = (*networks.named_parameters(), *networks.named_buffers())  # a normalizer that networks share is one
     mine = [key for key, _ in named if key in own]
     new = [key for key in mine if key not in fits]
+    if kept := [key for key in new if any(f"{key}.".startswith(f"{frozen}.") for frozen in config.freeze)]:
+        raise UserError(
+            f"freeze keeps {kept[0]}, which warm_start cannot take from {name}{elsewhere}: it would stay as drawn."
+        )
     if not new:
         return f"Warm start: all networks of {name}{elsewhere}."
     some = ", ".join(new[:3]) + ", …" * (len(new) > 3)

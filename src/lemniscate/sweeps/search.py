@@ -101,9 +101,12 @@ def read_texts(search: object) -> dict[str, str]:
         if not all(map(str.strip, pair)):
             written = "".join(pair).strip()
             raise UserError(f"A search is written as field=low:high, field=log:low:high or field=a|b, not {written!r}.")
+    names = [name.strip().lstrip("-").replace("-", "_") for name, _, _ in pairs]
+    if several := [name for name in names if names.count(name) > 1]:
+        raise UserError(f"The search has {several[0]} more than once: one range, or choices as {several[0]}=a|b.")
     if not pairs:
         raise UserError("Search what? Name fields with their ranges, such as learning_rate=log:1e-4:1e-2.")
-    return {name.strip().lstrip("-").replace("-", "_"): text.strip() for name, _, text in pairs}
+    return {name: text.strip() for name, (_, _, text) in zip(names, pairs, strict=True)}
 
 
 def read_space(texts: Mapping[str, str], config: RunConfig) -> Space:

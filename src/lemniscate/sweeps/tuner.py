@@ -63,8 +63,8 @@ def tune(
 ) -> Tuned:
     """Search for the settings with which an algorithm learns an environment best.
 
-    The first trial has the settings of the preset as they are. The result is a preset in `preset.json`, with its
-    provenance: `train(algorithm, preset="…/preset.json")`.
+    The first trial has the settings of the preset as they are, as far as they lie in the ranges. The result is a preset
+    in `preset.json`, with its provenance: `train(algorithm, preset="…/preset.json")`.
 
     Args:
         algorithm: a name.
