@@ -351,7 +351,7 @@ def test_q_of_a_choice_is_that_of_its_number(tmp_path):
     assert policy.q_value(obs[0], policy.act(obs[0])) == pytest.approx(values[0].max(), rel=1e-5)
     with pytest.raises(lem.UserError, match="action must be from 0 to below 2, not 2"):
         policy.q_value(obs[0], 2)
-    with pytest.raises(lem.UserError, match=r"action must be finite numbers of the shape \(\), not 'left'"):
+    with pytest.raises(lem.UserError, match=r"action must be whole numbers of the shape \(\), not 'left'"):
         policy.q_value(obs[0], "left")
 
 

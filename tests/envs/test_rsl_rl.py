@@ -254,12 +254,12 @@ def answering(method, change):
         (
             "get_observations",
             lambda obs: TensorDict({"policy": TensorDict({"x": obs["policy"]}, batch_size=[8])}, batch_size=[8]),
-            r"as policy; a group must be one Tensor \[8, …\], with its terms concatenated",
+            r"as the observations policy; a group must be one Tensor \[8, …\], with its terms concatenated",
         ),
         (
             "get_observations",
             lambda obs: {"policy": obs["policy"][:3]},
-            r"an array of shape \(3, 2\) .* as policy; a group",
+            r"an array of shape \(3, 2\) .* as the observations policy; a group",
         ),
         (
             "step",

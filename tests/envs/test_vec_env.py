@@ -1,12 +1,18 @@
 """Environments shared by several processes are those of one."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from gymnasium.vector import AutoresetMode
 
 import toy
 from lemniscate.envs import registry
+from lemniscate.envs.backend import Backend
 from lemniscate.envs.spaces import random_action
+from lemniscate.errors import UserError
+from lemniscate.spec import Discrete, ObservationPart, Spec
+from lemniscate.types import Step
 from threads import in_world
 
 ENVS = {"Pendulum-v1": "gymnasium", "CartPole-v1": "envpool", "Countdown-v0": "gymnasium"}
@@ -69,3 +75,72 @@ def test_the_vectors_of_several_shards_are_described_as_one_is():
     assert (one[0], two[0]) == ("GymnasiumBackend", "Joined")
     assert one[1] == two[1]
     assert one[1][0] is AutoresetMode.NEXT_STEP
+
+
+class Reusing(Backend):
+    """A simulator of one's own that fills the same tensors at each step; `spoil` changes its answers."""
+
+    spoil = staticmethod(lambda step: step)
+
+    @classmethod
+    def serves(cls, env):
+        return env == "Count"
+
+    def __init__(self, env, num_envs, device, *, stagger=False, kwargs=None, wrappers=()):
+        self.num_envs, self.device = num_envs * (kwargs or {}).get("times", 1), device
+        self.spec = Spec(env, (ObservationPart((), (1,)),), Discrete(2), 4)
+        self.counts = torch.ones(num_envs, dtype=torch.bool)
+        self.obs, self.reward = torch.zeros(self.num_envs, 1), torch.zeros(self.num_envs)
+        self.ended = torch.zeros(self.num_envs, dtype=torch.bool)
+
+    def restart(self, seed, first=0):
+        return self.obs.zero_()
+
+    def step(self, action):
+        self.obs += 1
+        self.reward += 1
+        self.ended[:] = self.obs[:, 0] % 4 == 0
+        return self.spoil(Step(self.obs, self.obs, self.reward, self.ended, self.ended, ~self.ended | True))
+
+    def close(self):
+        pass
+
+
+def test_a_backend_of_ones_own_may_write_over_what_it_returned():
+    env = registry.make("Count", 2, backend=f"{__name__}:Reusing")
+    env.restart(0)
+    steps = [env.step(torch.zeros(2, dtype=torch.int64)) for _ in range(4)]
+    assert [step.reward.tolist() for step in steps] == [[t, t] for t in (1, 2, 3, 4)]
+    assert [step.obs[0].item() for step in steps] == [1, 2, 3, 4]
+    assert steps[-1].terminated.all()
+    assert not steps[-1].truncated.any(), "never with terminated"
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (
+            lambda step: (step.obs, step.reward),
+            r"Spoiled.step\(\) returns a tuple; it must be a Step of lemniscate.types",
+        ),
+        (
+            lambda step: replace(step, reward=step.reward[:, None]),
+            r"as reward; it must be a Tensor \[2\] of torch.float32",
+        ),
+        (lambda step: replace(step, terminated=step.reward), r"as terminated; it must be a Tensor \[2\] of torch.bool"),
+        (lambda step: replace(step, obs=step.obs.double()), r"as obs; it must be a Tensor \[2, 1\] of torch.float32"),
+        (lambda step: replace(step, next_obs=step.obs.repeat(1, 2)), r"as next_obs; it must be a Tensor \[2, 1\]"),
+        (lambda step: replace(step, reward=step.reward.numpy()), "as reward; it must be a Tensor"),
+    ],
+)
+def test_what_a_backend_of_ones_own_returns_wrongly_is_said(spoil, said, monkeypatch):
+    monkeypatch.setitem(globals(), "Spoiled", type("Spoiled", (Reusing,), {"spoil": staticmethod(spoil)}))
+    env = registry.make("Count", 2, backend=f"{__name__}:Spoiled")
+    env.restart(0)
+    with pytest.raises(UserError, match=said):
+        env.step(torch.zeros(2, dtype=torch.int64))
+
+
+def test_a_backend_of_another_size_is_said():
+    with pytest.raises(UserError, match="has 4 environments where it was to make 2"):
+        registry.make("Count", 2, backend=f"{__name__}:Reusing", kwargs={"times": 2})

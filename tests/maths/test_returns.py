@@ -4,6 +4,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lemniscate import maths
 from lemniscate.maths import episode_return, gae, polyak, reward_to_go, td_target
 
 
@@ -169,3 +170,22 @@ def test_the_whole_return_is_that_of_the_first_row_of_the_episode(rollout, gamma
             expected[t, n] = to_go[t, n] if done[t - 1, n] else expected[t - 1, n]
     actual = episode_return(to_go, reward, done, gamma=gamma)
     torch.testing.assert_close(actual, expected, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", [torch.uint8, torch.int64, torch.float32])
+def test_flags_may_be_numbers(kind):
+    generator = torch.Generator().manual_seed(0)
+    reward, value, after = (torch.randn(5, 2, generator=generator) for _ in range(3))
+    terminated = torch.rand(5, 2, generator=generator) < 0.3
+    done = terminated | (torch.rand(5, 2, generator=generator) < 0.3)
+    flags = (terminated.to(kind), done.to(kind))
+    plain = {
+        name: getattr(maths, name) for name in ("gae", "q_lambda", "reward_to_go", "td_target", "soft_lambda_return")
+    }
+    for name, function in plain.items():
+        rows = {"gae": (reward, value, after), "soft_lambda_return": (reward, after, value)}.get(name, (reward, after))
+        number = 1 if name == "td_target" else 2
+        function = getattr(function, "__wrapped__", function)  # past the checks of shapes and types
+        expected, found = function(*rows, *(terminated, done)[:number]), function(*rows, *flags[:number])
+        for one, other in zip([*expected], [*found], strict=True):
+            assert torch.equal(one, other), name

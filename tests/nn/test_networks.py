@@ -230,3 +230,40 @@ def test_the_look_at_a_network_of_ones_own_draws_nothing():
     torch.manual_seed(0)
     nn.Linear(3, 2)
     assert torch.equal(drawn, torch.rand(()))
+
+
+class Sequence(nn.Module):
+    """A GRU, which takes the rows of a batch for one sequence."""
+
+    def __init__(self, inputs, outputs):
+        super().__init__()
+        self.gru = nn.GRU(inputs, outputs)
+
+    def forward(self, x):
+        return self.gru(x)[0]
+
+
+class Forgetful(nn.Linear):
+    """It says that it remembers nothing."""
+
+    memory_size = 0
+
+
+class Single(nn.Linear):
+    """It can be made once."""
+
+    made = 0
+
+    def __init__(self, inputs, outputs):
+        Single.made += 1
+        if Single.made > 1:
+            raise RuntimeError("in use")
+        super().__init__(inputs, outputs)
+
+
+def test_rows_are_no_sequence_and_what_is_made_is_made_again():
+    with pytest.raises(UserError, match="takes the rows for one sequence: in another order each has another output"):
+        OwnNetwork("test_networks:Sequence", 3, 2)
+    OwnNetwork("test_networks:Forgetful", 3, 2)
+    with pytest.raises(UserError, match="cannot be made again, to be loaded: RuntimeError: in use"):
+        OwnNetwork("test_networks:Single", 3, 2)

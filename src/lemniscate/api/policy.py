@@ -163,11 +163,10 @@ class TrainedPolicy:
         kind: Any = self.spec.action
         given, several = as_array(action), (len(flat),) * batched
         shape = () if isinstance(kind, Discrete) else kind.shape or (kind.size,)
-        if given.shape != several + shape or given.dtype.kind not in "iuf" or not np.isfinite(given).all():
-            raise UserError(
-                f"action must be finite numbers of the shape {several + shape}, not {kind_of(action)}: as act returns"
-                " it."
-            )
+        kinds, what = ("iu", "whole") if isinstance(kind, Discrete) else ("iuf", "finite")
+        if given.shape != several + shape or given.dtype.kind not in kinds or not np.isfinite(given).all():
+            said = f"action must be {what} numbers of the shape {several + shape}, not {kind_of(action)}"
+            raise UserError(f"{said}: as act returns it.")
         own = torch.from_numpy(normalized_action(given.reshape(len(flat), *shape), kind))
         if isinstance(kind, Discrete) and ((own < 0) | (own >= kind.n)).any():
             raise UserError(f"action must be from {kind.start} to below {kind.start + kind.n}, not {shown(action)}.")
@@ -315,7 +314,7 @@ def save(policy: Any, path: str | Path) -> Path:
         stored = checkpoint.read(path).record.get("stored", False)
     if path.exists() and not stored:
         raise UserError(f"{path} exists already, and is not a stored policy; choose another path.")
-    if others := sorted({file.name for file in path.glob("*")} - {*checkpoint.FILES, checkpoint.MANIFEST}):
+    if others := sorted({file.name for file in path.glob("[!.]*")} - {*checkpoint.FILES, checkpoint.MANIFEST}):
         raise UserError(f"{path} holds {others[0]} beside a stored policy, which would be lost; choose another path.")
     record = {"algorithm": algorithm_of(policy), "config": policy.config.to_json()}
     record |= {"spec": checkpoint.spec_to_json(policy.spec), "planned": False, "stored": True}

@@ -249,7 +249,12 @@ def of_updates(e: Evidence) -> Seen:
             "ratio-not-one",
             f"The KL divergence is {kl:.2g} although the learning rate has fallen to {rate:.1g}, which moves nothing.",
         )
-    elif tenth >= 1 and len(rates) == len(every) and rates[-tenth:].mean() < 0.2 * rates[0]:
+    elif (
+        e.config.get("desired_kl") is None
+        and tenth >= 1
+        and len(rates) == len(every)
+        and rates[-tenth:].mean() < 0.2 * rates[0]
+    ):
         last, usual = np.median(every[-tenth:]), np.median(every[: 5 * tenth])
         if last > 0.02 and last > 0.7 * usual:
             yield (
@@ -379,7 +384,7 @@ def of_values(e: Evidence) -> Seen:
                 "critic-overfits",
                 f"The error of Q at the newest transitions is {times:.0f} times that at sampled ones.",
             )
-    if len(moved) >= 2 and not moved.any() and "gae_lambda" in e.config:
+    if len(moved) >= 2 and not moved.any() and "gae_lambda" in e.config and not e.config.get("freeze"):
         yield "critic-still", "No update that was looked at changed a parameter of V."
     if len(behind) >= 3 and not behind.any() and first_number(e.config.get("tau")) != 1:
         yield "critic-still", "The weights of Q are those of its target networks, each time that they were looked at."

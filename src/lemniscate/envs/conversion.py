@@ -28,7 +28,6 @@ from lemniscate.errors import UserError
 from lemniscate.spec import Action, Box, Discrete, MultiDiscrete, ObservationPart
 from lemniscate.system.console import say
 
-SPACES = ("observation_space", "action_space")
 SUCCESS = ("is_success", "success")
 """what robotics environments call their success: 1 or 0, or True and False"""
 
@@ -47,7 +46,7 @@ class SingleEnv(gym.Wrapper):
 
     def __init__(self, env: gym.Env) -> None:
         super().__init__(env)
-        for name in SPACES:
+        for name in ("observation_space", "action_space"):
             if not isinstance(getattr(env, name, None), gym.Space):
                 kind = type(env.unwrapped).__name__
                 raise UserError(f"{kind} has no {name}: set self.{name} in its __init__, such as a Box.")
@@ -57,11 +56,10 @@ class SingleEnv(gym.Wrapper):
             if not takes_any and not taken.keys() >= {"seed", "options"}:
                 right = "reset(self, *, seed=None, options=None)"
                 raise UserError(f"{place(layer, 'reset')} takes no seed or no options; it must be {right}.")
-        self._spaces = {name: getattr(env, name) for name in SPACES}
         self._returns = Returns(env, env.observation_space)
         asked = [env.get_wrapper_attr(name) for name in MASKS if env.has_wrapper_attr(name)]
         self._ask = next(filter(callable, asked), None)
-        seen, self._declared = env.observation_space, measures_of(env.metadata)
+        seen, self._acts, self._declared = env.observation_space, env.action_space, measures_of(env.metadata)
         self._masked = bool(self._ask or (isinstance(seen, spaces.Dict) and seen.spaces.keys() & set(MASKS)))
         self._shape = seen.shape if isinstance(seen, spaces.Box | spaces.MultiBinary) else None
         self._dtype = seen.dtype
@@ -72,11 +70,10 @@ class SingleEnv(gym.Wrapper):
             returned: Any = self.env.reset(seed=seed, options=options)
         except (TypeError, ValueError, SystemExit) as error:
             raise self._returns.explained("reset", error) from error.__cause__
-        for name, space in self._spaces.items():
-            now = getattr(self.env, name)
-            if now is not space and now != space:
-                what = f"made {name} {shown_space(now)}; it was {shown_space(space)}, and must stay what __init__ set"
-                raise self._returns.wrong("reset", what)
+        now = self.env.action_space
+        if now is not self._acts and now != self._acts:
+            was = f"it was {shown_space(self._acts)}, and must stay what __init__ set"
+            raise self._returns.wrong("reset", f"made action_space {shown_space(now)}; {was}")
         two = type(returned) is tuple and len(returned) == 2
         usual = two and self._is_usual(returned[0], 0.0, False, False, returned[1])
         obs, info = returned if usual else self._returns.of_reset(returned)

@@ -6,7 +6,7 @@ import os
 import sys
 import sysconfig
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -143,12 +143,13 @@ def _require_whole(made: VectorEnv, num_envs: int) -> None:
     for name in ("single_observation_space", "single_action_space"):
         if not isinstance(getattr(made, name, None), gym.Space):
             raise UserError(f"{kind} has no {name}: set self.{name} in its __init__, such as a Box")
-    taken = inspect.signature(made.reset).parameters
-    takes_any = any(one.kind is one.VAR_KEYWORD for one in taken.values())
+    taken: Mapping[str, inspect.Parameter] = {}
+    with suppress(ValueError, TypeError):  # of what is not written in Python
+        taken = inspect.signature(made.reset).parameters
+    takes_any = not taken or any(one.kind is one.VAR_KEYWORD for one in taken.values())
     if not takes_any and not taken.keys() >= {"seed", "options"}:
-        raise UserError(
-            f"{kind}.reset() takes no seed or no options; it must be reset(self, *, seed=None, options=None)"
-        )
+        right = "reset(self, *, seed=None, options=None)"
+        raise UserError(f"{kind}.reset() takes no seed or no options; it must be {right}")
 
 
 STATISTICS = {"obs_rms", "return_rms", "ret_rms", "reward_rms", "running_mean_std"}

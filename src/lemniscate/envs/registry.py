@@ -258,5 +258,7 @@ def make(
     once = cls.exists_once(name, int(number))
     options = {"stagger": stagger and not once, "kwargs": kwargs, "wrappers": wraps}
     made = [cls(name, mine // vectors, torch.device(device), **options) for _ in range(vectors)]
+    if wrong := [one.num_envs for one in made if one.num_envs != mine // vectors]:
+        raise UserError(f"{chosen} has {wrong[0]} environments where it was to make {mine // vectors}.")
     made[0].once = once
     return VecEnv(made[0] if vectors == 1 else Joined(made), world)

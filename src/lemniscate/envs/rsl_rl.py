@@ -83,7 +83,8 @@ class RslRlBackend(Backend):
         size, *privileged = (part.shape[1] for part in self._parts(obs))
         limit, self._privileged = self._env.max_episode_length, sum(privileged)
         action = Box((-math.inf,) * self._env.num_actions, (math.inf,) * self._env.num_actions)
-        steps = int(limit.max()) if isinstance(limit, Tensor) else int(limit)
+        longest = float("inf") if limit is None else float(limit.max() if isinstance(limit, Tensor) else limit)
+        steps = int(longest) if math.isfinite(longest) else None
         self.spec = Spec(env, (ObservationPart((), (size,)),), action, steps, self._privileged)
         self.counts = torch.ones(num_envs, dtype=torch.bool, device=device)
         self.notices = []
@@ -101,7 +102,7 @@ class RslRlBackend(Backend):
 
     def step(self, action: Tensor) -> Step:
         """Act; the rows of time-outs have the true final observation, or else the one before."""
-        returned = self._env.step(action.to(self._env.device))
+        returned = self._env.step(action.to(getattr(self._env, "device", self.device)))
         if not isinstance(returned, tuple) or len(returned) != 4:
             what = f"{len(returned)} values" if isinstance(returned, tuple) else kind_of(returned)
             raise UserError(f"{self._env_id} returns {what} from step(); it must be 4, (obs, rewards, dones, extras).")
@@ -137,9 +138,10 @@ class RslRlBackend(Backend):
     def _parts(self, obs: Any) -> list[Tensor]:
         """[N, O], and [N, P] where there is a group of the critic's. Raises `UserError` for what is no such group."""
         for name in self._groups:
-            if not isinstance(obs[name], Tensor) or obs[name].shape[:1] != (self.num_envs,):
+            group = obs[name] if name in getattr(obs, "keys", dict)() else None
+            if not isinstance(group, Tensor) or group.shape[:1] != (self.num_envs,):
                 raise UserError(
-                    f"{self._env_id} observes {kind_of(obs[name])} as {name}; a group must be one Tensor"
+                    f"{self._env_id} gives {kind_of(group)} as the observations {name}; a group must be one Tensor"
                     f" [{self.num_envs}, …], with its terms concatenated."
                 )
         return [obs[name].reshape(self.num_envs, -1).to(self.device, torch.float32) for name in self._groups]

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from lemniscate.envs.backend import Backend
+from lemniscate.envs.returns import kind_of
 from lemniscate.envs.symmetry import Mirror
 from lemniscate.errors import NonFiniteError, UserError, wrong_action
 from lemniscate.spec import Box, Discrete, MultiBinary, Spec
@@ -52,6 +53,7 @@ class VecEnv:
         self._recent: deque[tuple[Tensor, Tensor, Step]] = deque(maxlen=max(4, kept))
         self._statistics = EpisodeStatistics(self.num_envs, self.device)
         self._actions: tuple[torch.Size, torch.dtype] | None = None  # before it is restarted, none is right
+        self._is_own = not type(backend).__module__.startswith("lemniscate.")
 
     def restart(self, seed: int, steps: int = 0) -> Tensor:
         """Begin again from a seed; also stored as `obs`, [N, O]. `steps` is what the run has taken."""
@@ -59,6 +61,7 @@ class VecEnv:
         self._recent.clear()
         self._statistics = EpisodeStatistics(self.num_envs, self.device)
         mine = self.backend.restart(seed, self._first)
+        mine = self._copy("restart", "obs", mine) if self._is_own else mine
         self._actions = _action_layout(self.spec, self.num_envs)
         self._require_finite(observation=mine)
         self.obs = self._world.gather(mine)
@@ -79,6 +82,7 @@ class VecEnv:
         mine = action if self._world.size == 1 else action[self._first : self._first + self.backend.num_envs]
         counts = self.backend.counts
         step = self.backend.step(mine.clone())  # an environment may write into the action that it was given
+        step = self._copied(step) if self._is_own else step
         self._require_finite(observation=step.next_obs, reward=step.reward)
         if step.obs is not step.next_obs:
             self._require_finite(observation=step.obs)
@@ -93,6 +97,26 @@ class VecEnv:
         self.steps += self.num_envs
         self._statistics.log(seen, counts, own)
         return step
+
+    def _copied(self, step: Step) -> Step:
+        """The step of a backend of one's own, copied, since it may be written over. Raises `UserError` for no step."""
+        if not isinstance(step, Step):
+            who = type(self.backend).__name__
+            raise UserError(f"{who}.step() returns {kind_of(step)}; it must be a Step of lemniscate.types.")
+        flags, names = ("terminated", "truncated", "valid"), ("obs", "next_obs", "reward")
+        copies = {name: self._copy("step", name, getattr(step, name), torch.bool) for name in flags}
+        copies |= {name: self._copy("step", name, getattr(step, name)) for name in names}
+        return replace(step, **{**copies, "truncated": copies["truncated"] & ~copies["terminated"]})
+
+    def _copy(self, method: str, name: str, value: Any, kind: torch.dtype | None = None) -> Tensor:
+        """A copy of what a backend of one's own returned. Raises `UserError` for another shape or type."""
+        columns = self.spec.observation_size + self.spec.privileged + self.spec.action.mask_size
+        shape = (self.backend.num_envs, columns) if "obs" in name else (self.backend.num_envs,)
+        kind = kind or (torch.uint8 if self.spec.image and "obs" in name else torch.float32)
+        if not isinstance(value, Tensor) or (value.shape, value.dtype) != (shape, kind):
+            said = f"{type(self.backend).__name__}.{method}() returns {kind_of(value)} as {name}"
+            raise UserError(f"{said}; it must be a Tensor {list(shape)} of {kind}.")
+        return value.clone()
 
     def detach(self) -> None:
         """Take the present state and `obs` as given; see `Backend.detach`."""

@@ -36,6 +36,7 @@ def gae(
     Returns:
         (advantage, target), each [T, N]; target = advantage + value is the TD(λ) return the critic regresses on.
     """
+    terminated, done = terminated.bool(), done.bool()
     delta = reward + gamma * next_value * ~terminated - value
     decay = gamma * lam * (~done).to(delta.dtype)
     advantage = torch.empty_like(delta)
@@ -70,7 +71,8 @@ def q_lambda(
         gamma: discount γ in [0, 1].
         lam: trace decay λ in [0, 1]; 0 is the target of one-step Q-learning.
     """
-    target = torch.empty_like(reward)
+    terminated, done = terminated.bool(), done.bool()
+    target = torch.empty_like(next_value)
     follows = next_value[-1]
     for t in reversed(range(len(reward))):
         ahead = torch.lerp(next_value[t], follows, lam * (~done[t]).to(follows.dtype))
@@ -100,6 +102,7 @@ def reward_to_go(
         done: the episode ended at row t for any reason.
         gamma: discount γ in [0, 1].
     """
+    terminated, done = terminated.bool(), done.bool()
     delta = reward + gamma * next_value * (done & ~terminated)
     delta[-1] = reward[-1] + gamma * next_value[-1] * ~terminated[-1]
     go = torch.empty_like(delta)

@@ -26,7 +26,7 @@ def td_target(
         terminated: the episode ended by its own rules.
         gamma: discount γ in [0, 1].
     """
-    return reward + gamma * next_value * ~terminated
+    return reward + gamma * next_value * ~terminated.bool()
 
 
 @torch.no_grad()
@@ -75,6 +75,7 @@ def soft_lambda_return(
         gamma: discount γ in [0, 1].
         lam: trace decay λ in [0, 1].
     """
+    terminated, done = terminated.bool(), done.bool()
     reward = reward + gamma * next_bonus * ~terminated
     return q_lambda(reward, next_value, terminated, done, gamma=gamma, lam=lam)
 

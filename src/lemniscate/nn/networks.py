@@ -155,13 +155,14 @@ class OwnNetwork(nn.Module):
             raise UserError(f"{name} {how}; of batch normalization, take track_running_stats=False, or LayerNorm.")
         if not _equal(out, again):
             how = "is random: two calls with the same rows differ, and so would old and new probabilities"
-            raise UserError(f"{name} {how}; leave its dropout out, or set it to 0.")
+            raise UserError(f"{name} {how}; leave out its dropout, and what it keeps, or changes in its input.")
         if lost:
             raise UserError(f"{name} has a number in {lost[0].removeprefix('module.')} that is not finite.")
         types = {str(parameter.dtype) for parameter in self.parameters() if parameter.requires_grad}
         if not out.requires_grad or types != {"torch.float32"}:
             kinds = f"parameters of {', '.join(sorted(types))}" if types else "no parameter to learn"
             raise UserError(f"{name} has {kinds}; it must have some of torch.float32 that its outputs depend on.")
+        self._require_rows(out, rows)
         self._require_saved(out, rows)
         try:
             with torch.no_grad():
@@ -176,18 +177,30 @@ class OwnNetwork(nn.Module):
             kind = type(maker).__name__
             raise UserError(f"network is a {kind} that is made already: give its class, of which each network is one.")
         module = maker(inputs, outputs)
-        if hasattr(module, "memory_size") and not _memory_size(maker):
+        if getattr(module, "memory_size", 0) and not _memory_size(maker):
             raise UserError(f"{self.name} sets its memory_size too late; it must stand in the class: memory_size = 64.")
         return module
+
+    def _require_rows(self, out: Tensor, rows: Tensor) -> None:
+        """Raise `UserError` where the outputs depend on the order of the rows."""
+        with torch.no_grad():
+            turned = self._call(rows.flip(0))
+        if not torch.allclose(out, turned.flip(0), rtol=1e-3, atol=1e-4):
+            raise UserError(f"{self.name} takes the rows for one sequence: in another order each has another output.")
 
     def _require_saved(self, out: Tensor, rows: Tensor) -> None:
         """Raise `UserError` where another module with the same state_dict has other outputs at rows [B, inputs]."""
         module = self.module
-        with torch.random.fork_rng([]), torch.no_grad():
-            self.module = self._made(rows.shape[-1], out.shape[-1])
-            self._call(rows)  # where its layers find out their sizes
-            self.module.load_state_dict(module.state_dict())
-            again, self.module = self._call(rows), module
+        try:
+            with torch.random.fork_rng([]), torch.no_grad():
+                self.module = self._made(rows.shape[-1], out.shape[-1])
+                self._call(rows)  # where its layers find out their sizes
+                self.module.load_state_dict(module.state_dict())
+                again, self.module = self._call(rows), module
+        except Exception as error:
+            raise UserError(
+                f"{self.name} cannot be made again, to be loaded: {type(error).__name__}: {error}"
+            ) from error
         if not _equal(out, again):
             raise UserError(
                 f"{self.name} has numbers that its state_dict has not, so that they would be neither learned nor saved:"

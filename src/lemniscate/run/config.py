@@ -126,10 +126,11 @@ def in_json(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [in_json(item) for item in value]
     if not isinstance(value, Mapping):
-        return json.loads(json.dumps(value, allow_nan=False))
+        plainly = type(value) in (str, int, bool) or (type(value) is float and math.isfinite(value))
+        return value if plainly else json.loads(json.dumps(value, allow_nan=False))
     if strange := [key for key in value if not isinstance(key, str)]:  # `json` would make texts of some
         raise TypeError(f"the key {strange[0]} is no text")
-    return {str(key): in_json(item) for key, item in value.items()}
+    return {str.__str__(key): in_json(item) for key, item in value.items()}
 
 
 def _number(value: Any, kind: type, limits: Range = Range()) -> int | float:

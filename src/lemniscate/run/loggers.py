@@ -1,5 +1,6 @@
 """Destinations of metrics. A logger is one class with `write` and `close`; a tracker is a logger on request."""
 
+import inspect
 import math
 import os
 import time
@@ -36,7 +37,10 @@ LoggerClass = Callable[[Path, Mapping[str, Any], int], Logger]
 def require_logger(thing: Any) -> Any:
     """A logger, or a class of them, as it is. Raises `UserError` for what is none."""
     methods = [(getattr(thing, name, None), count) for name, count in (("write", 3), ("close", 1))]
-    if not all(named.takes(method, count + isinstance(thing, type)) for method, count in methods):
+    if isinstance(thing, type):  # what its objects get otherwise, they show
+        own = [(inspect.getattr_static(thing, name, None), count) for name, count in (("write", 4), ("close", 2))]
+        methods = [(method, count) for method, count in own if inspect.isfunction(method)]
+    if not all(named.takes(method, count) for method, count in methods):
         raise UserError(f"{shown(thing)} is no logger: that has write(step, metrics, episodes) and close(pictures).")
     return thing
 

@@ -123,7 +123,7 @@ class WithArguments(partial[Any]):
 
     def __call__(self, /, *args: Any, **keywords: Any) -> Any:
         """The function's result."""
-        return self.func(*args, **deepcopy(self.keywords), **keywords)
+        return self.func(*args, **{**deepcopy(self.keywords), **keywords})
 
 
 def takes(function: Any, count: int) -> bool:

@@ -72,9 +72,10 @@ ALONE = World()
 
 
 def leave_if_imported_again() -> None:
-    """End this process where it is the worker of a script that has no `if __name__ == "__main__":`.
+    """End this process where it is to be an environment of a script that has no `if __name__ == "__main__":`.
 
-    Such a worker imports the script first, and would do all over again what stands in it; who made it says what lacks.
+    Such a process imports the script first, and would do all over again what stands in it; who made it says what lacks.
     """
-    if getattr(multiprocessing.process.current_process(), "_inheriting", False):
+    process = multiprocessing.process.current_process()
+    if getattr(process, "_inheriting", False) and "WatchedVectorEnv" in process.name:
         sys.exit(1)
