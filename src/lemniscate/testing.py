@@ -77,11 +77,15 @@ def check_seeds(algorithm: str | ModuleType, folder: Path, **settings: Any) -> N
 
 def check_resume(algorithm: str | ModuleType, folder: Path, **settings: Any) -> None:
     """A run that was stopped and resumed ends in the bits of one that was not."""
+    quarter = training.config_for(algorithm, **settings).total_steps // 4
+    settings = {"checkpoint_every": max(1, quarter), **settings}  # without one on the way it would begin anew
     whole = training.train(algorithm, run=folder / "whole", progress=False, **settings)
     half = whole.policy.config.total_steps // 2
     stopped = folder / "stopped"
     training.train(algorithm, run=stopped, progress=False, callbacks=[lambda step, *_: step >= half], **settings)
-    training.resume(stopped, progress=False)
+    first, seen = read_metrics(whole.path)[0]["step"], list[int]()
+    training.resume(stopped, progress=False, callbacks=[lambda step, *_: seen.append(step)])
+    assert min(seen) > first, "It begins at step 0 after a resume: is the state what run.restore(state) returns?"
     difference = _difference(_last_checkpoint(whole.path), _last_checkpoint(stopped))
     assert difference is None, f"{difference} differs after a resume: is it a field of State that is saved?"
 

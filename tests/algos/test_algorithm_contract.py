@@ -10,7 +10,7 @@ import lemniscate as lem
 from helpers import long, require_in_own_process
 from lemniscate.algos import ALGORITHMS, ppo
 from lemniscate.run import checkpoint
-from lemniscate.testing import ALGORITHM_CONTRACT, check_learning
+from lemniscate.testing import ALGORITHM_CONTRACT, check_learning, check_resume
 
 ON_POLICY = {"env": "CartPole-v1", "num_envs": 4, "num_steps": 32, "total_steps": 1280, "hidden": (8,)}
 OFF_POLICY = {
@@ -160,3 +160,40 @@ def test_in_a_network_of_ones_own_what_is_frozen_stays_and_the_rest_learns(algor
 def test_the_same_compiled_on_two_shards(algorithm):
     """Each optimizer's descent is a program of its own: their vectors differ in length."""
     require_in_own_process(__name__, f"frozen_stays({algorithm!r}, compile='on')")
+
+
+TINY = {"env": "CartPole-v1", "num_envs": 2, "num_steps": 8, "minibatch_size": 8, "hidden": (4,), "progress": False}
+
+
+def test_an_algorithm_that_restores_nothing_does_not_pass(tmp_path, monkeypatch):
+    def train(config, run):
+        run.restore(ppo.init(config, run.spec, run.env.device))
+        state = ppo.init(config, run.spec, run.env.device)
+        for env in run.until(config.total_steps, state):
+            rollout = ppo.collect(env, state.networks.policy, config.num_steps, state.rng.action)
+            run.log(state, ppo.update(config, state, rollout), env.take_episodes())
+        return state
+
+    settings = {name: value for name, value in TINY.items() if name != "progress"} | {"total_steps": 256}
+    check_resume("ppo", tmp_path / "right", **settings)
+    monkeypatch.setattr(ppo, "train", train)
+    with pytest.raises(AssertionError, match="begins at step 0 after a resume"):
+        check_resume("ppo", tmp_path / "wrong", **settings)
+
+
+def test_an_algorithm_that_counts_no_steps_or_returns_nothing_is_told(tmp_path, monkeypatch):
+    right = ppo.update
+
+    def stands(config, state, rollout):
+        before, metrics = state.step, right(config, state, rollout)
+        state.step = before
+        return metrics
+
+    monkeypatch.setattr(ppo, "update", stands)
+    with pytest.raises(lem.UserError, match=r"An update of ppo leaves state.step as it was: add its steps to it"):
+        lem.train("ppo", run=tmp_path / "a", total_steps=64, **TINY)
+    monkeypatch.setattr(
+        ppo, "train", lambda config, run: run.restore(ppo.init(config, run.spec, run.env.device)) and None
+    )
+    with pytest.raises(lem.UserError, match=r"must return the state that run.restore gave, not None"):
+        lem.train("ppo", run=tmp_path / "b", total_steps=64, **TINY)

@@ -10,6 +10,7 @@ import toy
 from lemniscate.envs import registry
 from lemniscate.envs.backend import Backend
 from lemniscate.envs.spaces import random_action
+from lemniscate.envs.vec_env import require_end
 from lemniscate.errors import UserError
 from lemniscate.spec import Discrete, ObservationPart, Spec
 from lemniscate.types import Step
@@ -144,3 +145,12 @@ def test_what_a_backend_of_ones_own_returns_wrongly_is_said(spoil, said, monkeyp
 def test_a_backend_of_another_size_is_said():
     with pytest.raises(UserError, match="has 4 environments where it was to make 2"):
         registry.make("Count", 2, backend=f"{__name__}:Reusing", kwargs={"times": 2})
+
+
+def test_an_episode_that_outlives_its_limit_is_told(monkeypatch):
+    monkeypatch.setattr("lemniscate.envs.vec_env.PATIENCE", 50)
+    require_end("Count", 53, 4)
+    with pytest.raises(
+        UserError, match="has not ended after 54 steps, and its time limit is 4: it must return truncated"
+    ):
+        require_end("Count", 54, 4)

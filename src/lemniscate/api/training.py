@@ -18,7 +18,7 @@ from lemniscate.api.options import RunOptions, own_names, require_importable, tr
 from lemniscate.api.policy import TrainedPolicy, TrainedRun, load, path_of
 from lemniscate.doctor import Attendance
 from lemniscate.envs import registry
-from lemniscate.errors import NotStoredError, UserError, is_installed
+from lemniscate.errors import NotStoredError, UserError, is_installed, shown
 from lemniscate.hub.repository import local_path
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import extend, is_finished, read_record, require_absent
@@ -293,6 +293,8 @@ def _train(world: World, path: Path, algorithm: str, config: RunConfig, options:
         for notice in config.notices(spec, envs[0].device) if progress else ():
             say(notice)
         state = algos.find(algorithm).train(config, run)
+        if not hasattr(state, "networks"):
+            raise UserError(f"train() of {algorithm} must return the state that run.restore gave, not {shown(state)}.")
         path = path if path.absolute() == home else home
         if envs[0].backend.once:
             envs[0].close()  # before a report makes another one

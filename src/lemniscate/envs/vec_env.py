@@ -163,7 +163,12 @@ class VecEnv:
 
 
 def require_end(env_id: str, age: int, limit: int | None) -> None:
-    """Raise `UserError` where an episode of `age` steps has had its chance to end, and there is no time `limit`."""
+    """Raise `UserError` where an episode of `age` steps has had its chance to end, beyond its time `limit` if any."""
+    if limit is not None and age >= limit + PATIENCE:
+        raise UserError(
+            f"An episode of {env_id} has not ended after {age:,} steps, and its time limit is {limit:,}: it must return"
+            " truncated there."
+        )
     if limit is None and age >= PATIENCE:
         raise UserError(
             f"An episode of {env_id} has not ended after {PATIENCE:,} steps, and there is no time limit: return"

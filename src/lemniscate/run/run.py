@@ -153,6 +153,10 @@ class Run:
                     looks = self.world.is_first and self._lines % every == 0
                     self._body = Body(state.step, self._episodes, acted_with(state) if looks else None)
                     yield self.env
+                    if state.step <= self._body.step and not self._body.cut_short:
+                        raise UserError(
+                            f"An update of {self.algorithm} leaves state.step as it was: add its steps to it."
+                        )
                     # What a body that was cut short would have had done, the process does that resumes the run.
                     planned = not self._body.cut_short and self._do_what_is_due(state, total_steps)
                     going_on = not self._stopped(state, planned) and state.step < total_steps
