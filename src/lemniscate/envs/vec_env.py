@@ -112,7 +112,7 @@ class VecEnv:
         """A copy of what a backend of one's own returned. Raises `UserError` for another shape or type."""
         columns = self.spec.observation_size + self.spec.privileged + self.spec.action.mask_size
         shape = (self.backend.num_envs, columns) if "obs" in name else (self.backend.num_envs,)
-        kind = kind or (torch.uint8 if self.spec.image and "obs" in name else torch.float32)
+        kind = kind or (torch.uint8 if self.spec.image and "obs" in name else torch.get_default_dtype())
         if not isinstance(value, Tensor) or (value.shape, value.dtype) != (shape, kind):
             said = f"{type(self.backend).__name__}.{method}() returns {kind_of(value)} as {name}"
             raise UserError(f"{said}; it must be a Tensor {list(shape)} of {kind}.")
