@@ -179,7 +179,7 @@ def test_runs_are_plotted_one_by_one_or_in_a_list(run):
         (lambda run: lem.train("ppo", "CartPole-v1", track=lambda path: None), r"track must be made as Class\(path, config, step\), which lambda"),
         (lambda run: lem.load(""), "A run is a directory, .* not ''"),
         (lambda run: lem.evaluate(run, report=run.path / "config.json"), "report is a directory, .*config.json is a file"),
-        (lambda run: lem.evaluate(run, report=run.path / "config.json/x"), "json/x is a file, or lies in one"),
+        (lambda run: lem.evaluate(run, report=run.path / "config.json/x"), "report is a directory, .*config.json is a file"),
         (lambda run: lem.train("ppo", "CartPole-v1", run=run.path / "config.json"), "config.json is a file, and a run is a dir"),
         (lambda run: lem.train("ppo", "CartPole-v1", run=run.path / "config.json/x"), "config.json is a file, and a run is"),
         (lambda run: lem.train("ppo", "./here:Env"), "names a file; name its module, without folder and ending, .*: here:Env"),

@@ -395,7 +395,7 @@ class Seeded(Plain):
         (Unspaced, "Unspaced has no single_action_space: set self.single_action_space in its __init__"),
         (
             Seeded,
-            r"Seeded.reset\(\) takes no seed or no options; it must be reset\(self, \*, seed=None, options=None\)",
+            r"Seeded.reset\(\) .*takes no seed or no options; it must be reset\(self, \*, seed=None, options=None\)",
         ),
         (Plain, r"hides the final observation \(no info\['final_obs'\]\)"),
     ],

@@ -37,7 +37,7 @@ from lemniscate.run.evaluate import evaluate as evaluate_policy
 from lemniscate.run.places import is_sweep, read_sweep
 from lemniscate.run.seeding import torch_defaults
 from lemniscate.system.console import say
-from lemniscate.system.files import DamagedFileError, at_home, make_directory, read_json, write_json
+from lemniscate.system.files import DamagedFileError, at_home, file_in_the_way, make_directory, read_json, write_json
 
 FINAL_EPISODES = 100
 """that a run's final policy is judged by where runs are compared"""
@@ -95,8 +95,8 @@ def evaluate(
     episodes, seed, file = checked("episodes", episodes, Episodes), checked("seed", seed, Natural), _film(video)
     deterministic = checked("deterministic", deterministic, bool)
     kwargs, folder = checked("env_kwargs", env_kwargs, dict | None), None if report is None else path_of(report)
-    if folder and any(place.is_file() for place in (folder, *folder.parents)):
-        raise UserError(f"report is a directory, such as 'runs/upright', and {folder} is a file, or lies in one.")
+    if folder and (file_there := file_in_the_way(folder)):
+        raise UserError(f"report is a directory, such as 'runs/upright', and {file_there} is a file.")
     how: dict[str, Any] = {"episodes": episodes, "seed": seed, "deterministic": deterministic}
     own = {"agent": agent, "normalized": checked("normalized_actions", normalized_actions, bool | None)}
     with _environments(chosen, env, own, how, env_kwargs=kwargs, backend=backend) as (player, vec, arguments):

@@ -112,7 +112,7 @@ def _one_line(message: object) -> str:
 
 
 def spaces_of(spec: Spec) -> tuple[str, str]:
-    """What an environment observes, and its space of actions, for a sentence."""
+    """The observation and the space of actions of an environment, as parts of a sentence."""
     return _seen(spec), shown_space(action_space(spec.action))
 
 

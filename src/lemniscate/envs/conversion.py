@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Mapping
 from functools import lru_cache, reduce
-from inspect import signature
 from operator import getitem
 from typing import Any
 
@@ -18,9 +17,8 @@ from lemniscate.envs.returns import (
     author,
     flat_mask,
     kind_of,
-    layers,
     mask_in,
-    place,
+    require_form,
     scalars,
     shown_space,
 )
@@ -46,16 +44,7 @@ class SingleEnv(gym.Wrapper):
 
     def __init__(self, env: gym.Env) -> None:
         super().__init__(env)
-        for name in ("observation_space", "action_space"):
-            if not isinstance(getattr(env, name, None), gym.Space):
-                kind = type(env.unwrapped).__name__
-                raise UserError(f"{kind} has no {name}: set self.{name} in its __init__, such as a Box.")
-        for layer in layers(env):
-            taken = signature(layer.reset).parameters
-            takes_any = any(one.kind is one.VAR_KEYWORD for one in taken.values())
-            if not takes_any and not taken.keys() >= {"seed", "options"}:
-                right = "reset(self, *, seed=None, options=None)"
-                raise UserError(f"{place(layer, 'reset')} takes no seed or no options; it must be {right}.")
+        require_form(env, ("observation_space", "action_space"))
         self._returns = Returns(env, env.observation_space)
         asked = [env.get_wrapper_attr(name) for name in MASKS if env.has_wrapper_attr(name)]
         self._ask = next(filter(callable, asked), None)

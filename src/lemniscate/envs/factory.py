@@ -6,7 +6,7 @@ import os
 import sys
 import sysconfig
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -118,7 +118,11 @@ def make_vector(
         made = make(num_envs=num_envs, **fresh(dict(kwargs)))
         if not isinstance(made, VectorEnv):
             raise _other(made, "gymnasium.vector.VectorEnv")
-        _require_whole(made, num_envs)
+        if made.num_envs != num_envs:
+            kind = type(made).__name__
+            raise UserError(
+                f"{kind} has {made.num_envs} environments where num_envs is {num_envs}; it must make as many"
+            )
         envs = one = CheckedVector(made)
     elif workers:
         multiprocessing.get_context("forkserver").set_forkserver_preload([__name__])  # imported once, for all
@@ -133,23 +137,6 @@ def make_vector(
             raise UserError("it returned the same environment again; make a new one at each call")
     require_no_statistics(one, envs)
     return envs, one.spec.max_episode_steps if one.spec else None
-
-
-def _require_whole(made: VectorEnv, num_envs: int) -> None:
-    """Raise `UserError` for a vector environment of another size, without spaces, or that cannot reset a part."""
-    kind = type(made).__name__
-    if made.num_envs != num_envs:
-        raise UserError(f"{kind} has {made.num_envs} environments where num_envs is {num_envs}; it must make as many")
-    for name in ("single_observation_space", "single_action_space"):
-        if not isinstance(getattr(made, name, None), gym.Space):
-            raise UserError(f"{kind} has no {name}: set self.{name} in its __init__, such as a Box")
-    taken: Mapping[str, inspect.Parameter] = {}
-    with suppress(ValueError, TypeError):  # of what is not written in Python
-        taken = inspect.signature(made.reset).parameters
-    takes_any = not taken or any(one.kind is one.VAR_KEYWORD for one in taken.values())
-    if not takes_any and not taken.keys() >= {"seed", "options"}:
-        right = "reset(self, *, seed=None, options=None)"
-        raise UserError(f"{kind}.reset() takes no seed or no options; it must be {right}")
 
 
 STATISTICS = {"obs_rms", "return_rms", "ret_rms", "reward_rms", "running_mean_std"}

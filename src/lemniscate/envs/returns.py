@@ -3,6 +3,7 @@
 import math
 import traceback
 from collections.abc import Iterator, Mapping
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -90,9 +91,10 @@ class Returns:
 
 
 class CheckedVector(VectorWrapper):
-    """A vector environment whose returns are checked."""
+    """A vector environment whose returns are checked. Raises `UserError` as `require_form`."""
 
     def __init__(self, env: VectorEnv) -> None:
+        require_form(env, ("single_observation_space", "single_action_space"))
         super().__init__(env)
         self._returns = Returns(env, env.single_observation_space, (env.num_envs,))
 
@@ -109,6 +111,27 @@ class CheckedVector(VectorWrapper):
             return self._returns.of_step(self.env.step(actions))
         except SystemExit as error:
             raise self._returns.explained("step", error) from None
+
+
+def require_form(env: Any, names: tuple[str, str]) -> None:
+    """Raise `UserError` for an environment that lacks one of these spaces, or whose reset takes no seed or options."""
+    for name in names:
+        if not isinstance(getattr(env, name, None), gym.Space):
+            kind = type(env.unwrapped).__name__
+            raise UserError(f"{kind} has no {name}: set self.{name} in its __init__, such as a Box.")
+    for layer in layers(env):
+        if not _takes_options(layer.reset):
+            right = "reset(self, *, seed=None, options=None)"
+            raise UserError(f"{place(layer, 'reset')} takes no seed or no options; it must be {right}.")
+
+
+def _takes_options(reset: Any) -> bool:
+    """Whether a method takes a seed and options by their names; what has no signature to read may."""
+    try:
+        taken = signature(reset).parameters
+    except (ValueError, TypeError):
+        return True
+    return taken.keys() >= {"seed", "options"} or any(one.kind is one.VAR_KEYWORD for one in taken.values())
 
 
 def layers(env: Any) -> Iterator[Any]:

@@ -100,7 +100,7 @@ def _told(call: Callable[..., Any], *args: Any, **options: Any) -> Any:
 
 
 def told_with_place(error: BaseException) -> str:
-    """What an error says, and where it was raised."""
+    """The words of an error, and the place where it was raised."""
     place = traceback.extract_tb(error.__traceback__)[-1]
     return f"{_words_of(error)} ({Path(place.filename).name}, line {place.lineno})"
 

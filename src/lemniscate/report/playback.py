@@ -30,7 +30,7 @@ from lemniscate.run.environments import env_arguments
 from lemniscate.run.evaluate import EVALUATION, EpisodeTable, Evaluation
 from lemniscate.run.seeding import derive
 from lemniscate.system.console import Place, in_notebook, say
-from lemniscate.system.files import remove
+from lemniscate.system.files import file_in_the_way, remove
 from lemniscate.types import Step
 
 Act = Callable[..., np.ndarray]
@@ -229,7 +229,7 @@ def check_film(file: Path) -> None:
         raise UserError(f"{file} must end in .gif, .webp or .mp4.")
     if file.is_dir():
         raise UserError(f"{file} is a folder; name a file in it.")
-    if blocked := next((place for place in file.parents if place.is_file()), None):
+    if blocked := file_in_the_way(file.parent):
         raise UserError(f"{file} cannot be written: {blocked} is a file.")
     if file.suffix == ".mp4" and not is_installed("imageio_ffmpeg"):
         raise missing_extra("imageio_ffmpeg", "video")

@@ -37,7 +37,7 @@ FUNCTION = ("network", "activation", "normalize_observations")
 
 def require_absent(path: Path) -> None:
     """Raise `UserError` if a run directory exists already; one whose creation failed half-way does not count."""
-    if file := next((place for place in (path, *path.parents) if place.is_file()), None):
+    if file := files.file_in_the_way(path):
         raise UserError(f"{file} is a file, and a run is a directory: choose another --run.")
     if path.exists() and (not path.is_dir() or {file.name for file in path.iterdir()} - UNFINISHED):
         raise UserError(f"{path} exists already; go on with it ({resume_line(path)}) or choose another --run.")

@@ -156,6 +156,11 @@ def remove(path: Path) -> None:
         path.unlink(missing_ok=True)
 
 
+def file_in_the_way(path: Path) -> Path | None:
+    """The file that stands where a directory `path`, or one above it, would have to be."""
+    return next((place for place in (path, *path.parents) if place.is_file()), None)
+
+
 def make_directory(path: Path) -> None:
     """Make a directory and those above it, synced. Raises `FileExistsError` where a link or a file is in its place."""
     if path.is_symlink() or (path.exists() and not path.is_dir()):
