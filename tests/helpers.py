@@ -231,8 +231,8 @@ def play(config, state, env):
     random, noise_std = state.step < config.learning_starts, getattr(config, "noise_std", 1.0)
     policy, noise = state.networks.policy, state.action_noise
     step = interact(env, policy, state.replay, noise, state.rng.action, noise_std=noise_std, random=random)
-    if isinstance(state, sac.State):
-        state.observe(step)
+    if bins := getattr(state.networks, "bins", None):
+        state.move_bins(bins, step)
     state.step += env.num_envs
 
 

@@ -380,15 +380,15 @@ MUTANTS = [
     (
         "no correction for the squashing",
         "maths/distributions.py",
-        "(normal - _log_slope(u))",
+        "(normal - log_slope)",
         "(normal)",
         "maths/test_distributions.py",
     ),
     (
         "a slope that is half as steep",
         "maths/distributions.py",
-        "return 2 * (math.log(2)",
-        "return (math.log(2)",
+        "log_slope = 2 * (math.log(2)",
+        "log_slope = (math.log(2)",
         "maths/test_distributions.py",
     ),
     (
@@ -625,7 +625,7 @@ MUTANTS = [
     (
         "the bins do not follow the rewards",
         "algos/sac.py",
-        "self.networks.bins.observe(self.reward_scale)",
+        "bins.observe(self.reward_scale)",
         "pass",
         SAC + "bins_follow_the_spread_of_the_returns_and_the_targets_share_them",
     ),

@@ -32,7 +32,6 @@ NOT_YET = {
     ("an iteration of ppo", "executed"),
     ("an iteration of sac", "lines"),
     ("an iteration of sac", "executed"),
-    ("an iteration of sac", "functions"),
     ("lemniscate train ppo", "files"),
     ("lemniscate train ppo", "lines"),
     ("lemniscate train ppo", "executed"),

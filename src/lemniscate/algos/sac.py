@@ -59,12 +59,11 @@ class State(OffPolicyState[SoftActorQ], ScaledState[SoftActorQ]):
     critic_optimizer: Adam
     temperature_optimizer: Adam
 
-    def observe(self, step: Step) -> None:
-        """Let the bins of Q, where it has any, follow the rewards of one more step of the environments."""
-        if self.networks.bins is not None:
-            rows = step.reward, step.terminated | step.truncated, step.valid
-            self.reward_scale.update(*(row[None] for row in rows))
-            self.networks.bins.observe(self.reward_scale)
+    def move_bins(self, bins: Bins, step: Step) -> None:
+        """Let the bins of Q follow the rewards of one more step of the environments."""
+        rows = step.reward, step.terminated | step.truncated, step.valid
+        self.reward_scale.update(*(row[None] for row in rows))
+        bins.observe(self.reward_scale)
 
     def on_warm_start(self) -> None:
         """Copy the loaded networks into the targets, and go on with the scale of their bins."""
@@ -156,7 +155,9 @@ def train(config: Config, run: Run) -> State:
         metrics: list[Metrics] = []
         for _ in run.steps(config.log_every):
             policy, random = state.networks.policy, state.step < config.learning_starts
-            state.observe(interact(env, policy, state.replay, state.action_noise, state.rng.action, random=random))
+            step = interact(env, policy, state.replay, state.action_noise, state.rng.action, random=random)
+            if bins := state.networks.bins:
+                state.move_bins(bins, step)
             state.step += config.num_envs
             due = state.step % (config.num_envs * config.update_every) == 0
             if due and state.step > config.learning_starts:

@@ -1,6 +1,7 @@
 """Replay (Lin 1992; Mnih et al. 2015): a ring buffer of transitions, the steps that fill it, and their noise."""
 
 import math
+import time
 from collections.abc import Callable
 from typing import Literal
 
@@ -146,13 +147,14 @@ def interact(
     deterministic policy in units of half the action range; of a stochastic one `noise_std` is 1. With `random`, it acts
     uniformly in [-1, 1]^A instead.
     """
-    with env.collecting:
-        obs, noise = env.obs, action_noise(generator)
-        action = uniform(noise) if random else policy.act(obs, noise_std * noise)
-        step = env.step(action)
-        replay.add(obs, action, step)
-        action_noise.on_episode_end(step.terminated | step.truncated | ~step.valid)
-        policy.observe(obs, step.valid)
+    began = time.perf_counter()
+    obs, noise = env.obs, action_noise(generator)
+    action = uniform(noise) if random else policy.act(obs, noise_std * noise)
+    step = env.step(action)
+    replay.add(obs, action, step)
+    action_noise.on_episode_end(step.terminated | step.truncated | ~step.valid)
+    policy.observe(obs, step.valid)
+    env.collecting += time.perf_counter() - began
     return step
 
 

@@ -1,6 +1,7 @@
 """Collecting rollouts, cutting them into minibatches, and the rows that a Q learns from."""
 
 import math
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -35,10 +36,10 @@ def collect(
     Raises:
         UserError: rewards that are to be differentiable, and are not.
     """
-    rows = []
+    rows, began = [], time.perf_counter()
     if through:
         env.detach()
-    with env.collecting, torch.set_grad_enabled(through is not None):
+    with torch.set_grad_enabled(through is not None):
         for noise in policy.draw_noise((num_steps, env.num_envs), generator):
             obs = env.obs
             action = policy.act(obs, noise)
@@ -49,7 +50,9 @@ def collect(
         if through and not rollout.reward.requires_grad:
             name = type(env.backend).__name__
             raise UserError(f"The rewards of {name} have no history of the actions, though it says differentiable.")
-        return env.mirror.both(rollout, 1) if env.mirror else rollout
+        rollout = env.mirror.both(rollout, 1) if env.mirror else rollout
+    env.collecting += time.perf_counter() - began
+    return rollout
 
 
 @torch.no_grad()
@@ -63,19 +66,20 @@ def collect_episodes(env: VecEnv, policy: Policy, episodes: int, generator: Gene
     Raises:
         UserError: an episode of an environment without a time limit takes more than 20,000 steps.
     """
-    rows, noise = [], partial(policy.draw_noise, (env.num_envs,), generator)
+    rows, began = [], time.perf_counter()
+    noise = partial(policy.draw_noise, (env.num_envs,), generator)
     ended = torch.zeros(env.num_envs, dtype=torch.int64, device=env.device)
     age = torch.zeros_like(ended)
-    with env.collecting:
-        while (ended <= episodes).any():
-            env.require_end(int(age.max()))
-            obs = env.obs
-            action = policy.act(obs, noise())
-            step = env.step(action)
-            whole = step.valid & (ended >= 1) & (ended <= episodes)
-            rows.append(Rollout(obs, action, step.reward, step.next_obs, step.terminated, step.truncated, whole))
-            done = (step.terminated | step.truncated) & step.valid
-            ended, age = ended + done.int(), (age + 1) * ~done
+    while (ended <= episodes).any():
+        env.require_end(int(age.max()))
+        obs = env.obs
+        action = policy.act(obs, noise())
+        step = env.step(action)
+        whole = step.valid & (ended >= 1) & (ended <= episodes)
+        rows.append(Rollout(obs, action, step.reward, step.next_obs, step.terminated, step.truncated, whole))
+        done = (step.terminated | step.truncated) & step.valid
+        ended, age = ended + done.int(), (age + 1) * ~done
+    env.collecting += time.perf_counter() - began
     return Rollout.stack(rows)
 
 

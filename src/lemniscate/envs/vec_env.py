@@ -1,7 +1,6 @@
 """Parallel environments as the floors above see them, and the episodes that run in them."""
 
 import math
-import time
 from collections import deque
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -45,8 +44,8 @@ class VecEnv:
         """the `Carrier` of `nn.memory` that appends what a policy remembers to the observations"""
         self.mirror: Mirror | None = None
         """the mirror image of transitions, where they are learned from too"""
-        self.collecting = Stopwatch()
-        """seconds that the functions of `data` spend acting and stepping"""
+        self.collecting = 0.0
+        """seconds that the functions of `data` have spent acting and stepping since the last line of metrics"""
         self.steps = 0
         size = (1 if self.spec.image else 4) * max(1, self.spec.observation_size)
         kept = min(RECENT_ROWS, RECENT_BYTES // size) // self.num_envs
@@ -183,24 +182,6 @@ def _action_layout(spec: Spec, num_envs: int) -> tuple[torch.Size, torch.dtype]:
     if isinstance(action, Box):
         return torch.Size((num_envs, action.size)), torch.float32
     return torch.Size((num_envs, action.n if isinstance(action, MultiBinary) else len(action.nvec))), torch.int64
-
-
-class Stopwatch:
-    """Seconds spent inside its `with` blocks."""
-
-    def __init__(self) -> None:
-        self._began, self._seconds = 0.0, 0.0
-
-    def __enter__(self) -> None:
-        self._began = time.perf_counter()
-
-    def __exit__(self, *_: object) -> None:
-        self._seconds += time.perf_counter() - self._began
-
-    def take(self) -> float:
-        """The seconds since the last call."""
-        seconds, self._seconds = self._seconds, 0.0
-        return seconds
 
 
 @dataclass(frozen=True)

@@ -94,7 +94,8 @@ class SquashedGaussian:
         """
         u = self.mean + self.log_std.exp() * noise
         normal = -0.5 * (noise.square() + LOG_2PI) - self.log_std
-        return torch.tanh(u), (normal - _log_slope(u)).sum(-1)
+        log_slope = 2 * (math.log(2) - u - softplus(-2 * u))
+        return torch.tanh(u), (normal - log_slope).sum(-1)
 
 
 def mean_and_std(distribution: Deterministic | Gaussian | SquashedGaussian) -> tuple[Tensor, Tensor]:
@@ -107,11 +108,6 @@ def mean_and_std(distribution: Deterministic | Gaussian | SquashedGaussian) -> t
     actions = distribution.sample(0 * z if isinstance(distribution, Deterministic) else z)  # [129, B, A]
     mean = (weights * actions).sum(0)
     return mean, (weights * (actions - mean).square()).sum(0).sqrt()
-
-
-def _log_slope(u: Tensor) -> Tensor:
-    """Log of the derivative of tanh."""
-    return 2 * (math.log(2) - u - softplus(-2 * u))
 
 
 def tanh(x: Tensor) -> Tensor:

@@ -195,7 +195,8 @@ class Run:
             numbers |= signals(state, self.config, self.spec, self.env.recent(), self._body.acted)
         numbers |= {f"info/{name.removeprefix('info/')}": mean for name, mean in episodes.measures.items()}
         # The speed since the last line, everything included; the seconds of the loop's body by their use.
-        now, (before, step_before), collect = time.monotonic(), self._last_line, self.env.collecting.take()
+        now, (before, step_before), collect = time.monotonic(), self._last_line, self.env.collecting
+        self.env.collecting = 0.0
         numbers["time/steps_per_second"] = (state.step - step_before) / max(now - before, 1e-9)
         numbers |= {"time/collect": collect, "time/learn": now - self._body.began - collect}
         self._last_line = now, state.step
