@@ -63,11 +63,19 @@ CASES = {
         {"observation__largest": [900.0] * 8},
     ),
     "action-without-effect": ({"action__effect": [0.01, -0.01] * 4}, {"action__effect": [0.5] + [0.0] * 7}),
+    "action-part": (
+        {"action__weakest": [0.001, -0.002] * 4, "action__effect": [0.5] * 8},
+        {"action__weakest": [0.3] + [0.001] * 7, "action__effect": [0.5] * 8},
+    ),
     "action-late": (
         {"action__late": [0.5] * 8, "action__effect": [0.01] * 8},
         {"action__late": [0.5] * 8, "action__effect": [0.4] * 8},
     ),
     "observation-repeated": ({"observation__repeated": [0.7] * 8}, {"observation__repeated": [0.3] * 8}),
+    "observation-part": (
+        {"observation__constant": [0.5] * 8, "action__effect": [0.5] * 8},
+        {"observation__constant": [0.5] * 7 + [0.1], "action__effect": [0.5] * 8},
+    ),
     "observation-noisy": ({"observation__predicted": [0.1] * 8}, {"observation__predicted": [0.1] * 2 + [0.8] * 6}),
     "reward-rare": (
         {"reward__zero": [0.99] * 8, "reward__largest": [5.0] * 8},
@@ -125,6 +133,19 @@ CASES = {
     ),
     "reward-zero": ({"reward__largest": [0.0] * 8, "returns": [0.0] * 400}, {"reward__largest": [0.0] * 7 + [1.0]}),
     "reward-by-time": ({"reward__by_time": [0.95] * 8}, {"reward__by_time": [0.95] * 3 + [0.1] * 5}),
+    "reward-by-episode": (
+        {"reward__within": [0.0] * 8, "reward__std": [1.0] * 8},
+        {"reward__within": [0.0] * 7 + [0.01], "reward__std": [1.0] * 8},
+    ),
+    "reward-late": ({"reward__before": [0.3] * 8}, {"reward__before": [0.3] * 3 + [0.1] * 5}),
+    "failure-goes-on": (
+        {"reward__zero": [0.5] * 4 + [0.99] * 4, "episode__terminated": [0.0] * 8},
+        {"reward__zero": [0.5] * 4 + [0.99] * 4, "episode__terminated": [0.0] * 7 + [0.1]},
+    ),
+    "reward-offset": (
+        {"reward__mean": [-500.0] * 8, "reward__std": [4.0] * 8, "reward__largest": [510.0] * 8},
+        {"reward__mean": [-500.0] * 8, "reward__std": [0.0] * 8},
+    ),
     "reward-unexplained": (
         {"reward__explained": [0.0] * 8, "reward__std": [1.0] * 8},
         {"reward__explained": [0.1] * 8, "reward__std": [1.0] * 8},
@@ -143,6 +164,10 @@ CASES = {
     "ratio-not-one": (
         {"approx_kl": [0.02] * 8, "learning_rate": [1e-4] * 2 + [1e-6] * 7},
         {"approx_kl": [0.02] * 8, "learning_rate": [1e-4] * 8},
+    ),
+    "temperature-opposed": (
+        {"algorithm": "sac", "temperature": list(np.linspace(1.0, 2.0, 8)), "losses__entropy": [0.6] * 8},
+        {"algorithm": "sac", "temperature": list(np.linspace(1.0, 0.5, 8)), "losses__entropy": [0.6] * 8},
     ),
     "normalizer-frozen": (
         {"normalizer__count": [500.0] * 8},
@@ -236,6 +261,43 @@ def test_a_divergence_that_does_not_fall_with_the_learning_rate_is_that_of_anoth
     assert "ratio-not-one" in names(approx_kl=[0.05] * 40, **shown)
     assert "ratio-not-one" not in names(approx_kl=list(np.linspace(0.05, 0.0, 40)), **shown)
     assert "ratio-not-one" not in names(approx_kl=[0.05] * 40, **(shown | {"learning_rate": [1e-3] * 40}))
+
+
+def test_a_value_far_from_what_follows_explains_nothing_though_the_returns_are_all_alike():
+    shown = {"explained_variance": [0.02] * 8, "returns": [-500.0 - i % 2 for i in range(400)]}
+    assert names(**shown, value__missing=[50.0, -150.0] * 4) == ["value-explains-nothing"]
+    assert names(**shown, value__missing=[50.0, 0.4] * 4) == []
+
+
+def test_a_temperature_rises_where_the_entropy_is_below_its_target():
+    rises = {"temperature": list(np.linspace(1.0, 2.0, 8)), "losses__entropy": [-2.0] * 8}
+    assert names("sac", **rises) == []
+    assert names("sac", **rises, changed={"target_entropy": -3.0}) == ["temperature-opposed"]
+
+
+def test_targets_that_no_update_moves_are_behind_however_near_they_are():
+    shown = {"targets__behind": [0.19, 0.18, 0.17, 0.16]}
+    assert names("sac", **shown, targets__length=[32.5] * 4) == ["targets-behind"]
+    assert names("sac", **shown, targets__length=[32.5] * 3 + [32.6]) == []
+
+
+def test_a_gradient_that_grows_while_the_loss_of_the_value_falls_is_named_sooner():
+    grows = {"gradient_norm": [1.4] + [40.0] * 8}
+    assert names("a2c", **grows, losses__value=[1.2] + [0.1] * 8) == ["gradient-grows"]
+    assert "gradient-grows" not in names("a2c", **grows, losses__value=[1.2] + [20.0] * 8)
+
+
+def test_what_is_large_from_the_beginning_does_not_explode():
+    large = {"observation__largest": [1e5] + [2e5] * 7}
+    assert names(**large) == []
+    assert names(**large, changed={"normalize_observations": False}) == ["large-observation"]
+
+
+def test_numbers_that_never_change_are_no_noise():
+    still = {"observation__constant": [0.75] * 8, "action__effect": [0.5] * 8, "returns": RISES}
+    assert names(**still) == []
+    assert names(**still, observation__predicted=[0.1] * 8) == ["observation-part"]
+    assert names(observation__constant=[0.75] * 8) == []  # of many numbers, such as contacts, many stand still
 
 
 def test_what_noise_hides_is_not_said_of_actions():

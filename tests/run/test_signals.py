@@ -21,14 +21,15 @@ from lemniscate.run.signals import (
     KINDS,
     LOOKS,
     acted_with,
-    by_time,
     late_effect,
     of_critics,
     of_effects,
     of_networks,
     of_rows,
     of_starts,
+    of_time,
     of_values,
+    paid_before,
     signals,
 )
 from lemniscate.spec import Box, Discrete, ObservationPart, Spec
@@ -148,10 +149,40 @@ def test_rewards_that_tell_the_time_do_so_within_each_episode():
     age = torch.arange(steps) % 10
     reward = (age[:, None] + 100.0 * torch.arange(envs)).float()  # another level in each environment
     shape = {"terminated": done, "truncated": ~done & done, "valid": torch.ones_like(done), "reward": reward}
-    assert by_time(SimpleNamespace(done=done, **shape)).item() == pytest.approx(1)
+    assert of_time(SimpleNamespace(done=done, **shape))["reward/by_time"].item() == pytest.approx(1)
     noise = numbers(steps, envs).float()
-    assert by_time(SimpleNamespace(done=done, **{**shape, "reward": noise})).item() < 0.1
-    assert by_time(SimpleNamespace(done=done, **{**shape, "reward": torch.ones_like(reward)})).item() == 0
+    assert of_time(SimpleNamespace(done=done, **{**shape, "reward": noise}))["reward/by_time"].item() < 0.1
+    assert of_time(SimpleNamespace(done=done, **{**shape, "reward": torch.ones_like(reward)}))["reward/by_time"] == 0
+
+
+def test_the_variance_of_rewards_within_episodes_is_what_their_means_leave():
+    steps, envs = 40, 3
+    done = torch.zeros(steps, envs, dtype=torch.bool)
+    done[9::10] = True
+    level = numbers(4, envs, seed=1).repeat_interleave(10, dim=0)  # one for each episode
+    noise = numbers(steps, envs)
+
+    def within(reward):
+        shape = {"terminated": done, "truncated": ~done & done, "valid": torch.ones_like(done)}
+        return of_time(SimpleNamespace(done=done, reward=reward.float(), **shape))["reward/within"].item()
+
+    episodes = (level + noise).view(4, 10, envs)
+    expected = (episodes - episodes.mean(1, keepdim=True)).square().mean() / (level + noise).var(correction=0)
+    assert within(level) == pytest.approx(0, abs=1e-9)
+    assert within(level + noise) == pytest.approx(expected.item(), rel=1e-4)
+
+
+@pytest.mark.parametrize("late", [0, 1, 3])
+def test_a_reward_of_an_earlier_step_is_explained_by_its_row(late):
+    steps, envs = 200, 4
+    obs, action = numbers(steps + 1, envs, O).float(), numbers(steps, envs, A, seed=1).float()
+    earned, done = obs[:-1].sum(-1) + action.sum(-1), torch.zeros(steps, envs, dtype=torch.bool)
+    done[19::20] = True
+    reward = torch.cat([torch.zeros(late, envs), earned[: steps - late]])
+    shape = {"obs": obs[:-1], "action": action, "reward": reward, "next_obs": obs[1:], "terminated": done}
+    rows = Rollout(**shape, truncated=~done & done, valid=torch.ones_like(done))
+    share = paid_before(rows, spec_of()).item()
+    assert share > 0.7 if late else share < -0.3  # the row before knows the observation, and no action
 
 
 def test_actions_explain_what_they_do():
@@ -165,6 +196,21 @@ def test_actions_explain_what_they_do():
     still = of_effects(rows(obs=obs, action=action, next_obs=obs + 0.1 * numbers(B, O, seed=5).float()), spec_of())
     assert still["action/effect"] < 0.05
     assert abs(still["reward/explained"]) < 0.1
+
+
+def test_a_number_of_the_action_without_effect_is_the_weakest():
+    obs, action = numbers(B, O).float(), numbers(B, A, seed=1).float()
+
+    def weakest(*effects):
+        moved = obs + 0.1 * numbers(B, O, seed=5).float()
+        for column, effect in enumerate(effects):
+            moved[:, column] += effect * action[:, column]
+        return of_effects(rows(obs=obs, action=action, next_obs=moved), spec_of())["action/weakest"].item()
+
+    assert weakest(1.0, 1.0) > 0.9
+    assert weakest(1.0, 0.0) < 0.02
+    alone = rows(action=action[:, :1])
+    assert "action/weakest" not in of_effects(alone, spec_of(Box((-1.0,), (1.0,))))
 
 
 def test_choices_explain_what_they_do():
@@ -437,6 +483,7 @@ def test_of_targets_the_distance_and_of_replay_what_stands_still(tmp_path):
     with patch("lemniscate.algos.td3.polyak", lambda *_: None):
         stayed = last(tmp_path / "stayed")
     assert 0 < moved["targets/behind"] < stayed["targets/behind"]
+    assert moved["targets/length"] != stayed["targets/length"] > 0
     assert moved["replay/repeated"] == 0
 
 

@@ -147,7 +147,8 @@ class TrainedPolicy:
         """V(s) of one raw observation, a scalar array, or of each of a batch, [B]; takes and raises as `act`.
 
         It is the discounted return that the policy expects, in units of the scaled reward where the run has
-        `scale_rewards`. Raises `UserError` for an algorithm that learns no V(s), or one of privileged numbers too.
+        `scale_rewards`; of a policy that acts by Q(s, ·), the largest of these. Raises `UserError` for an algorithm
+        that learns no V(s), or one of privileged numbers too.
         """
         flat, batched = self._read_for("value", obs)
         return _rows(self.networks.value(flat), batched=batched)

@@ -89,6 +89,8 @@ def of_observations(e: Evidence) -> Seen:
     """Faults of the observations, and of their copies in the replay buffer."""
     cut, repeated = e.late("observation/at_limits"), e.early("observation/repeated")
     predicted, whole, kept = map(e.late, ("observation/predicted", "observation/whole", "replay/repeated"))
+    constant, fitted = e.values("observation/constant"), e.values("action/effect")  # lines are fitted to few numbers
+    partly = len(fitted) >= 3 and 0.3 < constant.min(initial=1) < 1 and (predicted < 0.25 or not e.rose)
     if cut > 0.5:
         yield "observation-clipped", f"{cut:.0%} of the observed numbers stand at an end of their range."
     if e.sees_nothing:
@@ -109,7 +111,9 @@ def of_observations(e: Evidence) -> Seen:
             " of the next one.",
         )
     else:
-        if predicted < 0.25:
+        if partly:
+            yield "observation-part", f"{constant.min():.0%} of the observed numbers were never seen to change."
+        elif predicted < 0.25:
             yield "observation-noisy", f"An observation explains {max(0.0, predicted):.0%} of the next one."
         if kept > 0.9:
             yield (
@@ -124,7 +128,7 @@ def of_normalization(e: Evidence) -> Seen:
     offset = e.late("normalizer/offset")
     count, normalized = e.last("normalizer/count"), e.config.get("normalize_observations", True)
     steps = max((line["step"] for line in e.log if "normalizer/count" in line), default=0)
-    if late > 1e5 or late > 300 * max(first, 1.0):
+    if late > max(1e5, 10 * first) or late > 300 * max(first, 1.0):  # not what is in a small unit from the beginning
         yield (
             "exploding-observation",
             f"Observations reached {late:.3g} in the last half of the run, and {first:.3g} at its beginning.",
@@ -144,7 +148,7 @@ def of_actions(e: Evidence) -> Seen:
     """Faults of the actions: their effect, their delay and their bounds."""
     effects, shares = e.values("action/effect"), e.values("action/share")
     now, before, by_sign = e.early("action/effect"), e.early("action/late"), e.early("action/by_sign")
-    at_bounds, first = e.late("action/at_bounds"), slice(max(3, len(effects) // 4))
+    at_bounds, first, weakest = e.late("action/at_bounds"), slice(max(3, len(effects) // 4)), e.values("action/weakest")
     if before > 0.15 and before > 3 * max(now, 0.0):
         yield (
             "action-late",
@@ -159,6 +163,12 @@ def of_actions(e: Evidence) -> Seen:
                 "action-without-effect",
                 f"Actions explain {max(0.0, explained):.2%} of how observations change.",
             )
+    if min(len(weakest), len(effects)) >= 3 and weakest[first].max() < 0.02 < np.median(effects[first]):
+        yield (
+            "action-part",
+            f"One of the numbers of an action explains {max(0.0, weakest[first].max()):.2%} of how observations"
+            f" change, all together {np.median(effects[first]):.0%}.",
+        )
     if by_sign > 0.5:
         yield (
             "action-by-sign",
@@ -168,21 +178,42 @@ def of_actions(e: Evidence) -> Seen:
         yield "actions-at-bounds", f"{at_bounds:.0%} of the actions lie at or beyond a bound."
 
 
-def of_rewards(e: Evidence) -> Seen:
-    """Faults of the rewards: their size, and what they depend on."""
+def of_reward_sizes(e: Evidence) -> Seen:
+    """Faults of the size of rewards, and of those that are 0."""
     largest, scaled = e.greatest("reward/largest"), e.config.get("scale_rewards", False)
-    zero, by_time, explained = e.early("reward/zero"), e.late("reward/by_time"), e.values("reward/explained")
+    zero, unpaid, ends = e.early("reward/zero"), e.late("reward/zero"), e.greatest("episode/terminated")
+    mean, std = e.late("reward/mean"), e.late("reward/std")
     if largest == 0 and not e.returns.any():
         yield "reward-zero", "Every reward was 0."
     if zero > 0.9 and largest > 0:
         yield "reward-rare", f"{zero:.1%} of the rewards at the beginning were 0."
+    elif unpaid > 0.9 and ends == 0 and not e.rose and not e.returns_alike:
+        yield (
+            "failure-goes-on",
+            f"No episode terminates, and {unpaid:.0%} of the late rewards are 0; at the beginning {zero:.0%} were.",
+        )
     if 0 < largest < 0.03:
         yield "reward-small", f"No reward is larger than {largest:.2g}."
-    if largest > (1000 if scaled else 150):  # LunarLander, which is learned unscaled too, has 100
+    if abs(mean) > 20 and 1e-6 < std / abs(mean) < 1 / 30:
+        yield "reward-offset", f"Rewards are about {mean:,.3g}, and vary by {std:.2g} alone."
+    elif largest > (1000 if scaled else 150):  # LunarLander, which is learned unscaled too, has 100
         yield "reward-large", f"Rewards reach {largest:,.3g}{'' if scaled else ', and are not scaled'}."
+
+
+def of_rewards(e: Evidence) -> Seen:
+    """Faults of what the rewards depend on."""
+    by_time, explained, before = e.late("reward/by_time"), e.values("reward/explained"), e.values("reward/before")
+    std = e.late("reward/std")
     if by_time > 0.8:
         yield "reward-by-time", f"Time alone explains {by_time:.0%} of the rewards within an episode."
-    if e.late("reward/std") > 1e-6 and len(explained) >= 2 and not e.rose and not e.sees_nothing:
+    if std > 1e-6 and e.greatest("reward/within") < 1e-6:
+        yield "reward-by-episode", "The reward is the same in every step of an episode, and another in the next one."
+    if len(before) >= 3 and np.median(before) > 0.2 and not e.sees_nothing:
+        yield (
+            "reward-late",
+            f"The row before explains {np.median(before):.0%} more of the rewards' variance than their own row does.",
+        )
+    elif std > 1e-6 and len(explained) >= 2 and not e.rose and not e.sees_nothing:
         share = float(np.median(explained))
         if share < 0.02:
             yield (
@@ -304,6 +335,15 @@ def of_exploration(e: Evidence) -> Seen:
             "entropy-unreachable",
             f"The policy is to have {target:g} nats, and the temperature is {e.late('temperature'):.2g}.",
         )
+    temperature, aim = e.values("temperature"), target or 0.0  # without a target it is below 0
+    if len(temperature) == len(entropy) >= 4:
+        above = np.minimum(entropy[1:], entropy[:-1]) > aim + 0.1
+        if above.sum() >= 4 and np.mean(np.diff(temperature)[above] > 0) > 0.8:
+            yield (
+                "temperature-opposed",
+                f"The temperature rose from {temperature[0]:.2g} to {temperature[-1]:.2g} although the entropy,"
+                f" {np.median(entropy):.2g}, was above its target.",
+            )
     if starts and total and starts > total / 2 and not e.as_recommended("learning_starts"):
         yield "mostly-random", f"The first {starts:,} of {total:,} steps are at random, without an update."
 
@@ -351,10 +391,8 @@ def _standard_errors(values: np.ndarray) -> float:
 
 
 def of_values(e: Evidence) -> Seen:
-    """Faults of V and Q: bootstraps, explained variance, overfitting, target networks."""
+    """Faults of V and Q: bootstraps, explained variance, overfitting."""
     missing, explained, last = e.last_half("value/missing"), e.late("explained_variance"), e.ends[1]
-    moved, behind = e.values("value/moved"), e.values("targets/behind")
-    usual = all(map(e.as_recommended, ("tau", "policy_delay")))
     newest, sampled = e.last_half("td_error/newest"), e.last_half("td_error/sampled")
     settled = len(last) > 0 and last.std() <= 0.05 * abs(last.mean())  # there is nothing left to explain
     if len(missing) >= 2 and _is_missing(missing) and e.late("episode/terminated") < 0.5 and not e.begins:
@@ -371,7 +409,7 @@ def of_values(e: Evidence) -> Seen:
             "missing-bootstrap",
             f"The value has hardly more than one reward in it: r + γ V(s') lies {above:.0%} above V, early and late.",
         )
-    elif nothing and not settled and "gae_lambda" in e.config:
+    elif nothing and (not settled or (len(missing) >= 2 and np.abs(missing).min() > 5)) and "gae_lambda" in e.config:
         yield (
             "value-explains-nothing",
             f"The value explains {max(0.0, explained):.0%} of the variance of its targets,"
@@ -384,11 +422,19 @@ def of_values(e: Evidence) -> Seen:
                 "critic-overfits",
                 f"The error of Q at the newest transitions is {times:.0f} times that at sampled ones.",
             )
+
+
+def of_targets(e: Evidence) -> Seen:
+    """Faults of what no update moves: V, Q, target networks."""
+    moved, behind, length = map(e.values, ("value/moved", "targets/behind", "targets/length"))
+    usual = all(map(e.as_recommended, ("tau", "policy_delay")))
     if len(moved) >= 2 and not moved.any() and "gae_lambda" in e.config and not e.config.get("freeze"):
         yield "critic-still", "No update that was looked at changed a parameter of V."
     if len(behind) >= 3 and not behind.any() and first_number(e.config.get("tau")) != 1:
         yield "critic-still", "The weights of Q are those of its target networks, each time that they were looked at."
-    if len(behind) >= 3 and (np.diff(behind) > 0).all() and behind[-1] > 0.15 and usual:
+    if len(length) >= 3 and np.ptp(length) == 0 and behind.any() and usual:
+        yield "targets-behind", "The weights of the target networks were the same each time that they were looked at."
+    elif len(behind) >= 3 and (np.diff(behind) > 0).all() and behind[-1] > 0.15 and usual:
         yield (
             "targets-behind",
             f"The target networks differ from Q's by {behind[-1]:.0%} of the length of its weights, and ever more.",
@@ -412,7 +458,8 @@ def of_networks(e: Evidence) -> Seen:
             yield "network-small", f"{field} is {typed(given)}, and {typed(usual)} is recommended."
     norms, norm = e.values("gradient_norm"), e.late("gradient_norm")
     limit = first_number(e.config.get("max_grad_norm"))
-    times = 5 if norm > 100 and e.config.get("scale_rewards", False) else 100
+    fell = e.late("losses/value") < e.early("losses/value")
+    times = 5 if norm > 100 and e.config.get("scale_rewards", False) else 15 if fell else 100
     if inactive > 0.6:
         yield (
             "units-inactive",
@@ -500,6 +547,7 @@ SUBJECTS = (
     of_observations,
     of_normalization,
     of_actions,
+    of_reward_sizes,
     of_rewards,
     of_episodes,
     of_horizon,
@@ -507,6 +555,7 @@ SUBJECTS = (
     of_exploration,
     of_advantages,
     of_values,
+    of_targets,
     of_networks,
     of_returns,
     of_falls,

@@ -110,9 +110,13 @@ class ActionValues(nn.Module):
         """Q(s, a) of rows […, O] and […], […]."""
         return self.policy(obs).values.gather(-1, action.unsqueeze(-1)).squeeze(-1)
 
+    def value(self, obs: Tensor) -> Tensor:
+        """max_a Q(s, a) of rows […, O], […]."""
+        return self.policy(obs).values.amax(-1)
+
     def estimates(self, obs: Tensor, next_obs: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """Q(s, a) and max_a Q(s', a) of rows […, O], […, O] and […], […] each."""
-        return self.q(obs, action), self.policy(next_obs).values.amax(-1)
+        return self.q(obs, action), self.value(next_obs)
 
 
 def normalizer_of(spec: Spec, normalize_observations: bool, remembered: int = 0) -> NoNorm:

@@ -47,11 +47,16 @@ def signals(
     if rows is None or rows.valid.sum() < 2:
         return {}
     chosen = rows[rows.valid]
-    found = of_rows(chosen, spec) | of_networks(state, chosen) | of_critics(state, config, chosen)
-    found |= of_values(state, config, rows, acted)
-    found |= {"reward/by_time": by_time(rows), **of_starts(rows, spec)}
+    found = of_networks(state, chosen) | of_critics(state, config, chosen) | of_values(state, config, rows, acted)
+    return of_environment(rows, spec) | {name: float(value) for name, value in found.items()}
+
+
+def of_environment(rows: Rollout, spec: Spec) -> dict[str, float]:
+    """The signals of rows [T, N, …] alone, two of which are valid at least."""
+    chosen = rows[rows.valid]
+    found = of_rows(chosen, spec) | of_time(rows) | of_starts(rows, spec)
     if not spec.has_images and spec.observation_size <= MOST_NUMBERS:
-        found |= of_effects(chosen, spec)
+        found |= of_effects(chosen, spec) | {"reward/before": paid_before(rows, spec)}
         if found["action/effect"] < 0.2:
             found["action/late"] = late_effect(rows, spec)
     return {name: float(value) for name, value in found.items()}
@@ -93,8 +98,11 @@ def of_starts(rows: Rollout, spec: Spec) -> dict[str, Tensor]:
     return {"observation/starts_alike": (first == first[:1]).all().float()} if len(first) > 2 else {}
 
 
-def by_time(rows: Rollout) -> Tensor:
-    """The share of the rewards' variance within episodes that a line over time explains, of rows [T, N, …]."""
+def of_time(rows: Rollout) -> dict[str, Tensor]:
+    """The share of the rewards' variance that is within episodes, and of that what a line over time explains.
+
+    Of rows [T, N, …]; both are 0 for rewards that never change.
+    """
     steps, envs = rows.done.shape
     before = torch.cat([torch.zeros_like(rows.done[:1]), rows.done[:-1]]).cumsum(0)  # episodes that ended so far
     episode = (before * envs + torch.arange(envs, device=before.device))[rows.valid].cpu()
@@ -104,8 +112,9 @@ def by_time(rows: Rollout) -> Tensor:
         x - (torch.bincount(episode, weights=x) / count)[episode]
         for x in (time, rows.reward[rows.valid].cpu().double())
     )
-    size = time.square().sum() * reward.square().sum()
-    return (time * reward).sum().square() / size if size > 1e-12 else torch.zeros(())
+    varies = (len(reward) * moments(rows.reward[rows.valid].cpu().double())[1]).clamp(min=1e-12)
+    size = (time.square().sum() * reward.square().sum()).clamp(min=1e-12)
+    return {"reward/by_time": (time * reward).sum().square() / size, "reward/within": reward.square().sum() / varies}
 
 
 def of_effects(rows: Rollout, spec: Spec) -> dict[str, Tensor]:
@@ -113,13 +122,12 @@ def of_effects(rows: Rollout, spec: Spec) -> dict[str, Tensor]:
 
     Actions explain what a line fitted to them explains beyond one fitted to the observations alone, in that number of
     the observation of which it is most: as a share of what those left to explain, and of all. A reward may be a square
-    too, of a distance or of an action. Also the share of the next observations that these explain, on average, and
-    what the signs of actions explain beyond all this.
+    too, of a distance or of an action. Also the share of the next observations that these explain, on average; what
+    the signs of actions explain beyond all this; and what that number of an action explains of which it is least.
     """
     obs, after = (x[:, : spec.observation_size].cpu().double() for x in (rows.obs, rows.next_obs))
     action, inside = _numbers(rows.action.cpu(), spec.action), ~rows.done.cpu()
-    everything = torch.cat([obs, obs.square(), action, action.square(), after, after.square()], dim=-1)
-    nothing = obs[:, :0]
+    everything, nothing = _everything(rows, spec), obs[:, :0]
     change, effect = (after - obs)[inside], explained_by(action[inside], (after - obs)[inside], obs[inside])
     found = {
         "action/effect": effect.max(),
@@ -129,6 +137,10 @@ def of_effects(rows: Rollout, spec: Spec) -> dict[str, Tensor]:
     if isinstance(spec.action, Box):
         known = torch.cat([obs, action], dim=-1)[inside]
         found["action/by_sign"] = explained_by(action.sign()[inside], change, known).nan_to_num().max()
+        for column in range(obs.shape[1], known.shape[1]) if action.shape[1] > 1 else ():
+            others = torch.cat([known[:, :column], known[:, column + 1 :]], dim=1)
+            alone = explained_by(known[:, column, None], change, others).nan_to_num().max()
+            found["action/weakest"] = torch.minimum(alone, found.get("action/weakest", alone))
     if not ((obs == 0) | (obs == 1)).all():  # one of n says nothing of the next
         found["observation/predicted"] = explained_by(obs[inside], after[inside], nothing[inside]).mean()
     return found
@@ -147,6 +159,31 @@ def late_effect(rows: Rollout, spec: Spec) -> Tensor:
         change = (after - obs)[steps:][one]
         found.append(explained_by(action[:-steps][one], change, obs[steps:][one]).nan_to_num().max())
     return torch.stack(found).max()
+
+
+def paid_before(rows: Rollout, spec: Spec) -> Tensor:
+    """What a row before explains of the rewards beyond what their own row does, of rows [T, N, …].
+
+    The most of up to `LATEST` steps, or of one where their own row explains most of them. Above 0 a reward is that of
+    an earlier step: its own row knows no more of the action that earned it.
+    """
+    ended, found = rows.done.cumsum(0) - rows.done.int(), torch.tensor(-1.0)  # episodes that ended before each row
+    for steps in range(1, min(LATEST, len(rows.done) - 1) + 1):
+        one = (ended[steps:] == ended[:-steps]) & rows.valid[steps:] & rows.valid[:-steps]
+        before, own = rows[:-steps][one], rows[steps:][one]
+        reward, nothing = own.reward[:, None].cpu().double(), torch.empty(len(own.reward), 0, dtype=torch.float64)
+        earlier, present = (explained_by(_everything(each, spec), reward, nothing)[0] for each in (before, own))
+        found = torch.maximum(found, (earlier - present).nan_to_num())
+        if present > 0.5:
+            break
+    return found
+
+
+def _everything(rows: Rollout, spec: Spec) -> Tensor:
+    """Observations, actions and next observations of rows [B, …], with their squares, as numbers [B, F]."""
+    obs, after = (x[:, : spec.observation_size].cpu().double() for x in (rows.obs, rows.next_obs))
+    action = _numbers(rows.action.cpu(), spec.action)
+    return torch.cat([obs, obs.square(), action, action.square(), after, after.square()], dim=-1)
 
 
 def _numbers(action: Tensor, kind: Action) -> Tensor:
@@ -192,7 +229,7 @@ def of_networks(state: Any, rows: Rollout) -> dict[str, Tensor]:
 def of_values(
     state: Any, config: RunConfig, rows: Rollout, acted: Mapping[str, Tensor] | None = None
 ) -> dict[str, Tensor]:
-    """Of V and of the newest update, from rows [T, N, …], for algorithms with a V(s).
+    """Of V and of the newest update, from rows [T, N, …], for algorithms with a V(s); of Q(s, ·) it is the largest.
 
     - value/missing: the mean of r + γ V(s') − V(s) over (1 − γ) |V|, above 0 where V is too small. That mean is 1 − γ
       times the difference of the policy's value and V. Where learning takes the value behind a time limit for 0, the
@@ -221,8 +258,10 @@ def of_values(
     if acted is not None:
         for name, beginning in (("network/moved", "policy."), ("value/moved", "value.")):
             own = [(acted[key], now) for key, now in state.networks.named_parameters() if key.startswith(beginning)]
-            before, after_it = (torch.cat([x.flatten() for x in each]) for each in zip(*own, strict=True))
-            found[name] = (after_it - before).norm() / after_it.norm()
+            if own:
+                before, after_it = (torch.cat([x.flatten() for x in each]) for each in zip(*own, strict=True))
+                found[name] = (after_it - before).norm() / after_it.norm()
+    if acted is not None and isinstance(state.networks.value, nn.Module):  # not the largest of Q
         advantage, _ = gae(rows.reward, value, after, ends, rows.done, gamma=gamma, lam=0.95)
         of_policy = {key.removeprefix("policy."): x for key, x in acted.items() if key.startswith("policy.")}
         old = functional_call(state.policy, of_policy, (obs,), tie_weights=False).log_prob(action)
@@ -246,9 +285,9 @@ def _missing(target: Tensor, value: Tensor, gamma: float) -> Tensor:
 def of_critics(state: Any, config: RunConfig, rows: Rollout) -> dict[str, Tensor]:
     """The mean squared error of Q over one step, of the newest rows and of sampled ones, and the share that is missing.
 
-    For algorithms that learn Q from replay; with the distance of the target networks, as a share of the length of all
-    weights, and shares of the sampled transitions: of those that end where they began, and of those in which Q of the
-    policy's action is above that of one at random.
+    For algorithms that learn Q from replay. Also the length of the target networks' weights, their distance from Q's as
+    a share of the length of these, and shares of the sampled transitions: of those that end where they began, and of
+    those in which Q of the policy's action is above that of one at random.
     """
     replay, updates = getattr(state, "replay", None), getattr(state, "updates", 0)
     if replay is None or not updates or not hasattr(state.networks, "critics"):
@@ -277,5 +316,5 @@ def of_critics(state: Any, config: RunConfig, rows: Rollout) -> dict[str, Tensor
         "replay/repeated": (sampled.obs == sampled.next_obs).flatten(1).all(1).float().mean(),
     }
     own, behind = (torch.cat([p.flatten() for p in each.parameters()]) for each in (critics, targets))
-    found["targets/behind"] = (own - behind).norm() / own.norm()
+    found |= {"targets/behind": (own - behind).norm() / own.norm(), "targets/length": behind.norm()}
     return found | ({"value/missing": _missing(target, q, gamma)} if gamma < 1 else {})
