@@ -5,6 +5,7 @@
     .venv/bin/python benchmarks/doctor.py faults --half unseen                faults that nobody had in mind
     .venv/bin/python benchmarks/doctor.py faults --half unseen-too            and others, after rules for these
     .venv/bin/python benchmarks/doctor.py faults --half unseen-three          and others again
+    .venv/bin/python benchmarks/doctor.py faults --half unseen-four           and again
     .venv/bin/python benchmarks/doctor.py faults --half elsewhere --seeds 1   under other algorithms, elsewhere
     .venv/bin/python benchmarks/doctor.py healthy
     .venv/bin/python benchmarks/doctor.py remedies --seeds 1
@@ -29,6 +30,7 @@ from typing import Any, get_type_hints
 
 import faulty
 import unseen
+import unseen_four
 import unseen_three
 import unseen_too
 from common import append, provenance, rows
@@ -167,11 +169,36 @@ UNSEEN_THREE = {
     "one target for all actions": (),
 }
 """names that are right for the faults of `unseen_three.py`; none where there is no rule"""
-SETS = ((UNSEEN, unseen.UNSEEN), (UNSEEN_TOO, unseen_too.UNSEEN_TOO), (UNSEEN_THREE, unseen_three.UNSEEN_THREE))
+UNSEEN_FOUR = {
+    "a constant in the reward": ("reward-offset",),
+    "sensors that are not connected": ("observation-part",),
+    "units from millionths to millions": ("large-observation",),
+    "failures that end nothing": ("failure-goes-on",),
+    "a reward for the beginning": ("reward-by-episode",),
+    "a reward that comes a step late": ("reward-late",),
+    "a motor without a cable": ("action-part",),
+    "observations of a while ago": ("action-late",),
+    "a watchdog that nobody knows of": ("limit-as-termination",),
+    "a coin for a reward": ("reward-unexplained",),
+    "rewards cut off at zero": ("reward-zero",),
+    "one array for all copies": (),
+    "targets that pull Q back": ("targets-behind",),
+    "a temperature that runs away": ("temperature-opposed",),
+    "ends that Q does not know of": ("ends-ignored",),
+    "a value of the advantages": ("value-explains-nothing",),
+    "a ratio upside down": ("advantage-opposed", "gets-worse"),
+}
+"""names that are right for the faults of `unseen_four.py`; none where there is no rule"""
+SETS = (
+    (UNSEEN, unseen.UNSEEN),
+    (UNSEEN_TOO, unseen_too.UNSEEN_TOO),
+    (UNSEEN_THREE, unseen_three.UNSEEN_THREE),
+    (UNSEEN_FOUR, unseen_four.UNSEEN_FOUR),
+)
 FAULTS |= {name: (*faults[name][:3], right) for named, faults in SETS for name, right in named.items()}
 for name, algorithm, env, steps, change in ELSEWHERE:
     FAULTS[f"{name}: {algorithm}, {env}"] = (algorithm, {env: steps}, change or FAULTS[name][2], FAULTS[name][3])
-OF_SETS = unseen.LEARNERS | unseen_too.LEARNERS | unseen_three.LEARNERS
+OF_SETS = unseen.LEARNERS | unseen_too.LEARNERS | unseen_three.LEARNERS | unseen_four.LEARNERS
 LEARNERS = faulty.LEARNERS | {name: lambda _, change=change: change() for name, change in OF_SETS.items()}
 """the library with a fault in it, as a context, for the name of an algorithm"""
 
@@ -306,7 +333,7 @@ def cost() -> None:
 
 HALVES = {name: "elsewhere" if ":" in name else ("even", "odd")[i % 2] for i, name in enumerate(FAULTS)}
 HALVES |= dict.fromkeys(UNSEEN, "unseen") | dict.fromkeys(UNSEEN_TOO, "unseen-too")
-HALVES |= dict.fromkeys(UNSEEN_THREE, "unseen-three")
+HALVES |= dict.fromkeys(UNSEEN_THREE, "unseen-three") | dict.fromkeys(UNSEEN_FOUR, "unseen-four")
 
 
 def table(half: str | None) -> None:
@@ -340,7 +367,9 @@ def table(half: str | None) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=["faults", "healthy", "remedies", "cost", "table"])
-    parser.add_argument("--half", choices=["even", "odd", "unseen", "unseen-too", "unseen-three", "elsewhere"])
+    parser.add_argument(
+        "--half", choices=["even", "odd", "unseen", "unseen-too", "unseen-three", "unseen-four", "elsewhere"]
+    )
     parser.add_argument("--only", nargs="+", help="these faults, or algorithms of healthy runs")
     parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3])
     parser.add_argument("--runs", type=Path)

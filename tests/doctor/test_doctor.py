@@ -73,8 +73,8 @@ CASES = {
     ),
     "observation-repeated": ({"observation__repeated": [0.7] * 8}, {"observation__repeated": [0.3] * 8}),
     "observation-part": (
-        {"observation__constant": [0.5] * 8, "action__effect": [0.5] * 8},
-        {"observation__constant": [0.5] * 7 + [0.1], "action__effect": [0.5] * 8},
+        {"observation__constant": [0.5] * 8, "observation__predicted": [0.9] * 8},
+        {"observation__constant": [0.5] * 7 + [0.1], "observation__predicted": [0.9] * 8},
     ),
     "observation-noisy": ({"observation__predicted": [0.1] * 8}, {"observation__predicted": [0.1] * 2 + [0.8] * 6}),
     "reward-rare": (
@@ -294,8 +294,8 @@ def test_what_is_large_from_the_beginning_does_not_explode():
 
 
 def test_numbers_that_never_change_are_no_noise():
-    still = {"observation__constant": [0.75] * 8, "action__effect": [0.5] * 8, "returns": RISES}
-    assert names(**still) == []
+    still = {"observation__constant": [0.75] * 8, "returns": RISES}
+    assert names(**still, observation__predicted=[0.9] * 8) == []
     assert names(**still, observation__predicted=[0.1] * 8) == ["observation-part"]
     assert names(observation__constant=[0.75] * 8) == []  # of many numbers, such as contacts, many stand still
 

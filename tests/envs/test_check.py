@@ -153,6 +153,42 @@ class Unrewarded(Sound):
         return obs, 0.0, *rest
 
 
+class PaidLate(Sound):
+    """Pays what was observed two steps before."""
+
+    def reset(self, *, seed=None, options=None):
+        self.seen = [0.0, 0.0]
+        return super().reset(seed=seed)
+
+    def step(self, action):
+        obs, _, *rest = super().step(action)
+        self.seen.append(float(obs[1]))
+        return obs, self.seen[-3], *rest
+
+
+class PaidByEpisode(Sound):
+    def reset(self, *, seed=None, options=None):
+        found = super().reset(seed=seed)
+        self.price = self.np_random.uniform()
+        return found
+
+    def step(self, action):
+        obs, _, *rest = super().step(action)
+        return obs, self.price, *rest
+
+
+class Halved(Sound):
+    """Uses one number of its action, and writes one of its observation."""
+
+    action_space = gym.spaces.Box(-1, 1, (2,), np.float32)
+
+    def step(self, action):
+        return super().step(action[0] > 0)
+
+    def look(self):
+        return np.array([self.place, 0.3], dtype=np.float32)
+
+
 class Pixels(Sound):
     """Images of floats."""
 
@@ -275,7 +311,11 @@ def test_the_mode_of_a_vector_environment_is_told():
         ("Scales", "note", "Observations reach 1e+06 in obs[0] and 1e-06 in obs[1]"),
         ("Pixels", "note", "The array obs (20, 20, 3) becomes 1,200 numbers without their places"),
         ("Stacked", "good", "an image of 20 × 20 bytes with 4 channels, from arrays (4, 20, 20)"),
-        ("Stillborn", "bad", "It cannot be made: OSError: no such robot."),
+        ("Stillborn", "bad", "Stillborn cannot be made: OSError: no such robot"),
+        ("PaidLate", "note", "The row before explains"),
+        ("PaidByEpisode", "note", "The reward is the same in every step of an episode"),
+        ("Halved", "note", "One of the numbers of an action explains 0."),
+        ("Halved", "note", "50% of the observed numbers were never seen to change."),
         ("Breaks", "bad", "It cannot be played with random actions: AttributeError: 'Breaks' object has no attribute"),
         ("Stuck", "bad", "rules out every action of environment 0: its action_mask is all zero."),
     ],

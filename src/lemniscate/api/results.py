@@ -36,8 +36,11 @@ from lemniscate.run.evaluate import Evaluation, critic_of
 from lemniscate.run.evaluate import evaluate as evaluate_policy
 from lemniscate.run.places import is_sweep, read_sweep
 from lemniscate.run.seeding import torch_defaults
+from lemniscate.run.signals import of_environment
+from lemniscate.spec import Spec
 from lemniscate.system.console import say
 from lemniscate.system.files import DamagedFileError, at_home, file_in_the_way, make_directory, read_json, write_json
+from lemniscate.types import Rollout
 
 FINAL_EPISODES = 100
 """that a run's final policy is judged by where runs are compared"""
@@ -214,7 +217,15 @@ def each_finding(
     path = at_home(what)
     if run_check.is_stored(path):
         return run_check.each_finding(path)
-    return env_check.each_finding(what, backend, env_kwargs, wrappers)
+    return env_check.each_finding(what, backend, env_kwargs, wrappers, _shown_by)
+
+
+def _shown_by(rollouts: Sequence[Rollout], spec: Spec) -> list[str]:
+    """What the doctor sees in rollouts [T, N, …] of random play, each looked at in two halves."""
+    halves = [
+        rows[half] for rows in rollouts for half in (slice(len(rows.done) // 2), slice(len(rows.done) // 2, None))
+    ]
+    return doctor.of_random_play([of_environment(rows, spec) for rows in halves if rows.valid.sum() > 1])
 
 
 def runs_in(what: str) -> list[Path]:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lemniscate.doctor.evidence import Evidence, usual_ranges, with_ratios
-from lemniscate.doctor.rules import CAUSES, CERTAIN, HINT, KINDS, LIKELY, Rule, findings, settings_far_out
+from lemniscate.doctor.rules import CAUSES, CERTAIN, HINT, KINDS, LIKELY, RULES, Rule, findings, settings_far_out
 from lemniscate.run.config import RunConfig
 from lemniscate.run.fields import field_help
 from lemniscate.run.metrics import read_metrics
@@ -71,6 +71,18 @@ def _diagnosis(evidence: Evidence, rule: Rule, seen: str) -> Diagnosis:
     steps, values = [line["step"] for line in chosen], [line[rule.metric] for line in chosen]
     remedy = rule.remedy_for(evidence.config)
     return Diagnosis(rule.name, rule.sure, seen, rule.means, remedy, rule.source, rule.metric, steps, values)
+
+
+IN_PLAY = {rule.name for rule in RULES if rule.kind == "environment"} | {"action-by-sign"}
+IN_PLAY -= {"seed-ignored", "reward-zero", "reward-large", "no-episode"}
+"""faults that random play shows and that the check of an environment has no sentence for"""
+
+
+def of_random_play(looks: Sequence[Mapping[str, float]]) -> list[str]:
+    """What the signals of some looks at random play say of an environment, a text for each of its faults."""
+    lines = [{"step": i, **look} for i, look in enumerate(looks)]
+    found = findings(Evidence({}, {}, {}, {}, lines, {}))
+    return [f"{seen} {rule.means} {rule.remedy_for({})}." for rule, seen in found if rule.name in IN_PLAY]
 
 
 class Attendance:

@@ -89,7 +89,7 @@ def of_observations(e: Evidence) -> Seen:
     """Faults of the observations, and of their copies in the replay buffer."""
     cut, repeated = e.late("observation/at_limits"), e.early("observation/repeated")
     predicted, whole, kept = map(e.late, ("observation/predicted", "observation/whole", "replay/repeated"))
-    constant, fitted = e.values("observation/constant"), e.values("action/effect")  # lines are fitted to few numbers
+    constant, fitted = e.values("observation/constant"), e.values("observation/predicted")  # few, and not one of n
     partly = len(fitted) >= 3 and 0.3 < constant.min(initial=1) < 1 and (predicted < 0.25 or not e.rose)
     if cut > 0.5:
         yield "observation-clipped", f"{cut:.0%} of the observed numbers stand at an end of their range."

@@ -2,7 +2,7 @@
 
 import time
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from copy import deepcopy
 from dataclasses import dataclass
@@ -75,9 +75,17 @@ def verdict(env_id: str, findings: Sequence[Finding]) -> str:
 
 
 def each_finding(
-    env_id: str, backend: str | None, env_kwargs: Mapping[str, Any] | None, wrappers: Sequence[str]
+    env_id: str,
+    backend: str | None,
+    env_kwargs: Mapping[str, Any] | None,
+    wrappers: Sequence[str],
+    judge: Callable[[Sequence[Rollout], Spec], Sequence[str]],
 ) -> Iterator[Finding]:
-    """The findings about an environment, one by one. Raises `UserError` if there is none of that name."""
+    """The findings about an environment, one by one. Raises `UserError` if there is none of that name.
+
+    Beside what is found here, `judge` says what rollouts [T, N, …] of random play show of its rewards, observations and
+    actions.
+    """
     served_by = backend or registry.backend_for(env_id, wrappers)
     cls = registry.backend_class(served_by)  # an unknown backend is an error of the question, not a finding
     try:
@@ -93,7 +101,7 @@ def each_finding(
             maker = maker_of(env_id)
             one = make_one(maker, tuple(map(find_callable, wrappers)), **(env_kwargs or {}))
             yield from _gymnasium(one, env_id, wrapped=bool(wrappers) or not isinstance(maker, EnvSpec))
-        yield from _random_play(env)
+        yield from _random_play(env, judge)
     finally:
         env.close()
 
@@ -142,7 +150,7 @@ def _acts(action: Action) -> str:
     return f"{action.n} binary choices"
 
 
-def _random_play(env: VecEnv) -> Iterator[Finding]:
+def _random_play(env: VecEnv, judge: Callable[[Sequence[Rollout], Spec], Sequence[str]]) -> Iterator[Finding]:
     """Finite numbers, seeds, effects of actions, rows, ends, and whatever else random play shows."""
     try:
         started = time.perf_counter()
@@ -176,6 +184,7 @@ def _random_play(env: VecEnv) -> Iterator[Finding]:
     both = Rollout(*map(torch.cat, zip(vars(first).values(), vars(other).values(), strict=True)))
     yield from _ends_and_rewards(both, lengths + more_lengths, env.spec)
     yield from _sizes(both.obs[both.valid], env.spec)
+    yield from map(note, judge((first, other), env.spec))
     yield good(f"{speed:,.0f} steps a second ({NUM_ENVS} parallel environments, random actions).")
 
 
