@@ -4,6 +4,7 @@ import json
 import re
 import subprocess
 import sys
+import threading
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 
@@ -15,6 +16,8 @@ import torch
 import lemniscate as lem
 from conftest import tiny_fields
 from lemniscate.envs import registry
+from lemniscate.envs.vector_view import action_space
+from lemniscate.spec import Box, ObservationPart, Spec
 
 
 @pytest.fixture(scope="module")
@@ -339,6 +342,16 @@ def test_a_policy_says_the_q_of_an_action_in_the_units_of_the_environment(algori
         policy.value(obs)
 
 
+def test_q_of_an_action_without_a_shape_is_that_of_its_one_number():
+    config = lem.config_for("td3", "Pendulum-v1", hidden=(8,), critic_hidden=(8,))
+    spec = Spec("x", (ObservationPart((), (3,)),), Box((-2.0,), (2.0,), shape=()))
+    policy, obs = lem.TrainedPolicy(config.networks(spec), spec, config, 0), np.ones((2, 3), np.float32)
+    assert policy.act(obs[0]).shape == ()
+    of_each, of_one = policy.q_value(obs, policy.act(obs)), policy.q_value(obs[0], policy.act(obs[0]))
+    np.testing.assert_allclose(of_each, [of_one, of_one], rtol=1e-5)
+    assert action_space(spec.action) == gym.spaces.Box(-2, 2, (), np.float32)
+
+
 def test_q_of_a_choice_is_that_of_its_number(tmp_path):
     config = lem.config_for("pqn", "CartPole-v1", hidden=(8,))
     env = registry.make("CartPole-v1", 1)
@@ -349,10 +362,40 @@ def test_q_of_a_choice_is_that_of_its_number(tmp_path):
         values = policy.module(torch.from_numpy(obs)).values.numpy()
     np.testing.assert_allclose(policy.q_value(obs, action), values[[0, 1, 2], action], rtol=1e-5)
     assert policy.q_value(obs[0], policy.act(obs[0])) == pytest.approx(values[0].max(), rel=1e-5)
+    np.testing.assert_allclose(policy.value(obs), values.max(-1), rtol=1e-5)
+    policy.module.epsilon.fill_(0.2)
+    found = policy.distribution(obs).probabilities
+    np.testing.assert_allclose(np.sort(found, axis=-1), [[0.1, 0.9]] * 3, rtol=1e-5)
+    np.testing.assert_array_equal(found.argmax(-1), policy.act(obs))
     with pytest.raises(lem.UserError, match="action must be from 0 to below 2, not 2"):
         policy.q_value(obs[0], 2)
     with pytest.raises(lem.UserError, match=r"action must be whole numbers of the shape \(\), not 'left'"):
         policy.q_value(obs[0], "left")
+
+
+def test_a_second_thread_does_not_train_at_the_same_time(tmp_path):
+    begun, over, said = threading.Event(), threading.Event(), []
+
+    def waiting(step, metrics, policy):
+        begun.set()
+        assert over.wait(60)
+        nested = lem.train("ppo", "CartPole-v1", run=tmp_path / "nested", progress=False, **tiny_fields())
+        return nested.policy.step == 0
+
+    fields = {"progress": False, **tiny_fields(total_steps=32)}
+    first = threading.Thread(
+        target=lambda: said.append(lem.train("ppo", "CartPole-v1", run=tmp_path / "a", callbacks=[waiting], **fields))
+    )
+    first.start()
+    assert begun.wait(60)
+    try:
+        with pytest.raises(lem.UserError, match="Another thread of this process is training"):
+            lem.train("ppo", "CartPole-v1", run=tmp_path / "b", **fields)
+    finally:
+        over.set()
+        first.join(60)
+    assert said[0].policy.step == 32
+    lem.train("ppo", "CartPole-v1", run=tmp_path / "b", **fields)
 
 
 @contextmanager

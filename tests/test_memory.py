@@ -399,6 +399,7 @@ def test_act_says_what_is_wrong_with_another_number_of_episodes(trained):
     with pytest.raises(UserError, match=r"done has the shape \(2,\), of 3 episodes"):
         policy.reset([True, False])
     policy.reset()
+    policy.value(np.zeros((3, 4), np.float32))  # a question begins no episode
     policy.act(np.zeros(4))
     policy.reset(True)  # of one episode
     assert policy.act(np.zeros(4, np.float32)).shape == ()

@@ -13,6 +13,7 @@ from lemniscate.algos import ddpg, sac, td3
 from lemniscate.data.hindsight import HindsightReplay, goal_columns
 from lemniscate.envs import registry
 from lemniscate.errors import UserError, is_installed
+from lemniscate.run.metrics import read_metrics
 from lemniscate.spec import Box, ObservationPart, Spec
 from lemniscate.testing import check_resume
 from lemniscate.types import Step
@@ -147,6 +148,22 @@ def test_a_backend_without_single_environments_judges_no_goals():
 @pytest.mark.parametrize("algo", ["ddpg", "td3", "sac"])
 def test_a_resumed_run_ends_in_the_bits_of_one_that_was_not_stopped(algo, tmp_path):
     check_resume(algo, tmp_path, env="environments:Walk", **SMALL, checkpoint_every=128)
+
+
+@pytest.mark.parametrize("algo", ["ddpg", "td3", "sac"])
+def test_learning_waits_for_the_first_whole_episode(algo, tmp_path):
+    fields = SMALL | {"learning_starts": 4, "num_envs": 1, "total_steps": 64, "log_every": 8}
+    run = lem.train(algo, "environments:Walk", run=tmp_path / "r", progress=False, **fields)
+    learned = ["td_error/sampled" in line or "losses/critic" in line for line in read_metrics(run.path)]
+    assert learned[0] is False
+    assert learned[-1] is True
+
+
+def test_checkpoints_that_cut_every_episode_are_refused(tmp_path):
+    limit = ("gymnasium.wrappers:TimeLimit(max_episode_steps=50)",)
+    with pytest.raises(UserError, match=r"checkpoint_every 64 is less than an episode .*: it must be 100 at least"):
+        lem.train("sac", "environments:Walk", run=tmp_path / "r", wrappers=limit, checkpoint_every=64, **SMALL)
+    assert not (tmp_path / "r").exists()
 
 
 @pytest.mark.parametrize("algo", [ddpg, td3, sac], ids=["ddpg", "td3", "sac"])

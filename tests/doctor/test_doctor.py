@@ -139,8 +139,8 @@ CASES = {
     ),
     "reward-late": ({"reward__before": [0.3] * 8}, {"reward__before": [0.3] * 3 + [0.1] * 5}),
     "failure-goes-on": (
-        {"reward__zero": [0.5] * 4 + [0.99] * 4, "episode__terminated": [0.0] * 8},
-        {"reward__zero": [0.5] * 4 + [0.99] * 4, "episode__terminated": [0.0] * 7 + [0.1]},
+        {"reward__zero": [0.5] * 4 + [0.99] * 4, "episode__terminated": [0.0] * 8, "reward__mean": [0.01] * 8},
+        {"reward__zero": [0.5] * 4 + [0.99] * 4, "episode__terminated": [0.0] * 8, "reward__mean": [-0.01] * 8},
     ),
     "reward-offset": (
         {"reward__mean": [-500.0] * 8, "reward__std": [4.0] * 8, "reward__largest": [510.0] * 8},

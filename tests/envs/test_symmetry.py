@@ -77,6 +77,22 @@ class OneList(Pole):
     mirror = ([1, 2, 3],)
 
 
+class Uneven(Pole):
+    action_space = gym.spaces.Box(np.array([-1, -2], np.float32), np.array([1, 2], np.float32))
+
+
+def wrapped_pole():
+    return gym.wrappers.TransformObservation(Pole(), lambda obs: obs[::-1], Pole.observation_space)
+
+
+def swimmer(low, high, rescaled):
+    """A swimmer with other bounds: its actions are those of the swimmer itself, or are brought to these bounds."""
+    env, low, high = gym.make("Swimmer-v5"), np.float32(low), np.float32(high)
+    if rescaled:
+        return gym.wrappers.RescaleAction(env, low, high)
+    return gym.wrappers.TransformAction(env, lambda action: action, gym.spaces.Box(low, high, (2,), np.float32))
+
+
 # of each robot by hand, from its model: what a mirrored position takes, and with which sign; velocities alike
 ANT = [0, 1, 2, 3, 4, 5, 6, 13, 14, 11, 12, 9, 10, 7, 8], [1, -1, 1, 1, -1, 1, -1, *[-1, 1] * 4]
 ANT_SPEED = [0, 1, 2, 3, 4, 5, 12, 13, 10, 11, 8, 9, 6, 7], [1, -1, 1, -1, 1, -1, *[-1, 1] * 4]
@@ -137,6 +153,8 @@ def test_an_ant_is_mirrored_as_its_model_says():
             r"mirror of its observation is \[-2, 3, 1\]; it must have each of 1 to 3 once, in pairs.",
         ),
         ("test_symmetry:OneList", r"its attribute mirror is \(\[1, 2, 3\],\); it must be two lists of whole numbers"),
+        ("test_symmetry:Uneven", "the bounds of its action, .*, are not the mirror image of themselves."),
+        ("test_symmetry:wrapped_pole", "the wrapper TransformObservation changes what its attribute mirror is about"),
         ("CartPole-v1", "its action is not one row of numbers."),
         ("Pendulum-v1", "it is no MuJoCo environment of Gymnasium's kind, and has no attribute mirror."),
         ("DroneFigureEightTrajectory-v0", "has no symmetry that could be used"),
@@ -146,6 +164,14 @@ def test_an_ant_is_mirrored_as_its_model_says():
 def test_where_there_is_no_mirror_the_reason_is_said(env, said):
     with pytest.raises(UserError, match=said):
         mirror_of(env)
+
+
+def test_a_mirror_is_that_of_actions_as_a_policy_gives_them():
+    """In [-1, 1], whose image is itself: an action of 0 is another one between −1 and ½, which is no mirror image."""
+    with pytest.raises(UserError, match="moves otherwise on each side"):
+        mirror_of("test_symmetry:swimmer", low=-1.0, high=0.5, rescaled=False)
+    mirror = mirror_of("test_symmetry:swimmer", low=-2.0, high=2.0, rescaled=True)
+    assert mirror.action.sign.tolist() == [-1, -1]
 
 
 def test_a_mirror_that_is_given_is_taken():

@@ -7,6 +7,7 @@ import torch
 
 import lemniscate as lem
 from conftest import tiny_fields, tiny_off_policy
+from lemniscate.api.callbacks import StopAt
 from lemniscate.nn.policies import Policy
 from lemniscate.run import checkpoint
 from lemniscate.run.state import PolicyMean
@@ -48,6 +49,19 @@ def test_a_run_resumed_amid_the_mean_ends_in_the_same_bits(tmp_path):
     lem.resume(back, progress=False)
     ends = [checkpoint.read(path / "checkpoints" / "step-256").tensors for path in (whole, back)]
     assert all(ends[0][name].equal(ends[1][name]) for name in ends[0])
+
+
+def test_the_mean_of_a_total_that_is_extended_begins_anew(tmp_path):
+    fields = tiny_fields("CartPole-v1", average_last=0.5, checkpoint_every=32, keep_checkpoints=40)
+    path = tmp_path / "r"
+    lem.train("ppo", "CartPole-v1", run=path, progress=False, callbacks=[StopAt(192)], **fields)
+    lem.resume(path, total_steps=640, progress=False)
+    counts = {
+        step: tensors["mean.count"].item() if "mean.count" in tensors else 0
+        for step in (192, 224, 320, 352, 608)
+        for tensors in [checkpoint.read(path / "checkpoints" / f"step-{step}").tensors]
+    }
+    assert counts == {192: 2, 224: 0, 320: 0, 352: 1, 608: 9}
 
 
 def test_the_mean_begins_again_once_the_policy_has_it(rng):

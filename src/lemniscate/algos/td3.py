@@ -121,7 +121,7 @@ def train(config: Config, run: Run) -> State:
             interact(env, policy, state.replay, state.action_noise, rng, noise_std=noise_std, random=random)
             state.step += config.num_envs
             due = state.step % (config.num_envs * config.update_every) == 0
-            if due and state.step > config.learning_starts:
+            if due and state.step > config.learning_starts and len(state.replay):
                 metrics.append(update(config, state))
         run.log(state, means(metrics), env.take_episodes())
     return state

@@ -134,10 +134,9 @@ class TrainedPolicy:
         found: Any = self.module(flat)
         rows = partial(_rows, batched=batched)
         if isinstance(kind, MultiDiscrete):
-            return ActionDistribution(tuple(rows(part.logits.softmax(-1)) for part in found.parts))
+            return ActionDistribution(tuple(rows(part.probabilities) for part in found.parts))
         if not isinstance(kind, Box):
-            probabilities = found.logits.softmax(-1) if isinstance(kind, Discrete) else found.logits.sigmoid()
-            return ActionDistribution(rows(probabilities, getattr(kind, "shape", None)))
+            return ActionDistribution(rows(found.probabilities, getattr(kind, "shape", None)))
         mean, std = mean_and_std(found)
         _, _, middle, half = map(torch.from_numpy, scale_of(kind))
         return ActionDistribution(mean=rows(middle + half * mean, kind.shape), std=rows(half * std, kind.shape))
@@ -163,7 +162,7 @@ class TrainedPolicy:
         flat, batched = self._read_for("q", obs)
         kind: Any = self.spec.action
         given, several = as_array(action), (len(flat),) * batched
-        shape = () if isinstance(kind, Discrete) else kind.shape or (kind.size,)
+        shape = () if isinstance(kind, Discrete) else (kind.size,) if kind.shape is None else kind.shape
         kinds, what = ("iu", "whole") if isinstance(kind, Discrete) else ("iuf", "finite")
         if given.shape != several + shape or given.dtype.kind not in kinds or not np.isfinite(given).all():
             said = f"action must be {what} numbers of the shape {several + shape}, not {kind_of(action)}"

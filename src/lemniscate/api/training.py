@@ -2,9 +2,10 @@
 
 import os
 import sys
+import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from itertools import count
 from pathlib import Path
 from types import ModuleType
@@ -32,6 +33,9 @@ from lemniscate.system.console import say
 from lemniscate.system.files import make_directory, parsing
 from lemniscate.system.machine import keep_freed_memory
 from lemniscate.system.world import CLUSTER, World, leave_if_imported_again
+
+TRAINING = threading.RLock()
+"""held by the thread that trains; a callback of its run may train too"""
 
 
 def config_for(
@@ -228,6 +232,7 @@ def go_on(run: object, arguments: Mapping[str, Any], changes: Mapping[str, objec
 def _annealed(config: RunConfig) -> list[str]:
     """The fields that make others change over the steps of the whole run, with their values."""
     fractions = () if getattr(config, "desired_kl", None) else ("final_learning_rate", "final_critic_learning_rate")
+    fractions = (*fractions, "final_epsilon")
     annealed = [name for name in fractions if name.removeprefix("final_") not in config.schedules]
     fields = {**config.schedules, **{name: getattr(config, name, 1.0) for name in annealed}}
     return [f"{name} {value}" for name, value in fields.items() if value != 1]
@@ -262,6 +267,21 @@ def _train_elsewhere(path: Path, algorithm: str, config: RunConfig, options: Run
     return trained
 
 
+@contextmanager
+def _alone() -> Iterator[None]:
+    """Raise `UserError` where another thread of this process trains: both would draw from its global generators."""
+    if not TRAINING.acquire(blocking=False):
+        raise UserError(
+            "Another thread of this process is training, and both would draw from the same random numbers; train one"
+            " after the other, or each in a process of its own."
+        )
+    try:
+        yield
+    finally:
+        TRAINING.release()
+
+
+@_alone()
 def _train(world: World, path: Path, algorithm: str, config: RunConfig, options: RunOptions) -> TrainedRun:
     """Train in this process, of several the first alone writes, reports and talks; or where the options say."""
     if options.cluster is not None or (options.processes > 1 and world.size == 1):

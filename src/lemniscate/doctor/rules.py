@@ -187,7 +187,7 @@ def of_reward_sizes(e: Evidence) -> Seen:
         yield "reward-zero", "Every reward was 0."
     if zero > 0.9 and largest > 0:
         yield "reward-rare", f"{zero:.1%} of the rewards at the beginning were 0."
-    elif unpaid > 0.9 and ends == 0 and not e.rose and not e.returns_alike:
+    elif unpaid > 0.9 and ends == 0 and mean > 0 and not e.returns_alike:  # where rewards are costs, 0 is a success
         yield (
             "failure-goes-on",
             f"No episode terminates, and {unpaid:.0%} of the late rewards are 0; at the beginning {zero:.0%} were.",

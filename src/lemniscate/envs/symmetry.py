@@ -15,8 +15,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lemniscate.envs.conversion import SingleEnv
+from lemniscate.envs.conversion import SingleEnv, scale_action
 from lemniscate.envs.factory import make_one, maker_of, makes_vector, sentences
+from lemniscate.envs.returns import shown_space
+from lemniscate.envs.spaces import action_kind
 from lemniscate.errors import UserError, shown
 from lemniscate.system.named import find_callable
 from lemniscate.types import Record
@@ -71,7 +73,8 @@ def find_mirror(env: str, kwargs: Mapping[str, Any], wrappers: Sequence[str]) ->
     """The mirror of an environment: that of its attribute `mirror`, or of its MuJoCo model.
 
     `mirror` has two lists, of observation and action: for each number, which number (from 1) its image takes, negative
-    where with the other sign. It is believed; one that is derived from a model is proved.
+    where with the other sign. It is believed, but for bounds and wrappers that contradict it; one that is derived from
+    a model is proved.
 
     Raises:
         UserError: there is none, with the reason.
@@ -88,12 +91,34 @@ def find_mirror(env: str, kwargs: Mapping[str, Any], wrappers: Sequence[str]) ->
                 if not isinstance(space, gym.spaces.Box) or len(space.shape) != 1:
                     raise UserError(f"its {name} is not one row of numbers.")
                 sizes[name] = space.shape[0]
-            given = one.has_wrapper_attr("mirror")
-            return _given(one.get_wrapper_attr("mirror"), sizes) if given else _derived(one)
+            if not one.has_wrapper_attr("mirror"):
+                return _derived(one)
+            _require_unchanged(one)
+            mirror = _given(one.get_wrapper_attr("mirror"), sizes)
+            space: Any = one.action_space
+            bounds = np.stack([space.low, space.high])
+            images = np.where(mirror.action.sign < 0, -bounds[::-1], bounds)[:, mirror.action.source]
+            if not np.array_equal(images, bounds):
+                raise UserError(
+                    f"the bounds of its action, {shown_space(space)}, are not the mirror image of themselves."
+                )
+            return mirror
         finally:
             one.close()
     except UserError as error:
         raise UserError(f"{env} has no symmetry that could be used: {error}") from None
+
+
+def _require_unchanged(env: SingleEnv) -> None:
+    """Raise `UserError` where a wrapper changes the observations or actions that an attribute `mirror` is about."""
+    inner: Any = env.env
+    while not hasattr(inner, "mirror"):
+        if isinstance(inner, gym.ObservationWrapper | gym.ActionWrapper):
+            name = type(inner).__name__
+            raise UserError(
+                f"the wrapper {name} changes what its attribute mirror is about: {name} needs one of its own."
+            )
+        inner = inner.env
 
 
 def _given(given: Any, sizes: Mapping[str, int]) -> Mirror:
@@ -197,21 +222,23 @@ class _Body:
 def _proved(env: SingleEnv, pos: Order, vel: Order, controls: Order) -> Mirror:
     """The mirror, with the order of the observation as stepping shows it. Raises `UserError` where both sides differ.
 
-    It steps until no number of the observation could be the image of two, from `MOST` starts at most.
+    It steps until no number of the observation could be the image of two, from `MOST` starts at most. Actions are those
+    of a policy, in [-1, 1]: bounds that are no images of each other show as well.
     """
     bare: Any = env.unwrapped
     rng, reference = np.random.default_rng(0), bare.model.qpos0  # a mirrored pose is one on the other side of this
     env.reset(seed=0)
-    space: Any = env.action_space
+    box: Any = action_kind(env.action_space, "it")
     here, there = list[np.ndarray](), list[np.ndarray]()
     order, only, starts = Order(np.zeros(0, np.int64), np.zeros(0)), False, 0
     while not only and starts < MOST:
         starts += 1
         qpos, qvel = _pose(bare.model, rng), rng.normal(size=vel.source.shape)
         for _ in range(FOLLOWED):
-            action = rng.uniform(space.low, space.high)
-            one = _step(env, qpos, qvel, action)
-            other = _step(env, reference + pos(qpos - reference), vel(qvel), controls(action))
+            action = rng.uniform(-1, 1, box.size)
+            here_and_there = scale_action(np.stack([action, controls(action)]), box)
+            one = _step(env, qpos, qvel, here_and_there[0])
+            other = _step(env, reference + pos(qpos - reference), vel(qvel), here_and_there[1])
             qpos, qvel = one[:2]
             expected = reference + pos(qpos - reference), vel(qvel), *one[2:4]
             for name, values, found in zip(("position", "velocity", "reward", "end"), expected, other, strict=False):
@@ -241,7 +268,7 @@ def _step(env: SingleEnv, qpos: np.ndarray, qvel: np.ndarray, action: np.ndarray
     mujoco: Any = import_module("mujoco")
     mujoco.mj_resetData(bare.model, bare.data)
     bare.set_state(qpos, qvel)
-    obs, reward, terminated, _, _ = env.step(action.astype(env.action_space.dtype))
+    obs, reward, terminated, _, _ = env.step(action)
     return bare.data.qpos.copy(), bare.data.qvel.copy(), float(reward), float(terminated), obs
 
 

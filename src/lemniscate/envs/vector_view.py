@@ -143,8 +143,9 @@ def action_space(action: Action) -> spaces.Space:
         if kind.kind in "iu":  # what has no bound has that of its type
             least, most = np.iinfo(kind).min, np.iinfo(kind).max
             ends = [[int(min(max(x, least), most)) for x in end] for end in ends]
-        low, high = np.array(ends, dtype=kind).reshape(2, *(action.shape or (action.size,)))
-        return spaces.Box(low, high, dtype=kind.type)
+        shape = (action.size,) if action.shape is None else action.shape
+        low, high = np.array(ends, dtype=kind).reshape(2, *shape)
+        return spaces.Box(low, high, shape, kind.type)
     if isinstance(action, MultiDiscrete):
         shape = action.shape or (len(action.nvec),)
         nvec, start = np.reshape(action.nvec, shape), np.reshape(action.start, shape)

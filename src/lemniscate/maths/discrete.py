@@ -13,9 +13,14 @@ class Categorical:
 
     logits: Tensor
 
+    @property
+    def probabilities(self) -> Tensor:
+        """π(·|s), [B, n]."""
+        return self.logits.softmax(-1)
+
     def sample(self, noise: Tensor) -> Tensor:
         """[B] int64, from noise [B] uniform in [0, 1): the first action at which Σ π exceeds it."""
-        return _first_beyond(self.logits.softmax(-1), noise)
+        return _first_beyond(self.probabilities, noise)
 
     def mode(self) -> Tensor:
         """[B] int64."""
@@ -72,9 +77,14 @@ class Bernoulli:
 
     logits: Tensor
 
+    @property
+    def probabilities(self) -> Tensor:
+        """Those of 1, [B, n]."""
+        return self.logits.sigmoid()
+
     def sample(self, noise: Tensor) -> Tensor:
         """[B, n] of 0 and 1, int64, from noise [B, n] uniform in [0, 1)."""
-        return (noise < self.logits.sigmoid()).long()
+        return (noise < self.probabilities).long()
 
     def mode(self) -> Tensor:
         """[B, n] of 0 and 1, int64."""

@@ -87,14 +87,14 @@ class Recall:
 
     def rows(self, obs: Tensor) -> Tensor:
         """Observations [B, …] with their memory. Raises `UserError` for another B than before, without `reset`."""
-        if self._kept is None:
-            self._kept = obs.new_zeros(len(obs), self._memory.policy + self._memory.critic)
-        if len(obs) != len(self._kept):
+        nothing = obs.new_zeros(len(obs), self._memory.policy + self._memory.critic)
+        kept = nothing if self._kept is None else self._kept  # asking alone begins no episode
+        if len(obs) != len(kept):
             raise UserError(
-                f"This policy remembers {len(self._kept)} episodes, and is given {len(obs)} observations:"
-                " policy.reset() forgets them, for new ones."
+                f"This policy remembers {len(kept)} episodes, and is given {len(obs)} observations: policy.reset()"
+                " forgets them, for new ones."
             )
-        return self._memory.join(obs, self._kept)
+        return self._memory.join(obs, kept)
 
     def advance(self, rows: Tensor) -> None:
         """Remember these rows too."""

@@ -98,8 +98,8 @@ def _convert(value: Any, option: Any) -> Any:
     if kind is Literal and value not in get_args(option):
         raise ValueError(f"one of {', '.join(map(str, get_args(option)))}")
     if kind is tuple:
-        several = "names, such as ('module:name',)" if get_args(option)[0] is str else "numbers, such as (64, 64)"
-        raise ValueError(f"several {several}")
+        example = (value if isinstance(value, str) else "name",) if get_args(option)[0] is str else (64, 64)
+        raise ValueError(f"several {'numbers' if example == (64, 64) else 'names'}, such as {example}")
     if kind in WANTED and not isinstance(value, kind):
         raise ValueError(WANTED[kind])
     if kind is dict:

@@ -5,7 +5,7 @@ from typing import Any, Literal
 
 import torch
 
-from lemniscate.data.hindsight import HindsightReplay
+from lemniscate.data.hindsight import LONGEST, HindsightReplay
 from lemniscate.data.replay import ActionNoise, Kind, ReplayBuffer, bytes_per_transition
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError
@@ -140,9 +140,15 @@ class OffPolicyConfig(RunConfig):
         return self.num_updates * (updates - self.learning_starts // self.num_envs // self.update_every)
 
     def make_replay(self, spec: Spec, device: torch.device) -> ReplayBuffer:
-        """An empty replay buffer. Raises `UserError` for hindsight where there are no goals."""
+        """An empty replay buffer. Raises `UserError` for hindsight where there are no goals, or no whole episodes."""
         if self.replay == "uniform":
             return ReplayBuffer(spec, self.capacity, device)
+        least = self.num_envs * min(spec.max_episode_steps or 0, LONGEST)
+        if 0 < self.checkpoint_every < least:
+            raise UserError(
+                f"checkpoint_every {self.checkpoint_every:,} is less than an episode of each environment, which a"
+                f" checkpoint cuts, and hindsight stores whole ones: it must be {least:,} at least."
+            )
         copies = {"num_envs": self.num_envs, "goals": self.hindsight_goals, "seed": self.seed}
         return HindsightReplay(spec, self.capacity, device, **copies)
 

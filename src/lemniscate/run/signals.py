@@ -268,7 +268,8 @@ def of_values(
         change = (state.policy(obs).log_prob(action) - old).view(valid.shape)
         steps = getattr(config, "num_steps", len(valid))  # REINFORCE collects whole episodes
         newest = valid & (torch.arange(len(valid), device=valid.device) >= len(valid) - steps)[:, None]
-        found["advantage/followed"] = torch.corrcoef(torch.stack([advantage, change])[:, newest])[0, 1].nan_to_num()
+        both = torch.stack([advantage, change])[:, newest]
+        found["advantage/followed"] = torch.corrcoef(both)[0, 1].nan_to_num() if both.shape[1] > 1 else torch.zeros(())
     return found
 
 
