@@ -267,6 +267,15 @@ def test_a_value_far_from_what_follows_explains_nothing_though_the_returns_are_a
     shown = {"explained_variance": [0.02] * 8, "returns": [-500.0 - i % 2 for i in range(400)]}
     assert names(**shown, value__missing=[50.0, -150.0] * 4) == ["value-explains-nothing"]
     assert names(**shown, value__missing=[50.0, 0.4] * 4) == []
+    learns = {"explained_variance": [0.1] * 8, "returns": RISES}
+    assert names(**learns, value__missing=[50.0, -150.0] * 4) == ["value-explains-nothing"]
+    assert names(**learns, value__missing=[50.0, -15.0] * 4) == []
+
+
+def test_noise_is_no_reward_however_long_an_episode_gets():
+    noise = {"reward__explained": [0.0] * 8, "reward__std": [0.5] * 8, "returns": RISES}
+    assert names(**noise, reward__mean=[0.5] * 8) == ["reward-unexplained"]
+    assert names(**noise, reward__mean=[-5.0] * 8) == []  # a reward for a step that is rare
 
 
 def test_a_temperature_rises_where_the_entropy_is_below_its_target():

@@ -204,6 +204,7 @@ def of_rewards(e: Evidence) -> Seen:
     """Faults of what the rewards depend on."""
     by_time, explained, before = e.late("reward/by_time"), e.values("reward/explained"), e.values("reward/before")
     std = e.late("reward/std")
+    varies = std > 0.5 * abs(e.late("reward/mean"))  # not a reward that differs in the step of a goal alone
     if by_time > 0.8:
         yield "reward-by-time", f"Time alone explains {by_time:.0%} of the rewards within an episode."
     if std > 1e-6 and e.greatest("reward/within") < 1e-6:
@@ -213,7 +214,7 @@ def of_rewards(e: Evidence) -> Seen:
             "reward-late",
             f"The row before explains {np.median(before):.0%} more of the rewards' variance than their own row does.",
         )
-    elif std > 1e-6 and len(explained) >= 2 and not e.rose and not e.sees_nothing:
+    elif std > 1e-6 and len(explained) >= 2 and (varies or not e.rose) and not e.sees_nothing:
         share = float(np.median(explained))
         if share < 0.02:
             yield (
@@ -403,17 +404,18 @@ def of_values(e: Evidence) -> Seen:
     # Below -1 targets are constant; a weak baseline of REINFORCE, which has no λ, does no harm.
     nothing = -1 < explained < 0.05 and np.percentile(e.last_half("explained_variance"), 90) <= 0.15
     above = np.median(missing) * (1 - (first_number(e.config.get("gamma")) or 0.0)) if len(missing) else 0.0
-    one_reward = len(missing) >= 2 and missing.min() > 5 and e.late("reward/explained") > 0.1
-    if nothing and not settled and "gae_lambda" in e.config and one_reward:
+    away = np.abs(missing).min() if len(missing) >= 2 else 0.0  # healthy values come nearer than 5
+    one_reward = nothing and not settled and len(missing) >= 2 and missing.min() > 5
+    if one_reward and "gae_lambda" in e.config and e.late("reward/explained") > 0.1:
         yield (
             "missing-bootstrap",
             f"The value has hardly more than one reward in it: r + γ V(s') lies {above:.0%} above V, early and late.",
         )
-    elif nothing and (not settled or (len(missing) >= 2 and np.abs(missing).min() > 5)) and "gae_lambda" in e.config:
+    elif "gae_lambda" in e.config and ((nothing and (not settled or away > 5)) or (explained < 0.3 and away > 20)):
         yield (
             "value-explains-nothing",
-            f"The value explains {max(0.0, explained):.0%} of the variance of its targets,"
-            " no more than a constant would.",
+            f"The value explains {max(0.0, explained):.0%} of the variance of its targets"
+            f"{', no more than a constant would' if nothing else ', and is far from what follows'}.",
         )
     if len(newest) == len(sampled) >= 3:
         times = np.median(newest / np.maximum(sampled, 1e-12))
@@ -458,7 +460,7 @@ def of_networks(e: Evidence) -> Seen:
             yield "network-small", f"{field} is {typed(given)}, and {typed(usual)} is recommended."
     norms, norm = e.values("gradient_norm"), e.late("gradient_norm")
     limit = first_number(e.config.get("max_grad_norm"))
-    fell = e.late("losses/value") < e.early("losses/value")
+    fell = e.late("losses/value") < e.early("losses/value") and not e.greatest("reward/largest") > 150
     times = 5 if norm > 100 and e.config.get("scale_rewards", False) else 15 if fell else 100
     if inactive > 0.6:
         yield (
