@@ -341,6 +341,17 @@ def test_advantages_without_relation_are_seen_where_no_divergence_is_logged():
     assert "advantage-unrelated" not in names("a2c", **unrelated, network__moved=[0.0] * 8)
 
 
+def test_actions_that_are_paid_have_an_effect_though_the_next_observation_shows_none():
+    shown = {"action__effect": [0.0] * 8}
+    assert names(**shown, action__paid=[0.01] * 8) == ["action-without-effect"]
+    assert names(**shown, action__paid=[0.8] * 8) == []
+
+
+def test_settings_of_algorithms_of_ones_own_may_be_fewer():
+    assert with_ratios({"num_updates": 4, "num_envs": 2})["replay_ratio"] == 2
+    assert "replay_ratio" not in with_ratios({"num_envs": 2})
+
+
 def test_what_chance_explains_of_few_rows_is_no_effect():
     assert names("td3", action__effect=[0.065, 0.014, 0.006, 0.011]) == ["action-without-effect"]
     assert names("td3", action__effect=[0.15, 0.014, 0.006, 0.011]) == []
@@ -375,10 +386,12 @@ def test_returns_that_have_arrived_rise_no_more():
 
 
 def test_a_policy_that_descends_q_is_named():
-    assert names("td3", action__preferred=[0.5] * 3 + [0.2] * 5) == ["advantage-opposed"]
-    assert names("td3", action__preferred=[0.05] * 3 + [0.5] * 5) == []
+    assert names("td3", action__preferred=[0.5] * 3 + [0.2] * 5, steps=30_000) == ["advantage-opposed"]
+    assert names("td3", action__preferred=[0.05] * 3 + [0.5] * 5, steps=30_000) == []
     few = {"update_every": 128}
-    assert "advantage-opposed" not in names("td3", action__preferred=[0.1] * 8, steps=3_000, changed=few)
+    assert "advantage-opposed" not in names("td3", action__preferred=[0.1] * 8, steps=30_000, changed=few)
+    begun = {"learning_starts": 29_600}
+    assert "advantage-opposed" not in names("td3", action__preferred=[0.1] * 8, steps=30_000, changed=begun)
 
 
 def test_returns_that_fall_while_q_begins_are_no_finding():
@@ -579,7 +592,7 @@ def test_what_is_certain_is_said_once_while_a_run_is_trained(tmp_path, capsys):
     lem.train("ppo", "CartPole-v1", run=tmp_path / "r", **fields)
     said = [line for line in capsys.readouterr().err.splitlines() if "The policy sees nothing" in line]
     assert len(said) == 1
-    assert "lemniscate doctor ENV" in said[0]
+    assert "Look at what step() returns" in said[0]
     lem.train("ppo", "CartPole-v1", run=tmp_path / "quiet", progress=False, **fields)
     assert "sees nothing" not in capsys.readouterr().err
     assert lem.diagnose(tmp_path / "quiet")[0].name == "constant-observation"

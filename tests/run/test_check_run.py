@@ -1,5 +1,6 @@
 """`lemniscate doctor RUN`: every damaged file is named, with what can be done; nothing is changed."""
 
+import json
 import shutil
 
 import pytest
@@ -73,6 +74,31 @@ def test_a_damaged_file_is_named_with_what_can_be_done(run, capsys, file, advice
     assert f"✗ {run / file}" in said
     assert advice in said
     assert f"lemniscate resume {run}" in said
+
+
+def test_a_run_whose_checkpoints_are_gone_is_not_begun_again(run, capsys):
+    """Its metrics would be lost too."""
+    shutil.rmtree(run / "checkpoints")
+    code, said = answer(run, capsys)
+    assert code == 2
+    assert f"✗ {run} has come to step 256, its end, and its checkpoints are gone" in said
+    before = contents(run)
+    for changes in ({}, {"total_steps": 512}):
+        with pytest.raises(lem.UserError, match=r"its metrics are all that is left\. Train anew in another directory\."):
+            lem.resume(run, progress=False, **changes)
+    assert contents(run) == before
+    lines = (run / "metrics.jsonl").read_text().splitlines(keepends=True)
+    (run / "metrics.jsonl").write_text("".join(lines[:-1]))  # stopped before its first checkpoint
+    assert "There is no checkpoint yet: resume would begin at step 0." in answer(run, capsys)[1]
+    assert lem.resume(run, progress=False).policy.step == 256
+
+
+def test_what_is_bad_is_in_the_json_too(run, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "1")
+    (run / "config.json").write_text("{")
+    assert main(["doctor", str(run), "--json"]) == 2
+    checked = json.loads(capsys.readouterr().out)["checked"]
+    assert "bad" in {finding["grade"] for finding in checked}
 
 
 def test_a_run_without_any_copy_is_beyond_repair(run, capsys):

@@ -12,7 +12,7 @@ from torch import nn
 import lemniscate as lem
 from conftest import tiny_fields, tiny_off_policy
 from lemniscate.algos import ppo
-from lemniscate.maths import Deterministic, explained_by, gae
+from lemniscate.maths import Deterministic, explained_by, explained_by_each, gae
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.networks import Layers
 from lemniscate.nn.normalizer import NoNorm, RunningNorm
@@ -67,6 +67,17 @@ def test_what_features_explain_is_the_partial_coefficient_of_determination(besid
     few, many = B - beside - 1, B - beside - 1 - 3
     expected = 1 - (rss(z, x) / many) / (rss(z) / few)
     assert np.allclose(explained_by(x, y, z), expected, atol=1e-6)
+
+
+def test_what_each_column_explains_is_what_it_explains_beside_the_others():
+    x = numbers(B, 5)
+    x[:, 4] = x[:, 3] + 0.1 * x[:, 4]
+    y = x @ numbers(5, 2, seed=2) + 0.3 * numbers(B, 2, seed=3)
+    alone = [explained_by(x[:, [i]], y, torch.cat([x[:, :i], x[:, i + 1 :]], dim=1)) for i in range(5)]
+    torch.testing.assert_close(explained_by_each(x, y), torch.stack(alone), rtol=1e-5, atol=1e-6)
+    twice = explained_by_each(torch.cat([x, x[:, :1]], dim=1), y)
+    assert twice[[0, 5]].abs().max() < 0.01  # each says what the other does
+    assert torch.isnan(explained_by_each(x[:5], y[:5])).all()
 
 
 def test_noise_explains_nothing_and_too_few_rows_are_not_a_number():
@@ -169,6 +180,8 @@ def test_the_variance_of_rewards_within_episodes_is_what_their_means_leave():
     episodes = (level + noise).view(4, 10, envs)
     expected = (episodes - episodes.mean(1, keepdim=True)).square().mean() / (level + noise).var(correction=0)
     assert within(level) == pytest.approx(0, abs=1e-9)
+    each = {"terminated": ~(done & ~done), "truncated": done & ~done, "valid": torch.ones_like(done)}
+    assert "reward/within" not in of_time(SimpleNamespace(done=each["terminated"], reward=noise.float(), **each))
     assert within(level + noise) == pytest.approx(expected.item(), rel=1e-4)
 
 
@@ -193,6 +206,9 @@ def test_actions_explain_what_they_do():
     found = of_effects(rows(obs=obs, action=action, next_obs=moved, reward=pays), spec_of())
     assert found["action/effect"] == pytest.approx(1)
     assert found["reward/explained"] == pytest.approx(1)
+    assert found["action/paid"] < 0.1  # of squares, no line explains anything
+    paid = of_effects(rows(obs=obs, action=action, reward=action.sum(1)), spec_of())
+    assert paid["action/paid"] == pytest.approx(1)
     still = of_effects(rows(obs=obs, action=action, next_obs=obs + 0.1 * numbers(B, O, seed=5).float()), spec_of())
     assert still["action/effect"] < 0.05
     assert abs(still["reward/explained"]) < 0.1

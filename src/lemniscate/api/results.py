@@ -345,6 +345,8 @@ def _environments(
     """
     if isinstance(chosen, TrainedPolicy):
         config = chosen.config
+        if any(value is not None for value in own.values()):
+            raise UserError("agent and normalized_actions are for policies of your own; this one was trained here.")
     elif env is None:
         raise UserError("A policy of your own acts in an environment that is named with it, such as env='CartPole-v1'.")
     else:

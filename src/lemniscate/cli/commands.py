@@ -184,24 +184,26 @@ def doctor(what: str, json: bool, **options: Any) -> None:
     from lemniscate.envs.check import BAD
 
     found = []
-    width = min(get_terminal_size((112, 24)).columns, 120)
+    width = max(20, min(get_terminal_size((112, 24)).columns, 120))
     for finding in each_finding(what, **options):
         found.append(finding)
         say(finding.listed(width))
-    if any(finding.grade == BAD for finding in found):
-        raise UserError(verdict(what, found))
-    say(verdict(what, found))
-    diagnoses = {str(run): diagnose(run) for run in runs_in(what)}
+    damaged = any(finding.grade == BAD for finding in found)
+    if not damaged:
+        say(verdict(what, found))
+    diagnoses = {} if damaged else {str(run): diagnose(run) for run in runs_in(what)}
     for run, of_run in diagnoses.items():
         names = ", ".join(one.name for one in of_run if one.sure != "hint")
         say(f"{run}: {names or 'no rule finds a fault'}.")
         for one in of_run:
             say(one.listed(width))
-    if spread := spread_of(what):
+    if not damaged and (spread := spread_of(what)):
         say(spread)
     if json:
         runs = {run: [vars(one) for one in of_run] for run, of_run in diagnoses.items()}
         print(notation.dumps({"checked": [vars(one) for one in found], "runs": runs}))
+    if damaged:
+        raise UserError(verdict(what, found))
 
 
 def course(action: str, folder: Path, solutions: bool) -> None:

@@ -89,7 +89,8 @@ class Evidence:
     @property
     def q_steps(self) -> float:
         """The gradient steps that Q has had, with replay."""
-        return self.config.get("replay_ratio", 0.0) * self.log[-1]["step"] if self.log else 0.0
+        learned = self.log[-1]["step"] - self.config.get("learning_starts", 0) if self.log else 0
+        return self.config.get("replay_ratio", 0.0) * max(0, learned)
 
     @cached_property
     def rose(self) -> bool:
@@ -136,7 +137,7 @@ def with_ratios(config: Mapping[str, Any]) -> dict[str, Any]:
     """A Config with the numbers that are made of several fields: updates for each step, and rows of a rollout."""
     found, envs = dict(config), config.get("num_envs", 1)
     if "num_updates" in config:
-        found["replay_ratio"] = config["num_updates"] / (envs * config["update_every"])
+        found["replay_ratio"] = config["num_updates"] / (envs * config.get("update_every", 1))
     if "num_steps" in config:
         found["rollout_rows"] = envs * config["num_steps"]
     return found

@@ -158,7 +158,8 @@ def of_actions(e: Evidence) -> Seen:
     elif len(effects) >= 3 and not e.rose and not e.sees_nothing and not e.late("observation/predicted") < 0.25:
         explained, most = (shares if len(shares) else effects)[first].max(), effects[first].max()
         none = np.median(effects[first]) < 0.02 and most < 0.1  # of a hundred rows chance explains 0.07
-        if none or (len(shares) and explained < 0.001):
+        paid = e.early("action/paid") > 0.1  # as where each step is a task of its own
+        if not paid and (none or (len(shares) and explained < 0.001)):
             yield (
                 "action-without-effect",
                 f"Actions explain {max(0.0, explained):.2%} of how observations change.",

@@ -18,6 +18,7 @@ from lemniscate.maths.returns import episode_return, gae, q_lambda, reward_to_go
 from lemniscate.maths.stats import (
     clip_fraction,
     explained_by,
+    explained_by_each,
     explained_variance,
     kl_k1,
     kl_k3,

@@ -65,12 +65,35 @@ def explained_by(features: Tensor, targets: Tensor, beside: Tensor) -> Tensor:
     return torch.where(left > 1e-9 * targets.square().sum(0), share, 0.0)
 
 
+def explained_by_each(features: Tensor, targets: Tensor) -> Tensor:
+    """What `explained_by` says of each column of `features` [B, F] beside all the others, of one inverse: [F, K].
+
+    Without column i the sum of squares is larger by β_i² / (XᵀX)⁻¹_ii, where β is the solution with all of them.
+    """
+    many = len(targets) - features.shape[1] - 1
+    if many <= 0:
+        return targets.new_full((features.shape[1], targets.shape[1]), torch.nan)
+    x, y, gram = _normal(features, targets)
+    inverse = torch.linalg.inv(gram)
+    slopes = inverse @ (x.T @ y)
+    after = (y - x @ slopes).square().sum(0)
+    left = after + slopes.square() / inverse.diagonal()[:, None]
+    share = 1 - (after / many) / (left / (many + 1))
+    return torch.where(left > 1e-9 * targets.square().sum(0), share, 0.0)
+
+
 def _residual(columns: Tensor, targets: Tensor) -> Tensor:
     """The sum of squares [K] that a line in `columns`, with an intercept, leaves of the targets."""
+    x, y, gram = _normal(columns, targets)
+    return (y - x @ torch.linalg.solve(gram, x.T @ y)).square().sum(0)
+
+
+def _normal(columns: Tensor, targets: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Columns x of mean 0 and length 1, targets y of mean 0, and xᵀx, which has an inverse."""
     x, y = columns - columns.mean(0), targets - targets.mean(0)
     x = x / (x.square().sum(0).sqrt() + 1e-12)
     ridge = 1e-9 * torch.eye(x.shape[1], dtype=x.dtype, device=x.device)  # columns may be multiples of each other
-    return (y - x @ torch.linalg.solve(x.T @ x + ridge, x.T @ y)).square().sum(0)
+    return x, y, x.T @ x + ridge
 
 
 def kl_k1(log_ratio: Tensor) -> Tensor:

@@ -6,7 +6,7 @@ from pathlib import Path
 from lemniscate.envs.check import BAD, GOOD, NOTE, Finding
 from lemniscate.errors import UserError, resume_line
 from lemniscate.run import checkpoint
-from lemniscate.run.directory import BEST, CONFIG, FINAL, LOCK, SWEEP, locked
+from lemniscate.run.directory import BEST, CONFIG, FINAL, LOCK, SWEEP, locked, lost
 from lemniscate.run.metrics import METRICS, damage, read_metrics
 from lemniscate.run.places import is_sweep, read_sweep
 from lemniscate.system.files import DamagedFileError, is_whole, parsing, read_json
@@ -95,7 +95,12 @@ def _going_on(path: Path, whole: list[checkpoint.Checkpoint]) -> Finding:
     """The whole checkpoints, and what `resume` would do."""
     planned = [found for found in whole if found.record.get("planned")]
     if not checkpoint.list_steps(path / "checkpoints"):
-        return Finding(GOOD, "It has not begun.")
+        if not read_metrics(path):
+            return Finding(GOOD, "It has not begun.")
+        gone = lost(path) if is_whole(path / CONFIG) else None
+        return (
+            Finding(BAD, gone) if gone else Finding(NOTE, "There is no checkpoint yet: resume would begin at step 0.")
+        )
     if not planned:
         return Finding(NOTE, "There is no whole planned checkpoint: resume would begin at step 0.")
     try:

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from lemniscate.errors import UserError, resume_line
 from lemniscate.run import checkpoint
 from lemniscate.run.config import Natural, RunConfig, checked
-from lemniscate.run.metrics import METRICS, damage
+from lemniscate.run.metrics import METRICS, damage, read_metrics
 from lemniscate.run.state import TrainState
 from lemniscate.spec import Spec
 from lemniscate.system import files
@@ -85,6 +85,16 @@ def is_finished(path: Path) -> bool:
     _, config = read_config(path)
     steps = checkpoint.list_steps(path / "checkpoints")
     return steps[-1:] >= [config["total_steps"]] and checkpoint.is_whole(path / "checkpoints" / f"step-{steps[-1]}")
+
+
+def lost(path: Path) -> str | None:
+    """A sentence where a run has taken all its steps, and every checkpoint is gone; else None."""
+    _, config = read_config(path)
+    if checkpoint.list_steps(path / "checkpoints") or not (lines := read_metrics(path)):
+        return None
+    last = lines[-1]["step"]
+    gone = f"{path} has come to step {last:,}, its end, and its checkpoints are gone: its metrics are all that is left."
+    return gone if last >= config["total_steps"] else None
 
 
 @contextmanager

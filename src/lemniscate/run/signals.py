@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.func import functional_call
 from torch.nn.functional import one_hot
 
-from lemniscate.maths import explained_by, gae, moments, td_target
+from lemniscate.maths import explained_by, explained_by_each, gae, moments, td_target
 from lemniscate.nn.networks import ACTIVATIONS
 from lemniscate.nn.normalizer import RunningNorm
 from lemniscate.run.config import RunConfig
@@ -112,35 +112,38 @@ def of_time(rows: Rollout) -> dict[str, Tensor]:
         x - (torch.bincount(episode, weights=x) / count)[episode]
         for x in (time, rows.reward[rows.valid].cpu().double())
     )
+    by_time = (time * reward).sum().square() / (time.square().sum() * reward.square().sum()).clamp(min=1e-12)
+    if count.max() < 2:  # of one step each
+        return {"reward/by_time": by_time}
     varies = (len(reward) * moments(rows.reward[rows.valid].cpu().double())[1]).clamp(min=1e-12)
-    size = (time.square().sum() * reward.square().sum()).clamp(min=1e-12)
-    return {"reward/by_time": (time * reward).sum().square() / size, "reward/within": reward.square().sum() / varies}
+    return {"reward/by_time": by_time, "reward/within": reward.square().sum() / varies}
 
 
 def of_effects(rows: Rollout, spec: Spec) -> dict[str, Tensor]:
     """The shares of the observations' changes that actions explain, and of the rewards that all of a row explains.
 
     Actions explain what a line fitted to them explains beyond one fitted to the observations alone, in that number of
-    the observation of which it is most: as a share of what those left to explain, and of all. A reward may be a square
-    too, of a distance or of an action. Also the share of the next observations that these explain, on average; what
-    the signs of actions explain beyond all this; and what that number of an action explains of which it is least.
+    the observation of which it is most: as a share of what those left to explain, and of all; and of the rewards the
+    same. A reward may be a square too, of a distance or of an action. Also the share of the next observations that
+    these explain, on average; what the signs of actions explain beyond all this; and what that number of an action
+    explains of which it is least.
     """
     obs, after = (x[:, : spec.observation_size].cpu().double() for x in (rows.obs, rows.next_obs))
     action, inside = _numbers(rows.action.cpu(), spec.action), ~rows.done.cpu()
+    reward = rows.reward[:, None].cpu().double()
     everything, nothing = _everything(rows, spec), obs[:, :0]
     change, effect = (after - obs)[inside], explained_by(action[inside], (after - obs)[inside], obs[inside])
     found = {
         "action/effect": effect.max(),
         "action/share": (effect * (1 - explained_by(obs[inside], change, nothing[inside]))).max(),
-        "reward/explained": explained_by(everything, rows.reward[:, None].cpu().double(), nothing).max(),
+        "action/paid": explained_by(action, reward, obs).max(),
+        "reward/explained": explained_by(everything, reward, nothing).max(),
     }
     if isinstance(spec.action, Box):
         known = torch.cat([obs, action], dim=-1)[inside]
         found["action/by_sign"] = explained_by(action.sign()[inside], change, known).nan_to_num().max()
-        for column in range(obs.shape[1], known.shape[1]) if action.shape[1] > 1 else ():
-            others = torch.cat([known[:, :column], known[:, column + 1 :]], dim=1)
-            alone = explained_by(known[:, column, None], change, others).nan_to_num().max()
-            found["action/weakest"] = torch.minimum(alone, found.get("action/weakest", alone))
+        if action.shape[1] > 1:
+            found["action/weakest"] = explained_by_each(known, change)[obs.shape[1] :].nan_to_num().amax(1).min()
     if not ((obs == 0) | (obs == 1)).all():  # one of n says nothing of the next
         found["observation/predicted"] = explained_by(obs[inside], after[inside], nothing[inside]).mean()
     return found
