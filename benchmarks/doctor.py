@@ -181,7 +181,7 @@ UNSEEN_FOUR = {
     "a watchdog that nobody knows of": ("limit-as-termination",),
     "a coin for a reward": ("reward-unexplained",),
     "rewards cut off at zero": ("reward-zero",),
-    "one array for all copies": (),
+    "one array for all copies": ("observation-of-another",),
     "targets that pull Q back": ("targets-behind",),
     "a temperature that runs away": ("temperature-opposed",),
     "ends that Q does not know of": ("ends-ignored",),

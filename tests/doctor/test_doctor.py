@@ -67,6 +67,10 @@ CASES = {
         {"action__weakest": [0.001, -0.002] * 4, "action__effect": [0.5] * 8},
         {"action__weakest": [0.3] + [0.001] * 7, "action__effect": [0.5] * 8},
     ),
+    "observation-of-another": (
+        {"action__beside": [0.5] * 8, "action__effect": [0.01] * 8},
+        {"action__beside": [0.5] * 8, "action__effect": [0.4] * 8},
+    ),
     "action-late": (
         {"action__late": [0.5] * 8, "action__effect": [0.01] * 8},
         {"action__late": [0.5] * 8, "action__effect": [0.4] * 8},

@@ -84,7 +84,9 @@ def test_a_run_whose_checkpoints_are_gone_is_not_begun_again(run, capsys):
     assert f"✗ {run} has come to step 256, its end, and its checkpoints are gone" in said
     before = contents(run)
     for changes in ({}, {"total_steps": 512}):
-        with pytest.raises(lem.UserError, match=r"its metrics are all that is left\. Train anew in another directory\."):
+        with pytest.raises(
+            lem.UserError, match=r"its metrics are all that is left\. Train anew in another directory\."
+        ):
             lem.resume(run, progress=False, **changes)
     assert contents(run) == before
     lines = (run / "metrics.jsonl").read_text().splitlines(keepends=True)

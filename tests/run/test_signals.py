@@ -21,6 +21,7 @@ from lemniscate.run.signals import (
     KINDS,
     LOOKS,
     acted_with,
+    effect_beside,
     late_effect,
     of_critics,
     of_effects,
@@ -124,6 +125,14 @@ def test_an_action_that_is_late_is_found_within_episodes():
     done[2::3] = True
     rows = Rollout(**{**vars(rows), "terminated": done})
     assert late_effect(rows, spec_of()).item() < 0.1
+
+
+def test_an_observation_of_the_environment_beside_shows_its_action():
+    own, one = delayed(0), delayed(0)[:, :1]
+    exchanged = Rollout(**{name: x if name == "action" else x.roll(1, 1) for name, x in vars(own).items()})
+    assert effect_beside(exchanged, spec_of()).item() > 0.9
+    assert effect_beside(own, spec_of()).item() < 0.1
+    assert effect_beside(one, spec_of()).item() == 0
 
 
 def test_rewards_of_nothing_and_observations_that_repeat_are_counted():

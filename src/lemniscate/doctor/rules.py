@@ -149,7 +149,14 @@ def of_actions(e: Evidence) -> Seen:
     effects, shares = e.values("action/effect"), e.values("action/share")
     now, before, by_sign = e.early("action/effect"), e.early("action/late"), e.early("action/by_sign")
     at_bounds, first, weakest = e.late("action/at_bounds"), slice(max(3, len(effects) // 4)), e.values("action/weakest")
-    if before > 0.15 and before > 3 * max(now, 0.0):
+    beside = e.early("action/beside")
+    if beside > 0.15 and beside > 3 * max(now, 0.0):
+        yield (
+            "observation-of-another",
+            f"Actions in the environment beside explain {beside:.0%} of how observations change, those in their own"
+            f" {max(now, 0.0):.0%}.",
+        )
+    elif before > 0.15 and before > 3 * max(now, 0.0):
         yield (
             "action-late",
             f"Earlier actions explain {before:.0%} of how observations change,"

@@ -58,7 +58,7 @@ def of_environment(rows: Rollout, spec: Spec) -> dict[str, float]:
     if not spec.has_images and spec.observation_size <= MOST_NUMBERS:
         found |= of_effects(chosen, spec) | {"reward/before": paid_before(rows, spec)}
         if found["action/effect"] < 0.2:
-            found["action/late"] = late_effect(rows, spec)
+            found |= {"action/late": late_effect(rows, spec), "action/beside": effect_beside(rows, spec)}
     return {name: float(value) for name, value in found.items()}
 
 
@@ -162,6 +162,18 @@ def late_effect(rows: Rollout, spec: Spec) -> Tensor:
         change = (after - obs)[steps:][one]
         found.append(explained_by(action[:-steps][one], change, obs[steps:][one]).nan_to_num().max())
     return torch.stack(found).max()
+
+
+def effect_beside(rows: Rollout, spec: Spec) -> Tensor:
+    """What the action in the environment beside explains of how observations change, of rows [T, N, …]; 0 for one.
+
+    Where that is much, an observation is of that environment: all write into one array, say.
+    """
+    inside = (rows.valid & ~rows.done).cpu()
+    obs, after = (x[..., : spec.observation_size].cpu().double()[inside] for x in (rows.obs, rows.next_obs))
+    others = [rows.action.cpu().roll(side, 1)[inside] for side in (1, -1) if inside.shape[1] > 1]
+    shares = [explained_by(_numbers(other, spec.action), after - obs, obs).nan_to_num().max() for other in others]
+    return torch.stack([torch.zeros((), dtype=torch.float64), *shares]).max()
 
 
 def paid_before(rows: Rollout, spec: Spec) -> Tensor:
