@@ -173,6 +173,14 @@ CASES = {
         {"algorithm": "sac", "temperature": list(np.linspace(1.0, 2.0, 8)), "losses__entropy": [0.6] * 8},
         {"algorithm": "sac", "temperature": list(np.linspace(1.0, 0.5, 8)), "losses__entropy": [0.6] * 8},
     ),
+    "targets-alike": (
+        {"losses__value": [1e-7] * 8, "reward__std": [1.0] * 8, "reward__mean": [-5.0] * 8},
+        {"losses__value": [1e-7] * 8, "reward__std": [0.0] * 8, "reward__mean": [-5.0] * 8},
+    ),
+    "targets-of-others": (
+        {"algorithm": "td3", "td_error__sampled": [2.0] * 8, "losses__critic": [0.1] * 8},
+        {"algorithm": "td3", "td_error__sampled": [0.6] * 8, "losses__critic": [0.1] * 8},
+    ),
     "normalizer-frozen": (
         {"normalizer__count": [500.0] * 8},
         {"normalizer__count": list(np.linspace(500.0, 4_000.0, 8))},
@@ -242,6 +250,7 @@ def test_a_value_that_has_learned_nothing_or_too_little_ignores_no_ends():
     shown = {"value__at_ends": [0.95] * 8, "episode__terminated": [1.0] * 8}
     assert "ends-ignored" in names(**shown, explained_variance=[0.5] * 8, value__missing=[-1.0] * 8)
     assert "ends-ignored" not in names(**shown, explained_variance=[0.01] * 8, value__missing=[-1.0] * 8)
+    assert "ends-ignored" in names(**shown, explained_variance=[-1.5] * 8, value__missing=[-7.0] * 8)
     assert "ends-ignored" not in names(**shown, explained_variance=[0.5] * 8, value__missing=[0.6] * 8)
 
 
@@ -304,6 +313,9 @@ def test_what_is_large_from_the_beginning_does_not_explode():
     large = {"observation__largest": [1e5] + [2e5] * 7}
     assert names(**large) == []
     assert names(**large, changed={"normalize_observations": False}) == ["large-observation"]
+    few = {"observation__largest": [900.0] * 8, "changed": {"normalize_observations": False, "activation": "relu"}}
+    assert names(**few, observation__predicted=[0.9] * 8) == ["large-observation"]
+    assert names(**few) == []
 
 
 def test_numbers_that_never_change_are_no_noise():

@@ -133,7 +133,8 @@ def of_normalization(e: Evidence) -> Seen:
             "exploding-observation",
             f"Observations reached {late:.3g} in the last half of the run, and {first:.3g} at its beginning.",
         )
-    if not normalized and late > (200 if e.config.get("activation") == "tanh" else 20_000):
+    few = len(e.values("observation/predicted")) > 0  # of many numbers, as a Humanoid's, some are healthily large
+    if not normalized and late > (200 if e.config.get("activation") == "tanh" else 500 if few else 20_000):
         yield "large-observation", f"Observations reach {late:.3g}, and are not normalized."
     if normalized and count <= 0.5 * steps:
         yield "normalizer-frozen", f"The normalizer has seen {count:,.0f} observations of {steps:,} steps."
@@ -365,8 +366,9 @@ def of_advantages(e: Evidence) -> Seen:
     given, usual = (config.get("normalize_advantage") for config in (e.config, e.recommended))
     errors = _standard_errors(followed) if len(followed) >= 4 else np.nan
     moves = e.late("approx_kl") > 1e-5 or e.late("network/moved") > 1e-6
-    # A V that is a constant awaits the same everywhere; and one that goes on where nothing follows, too much.
-    learned = not e.late("explained_variance") < 0.1 and not e.late("value/missing") > 0
+    # A V that has learned nothing awaits the same everywhere; one that goes on where nothing follows, too much.
+    missing = e.late("value/missing")
+    learned = (missing < -2 or not e.late("explained_variance") < 0.1) and not missing > 0
     ignored = learned and 0.8 < awaited < 1.2  # below, V is only behind; above, it has no scale yet
     if ignored:
         yield (
@@ -435,7 +437,19 @@ def of_values(e: Evidence) -> Seen:
 
 
 def of_targets(e: Evidence) -> Seen:
-    """Faults of what no update moves: V, Q, target networks."""
+    """Faults of the targets of V and Q, and of what no update moves: V, Q, target networks."""
+    error, loss = e.last_half("td_error/sampled"), e.last_half("losses/critic")
+    constant = e.late("losses/value") < 1e-5 and not e.late("explained_variance") > 0
+    if constant and "gae_lambda" in e.config and e.late("reward/std") > 0.02 * abs(e.late("reward/mean")):
+        yield "targets-alike", "The targets of V are all the same, and the rewards are not."
+    if min(len(error), len(loss)) >= 2 and not e.config.get("value_range"):
+        times = np.median(error) / max(np.median(loss), 1e-12)
+        if times > (12 if "initial_temperature" in e.config else 8):  # the entropy is estimated otherwise
+            yield (
+                "targets-of-others",
+                f"The squared error of Q against r + γ Q'(s', π(s')) of the stored steps is {times:.0f} times the loss"
+                " that is descended.",
+            )
     moved, behind, length = map(e.values, ("value/moved", "targets/behind", "targets/length"))
     usual = all(map(e.as_recommended, ("tau", "policy_delay")))
     if len(moved) >= 2 and not moved.any() and "gae_lambda" in e.config and not e.config.get("freeze"):
