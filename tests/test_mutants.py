@@ -751,15 +751,15 @@ MUTANTS = [
     (
         "the maximum is of the action taken",
         "nn/actor_critic.py",
-        "self.policy(next_obs).values.amax(-1)",
+        "self.value(next_obs)",
         "self.q(next_obs, action)",
         PQN + "the_target_is_the_return_of_the_best_next_action",
     ),
     (
         "the maximum is of the state before",
         "nn/actor_critic.py",
-        "self.policy(next_obs).values.amax(-1)",
-        "self.policy(obs).values.amax(-1)",
+        "self.value(next_obs)",
+        "self.value(obs)",
         PQN + "the_target_is_the_return_of_the_best_next_action",
     ),
     (

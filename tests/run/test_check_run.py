@@ -76,23 +76,19 @@ def test_a_damaged_file_is_named_with_what_can_be_done(run, capsys, file, advice
     assert f"lemniscate resume {run}" in said
 
 
-def test_a_run_whose_checkpoints_are_gone_is_not_begun_again(run, capsys):
-    """Its metrics would be lost too."""
+def test_a_run_whose_checkpoints_are_gone_keeps_its_metrics_when_it_begins_again(run, capsys):
     shutil.rmtree(run / "checkpoints")
     code, said = answer(run, capsys)
     assert code == 2
-    assert f"✗ {run} has come to step 256, its end, and its checkpoints are gone" in said
-    before = contents(run)
-    for changes in ({}, {"total_steps": 512}):
-        with pytest.raises(
-            lem.UserError, match=r"its metrics are all that is left\. Train anew in another directory\."
-        ):
-            lem.resume(run, progress=False, **changes)
-    assert contents(run) == before
-    lines = (run / "metrics.jsonl").read_text().splitlines(keepends=True)
-    (run / "metrics.jsonl").write_text("".join(lines[:-1]))  # stopped before its first checkpoint
-    assert "There is no checkpoint yet: resume would begin at step 0." in answer(run, capsys)[1]
+    assert f"✗ {run} came to step 256, its end; its checkpoints are gone, so that resume begins a new" in said
+    before = (run / "metrics.jsonl").read_bytes()
     assert lem.resume(run, progress=False).policy.step == 256
+    said = capsys.readouterr().err
+    assert "resume begins a new metrics.jsonl. It is kept as" in said
+    assert (run / "metrics.damaged-1.jsonl").read_bytes() == before
+    shutil.rmtree(run / "checkpoints")
+    (run / "metrics.jsonl").write_bytes(b"".join(before.splitlines(keepends=True)[:-1]))  # stopped before its first one
+    assert "There is no checkpoint yet: resume would begin at step 0." in answer(run, capsys)[1]
 
 
 def test_what_is_bad_is_in_the_json_too(run, capsys, monkeypatch):

@@ -22,7 +22,7 @@ from lemniscate.envs import registry
 from lemniscate.errors import NotStoredError, UserError, is_installed, shown
 from lemniscate.hub.repository import local_path
 from lemniscate.run.config import RunConfig
-from lemniscate.run.directory import extend, is_finished, lost, read_record, require_absent
+from lemniscate.run.directory import extend, is_finished, read_record, require_absent
 from lemniscate.run.environments import envs_of, require_several
 from lemniscate.run.loggers import LoggerClass
 from lemniscate.run.run import Run
@@ -215,8 +215,6 @@ def go_on(run: object, arguments: Mapping[str, Any], changes: Mapping[str, objec
             algorithm, fields = record["algorithm"], record["config"]
         config = algos.find(algorithm).Config.from_json(fields).replace(**changes)
         world.divide(config.shards)
-        if gone := world.from_first(lost(path) if world.is_first else None):  # to begin again would cost these too
-            raise UserError(f"{gone} Train anew in another directory.")
         if "total_steps" in changes and world.is_first:
             extend(path, config.total_steps)
             if options.progress and (names := _annealed(config)):

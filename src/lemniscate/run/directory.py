@@ -93,7 +93,7 @@ def lost(path: Path) -> str | None:
     if checkpoint.list_steps(path / "checkpoints") or not (lines := read_metrics(path)):
         return None
     last = lines[-1]["step"]
-    gone = f"{path} has come to step {last:,}, its end, and its checkpoints are gone: its metrics are all that is left."
+    gone = f"{path} came to step {last:,}, its end; its checkpoints are gone, so that resume begins a new {METRICS}."
     return gone if last >= config["total_steps"] else None
 
 
@@ -273,9 +273,11 @@ class Saver:
             return found is not None
         steps = checkpoint.list_steps(self._checkpoints)
         if found:
-            self._keep_damaged_metrics(found.record.get("logged", 0))
+            self._keep_metrics(damage(self.path, found.record.get("logged", 0)))
         elif steps:
             say(f"{self.path} has no planned checkpoint to go on from; it begins again at step 0.")
+        else:
+            self._keep_metrics(lost(self.path))
         for step in steps:
             if step > state.step:
                 files.remove(self._checkpoints / f"step-{step}")
@@ -293,9 +295,9 @@ class Saver:
                     return
         files.remove(best)
 
-    def _keep_damaged_metrics(self, logged: int) -> None:
-        """Copy metrics that are damaged, before they are written again without what is damaged."""
-        if sentence := damage(self.path, logged):
+    def _keep_metrics(self, sentence: str | None) -> None:
+        """Copy the metrics, which are then written again, where a sentence says what is wrong with them."""
+        if sentence:
             file = self.path / METRICS
             names = (file.with_name(f"metrics.damaged-{n}.jsonl") for n in count(1))
             kept = next(name for name in names if not name.exists())

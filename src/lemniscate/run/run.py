@@ -231,12 +231,12 @@ class Run:
         """The work after a whole update; returns whether a planned checkpoint was part of it."""
         config, before, step = self.config, self._body.step, state.step
         finished = step >= total_steps
-        if step <= (1 - config.average_last) * total_steps:
-            state.mean.load_state_dict({})  # what was added is of a total that has been extended since
-        elif config.average_last:
+        if config.average_last and step > (1 - config.average_last) * total_steps:
             state.mean.add(state.policy)
             if finished:
                 state.mean.move_to(state.policy)
+        elif config.average_last:
+            state.mean.load_state_dict({})  # what was added is of a total that has been extended since
         if _passed(config.evaluate_every, before, step):
             self._evaluate(state)
         if self._curriculum:
