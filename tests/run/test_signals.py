@@ -203,7 +203,7 @@ def test_a_reward_of_an_earlier_step_is_explained_by_its_row(late):
     reward = torch.cat([torch.zeros(late, envs), earned[: steps - late]])
     shape = {"obs": obs[:-1], "action": action, "reward": reward, "next_obs": obs[1:], "terminated": done}
     rows = Rollout(**shape, truncated=~done & done, valid=torch.ones_like(done))
-    share = paid_before(rows, spec_of()).item()
+    share = paid_before(rows, spec_of(), of_effects(rows[rows.valid], spec_of())["reward/explained"]).item()
     assert share > 0.7 if late else share < -0.3  # the row before knows the observation, and no action
 
 

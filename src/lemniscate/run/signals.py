@@ -56,7 +56,9 @@ def of_environment(rows: Rollout, spec: Spec) -> dict[str, float]:
     chosen = rows[rows.valid]
     found = of_rows(chosen, spec) | of_time(rows) | of_starts(rows, spec)
     if not spec.has_images and spec.observation_size <= MOST_NUMBERS:
-        found |= of_effects(chosen, spec) | {"reward/before": paid_before(rows, spec)}
+        found |= of_effects(chosen, spec)
+        if found["reward/explained"] < 0.8 and found["reward/std"] > 0:  # else no other row has more to explain
+            found["reward/before"] = paid_before(rows, spec, found["reward/explained"])
         if found["action/effect"] < 0.2:
             found |= {"action/late": late_effect(rows, spec), "action/beside": effect_beside(rows, spec)}
     return {name: float(value) for name, value in found.items()}
@@ -176,22 +178,18 @@ def effect_beside(rows: Rollout, spec: Spec) -> Tensor:
     return torch.stack([torch.zeros((), dtype=torch.float64), *shares]).max()
 
 
-def paid_before(rows: Rollout, spec: Spec) -> Tensor:
-    """What a row before explains of the rewards beyond what their own row does, of rows [T, N, …].
+def paid_before(rows: Rollout, spec: Spec, present: Tensor) -> Tensor:
+    """What a row before explains of the rewards beyond what their own row does, `present`, of rows [T, N, …].
 
     The most of up to `LATEST` steps, or of one where their own row explains most of them. Above 0 a reward is that of
     an earlier step: its own row knows no more of the action that earned it.
     """
-    ended, found = rows.done.cumsum(0) - rows.done.int(), torch.tensor(-1.0)  # episodes that ended before each row
-    for steps in range(1, min(LATEST, len(rows.done) - 1) + 1):
+    ended, found = rows.done.cumsum(0) - rows.done.int(), torch.zeros_like(present)  # episodes that ended before a row
+    for steps in range(1, min(LATEST, len(rows.done) - 1) + 1 if present < 0.5 else 2):
         one = (ended[steps:] == ended[:-steps]) & rows.valid[steps:] & rows.valid[:-steps]
-        before, own = rows[:-steps][one], rows[steps:][one]
-        reward, nothing = own.reward[:, None].cpu().double(), torch.empty(len(own.reward), 0, dtype=torch.float64)
-        earlier, present = (explained_by(_everything(each, spec), reward, nothing)[0] for each in (before, own))
-        found = torch.maximum(found, (earlier - present).nan_to_num())
-        if present > 0.5:
-            break
-    return found
+        before, reward = _everything(rows[:-steps][one], spec), rows.reward[steps:][one].cpu().double()
+        found = torch.maximum(found, explained_by(before, reward[:, None], before[:, :0])[0].nan_to_num())
+    return found - present
 
 
 def _everything(rows: Rollout, spec: Spec) -> Tensor:
