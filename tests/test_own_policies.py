@@ -12,6 +12,7 @@ from torch import nn
 import environments
 import lemniscate as lem
 from lemniscate.cli import main
+from lemniscate.envs import registry
 from lemniscate.envs.conversion import flatten_observation, unflatten_observation
 from lemniscate.envs.spaces import observation_parts
 from lemniscate.run.config import RunConfig
@@ -487,3 +488,13 @@ def test_a_batch_is_given_only_where_each_row_has_the_answer_that_it_has_alone(p
     assert (
         lem.evaluate(policy, "CartPole-v1", episodes=5).returns == lem.evaluate(act, "CartPole-v1", episodes=5).returns
     )
+
+
+@pytest.mark.parametrize("own", [{"agent": "test_own_policies:Actor"}, {"normalized_actions": True}])
+def test_what_is_said_of_a_policy_of_ones_own_is_not_for_one_that_was_trained_here(own):
+    env = registry.make("CartPole-v1", 1)
+    config = lem.config_for("pqn", "CartPole-v1", hidden=(8,))
+    policy = lem.TrainedPolicy(config.networks(env.spec), env.spec, config, 0)
+    env.close()
+    with pytest.raises(lem.UserError, match="are for policies of your own; this one was trained here"):
+        lem.evaluate(policy, episodes=1, **own)

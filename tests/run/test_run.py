@@ -256,6 +256,13 @@ def test_a_run_that_goes_on_beyond_its_end_is_the_longer_run(tmp_path, env):
     assert history(path) == history(tmp_path / "whole")
 
 
+def test_what_falls_over_the_whole_run_is_said_where_it_is_extended(tmp_path, capsys):
+    fields = {"num_envs": 2, "num_steps": 8, "minibatch_size": 8, "total_steps": 64, "hidden": (8,)}
+    path = lem.train("pqn", "CartPole-v1", run=tmp_path / "r", progress=False, **fields).path
+    lem.resume(path, total_steps=128)
+    assert "from here on: final_learning_rate 0.0, final_epsilon 0.05." in capsys.readouterr().err
+
+
 def test_a_run_that_goes_on_is_interrupted_like_any_other(tmp_path, capsys):
     """With annealing, and checkpoints by the length of the run: the first part keeps its own."""
     path = train(tmp_path / "r", desired_kl=None, clip="0.2>0.1", keep_checkpoints=20).path

@@ -336,6 +336,15 @@ def test_measuring_changes_no_bit_of_a_run(tmp_path, monkeypatch, algorithm):
     assert all(torch.equal(one[name], other[name]) for name in other)
 
 
+def test_of_the_largest_q_is_known_what_is_known_of_a_value(tmp_path):
+    fields = {"num_envs": 2, "num_steps": 8, "minibatch_size": 8, "total_steps": 128}
+    run = lem.train("pqn", "CartPole-v1", run=tmp_path / "r", progress=False, **fields)
+    line = read_metrics(run.path)[0]
+    assert line["network/moved"] > 0
+    assert "value/missing" in line
+    assert not {"value/moved", "advantage/followed"} & line.keys()
+
+
 def test_of_replay_the_errors_of_new_and_of_sampled_transitions_stand_side_by_side(tmp_path):
     run = lem.train("td3", "Pendulum-v1", run=tmp_path / "r", progress=False, **tiny_off_policy())
     last = [line for line in read_metrics(run.path) if "td_error/newest" in line][-1]

@@ -221,7 +221,7 @@ def each_finding(
 
 
 def _shown_by(rollouts: Sequence[Rollout], spec: Spec) -> list[str]:
-    """What the doctor sees in rollouts [T, N, …] of random play, each looked at in two halves."""
+    """The doctor's sentences on rollouts [T, N, …] of random play, each looked at in two halves."""
     halves = [
         rows[half] for rows in rollouts for half in (slice(len(rows.done) // 2), slice(len(rows.done) // 2, None))
     ]

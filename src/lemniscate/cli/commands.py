@@ -191,13 +191,13 @@ def doctor(what: str, json: bool, **options: Any) -> None:
     damaged = any(finding.grade == BAD for finding in found)
     if not damaged:
         say(verdict(what, found))
-    diagnoses = {} if damaged else {str(run): diagnose(run) for run in runs_in(what)}
+    diagnoses = {str(run): diagnose(run) for run in ([] if damaged else runs_in(what))}
     for run, of_run in diagnoses.items():
         names = ", ".join(one.name for one in of_run if one.sure != "hint")
         say(f"{run}: {names or 'no rule finds a fault'}.")
         for one in of_run:
             say(one.listed(width))
-    if not damaged and (spread := spread_of(what)):
+    if diagnoses and (spread := spread_of(what)):
         say(spread)
     if json:
         runs = {run: [vars(one) for one in of_run] for run, of_run in diagnoses.items()}

@@ -79,7 +79,7 @@ IN_PLAY -= {"seed-ignored", "reward-zero", "reward-large", "no-episode"}
 
 
 def of_random_play(looks: Sequence[Mapping[str, float]]) -> list[str]:
-    """What the signals of some looks at random play say of an environment, a text for each of its faults."""
+    """A text for each fault of an environment that the signals of some looks at random play show."""
     lines = [{"step": i, **look} for i, look in enumerate(looks)]
     found = findings(Evidence({}, {}, {}, {}, lines, {}))
     return [f"{seen} {rule.means} {rule.remedy_for({})}." for rule, seen in found if rule.name in IN_PLAY]

@@ -95,18 +95,19 @@ def find_mirror(env: str, kwargs: Mapping[str, Any], wrappers: Sequence[str]) ->
                 return _derived(one)
             _require_unchanged(one)
             mirror = _given(one.get_wrapper_attr("mirror"), sizes)
-            space: Any = one.action_space
-            bounds = np.stack([space.low, space.high])
-            images = np.where(mirror.action.sign < 0, -bounds[::-1], bounds)[:, mirror.action.source]
-            if not np.array_equal(images, bounds):
-                raise UserError(
-                    f"the bounds of its action, {shown_space(space)}, are not the mirror image of themselves."
-                )
+            _require_own_image(mirror.action, one.action_space)
             return mirror
         finally:
             one.close()
     except UserError as error:
         raise UserError(f"{env} has no symmetry that could be used: {error}") from None
+
+
+def _require_own_image(order: Order, space: Any) -> None:
+    """Raise `UserError` where the bounds of actions are not their own mirror image, as those of a policy are."""
+    bounds = np.stack([space.low, space.high])
+    if not np.array_equal(np.where(order.sign < 0, -bounds[::-1], bounds)[:, order.source], bounds):
+        raise UserError(f"the bounds of its action, {shown_space(space)}, are not the mirror image of themselves.")
 
 
 def _require_unchanged(env: SingleEnv) -> None:

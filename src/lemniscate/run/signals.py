@@ -106,8 +106,7 @@ def of_time(rows: Rollout) -> dict[str, Tensor]:
     Of rows [T, N, …]; both are 0 for rewards that never change.
     """
     steps, envs = rows.done.shape
-    before = torch.cat([torch.zeros_like(rows.done[:1]), rows.done[:-1]]).cumsum(0)  # episodes that ended so far
-    episode = (before * envs + torch.arange(envs, device=before.device))[rows.valid].cpu()
+    episode = (_ended(rows) * envs + torch.arange(envs, device=rows.done.device))[rows.valid].cpu()
     time = torch.arange(steps).double()[:, None].expand(steps, envs)[rows.valid.cpu()]
     count = torch.bincount(episode).clamp(min=1)
     time, reward = (
@@ -158,9 +157,9 @@ def late_effect(rows: Rollout, spec: Spec) -> Tensor:
     """
     obs, after = (x[..., : spec.observation_size].cpu().double() for x in (rows.obs, rows.next_obs))
     action, found = _numbers(rows.action.cpu(), spec.action), [torch.zeros((), dtype=torch.float64)]
-    broken = torch.cat([torch.zeros_like(rows.done[:1]), rows.done[:-1]]).cumsum(0).cpu()  # episodes that ended so far
+    ended = _ended(rows).cpu()
     for steps in range(1, min(LATEST, len(obs) - 2) + 1):
-        one = (broken[steps:] == broken[:-steps]) & (rows.valid & ~rows.done).cpu()[steps:]
+        one = (ended[steps:] == ended[:-steps]) & (rows.valid & ~rows.done).cpu()[steps:]
         change = (after - obs)[steps:][one]
         found.append(explained_by(action[:-steps][one], change, obs[steps:][one]).nan_to_num().max())
     return torch.stack(found).max()
@@ -184,12 +183,17 @@ def paid_before(rows: Rollout, spec: Spec, present: Tensor) -> Tensor:
     The most of up to `LATEST` steps, or of one where their own row explains most of them. Above 0 a reward is that of
     an earlier step: its own row knows no more of the action that earned it.
     """
-    ended, found = rows.done.cumsum(0) - rows.done.int(), torch.zeros_like(present)  # episodes that ended before a row
+    ended, found = _ended(rows), torch.zeros_like(present)
     for steps in range(1, min(LATEST, len(rows.done) - 1) + 1 if present < 0.5 else 2):
         one = (ended[steps:] == ended[:-steps]) & rows.valid[steps:] & rows.valid[:-steps]
         before, reward = _everything(rows[:-steps][one], spec), rows.reward[steps:][one].cpu().double()
         found = torch.maximum(found, explained_by(before, reward[:, None], before[:, :0])[0].nan_to_num())
     return found - present
+
+
+def _ended(rows: Rollout) -> Tensor:
+    """The number of episodes that ended before each row, [T, N]: rows of one number are of one episode."""
+    return rows.done.cumsum(0) - rows.done.int()
 
 
 def _everything(rows: Rollout, spec: Spec) -> Tensor:
