@@ -1563,8 +1563,8 @@ MUTANTS = [
     (
         "time runs on through the ends of episodes",
         "run/signals.py",
-        "(before * envs + torch.arange(",
-        "(0 * before + torch.arange(",
+        "(_ended(rows) * envs + torch.arange(",
+        "(0 * _ended(rows) + torch.arange(",
         "run/test_signals.py::test_rewards_that_tell_the_time_do_so_within_each_episode",
     ),
     (
@@ -1668,8 +1668,8 @@ MUTANTS = [
     (
         "actions that are late are looked for across ends",
         "run/signals.py",
-        "one = (broken[steps:] == broken[:-steps]) & ",
-        "one = ",
+        "one = (ended[steps:] == ended[:-steps]) & (rows",
+        "one = (rows",
         "run/test_signals.py::test_an_action_that_is_late_is_found_within_episodes",
     ),
 ]
