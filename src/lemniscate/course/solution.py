@@ -69,7 +69,7 @@ NAMES = {name: f"{names} {others}".split() for names, others in _NAMES.items() f
 """all names of an argument, by its name in the exercise"""
 SETTINGS = ("config", "cfg", "conf", "args", "hp", "hparams", "hyperparameters", "params", "settings", "train_config")
 """names of what holds a reader's settings"""
-LIMIT = 15.0
+LIMIT = 8.0
 """seconds that a function may take for all its cases; what is right takes milliseconds"""
 
 
