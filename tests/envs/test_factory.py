@@ -8,6 +8,7 @@ from gymnasium.wrappers import NormalizeReward, vector
 from gymnasium.wrappers.utils import RunningMeanStd
 
 import environments
+import lemniscate as lem
 import toy
 from environments import PlusOne, Reach, times_ten
 from lemniscate.algos import ppo
@@ -239,6 +240,17 @@ def test_the_measure_of_a_last_step_is_that_before_the_reset():
     assert heights == [[1, 1], [2, 2], [3, 3], [1, 1]]
 
 
+def test_a_vector_that_makes_one_number_is_evaluated_in_as_many(tmp_path):
+    class Fixed(toy.Countdown):
+        def __init__(self, num_envs):
+            assert num_envs == 3, num_envs
+            super().__init__(num_envs, "DISABLED")
+
+    fields = {"num_envs": 3, "num_steps": 8, "minibatch_size": 8, "total_steps": 48, "progress": False}
+    run = lem.train("ppo", Fixed, run=tmp_path / "r", evaluate_every=24, **fields)
+    assert lem.evaluate(run, episodes=20).returns == [5.0] * 20
+
+
 def test_actions_of_another_shape_are_refused():
     env = registry.make("CartPole-v1", 4)
     env.restart(0)
@@ -374,6 +386,15 @@ class Plain(gym.vector.VectorEnv):
         return self.reset()[0], np.zeros(self.num_envs), none, all_, {"final_obs": [None] * self.num_envs}
 
 
+def final(obs):
+    """It, with other final observations."""
+
+    def step(self, actions):
+        return *Plain.step(self, actions)[:4], {} if obs is None else {"final_obs": obs}
+
+    return type("Final", (Plain,), {"step": step})
+
+
 class Twice(Plain):
     def __init__(self, num_envs):
         super().__init__(2 * num_envs)
@@ -397,7 +418,12 @@ class Seeded(Plain):
             Seeded,
             r"Seeded.reset\(\) .*takes no seed or no options; it must be reset\(self, \*, seed=None, options=None\)",
         ),
-        (Plain, r"hides the final observation \(no info\['final_obs'\]\)"),
+        (Plain, r"hides the final observation \(no info\['final_obs'\]\[0\]\)"),
+        (final(None), r"hides the final observation \(no info\['final_obs'\]\)"),
+        (final(1.0), r"hides the final observation \(no info\['final_obs'\]\[0\]\)"),
+        (final([np.zeros(2)]), r"hides the final observation \(no info\['final_obs'\]\[1\]\)"),
+        (final(np.zeros((2, 3))), r"gives in info\['final_obs'\] an observation of shape \(3,\); its space is Box"),
+        (final({"a": np.zeros((2, 2))}), r"gives in info\['final_obs'\] an observation that is .*; its space is Box"),
     ],
 )
 def test_a_vector_environment_that_cannot_be_used_is_said(env, said):

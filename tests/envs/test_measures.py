@@ -12,3 +12,11 @@ def test_what_an_environment_did_not_give_is_nan_and_not_zero():
     found = measured(info, ("distance", "height"), 3, torch.device("cpu"))
     assert found.keys() == {"distance"}
     np.testing.assert_equal(found["distance"].numpy(), np.float32([1, 5, np.nan]))
+
+
+def test_of_a_dictionary_that_some_gave_only_theirs_count():
+    """As Gymnasium's RecordEpisodeStatistics of vectors has them: zeros where no episode ended."""
+    info = {"episode": {"r": np.array([0.0, 7.0]), "_l": np.array([True, False]), "l": np.array([3, 0])}}
+    info["_episode"] = np.array([False, True])
+    found = {name: values.tolist() for name, values in measured(info, (), 2, torch.device("cpu")).items()}
+    np.testing.assert_equal(found, {"info/episode/r": [np.nan, 7], "info/episode/l": [3, np.nan]})

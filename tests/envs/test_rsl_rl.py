@@ -105,7 +105,7 @@ def test_what_has_no_reset_says_so():
     env = registry.make(Cart(gives=("final_obs",)), 8)
     rollout_of(env)
     assert env.spec.privileged == 0
-    assert any("has no reset" in said for said in env.backend.notices)
+    assert any("has no reset()" in said for said in env.backend.notices)
 
 
 @pytest.mark.parametrize("env_id", ["Pendulum-v1", "Copy-box-v0"])
@@ -206,6 +206,36 @@ def test_groups_without_a_policys_are_refused():
         registry.make(Odd(), 8)
 
 
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("num_actions", 0), ("num_actions", None), ("max_episode_length", "20"), ("num_envs", None)],
+)
+def test_attributes_that_count_are_numbers(name, value):
+    odd = Cart(8)
+    setattr(odd, name, value)
+    with pytest.raises(UserError, match=rf"{name} of .*Cart.* is .*; it must be a whole number from 1"):
+        registry.make(odd, 8)
+
+
+def test_a_plain_tensor_of_final_observations_is_that_of_the_one_group():
+    class Loose(Cart):
+        def step(self, actions):
+            *rest, extras = super().step(actions)
+            return *rest, extras | {"final_obs": extras["final_obs"]["policy"]}
+
+    plain, loose = (rollout_of(registry.make(kind(8, ("final_obs", "reset", "seed")), 8)) for kind in (Cart, Loose))
+    assert torch.equal(plain.next_obs, loose.next_obs)
+
+
+@pytest.mark.parametrize("seed", [42, lambda: None])
+def test_a_seed_that_takes_no_number_is_not_called_which_is_said(seed):
+    odd = Cart(8, ("final_obs", "reset"))
+    odd.seed = seed
+    env = registry.make(odd, 8)
+    rollout_of(env)
+    assert any(r"has no seed(number): no run can be repeated" in said for said in env.backend.notices)
+
+
 def test_it_serves_what_speaks_it():
     assert RslRlBackend.serves(registry.name_of(Cart()))
     assert not RslRlBackend.serves("CartPole-v1")
@@ -269,6 +299,24 @@ def answering(method, change):
         ("step", lambda step: (step[0], step[1].numpy(), *step[2:]), r"as rewards; it must be a Tensor \[8\]"),
         ("step", lambda step: (*step[:2], step[2][:3], step[3]), r"as dones; it must be a Tensor \[8\]"),
         ("step", lambda step: (*step[:3], {"time_outs": True}), r"gives True as time_outs; it must be a Tensor \[8\]"),
+        ("step", lambda step: (step[0], step[1] + 1j, *step[2:]), r"complex64 as rewards; it must be a Tensor \[8\]\."),
+        (
+            "step",
+            lambda step: (*step[:2], torch.full((8,), torch.nan), step[3]),
+            r"as dones; it must be a Tensor \[8\] of True and False",
+        ),
+        ("step", lambda step: (*step[:3], [1]), r"gives \[1\] as extras; it must be a dictionary"),
+        ("step", lambda step: (*step[:3], {"log": [1]}), r"gives \[1\] as extras\['log'\]; it must be a dictionary"),
+        (
+            "step",
+            lambda step: (*step[:3], step[3] | {"final_obs": {"policy": step[0]["policy"][:, :1], "critic": None}}),
+            r"\(8, 1\) .* as extras\['final_obs'\], group policy; a group must be one Tensor \[8, 2\]",
+        ),
+        (
+            "step",
+            lambda step: ({name: step[0][name][:, :1] for name in ("policy", "critic")}, *step[1:]),
+            r"\(8, 1\) .* as the observations policy; a group must be one Tensor \[8, 2\]",
+        ),
     ],
 )
 def test_what_is_returned_wrongly_is_said(method, change, said):

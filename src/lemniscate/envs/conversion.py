@@ -143,8 +143,9 @@ def measured(
 ) -> dict[str, Tensor]:
     """The numbers [N] float32 in the info of a vector environment; NaN where an environment gave none.
 
-    Measures, `declared`, have their names; the others "info/" before it. `info[name]` counts where `info["_" + name]`
-    is True. Where an environment was reset in the same step, its true info is in `info["final_info"]`.
+    Measures, `declared`, have their names; the others "info/" before it. `info[name]`, a dictionary as a whole, counts
+    where `info["_" + name]` is True. Where an environment was reset in the same step, its true info is in
+    `info["final_info"]`.
     """
     found: dict[str, Tensor] = {}
     final = info.get("final_info")  # of what is no vector environment it may be anything
@@ -163,15 +164,16 @@ def measured(
     return found
 
 
-def _columns(info: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, np.ndarray, Any]]:
+def _columns(info: Mapping[str, Any], prefix: str = "", outer: Any = None) -> Iterator[tuple[str, np.ndarray, Any]]:
     """(name, values, where they count) of each entry that may be a number, those of dictionaries by "outer/inner"."""
     for key, values in info.items():
         if key in APART or key[:1] == "_":
             continue
+        given = info.get(f"_{key}", outer)
         if isinstance(values, Mapping):
-            yield from _columns(values, f"{prefix}{key}/")
+            yield from _columns(values, f"{prefix}{key}/", given)
         else:
-            yield f"{prefix}{key}", np.asarray(values), info.get(f"_{key}")
+            yield f"{prefix}{key}", np.asarray(values), given
 
 
 def flatten_observation(parts: tuple[ObservationPart, ...], obs: Any, *, image: bool = False) -> np.ndarray:

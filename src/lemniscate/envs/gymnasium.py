@@ -14,7 +14,7 @@ from lemniscate.envs import spaces
 from lemniscate.envs.backend import Backend
 from lemniscate.envs.conversion import flatten_observation, measured, measures_of, physical_action, row_of
 from lemniscate.envs.factory import is_own, make_one, make_vector, maker_of, makes_vector, sentences
-from lemniscate.envs.returns import mask_in
+from lemniscate.envs.returns import fitted, mask_in
 from lemniscate.envs.vec_env import Stagger
 from lemniscate.envs.workers import WatchedVectorEnv, call_method
 from lemniscate.errors import UserError
@@ -191,19 +191,32 @@ class GymnasiumBackend(Backend):
     def _with_final(self, obs: np.ndarray, info: dict, done: np.ndarray) -> np.ndarray:
         if not done.any():
             return obs
-        if "final_obs" not in info or any(row_of(info["final_obs"], int(row)) is None for row in np.flatnonzero(done)):
-            raise UserError(
-                f"{self.spec.env_id} resets in the same step and hides the final observation (no info['final_obs']), so"
-                " its time-outs cannot be learned from; make it NEXT_STEP, DISABLED, or give final_obs."
-            )
-        next_obs, size, final_info = obs.copy(), self.spec.observation_size, info.get("final_info", {})
+        next_obs, size, final_info = obs.copy(), self.spec.observation_size, info.get("final_info")
+        final_info = final_info if isinstance(final_info, Mapping) else {}
         for row in np.flatnonzero(done):
-            final = row_of(info["final_obs"], int(row))
+            final = self._final(info, int(row))
             next_obs[row, :size] = flatten_observation(self.spec.observation_parts, final, image=self.spec.image)
             name, mask = mask_in(final, final_info)
             if self._masks and mask is not None and final_info.get(f"_{name}", done)[row]:
                 next_obs[row, size:] = self._masks.of_row(row_of(mask, int(row)) if name else mask, int(row))
         return next_obs
+
+    def _final(self, info: dict, row: int) -> Any:
+        """The observation in which an episode ended."""
+        try:
+            final = row_of(info["final_obs"], row)
+        except (TypeError, KeyError, IndexError):
+            final = None
+        if final is None:
+            entry = f"info['final_obs'][{row}]" if "final_obs" in info else "info['final_obs']"
+            raise UserError(
+                f"{self.spec.env_id} resets in the same step and hides the final observation (no {entry}), so"
+                " its time-outs cannot be learned from; make it NEXT_STEP, DISABLED, or give final_obs."
+            )
+        try:
+            return fitted(self._envs.single_observation_space, final)
+        except ValueError as error:
+            raise UserError(f"{self.spec.env_id} gives in info['final_obs'] an observation {error}.") from None
 
     def _observe(self, raw: Any, info: dict) -> np.ndarray:
         """The flat observation, a copy; after it the action mask, where there is one."""

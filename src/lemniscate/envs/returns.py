@@ -68,7 +68,7 @@ class Returns:
 
     def _observation(self, method: str, obs: Any) -> Any:
         try:
-            return _fitted(self._space, obs, self._lead)
+            return fitted(self._space, obs, self._lead)
         except ValueError as error:
             raise self.wrong(method, f"returned an observation {error}") from None
 
@@ -175,7 +175,7 @@ def as_array(value: Any) -> np.ndarray:
         return np.full((), None, dtype=object)
 
 
-def _fitted(space: gym.Space, obs: Any, lead: tuple[int, ...], where: str = "") -> Any:
+def fitted(space: gym.Space, obs: Any, lead: tuple[int, ...] = (), where: str = "") -> Any:
     """An observation in the types of its space. Raises `ValueError`, with the rest of a sentence, where it is none."""
     if isinstance(space, spaces.Dict):
         keys = ", ".join(map(str, space.spaces))
@@ -185,11 +185,11 @@ def _fitted(space: gym.Space, obs: Any, lead: tuple[int, ...], where: str = "") 
             raise ValueError(f"without {lacking[0]}{where}; its space is a Dict with the keys {keys}")
         if beside := [name for name in MASKS if name in obs and name not in space.spaces]:
             raise ValueError(f"with {beside[0]}{where}, which is not in its space, a Dict with the keys {keys}")
-        return {key: _fitted(part, obs[key], lead, f"{where} in {key}") for key, part in space.items()}
+        return {key: fitted(part, obs[key], lead, f"{where} in {key}") for key, part in space.items()}
     if isinstance(space, spaces.Tuple):
         if not isinstance(obs, tuple | list) or len(obs) != len(space):
             raise ValueError(f"that is {kind_of(obs)}{where}; its space is a Tuple of {len(space)}")
-        return tuple(_fitted(part, obs[i], lead, f"{where} in part {i}") for i, part in enumerate(space))
+        return tuple(fitted(part, obs[i], lead, f"{where} in part {i}") for i, part in enumerate(space))
     return _fitted_array(space, obs, (*lead, *(space.shape or ())), where)
 
 

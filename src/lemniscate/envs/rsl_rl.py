@@ -6,6 +6,7 @@ Neither needs rsl_rl; ours as one needs tensordict.
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from itertools import zip_longest
 from typing import Any
 
 import torch
@@ -64,10 +65,8 @@ class RslRlBackend(Backend):
         wrappers: Sequence[str] = (),
     ) -> None:
         self._env, self.num_envs, self.device = _made_once(env, num_envs, kwargs or {}), num_envs, device
-        if self._env.num_envs != num_envs:
-            raise UserError(
-                f"{env} has {self._env.num_envs:,} environments, not {num_envs:,}: num_envs={self._env.num_envs}."
-            )
+        if (there := int(self._number("num_envs", env))) != num_envs:
+            raise UserError(f"{env} has {there:,} environments, not {num_envs:,}: num_envs={there}.")
         obs = self._env.get_observations()
         if not hasattr(obs, "keys"):
             raise UserError(
@@ -80,23 +79,26 @@ class RslRlBackend(Backend):
             given = ", ".join(groups)
             raise UserError(f"{env} has the groups of observations {given}; one must be actor or policy.")
         self._env_id, self._groups = env, [group, *([CRITIC] if CRITIC in groups else [])]
-        size, *privileged = (part.shape[1] for part in self._parts(obs))
-        limit, self._privileged = self._env.max_episode_length, sum(privileged)
-        action = Box((-math.inf,) * self._env.num_actions, (math.inf,) * self._env.num_actions)
-        longest = float("inf") if limit is None else float(limit.max() if isinstance(limit, Tensor) else limit)
+        self._sizes: list[int] = []
+        self._sizes = [part.shape[1] for part in self._parts(obs)]
+        actions = int(self._number("num_actions", env))
+        longest = math.inf if self._env.max_episode_length is None else self._number("max_episode_length", env)
         steps = int(longest) if math.isfinite(longest) else None
-        self.spec = Spec(env, (ObservationPart((), (size,)),), action, steps, self._privileged)
+        bounds = Box((-math.inf,) * actions, (math.inf,) * actions)
+        self.spec = Spec(env, (ObservationPart((), (self._sizes[0],)),), bounds, steps, sum(self._sizes[1:]))
         self.counts = torch.ones(num_envs, dtype=torch.bool, device=device)
         self.notices = []
 
     def restart(self, seed: int, first: int = 0) -> Tensor:
         """Seed and reset it, where it has `seed` and `reset`; else it goes on from where it is, which is said."""
-        if hasattr(self._env, "seed"):
+        if named.takes(getattr(self._env, "seed", None), 1):
             self._env.seed(seed + first)
-        if hasattr(self._env, "reset"):
+        else:
+            self._note(f"{self.spec.env_id} has no seed(number): no run can be repeated.")
+        if named.takes(getattr(self._env, "reset", None), 0):
             self._env.reset()
         else:
-            self._note(f"{self.spec.env_id} has no reset: episodes go on where they are, and no run can be repeated.")
+            self._note(f"{self.spec.env_id} has no reset(): episodes go on where they are, and no run can be repeated.")
         self._obs = self._rows(self._env.get_observations())
         return self._obs
 
@@ -107,17 +109,17 @@ class RslRlBackend(Backend):
             what = f"{len(returned)} values" if isinstance(returned, tuple) else kind_of(returned)
             raise UserError(f"{self._env_id} returns {what} from step(); it must be 4, (obs, rewards, dones, extras).")
         obs, reward, dones, extras = returned
-        extras = extras or {}
+        extras = self._dictionary("extras", extras)
         done, late = self._column("dones", dones, torch.bool), extras.get("time_outs")
         truncated = torch.zeros_like(done) if late is None else done & self._column("time_outs", late, torch.bool)
         before, self._obs = self._obs, self._rows(obs)
-        final = next((extras[name] for name in FINAL if name in extras), None)
+        final = next((name for name in FINAL if extras.get(name) is not None), None)
         if final is None and truncated.any():
             self._note(
                 f"{self.spec.env_id} hides final observations (no extras['final_obs']): at time-outs the value of the"
                 " observation before stands for what follows."
             )
-        last = before if final is None else self._rows(final)
+        last = before if final is None else self._rows(extras[final], f"extras[{final!r}], group ")
         return Step(
             obs=self._obs,
             next_obs=torch.where(done[:, None], last, self._obs),
@@ -125,40 +127,65 @@ class RslRlBackend(Backend):
             terminated=done & ~truncated,
             truncated=truncated,
             valid=torch.ones_like(done),
-            measures=self._logged(extras.get("log") or extras.get("episode") or {}),
+            measures=self._logged(extras),
         )
 
     def close(self) -> None:
         """Nothing: the object is used again, and is its owner's."""
 
-    def _rows(self, obs: Any) -> Tensor:
+    def _rows(self, obs: Any, where: str = "the observations ") -> Tensor:
         """[N, O + P] of groups [N, …]; clones, since a simulator may write over its own."""
-        return torch.cat(self._parts(obs), dim=-1)
+        return torch.cat(self._parts(obs, where), dim=-1)
 
-    def _parts(self, obs: Any) -> list[Tensor]:
+    def _parts(self, obs: Any, where: str = "the observations ") -> list[Tensor]:
         """[N, O], and [N, P] where there is a group of the critic's. Raises `UserError` for what is no such group."""
-        for name in self._groups:
-            group = obs[name] if name in getattr(obs, "keys", dict)() else None
-            if not isinstance(group, Tensor) or group.shape[:1] != (self.num_envs,):
+        alone = isinstance(obs, Tensor) and len(self._groups) == 1
+        groups: Any = {self._groups[0]: obs} if alone else obs
+        found = []
+        for name, size in zip_longest(self._groups, self._sizes):
+            group: Any = groups[name] if name in getattr(groups, "keys", dict)() else None
+            rows = isinstance(group, Tensor) and group.shape[:1] == (self.num_envs,) and not group.is_complex()
+            width = group.numel() // self.num_envs if rows else 0
+            if not width or width != (size or width):
                 raise UserError(
-                    f"{self._env_id} gives {kind_of(group)} as the observations {name}; a group must be one Tensor"
-                    f" [{self.num_envs}, …], with its terms concatenated."
+                    f"{self._env_id} gives {kind_of(group)} as {where}{name}; a group must be one Tensor"
+                    f" [{self.num_envs}, {size or '…'}], with its terms concatenated."
                 )
-        return [obs[name].reshape(self.num_envs, -1).to(self.device, torch.float32) for name in self._groups]
+            found.append(group.reshape(self.num_envs, -1).to(self.device, torch.float32))
+        return found
 
     def _column(self, name: str, values: Any, dtype: torch.dtype) -> Tensor:
         """[N] of one number for each environment, [N] or [N, 1]; a clone, as of observations."""
-        if not isinstance(values, Tensor) or values.numel() != self.num_envs:
-            raise UserError(f"{self._env_id} gives {kind_of(values)} as {name}; it must be a Tensor [{self.num_envs}].")
+        right = isinstance(values, Tensor) and values.numel() == self.num_envs and not values.is_complex()
+        if not right or (dtype is torch.bool and values.is_floating_point() and values.isnan().any()):
+            wanted = f"a Tensor [{self.num_envs}]{' of True and False' * (dtype is torch.bool)}"
+            raise UserError(f"{self._env_id} gives {kind_of(values)} as {name}; it must be {wanted}.")
         return values.reshape(self.num_envs).to(self.device, dtype, copy=True)
 
-    def _logged(self, log: Mapping[str, Any]) -> dict[str, Tensor]:
+    def _number(self, name: str, env: str) -> float:
+        """An attribute that counts, the largest number of a Tensor. Raises `UserError` for one that counts nothing."""
+        value = getattr(self._env, name)
+        try:
+            number = float(torch.as_tensor(value).max())
+        except (TypeError, ValueError, RuntimeError):
+            number = math.nan
+        if not number >= 1:
+            raise UserError(f"{name} of {env} is {kind_of(value)}; it must be a whole number from 1.")
+        return number
+
+    def _dictionary(self, name: str, value: Any) -> Mapping[str, Any]:
+        if value is not None and not (hasattr(value, "get") and hasattr(value, "items")):
+            raise UserError(f"{self._env_id} gives {kind_of(value)} as {name}; it must be a dictionary.")
+        return {} if value is None else value
+
+    def _logged(self, extras: Mapping[str, Any]) -> dict[str, Tensor]:
         """The means of what numbers a log has, each the same in all rows."""
         rows, found = self.counts.float(), {}
-        for name, value in log.items():
+        name = next((name for name in ("log", "episode") if extras.get(name) is not None), "log")
+        for key, value in self._dictionary(f"extras[{name!r}]", extras.get(name)).items():
             with suppress(TypeError, ValueError, RuntimeError):  # what is no number is not measured
                 mean = torch.as_tensor(value, dtype=torch.float32).mean().item()
-                found[f"info/{name.strip('/')}"] = torch.full_like(rows, mean)
+                found[f"info/{str(key).strip('/')}"] = torch.full_like(rows, mean)
         return found
 
     def _note(self, sentence: str) -> None:

@@ -96,14 +96,15 @@ def evaluation_env(
     backend: str | None = None,
     device: str = "cpu",
 ) -> VecEnv:
-    """A few environments of a run, or of another `env`; as many as in training where a program is compiled for these.
+    """A few environments of a run, or of another `env`; as many as in training where no others may be made.
 
     `env_kwargs` change those of the run; in another environment they are the only ones.
     """
     arguments = env_arguments(config, env, env_kwargs, backend)
     name = arguments["env"]
     served_by = registry.backend_class(arguments["backend"] or registry.backend_for(name, config.all_wrappers))
-    as_in_training = served_by.compiled or served_by.exists_once(name, config.num_envs)
+    own_vector = ":" in name and not served_by.wraps(name)  # which may make no other number
+    as_in_training = served_by.compiled or served_by.exists_once(name, config.num_envs) or own_vector
     return registry.make(num_envs=config.num_envs if as_in_training else min(episodes, 16), device=device, **arguments)
 
 
