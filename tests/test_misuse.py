@@ -150,6 +150,8 @@ def test_runs_are_plotted_one_by_one_or_in_a_list(run):
         (lambda run: lem.train("ppo", "CartPole-v1", callbacks=3), "A callback must be a function of"),
         (lambda run: lem.train("ppo", "CartPole-v1", callbacks=lambda step: None), "A callback must be a function of"),
         (lambda run: lem.train("ppo", ""), "There is no environment ''"),
+        (lambda run: lem.train("ppo", "CartPole-v1", run="."), "A run needs a directory of its own: name one that is new"),
+        (lambda run: lem.diagnose("hf://u/x"), "hf://u/x is on the Hub, and no run directory"),
         (lambda run: lem.evaluate(run, env_kwargs=3), "env_kwargs must be a dictionary"),
         (lambda run: lem.evaluate(run, env_kwargs="x"), "env_kwargs must be a dictionary"),
         (lambda run: lem.evaluate(run, video=3), "video must be a path, such as 'film.gif', not 3"),
@@ -163,7 +165,8 @@ def test_runs_are_plotted_one_by_one_or_in_a_list(run):
         (lambda run: lem.make_vec("CartPole-v1", 0), "num_envs must be a whole number from 1 to 1,000,000, not 0"),
         (lambda run: lem.make_vec("CartPole-v1", 2.5), "num_envs must be a whole number from 1 to 1,000,000, not 2.5"),
         (lambda run: lem.make_vec("CartPole-v1", "3"), "num_envs must be a whole number from 1 to 1,000,000, not '3'"),
-        (lambda run: lem.make_vec("CartPole-v1", wrappers="a:b"), r"wrappers must be several, such as \[MyWrapper\], not 'a:b'"),
+        (lambda run: lem.make_vec("CartPole-v1", wrappers="a_:b"), "a_:b cannot be found: there is no module a_"),
+        (lambda run: lem.train("ppo", gym.spec("CartPole-v1")), "env is the EnvSpec of CartPole-v1; give its class, its id"),
         (lambda run: lem.make_vec("CartPole-v1", wrappers=3), "wrappers must be several, .* not 3"),
         (lambda run: lem.make_vec("CartPole-v1", backend=3), "There is no backend 3"),
         (lambda run: run.policy.act(np.zeros(4), action_mask=[1, 0]), "CartPole-v1 has no action mask"),
@@ -309,7 +312,8 @@ def test_the_install_line_of_an_extra_works_in_a_clone():
 
 
 def test_values_are_shown_short():
-    assert [shown(x) for x in ("3", None, [1], "x" * 99, gym)] == ["'3'", "None", "[1]", "a str", "a module"]
+    said = ["'3'", "None", "[1]", repr("x" * 56 + "…"), "a module"]
+    assert [shown(x) for x in ("3", None, [1], "x" * 99, gym)] == said
 
 
 def test_a_run_stays_where_it_began_where_the_working_directory_changes(tmp_path, monkeypatch):

@@ -249,6 +249,7 @@ def test_runs_that_fail_are_named_and_the_others_are_trained_side_by_side(tmp_pa
     assert again == f"Try them again with: lemniscate resume {tmp_path / 's'}"
     assert lem.load(tmp_path / "s" / "ppo-1").step >= 2_000
     said = capsys.readouterr().err
+    assert f"{tmp_path / 's'} has no metrics yet of ppo-2" in said
     assert "PPO      1" in said
     assert "One seed says nothing" in said
 

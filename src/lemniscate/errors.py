@@ -84,7 +84,12 @@ def shown(value: object) -> str:
         return text
     if isinstance(value, int):
         return f"a number of {int(math.log10(abs(value))) + 1:,} digits"
-    return f"a {type(value).__name__}"
+    return repr(f"{value[:56]}…") if isinstance(value, str) else with_article(type(value).__name__)
+
+
+def with_article(noun: str) -> str:
+    """A noun with "a" or "an"."""
+    return f"{'an' if noun[:1] in tuple('aeiouAEIOU') else 'a'} {noun}"
 
 
 def _signature(function: Any) -> str:

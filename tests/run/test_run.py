@@ -488,6 +488,18 @@ def test_a_full_disk_costs_a_checkpoint_and_not_the_run(tmp_path, capsys):
     assert not list(path.rglob("*.tmp"))
 
 
+def test_a_run_directory_that_is_moved_while_it_trains_does_not_begin_anew_beside_itself(tmp_path):
+    def move(step, *_):
+        if step == 96:
+            (tmp_path / "r").rename(tmp_path / "moved")
+
+    fields = {**tiny_fields(), "checkpoint_every": 64}
+    with pytest.raises(lem.NotStoredError, match=r"is not stored: .*the run directory is gone"):
+        lem.train("ppo", "Countdown-v0", run=tmp_path / "r", callbacks=[move], progress=False, **fields)
+    assert not (tmp_path / "r").exists()
+    assert checkpoint.list_steps(tmp_path / "moved" / "checkpoints") == [64]
+
+
 def test_a_policy_that_the_disk_refuses_is_not_lost_and_no_success(tmp_path, capsys):
     train(tmp_path / "whole")
     with ExitStack() as full:

@@ -93,7 +93,7 @@ def test_the_settings_of_a_config_are_a_point_of_the_space_where_they_lie_in_it(
         ("gamma=.99:.9", "below its second"),
         ("gamma=.9:.9", "below its second"),
         ("learning_rate=log:0:1", "learning_rate"),
-        ("value_coef=log:0:1", "above 0 below"),
+        ("value_coef=log:0:1", "above 0 and below"),
         ("gamma=.9", "is no range"),
         ("gamma=.9:2", "gamma must be"),
         ("gamma=.9:1:2", "gamma"),

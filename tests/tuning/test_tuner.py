@@ -125,6 +125,14 @@ def test_an_interrupted_search_goes_on_with_every_trial_exact(tuned, tmp_path):
     assert final_hash(path / run) == final_hash(tuned[0] / run)
 
 
+def test_what_needs_one_run_says_so_of_a_search(tuned, capsys):
+    path, *_ = tuned
+    for words in (["evaluate", str(path)], ["plot", str(path)], ["doctor", str(path)]):
+        assert main(words) == 2, words
+        said = capsys.readouterr().err
+        assert said == f"{path} is a search: name one of its trials, such as {path / 'trials' / '000'}.\n"
+
+
 def test_a_finished_search_is_resumed_in_no_time(tuned, monkeypatch, capsys):
     monkeypatch.setattr(subprocess, "Popen", None)
     assert main(["resume", str(tuned[0])]) == 0

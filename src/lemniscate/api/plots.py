@@ -126,9 +126,12 @@ def _members(path: Path) -> list[Path]:
     """A run itself, or those of a sweep that have something to show."""
     if not is_sweep(path):
         read_config(path)
-    runs = [run for run in (read_sweep(path).runs if is_sweep(path) else [path]) if read_metrics(run)]
+    every = list(read_sweep(path).runs) if is_sweep(path) else [path]
+    runs = [run for run in every if read_metrics(run)]
     if not runs:
         raise UserError(f"{path} has no metrics to plot yet.")
+    if absent := [run.name for run in every if run not in runs]:
+        say(f"{path} has no metrics yet of {', '.join(absent)}: they are left out.")
     for sentence in filter(None, (damage(run, logged=0) for run in runs)):
         say(sentence)
     return runs

@@ -214,7 +214,7 @@ def each_finding(
     what: str, backend: str | None, env_kwargs: Mapping[str, Any] | None, wrappers: Sequence[str]
 ) -> Iterator[Finding]:
     """The findings of `check`, one by one."""
-    path = at_home(what)
+    path = path_of(what)
     if run_check.is_stored(path):
         return run_check.each_finding(path)
     return env_check.each_finding(what, backend, env_kwargs, wrappers, _shown_by)

@@ -86,7 +86,7 @@ def choose_config(
 
 def name_in_config(value: object) -> object:
     """A value of a Config: functions and classes, and those in a sequence, by their names."""
-    if isinstance(value, list | tuple):
+    if isinstance(value, list | tuple | Iterator):
         return tuple(map(name_in_config, value))
     if isinstance(value, TrainedRun | TrainedPolicy):  # to start warm from
         return str(path_of(value))

@@ -21,7 +21,7 @@ from lemniscate.envs.conversion import SingleEnv
 from lemniscate.envs.registry import SPOKEN
 from lemniscate.envs.returns import CheckedVector
 from lemniscate.envs.workers import WatchedVectorEnv, Worker, told_with_place
-from lemniscate.errors import UserError, WorkerError, shown
+from lemniscate.errors import UserError, WorkerError, shown, with_article
 from lemniscate.system import named
 
 Maker = EnvSpec | Callable[..., Any]
@@ -103,9 +103,8 @@ def make_one(maker: Maker, wrappers: Sequence[Callable[..., Any]] = (), **kwargs
 
 def _other(made: object, wanted: str) -> TypeError:
     """The words on something else than what is wanted."""
-    kind = type(made).__name__
     instead = "; what speaks rsl_rl's VecEnv is of the backend rsl_rl" if hasattr(made, SPOKEN) else ""
-    return TypeError(f"it makes {'an' if kind[0] in 'aeiouAEIOU' else 'a'} {kind}, not a {wanted}{instead}")
+    return TypeError(f"it makes {with_article(type(made).__name__)}, not a {wanted}{instead}")
 
 
 def make_vector(
@@ -207,4 +206,6 @@ def sentences(env: str, kwargs: Mapping[str, Any] | None, wrappers: Sequence[str
             said = told_with_place(error)
         if "required positional argument" in said:
             said += "; it is given in env_kwargs (--env-args), or with a wrapper: module:Name(key=value)"
+        elif "unexpected keyword argument 'num_envs'" in said:
+            said += "; a vector environment is made with num_envs"
         raise UserError(f"{env} cannot be made{with_these}: {said}") from error

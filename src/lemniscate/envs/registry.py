@@ -1,7 +1,7 @@
 """The table of backends, and which of them runs an environment."""
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any
@@ -148,6 +148,8 @@ def name_of(env: object) -> str:
         return env
     if not callable(env) and not hasattr(env, SPOKEN):
         what = "an environment that is made already" if hasattr(env, "step") else shown(env)
+        if hasattr(env, "entry_point"):
+            what = f"the EnvSpec of {getattr(env, 'id', None)}"
         raise UserError(f"env is {what}; give its class, its id, or a function that makes it: several are needed.")
     return named.name_of(env)
 
@@ -158,8 +160,10 @@ def count_of(env: object) -> int | None:
 
 
 def names_of(wrappers: "Sequence[str | Callable[..., Any]]") -> tuple[str, ...]:
-    """The names of wrappers for a Config. Raises `UserError` for what is not several of them."""
-    if not isinstance(wrappers, list | tuple):
+    """The names of wrappers for a Config; one alone is one. Raises `UserError` for what is none."""
+    if callable(wrappers) or isinstance(wrappers, str):
+        return (named.name_of(wrappers),)
+    if not isinstance(wrappers, list | tuple | Iterator):
         raise UserError(f"wrappers must be several, such as [MyWrapper], not {shown(wrappers)}.")
     return tuple(map(named.name_of, wrappers))
 

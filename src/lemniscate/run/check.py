@@ -6,19 +6,20 @@ from pathlib import Path
 from lemniscate.envs.check import BAD, GOOD, NOTE, Finding
 from lemniscate.errors import UserError, resume_line
 from lemniscate.run import checkpoint
-from lemniscate.run.directory import BEST, CONFIG, FINAL, LOCK, SWEEP, locked, lost
+from lemniscate.run.directory import BEST, CONFIG, FINAL, LOCK, SWEEP, TUNE, locked, lost, require_no_search
 from lemniscate.run.metrics import METRICS, damage, read_metrics
 from lemniscate.run.places import is_sweep, read_sweep
 from lemniscate.system.files import DamagedFileError, is_whole, parsing, read_json
 
 
 def is_stored(path: Path) -> bool:
-    """Whether a directory is that of a run or of a sweep, whole or not."""
-    return any((path / name).exists() for name in (CONFIG, SWEEP, "checkpoints"))
+    """Whether a directory is that of a run, of a sweep or of a search, whole or not."""
+    return any((path / name).exists() for name in (CONFIG, SWEEP, TUNE, "checkpoints"))
 
 
 def each_finding(path: Path) -> Iterator[Finding]:
-    """The findings in the files of a run, or of each run of a sweep, one by one."""
+    """The findings in the files of a run, or of each run of a sweep, one by one. Raises `UserError` for a search."""
+    require_no_search(path)
     if not is_sweep(path):
         yield from _of_run(path)
         return

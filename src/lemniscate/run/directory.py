@@ -1,5 +1,6 @@
 """The run directory: its creation, its config, its lock, and the checkpoints in it, from which a run may begin."""
 
+import errno
 import json
 import math
 from collections.abc import Callable, Iterator
@@ -39,8 +40,16 @@ def require_absent(path: Path) -> None:
     """Raise `UserError` if a run directory exists already; one whose creation failed half-way does not count."""
     if file := files.file_in_the_way(path):
         raise UserError(f"{file} is a file, and a run is a directory: choose another --run.")
+    if path == Path():
+        raise UserError("A run needs a directory of its own: name one that is new, such as --run runs/first.")
     if path.exists() and (not path.is_dir() or {file.name for file in path.iterdir()} - UNFINISHED):
         raise UserError(f"{path} exists already; go on with it ({resume_line(path)}) or choose another --run.")
+
+
+def require_no_search(path: Path) -> None:
+    """Raise `UserError` for the directory of a search, whose trials are sweeps."""
+    if (path / TUNE).exists():
+        raise UserError(f"{path} is a search: name one of its trials, such as {path / 'trials' / '000'}.")
 
 
 def create_directory(path: Path, name: str, record: dict[str, Any]) -> None:
@@ -61,6 +70,7 @@ def read_record(path: Path) -> dict[str, Any]:
     if (path / SWEEP).exists():
         runs = sorted(file.parent for file in path.glob(f"*/{CONFIG}"))
         raise UserError(f"{path} is a sweep: name one of its runs, such as {runs[0] if runs else path / '…'}.")
+    require_no_search(path)
     try:
         return files.read_json(path / CONFIG)
     except DamagedFileError as error:
@@ -318,6 +328,8 @@ class Saver:
         if not self._world.is_first:
             return
         try:
+            if not self.path.is_dir():  # else it would begin anew beside what was moved
+                raise FileNotFoundError(errno.ENOENT, "the run directory is gone", str(self.path))
             if (self.path / METRICS).exists():
                 files.sync(self.path / METRICS)  # before the checkpoint, which says up to which step they are whole
             record = {**self._record, "planned": planned, "logged": self.logged, "calls": self.calls}

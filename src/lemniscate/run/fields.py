@@ -172,6 +172,7 @@ def unknown_field(name: str, known: Iterable[str], spell: Callable[[str], str] =
     known = list(known)
     found = ours(name, known)
     if not found:
-        return unknown_name("field", spell(name), map(spell, known))
+        otherwise = "`lemniscate train ALGO --help` lists them."
+        return unknown_name("field", spell(name), map(spell, known), otherwise)
     here = " or ".join(spell(mine) + (f" (theirs: {remark})" if remark else "") for mine, remark in found.items())
     return UserError(f"There is no {spell(name)}: here it is {here}.")

@@ -140,7 +140,7 @@ def _range(name: str, text: str, hint: Any, config: RunConfig) -> Interval | Cho
     if not all(isinstance(end, int | float) and not isinstance(end, bool) for end in (low, high)):
         raise UserError(f"{name} is no number: give its values as {name}=a|b.")
     if not low < high or (log and low <= 0):
-        above = " above 0" if log else ""
+        above = " above 0 and" if log else ""
         raise UserError(f"{name}={text} is no range: its first number must be{above} below its second one.")
     return Interval(low, high, log, isinstance(low, int) and isinstance(high, int))
 
