@@ -67,6 +67,19 @@ CASES = {
         {"action__weakest": [0.001, -0.002] * 4, "action__effect": [0.5] * 8},
         {"action__weakest": [0.3] + [0.001] * 7, "action__effect": [0.5] * 8},
     ),
+    "action-half": (
+        {"action__half": [0.001, -0.002] * 4, "action__effect": [0.5] * 8},
+        {"action__half": [0.3] + [0.001] * 7, "action__effect": [0.5] * 8},
+    ),
+    "steps-short": ({"observation__pace": [0.01] * 5 + [0.1] * 3}, {"observation__pace": [0.01] * 3 + [0.1] * 5}),
+    "exploration-still": (
+        {"algorithm": "pqn", "epsilon": [1.0] * 8, "changed": {"final_epsilon": 0.01}},
+        {"algorithm": "pqn", "epsilon": [1.0] * 7 + [0.9], "changed": {"final_epsilon": 0.01}},
+    ),
+    "units-alike": (
+        {"network__rank": [1 / 64] * 8, "changed": {"hidden": [64, 64]}},
+        {"network__rank": [1 / 64] * 7 + [2 / 64], "changed": {"hidden": [64, 64]}},
+    ),
     "observation-of-another": (
         {"action__beside": [0.5] * 8, "action__effect": [0.01] * 8},
         {"action__beside": [0.5] * 8, "action__effect": [0.4] * 8},
@@ -223,7 +236,10 @@ CASES = {
         {"network__inactive": [0.1] * 3 + [0.5] * 5, "returns": [*range(300), *[20] * 100]},
         {"network__inactive": [0.1] * 3 + [0.5] * 5, "returns": RISES},
     ),
-    "q-biased": ({"scores": {"q_bias": {"bias": 0.8}}}, {"scores": {"q_bias": {"bias": 0.3}}}),
+    "q-biased": (
+        {"algorithm": "td3", "scores": {"q_bias": {"bias": 0.8}}, "steps": 30_000},
+        {"algorithm": "td3", "scores": {"q_bias": {"bias": 0.3}}, "steps": 30_000},
+    ),
     "critic-overfits": (
         {"algorithm": "sac", "td_error__newest": [20.0] * 8, "td_error__sampled": [1.0] * 8},
         {"algorithm": "sac", "td_error__newest": [3.0] * 8, "td_error__sampled": [1.0] * 8},
@@ -403,11 +419,52 @@ def test_returns_that_have_arrived_rise_no_more():
 
 def test_a_policy_that_descends_q_is_named():
     assert names("td3", action__preferred=[0.5] * 3 + [0.2] * 5, steps=30_000) == ["advantage-opposed"]
-    assert names("td3", action__preferred=[0.05] * 3 + [0.5] * 5, steps=30_000) == []
+    assert names("td3", action__preferred=[0.05] * 3 + [0.5] * 5, steps=30_000) == ["advantage-unrelated"]
+    assert names("td3", action__preferred=[0.05] * 3 + [0.5] * 5, steps=30_000, returns=RISES) == []
+    assert names("td3", action__preferred=[0.05] * 3 + [0.7] * 5, steps=30_000) == []
     few = {"update_every": 128}
     assert "advantage-opposed" not in names("td3", action__preferred=[0.1] * 8, steps=30_000, changed=few)
     begun = {"learning_starts": 29_600}
     assert "advantage-opposed" not in names("td3", action__preferred=[0.1] * 8, steps=30_000, changed=begun)
+
+
+def test_a_q_without_a_gradient_stands_still():
+    flat = {"losses__critic": [40.0] * 8, "steps": 30_000}
+    assert names("sac", gradient_norm__critic=[3.0] * 3 + [0.0] * 5, **flat) == ["critic-still"]
+    assert names("sac", gradient_norm__critic=[0.0] * 7 + [1.0], **flat) == []
+
+
+def test_both_ends_of_a_schedule_are_looked_at():
+    assert names(changed={"entropy_coef": "0>0.5"}) == ["setting-entropy-coef"]
+    assert names(changed={"learning_rate": "3e-4>0"}) == []
+
+
+def test_rollouts_of_a_few_steps_are_named_however_many_environments_there_are():
+    assert names(changed={"num_steps": 2, "num_envs": 512}) == ["setting-num-steps"]
+
+
+def test_two_choices_that_do_the_same_are_named():
+    assert names(action__alike=[0.001] * 8, action__effect=[0.5] * 8) == ["action-part"]
+    assert names(action__alike=[0.001] + [0.05] * 7, action__effect=[0.5] * 8) == []
+
+
+def test_a_value_of_one_reward_is_named_where_all_rewards_are_one():
+    far = {"value__missing": [6.0] + [95.0] * 7, "explained_variance": [-29.0] * 8}
+    assert names(reward__std=[0.0] * 8, **far) == ["missing-bootstrap"]
+
+
+def test_a_policy_that_is_still_because_it_has_collapsed_is_named_so():
+    assert names(approx_kl=[0.01] * 3 + [0.0] * 5, losses__entropy=[0.7, 0.6, 0.5, 0.1] + [1e-4] * 4) == [
+        "entropy-collapsed"
+    ]
+
+
+def test_slow_steps_come_before_rewards_that_time_explains():
+    assert names(observation__pace=[0.01] * 8, reward__by_time=[0.95] * 8) == ["steps-short"]
+
+
+def test_of_a_q_that_has_hardly_learned_no_bias_is_told():
+    assert names("sac", scores={"q_bias": {"bias": 0.8}}, steps=4_000) == []
 
 
 def test_returns_that_fall_while_q_begins_are_no_finding():

@@ -118,6 +118,17 @@ def test_an_action_that_is_late_is_found(late):
     assert late_effect(delayed(0), spec_of()).item() < 0.1
 
 
+def test_of_a_servo_that_is_not_observed_the_sum_of_the_actions_is_found():
+    rows = delayed(0)
+    done = torch.zeros_like(rows.terminated)
+    done[9::10] = True
+    sums = torch.stack([rows.action[10 * (t // 10) : t + 1].sum(0) for t in range(len(rows.action))])
+    moved = rows.obs + 0.1 * numbers(*rows.obs.shape, seed=9).float()
+    moved[..., :A] += sums
+    late = Rollout(**{**vars(rows), "next_obs": moved, "terminated": done})
+    assert late_effect(late, spec_of()).item() > 0.6
+
+
 def test_an_action_that_is_late_is_found_within_episodes():
     """Where episodes end every three steps, actions of more than two steps before are of another one."""
     rows = delayed(3)
@@ -236,6 +247,41 @@ def test_a_number_of_the_action_without_effect_is_the_weakest():
     assert weakest(1.0, 0.0) < 0.02
     alone = rows(action=action[:, :1])
     assert "action/weakest" not in of_effects(alone, spec_of(Box((-1.0,), (1.0,))))
+
+
+def test_actions_of_a_sign_without_effect_explain_nothing():
+    obs, action = numbers(B, O).float(), numbers(B, A, seed=1).float()
+
+    def half(moved):
+        return of_effects(rows(obs=obs, action=action, next_obs=moved), spec_of())["action/half"].item()
+
+    moved = obs + 0.1 * numbers(B, O, seed=5).float()
+    moved[:, :A] += action
+    assert half(moved) > 0.9
+    moved[:, :A] -= action.clamp(max=0)
+    assert half(moved) < 0.05
+    moved[:, 1] += action[:, 1].clamp(max=0)  # of one number they have an effect
+    assert half(moved) > 0.9
+
+
+def test_two_choices_that_do_the_same_are_alike():
+    obs, action = numbers(B, O).float(), torch.arange(B) % 4
+
+    def alike(*effects, action=action):
+        moved = obs + 0.1 * numbers(B, O, seed=5).float() + torch.tensor(effects)[action][:, None]
+        return of_effects(rows(obs=obs, action=action, next_obs=moved), spec_of(Discrete(4))).get("action/alike")
+
+    assert alike(0.0, 5.0, -1.0, 2.0) > 0.9
+    assert alike(0.0, 5.0, -1.0, 5.0) < 0.02
+    assert alike(0.0, 5.0, 5.0, 5.0, action=action.clamp(max=1)) > 0.9  # the others are hardly made
+    assert alike(1.0, 1.0, 1.0, 1.0, action=torch.zeros_like(action)) is None
+
+
+def test_the_pace_is_that_of_the_number_that_moves_most():
+    obs = numbers(B, O).float()
+    moved = obs + torch.tensor([0.0, 0.5, 0.01])[:O]
+    found = of_effects(rows(obs=obs, next_obs=moved), spec_of())
+    assert found["observation/pace"] == pytest.approx(0.5 / obs[:, 1].std().item(), rel=1e-5)
 
 
 def test_choices_explain_what_they_do():
@@ -543,13 +589,14 @@ class QIsTheAction(nn.Module):
         return self.weight * action.T
 
 
-@pytest.mark.parametrize(("action", "share"), [(1.0, 1.0), (-1.0, 0.0)])
-def test_the_policys_action_stands_beside_one_at_random(action, share):
+@pytest.mark.parametrize(("action", "weight", "share"), [(1.0, 1.0, 1.0), (-1.0, 1.0, 0.0), (1.0, 0.0, 0.5)])
+def test_the_policys_action_stands_beside_one_at_random(action, weight, share):
     columns = Transition(
         numbers(B, O).float(), torch.zeros(B, 1), torch.zeros(B), numbers(B, O).float(), torch.zeros(B).bool()
     )
     replay = SimpleNamespace(transitions=columns, sample_indices=lambda *_: torch.arange(B)[None])
     networks = SimpleNamespace(critics=QIsTheAction(), entropy_bonus=lambda *_: 0.0)
+    networks.critics.weight.data.fill_(weight)
     state = SimpleNamespace(replay=replay, updates=1, networks=networks, targets=QIsTheAction(), policy=AtAnEnd(action))
     rows = Rollout(**vars(columns), truncated=columns.terminated, valid=~columns.terminated)
     assert of_critics(state, SimpleNamespace(gamma=0.9), rows)["action/preferred"] == share

@@ -82,6 +82,21 @@ class Evidence:
         return len(self.returns) >= 10 and bool(np.ptp(self.returns) <= 1e-6 * (1 + abs(self.returns[0])))
 
     @property
+    def is_slow(self) -> bool:
+        """Whether no number of the observation moves by a twentieth of its standard deviation in a step."""
+        pace = self.values("observation/pace")
+        return len(pace) >= 3 and bool(np.median(pace) < 0.05)
+
+    @property
+    def collapsed(self) -> bool:
+        """Whether the policy's spread has fallen to a tenth in a quarter of the run, or to nothing in half of it."""
+        std = self.values("policy_std")
+        spread = std if len(std) else self.values("losses/entropy")
+        if len(spread) < 8 or spread[0] <= 0 or self.gain > 10:
+            return False
+        return bool(spread[len(spread) // 4] < 0.1 * spread[0] or spread[len(spread) // 2] < 0.01 * spread[0])
+
+    @property
     def begins(self) -> bool:
         """Whether Q has hardly begun: with replay it comes slowly, and the first policies are worse than chance."""
         return "tau" in self.config and bool(self.log) and self.log[-1]["step"] < 20_000
@@ -119,9 +134,10 @@ class Evidence:
 
     def beyond(self, field: str, low: float, high: float) -> float:
         """The factor by which a field is outside its usual range, negative below it; 0 inside, or as recommended."""
-        value = first_number(self.config.get(field))
-        if value is None or self.as_recommended(field):
+        value, last = first_number(self.config.get(field)), last_number(self.config.get(field))
+        if value is None or last is None or self.as_recommended(field):
             return 0.0
+        value = last if last > high else value  # a schedule may fall to 0
         if field == "buffer_size" and value >= self.config["total_steps"]:  # all of the run
             return 0.0
         if field in HORIZONS:
@@ -147,6 +163,11 @@ def first_number(value: Any) -> float | None:
     """A number of a Config as it is, the first of a schedule "FIRST>LAST"; None for anything else."""
     value = number(value.partition(">")[0]) if isinstance(value, str) else value
     return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
+
+
+def last_number(value: Any) -> float | None:
+    """As `first_number`, of a schedule the last."""
+    return first_number(value.rpartition(">")[2] if isinstance(value, str) else value)
 
 
 def usual_ranges(texts: Mapping[str, str]) -> dict[str, tuple[float, float]]:

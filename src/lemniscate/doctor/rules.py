@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from lemniscate.doctor.evidence import HORIZONS, Evidence, first_number
+from lemniscate.doctor.evidence import HORIZONS, Evidence, first_number, last_number
 from lemniscate.run.fields import field_of, flag, typed
 
 Seen = Iterator[tuple[str, str]]
@@ -146,11 +146,16 @@ def of_normalization(e: Evidence) -> Seen:
 
 
 def of_actions(e: Evidence) -> Seen:
-    """Faults of the actions: their effect, their delay and their bounds."""
+    """Faults of the actions' effect, and of its delay."""
     effects, shares = e.values("action/effect"), e.values("action/share")
-    now, before, by_sign = e.early("action/effect"), e.early("action/late"), e.early("action/by_sign")
-    at_bounds, first, weakest = e.late("action/at_bounds"), slice(max(3, len(effects) // 4)), e.values("action/weakest")
-    beside = e.early("action/beside")
+    now, before, beside = e.early("action/effect"), e.early("action/late"), e.early("action/beside")
+    first = slice(max(3, len(effects) // 4))
+    if e.is_slow:
+        pace = np.median(e.values("observation/pace"))
+        yield (
+            "steps-short",
+            f"In a step no number of the observation moves by more than {pace:.1%} of its standard deviation.",
+        )
     if beside > 0.15 and beside > 3 * max(now, 0.0):
         yield (
             "observation-of-another",
@@ -172,11 +177,29 @@ def of_actions(e: Evidence) -> Seen:
                 "action-without-effect",
                 f"Actions explain {max(0.0, explained):.2%} of how observations change.",
             )
+
+
+def of_parts_of_actions(e: Evidence) -> Seen:
+    """Faults of single numbers, signs and choices of actions, and of their bounds."""
+    effects, at_bounds, by_sign = e.values("action/effect"), e.late("action/at_bounds"), e.early("action/by_sign")
+    weakest, half, alike = map(e.values, ("action/weakest", "action/half", "action/alike"))
+    first = slice(max(3, len(effects) // 4))
     if min(len(weakest), len(effects)) >= 3 and weakest[first].max() < 0.02 < np.median(effects[first]):
         yield (
             "action-part",
             f"One of the numbers of an action explains {max(0.0, weakest[first].max()):.2%} of how observations"
             f" change, all together {np.median(effects[first]):.0%}.",
+        )
+    if min(len(half), len(effects)) >= 3 and half[first].max() < 0.02 and np.median(effects[first]) > 0.1:
+        yield (
+            "action-half",
+            f"Actions of one sign explain {max(0.0, half[first].max()):.2%} of how observations change, all together"
+            f" {np.median(effects[first]):.0%}.",
+        )
+    if len(alike) >= 3 and alike[first].max() < 0.005 and np.median(effects[first]) > 0.02:
+        yield (
+            "action-part",
+            f"Which of two choices is made explains {max(0.0, alike[first].max()):.2%} of how observations change.",
         )
     if by_sign > 0.5:
         yield (
@@ -214,7 +237,7 @@ def of_rewards(e: Evidence) -> Seen:
     by_time, explained, before = e.late("reward/by_time"), e.values("reward/explained"), e.values("reward/before")
     std = e.late("reward/std")
     varies = std > 0.5 * abs(e.late("reward/mean"))  # not a reward that differs in the step of a goal alone
-    if by_time > 0.8:
+    if by_time > 0.8 and not e.is_slow:
         yield "reward-by-time", f"Time alone explains {by_time:.0%} of the rewards within an episode."
     if std > 1e-6 and e.greatest("reward/within") < 1e-6:
         yield "reward-by-episode", "The reward is the same in every step of an episode, and another in the next one."
@@ -247,10 +270,11 @@ def of_episodes(e: Evidence) -> Seen:
             f"Nine of ten episodes took no more than {np.percentile(e.lengths, 90):.0f} steps.",
         )
     elif e.returns_alike and e.returns.any():
+        cut = terminated == 0 and np.ptp(e.lengths) == 0
         yield (
             "every-return-alike",
             f"All {len(e.returns):,} episodes had the same return, {e.returns[0]:,.4g}, whatever was done"
-            f"{', and none terminated' if terminated == 0 else ''}.",
+            f"{f', and each was cut after {e.lengths[0]:,.0f} steps' if cut else ''}.",
         )
     if terminated > 0.9 and len(late) >= 5 and np.ptp(late) == 0 and late[0] >= 10:
         yield (
@@ -312,7 +336,7 @@ def of_updates(e: Evidence) -> Seen:
     if kl > (2 * target if target else 0.1):
         beside = f"{kl / target:.0f} times its target of {target:g}" if target else "and 0.003 to 0.03 is usual"
         yield "kl-too-large", f"The KL divergence of the late updates is {kl:.2g}, {beside}."
-    if kl < 1e-6 and not e.rose:
+    if kl < 1e-6 and not e.rose and not e.collapsed:
         yield "policy-still", f"The KL divergence of the late updates is {kl:.1g}: the policy hardly moves."
     elif e.greatest("network/moved") == 0:
         yield "policy-still", "No update that was looked at changed a parameter of the policy."
@@ -328,13 +352,15 @@ def of_exploration(e: Evidence) -> Seen:
     first, late = e.early("policy_std"), e.late("policy_std")
     starts, total = e.config.get("learning_starts"), e.config.get("total_steps")
     target = first_number(e.config.get("target_entropy"))
-    if len(spread) >= 8 and not chosen and spread[0] > 0 and e.gain <= 10:
-        left = spread[len(spread) // 4] / spread[0]
-        if left < 0.1:
-            yield (
-                "entropy-collapsed",
-                f"After a quarter of the run the policy's {name} is {max(0.0, left):.0%} of what it was.",
-            )
+    if e.collapsed and not chosen:
+        yield (
+            "entropy-collapsed",
+            f"In the middle of the run the policy's {name} is {max(0.0, spread[len(spread) // 2] / spread[0]):.0%} of"
+            " what it was.",
+        )
+    epsilon, final = e.values("epsilon"), last_number(e.config.get("final_epsilon"))
+    if len(epsilon) >= 4 and np.ptp(epsilon) == 0 and final is not None and abs(epsilon[0] - final) > 0.01:
+        yield "exploration-still", f"epsilon is {epsilon[0]:g} in each line, and is to end at {final:g}."
     if late > max(3 * first, 2.0):
         yield (
             "std-exploded",
@@ -391,6 +417,11 @@ def of_advantages(e: Evidence) -> Seen:
             "advantage-opposed",
             f"In {preferred:.0%} of the sampled states Q of the policy's action is above that of one at random.",
         )
+    elif preferred < 0.58 and e.q_steps >= 2_000 and not e.rose:
+        yield (
+            "advantage-unrelated",
+            f"In {preferred:.0%} of the sampled states Q of the policy's action is above that of one at random.",
+        )
     neither = given is False and usual and not e.config.get("scale_rewards")
     if neither and not e.as_recommended("normalize_advantage"):
         yield "advantage-not-normalized", "Neither advantages nor rewards are normalized."
@@ -416,7 +447,8 @@ def of_values(e: Evidence) -> Seen:
     above = np.median(missing) * (1 - (first_number(e.config.get("gamma")) or 0.0)) if len(missing) else 0.0
     away = np.abs(missing).min() if len(missing) >= 2 else 0.0  # healthy values come nearer than 5
     one_reward = nothing and not settled and len(missing) >= 2 and missing.min() > 5
-    if one_reward and "gae_lambda" in e.config and e.late("reward/explained") > 0.1:
+    paid = e.late("reward/explained") > 0.1 or e.late("reward/std") == 0  # by what is seen, or always the same
+    if (one_reward or away > 40) and "gae_lambda" in e.config and paid:
         yield (
             "missing-bootstrap",
             f"The value has hardly more than one reward in it: r + γ V(s') lies {above:.0%} above V, early and late.",
@@ -456,6 +488,9 @@ def of_targets(e: Evidence) -> Seen:
         yield "critic-still", "No update that was looked at changed a parameter of V."
     if len(behind) >= 3 and not behind.any() and first_number(e.config.get("tau")) != 1:
         yield "critic-still", "The weights of Q are those of its target networks, each time that they were looked at."
+    flat, losses = e.last_half("gradient_norm/critic"), e.last_half("losses/critic")
+    if len(flat) >= 3 and not flat.any() and losses.all():
+        yield "critic-still", f"The gradient of Q is 0, and its loss {np.median(losses):.3g}."
     if len(length) >= 3 and np.ptp(length) == 0 and behind.any() and usual:
         yield "targets-behind", "The weights of the target networks were the same each time that they were looked at."
     elif len(behind) >= 3 and (np.diff(behind) > 0).all() and behind[-1] > 0.15 and usual:
@@ -484,6 +519,9 @@ def of_networks(e: Evidence) -> Seen:
     limit = first_number(e.config.get("max_grad_norm"))
     fell = e.late("losses/value") < e.early("losses/value") and not e.greatest("reward/largest") > 150
     times = 5 if norm > 100 and e.config.get("scale_rewards", False) else 15 if fell else 100
+    rank, width = e.values("network/rank"), (e.config.get("hidden") or (0,))[-1]
+    if len(rank) >= 3 and width >= 8 and rank.max() * width < 1.5 and not e.sees_nothing:
+        yield "units-alike", "At every observation all hidden units of the policy's last layer say the same."
     if inactive > 0.6:
         yield (
             "units-inactive",
@@ -555,7 +593,7 @@ def of_evaluations(e: Evidence) -> Seen:
             "evaluated-otherwise",
             f"Training ends at {last.mean():,.4g}, and the deterministic policy has {mean:,.4g} in the evaluation.",
         )
-    if abs(bias) > 0.5 and not e.rose:
+    if abs(bias) > 0.5 and not e.rose and e.q_steps >= 4_000:  # before, Q is only new
         yield "q-biased", f"Q {'over' if bias > 0 else 'under'}-estimates the return by {abs(bias):.0%}."
     if e.config.get("evaluate_every") and each < 10:
         episodes = "episode" if each == 1 else "episodes"
@@ -571,6 +609,7 @@ SUBJECTS = (
     of_observations,
     of_normalization,
     of_actions,
+    of_parts_of_actions,
     of_reward_sizes,
     of_rewards,
     of_episodes,

@@ -5,6 +5,7 @@ They are taken some thirty times in a run, and cost less than a hundredth of it.
 
 from collections.abc import Mapping
 from dataclasses import replace
+from itertools import combinations
 from typing import Any
 
 import torch
@@ -30,6 +31,10 @@ LATEST = 6
 """steps until an action that is late takes effect, up to which it is looked for"""
 SEEN = 256
 """rows that the networks are asked about"""
+FEW = 40
+"""rows of a choice below which it is not compared with others"""
+MOST_CHOICES = 6
+"""choices up to which each two are compared"""
 MOST_NUMBERS = 32
 """numbers of an observation up to which lines are fitted to them; for more there are too few rows"""
 UNITS = (*ACTIVATIONS.values(), nn.Tanh, nn.GELU, nn.LeakyReLU)
@@ -126,8 +131,9 @@ def of_effects(rows: Rollout, spec: Spec) -> dict[str, Tensor]:
     Actions explain what a line fitted to them explains beyond one fitted to the observations alone, in that number of
     the observation of which it is most: as a share of what those left to explain, and of all; and of the rewards the
     same. A reward may be a square too, of a distance or of an action. Also the share of the next observations that
-    these explain, on average; what the signs of actions explain beyond all this; and what that number of an action
-    explains of which it is least.
+    these explain, on average; what the signs of actions explain beyond all this; what that number of an action explains
+    of which it is least, and actions of that sign; what it explains which of two choices was made, of those alike most;
+    and the root mean square of a change over the standard deviation, in that number which moves most.
     """
     obs, after = (x[:, : spec.observation_size].cpu().double() for x in (rows.obs, rows.next_obs))
     action, inside = _numbers(rows.action.cpu(), spec.action), ~rows.done.cpu()
@@ -145,15 +151,49 @@ def of_effects(rows: Rollout, spec: Spec) -> dict[str, Tensor]:
         found["action/by_sign"] = explained_by(action.sign()[inside], change, known).nan_to_num().max()
         if action.shape[1] > 1:
             found["action/weakest"] = explained_by_each(known, change)[obs.shape[1] :].nan_to_num().amax(1).min()
+        found["action/half"] = torch.stack([_of_sign(sign, known, change, obs.shape[1]) for sign in (1, -1)]).min()
+    elif action.shape[1] <= MOST_CHOICES:
+        found |= _choices_alike(action[inside], change, obs[inside])
+    still = obs[inside].std(0) < 1e-9
+    if not still.all():
+        found["observation/pace"] = (change.square().mean(0).sqrt() / obs[inside].std(0))[~still].max()
     if not ((obs == 0) | (obs == 1)).all():  # one of n says nothing of the next
         found["observation/predicted"] = explained_by(obs[inside], after[inside], nothing[inside]).mean()
     return found
 
 
-def late_effect(rows: Rollout, spec: Spec) -> Tensor:
-    """What an earlier action explains of how observations change, of rows [T, N, …]: the most of up to `LATEST` steps.
+def _of_sign(sign: int, known: Tensor, change: Tensor, size: int) -> Tensor:
+    """What a number of the action explains of the change beside the others, where it has a sign; the most of all.
 
-    Where an observation tells the state, that is nothing: what an action did is in the observations since.
+    Of rows `known` [B, O + A], the first O of them, `size`, the observations.
+    """
+    found = [torch.zeros((), dtype=known.dtype)]
+    for column in range(size, known.shape[1]):
+        rows = known[:, column] * sign > 0
+        own = known[rows, column : column + 1]
+        others = torch.cat([known[rows, :column], known[rows, column + 1 :]], dim=-1)
+        found.append(explained_by(own, change[rows], others).nan_to_num().max())
+    return torch.stack(found).max()
+
+
+def _choices_alike(action: Tensor, change: Tensor, obs: Tensor) -> dict[str, Tensor]:
+    """What it explains of the change which of two choices was made, of the pair of which it is least.
+
+    Of choices [B, n], one of n each, that were made `FEW` times at least; nothing where there are no two of these.
+    """
+    often = (action.sum(0) >= FEW).nonzero()[:, 0].tolist()
+    found = []
+    for one, other in combinations(often, 2):
+        rows = (action[:, one] + action[:, other]) > 0
+        found.append(explained_by(action[rows, one : one + 1], change[rows], obs[rows]).nan_to_num().max())
+    return {"action/alike": torch.stack(found).min()} if found else {}
+
+
+def late_effect(rows: Rollout, spec: Spec) -> Tensor:
+    """What earlier actions explain of how observations change, of rows [T, N, …]: one of up to `LATEST` steps, or all.
+
+    Where an observation tells the state, that is nothing: what an action did is in the observations since. All, as a
+    sum over the episode, where an action is a step of a servo, say, whose position is not observed.
     """
     obs, after = (x[..., : spec.observation_size].cpu().double() for x in (rows.obs, rows.next_obs))
     action, found = _numbers(rows.action.cpu(), spec.action), [torch.zeros((), dtype=torch.float64)]
@@ -162,7 +202,17 @@ def late_effect(rows: Rollout, spec: Spec) -> Tensor:
         one = (ended[steps:] == ended[:-steps]) & (rows.valid & ~rows.done).cpu()[steps:]
         change = (after - obs)[steps:][one]
         found.append(explained_by(action[:-steps][one], change, obs[steps:][one]).nan_to_num().max())
-    return torch.stack(found).max()
+    total, before, done, inside = (
+        torch.zeros_like(action[0]),
+        list[Tensor](),
+        rows.done.cpu(),
+        (rows.valid & ~rows.done).cpu(),
+    )
+    for t in range(len(action)):
+        before.append(total)
+        total = (total + action[t]) * ~done[t, :, None]
+    of_all = explained_by(torch.stack(before)[inside], (after - obs)[inside], obs[inside])
+    return torch.stack([*found, of_all.nan_to_num().max()]).max()
 
 
 def effect_beside(rows: Rollout, spec: Spec) -> Tensor:
@@ -326,9 +376,9 @@ def of_critics(state: Any, config: RunConfig, rows: Rollout) -> dict[str, Tensor
         state.policy(sampled.obs).mode(),
         torch.empty_like(sampled.action).uniform_(-1, 1, generator=generator),
     )
-    preferred = critics(sampled.obs, chosen)[0] > critics(sampled.obs, chance)[0]
+    better = critics(sampled.obs, chosen)[0] - critics(sampled.obs, chance)[0]
     found = {
-        "action/preferred": preferred.float().mean(),
+        "action/preferred": (0.5 + 0.5 * better.sign()).mean(),  # where Q is flat, neither
         "td_error/newest": (q - target).square().mean(),
         "td_error/sampled": (other_q - other_target).square().mean(),
         "replay/repeated": (sampled.obs == sampled.next_obs).flatten(1).all(1).float().mean(),
