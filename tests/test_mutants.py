@@ -1050,6 +1050,13 @@ MUTANTS = [
         HINDSIGHT + "each_episode_is_stored_as_it_was_and_with_goals_that_were_reached_later",
     ),
     (
+        "goals that were achieved at the beginning are told",
+        "data/hindsight.py",
+        "[new[later]]",
+        "[new[later] | True]",
+        HINDSIGHT + "of_goals_that_were_achieved_at_the_beginning_nothing_is_told",
+    ),
+    (
         "reset rows in episodes",
         "data/hindsight.py",
         "step.valid.nonzero()",
@@ -1605,8 +1612,8 @@ MUTANTS = [
     (
         "presets are blamed for their settings",
         "doctor/evidence.py",
-        "if value is None or self.as_recommended(field):",
-        "if value is None:",
+        "if value is None or last is None or self.as_recommended(field):",
+        "if value is None or last is None:",
         "doctor/test_doctor.py::test_the_defaults_and_all_presets_are_never_named",
     ),
     (
@@ -1664,6 +1671,41 @@ MUTANTS = [
         "(grounded & away)",
         "grounded",
         "envs/test_gates.py::test_a_race_ends_outside_on_the_ground_and_at_what_stands",
+    ),
+    (
+        "the actions of a servo are summed over ends",
+        "run/signals.py",
+        "total = (total + action[t]) * ~done[t, :, None]",
+        "total = total + action[t]",
+        "run/test_signals.py::test_of_a_servo_that_is_not_observed_the_sum_of_the_actions_is_found",
+    ),
+    (
+        "actions of one sign are looked at on all rows",
+        "run/signals.py",
+        "rows = known[:, column] * sign > 0",
+        "rows = known[:, column] == known[:, column]",
+        "run/test_signals.py::test_actions_of_a_sign_without_effect_explain_nothing",
+    ),
+    (
+        "choices are alike where one of them is",
+        "run/signals.py",
+        '{"action/alike": torch.stack(found).min()}',
+        '{"action/alike": torch.stack(found).max()}',
+        "run/test_signals.py::test_two_choices_that_do_the_same_are_alike",
+    ),
+    (
+        "a group of another width is broadcast",
+        "envs/rsl_rl.py",
+        "if not width or width != (size or width):",
+        "if not width:",
+        "envs/test_rsl_rl.py::test_what_is_returned_wrongly_is_said",
+    ),
+    (
+        "numbers of a dictionary that nobody gave count",
+        "envs/conversion.py",
+        'given = info.get(f"_{key}", outer)',
+        'given = info.get(f"_{key}")',
+        "envs/test_measures.py::test_of_a_dictionary_that_some_gave_only_theirs_count",
     ),
     (
         "actions that are late are looked for across ends",

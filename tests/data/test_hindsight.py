@@ -33,10 +33,18 @@ SMALL = {
 }
 
 
+class Noted(HindsightReplay):
+    """It, with the rows of each call of `extend`: of an episode, then of its copies."""
+
+    def extend(self, rows):
+        self.stored = [*getattr(self, "stored", []), rows]
+        super().extend(rows)
+
+
 def played(env, steps, num_envs=3, goals=4, capacity=20_000, backend=None, **kwargs):
     """A buffer after so many random steps, and every step that was taken: rows of (environment, obs, …, ended)."""
     made = registry.make(env, num_envs, kwargs=kwargs, backend=backend)
-    replay = HindsightReplay(made.spec, capacity, CPU, num_envs=num_envs, goals=goals, seed=3)
+    replay = Noted(made.spec, capacity, CPU, num_envs=num_envs, goals=goals, seed=3)
     made.restart(5)
     replay.on_restart(made.backend.judge_goals)
     generator, taken = torch.Generator().manual_seed(0), []
@@ -67,18 +75,19 @@ def episodes_of(taken, num_envs):
 def test_each_episode_is_stored_as_it_was_and_with_goals_that_were_reached_later(ends, edge, backend):
     """By brute force: rewards and ends of the copies from the rules that `Walk` is described by."""
     replay, taken = played("environments:Walk", 60, ends=ends, edge=edge, limit=12, backend=backend)
-    rows, at = replay.transitions, 0
     episodes = episodes_of(taken, 3)
     assert len(episodes) > 12
-    for episode in episodes:
-        for name, column in zip(vars(rows), zip(*episode, strict=True), strict=True):
-            assert torch.equal(getattr(rows, name)[at : at + len(episode)], torch.stack(column))
-        at += len(episode)
-        reached = [float(row[3][ACHIEVED]) for row in episode]
+    assert len(replay) == sum(len(rows.reward) for rows in replay.stored)
+    for episode, whole, rows in zip(episodes, replay.stored[::2], replay.stored[1::2], strict=True):
+        for name, column in zip(vars(whole), zip(*episode, strict=True), strict=True):
+            assert torch.equal(getattr(whole, name), torch.stack(column))
+        reached, copy = [float(row[3][ACHIEVED]) for row in episode], 0
         for t, (obs, action, _, next_obs, _) in enumerate(episode):
-            for copy in range(at, at + 4):
+            first = copy
+            while copy < len(rows.reward) and rows.obs[copy, TIME] == obs[TIME]:
                 goal = float(rows.obs[copy, DESIRED])
                 assert goal in reached[t:]
+                assert abs(goal) >= 0.5  # not achieved at the beginning, which is at 0
                 assert float(rows.next_obs[copy, DESIRED]) == goal
                 for was, now in ((obs, rows.obs[copy]), (next_obs, rows.next_obs[copy])):
                     assert torch.equal(was[[ACHIEVED, TIME]], now[[ACHIEVED, TIME]])
@@ -87,20 +96,21 @@ def test_each_episode_is_stored_as_it_was_and_with_goals_that_were_reached_later
                 there = abs(x - goal) < 0.5
                 assert float(rows.reward[copy]) == (0.0 if there else -1.0)
                 assert bool(rows.terminated[copy]) == ((ends and there) or abs(x) > edge)
-            at += 4
-    assert at == len(replay)
+                copy += 1
+            assert copy - first <= 4
+            if all(abs(x) >= 0.5 for x in reached[t:]):
+                assert copy - first == 4
+        assert copy == len(rows.reward)
 
 
 def test_the_goals_are_drawn_uniformly_from_the_rest_of_the_episode():
     replay, taken = played("environments:Walk", 2_000, num_envs=1, goals=8, capacity=200_000, ends=False, limit=4)
-    counts, at = np.zeros((4, 4)), 0
-    for episode in episodes_of(taken, 1):
+    counts = np.zeros((4, 4))
+    for episode, rows in zip(episodes_of(taken, 1), replay.stored[1::2], strict=True):
         reached = [float(row[3][ACHIEVED]) for row in episode]
-        for t in range(len(episode)):
-            for copy in range(8):
-                goal = float(replay.transitions.obs[at + len(episode) + 8 * t + copy, DESIRED])
-                counts[t, reached.index(goal)] += len(episode) == 4
-        at += 9 * len(episode)
+        if len(episode) == 4 and min(map(abs, reached)) >= 0.5:  # none of them was achieved at the beginning
+            for t, goal in zip(rows.obs[:, TIME].int().tolist(), rows.obs[:, DESIRED].tolist(), strict=True):
+                counts[t, reached.index(goal)] += 1
     shares = counts / counts.sum(1, keepdims=True)
     assert not np.tril(counts, -1).any()
     for t in range(4):
@@ -110,7 +120,25 @@ def test_the_goals_are_drawn_uniformly_from_the_rest_of_the_episode():
 
 def test_without_a_time_limit_a_piece_is_stored_after_a_thousand_steps():
     replay, _ = played("environments:Walk", 1_001, num_envs=1, goals=1, ends=False, limit=10_000)
-    assert len(replay) == 2_000
+    whole, copies = replay.stored
+    assert len(whole.reward) == 1_000 >= len(copies.reward) > 500
+
+
+def test_of_goals_that_were_achieved_at_the_beginning_nothing_is_told():
+    """In a walk that stays where it is, no step is stored twice; with rewards of distances none is left out."""
+    parts = tuple(ObservationPart((name,), (1,)) for name in ("achieved_goal", "desired_goal"))
+    for reward, copies in (
+        (lambda a, d: -((a - d).abs() > 0.5).float()[:, 0], 2),
+        (lambda a, d: -(a - d).abs()[:, 0], 9),
+    ):
+        replay = Noted(Spec("x", parts, Box((-1.0,), (1.0,)), 9), 100, CPU, num_envs=1, goals=1, seed=0)
+        replay.on_restart(lambda a, d, reward=reward: (reward(a, d), torch.zeros(len(a)) > 0))
+        for t in range(9):  # 0.1, 0.2, … and at last 1.0
+            x = torch.tensor([[0.1 * t, 5.0], [0.1 * (t + 1) if t < 8 else 1.0, 5.0]])[:, None]
+            ends = torch.tensor([False]), torch.tensor([t == 8]), torch.tensor([True])
+            replay.add(x[0], torch.zeros(1, 1), Step(x[1], x[1], reward(x[1][:, :1], x[1][:, 1:]), *ends))
+        goals = replay.stored[1].obs[:, 1]
+        assert (goals > 0.5).all() if copies == 2 else len(goals) == 9
 
 
 def test_a_restart_drops_the_episodes_under_way():
@@ -125,7 +153,7 @@ def test_a_restart_drops_the_episodes_under_way():
 def test_reset_rows_belong_to_no_episode():
     parts = tuple(ObservationPart((name,), (1,)) for name in ("achieved_goal", "desired_goal"))
     replay = HindsightReplay(Spec("x", parts, Box((-1.0,), (1.0,)), 3), 100, CPU, num_envs=1, goals=1, seed=0)
-    replay.on_restart(lambda achieved, desired: (torch.zeros(len(achieved)), torch.zeros(len(achieved)) > 0))
+    replay.on_restart(lambda achieved, desired: (-(achieved - desired).abs()[:, 0], torch.zeros(len(achieved)) > 0))
     for t in range(8):  # NEXT_STEP: after two steps and an end, an action is ignored
         at, reward = torch.full((1, 2), float(t)), torch.zeros(1)
         flags = torch.tensor([False]), torch.tensor([t % 3 == 1]), torch.tensor([t % 3 != 2])

@@ -23,7 +23,8 @@ class HindsightReplay(ReplayBuffer):
 
     Algorithm 1 with the strategy "future" (section 4.5). An episode is stored when it ends; one that a checkpoint cuts
     is dropped. The rewards and ends of the copies are the environment's own answers; an episode that was terminated,
-    by its goal or by a fall, ends with its last step in any case.
+    by its goal or by a fall, ends with its last step in any case. Goals that were achieved when the episode began are
+    left out, as of a block that nobody has touched: they are most of the first ones, and teach to do nothing.
 
     Args:
         spec: of an environment whose observation is a Dict with `achieved_goal` and `desired_goal`; else a `UserError`.
@@ -65,14 +66,17 @@ class HindsightReplay(ReplayBuffer):
                 episode.clear()
 
     def _copies(self, episode: Transition) -> Transition:
-        """Each transition t k times, with goals achieved after steps drawn uniformly from t, …, T − 1; [k · T] rows."""
+        """Each transition t k times at most, with goals achieved after steps drawn uniformly from t, …, T − 1."""
         assert self._judge is not None
         length = len(episode.reward)
         reward, _ = self._judge(episode.next_obs[:, self._achieved], episode.next_obs[:, self._desired])
         self._compare(episode.reward, reward)
         times = np.repeat(np.arange(length), self._goals)
         later = np.random.default_rng((self._seed, self._written)).integers(times, length)
-        copies, goal = episode[torch.from_numpy(times)], episode.next_obs[torch.from_numpy(later), self._achieved]
+        goals, start = episode.next_obs[:, self._achieved], episode.obs[:1, self._achieved]
+        new = (self._judge(start.expand_as(goals), goals)[0] != self._judge(goals, goals)[0]).cpu()
+        times, later = (torch.from_numpy(x)[new[later]] for x in (times, later))
+        copies, goal = episode[times], goals[later]
         reward, ends = self._judge(copies.next_obs[:, self._achieved], goal)
         for obs in (copies.obs, copies.next_obs):
             obs[:, self._desired] = goal
