@@ -5,7 +5,7 @@
     .venv/bin/python benchmarks/doctor.py faults --half unseen                faults that nobody had in mind
     .venv/bin/python benchmarks/doctor.py faults --half unseen-too            and others, after rules for these
     .venv/bin/python benchmarks/doctor.py faults --half unseen-three          and others again
-    .venv/bin/python benchmarks/doctor.py faults --half unseen-four           and again
+    .venv/bin/python benchmarks/doctor.py faults --half unseen-four           and again; and unseen-five
     .venv/bin/python benchmarks/doctor.py faults --half elsewhere --seeds 1   under other algorithms, elsewhere
     .venv/bin/python benchmarks/doctor.py healthy
     .venv/bin/python benchmarks/doctor.py remedies --seeds 1
@@ -30,6 +30,7 @@ from typing import Any, get_type_hints
 
 import faulty
 import unseen
+import unseen_five
 import unseen_four
 import unseen_three
 import unseen_too
@@ -189,16 +190,32 @@ UNSEEN_FOUR = {
     "a ratio upside down": ("advantage-opposed", "gets-worse"),
 }
 """names that are right for the faults of `unseen_four.py`; none where there is no rule"""
+UNSEEN_FIVE = {
+    "a servo that nobody observes": ("action-late",),
+    "steps that are too short": ("steps-short",),
+    "a motor that does not run backwards": ("action-half",),
+    "two choices that are one": ("action-part",),
+    "a limit before the goal": ("every-return-alike",),
+    "an entropy bonus that grows": ("setting-entropy-coef",),
+    "two steps to a rollout": ("setting-num-steps",),
+    "weights that are all alike": ("units-alike",),
+    "a Q that cannot be negative": ("critic-still",),
+    "one less γ": ("missing-bootstrap",),
+    "ε of a whole number": ("exploration-still",),
+    "no gradient of Q": ("advantage-unrelated",),
+}
+"""names that are right for the faults of `unseen_five.py`; none where there is no rule"""
 SETS = (
     (UNSEEN, unseen.UNSEEN),
     (UNSEEN_TOO, unseen_too.UNSEEN_TOO),
     (UNSEEN_THREE, unseen_three.UNSEEN_THREE),
     (UNSEEN_FOUR, unseen_four.UNSEEN_FOUR),
+    (UNSEEN_FIVE, unseen_five.UNSEEN_FIVE),
 )
 FAULTS |= {name: (*faults[name][:3], right) for named, faults in SETS for name, right in named.items()}
 for name, algorithm, env, steps, change in ELSEWHERE:
     FAULTS[f"{name}: {algorithm}, {env}"] = (algorithm, {env: steps}, change or FAULTS[name][2], FAULTS[name][3])
-OF_SETS = unseen.LEARNERS | unseen_too.LEARNERS | unseen_three.LEARNERS | unseen_four.LEARNERS
+OF_SETS = unseen.LEARNERS | unseen_too.LEARNERS | unseen_three.LEARNERS | unseen_four.LEARNERS | unseen_five.LEARNERS
 LEARNERS = faulty.LEARNERS | {name: lambda _, change=change: change() for name, change in OF_SETS.items()}
 """the library with a fault in it, as a context, for the name of an algorithm"""
 
@@ -334,6 +351,7 @@ def cost() -> None:
 HALVES = {name: "elsewhere" if ":" in name else ("even", "odd")[i % 2] for i, name in enumerate(FAULTS)}
 HALVES |= dict.fromkeys(UNSEEN, "unseen") | dict.fromkeys(UNSEEN_TOO, "unseen-too")
 HALVES |= dict.fromkeys(UNSEEN_THREE, "unseen-three") | dict.fromkeys(UNSEEN_FOUR, "unseen-four")
+HALVES |= dict.fromkeys(UNSEEN_FIVE, "unseen-five")
 
 
 def table(half: str | None) -> None:
@@ -368,7 +386,8 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=["faults", "healthy", "remedies", "cost", "table"])
     parser.add_argument(
-        "--half", choices=["even", "odd", "unseen", "unseen-too", "unseen-three", "unseen-four", "elsewhere"]
+        "--half",
+        choices=["even", "odd", "unseen", "unseen-too", "unseen-three", "unseen-four", "unseen-five", "elsewhere"],
     )
     parser.add_argument("--only", nargs="+", help="these faults, or algorithms of healthy runs")
     parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3])
