@@ -202,7 +202,7 @@ UNSEEN_FIVE = {
     "a Q that cannot be negative": ("critic-still",),
     "one less γ": ("missing-bootstrap",),
     "ε of a whole number": ("exploration-still",),
-    "no gradient of Q": ("advantage-unrelated",),
+    "no gradient of Q": ("q-unfollowed",),
 }
 """names that are right for the faults of `unseen_five.py`; none where there is no rule"""
 SETS = (

@@ -1675,15 +1675,15 @@ MUTANTS = [
     (
         "the actions of a servo are summed over ends",
         "run/signals.py",
-        "total = (total + action[t]) * ~done[t, :, None]",
-        "total = total + action[t]",
+        "before - before.gather(0, first)",
+        "before",
         "run/test_signals.py::test_of_a_servo_that_is_not_observed_the_sum_of_the_actions_is_found",
     ),
     (
-        "actions of one sign are looked at on all rows",
+        "actions of one sign are taken with those of the other",
         "run/signals.py",
-        "rows = known[:, column] * sign > 0",
-        "rows = known[:, column] == known[:, column]",
+        "halves = torch.cat([obs, action.clamp(min=0), action.clamp(max=0)], dim=-1)",
+        "halves = torch.cat([obs, action.abs(), action], dim=-1)",
         "run/test_signals.py::test_actions_of_a_sign_without_effect_explain_nothing",
     ),
     (

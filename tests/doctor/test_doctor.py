@@ -67,19 +67,17 @@ CASES = {
         {"action__weakest": [0.001, -0.002] * 4, "action__effect": [0.5] * 8},
         {"action__weakest": [0.3] + [0.001] * 7, "action__effect": [0.5] * 8},
     ),
-    "action-half": (
-        {"action__half": [0.001, -0.002] * 4, "action__effect": [0.5] * 8},
-        {"action__half": [0.3] + [0.001] * 7, "action__effect": [0.5] * 8},
+    "action-half": ({"action__half": [0.001, 0.0] * 4}, {"action__half": [0.3] + [0.001] * 7}),
+    "q-unfollowed": (
+        {"algorithm": "td3", "action__preferred": [0.5] * 8, "reward__largest": [1.0] * 8, "steps": 30_000},
+        {"algorithm": "td3", "action__preferred": [0.5] * 8, "reward__largest": [0.0] * 8, "steps": 30_000},
     ),
     "steps-short": ({"observation__pace": [0.01] * 5 + [0.1] * 3}, {"observation__pace": [0.01] * 3 + [0.1] * 5}),
     "exploration-still": (
         {"algorithm": "pqn", "epsilon": [1.0] * 8, "changed": {"final_epsilon": 0.01}},
         {"algorithm": "pqn", "epsilon": [1.0] * 7 + [0.9], "changed": {"final_epsilon": 0.01}},
     ),
-    "units-alike": (
-        {"network__rank": [1 / 64] * 8, "changed": {"hidden": [64, 64]}},
-        {"network__rank": [1 / 64] * 7 + [2 / 64], "changed": {"hidden": [64, 64]}},
-    ),
+    "units-alike": ({"network__alike": [1.0] * 8}, {"network__alike": [1.0] * 7 + [0.9]}),
     "observation-of-another": (
         {"action__beside": [0.5] * 8, "action__effect": [0.01] * 8},
         {"action__beside": [0.5] * 8, "action__effect": [0.4] * 8},
@@ -419,7 +417,7 @@ def test_returns_that_have_arrived_rise_no_more():
 
 def test_a_policy_that_descends_q_is_named():
     assert names("td3", action__preferred=[0.5] * 3 + [0.2] * 5, steps=30_000) == ["advantage-opposed"]
-    assert names("td3", action__preferred=[0.05] * 3 + [0.5] * 5, steps=30_000) == ["advantage-unrelated"]
+    assert names("td3", action__preferred=[0.05] * 3 + [0.5] * 5, steps=30_000) == ["q-unfollowed"]
     assert names("td3", action__preferred=[0.05] * 3 + [0.5] * 5, steps=30_000, returns=RISES) == []
     assert names("td3", action__preferred=[0.05] * 3 + [0.7] * 5, steps=30_000) == []
     few = {"update_every": 128}

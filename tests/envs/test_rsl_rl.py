@@ -208,7 +208,14 @@ def test_groups_without_a_policys_are_refused():
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("num_actions", 0), ("num_actions", None), ("max_episode_length", "20"), ("num_envs", None)],
+    [
+        ("num_actions", 0),
+        ("num_actions", None),
+        ("num_actions", 2.5),
+        ("num_actions", float("inf")),
+        ("max_episode_length", "20"),
+        ("num_envs", None),
+    ],
 )
 def test_attributes_that_count_are_numbers(name, value):
     odd = Cart(8)

@@ -148,7 +148,8 @@ def test_every_learning_rate_may_have_a_schedule_with_an_end_of_its_own(algorith
         ("whole", 0.5, "whole must be a whole number, not 0.5."),
         ("word", 3, "word must be a text or None, not 3."),
         ("which", "c", "which must be one of a, b or a number, not 'c'."),
-        ("words", 3, "words must be several names, such as ('name',), not 3."),
+        ("words", 3, "words must be several names, such as ('name', 'other'), not 3."),
+        ("words", "a:b,c:d", "words must be several names, such as ('name', 'other'), not 'a:b,c:d'."),
         ("words", [3], "words must be a text, not 3."),
         ("arguments", "x", "arguments must be a dictionary, such as {'gravity': -5}, not 'x'."),
         (

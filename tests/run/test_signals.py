@@ -33,7 +33,7 @@ from lemniscate.run.signals import (
     paid_before,
     signals,
 )
-from lemniscate.spec import Box, Discrete, ObservationPart, Spec
+from lemniscate.spec import Box, Discrete, MultiDiscrete, ObservationPart, Spec
 from lemniscate.types import Rollout, Transition
 
 B, O, A = 400, 3, 2
@@ -259,9 +259,39 @@ def test_actions_of_a_sign_without_effect_explain_nothing():
     moved[:, :A] += action
     assert half(moved) > 0.9
     moved[:, :A] -= action.clamp(max=0)
-    assert half(moved) < 0.05
+    assert half(moved) < 0.02
     moved[:, 1] += action[:, 1].clamp(max=0)  # of one number they have an effect
     assert half(moved) > 0.9
+    by_sign = rows(obs=obs, action=action, next_obs=obs + action.sign() @ torch.eye(A, O))
+    assert of_effects(by_sign, spec_of())["action/half"] > 0.5
+    positive = rows(obs=obs, action=action.abs(), next_obs=obs + action.abs() @ torch.eye(A, O))
+    assert "action/half" not in of_effects(positive, spec_of())
+
+
+def test_the_time_is_no_servo():
+    """An observation that drifts within an episode is explained by no sum of choices, which add up to the time."""
+    steps, envs = 120, 4
+    action = torch.from_numpy(np.random.default_rng(0).integers(0, 3, (steps, envs)))
+    done = (torch.arange(steps) % 20 == 19)[:, None].expand(steps, envs)
+    obs = 0.01 * numbers(steps, envs, O).float()
+    drift = (torch.arange(steps) % 20)[:, None, None] * torch.ones(1, envs, O)
+    whole = {"obs": obs, "next_obs": obs + drift, "action": action, "reward": torch.zeros(steps, envs)}
+    drifting = Rollout(**whole, terminated=done, truncated=done & ~done, valid=torch.ones_like(done))
+    assert late_effect(drifting, spec_of(Discrete(3))).item() < 0.15
+
+
+@pytest.mark.filterwarnings("error")
+def test_one_step_episodes_have_signals():
+    obs = numbers(B, O).float()
+    found = of_effects(rows(obs=obs, terminated=torch.ones(B, dtype=torch.bool)), spec_of())
+    assert "observation/pace" not in found
+
+
+def test_of_several_choices_at_once_none_are_compared():
+    obs, action = numbers(B, O).float(), torch.randint(0, 2, (B, 2), generator=torch.Generator().manual_seed(0))
+    moved = obs + (action[:, :1] + 2 * action[:, 1:])
+    found = of_effects(rows(obs=obs, action=action, next_obs=moved), spec_of(MultiDiscrete((2, 2), (0, 0))))
+    assert "action/alike" not in found
 
 
 def test_two_choices_that_do_the_same_are_alike():
@@ -337,6 +367,20 @@ def test_the_rank_is_that_of_the_features():
         layer.bias.zero_()
     found = of_networks(SimpleNamespace(policy=Policy(nn.Sequential(layer, nn.Tanh()), NoNorm(O))), rows())
     assert found["network/rank"] == 1 / 8
+
+
+def test_units_that_begin_with_one_number_are_alike():
+    layer = nn.Linear(O, 8)
+
+    def alike(weights):
+        with torch.no_grad():
+            layer.weight.copy_(weights)
+            layer.bias.zero_()
+        return of_networks(SimpleNamespace(policy=Policy(nn.Sequential(layer, nn.Tanh()), NoNorm(O))), rows())
+
+    assert alike(torch.full((8, O), 0.1))["network/alike"] == 1
+    assert alike(torch.arange(8.0)[:, None] * torch.ones(O))["network/alike"] == 1 / 8  # of rank 1, too
+    assert "network/alike" not in alike(torch.zeros(8, O))
 
 
 def test_a_normalizer_that_is_behind_shows_its_offset():

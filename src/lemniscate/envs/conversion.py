@@ -14,6 +14,7 @@ from torch import Tensor
 from lemniscate.envs.returns import (
     MASKS,
     Returns,
+    as_array,
     author,
     flat_mask,
     kind_of,
@@ -143,23 +144,25 @@ def measured(
 ) -> dict[str, Tensor]:
     """The numbers [N] float32 in the info of a vector environment; NaN where an environment gave none.
 
-    Measures, `declared`, have their names; the others "info/" before it. `info[name]`, a dictionary as a whole, counts
-    where `info["_" + name]` is True. Where an environment was reset in the same step, its true info is in
-    `info["final_info"]`.
+    Measures, `declared`, have their names; the others "info/" before it. `info[name]` counts where `info["_" + name]`
+    is True; what a dictionary holds, where its own mask is, or else that of the dictionary. Where an environment was
+    reset in the same step, its true info is in `info["final_info"]`.
     """
     found: dict[str, Tensor] = {}
     final = info.get("final_info")  # of what is no vector environment it may be anything
-    for source in (info, final) if isinstance(final, Mapping) else (info,):
-        for key, values, given in _columns(source):
+    sources = [(info, None), *([(final, info.get("_final_info"))] if isinstance(final, Mapping) else [])]
+    for source, outer in sources:
+        for key, values, given in _columns(source, outer=outer):
             if values.dtype.kind not in "biuf" or values.size != num_envs:
                 if key in declared:
                     raise UserError(f"info[{key!r}] is {kind_of(values)}; a measure is a number for each environment.")
                 continue
             numbers = torch.from_numpy(values.reshape(num_envs).astype(np.float32)).to(device)
             name = key if key in declared else f"info/{key}"
-            if given is not None and not given.all():
+            mask = as_array(given)
+            if mask.shape == (num_envs,) and mask.dtype == bool and not mask.all():
                 before = found.get(name, torch.full((num_envs,), torch.nan, device=device))
-                numbers = torch.where(torch.from_numpy(np.asarray(given)).to(device), numbers, before)
+                numbers = torch.where(torch.from_numpy(mask).to(device), numbers, before)
             found[name] = numbers
     return found
 

@@ -169,7 +169,7 @@ class RslRlBackend(Backend):
             number = float(torch.as_tensor(value).max())
         except (TypeError, ValueError, RuntimeError):
             number = math.nan
-        if not number >= 1:
+        if not number >= 1 or (number % 1 and name != "max_episode_length"):
             raise UserError(f"{name} of {env} is {kind_of(value)}; it must be a whole number from 1.")
         return number
 
@@ -181,8 +181,8 @@ class RslRlBackend(Backend):
     def _logged(self, extras: Mapping[str, Any]) -> dict[str, Tensor]:
         """The means of what numbers a log has, each the same in all rows."""
         rows, found = self.counts.float(), {}
-        name = next((name for name in ("log", "episode") if extras.get(name) is not None), "log")
-        for key, value in self._dictionary(f"extras[{name!r}]", extras.get(name)).items():
+        logs = [self._dictionary(f"extras[{name!r}]", extras.get(name)) for name in ("log", "episode")]
+        for key, value in next(filter(len, logs), {}).items():
             with suppress(TypeError, ValueError, RuntimeError):  # what is no number is not measured
                 mean = torch.as_tensor(value, dtype=torch.float32).mean().item()
                 found[f"info/{str(key).strip('/')}"] = torch.full_like(rows, mean)

@@ -97,10 +97,11 @@ def _convert(value: Any, option: Any) -> Any:
         return read(value, basic, *(mark for mark in marks if isinstance(mark, Range)))
     if kind is Literal and value not in get_args(option):
         raise ValueError(f"one of {', '.join(map(str, get_args(option)))}")
-    if kind is tuple and get_args(option)[0] is str and isinstance(value, str):
-        return (value,)
     if kind is tuple:
-        example = (value if isinstance(value, str) else "name",) if get_args(option)[0] is str else (64, 64)
+        words = get_args(option)[0] is str
+        if words and isinstance(value, str) and "," not in re.sub(r"\(.*\)", "", value):  # one alone
+            return (value,)
+        example = ("name", "other") if words else (64, 64)
         raise ValueError(f"several {'numbers' if example == (64, 64) else 'names'}, such as {example}")
     if kind in WANTED and not isinstance(value, kind):
         raise ValueError(WANTED[kind])

@@ -35,6 +35,8 @@ FEW = 40
 """rows of a choice below which it is not compared with others"""
 MOST_CHOICES = 6
 """choices up to which each two are compared"""
+MOST_ROWS = 4096
+"""rows to which lines are fitted"""
 MOST_NUMBERS = 32
 """numbers of an observation up to which lines are fitted to them; for more there are too few rows"""
 UNITS = (*ACTIVATIONS.values(), nn.Tanh, nn.GELU, nn.LeakyReLU)
@@ -58,10 +60,11 @@ def signals(
 
 def of_environment(rows: Rollout, spec: Spec) -> dict[str, float]:
     """The signals of rows [T, N, …] alone, two of which are valid at least."""
-    chosen = rows[rows.valid]
-    found = of_rows(chosen, spec) | of_time(rows) | of_starts(rows, spec)
+    found = of_rows(rows[rows.valid], spec) | of_time(rows) | of_starts(rows, spec)
     if not spec.has_images and spec.observation_size <= MOST_NUMBERS:
-        found |= of_effects(chosen, spec)
+        few = slice(max(2, MOST_ROWS // len(rows.done)))  # of the environments
+        rows = Rollout(**{name: column[:, few] for name, column in vars(rows).items()})
+        found |= of_effects(rows[rows.valid], spec)
         if found["reward/explained"] < 0.8 and found["reward/std"] > 0:  # else no other row has more to explain
             found["reward/before"] = paid_before(rows, spec, found["reward/explained"])
         if found["action/effect"] < 0.2:
@@ -132,8 +135,8 @@ def of_effects(rows: Rollout, spec: Spec) -> dict[str, Tensor]:
     the observation of which it is most: as a share of what those left to explain, and of all; and of the rewards the
     same. A reward may be a square too, of a distance or of an action. Also the share of the next observations that
     these explain, on average; what the signs of actions explain beyond all this; what that number of an action explains
-    of which it is least, and actions of that sign; what it explains which of two choices was made, of those alike most;
-    and the root mean square of a change over the standard deviation, in that number which moves most.
+    of which it is least; what actions of one sign explain, over the other; what it explains which of two choices was
+    made, of those alike most; and the root mean square of a change over the standard deviation, where most.
     """
     obs, after = (x[:, : spec.observation_size].cpu().double() for x in (rows.obs, rows.next_obs))
     action, inside = _numbers(rows.action.cpu(), spec.action), ~rows.done.cpu()
@@ -151,29 +154,29 @@ def of_effects(rows: Rollout, spec: Spec) -> dict[str, Tensor]:
         found["action/by_sign"] = explained_by(action.sign()[inside], change, known).nan_to_num().max()
         if action.shape[1] > 1:
             found["action/weakest"] = explained_by_each(known, change)[obs.shape[1] :].nan_to_num().amax(1).min()
-        found["action/half"] = torch.stack([_of_sign(sign, known, change, obs.shape[1]) for sign in (1, -1)]).min()
-    elif action.shape[1] <= MOST_CHOICES:
+        found |= _weaker_half(known, change, obs.shape[1])
+    elif isinstance(spec.action, Discrete) and spec.action.n <= MOST_CHOICES:
         found |= _choices_alike(action[inside], change, obs[inside])
-    still = obs[inside].std(0) < 1e-9
-    if not still.all():
-        found["observation/pace"] = (change.square().mean(0).sqrt() / obs[inside].std(0))[~still].max()
+    std = obs[inside].std(0) if inside.sum() > 1 else obs[0] * 0
+    if (std > 1e-9).any():
+        found["observation/pace"] = (change.square().mean(0).sqrt() / std)[std > 1e-9].max()
     if not ((obs == 0) | (obs == 1)).all():  # one of n says nothing of the next
         found["observation/predicted"] = explained_by(obs[inside], after[inside], nothing[inside]).mean()
     return found
 
 
-def _of_sign(sign: int, known: Tensor, change: Tensor, size: int) -> Tensor:
-    """What a number of the action explains of the change beside the others, where it has a sign; the most of all.
+def _weaker_half(known: Tensor, change: Tensor, size: int) -> dict[str, Tensor]:
+    """What actions of one sign explain of the change, over what those of the other do, in the number where most.
 
-    Of rows `known` [B, O + A], the first O of them, `size`, the observations.
+    Of rows `known` [B, O + A], the first O of them, `size`, the observations; nothing where neither explains much, or
+    where a sign is rare.
     """
-    found = [torch.zeros((), dtype=known.dtype)]
-    for column in range(size, known.shape[1]):
-        rows = known[:, column] * sign > 0
-        own = known[rows, column : column + 1]
-        others = torch.cat([known[rows, :column], known[rows, column + 1 :]], dim=-1)
-        found.append(explained_by(own, change[rows], others).nan_to_num().max())
-    return torch.stack(found).max()
+    obs, action = known[:, :size], known[:, size:]
+    if min((action > 0).any(1).sum(), (action < 0).any(1).sum()) < FEW:
+        return {}
+    halves = torch.cat([obs, action.clamp(min=0), action.clamp(max=0)], dim=-1)
+    weak, strong = explained_by_each(halves, change)[size:].nan_to_num().view(2, -1).amax(1).sort().values
+    return {"action/half": weak.clamp(min=0) / strong} if strong > 0.1 else {}
 
 
 def _choices_alike(action: Tensor, change: Tensor, obs: Tensor) -> dict[str, Tensor]:
@@ -202,17 +205,14 @@ def late_effect(rows: Rollout, spec: Spec) -> Tensor:
         one = (ended[steps:] == ended[:-steps]) & (rows.valid & ~rows.done).cpu()[steps:]
         change = (after - obs)[steps:][one]
         found.append(explained_by(action[:-steps][one], change, obs[steps:][one]).nan_to_num().max())
-    total, before, done, inside = (
-        torch.zeros_like(action[0]),
-        list[Tensor](),
-        rows.done.cpu(),
-        (rows.valid & ~rows.done).cpu(),
-    )
-    for t in range(len(action)):
-        before.append(total)
-        total = (total + action[t]) * ~done[t, :, None]
-    of_all = explained_by(torch.stack(before)[inside], (after - obs)[inside], obs[inside])
-    return torch.stack([*found, of_all.nan_to_num().max()]).max()
+    valid = rows.valid.cpu()
+    moved = ((action - action[valid].mean(0)) * valid[..., None]).cumsum(0)  # less their mean, which tells the time
+    begins = torch.cat([torch.ones_like(valid[:1]), ended.diff(dim=0) > 0])
+    first = torch.where(begins, torch.arange(len(valid))[:, None], 0).cummax(0).values[..., None].expand_as(moved)
+    before = torch.cat([torch.zeros_like(moved[:1]), moved[:-1]])
+    inside, sums = valid & ~rows.done.cpu(), before - before.gather(0, first)
+    found.append(explained_by(sums[inside], (after - obs)[inside], obs[inside]).nan_to_num().max())
+    return torch.stack(found).max()
 
 
 def effect_beside(rows: Rollout, spec: Spec) -> Tensor:
@@ -263,7 +263,7 @@ def _numbers(action: Tensor, kind: Action) -> Tensor:
 
 
 def of_networks(state: Any, rows: Rollout) -> dict[str, Tensor]:
-    """Of the policy: the shares of hidden units that never change and that are at ±1, its rank, its normalizer's state.
+    """Of the policy: shares of units that never change, are at ±1, and are alike; its rank, its normalizer's state.
 
     Inactive is a unit whose standard deviation over rows is below a fortieth of its layer's mean, as the dormant units
     of Sokar et al. 2023, arXiv:2302.12902, definition 3.1; a unit at a bound of tanh counts too. The rank is the
@@ -285,6 +285,8 @@ def of_networks(state: Any, rows: Rollout) -> dict[str, Tensor]:
         found["network/saturated"] = (
             torch.cat([(unit.abs() > 0.97) & (unit.abs() <= 1) for unit in units], 1).float().mean()
         )
+        if units[-1].shape[1] > 3 and units[-1].std(0).max() > 0:
+            found["network/alike"] = (units[-1] - units[-1][:, :1]).abs().amax(0).le(1e-5).float().mean()
         found["network/inactive"] = torch.cat(inactive).float().mean()
         found["network/rank"] = ((sizes < 0.99 * sizes[-1]).sum() + 1) / min(units[-1].shape)
     if isinstance(normalizer := state.policy.normalizer, RunningNorm):
