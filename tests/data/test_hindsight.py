@@ -191,6 +191,9 @@ def test_checkpoints_that_cut_every_episode_are_refused(tmp_path):
     limit = ("gymnasium.wrappers:TimeLimit(max_episode_steps=50)",)
     with pytest.raises(UserError, match=r"checkpoint_every 64 is less than an episode .*: it must be 100 at least"):
         lem.train("sac", "environments:Walk", run=tmp_path / "r", wrappers=limit, checkpoint_every=64, **SMALL)
+    alone = SMALL | {"num_envs": 1, "evaluate_every": 40}  # in the same environment, which exists once
+    with pytest.raises(UserError, match=r"evaluate_every 40 is less .* which an evaluation cuts.*: it must be 50 at"):
+        lem.train("sac", "environments:Walk", run=tmp_path / "r", wrappers=limit, **alone)
     assert not (tmp_path / "r").exists()
 
 

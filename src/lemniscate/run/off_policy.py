@@ -7,6 +7,7 @@ import torch
 
 from lemniscate.data.hindsight import LONGEST, HindsightReplay
 from lemniscate.data.replay import ActionNoise, Kind, ReplayBuffer, bytes_per_transition
+from lemniscate.envs import registry
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError
 from lemniscate.nn.networks import Activation, Layers, Matmul
@@ -144,11 +145,14 @@ class OffPolicyConfig(RunConfig):
         if self.replay == "uniform":
             return ReplayBuffer(spec, self.capacity, device)
         least = self.num_envs * min(spec.max_episode_steps or 0, LONGEST)
-        if 0 < self.checkpoint_every < least:
-            raise UserError(
-                f"checkpoint_every {self.checkpoint_every:,} is less than an episode of each environment, which a"
-                f" checkpoint cuts, and hindsight stores whole ones: it must be {least:,} at least."
-            )
+        once = self.backend and registry.backend_class(self.backend).exists_once(self.env, self.num_envs)
+        for field in ("checkpoint_every", "evaluate_every") if once else ("checkpoint_every",):
+            if 0 < (every := getattr(self, field)) < least:
+                cut = f"which a{'n evaluation' if field == 'evaluate_every' else ' checkpoint'} cuts"
+                raise UserError(
+                    f"{field} {every:,} is less than an episode of each environment, {cut}, and hindsight stores whole"
+                    f" ones: it must be {least:,} at least."
+                )
         copies = {"num_envs": self.num_envs, "goals": self.hindsight_goals, "seed": self.seed}
         return HindsightReplay(spec, self.capacity, device, **copies)
 
