@@ -7,7 +7,7 @@ import torch
 from torch import nn
 
 import lemniscate as lem
-from helpers import long, require_in_own_process
+from helpers import COMPILERS, long, require_in_own_process
 from lemniscate.algos import ALGORITHMS, ppo
 from lemniscate.run import checkpoint
 from lemniscate.testing import ALGORITHM_CONTRACT, check_learning, check_resume
@@ -156,10 +156,11 @@ def test_in_a_network_of_ones_own_what_is_frozen_stays_and_the_rest_learns(algor
     frozen_stays(algorithm, compile="off")
 
 
+@pytest.mark.parametrize("compiler", COMPILERS)
 @pytest.mark.parametrize("algorithm", ["sac", *long("ppo", "trpo", "reppo", "td3")])
-def test_the_same_compiled_on_two_shards(algorithm):
+def test_the_same_compiled_on_two_shards(algorithm, compiler):
     """Each optimizer's descent is a program of its own: their vectors differ in length."""
-    require_in_own_process(__name__, f"frozen_stays({algorithm!r}, compile='on')")
+    require_in_own_process(__name__, f"frozen_stays({algorithm!r}, compile='on')", compiler)
 
 
 TINY = {"env": "CartPole-v1", "num_envs": 2, "num_steps": 8, "minibatch_size": 8, "hidden": (4,), "progress": False}
