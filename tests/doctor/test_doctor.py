@@ -444,6 +444,8 @@ def test_rollouts_of_a_few_steps_are_named_however_many_environments_there_are()
 def test_two_choices_that_do_the_same_are_named():
     assert names(action__alike=[0.001] * 8, action__effect=[0.5] * 8) == ["action-part"]
     assert names(action__alike=[0.001] + [0.05] * 7, action__effect=[0.5] * 8) == []
+    assert names(action__alike=[0.001] * 8, action__effect=[0.01] * 8) == ["action-without-effect"]
+    assert names(action__alike=[0.001] * 8, action__effect=[0.5] * 8, returns=RISES) == []
 
 
 def test_a_value_of_one_reward_is_named_where_all_rewards_are_one():

@@ -196,10 +196,12 @@ def of_parts_of_actions(e: Evidence) -> Seen:
             f"How observations change, actions of one sign explain by {np.median(half):.1%} of what those of the other"
             " explain.",
         )
-    if len(alike) >= 3 and alike[first].max() < 0.004 and np.median(effects[first]) > 0.02 and not e.rose:
+    share = np.median(alike[:3] / effects[:3]) if min(len(alike), len(effects)) >= 3 else 1.0  # while all are tried
+    if share < 0.03 and np.median(effects[:3]) > 0.02 and not e.rose:
         yield (
             "action-part",
-            f"Which of two choices is made explains {max(0.0, alike[first].max()):.2%} of how observations change.",
+            f"Which of two choices is made explains {max(0.0, np.median(alike[:3])):.2%} of how observations change,"
+            f" all together {np.median(effects[:3]):.0%}.",
         )
     if by_sign > 0.5:
         yield (
