@@ -8,6 +8,7 @@ the learner. The others are told in `docs/doctor.md`.
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from types import SimpleNamespace
 from typing import Any
 from unittest.mock import patch
 
@@ -115,14 +116,13 @@ def _no_gradient_of_q() -> Iterator[None]:
             self.policy = policy
 
         def __call__(self, obs: Tensor) -> Any:
-            distribution, sample = self.policy(obs), self.policy(obs).sample_with_log_prob
+            distribution = self.policy(obs)
 
             def detached(noise: Tensor) -> tuple[Tensor, Tensor]:
-                action, log_prob = sample(noise)
+                action, log_prob = distribution.sample_with_log_prob(noise)
                 return action.detach(), log_prob
 
-            distribution.sample_with_log_prob = detached
-            return distribution
+            return SimpleNamespace(sample_with_log_prob=detached)
 
     def wrong(state: Any, policy: Any, *batch: Any) -> Any:
         return right(state, Detached(policy), *batch)  # pyright: ignore[reportArgumentType]
