@@ -445,12 +445,12 @@ def test_two_choices_that_do_the_same_are_named():
     assert names(action__alike=[0.001] * 8, action__effect=[0.5] * 8) == ["action-part"]
     assert names(action__alike=[0.001] + [0.05] * 7, action__effect=[0.5] * 8) == []
     assert names(action__alike=[0.001] * 8, action__effect=[0.01] * 8) == ["action-without-effect"]
-    assert names(action__alike=[0.001] * 8, action__effect=[0.5] * 8, returns=RISES) == []
 
 
 def test_a_value_of_one_reward_is_named_where_all_rewards_are_one():
     far = {"value__missing": [6.0] + [95.0] * 7, "explained_variance": [-29.0] * 8}
     assert names(reward__std=[0.0] * 8, **far) == ["missing-bootstrap"]
+    assert names(reward__std=[0.0] * 8, advantage__followed=[-0.02, 0.02] * 4, **far) == ["missing-bootstrap"]
 
 
 def test_a_policy_that_is_still_because_it_has_collapsed_is_named_so():

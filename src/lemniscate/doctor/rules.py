@@ -197,7 +197,7 @@ def of_parts_of_actions(e: Evidence) -> Seen:
             " explain.",
         )
     share = np.median(alike[:3] / effects[:3]) if min(len(alike), len(effects)) >= 3 else 1.0  # while all are tried
-    if share < 0.03 and np.median(effects[:3]) > 0.02 and not e.rose:
+    if share < 0.03 and np.median(effects[:3]) > 0.02:
         yield (
             "action-part",
             f"Which of two choices is made explains {max(0.0, np.median(alike[:3])):.2%} of how observations change,"
@@ -408,7 +408,7 @@ def of_advantages(e: Evidence) -> Seen:
             "advantage-opposed",
             f"The probabilities of actions fall with their advantage: the correlation is {followed.mean():.2f}.",
         )
-    elif errors <= 2 and not ignored and followed.mean() <= 0.04 and moves:
+    elif errors <= 2 and not ignored and followed.mean() <= 0.04 and moves and not abs(missing) > 40:  # else V is wrong
         yield (
             "advantage-unrelated",
             f"Changes of log π and advantages have a correlation of {followed.mean():.2f}: none.",
