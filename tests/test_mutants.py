@@ -1050,6 +1050,13 @@ MUTANTS = [
         HINDSIGHT + "each_episode_is_stored_as_it_was_and_with_goals_that_were_reached_later",
     ),
     (
+        "a reward at the edge of a threshold ends a run",
+        "data/hindsight.py",
+        "if not right.all() else ():",
+        "if False else ():",
+        HINDSIGHT + "a_reward_at_the_edge_of_a_threshold_may_differ_by_rounding",
+    ),
+    (
         "goals that were achieved at the beginning are told",
         "data/hindsight.py",
         "[new[later]]",
@@ -1073,8 +1080,8 @@ MUTANTS = [
     (
         "rewards that a wrapper changes go unnoticed",
         "data/hindsight.py",
-        "if len(wrong):",
-        "if False:",
+        "        if not right.all():\n            step",
+        "        if False:\n            step",
         HINDSIGHT + "a_wrapper_that_changes_rewards_is_found_out",
     ),
     (

@@ -290,6 +290,38 @@ class LateBonus(gym.Wrapper):
         return obs, reward if self.steps < 40 else 2 * reward, *rest
 
 
+def test_a_reward_at_the_edge_of_a_threshold_may_differ_by_rounding():
+    """The environment has float64, and the buffer float32: of places at 0.5 m of a goal these know more or less."""
+    rng = np.random.default_rng(0)
+    goal = rng.uniform(-8, 8, 100_000)
+    place = goal + 0.5 + rng.uniform(-1e-7, 1e-7, goal.shape)
+
+    def reward(place, goal):
+        return np.where(np.abs(place.astype(np.float64) - goal.astype(np.float64)) < 0.5, 0.0, -1.0)
+
+    near = np.flatnonzero(reward(place, goal) != reward(np.float32(place), np.float32(goal)))[:20]
+    assert len(near) == 20
+    parts = tuple(ObservationPart((name,), (1,)) for name in ("achieved_goal", "desired_goal"))
+
+    def judge(achieved, desired):
+        return torch.from_numpy(reward(achieved.numpy()[:, 0], desired.numpy()[:, 0])).float(), torch.zeros(
+            len(achieved)
+        ) > 0
+
+    def store(shift):
+        replay = HindsightReplay(Spec("x", parts, Box((-1.0,), (1.0,)), 1), 100, CPU, num_envs=1, goals=1, seed=0)
+        replay.on_restart(judge)
+        for i in near:
+            obs = torch.tensor([[place[i] + shift, goal[i]]], dtype=torch.float32)
+            paid = torch.from_numpy(reward(place[i : i + 1], goal[i : i + 1])).float()
+            flags = torch.tensor([False]), torch.tensor([True]), torch.tensor([True])
+            replay.add(obs, torch.zeros(1, 1), Step(obs, obs, paid, *flags))
+
+    store(0.0)
+    with pytest.raises(UserError, match="hindsight needs rewards that follow"):
+        store(0.01)
+
+
 def test_a_wrapper_that_changes_rewards_later_is_found_out_too(tmp_path):
     with pytest.raises(UserError, match=r"the reward of .* is -2, and its compute_reward says -1: hindsight needs"):
         lem.train("sac", Walk, run=tmp_path / "r", wrappers=[LateBonus], progress=False, **SMALL)

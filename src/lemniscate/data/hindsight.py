@@ -69,8 +69,7 @@ class HindsightReplay(ReplayBuffer):
         """Each transition t k times at most, with goals achieved after steps drawn uniformly from t, …, T − 1."""
         assert self._judge is not None
         length = len(episode.reward)
-        reward, _ = self._judge(episode.next_obs[:, self._achieved], episode.next_obs[:, self._desired])
-        self._compare(episode.reward, reward)
+        self._compare(episode)
         times = np.repeat(np.arange(length), self._goals)
         later = np.random.default_rng((self._seed, self._written)).integers(times, length)
         goals, start = episode.next_obs[:, self._achieved], episode.obs[:1, self._achieved]
@@ -82,15 +81,25 @@ class HindsightReplay(ReplayBuffer):
             obs[:, self._desired] = goal
         return replace(copies, reward=reward, terminated=ends | copies.terminated)  # the last step has no later goal
 
-    def _compare(self, given: Tensor, judged: Tensor) -> None:
-        """Raise `UserError` where the judge does not give the rewards that an episode had."""
-        wrong = torch.nonzero(~torch.isclose(given, judged, rtol=1e-4, atol=1e-5))
-        if len(wrong):
-            step = int(wrong[0])
+    def _compare(self, episode: Transition) -> None:
+        """Raise `UserError` where the judge does not give the rewards that an episode had.
+
+        Goals are float32 here, and may have been float64 there: at the edge of a threshold the judge is asked on both
+        sides of it.
+        """
+        assert self._judge is not None
+        achieved, desired = (episode.next_obs[:, columns] for columns in (self._achieved, self._desired))
+        judged = self._judge(achieved, desired)[0]
+        right = torch.isclose(episode.reward, judged, rtol=1e-4, atol=1e-5)
+        rounding = (achieved - desired).sign() * torch.maximum(achieved.abs(), desired.abs()) * 2**-21
+        for edge in (rounding, -rounding) if not right.all() else ():
+            right |= torch.isclose(episode.reward, self._judge(achieved + edge, desired)[0], rtol=1e-4, atol=1e-5)
+        if not right.all():
+            step = int(right.int().argmin())
             raise UserError(
-                f"In step {step:,} of an episode the reward of {self._env_id} is {given[step]:g}, and its"
-                f" compute_reward says {judged[step]:g}: hindsight needs rewards that follow from achieved_goal and"
-                " desired_goal alone, without wrappers that change them. --replay uniform learns from any."
+                f"In step {step:,} of an episode the reward of {self._env_id} is {episode.reward[step]:g}, and its"
+                f" compute_reward says {judged[step] + 0.0:g}: hindsight needs rewards that follow from achieved_goal"
+                " and desired_goal alone, without wrappers that change them. --replay uniform learns from any."
             )
 
 
