@@ -35,7 +35,7 @@ def wide_float(device: torch.device) -> torch.dtype:
 class Record:
     """Tensors that share their leading dimensions."""
 
-    def __getitem__(self, rows: Tensor | slice) -> Self:
+    def __getitem__(self, rows: Tensor | slice | tuple[slice, slice]) -> Self:
         return type(self)(*(tensor[rows] for tensor in vars(self).values()))
 
     def flatten(self) -> Self:

@@ -6,7 +6,8 @@ outside their usual range, which is in their help, are in `settings.toml`. A met
 every comparison is false.
 
 The thresholds were chosen on one half of the runs with injected faults of `benchmarks/doctor.py`, six of them with a
-look at the other half: `docs/doctor.md` has how often all this is right.
+look at the other half; those of later rules on the faults that outsiders injected. `docs/doctor.md` has how often all
+this is right.
 """
 
 import re
@@ -193,8 +194,8 @@ def of_parts_of_actions(e: Evidence) -> Seen:
     if len(half) >= 3 and half[first].max() < 0.1 and np.median(half) < 0.05:
         yield (
             "action-half",
-            f"How observations change, actions of one sign explain by {np.median(half):.1%} of what those of the other"
-            " explain.",
+            f"Actions of one sign explain {np.median(half):.1%} of what those of the other explain of how observations"
+            " change.",
         )
     share = np.median(alike[:3] / effects[:3]) if min(len(alike), len(effects)) >= 3 else 1.0  # while all are tried
     if share < 0.03 and np.median(effects[:3]) > 0.02:
@@ -338,7 +339,7 @@ def of_updates(e: Evidence) -> Seen:
     if kl > (2 * target if target else 0.1):
         beside = f"{kl / target:.0f} times its target of {target:g}" if target else "and 0.003 to 0.03 is usual"
         yield "kl-too-large", f"The KL divergence of the late updates is {kl:.2g}, {beside}."
-    if kl < 1e-6 and not e.rose and not e.collapsed:
+    if kl < 1e-6 and not e.rose and not e.spread_left >= 0:
         yield "policy-still", f"The KL divergence of the late updates is {kl:.1g}: the policy hardly moves."
     elif e.greatest("network/moved") == 0:
         yield "policy-still", "No update that was looked at changed a parameter of the policy."
@@ -348,17 +349,14 @@ def of_updates(e: Evidence) -> Seen:
 
 def of_exploration(e: Evidence) -> Seen:
     """Faults of exploration: the policy's spread, and random play."""
-    std, entropy = e.values("policy_std"), e.values("losses/entropy")
-    spread, name = (std, "standard deviation") if len(std) else (entropy, "entropy")
-    chosen = {"initial_temperature", "min_temperature"} & set(e.config)  # SAC and REPPO choose their entropy
-    first, late = e.early("policy_std"), e.late("policy_std")
+    entropy, first, late = e.values("losses/entropy"), e.early("policy_std"), e.late("policy_std")
     starts, total = e.config.get("learning_starts"), e.config.get("total_steps")
     target = first_number(e.config.get("target_entropy"))
-    if e.collapsed and not chosen:
-        left = spread[[len(spread) // 4, len(spread) // 2]].min() / spread[0]
+    if e.spread_left >= 0:
+        name = "standard deviation" if first >= 0 else "entropy"
         yield (
             "entropy-collapsed",
-            f"In the first half of the run the policy's {name} fell to {max(0.0, left):.0%} of what it was.",
+            f"In the first half of the run the policy's {name} fell to {e.spread_left:.0%} of what it was.",
         )
     epsilon, final = e.values("epsilon"), last_number(e.config.get("final_epsilon"))
     if len(epsilon) >= 4 and np.ptp(epsilon) == 0 and final is not None and abs(epsilon[0] - final) > 0.01:

@@ -146,12 +146,12 @@ class OffPolicyConfig(RunConfig):
             return ReplayBuffer(spec, self.capacity, device)
         least = self.num_envs * min(spec.max_episode_steps or 0, LONGEST)
         once = self.backend and registry.backend_class(self.backend).exists_once(self.env, self.num_envs)
-        for field in ("checkpoint_every", "evaluate_every") if once else ("checkpoint_every",):
+        cuts = {"checkpoint_every": "a checkpoint"} | ({"evaluate_every": "an evaluation"} if once else {})
+        for field, what in cuts.items():
             if 0 < (every := getattr(self, field)) < least:
-                cut = f"which a{'n evaluation' if field == 'evaluate_every' else ' checkpoint'} cuts"
                 raise UserError(
-                    f"{field} {every:,} is less than an episode of each environment, {cut}, and hindsight stores whole"
-                    f" ones: it must be {least:,} at least."
+                    f"{field} {every:,} is less than an episode of each environment, which {what} cuts, and hindsight"
+                    f" stores whole ones: it must be {least:,} at least."
                 )
         copies = {"num_envs": self.num_envs, "goals": self.hindsight_goals, "seed": self.seed}
         return HindsightReplay(spec, self.capacity, device, **copies)

@@ -1,6 +1,7 @@
 """Signals: measurements of a run's newest rows and of its networks, from which `lemniscate doctor` reads what is wrong.
 
-They are taken some thirty times in a run, and cost less than a hundredth of it. Nothing learns from them.
+They are taken some thirty times in a run, and cost a hundredth of one of some seconds, less of longer ones. Nothing
+learns from them.
 """
 
 from collections.abc import Mapping
@@ -36,7 +37,7 @@ FEW = 40
 MOST_CHOICES = 6
 """choices up to which each two are compared"""
 MOST_ROWS = 4096
-"""rows to which lines are fitted"""
+"""rows to which lines are fitted at most"""
 MOST_NUMBERS = 32
 """numbers of an observation up to which lines are fitted to them; for more there are too few rows"""
 UNITS = (*ACTIVATIONS.values(), nn.Tanh, nn.GELU, nn.LeakyReLU)
@@ -63,7 +64,7 @@ def of_environment(rows: Rollout, spec: Spec) -> dict[str, float]:
     found = of_rows(rows[rows.valid], spec) | of_time(rows) | of_starts(rows, spec)
     if not spec.has_images and spec.observation_size <= MOST_NUMBERS:
         few = slice(max(2, MOST_ROWS // len(rows.done)))  # of the environments
-        rows = Rollout(**{name: column[:, few] for name, column in vars(rows).items()})
+        rows = rows[:, few]
         found |= of_effects(rows[rows.valid], spec)
         if found["reward/explained"] < 0.8 and found["reward/std"] > 0:  # else no other row has more to explain
             found["reward/before"] = paid_before(rows, spec, found["reward/explained"])
