@@ -443,6 +443,7 @@ def test_who_names_no_algorithm_gets_the_recommended_one_and_is_told_why(tmp_pat
         (["train", "ppo", "--lr", "1"], "There is no --lr: here it is --learning-rate."),
         (["train", "sac", "--lr", "1"], "There is no --lr: here it is --actor-learning-rate or --critic-learning-rate."),
         (["train", "ppo", "--batch-size=32"], "There is no --batch-size: here it is --minibatch-size."),
+        (["train", "ppo", "--env", "x", "--qqqq", "1"], "There is no field '--qqqq': `lemniscate train ALGO --help` lists them."),
         (["train", "ppo,sac", "--polyak", "1"], "ppo: There is no field '--polyak'"),
         (["train", "sac", "--polyak", "1"], "There is no --polyak: here it is --tau (theirs: 1 − tau)."),
         (["train", "ppo", "--total_timesteps", "1"], "There is no --total-timesteps: here it is --total-steps."),

@@ -459,6 +459,12 @@ def test_a_policy_that_is_still_because_it_has_collapsed_is_named_so():
     ]
 
 
+def test_an_entropy_that_the_algorithm_chooses_has_not_collapsed():
+    assert "entropy-collapsed" in names(policy_std=[1.0, 0.5] + [0.01] * 6)
+    assert "entropy-collapsed" not in names("reppo", policy_std=[1.0, 0.5] + [0.01] * 6)
+    assert "policy-still" in names("reppo", policy_std=[1.0, 0.5] + [0.01] * 6, approx_kl=[0.01] * 3 + [0.0] * 5)
+
+
 def test_slow_steps_come_before_rewards_that_time_explains():
     assert names(observation__pace=[0.01] * 8, reward__by_time=[0.95] * 8) == ["steps-short"]
 

@@ -240,6 +240,11 @@ def test_the_measure_of_a_last_step_is_that_before_the_reset():
     assert heights == [[1, 1], [2, 2], [3, 3], [1, 1]]
 
 
+@pytest.mark.parametrize("wrappers", [PlusOne, "environments:PlusOne", (PlusOne for _ in range(1)), [PlusOne]])
+def test_one_wrapper_alone_and_those_of_a_generator_are_a_list_of_them(wrappers):
+    assert lem.config_for("ppo", "CartPole-v1", wrappers=wrappers).wrappers == ("environments:PlusOne",)
+
+
 def test_a_vector_that_makes_one_number_is_evaluated_in_as_many(tmp_path):
     class Fixed(toy.Countdown):
         def __init__(self, num_envs):
@@ -395,6 +400,11 @@ def final(obs):
     return type("Final", (Plain,), {"step": step})
 
 
+class Lone(Plain):
+    def __init__(self):
+        super().__init__(2)
+
+
 class Twice(Plain):
     def __init__(self, num_envs):
         super().__init__(2 * num_envs)
@@ -412,6 +422,7 @@ class Seeded(Plain):
 @pytest.mark.parametrize(
     ("env", "said"),
     [
+        (Lone, "unexpected keyword argument 'num_envs'; a vector environment is made with num_envs"),
         (Twice, "Twice has 4 environments where num_envs is 2; it must make as many"),
         (Unspaced, "Unspaced has no single_action_space: set self.single_action_space in its __init__"),
         (

@@ -25,6 +25,7 @@ from lemniscate.run.signals import (
     late_effect,
     of_critics,
     of_effects,
+    of_environment,
     of_networks,
     of_rows,
     of_starts,
@@ -285,6 +286,14 @@ def test_one_step_episodes_have_signals():
     obs = numbers(B, O).float()
     found = of_effects(rows(obs=obs, terminated=torch.ones(B, dtype=torch.bool)), spec_of())
     assert "observation/pace" not in found
+
+
+def test_of_many_environments_some_are_looked_at():
+    """Of the first there are lines; those beyond `MOST_ROWS` rows change nothing of them."""
+    many = {name: torch.cat([column] * 30, 1) for name, column in vars(delayed(3)).items()}
+    other = many | {"next_obs": torch.cat([many["next_obs"][:, :60], torch.randn(200, 60, O)], 1)}
+    one, two = (of_environment(Rollout(**columns), spec_of()) for columns in (many, other))
+    assert one["action/late"] == two["action/late"] > 0.9
 
 
 def test_of_several_choices_at_once_none_are_compared():
