@@ -291,7 +291,7 @@ def test_one_step_episodes_have_signals():
 def test_of_many_environments_some_are_looked_at():
     """Of the first there are lines; those beyond `MOST_ROWS` rows change nothing of them."""
     many = {name: torch.cat([column] * 30, 1) for name, column in vars(delayed(3)).items()}
-    other = many | {"next_obs": torch.cat([many["next_obs"][:, :60], torch.randn(200, 60, O)], 1)}
+    other = many | {"next_obs": torch.cat([many["next_obs"][:, :60], numbers(200, 60, O, seed=7).float()], 1)}
     one, two = (of_environment(Rollout(**columns), spec_of()) for columns in (many, other))
     assert one["action/late"] == two["action/late"] > 0.9
 
@@ -361,6 +361,8 @@ class Policy(nn.Module):
 def test_inactive_units_are_counted(kind):
     layer = nn.Linear(O, 8)
     with torch.no_grad():
+        layer.weight.copy_(0.5 * numbers(8, O, seed=2))
+        layer.bias.zero_()
         layer.bias[:6] = -50.0  # of ReLU zero, of tanh at its bound
     found = of_networks(SimpleNamespace(policy=Policy(nn.Sequential(layer, kind()), NoNorm(O))), rows())
     assert found["network/inactive"] == 0.75
