@@ -24,7 +24,8 @@ from textwrap import fill
 import numpy as np
 from common import RESULTS, append, provenance, rows
 
-MILLION, DRONE = 1_000_000, "DroneFigureEightTrajectory-v0"
+MILLION = 1_000_000
+DRONE, BREAKOUT = "DroneFigureEightTrajectory-v0", "MinAtar/Breakout-v1"
 RUNS = {
     # algorithm: environment: (numbers of steps, seeds)
     "ppo": {
@@ -51,7 +52,12 @@ RUNS = {
         "Walker2d-v5": ((MILLION,), 10),
         "Ant-v5": ((4_500_000,), 5),
     },
-    "pqn": {"CartPole-v1": ((200_000,), 10), "Acrobot-v1": ((400_000,), 10), "LunarLander-v3": ((400_000,), 10)},
+    "pqn": {
+        "CartPole-v1": ((200_000,), 10),
+        "Acrobot-v1": ((400_000,), 10),
+        "LunarLander-v3": ((400_000,), 10),
+        BREAKOUT: ((2 * MILLION,), 10),
+    },
     "ddpg": {
         "MountainCarContinuous-v0": ((30_000,), 10),
         "Pendulum-v1": ((20_000,), 5),
@@ -78,7 +84,7 @@ def one(algorithm, env, seed, marks, runs):
     import lemniscate as lem
 
     with tempfile.TemporaryDirectory() if runs is None else nullcontext(runs) as folder:
-        path = Path(folder) / f"{algorithm}-{env}-{marks[-1]}-{seed}"
+        path = Path(folder) / f"{algorithm}-{Path(env).name}-{marks[-1]}-{seed}"
         fields = {"total_steps": marks[-1], "keep_checkpoints": 50}
         if path.exists():
             run = lem.resume(path, progress=False)
@@ -93,7 +99,8 @@ def one(algorithm, env, seed, marks, runs):
         checkpoints = sorted((run.path / "checkpoints").glob("step-*"), key=lambda path: int(path.name[5:]))
         for mark in marks:
             policy = lem.load(next(path for path in checkpoints if int(path.name[5:]) >= mark))
-            scores = lem.evaluate(policy, episodes=100, seed=0, backend=None if env == DRONE else "gymnasium")
+            backend = None if env in (DRONE, BREAKOUT) else "gymnasium"
+            scores = lem.evaluate(policy, episodes=100, seed=0, backend=backend)
             row = {
                 "algorithm": algorithm,
                 "env": env,

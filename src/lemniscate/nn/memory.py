@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from lemniscate.errors import UserError
+from lemniscate.maths import tanh
 from lemniscate.nn.networks import NETWORKS, Layers, OwnNetwork, orthogonal
 from lemniscate.spec import Spec
 from lemniscate.types import Step
@@ -184,8 +185,8 @@ class GRU(nn.Module):
 
     def step(self, prepared: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
         """[B, 3 size] and h [B, size] to the output, which is h', and h'."""
-        _, keep, _, new = _gates(prepared, self.state(memory))
-        after = torch.lerp(new, memory, keep)
+        _, keep, _, candidate = _gates(prepared, self.state(memory))
+        after = torch.lerp(torch.tanh(candidate), memory, keep)
         return after, after
 
     def over(self, prepared: Tensor, goes_on: Tensor, memory: Tensor) -> Tensor:
@@ -196,11 +197,11 @@ class GRU(nn.Module):
 
 
 def _gates(prepared: Tensor, state: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """r, z, the new memory's part in the product, and the candidate n, from both products […, 3 size]."""
+    """r, z, the new memory's part in the product, and the candidate before its tanh, from both products […, 3 size]."""
     sizes = [2 * state.shape[-1] // 3, state.shape[-1] // 3]
     (gates_x, new_x), (gates_h, new_h) = prepared.split(sizes, dim=-1), state.split(sizes, dim=-1)
     reset, keep = torch.sigmoid(gates_x + gates_h).chunk(2, dim=-1)
-    return reset, keep, new_h, torch.tanh(torch.addcmul(new_x, reset, new_h))
+    return reset, keep, new_h, torch.addcmul(new_x, reset, new_h)
 
 
 class _Pieces(torch.autograd.Function):
@@ -219,10 +220,9 @@ class _Pieces(torch.autograd.Function):
         begins = [True] * len(sums) if compiling else (~goes_on).flatten(1).any(1).tolist()
         for t, (candidate, part) in enumerate(zip(candidates.unbind(), sums.unbind(), strict=True)):
             h = torch.where(goes_on[t], h, memory[t]) if t and begins[t] else h
-            state = torch.addmm(part, h, transposed)
-            gates = torch.sigmoid(state[:, : 2 * size])
-            new = torch.tanh(torch.addcmul(candidate, gates[:, :size], state[:, 2 * size :]))
-            h = torch.lerp(new, h, gates[:, size:])
+            gates, new_h = torch.addmm(part, h, transposed).split([2 * size, size], dim=1)
+            reset, keep = torch.sigmoid(gates).chunk(2, dim=1)
+            h = torch.lerp(torch.tanh(torch.addcmul(candidate, reset, new_h)), h, keep)
             outs.append(h)
         return torch.stack(outs)
 
@@ -233,18 +233,19 @@ class _Pieces(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> Any:
-        weight, goes_on, before, keep, by_input, by_state = _changes(*ctx.saved_tensors)
-        (by_out,) = gradients
-        kept, states, total = keep * goes_on, (by_state * goes_on[..., None]).unbind(), by_out[-1]
-        totals = [total]
-        for t in range(len(by_out) - 1, 0, -1):
-            back = (states[t] * total[:, None]).flatten(1) @ weight
-            total = by_out[t - 1] + torch.addcmul(back, kept[t], total)
+        weight, goes_on, before, keep, by_new, by_state = _changes(*ctx.saved_tensors)
+        by_out, goes_on, keep, changes = gradients[0].unbind(), goes_on.to(keep).unbind(), keep.unbind(), by_state.unbind()
+        total, totals, states = by_out[-1], [], []
+        for t in reversed(range(len(by_out))):
+            state = (changes[t] * total[:, None]).flatten(1)
             totals.append(total)
-        by_after = torch.stack(totals[::-1])[:, :, None]
-        state = (by_state * by_after).flatten(2)
-        by_weight = state.flatten(0, 1).T @ before.flatten(0, 1)
-        return (by_input * by_after).flatten(2), None, None, by_weight, state.sum((0, 1))
+            states.append(state)
+            if t:
+                total = torch.addcmul(by_out[t - 1], goes_on[t], torch.addcmul(state @ weight, keep[t], total))
+        state = torch.stack(states[::-1])
+        gates = state[..., : -weight.shape[1]]
+        by_prepared = torch.cat([gates, by_new * torch.stack(totals[::-1])], dim=-1)
+        return by_prepared, None, None, state.flatten(0, 1).T @ before.flatten(0, 1), state.sum((0, 1))
 
 
 class _PiecesForward(_Pieces):
@@ -252,10 +253,11 @@ class _PiecesForward(_Pieces):
 
     @staticmethod
     def jvp(ctx: Any, *tangents: Any) -> Any:
-        weight, goes_on, before, keep, by_input, by_state = _changes(*ctx.saved_tensors)
+        weight, goes_on, before, keep, by_new, by_state = _changes(*ctx.saved_tensors)
         prepared, _, _, weight_tangent, bias_tangent = tangents
-        state = before @ weight_tangent.T + bias_tangent
-        own = (by_input * prepared.unflatten(-1, (3, -1)) + by_state * state.unflatten(-1, (3, -1))).sum(2)
+        *gates, new = prepared.unflatten(-1, (3, -1)).unbind(2)
+        state = (before @ weight_tangent.T + bias_tangent).unflatten(-1, (3, -1))
+        own = (by_state * state).sum(2) + (by_state[:, :, :2] * torch.stack(gates, dim=2)).sum(2) + by_new * new
         tangent, outs = own[0], [own[0]]
         for t in range(1, len(own)):
             h = goes_on[t] * tangent
@@ -265,13 +267,13 @@ class _PiecesForward(_Pieces):
 
 
 def _changes(prepared: Tensor, goes_on: Tensor, memory: Tensor, weight: Tensor, bias: Tensor, out: Tensor) -> Any:
-    """W, the 1 or 0, h, z, and ∂h'/∂ of each third of both products, [L, P, 3, size]."""
+    """W, the 1 or 0, h, z, and ∂h'/∂ of the candidate [L, P, size], and of each third of the product [L, P, 3, size]."""
     before = torch.cat([memory[:1], torch.where(goes_on[1:], out[:-1], memory[1:])])
-    reset, keep, new_h, new = _gates(prepared, before @ weight.T + bias)
+    reset, keep, new_h, candidate = _gates(prepared, before @ weight.T + bias)
+    new = tanh(candidate)
     by_new = (1 - keep) * (1 - new * new)
     by_reset, by_keep = by_new * new_h * reset * (1 - reset), (before - new) * keep * (1 - keep)
-    by_input = torch.stack([by_reset, by_keep, by_new], dim=2)
-    return weight, goes_on, before, keep, by_input, torch.stack([by_reset, by_keep, by_new * reset], dim=2)
+    return weight, goes_on, before, keep, by_new, torch.stack([by_reset, by_keep, by_new * reset], dim=2)
 
 
 def cell_of(layers: Layers, inputs: int, outputs: int) -> GRU | OwnCell:
