@@ -145,6 +145,22 @@ def test_gradients_of_pieces_are_differences():
     assert torch.autograd.gradcheck(over, inputs, check_forward_ad=True, fast_mode=True, raise_exception=False)
 
 
+@pytest.mark.parametrize("fields", [{}, {"critic_hidden": (6,)}, {"shared_memory": True}])
+@pytest.mark.parametrize("in_pieces", [False, True])
+def test_a_policy_and_a_value_side_by_side_say_what_each_says_alone(fields, in_pieces):
+    _, state, env = begin(ppo, **fields)
+    rollout, networks = collect(env, state.policy, 8, state.rng.action), state.networks
+    obs = rollout.obs.flatten(0, 1)
+    if in_pieces:
+        obs = obs[rows_of(rollout, L)]
+    weights, found = torch.randn(2, *obs.shape[:-1]), []
+    for policy, value in (networks(obs), (networks.policy(obs), networks.value(obs))):
+        total = (weights[0] * policy.log_prob(torch.ones(obs.shape[:-1], dtype=torch.int64)) + weights[1] * value).sum()
+        found.append([policy.logits, value, *torch.autograd.grad(total, [*networks.parameters()])])
+    for together, alone in zip(*found, strict=True):
+        torch.testing.assert_close(together, alone, rtol=1e-4, atol=1e-5)
+
+
 def test_a_row_with_a_zero_in_front_starts_from_its_own_memory():
     gru, prepared, goes_on, memory = random_pieces()
     goes_on[:] = True

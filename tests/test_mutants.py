@@ -884,9 +884,16 @@ MUTANTS = [
     (
         "the gradient forgets the step before",
         "nn/memory.py",
-        "total = by_out[t - 1] + torch.addcmul(back, kept[t], total)",
-        "total = by_out[t - 1] + back",
+        "going_on[t], torch.addcmul(state @ weight, keep[t], total))",
+        "going_on[t], state @ weight)",
         MEMORY + "pieces_are_the_steps_one_after_the_other_and_so_are_their_derivatives",
+    ),
+    (
+        "side by side, the value has the policy's memory",
+        "nn/memory.py",
+        "outs = _through_pieces(cells, prepared, goes_on[0] == 1, memory)",
+        "outs = _through_pieces(cells, prepared, goes_on[0] == 1, (memory[0], memory[0]))",
+        MEMORY + "a_policy_and_a_value_side_by_side_say_what_each_says_alone",
     ),
     (
         "the tangent goes over an end",

@@ -1,6 +1,7 @@
 """Data records of tensors. Shapes: T time, N environments, B batch, O observation, A action."""
 
 from dataclasses import dataclass, field, replace
+from operator import itemgetter
 from typing import Self
 
 import torch
@@ -36,7 +37,7 @@ class Record:
     """Tensors that share their leading dimensions."""
 
     def __getitem__(self, rows: Tensor | slice | tuple[slice, slice]) -> Self:
-        return type(self)(*(tensor[rows] for tensor in vars(self).values()))
+        return type(self)(*map(itemgetter(rows), vars(self).values()))
 
     def flatten(self) -> Self:
         """[T, N, …] to [T · N, …]."""

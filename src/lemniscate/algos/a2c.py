@@ -83,9 +83,9 @@ def advantages(config: Config, networks: ActorCritic, rollout: Rollout) -> Batch
 
 def loss(config: Config, networks: ActorCritic, batch: Batch) -> Loss:
     """−log π(a|s) A − β H + c ½ (V − target)² (section 4), and its metrics."""
-    distribution = networks.policy(batch.obs)
+    distribution, value = networks(batch.obs)
     policy_loss = policy_gradient(distribution.log_prob(batch.action), batch.advantage)
-    critic_loss = value_loss(networks.value(batch.obs), batch.target)
+    critic_loss = value_loss(value, batch.target)
     entropy = distribution.entropy().mean()
     total = policy_loss + config.value_coef * critic_loss - config.entropy_coef * entropy
     return total, {

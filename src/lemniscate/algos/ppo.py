@@ -109,10 +109,10 @@ def advantages(config: Config, networks: ActorCritic, rollout: Rollout) -> Batch
 
 def loss(config: Config, networks: ActorCritic, batch: Batch) -> Loss:
     """The loss of a minibatch [M, …], the negative of eq. 9, and its metrics."""
-    distribution = networks.policy(batch.obs)
+    distribution, value = networks(batch.obs)
     log_ratio = distribution.log_prob(batch.action) - batch.log_prob  # log r_t(θ), below eq. 6
     policy_loss = clipped_surrogate(log_ratio, batch.advantage, config.clip)  # −L^CLIP, eq. 7
-    critic_loss = value_loss(networks.value(batch.obs), batch.target, batch.value, config.clip_value)  # L^VF, eq. 9
+    critic_loss = value_loss(value, batch.target, batch.value, config.clip_value)  # L^VF, eq. 9
     entropy = distribution.entropy().mean()  # S, eq. 9
     total = policy_loss + config.value_coef * critic_loss - config.entropy_coef * entropy  # −L^CLIP+VF+S, eq. 9
     return total, {

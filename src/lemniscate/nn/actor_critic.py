@@ -6,7 +6,17 @@ import torch
 from torch import Tensor, nn
 
 from lemniscate.errors import UserError
-from lemniscate.nn.memory import Columns, Remembering, cell_of, give_memory, head_of, remember, remembered_by
+from lemniscate.maths import Distribution
+from lemniscate.nn.memory import (
+    Columns,
+    Remembering,
+    cell_of,
+    give_memory,
+    head_of,
+    remember,
+    remembered_by,
+    side_by_side,
+)
 from lemniscate.nn.networks import ImageEncoder, Layers, PartsEncoder
 from lemniscate.nn.normalizer import NoNorm, NormByPart, RunningNorm, ScaleBytes, with_privileged
 from lemniscate.nn.policies import (
@@ -32,14 +42,17 @@ class Value(nn.Module):
         self.net = net
         self.privileged = privileged
 
+    def inputs(self, obs: Tensor) -> Tensor:
+        """Rows […, O + P], normalized."""
+        return with_privileged(self.normalizer(obs), obs, self.normalizer.size, self.privileged)
+
     def forward(self, obs: Tensor) -> Tensor:
         """[…, O + P] to […]."""
-        inputs = with_privileged(self.normalizer(obs), obs, self.normalizer.size, self.privileged)
-        return self.net(inputs).squeeze(-1)
+        return self.net(self.inputs(obs)).squeeze(-1)
 
     def remember(self, obs: Tensor) -> Tensor:
         """The memory of its network after rows [N, O + P]."""
-        return remember(self.net, with_privileged(self.normalizer(obs), obs, self.normalizer.size, self.privileged))
+        return remember(self.net, self.inputs(obs))
 
 
 class ActorCritic(nn.Module):
@@ -69,6 +82,12 @@ class ActorCritic(nn.Module):
         self.value = Value(self.policy.normalizer, critic, spec.privileged + remembered_by(critic))
         self.memory = give_memory(self.policy, critic, spec, length)
         self.piece_length = length if self.memory else 0
+
+    def forward(self, obs: Tensor) -> tuple[Distribution, Tensor]:
+        """π(·|s) and V(s) of rows [B, …], or of pieces of L steps [P, L, …]."""
+        inputs = self.policy.normalizer(obs), self.value.inputs(obs)
+        outputs, value = side_by_side((self.policy.net, self.value.net), inputs)
+        return self.policy.distribution_of(outputs, obs), value.squeeze(-1)
 
     def estimates(self, obs: Tensor, next_obs: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """V(s), V(s') and log π(a|s) of rows [T, N, …], [T, N] each."""

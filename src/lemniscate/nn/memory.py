@@ -6,7 +6,7 @@ are [O | policy's | P | critic's | mask], O the observation, P what is privilege
 0 where a row's memory does not follow from the row before.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -144,7 +144,7 @@ class OwnCell(OwnNetwork):
         return self.module(prepared, memory.clone())  # it may write into what it is given
 
     def over(self, prepared: Tensor, goes_on: Tensor, memory: Tensor) -> Tensor:
-        """The outputs [P, L, outputs] of pieces, [P, L, inputs], [P, L, 1] and [P, L, size]; see `Remembering`."""
+        """The outputs [P, L, outputs] of pieces, [P, L, inputs], [P, L, 1] and [P, L, size]; see `side_by_side`."""
         rows, after = [], memory[:, 0]
         for t in range(prepared.shape[1]):
             row, after = self.step(prepared[:, t], torch.where(goes_on[:, t], after, memory[:, t]) if t else after)
@@ -190,10 +190,16 @@ class GRU(nn.Module):
         return after, after
 
     def over(self, prepared: Tensor, goes_on: Tensor, memory: Tensor) -> Tensor:
-        """The outputs [P, L, size] of pieces, [P, L, 3 size], [P, L, 1] and [P, L, size]; see `Remembering`."""
-        by_time = prepared.movedim(1, 0), goes_on.movedim(1, 0), memory.movedim(1, 0)
-        kind = _Pieces if torch.compiler.is_compiling() else _PiecesForward
-        return kind.apply(*by_time, self.state.weight, self.state.bias).movedim(0, 1)
+        """The outputs [P, L, size] of pieces, [P, L, 3 size], [P, L, 1] and [P, L, size]; see `side_by_side`."""
+        return _through_pieces([self], [prepared], goes_on, [memory])[0]
+
+
+def _through_pieces(cells: Sequence[GRU], prepared: Any, goes_on: Tensor, memory: Any) -> Sequence[Tensor]:
+    """`GRU.over` of C cells of one size, each with its own products and memory, in one loop over the steps."""
+    by_time = torch.stack([*prepared]).transpose(1, 2), goes_on.transpose(0, 1), torch.stack([*memory]).transpose(1, 2)
+    parameters = [torch.stack([getattr(cell.state, name) for cell in cells]) for name in ("weight", "bias")]
+    kind = _Pieces if torch.compiler.is_compiling() else _PiecesForward
+    return kind.apply(*by_time, *parameters).transpose(1, 2).unbind()
 
 
 def _gates(prepared: Tensor, state: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -205,26 +211,27 @@ def _gates(prepared: Tensor, state: Tensor) -> tuple[Tensor, Tensor, Tensor, Ten
 
 
 class _Pieces(torch.autograd.Function):
-    """`GRU.over`, with its own derivatives: each step has a few operations that depend on the step beside it.
+    """`_through_pieces`, with its own derivatives: each step has a few operations that depend on the step beside it.
 
     What does not, the gates and what they change with, is computed of all steps at once, from the inputs and outputs
-    alone; so derivatives of the derivative are exact too. The memory in the rows is constant.
+    alone; so derivatives of the derivative are exact too. The memory in the rows is constant. Tensors are [C, L, P, …].
     """
 
     @staticmethod
     def forward(prepared: Tensor, goes_on: Tensor, memory: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-        size, h, outs, transposed = weight.shape[1], memory[0], [], weight.T
-        candidates = prepared[..., 2 * size :]
-        sums = torch.cat([prepared[..., : 2 * size] + bias[: 2 * size], bias[2 * size :].expand_as(candidates)], dim=-1)
+        size, h, outs, transposed = weight.shape[-1], memory[:, 0], [], weight.mT
+        candidates, bias = prepared[..., 2 * size :], bias[:, None, None]
+        gates = prepared[..., : 2 * size] + bias[..., : 2 * size]
+        sums = torch.cat([gates, bias[..., 2 * size :].expand_as(candidates)], dim=-1)
         compiling = torch.compiler.is_compiling()  # a program does not ask for the numbers in a tensor
-        begins = [True] * len(sums) if compiling else (~goes_on).flatten(1).any(1).tolist()
-        for t, (candidate, part) in enumerate(zip(candidates.unbind(), sums.unbind(), strict=True)):
-            h = torch.where(goes_on[t], h, memory[t]) if t and begins[t] else h
-            gates, new_h = torch.addmm(part, h, transposed).split([2 * size, size], dim=1)
-            reset, keep = torch.sigmoid(gates).chunk(2, dim=1)
+        begins = [True] * len(goes_on) if compiling else (~goes_on).flatten(1).any(1).tolist()
+        for t, (candidate, part) in enumerate(zip(candidates.unbind(1), sums.unbind(1), strict=True)):
+            h = torch.where(goes_on[t], h, memory[:, t]) if t and begins[t] else h
+            gates, new_h = torch.baddbmm(part, h, transposed).split([2 * size, size], dim=-1)
+            reset, keep = torch.sigmoid(gates).chunk(2, dim=-1)
             h = torch.lerp(torch.tanh(torch.addcmul(candidate, reset, new_h)), h, keep)
             outs.append(h)
-        return torch.stack(outs)
+        return torch.stack(outs, dim=1)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
@@ -234,18 +241,20 @@ class _Pieces(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> Any:
         weight, goes_on, before, keep, by_new, by_state = _changes(*ctx.saved_tensors)
-        by_out, goes_on, keep, changes = gradients[0].unbind(), goes_on.to(keep).unbind(), keep.unbind(), by_state.unbind()
+        by_out, changes = gradients[0].unbind(1), by_state.unbind(1)
+        going_on, keep = goes_on.to(keep).unbind(), keep.unbind(1)
         total, totals, states = by_out[-1], [], []
         for t in reversed(range(len(by_out))):
-            state = (changes[t] * total[:, None]).flatten(1)
+            state = (changes[t] * total[:, :, None]).flatten(2)
             totals.append(total)
             states.append(state)
             if t:
-                total = torch.addcmul(by_out[t - 1], goes_on[t], torch.addcmul(state @ weight, keep[t], total))
-        state = torch.stack(states[::-1])
-        gates = state[..., : -weight.shape[1]]
-        by_prepared = torch.cat([gates, by_new * torch.stack(totals[::-1])], dim=-1)
-        return by_prepared, None, None, state.flatten(0, 1).T @ before.flatten(0, 1), state.sum((0, 1))
+                total = torch.addcmul(by_out[t - 1], going_on[t], torch.addcmul(state @ weight, keep[t], total))
+        state = torch.stack(states[::-1], dim=1)
+        gates = state[..., : -weight.shape[-1]]
+        by_prepared = torch.cat([gates, by_new * torch.stack(totals[::-1], dim=1)], dim=-1)
+        by_weight = state.flatten(1, 2).mT @ before.flatten(1, 2)
+        return by_prepared, None, None, by_weight, state.sum((1, 2))
 
 
 class _PiecesForward(_Pieces):
@@ -255,25 +264,27 @@ class _PiecesForward(_Pieces):
     def jvp(ctx: Any, *tangents: Any) -> Any:
         weight, goes_on, before, keep, by_new, by_state = _changes(*ctx.saved_tensors)
         prepared, _, _, weight_tangent, bias_tangent = tangents
-        *gates, new = prepared.unflatten(-1, (3, -1)).unbind(2)
-        state = (before @ weight_tangent.T + bias_tangent).unflatten(-1, (3, -1))
-        own = (by_state * state).sum(2) + (by_state[:, :, :2] * torch.stack(gates, dim=2)).sum(2) + by_new * new
-        tangent, outs = own[0], [own[0]]
-        for t in range(1, len(own)):
+        *gates, new = prepared.unflatten(-1, (3, -1)).unbind(3)
+        state = (before @ weight_tangent.mT[:, None] + bias_tangent[:, None, None]).unflatten(-1, (3, -1))
+        own = (by_state * state).sum(3) + (by_state[..., :2, :] * torch.stack(gates, dim=3)).sum(3) + by_new * new
+        tangent, outs = own[:, 0], [own[:, 0]]
+        for t in range(1, own.shape[1]):
             h = goes_on[t] * tangent
-            tangent = own[t] + keep[t] * h + (by_state[t] * (h @ weight.T).unflatten(-1, (3, -1))).sum(1)
+            change = (by_state[:, t] * (h @ weight.mT).unflatten(-1, (3, -1))).sum(2)
+            tangent = own[:, t] + keep[:, t] * h + change
             outs.append(tangent)
-        return torch.stack(outs)
+        return torch.stack(outs, dim=1)
 
 
 def _changes(prepared: Tensor, goes_on: Tensor, memory: Tensor, weight: Tensor, bias: Tensor, out: Tensor) -> Any:
-    """W, the 1 or 0, h, z, and ∂h'/∂ of the candidate [L, P, size], and of each third of the product [L, P, 3, size]."""
-    before = torch.cat([memory[:1], torch.where(goes_on[1:], out[:-1], memory[1:])])
-    reset, keep, new_h, candidate = _gates(prepared, before @ weight.T + bias)
+    """W, the 1 or 0, h, z, and ∂h'/∂ of the candidate [C, L, P, size] and of each third of the product, with a 3."""
+    before = torch.cat([memory[:, :1], torch.where(goes_on[1:], out[:, :-1], memory[:, 1:])], dim=1)
+    state = torch.baddbmm(bias[:, None], before.flatten(1, 2), weight.mT).view_as(prepared)
+    reset, keep, new_h, candidate = _gates(prepared, state)
     new = tanh(candidate)
     by_new = (1 - keep) * (1 - new * new)
     by_reset, by_keep = by_new * new_h * reset * (1 - reset), (before - new) * keep * (1 - keep)
-    return weight, goes_on, before, keep, by_new, torch.stack([by_reset, by_keep, by_new * reset], dim=2)
+    return weight, goes_on, before, keep, by_new, torch.stack([by_reset, by_keep, by_new * reset], dim=3)
 
 
 def cell_of(layers: Layers, inputs: int, outputs: int) -> GRU | OwnCell:
@@ -313,22 +324,36 @@ class Remembering(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """[B, I] or [B, L, I] to [B, outputs] or [B, L, outputs]."""
-        prepared, goes_on, memory, action = self._parts(x)
+        prepared, goes_on, memory, action = self.parts(x)
         in_pieces = x.dim() > 2
         out = self.cell.over(prepared, goes_on == 1, memory) if in_pieces else self.cell.step(prepared, memory)[0]
         return self.head(torch.cat([out, action], dim=-1))
 
     def remember(self, x: Tensor) -> Tensor:
         """The memory after rows [B, I], with a 1 in front: [B, 1 + size]."""
-        prepared, _, memory, _ = self._parts(x)
+        prepared, _, memory, _ = self.parts(x)
         _, after = self.cell.step(prepared, memory)
         return torch.cat([torch.ones_like(after[:, :1]), after], dim=-1)
 
-    def _parts(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def parts(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """The cell's prepared inputs, the 1 or 0, the memory and the actions of rows […, I]."""
         obs, _, privileged, goes_on, memory, action = _split(x, self.columns)
         inputs = torch.cat([self.encoder(obs), privileged], dim=-1)
         return self.cell.prepare(inputs), goes_on, memory, action
+
+
+def side_by_side(nets: Sequence[Any], inputs: Sequence[Tensor]) -> list[Tensor]:
+    """The outputs of networks at inputs of their own: rows [B, I], or pieces [P, L, I], as of `Remembering`.
+
+    Through pieces, the memories of GRUs of one size go in one loop: its operations are small, and cost by their number.
+    """
+    cells: list[Any] = [getattr(net, "cell", None) for net in nets]
+    alike = all(isinstance(cell, GRU) for cell in cells) and len({cell.size for cell in cells}) == 1
+    if not alike or inputs[0].dim() == 2:
+        return [net(x) for net, x in zip(nets, inputs, strict=True)]
+    prepared, goes_on, memory, _ = zip(*(net.parts(x) for net, x in zip(nets, inputs, strict=True)), strict=True)
+    outs = _through_pieces(cells, prepared, goes_on[0] == 1, memory)
+    return [net.head(out) for net, out in zip(nets, outs, strict=True)]
 
 
 def _split(x: Tensor, sizes: tuple[int, ...]) -> tuple[Tensor, ...]:

@@ -22,7 +22,7 @@ from lemniscate.spec import Action, Box, Discrete, MultiDiscrete
 
 
 class Policy(nn.Module):
-    """Base of all policies: `normalizer`, `net`, then `forward(obs [B, O]) -> Distribution` over an `action`."""
+    """Base of all policies: `normalizer`, `net`, and `distribution_of` its outputs, over an `action`."""
 
     def __init__(self, normalizer: NoNorm, net: nn.Module, action: Action) -> None:
         super().__init__()
@@ -48,6 +48,10 @@ class Policy(nn.Module):
 
     def forward(self, obs: Tensor) -> Distribution:
         """The distribution over actions at each observation, [B, O]."""
+        return self.distribution_of(self.net(self.normalizer(obs)), obs)
+
+    def distribution_of(self, outputs: Tensor, obs: Tensor) -> Distribution:
+        """The distribution that the network's outputs [B, …] at observations [B, O] say."""
         raise NotImplementedError
 
     def draw_noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
@@ -68,9 +72,8 @@ class Policy(nn.Module):
         """
         self.normalizer.update(obs, valid)
 
-    def _permitted(self, obs: Tensor) -> Tensor:
-        """The network's outputs at [B, O], those of actions that the mask at the end of `obs` rules out at −10⁹."""
-        outputs = self.net(self.normalizer(obs))
+    def _permitted(self, outputs: Tensor, obs: Tensor) -> Tensor:
+        """The network's outputs, those of actions that the mask at the end of `obs` rules out at −10⁹."""
         size = self.action.mask_size
         return outputs.masked_fill(obs[..., -size:] == 0, -1e9) if size else outputs
 
@@ -91,9 +94,9 @@ class GaussianPolicy(Policy):
         super().__init__(normalizer, net, action)
         self.log_std = nn.Parameter(torch.full((action.size,), initial_log_std))
 
-    def forward(self, obs: Tensor) -> Gaussian:
-        """[B, O] to N(μ [B, A], σ [A])."""
-        return Gaussian(self.net(self.normalizer(obs)), self.log_std)
+    def distribution_of(self, outputs: Tensor, obs: Tensor) -> Gaussian:
+        """N(μ [B, A], σ [A])."""
+        return Gaussian(outputs, self.log_std)
 
     def metrics(self) -> dict[str, Tensor]:
         """The mean of σ over coordinates."""
@@ -103,9 +106,9 @@ class GaussianPolicy(Policy):
 class CategoricalPolicy(Policy):
     """A softmax over n actions; those that the observation's mask rules out get probability zero."""
 
-    def forward(self, obs: Tensor) -> Categorical:
-        """[B, O] to logits [B, n]."""
-        return Categorical(self._permitted(obs))
+    def distribution_of(self, outputs: Tensor, obs: Tensor) -> Categorical:
+        """By logits [B, n]."""
+        return Categorical(self._permitted(outputs, obs))
 
 
 class EpsilonGreedyPolicy(Policy):
@@ -118,9 +121,9 @@ class EpsilonGreedyPolicy(Policy):
         super().__init__(normalizer, net, action)
         self.register_buffer("epsilon", torch.ones(()))
 
-    def forward(self, obs: Tensor) -> EpsilonGreedy:
-        """[B, O] to Q(s, ·), [B, n], with −10⁹ for actions that are not permitted."""
-        return EpsilonGreedy(self._permitted(obs), self.epsilon)
+    def distribution_of(self, outputs: Tensor, obs: Tensor) -> EpsilonGreedy:
+        """By Q(s, ·), [B, n], with −10⁹ for actions that are not permitted."""
+        return EpsilonGreedy(self._permitted(outputs, obs), self.epsilon)
 
     def metrics(self) -> dict[str, Tensor]:
         """ε."""
@@ -132,25 +135,25 @@ class MultiCategoricalPolicy(Policy):
 
     action: MultiDiscrete
 
-    def forward(self, obs: Tensor) -> MultiCategorical:
-        """[B, O] to logits [B, n_k] for each of K."""
-        return MultiCategorical(tuple(map(Categorical, self._permitted(obs).split(self.action.nvec, dim=-1))))
+    def distribution_of(self, outputs: Tensor, obs: Tensor) -> MultiCategorical:
+        """By logits [B, n_k] for each of K."""
+        return MultiCategorical(tuple(map(Categorical, self._permitted(outputs, obs).split(self.action.nvec, dim=-1))))
 
 
 class BernoulliPolicy(Policy):
     """n independent binary components."""
 
-    def forward(self, obs: Tensor) -> Bernoulli:
-        """[B, O] to logits [B, n]."""
-        return Bernoulli(self.net(self.normalizer(obs)))
+    def distribution_of(self, outputs: Tensor, obs: Tensor) -> Bernoulli:
+        """By logits [B, n]."""
+        return Bernoulli(outputs)
 
 
 class DeterministicPolicy(Policy):
     """One action at each observation, tanh of a network: in [-1, 1]^A, which the env floor maps onto its bounds."""
 
-    def forward(self, obs: Tensor) -> Deterministic:
-        """[B, O] to [B, A]."""
-        return Deterministic(torch.tanh(self.net(self.normalizer(obs))))
+    def distribution_of(self, outputs: Tensor, obs: Tensor) -> Deterministic:
+        """[B, A]."""
+        return Deterministic(torch.tanh(outputs))
 
     def draw_noise(self, shape: Sequence[int], generator: Generator) -> Tensor:
         """Zeros, [*shape, A]: the policy has no randomness of its own."""
@@ -171,7 +174,7 @@ class SquashedGaussianPolicy(Policy):
         super().__init__(normalizer, net, action)
         self._offset = math.atanh((initial_log_std + 5) / 3.5 - 1)
 
-    def forward(self, obs: Tensor) -> SquashedGaussian:
-        """[B, O] to μ and log σ, [B, A] each."""
-        mean, log_std = self.net(self.normalizer(obs)).chunk(2, dim=-1)
+    def distribution_of(self, outputs: Tensor, obs: Tensor) -> SquashedGaussian:
+        """By μ and log σ, [B, A] each."""
+        mean, log_std = outputs.chunk(2, dim=-1)
         return SquashedGaussian(mean, -5 + 3.5 * (torch.tanh(log_std + self._offset) + 1))
