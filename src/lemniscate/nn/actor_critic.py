@@ -85,6 +85,8 @@ class ActorCritic(nn.Module):
 
     def forward(self, obs: Tensor) -> tuple[Distribution, Tensor]:
         """π(·|s) and V(s) of rows [B, …], or of pieces of L steps [P, L, …]."""
+        if obs.dim() == 2:
+            return self.policy(obs), self.value(obs)
         inputs = self.policy.normalizer(obs), self.value.inputs(obs)
         outputs, value = side_by_side((self.policy.net, self.value.net), inputs)
         return self.policy.distribution_of(outputs, obs), value.squeeze(-1)

@@ -186,7 +186,7 @@ class GRU(nn.Module):
     def step(self, prepared: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
         """[B, 3 size] and h [B, size] to the output, which is h', and h'."""
         _, keep, _, candidate = _gates(prepared, self.state(memory))
-        after = torch.lerp(torch.tanh(candidate), memory, keep)
+        after = torch.lerp(tanh(candidate), memory, keep)
         return after, after
 
     def over(self, prepared: Tensor, goes_on: Tensor, memory: Tensor) -> Tensor:
@@ -343,13 +343,12 @@ class Remembering(nn.Module):
 
 
 def side_by_side(nets: Sequence[Any], inputs: Sequence[Tensor]) -> list[Tensor]:
-    """The outputs of networks at inputs of their own: rows [B, I], or pieces [P, L, I], as of `Remembering`.
+    """The outputs of networks at pieces [P, L, I] of their own, as of `Remembering`.
 
-    Through pieces, the memories of GRUs of one size go in one loop: its operations are small, and cost by their number.
+    The memories of GRUs of one size go through them in one loop: its operations are small, and cost by their number.
     """
     cells: list[Any] = [getattr(net, "cell", None) for net in nets]
-    alike = all(isinstance(cell, GRU) for cell in cells) and len({cell.size for cell in cells}) == 1
-    if not alike or inputs[0].dim() == 2:
+    if not all(isinstance(cell, GRU) and cell.size == cells[0].size for cell in cells):
         return [net(x) for net, x in zip(nets, inputs, strict=True)]
     prepared, goes_on, memory, _ = zip(*(net.parts(x) for net, x in zip(nets, inputs, strict=True)), strict=True)
     outs = _through_pieces(cells, prepared, goes_on[0] == 1, memory)
