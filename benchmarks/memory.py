@@ -29,7 +29,7 @@ ENVS = {
     # environment: (steps, what is asked for, settings of ppo, found on seeds 101 to 103)
     "cart_pole": (60_000, "500", SHARED),
     "pendulum": (400_000, "≥ −200", SHARED | {"gamma": 0.95, "sequence_length": 32, "desired_kl": None}),
-    "RepeatFirst": (300_000, "1", SHARED | {"sequence_length": 64}),
+    "RepeatFirst": (300_000, "1", SHARED | {"sequence_length": 64, "desired_kl": None}),
     "lunar_lander": (2_000_000, "≥ 200", SHARED | {"gamma": 0.995, "sequence_length": 32, "desired_kl": None}),
 }
 

@@ -51,7 +51,7 @@ ENVS = {
     "CartPole-v1": (50_000, CART_POLE),
     "Acrobot-v1": (100_000, LANDER),
     "LunarLander-v3": (100_000, LANDER),
-    "MinAtar/Breakout-v1": (500_000, BREAKOUT),
+    "MinAtar/Breakout-v1": (300_000, BREAKOUT),
 }
 
 

@@ -467,3 +467,16 @@ def test_what_the_caller_has_set_in_torch_does_not_reach_what_looks_at_a_policy(
         assert each[1:3] == first[1:3], name
         assert [re.sub(r"[\d.,]+", "", said) for said in each[3]] == [re.sub(r"[\d.,]+", "", said) for said in first[3]]
         assert each[0] == first[0], name
+
+
+@pytest.mark.parametrize(
+    ("obs", "said"),
+    [
+        ([10**400] * 4, "cannot be read: .*too large"),
+        ([1e39] * 4, "number that is inf"),
+        ([1j] * 4, "numbers are complex"),
+    ],
+)
+def test_numbers_that_float32_cannot_hold_are_said(cartpole, obs, said):
+    with pytest.raises(lem.UserError, match=said):
+        cartpole.policy.act(obs)

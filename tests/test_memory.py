@@ -407,6 +407,12 @@ def test_act_remembers_and_reset_forgets(trained):
     assert np.isfinite(policy.value(obs[2])).all()
 
 
+@pytest.mark.parametrize("done", ["x", [0.5, None], [2, 0], 1j])
+def test_reset_takes_flags(trained, done):
+    with pytest.raises(UserError, match="done must be True or False for each episode of the batch, not"):
+        lem.load(trained.path).reset(done)
+
+
 def test_act_says_what_is_wrong_with_another_number_of_episodes(trained):
     policy = lem.load(trained.path)
     policy.act(np.zeros((3, 4), np.float32))

@@ -15,6 +15,7 @@ from lemniscate.cli import main
 from lemniscate.envs import registry
 from lemniscate.envs.conversion import flatten_observation, unflatten_observation
 from lemniscate.envs.spaces import observation_parts
+from lemniscate.errors import UserError
 from lemniscate.run.config import RunConfig
 from test_flight import Aviary, Glider
 
@@ -353,7 +354,7 @@ def test_a_file_that_does_not_fit_is_refused_in_a_sentence(files, tmp_path):
     refused(nn.Linear(3, 1), "cannot be read without running what it holds; save weights alone: torch.save")
     refused({"epoch": 3}, "has no weights")
     (tmp_path / "x.pt").write_text("weights")
-    with pytest.raises(lem.UserError, match="cannot be read"):
+    with pytest.raises(lem.UserError, match="is damaged, or no file of torch"):
         lem.evaluate(tmp_path / "x.pt", env="Pendulum-v1")
     with pytest.raises(lem.UserError, match=r"absent\.pt does not exist"):
         lem.evaluate("absent.pt", env="Pendulum-v1")
@@ -498,3 +499,64 @@ def test_what_is_said_of_a_policy_of_ones_own_is_not_for_one_that_was_trained_he
     env.close()
     with pytest.raises(lem.UserError, match="are for policies of your own; this one was trained here"):
         lem.evaluate(policy, episodes=1, **own)
+
+
+class Masked(gym.Env):
+    """Three actions, of which one alone is permitted: the number that is observed."""
+
+    observation_space, action_space = gym.spaces.Box(0, 2, (1,)), gym.spaces.Discrete(3)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        return self._see()
+
+    def step(self, action):
+        self.t, right = self.t + 1, float(action == self.only)
+        obs, info = self._see()
+        return obs, right, self.t == 5, False, info
+
+    def _see(self):
+        self.only = int(self.np_random.integers(3))
+        return np.zeros(1, np.float32), {"action_mask": np.arange(3) == self.only}
+
+
+@pytest.mark.parametrize("name", ["action_mask", "action_masks"])
+def test_a_policy_that_asks_for_the_action_mask_gets_it(name):
+    scope = {"np": np}
+    exec(f"def act(obs, {name}=None): return int(np.argmax({name}))", scope)
+    assert lem.evaluate(scope["act"], Masked, episodes=3).returns == [5.0] * 3
+
+
+def test_scores_that_are_no_numbers_are_no_choice():
+    with pytest.raises(UserError, match="with a number that is nan"):
+        lem.evaluate(lambda obs: np.full(2, np.nan, np.float32), "CartPole-v1", episodes=1)
+
+
+def test_files_that_hold_something_else_get_a_sentence(tmp_path):
+    good = {"actor_mean.0.weight": torch.zeros(2, 4), "actor_mean.0.bias": torch.zeros(2)}
+    normalizer = {"obs_mean": torch.zeros(4), "obs_var": torch.ones(4)}
+    wide = {"actor_mean.2.weight": torch.zeros(2, 9), "actor_mean.2.bias": torch.zeros(2)}
+    for number, (record, sentence) in enumerate(
+        (
+            ({"state_dict": 3}, "has no weights"),
+            ({1: torch.zeros(2)}, "has no weights"),
+            ({**good, **wide}, r"layers that do not fit each other: \(2, 4\), \(2, 9\)"),
+            ({"state_dict": good, **normalizer, "obs_mean": "four"}, "must be finite numbers"),
+            ({"state_dict": good, **normalizer, "obs_var": -torch.ones(4)}, "no variance negative"),
+        )
+    ):
+        file = tmp_path / f"{number}.pt"
+        torch.save(record, file)
+        with pytest.raises(UserError, match=sentence):
+            lem.evaluate(file, "CartPole-v1", episodes=1)
+    (tmp_path / "text.pt").write_text("no weights")
+    with pytest.raises(UserError, match="is damaged, or no file of torch"):
+        lem.evaluate(tmp_path / "text.pt", "CartPole-v1", episodes=1)
+    torch.save({name: tensor.half() for name, tensor in good.items()}, tmp_path / "half.pt")
+    assert len(lem.evaluate(tmp_path / "half.pt", "CartPole-v1", episodes=2).returns) == 2
+
+
+def test_any_seed_will_do_for_a_function():
+    first, again = (lem.evaluate(lambda obs: 0, "CartPole-v1", episodes=2, seed=2**32 + 1).returns for _ in range(2))
+    assert first == again

@@ -236,6 +236,52 @@ def test_an_environment_that_cannot_be_shown_is_closed(unwritten, picture):
     assert Unshown.open == 0
 
 
+class Shown(gym.Env):
+    """Three steps; each picture is drawn by the class."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012
+    observation_space, action_space = gym.spaces.Box(-1, 1, (1,)), gym.spaces.Discrete(2)
+    paid = 1.0
+
+    def __init__(self, render_mode=None):
+        self.render_mode, self.t = render_mode, 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.t += 1
+        return np.zeros(1, np.float32), self.paid, self.t == 3, False, {}
+
+    def render(self):
+        return np.full((16 + self.size * self.t, 16, 3), 40 * self.t, np.uint8)
+
+    size = 0
+
+
+@pytest.mark.parametrize("ending", [".gif", ".webp"])
+def test_pictures_that_change_their_size_are_no_film(ending, tmp_path):
+    growing = type("Growing", (Shown,), {"size": 2})
+    with pytest.raises(lem.UserError, match=r"after pictures of 16 × 16 render\(\) returns one of 16 × 18"):
+        lem.watch(env=growing, random=True, video=tmp_path / f"film{ending}")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("fps", ["fast", math.nan, math.inf, -5, [30], 1e-6, None])
+def test_a_film_has_a_usual_speed_where_the_environment_says_none(fps, tmp_path):
+    odd = type("Odd", (Shown,), {"metadata": {"render_modes": ["rgb_array"], "render_fps": fps}})
+    lem.watch(env=odd, random=True, video=tmp_path / "film.gif")
+    with Image.open(tmp_path / "film.gif") as film:
+        assert film.info["duration"] in (30, 40)
+
+
+def test_a_reward_beyond_float32_is_not_watched(tmp_path):
+    with pytest.raises(lem.NonFiniteError, match=r"is 1e\+300 in step 1 of an episode"):
+        lem.watch(env=type("Rich", (Shown,), {"paid": 1e300}), random=True, video=tmp_path / "film.gif")
+
+
 def test_a_function_is_a_policy(policy, unwritten, capsys):
     how = {"env": "CartPole-v1", "episodes": 3, "seed": 7}
     scores = lem.evaluate(policy, **how, backend="gymnasium")

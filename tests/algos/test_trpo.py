@@ -5,7 +5,9 @@ import dataclasses
 
 import pytest
 import torch
+from torch import nn
 
+import lemniscate as lem
 from helpers import begin, copy_of, equal, one_rollout, small
 from lemniscate.algos import reinforce, trpo
 from lemniscate.data.rollout import collect
@@ -131,3 +133,19 @@ def test_minibatches_of_the_value_have_no_more_rows_than_the_rollout(algo):
     algo.Config(**fields, critic_minibatch_size=32)
     with pytest.raises(UserError, match="critic_minibatch_size 33 is above the 32 rows of a rollout"):
         algo.Config(**fields, critic_minibatch_size=33)
+
+
+class Backward(nn.Module):
+    """A layer whose derivative torch has in one mode only."""
+
+    def __init__(self, inputs, outputs):
+        super().__init__()
+        self.layer = nn.utils.parametrizations.weight_norm(nn.Linear(inputs, outputs))
+
+    def forward(self, x):
+        return self.layer(x)
+
+
+def test_a_layer_without_a_derivative_in_forward_mode_gets_a_sentence(tmp_path):
+    with pytest.raises(UserError, match=r"has no derivative in forward mode, which trpo takes .*; ppo learns with it"):
+        lem.train("trpo", "CartPole-v1", network=Backward, run=tmp_path / "r", total_steps=256, progress=False)

@@ -260,7 +260,10 @@ class Silent(gym.Env):
     ("env", "sentence"),
     [
         ("Pendulum-v1", "replay is hindsight, which needs goals, and Pendulum-v1 has none"),
-        (Silent, r"compute_reward\(achieved_goal, desired_goal, \{\}\) raised .* no attribute 'compute_reward'"),
+        (
+            Silent,
+            r"compute_reward\(achieved_goal, desired_goal, \{\}\), of one goal each, raised .* no attribute 'compute_reward'",
+        ),
         (other(lambda self, achieved, desired: -1.0), "takes 3 positional arguments but 4 were given"),
         (other(lambda self, achieved, desired, info: info["distance"]), "KeyError: 'distance'"),
         (other(lambda self, achieved, desired, info: abs(achieved - desired) * np.ones(2)), "compute_reward"),
@@ -360,3 +363,61 @@ def test_gymnasium_robotics_judges_goals_as_in_a_step(env):
     reward, _ = made.backend.judge_goals(obs[:, achieved], obs[:, achieved])
     assert (reward == (0.0 if "Maze" not in env else 1.0)).all()
     made.close()
+
+
+@pytest.mark.parametrize(
+    ("reward", "terminated", "sentence"),
+    [
+        (
+            lambda self, a, d, info: -float(a[:, 0] != d),
+            None,
+            "of one goal each, raised (IndexError|TypeError|ValueError)",
+        ),
+        (lambda self, a, d, info: None, None, "of one goal each, returned None; it must be a number"),
+        (lambda self, a, d, info: "0", None, "returned '0'; it must be a number"),
+        (None, lambda self, a, d, info: 0.5, "compute_terminated.*returned 0.5; it must be True or False"),
+        (None, lambda self, a, d, info: True, "goes on, and its compute_terminated says that it ends"),
+    ],
+)
+def test_judges_that_judge_otherwise_than_one_goal_get_a_sentence(reward, terminated, sentence, tmp_path):
+    own = {"compute_reward": reward or (lambda self, achieved, desired, info: -1.0)}
+    own |= {"compute_terminated": terminated} if terminated else {}
+    own["step"] = lambda self, action: (self._see(), -1.0, False, True, {})
+    own["__init__"] = lambda self: Walk.__init__(self, ends=False)
+    with pytest.raises(UserError, match=sentence):
+        lem.train("sac", type("Own", (Walk,), own), run=tmp_path / "r", progress=False, **SMALL)
+
+
+def test_a_judge_may_write_into_the_goals_that_it_gets_and_answer_with_an_array_of_one():
+    class Own(Walk):
+        def __init__(self):
+            super().__init__(ends=False)
+
+        def compute_reward(self, achieved, desired, info):
+            achieved -= desired
+            return np.array([-float(np.abs(achieved).max())])
+
+        def compute_terminated(self, achieved, desired, info):
+            return bool(np.abs(achieved - desired).max() == 0)
+
+    env = registry.make(registry.name_of(Own), 1)
+    goals = torch.tensor([[1.0], [2.0]])
+    reward, ends = env.backend.judge_goals(goals, torch.tensor([[1.0], [5.0]]))
+    assert reward.tolist() == [0, -3]
+    assert ends.tolist() == [True, False]
+
+
+def test_goals_of_two_types_are_judged_each_in_its_own():
+    class Own(Walk):
+        def __init__(self):
+            super().__init__(ends=False)
+            kinds = {"observation": np.float32, "achieved_goal": np.float32, "desired_goal": np.int32}
+            boxes = {name: gym.spaces.Box(-9, 9, (1,), kind) for name, kind in kinds.items()}
+            self.observation_space = gym.spaces.Dict(boxes)
+
+        def compute_reward(self, achieved, desired, info):
+            assert (achieved.dtype, desired.dtype) == (np.float32, np.int32)
+            return -float(abs(achieved[0] - desired[0]))
+
+    env = registry.make(registry.name_of(Own), 1)
+    assert env.backend.judge_goals(torch.tensor([[1.25]]), torch.tensor([[2.0]]))[0].item() == -0.75

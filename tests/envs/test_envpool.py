@@ -7,6 +7,7 @@ import torch
 
 from lemniscate.envs import registry
 from lemniscate.envs.envpool import GYMNASIUM_IDS, EnvpoolBackend
+from lemniscate.errors import UserError
 
 CPU = torch.device("cpu")
 MUJOCO = {"Ant-v5": 2, "HalfCheetah-v5": 1, "Hopper-v5": 1, "Humanoid-v5": 2, "Walker2d-v5": 1}
@@ -113,3 +114,9 @@ def test_bits_do_not_depend_on_workers():
         return torch.stack(obs)
 
     assert torch.equal(play("gymnasium"), play("gymnasium-async"))
+
+
+@pytest.mark.parametrize("steps", [0, -1, 10**12])
+def test_a_time_limit_is_a_number_of_steps(steps):
+    with pytest.raises(UserError, match="max_episode_steps of EnvPool's CartPole-v1 must be from 1 to 2,147,483,647"):
+        registry.make("EnvPool/CartPole-v1", 2, kwargs={"max_episode_steps": steps})

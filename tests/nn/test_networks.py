@@ -164,13 +164,27 @@ def count_calls(self):
         (kind(forward=lambda self, x: Own.forward(self.double(), x.double()).float()), "parameters of torch.float64"),
         (kind(forward=lambda self, x: {}["no"]), "KeyError: 'no'"),
         (kind(get_extra_state=lambda self: {"a": 1}), "must make a module"),
-        (lambda inputs, outputs: lambda x: x[:, :outputs], "has no parameter to learn"),
+        (lambda inputs, outputs: lambda x: x[:, :outputs], "must make a module"),
+        (kind(forward=lambda self, x: Own.forward(self, x) + (not self.training)), r"other outputs after eval\(\), in wh"),
+        (kind(forward=lambda self, x: Own.forward(self, x) if self.training else (x,)), "outputs after eval"),
+        (kind(forward=lambda self, x: Own.forward(self, x).squeeze(0)), r"one row, \[1, 5\], to \[3\]; it must be \[1, 3"),
+        (kind(forward=lambda self, x: self.last((y := self.first(x)).sin() + y.mul_(2))), "RuntimeError: one of the"),
+        (kind(memory_size="7"), "memory_size of Changed is '7'; in the class it must be a whole number, such as 64"),
+        (kind(memory_size=property(lambda self: 7)), "memory_size of Changed is .*; in the class it must be a whole num"),
     ],
 )  # fmt: skip
 def test_a_network_that_could_not_be_trained_again_is_one_sentence(network, said):
     with pytest.raises(UserError, match=said) as error:
         own(network)
     assert "\n" not in str(error.value)
+
+
+def test_a_network_may_write_into_the_rows_that_it_gets(rng):
+    network, x = own(kind(forward=lambda self, x: Own.forward(self, x.clamp_(-0.5, 0.5)))), torch.randn(4, 5)
+    before = x.clone()
+    out = network(x)
+    assert torch.equal(x, before)
+    torch.testing.assert_close(out, Own.forward(network.module, x.clamp(-0.5, 0.5)))
 
 
 def test_a_network_of_ones_own_is_looked_at_with_gradients_wherever_it_is_made():

@@ -82,6 +82,9 @@ def test_a_run_whose_checkpoints_are_gone_keeps_its_metrics_when_it_begins_again
     assert code == 2
     assert f"✗ {run} came to step 256, its end; its checkpoints are gone, so that resume begins a new" in said
     before = (run / "metrics.jsonl").read_bytes()
+    with pytest.raises(lem.UserError, match="its checkpoints are gone: nothing is left to go on from to 512 steps"):
+        lem.resume(run, total_steps=512, progress=False)
+    assert (run / "metrics.jsonl").read_bytes() == before
     assert lem.resume(run, progress=False).policy.step == 256
     said = capsys.readouterr().err
     assert "resume begins a new metrics.jsonl. It is kept as" in said
@@ -139,3 +142,26 @@ def test_a_sweep_is_checked_run_by_run(tmp_path, capsys):
 def test_from_python_it_takes_a_path_or_what_train_returned(run):
     assert [finding.grade for finding in lem.check(run)] == ["good"] * 4
     assert lem.check(str(run)) == lem.check(run)
+
+
+def test_a_directory_in_the_place_of_the_metrics_is_said(run):
+    (run / "metrics.jsonl").unlink()
+    (run / "metrics.jsonl").mkdir()
+    with pytest.raises(lem.UserError, match="is a directory, where the lines of metrics have their file"):
+        lem.resume(run, total_steps=512, progress=False)
+
+
+@pytest.mark.parametrize("verb", [lem.load, lem.resume, lambda path: lem.save(None, path)])
+@pytest.mark.parametrize(("name", "said"), [("x" * 300, "a name of more than 255 bytes"), ("a\0b", "has a zero byte")])
+def test_what_can_be_no_path_is_said(verb, name, said):
+    with pytest.raises(lem.UserError, match=said):
+        verb(name)
+
+
+def test_an_export_is_no_run_and_a_dead_link_no_place(run, tmp_path):
+    lem.export(run, to=tmp_path / "export")
+    with pytest.raises(lem.UserError, match="is an export, for other programs: load the run"):
+        lem.load(tmp_path / "export")
+    (tmp_path / "link").symlink_to(tmp_path / "nowhere")
+    with pytest.raises(lem.UserError, match="is a link that leads nowhere"):
+        lem.save(lem.load(run), tmp_path / "link")

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
 from inspect import signature
-from itertools import product
+from itertools import pairwise, product
 from os import PathLike
 from pathlib import Path
 from types import SimpleNamespace
@@ -22,8 +22,8 @@ from torch import Tensor, nn
 
 from lemniscate.api.policy import TrainedPolicy, TrainedRun, load
 from lemniscate.envs.conversion import normalized_action, physical_action, row_of, unflatten_observation
-from lemniscate.envs.returns import as_array, kind_of, shown_space
-from lemniscate.envs.spaces import random_action, read_observation
+from lemniscate.envs.returns import MASKS, as_array, kind_of, shown_space
+from lemniscate.envs.spaces import random_action, read_mask, read_observation
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.envs.vector_view import action_space, observation_space
 from lemniscate.errors import UserError, shown
@@ -41,6 +41,9 @@ from lemniscate.system.files import at_home
 
 FILES = (".pt", ".pth")
 """the endings of files of weights"""
+
+HALVES = torch.float16, torch.bfloat16
+"""of which weights are taken in float32, as the observations are"""
 
 LOOKS, ROWS = 10, 48
 """steps of random play, and observations of these, by which it is found out how a policy is called"""
@@ -76,15 +79,18 @@ def read_weights(file: Path, spec: Spec, agent: Any = None) -> tuple[Any, list[T
     except FileNotFoundError:
         raise UserError(f"{file} does not exist.") from None
     except Exception as error:  # of pickle, of zip and of torch
+        if "global" not in str(error).lower():  # what torch refuses to import
+            raise UserError(f"{file} is damaged, or no file of torch.save's: {type(error).__name__}.") from error
         line = f"torch.save(agent.state_dict(), {file.name!r})"
         raise UserError(f"{file} cannot be read without running what it holds; save weights alone: {line}.") from error
     held = record if isinstance(record, dict) else {}
-    weights = next((part for name, part in held.items() if re.match(r"(?!.*optim).*state_dict$", str(name))), held)
-    if not weights or not all(isinstance(tensor, Tensor) for tensor in weights.values()):
+    parts = (part for name, part in held.items() if re.match(r"(?!.*optim).*state_dict$", str(name)))
+    weights = next(parts, held)
+    pairs = weights.items() if isinstance(weights, dict) else ()
+    if not pairs or not all(isinstance(name, str) and isinstance(tensor, Tensor) for name, tensor in pairs):
         raise UserError(f"{file} has no weights: a state_dict, or a dictionary with one, such as model_state_dict.")
-    moments = [torch.as_tensor(held[name]).double().flatten() for name in ("obs_mean", "obs_var") if name in held]
-    if len(moments) == 1:
-        raise UserError(f"{file} has one of obs_mean and obs_var; a normalizer needs both.")
+    weights = {name: tensor.float() if tensor.dtype in HALVES else tensor for name, tensor in pairs}
+    moments = _moments(held, file)
     said, sizes = f"{file}: {'with' if moments else 'without'} obs_mean and obs_var", list(map(len, moments))
     if agent is None:
         made, widths = _of_layout(weights, file)
@@ -97,6 +103,18 @@ def read_weights(file: Path, spec: Spec, agent: Any = None) -> tuple[Any, list[T
     for wrong in (size for size in sizes if size != spec.observation_size):
         raise UserError(f"{file} is for {wrong} observed numbers; {observed(spec)}{_remedy(wrong, spec)}.")
     return made, moments, any(name.endswith("action_scale") for name in weights), said
+
+
+def _moments(held: dict[Any, Any], file: Path) -> list[Tensor]:
+    """Mean and variance of the observations, if a file has them. Raises `UserError` for others than these."""
+    names = [name for name in ("obs_mean", "obs_var") if name in held]
+    if len(names) == 1:
+        raise UserError(f"{file} has one of obs_mean and obs_var; a normalizer needs both.")
+    arrays = [as_array(held[name]) for name in names]
+    right = [array.dtype.kind in "iuf" and np.isfinite(array).all() for array in arrays]
+    if not all(right) or (arrays and (arrays[1] < 0).any()):
+        raise UserError(f"obs_mean and obs_var in {file} must be finite numbers, and no variance negative.")
+    return [torch.from_numpy(array.astype(np.float64)).flatten() for array in arrays]
 
 
 def _of_layout(weights: dict[str, Tensor], file: Path) -> tuple[Callable[[Tensor], Any], list[int]]:
@@ -113,7 +131,12 @@ def _of_layout(weights: dict[str, Tensor], file: Path) -> tuple[Callable[[Tensor
             f"{file} has another layout than the courses' agents: name the class or the function that makes yours,"
             " agent=Agent in Python, --agent module:Agent on the command line."
         )
-    layers = [(weights[f"{name}.weight"], weights[f"{name}.bias"]) for name in names]
+    layers = [(weights[f"{name}.weight"].float(), weights[f"{name}.bias"].float()) for name in names]
+    sizes = [(len(bias), *weight.shape[1:]) for weight, bias in layers]
+    if any(weight.shape != size or len(size) != 2 for (weight, _), size in zip(layers, sizes, strict=True)) or any(
+        after[1] != before[0] for before, after in pairwise(sizes)
+    ):
+        raise UserError(f"{file} has layers that do not fit each other: {', '.join(map(str, sizes))}.")
 
     def forward(x: Tensor) -> Any:
         for number, layer in enumerate(layers):
@@ -221,11 +244,15 @@ class Agent:
         self._policy, self._spec, self._deterministic = policy, spec, deterministic
         self._space: Any = action_space(spec.action)
         self._function = function_of(policy, deterministic)
+        self._mask = ""
+        """the argument in which the policy takes an action mask, if it does"""
+        with suppress(ValueError):  # a function that is not written in Python
+            self._mask = next((name for name in MASKS if name in signature(self._function).parameters), "")
         self._look(seen)
 
     def __call__(self, obs: Tensor) -> Deterministic:
         """The action at each flat observation, [N, O] or more. Raises `UserError` for what is no action."""
-        action = self._answers(self._form(obs.numpy()), len(obs))
+        action = self._answers(obs.numpy())
         if self.normalized and isinstance(self._spec.action, Box):
             return Deterministic(torch.from_numpy(action.reshape(len(obs), -1).astype(np.float32)))
         return Deterministic(torch.from_numpy(normalized_action(action, self._spec.action)))
@@ -233,13 +260,17 @@ class Agent:
     def act(self, obs: Any, action_mask: Any = None) -> np.ndarray:
         """The action for `env.step` at one observation, as the environment returns it."""
         flat, _ = read_observation(self._spec, obs)
+        if self._spec.action.mask_size:
+            flat = np.concatenate([flat, read_mask(action_mask, self._spec, flat).astype(flat.dtype)], axis=-1)
         return physical_action(self(torch.from_numpy(flat)).mode().numpy(), self._spec.action)[0]
 
-    def _answers(self, rows: Any, count: int) -> np.ndarray:
-        """The actions at the first `count` of some observations, [count, …] in the shape of the space."""
+    def _answers(self, flat: np.ndarray) -> np.ndarray:
+        """The actions at flat observations [B, …], in the shape of the space; masks are given where asked for."""
+        rows, count, masks = self._form(flat), len(flat), flat[:, self._spec.observation_size :].astype(bool)
+        told = {self._mask: masks} if self._mask and masks.size else {}
         if self._batched:
-            return self._answer(rows, (count,))
-        return np.stack([self._answer(row_of(rows, i), ()) for i in range(count)])
+            return self._answer(rows, (count,), told)
+        return np.stack([self._answer(row_of(rows, i), (), row_of(told, i)) for i in range(count)])
 
     def _look(self, seen: np.ndarray) -> None:
         """Find out how the policy is called.
@@ -291,7 +322,7 @@ class Agent:
     def _try(self, flat: np.ndarray, failures: list[UserError]) -> np.ndarray | None:
         seed_globals(0)  # what is drawn at random is not what a policy remembers
         try:
-            return self._answers(self._form(flat), len(flat))
+            return self._answers(flat)
         except UserError as error:
             failures.append(error)
             return None
@@ -306,11 +337,11 @@ class Agent:
         for layout, kind in product((own, lambda flat: flat[:, : self._spec.observation_size]), kinds):
             yield lambda flat, layout=layout, kind=kind: _copied(layout(flat), kind)
 
-    def _answer(self, rows: Any, leads: tuple[int, ...]) -> np.ndarray:
+    def _answer(self, rows: Any, leads: tuple[int, ...], told: dict[str, Any]) -> np.ndarray:
         """The actions at observations [*leads, …], float64. Raises `UserError` with what the policy raised."""
         try:
             with torch.set_grad_enabled(not isinstance(self._policy, nn.Module)):  # a function may plan by gradients
-                returned = self._function(rows)
+                returned = self._function(rows, **told)
         except Exception as error:
             frames = traceback.extract_tb(error.__traceback__)[1:]
             own = [frame for frame in frames if "site-packages" not in frame.filename]
@@ -330,7 +361,8 @@ class Agent:
             value = value.mode if self._deterministic else value.sample()
             value = value + kind.start if isinstance(kind, Discrete) else value
         array = as_array(value.double() if isinstance(value, Tensor) and value.is_floating_point() else value)
-        if isinstance(kind, Discrete) and array.dtype.kind == "f" and _alike(array.shape, (*leads, kind.n)):
+        numbers = array.dtype.kind == "f" and not np.isnan(array).any()
+        if isinstance(kind, Discrete) and numbers and _alike(array.shape, (*leads, kind.n)):
             if not self._deterministic:
                 raise UserError(
                     "The policy returns a number for each action, from which none is drawn: return the action."

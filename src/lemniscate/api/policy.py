@@ -125,7 +125,10 @@ class TrainedPolicy:
             UserError: `done` of another shape.
         """
         if self._recall:
-            self._recall.reset(None if done is None else torch.as_tensor(done, dtype=torch.bool))
+            flags = None if done is None else as_array(done)
+            if flags is not None and not (flags.dtype.kind in "biuf" and ((flags == 0) | (flags == 1)).all()):
+                raise UserError(f"done must be True or False for each episode of the batch, not {kind_of(done)}.")
+            self._recall.reset(None if flags is None else torch.from_numpy(flags.astype(bool)))
 
     @torch_defaults(grad=False)
     def distribution(self, obs: Any, action_mask: Any = None) -> ActionDistribution:
@@ -255,6 +258,8 @@ def load(run: Trained, *, checkpoint: str | int | None = None, trust: bool = Fal
                 f"{run} is a file, and a policy of lemniscate is a folder: lem.evaluate('{run}', env=…) plays the"
                 " weights of a .pt file and lem.watch shows it; that of another library is to be loaded by it."
             )
+        if (path_of(run) / "policy.onnx").is_file():
+            raise UserError(f"{run} is an export, for other programs: load the run or the checkpoint that it is of.")
         return _read(find_checkpoint(path_of(run), checkpoint), path_of(run))
     address = hub.read_address(run)
     if checkpoint is not None:
@@ -312,6 +317,8 @@ def save(policy: Any, path: str | Path) -> Path:
     stored = False  # what a run has saved is not to be replaced
     with suppress(UserError):
         stored = checkpoint.read(path).record.get("stored", False)
+    if path.is_symlink() and not path.exists():
+        raise UserError(f"{path} is a link that leads nowhere; choose another path.")
     if path.exists() and not stored:
         raise UserError(f"{path} exists already, and is not a stored policy; choose another path.")
     if others := sorted({file.name for file in path.glob("[!.]*")} - {*checkpoint.FILES, checkpoint.MANIFEST}):

@@ -82,18 +82,26 @@ class HindsightReplay(ReplayBuffer):
         return replace(copies, reward=reward, terminated=ends | copies.terminated)  # the last step has no later goal
 
     def _compare(self, episode: Transition) -> None:
-        """Raise `UserError` where the judge does not give the rewards that an episode had.
+        """Raise `UserError` where the judge does not give the rewards that an episode had, or ends it before.
 
         Goals are float32 here, and may have been float64 there: at the edge of a threshold the judge is asked on both
         sides of it.
         """
         assert self._judge is not None
         achieved, desired = (episode.next_obs[:, columns] for columns in (self._achieved, self._desired))
-        judged = self._judge(achieved, desired)[0]
+        judged, ends = self._judge(achieved, desired)
         right = torch.isclose(episode.reward, judged, rtol=1e-4, atol=1e-5)
+        early = ends & ~episode.terminated
         rounding = (achieved - desired).sign() * torch.maximum(achieved.abs(), desired.abs()) * 2**-21
-        for edge in (rounding, -rounding) if not right.all() else ():
-            right |= torch.isclose(episode.reward, self._judge(achieved + edge, desired)[0], rtol=1e-4, atol=1e-5)
+        for edge in (rounding, -rounding) if early.any() or not right.all() else ():
+            at_edge, ends = self._judge(achieved + edge, desired)
+            right, early = right | torch.isclose(episode.reward, at_edge, rtol=1e-4, atol=1e-5), early & ends
+        if early.any():
+            step = int(early.int().argmax())
+            raise UserError(
+                f"In step {step:,} of an episode {self._env_id} goes on, and its compute_terminated says that it ends:"
+                " both must say the same. --replay uniform does not ask it."
+            )
         if not right.all():
             step = int(right.int().argmin())
             raise UserError(

@@ -93,19 +93,32 @@ class SingleEnv(gym.Wrapper):
 
         Asked row by row, as `step` asks. Without `compute_terminated` no goal ends an episode. There is no info.
         """
-        space: Any = self.observation_space
-        kind, shape = space["desired_goal"].dtype, space["desired_goal"].shape
-        pairs = [goals.astype(kind).reshape(-1, *shape) for goals in (achieved, desired)]
         answers = np.zeros((2, len(achieved)), dtype=np.float32)
-        for row, name in zip(answers, ("compute_reward", "compute_terminated"), strict=True):
+        for row, name, kind in zip(answers, ("compute_reward", "compute_terminated"), (float, bool), strict=True):
             if name == "compute_reward" or self.has_wrapper_attr(name):
-                try:
-                    judge = self.get_wrapper_attr(name)
-                    row[:] = [float(judge(*pair, {})) for pair in zip(*pairs, strict=True)]
-                except (AttributeError, TypeError, ValueError, KeyError) as error:
-                    said = f"{type(error).__name__}: {error}"
-                    raise UserError(f"{name}(achieved_goal, desired_goal, {{}}) raised {said}.") from error
+                goals = self._goals("achieved_goal", achieved), self._goals("desired_goal", desired)
+                row[:] = [self._judged(name, kind, *pair) for pair in zip(*goals, strict=True)]
         return answers[0], answers[1].astype(bool)
+
+    def _goals(self, name: str, rows: np.ndarray) -> np.ndarray:
+        """Goals [B, G] in the shape and the type of their space; new ones, into which a judge may write."""
+        space: Any = self.observation_space
+        kind, shape = np.dtype(space[name].dtype), space[name].shape
+        return (np.rint(rows) if kind.kind in "iu" else rows).astype(kind).reshape(-1, *shape)
+
+    def _judged(self, name: str, kind: type, achieved: np.ndarray, desired: np.ndarray) -> float:
+        """The answer of a judge on one goal. Raises `UserError` where it raises, or answers with something else."""
+        call = f"{name}(achieved_goal, desired_goal, {{}})"
+        try:
+            answer = self.get_wrapper_attr(name)(achieved, desired, {})
+        except Exception as error:  # one for batches may raise anything
+            said = f"{type(error).__name__}: {error}"
+            raise UserError(f"{call}, of one goal each, raised {said}.") from error
+        array = as_array(answer)
+        if array.dtype.kind not in "biuf" or array.size != 1 or (kind is bool and array.item() not in (0, 1)):
+            wanted = "a number" if kind is float else "True or False"
+            raise UserError(f"{call}, of one goal each, returned {kind_of(answer)}; it must be {wanted}.")
+        return float(array.item())
 
     def close(self) -> None:
         """Gymnasium's. An exception in it is said, and costs nothing that was learned."""
@@ -219,7 +232,10 @@ def _with_tuples(tree: Any) -> Any:
 
 def _one_hot(part: ObservationPart, obs: Any) -> np.ndarray:
     """A batch of whole numbers, each as a one-hot vector. Raises `ValueError` for one that is not in its space."""
-    whole = np.asarray(obs).astype(np.int64, casting="same_kind")  # of uint64 and int64 NumPy makes float64
+    array = np.asarray(obs)
+    if array.dtype.kind == "f" and (array == np.rint(array)).all():
+        array = array.astype(np.int64)
+    whole = array.astype(np.int64, casting="same_kind")  # of uint64 and int64 NumPy makes float64
     numbers = whole.reshape(-1, len(part.nvec)) - np.array(part.start)
     if (numbers < 0).any() or (numbers >= np.array(part.nvec)).any():
         raise ValueError(f"{part.name} is {obs}, which is not in its space")

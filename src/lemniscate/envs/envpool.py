@@ -233,4 +233,7 @@ def pools(task: str, options: Mapping[str, Any], own: Mapping[str, Any]) -> Call
             raise UserError(
                 f"{name} of EnvPool's {task} must be of type {kind}, such as {known[name]!r}, not {value!r}."
             )
+    if not 1 <= options.get("max_episode_steps", 1) < 2**31:
+        steps = options["max_episode_steps"]
+        raise UserError(f"max_episode_steps of EnvPool's {task} must be from 1 to {2**31 - 1:,}, not {steps:,}.")
     return partial(make_pool, task, {**options, **own})

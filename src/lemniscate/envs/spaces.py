@@ -320,11 +320,15 @@ def read_observation(spec: Spec, obs: Any) -> tuple[np.ndarray, bool]:
     """
     parts = spec.observation_parts
     try:
-        if not isinstance(obs, dict | tuple) and _is_flat(spec, np.asarray(obs)):
+        array = None if isinstance(obs, dict | tuple) else np.asarray(obs)
+        if array is not None and array.dtype.kind == "c":
+            raise TypeError("its numbers are complex")
+        if array is not None and _is_flat(spec, array):
             parts = (ObservationPart((), (spec.observation_size,), image=spec.image),)
         batched = _is_batch(parts, obs)
-        flat = flatten_observation(parts, obs, image=spec.image)
-    except (KeyError, IndexError, TypeError, ValueError) as error:
+        with np.errstate(over="ignore"):  # to infinity, which is said below
+            flat = flatten_observation(parts, obs, image=spec.image)
+    except (KeyError, IndexError, TypeError, ValueError, OverflowError) as error:
         raise _unreadable(spec, obs, error) from None
     if not np.isfinite(flat).all():
         number = flat[~np.isfinite(flat)][0]

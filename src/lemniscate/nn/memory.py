@@ -141,7 +141,7 @@ class OwnCell(OwnNetwork):
 
     def step(self, prepared: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
         """[B, inputs] and [B, size] to the outputs [B, outputs], and the next memory."""
-        return self.module(prepared, memory.clone())  # it may write into what it is given
+        return self.module(prepared.clone() if self.writes else prepared, memory.clone())  # it may write into it
 
     def over(self, prepared: Tensor, goes_on: Tensor, memory: Tensor) -> Tensor:
         """The outputs [P, L, outputs] of pieces, [P, L, inputs], [P, L, 1] and [P, L, size]; see `side_by_side`."""
@@ -156,10 +156,10 @@ class OwnCell(OwnNetwork):
 
     def _call(self, rows: Tensor) -> Tensor:
         memory = rows.new_zeros(len(rows), self.module.memory_size)
-        out, after = self.module(rows, memory)
+        out, after = self.step(rows, memory)
         if (after.shape, after.dtype) != (memory.shape, memory.dtype):
             raise ValueError(f"the next memory is {list(after.shape)} of {after.dtype}")
-        out, _ = self.module(rows, after)  # on from there, so that what the memory is for takes part
+        out, _ = self.step(rows, after)  # on from there, so that what the memory is for takes part
         return out
 
 

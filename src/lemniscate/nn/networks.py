@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.parameter import is_lazy
 
-from lemniscate.errors import UserError, unknown_name
+from lemniscate.errors import UserError, shown, unknown_name
 from lemniscate.maths import tanh
 from lemniscate.spec import ObservationPart
 from lemniscate.system.named import find_callable
@@ -118,8 +118,12 @@ NETWORKS: dict[str, Callable[[Layers, int], tuple[list[nn.Module], int]]] = {
 
 
 def _memory_size(maker: Callable[..., Any]) -> int:
-    """The numbers that modules of a class remember; 0 where it does not say so."""
-    return getattr(getattr(maker, "func", maker), "memory_size", 0)
+    """The numbers that modules of a class remember; 0 where it does not say so. Raises `UserError` for no number."""
+    size = getattr(getattr(maker, "func", maker), "memory_size", 0)
+    if type(size) is not int or size < 0:
+        name = getattr(maker, "__name__", maker)
+        raise UserError(f"memory_size of {name} is {shown(size)}; in the class it must be a whole number, such as 64.")
+    return size
 
 
 class OwnNetwork(nn.Module):
@@ -132,15 +136,19 @@ class OwnNetwork(nn.Module):
 
     def __init__(self, name: str, inputs: int, outputs: int) -> None:
         super().__init__()
-        self.name, self.least, rows = name, 1, torch.randn(64, inputs, generator=torch.Generator().manual_seed(0))
+        self.name, self.least, self.writes = name, 1, False
+        rows = torch.randn(64, inputs, generator=torch.Generator().manual_seed(0))
         wanted = f"{name}({inputs}, {outputs}) must make a module that takes {self._taken(inputs, outputs)}"
         try:
             self.module = self._made(inputs, outputs)
-            before = self._tensors()
+            before, given = self._tensors(), rows.clone()
             with torch.enable_grad():
-                out = self._call(rows)
+                out = self._call(given)
+                if isinstance(out, Tensor) and out.requires_grad:  # what it overwrites may be missing here
+                    torch.autograd.grad(out.sum(), [x for x in self.parameters() if x.requires_grad], allow_unused=True)
+            self.writes = not _equal(given, rows)
             with torch.no_grad():  # last, so that nothing that the module keeps has a graph, which could not be copied
-                again = self._call(rows)
+                again, acting = self._call(rows), self._call_to_act(rows)
             changed = [key for key, tensor in self._tensors().items() if not _equal(before.get(key, tensor), tensor)]
             lost = [key for key, tensor in self.state_dict().items() if not tensor.isfinite().all()]
         except UserError:
@@ -153,22 +161,11 @@ class OwnNetwork(nn.Module):
         if changed:
             how = f"changes {changed[0].removeprefix('module.')} in forward, which no other process would repeat"
             raise UserError(f"{name} {how}; of batch normalization, take track_running_stats=False, or LayerNorm.")
-        if not _equal(out, again):
-            how = "is random: two calls with the same rows differ, and so would old and new probabilities"
-            raise UserError(f"{name} {how}; leave out its dropout, and what it keeps, or changes in its input.")
-        if lost:
-            raise UserError(f"{name} has a number in {lost[0].removeprefix('module.')} that is not finite.")
-        types = {str(parameter.dtype) for parameter in self.parameters() if parameter.requires_grad}
-        if not out.requires_grad or types != {"torch.float32"}:
-            kinds = f"parameters of {', '.join(sorted(types))}" if types else "no parameter to learn"
-            raise UserError(f"{name} has {kinds}; it must have some of torch.float32 that its outputs depend on.")
+        self._require_repeated(out, again, acting)
+        self._require_learned(out, lost)
         self._require_rows(out, rows)
         self._require_saved(out, rows)
-        try:
-            with torch.no_grad():
-                self._call(rows[:1])
-        except ValueError:  # of batch normalization, by the statistics of the rows themselves
-            self.least = 2
+        self._require_one_row(rows[:1], outputs)
 
     def _made(self, inputs: int, outputs: int) -> Any:
         """A new module. Raises `UserError` for one that is made already, or says too late that it has a memory."""
@@ -180,6 +177,36 @@ class OwnNetwork(nn.Module):
         if getattr(module, "memory_size", 0) and not _memory_size(maker):
             raise UserError(f"{self.name} sets its memory_size too late; it must stand in the class: memory_size = 64.")
         return module
+
+    def _require_repeated(self, out: Tensor, again: Tensor, acting: Any) -> None:
+        """Raise `UserError` where the same rows have other outputs, in a second call or out of training."""
+        if not _equal(out, again):
+            how = "is random: two calls with the same rows differ, and so would old and new probabilities"
+            raise UserError(f"{self.name} {how}; leave out its dropout, and what it keeps, or changes in its input.")
+        if not isinstance(acting, Tensor) or not _equal(out, acting):
+            how = "has other outputs after eval(), in which policies act, than in training"
+            raise UserError(f"{self.name} {how}: they must not depend on self.training.")
+
+    def _require_learned(self, out: Tensor, lost: list[str]) -> None:
+        """Raise `UserError` for numbers that are not finite, and where nothing of float32 would be learned."""
+        if lost:
+            raise UserError(f"{self.name} has a number in {lost[0].removeprefix('module.')} that is not finite.")
+        types = {str(parameter.dtype) for parameter in self.parameters() if parameter.requires_grad}
+        if not out.requires_grad or types != {"torch.float32"}:
+            kinds = f"parameters of {', '.join(sorted(types))}" if types else "no parameter to learn"
+            raise UserError(f"{self.name} has {kinds}; it must have some of torch.float32 that its outputs depend on.")
+
+    def _require_one_row(self, row: Tensor, outputs: int) -> None:
+        """Raise `UserError` where one row [1, inputs] does not stay a row; `least` is 2 where it needs others."""
+        try:
+            with torch.no_grad():
+                out = self._call(row)
+        except ValueError:  # of batch normalization, by the statistics of the rows themselves
+            self.least = 2
+            return
+        if out.shape != (1, outputs):
+            shapes = f"[1, {row.shape[1]}], to {list(out.shape)}; it must be [1, {outputs}]"
+            raise UserError(f"{self.name} takes one row, {shapes}.")
 
     def _require_rows(self, out: Tensor, rows: Tensor) -> None:
         """Raise `UserError` where the outputs depend on the order of the rows."""
@@ -213,14 +240,24 @@ class OwnNetwork(nn.Module):
 
     def _call(self, rows: Tensor) -> Tensor:
         """The outputs at rows [B, inputs] for the checks above."""
-        return self.module(rows)
+        return self.module(rows.clone() if self.writes else rows)
+
+    def _call_to_act(self, rows: Tensor) -> Tensor:
+        """The outputs while the module is not in training."""
+        modes = [(module, module.training) for module in self.module.modules()]
+        try:
+            self.module.eval()
+            return self._call(rows)
+        finally:
+            for module, mode in modes:
+                module.training = mode
 
     def forward(self, x: Tensor) -> Tensor:
         """[…, inputs] to […, outputs]."""
         rows = x.reshape(-1, x.shape[-1]) if x.dim() != 2 else x
         if rows.shape[0] < self.least:  # its `len` would fix the number of rows where it is exported
             raise UserError(f"{self.name} needs 2 rows or more at once, so it cannot act on 1; LayerNorm can.")
-        out = self.module(rows)
+        out = self.module(rows.clone() if self.writes else rows)
         return out.reshape(*x.shape[:-1], out.shape[-1]) if x.dim() != 2 else out
 
     def _tensors(self) -> dict[str, Tensor]:

@@ -70,8 +70,18 @@ class PolicyVector(ParameterVector):
         return functional_call(self.module, self.views(theta), (obs,))
 
     def fisher(self, vector: Tensor, obs: Tensor) -> Tensor:
-        """F v [P], where F is the Fisher matrix at the present θ, averaged over observations [B, O]."""
-        return fisher_product(lambda theta: self.at(theta, obs), self.vector, vector)
+        """F v [P], where F is the Fisher matrix at the present θ, averaged over observations [B, O].
+
+        Raises `UserError` for a layer without a derivative in forward mode.
+        """
+        try:
+            return fisher_product(lambda theta: self.at(theta, obs), self.vector, vector)
+        except NotImplementedError as error:
+            said = str(error).partition(" that ")[0]
+            raise UserError(
+                f"A layer of the policy has no derivative in forward mode, which trpo takes (torch: {said}); ppo learns"
+                " with it."
+            ) from error
 
 
 class Adam(ParameterVector):

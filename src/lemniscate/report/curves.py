@@ -349,7 +349,7 @@ def limit_axis(axes: Axes) -> None:
         return
     values = np.concatenate([y for _, _, y in lines])
     low, high = robust_range(values)
-    margin = 0.05 * (high - low)
+    margin = 0.05 * (high - low) or 0.05 * abs(high) or 0.05
     said = [f"▲ to {values.max():,.3g}"] if values.max() > high else []
     said += [f"▼ to {values.min():,.3g}"] if values.min() < low else []
     if said:  # both ends: the margin of one that is left as it is would be a share of the outliers

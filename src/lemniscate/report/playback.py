@@ -37,7 +37,7 @@ Act = Callable[..., np.ndarray]
 """(observation, action_mask=…) of an environment to an action"""
 Tell = Callable[[str], object]
 
-ONE = torch.ones(1, dtype=torch.bool)
+ONE, LARGEST = torch.ones(1, dtype=torch.bool), torch.finfo(torch.float32).max
 
 FILMS = {".gif": "image/gif", ".webp": "image/webp", ".mp4": "video/mp4"}
 """the endings of a film's file, and what it is to a browser"""
@@ -73,7 +73,7 @@ def show_episodes(
         if in_window:
             deque(played, maxlen=0)  # Gymnasium draws at each step
         else:
-            give((_picture(env, name) for _ in played), float((env.metadata or {}).get("render_fps") or 30), video)
+            give((_picture(env, name) for _ in played), _pace(env), video)
     return table.evaluation(name, SUMMARIES)
 
 
@@ -125,7 +125,7 @@ def _play(
         while not done:
             require_end(name, length, limit)
             obs, reward, terminated, truncated, info = env.step(act(obs, action_mask=info.get("action_mask")))
-            if not math.isfinite(reward):
+            if not abs(float(reward)) <= LARGEST:
                 raise NonFiniteError(f"The reward of {name} is {reward} in step {length + 1} of an episode.")
             total, length = total + float(reward), length + 1
             done = terminated or truncated
@@ -141,6 +141,15 @@ def _play(
             table.add(step, ONE)
             yield
         tell(sentence(number + 1, total, length))
+
+
+def _pace(env: gym.Env) -> float:
+    """The frames a second that an environment says it has; 30 where it says nothing that a film can have."""
+    try:
+        fps = float((env.metadata or {}).get("render_fps") or 30)
+    except (TypeError, ValueError):
+        return 30.0
+    return fps if 0.1 <= fps <= 1000 else 30.0
 
 
 def _random(env: gym.Env, seed: int) -> Act:
@@ -183,7 +192,7 @@ def _rendered(arguments: dict[str, Any], mode: str) -> gym.Env:
         except Exception as error:  # pygame, GLFW and MuJoCo each have their own
             hint = " (without a display MuJoCo needs MUJOCO_GL=egl or osmesa)" if "OpenGL" in str(error) else ""
             none = "it has no render() that returns a picture with render_mode='rgb_array'."
-            said = none if isinstance(error, NotImplementedError) else error
+            said = none if isinstance(error, NotImplementedError) else " ".join(str(error).split())
             raise UserError(f"{name} cannot be shown here: {said}{hint}") from error
         if mode == "rgb_array":
             _picture(env, name)
@@ -244,10 +253,21 @@ def save_frames(frames: Iterable[np.ndarray], file: Path, fps: float) -> None:
         raise UserError(f"{file} cannot be written: {error.strerror}.") from error
     remove(file)  # writing would follow a link
     try:
-        _write(frames, file, fps)
+        _write(_of_one_size(frames, file), file, fps)
     except BaseException:  # what draws the frames may fail: no half of a film is left
         file.unlink(missing_ok=True)
         raise
+
+
+def _of_one_size(frames: Iterable[np.ndarray], file: Path) -> Iterator[np.ndarray]:
+    """The frames. Raises `UserError` for one of another size than the first."""
+    size = None
+    for frame in frames:
+        size = size or frame.shape
+        if frame.shape != size:
+            one, other = (f"{shape[1]} × {shape[0]}" for shape in (size, frame.shape))
+            raise UserError(f"{file} cannot be recorded: after pictures of {one} render() returns one of {other}.")
+        yield frame
 
 
 def _write(frames: Iterable[np.ndarray], file: Path, fps: float) -> None:

@@ -96,7 +96,8 @@ def _convert(value: Any, option: Any) -> Any:
         read = _number_or_schedule if Schedule in marks else _number
         return read(value, basic, *(mark for mark in marks if isinstance(mark, Range)))
     if kind is Literal and value not in get_args(option):
-        raise ValueError(f"one of {', '.join(map(str, get_args(option)))}")
+        choices = ", ".join(map(str, get_args(option)))
+        raise ValueError(f"one of {choices}" if "," in choices else choices)
     if kind is tuple:
         words = get_args(option)[0] is str
         if words and isinstance(value, str) and "," not in re.sub(r"\(.*\)", "", value):  # one alone

@@ -122,6 +122,8 @@ def extend(path: Path, total_steps: int) -> None:
     newest = max(checkpoint.list_steps(path / "checkpoints"), default=0)
     if total_steps <= newest:
         raise UserError(f"{path} stands at step {newest:,}: total_steps must be above that, not {total_steps:,}.")
+    if gone := lost(path):
+        raise UserError(f"{gone.partition(', so')[0]}: nothing is left to go on from to {total_steps:,} steps.")
     try:
         with locked(path):
             record = read_record(path)

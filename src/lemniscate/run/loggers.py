@@ -53,6 +53,8 @@ class JsonLines:
 
     def __init__(self, path: Path, config: Mapping[str, Any], step: int) -> None:
         self._path = path / METRICS
+        if self._path.is_dir():
+            raise UserError(f"{self._path} is a directory, where the lines of metrics have their file: move it away.")
         lines = [line for line in read_metrics(path) if line["step"] <= step] if step else []
         replace_file(self._path, b"".join(map(to_line, lines)))
         self._file = self._path.open("ab", buffering=0)  # what a buffer held would be lost in a crash

@@ -64,7 +64,7 @@ def torch_defaults(grad: bool = True) -> Iterator[None]:
 def seed_globals(seed: int) -> None:
     """Seed the global generators: Python's, NumPy's legacy one, torch's on every device."""
     random.seed(seed)
-    np.random.seed(seed)  # noqa: NPY002  (users' environments may draw from it)
+    np.random.seed(seed % 2**32)  # noqa: NPY002  (users' environments may draw from it)
     torch.manual_seed(seed)
     torch.cuda.manual_seed_all(seed)
 

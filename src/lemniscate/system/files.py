@@ -22,6 +22,9 @@ from lemniscate.errors import UserError
 MAX_JSON_BYTES = 64 * 2**20
 """more than any JSON that is written here"""
 
+LONGEST_NAME = 255
+"""bytes of a name in a folder, on every common file system"""
+
 HASH = "sha256"
 
 
@@ -30,8 +33,12 @@ class DamagedFileError(UserError):
 
 
 def at_home(path: str | os.PathLike[str]) -> Path:
-    """A path as a person gives it: `~` at its beginning is the home folder."""
-    return Path(os.path.expanduser(path))  # noqa: PTH111 (pathlib's raises where `~name` is no user)
+    """A path as a person gives it: `~` at its beginning is the home folder. Raises `UserError` for what none can be."""
+    found = Path(os.path.expanduser(path))  # noqa: PTH111 (pathlib's raises where `~name` is no user)
+    if "\0" in str(found) or any(len(os.fsencode(part)) > LONGEST_NAME for part in found.parts):
+        what = "has a zero byte" if "\0" in str(found) else f"has a name of more than {LONGEST_NAME} bytes"
+        raise UserError(f"{str(found)[:40]!r}… {what}, and is no path.")
+    return found
 
 
 def write_json(path: Path, record: Mapping[str, Any]) -> None:
