@@ -1066,7 +1066,7 @@ MUTANTS = [
     (
         "a reward at the edge of a threshold ends a run",
         "data/hindsight.py",
-        "if not right.all() else ():",
+        "if early.any() or not right.all() else ():",
         "if False else ():",
         HINDSIGHT + "a_reward_at_the_edge_of_a_threshold_may_differ_by_rounding",
     ),
