@@ -313,7 +313,7 @@ def test_the_best_checkpoint_is_kept_and_the_final_one_stays_the_policy_of_the_r
     assert lem.load(lem.load(whole), checkpoint="best").step == 160
     with pytest.raises(lem.UserError, match="has no checkpoint 96; those at steps: 256; best is kept with keep_best"):
         lem.load(whole, checkpoint=96)
-    with pytest.raises(lem.UserError, match="checkpoint must be a whole number at least 0 or one of best, not 'bst'"):
+    with pytest.raises(lem.UserError, match="checkpoint must be a whole number at least 0 or best, not 'bst'"):
         lem.load(whole, checkpoint="bst")
     assert any("Whole checkpoints: 256; it is finished." in finding.sentence for finding in lem.check(whole))
     names = ("manifest.json", "state.json", "tensors.safetensors")
