@@ -896,6 +896,27 @@ MUTANTS = [
         "nn/test_actor_critic.py::test_the_value_of_what_follows_is_that_of_the_true_next_observation",
     ),
     (
+        "a network of one's own writes into the rows that are stored",
+        "nn/networks.py",
+        "out = self.module(rows.clone() if self.writes else rows)",
+        "out = self.module(rows)",
+        "nn/test_networks.py::test_a_network_may_write_into_the_rows_that_it_gets",
+    ),
+    (
+        "a judge of goals writes into those of the next judge",
+        "envs/conversion.py",
+        'return (np.rint(rows) if kind.kind in "iu" else rows).astype(kind).reshape(-1, *shape)',
+        "return rows.reshape(-1, *shape)",
+        "data/test_hindsight.py::test_a_judge_may_write_into_the_goals_that_it_gets_and_answer_with_an_array_of_one",
+    ),
+    (
+        "a policy of one's own gets no action mask",
+        "api/agents.py",
+        "told = {self._mask: masks} if self._mask and masks.size else {}",
+        "told = {}",
+        "test_own_policies.py::test_a_policy_that_asks_for_the_action_mask_gets_it",
+    ),
+    (
         "side by side, the value has the policy's memory",
         "nn/memory.py",
         "outs = _through_pieces(cells, prepared, goes_on[0] == 1, memory)",

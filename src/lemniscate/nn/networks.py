@@ -144,7 +144,7 @@ class OwnNetwork(nn.Module):
             before, given = self._tensors(), rows.clone()
             with torch.enable_grad():
                 out = self._call(given)
-                if isinstance(out, Tensor) and out.requires_grad:  # what it overwrites may be missing here
+                if isinstance(out, Tensor) and out.requires_grad:  # fails where forward has overwritten what it needs
                     torch.autograd.grad(out.sum(), [x for x in self.parameters() if x.requires_grad], allow_unused=True)
             self.writes = not _equal(given, rows)
             with torch.no_grad():  # last, so that nothing that the module keeps has a graph, which could not be copied
