@@ -26,7 +26,7 @@ from lemniscate.run.metrics import read_metrics
 
 SHARED = {"minibatch_size": 512, "learning_rate": 1e-3, "hidden": (64,)}
 ENVS = {
-    # environment: (steps, what is asked for, settings of ppo, found on seeds 101 to 103)
+    # environment: (steps, what is asked for, settings of ppo, found on seeds 101 to 108)
     "cart_pole": (60_000, "500", SHARED),
     "pendulum": (400_000, "≥ −200", SHARED | {"gamma": 0.95, "sequence_length": 32, "desired_kl": None}),
     "RepeatFirst": (300_000, "1", SHARED | {"sequence_length": 64, "desired_kl": None}),

@@ -112,6 +112,7 @@ def test_one_spike_does_not_flatten_a_panel():
     values = np.array([*np.linspace(1, 2, 50), 1e6])
     assert curves.robust_range(values) == (1.0, 2.0)
     assert curves.robust_range(np.array([3.0, 3.0, 3.0, 9.0])) == (3.0, 9.0)
+    assert curves.robust_range(np.array([3.0, 3.0 + 1e-15, 3.0, 3.0, 3.0 + 1e-15, 9.0, *[3.0] * 20])) == (3.0, 9.0)
     axes = Figure().subplots()
     axes.plot(np.arange(51), values)
     curves.limit_axis(axes)

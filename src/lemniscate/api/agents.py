@@ -42,9 +42,6 @@ from lemniscate.system.files import at_home
 FILES = (".pt", ".pth")
 """the endings of files of weights"""
 
-HALVES = torch.float16, torch.bfloat16
-"""of which weights are taken in float32, as the observations are"""
-
 LOOKS, ROWS = 10, 48
 """steps of random play, and observations of these, by which it is found out how a policy is called"""
 ARRAYS: list[Any] = [np.ndarray, np.dtype, *(type(np.dtype(kind)) for kind in ("f4", "f8", "i4", "i8"))]
@@ -86,10 +83,9 @@ def read_weights(file: Path, spec: Spec, agent: Any = None) -> tuple[Any, list[T
     held = record if isinstance(record, dict) else {}
     parts = (part for name, part in held.items() if re.match(r"(?!.*optim).*state_dict$", str(name)))
     weights = next(parts, held)
-    pairs = weights.items() if isinstance(weights, dict) else ()
-    if not pairs or not all(isinstance(name, str) and isinstance(tensor, Tensor) for name, tensor in pairs):
+    named_tensors = weights.items() if isinstance(weights, dict) else ()
+    if not named_tensors or not all(isinstance(name, str) and isinstance(x, Tensor) for name, x in named_tensors):
         raise UserError(f"{file} has no weights: a state_dict, or a dictionary with one, such as model_state_dict.")
-    weights = {name: tensor.float() if tensor.dtype in HALVES else tensor for name, tensor in pairs}
     moments = _moments(held, file)
     said, sizes = f"{file}: {'with' if moments else 'without'} obs_mean and obs_var", list(map(len, moments))
     if agent is None:
@@ -132,11 +128,10 @@ def _of_layout(weights: dict[str, Tensor], file: Path) -> tuple[Callable[[Tensor
             " agent=Agent in Python, --agent module:Agent on the command line."
         )
     layers = [(weights[f"{name}.weight"].float(), weights[f"{name}.bias"].float()) for name in names]
-    sizes = [(len(bias), *weight.shape[1:]) for weight, bias in layers]
-    if any(weight.shape != size or len(size) != 2 for (weight, _), size in zip(layers, sizes, strict=True)) or any(
-        after[1] != before[0] for before, after in pairwise(sizes)
-    ):
-        raise UserError(f"{file} has layers that do not fit each other: {', '.join(map(str, sizes))}.")
+    widths = [layers[0][0].shape[-1], *(len(bias) for _, bias in layers)]
+    shapes = [tuple(weight.shape) for weight, _ in layers]
+    if shapes != [(after, before) for before, after in pairwise(widths)]:
+        raise UserError(f"{file} has layers that do not fit each other: {', '.join(map(str, shapes))}.")
 
     def forward(x: Tensor) -> Any:
         for number, layer in enumerate(layers):
@@ -147,7 +142,7 @@ def _of_layout(weights: dict[str, Tensor], file: Path) -> tuple[Callable[[Tensor
         log_std = weights.get("actor_logstd")
         return x if log_std is None else torch.distributions.Normal(x, log_std.flatten().exp())
 
-    return forward, [layers[0][0].shape[-1], *(len(bias) for _, bias in layers)]
+    return forward, widths
 
 
 def _filled(agent: Any, weights: dict[str, Tensor], spec: Spec, file: Path) -> nn.Module:
@@ -245,7 +240,7 @@ class Agent:
         self._space: Any = action_space(spec.action)
         self._function = function_of(policy, deterministic)
         self._mask = ""
-        """the argument in which the policy takes an action mask, if it does"""
+        """the argument in which the policy takes an action mask; empty where it takes none"""
         with suppress(ValueError):  # a function that is not written in Python
             self._mask = next((name for name in MASKS if name in signature(self._function).parameters), "")
         self._look(seen)

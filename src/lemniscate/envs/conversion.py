@@ -95,9 +95,15 @@ class SingleEnv(gym.Wrapper):
         """
         answers = np.zeros((2, len(achieved)), dtype=np.float32)
         for row, name, kind in zip(answers, ("compute_reward", "compute_terminated"), (float, bool), strict=True):
-            if name == "compute_reward" or self.has_wrapper_attr(name):
+            if self.has_wrapper_attr(name):
+                judge = self.get_wrapper_attr(name)
                 goals = self._goals("achieved_goal", achieved), self._goals("desired_goal", desired)
-                row[:] = [self._judged(name, kind, *pair) for pair in zip(*goals, strict=True)]
+                row[:] = [_judged(name, judge, kind, *pair) for pair in zip(*goals, strict=True)]
+            elif name == "compute_reward":
+                kind = type(self.unwrapped).__name__
+                raise UserError(
+                    f"{kind} has no compute_reward(achieved_goal, desired_goal, info), by which goals are judged."
+                )
         return answers[0], answers[1].astype(bool)
 
     def _goals(self, name: str, rows: np.ndarray) -> np.ndarray:
@@ -105,20 +111,6 @@ class SingleEnv(gym.Wrapper):
         space: Any = self.observation_space
         kind, shape = np.dtype(space[name].dtype), space[name].shape
         return (np.rint(rows) if kind.kind in "iu" else rows).astype(kind).reshape(-1, *shape)
-
-    def _judged(self, name: str, kind: type, achieved: np.ndarray, desired: np.ndarray) -> float:
-        """The answer of a judge on one goal. Raises `UserError` where it raises, or answers with something else."""
-        call = f"{name}(achieved_goal, desired_goal, {{}})"
-        try:
-            answer = self.get_wrapper_attr(name)(achieved, desired, {})
-        except Exception as error:  # one for batches may raise anything
-            said = f"{type(error).__name__}: {error}"
-            raise UserError(f"{call}, of one goal each, raised {said}.") from error
-        array = as_array(answer)
-        if array.dtype.kind not in "biuf" or array.size != 1 or (kind is bool and array.item() not in (0, 1)):
-            wanted = "a number" if kind is float else "True or False"
-            raise UserError(f"{call}, of one goal each, returned {kind_of(answer)}; it must be {wanted}.")
-        return float(array.item())
 
     def close(self) -> None:
         """Gymnasium's. An exception in it is said, and costs nothing that was learned."""
@@ -178,6 +170,21 @@ def measured(
                 numbers = torch.where(torch.from_numpy(mask).to(device), numbers, before)
             found[name] = numbers
     return found
+
+
+def _judged(name: str, judge: Any, kind: type, achieved: np.ndarray, desired: np.ndarray) -> float:
+    """The answer of a judge of one goal. Raises `UserError` where it raises, or its answer is not of this kind."""
+    call = f"{name}(achieved_goal, desired_goal, {{}})"
+    try:
+        answer = judge(achieved, desired, {})
+    except Exception as error:  # one for batches may raise anything
+        said = f"{type(error).__name__}: {error}"
+        raise UserError(f"{call}, of one goal each, raised {said}.") from error
+    array = as_array(answer)
+    if array.dtype.kind not in "biuf" or array.size != 1 or (kind is bool and array.item() not in (0, 1)):
+        wanted = "a number" if kind is float else "True or False"
+        raise UserError(f"{call}, of one goal each, returned {kind_of(answer)}; it must be {wanted}.")
+    return float(array.item())
 
 
 def _columns(info: Mapping[str, Any], prefix: str = "", outer: Any = None) -> Iterator[tuple[str, np.ndarray, Any]]:

@@ -337,7 +337,7 @@ def robust_range(values: np.ndarray) -> tuple[float, float]:
     there is none.
     """
     low, high = np.percentile(values, [10, 90])
-    fence = FENCE * (high - low) or np.inf
+    fence = np.inf if np.isclose(low, high, rtol=1e-9, atol=0) else FENCE * (high - low)
     inside = values[(values >= low - fence) & (values <= high + fence)]
     return float(inside.min()), float(inside.max())
 
@@ -349,7 +349,7 @@ def limit_axis(axes: Axes) -> None:
         return
     values = np.concatenate([y for _, _, y in lines])
     low, high = robust_range(values)
-    margin = 0.05 * (high - low) or 0.05 * abs(high) or 0.05
+    margin = 0.05 * (high - low)
     said = [f"▲ to {values.max():,.3g}"] if values.max() > high else []
     said += [f"▼ to {values.min():,.3g}"] if values.min() < low else []
     if said:  # both ends: the margin of one that is left as it is would be a share of the outliers

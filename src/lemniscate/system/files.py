@@ -33,7 +33,7 @@ class DamagedFileError(UserError):
 
 
 def at_home(path: str | os.PathLike[str]) -> Path:
-    """A path as a person gives it: `~` at its beginning is the home folder. Raises `UserError` for what none can be."""
+    """A path as a person gives it: `~` at its beginning is the home folder. Raises `UserError` for no possible name."""
     found = Path(os.path.expanduser(path))  # noqa: PTH111 (pathlib's raises where `~name` is no user)
     if "\0" in str(found) or any(len(os.fsencode(part)) > LONGEST_NAME for part in found.parts):
         what = "has a zero byte" if "\0" in str(found) else f"has a name of more than {LONGEST_NAME} bytes"
