@@ -751,15 +751,15 @@ MUTANTS = [
     (
         "the maximum is of the action taken",
         "nn/actor_critic.py",
-        "self.value(next_obs)",
-        "self.q(next_obs, action)",
+        "values.amax(-1), obs, next_obs)",
+        "_taken(values, action), obs, next_obs)",
         PQN + "the_target_is_the_return_of_the_best_next_action",
     ),
     (
         "the maximum is of the state before",
         "nn/actor_critic.py",
-        "self.value(next_obs)",
-        "self.value(obs)",
+        "function(next_obs[others])",
+        "function(obs[others])",
         PQN + "the_target_is_the_return_of_the_best_next_action",
     ),
     (
@@ -887,6 +887,13 @@ MUTANTS = [
         "going_on[t], torch.addcmul(state @ weight, keep[t], total))",
         "going_on[t], state @ weight)",
         MEMORY + "pieces_are_the_steps_one_after_the_other_and_so_are_their_derivatives",
+    ),
+    (
+        "the value of what follows is that of the row after",
+        "nn/actor_critic.py",
+        "others[:-1] = (next_obs[:-1] != obs[1:]).any(-1)",
+        "others[:-1] = False",
+        "nn/test_actor_critic.py::test_the_value_of_what_follows_is_that_of_the_true_next_observation",
     ),
     (
         "a network of one's own writes into the rows that are stored",

@@ -108,7 +108,7 @@ def test_actions_that_are_masked_are_never_drawn_and_never_the_maximum(rng):
     drawn = state.policy.act(obs, torch.rand(400, generator=rng))
     assert set(drawn.tolist()) == {0, 2}
     values = state.policy.net(obs[:, :5])
-    _, best = state.networks.estimates(obs, obs, drawn)
+    _, (best,) = state.networks.estimates(obs[None], obs[None], drawn[None])
     assert (values.argmax(1) == 1).any()
     torch.testing.assert_close(best, values[:, [0, 2]].max(1).values)
 

@@ -22,6 +22,21 @@ def test_policy_and_value_share_one_normalizer():
     assert type(ActorCritic(spec_of(), Layers()).policy.normalizer) is NoNorm
 
 
+def test_the_value_of_what_follows_is_that_of_the_true_next_observation(rng):
+    """Also where the row after begins with another one: at ends, and at the end of the rollout."""
+    networks = ActorCritic(spec_of(), SMALL, normalize_observations=True)
+    obs, action = torch.randn(6, 3, 5, generator=rng), torch.randn(6, 3, 2, generator=rng)
+    next_obs = torch.cat([obs[1:], torch.randn(1, 3, 5, generator=rng)])
+    next_obs[2, 1, 0] += 1  # the end of an episode
+    next_obs[4, 2] = torch.nan  # never equal to anything
+    with torch.no_grad():
+        value, after, log_prob = networks.estimates(obs, next_obs, action)
+        torch.testing.assert_close(value, networks.value(obs))
+        torch.testing.assert_close(after, networks.value(next_obs), equal_nan=True)
+        torch.testing.assert_close(log_prob, networks.policy(obs).log_prob(action))
+        assert after.isnan().sum() == 1
+
+
 def test_policy_and_critics_share_one_normalizer():
     networks = ActorQ(spec_of(), SMALL, SMALL, True, critics=2)
     assert all(q.normalizer is networks.policy.normalizer for q in networks.critics.members)

@@ -1,5 +1,6 @@
 """A policy for the spaces of an environment, and V(s): separate networks behind one normalizer; or Q alone."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
@@ -93,13 +94,12 @@ class ActorCritic(nn.Module):
 
     def estimates(self, obs: Tensor, next_obs: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """V(s), V(s') and log π(a|s) of rows [T, N, …], [T, N] each."""
-        s, after, a = obs.flatten(0, 1), next_obs.flatten(0, 1), action.flatten(0, 1)  # rows, not pieces
-        parts = []
-        for begin in range(0, len(s), CHUNK):
-            rows = slice(begin, begin + CHUNK)
-            parts.append((self.value(s[rows]), self.value(after[rows]), self.policy(s[rows]).log_prob(a[rows])))
-        value, next_value, log_prob = map(torch.cat, zip(*parts, strict=True))
-        return value.view(obs.shape[:2]), next_value.view(obs.shape[:2]), log_prob.view(obs.shape[:2])
+        values, log_probs = [], []
+        for s, a in zip(obs.flatten(0, 1).split(CHUNK), action.flatten(0, 1).split(CHUNK), strict=True):
+            values.append(self.value(s))  # of rows, not of pieces
+            log_probs.append(self.policy(s).log_prob(a))
+        value, log_prob = torch.cat(values).view(obs.shape[:2]), torch.cat(log_probs).view(obs.shape[:2])
+        return value, of_next(self.value, value, obs, next_obs), log_prob
 
     def remember(self, obs: Tensor) -> Tensor:
         """The memories of policy and critic after rows [N, …], [N, policy + critic]."""
@@ -129,15 +129,32 @@ class ActionValues(nn.Module):
 
     def q(self, obs: Tensor, action: Tensor) -> Tensor:
         """Q(s, a) of rows […, O] and […], […]."""
-        return self.policy(obs).values.gather(-1, action.unsqueeze(-1)).squeeze(-1)
+        return _taken(self.policy(obs).values, action)
 
     def value(self, obs: Tensor) -> Tensor:
         """max_a Q(s, a) of rows […, O], […]."""
         return self.policy(obs).values.amax(-1)
 
     def estimates(self, obs: Tensor, next_obs: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-        """Q(s, a) and max_a Q(s', a) of rows […, O], […, O] and […], […] each."""
-        return self.q(obs, action), self.value(next_obs)
+        """Q(s, a) and max_a Q(s', a) of rows [T, N, O], [T, N, O] and [T, N], [T, N] each."""
+        values = self.policy(obs).values
+        return _taken(values, action), of_next(self.value, values.amax(-1), obs, next_obs)
+
+
+def _taken(values: Tensor, action: Tensor) -> Tensor:
+    """Those of the actions taken, […], of Q(s, ·) […, n]."""
+    return values.gather(-1, action.unsqueeze(-1)).squeeze(-1)
+
+
+def of_next(function: Callable[[Tensor], Tensor], now: Tensor, obs: Tensor, next_obs: Tensor) -> Tensor:
+    """A function at s' [T, N, …]: what it says `now` [T, N] of the row after, where that begins with s'."""
+    if torch.compiler.is_compiling():  # a program has one shape
+        return torch.cat([function(rows) for rows in next_obs.flatten(0, 1).split(CHUNK)]).view_as(now)
+    others = torch.ones_like(now, dtype=torch.bool)
+    others[:-1] = (next_obs[:-1] != obs[1:]).any(-1)
+    after = now.roll(-1, 0)
+    after[others] = function(next_obs[others])
+    return after
 
 
 def normalizer_of(spec: Spec, normalize_observations: bool, remembered: int = 0) -> NoNorm:
