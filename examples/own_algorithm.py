@@ -27,7 +27,7 @@ from lemniscate.run.config import Count, Fraction, NonNegative, Positive
 from lemniscate.run.on_policy import ActorCriticConfig, OnPolicyState
 from lemniscate.run.run import Run
 from lemniscate.spec import Spec
-from lemniscate.types import Batch, Loss, Metrics, Rollout
+from lemniscate.types import DrawnBatch, Loss, Metrics, Rollout
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,7 +75,7 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
     )
 
 
-def loss(config: Config, networks: ActorCritic, batch: Batch) -> Loss:
+def loss(config: Config, networks: ActorCritic, batch: DrawnBatch) -> Loss:
     """−r A + β KL(π_old ‖ π) + ½ (V − target)² (eq. 8, with the value's loss), and its metrics."""
     log_ratio = networks.policy(batch.obs).log_prob(batch.action) - batch.log_prob
     policy_loss, kl = surrogate(log_ratio, batch.advantage), kl_k3(log_ratio)
@@ -87,7 +87,7 @@ def loss(config: Config, networks: ActorCritic, batch: Batch) -> Loss:
     }
 
 
-def learn(config: Config, state: State, batch: Batch, minibatches: Tensor, advantage: Tensor) -> list[Metrics]:
+def learn(config: Config, state: State, batch: DrawnBatch, minibatches: Tensor, advantage: Tensor) -> list[Metrics]:
     """A gradient step on each minibatch, rows [K, M] of the batch, with its standardized advantages [K, M]."""
     steps = (replace(batch[rows], advantage=a) for rows, a in zip(minibatches, advantage, strict=True))
     return [state.optimizer.step(partial(loss, config), minibatch) for minibatch in steps]
@@ -97,7 +97,8 @@ def update(config: Config, state: State, rollout: Rollout) -> Metrics:
     """Some epochs of minibatch steps on one rollout; returns the means of the metrics."""
     if config.scale_rewards:
         rollout = state.reward_scale.scale(rollout)
-    batch, valid_rows = advantages(config, state.networks, rollout), rollout.valid_rows
+    log_prob = state.networks.log_prob(rollout.obs, rollout.action)
+    batch, valid_rows = advantages(config, state.networks, rollout, log_prob), rollout.valid_rows
     metrics: list[Metrics] = []
     for _ in range(config.epochs):
         minibatches = epoch_minibatches(valid_rows, rollout.num_rows, config.minibatch_size, state.rng.minibatch)

@@ -17,7 +17,7 @@ from lemniscate.data.rollout import collect
 from lemniscate.envs.gymnasium import GymnasiumBackend
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.spec import Box, Discrete, ObservationPart, Spec
-from lemniscate.types import Batch
+from lemniscate.types import DrawnBatch
 
 CPU = torch.device("cpu")
 MODES = ["NEXT_STEP", "SAME_STEP", "DISABLED"]
@@ -189,10 +189,11 @@ def half_square(value, target):
 def numbers(actions="box", size=24, dtype=torch.float64):
     """A batch of random numbers for the losses of `small_networks`."""
     generator = torch.Generator().manual_seed(3)
-    obs, rest = (torch.randn(size, n, generator=generator, dtype=dtype) for n in (5, 4))
+    obs, numbers = (torch.randn(size, n, generator=generator, dtype=dtype) for n in (5, 4))
     box = torch.randn(size, 2, generator=generator, dtype=dtype)
     discrete = torch.randint(3, (size,), generator=generator)
-    return Batch(obs, box if actions == "box" else discrete, *rest.unbind(-1))
+    log_prob, *others = numbers.unbind(-1)
+    return DrawnBatch(obs, box if actions == "box" else discrete, *others, log_prob)
 
 
 def small_networks(actions="box", dtype=torch.float64, **fields):

@@ -213,7 +213,8 @@ def test_in_pieces_the_policy_says_what_it_said_when_it_acted(algo):
     rollout = collect(env, state.policy, 40, state.rng.action)
     assert rollout.done.any()
     networks, rows = state.networks, rows_of(rollout, L)
-    value, _, log_prob = networks.estimates(rollout.obs, rollout.next_obs, rollout.action)
+    value, _ = networks.estimates(rollout.obs, rollout.next_obs)
+    log_prob = networks.log_prob(rollout.obs, rollout.action)
     flat = rollout.obs.flatten(0, 1)
     valid = rollout.valid.flatten()[rows]
     again = networks.policy(flat[rows]).log_prob(rollout.action.flatten(0, 1)[rows])

@@ -133,14 +133,20 @@ class Transition(Record):
 
 @dataclass(frozen=True)
 class Batch(Record):
-    """The rows of a rollout with their advantages, [B, …]: the input of on-policy losses."""
+    """The rows of a rollout with V(s), advantage and value target, [B, …]: the input of on-policy losses."""
 
     obs: Tensor
     action: Tensor
-    log_prob: Tensor
     value: Tensor
     advantage: Tensor
     target: Tensor
 
     def __len__(self) -> int:
         return len(self.obs)
+
+
+@dataclass(frozen=True)
+class DrawnBatch(Batch):
+    """A batch with log π_old(a|s), of the policy that drew the actions, [B]: for losses that hold the new one to it."""
+
+    log_prob: Tensor

@@ -107,8 +107,7 @@ def test_the_normalizer_moves_after_the_update_and_sees_valid_rows_only(algo):
     state, env = begin(algo, config, "NEXT_STEP", length=3)
     rollout = collect(env, state.policy, 8, state.rng.action)
     assert not rollout.valid.all()
-    estimate = algo.weights if algo is reinforce else algo.advantages
-    estimate(config, state.networks, rollout)
+    state.networks.estimates(rollout.obs, rollout.next_obs)
     assert state.policy.normalizer.count == 0
     algo.update(config, state, rollout)
     assert state.policy.normalizer.count == rollout.valid.sum()

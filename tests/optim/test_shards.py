@@ -14,7 +14,7 @@ from lemniscate.maths import standardize
 from lemniscate.optim.adam import Adam
 from lemniscate.optim.shards import GradientOverShards, estimates_over_shards
 from lemniscate.system.world import World
-from lemniscate.types import Batch, Rollout, Transition
+from lemniscate.types import Rollout, Transition
 from threads import in_world
 
 
@@ -40,7 +40,7 @@ def require_equal(one, two, loss, *args):
 def test_a_step_over_four_shards_is_one_over_all_rows(actions):
     networks, config = small_networks(actions, entropy_coef=0.1)
     batch = numbers(actions)
-    batch = Batch(**{**vars(batch), "advantage": standardize(batch.advantage)})
+    batch = replace(batch, advantage=standardize(batch.advantage))
     require_equal(*twins(networks, max_grad_norm=0.1), partial(ppo.loss, config), batch)
 
 

@@ -19,7 +19,7 @@ from lemniscate.errors import NonFiniteError, UserError
 from lemniscate.run import checkpoint
 from lemniscate.spec import Box, Discrete, MultiBinary, MultiDiscrete, ObservationPart, Spec
 from lemniscate.system.files import DamagedFileError, read_json, write_json
-from lemniscate.types import Batch
+from lemniscate.types import DrawnBatch
 
 SPEC = Spec("x", (ObservationPart((), (3,)),), Box((-1.0,), (1.0,)), 500)
 CPU = torch.device("cpu")
@@ -27,7 +27,7 @@ CPU = torch.device("cpu")
 
 def learn(state):
     """One gradient step on noise."""
-    batch = Batch(torch.randn(4, 3), torch.randn(4, 1), *torch.randn(4, 4))
+    batch = DrawnBatch(torch.randn(4, 3), torch.randn(4, 1), *torch.randn(4, 4))
     state.optimizer.learning_rate = 1e-3
     state.learn(tiny(), state, batch, torch.arange(4)[None], batch.advantage[None])
 

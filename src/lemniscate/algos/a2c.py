@@ -74,10 +74,10 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
 @torch.no_grad()
 def advantages(config: Config, networks: ActorCritic, rollout: Rollout) -> Batch:
     """The rows of a rollout with V(s), advantage and value target (section 4; with λ: arXiv:1506.02438, eq. 16)."""
-    value, next_value, log_prob = networks.estimates(rollout.obs, rollout.next_obs, rollout.action)
+    value, next_value = networks.estimates(rollout.obs, rollout.next_obs)
     gamma, lam = config.gamma, config.gae_lambda
     advantage, target = gae(rollout.reward, value, next_value, rollout.terminated, rollout.done, gamma=gamma, lam=lam)
-    batch = Batch(rollout.obs, rollout.action, log_prob, value, advantage, target)
+    batch = Batch(rollout.obs, rollout.action, value, advantage, target)
     return batch.flatten()  # [T, N, …] -> [B, …]
 
 

@@ -28,7 +28,7 @@ from lemniscate.run.config import Count, Epsilon, Fraction, NonNegative, Positiv
 from lemniscate.run.on_policy import OnPolicyState, RecurrentConfig
 from lemniscate.run.run import Run
 from lemniscate.spec import Spec
-from lemniscate.types import Batch, Loss, Metrics, Rollout
+from lemniscate.types import DrawnBatch, Loss, Metrics, Rollout
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,16 +98,16 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
 
 
 @torch.no_grad()
-def advantages(config: Config, networks: ActorCritic, rollout: Rollout) -> Batch:
-    """The rows of a rollout with log π_old(a|s), V(s), advantage (eq. 11) and value target, [B, …]."""
-    value, next_value, log_prob = networks.estimates(rollout.obs, rollout.next_obs, rollout.action)
+def advantages(config: Config, networks: ActorCritic, rollout: Rollout, log_prob: Tensor) -> DrawnBatch:
+    """The rows of a rollout with V(s), advantage (eq. 11), value target and log π_old(a|s) [T, N], [B, …]."""
+    value, next_value = networks.estimates(rollout.obs, rollout.next_obs)
     gamma, lam = config.gamma, config.gae_lambda
     advantage, target = gae(rollout.reward, value, next_value, rollout.terminated, rollout.done, gamma=gamma, lam=lam)
-    batch = Batch(rollout.obs, rollout.action, log_prob, value, advantage, target)
+    batch = DrawnBatch(rollout.obs, rollout.action, value, advantage, target, log_prob)
     return batch.flatten()  # [T, N, …] -> [B, …]
 
 
-def loss(config: Config, networks: ActorCritic, batch: Batch) -> Loss:
+def loss(config: Config, networks: ActorCritic, batch: DrawnBatch) -> Loss:
     """The loss of a minibatch [M, …], the negative of eq. 9, and its metrics."""
     distribution, value = networks(batch.obs)
     log_ratio = distribution.log_prob(batch.action) - batch.log_prob  # log r_t(θ), below eq. 6
@@ -123,7 +123,7 @@ def loss(config: Config, networks: ActorCritic, batch: Batch) -> Loss:
     }
 
 
-def learn(config: Config, state: State, batch: Batch, minibatches: Tensor, advantage: Tensor) -> list[Metrics]:
+def learn(config: Config, state: State, batch: DrawnBatch, minibatches: Tensor, advantage: Tensor) -> list[Metrics]:
     """A clipped gradient step on each minibatch, rows [K, M] of the batch, with its advantages [K, M]."""
     metrics = []
     for rows, its_advantage in zip(minibatches, advantage, strict=True):
@@ -139,12 +139,13 @@ def update(config: Config, state: State, rollout: Rollout) -> dict[str, Tensor |
     config = state.apply_schedules(config) if config.schedules else config
     if config.scale_rewards:
         rollout = state.reward_scale.scale(rollout)
-    batch = collected = advantages(config, state.networks, rollout)
+    log_prob = state.networks.log_prob(rollout.obs, rollout.action)  # log π_old
+    batch = collected = advantages(config, state.networks, rollout, log_prob)
     valid_rows, rows = rollout.valid_rows, rows_of(rollout, state.networks.piece_length)
     metrics: list[Metrics] = []
     for epoch in range(config.epochs):
         if config.recompute_advantages and epoch > 0:
-            batch = replace(advantages(config, state.networks, rollout), log_prob=collected.log_prob)
+            batch = advantages(config, state.networks, rollout, log_prob)
         minibatches = epoch_minibatches(rows, rollout.num_rows, config.minibatch_size, state.rng.minibatch)
         advantage = batch.advantage[minibatches]
         if config.normalize_advantage:

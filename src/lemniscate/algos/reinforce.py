@@ -110,15 +110,15 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
 
 @torch.no_grad()
 def weights(config: Config, networks: ActorCritic, rollout: Rollout) -> Batch:
-    """The rows of a rollout with log π(a|s), V(s), weight (return minus baseline) and value target, [B, …]."""
-    value, next_value, log_prob = networks.estimates(rollout.obs, rollout.next_obs, rollout.action)
+    """The rows of a rollout with V(s), weight (return minus baseline) and value target, [B, …]."""
+    value, next_value = networks.estimates(rollout.obs, rollout.next_obs)
     if config.baseline != "value":
         value, next_value = torch.zeros_like(value), torch.zeros_like(value)
     to_go = reward_to_go(rollout.reward, next_value, rollout.terminated, rollout.done, gamma=config.gamma)
     ended = rollout.done | ~rollout.valid
     weight = to_go if config.returns == "to_go" else episode_return(to_go, rollout.reward, ended, gamma=config.gamma)
     baseline = weight[rollout.valid].mean() if config.baseline == "mean" else value
-    return Batch(rollout.obs, rollout.action, log_prob, value, weight - baseline, to_go).flatten()
+    return Batch(rollout.obs, rollout.action, value, weight - baseline, to_go).flatten()
 
 
 def policy_loss(config: Config, policy: Policy, batch: Batch) -> Loss:
@@ -150,6 +150,7 @@ def update(config: Config, state: State, rollout: Rollout) -> dict[str, Tensor |
     if config.scale_rewards:
         rollout = state.reward_scale.scale(rollout)
     batch, valid_rows = weights(config, state.networks, rollout), rollout.valid_rows
+    old_log_prob = state.networks.log_prob(rollout.obs, rollout.action).flatten()[valid_rows]
     size = len(valid_rows) if config.episodes else rollout.num_rows
     learned = batch[one_minibatch(valid_rows, size)[0]]
     if config.standardize:
@@ -157,7 +158,7 @@ def update(config: Config, state: State, rollout: Rollout) -> dict[str, Tensor |
     all_rows = torch.arange(size, device=batch.obs.device)[None]
     metrics = means(state.learn(config, state, learned, all_rows, update_policy=True))
     valid = batch[valid_rows]
-    metrics["approx_kl"] = kl_k3(state.policy(valid.obs).log_prob(valid.action).detach() - valid.log_prob)
+    metrics["approx_kl"] = kl_k3(state.policy(valid.obs).log_prob(valid.action).detach() - old_log_prob)
     if config.baseline == "value":
         for _ in range(config.critic_epochs):
             minibatches = epoch_minibatches(valid_rows, size, config.critic_minibatch_size, state.rng.minibatch)

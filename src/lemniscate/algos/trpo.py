@@ -88,11 +88,11 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
 
 @torch.no_grad()
 def advantages(config: Config, networks: ActorCritic, rollout: Rollout) -> Batch:
-    """The rows of a rollout with log π_old(a|s), V(s), advantage and value target (arXiv:1506.02438, eq. 16)."""
-    value, next_value, log_prob = networks.estimates(rollout.obs, rollout.next_obs, rollout.action)
+    """The rows of a rollout with V(s), advantage and value target (arXiv:1506.02438, eq. 16)."""
+    value, next_value = networks.estimates(rollout.obs, rollout.next_obs)
     gamma, lam = config.gamma, config.gae_lambda
     advantage, target = gae(rollout.reward, value, next_value, rollout.terminated, rollout.done, gamma=gamma, lam=lam)
-    batch = Batch(rollout.obs, rollout.action, log_prob, value, advantage, target)
+    batch = Batch(rollout.obs, rollout.action, value, advantage, target)
     return batch.flatten()  # [T, N, …] -> [B, …]
 
 
@@ -111,8 +111,11 @@ def improve(config: Config, state: State, batch: Batch, fisher_obs: Tensor) -> d
     if config.normalize_advantage:
         batch = replace(batch, advantage=standardize(batch.advantage.flatten()).view_as(batch.advantage))
 
+    with torch.no_grad():
+        old_log_prob = pi(here, batch.obs).log_prob(batch.action)
+
     def loss(theta: Tensor) -> Tensor:
-        return surrogate(pi(theta, batch.obs).log_prob(batch.action) - batch.log_prob, batch.advantage)
+        return surrogate(pi(theta, batch.obs).log_prob(batch.action) - old_log_prob, batch.advantage)
 
     def kl(theta: Tensor) -> Tensor:
         return pi(here, batch.obs).kl(pi(theta, batch.obs)).mean()

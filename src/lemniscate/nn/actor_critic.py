@@ -92,14 +92,16 @@ class ActorCritic(nn.Module):
         outputs, value = side_by_side((self.policy.net, self.value.net), inputs)
         return self.policy.distribution_of(outputs, obs), value.squeeze(-1)
 
-    def estimates(self, obs: Tensor, next_obs: Tensor, action: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """V(s), V(s') and log π(a|s) of rows [T, N, …], [T, N] each."""
-        values, log_probs = [], []
-        for s, a in zip(obs.flatten(0, 1).split(CHUNK), action.flatten(0, 1).split(CHUNK), strict=True):
-            values.append(self.value(s))  # of rows, not of pieces
-            log_probs.append(self.policy(s).log_prob(a))
-        value, log_prob = torch.cat(values).view(obs.shape[:2]), torch.cat(log_probs).view(obs.shape[:2])
-        return value, of_next(self.value, value, obs, next_obs), log_prob
+    def estimates(self, obs: Tensor, next_obs: Tensor) -> tuple[Tensor, Tensor]:
+        """V(s) and V(s') of rows [T, N, …], [T, N] each."""
+        value = by_chunks(self.value, obs)  # of rows, not of pieces
+        return value, of_next(self.value, value, obs, next_obs)
+
+    @torch.no_grad()
+    def log_prob(self, obs: Tensor, action: Tensor) -> Tensor:
+        """Log π(a|s) of rows [T, N, …], [T, N], without a gradient."""
+        rows = zip(obs.flatten(0, 1).split(CHUNK), action.flatten(0, 1).split(CHUNK), strict=True)
+        return torch.cat([self.policy(s).log_prob(a) for s, a in rows]).view(obs.shape[:2])
 
     def remember(self, obs: Tensor) -> Tensor:
         """The memories of policy and critic after rows [N, …], [N, policy + critic]."""
@@ -146,10 +148,15 @@ def _taken(values: Tensor, action: Tensor) -> Tensor:
     return values.gather(-1, action.unsqueeze(-1)).squeeze(-1)
 
 
+def by_chunks(function: Callable[[Tensor], Tensor], rows: Tensor) -> Tensor:
+    """A function of rows [T, N, …], a chunk of them at a time, [T, N]."""
+    return torch.cat(list(map(function, rows.flatten(0, 1).split(CHUNK)))).view(rows.shape[:2])
+
+
 def of_next(function: Callable[[Tensor], Tensor], now: Tensor, obs: Tensor, next_obs: Tensor) -> Tensor:
     """A function at s' [T, N, …]: what it says `now` [T, N] of the row after, where that begins with s'."""
     if torch.compiler.is_compiling():  # a program has one shape
-        return torch.cat([function(rows) for rows in next_obs.flatten(0, 1).split(CHUNK)]).view_as(now)
+        return by_chunks(function, next_obs)
     others = torch.ones_like(now, dtype=torch.bool)
     others[:-1] = (next_obs[:-1] != obs[1:]).any(-1)
     after = now.roll(-1, 0)
