@@ -39,7 +39,9 @@ class Record:
 
     def __getitem__(self, rows: Tensor | slice | tuple[slice, slice]) -> Self:
         pick = itemgetter(rows)
-        if isinstance(rows, Tensor) and rows.dim() == 1 and rows.dtype == torch.int64:
+        if isinstance(rows, Tensor) and rows.dim() and rows.dtype == torch.int64:
+            if rows.dim() > 1:
+                return type(self)(*(tensor.unflatten(0, rows.shape) for tensor in vars(self[rows.flatten()]).values()))
             pick = partial(torch.index_select, dim=0, index=rows)  # takes a half to a quarter of the time
         return type(self)(*map(pick, vars(self).values()))
 

@@ -185,8 +185,10 @@ class GRU(nn.Module):
 
     def step(self, prepared: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
         """[B, 3 size] and h [B, size] to the output, which is h', and h'."""
-        _, keep, _, candidate = _gates(prepared, self.state(memory))
-        after = torch.lerp(tanh(candidate), memory, keep)
+        sizes = [2 * self.size, self.size]
+        (gates_x, new_x), (gates_h, new_h) = prepared.split(sizes, dim=-1), self.state(memory).split(sizes, dim=-1)
+        reset, keep = torch.sigmoid(gates_x + gates_h).chunk(2, dim=-1)
+        after = torch.lerp(tanh(torch.addcmul(new_x, reset, new_h)), memory, keep)
         return after, after
 
     def over(self, prepared: Tensor, goes_on: Tensor, memory: Tensor) -> Tensor:
@@ -199,44 +201,39 @@ def _through_pieces(cells: Sequence[GRU], prepared: Any, goes_on: Tensor, memory
     by_time = torch.stack([*prepared]).transpose(1, 2), goes_on.transpose(0, 1), torch.stack([*memory]).transpose(1, 2)
     parameters = [torch.stack([getattr(cell.state, name) for cell in cells]) for name in ("weight", "bias")]
     kind = _Pieces if torch.compiler.is_compiling() else _PiecesForward
-    return kind.apply(*by_time, *parameters).transpose(1, 2).unbind()
-
-
-def _gates(prepared: Tensor, state: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """r, z, the new memory's part in the product, and the candidate before its tanh, from both products […, 3 size]."""
-    sizes = [2 * state.shape[-1] // 3, state.shape[-1] // 3]
-    (gates_x, new_x), (gates_h, new_h) = prepared.split(sizes, dim=-1), state.split(sizes, dim=-1)
-    reset, keep = torch.sigmoid(gates_x + gates_h).chunk(2, dim=-1)
-    return reset, keep, new_h, torch.addcmul(new_x, reset, new_h)
+    return kind.apply(*by_time, *parameters)[0].transpose(1, 2).unbind()
 
 
 class _Pieces(torch.autograd.Function):
     """`_through_pieces`, with its own derivatives: each step has a few operations that depend on the step beside it.
 
-    What does not, the gates and what they change with, is computed of all steps at once, from the inputs and outputs
-    alone; so derivatives of the derivative are exact too. The memory in the rows is constant. Tensors are [C, L, P, …].
+    What does not, the gates and what they change with, is computed of all steps at once; in derivatives of the
+    derivative from the inputs and outputs alone, so that these are exact too. The memory in the rows is constant.
+    Tensors are [C, L, P, …].
     """
 
     @staticmethod
-    def forward(prepared: Tensor, goes_on: Tensor, memory: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-        size, h, outs, transposed = weight.shape[-1], memory[:, 0], [], weight.mT
-        candidates, bias = prepared[..., 2 * size :], bias[:, None, None]
-        gates = prepared[..., : 2 * size] + bias[..., : 2 * size]
-        sums = torch.cat([gates, bias[..., 2 * size :].expand_as(candidates)], dim=-1)
+    def forward(
+        prepared: Tensor, goes_on: Tensor, memory: Tensor, weight: Tensor, bias: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        size, h, outs, states, transposed = weight.shape[-1], memory[:, 0], [], [], weight.mT
+        candidates, sums = prepared[..., 2 * size :], _sums(prepared, bias)
         compiling = torch.compiler.is_compiling()  # a program does not ask for the numbers in a tensor
         begins = [True] * len(goes_on) if compiling else (~goes_on).flatten(1).any(1).tolist()
         for t, (candidate, part) in enumerate(zip(candidates.unbind(1), sums.unbind(1), strict=True)):
             h = torch.where(goes_on[t], h, memory[:, t]) if t and begins[t] else h
-            gates, new_h = torch.baddbmm(part, h, transposed).split([2 * size, size], dim=-1)
+            states.append(torch.baddbmm(part, h, transposed))
+            gates, new_h = states[-1].split([2 * size, size], dim=-1)
             reset, keep = torch.sigmoid(gates).chunk(2, dim=-1)
             h = torch.lerp(torch.tanh(torch.addcmul(candidate, reset, new_h)), h, keep)
             outs.append(h)
-        return torch.stack(outs, dim=1)
+        return torch.stack(outs, dim=1), torch.stack(states, dim=1)
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
-        ctx.save_for_backward(*inputs, output)
-        ctx.save_for_forward(*inputs, output)
+    def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: tuple[Tensor, Tensor]) -> None:
+        ctx.mark_non_differentiable(output[1])
+        ctx.save_for_backward(*inputs, *output)
+        ctx.save_for_forward(*inputs, *output)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> Any:
@@ -273,15 +270,26 @@ class _PiecesForward(_Pieces):
             change = (by_state[:, t] * (h @ weight.mT).unflatten(-1, (3, -1))).sum(2)
             tangent = own[:, t] + keep[:, t] * h + change
             outs.append(tangent)
-        return torch.stack(outs, dim=1)
+        return torch.stack(outs, dim=1), None
 
 
-def _changes(prepared: Tensor, goes_on: Tensor, memory: Tensor, weight: Tensor, bias: Tensor, out: Tensor) -> Any:
+def _sums(prepared: Tensor, bias: Tensor) -> Tensor:
+    """What the product with h is added to, [C, L, P, 3 size]: both gates' inputs, and nothing of the candidate's."""
+    size, bias = bias.shape[-1] // 3, bias[:, None, None]
+    new = bias[..., 2 * size :].expand_as(prepared[..., 2 * size :])
+    return torch.cat([prepared[..., : 2 * size] + bias[..., : 2 * size], new], dim=-1)
+
+
+def _changes(
+    prepared: Tensor, goes_on: Tensor, memory: Tensor, weight: Tensor, bias: Tensor, out: Tensor, state: Tensor
+) -> Any:
     """W, the 1 or 0, h, z, and ∂h'/∂ of the candidate [C, L, P, size] and of each third of the product, with a 3."""
     before = torch.cat([memory[:, :1], torch.where(goes_on[1:], out[:, :-1], memory[:, 1:])], dim=1)
-    state = torch.baddbmm(bias[:, None], before.flatten(1, 2), weight.mT).view_as(prepared)
-    reset, keep, new_h, candidate = _gates(prepared, state)
-    new = tanh(candidate)
+    if torch.is_grad_enabled():  # for derivatives of this derivative
+        state = _sums(prepared, bias) + before @ weight.mT[:, None]
+    size = weight.shape[-1]
+    new_h, (reset, keep) = state[..., 2 * size :], torch.sigmoid(state[..., : 2 * size]).chunk(2, dim=-1)
+    new = tanh(torch.addcmul(prepared[..., 2 * size :], reset, new_h))
     by_new = (1 - keep) * (1 - new * new)
     by_reset, by_keep = by_new * new_h * reset * (1 - reset), (before - new) * keep * (1 - keep)
     return weight, goes_on, before, keep, by_new, torch.stack([by_reset, by_keep, by_new * reset], dim=3)
