@@ -328,6 +328,36 @@ def test_a_run_stays_where_it_began_where_the_working_directory_changes(tmp_path
     assert lem.load(trained.path).step == lem.load(tmp_path / "r").step == 128
 
 
+class Moves(gym.Env):
+    """Changes the working directory and torch's defaults as it is made."""
+
+    observation_space = gym.spaces.Box(-1, 1, (2,))
+    action_space = gym.spaces.Discrete(2)
+
+    def __init__(self, to):
+        os.chdir(to)
+        torch.set_default_dtype(torch.float64)
+        torch.set_grad_enabled(False)
+
+    def reset(self, *, seed=None, options=None):
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        return np.zeros(2, np.float32), 1.0, False, True, {}
+
+
+def test_an_environment_that_moves_to_its_files_leaves_the_run_where_it_belongs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "elsewhere").mkdir()
+    fields = tiny_fields("CartPole-v1", total_steps=128)
+    trained = lem.train("ppo", Moves, env_kwargs={"to": str(tmp_path / "elsewhere")}, run="r", progress=False, **fields)
+    assert trained.path == tmp_path / "r"
+    assert lem.load(tmp_path / "r").step == 128
+    assert not list((tmp_path / "elsewhere").iterdir())
+    assert torch.is_grad_enabled()
+    assert torch.get_default_dtype() == torch.float32
+
+
 def test_what_lies_beside_a_stored_policy_is_not_lost(run, tmp_path):
     lem.save(run, tmp_path / "p")
     lem.save(run, tmp_path / "p")

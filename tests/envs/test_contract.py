@@ -158,6 +158,17 @@ class SaysNothing(toy.Countdown):
         self.metadata = {}
 
 
+class SaysAText(toy.Countdown):
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.metadata = {"autoreset_mode": "NextStep"}
+
+
+def test_a_text_does_not_say_when_an_environment_resets():
+    with pytest.raises(UserError, match=r"such as AutoresetMode.NEXT_STEP of gymnasium.vector, not 'NextStep'"):
+        countdown("NEXT_STEP", kind=SaysAText)
+
+
 @pytest.mark.filterwarnings("ignore:.*missing AutoresetMode")
 def test_an_environment_that_does_not_say_when_it_resets_is_refused():
     with pytest.raises(UserError, match="autoreset_mode"):

@@ -140,7 +140,7 @@ gym.register("Learns-v0", Reach, additional_wrappers=(NormalizeReward.wrapper_sp
     ],
 )
 def test_what_learns_statistics_is_refused_wherever_it_stands(env, fields, name):
-    with pytest.raises(UserError, match=f"{name} learns statistics .* normalize_observations, .*scale_rewards"):
+    with pytest.raises(UserError, match=f"{name} learns statistics, .* normalize_observations, .*scale_rewards"):
         registry.make(env, 2, **fields)
 
 
@@ -153,6 +153,20 @@ def test_fixed_statistics_and_tables_are_the_environments_own():
 
     assert reward_of(fixed) == 1
     assert reward_of(Reach, wrappers=[Table]) == 1
+
+
+def test_a_filter_with_a_mean_and_a_variance_learns_nothing_of_the_training():
+    class Kalman:
+        mean, var = 0.0, 1.0
+
+        def update(self, seen): ...
+
+    class Filtering(Reach):
+        def __init__(self):
+            super().__init__()
+            self.filter = Kalman()
+
+    assert reward_of(Filtering) == 1
 
 
 def test_wrappers_choose_the_backend_that_can_wrap():
@@ -174,6 +188,17 @@ def test_wrappers_choose_the_backend_that_can_wrap():
         ("DroneLanding-v0", {"kwargs": {"dynamics": "heavy"}}, "There is no dynamics 'heavy'"),
         ("Countdown-v0", {"wrappers": [times_ten]}, "The gymnasium backend cannot wrap Countdown-v0"),
         (Reach(), {}, "env is an environment that is made already; give its class"),
+        (Reach(), {}, "training makes as many as it needs."),
+        (
+            gym.vector.SyncVectorEnv([Reach]),
+            {},
+            "made already; give a function that makes as many as it is told: def make(",
+        ),
+        (
+            lambda num_envs: Reach(),
+            {},
+            "a Reach, not a gymnasium.vector.VectorEnv; what has an argument num_envs makes",
+        ),
         (3, {}, "env is 3; give its class"),
         (lambda: 3, {}, "cannot be made: it makes an int, not a gymnasium.Env"),
         (dict, {}, "neither an environment class, nor a function, nor an id"),

@@ -788,7 +788,7 @@ def check_action(plan, before, event, chosen):
         np.testing.assert_array_equal(got, table(plan)[int(chosen)])
         return
     assert got.shape == space.shape
-    assert np.can_cast(got.dtype, space.dtype) or isinstance(space, spaces.MultiBinary | spaces.Discrete), got.dtype
+    assert np.can_cast(got.dtype, space.dtype) or isinstance(space, spaces.Discrete), got.dtype
     if isinstance(space, spaces.Box):
         assert (got >= space.low).all()
         assert (got <= space.high).all()

@@ -98,6 +98,43 @@ def test_a_mask_is_obeyed_wherever_it_stands(kind, place, tmp_path):
     assert Board.taken == 0
 
 
+class Property(Board):
+    @property
+    def action_masks(self):
+        return self.masks()[0]  # before `reset` it raises AttributeError
+
+
+class Array(Board):
+    def __init__(self):
+        super().__init__(place="array")
+        self.legal_action_mask = np.zeros(4, np.int8)
+
+    def look(self):
+        self.legal_action_mask = self.masks()[0]
+        return super().look()
+
+
+@pytest.mark.parametrize("kind", [Property, Array])
+def test_a_mask_may_be_a_property_or_an_array(kind):
+    Board.taken = 0
+    env, rng = registry.make(kind, 2), torch.Generator().manual_seed(0)
+    env.restart(0)
+    assert env.spec.action.mask_size == 4
+    for _ in range(20):
+        env.step(random_action(env.spec, env.obs, rng))
+    assert Board.taken == 0
+
+
+def test_a_mask_that_is_asked_for_someone_is_named():
+    class Players(Board):
+        def action_mask(self, player): ...
+
+    with pytest.raises(
+        UserError, match=r"Players\.action_mask, asked for the action mask without arguments, raised Type"
+    ):
+        registry.make(Players, 2, kwargs={"place": "method of one's own"})
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_workers_and_vectors_give_masks_too(kind):
     Board.taken = 0

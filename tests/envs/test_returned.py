@@ -150,16 +150,21 @@ class OldReset(Told):
         return self.told["reset"]
 
 
+class ByPosition(Told):
+    def reset(self, seed=None, options=None, /):
+        return self.told["reset"]
+
+
 class Bare(gym.Env):
     def reset(self, *, seed=None, options=None):
         return SEEN, {}
 
 
 def test_a_class_without_seed_or_spaces_is_told_what_it_lacks():
-    with pytest.raises(
-        UserError, match=r"OldReset.reset\(\) .*takes no seed or no options; it must be reset\(self, \*, seed"
-    ):
-        registry.make(OldReset, 1)
+    for kind in (OldReset, ByPosition):
+        said = rf"{kind.__name__}.reset\(\) .*takes no seed or no options; it must be reset\(self, \*, seed"
+        with pytest.raises(UserError, match=said):
+            registry.make(kind, 1)
     with pytest.raises(UserError, match=r"Bare has no observation_space: set self.observation_space in its __init__"):
         registry.make(Bare, 1)
 

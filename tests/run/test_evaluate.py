@@ -104,7 +104,7 @@ class Climbs(gym.Env):
 
     def step(self, action):
         self.t += 1
-        info = {"height": float(self.t), "is_success": self.t == self.length}
+        info = {"height": float(self.t), "is_success": self.t == self.length, "drift": np.inf if self.t > 1 else 3.0}
         return np.zeros(1, np.float32), 1.0, self.t == self.length, False, info
 
 
@@ -115,7 +115,7 @@ def test_what_is_measured_is_averaged_over_the_rows_that_count():
     scores = evaluate(ActorCritic(env.spec, Layers((4,))).policy, env, 10, seed=0)
     rows = 3 * 1 + 3 * 2 + 2 * 3 + 2 * 4
     heights = 3 * 1 + 3 * (1 + 2) + 2 * (1 + 2 + 3) + 2 * (1 + 2 + 3 + 4)
-    expected = {"height": heights / rows, "is_success": 10 / rows, "is_success_at_end": 1.0}
+    expected = {"height": heights / rows, "is_success": 10 / rows, "is_success_at_end": 1.0, "info/drift": 3.0}
     assert scores.measures == pytest.approx(expected)
     assert scores.to_json() | scores.measures == scores.to_json()
 

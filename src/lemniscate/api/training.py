@@ -290,8 +290,9 @@ def _train(world: World, path: Path, algorithm: str, config: RunConfig, options:
     set_seeds(config.seed)  # before JAX starts, which reads its flags then
     torch.set_num_threads(config.threads)
     keep_freed_memory()
-    envs = envs_of(config, world)
-    spec = envs[0].spec
+    with torch_defaults():  # which an environment may change as it is made, as it may the working directory
+        envs = envs_of(config, world)
+    path, spec = path if path.absolute() == home else home, envs[0].spec
 
     def film(state: TrainState) -> None:
         from lemniscate.api.results import evaluate

@@ -18,6 +18,7 @@ from lemniscate.envs.returns import (
     author,
     flat_mask,
     kind_of,
+    layers,
     mask_in,
     require_form,
     scalars,
@@ -47,8 +48,7 @@ class SingleEnv(gym.Wrapper):
         super().__init__(env)
         require_form(env, ("observation_space", "action_space"))
         self._returns = Returns(env, env.observation_space)
-        asked = [env.get_wrapper_attr(name) for name in MASKS if env.has_wrapper_attr(name)]
-        self._ask = next(filter(callable, asked), None)
+        self._ask = _mask_of(env)
         seen, self._acts, self._declared = env.observation_space, env.action_space, measures_of(env.metadata)
         self._masked = bool(self._ask or (isinstance(seen, spaces.Dict) and seen.spaces.keys() & set(MASKS)))
         self._shape = seen.shape if isinstance(seen, spaces.Box | spaces.MultiBinary) else None
@@ -129,13 +129,33 @@ class SingleEnv(gym.Wrapper):
             return numbers
         name, mask = mask_in(obs, info)
         if mask is None and self._ask:
-            name, mask = MASKS[0], self._ask()
+            name, mask = MASKS[0], self._asked(*self._ask)
         if mask is not None or (name and isinstance(self.action_space, spaces.Discrete | spaces.MultiDiscrete)):
             try:
                 numbers["action_mask"] = flat_mask(mask, self.action_space)
             except ValueError as error:
                 raise self._returns.wrong(method, f"comes with an action mask {error}") from None
         return numbers
+
+    def _asked(self, layer: Any, name: str) -> Any:
+        """The mask that a method or an attribute of a layer gives."""
+        try:
+            mask = getattr(layer, name)
+            return mask() if callable(mask) else mask
+        except Exception as error:
+            said = f"asked for the action mask without arguments, raised {type(error).__name__}: {error}"
+            raise UserError(f"{type(layer).__name__}.{name}, {said}") from error
+
+
+def _mask_of(env: gym.Env) -> tuple[Any, str] | None:
+    """The outermost layer of an environment that has an action mask, as a method, a property or an array; its name."""
+    for name in MASKS:
+        for layer in layers(env):
+            found = getattr(type(layer), name, None)  # before `reset` a property may have nothing to say
+            found = found if isinstance(found, property) else getattr(layer, name, None)
+            if callable(found) or isinstance(found, property | np.ndarray | list | tuple):
+                return layer, name
+    return None
 
 
 def measures_of(metadata: Mapping[str, Any]) -> tuple[str, ...]:
@@ -302,7 +322,7 @@ def physical_action(action: np.ndarray, kind: Action) -> np.ndarray:
     elif isinstance(kind, MultiDiscrete):
         action = (_require_below(np.array(kind.nvec), action) + np.array(kind.start)).astype(kind.dtype)
     else:
-        _require_below(2, action)
+        action = _require_below(2, action).astype(np.int8)  # the only type of a MultiBinary
     return action if kind.shape is None else action.reshape(-1, *kind.shape)
 
 

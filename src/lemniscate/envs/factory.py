@@ -104,6 +104,8 @@ def make_one(maker: Maker, wrappers: Sequence[Callable[..., Any]] = (), **kwargs
 def _other(made: object, wanted: str) -> TypeError:
     """The words on something else than what is wanted."""
     instead = "; what speaks rsl_rl's VecEnv is of the backend rsl_rl" if hasattr(made, SPOKEN) else ""
+    if isinstance(made, gym.Env):
+        instead = "; what has an argument num_envs makes that many at once"
     return TypeError(f"it makes {with_article(type(made).__name__)}, not a {wanted}{instead}")
 
 
@@ -149,22 +151,25 @@ def require_no_statistics(env: Any, vector: VectorEnv) -> None:
     """
     while isinstance(env, gym.Env | VectorEnv):
         held = {name.strip("_"): value for name, value in vars(env).items()}
-        learns = STATISTICS & held.keys() or any(map(_is_running, held.values()))
+        learns = STATISTICS & held.keys() or {name for name, value in held.items() if _is_running(value)}
         if isinstance(env, AsyncVectorEnv):
-            learns = any(any(env.call("has_wrapper_attr", name)) for name in STATISTICS)
+            learns = {name for name in STATISTICS if any(env.call("has_wrapper_attr", name))}
         if learns and held.get("update_running_mean", True):
             vector.close()
             raise UserError(
-                f"{type(env).__name__} learns statistics that no checkpoint has: leave it out, and train with"
-                " normalize_observations, for rewards with scale_rewards (--normalize-observations, --scale-rewards)."
+                f"{type(env).__name__} learns statistics, {min(learns)}, that no checkpoint has: leave them out, and"
+                " train with normalize_observations, for rewards with scale_rewards (--normalize-observations,"
+                " --scale-rewards)."
             )
         env = held.get("env", next(iter(held.get("envs") or ()), None))
 
 
 def _is_running(value: object) -> bool:
-    """Whether it is a running mean and variance, as `RunningMeanStd` is; of an array or a table these are methods."""
-    names = set(dir(value))
-    return {"mean", "var"} <= names and bool({"update", "count"} & names) and not callable(getattr(value, "mean", len))
+    """Whether it is a running mean and variance, as `RunningMeanStd` is; of an array or a table these are methods.
+
+    A filter of one's own may have a mean and a variance too: it counts nothing.
+    """
+    return {"mean", "var", "count"} <= set(dir(value)) and not callable(getattr(value, "mean", len))
 
 
 def give_numbers_of_joints() -> None:

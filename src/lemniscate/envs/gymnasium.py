@@ -17,7 +17,7 @@ from lemniscate.envs.factory import is_own, make_one, make_vector, maker_of, mak
 from lemniscate.envs.returns import fitted, mask_in
 from lemniscate.envs.vec_env import Stagger
 from lemniscate.envs.workers import WatchedVectorEnv, call_method
-from lemniscate.errors import UserError
+from lemniscate.errors import UserError, shown
 from lemniscate.spec import Discrete, MultiDiscrete, Spec
 from lemniscate.system.named import find_callable
 from lemniscate.types import Step
@@ -97,7 +97,8 @@ class GymnasiumBackend(Backend):
             self._envs, limit = self._build()
         mode = self._envs.metadata.get("autoreset_mode")
         if not isinstance(mode, AutoresetMode):
-            raise UserError(f"{env} does not say when it resets: its metadata needs an autoreset_mode.")
+            needed = "its metadata needs an autoreset_mode, such as AutoresetMode.NEXT_STEP of gymnasium.vector"
+            raise UserError(f"{env} does not say when it resets: {needed}{f', not {shown(mode)}' if mode else ''}.")
         self.mode = mode
         space, action = self._envs.single_observation_space, spaces.action_kind(self._envs.single_action_space, env)
         parts = spaces.observation_parts(space, env)

@@ -147,10 +147,14 @@ def name_of(env: object) -> str:
     if isinstance(env, str):
         return env
     if not callable(env) and not hasattr(env, SPOKEN):
-        what = "an environment that is made already" if hasattr(env, "step") else shown(env)
-        if hasattr(env, "entry_point"):
+        what, right = shown(env), "its class, its id, or a function that makes it"
+        if hasattr(env, "step"):
+            what, right = "an environment that is made already", f"{right}: training makes as many as it needs"
+            if hasattr(env, "num_envs"):
+                right = "a function that makes as many as it is told: def make(num_envs): …"
+        elif hasattr(env, "entry_point"):
             what = f"the EnvSpec of {getattr(env, 'id', None)}"
-        raise UserError(f"env is {what}; give its class, its id, or a function that makes it: several are needed.")
+        raise UserError(f"env is {what}; give {right}.")
     return named.name_of(env)
 
 

@@ -128,10 +128,11 @@ def require_form(env: Any, names: tuple[str, str]) -> None:
 def _takes_options(reset: Any) -> bool:
     """Whether a method takes a seed and options by their names; what has no signature to read may."""
     try:
-        taken = signature(reset).parameters
+        taken = signature(reset).parameters.values()
     except (ValueError, TypeError):
         return True
-    return taken.keys() >= {"seed", "options"} or any(one.kind is one.VAR_KEYWORD for one in taken.values())
+    named = {one.name for one in taken if one.kind is not one.POSITIONAL_ONLY}
+    return named >= {"seed", "options"} or any(one.kind is one.VAR_KEYWORD for one in taken)
 
 
 def layers(env: Any) -> Iterator[Any]:

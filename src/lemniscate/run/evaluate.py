@@ -181,7 +181,7 @@ class EpisodeTable:
         """One step of every environment, of which only those in `counts` [N] count."""
         done = (step.terminated | step.truncated) & counts
         for name, values in step.measures.items():
-            row = torch.stack([values, self._running[1], done])[:, counts & ~values.isnan()]
+            row = torch.stack([values, self._running[1], done])[:, counts & values.isfinite()]
             self._measured.setdefault(name, []).append(row)
         self._running = self._running + torch.stack([step.reward, torch.ones_like(step.reward)]) * counts
         if done.any():
