@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 import threading
+import warnings
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 
@@ -469,12 +470,24 @@ def test_what_the_caller_has_set_in_torch_does_not_reach_what_looks_at_a_policy(
         assert each[0] == first[0], name
 
 
+def test_an_observation_may_be_read_only_or_run_backwards(cartpole):
+    obs = np.array([0.1, 0.2, 0.3, 0.4], np.float32)
+    expected = cartpole.policy.value(obs[::-1].copy())
+    fixed = obs[::-1].copy()
+    fixed.setflags(write=False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert cartpole.policy.value(obs[::-1]) == cartpole.policy.value(fixed) == expected
+
+
 @pytest.mark.parametrize(
     ("obs", "said"),
     [
         ([10**400] * 4, "cannot be read: .*too large"),
         ([1e39] * 4, "number that is inf"),
         ([1j] * 4, "numbers are complex"),
+        (["1", "2", "3", "4"], "numbers are texts"),
+        (np.ma.array([1.0, 2.0, 3.0, 4.0], mask=[1, 0, 0, 0]), "some of its numbers are masked"),
     ],
 )
 def test_numbers_that_float32_cannot_hold_are_said(cartpole, obs, said):

@@ -1,6 +1,7 @@
 """The commands, as a person types them."""
 
 import json
+import os
 import re
 import subprocess
 import sys
@@ -263,6 +264,14 @@ def test_help_and_a_mistyped_name_import_nothing_heavy(words):
     assert "lemniscate.cli" in loaded
     assert not loaded & {"torch", "numpy", "gymnasium", "matplotlib"}
     assert not loaded & {"lemniscate.cli.fields", "lemniscate.cli.commands"}
+
+
+def test_help_is_written_in_any_locale():
+    plain = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    words = [sys.executable, "-m", "lemniscate", "train", "--help"]
+    ended = subprocess.run(words, capture_output=True, text=True, env=plain)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert "--FIELD VALUE \\u2026" in ended.stdout
 
 
 def test_importing_the_package_imports_nothing_heavy_and_shows_its_names():

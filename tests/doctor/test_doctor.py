@@ -597,6 +597,16 @@ def test_no_remedy_is_to_turn_on_what_is_on():
     assert "--scale-rewards" not in rule.remedy_for(config | {"scale_rewards": True})
 
 
+def test_a_remedy_that_is_in_force_already_is_left_out():
+    rule = next(rule for rule in RULES if rule.name == "fell-back")
+    config = algos.find("ppo").Config().to_json()
+    assert "--desired-kl none" in rule.remedy_for(config)
+    assert "--final-learning-rate" not in rule.remedy_for(config)  # it is 0
+    annealed = rule.remedy_for(config | {"desired_kl": None, "final_learning_rate": 0.5})
+    assert "--desired-kl" not in annealed
+    assert "--final-learning-rate 0" in annealed
+
+
 def test_the_page_has_a_paragraph_for_each_rule_and_no_other():
     anchors = re.findall(r"^### ([a-z-]+)$", PAGE, re.MULTILINE)
     assert set(anchors) == {rule.name for rule in RULES} | {"setting"}

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 os.environ.setdefault("SCIPY_ARRAY_API", "1")
 
+import numpy as np
 import pytest
 import torch
 
@@ -70,6 +71,14 @@ def test_it_flies_the_figure_eight_and_its_gains_matter():
     soft = evaluate(replace(env.baseline, gains=(3.0, 3.0, 3.0, 3.0)), env, 8, seed=0)
     assert soft.mean_return < flown.mean_return - 10
     assert set(GAINS) == {"so_rpy", "so_rpy_rotor", "so_rpy_rotor_drag", "first_principles"}
+
+
+def test_of_a_baseline_there_is_neither_film_nor_page(tmp_path):
+    pytest.importorskip("crazyflow")
+    arguments = {"env": "DroneFigureEightTrajectory-v0", "episodes": 1, "baseline": True}
+    for more in ({"video": tmp_path / "film.gif"}, {"report": tmp_path / "page"}):
+        with pytest.raises(lem.errors.UserError, match="leave out video and report"):
+            lem.evaluate(lambda obs: np.array([0, 0, 0, 0.3], np.float32), **arguments, **more)
 
 
 def test_an_environment_without_a_baseline_says_so():

@@ -60,8 +60,6 @@ def test_a_whole_run_is_said_to_be_whole(run, capsys):
     ("file", "advice"),
     [
         ("config.json", "has a copy, which is taken"),
-        ("final.json", "computed again"),
-        ("metrics.jsonl", "resume keeps the damaged file beside the new one"),
         ("checkpoints/step-256/tensors.safetensors", "resume goes on from step"),
         ("checkpoints/step-256/state.json", "resume goes on from step"),
         ("checkpoints/step-256/manifest.json", "resume goes on from step"),
@@ -73,6 +71,25 @@ def test_a_damaged_file_is_named_with_what_can_be_done(run, capsys, file, advice
     assert code == 2
     assert f"✗ {run / file}" in said
     assert advice in said
+    assert f"lemniscate resume {run}" in said
+
+
+@pytest.mark.parametrize(("file", "said_too"), [("final.json", "computed again"), ("metrics.jsonl", "metrics.jsonl")])
+def test_of_a_finished_run_resume_is_not_said_to_repair_anything(run, capsys, file, said_too):
+    flip(run / file)
+    code, said = answer(run, capsys)
+    assert code == 2
+    assert f"✗ {run / file}" in said
+    assert said_too in said
+    assert "It is finished, so that resume changes nothing; its policy serves." in said
+    assert "lemniscate resume" not in said
+
+
+def test_of_a_run_that_goes_on_resume_keeps_the_damaged_metrics(run, capsys):
+    flip(run / "metrics.jsonl")
+    shutil.rmtree(run / "checkpoints" / "step-256")
+    said = answer(run, capsys)[1]
+    assert "resume keeps the damaged file beside the new one" in said
     assert f"lemniscate resume {run}" in said
 
 

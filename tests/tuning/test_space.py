@@ -95,6 +95,13 @@ def test_the_settings_of_a_config_are_a_point_of_the_space_where_they_lie_in_it(
         ("learning_rate=log:0:1", "learning_rate"),
         ("value_coef=log:0:1", "above 0 and below"),
         ("gamma=.9", "is no range"),
+        ("clip=.1|0.10", "is no range"),
+        (
+            {"gamma": (0.9, 0.99)},
+            r"search\['gamma'\] must be a text such as 'log:1e-4:1e-2', '.9:.999' or 'a|b', not \(0.9",
+        ),
+        ({"activation": ["tanh", "relu"]}, "must be a text such as"),
+        ({"gamma": 0.9}, "is no range"),
         ("gamma=.9:2", "gamma must be"),
         ("gamma=.9:1:2", "gamma"),
         ("activation=tanh:relu", "is no number"),

@@ -207,6 +207,12 @@ def test_what_cannot_be_searched_has_its_sentence_and_leaves_nothing(tmp_path, w
     assert not path.exists()
 
 
+def test_whether_to_prune_is_true_or_false(tmp_path):
+    with pytest.raises(lem.UserError, match=r"prune must be True or False, not 'no'\."):
+        lem.tune("ppo", env="CartPole-v1", search="gamma=.9:.99", prune="no", run=tmp_path / "t")
+    assert not (tmp_path / "t").exists()
+
+
 def test_a_search_is_for_one_algorithm(capsys):
     assert main(["tune", "ppo,sac", "--search", "gamma=.9:.99"]) == 2
     assert "A search is for one algorithm: lemniscate tune ppo" in capsys.readouterr().err

@@ -183,7 +183,7 @@ class TrainedPolicy:
         if self.is_masked:
             mask = read_mask(action_mask, self.spec, flat)
             flat = np.concatenate([flat, mask.astype(flat.dtype)], axis=-1)
-        rows = torch.from_numpy(flat)
+        rows = torch.from_numpy(np.array(flat, order="C"))  # the caller's may be read-only, or run backwards
         return self._recall.rows(rows) if self._recall else rows, batched
 
     def _read_for(self, critic: str, obs: Any) -> tuple[Tensor, bool]:

@@ -106,6 +106,8 @@ def evaluate(
         if baseline:
             if vec.baseline is None:
                 raise UserError(f"{vec.spec.env_id} has no baseline to compare with.")
+            if file or folder:
+                raise UserError("Of a baseline there are the scores alone: leave out video and report.")
             return evaluate_policy(vec.baseline, vec, episodes, seed)
         if file:
             scores = _show(player, vec, arguments, **how, video=file, tell=str)

@@ -9,6 +9,7 @@ options of an algorithm's Config, which imports torch; `commands` works.
 import argparse
 import atexit
 import gc
+import io
 import os
 import re
 import sys
@@ -150,6 +151,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     command = None
     if "RANK" in os.environ:  # torch has whole pages to say of a connection that ends
         os.environ.setdefault("TORCH_CPP_LOG_LEVEL", "ERROR")
+    if isinstance(sys.stdout, io.TextIOWrapper):  # not every locale has the letters of a help
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         options = vars(parse(sys.argv[1:] if arguments is None else arguments))
         command = options.pop("command")

@@ -67,8 +67,13 @@ class Rule:
 
 
 def _may_help(clause: str, config: Mapping[str, object]) -> bool:
-    options = [(field_of(option), off) for option, off in re.findall(r"(--[a-z-]+)( off)?", clause)]
-    return all(name in OF_COMMANDS or (name in config and (off or config[name] is not True)) for name, off in options)
+    options = [(field_of(option), value) for option, value in re.findall(r"(--[a-z-]+)(?: (off|none|0)\b)?", clause)]
+    on_already = [repr(config.get(name)) == PRESENT[value] for name, value in options]
+    return all(name in OF_COMMANDS or name in config for name, _ in options) and not (options and all(on_already))
+
+
+PRESENT = {"": "True", "off": "False", "none": "None", "0": "0.0"}
+"""what stands in a Config where an option was given with this value"""
 
 
 OF_COMMANDS = ("episodes", "stochastic", "env_kwargs")

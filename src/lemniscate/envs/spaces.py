@@ -321,8 +321,10 @@ def read_observation(spec: Spec, obs: Any) -> tuple[np.ndarray, bool]:
     parts = spec.observation_parts
     try:
         array = None if isinstance(obs, dict | tuple) else np.asarray(obs)
-        if array is not None and array.dtype.kind == "c":
-            raise TypeError("its numbers are complex")
+        if np.ma.is_masked(obs):
+            raise TypeError("some of its numbers are masked")
+        if array is not None and array.dtype.kind in "cSU":
+            raise TypeError(f"its numbers are {'complex' if array.dtype.kind == 'c' else 'texts'}")
         if array is not None and _is_flat(spec, array):
             parts = (ObservationPart((), (spec.observation_size,), image=spec.image),)
         batched = _is_batch(parts, obs)

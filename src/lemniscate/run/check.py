@@ -6,7 +6,18 @@ from pathlib import Path
 from lemniscate.envs.check import BAD, GOOD, NOTE, Finding
 from lemniscate.errors import UserError, resume_line
 from lemniscate.run import checkpoint
-from lemniscate.run.directory import BEST, CONFIG, FINAL, LOCK, SWEEP, TUNE, locked, lost, require_no_search
+from lemniscate.run.directory import (
+    BEST,
+    CONFIG,
+    FINAL,
+    LOCK,
+    SWEEP,
+    TUNE,
+    is_finished,
+    locked,
+    lost,
+    require_no_search,
+)
 from lemniscate.run.metrics import METRICS, damage, read_metrics
 from lemniscate.run.places import is_sweep, read_sweep
 from lemniscate.system.files import DamagedFileError, is_whole, parsing, read_json
@@ -44,6 +55,8 @@ def verdict(path: Path, found: list[Finding]) -> str:
     planned = any(found.record.get("planned") for found in _checkpoints(path)[0])
     repairable = is_whole(path / SWEEP) if is_sweep(path) else planned
     files = f"{damaged} finding{'s' * (damaged > 1)} above, marked ✗"
+    if not is_sweep(path) and _is_finished(path):
+        return f"{path} is damaged: {files}. It is finished, so that resume changes nothing; its policy serves."
     if repairable:
         return f"{path} is damaged: {files}. What can be repaired, this repairs: {resume_line(path)}"
     return f"{path} is damaged: {files}. There is nothing that it can be repaired from."
@@ -120,9 +133,15 @@ def _metrics(path: Path, whole: list[checkpoint.Checkpoint]) -> Iterator[Finding
     steps = [found.record.get("logged") for found in whole]
     logged = max((step for step in steps if isinstance(step, int)), default=0)
     if sentence := damage(path, logged):
-        yield Finding(BAD, f"{sentence} The other lines serve; resume keeps the damaged file beside the new one.")
+        kept = "" if _is_finished(path) else " The other lines serve; resume keeps the damaged file beside the new one."
+        yield Finding(BAD, f"{sentence}{kept}")
     elif lines := read_metrics(path):
         yield Finding(GOOD, f"{METRICS}: {len(lines):,} lines up to step {lines[-1]['step']:,}.")
+
+
+def _is_finished(path: Path) -> bool:
+    """Whether nothing is left to train, so that nothing is repaired either."""
+    return is_whole(path / CONFIG) and is_finished(path)
 
 
 def _is_locked(path: Path) -> bool:

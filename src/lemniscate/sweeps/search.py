@@ -94,7 +94,7 @@ def read_texts(search: object) -> dict[str, str]:
     if not isinstance(search, str | Mapping):
         raise UserError(f"search must be a text such as 'gamma=.9:.999', or a dictionary, not {shown(search)}.")
     if isinstance(search, Mapping):
-        pairs = [(str(name), "=", str(text)) for name, text in search.items()]
+        pairs = [(str(name), "=", _text(name, text)) for name, text in search.items()]
     else:
         pairs = [field.partition("=") for field in re.split(r",\s*(?=[\w-]+\s*=)", search.strip(" ,")) if field]
     for pair in pairs:
@@ -107,6 +107,13 @@ def read_texts(search: object) -> dict[str, str]:
     if not pairs:
         raise UserError("Search what? Name fields with their ranges, such as learning_rate=log:1e-4:1e-2.")
     return {name: text.strip() for name, (_, _, text) in zip(names, pairs, strict=True)}
+
+
+def _text(name: object, text: object) -> str:
+    """A range of a dictionary, which is a text; a number stands for itself, and is refused as no range."""
+    if isinstance(text, str | int | float):
+        return str(text)
+    raise UserError(f"search[{name!r}] must be a text such as 'log:1e-4:1e-2', '.9:.999' or 'a|b', not {shown(text)}.")
 
 
 def read_space(texts: Mapping[str, str], config: RunConfig) -> Space:
@@ -132,7 +139,7 @@ def _range(name: str, text: str, hint: Any, config: RunConfig) -> Interval | Cho
     if not ends:
         values = {part.strip(): _read(name, hint, part) for part in text.split("|")}
         checked = {key: getattr(config.replace(**{name: value}), name) for key, value in values.items()}
-        if len(checked) < 2:
+        if len({repr(value) for value in checked.values()}) < max(2, len(checked)):
             raise UserError(f"{name}={text} is no range: write {name}=low:high, {name}=log:low:high or {name}=a|b.")
         return Choice(checked)
     low, high = (getattr(config.replace(**{name: _read(name, hint, end)}), name) for end in ends.groups()[1:])
@@ -148,7 +155,7 @@ def _range(name: str, text: str, hint: Any, config: RunConfig) -> Interval | Cho
 def _read(name: str, hint: Any, text: str) -> Any:
     kinds, text = kinds_of(hint), text.strip()
     if bool in kinds:
-        return {"on": True, "off": False}.get(text, text)
+        return {"on": True, "true": True, "off": False, "false": False}.get(text.lower(), text)
     return read(name, hint, text.split() if tuple in kinds else text)
 
 

@@ -92,7 +92,7 @@ def tune(
         raise UserError(f"{name} follows from the search: at the end of each part of a run trials are compared.")
     algorithm = name_of(algorithm)
     config = training.config_for(algorithm, env, preset, **fields)
-    trials = checked("trials", trials, Annotated[int, Range(1, 10_000)])
+    trials, prune = checked("trials", trials, Annotated[int, Range(1, 10_000)]), checked("prune", prune, bool)
     config = config.replace(
         checkpoint_every=-(-config.total_steps // NINTHS),
         evaluate_every=config.total_steps,
