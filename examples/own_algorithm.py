@@ -97,8 +97,7 @@ def update(config: Config, state: State, rollout: Rollout) -> Metrics:
     """Some epochs of minibatch steps on one rollout; returns the means of the metrics."""
     if config.scale_rewards:
         rollout = state.reward_scale.scale(rollout)
-    log_prob = state.networks.log_prob(rollout.obs, rollout.action)
-    batch, valid_rows = advantages(config, state.networks, rollout, log_prob), rollout.valid_rows
+    batch, valid_rows = advantages(config, state.networks, rollout), rollout.valid_rows
     metrics: list[Metrics] = []
     for _ in range(config.epochs):
         minibatches = epoch_minibatches(valid_rows, rollout.num_rows, config.minibatch_size, state.rng.minibatch)

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from types import ModuleType, SimpleNamespace
 
 import psutil
@@ -273,7 +274,9 @@ def test_stopped_or_killed_it_goes_on(tmp_path, signum):
         (folder / f"{number}.py").write_text(hand_ins.IMPORTS + hand_ins.RIGHT["polyak"])
     endless = "import subprocess, sys, time\ndef gae(*a, **k):\n    open('/{}/mark', 'w')\n    time.sleep(987654)\n"
     (folder / "z.py").write_text(endless.format(tmp_path))
-    process = subprocess.Popen([*COMMAND, folder], stderr=subprocess.PIPE, text=True, start_new_session=True)
+    heard = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)  # a shell's job in the background ignores it
+    how = {"stderr": subprocess.PIPE, "text": True, "start_new_session": True, "preexec_fn": heard}
+    process = subprocess.Popen([*COMMAND, folder], **how)
     wait_for(lambda: len(stored(to)) == 3 and (tmp_path / "mark").exists())
     family = psutil.Process(process.pid).children(recursive=True)
     process.send_signal(signum)

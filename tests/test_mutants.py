@@ -1199,8 +1199,8 @@ MUTANTS = [
     (
         "recomputed advantages forget the old probabilities",
         "algos/ppo.py",
-        "            batch = advantages(config, state.networks, rollout, log_prob)",
-        "            batch = advantages(config, state.networks, rollout, state.networks.log_prob(rollout.obs, rollout.action))",
+        "advantages(config, state.networks, rollout, collected.log_prob)",
+        "advantages(config, state.networks, rollout)",
         PPO + "advantages_are_estimated_again_before_each_epoch_on_request",
     ),
     (

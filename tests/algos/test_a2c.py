@@ -29,8 +29,7 @@ def test_with_one_step_it_is_the_one_step_actor_critic():
 def test_at_ratio_1_it_has_the_gradient_of_ppo():
     shared = {"gae_lambda": 0.9, "normalize_advantage": False, "value_coef": 0.4, "entropy_coef": 0.01}
     config, state, rollout = one_rollout(a2c, **shared)
-    log_prob = state.networks.log_prob(rollout.obs, rollout.action)
-    batch = ppo.advantages(config, state.networks, rollout, log_prob)
+    batch = ppo.advantages(config, state.networks, rollout)
     configs = ((a2c, config), (ppo, small(ppo, "Pendulum-v1", **{**shared, "minibatch_size": 32})))
     gradients = [slope(algo.loss(its, state.networks, batch)[0], state.networks) for algo, its in configs]
     torch.testing.assert_close(*gradients, rtol=1e-4, atol=1e-6)

@@ -39,14 +39,9 @@ def one_rollout(**fields):
     return config, state, collect(env, state.policy, config.num_steps, state.rng.action)
 
 
-def batch_of(config, state, rollout):
-    """What the losses of an update see."""
-    return ppo.advantages(config, state.networks, rollout, state.networks.log_prob(rollout.obs, rollout.action))
-
-
 def test_the_first_ratio_is_one():
     config, state, rollout = one_rollout(normalize_observations=True)
-    batch = batch_of(config, state, rollout)
+    batch = ppo.advantages(config, state.networks, rollout)
     _, metrics = ppo.loss(config, state.networks, batch)
     assert metrics["approx_kl"].abs() < 1e-6
     assert metrics["clip_fraction"] == 0
@@ -64,7 +59,7 @@ def test_the_first_gradient_step_of_every_update_has_ratios_of_one():
 
 def test_the_loss_is_equation_9():
     config, state, rollout = one_rollout(entropy_coef=0.1, value_coef=0.7, normalize_advantage=False)
-    batch = batch_of(config, state, rollout)
+    batch = ppo.advantages(config, state.networks, rollout)
     total, parts = ppo.loss(config, state.networks, batch)
     expected = parts["losses/policy"] + 0.7 * parts["losses/value"] - 0.1 * parts["losses/entropy"]
     torch.testing.assert_close(total.detach(), expected)
@@ -72,7 +67,7 @@ def test_the_loss_is_equation_9():
 
 def test_the_clip_of_the_value_is_a_setting():
     config, state, rollout = one_rollout(clip_value=1e-3)
-    batch = batch_of(config, state, rollout)
+    batch = ppo.advantages(config, state.networks, rollout)
     shifted = dataclasses.replace(batch, value=batch.value + 1)
     _, plain = ppo.loss(config.replace(clip_value=None), state.networks, shifted)
     _, clipped = ppo.loss(config, state.networks, shifted)

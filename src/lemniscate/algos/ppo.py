@@ -98,9 +98,10 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
 
 
 @torch.no_grad()
-def advantages(config: Config, networks: ActorCritic, rollout: Rollout, log_prob: Tensor) -> DrawnBatch:
-    """The rows of a rollout with V(s), advantage (eq. 11), value target and log π_old(a|s) [T, N], [B, …]."""
+def advantages(config: Config, networks: ActorCritic, rollout: Rollout, log_prob: Tensor | None = None) -> DrawnBatch:
+    """The rows of a rollout with V(s), advantage (eq. 11), value target, and log π_old(a|s) if not given, [B, …]."""
     value, next_value = networks.estimates(rollout.obs, rollout.next_obs)
+    log_prob = networks.log_prob(rollout.obs, rollout.action) if log_prob is None else log_prob.view_as(value)
     gamma, lam = config.gamma, config.gae_lambda
     advantage, target = gae(rollout.reward, value, next_value, rollout.terminated, rollout.done, gamma=gamma, lam=lam)
     batch = DrawnBatch(rollout.obs, rollout.action, value, advantage, target, log_prob)
@@ -139,13 +140,12 @@ def update(config: Config, state: State, rollout: Rollout) -> dict[str, Tensor |
     config = state.apply_schedules(config) if config.schedules else config
     if config.scale_rewards:
         rollout = state.reward_scale.scale(rollout)
-    log_prob = state.networks.log_prob(rollout.obs, rollout.action)  # log π_old
-    batch = collected = advantages(config, state.networks, rollout, log_prob)
+    batch = collected = advantages(config, state.networks, rollout)
     valid_rows, rows = rollout.valid_rows, rows_of(rollout, state.networks.piece_length)
     metrics: list[Metrics] = []
     for epoch in range(config.epochs):
         if config.recompute_advantages and epoch > 0:
-            batch = advantages(config, state.networks, rollout, log_prob)
+            batch = advantages(config, state.networks, rollout, collected.log_prob)
         minibatches = epoch_minibatches(rows, rollout.num_rows, config.minibatch_size, state.rng.minibatch)
         advantage = batch.advantage[minibatches]
         if config.normalize_advantage:
