@@ -112,7 +112,7 @@ WAYS = {
     "exception without words": (lambda: raise_(Wordless(1, 2)), "Wordless"),
     "exception of 10 MB": (lambda: raise_(ValueError("x" * 10**7)), "ValueError: xxx"),
     "keyboard interrupt": (lambda: raise_(KeyboardInterrupt()), "KeyboardInterrupt|died"),
-    "system exit": (lambda: raise_(SystemExit(1)), "SystemExit|died"),
+    "system exit": (lambda: raise_(SystemExit(1)), r"SystemExit|called sys\.exit\(1\)"),
     "recursion": (lambda: (lambda f: f(f))(lambda f: f(f)), "RecursionError"),
     "memory error": (lambda: raise_(MemoryError()), "MemoryError"),
 }

@@ -1,6 +1,7 @@
 """Gymnasium environments, in all three autoreset modes."""
 
 from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
@@ -95,6 +96,20 @@ class GymnasiumBackend(Backend):
         self._make_judge, self._judge = partial(make_one, maker, wraps, **given), None
         with sentences(env, kwargs, wrappers):
             self._envs, limit = self._build()
+        try:
+            self._read_form(env, limit)
+        except BaseException:
+            with suppress(Exception):  # no process is left behind
+                self._envs.close()
+            raise
+        self._stagger_up_to = limit if stagger and self.mode is AutoresetMode.DISABLED else None
+        self._calls: dict[str, Any] = {}
+        self._measures = measures_of(self._envs.metadata)
+        self.notices = spaces.notices(self.spec)
+        self._digits: spaces.LostDigits | None = None if self.spec.image else spaces.LostDigits(self.spec)
+
+    def _read_form(self, env: str, limit: int | None) -> None:
+        """When the environments reset, and their spaces. Raises `UserError` for what nobody can learn from."""
         mode = self._envs.metadata.get("autoreset_mode")
         if not isinstance(mode, AutoresetMode):
             needed = "its metadata needs an autoreset_mode, such as AutoresetMode.NEXT_STEP of gymnasium.vector"
@@ -105,12 +120,7 @@ class GymnasiumBackend(Backend):
         self._used = isinstance(action, Discrete | MultiDiscrete)
         if self._used:
             action = spaces.masked(action, *self._envs.reset(seed=0))
-        self._stagger_up_to = limit if stagger and self.mode is AutoresetMode.DISABLED else None
-        self._calls: dict[str, Any] = {}
-        self._measures = measures_of(self._envs.metadata)
         self.spec = Spec(env, parts, action, max_episode_steps=limit)
-        self.notices = spaces.notices(self.spec)
-        self._digits: spaces.LostDigits | None = None if self.spec.image else spaces.LostDigits(self.spec)
 
     def restart(self, seed: int, first: int = 0) -> Tensor:
         """Close the environments and build them again: some (Box2D) carry more over a reset than they tell.
