@@ -249,7 +249,7 @@ def test_a_path_with_spaces_is_quoted_where_it_is_to_be_typed(run):
         (np.zeros(8), r"obs has the shape \(8,\)"),
         (np.zeros((2, 2)), r"obs has the shape \(2, 2\)"),
         (None, r"obs has the shape \(\)"),
-        ("left", r"obs has the shape \(\)"),
+        ("left", "its numbers are texts"),
         ((np.zeros(4), {}), "it is what `reset` or `step` returned"),
     ],
 )
@@ -350,7 +350,8 @@ def test_an_environment_that_moves_to_its_files_leaves_the_run_where_it_belongs(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "elsewhere").mkdir()
     fields = tiny_fields("CartPole-v1", total_steps=128)
-    trained = lem.train("ppo", Moves, env_kwargs={"to": str(tmp_path / "elsewhere")}, run="r", progress=False, **fields)
+    fields |= {"env_kwargs": {"to": str(tmp_path / "elsewhere")}}
+    trained = lem.train("ppo", Moves, run="r", progress=False, **fields)
     assert trained.path == tmp_path / "r"
     assert lem.load(tmp_path / "r").step == 128
     assert not list((tmp_path / "elsewhere").iterdir())

@@ -290,9 +290,8 @@ def _train(world: World, path: Path, algorithm: str, config: RunConfig, options:
     set_seeds(config.seed)  # before JAX starts, which reads its flags then
     torch.set_num_threads(config.threads)
     keep_freed_memory()
-    with torch_defaults():  # which an environment may change as it is made, as it may the working directory
-        envs = envs_of(config, world)
-    path, spec = path if path.absolute() == home else home, envs[0].spec
+    envs = envs_of(config, world)
+    path, spec = path if path.absolute() == home else home, envs[0].spec  # an environment may have gone to its files
 
     def film(state: TrainState) -> None:
         from lemniscate.api.results import evaluate

@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch
-from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 from torch import Tensor
 
 from lemniscate.envs import spaces
@@ -92,7 +92,7 @@ class GymnasiumBackend(Backend):
         if makes_vector(maker) and self.workers:
             raise UserError(f"{env} makes {num_envs} environments at once, so there is none for a process of its own.")
         wraps, given = tuple(map(find_callable, wrappers)), dict(kwargs or {})
-        self._build = partial(make_vector, maker, num_envs, given, wraps, self.workers)
+        self._make = partial(make_vector, maker, num_envs, given, wraps, self.workers)
         self._make_judge, self._judge = partial(make_one, maker, wraps, **given), None
         with sentences(env, kwargs, wrappers):
             self._envs, limit = self._build()
@@ -107,6 +107,15 @@ class GymnasiumBackend(Backend):
         self._measures = measures_of(self._envs.metadata)
         self.notices = spaces.notices(self.spec)
         self._digits: spaces.LostDigits | None = None if self.spec.image else spaces.LostDigits(self.spec)
+
+    def _build(self) -> tuple[VectorEnv, int | None]:
+        """The environments, and their time limit. What they change of torch's defaults as they are made is undone."""
+        dtype = torch.get_default_dtype()
+        try:
+            with torch.set_grad_enabled(torch.is_grad_enabled()):
+                return self._make()
+        finally:
+            torch.set_default_dtype(dtype)
 
     def _read_form(self, env: str, limit: int | None) -> None:
         """When the environments reset, and their spaces. Raises `UserError` for what nobody can learn from."""
