@@ -99,7 +99,10 @@ def init(config: Config, spec: Spec, device: torch.device) -> State:
 
 @torch.no_grad()
 def advantages(config: Config, networks: ActorCritic, rollout: Rollout, log_prob: Tensor | None = None) -> DrawnBatch:
-    """The rows of a rollout with V(s), advantage (eq. 11), value target, and log π_old(a|s) if not given, [B, …]."""
+    """The rows of a rollout with V(s), advantage (eq. 11), value target and log π_old(a|s), [B, …].
+
+    `log_prob` is the last of these, of all rows, where it is known already.
+    """
     value, next_value = networks.estimates(rollout.obs, rollout.next_obs)
     log_prob = networks.log_prob(rollout.obs, rollout.action) if log_prob is None else log_prob.view_as(value)
     gamma, lam = config.gamma, config.gae_lambda
