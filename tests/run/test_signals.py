@@ -320,7 +320,7 @@ def test_the_pace_is_that_of_the_number_that_moves_most():
     obs = numbers(B, O).float()
     moved = obs + torch.tensor([0.0, 0.5, 0.01])[:O]
     found = of_effects(rows(obs=obs, next_obs=moved), spec_of())
-    assert found["observation/pace"] == pytest.approx(0.5 / obs[:, 1].std().item(), rel=1e-5)
+    assert found["observation/pace"] == pytest.approx(0.5 / obs[:, 1].std(correction=0).item(), rel=1e-5)
 
 
 def test_choices_explain_what_they_do():

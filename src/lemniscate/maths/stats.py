@@ -60,7 +60,8 @@ def explained_by(features: Tensor, targets: Tensor, beside: Tensor) -> Tensor:
     many = few - features.shape[1]
     if many <= 0:
         return targets.new_full(targets.shape[1:], torch.nan)
-    left, after = (_residual(columns, targets) for columns in (beside, torch.cat([beside, features], dim=-1)))
+    x, y, gram = _normal(torch.cat([beside, features], dim=-1), targets)
+    left, after = (_residual(x[:, :n], y, gram[:n, :n]) for n in (beside.shape[1], len(gram)))
     share = 1 - (after / many) / (left / few)
     return torch.where(left > 1e-9 * targets.square().sum(0), share, 0.0)
 
@@ -82,9 +83,8 @@ def explained_by_each(features: Tensor, targets: Tensor) -> Tensor:
     return torch.where(left > 1e-9 * targets.square().sum(0), share, 0.0)
 
 
-def _residual(columns: Tensor, targets: Tensor) -> Tensor:
-    """The sum of squares [K] that a line in `columns`, with an intercept, leaves of the targets."""
-    x, y, gram = _normal(columns, targets)
+def _residual(x: Tensor, y: Tensor, gram: Tensor) -> Tensor:
+    """The sum of squares [K] that a line in columns x [B, F] of mean 0 leaves of targets y [B, K]; xᵀx is `gram`."""
     return (y - x @ torch.linalg.solve(gram, x.T @ y)).square().sum(0)
 
 
