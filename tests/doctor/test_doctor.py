@@ -415,6 +415,13 @@ def test_returns_that_have_arrived_rise_no_more():
     assert "still-rising" not in {one.name for one in diagnose(evidence(returns=arrived))}
 
 
+def test_an_advantage_is_opposed_where_its_sign_is_though_sizes_vary():
+    collapsed = [-0.09, -0.34, -0.1, -0.04, -0.002, -0.07, 0.03]
+    assert names(advantage__followed=collapsed, approx_kl=[0.01] * 7) == ["advantage-opposed"]
+    small = [each / 4 for each in collapsed]
+    assert names(advantage__followed=small, approx_kl=[0.01] * 7) == ["advantage-unrelated"]
+
+
 def test_a_policy_that_descends_q_is_named():
     assert names("td3", action__preferred=[0.5] * 3 + [0.2] * 5, steps=30_000) == ["advantage-opposed"]
     assert names("td3", action__preferred=[0.05] * 3 + [0.5] * 5, steps=30_000) == ["q-unfollowed"]
