@@ -5,7 +5,7 @@
     .venv/bin/python benchmarks/doctor.py faults --half unseen                faults that nobody had in mind
     .venv/bin/python benchmarks/doctor.py faults --half unseen-too            and others, after rules for these
     .venv/bin/python benchmarks/doctor.py faults --half unseen-three          and others again
-    .venv/bin/python benchmarks/doctor.py faults --half unseen-four           and again; and unseen-five
+    .venv/bin/python benchmarks/doctor.py faults --half unseen-four           and again; and unseen-five, unseen-six
     .venv/bin/python benchmarks/doctor.py faults --half elsewhere --seeds 1   under other algorithms, elsewhere
     .venv/bin/python benchmarks/doctor.py healthy
     .venv/bin/python benchmarks/doctor.py remedies --seeds 1
@@ -32,6 +32,7 @@ import faulty
 import unseen
 import unseen_five
 import unseen_four
+import unseen_six
 import unseen_three
 import unseen_too
 from common import append, provenance, rows
@@ -205,17 +206,31 @@ UNSEEN_FIVE = {
     "no gradient of Q": ("q-unfollowed",),
 }
 """names that are right for the faults of `unseen_five.py`; none where there is no rule"""
+UNSEEN_SIX = {
+    "observations that grow": ("exploding-observation",),
+    "sizes of advantages": ("advantage-not-normalized",),
+    "a minus in the target": ("q-opposed",),
+    "rows that do not belong together": ("ratio-not-one",),
+    "a value that counts for nothing": ("setting-value-coef",),
+    "a temperature far too high": ("setting-initial-temperature",),
+}
+"""names that are right for the faults of `unseen_six.py`"""
 SETS = (
     (UNSEEN, unseen.UNSEEN),
     (UNSEEN_TOO, unseen_too.UNSEEN_TOO),
     (UNSEEN_THREE, unseen_three.UNSEEN_THREE),
     (UNSEEN_FOUR, unseen_four.UNSEEN_FOUR),
     (UNSEEN_FIVE, unseen_five.UNSEEN_FIVE),
+    (UNSEEN_SIX, unseen_six.UNSEEN_SIX),
 )
 FAULTS |= {name: (*faults[name][:3], right) for named, faults in SETS for name, right in named.items()}
 for name, algorithm, env, steps, change in ELSEWHERE:
     FAULTS[f"{name}: {algorithm}, {env}"] = (algorithm, {env: steps}, change or FAULTS[name][2], FAULTS[name][3])
-OF_SETS = unseen.LEARNERS | unseen_too.LEARNERS | unseen_three.LEARNERS | unseen_four.LEARNERS | unseen_five.LEARNERS
+OF_SETS = {
+    name: change
+    for each in (unseen, unseen_too, unseen_three, unseen_four, unseen_five, unseen_six)
+    for name, change in each.LEARNERS.items()
+}
 LEARNERS = faulty.LEARNERS | {name: lambda _, change=change: change() for name, change in OF_SETS.items()}
 """the library with a fault in it, as a context, for the name of an algorithm"""
 
@@ -351,7 +366,7 @@ def cost() -> None:
 HALVES = {name: "elsewhere" if ":" in name else ("even", "odd")[i % 2] for i, name in enumerate(FAULTS)}
 HALVES |= dict.fromkeys(UNSEEN, "unseen") | dict.fromkeys(UNSEEN_TOO, "unseen-too")
 HALVES |= dict.fromkeys(UNSEEN_THREE, "unseen-three") | dict.fromkeys(UNSEEN_FOUR, "unseen-four")
-HALVES |= dict.fromkeys(UNSEEN_FIVE, "unseen-five")
+HALVES |= dict.fromkeys(UNSEEN_FIVE, "unseen-five") | dict.fromkeys(UNSEEN_SIX, "unseen-six")
 
 
 def table(half: str | None) -> None:
@@ -387,7 +402,17 @@ if __name__ == "__main__":
     parser.add_argument("what", choices=["faults", "healthy", "remedies", "cost", "table"])
     parser.add_argument(
         "--half",
-        choices=["even", "odd", "unseen", "unseen-too", "unseen-three", "unseen-four", "unseen-five", "elsewhere"],
+        choices=[
+            "even",
+            "odd",
+            "unseen",
+            "unseen-too",
+            "unseen-three",
+            "unseen-four",
+            "unseen-five",
+            "unseen-six",
+            "elsewhere",
+        ],
     )
     parser.add_argument("--only", nargs="+", help="these faults, or algorithms of healthy runs")
     parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3])

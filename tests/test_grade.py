@@ -373,3 +373,74 @@ def test_what_functions_need_is_read_and_a_function_counts_before_a_method(tmp_p
     assert found_in(tmp_path / "py", work__py=text) == [["gae"], []]
     code = SCRIPT.replace("print(", "assert handin.solutions(reader, [])['gae'][0]() == 1; print(")
     subprocess.run([sys.executable, "-c", code, tmp_path / "py"], check=True)
+
+
+RETURNS = """import torch
+
+{before}
+
+def discounted_returns(rewards, gamma):
+    returns, after = torch.zeros_like(rewards), 0.0
+    for t in reversed(range(len(rewards))):
+        after = rewards[t] * {one} + gamma * after
+        returns[t] = after
+    return returns
+
+{behind}
+"""
+FILLED = {
+    "loop.py": ("SCALE = {}\nfor name in 'ab':\n    SCALE[name] = 1.0", "SCALE['a']", ""),
+    "with.py": ("SCALE = {}\nwith torch.no_grad():\n    SCALE['a'] = 1.0", "SCALE['a']", ""),
+    "append.py": ("SCALE = []\nwhile not SCALE:\n    SCALE.append(1.0)", "SCALE[0]", ""),
+    "insert.py": ("SCALE = []\nSCALE.insert(0, 1.0)", "SCALE[0]", ""),
+    "setattr.py": ("class Scale: ...\nsetattr(Scale, 'a', 1.0)", "Scale.a", ""),
+    "later.py": ("SCALE = {}\ndef set_up():\n    SCALE.update(a=1.0)", "SCALE['a']", "set_up()"),
+    "global.py": ("def set_up():\n    global SCALE\n    SCALE = 1.0", "SCALE", "set_up()"),
+}
+
+
+@pytest.fixture(scope="module")
+def in_other_forms(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("forms") / "in"
+    (folder / "package" / "mine").mkdir(parents=True)
+    for name, (before, one, behind) in FILLED.items():
+        (folder / name).write_text(RETURNS.format(before=before, one=one, behind=behind))
+    plain = RETURNS.format(before="", one="1.0", behind="")
+    (folder / "writes.ipynb").write_text(
+        hand_ins.notebook(f"%%writefile mine.py\n{plain}", "from mine import discounted_returns")
+    )
+    (folder / "writes and runs.ipynb").write_text(hand_ins.notebook(f"%%writefile mine.py\n{plain}", "!python mine.py"))
+    (folder / "profiles.ipynb").write_text(hand_ins.notebook(f"%%prun\n{plain}", "%%bash\nls"))
+    (folder / "package" / "mine" / "__init__.py").touch()
+    (folder / "package" / "mine" / "helper.py").write_text(plain.replace("discounted_returns", "their_returns"))
+    uses = "from .helper import their_returns\n\ndef discounted_returns(rewards, gamma):\n    return their_returns(rewards, gamma)\n"
+    (folder / "package" / "mine" / "main.py").write_text(uses)
+    (folder / "empty.ipynb").touch()
+    (folder / "old.ipynb").write_text(json.dumps({"nbformat": 3, "worksheets": []}))
+    (folder / "nul.py").write_bytes(b"x = 1\0")
+    (folder / "large.ipynb").write_text(hand_ins.notebook(plain)[:-2] + ', "x": "' + "0" * grading.MOST_COPIED + '"}')
+    grades = course.grade(folder, "discounted_returns", to=folder.parent / "out")
+    return SimpleNamespace(grades=grades)
+
+
+@pytest.mark.parametrize("name", [*FILLED, "writes.ipynb", "writes and runs.ipynb", "profiles.ipynb", "package"])
+def test_right_solutions_in_other_forms_are_right(in_other_forms, name):
+    assert marks(in_other_forms.grades)[name] == {"discounted_returns": True}, sentence(
+        in_other_forms, name, "discounted_returns"
+    )
+
+
+@pytest.mark.parametrize(
+    ("hand_in", "words"),
+    [
+        ("profiles.ipynb", "code cell 2 of profiles.ipynb: left out, since %%bash makes it another language."),
+        ("empty.ipynb", "empty.ipynb cannot be read: it is no notebook with cells: it is empty."),
+        ("old.ipynb", "old.ipynb cannot be read: it is no notebook with cells: save it once with a newer Jupyter."),
+        ("nul.py", "nul.py: SyntaxError: source code string cannot contain null bytes."),
+        ("large.ipynb", "large.ipynb has 64 MB; at most 64 are read: clear the outputs of a notebook."),
+        ("package", ""),
+    ],
+)
+def test_what_is_left_out_is_said(in_other_forms, hand_in, words):
+    said = notes(in_other_forms, hand_in)
+    assert words in said if words else said == ""

@@ -121,6 +121,10 @@ CASES = {
         {"algorithm": "td3", "targets__behind": [0.1, 0.2, 0.5, 0.6]},
         {"algorithm": "td3", "targets__behind": [0.6, 0.5, 0.55, 0.6]},
     ),
+    "q-opposed": (
+        {"algorithm": "td3", "q": [-1.0] * 8, "reward__mean": [1.0] * 8, "reward__std": [0.1] * 8},
+        {"algorithm": "td3", "q": [-1.0] * 7 + [1.0], "reward__mean": [1.0] * 8, "reward__std": [0.1] * 8},
+    ),
     "starts-alike": (
         {"observation__starts_alike": [1.0] * 8},
         {"observation__starts_alike": [1.0] * 7 + [0.0]},
@@ -420,6 +424,41 @@ def test_an_advantage_is_opposed_where_its_sign_is_though_sizes_vary():
     assert names(advantage__followed=collapsed, approx_kl=[0.01] * 7) == ["advantage-opposed"]
     small = [each / 4 for each in collapsed]
     assert names(advantage__followed=small, approx_kl=[0.01] * 7) == ["advantage-unrelated"]
+
+
+def test_observations_that_explode_once_are_named():
+    assert names(observation__largest=[100.0, 80.0, 2e4, 7e10, 1e4, 150.0, 70.0, 230.0]) == ["exploding-observation"]
+    assert names(observation__largest=[100.0, 80.0, 90.0, 9e4, 100.0, 150.0, 70.0, 230.0]) == []
+
+
+def test_advantages_that_are_not_centred_are_named():
+    weights = {"losses__policy": [5.6, 7.9] * 4}
+    assert names("reinforce", **weights) == ["advantage-not-normalized"]
+    assert names("reinforce", **weights, changed={"standardize": False}) == []
+    assert names("ppo", losses__policy=[-0.6] * 8) == ["advantage-not-normalized"]
+    assert names("ppo", losses__policy=[-0.2] * 8) == []
+    stale = {"learning_rate": [1e-6] * 8, "approx_kl": [0.05] * 8}
+    assert names("ppo", losses__policy=[-0.6] * 8, **stale) == ["ratio-not-one"]
+
+
+def test_q_of_entropies_tells_nothing_of_signs():
+    of_entropies = {"q": [1.0] * 8, "reward__mean": [-1.0] * 8, "reward__std": [0.1] * 8}
+    assert names("sac", **of_entropies) == []
+    hot = {"temperature": [100.0] * 8, "losses__entropy": [0.7] * 8, "reward__largest": [8.0] * 8}
+    assert "advantage-opposed" not in names("sac", action__preferred=[0.1] * 8, steps=30_000, **hot)
+    cold = hot | {"temperature": [0.1] * 8}
+    assert "advantage-opposed" in names("sac", action__preferred=[0.1] * 8, steps=30_000, **cold)
+
+
+def test_a_value_that_is_not_to_learn_stands_still():
+    assert names(value__moved=[0.0] * 4, changed={"value_coef": 0.0}) == ["setting-value-coef"]
+
+
+def test_what_follows_of_repeated_observations_is_not_named_beside_them():
+    repeated = {"observation__repeated": [0.7] * 8, "observation__pace": [0.01] * 8}
+    still = {"action__effect": [0.0] * 8, "action__share": [0.0] * 8}
+    assert names(**repeated, **still) == ["observation-repeated"]
+    assert names(observation__pace=[0.01] * 8, **still) == ["action-without-effect", "steps-short"]
 
 
 def test_a_policy_that_descends_q_is_named():

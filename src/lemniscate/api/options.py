@@ -4,8 +4,10 @@ import logging
 import os
 import signal
 import sys
+import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -112,6 +114,24 @@ def _by_name(name: str) -> Any:
         raise UserError(f"{name} cannot be made; give its arguments as module:Class(key=value, …): {error}.") from error
 
 
+@contextmanager
+def _undone() -> Iterator[None]:
+    """Afterwards, signals, the environment's variables and logging are as before, which torch's launcher changes."""
+    caught = signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT
+    handlers = [(signum, signal.getsignal(signum)) for signum in caught]
+    variables, disabled = dict(os.environ), logging.root.manager.disable
+    try:
+        yield
+    finally:
+        if threading.current_thread() is threading.main_thread():
+            for signum, handler in handlers:
+                signal.signal(signum, handler)
+        for name in os.environ.keys() - variables.keys():
+            del os.environ[name]
+        os.environ.update(variables)
+        logging.disable(disabled)
+
+
 def train_in_processes(path: Path, algorithm: str, config: RunConfig, options: RunOptions) -> None:
     """Train in several processes of this machine, and wait: each resumes the run, which begins here if it is new.
 
@@ -132,7 +152,6 @@ def train_in_processes(path: Path, algorithm: str, config: RunConfig, options: R
     from torch.distributed.elastic.multiprocessing.errors import ChildFailedError
     from torch.distributed.launcher.api import LaunchConfig, elastic_launch
 
-    logging.disable(logging.ERROR)
     launched = LaunchConfig(
         min_nodes=1,
         max_nodes=1,
@@ -145,21 +164,24 @@ def train_in_processes(path: Path, algorithm: str, config: RunConfig, options: R
         shutdown_timeout=SECONDS_TO_END,
     )
     reading, writing = os.pipe()  # closed when this process ends, however it ends; then they end, too
-    os.environ[OWNED] = f"/proc/{os.getpid()}/fd/{reading}"
-    os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))
     try:
-        elastic_launch(launched, sys.executable)("-m", "lemniscate", *words)
+        with _undone():
+            logging.disable(logging.ERROR)
+            os.environ[OWNED] = f"/proc/{os.getpid()}/fd/{reading}"
+            os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))
+            elastic_launch(launched, sys.executable)("-m", "lemniscate", *words)
     except SignalException as stopped:
         raise Stopped("", stopped.sigval) from None
     except ChildFailedError as failed:
         codes = {rank: failure.exitcode for rank, failure in failed.failures.items()}
+        killed = [rank for rank, code in codes.items() if code == -signal.SIGKILL]
         for signum in (signal.SIGINT, signal.SIGTERM):
             if 128 + signum in codes.values():
+                if killed:  # the others were asked to stop for that
+                    why = "killed, as the system does where memory has run out"
+                    raise RankError(f"Process {killed[0]} of the run was {why}.") from None
                 raise Stopped("", signum) from None
-        killed = len(codes) == processes and all(code == -signal.SIGKILL for code in codes.values())
-        raise RankError("All processes of the run were killed." if killed else "") from None
+        raise RankError("All processes of the run were killed." if len(killed) == processes else "") from None
     finally:
-        logging.disable(logging.NOTSET)
-        del os.environ[OWNED]
         os.close(writing)
         os.close(reading)

@@ -111,6 +111,9 @@ class Trial:
             notes = [f"While it was read, {handin.ending(self.process.exitcode)}."]
         if not any(file.suffix in handin.SUFFIXES for file in files_of(self.path)):
             notes = ["There is no .py and no .ipynb file."]
+        for file in files_of(self.path, large=True):
+            size = f"{file.stat().st_size / 2**20:,.0f} MB; at most {MOST_COPIED / 2**20:.0f} are read"
+            notes = [*notes, f"{file.name} has {size}: clear the outputs of a notebook."]
         asked = [name for name in course.EXERCISES if name in files or name in self._demanded]
         return {
             "hand_in": self.path.name,
@@ -143,16 +146,20 @@ class Trial:
         return b""
 
 
-def files_of(path: Path) -> dict[Path, Path]:
-    """The files of a hand-in, with their names in its copy; beside a single file, those that are no code, too."""
+def files_of(path: Path, large: bool = False) -> dict[Path, Path]:
+    """The files of a hand-in, with their names in its copy; beside a single file, those that are no code, too.
+
+    With `large`, those that are too large to be read, of code.
+    """
     root, every = (path, path.rglob("*")) if path.is_dir() else (path.parent, path.parent.iterdir())
     found = {file: file.relative_to(root) for file in sorted(every) if file.is_file()}
     return {
         file: name
         for file, name in found.items()
         if (file == path or root == path or file.suffix not in handin.SUFFIXES)
-        and not any(part.startswith((".", "__")) or part in IGNORED for part in name.parts)
-        and file.stat().st_size <= MOST_COPIED
+        and not any(part.startswith((".", "__")) or part in IGNORED for part in name.parts if part != "__init__.py")
+        and (file.stat().st_size > MOST_COPIED) is large
+        and (file.suffix in handin.SUFFIXES or not large)
     }
 
 

@@ -2,7 +2,7 @@
 
 The definitions count: imports, functions, classes and assignments are executed one by one; what raises is noted with
 its line. Loops, `with` blocks and bare expressions at the top level, which train, draw, test and print, are left out,
-unless a function uses a name that they assign.
+unless a function uses a name that they assign or fill.
 """
 
 import __future__
@@ -32,6 +32,7 @@ import torch
 from lemniscate import course
 from lemniscate.course.exercise import raised
 from lemniscate.course.solution import LIMIT, TooLong, limited
+from lemniscate.errors import UserError
 from lemniscate.system.watchdog import end_when_closed
 
 SUFFIXES = (".py", ".ipynb")
@@ -44,6 +45,10 @@ MAGIC = re.compile(
     r"^(\s*)(?:(?:%{1,2}[A-Za-z_]|!(?!=)|\?)(?:.*\\\n)*.*|[\w.]+\?+|[\w, ]+=\s*(?:%[A-Za-z_]|!(?!=)).*)$", re.MULTILINE
 )
 """a line of a notebook that is not Python, with those that a backslash adds to it"""
+PYTHON = ("%%time", "%%timeit", "%%capture", "%%prun", "%%memit")
+"""the magics at the head of a cell that is Python"""
+FILLING = ("update", "setdefault", "append", "extend", "insert", "add", "appendleft")
+"""the methods that put something into a collection"""
 UNREADABLE = (SyntaxError, ValueError, LookupError, TypeError, RecursionError, MemoryError)
 
 
@@ -72,31 +77,49 @@ class Reader:
         self.defined: dict[str, dict[str, ModuleType]] = {}
         self.notes: list[str] = []
         self._work = work
+        self._written: list[Path] = []
+        """modules that cells of notebooks are"""
 
     def read(self) -> None:
-        """Execute the modules, then the notebooks, that no other one has imported."""
+        """Execute the modules, then the notebooks, that no other one has imported, and what these have written."""
         files = [file for file in sorted((self._work / "hand-in").rglob("*")) if file.suffix in SUFFIXES]
         execute = {"exec_module": lambda _, module: self._execute(module)}
         loader: Any = type("Loader", (SourceFileLoader,), execute), list(SUFFIXES)
-        sys.path[:0] = folders = dict.fromkeys(str(file.parent) for file in files)
+        sys.path[:0] = folders = dict.fromkeys(str(folder) for file in files for folder in (_root(file), file.parent))
         sys.path_importer_cache |= {folder: FileFinder(folder, loader) for folder in folders}
         for file in sorted(files, key=lambda file: file.suffix != ".py"):
-            if not any(getattr(module, "__file__", None) == str(file) for module in [*sys.modules.values()]):
-                name = file.stem if file.stem not in sys.modules else f"{file.stem} as it was handed in"
-                module = sys.modules[name] = ModuleType(name)
-                module.__file__ = str(file)
-                self._execute(module)
+            self._load(file)
+        for file in self._written:
+            self._load(file)
+
+    def _load(self, file: Path) -> None:
+        """Execute a module or a notebook, unless it has been imported; a module of a package as a part of that."""
+        if any(getattr(module, "__file__", None) == str(file) for module in [*sys.modules.values()]):
+            return
+        name = ".".join(file.relative_to(_root(file)).with_suffix("").parts)
+        package = sys.modules.get(name.partition(".")[0])
+        if "." in name and str(getattr(package, "__file__", file)).startswith(str(self._work)):
+            with suppress(Exception):
+                importlib.import_module(name.removesuffix(".__init__"))
+                return
+        name = name if name not in sys.modules else f"{name} as it was handed in"
+        module = sys.modules[name] = ModuleType(name)
+        module.__file__, module.__package__ = str(file), name.rpartition(".")[0]
+        self._execute(module)
 
     def _execute(self, module: ModuleType) -> None:
         """Execute a module or a notebook, one statement after the other."""
         file, flags = Path(str(module.__file__)), 0
         module.__dict__.setdefault("display", print)
         parsed = [(code, node) for code, tree in self._trees(file) for node in tree.body]
-        used = set().union(*(_free(node) for _, node in parsed if isinstance(node, ast.FunctionDef | ast.ClassDef)))
+        functions = [node for _, node in parsed if isinstance(node, ast.FunctionDef | ast.ClassDef)]
+        used = set().union(*map(_free, functions))
+        fills = {node.name: (_filled(node) & _free(node)) | _global(node) for node in functions}
         for code, node in parsed:
             if isinstance(node, ast.ImportFrom) and node.module == "__future__":
                 flags |= sum(getattr(__future__, each.name).compiler_flag for each in node.names)
-            if not isinstance(node, LEFT_OUT) or (_bound(node) | _filled(node)) & used:
+            touched = _bound(node) | _filled(node) | fills.get(_called(node), set())
+            if not isinstance(node, LEFT_OUT) or touched & used:
                 self._run(node, code, flags, module.__dict__)
                 self.defined |= {each: {**self.defined.get(each, {}), file.name: module} for each in _bound(node)}
 
@@ -110,39 +133,71 @@ class Reader:
             self.notes.append(f"{where}: left out, since it did not end within {seconds:g} s.")
         except BaseException as error:  # what ends a program, too, ends this statement alone
             absent = isinstance(error, ModuleNotFoundError) and f"the package {error.name} is not installed here"
-            reason = absent or f"{type(error).__name__}: {error}".rstrip(".")
+            reason = absent or f"{type(error).__name__}: {error}".rstrip(".: ")
             self.notes.append(f"{where}: {reason}.")
             for each in imports[0].names if imports and imports[0] is node else ():
-                scope.setdefault(each.asname or each.name.partition(".")[0], Missing(reason))
+                scope.setdefault(each.asname or each.name.partition(".")[0], Missing(absent or str(error)))
 
     def _trees(self, file: Path) -> Iterator[tuple[Path, ast.Module]]:
         """The statements of a module, or of each cell, with the file that Python names in a traceback."""
         is_module = file.suffix == ".py"
         try:
             text = importlib.util.decode_source(file.read_bytes())
-            cells = [{"cell_type": "code", "source": text}] if is_module else json.loads(text)["cells"]
+            cells = [{"cell_type": "code", "source": text}] if is_module else _cells(text)
             sources = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
         except UNREADABLE as error:
-            self.notes.append(f"{file.name} cannot be read: {type(error).__name__}: {error}.")
+            kind = "" if isinstance(error, UserError) else f"{type(error).__name__}: "
+            self.notes.append(f"{file.name} cannot be read: {kind}{error}.")
             return
         (self._work / "cells").mkdir(exist_ok=True)
         for number, source in enumerate(sources, start=1):
             code = file if is_module else self._work / "cells" / f"code cell {number} of {file.name}"
             if not is_module:
                 code.write_text(source, "utf-8", "replace")  # so that inspect finds it
+            if not is_module and source.lstrip().startswith("%%") and source.split()[0] not in PYTHON:
+                self._set_aside(file, code.name, source.lstrip())
+                continue
             try:
                 yield code, _parsed(source)
             except UNREADABLE as error:
-                line = f", line {error.lineno}" if isinstance(error, SyntaxError) else ""
+                line = f", line {error.lineno}" if isinstance(error, SyntaxError) and error.lineno else ""
                 self.notes.append(f"{code.name}{line}: {type(error).__name__}: {getattr(error, 'msg', error)}.")
+
+    def _set_aside(self, notebook: Path, cell: str, source: str) -> None:
+        """Write the module that a cell with %%writefile is; of a cell in another language, say that it is left out."""
+        head, _, body = source.partition("\n")
+        magic, *words = head.split()
+        if magic in ("%%writefile", "%%file") and words and words[-1].endswith(".py"):
+            file = notebook.parent / words[-1]
+            with suppress(OSError), file.open("a" if "-a" in words else "w", encoding="utf-8") as module:
+                module.write(f"{body}\n")
+                self._written.append(file)
+                importlib.invalidate_caches()
+        else:
+            self.notes.append(f"{cell}: left out, since {magic} makes it another language.")
+
+
+def _root(file: Path) -> Path:
+    """The folder that the outermost package of a module is in, or that of the module."""
+    folder = file.parent
+    while (folder / "__init__.py").exists():
+        folder = folder.parent
+    return folder
+
+
+def _cells(text: str) -> list[dict[str, Any]]:
+    """The cells of a notebook. Raises `UserError` for another file."""
+    try:
+        return json.loads(text)["cells"]
+    except (ValueError, LookupError, TypeError):
+        why = "it is empty" if not text.strip() else "save it once with a newer Jupyter"
+        raise UserError(f"it is no notebook with cells: {why}") from None
 
 
 def _parsed(source: str) -> ast.Module:
-    """The statements of a cell, without magics; none of a cell in another language."""
+    """The statements of a cell, without magics."""
     with suppress(SyntaxError):
         return ast.parse(source)
-    if source.lstrip().startswith("%%") and source.split()[0] not in ("%%time", "%%timeit", "%%capture"):
-        return ast.parse("")
     return ast.parse(MAGIC.sub(r"\1pass", source))
 
 
@@ -155,11 +210,30 @@ def _bound(node: ast.AST) -> set[str]:
 
 
 def _filled(node: ast.AST) -> set[str]:
-    """The name of what a bare expression puts something into, as `config.update(gamma=0.9)` does."""
+    """The names of what a statement puts something into, as `config.update(gamma=0.9)` and `scale["a"] = 1.0` do."""
+    found = set[str]()
+    for each in ast.walk(node):
+        match each:
+            case ast.Subscript(value=thing, ctx=ast.Store()) | ast.Attribute(value=thing, ctx=ast.Store()):
+                found |= {name.id for name in ast.walk(thing) if isinstance(name, ast.Name)}
+            case ast.Call(ast.Attribute(ast.Name(name), method)) if method in FILLING:
+                found.add(name)
+            case ast.Call(ast.Name("setattr"), [ast.Name(name), *_]):
+                found.add(name)
+    return found
+
+
+def _global(function: ast.AST) -> set[str]:
+    """The names that a function declares global."""
+    return {name for each in ast.walk(function) if isinstance(each, ast.Global) for name in each.names}
+
+
+def _called(node: ast.AST) -> str:
+    """The name of the function that a bare expression calls without arguments, if it is one."""
     match node:
-        case ast.Expr(ast.Call(ast.Attribute(ast.Name(name), "update" | "setdefault" | "append" | "extend" | "add"))):
-            return {name}
-    return set()
+        case ast.Expr(ast.Call(ast.Name(name), [], [])):
+            return name
+    return ""
 
 
 def _free(function: ast.AST) -> set[str]:

@@ -79,6 +79,13 @@ PRESENT = {"": "True", "off": "False", "none": "None", "0": "0.0"}
 OF_COMMANDS = ("episodes", "stochastic", "env_kwargs")
 """options that are no fields"""
 
+CONSEQUENCES = {
+    "action-without-effect": {"observation-repeated"},
+    "steps-short": {"observation-repeated"},
+    "advantage-not-normalized": {"ratio-not-one"},
+}
+"""faults that are not named beside one of these, which brings them about"""
+
 TABLE = read("rules.toml")
 KINDS = tuple(TABLE)
 RULES = [Rule(name, kind, **row) for kind, rows in TABLE.items() for name, row in rows.items()]
@@ -88,7 +95,8 @@ def findings(e: Evidence) -> list[tuple[Rule, str]]:
     """The rules that apply, each with what was seen, in their order."""
     with np.errstate(all="ignore"):  # a run that has broken logs ∞ and NaN
         seen = dict(fault for of_subject in SUBJECTS for fault in of_subject(e))
-    return [(rule, seen[rule.name]) for rule in RULES if rule.name in seen]
+    gone = {name for name, causes in CONSEQUENCES.items() if causes & seen.keys()}
+    return [(rule, seen[rule.name]) for rule in RULES if rule.name in seen.keys() - gone]
 
 
 def of_observations(e: Evidence) -> Seen:
@@ -134,11 +142,14 @@ def of_normalization(e: Evidence) -> Seen:
     offset = e.late("normalizer/offset")
     count, normalized = e.last("normalizer/count"), e.config.get("normalize_observations", True)
     steps = max((line["step"] for line in e.log if "normalizer/count" in line), default=0)
+    sizes = e.values("observation/largest")
     if late > max(1e5, 10 * first) or late > 300 * max(first, 1.0):  # not what is in a small unit from the beginning
         yield (
             "exploding-observation",
             f"Observations reached {late:.3g} in the last half of the run, and {first:.3g} at its beginning.",
         )
+    elif len(sizes) >= 4 and sizes.max() > max(1e5, 1000 * np.median(sizes)):
+        yield "exploding-observation", f"Observations reached {sizes.max():.3g}, and usually {np.median(sizes):.3g}."
     few = len(e.values("observation/predicted")) > 0  # of many numbers, as a Humanoid's, some are healthily large
     if not normalized and late > (200 if e.config.get("activation") == "tanh" else 500 if few else 20_000):
         yield "large-observation", f"Observations reach {late:.3g}, and are not normalized."
@@ -418,7 +429,8 @@ def of_advantages(e: Evidence) -> Seen:
             f"Changes of log π and advantages have a correlation of {followed.mean():.2f}: none.",
         )
     preferred = e.late("action/preferred")
-    if preferred < 0.4 and e.q_steps >= 500:  # healthy runs have 0.7 or more; a Q of few steps says nothing
+    drowned = e.late("temperature") * abs(e.late("losses/entropy")) > e.greatest("reward/largest")  # Q tells entropies
+    if preferred < 0.4 and e.q_steps >= 500 and not drowned:  # healthy runs have 0.7 or more; a new Q says nothing
         yield (
             "advantage-opposed",
             f"In {preferred:.0%} of the sampled states Q of the policy's action is above that of one at random.",
@@ -431,6 +443,12 @@ def of_advantages(e: Evidence) -> Seen:
     neither = given is False and usual and not e.config.get("scale_rewards")
     if neither and not e.as_recommended("normalize_advantage"):
         yield "advantage-not-normalized", "Neither advantages nor rewards are normalized."
+    centred, weight = e.config.get("normalize_advantage", e.config.get("standardize")), e.values("losses/policy")
+    if centred and len(weight) >= 4 and np.median(np.abs(weight)) > 0.4:  # healthy runs have less than 0.2
+        yield (
+            "advantage-not-normalized",
+            f"The policy's loss is {np.median(weight):.2g}, and about 0 where the mean of the advantages is.",
+        )
 
 
 def _standard_errors(values: np.ndarray) -> float:
@@ -475,7 +493,7 @@ def of_values(e: Evidence) -> Seen:
 
 
 def of_targets(e: Evidence) -> Seen:
-    """Faults of the targets of V and Q, and of what no update moves: V, Q, target networks."""
+    """Faults of the targets of V and Q."""
     error, loss = e.last_half("td_error/sampled"), e.last_half("losses/critic")
     constant = e.late("losses/value") < 1e-5 and not e.late("explained_variance") > 0
     if constant and "gae_lambda" in e.config and e.late("reward/std") > 0.02 * abs(e.late("reward/mean")):
@@ -488,9 +506,18 @@ def of_targets(e: Evidence) -> Seen:
                 f"The squared error of Q against r + γ Q'(s', π(s')) of the stored steps is {times:.0f} times the loss"
                 " that is descended.",
             )
+    q, mean = e.last_half("q"), e.late("reward/mean")
+    one_sign = abs(mean) > 2 * e.late("reward/std") and "initial_temperature" not in e.config  # entropies are positive
+    if one_sign and len(q) >= 4 and (q * mean < 0).all() and abs(np.median(q)) > 0.2 * abs(mean):
+        yield "q-opposed", f"Q is {np.median(q):.3g}, and the rewards are {mean:.3g} on average: of the other sign."
+
+
+def of_what_stands_still(e: Evidence) -> Seen:
+    """Faults of what no update moves: V, Q, target networks."""
     moved, behind, length = map(e.values, ("value/moved", "targets/behind", "targets/length"))
     usual = all(map(e.as_recommended, ("tau", "policy_delay")))
-    if len(moved) >= 2 and not moved.any() and "gae_lambda" in e.config and not e.config.get("freeze"):
+    learns = not e.config.get("freeze") and e.config.get("value_coef") != 0
+    if len(moved) >= 2 and not moved.any() and "gae_lambda" in e.config and learns:
         yield "critic-still", "No update that was looked at changed a parameter of V."
     if len(behind) >= 3 and not behind.any() and first_number(e.config.get("tau")) != 1:
         yield "critic-still", "The weights of Q are those of its target networks, each time that they were looked at."
@@ -625,6 +652,7 @@ SUBJECTS = (
     of_advantages,
     of_values,
     of_targets,
+    of_what_stands_still,
     of_networks,
     of_returns,
     of_falls,

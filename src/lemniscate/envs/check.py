@@ -27,7 +27,7 @@ from lemniscate.envs.vec_env import VecEnv
 from lemniscate.envs.vector_view import action_space
 from lemniscate.errors import NonFiniteError, UserError
 from lemniscate.spec import Action, Box, Discrete, MultiDiscrete, ObservationPart, Spec
-from lemniscate.system.named import find_callable
+from lemniscate.system.named import find, find_callable
 from lemniscate.types import Rollout
 
 GOOD, NOTE, BAD = "good", "note", "bad"
@@ -88,9 +88,10 @@ def each_finding(
     """
     served_by = backend or registry.backend_for(env_id, wrappers)
     cls = registry.backend_class(served_by)  # an unknown backend is an error of the question, not a finding
+    num_envs = (registry.count_of(find(env_id)) if ":" in env_id else None) or NUM_ENVS
     try:
         with warnings.catch_warnings(action="ignore"):
-            env = registry.make(env_id, NUM_ENVS, kwargs=env_kwargs, wrappers=wrappers, backend=backend)
+            env = registry.make(env_id, num_envs, kwargs=env_kwargs, wrappers=wrappers, backend=backend)
     except Exception as error:  # the environment's own code, here and below: whatever it raises is the finding
         yield _raised(error, "It cannot be made")
         return
@@ -155,7 +156,7 @@ def _random_play(env: VecEnv, judge: Callable[[Sequence[Rollout], Spec], Sequenc
     try:
         started = time.perf_counter()
         first, lengths = _play(env, seed=0)
-        speed = NUM_ENVS * STEPS / (time.perf_counter() - started)
+        speed = env.num_envs * STEPS / (time.perf_counter() - started)
         repeated = _same(first, _play(env, seed=0)[0])
         other, more_lengths = _play(env, seed=1)
         acted, _ = _play(env, seed=0, actions=8, steps=STEPS // 2)
@@ -185,7 +186,7 @@ def _random_play(env: VecEnv, judge: Callable[[Sequence[Rollout], Spec], Sequenc
     yield from _ends_and_rewards(both, lengths + more_lengths, env.spec)
     yield from _sizes(both.obs[both.valid], env.spec)
     yield from map(note, judge((first, other), env.spec))
-    yield good(f"{speed:,.0f} steps a second ({NUM_ENVS} parallel environments, random actions).")
+    yield good(f"{speed:,.0f} steps a second ({env.num_envs} parallel environments, random actions).")
 
 
 def _play(env: VecEnv, seed: int, actions: int = 7, steps: int = STEPS) -> tuple[Rollout, list[int]]:

@@ -89,7 +89,8 @@ class GymnasiumBackend(Backend):
     ) -> None:
         self.num_envs, self.device = num_envs, device
         maker = maker_of(env)
-        if makes_vector(maker) and self.workers:
+        self._is_vector = makes_vector(maker)
+        if self._is_vector and self.workers:
             raise UserError(f"{env} makes {num_envs} environments at once, so there is none for a process of its own.")
         wraps, given = tuple(map(find_callable, wrappers)), dict(kwargs or {})
         self._make = partial(make_vector, maker, num_envs, given, wraps, self.workers)
@@ -168,6 +169,8 @@ class GymnasiumBackend(Backend):
             done = terminated | truncated
             if done.any():
                 obs = self._observe(*self._envs.reset(options={"reset_mask": done.copy()}))
+                if self._is_vector:
+                    self._require_going_on(obs[~done], next_obs[~done])
                 self.counts = torch.as_tensor(self._stagger.counts, device=self.device)
         if self._masks:
             self._masks.require_choice(obs, ~self._resetting)
@@ -207,6 +210,15 @@ class GymnasiumBackend(Backend):
         self._envs.close()
         if self._judge:
             self._judge.close()
+
+    def _require_going_on(self, obs: np.ndarray, next_obs: np.ndarray) -> None:
+        """Raise `UserError` where a reset by mask has changed observations of other rows."""
+        size = self.spec.observation_size
+        if not np.array_equal(obs[:, :size], next_obs[:, :size], equal_nan=True):
+            raise UserError(
+                f"{self.spec.env_id} is DISABLED, and its reset() changes rows whose episodes go on, in which"
+                " options['reset_mask'] is False: leave them as they are, or declare NEXT_STEP or SAME_STEP."
+            )
 
     def _with_final(self, obs: np.ndarray, info: dict, done: np.ndarray) -> np.ndarray:
         if not done.any():

@@ -160,7 +160,8 @@ def name_of(env: object) -> str:
 
 def count_of(env: object) -> int | None:
     """The number of environments in an object that speaks rsl_rl's `VecEnv`; None of anything else."""
-    return getattr(env, "num_envs", None) if hasattr(env, SPOKEN) else None
+    number = getattr(env, "num_envs", None)
+    return number if hasattr(env, SPOKEN) and isinstance(number, int) else None
 
 
 def names_of(wrappers: "Sequence[str | Callable[..., Any]]") -> tuple[str, ...]:

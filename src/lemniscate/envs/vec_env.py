@@ -142,7 +142,8 @@ class VecEnv:
 
     def require_end(self, age: int) -> None:
         """Raise `UserError` where an episode of `age` steps has had its chance to end, and there is no time limit."""
-        require_end(self.spec.env_id, age, self.spec.max_episode_steps)
+        env_id = self.spec.env_id
+        require_end(env_id, age, self.spec.max_episode_steps, type(self.backend).wraps(env_id))
 
     def recent(self) -> Rollout | None:
         """The newest rows since the last restart, [T, N, …], some thousand; None before the first step."""
@@ -161,7 +162,7 @@ class VecEnv:
         self.backend.close()
 
 
-def require_end(env_id: str, age: int, limit: int | None) -> None:
+def require_end(env_id: str, age: int, limit: int | None, can_wrap: bool = True) -> None:
     """Raise `UserError` where an episode of `age` steps has had its chance to end, beyond its time `limit` if any."""
     if limit is not None and age >= limit + PATIENCE:
         raise UserError(
@@ -169,9 +170,10 @@ def require_end(env_id: str, age: int, limit: int | None) -> None:
             " truncated there."
         )
     if limit is None and age >= PATIENCE:
+        wrap = ", or train with --wrappers 'gymnasium.wrappers:TimeLimit(max_episode_steps=1000)'" if can_wrap else ""
         raise UserError(
             f"An episode of {env_id} has not ended after {PATIENCE:,} steps, and there is no time limit: return"
-            " truncated in its step(), or train with --wrappers 'gymnasium.wrappers:TimeLimit(max_episode_steps=1000)'."
+            f" truncated in its step(){wrap}."
         )
 
 
