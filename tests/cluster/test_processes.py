@@ -1,5 +1,6 @@
 """Several processes of one run: the same bits for any number of them; those that die, hang or fail are named."""
 
+import logging
 import os
 import random
 import re
@@ -16,6 +17,7 @@ from hosts import hosts
 import lemniscate as lem
 from cluster.worlds import KINDS, SHARDS, finish, free_port, outcome, ranks, train, wait_for, words
 from forks import command
+from lemniscate.api.options import CAUGHT, _undone
 from lemniscate.errors import UserError
 from lemniscate.system.world import World
 
@@ -274,6 +276,30 @@ def test_processes_launches_them_and_leaves_none(tmp_path):
     while any(str(tmp_path / "endless") in (p.info["cmdline"] or ()) for p in psutil.process_iter(["cmdline"])):
         assert time.monotonic() < deadline
         time.sleep(0.05)
+
+
+@pytest.mark.cluster
+def test_a_process_that_is_killed_is_named_and_is_no_stop(tmp_path):
+    launcher = command(*ENDLESS, tmp_path / "endless", "--processes", 2)
+    wait_for(tmp_path / "endless" / "metrics.jsonl")
+    mine = [p for p in psutil.Process(launcher.pid).children(recursive=True) if "resume" in p.cmdline()]
+    max(mine, key=lambda process: process.pid).kill()
+    said = launcher.communicate(timeout=60)
+    assert launcher.returncode == 1, said
+    assert "SIGKILL" in str(said) or "was killed" in str(said), said
+
+
+def test_what_the_launcher_changes_is_undone(monkeypatch):
+    monkeypatch.setenv("KEPT", "as it was")
+    handlers, disabled = [signal.getsignal(each) for each in CAUGHT], logging.root.manager.disable
+    with _undone():
+        for each in CAUGHT:
+            signal.signal(each, lambda *_: None)
+        os.environ |= {"KEPT": "changed", "NEW": "here"}
+        logging.disable(logging.CRITICAL)
+    assert [signal.getsignal(each) for each in CAUGHT] == handlers
+    assert (os.environ["KEPT"], "NEW" in os.environ) == ("as it was", False)
+    assert logging.root.manager.disable == disabled
 
 
 def test_without_shards_every_process_has_one(tmp_path):

@@ -189,6 +189,18 @@ def test_a_nan_is_named_with_environment_and_step(quantity):
         play(env, 8)
 
 
+def test_a_reset_by_mask_that_resets_all_is_refused():
+    class Forgetful(toy.Countdown):
+        def __init__(self, num_envs, mode, length, horizon=None):
+            super().__init__(num_envs, mode, length + np.arange(num_envs), horizon)
+
+        def reset(self, *, seed=None, options=None):
+            return super().reset(seed=seed)
+
+    with pytest.raises(UserError, match=r"is DISABLED, and its reset\(\) changes rows whose episodes go on"):
+        play(countdown("DISABLED", kind=Forgetful, length=4), 8)
+
+
 def test_a_nan_that_a_reset_returns_is_named():
     class BornBroken(toy.Countdown):
         def reset(self, **kwargs):

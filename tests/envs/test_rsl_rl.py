@@ -273,6 +273,12 @@ class Bare(Cart):
         return *super().step(actions)[:3], None
 
 
+def test_it_is_checked_with_the_environments_that_it_has():
+    found = lem.check(Cart(8))
+    assert {each.grade for each in found} == {"good"}
+    assert "8 parallel environments" in found[-1].sentence
+
+
 def test_nothing_beside_the_rewards_is_needed():
     rollout = rollout_of(registry.make(Bare(8), 8))
     assert rollout.terminated.any()

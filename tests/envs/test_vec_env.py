@@ -154,3 +154,7 @@ def test_an_episode_that_outlives_its_limit_is_told(monkeypatch):
         UserError, match="has not ended after 54 steps, and its time limit is 4: it must return truncated"
     ):
         require_end("Count", 54, 4)
+    with pytest.raises(UserError, match="or train with --wrappers"):
+        require_end("Count", 50, None)
+    with pytest.raises(UserError, match=r"return truncated in its step\(\)\.$"):
+        require_end("Count", 50, None, can_wrap=False)

@@ -27,6 +27,10 @@ SECONDS_TO_END = 10
 """that the processes have to end by themselves, once one has ended or the launcher was asked to stop"""
 
 
+CAUGHT = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT") if hasattr(signal, name)]
+"""the signals that torch's launcher catches"""
+
+
 class RunOptions:
     """The arguments of `train` and `resume` that are not saved with the run, which describes them; made at the door.
 
@@ -117,8 +121,7 @@ def _by_name(name: str) -> Any:
 @contextmanager
 def _undone() -> Iterator[None]:
     """Afterwards, signals, the environment's variables and logging are as before, which torch's launcher changes."""
-    caught = signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT
-    handlers = [(signum, signal.getsignal(signum)) for signum in caught]
+    handlers = [(signum, signal.getsignal(signum)) for signum in CAUGHT]
     variables, disabled = dict(os.environ), logging.root.manager.disable
     try:
         yield

@@ -170,11 +170,11 @@ def require_end(env_id: str, age: int, limit: int | None, can_wrap: bool = True)
             " truncated there."
         )
     if limit is None and age >= PATIENCE:
-        wrap = ", or train with --wrappers 'gymnasium.wrappers:TimeLimit(max_episode_steps=1000)'" if can_wrap else ""
-        raise UserError(
+        said = (
             f"An episode of {env_id} has not ended after {PATIENCE:,} steps, and there is no time limit: return"
-            f" truncated in its step(){wrap}."
+            " truncated in its step(), or train with --wrappers 'gymnasium.wrappers:TimeLimit(max_episode_steps=1000)'."
         )
+        raise UserError(said if can_wrap else f"{said.partition(', or train')[0]}.")
 
 
 def _action_layout(spec: Spec, num_envs: int) -> tuple[torch.Size, torch.dtype]:
