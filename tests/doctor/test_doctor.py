@@ -171,7 +171,7 @@ CASES = {
     ),
     "every-return-alike": ({"returns": [7.0] * 400}, {"returns": [7.0] * 399 + [8.0]}),
     "limit-as-termination": (
-        {"lengths": [50] * 400, "episode__terminated": [1.0] * 8},
+        {"lengths": [50] * 300 + [33] + [50] * 99, "episode__terminated": [1.0] * 8},
         {"lengths": [50] * 400, "episode__terminated": [0.0] * 8},
     ),
     "short-episodes": ({"lengths": [1] * 400}, {"lengths": [3] * 400}),

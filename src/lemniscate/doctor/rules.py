@@ -83,6 +83,7 @@ CONSEQUENCES = {
     "action-without-effect": {"observation-repeated"},
     "steps-short": {"observation-repeated"},
     "advantage-not-normalized": {"ratio-not-one"},
+    "targets-of-others": {"critic-still"},
 }
 """faults that are not named beside one of these, which brings them about"""
 
@@ -295,10 +296,12 @@ def of_episodes(e: Evidence) -> Seen:
             f"All {len(e.returns):,} episodes had the same return, {e.returns[0]:,.4g}, whatever was done"
             f"{f', and each was cut after {e.lengths[0]:,.0f} steps' if cut else ''}.",
         )
-    if terminated > 0.9 and len(late) >= 5 and np.ptp(late) == 0 and late[0] >= 10:
+    longest = np.max(late, initial=0)
+    if terminated > 0.9 and len(late) >= 5 and np.mean(late == longest) > 0.98 and longest >= 10:
         yield (
             "limit-as-termination",
-            f"Each of the last {len(late):,} episodes terminated after exactly {late[0]:,.0f} steps.",
+            f"{np.sum(late == longest):,} of the last {len(late):,} episodes terminated after exactly {longest:,.0f}"
+            " steps.",
         )
     if len(starts) > 2 and starts.min() == 1:
         yield "starts-alike", "Every episode began with the same observation."
