@@ -213,6 +213,12 @@ UNSEEN_SIX = {
     "rows that do not belong together": ("ratio-not-one",),
     "a value that counts for nothing": ("setting-value-coef",),
     "a temperature far too high": ("setting-initial-temperature",),
+    "a reward for each action alone": ("missing-bootstrap",),
+    "forwards in time": ("value-runaway",),
+    "no ends": ("ends-ignored",),
+    "limits are ends": ("missing-bootstrap",),
+    "the wrong way": ("step-refused",),
+    "a bonus with a minus": ("entropy-opposed",),
 }
 """names that are right for the faults of `unseen_six.py`"""
 SETS = (

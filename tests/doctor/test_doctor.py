@@ -121,6 +121,18 @@ CASES = {
         {"algorithm": "td3", "targets__behind": [0.1, 0.2, 0.5, 0.6]},
         {"algorithm": "td3", "targets__behind": [0.6, 0.5, 0.55, 0.6]},
     ),
+    "value-runaway": (
+        {"value__missing": [-0.5] + [-11.0] * 7, "losses__value": [0.8] + [100.0] * 7},
+        {"value__missing": [-0.5] + [-11.0] * 7, "losses__value": [20.0] + [100.0] * 7},
+    ),
+    "step-refused": (
+        {"algorithm": "trpo", "step_fraction": [0.0] * 8, "gradient_norm": [1.0] * 8},
+        {"algorithm": "trpo", "step_fraction": [0.0] * 7 + [0.5], "gradient_norm": [1.0] * 8},
+    ),
+    "entropy-opposed": (
+        {"losses__entropy": [1.0, 0.5, 0.2, 0.1] * 2, "changed": {"entropy_coef": 0.5}},
+        {"losses__entropy": [1.0, 0.9, 0.9, 0.9] * 2, "changed": {"entropy_coef": 0.5}},
+    ),
     "q-opposed": (
         {"algorithm": "td3", "q": [-1.0] * 8, "reward__mean": [1.0] * 8, "reward__std": [0.1] * 8},
         {"algorithm": "td3", "q": [-1.0] * 7 + [1.0], "reward__mean": [1.0] * 8, "reward__std": [0.1] * 8},
@@ -439,6 +451,34 @@ def test_advantages_that_are_not_centred_are_named():
     assert names("ppo", losses__policy=[-0.2] * 8) == []
     stale = {"learning_rate": [1e-6] * 8, "approx_kl": [0.05] * 8}
     assert names("ppo", losses__policy=[-0.6] * 8, **stale) == ["ratio-not-one"]
+
+
+def test_the_sign_of_the_bonus_takes_the_place_of_its_weight():
+    fell = {"losses__entropy": [1.0, 0.5, 0.2, 0.1] * 2}
+    assert names(**fell, changed={"entropy_coef": 0.5}) == ["entropy-opposed"]
+    assert names(losses__entropy=[1.0] * 8, changed={"entropy_coef": 0.5}) == ["setting-entropy-coef"]
+    assert names(**fell, changed={"entropy_coef": "0.5>0"}) == ["setting-entropy-coef"]
+
+
+def test_estimates_of_the_kl_that_differ_tell_of_other_actions():
+    other = {"old_approx_kl": [0.08] * 8, "approx_kl": [0.01] * 8, "advantage__followed": [-0.07] * 8}
+    assert names(**other) == ["ratio-not-one"]
+    assert names(**other | {"old_approx_kl": [0.012] * 8}) == ["advantage-opposed"]
+
+
+def test_a_value_of_one_reward_is_named_without_gae_too():
+    one = {"value__missing": [93.0] * 8, "losses__value": [1e-5] * 8, "reward__std": [0.0] * 8}
+    assert names("reinforce", **one) == ["missing-bootstrap"]
+    assert names("reinforce", **one | {"losses__value": [1.0] * 8}) == []
+    still = {"value__moved": [1e-4] * 8}
+    assert names("reinforce", **one, **still) == []
+
+
+def test_ends_that_v_ignores_may_feed_on_themselves():
+    beyond = {"value__at_ends": [1.5] * 8, "episode__terminated": [1.0] * 8, "value__missing": [-3.0] * 8}
+    assert names(**beyond) == ["ends-ignored"]
+    assert names(**beyond | {"value__missing": [-1.0] * 8}) == []
+    assert names(**beyond, changed={"gamma": 0.3}) == ["setting-gamma"]
 
 
 def test_q_of_entropies_tells_nothing_of_signs():

@@ -9,7 +9,18 @@ from typing import Any
 import numpy as np
 
 from lemniscate.doctor.evidence import Evidence, usual_ranges, with_ratios
-from lemniscate.doctor.rules import CAUSES, CERTAIN, HINT, KINDS, LIKELY, RULES, Rule, findings, settings_far_out
+from lemniscate.doctor.rules import (
+    CAUSES,
+    CERTAIN,
+    HINT,
+    KINDS,
+    LIKELY,
+    RULES,
+    Rule,
+    findings,
+    settings_far_out,
+    without_consequences,
+)
 from lemniscate.run.config import RunConfig
 from lemniscate.run.fields import field_help
 from lemniscate.run.metrics import read_metrics
@@ -54,7 +65,7 @@ class Diagnosis:
 
 def diagnose(evidence: Evidence) -> list[Diagnosis]:
     """The findings of all rules, causes first: beside a cause that is certain or likely no symptom is named."""
-    both = [*findings(evidence), *settings_far_out(evidence)]
+    both = without_consequences([*findings(evidence), *settings_far_out(evidence)])
     found = sorted(both, key=lambda each: KINDS.index(each[0].kind))
     caused = any(rule.kind in CAUSES and rule.sure in (CERTAIN, LIKELY) for rule, _ in found)
     faulty = any(rule.sure != HINT for rule, _ in found)

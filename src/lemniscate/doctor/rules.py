@@ -79,10 +79,19 @@ PRESENT = {"": "True", "off": "False", "none": "None", "0": "0.0"}
 OF_COMMANDS = ("episodes", "stochastic", "env_kwargs")
 """options that are no fields"""
 
+FAR = 3.0
+"""the factor outside of its usual range from which on a setting is named"""
+
 CONSEQUENCES = {
     "action-without-effect": {"observation-repeated"},
-    "steps-short": {"observation-repeated"},
+    "steps-short": {"observation-repeated", "exploding-observation"},
+    "action-late": {"exploding-observation"},
+    "reward-unexplained": {"exploding-observation"},
     "advantage-not-normalized": {"ratio-not-one"},
+    "advantage-opposed": {"ratio-not-one"},
+    "gradient-grows": {"value-runaway"},
+    "policy-still": {"step-refused"},
+    "setting-entropy-coef": {"entropy-opposed"},
     "targets-of-others": {"critic-still"},
 }
 """faults that are not named beside one of these, which brings them about"""
@@ -96,8 +105,13 @@ def findings(e: Evidence) -> list[tuple[Rule, str]]:
     """The rules that apply, each with what was seen, in their order."""
     with np.errstate(all="ignore"):  # a run that has broken logs ∞ and NaN
         seen = dict(fault for of_subject in SUBJECTS for fault in of_subject(e))
-    gone = {name for name, causes in CONSEQUENCES.items() if causes & seen.keys()}
-    return [(rule, seen[rule.name]) for rule in RULES if rule.name in seen.keys() - gone]
+    return without_consequences([(rule, seen[rule.name]) for rule in RULES if rule.name in seen])
+
+
+def without_consequences(found: Sequence[tuple[Rule, str]]) -> list[tuple[Rule, str]]:
+    """The findings without those that another one of them brings about."""
+    names = {rule.name for rule, _ in found}
+    return [(rule, seen) for rule, seen in found if not CONSEQUENCES.get(rule.name, set()) & names]
 
 
 def of_observations(e: Evidence) -> Seen:
@@ -287,7 +301,7 @@ def of_episodes(e: Evidence) -> Seen:
     if short:
         yield (
             "short-episodes",
-            f"Nine of ten episodes took no more than {np.percentile(e.lengths, 90):.0f} steps.",
+            f"Nine of ten episodes took {np.percentile(e.lengths, 90):.0f} or fewer steps.",
         )
     elif e.returns_alike and e.returns.any():
         cut = terminated == 0 and np.ptp(e.lengths) == 0
@@ -325,23 +339,18 @@ def of_horizon(e: Evidence) -> Seen:
             yield "ends-early", f"Returns rose while episodes went from {first:.0f} steps to {last:.0f}."
 
 
-def of_updates(e: Evidence) -> Seen:
-    """Faults of the update's size: KL divergence, ratios and clips."""
-    kl, clipped, rate = e.late("approx_kl"), e.late("clip_fraction"), e.late("learning_rate")
+def of_ratios(e: Evidence) -> Seen:
+    """Faults of the probability ratios: those of the KL divergence that no step explains, and their clip."""
+    kl, other, rate = e.late("approx_kl"), e.late("old_approx_kl"), e.late("learning_rate")
     every, entropy, rates = e.values("approx_kl"), e.values("losses/entropy"), e.values("learning_rate")
-    tenth = len(every) // 10
-    target = next(filter(None, map(first_number, map(e.config.get, ("target_kl", "desired_kl", "max_kl")))), None)
-    if e.config.get("desired_kl") is not None and rate < 3e-6 and kl > 1e-3:
+    tenth, adapts, clipped = len(every) // 10, e.config.get("desired_kl") is not None, e.late("clip_fraction")
+    fell = tenth >= 1 and len(rates) == len(every) and rates[-tenth:].mean() < 0.2 * rates[0]
+    if adapts and rate < 3e-6 and kl > 1e-3:
         yield (
             "ratio-not-one",
             f"The KL divergence is {kl:.2g} although the learning rate has fallen to {rate:.1g}, which moves nothing.",
         )
-    elif (
-        e.config.get("desired_kl") is None
-        and tenth >= 1
-        and len(rates) == len(every)
-        and rates[-tenth:].mean() < 0.2 * rates[0]
-    ):
+    elif fell and not adapts:
         last, usual = np.median(every[-tenth:]), np.median(every[: 5 * tenth])
         if last > 0.02 and last > 0.7 * usual:
             yield (
@@ -349,28 +358,41 @@ def of_updates(e: Evidence) -> Seen:
                 f"The KL divergence of the last updates is {last:.2g}, and was {usual:.2g}, although the learning rate"
                 f" has fallen to {rates[-tenth:].mean() / rates[0]:.0%} of what it was.",
             )
+    elif other > max(4 * kl, 1e-3):  # both are unbiased where the old policy acted
+        yield (
+            "ratio-not-one",
+            f"The two estimates of the KL divergence are {other:.2g} and {kl:.2g}: the actions are not those of the old"
+            " policy.",
+        )
     several = e.config.get("epochs", 1) >= 2 and min(len(every), len(entropy)) >= 4
     if several and np.abs(every).max() <= 1e-9 and np.ptp(entropy) >= 1e-3:
         yield (
             "ratio-always-one",
             f"Every update's KL divergence is 0, though the entropy went from {entropy[0]:.3g} to {entropy[-1]:.3g}.",
         )
-    if kl > (2 * target if target else 0.1):
-        beside = f"{kl / target:.0f} times its target of {target:g}" if target else "and 0.003 to 0.03 is usual"
-        yield "kl-too-large", f"The KL divergence of the late updates is {kl:.2g}, {beside}."
-    if kl < 1e-6 and not e.rose and not e.spread_left >= 0:
-        yield "policy-still", f"The KL divergence of the late updates is {kl:.1g}: the policy hardly moves."
-    elif e.greatest("network/moved") == 0:
-        yield "policy-still", "No update that was looked at changed a parameter of the policy."
     if clipped > 0.4:
         yield "ratios-clipped", f"{clipped:.0%} of the late probability ratios are clipped."
 
 
+def of_updates(e: Evidence) -> Seen:
+    """Faults of the update's size."""
+    kl = e.late("approx_kl")
+    target = next(filter(None, map(first_number, map(e.config.get, ("target_kl", "desired_kl", "max_kl")))), None)
+    if kl > (2 * target if target else 0.1):
+        beside = f"{kl / target:.0f} times its target of {target:g}" if target else "and 0.003 to 0.03 is usual"
+        yield "kl-too-large", f"The KL divergence of the late updates is {kl:.2g}, {beside}."
+    if e.greatest("step_fraction") == 0 and e.late("gradient_norm") > 0:
+        yield "step-refused", "The line search took no step in any update."
+    if kl < 1e-6 and not e.rose and not e.spread_left >= 0:
+        yield "policy-still", f"The KL divergence of the late updates is {kl:.1g}: the policy hardly moves."
+    elif e.greatest("network/moved") == 0:
+        yield "policy-still", "No update that was looked at changed a parameter of the policy."
+
+
 def of_exploration(e: Evidence) -> Seen:
     """Faults of exploration: the policy's spread, and random play."""
-    entropy, first, late = e.values("losses/entropy"), e.early("policy_std"), e.late("policy_std")
+    first, late = e.early("policy_std"), e.late("policy_std")
     starts, total = e.config.get("learning_starts"), e.config.get("total_steps")
-    target = first_number(e.config.get("target_entropy"))
     if e.spread_left >= 0:
         name = "standard deviation" if first >= 0 else "entropy"
         yield (
@@ -385,22 +407,35 @@ def of_exploration(e: Evidence) -> Seen:
             "std-exploded",
             f"The policy's standard deviation rose from {first:.2g} to {late:.2g}, in units of half the action range.",
         )
+    if starts and total and starts > total / 2 and not e.as_recommended("learning_starts"):
+        yield "mostly-random", f"The first {starts:,} of {total:,} steps are at random, without an update."
+
+
+def of_entropies(e: Evidence) -> Seen:
+    """Faults of what is paid for the entropy."""
+    entropy, temperature = e.values("losses/entropy"), e.values("temperature")
+    weight, target = e.config.get("entropy_coef"), first_number(e.config.get("target_entropy"))
+    far = e.beyond("entropy_coef", *e.usual.get("entropy_coef", (0.0, np.inf))) > FAR and ">" not in str(weight)
+    if far and len(entropy) >= 4:
+        lost = entropy[0] - np.median(entropy[len(entropy) // 2 :])
+        if lost > max(0.2, 0.3 * abs(entropy[0])):
+            yield (
+                "entropy-opposed",
+                f"The entropy fell from {entropy[0]:.2g} to {entropy[0] - lost:.2g}, though its weight is {weight}.",
+            )
     if target is not None and target >= 0 and not e.as_recommended("target_entropy"):
         yield (
             "entropy-unreachable",
             f"The policy is to have {target:g} nats, and the temperature is {e.late('temperature'):.2g}.",
         )
-    temperature, aim = e.values("temperature"), target or 0.0  # without a target it is below 0
     if len(temperature) == len(entropy) >= 4:
-        above = np.minimum(entropy[1:], entropy[:-1]) > aim + 0.1
+        above = np.minimum(entropy[1:], entropy[:-1]) > (target or 0.0) + 0.1  # without a target it is below 0
         if above.sum() >= 4 and np.mean(np.diff(temperature)[above] > 0) > 0.8:
             yield (
                 "temperature-opposed",
                 f"The temperature rose from {temperature[0]:.2g} to {temperature[-1]:.2g} although the entropy,"
                 f" {np.median(entropy):.2g}, was above its target.",
             )
-    if starts and total and starts > total / 2 and not e.as_recommended("learning_starts"):
-        yield "mostly-random", f"The first {starts:,} of {total:,} steps are at random, without an update."
 
 
 def of_advantages(e: Evidence) -> Seen:
@@ -414,7 +449,9 @@ def of_advantages(e: Evidence) -> Seen:
     # A V that has learned nothing awaits the same everywhere; one that goes on where nothing follows, too much.
     missing = e.late("value/missing")
     learned = (missing < -2 or not e.late("explained_variance") < 0.1) and not missing > 0
-    ignored = learned and 0.8 < awaited < 1.2  # below, V is only behind; above, it has no scale yet
+    most = 2.0 if missing < -2 else 1.2  # below, V is only behind; above, it has no scale yet, or feeds on itself
+    ignored = learned and 0.8 < awaited < most and not e.beyond("gamma", *e.usual.get("gamma", (0.0, 1.0)))
+    wrong = ignored or abs(missing) > 40 or _lacks_bootstrap(e)  # the value, and so the advantages
     if ignored:
         yield (
             "ends-ignored",
@@ -426,7 +463,7 @@ def of_advantages(e: Evidence) -> Seen:
             "advantage-opposed",
             f"The probabilities of actions fall with their advantage: the correlation is {followed.mean():.2f}.",
         )
-    elif errors <= 2 and not ignored and followed.mean() <= 0.04 and moves and not abs(missing) > 40:  # else V is wrong
+    elif errors <= 2 and not wrong and followed.mean() <= 0.04 and moves:
         yield (
             "advantage-unrelated",
             f"Changes of log π and advantages have a correlation of {followed.mean():.2f}: none.",
@@ -460,22 +497,28 @@ def _standard_errors(values: np.ndarray) -> float:
 
 
 def of_values(e: Evidence) -> Seen:
-    """Faults of V and Q: bootstraps, explained variance, overfitting."""
+    """Faults of V: bootstraps, explained variance, targets that feed on themselves."""
     missing, explained, last = e.last_half("value/missing"), e.late("explained_variance"), e.ends[1]
-    newest, sampled = e.last_half("td_error/newest"), e.last_half("td_error/sampled")
+    fits, grew = e.late("losses/value"), e.late("losses/value") / max(e.early("losses/value"), 1e-12)
     settled = len(last) > 0 and last.std() <= 0.05 * abs(last.mean())  # there is nothing left to explain
-    if len(missing) >= 2 and _is_missing(missing) and e.late("episode/terminated") < 0.5 and not e.begins:
+    if _lacks_bootstrap(e):
         yield (
             "missing-bootstrap",
             f"{np.median(missing):.0%} of the value that follows is missing, and most episodes end at a time limit.",
         )
     # Below -1 targets are constant; a weak baseline of REINFORCE, which has no λ, does no harm.
-    nothing = -1 < explained < 0.05 and np.percentile(e.last_half("explained_variance"), 90) <= 0.15
+    nothing = -1 < explained < 0.05 and np.percentile(e.last_half("explained_variance"), 90) <= 0.15 and not fits < 1e-4
     above = np.median(missing) * (1 - (first_number(e.config.get("gamma")) or 0.0)) if len(missing) else 0.0
     away = np.abs(missing).min() if len(missing) >= 2 else 0.0  # healthy values come nearer than 5
     one_reward = nothing and not settled and len(missing) >= 2 and missing.min() > 5
     paid = e.late("reward/explained") > 0.1 or e.late("reward/std") == 0  # by what is seen, or always the same
-    if (one_reward or (away > 40 and explained < 0.3)) and "gae_lambda" in e.config and paid:
+    few = (one_reward or (away > 40 and explained < 0.3)) if "gae_lambda" in e.config else away > 40 and fits < 1e-3
+    if len(missing) and np.median(missing) < -5 and grew > 10:
+        yield (
+            "value-runaway",
+            f"V lies {-above:.0%} above what rewards and the next V make of it, and its loss grew {grew:,.0f} times.",
+        )
+    elif few and paid and not e.early("value/moved") < 1e-3:  # else it has only not learned
         yield (
             "missing-bootstrap",
             f"The value has hardly more than one reward in it: r + γ V(s') lies {above:.0%} above V, early and late.",
@@ -486,18 +529,24 @@ def of_values(e: Evidence) -> Seen:
             f"The value explains {max(0.0, explained):.0%} of the variance of its targets"
             f"{', no more than a constant would' if nothing else ', and is far from what follows'}.",
         )
-    if len(newest) == len(sampled) >= 3:
-        times = np.median(newest / np.maximum(sampled, 1e-12))
+
+
+def _lacks_bootstrap(e: Evidence) -> bool:
+    """Whether a share of the value is missing, and not on its way, where most episodes end at a time limit."""
+    missing = e.last_half("value/missing")
+    return len(missing) >= 2 and _is_missing(missing) and e.late("episode/terminated") < 0.5 and not e.begins
+
+
+def of_targets(e: Evidence) -> Seen:
+    """Faults of the targets of V and Q."""
+    error, loss, newest = map(e.last_half, ("td_error/sampled", "losses/critic", "td_error/newest"))
+    if len(newest) == len(error) >= 3:
+        times = np.median(newest / np.maximum(error, 1e-12))
         if times > 10 and not e.rose:
             yield (
                 "critic-overfits",
                 f"The error of Q at the newest transitions is {times:.0f} times that at sampled ones.",
             )
-
-
-def of_targets(e: Evidence) -> Seen:
-    """Faults of the targets of V and Q."""
-    error, loss = e.last_half("td_error/sampled"), e.last_half("losses/critic")
     constant = e.late("losses/value") < 1e-5 and not e.late("explained_variance") > 0
     if constant and "gae_lambda" in e.config and e.late("reward/std") > 0.02 * abs(e.late("reward/mean")):
         yield "targets-alike", "The targets of V are all the same, and the rewards are not."
@@ -596,7 +645,7 @@ def of_returns(e: Evidence) -> Seen:
         )
     before = e.returns[-2 * fifth : -fifth]
     rise, error = last.mean() - before.mean(), np.hypot(last.std(), before.std()) / np.sqrt(fifth)
-    arrived = last.std() == 0  # as in CartPole, whose return has a maximum
+    arrived = np.ptp(e.returns[-max(5, fifth // 10) :]) == 0  # as in CartPole, whose return has a maximum
     if rise > 3 * error and rise > 0.05 * np.ptp(e.returns) and not arrived:
         yield (
             "still-rising",
@@ -650,8 +699,10 @@ SUBJECTS = (
     of_rewards,
     of_episodes,
     of_horizon,
+    of_ratios,
     of_updates,
     of_exploration,
+    of_entropies,
     of_advantages,
     of_values,
     of_targets,
@@ -661,9 +712,6 @@ SUBJECTS = (
     of_falls,
     of_evaluations,
 )
-
-FAR = 3.0
-"""the factor outside of its usual range from which on a setting is named"""
 
 OF_RATIOS = {"rollout_rows": ("num_envs", "num_steps"), "replay_ratio": ("num_updates", "update_every", "num_envs")}
 """what is made of several fields: these"""
