@@ -215,7 +215,7 @@ UNSEEN_SIX = {
     "a temperature far too high": ("setting-initial-temperature",),
     "a reward for each action alone": ("missing-bootstrap",),
     "forwards in time": ("value-runaway",),
-    "no ends": ("ends-ignored",),
+    "no ends": ("ends-ignored", "value-runaway"),
     "limits are ends": ("missing-bootstrap",),
     "the wrong way": ("step-refused",),
     "a bonus with a minus": ("entropy-opposed",),

@@ -122,8 +122,8 @@ CASES = {
         {"algorithm": "td3", "targets__behind": [0.6, 0.5, 0.55, 0.6]},
     ),
     "value-runaway": (
-        {"value__missing": [-0.5] + [-11.0] * 7, "losses__value": [0.8] + [100.0] * 7},
-        {"value__missing": [-0.5] + [-11.0] * 7, "losses__value": [20.0] + [100.0] * 7},
+        {"losses__value": [0.8] + [8.0] * 7},
+        {"losses__value": [0.8] + [8.0] * 7, "changed": {"scale_rewards": False}},
     ),
     "step-refused": (
         {"algorithm": "trpo", "step_fraction": [0.0] * 8, "gradient_norm": [1.0] * 8},

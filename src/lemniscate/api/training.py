@@ -315,6 +315,7 @@ def _train(world: World, path: Path, algorithm: str, config: RunConfig, options:
         state = algos.find(algorithm).train(config, run)
         if not hasattr(state, "networks"):
             raise UserError(f"train() of {algorithm} must return the state that run.restore gave, not {shown(state)}.")
+        run.require_whole(state)
         path = path if path.absolute() == home else home
         if envs[0].backend.once:
             envs[0].close()  # before a report makes another one

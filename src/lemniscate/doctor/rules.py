@@ -499,7 +499,8 @@ def _standard_errors(values: np.ndarray) -> float:
 def of_values(e: Evidence) -> Seen:
     """Faults of V: bootstraps, explained variance, targets that feed on themselves."""
     missing, explained, last = e.last_half("value/missing"), e.late("explained_variance"), e.ends[1]
-    fits, grew = e.late("losses/value"), e.late("losses/value") / max(e.early("losses/value"), 1e-12)
+    losses, fits = e.values("losses/value"), e.late("losses/value")
+    grew = np.median(losses[len(losses) // 4 :]) / max(losses[0], 0.05) if len(losses) >= 4 else np.nan
     settled = len(last) > 0 and last.std() <= 0.05 * abs(last.mean())  # there is nothing left to explain
     if _lacks_bootstrap(e):
         yield (
@@ -513,11 +514,8 @@ def of_values(e: Evidence) -> Seen:
     one_reward = nothing and not settled and len(missing) >= 2 and missing.min() > 5
     paid = e.late("reward/explained") > 0.1 or e.late("reward/std") == 0  # by what is seen, or always the same
     few = (one_reward or (away > 40 and explained < 0.3)) if "gae_lambda" in e.config else away > 40 and fits < 1e-3
-    if len(missing) and np.median(missing) < -5 and grew > 10:
-        yield (
-            "value-runaway",
-            f"V lies {-above:.0%} above what rewards and the next V make of it, and its loss grew {grew:,.0f} times.",
-        )
+    if grew > (7 if e.config.get("scale_rewards") else 50) and not e.rose:
+        yield "value-runaway", f"The loss of V grew to {grew:,.0f} times what it was, though returns did not rise."
     elif few and paid and not e.early("value/moved") < 1e-3:  # else it has only not learned
         yield (
             "missing-bootstrap",

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import inspect
 import io
+import math
 import os
 import warnings
 from collections.abc import Collection, Mapping, Sequence
@@ -26,7 +27,7 @@ from lemniscate.drones.vehicle import CONDITIONS, DYNAMICS, GAINS, PD, Ranges, i
 from lemniscate.envs.backend import Backend, Scene, Summary
 from lemniscate.envs.factory import model_warnings_off, sentences
 from lemniscate.envs.spaces import action_kind
-from lemniscate.errors import UserError, missing_extra, unknown_name
+from lemniscate.errors import UserError, missing_extra, shown, unknown_name
 from lemniscate.spec import Spec
 from lemniscate.types import Step
 
@@ -35,7 +36,8 @@ if TYPE_CHECKING:
     from lemniscate.drones.probe import DroneProbe
 
 IDS = ("DroneFigureEightTrajectory-v0", "DroneGates-v0", "DroneLanding-v0", "DroneReachPos-v0", "DroneReachVel-v0")
-CONTROL_HZ = 50
+CONTROL_HZ, SIMULATED_HZ = 50, 500
+"""control steps in a second unless `freq` says another number, and crazyflow's of its dynamics"""
 MOST_HISTORY = 50
 OWN = (*CONDITIONS, "history", "privileged", "dynamics")
 """the arguments that are ours or read by us; the others are crazyflow's"""
@@ -279,6 +281,7 @@ def _check(env_id: str, num_envs: int, kwargs: Mapping[str, Any]) -> None:
         several = name == "dynamics" and isinstance(value, list | tuple)
         if not (name in CONDITIONS or several or isinstance(value, int | float | str | None) or callable(value)):
             raise UserError(f"{name} of {env_id} must be a number or a word, not {value!r}.")
+    _check_simulation(env_id, kwargs)
     history, several = kwargs.get("history", 0), dynamics_of(kwargs)
     if not isinstance(history, int) or isinstance(history, bool) or not 0 <= history <= MOST_HISTORY:
         raise UserError(f"history must be a whole number of steps from 0 to {MOST_HISTORY}, not {history!r}.")
@@ -291,6 +294,21 @@ def _check(env_id: str, num_envs: int, kwargs: Mapping[str, Any]) -> None:
     if several and num_envs % len(several):
         raise UserError(f"{num_envs} drones cannot be divided equally among {len(several)} dynamics.")
     read_ranges(kwargs)
+
+
+def _check_simulation(env_id: str, kwargs: Mapping[str, Any]) -> None:
+    """Raise `UserError` for steps, a time limit or a drone that crazyflow has not."""
+    freq, most = kwargs.get("freq", CONTROL_HZ), kwargs.get("max_episode_time", 10.0)
+    if type(freq) is not int or not 0 < freq <= SIMULATED_HZ or SIMULATED_HZ % freq:
+        raise UserError(f"freq of {env_id} must be a whole number that divides {SIMULATED_HZ}, not {shown(freq)}.")
+    if type(most) not in (int, float) or not 1 / freq < most < math.inf:
+        wanted = f"seconds, more than the {1 / freq:g} of a step"
+        raise UserError(f"max_episode_time of {env_id} must be {wanted}, not {shown(most)}.")
+    if "drone" in kwargs:
+        from crazyflow.drones import Drone
+
+        if kwargs["drone"] not in (models := [each.value for each in Drone]):
+            raise unknown_name("drone", kwargs["drone"], models)
 
 
 def dynamics_of(kwargs: Mapping[str, Any]) -> tuple[str, ...]:

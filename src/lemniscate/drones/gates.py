@@ -96,23 +96,57 @@ class Track:
 
 def read_track(file: str | Path | None = None) -> Track:
     """A track from a file as `gates.toml`, which is taken by default. Raises `UserError` for one that is none."""
+    if not isinstance(file, str | Path | None):
+        raise UserError(f"track of DroneGates-v0 must be the path of a file, not {shown(file)}.")
     path = Path(file) if file else Path(__file__).with_name("gates.toml")
     try:
-        table = tomllib.loads(path.read_text("utf-8"))
-        angles = [[gate.get(name, 0.0) for name in ("roll", "pitch", "yaw")] for gate in table["gates"]]
-        gates = [[*gate["position"], *own] for gate, own in zip(table["gates"], angles, strict=True)]
-        obstacles = [obstacle["position"] for obstacle in table.get("obstacles", [])]
-        order, room = np.array(table["order"], int), [table["room"]["low"], table["room"]["high"]]
-        given = (gates, (-1, 6)), (obstacles, (-1, 3)), (table["start"], (3,)), (room, (2, 3))
-        gates, obstacles, start, room = (np.array(rows, np.float32).reshape(shape) for rows, shape in given)
-    except (OSError, tomllib.TOMLDecodeError, KeyError, TypeError, ValueError) as error:
-        what = f"lacks {error}" if isinstance(error, KeyError) else str(error)
+        table = _table(tomllib.loads(path.read_text("utf-8")), "it", ("order", "start", "room", "gates", "obstacles"))
+        room = _table(table["room"], "room", ("low", "high"))
+        low, high, start = (_three(room["low"], "low"), _three(room["high"], "high"), _three(table["start"], "start"))
+        gates = _rows(table["gates"], "gates", ("roll", "pitch", "yaw"))
+        obstacles, order = _rows(table.get("obstacles", []), "obstacles", ()), table["order"]
+        if not (low < high).all() or any(((place < low) | (place > high)).any() for place in (start, *gates[:, :3])):
+            raise ValueError("room must reach from low to high, in metres, with the start and all gates between")
+        if (np.abs(gates[:, 3:]) > 2 * math.pi).any():
+            raise ValueError("roll, pitch and yaw are radians, at most 2 π")
+    except (OSError, tomllib.TOMLDecodeError, KeyError, ValueError) as error:
+        what = f"it lacks {error}" if isinstance(error, KeyError) else str(error)
         raise UserError(f"{path} is no track: {what}; one looks as lemniscate/drones/gates.toml does.") from error
-    if not len(order) or (np.abs(order) > len(gates)).any() or (order == 0).any():
+    right = isinstance(order, list) and all(type(gate) is int and 0 < abs(gate) <= len(gates) for gate in order)
+    if not right or not order:
         raise UserError(
-            f"{path}: order names gates from 1 to {len(gates)}, in reverse with a minus, not {order.tolist()}."
+            f"{path}: order names gates from 1 to {len(gates)}, in reverse with a minus, not {shown(order)}."
         )
-    return Track(gates, obstacles, np.abs(order) - 1, order < 0, start, room)
+    flown = np.array(order)
+    return Track(gates, obstacles, np.abs(flown) - 1, flown < 0, start, np.stack([low, high]))
+
+
+def _table(given: Any, name: str, known: tuple[str, ...]) -> dict[str, Any]:
+    """A table of a file as it is. Raises `ValueError` for anything else, and for a key that is not `known`."""
+    if not isinstance(given, dict):
+        raise ValueError(f"{name} must be a table, not {shown(given)}")
+    if strange := [key for key in given if key not in known]:
+        raise ValueError(f"{name} has {strange[0]!r}, and may have {', '.join(known)}")
+    return given
+
+
+def _three(given: Any, name: str) -> np.ndarray:
+    """Three numbers. Raises `ValueError` for anything else."""
+    if not isinstance(given, list) or [type(x) in (int, float) and math.isfinite(x) for x in given] != [True] * 3:
+        raise ValueError(f"{name} must be three numbers, not {shown(given)}")
+    return np.array(given, np.float32)
+
+
+def _rows(given: Any, name: str, angles: tuple[str, ...]) -> np.ndarray:
+    """The positions and angles of tables, [M, 3 or 6]. Raises `ValueError` for other tables."""
+    if not isinstance(given, list):
+        raise ValueError(f"{name} are tables, each below [[{name}]], not {shown(given)}")
+    rows = []
+    for number, one in enumerate(given, 1):
+        row = _table(one, f"{name} {number}", ("position", *angles))
+        turned = _three([row.get(angle, 0.0) for angle in angles] or [0, 0, 0], f"what turns {name} {number}")
+        rows.append([*_three(row["position"], f"position of {name} {number}"), *turned[: len(angles)]])
+    return np.array(rows, np.float32).reshape(-1, 3 + len(angles))
 
 
 def out_of(matrix: jax.Array, vector: Any) -> jax.Array:

@@ -13,8 +13,9 @@ from gymnasium.wrappers.utils import RunningMeanStd
 
 from lemniscate.envs import registry
 from lemniscate.envs.conversion import normalized_action
+from lemniscate.envs.returns import as_array
 from lemniscate.envs.vec_env import VecEnv
-from lemniscate.errors import UserError
+from lemniscate.errors import UserError, shown
 from lemniscate.spec import Action, Box, Discrete, MultiDiscrete, Spec
 from lemniscate.types import Step
 
@@ -73,9 +74,10 @@ class VectorView(VectorEnv):
         """
         if options:
             raise UserError(f"All environments are reset together, without options such as {next(iter(options))}.")
-        if not isinstance(seed, int | np.integer | None):
+        if isinstance(seed, bool) or not isinstance(seed, int | np.integer | None) or not 0 <= (seed or 0) < 2**32:
             raise UserError(
-                f"seed must be one whole number, from which those of all environments follow, not {seed!r}."
+                "seed must be one whole number from 0 to 4,294,967,295, from which those of all environments follow,"
+                f" not {seed!r}."
             )
         super().reset(seed=None if seed is None else int(seed))
         obs = self.env.restart(int(self.np_random.integers(2**31)) if seed is None else int(seed))
@@ -85,11 +87,14 @@ class VectorView(VectorEnv):
         """(observations, rewards [N] float32, terminated [N], truncated [N], info) after one action in each.
 
         Raises:
-            UserError: actions of another shape.
+            UserError: actions of another shape, or that are no choices.
         """
-        actions = np.asarray(actions)
+        actions, is_box = as_array(actions), isinstance(self.env.spec.action, Box)
         if actions.shape != self.action_space.shape:
             raise UserError(f"Actions have the shape {self.action_space.shape} here, not {actions.shape}.")
+        if actions.dtype.kind not in "biuf" or not (is_box or (actions == np.rint(actions)).all()):
+            wrong = next((x for x in actions.flatten().tolist() if not isinstance(x, int | float) or x % 1), None)
+            raise UserError(f"Actions are {'' if is_box else 'whole '}numbers here, and not {shown(wrong)}.")
         step = self.env.step(torch.from_numpy(normalized_action(actions, self.env.spec.action)))
         reward = (step.reward * step.valid).numpy()  # that of an ignored action is 0, as in Gymnasium
         flags = step.terminated.numpy().copy(), step.truncated.numpy().copy()

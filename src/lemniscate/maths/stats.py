@@ -24,7 +24,7 @@ def means(rows: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
     for row in rows:
         for name, value in row.items():
             columns.setdefault(name, []).append(value)
-    return {name: torch.stack(column).mean() for name, column in columns.items()}
+    return {name: torch.stack(list(map(torch.as_tensor, column))).mean() for name, column in columns.items()}
 
 
 def standardize(x: Float[Tensor, "*K B"]) -> Float[Tensor, "*K B"]:

@@ -136,7 +136,7 @@ class OwnNetwork(nn.Module):
 
     def __init__(self, name: str, inputs: int, outputs: int) -> None:
         super().__init__()
-        self.name, self.least, self.writes = name, 1, False
+        self.name, self.writes = name, False
         rows = torch.randn(64, inputs, generator=torch.Generator().manual_seed(0))
         wanted = f"{name}({inputs}, {outputs}) must make a module that takes {self._taken(inputs, outputs)}"
         try:
@@ -160,12 +160,11 @@ class OwnNetwork(nn.Module):
             raise UserError(f"{wanted}, in float32; it takes [{len(rows)}, {inputs}] to {what}.")
         if changed:
             how = f"changes {changed[0].removeprefix('module.')} in forward, which no other process would repeat"
-            raise UserError(f"{name} {how}; of batch normalization, take track_running_stats=False, or LayerNorm.")
+            raise UserError(f"{name} {how}; take LayerNorm in the place of batch normalization.")
         self._require_repeated(out, again, acting)
         self._require_learned(out, lost)
         self._require_rows(out, rows)
         self._require_saved(out, rows)
-        self._require_one_row(rows[:1], outputs)
 
     def _made(self, inputs: int, outputs: int) -> Any:
         """A new module. Raises `UserError` for one that is made already, or says too late that it has a memory."""
@@ -174,6 +173,8 @@ class OwnNetwork(nn.Module):
             kind = type(maker).__name__
             raise UserError(f"network is a {kind} that is made already: give its class, of which each network is one.")
         module = maker(inputs, outputs)
+        if not isinstance(module, nn.Module):
+            raise UserError(f"network must make a torch module, and {self.name} makes {shown(module)}.")
         if getattr(module, "memory_size", 0) and not _memory_size(maker):
             raise UserError(f"{self.name} sets its memory_size too late; it must stand in the class: memory_size = 64.")
         return module
@@ -192,28 +193,29 @@ class OwnNetwork(nn.Module):
         if lost:
             raise UserError(f"{self.name} has a number in {lost[0].removeprefix('module.')} that is not finite.")
         types = {str(parameter.dtype) for parameter in self.parameters() if parameter.requires_grad}
-        if not out.requires_grad or types != {"torch.float32"}:
+        if types == {"torch.float32"} and not out.requires_grad:
+            raise UserError(f"{self.name} has outputs that do not depend on its parameters: no detach, and no no_grad.")
+        if types != {"torch.float32"}:
             kinds = f"parameters of {', '.join(sorted(types))}" if types else "no parameter to learn"
             raise UserError(f"{self.name} has {kinds}; it must have some of torch.float32 that its outputs depend on.")
 
-    def _require_one_row(self, row: Tensor, outputs: int) -> None:
-        """Raise `UserError` where one row [1, inputs] does not stay a row; `least` is 2 where it needs others."""
+    def _require_rows(self, out: Tensor, rows: Tensor) -> None:
+        """Raise `UserError` where a row [1, inputs] does not stay a row, or where its output depends on the others."""
+        if not out.isfinite().all():
+            raise UserError(f"{self.name} has outputs that are not finite, of inputs of ordinary size.")
         try:
             with torch.no_grad():
-                out = self._call(row)
+                alone, turned = self._call(rows[:1]), self._call(rows.flip(0))
         except ValueError:  # of batch normalization, by the statistics of the rows themselves
-            self.least = 2
-            return
-        if out.shape != (1, outputs):
-            shapes = f"[1, {row.shape[1]}], to {list(out.shape)}; it must be [1, {outputs}]"
+            alone = turned = torch.full_like(out, torch.nan)
+        if alone.shape != (1, out.shape[1]) and alone.shape != out.shape:
+            shapes = f"[1, {rows.shape[1]}], to {list(alone.shape)}; it must be [1, {out.shape[1]}]"
             raise UserError(f"{self.name} takes one row, {shapes}.")
-
-    def _require_rows(self, out: Tensor, rows: Tensor) -> None:
-        """Raise `UserError` where the outputs depend on the order of the rows."""
-        with torch.no_grad():
-            turned = self._call(rows.flip(0))
-        if not torch.allclose(out, turned.flip(0), rtol=1e-3, atol=1e-4):
-            raise UserError(f"{self.name} takes the rows for one sequence: in another order each has another output.")
+        if not all(torch.allclose(out[: len(x)], x, rtol=1e-3, atol=1e-4) for x in (alone, turned.flip(0))):
+            raise UserError(
+                f"{self.name} gives a row another output among other rows: it takes them for one sequence, or"
+                " normalizes over them, as batch normalization does; LayerNorm does not."
+            )
 
     def _require_saved(self, out: Tensor, rows: Tensor) -> None:
         """Raise `UserError` where another module with the same state_dict has other outputs at rows [B, inputs]."""
@@ -255,8 +257,6 @@ class OwnNetwork(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """[…, inputs] to […, outputs]."""
         rows = x.reshape(-1, x.shape[-1]) if x.dim() != 2 else x
-        if rows.shape[0] < self.least:  # its `len` would fix the number of rows where it is exported
-            raise UserError(f"{self.name} needs 2 rows or more at once, so it cannot act on 1; LayerNorm can.")
         out = self.module(rows.clone() if self.writes else rows)
         return out.reshape(*x.shape[:-1], out.shape[-1]) if x.dim() != 2 else out
 

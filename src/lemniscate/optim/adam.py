@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.func import functional_call, grad_and_value
 
-from lemniscate.errors import UserError
+from lemniscate.errors import UserError, shown
 from lemniscate.maths import fisher_product
 from lemniscate.types import Loss, Metrics, Schedule, wide_float
 
@@ -148,7 +148,12 @@ class Adam(ParameterVector):
             with torch.no_grad():  # of networks that only take part in the loss
                 gradients, (_, metrics) = differentiate(self.views(self.vector))
             return self.join(gradients), metrics
-        total, metrics = loss(self.networks, *args)
+        returned = loss(self.networks, *args)
+        pair: Any = returned if isinstance(returned, tuple) and len(returned) == 2 else (None, None)
+        if not getattr(pair[0], "requires_grad", False) or pair[0].dim():
+            wanted = "a scalar that can be differentiated, and its metrics, (Tensor, dict)"
+            raise UserError(f"A loss must return {wanted}, not {shown(returned)}.")
+        total, metrics = pair
         self._gradient.zero_()
         total.backward(inputs=self.parameters)
         return self._gradient, metrics

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 from lemniscate.algos import ALGORITHMS, find
-from lemniscate.errors import UserError, unknown_name
+from lemniscate.errors import UserError, shown, unknown_name
 from lemniscate.run.config import RunConfig
 from lemniscate.run.fields import read
 from lemniscate.system.files import DamagedFileError, at_home, parsing, read_json, write_json
@@ -51,7 +51,14 @@ class Preset:
 
 def of(algorithm: str) -> list[Preset]:
     """The presets of an algorithm; those of a module of one's own are its `PRESETS`, if it has any."""
-    return _stored(algorithm) if algorithm in ALGORITHMS else getattr(find(algorithm), "PRESETS", [])
+    if algorithm in ALGORITHMS:
+        return _stored(algorithm)
+    own = getattr(find(algorithm), "PRESETS", [])
+    if not isinstance(own, list | tuple) or not all(isinstance(preset, Preset) for preset in own):
+        raise UserError(
+            f"PRESETS of {algorithm} must be a list of Preset(name, config, source, date), not {shown(own)}."
+        )
+    return list(own)
 
 
 def names(algorithm: str) -> list[str]:

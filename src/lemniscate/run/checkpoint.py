@@ -10,6 +10,7 @@ find damage, not malice; but nothing in these files can be executed.
 
 import dataclasses
 import hashlib
+import json
 import os
 import re
 from collections.abc import Mapping
@@ -21,7 +22,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from lemniscate.errors import NonFiniteError, UserError
+from lemniscate.errors import NonFiniteError, UserError, shown
 from lemniscate.run.state import TrainState
 from lemniscate.spec import Action, ObservationPart, Spec
 from lemniscate.system import files
@@ -72,6 +73,24 @@ def write(directory: Path, fields: Mapping[str, Any], step: int, record: dict[st
         with suppress(OSError):  # the next one tries again
             files.remove(path)
     return final
+
+
+def require_stored(kind: str, fields: Mapping[str, Any]) -> None:
+    """Raise `UserError` for a field of a State that a checkpoint cannot hold."""
+    for name, value in fields.items():
+        state = value.state_dict() if hasattr(value, "state_dict") else {}
+        if odd := [key for key, tensor in state.items() if not isinstance(tensor, Tensor)]:
+            raise UserError(
+                f"{kind}.{name} is a {type(value).__name__}, whose state_dict has {odd[0]!r}, no tensor: optimizers are"
+                " those of lemniscate.optim.adam."
+            )
+        try:
+            json.dumps(None if hasattr(value, "state_dict") else value)
+        except (TypeError, ValueError):
+            raise UserError(
+                f"{kind}.{name} is {shown(value)}: a field of a State is a number, or has state_dict and"
+                " load_state_dict; or field(metadata={'saved': False}) keeps it out of checkpoints."
+            ) from None
 
 
 def write_fields(final: Path, fields: Mapping[str, Any], record: dict[str, Any]) -> None:

@@ -306,7 +306,10 @@ class RunConfig:
 
     def to_json(self) -> dict[str, Any]:
         """A dictionary that survives JSON."""
-        return json.loads(json.dumps(dataclasses.asdict(self)))
+        try:
+            return json.loads(json.dumps(dataclasses.asdict(self)))
+        except TypeError as error:
+            raise UserError(f"A field of {type(self).__module__}.Config cannot be stored: {error}.") from None
 
     @classmethod
     def from_json(cls, record: dict[str, Any]) -> Self:

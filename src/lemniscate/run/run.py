@@ -24,9 +24,10 @@ import numpy as np
 import torch
 
 from lemniscate.envs.vec_env import Episodes, VecEnv
-from lemniscate.errors import NonFiniteError, NotStoredError, UserError, resume_line
+from lemniscate.errors import NonFiniteError, NotStoredError, UserError, resume_line, shown
 from lemniscate.nn.memory import Carrier
 from lemniscate.optim.compiled import Compiler
+from lemniscate.run.checkpoint import require_stored
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import Saver, load_networks
 from lemniscate.run.environments import Curriculum
@@ -98,8 +99,8 @@ class Run:
         self._recent_returns = deque[float](maxlen=100)
         self._unobserved: list[tuple[int, dict[str, float]]] = []
         """logged lines that callbacks have not seen"""
-        self._told = 0
-        """notices of the environments that have been said"""
+        self._told, self._ended = 0, False
+        """notices of the environments that have been said; whether the loop has come to its end"""
         self._last_line = 0.0, 0
         """when the last line was logged, and at which step"""
 
@@ -110,6 +111,7 @@ class Run:
         saved as a checkpoint at step 0, so that from then on the run does not depend on where its networks came from.
         """
         saver = self._saver
+        require_stored(type(state).__name__, state.saved())
         if not saver.exists:  # first, since it may fail
             self._begin(state)
         saver.open()
@@ -162,6 +164,7 @@ class Run:
                     going_on = not self._stopped(state, planned) and state.step < total_steps
                     if planned and going_on:
                         self._restart(state)
+                self._ended = True
         finally:
             self.seconds = time.monotonic() - started
             self._bar.close()
@@ -182,7 +185,13 @@ class Run:
 
         Raises `NonFiniteError` where a loss, the gradient or a parameter is NaN or infinite; no checkpoint is touched.
         """
-        numbers = {name: float(value) for name, value in metrics.items()}
+        try:
+            numbers = {name: float(value) for name, value in metrics.items()}
+        except (AttributeError, TypeError, ValueError, RuntimeError) as error:
+            said = f"run.log of {self.algorithm} is given {shown(metrics)}; metrics are scalars by their names"
+            raise UserError(f"{said}: {error}.") from error
+        if type(state.step) is not int:
+            raise UserError(f"state.step of {self.algorithm} is {state.step!r}; it must be a whole number of Python's.")
         require_finite(state, numbers)
         if self.world.size > 1:
             require_agreement(self.world, state)
@@ -208,6 +217,15 @@ class Run:
         self._told = len(notices)
         recent = self._recent_returns
         self._bar.update(state.step, sum(recent) / len(recent) if recent else None, learned=bool(metrics))
+
+    def require_whole(self, state: TrainState) -> None:
+        """Raise `UserError` if the algorithm did not go through the loop of `until` to its end."""
+        if not self._ended:
+            done = f"at step {state.step:,} of {self.config.total_steps:,}"
+            raise UserError(
+                f"train() of {self.algorithm} left the loop of run.until {done}, and nothing since step"
+                f" {self._saver.last_planned:,} is stored: to stop a run, let a callback return True."
+            )
 
     def require_stored(self) -> None:
         """Raise `NotStoredError` if the disk refused the last checkpoint."""
@@ -363,7 +381,7 @@ class Run:
 
     def _write(self, step: int, numbers: dict[str, float], episodes: Episodes = NO_EPISODES) -> None:
         for logger in self._loggers:
-            logger.write(step, numbers, episodes)
+            logger.write(step, dict(numbers), episodes)  # it may change its own
         self._saver.logged = step
         self._unobserved.append((step, numbers))
 

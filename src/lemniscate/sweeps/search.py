@@ -137,10 +137,13 @@ def _range(name: str, text: str, hint: Any, config: RunConfig) -> Interval | Cho
     """The range that a text stands for; every end of it is a value that the Config has room for."""
     ends = re.fullmatch(r"(log:)?([^:|]+):([^:|]+)", text)
     if not ends:
+        known = f"write {name}=low:high, {name}=log:low:high or {name}=a|b"
+        if ":" in text and kinds_of(hint).keys() & {int, float}:
+            raise UserError(f"{name}={text} is no range: {known}.")
         values = {part.strip(): _read(name, hint, part) for part in text.split("|")}
         checked = {key: getattr(config.replace(**{name: value}), name) for key, value in values.items()}
         if len({repr(value) for value in checked.values()}) < max(2, len(checked)):
-            raise UserError(f"{name}={text} is no range: write {name}=low:high, {name}=log:low:high or {name}=a|b.")
+            raise UserError(f"{name}={text} is no range: {known}.")
         return Choice(checked)
     low, high = (getattr(config.replace(**{name: _read(name, hint, end)}), name) for end in ends.groups()[1:])
     log = ends[1] is not None
