@@ -1,6 +1,7 @@
 """What is asked wrongly is answered in one sentence, in Python as on the command line; what is meant well is taken."""
 
 import os
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -365,3 +366,91 @@ def test_what_lies_beside_a_stored_policy_is_not_lost(run, tmp_path):
     (tmp_path / "p" / "notes.txt").touch()
     with pytest.raises(UserError, match=r"holds notes\.txt beside a stored policy, which would be lost"):
         lem.save(run, tmp_path / "p")
+
+
+OWN = Path(__file__).parents[1] / "examples" / "own_algorithm.py"
+TORCHS = "optimizer = torch.optim.Adam(networks.parameters())"
+LEFT = "left the loop of run.until at step 64 of 256, and nothing since step 0 is stored: to stop a run, let a callback"
+LOST = "must begin with state = run.restore"
+MISTAKES = {
+    # change of an algorithm of one's own: what is said
+    "no loss": (
+        ("    return policy_loss + config.beta", "    policy_loss + config.beta"),
+        "A loss must return a scalar that",
+    ),
+    "detached": (
+        ("return policy_loss + config.beta * kl + critic_loss, {", "return policy_loss.detach(), {"),
+        "A loss must r",
+    ),
+    "loss of each row": (
+        ("return policy_loss + config.beta * kl + critic_loss, {", "return log_ratio, {"),
+        "A loss must ret",
+    ),
+    "no metrics": (
+        ("    return means(metrics)\n", "    return None\n"),
+        "is given None; metrics are scalars by their names",
+    ),
+    "a text": (
+        ("    return means(metrics)\n", "    return {'a': 'x'}\n"),
+        "is given {'a': 'x'}; metrics are scalars by",
+    ),
+    "half a step": (
+        ("state.step += config.num_rows", "state.step += config.num_rows / 2"),
+        "it must be a whole number of Py",
+    ),
+    "torch's Adam": (
+        ("optimizer = Adam(networks, max_grad_norm=1.0)\n    optimizer.learning_rate = config.learning_rate", TORCHS),
+        "State.optimizer is a Adam, whose state_dict has 'state', no tensor: optimizers are those of lemniscate.optim.adam",
+    ),
+    "a function": (
+        ("    optimizer: Adam\n", "    optimizer: Adam\n    f: object = print\n"),
+        "State.f is print.*: a field of a St",
+    ),
+    "a set": (
+        ("    beta: NonNegative = 3.0\n", "    some: frozenset = frozenset()\n    beta: NonNegative = 3.0\n"),
+        "A field of .*Config cannot be stored: .*frozenset",
+    ),
+    "a tuple for a preset": (
+        ("PRESETS = [", "PRESETS = [(1, 2), "),
+        "PRESETS of .* must be a list of Preset.name, config,",
+    ),
+    "left early": (
+        ("        rollout = collect(", "        if state.step:\n            break\n        rollout = collect("),
+        LEFT,
+    ),
+    "no restore": (
+        ("run.restore(init(config, run.spec, run.env.device))", "init(config, run.spec, run.env.device)"),
+        LOST,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_a_mistake_in_an_algorithm_of_ones_own_is_one_sentence(name, tmp_path, monkeypatch):
+    (before, after), said = MISTAKES[name]
+    text = OWN.read_text()
+    assert text.count(before) == 1
+    module = f"own_{list(MISTAKES).index(name)}"
+    (tmp_path / f"{module}.py").write_text(text.replace(before, after))
+    monkeypatch.syspath_prepend(tmp_path)
+    sizes = {"num_envs": 2, "num_steps": 32, "minibatch_size": 64, "total_steps": 256}
+    with pytest.raises(UserError, match=said):
+        lem.train(module, "CartPole-v1", run=tmp_path / "run", progress=False, **sizes)
+
+
+def test_a_logger_cannot_empty_what_others_get(tmp_path):
+    class Empties:
+        def __init__(self, *_):
+            pass
+
+        def write(self, step, metrics, episodes=None):
+            metrics.clear()
+
+        def close(self, pictures): ...
+
+    seen = []
+    sizes = {"num_envs": 2, "num_steps": 32, "minibatch_size": 64, "total_steps": 64}
+    callbacks = [lambda step, metrics, policy: seen.append(len(metrics))]
+    lem.train("ppo", "CartPole-v1", run=tmp_path / "run", track=Empties, callbacks=callbacks, progress=False, **sizes)
+    assert seen
+    assert min(seen) > 5

@@ -398,6 +398,13 @@ def test_a_track_of_ones_own_is_read(racing, tmp_path):
         ({"crash": -1}, "crash of DroneGates-v0 must be a number from 0 on, what a crash costs, not -1"),
         ({"crash": True}, "crash of DroneGates-v0 must be a number from 0 on, what a crash costs, not True"),
         ({"track": "none.toml"}, "none.toml is no track"),
+        ({"track": 3}, "track of DroneGates-v0 must be the path of a file, not 3"),
+        ({"freq": 0}, "freq of DroneGates-v0 must be a whole number that divides 500, not 0"),
+        ({"freq": "50"}, "freq of DroneGates-v0 must be a whole number that divides 500, not '50'"),
+        ({"freq": 60}, "freq of DroneGates-v0 must be a whole number that divides 500, not 60"),
+        ({"max_episode_time": -1}, "must be seconds, more than the 0.02 of a step, not -1"),
+        ({"max_episode_time": math.nan}, "must be seconds, more than the 0.02 of a step, not nan"),
+        ({"drone": "cf2x"}, "did you mean cf2x_"),
         ({"levle": 1}, "did you mean level"),
     ],
 )
@@ -414,6 +421,24 @@ def test_what_is_wrong_is_said(kwargs, said):
         (("position = [0.0, 0.0, 1.0]", "position = [0.0, 1.0]"), "is no track"),
         (("start = [-1.0, 0.0, 0.5]", ""), "lacks 'start'"),
         (("[[gates]]", "[gates"), "is no track"),
+        (("[[gates]]", "[gates]"), r"gates are tables, each below \[\[gates\]\], not {'position"),
+        (("order = [1, -1]", "order = 1"), "order names gates from 1 to 1, in reverse with a minus, not 1"),
+        (("order = [1, -1]", "order = [1.0]"), r"not \[1.0\]"),
+        (("order = [1, -1]", "order = [true]"), r"not \[True\]"),
+        (("order = [1, -1]", "order = [[1], [1]]"), r"not \[\[1\], \[1\]\]"),
+        (("position = [0.0, 0.0, 1.0]", "position = [0.0, 0.0, nan]"), "position of gates 1 must be three numbers"),
+        (("position = [0.0, 0.0, 1.0]", "position = [0.0, 0.0, 900.0]"), "room must reach from low to high, in metres"),
+        (
+            ("position = [0.0, 0.0, 1.0]", "position = [0.0, 0.0, 1.0]\nyawn = 1"),
+            "gates 1 has 'yawn', and may have pos",
+        ),
+        (("position = [0.0, 0.0, 1.0]", "position = [0.0, 0.0, 1.0]\nyaw = 90"), "are radians, at most 2 π"),
+        (
+            ("position = [0.0, 0.0, 1.0]", "position = [0, 0, 1]\n[[obstacles]]\nposition = [0, 1]"),
+            "obstacles 1 must be",
+        ),
+        (("position = [0.0, 0.0, 1.0]", "position = [0, 0, 1]\n[speed]"), "it has 'speed', and may have order"),
+        (("start = [-1.0, 0.0, 0.5]", "start = [-9.0, 0.0, 0.5]"), "with the start and all gates between"),
     ],
 )
 def test_what_is_wrong_with_a_track_is_said(change, said, tmp_path):

@@ -3,6 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers import vector as wrappers
 
@@ -141,3 +142,28 @@ def test_what_cannot_be_asked_is_a_sentence(ask, said):
     env.reset(seed=0)
     with pytest.raises(lem.UserError, match=said):
         ask(env)
+
+
+@pytest.mark.parametrize(
+    ("actions", "said"),
+    [
+        ([0.9, 0.9], "Actions are whole numbers here, and not 0.9"),
+        ([np.nan, 0], "Actions are whole numbers here, and not nan"),
+        (["a", "b"], "Actions are whole numbers here, and not 'a'"),
+        ([None, None], "Actions are whole numbers here, and not None"),
+        ([0], "Actions have the shape"),
+    ],
+)
+def test_what_is_no_choice_is_no_action(actions, said):
+    envs = lem.make_vec("CartPole-v1", 2, backend="gymnasium")
+    envs.reset(seed=0)
+    envs.step(torch.tensor([0.0, 1.0], requires_grad=True))
+    with pytest.raises(lem.UserError, match=said):
+        envs.step(actions)
+
+
+@pytest.mark.parametrize("seed", [-1, 2**32, 2**40, True, [1, 2]])
+def test_a_seed_is_one_of_those_of_runs(seed):
+    envs = lem.make_vec("CartPole-v1", 2, backend="gymnasium")
+    with pytest.raises(lem.UserError, match="seed must be one whole number from 0 to 4,294,967,295"):
+        envs.reset(seed=seed)

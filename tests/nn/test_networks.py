@@ -155,7 +155,7 @@ def count_calls(self):
         (changed(lambda self: nn.utils.parametrizations.spectral_norm(self.first)), "changes first.param.* in forward"),
         (changed(lambda self: setattr(self, "between", nn.Dropout(0.1))), "is random: two calls with the same rows"),
         (changed(lambda self: self.requires_grad_(False)), "has no parameter to learn"),
-        (kind(forward=torch.no_grad()(Own.forward)), "that its outputs depend on"),
+        (kind(forward=torch.no_grad()(Own.forward)), "outputs that do not depend on its parameters"),
         (changed(lambda self: self.register_buffer("mask", torch.tensor(-math.inf))), "number in mask that is not fini"),
         (kind(forward=lambda self, x: (Own.forward(self, x), x)), r"takes \[B, 5\] to \[B, 3\], in float32; .* to a tup"),
         (kind(forward=lambda self, x: Own.forward(self, x).double()), r"to \[64, 3\] of torch.float64"),
@@ -164,7 +164,14 @@ def count_calls(self):
         (kind(forward=lambda self, x: Own.forward(self.double(), x.double()).float()), "parameters of torch.float64"),
         (kind(forward=lambda self, x: {}["no"]), "KeyError: 'no'"),
         (kind(get_extra_state=lambda self: {"a": 1}), "must make a module"),
-        (lambda inputs, outputs: lambda x: x[:, :outputs], "must make a module"),
+        (lambda inputs, outputs: lambda x: x[:, :outputs], "network must make a torch module, and .* makes lambda"),
+        (kind(forward=lambda self, x: Own.forward(self, x) / 0), "has outputs that are not finite"),
+        (kind(forward=lambda self, x: Own.forward(self, x - x.mean(0))), "gives a row another output among other rows"),
+        (kind(forward=lambda self, x: Own.forward(self, x) + x[:1, :1]), "gives a row another output among other rows"),
+        (
+            changed(lambda self: setattr(self, "between", nn.BatchNorm1d(8, track_running_stats=False))),
+            "normalizes over them, as batch normalization does; LayerNorm does not",
+        ),
         (kind(forward=lambda self, x: Own.forward(self, x) + (not self.training)), r"other outputs after eval\(\), in wh"),
         (kind(forward=lambda self, x: Own.forward(self, x) if self.training else (x,)), "outputs after eval"),
         (kind(forward=lambda self, x: Own.forward(self, x).squeeze(0)), r"one row, \[1, 5\], to \[3\]; it must be \[1, 3"),
@@ -190,13 +197,6 @@ def test_a_network_may_write_into_the_rows_that_it_gets(rng):
 def test_a_network_of_ones_own_is_looked_at_with_gradients_wherever_it_is_made():
     with torch.no_grad():
         assert own(Own)(torch.zeros(2, 5)).shape == (2, 3)
-
-
-def test_a_network_that_looks_at_all_rows_at_once_says_so_on_one():
-    network = own(changed(lambda self: setattr(self, "between", nn.BatchNorm1d(8, track_running_stats=False))))
-    assert network(torch.zeros(2, 5)).shape == (2, 3)
-    with pytest.raises(UserError, match="needs 2 rows or more at once, so it cannot act on 1"):
-        network(torch.zeros(1, 5))
 
 
 def test_parameters_that_need_no_gradient_are_not_in_the_vector():
@@ -276,7 +276,7 @@ class Single(nn.Linear):
 
 
 def test_rows_are_no_sequence_and_what_is_made_is_made_again():
-    with pytest.raises(UserError, match="takes the rows for one sequence: in another order each has another output"):
+    with pytest.raises(UserError, match="among other rows: it takes them for one sequence"):
         OwnNetwork("test_networks:Sequence", 3, 2)
     OwnNetwork("test_networks:Forgetful", 3, 2)
     with pytest.raises(UserError, match="cannot be made again, to be loaded: RuntimeError: in use"):

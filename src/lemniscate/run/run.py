@@ -99,8 +99,8 @@ class Run:
         self._recent_returns = deque[float](maxlen=100)
         self._unobserved: list[tuple[int, dict[str, float]]] = []
         """logged lines that callbacks have not seen"""
-        self._told, self._ended = 0, False
-        """notices of the environments that have been said; whether the loop has come to its end"""
+        self._told, self._restored, self._ended = 0, False, False
+        """notices of the environments that have been said; whether the loop may begin, and has come to its end"""
         self._last_line = 0.0, 0
         """when the last line was logged, and at which step"""
 
@@ -132,6 +132,7 @@ class Run:
         self._episodes = sum(len(line.get("episode/returns", ())) for line in lines)
         self._lines = sum("time/collect" in line for line in lines)
         saver.logged = max((line["step"] for line in lines), default=0)
+        self._restored = True
         return state
 
     def until(self, total_steps: int, state: TrainState) -> Iterator[VecEnv]:
@@ -139,6 +140,8 @@ class Run:
 
         Raises `Stopped` after a signal, when the current update is done and saved.
         """
+        if not self._restored:
+            raise UserError(f"train() of {self.algorithm} must begin with state = run.restore(init(…)).")
         self._bar = ProgressBar(total_steps, state.step, self._visible)
         started = time.monotonic()
         self._last_line = started, state.step
