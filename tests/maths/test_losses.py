@@ -1,3 +1,4 @@
+import inspect
 import math
 
 import pytest
@@ -5,6 +6,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lemniscate import maths
 from lemniscate.maths import Categorical, clipped_surrogate, policy_gradient, surrogate, value_loss
 
 
@@ -125,3 +127,50 @@ def test_the_score_is_zero_in_the_mean():
     """E[∇log π] = 0, which is why."""
     scores = gradients(PAYS - 1)  # every pull weighs one
     assert (scores.mean(0).abs() < 4 * scores.std(0) / len(scores) ** 0.5).all()
+
+
+def unchecked(name):
+    """A function as users have it: in these tests alone jaxtyping looks at shapes first."""
+    return inspect.unwrap(getattr(maths, name))
+
+
+A, B_1 = torch.zeros(4), torch.zeros(4, 1)
+T_N, N_T = torch.zeros(3, 2), torch.zeros(2, 3)
+ENDS = torch.zeros(3, 2, dtype=torch.bool)
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (
+            lambda: unchecked("value_loss")(B_1, A),
+            r"value has the shape \[4, 1\], and target \[4\]; they must be the same",
+        ),
+        (lambda: unchecked("value_loss")(A, A, B_1, 0.2), r"value has the shape \[4\], and old_value \[4, 1\]"),
+        (lambda: unchecked("policy_gradient")(A, B_1), r"log_prob has the shape \[4\], and weight \[4, 1\]"),
+        (lambda: unchecked("surrogate")(A, B_1), r"log_ratio has the shape \[4\], and advantage \[4, 1\]"),
+        (lambda: unchecked("clipped_surrogate")(B_1, A), r"log_ratio has the shape \[4, 1\], and advantage \[4\]"),
+        (lambda: unchecked("cross_entropy")(T_N, N_T), r"logits has the shape \[3, 2\], and target \[2, 3\]"),
+        (lambda: unchecked("explained_variance")(B_1, A), r"prediction has the shape \[4, 1\], and target \[4\]"),
+        (lambda: unchecked("td_target")(A, B_1, A.bool()), r"reward has the shape \[4\], and next_value \[4, 1\]"),
+        (lambda: unchecked("td_target")(A, A, B_1.bool()), r"reward has the shape \[4\], and terminated \[4, 1\]"),
+        (
+            lambda: unchecked("gae")(T_N, T_N, N_T, ENDS, ENDS),
+            r"reward has the shape \[3, 2\], and next_value \[2, 3\]",
+        ),
+        (lambda: unchecked("gae")(T_N, T_N, T_N, ENDS, ENDS[0]), r"reward has the shape \[3, 2\], and done \[2\]"),
+        (lambda: unchecked("q_lambda")(T_N, T_N[:, :1], ENDS, ENDS), r"and next_value \[3, 1\]"),
+        (lambda: unchecked("reward_to_go")(T_N, T_N, ENDS[:, 0], ENDS), r"and terminated \[3\]"),
+        (lambda: unchecked("episode_return")(T_N, N_T, ENDS), r"to_go has the shape \[3, 2\], and reward \[2, 3\]"),
+        (lambda: unchecked("soft_lambda_return")(T_N, T_N, N_T, ENDS, ENDS), r"and next_bonus \[2, 3\]"),
+        (lambda: unchecked("gae")([1.0], T_N, T_N, ENDS, ENDS), "reward and value must be Tensors, not list, Tensor"),
+        (lambda: unchecked("value_loss")(A, A.numpy()), "value and target must be Tensors, not Tensor, ndarray"),
+    ],
+)
+def test_shapes_that_would_be_broadcast_are_refused(call, said):
+    with pytest.raises(ValueError, match=said):
+        call()
+
+
+def test_two_critics_share_a_reward():
+    assert unchecked("td_target")(A, torch.zeros(2, 4), A.bool()).shape == (2, 4)

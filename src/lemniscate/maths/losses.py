@@ -1,10 +1,12 @@
-"""Losses: scalars to descend."""
+"""Losses: scalars to descend. They raise `ValueError` for tensors whose shapes differ."""
 
 from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+
+from lemniscate.maths.stats import require_alike
 
 
 def policy_gradient(log_prob: Float[Tensor, " *B"], weight: Float[Tensor, " *B"]) -> Float[Tensor, ""]:
@@ -18,6 +20,7 @@ def policy_gradient(log_prob: Float[Tensor, " *B"], weight: Float[Tensor, " *B"]
         log_prob: log π(a|s).
         weight: Ψ, no gradient: a return, a reward-to-go, an advantage (arXiv:1506.02438, eq. 1).
     """
+    require_alike(log_prob=log_prob, weight=weight)
     return -(log_prob * weight).mean()
 
 
@@ -32,6 +35,7 @@ def surrogate(log_ratio: Float[Tensor, " *B"], advantage: Float[Tensor, " *B"]) 
         log_ratio: log π(a|s) − log π_old(a|s).
         advantage: A, no gradient.
     """
+    require_alike(log_ratio=log_ratio, advantage=advantage)
     return -(log_ratio.exp() * advantage).mean()
 
 
@@ -50,6 +54,7 @@ def clipped_surrogate(
         advantage: A, no gradient.
         clip: ε > 0, a number or a scalar tensor.
     """
+    require_alike(log_ratio=log_ratio, advantage=advantage)
     ratio = log_ratio.exp()
     return -torch.min(ratio * advantage, ratio.clamp(1 - clip, 1 + clip) * advantage).mean()
 
@@ -76,6 +81,7 @@ def value_loss(
     Raises:
         ValueError: `clip` without `old_value`.
     """
+    require_alike(value=value, target=target, old_value=value if old_value is None else old_value)
     error = (value - target).square()
     if clip is not None:
         if old_value is None:

@@ -1,8 +1,10 @@
-"""Advantages and returns of rollouts."""
+"""Advantages and returns of rollouts. They raise `ValueError` for tensors whose shapes differ."""
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+
+from lemniscate.maths.stats import require_alike
 
 
 def gae(
@@ -36,6 +38,7 @@ def gae(
     Returns:
         (advantage, target), each [T, N]; target = advantage + value is the TD(λ) return the critic regresses on.
     """
+    require_alike(reward=reward, value=value, next_value=next_value, terminated=terminated, done=done)
     terminated, done = terminated.bool(), done.bool()
     delta = reward + gamma * next_value * ~terminated - value
     decay = gamma * lam * (~done).to(delta.dtype)
@@ -71,6 +74,7 @@ def q_lambda(
         gamma: discount γ in [0, 1].
         lam: trace decay λ in [0, 1]; 0 is the target of one-step Q-learning.
     """
+    require_alike(reward=reward, next_value=next_value, terminated=terminated, done=done)
     terminated, done = terminated.bool(), done.bool()
     target = torch.empty_like(next_value)
     follows = next_value[-1]
@@ -102,6 +106,7 @@ def reward_to_go(
         done: the episode ended at row t for any reason.
         gamma: discount γ in [0, 1].
     """
+    require_alike(reward=reward, next_value=next_value, terminated=terminated, done=done)
     terminated, done = terminated.bool(), done.bool()
     delta = reward + gamma * next_value * (done & ~terminated)
     delta[-1] = reward[-1] + gamma * next_value[-1] * ~terminated[-1]
@@ -126,6 +131,7 @@ def episode_return(
         done: the episode ended at row t. Row 0 begins an episode, and so does every row after an end.
         gamma: discount γ in [0, 1].
     """
+    require_alike(to_go=to_go, reward=reward, done=done)
     whole, weight, paid = torch.empty_like(to_go), torch.ones_like(to_go[0]), torch.zeros_like(to_go[0])
     for t in range(len(to_go)):
         whole[t] = paid + weight * to_go[t]

@@ -10,6 +10,19 @@ Moments = tuple[Tensor, Tensor, Tensor]
 """mean, population variance and count of rows"""
 
 
+def require_alike(**tensors: object) -> None:
+    """Raise `ValueError` unless all have one shape: [B, 1] less [B] would be [B, B], and no error."""
+    (name, first), *others = tensors.items()
+    for other, tensor in others:
+        if not isinstance(first, Tensor) or not isinstance(tensor, Tensor):
+            raise ValueError(
+                f"{name} and {other} must be Tensors, not {type(first).__name__}, {type(tensor).__name__}."
+            )
+        if first.shape != tensor.shape:
+            shapes = f"{name} has the shape {list(first.shape)}, and {other} {list(tensor.shape)}"
+            raise ValueError(f"{shapes}; they must be the same.")
+
+
 def moments(rows: Tensor) -> Moments:
     """The moments over the last dimension of rows [..., B]; those of no rows are zero."""
     count = rows.new_tensor(rows.shape[-1])
@@ -21,10 +34,13 @@ def moments(rows: Tensor) -> Moments:
 def means(rows: Sequence[Mapping[str, Tensor]]) -> dict[str, Tensor]:
     """The mean of each quantity over the rows in which it is."""
     columns: dict[str, list[Tensor]] = {}
+    found: dict[str, Tensor] = {}
     for row in rows:
         for name, value in row.items():
             columns.setdefault(name, []).append(value)
-    return {name: torch.stack(list(map(torch.as_tensor, column))).mean() for name, column in columns.items()}
+    for name, column in columns.items():
+        found[name] = torch.stack(list(map(torch.as_tensor, column))).mean()
+    return found
 
 
 def standardize(x: Float[Tensor, "*K B"]) -> Float[Tensor, "*K B"]:
@@ -37,8 +53,9 @@ def standardize(x: Float[Tensor, "*K B"]) -> Float[Tensor, "*K B"]:
 def explained_variance(prediction: Tensor, target: Tensor) -> Tensor:
     """1 − Var[target − prediction] / Var[target], over [B]: 1 is perfect, 0 no better than the mean, below 0 worse.
 
-    Not finite where the target is constant.
+    Not finite where the target is constant. Raises `ValueError` for other shapes.
     """
+    require_alike(prediction=prediction, target=target)
     return 1 - moments(target - prediction)[1] / moments(target)[1]
 
 

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from lemniscate.maths.returns import q_lambda
+from lemniscate.maths.stats import require_alike
 
 
 def td_target(
@@ -26,6 +27,9 @@ def td_target(
         terminated: the episode ended by its own rules.
         gamma: discount γ in [0, 1].
     """
+    require_alike(reward=reward, terminated=terminated)
+    if next_value.shape[-1:] != reward.shape[-1:]:
+        require_alike(reward=reward, next_value=next_value)
     return reward + gamma * next_value * ~terminated.bool()
 
 
@@ -75,6 +79,7 @@ def soft_lambda_return(
         gamma: discount γ in [0, 1].
         lam: trace decay λ in [0, 1].
     """
+    require_alike(reward=reward, next_bonus=next_bonus, terminated=terminated)
     terminated, done = terminated.bool(), done.bool()
     reward = reward + gamma * next_bonus * ~terminated
     return q_lambda(reward, next_value, terminated, done, gamma=gamma, lam=lam)
@@ -102,4 +107,5 @@ def cross_entropy(logits: Float[Tensor, "*B K"], target: Float[Tensor, "*B K"]) 
         logits: of q.
         target: p, no gradient.
     """
+    require_alike(logits=logits, target=target)
     return -(target * logits.log_softmax(-1)).sum(-1).mean()
