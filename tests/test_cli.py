@@ -590,3 +590,20 @@ def test_a_folder_that_cannot_be_written_is_a_sentence(run, tmp_path, capsys):
 def test_a_film_that_cannot_be_written_is_a_sentence(run, capsys):
     assert main(["watch", str(run), "--video", str(run / "film.avi")]) == 2
     assert "must end in .gif, .webp or .mp4" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("busy", "set_to"), [(0.0, None), (60.0, "100")])
+def test_threads_give_way_where_the_cores_are_busy(busy, set_to, monkeypatch):
+    monkeypatch.setenv("GOMP_SPINCOUNT", "of a moment")  # so that it is taken away afterwards
+    monkeypatch.delenv("GOMP_SPINCOUNT")
+    monkeypatch.setattr("psutil.cpu_percent", lambda interval: busy)
+    monkeypatch.setattr("os.cpu_count", lambda: 2)
+    assert main(["train", "ppo", "--env", "CartPole-v1", "--nonsense"]) == 2
+    assert os.environ.get("GOMP_SPINCOUNT") == set_to
+
+
+def test_what_a_user_says_of_waiting_threads_stays(monkeypatch):
+    monkeypatch.setenv("GOMP_SPINCOUNT", "7")
+    monkeypatch.setattr("psutil.cpu_percent", lambda interval: 100.0)
+    assert main(["resume", "nowhere"]) == 2
+    assert os.environ["GOMP_SPINCOUNT"] == "7"

@@ -154,7 +154,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if isinstance(sys.stdout, io.TextIOWrapper):  # not every locale has the letters of a help
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
-        options = vars(parse(sys.argv[1:] if arguments is None else arguments))
+        words = sys.argv[1:] if arguments is None else list(arguments)
+        if words[:1] in (["train"], ["resume"]):
+            give_way()
+        options = vars(parse(words))
         command = options.pop("command")
         from lemniscate.cli import commands  # imports torch
 
@@ -169,6 +172,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         say(sentence)
         return code
     return 0
+
+
+def give_way() -> None:
+    """Have threads that wait for each other sleep at once, and not spin, where other programs keep the cores busy.
+
+    Called before torch is imported, whose OpenMP reads it then. One of two threads would spin for a millisecond at each
+    operation while the other waits for a core. On free cores to spin is twice as fast.
+    """
+    import psutil  # takes as long as all of the help
+
+    if (os.cpu_count() or 1) * (1 - psutil.cpu_percent(interval=0.1) / 100) < 1.5:
+        os.environ.setdefault("GOMP_SPINCOUNT", "100")
 
 
 def ending(error: BaseException, command: str | None) -> tuple[int, str] | None:
