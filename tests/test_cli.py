@@ -14,7 +14,7 @@ from PIL import Image
 import lemniscate as lem
 from conftest import tiny_fields
 from lemniscate.algos import find
-from lemniscate.cli import algorithms, main, parse
+from lemniscate.cli import algorithms, give_way, main, parse
 from lemniscate.envs import registry
 from lemniscate.errors import UserError
 from lemniscate.presets import Preset
@@ -598,12 +598,19 @@ def test_threads_give_way_where_the_cores_are_busy(busy, set_to, monkeypatch):
     monkeypatch.delenv("GOMP_SPINCOUNT")
     monkeypatch.setattr("psutil.cpu_percent", lambda interval: busy)
     monkeypatch.setattr("os.cpu_count", lambda: 2)
-    assert main(["train", "ppo", "--env", "CartPole-v1", "--nonsense"]) == 2
+    give_way()
     assert os.environ.get("GOMP_SPINCOUNT") == set_to
 
 
 def test_what_a_user_says_of_waiting_threads_stays(monkeypatch):
     monkeypatch.setenv("GOMP_SPINCOUNT", "7")
     monkeypatch.setattr("psutil.cpu_percent", lambda interval: 100.0)
-    assert main(["resume", "nowhere"]) == 2
+    give_way()
     assert os.environ["GOMP_SPINCOUNT"] == "7"
+
+
+def test_the_cores_are_looked_at_before_torch_is_imported():
+    code = "import psutil; psutil.cpu_percent = lambda interval: 100; from lemniscate.cli import main; import os, sys"
+    code += "; main(['train', 'ppo', '--nonsense']); print(os.environ['GOMP_SPINCOUNT'], 'torch' in sys.modules)"
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert said.split() == ["100", "True"]

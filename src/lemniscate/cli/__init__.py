@@ -155,7 +155,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
         words = sys.argv[1:] if arguments is None else list(arguments)
-        if words[:1] in (["train"], ["resume"]):
+        if words[:1] in (["train"], ["resume"]) and "torch" not in sys.modules:
             give_way()
         options = vars(parse(words))
         command = options.pop("command")
