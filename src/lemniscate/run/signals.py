@@ -1,6 +1,6 @@
 """Signals: measurements of a run's newest rows and of its networks, from which `lemniscate doctor` reads what is wrong.
 
-They are taken some thirty times in a run, and cost a hundredth of one of some seconds, less of longer ones. Nothing
+They are taken some twenty times in a run, and cost a hundredth of one of some seconds, less of longer ones. Nothing
 learns from them.
 """
 
@@ -21,7 +21,7 @@ from lemniscate.run.config import RunConfig
 from lemniscate.spec import Action, Box, Discrete, MultiDiscrete, Spec
 from lemniscate.types import Rollout, Transition
 
-LOOKS = 32
+LOOKS = 24
 """how often in a run the signals are measured"""
 KINDS = (
     *("reward/", "observation/", "action/", "value/", "advantage/"),
@@ -144,9 +144,11 @@ def of_effects(rows: Rollout, spec: Spec) -> dict[str, Tensor]:
     reward = rows.reward[:, None].cpu().double()
     everything, nothing = _everything(rows, spec), obs[:, :0]
     change, effect = (after - obs)[inside], explained_by(action[inside], (after - obs)[inside], obs[inside])
+    both = explained_by(obs[inside], torch.cat([change, after[inside]], dim=-1), nothing[inside])
+    of_changes, of_next = both.tensor_split(2)
     found = {
         "action/effect": effect.max(),
-        "action/share": (effect * (1 - explained_by(obs[inside], change, nothing[inside]))).max(),
+        "action/share": (effect * (1 - of_changes)).max(),
         "action/paid": explained_by(action, reward, obs).max(),
         "reward/explained": explained_by(everything, reward, nothing).max(),
     }
@@ -162,7 +164,7 @@ def of_effects(rows: Rollout, spec: Spec) -> dict[str, Tensor]:
     if (std > 1e-9).any():
         found["observation/pace"] = (change.square().mean(0).sqrt() / std)[std > 1e-9].max()
     if not ((obs == 0) | (obs == 1)).all():  # one of n says nothing of the next
-        found["observation/predicted"] = explained_by(obs[inside], after[inside], nothing[inside]).mean()
+        found["observation/predicted"] = of_next.mean()
     return found
 
 
