@@ -596,21 +596,21 @@ def test_a_film_that_cannot_be_written_is_a_sentence(run, capsys):
 def test_threads_give_way_where_the_cores_are_busy(busy, set_to, monkeypatch):
     monkeypatch.setenv("GOMP_SPINCOUNT", "of a moment")  # so that it is taken away afterwards
     monkeypatch.delenv("GOMP_SPINCOUNT")
-    monkeypatch.setattr("psutil.cpu_percent", lambda interval: busy)
-    monkeypatch.setattr("os.cpu_count", lambda: 2)
+    monkeypatch.setattr("psutil.cpu_percent", lambda interval, percpu: [100.0, busy, busy])
+    monkeypatch.setattr("os.sched_getaffinity", lambda pid: {1, 2})
     give_way()
     assert os.environ.get("GOMP_SPINCOUNT") == set_to
 
 
 def test_what_a_user_says_of_waiting_threads_stays(monkeypatch):
     monkeypatch.setenv("GOMP_SPINCOUNT", "7")
-    monkeypatch.setattr("psutil.cpu_percent", lambda interval: 100.0)
+    monkeypatch.setattr("psutil.cpu_percent", lambda interval, percpu: [100.0] * 512)
     give_way()
     assert os.environ["GOMP_SPINCOUNT"] == "7"
 
 
 def test_the_cores_are_looked_at_before_torch_is_imported():
-    code = "import psutil; psutil.cpu_percent = lambda interval: 100; from lemniscate.cli import main; import os, sys"
+    code = "import psutil; psutil.cpu_percent = lambda interval, percpu: [100] * 512; from lemniscate.cli import main; import os, sys"
     code += "; main(['train', 'ppo', '--nonsense']); print(os.environ['GOMP_SPINCOUNT'], 'torch' in sys.modules)"
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert said.split() == ["100", "True"]

@@ -395,6 +395,12 @@ FILLED = {
     "insert.py": ("SCALE = []\nSCALE.insert(0, 1.0)", "SCALE[0]", ""),
     "setattr.py": ("class Scale: ...\nsetattr(Scale, 'a', 1.0)", "Scale.a", ""),
     "later.py": ("SCALE = {}\ndef set_up():\n    SCALE.update(a=1.0)", "SCALE['a']", "set_up()"),
+    "set anew.py": ("SCALE = {'a': 1.0}\nfor each in (1.0, 5.0):\n    SCALE['a'] = each", "SCALE['a']", ""),
+    "long.py": (
+        "SCALE = {}\nSCALE['a'] = 1.0\nseen = []",
+        "(SCALE['a'] + 0 * len(seen))",
+        "while True:\n    seen.append(1)",
+    ),
     "global.py": ("def set_up():\n    global SCALE\n    SCALE = 1.0", "SCALE", "set_up()"),
 }
 
@@ -410,6 +416,9 @@ def in_other_forms(tmp_path_factory):
         hand_ins.notebook(f"%%writefile mine.py\n{plain}", "from mine import discounted_returns")
     )
     (folder / "writes and runs.ipynb").write_text(hand_ins.notebook(f"%%writefile mine.py\n{plain}", "!python mine.py"))
+    wrong = plain.replace("gamma * after", "after")
+    drafts = f"%%writefile 'lib/a draft.py'\n{wrong}", "%%writefile notes.md\n# so", plain
+    (folder / "draft.ipynb").write_text(hand_ins.notebook(*drafts))
     (folder / "profiles.ipynb").write_text(hand_ins.notebook(f"%%prun\n{plain}", "%%bash\nls"))
     (folder / "package" / "mine" / "__init__.py").touch()
     (folder / "package" / "mine" / "helper.py").write_text(plain.replace("discounted_returns", "their_returns"))
@@ -423,7 +432,9 @@ def in_other_forms(tmp_path_factory):
     return SimpleNamespace(grades=grades)
 
 
-@pytest.mark.parametrize("name", [*FILLED, "writes.ipynb", "writes and runs.ipynb", "profiles.ipynb", "package"])
+@pytest.mark.parametrize(
+    "name", [*FILLED, "draft.ipynb", "writes.ipynb", "writes and runs.ipynb", "profiles.ipynb", "package"]
+)
 def test_right_solutions_in_other_forms_are_right(in_other_forms, name):
     assert marks(in_other_forms.grades)[name] == {"discounted_returns": True}, sentence(
         in_other_forms, name, "discounted_returns"
@@ -439,6 +450,7 @@ def test_right_solutions_in_other_forms_are_right(in_other_forms, name):
         ("nul.py", "nul.py: SyntaxError: source code string cannot contain null bytes."),
         ("large.ipynb", "large.ipynb has 64 MB; at most 64 are read: clear the outputs of a notebook."),
         ("package", ""),
+        ("draft.ipynb", ""),
     ],
 )
 def test_what_is_left_out_is_said(in_other_forms, hand_in, words):

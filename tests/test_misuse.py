@@ -370,7 +370,7 @@ def test_what_lies_beside_a_stored_policy_is_not_lost(run, tmp_path):
 
 OWN = Path(__file__).parents[1] / "examples" / "own_algorithm.py"
 TORCHS = "optimizer = torch.optim.Adam(networks.parameters())"
-LEFT = "left the loop of run.until at step 64 of 256, and nothing since step 0 is stored: to stop a run, let a callback"
+LEFT = "left the loop of run.until at step 64 of 256, where its policy is stored: to stop a run, let a callback return"
 LOST = "must begin with state = run.restore"
 MISTAKES = {
     # change of an algorithm of one's own: what is said
@@ -454,3 +454,13 @@ def test_a_logger_cannot_empty_what_others_get(tmp_path):
     lem.train("ppo", "CartPole-v1", run=tmp_path / "run", track=Empties, callbacks=callbacks, progress=False, **sizes)
     assert seen
     assert min(seen) > 5
+
+
+def test_what_an_algorithm_learned_that_left_its_loop_is_stored(tmp_path, monkeypatch):
+    early = "        if state.step:\n            return state\n        rollout = collect("
+    (tmp_path / "own_early.py").write_text(OWN.read_text().replace("        rollout = collect(", early))
+    monkeypatch.syspath_prepend(tmp_path)
+    sizes = {"num_envs": 2, "num_steps": 32, "minibatch_size": 64, "total_steps": 256}
+    with pytest.raises(UserError, match=r"left the loop of run\.until at step 64 of 256, where its policy is stored"):
+        lem.train("own_early", "CartPole-v1", run=tmp_path / "run", progress=False, **sizes)
+    assert lem.load(tmp_path / "run").step == 64

@@ -201,6 +201,17 @@ def test_a_reset_by_mask_that_resets_all_is_refused():
         play(countdown("DISABLED", kind=Forgetful, length=4), 8)
 
 
+def test_noise_of_a_sensor_is_no_reset():
+    class Noisy(toy.Countdown):
+        def _observe(self):
+            return super()._observe() + self.np_random.normal(0, 0.01, (self.num_envs, 3)).astype(np.float32)
+
+        def __init__(self, num_envs, mode, length, horizon=None):
+            super().__init__(num_envs, mode, length + np.arange(num_envs), horizon)
+
+    play(countdown("DISABLED", kind=Noisy, length=4), 8)
+
+
 def test_a_nan_that_a_reset_returns_is_named():
     class BornBroken(toy.Countdown):
         def reset(self, **kwargs):

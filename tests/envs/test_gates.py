@@ -430,14 +430,14 @@ def test_what_is_wrong_is_said(kwargs, said):
         (("position = [0.0, 0.0, 1.0]", "position = [0.0, 0.0, 900.0]"), "room must reach from low to high, in metres"),
         (
             ("position = [0.0, 0.0, 1.0]", "position = [0.0, 0.0, 1.0]\nyawn = 1"),
-            "gates 1 has 'yawn', and may have pos",
+            "gates 1 has 'yawn', and may have name, pos",
         ),
         (("position = [0.0, 0.0, 1.0]", "position = [0.0, 0.0, 1.0]\nyaw = 90"), "are radians, at most 2 π"),
         (
             ("position = [0.0, 0.0, 1.0]", "position = [0, 0, 1]\n[[obstacles]]\nposition = [0, 1]"),
             "obstacles 1 must be",
         ),
-        (("position = [0.0, 0.0, 1.0]", "position = [0, 0, 1]\n[speed]"), "it has 'speed', and may have order"),
+        (("position = [0.0, 0.0, 1.0]", "position = [0, 0, 1]\n[speed]"), "it has 'speed', and may have name, order"),
         (("start = [-1.0, 0.0, 0.5]", "start = [-9.0, 0.0, 0.5]"), "with the start and all gates between"),
     ],
 )

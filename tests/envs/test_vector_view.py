@@ -150,7 +150,7 @@ def test_what_cannot_be_asked_is_a_sentence(ask, said):
         ([0.9, 0.9], "Actions are whole numbers here, and not 0.9"),
         ([np.nan, 0], "Actions are whole numbers here, and not nan"),
         (["a", "b"], "Actions are whole numbers here, and not 'a'"),
-        ([None, None], "Actions are whole numbers here, and not None"),
+        ([None, None], "Actions are whole numbers here, and not nan"),
         ([0], "Actions have the shape"),
     ],
 )
@@ -158,6 +158,7 @@ def test_what_is_no_choice_is_no_action(actions, said):
     envs = lem.make_vec("CartPole-v1", 2, backend="gymnasium")
     envs.reset(seed=0)
     envs.step(torch.tensor([0.0, 1.0], requires_grad=True))
+    envs.step(np.array([0, 1], dtype=object))
     with pytest.raises(lem.UserError, match=said):
         envs.step(actions)
 

@@ -170,7 +170,7 @@ def count_calls(self):
         (kind(forward=lambda self, x: Own.forward(self, x) + x[:1, :1]), "gives a row another output among other rows"),
         (
             changed(lambda self: setattr(self, "between", nn.BatchNorm1d(8, track_running_stats=False))),
-            "normalizes over them, as batch normalization does; LayerNorm does not",
+            "cannot take one row: Expected more than 1 value.*; LayerNorm takes the place of batch normalization",
         ),
         (kind(forward=lambda self, x: Own.forward(self, x) + (not self.training)), r"other outputs after eval\(\), in wh"),
         (kind(forward=lambda self, x: Own.forward(self, x) if self.training else (x,)), "outputs after eval"),

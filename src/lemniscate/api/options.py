@@ -128,7 +128,8 @@ def _undone() -> Iterator[None]:
     finally:
         if threading.current_thread() is threading.main_thread():
             for signum, handler in handlers:
-                signal.signal(signum, handler)
+                if handler is not None:  # one that is not Python's
+                    signal.signal(signum, handler)
         for name in os.environ.keys() - variables.keys():
             del os.environ[name]
         os.environ.update(variables)
@@ -177,14 +178,15 @@ def train_in_processes(path: Path, algorithm: str, config: RunConfig, options: R
         raise Stopped("", stopped.sigval) from None
     except ChildFailedError as failed:
         codes = {rank: failure.exitcode for rank, failure in failed.failures.items()}
-        killed = [rank for rank, code in codes.items() if code == -signal.SIGKILL]
-        for signum in (signal.SIGINT, signal.SIGTERM):
-            if 128 + signum in codes.values():
-                if killed:  # the others were asked to stop for that
-                    why = "killed, as the system does where memory has run out"
-                    raise RankError(f"Process {killed[0]} of the run was {why}.") from None
-                raise Stopped("", signum) from None
-        raise RankError("All processes of the run were killed." if len(killed) == processes else "") from None
+        rank, first = failed.get_first_failure()
+        stopped = [signum for signum in (signal.SIGINT, signal.SIGTERM) if 128 + signum in codes.values()]
+        if first.exitcode == -signal.SIGKILL and stopped:  # the others were asked to stop for that
+            why = "killed, as the system does where memory has run out"
+            raise RankError(f"Process {rank} of the run was {why}.") from None
+        if stopped:
+            raise Stopped("", stopped[0]) from None
+        killed = len(codes) == processes and all(code == -signal.SIGKILL for code in codes.values())
+        raise RankError("All processes of the run were killed." if killed else "") from None
     finally:
         os.close(writing)
         os.close(reading)

@@ -14,6 +14,7 @@ import os
 import re
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from itertools import takewhile
 from pathlib import Path
 from shutil import get_terminal_size
@@ -155,8 +156,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
         words = sys.argv[1:] if arguments is None else list(arguments)
-        if words[:1] in (["train"], ["resume"]) and "torch" not in sys.modules:
-            give_way()
+        if words[:1] in (["train"], ["resume"]) and "torch" not in sys.modules and "RANK" not in os.environ:
+            with suppress(Exception):  # a sandbox may not tell
+                give_way()
         options = vars(parse(words))
         command = options.pop("command")
         from lemniscate.cli import commands  # imports torch
@@ -182,7 +184,9 @@ def give_way() -> None:
     """
     import psutil  # takes as long as all of the help
 
-    if (os.cpu_count() or 1) * (1 - psutil.cpu_percent(interval=0.1) / 100) < 1.5:
+    busy = psutil.cpu_percent(interval=0.1, percpu=True)
+    mine = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(len(busy))
+    if sum(1 - busy[core] / 100 for core in mine) < 1.5:
         os.environ.setdefault("GOMP_SPINCOUNT", "100")
 
 

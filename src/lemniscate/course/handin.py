@@ -14,6 +14,7 @@ import inspect
 import json
 import os
 import re
+import shlex
 import signal
 import socket
 import sys
@@ -79,6 +80,8 @@ class Reader:
         self._work = work
         self._written: list[Path] = []
         """modules that cells of notebooks are"""
+        self._time_to_fill = ASSIGNING
+        """seconds that are left for loops that fill what a function uses"""
 
     def read(self) -> None:
         """Execute the modules, then the notebooks, that no other one has imported, and what these have written."""
@@ -89,8 +92,10 @@ class Reader:
         sys.path_importer_cache |= {folder: FileFinder(folder, loader) for folder in folders}
         for file in sorted(files, key=lambda file: file.suffix != ".py"):
             self._load(file)
-        for file in self._written:
+        for file in self._written:  # a draft, where the notebook has a definition of its own
+            there = dict(self.defined)
             self._load(file)
+            self.defined |= there
 
     def _load(self, file: Path) -> None:
         """Execute a module or a notebook, unless it has been imported; a module of a package as a part of that."""
@@ -118,14 +123,20 @@ class Reader:
         for code, node in parsed:
             if isinstance(node, ast.ImportFrom) and node.module == "__future__":
                 flags |= sum(getattr(__future__, each.name).compiler_flag for each in node.names)
-            touched = _bound(node) | _filled(node) | fills.get(_called(node), set())
-            if not isinstance(node, LEFT_OUT) or touched & used:
+            filled = _filled(node) | fills.get(_called(node), set())
+            if not isinstance(node, ast.Expr):  # a loop may fill what is empty, and not set a setting anew
+                filled = {name for name in filled if _is_empty(module.__dict__.get(name))}
+            if not isinstance(node, LEFT_OUT) or (_bound(node) | filled) & used:
                 self._run(node, code, flags, module.__dict__)
                 self.defined |= {each: {**self.defined.get(each, {}), file.name: module} for each in _bound(node)}
 
     def _run(self, node: ast.stmt, file: Path, flags: int, scope: dict[str, Any]) -> None:
         imports = [each for each in ast.walk(node) if isinstance(each, ast.Import | ast.ImportFrom)]
         seconds, where = IMPORTING if imports else ASSIGNING, f"{file.name}, line {node.lineno}"
+        began, filling = time.monotonic(), isinstance(node, LEFT_OUT)
+        seconds = min(seconds, self._time_to_fill) if filling else seconds
+        if seconds <= 0:
+            return
         try:
             with limited(seconds):
                 exec(compile(ast.Module([node], []), str(file), "exec", flags, dont_inherit=True), scope)
@@ -137,6 +148,7 @@ class Reader:
             self.notes.append(f"{where}: {reason}.")
             for each in imports[0].names if imports and imports[0] is node else ():
                 scope.setdefault(each.asname or each.name.partition(".")[0], Missing(absent or str(error)))
+        self._time_to_fill -= filling * (time.monotonic() - began)
 
     def _trees(self, file: Path) -> Iterator[tuple[Path, ast.Module]]:
         """The statements of a module, or of each cell, with the file that Python names in a traceback."""
@@ -166,12 +178,14 @@ class Reader:
     def _set_aside(self, notebook: Path, cell: str, source: str) -> None:
         """Write the module that a cell with %%writefile is; of a cell in another language, say that it is left out."""
         head, _, body = source.partition("\n")
-        magic, *words = head.split()
-        if magic in ("%%writefile", "%%file") and words and words[-1].endswith(".py"):
+        magic, *words = shlex.split(head)
+        if magic in ("%%writefile", "%%file"):
             file = notebook.parent / words[-1]
-            with suppress(OSError), file.open("a" if "-a" in words else "w", encoding="utf-8") as module:
-                module.write(f"{body}\n")
-                self._written.append(file)
+            with suppress(OSError):
+                file.parent.mkdir(parents=True, exist_ok=True)
+                with file.open("a" if "-a" in words else "w", encoding="utf-8") as written:
+                    written.write(f"{body}\n")
+                self._written += [file] if file.suffix == ".py" else []
                 importlib.invalidate_caches()
         else:
             self.notes.append(f"{cell}: left out, since {magic} makes it another language.")
@@ -226,6 +240,14 @@ def _filled(node: ast.AST) -> set[str]:
 def _global(function: ast.AST) -> set[str]:
     """The names that a function declares global."""
     return {name for each in ast.walk(function) if isinstance(each, ast.Global) for name in each.names}
+
+
+def _is_empty(thing: Any) -> bool:
+    """Whether there is nothing, or nothing in it."""
+    try:
+        return thing is None or len(thing) == 0
+    except TypeError:
+        return False
 
 
 def _called(node: ast.AST) -> str:

@@ -572,7 +572,7 @@ def of_what_stands_still(e: Evidence) -> Seen:
     if len(behind) >= 3 and not behind.any() and first_number(e.config.get("tau")) != 1:
         yield "critic-still", "The weights of Q are those of its target networks, each time that they were looked at."
     flat, losses = e.last_half("gradient_norm/critic"), e.last_half("losses/critic")
-    if len(flat) >= 3 and not flat.any() and losses.all():
+    if len(flat) >= 3 and not flat.any() and len(losses) and losses.all():
         yield "critic-still", f"The gradient of Q is 0, and its loss {np.median(losses):.3g}."
     if len(length) >= 3 and np.ptp(length) == 0 and behind.any() and usual:
         yield "targets-behind", "The weights of the target networks were the same each time that they were looked at."

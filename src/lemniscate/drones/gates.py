@@ -100,14 +100,16 @@ def read_track(file: str | Path | None = None) -> Track:
         raise UserError(f"track of DroneGates-v0 must be the path of a file, not {shown(file)}.")
     path = Path(file) if file else Path(__file__).with_name("gates.toml")
     try:
-        table = _table(tomllib.loads(path.read_text("utf-8")), "it", ("order", "start", "room", "gates", "obstacles"))
+        table = _table(
+            tomllib.loads(path.read_text("utf-8")), "it", ("name", "order", "start", "room", "gates", "obstacles")
+        )
         room = _table(table["room"], "room", ("low", "high"))
         low, high, start = (_three(room["low"], "low"), _three(room["high"], "high"), _three(table["start"], "start"))
         gates = _rows(table["gates"], "gates", ("roll", "pitch", "yaw"))
         obstacles, order = _rows(table.get("obstacles", []), "obstacles", ()), table["order"]
         if not (low < high).all() or any(((place < low) | (place > high)).any() for place in (start, *gates[:, :3])):
             raise ValueError("room must reach from low to high, in metres, with the start and all gates between")
-        if (np.abs(gates[:, 3:]) > 2 * math.pi).any():
+        if (np.abs(gates[:, 3:]) > 6.3).any():
             raise ValueError("roll, pitch and yaw are radians, at most 2 π")
     except (OSError, tomllib.TOMLDecodeError, KeyError, ValueError) as error:
         what = f"it lacks {error}" if isinstance(error, KeyError) else str(error)
@@ -143,7 +145,7 @@ def _rows(given: Any, name: str, angles: tuple[str, ...]) -> np.ndarray:
         raise ValueError(f"{name} are tables, each below [[{name}]], not {shown(given)}")
     rows = []
     for number, one in enumerate(given, 1):
-        row = _table(one, f"{name} {number}", ("position", *angles))
+        row = _table(one, f"{name} {number}", ("name", "position", *angles))
         turned = _three([row.get(angle, 0.0) for angle in angles] or [0, 0, 0], f"what turns {name} {number}")
         rows.append([*_three(row["position"], f"position of {name} {number}"), *turned[: len(angles)]])
     return np.array(rows, np.float32).reshape(-1, 3 + len(angles))

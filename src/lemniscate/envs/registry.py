@@ -161,7 +161,7 @@ def name_of(env: object) -> str:
 def count_of(env: object) -> int | None:
     """The number of environments in an object that speaks rsl_rl's `VecEnv`; None of anything else."""
     number = getattr(env, "num_envs", None)
-    return number if hasattr(env, SPOKEN) and isinstance(number, int) else None
+    return None if isinstance(env, type) or not hasattr(env, SPOKEN) else number
 
 
 def names_of(wrappers: "Sequence[str | Callable[..., Any]]") -> tuple[str, ...]:

@@ -1,6 +1,7 @@
 """Our parallel environments as Gymnasium's `VectorEnv`, for a training loop of one's own."""
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -92,6 +93,8 @@ class VectorView(VectorEnv):
         actions, is_box = as_array(actions), isinstance(self.env.spec.action, Box)
         if actions.shape != self.action_space.shape:
             raise UserError(f"Actions have the shape {self.action_space.shape} here, not {actions.shape}.")
+        with suppress(ValueError, TypeError):  # of numbers, each an object
+            actions = actions.astype(np.float64) if actions.dtype.kind == "O" else actions
         if actions.dtype.kind not in "biuf" or not (is_box or (actions == np.rint(actions)).all()):
             wrong = next((x for x in actions.flatten().tolist() if not isinstance(x, int | float) or x % 1), None)
             raise UserError(f"Actions are {'' if is_box else 'whole '}numbers here, and not {shown(wrong)}.")

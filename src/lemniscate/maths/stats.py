@@ -11,14 +11,16 @@ Moments = tuple[Tensor, Tensor, Tensor]
 
 
 def require_alike(**tensors: object) -> None:
-    """Raise `ValueError` unless all have one shape: [B, 1] less [B] would be [B, B], and no error."""
-    (name, first), *others = tensors.items()
-    for other, tensor in others:
-        if not isinstance(first, Tensor) or not isinstance(tensor, Tensor):
-            raise ValueError(
-                f"{name} and {other} must be Tensors, not {type(first).__name__}, {type(tensor).__name__}."
-            )
-        if first.shape != tensor.shape:
+    """Raise `ValueError` unless all have one shape, numbers left out: [B, 1] less [B] would be [B, B], and no error."""
+    name, first = "", None
+    for other, tensor in tensors.items():
+        if isinstance(tensor, int | float) or getattr(tensor, "ndim", 1) == 0:
+            continue
+        if not isinstance(tensor, Tensor):
+            raise ValueError(f"{other} must be a Tensor, not {type(tensor).__name__}.")
+        if first is None:
+            name, first = other, tensor
+        elif first.shape != tensor.shape:
             shapes = f"{name} has the shape {list(first.shape)}, and {other} {list(tensor.shape)}"
             raise ValueError(f"{shapes}; they must be the same.")
 

@@ -28,7 +28,7 @@ def td_target(
         gamma: discount γ in [0, 1].
     """
     require_alike(reward=reward, terminated=terminated)
-    if next_value.shape[-1:] != reward.shape[-1:]:
+    if getattr(reward, "ndim", 0) and next_value.shape[-1:] != reward.shape[-1:]:
         require_alike(reward=reward, next_value=next_value)
     return reward + gamma * next_value * ~terminated.bool()
 

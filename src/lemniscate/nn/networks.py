@@ -206,8 +206,10 @@ class OwnNetwork(nn.Module):
         try:
             with torch.no_grad():
                 alone, turned = self._call(rows[:1]), self._call(rows.flip(0))
-        except ValueError:  # of batch normalization, by the statistics of the rows themselves
-            alone = turned = torch.full_like(out, torch.nan)
+        except ValueError as error:  # of batch normalization, by the statistics of the rows themselves
+            raise UserError(
+                f"{self.name} cannot take one row: {error}; LayerNorm takes the place of batch normalization."
+            ) from error
         if alone.shape != (1, out.shape[1]) and alone.shape != out.shape:
             shapes = f"[1, {rows.shape[1]}], to {list(alone.shape)}; it must be [1, {out.shape[1]}]"
             raise UserError(f"{self.name} takes one row, {shapes}.")

@@ -149,8 +149,8 @@ class Adam(ParameterVector):
                 gradients, (_, metrics) = differentiate(self.views(self.vector))
             return self.join(gradients), metrics
         returned = loss(self.networks, *args)
-        pair: Any = returned if isinstance(returned, tuple) and len(returned) == 2 else (None, None)
-        if not getattr(pair[0], "requires_grad", False) or pair[0].dim():
+        pair: Any = returned if isinstance(returned, tuple | list) and len(returned) == 2 else (None, None)
+        if not getattr(pair[0], "requires_grad", False) or pair[0].numel() != 1:
             wanted = "a scalar that can be differentiated, and its metrics, (Tensor, dict)"
             raise UserError(f"A loss must return {wanted}, not {shown(returned)}.")
         total, metrics = pair

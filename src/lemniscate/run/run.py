@@ -191,6 +191,8 @@ class Run:
         try:
             numbers = {name: float(value) for name, value in metrics.items()}
         except (AttributeError, TypeError, ValueError, RuntimeError) as error:
+            if isinstance(error, RuntimeError) and "Scalar" not in str(error):
+                raise  # of a device, which tells late of what failed before
             said = f"run.log of {self.algorithm} is given {shown(metrics)}; metrics are scalars by their names"
             raise UserError(f"{said}: {error}.") from error
         if type(state.step) is not int:
@@ -222,12 +224,14 @@ class Run:
         self._bar.update(state.step, sum(recent) / len(recent) if recent else None, learned=bool(metrics))
 
     def require_whole(self, state: TrainState) -> None:
-        """Raise `UserError` if the algorithm did not go through the loop of `until` to its end."""
+        """Raise `UserError` if the algorithm did not go through the loop of `until` to its end; the state is saved."""
         if not self._ended:
-            done = f"at step {state.step:,} of {self.config.total_steps:,}"
+            if state.step > self._saver.last_planned:
+                self._saver.save(state, planned=False)
+            done = f"at step {state.step:,} of {self.config.total_steps:,}, where its policy is stored"
             raise UserError(
-                f"train() of {self.algorithm} left the loop of run.until {done}, and nothing since step"
-                f" {self._saver.last_planned:,} is stored: to stop a run, let a callback return True."
+                f"train() of {self.algorithm} left the loop of run.until {done}: to stop a run, let a callback return"
+                " True."
             )
 
     def require_stored(self) -> None:
