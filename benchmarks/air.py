@@ -134,7 +134,7 @@ def gains(trials):
                 tried = [rng.uniform(*ends) for ends in ((4, 40), (2, 14), (4, 60), (2, 20))]
             else:
                 tried = [gain * rng.uniform(0.8, 1.25) for gain in best[1]]
-            pd = replace(env.baseline, gains=tried)
+            pd = replace(env.baseline, gains=[tried])
             best = max(best, (mean(evaluate(pd, env, STARTS, seed).mean_return for seed in (101, 102, 103)), tried))
         print(dynamics, [round(gain, 1) for gain in best[1]], f"{best[0]:.1f}", flush=True)
 

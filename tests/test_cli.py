@@ -614,3 +614,11 @@ def test_the_cores_are_looked_at_before_torch_is_imported():
     code += "; main(['train', 'ppo', '--nonsense']); print(os.environ['GOMP_SPINCOUNT'], 'torch' in sys.modules)"
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert said.split() == ["100", "True"]
+
+
+def test_a_name_that_is_too_long_is_said_to_be_that(capsys):
+    for command in ("evaluate", "resume", "plot"):
+        assert main([command, "a" * 300]) == 2
+        said = capsys.readouterr().err
+        assert "has a name of more than 255 bytes" in said
+        assert "at_home" not in said

@@ -398,6 +398,9 @@ def test_a_track_of_ones_own_is_read(racing, tmp_path):
         ({"crash": -1}, "crash of DroneGates-v0 must be a number from 0 on, what a crash costs, not -1"),
         ({"crash": True}, "crash of DroneGates-v0 must be a number from 0 on, what a crash costs, not True"),
         ({"track": "none.toml"}, "none.toml is no track"),
+        ({"dynamics": 3}, "There is no dynamics '3'"),
+        ({"dynamics": "so_rpy", "mass": 10**400}, "mass must be from"),
+        ({"track": ""}, "is no track"),
         ({"track": 3}, "track of DroneGates-v0 must be the path of a file, not 3"),
         ({"freq": 0}, "freq of DroneGates-v0 must be a whole number that divides 500, not 0"),
         ({"freq": "50"}, "freq of DroneGates-v0 must be a whole number that divides 500, not '50'"),
@@ -543,3 +546,13 @@ def test_a_preflight_knows_a_finish_from_a_crash(tmp_path):
     assert not finished.terminated.any()
     assert (finished.returns > crashed.returns + 3).all()  # what a gate is worth
     assert crashed.terminated.all()  # it flies on, out of the room
+
+
+def test_a_track_is_what_its_file_holds_now(tmp_path):
+    file = tmp_path / "track.toml"
+    file.write_text(TRACK)
+    first = registry.make("DroneGates-v0", 2, kwargs={"track": str(file)})
+    file.write_text("no track")
+    with pytest.raises(UserError, match="is no track"):
+        registry.make("DroneGates-v0", 2, kwargs={"track": str(file)})
+    first.close()

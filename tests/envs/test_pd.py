@@ -22,7 +22,7 @@ MASS, H = 0.03, 0.1
 
 def command(points, velocity=(0.0, 0.0, 0.0), gains=(10.0, 5.0, 20.0, 8.0)):
     """Roll, pitch, yaw and thrust at a reference [K, 3] as seen from the drone."""
-    pd = PD(gains, MASS, BOX, slice(13, 13 + 3 * len(points)), slice(7, 10), H)
+    pd = PD([gains], [MASS], BOX, slice(13, 13 + 3 * len(points)), slice(7, 10), H)
     obs = torch.zeros(1, 13 + 3 * len(points), dtype=torch.float64)
     obs[0, 7:10] = torch.tensor(velocity)
     obs[0, 13:] = torch.tensor(points).flatten()
@@ -68,7 +68,7 @@ def test_it_flies_the_figure_eight_and_its_gains_matter():
     flown = evaluate(env.baseline, env, 8, seed=0)
     assert flown.terminated == 0
     assert flown.mean_return > 485
-    soft = evaluate(replace(env.baseline, gains=(3.0, 3.0, 3.0, 3.0)), env, 8, seed=0)
+    soft = evaluate(replace(env.baseline, gains=[(3.0, 3.0, 3.0, 3.0)]), env, 8, seed=0)
     assert soft.mean_return < flown.mean_return - 10
     assert set(GAINS) == {"so_rpy", "so_rpy_rotor", "so_rpy_rotor_drag", "first_principles"}
 
@@ -84,3 +84,14 @@ def test_of_a_baseline_there_is_neither_film_nor_page(tmp_path):
 def test_an_environment_without_a_baseline_says_so():
     with pytest.raises(lem.errors.UserError, match=r"CartPole-v1 has no baseline to compare with\."):
         lem.evaluate(lambda obs: 0, env="CartPole-v1", baseline=True)
+
+
+def test_each_of_several_dynamics_has_its_own_gains():
+    points = [[0.1, 0.0, 0.0]] * 3
+    soft, hard = command(points, gains=(10.0, 5.0, 20.0, 8.0)), command(points, gains=(30.0, 5.0, 20.0, 8.0))
+    pd = PD([(10.0, 5.0, 20.0, 8.0), (30.0, 5.0, 20.0, 8.0)], [MASS] * 2, BOX, slice(13, 22), slice(7, 10), H)
+    obs = torch.zeros(4, 22, dtype=torch.float64)
+    obs[:, 13:] = torch.tensor(points).flatten()
+    low, high = torch.tensor(BOX.low), torch.tensor(BOX.high)
+    both = low + (pd(obs).mode() + 1) / 2 * (high - low)
+    assert both.tolist() == [pytest.approx(each, abs=1e-6) for each in (soft, hard, soft, hard)]

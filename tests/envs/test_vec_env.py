@@ -1,5 +1,6 @@
 """Environments shared by several processes are those of one."""
 
+import sys
 from dataclasses import replace
 
 import pytest
@@ -158,3 +159,39 @@ def test_an_episode_that_outlives_its_limit_is_told(monkeypatch):
         require_end("Count", 50, None)
     with pytest.raises(UserError, match=r"return truncated in its step\(\)\.$"):
         require_end("Count", 50, None, can_wrap=False)
+
+
+def without(name):
+    class Lacking(Reusing):
+        def restart(self, seed, first=0):
+            obs = super().restart(seed, first)
+            if name == "counts":
+                self.counts = None
+            return obs
+
+        def step(self, action):
+            step = super().step(action)
+            return replace(step, measures={"m": 3}) if name == "measures" else step
+
+    if name == "spec":
+        Lacking.spec = property(lambda self: {}, lambda self, value: None)
+    if name == "options":
+        Lacking.__init__ = lambda self, env, num_envs, device: None
+    return Lacking
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("counts", "restart.. returns None as counts; it must be a Tensor .2. of torch.bool"),
+        ("measures", "step.. returns 3 as measures.'m'.; it must be a Tensor .2."),
+        ("spec", "must have a spec, a Spec of lemniscate.spec"),
+        ("options", "The backend .* cannot be made: TypeError: .* unexpected keyword argument"),
+    ],
+)
+def test_what_a_backend_of_ones_own_lacks_is_said(name, said, monkeypatch):
+    monkeypatch.setattr(sys.modules[__name__], "Lacking", without(name), raising=False)
+    with pytest.raises(UserError, match=said):  # noqa: PT012  (each of these may be where it is said)
+        env = registry.make("Count", 2, backend=f"{__name__}:Lacking")
+        env.restart(0)
+        env.step(torch.zeros(2, dtype=torch.int64))

@@ -84,6 +84,17 @@ def test_the_exported_c_acts_as_the_policy_does(copy, monkeypatch):
     write_json(copy / "export" / "manifest.json", {**record, "step": 128})
     with pytest.raises(lem.UserError, match="is of step 128, the policy of step 256: lemniscate export"):
         preflight(copy, compiled=True)
+    write_json(copy / "export" / "manifest.json", record)
+    text = (copy / "export" / "policy.c").read_text()
+    (copy / "export" / "policy.c").write_text(text + "\n")
+    with pytest.raises(lem.UserError, match="has been changed since it was written: lemniscate export"):
+        preflight(copy, compiled=True)
+    (copy / "export" / "policy.c").write_text(text)
+    policy = lem.load(copy)
+    with torch.no_grad():
+        policy.module.net[-1].bias += torch.arange(2) * 100.0
+    with pytest.raises(lem.UserError, match="is of another policy: lemniscate export"):
+        preflight(policy, compiled=True)
     (copy / "export" / "policy.c").unlink()
     with pytest.raises(lem.UserError, match=r"There is no whole export of .*: lemniscate export "):
         preflight(copy, compiled=True)

@@ -242,8 +242,16 @@ class Parser(argparse.ArgumentParser):
         elif several:
             shared["nargs"] = "+"
         hint = tuple[str, ...] if several else KINDS.get(kind, str)
-        shared |= {"type": at_home} if kind in PATHS else {"action": Read, "hint": hint}
+        shared |= {"type": _path} if kind in PATHS else {"action": Read, "hint": hint}
         self.add_argument(name, metavar=kind, **shared)
+
+
+def _path(text: str) -> Path:
+    """A path, with `~` for the home folder; what argparse says where it is none is the sentence on it."""
+    try:
+        return at_home(text)
+    except UserError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 class Read(argparse.Action):

@@ -34,7 +34,8 @@ def train(
 ) -> None:
     """Train one policy, or with --seeds one for each algorithm and seed, and compare them."""
     if seeds is None and "," not in algorithm:
-        usual = training.choose_config(algorithm, env, preset, {})[2].env_kwargs if "env_kwargs" in fields else {}
+        others = {name: value for name, value in fields.items() if name != "env_kwargs"}
+        usual = training.choose_config(algorithm, env, preset, others)[2].env_kwargs if others != fields else {}
         name, preset, config = training.choose_config(algorithm, env, preset, fields)
         registry.backend_class(str(config.backend))  # refuses one that is not there
         what = f"{name} on {config.num_envs} × {config.env}, backend {config.backend}"

@@ -194,6 +194,10 @@ class CrazyflowBackend(JaxBackend):
         _import()
         kwargs = dict(kwargs or {})
         _check(env, num_envs, kwargs)
+        if kwargs.get("track") is not None:  # programs are kept by what a file holds, and not by its name
+            from lemniscate.drones.gates import text_of_track
+
+            kwargs["track"] = text_of_track(kwargs["track"])
         with sentences(env, kwargs):
             hashable = {name: tuple(value) if isinstance(value, list) else value for name, value in kwargs.items()}
             shared, vectors = programs(env, num_envs, jax_device(device), tuple(sorted(hashable.items())))
@@ -213,7 +217,8 @@ class CrazyflowBackend(JaxBackend):
             first = drones.error.start
             reference, preview = slice(first, first + 3 * drones.env.n_samples), drones.env.samples_dt
             action = self.spec.bounded_box()
-            self.baseline = PD(GAINS[drones.dynamics], drones.mass, action, reference, slice(7, 10), preview)
+            each = [GAINS[one] for one in flown], [one.mass for one in vectors]
+            self.baseline = PD(*each, action, reference, slice(7, 10), preview)
 
     def _boxes(self, env: Any) -> np.ndarray:
         """The boxes of a `Scene`, of each drone's present episode."""
@@ -314,4 +319,4 @@ def _check_simulation(env_id: str, kwargs: Mapping[str, Any]) -> None:
 def dynamics_of(kwargs: Mapping[str, Any]) -> tuple[str, ...]:
     """The names of the dynamics among the arguments; none where crazyflow is to choose."""
     given = kwargs.get("dynamics")
-    return () if given is None else (given,) if isinstance(given, str) else tuple(given)
+    return () if given is None else tuple(given) if isinstance(given, list | tuple) else (given,)

@@ -95,14 +95,13 @@ class Track:
 
 
 def read_track(file: str | Path | None = None) -> Track:
-    """A track from a file as `gates.toml`, which is taken by default. Raises `UserError` for one that is none."""
-    if not isinstance(file, str | Path | None):
-        raise UserError(f"track of DroneGates-v0 must be the path of a file, not {shown(file)}.")
-    path = Path(file) if file else Path(__file__).with_name("gates.toml")
+    """A track from a file as `gates.toml`, which is taken by default, or from its text. Raises `UserError` for none."""
+    given = Path(__file__).with_name("gates.toml") if file is None else file
+    text = given if isinstance(given, str) and "\n" in given else text_of_track(given)
+    name = "The file" if text == given else given
     try:
-        table = _table(
-            tomllib.loads(path.read_text("utf-8")), "it", ("name", "order", "start", "room", "gates", "obstacles")
-        )
+        table = tomllib.loads(text)
+        _table(table, "it", ("name", "order", "start", "room", "gates", "obstacles"))
         room = _table(table["room"], "room", ("low", "high"))
         low, high, start = (_three(room["low"], "low"), _three(room["high"], "high"), _three(table["start"], "start"))
         gates = _rows(table["gates"], "gates", ("roll", "pitch", "yaw"))
@@ -111,16 +110,26 @@ def read_track(file: str | Path | None = None) -> Track:
             raise ValueError("room must reach from low to high, in metres, with the start and all gates between")
         if (np.abs(gates[:, 3:]) > 6.3).any():
             raise ValueError("roll, pitch and yaw are radians, at most 2 π")
-    except (OSError, tomllib.TOMLDecodeError, KeyError, ValueError) as error:
+    except (KeyError, ValueError, OverflowError) as error:
         what = f"it lacks {error}" if isinstance(error, KeyError) else str(error)
-        raise UserError(f"{path} is no track: {what}; one looks as lemniscate/drones/gates.toml does.") from error
+        raise UserError(f"{name} is no track: {what}; one looks as lemniscate/drones/gates.toml does.") from error
     right = isinstance(order, list) and all(type(gate) is int and 0 < abs(gate) <= len(gates) for gate in order)
     if not right or not order:
         raise UserError(
-            f"{path}: order names gates from 1 to {len(gates)}, in reverse with a minus, not {shown(order)}."
+            f"{name}: order names gates from 1 to {len(gates)}, in reverse with a minus, not {shown(order)}."
         )
     flown = np.array(order)
     return Track(gates, obstacles, np.abs(flown) - 1, flown < 0, start, np.stack([low, high]))
+
+
+def text_of_track(file: object) -> str:
+    """What a file of a track holds. Raises `UserError` where it cannot be read."""
+    if not isinstance(file, str | Path):
+        raise UserError(f"track of DroneGates-v0 must be the path of a file, not {shown(file)}.")
+    try:
+        return Path(file).read_text("utf-8") + "\n"
+    except (OSError, ValueError) as error:
+        raise UserError(f"{file} is no track: {error}; one looks as lemniscate/drones/gates.toml does.") from error
 
 
 def _table(given: Any, name: str, known: tuple[str, ...]) -> dict[str, Any]:

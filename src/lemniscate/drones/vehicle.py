@@ -71,13 +71,13 @@ def _range(name: str, value: Any) -> tuple[float, float]:
     numbers = all(isinstance(end, int | float) and not isinstance(end, bool) for end in ends)
     if len(ends) != 2 or not numbers:
         raise UserError(f"{name} must be a number or a range [low, high], not {shown(value)}.")
-    condition, (low, high) = CONDITIONS[name], map(float, ends)
+    condition, (low, high) = CONDITIONS[name], ends
     if low > high:
         raise UserError(f"{name} is a range upside down: {low:g} is above {high:g}.")
     if not condition.low <= low <= high <= condition.high:
         limits = f"from {condition.low:g} to {condition.high:g}"
         raise UserError(f"{name} must be {limits} ({condition.meaning}), not {shown(value)}.")
-    return low, high
+    return float(low), float(high)
 
 
 WORLD, BODY = "world: x, y, z, z is up", "body: x is ahead, y to the left, z up"
@@ -160,16 +160,16 @@ class PD:
     without their attitude loop, which the drone has itself. It is a function of flat observations.
 
     Attributes:
-        gains: kp, kd, kp_z, kd_z.
-        mass: that it believes in, kg.
+        gains: kp, kd, kp_z, kd_z of each of K dynamics, in which the drones are by turns.
+        mass: that it believes in, kg, [K].
         action: the bounds of roll, pitch, yaw (rad) and thrust (N).
         reference: where the observation has the reference less the position, at least three points, x, y, z each (m).
         velocity: where it has the velocity (m/s).
         preview: seconds from one point to the next.
     """
 
-    gains: Sequence[float]
-    mass: float
+    gains: Sequence[Sequence[float]]
+    mass: Sequence[float]
     action: Box
     reference: slice
     velocity: slice
@@ -177,8 +177,9 @@ class PD:
 
     def __call__(self, obs: Tensor) -> Deterministic:
         """The action [N, 4] at each observation [N, O]."""
-        horizontal, vertical = self.gains[:2], self.gains[2:]
-        kp, kd = (torch.tensor((one, one, other)) for one, other in zip(horizontal, vertical, strict=True))
+        turn = torch.arange(len(obs)) % len(self.mass)
+        gains, mass = torch.tensor(self.gains)[turn], torch.tensor(self.mass)[turn]
+        kp, kd = gains[:, [0, 0, 2]], gains[:, [1, 1, 3]]
         points = obs[:, self.reference].unflatten(1, (-1, 3))
         here, next_, after = points[:, 0], points[:, 1], points[:, 2]
         velocity = (-3 * here + 4 * next_ - after) / (2 * self.preview)  # derivatives of the parabola through them
@@ -188,6 +189,6 @@ class PD:
         size = wish.norm(dim=1)
         x, y, z = (wish / size[:, None]).unbind(1)
         roll, pitch = -torch.asin(y.clamp(-1, 1)), torch.atan2(x, z)
-        command = torch.stack([roll, pitch, torch.zeros_like(roll), self.mass * size], dim=1)
+        command = torch.stack([roll, pitch, torch.zeros_like(roll), mass * size], dim=1)
         low, high = torch.tensor(self.action.low), torch.tensor(self.action.high)
         return Deterministic((2 * (command - low) / (high - low) - 1).clamp(-1, 1))

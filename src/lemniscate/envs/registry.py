@@ -204,6 +204,17 @@ def file_name(env: str) -> str:
     return re.sub(r"[^\w.-]+", "_", env)
 
 
+def _made(cls: "type[Backend]", *arguments: Any) -> "Backend":
+    """A backend. Raises `UserError` where one of a user's own cannot be made so."""
+    *given, options = arguments
+    try:
+        return cls(*given, **options)
+    except (TypeError, AttributeError, LookupError) as error:
+        if cls.__module__.startswith("lemniscate."):
+            raise
+        raise UserError(f"The backend {cls.__name__} cannot be made: {type(error).__name__}: {error}.") from error
+
+
 def make(
     env: "str | Callable[..., Any]",
     num_envs: int,
@@ -266,7 +277,7 @@ def make(
     vectors = 1 if cls.divides(name) else len(world.held)
     once = cls.exists_once(name, int(number))
     options = {"stagger": stagger and not once, "kwargs": kwargs, "wrappers": wraps}
-    made = [cls(name, mine // vectors, torch.device(device), **options) for _ in range(vectors)]
+    made = [_made(cls, name, mine // vectors, torch.device(device), options) for _ in range(vectors)]
     if wrong := [one.num_envs for one in made if one.num_envs != mine // vectors]:
         raise UserError(f"{chosen} has {wrong[0]} environments where it was to make {mine // vectors}.")
     made[0].once = once

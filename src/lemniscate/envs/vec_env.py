@@ -34,6 +34,8 @@ class VecEnv:
 
     def __init__(self, backend: Backend, world: World = ALONE) -> None:
         self.backend, self._world = backend, world
+        if not isinstance(getattr(backend, "spec", None), Spec):
+            raise UserError(f"{type(backend).__name__} must have a spec, a Spec of lemniscate.spec.")
         self.spec = backend.spec
         self.num_envs = world.size * backend.num_envs
         self._first = world.rank * backend.num_envs
@@ -60,7 +62,9 @@ class VecEnv:
         self._recent.clear()
         self._statistics = EpisodeStatistics(self.num_envs, self.device)
         mine = self.backend.restart(seed, self._first)
-        mine = self._copy("restart", "obs", mine) if self._is_own else mine
+        if self._is_own:
+            mine = self._copy("restart", "obs", mine)
+            self._copy("restart", "counts", getattr(self.backend, "counts", None), torch.bool)
         self._actions = _action_layout(self.spec, self.num_envs)
         self._require_finite(observation=mine)
         self.obs = self._world.gather(mine)
@@ -105,6 +109,8 @@ class VecEnv:
         flags, names = ("terminated", "truncated", "valid"), ("obs", "next_obs", "reward")
         copies = {name: self._copy("step", name, getattr(step, name), torch.bool) for name in flags}
         copies |= {name: self._copy("step", name, getattr(step, name)) for name in names}
+        for name, values in step.measures.items():
+            self._copy("step", f"measures[{name!r}]", values)
         return replace(step, **{**copies, "truncated": copies["truncated"] & ~copies["terminated"]})
 
     def _copy(self, method: str, name: str, value: Any, kind: torch.dtype | None = None) -> Tensor:

@@ -3,9 +3,11 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
+from hashlib import sha256
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import torch
 
 from lemniscate.api.policy import Trained, TrainedPolicy, load, path_of
@@ -13,7 +15,7 @@ from lemniscate.envs import probe as probes
 from lemniscate.envs import registry
 from lemniscate.errors import UserError
 from lemniscate.exporting.compiled import HostPolicy, host_compiler
-from lemniscate.exporting.deployed import Act, act_with, carried, for_policy, memory_size
+from lemniscate.exporting.deployed import Act, act_with, carried, for_policy, input_size, memory_size
 from lemniscate.exporting.export import MANIFEST, commit
 from lemniscate.margins.presentation import FAILS, FALLS_SHORT, draw, rows, sentences, smoothness_sentence
 from lemniscate.margins.record import AxisMargins, margins_of, smoothness, worst_accepted
@@ -152,13 +154,21 @@ def _compiled(policy: TrainedPolicy, run: Path) -> Act:
     if compiler is None:
         raise UserError("There is no C compiler here (cc, gcc, clang or CC), which --compiled needs.")
     try:
-        step = read_json(folder / MANIFEST)["step"]
+        manifest = read_json(folder / MANIFEST)
+        step, digests = manifest["step"], manifest["files"]
         files = {name: (folder / name).read_text("utf-8") for name in ("policy.c", "policy.h")}
-    except (DamagedFileError, OSError, KeyError):
+        if any(sha256(text.encode()).hexdigest() != digests[name] for name, text in files.items()):
+            raise UserError(f"{folder} has been changed since it was written: lemniscate export {run}")
+    except (DamagedFileError, OSError, KeyError, TypeError):
         raise UserError(f"There is no whole export of {run}: lemniscate export {run}") from None
     if step != policy.step:
         raise UserError(f"{folder} is of step {step:,}, the policy of step {policy.step:,}: lemniscate export {run}")
-    return HostPolicy(files, compiler).act
+    act = HostPolicy(files, compiler).act
+    inputs = input_size(policy.spec) + memory_size(policy)
+    rows = np.random.default_rng(0).standard_normal((64, inputs)).astype(np.float32)
+    if not np.allclose(act(rows), act_with(policy)(rows), rtol=1e-2, atol=1e-2):
+        raise UserError(f"{folder} is of another policy: lemniscate export {run}")
+    return act
 
 
 def _begin(policy: TrainedPolicy, act: Act | None) -> probes.Act:
