@@ -344,7 +344,7 @@ def of_ratios(e: Evidence) -> Seen:
     kl, other, rate = e.late("approx_kl"), e.late("old_approx_kl"), e.late("learning_rate")
     every, entropy, rates = e.values("approx_kl"), e.values("losses/entropy"), e.values("learning_rate")
     tenth, adapts, clipped = len(every) // 10, e.config.get("desired_kl") is not None, e.late("clip_fraction")
-    fell = tenth >= 1 and len(rates) == len(every) and rates[-tenth:].mean() < 0.2 * rates[0]
+    fell = tenth >= 2 and len(rates) == len(every) and rates[-tenth:].mean() < 0.2 * rates[0]
     if adapts and rate < 3e-6 and kl > 1e-3:
         yield (
             "ratio-not-one",
