@@ -419,7 +419,7 @@ def in_other_forms(tmp_path_factory):
     wrong = plain.replace("gamma * after", "after")
     drafts = f"%%writefile 'lib/a draft.py'\n{wrong}", "%%writefile notes.md\n# so", plain
     (folder / "draft.ipynb").write_text(hand_ins.notebook(*drafts))
-    (folder / "profiles.ipynb").write_text(hand_ins.notebook(f"%%prun\n{plain}", "%%bash\nls"))
+    (folder / "profiles.ipynb").write_text(hand_ins.notebook(f"%%prun\n{plain}", "%%bash echo 'it\nls", "%%writefile"))
     (folder / "package" / "mine" / "__init__.py").touch()
     (folder / "package" / "mine" / "helper.py").write_text(plain.replace("discounted_returns", "their_returns"))
     uses = "from .helper import their_returns\n\ndef discounted_returns(rewards, gamma):\n    return their_returns(rewards, gamma)\n"

@@ -400,7 +400,7 @@ MISTAKES = {
     ),
     "torch's Adam": (
         ("optimizer = Adam(networks, max_grad_norm=1.0)\n    optimizer.learning_rate = config.learning_rate", TORCHS),
-        "State.optimizer is a Adam, whose state_dict has 'state', no tensor: optimizers are those of lemniscate.optim.adam",
+        "State.optimizer is an Adam, whose state_dict has 'state', no tensor: optimizers are those of lemniscate.optim.adam",
     ),
     "a function": (
         ("    optimizer: Adam\n", "    optimizer: Adam\n    f: object = print\n"),

@@ -13,12 +13,14 @@ from pathlib import Path
 import psutil
 import pytest
 from hosts import hosts
+from torch.distributed.elastic.multiprocessing.errors import ChildFailedError, ProcessFailure
 
 import lemniscate as lem
 from cluster.worlds import KINDS, SHARDS, finish, free_port, outcome, ranks, train, wait_for, words
 from forks import command
 from lemniscate.api.options import CAUGHT, _undone
-from lemniscate.errors import UserError
+from lemniscate.errors import RankError, UserError
+from lemniscate.run.stopping import Stopped
 from lemniscate.system.world import World
 
 ALWAYS = ("ppo",)
@@ -278,15 +280,27 @@ def test_processes_launches_them_and_leaves_none(tmp_path):
         time.sleep(0.05)
 
 
-@pytest.mark.cluster
-def test_a_process_that_is_killed_is_named_and_is_no_stop(tmp_path):
-    launcher = command(*ENDLESS, tmp_path / "endless", "--processes", 2)
-    wait_for(tmp_path / "endless" / "metrics.jsonl")
-    mine = [p for p in psutil.Process(launcher.pid).children(recursive=True) if "resume" in p.cmdline()]
-    max(mine, key=lambda process: process.pid).kill()
-    said = launcher.communicate(timeout=60)
-    assert launcher.returncode == 1, said
-    assert "SIGKILL" in str(said) or "was killed" in str(said), said
+@pytest.mark.parametrize(
+    ("codes", "error", "said"),
+    [
+        ({1: -9, 0: 143}, RankError, "Process 1 of the run was killed"),
+        ({1: 143, 0: -9}, Stopped, "^$"),
+        ({0: -9, 1: -9}, RankError, "All processes of the run were killed"),
+        ({0: 1}, RankError, "^$"),
+    ],
+)
+def test_a_process_that_is_killed_is_named_and_is_no_stop(tmp_path, monkeypatch, codes, error, said):
+    """`codes` are the exit codes by rank, in the order in which the processes failed."""
+
+    def launch(*_):
+        failures = {rank: ProcessFailure(rank, 1, code, "") for rank, code in codes.items()}
+        for when, failure in enumerate(failures.values()):
+            failure.timestamp = when
+        raise ChildFailedError("lemniscate", failures)
+
+    monkeypatch.setattr("torch.distributed.launcher.api.elastic_launch", lambda *_: launch)
+    with pytest.raises(error, match=said):
+        lem.train("ppo", "CartPole-v1", run=tmp_path / "run", processes=2, progress=False)
 
 
 def test_what_the_launcher_changes_is_undone(monkeypatch):

@@ -552,7 +552,7 @@ def test_a_track_is_what_its_file_holds_now(tmp_path):
     file = tmp_path / "track.toml"
     file.write_text(TRACK)
     first = registry.make("DroneGates-v0", 2, kwargs={"track": str(file)})
-    file.write_text("no track")
-    with pytest.raises(UserError, match="is no track"):
+    file.write_text(TRACK.replace("start = [-1.0", "start = [nan"))
+    with pytest.raises(UserError, match=r"track\.toml is no track: start must be three numbers"):
         registry.make("DroneGates-v0", 2, kwargs={"track": str(file)})
     first.close()

@@ -26,7 +26,6 @@ from lemniscate.system.world import World
 SECONDS_TO_END = 10
 """that the processes have to end by themselves, once one has ended or the launcher was asked to stop"""
 
-
 CAUGHT = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT") if hasattr(signal, name)]
 """the signals that torch's launcher catches"""
 

@@ -14,7 +14,6 @@ import inspect
 import json
 import os
 import re
-import shlex
 import signal
 import socket
 import sys
@@ -141,7 +140,7 @@ class Reader:
             with limited(seconds):
                 exec(compile(ast.Module([node], []), str(file), "exec", flags, dont_inherit=True), scope)
         except TooLong:
-            self.notes.append(f"{where}: left out, since it did not end within {seconds:g} s.")
+            self.notes.append(f"{where}: left out, since it did not end within {seconds:.2g} s.")
         except BaseException as error:  # what ends a program, too, ends this statement alone
             absent = isinstance(error, ModuleNotFoundError) and f"the package {error.name} is not installed here"
             reason = absent or f"{type(error).__name__}: {error}".rstrip(".: ")
@@ -178,12 +177,13 @@ class Reader:
     def _set_aside(self, notebook: Path, cell: str, source: str) -> None:
         """Write the module that a cell with %%writefile is; of a cell in another language, say that it is left out."""
         head, _, body = source.partition("\n")
-        magic, *words = shlex.split(head)
+        magic, _, given = head.partition(" ")
         if magic in ("%%writefile", "%%file"):
-            file = notebook.parent / words[-1]
-            with suppress(OSError):
+            name = given.strip().removeprefix("-a ")
+            file = notebook.parent / name.strip(" '\"")
+            with suppress(OSError, ValueError):
                 file.parent.mkdir(parents=True, exist_ok=True)
-                with file.open("a" if "-a" in words else "w", encoding="utf-8") as written:
+                with file.open("w" if name == given.strip() else "a", encoding="utf-8") as written:
                     written.write(f"{body}\n")
                 self._written += [file] if file.suffix == ".py" else []
                 importlib.invalidate_caches()

@@ -469,7 +469,7 @@ def of_advantages(e: Evidence) -> Seen:
             f"Changes of log π and advantages have a correlation of {followed.mean():.2f}: none.",
         )
     preferred = e.late("action/preferred")
-    drowned = e.late("temperature") * abs(e.late("losses/entropy")) > e.greatest("reward/largest")  # Q tells entropies
+    drowned = e.late("temperature") * abs(e.late("losses/entropy")) > e.greatest("reward/largest")  # Q is of entropies
     if preferred < 0.4 and e.q_steps >= 500 and not drowned:  # healthy runs have 0.7 or more; a new Q says nothing
         yield (
             "advantage-opposed",
@@ -487,7 +487,7 @@ def of_advantages(e: Evidence) -> Seen:
     if centred and len(weight) >= 4 and np.median(np.abs(weight)) > 0.4:  # healthy runs have less than 0.2
         yield (
             "advantage-not-normalized",
-            f"The policy's loss is {np.median(weight):.2g}, and about 0 where the mean of the advantages is.",
+            f"The policy's loss is {np.median(weight):.2g}; it is about 0 where advantages have a mean of 0.",
         )
 
 

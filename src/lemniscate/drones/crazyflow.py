@@ -195,8 +195,9 @@ class CrazyflowBackend(JaxBackend):
         kwargs = dict(kwargs or {})
         _check(env, num_envs, kwargs)
         if kwargs.get("track") is not None:  # programs are kept by what a file holds, and not by its name
-            from lemniscate.drones.gates import text_of_track
+            from lemniscate.drones.gates import read_track, text_of_track
 
+            read_track(kwargs["track"])  # says by the file's name what is wrong with it
             kwargs["track"] = text_of_track(kwargs["track"])
         with sentences(env, kwargs):
             hashable = {name: tuple(value) if isinstance(value, list) else value for name, value in kwargs.items()}

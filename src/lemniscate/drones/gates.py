@@ -123,7 +123,7 @@ def read_track(file: str | Path | None = None) -> Track:
 
 
 def text_of_track(file: object) -> str:
-    """What a file of a track holds. Raises `UserError` where it cannot be read."""
+    """The text of a track's file, with a line break at its end. Raises `UserError` where it cannot be read."""
     if not isinstance(file, str | Path):
         raise UserError(f"track of DroneGates-v0 must be the path of a file, not {shown(file)}.")
     try:

@@ -204,11 +204,10 @@ def file_name(env: str) -> str:
     return re.sub(r"[^\w.-]+", "_", env)
 
 
-def _made(cls: "type[Backend]", *arguments: Any) -> "Backend":
+def _made(cls: "type[Backend]", env: str, num_envs: int, device: Any, options: dict[str, Any]) -> "Backend":
     """A backend. Raises `UserError` where one of a user's own cannot be made so."""
-    *given, options = arguments
     try:
-        return cls(*given, **options)
+        return cls(env, num_envs, device, **options)
     except (TypeError, AttributeError, LookupError) as error:
         if cls.__module__.startswith("lemniscate."):
             raise

@@ -22,7 +22,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
-from lemniscate.errors import NonFiniteError, UserError, shown
+from lemniscate.errors import NonFiniteError, UserError, shown, with_article
 from lemniscate.run.state import TrainState
 from lemniscate.spec import Action, ObservationPart, Spec
 from lemniscate.system import files
@@ -75,17 +75,16 @@ def write(directory: Path, fields: Mapping[str, Any], step: int, record: dict[st
     return final
 
 
-def require_stored(kind: str, fields: Mapping[str, Any]) -> None:
-    """Raise `UserError` for a field of a State that a checkpoint cannot hold."""
+def require_storable(kind: str, fields: Mapping[str, Any]) -> None:
+    """Raise `UserError` for a field of a State of this `kind` that a checkpoint cannot hold."""
     for name, value in fields.items():
-        state = value.state_dict() if hasattr(value, "state_dict") else {}
-        if odd := [key for key, tensor in state.items() if not isinstance(tensor, Tensor)]:
-            raise UserError(
-                f"{kind}.{name} is a {type(value).__name__}, whose state_dict has {odd[0]!r}, no tensor: optimizers are"
-                " those of lemniscate.optim.adam."
-            )
+        if hasattr(value, "state_dict"):
+            if odd := [key for key, tensor in value.state_dict().items() if not isinstance(tensor, Tensor)]:
+                what = f"{with_article(type(value).__name__)}, whose state_dict has {odd[0]!r}, no tensor"
+                raise UserError(f"{kind}.{name} is {what}: optimizers are those of lemniscate.optim.adam.")
+            continue
         try:
-            json.dumps(None if hasattr(value, "state_dict") else value)
+            json.dumps(value)
         except (TypeError, ValueError):
             raise UserError(
                 f"{kind}.{name} is {shown(value)}: a field of a State is a number, or has state_dict and"

@@ -305,7 +305,7 @@ class RunConfig:
         return [field.name for field in dataclasses.fields(cls)]
 
     def to_json(self) -> dict[str, Any]:
-        """A dictionary that survives JSON."""
+        """A dictionary that survives JSON. Raises `UserError` for a field that does not."""
         try:
             return json.loads(json.dumps(dataclasses.asdict(self)))
         except TypeError as error:

@@ -27,7 +27,7 @@ from lemniscate.envs.vec_env import Episodes, VecEnv
 from lemniscate.errors import NonFiniteError, NotStoredError, UserError, resume_line, shown
 from lemniscate.nn.memory import Carrier
 from lemniscate.optim.compiled import Compiler
-from lemniscate.run.checkpoint import require_stored
+from lemniscate.run.checkpoint import require_storable
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import Saver, load_networks
 from lemniscate.run.environments import Curriculum
@@ -111,7 +111,7 @@ class Run:
         saved as a checkpoint at step 0, so that from then on the run does not depend on where its networks came from.
         """
         saver = self._saver
-        require_stored(type(state).__name__, state.saved())
+        require_storable(type(state).__name__, state.saved())
         if not saver.exists:  # first, since it may fail
             self._begin(state)
         saver.open()
@@ -187,6 +187,7 @@ class Run:
         """Write one line of metrics.
 
         Raises `NonFiniteError` where a loss, the gradient or a parameter is NaN or infinite; no checkpoint is touched.
+        Raises `UserError` for metrics that are no scalars, and for a `state.step` that is no whole number.
         """
         try:
             numbers = {name: float(value) for name, value in metrics.items()}
