@@ -5,6 +5,7 @@ import os
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -622,3 +623,10 @@ def test_a_name_that_is_too_long_is_said_to_be_that(capsys):
         said = capsys.readouterr().err
         assert "has a name of more than 255 bytes" in said
         assert "at_home" not in said
+
+
+def test_a_backend_of_ones_own_takes_arguments_of_the_environment(tmp_path, monkeypatch, capsys):
+    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "examples")
+    sizes = ["--num-envs", "4", "--num-steps", "16", "--minibatch-size", "64", "--total-steps", "64"]
+    words = ["train", "ppo", "--env", "Glide-v0", "--backend", "own_simulator:Glide", "--env-args", '{"x": 1}', *sizes]
+    assert main([*words, "--run", str(tmp_path / "run")]) == 0, capsys.readouterr().err

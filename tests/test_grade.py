@@ -397,9 +397,9 @@ FILLED = {
     "later.py": ("SCALE = {}\ndef set_up():\n    SCALE.update(a=1.0)", "SCALE['a']", "set_up()"),
     "set anew.py": ("SCALE = {'a': 1.0}\nfor each in (1.0, 5.0):\n    SCALE['a'] = each", "SCALE['a']", ""),
     "long.py": (
-        "SCALE = {}\nSCALE['a'] = 1.0\nseen = []",
-        "(SCALE['a'] + 0 * len(seen))",
-        "while True:\n    seen.append(1)",
+        "SCALE = {}\nSCALE['a'] = 1.0\nseen, more = [], []",
+        "(SCALE['a'] + 0 * len(seen) + 0 * len(more))",
+        "while True:\n    seen.append(1)\nwhile True:\n    more.append(1)",
     ),
     "global.py": ("def set_up():\n    global SCALE\n    SCALE = 1.0", "SCALE", "set_up()"),
 }
@@ -451,8 +451,10 @@ def test_right_solutions_in_other_forms_are_right(in_other_forms, name):
         ("large.ipynb", "large.ipynb has 64 MB; at most 64 are read: clear the outputs of a notebook."),
         ("package", ""),
         ("draft.ipynb", ""),
+        ("long.py", "left out, since it did not end within 3 s."),
     ],
 )
 def test_what_is_left_out_is_said(in_other_forms, hand_in, words):
     said = notes(in_other_forms, hand_in)
     assert words in said if words else said == ""
+    assert said.count("did not end") <= 1  # all loops share the time of one

@@ -481,6 +481,15 @@ def test_ends_that_v_ignores_may_feed_on_themselves():
     assert names(**beyond, changed={"gamma": 0.3}) == ["setting-gamma"]
 
 
+def test_one_look_is_too_few_for_a_ratio_that_is_not_one():
+    def falls(lines):
+        rates = list(np.linspace(1e-3, 1e-5, lines))
+        return names(approx_kl=[0.03] * lines, learning_rate=rates, changed={"desired_kl": None})
+
+    assert falls(18) == []
+    assert falls(40) == ["ratio-not-one"]
+
+
 def test_q_of_entropies_tells_nothing_of_signs():
     of_entropies = {"q": [1.0] * 8, "reward__mean": [-1.0] * 8, "reward__std": [0.1] * 8}
     assert names("sac", **of_entropies) == []

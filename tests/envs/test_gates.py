@@ -548,11 +548,20 @@ def test_a_preflight_knows_a_finish_from_a_crash(tmp_path):
     assert crashed.terminated.all()  # it flies on, out of the room
 
 
-def test_a_track_is_what_its_file_holds_now(tmp_path):
-    file = tmp_path / "track.toml"
-    file.write_text(TRACK)
-    first = registry.make("DroneGates-v0", 2, kwargs={"track": str(file)})
+def test_a_track_is_what_its_file_holds_now(tmp_path, monkeypatch):
+    """Programs are kept by their arguments; to compile others would take half a minute."""
+    file, kept = tmp_path / "track.toml", []
+
+    def programs(*given):
+        kept.append(given)
+        raise UserError("that is all")
+
+    monkeypatch.setattr("lemniscate.drones.crazyflow.programs", programs)
+    for text in (TRACK, TRACK, TRACK.replace("start = [-1.0", "start = [-1.1")):
+        file.write_text(text)
+        with pytest.raises(UserError, match="that is all"):
+            registry.make("DroneGates-v0", 2, kwargs={"track": str(file)})
+    assert kept[0] == kept[1] != kept[2]
     file.write_text(TRACK.replace("start = [-1.0", "start = [nan"))
     with pytest.raises(UserError, match=r"track\.toml is no track: start must be three numbers"):
         registry.make("DroneGates-v0", 2, kwargs={"track": str(file)})
-    first.close()
