@@ -113,6 +113,14 @@ CASES = {
         {"algorithm": "ddpg", "changed": {"critic_hidden": []}},
         {"algorithm": "ddpg", "changed": {"critic_hidden": [64]}},
     ),
+    "replay-differs": (
+        {"algorithm": "sac", "replay__other_limits": [1.0] * 8},
+        {"algorithm": "sac", "replay__other_limits": [0.4] * 8},
+    ),
+    "acts-at-mode": (
+        {"action__off_mode": [0.1] * 8, "losses__entropy": [1.0] * 8},
+        {"action__off_mode": [0.1] * 3 + [1.0] * 5, "losses__entropy": [1.0] * 8},
+    ),
     "replay-repeated": (
         {"algorithm": "sac", "replay__repeated": [1.0] * 8},
         {"algorithm": "sac", "replay__repeated": [0.3] * 8},
@@ -571,6 +579,41 @@ def test_of_a_q_that_has_hardly_learned_no_bias_is_told():
 def test_returns_that_fall_while_q_begins_are_no_finding():
     assert "gets-worse" not in names("td3", returns=RISES[::-1], steps=19_000)
     assert "gets-worse" in names("td3", returns=RISES[::-1], steps=30_000)
+
+
+@pytest.mark.parametrize("column", ["actions", "next", "signs", "ends", "limits"])
+def test_what_is_stored_otherwise_is_named_by_its_column_and_before_what_follows(column):
+    metrics = {f"replay__other_{each}": [float(each == column)] * 8 for each in ("actions", "next", "signs", "ends")}
+    metrics["replay__other_limits"] = [float(column == "limits")] * 8
+    follows = {"replay__repeated": [1.0] * 8, "td_error__newest": [20.0] * 8, "td_error__sampled": [1.0] * 8}
+    assert names("sac", **metrics, **follows) == ["replay-differs"]
+
+
+def test_a_deterministic_policy_is_near_its_mode():
+    assert "acts-at-mode" not in names("td3", action__off_mode=[0.1] * 8)
+
+
+def test_a_v_of_the_other_sign_is_named():
+    opposed = {"value__missing": [-2.0] * 8, "reward__mean": [-6.0] * 8}
+    assert names(**opposed, reward__std=[3.0] * 8) == ["q-opposed"]
+    assert names(**opposed, reward__std=[9.0] * 8) == []  # rewards of both signs
+    assert names(**opposed | {"value__missing": [-0.9] * 8}, reward__std=[3.0] * 8) == []  # V is too large
+
+
+def test_a_value_is_judged_by_the_targets_of_gae_too():
+    own = {"explained_variance": [0.95] * 8, "losses__value": [0.5] * 8}
+    assert names(**own, value__explained=[0.6] * 8) == []
+    assert names(**own, value__explained=[0.0] * 8) == ["value-explains-nothing"]
+    constant = {"explained_variance": [-1e9] * 8, "losses__value": [0.0] * 8}
+    assert names(**constant, value__explained=[0.0] * 8) == ["value-explains-nothing"]
+    assert names(**constant) == []
+
+
+def test_of_reppo_the_sign_the_divergence_and_the_bootstrap_are_judged():
+    assert "advantage-opposed" in names("reppo", action__preferred=[0.05] * 8, steps=100_000)
+    assert "kl-too-large" in names("reppo", kl=[0.5] * 8)
+    assert "missing-bootstrap" in names("reppo", value__missing=[30.0] * 8, reward__explained=[0.5] * 8)
+    assert names("reppo", value__missing=[0.5] * 8, episode__terminated=[0.0] * 8) == []  # Q is on its way
 
 
 def test_every_rule_has_a_case():

@@ -12,6 +12,7 @@ from torch import nn
 import lemniscate as lem
 from conftest import tiny_fields, tiny_off_policy
 from lemniscate.algos import ppo
+from lemniscate.data.replay import ReplayBuffer
 from lemniscate.maths import Deterministic, explained_by, explained_by_each, gae
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.networks import Layers
@@ -27,15 +28,17 @@ from lemniscate.run.signals import (
     of_effects,
     of_environment,
     of_networks,
+    of_replay,
     of_rows,
     of_starts,
     of_time,
+    of_update,
     of_values,
     paid_before,
     signals,
 )
 from lemniscate.spec import Box, Discrete, MultiDiscrete, ObservationPart, Spec
-from lemniscate.types import Rollout, Transition
+from lemniscate.types import Rollout, Step, Transition
 
 B, O, A = 400, 3, 2
 
@@ -521,11 +524,14 @@ def test_the_correlation_of_advantages_and_of_what_an_update_did_to_the_policy(a
     state, rows = stateful(action)
     before = acted_with(state)
     old = state.policy(rows.obs).log_prob(rows.action).detach()
+    value, after = state.networks.value(rows.obs).detach(), state.networks.value(rows.next_obs).detach()
     with torch.no_grad():
         for parameter in state.policy.parameters():
             parameter.add_(0.1 * torch.randn_like(parameter))
     state.policy.observe(5 * rows.obs, rows.valid)  # the normalizer is a part of what changed
-    value, after = state.networks.value(rows.obs).detach(), state.networks.value(rows.next_obs).detach()
+    with torch.no_grad():  # V of before the update is what advantages are of
+        for parameter in state.networks.value.parameters():
+            parameter.add_(0.1)
     advantage = np.zeros((T, N))
     for n in range(N):
         for t in reversed(range(T)):
@@ -536,10 +542,14 @@ def test_the_correlation_of_advantages_and_of_what_an_update_did_to_the_policy(a
     newest = rows.valid.numpy() & (np.arange(T) >= T - 12)[:, None]
     expected = np.corrcoef(advantage[newest], change[newest])[0, 1]
     config = SimpleNamespace(gamma=0.9, num_steps=12)
-    assert of_values(state, config, rows, before)["advantage/followed"].item() == pytest.approx(expected, abs=1e-4)
-    still = of_values(state, config, rows, acted_with(state))
+    found = of_update(state, config, rows, before)
+    assert found["advantage/followed"].item() == pytest.approx(expected, abs=1e-4)
+    target = (advantage + value.numpy())[newest]
+    left = np.var(target - value.numpy()[newest]) / np.var(target)
+    assert found["value/explained"].item() == pytest.approx(1 - left, abs=1e-4)
+    still = of_update(state, config, rows, acted_with(state))
     assert still["advantage/followed"] == still["network/moved"] == 0
-    assert "advantage/followed" not in of_values(state, config, rows)
+    assert of_update(state, config, rows, None) == {}
 
 
 def test_the_way_of_a_policy_is_that_of_its_parameters_alone():
@@ -547,17 +557,17 @@ def test_the_way_of_a_policy_is_that_of_its_parameters_alone():
     before = acted_with(state)
     state.policy.observe(5 * rows.obs, rows.valid)
     config = SimpleNamespace(gamma=0.9, num_steps=12)
-    assert of_values(state, config, rows, before)["network/moved"] == 0
+    assert of_update(state, config, rows, before)["network/moved"] == 0
     with torch.no_grad():
         for parameter in state.policy.parameters():
             parameter *= 1.25
-    found = of_values(state, config, rows, before)
+    found = of_update(state, config, rows, before)
     assert found["network/moved"].item() == pytest.approx(0.2)
     assert found["value/moved"] == 0
     with torch.no_grad():
         for parameter in state.networks.value.parameters():
             parameter *= 0.5
-    assert of_values(state, config, rows, before)["value/moved"].item() == pytest.approx(1.0)
+    assert of_update(state, config, rows, before)["value/moved"].item() == pytest.approx(1.0)
 
 
 def test_ppo_follows_its_advantages_and_with_a_wrong_sign_it_does_not(tmp_path):
@@ -655,6 +665,78 @@ def test_the_policys_action_stands_beside_one_at_random(action, weight, share):
     state = SimpleNamespace(replay=replay, updates=1, networks=networks, targets=QIsTheAction(), policy=AtAnEnd(action))
     rows = Rollout(**vars(columns), truncated=columns.terminated, valid=~columns.terminated)
     assert of_critics(state, SimpleNamespace(gamma=0.9), rows)["action/preferred"] == share
+
+
+def test_a_q_without_replay_is_measured_at_the_newest_rows():
+    """Q is the action: 1 at the policy's, 0 at those that were taken; γ = 0.9, rewards of −2, ends at every other row."""
+    ends = torch.arange(B) % 2 == 0
+    networks = SimpleNamespace(q=lambda obs, action: action[:, 0] + 0 * obs[:, 0], entropy_bonus=lambda *_: 0.5)
+    state = SimpleNamespace(networks=networks, policy=AtAnEnd(1.0))
+    taken = rows(action=torch.full((B, 1), 0.5), reward=torch.full((B,), -2.0), terminated=ends)
+    found = of_critics(state, SimpleNamespace(gamma=0.9), taken)
+    assert found.keys() == {"action/preferred", "value/missing", "value/at_ends"}
+    assert found["action/preferred"] == 1
+    target = -2 + 0.9 * 1.5 / 2  # on average
+    assert found["value/missing"] == pytest.approx((target - 0.5) / (0.1 * 0.5), rel=1e-5)
+    assert found["value/at_ends"] == 1  # 0.5 is less than 0.5 + 2
+
+
+@pytest.mark.parametrize("changed", ["actions", "next", "signs", "ends", "limits", None])
+def test_what_stands_otherwise_in_the_replay_buffer_is_found(changed):
+    """Rows of two environments, some of them not valid, in a ring that they fill more than once."""
+    steps, envs = 40, 2
+    obs, after = numbers(steps, envs, O).float(), numbers(steps, envs, O, seed=1).float()
+    flags = torch.zeros(steps, envs, dtype=torch.bool)
+    terminated, truncated, valid = flags.clone(), flags.clone(), ~flags
+    terminated[[30, 35], 0] = truncated[33, 1] = True
+    valid[34, 1] = False
+    recent = Rollout(
+        obs,
+        numbers(steps, envs, A, seed=2).float(),
+        numbers(steps, envs, seed=3).float(),
+        after,
+        terminated,
+        truncated,
+        valid,
+    )
+    replay = ReplayBuffer(spec_of(), 70, torch.device("cpu"))
+    for row in range(steps):
+        one = recent[row]
+        replay.add(
+            one.obs,
+            one.action + (changed == "actions"),
+            Step(
+                one.obs,
+                obs[row] if changed == "next" else one.next_obs,
+                -one.reward if changed == "signs" else one.reward,
+                one.terminated | one.truncated if changed == "limits" else one.terminated & (changed != "ends"),
+                one.truncated,
+                one.valid,
+            ),
+        )
+    found = of_replay(SimpleNamespace(replay=replay), recent)
+    assert found == {
+        f"replay/other_{name}": float(name == changed) for name in ("actions", "next", "signs", "ends", "limits")
+    }
+    assert of_replay(SimpleNamespace(replay=None), recent) == {}
+
+
+def test_rows_that_look_alike_differ_where_none_of_them_agrees():
+    same = rows(obs=torch.zeros(B, O), action=torch.zeros(B, A))
+    replay = ReplayBuffer(spec_of(), B, torch.device("cpu"))
+    replay.extend(Transition(same.obs, same.action, same.reward, same.next_obs, same.terminated))
+    found = of_replay(SimpleNamespace(replay=replay), same[None])
+    assert len(found) == 3
+    assert not any(found.values())
+
+
+def test_the_distance_from_the_mode_is_one_for_actions_that_were_drawn():
+    networks = ActorCritic(spec_of(), Layers((8,)), -0.5)
+    obs = numbers(B, O).float()
+    noise = networks.policy.draw_noise((B,), torch.Generator().manual_seed(1))
+    for action, away in ((networks.policy.act(obs, noise), 1.0), (networks.policy.act(obs, 0 * noise), 0.0)):
+        found = of_networks(SimpleNamespace(policy=networks.policy), rows(obs=obs, action=action))
+        assert found["action/off_mode"].item() == pytest.approx(away, abs=0.1)
 
 
 def test_before_there_are_rows_there_are_no_signals():

@@ -60,6 +60,11 @@ class ReplayBuffer:
         """Rows of `transitions`, drawn uniformly with replacement: [minibatches, size] int64."""
         return torch.randint(len(self), (minibatches, size), generator=generator, device=generator.device)
 
+    def newest(self, count: int) -> Tensor:
+        """Rows of `transitions`, the `count` that were added last or as many as there are, oldest first: int64."""
+        count = min(count, len(self))
+        return torch.arange(self._written - count, self._written, device=self.transitions.reward.device) % self.capacity
+
     def state_dict(self) -> dict[str, Tensor]:
         """The rows that are filled, not copied, [B, …]; and the number ever written."""
         rows = {name: ring[: len(self)] for name, ring in vars(self.transitions).items()}

@@ -109,9 +109,13 @@ class Evidence:
 
     @property
     def q_steps(self) -> float:
-        """The gradient steps that Q has had, with replay."""
-        learned = self.log[-1]["step"] - self.config.get("learning_starts", 0) if self.log else 0
-        return self.config.get("replay_ratio", 0.0) * max(0, learned)
+        """The gradient steps that Q(s, a) has had, from replay or from epochs of rollouts."""
+        learned, size = (
+            self.log[-1]["step"] - self.config.get("learning_starts", 0) if self.log else 0,
+            "minibatch_size",
+        )
+        ratio = self.config["epochs"] / self.config[size] if {"epochs", size} <= set(self.config) else 0.0
+        return self.config.get("replay_ratio", ratio) * max(0, learned)
 
     @cached_property
     def rose(self) -> bool:

@@ -90,9 +90,15 @@ CONSEQUENCES = {
     "advantage-not-normalized": {"ratio-not-one"},
     "advantage-opposed": {"ratio-not-one"},
     "gradient-grows": {"value-runaway"},
-    "policy-still": {"step-refused"},
+    "policy-still": {"step-refused", "acts-at-mode"},
+    "advantage-unrelated": {"acts-at-mode"},
+    "q-unfollowed": {"acts-at-mode"},
+    "acts-at-mode": {"advantage-opposed"},
+    "replay-repeated": {"replay-differs"},
     "setting-entropy-coef": {"entropy-opposed"},
-    "targets-of-others": {"critic-still"},
+    "targets-of-others": {"critic-still", "replay-differs"},
+    "critic-overfits": {"replay-differs"},
+    "q-opposed": {"replay-differs"},
 }
 """faults that are not named beside one of these, which brings them about"""
 
@@ -376,7 +382,7 @@ def of_ratios(e: Evidence) -> Seen:
 
 def of_updates(e: Evidence) -> Seen:
     """Faults of the update's size."""
-    kl = e.late("approx_kl")
+    kl = np.fmax(e.late("approx_kl"), e.late("kl"))
     target = next(filter(None, map(first_number, map(e.config.get, ("target_kl", "desired_kl", "max_kl")))), None)
     if kl > (2 * target if target else 0.1):
         beside = f"{kl / target:.0f} times its target of {target:g}" if target else "and 0.003 to 0.03 is usual"
@@ -402,6 +408,12 @@ def of_exploration(e: Evidence) -> Seen:
     epsilon, final = e.values("epsilon"), last_number(e.config.get("final_epsilon"))
     if len(epsilon) >= 4 and np.ptp(epsilon) == 0 and final is not None and abs(epsilon[0] - final) > 0.01:
         yield "exploration-still", f"epsilon is {epsilon[0]:g} in each line, and is to end at {final:g}."
+    away, drawn = e.late("action/off_mode"), "losses/entropy"
+    if away < 0.25 and len(e.values(drawn)) and np.isfinite(e.late(drawn)):
+        yield (
+            "acts-at-mode",
+            f"Actions lie {away:.2f} times as far from the policy's mode as those that are drawn from it.",
+        )
     if late > max(3 * first, 2.0):
         yield (
             "std-exploded",
@@ -470,7 +482,8 @@ def of_advantages(e: Evidence) -> Seen:
         )
     preferred = e.late("action/preferred")
     drowned = e.late("temperature") * abs(e.late("losses/entropy")) > e.greatest("reward/largest")  # Q is of entropies
-    if preferred < 0.4 and e.q_steps >= 500 and not drowned:  # healthy runs have 0.7 or more; a new Q says nothing
+    tells = e.q_steps >= 500 and (preferred < 0.1 or not drowned)  # a new Q says nothing
+    if preferred < 0.4 and tells:  # healthy runs have 0.7 or more
         yield (
             "advantage-opposed",
             f"In {preferred:.0%} of the sampled states Q of the policy's action is above that of one at random.",
@@ -498,7 +511,11 @@ def _standard_errors(values: np.ndarray) -> float:
 
 def of_values(e: Evidence) -> Seen:
     """Faults of V: bootstraps, explained variance, targets that feed on themselves."""
-    missing, explained, last = e.last_half("value/missing"), e.late("explained_variance"), e.ends[1]
+    missing, last = e.last_half("value/missing"), e.ends[1]
+    own, of_gae = map(e.last_half, ("explained_variance", "value/explained"))
+    constant = len(own) and np.median(own) < -1
+    shares = of_gae if len(of_gae) and (constant or not len(own) or np.median(of_gae) < np.median(own)) else own
+    explained = float(np.median(shares)) if len(shares) else np.nan
     losses, fits = e.values("losses/value"), e.late("losses/value")
     grew = np.median(losses[len(losses) // 4 :]) / max(losses[0], 0.05) if len(losses) >= 4 else np.nan
     settled = len(last) > 0 and last.std() <= 0.05 * abs(last.mean())  # there is nothing left to explain
@@ -508,12 +525,13 @@ def of_values(e: Evidence) -> Seen:
             f"{np.median(missing):.0%} of the value that follows is missing, and most episodes end at a time limit.",
         )
     # Below -1 targets are constant; a weak baseline of REINFORCE, which has no λ, does no harm.
-    nothing = -1 < explained < 0.05 and np.percentile(e.last_half("explained_variance"), 90) <= 0.15 and not fits < 1e-4
+    nothing = -1 < explained < 0.05 and np.percentile(shares, 90) <= 0.15 and (constant or not fits < 1e-4)
     above = np.median(missing) * (1 - (first_number(e.config.get("gamma")) or 0.0)) if len(missing) else 0.0
     away = np.abs(missing).min() if len(missing) >= 2 else 0.0  # healthy values come nearer than 5
     one_reward = nothing and not settled and len(missing) >= 2 and missing.min() > 5
     paid = e.late("reward/explained") > 0.1 or e.late("reward/std") == 0  # by what is seen, or always the same
     few = (one_reward or (away > 40 and explained < 0.3)) if "gae_lambda" in e.config else away > 40 and fits < 1e-3
+    few = few or ("td_lambda" in e.config and away > 7 and missing.min() > 0)
     if grew > (7 if e.config.get("scale_rewards") else 50) and not e.rose:
         yield "value-runaway", f"The loss of V grew to {grew:,.0f} times what it was, though returns did not rise."
     elif few and paid and not e.early("value/moved") < 1e-3:  # else it has only not learned
@@ -532,7 +550,23 @@ def of_values(e: Evidence) -> Seen:
 def _lacks_bootstrap(e: Evidence) -> bool:
     """Whether a share of the value is missing, and not on its way, where most episodes end at a time limit."""
     missing = e.last_half("value/missing")
-    return len(missing) >= 2 and _is_missing(missing) and e.late("episode/terminated") < 0.5 and not e.begins
+    climbs = e.begins or "min_temperature" in e.config  # REPPO's Q, which is behind for as long as returns rise
+    return len(missing) >= 2 and _is_missing(missing) and e.late("episode/terminated") < 0.5 and not climbs
+
+
+def of_replay(e: Evidence) -> Seen:
+    """Faults of what stands in the replay buffer."""
+    for name, least, what in (
+        ("actions", 0.5, "the stored transitions the action is not the one that was taken."),
+        ("next", 0.01, "the stored transitions the next observation is not the one that followed."),
+        ("signs", 0.5, "the stored transitions the reward has not the sign of the one that was paid."),
+        ("ends", 0.5, "the terminations none is stored."),
+        ("limits", 0.5, "the steps that a limit cut off a termination is stored."),
+    ):
+        share = e.late(f"replay/other_{name}")
+        if share > least:
+            yield "replay-differs", f"In {share:.0%} of {what}"
+            return
 
 
 def of_targets(e: Evidence) -> Seen:
@@ -560,6 +594,9 @@ def of_targets(e: Evidence) -> Seen:
     one_sign = abs(mean) > 2 * e.late("reward/std") and "initial_temperature" not in e.config  # entropies are positive
     if one_sign and len(q) >= 4 and (q * mean < 0).all() and abs(np.median(q)) > 0.2 * abs(mean):
         yield "q-opposed", f"Q is {np.median(q):.3g}, and the rewards are {mean:.3g} on average: of the other sign."
+    missing = e.last_half("value/missing") if "gae_lambda" in e.config else q[:0]
+    if abs(mean) > e.late("reward/std") and len(missing) >= 4 and missing.max() < -1.5:  # below -1 signs differ
+        yield "q-opposed", f"V has to move by {-np.median(missing):.1f} times itself, to the other side of 0."
 
 
 def of_what_stands_still(e: Evidence) -> Seen:
@@ -703,6 +740,7 @@ SUBJECTS = (
     of_entropies,
     of_advantages,
     of_values,
+    of_replay,
     of_targets,
     of_what_stands_still,
     of_networks,

@@ -118,6 +118,8 @@ class WatchedVectorEnv(AsyncVectorEnv):
     """Gymnasium's `AsyncVectorEnv`, with at most `patience` seconds for each answer."""
 
     patience: float = 60.0
+    _is_broken = False
+    """whether a worker has died or has not answered"""
 
     def reset(self, *, seed: Any = None, options: Any = None) -> Any:
         """Gymnasium's, with the timeout. Raises `WorkerError` if a worker died or does not answer."""
@@ -148,6 +150,7 @@ class WatchedVectorEnv(AsyncVectorEnv):
             ask()
             return wait(timeout=self.patience)
         except (multiprocessing.TimeoutError, EOFError, ConnectionError):
+            self._is_broken = True
             raise WorkerError(self._diagnosis()) from None
 
     def _raise_if_errors(self, successes: Iterable[bool]) -> None:
@@ -172,8 +175,11 @@ class WatchedVectorEnv(AsyncVectorEnv):
         return f"Environment {', '.join(silent) or 'unknown'} has not answered for {self.patience:g} s."
 
     def close_extras(self, timeout: float | None = None, terminate: bool = False) -> None:
-        """Ask every worker to close its environment; kill those that do not, or are in the middle of a step."""
-        terminate = terminate or self._state is not AsyncState.DEFAULT
+        """Ask every worker to close its environment; kill those that do not, or are in the middle of a step.
+
+        Where one has not answered, all of them are killed at once.
+        """
+        terminate = terminate or self._is_broken or self._state is not AsyncState.DEFAULT
         for pipe in self.parent_pipes:
             if pipe is not None and not pipe.closed:
                 with suppress(OSError):

@@ -94,8 +94,12 @@ class SoftActorQ(ActorQ):
 
     def entropy_bonus(self, obs: Tensor, generator: Generator) -> Tensor:
         """−α log π(a|s) of an action drawn at each observation [B, O], [B]."""
-        _, log_prob = self.policy(obs).sample_with_log_prob(self.policy.draw_noise((len(obs),), generator))
-        return -self.temperature() * log_prob
+        return _bonus(self.temperature(), self.policy, obs, generator)
+
+
+def _bonus(temperature: Tensor, policy: Policy, obs: Tensor, generator: Generator) -> Tensor:
+    _, log_prob = policy(obs).sample_with_log_prob(policy.draw_noise((len(obs),), generator))
+    return -temperature * log_prob
 
 
 class Multipliers(nn.Module):
@@ -163,6 +167,10 @@ class ActorCategoricalQ(nn.Module):
     def q(self, obs: Tensor, action: Tensor) -> Tensor:
         """[B, O] and [B, A] to Q(s, a), [B]."""
         return self.critic(obs, action)
+
+    def entropy_bonus(self, obs: Tensor, generator: Generator) -> Tensor:
+        """−α log π(a|s) of an action drawn at each observation [B, O], [B]."""
+        return _bonus(self.multipliers()[0], self.policy, obs, generator)
 
     def estimates(self, obs: Tensor, next_obs: Tensor, action: Tensor, noise: Tensor) -> tuple[Tensor, ...]:
         """Q(s, a), Q(s', a') and log π(a'|s') of an a' drawn with `noise`, μ and log σ of π(·|s): of rows [T, N, …]."""

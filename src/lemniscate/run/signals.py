@@ -6,15 +6,18 @@ learns from them.
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from itertools import combinations
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Generator, Tensor, nn
 from torch.func import functional_call
 from torch.nn.functional import one_hot
 
-from lemniscate.maths import explained_by, explained_by_each, gae, moments, td_target
+from lemniscate.data.replay import ReplayBuffer
+from lemniscate.maths import explained_by, explained_by_each, explained_variance, gae, moments, td_target
+from lemniscate.nn.actor_critic import of_next
 from lemniscate.nn.networks import ACTIVATIONS
 from lemniscate.nn.normalizer import RunningNorm
 from lemniscate.run.config import RunConfig
@@ -30,6 +33,8 @@ KINDS = (
 """how the names of signals begin"""
 LATEST = 6
 """steps until an action that is late takes effect, up to which it is looked for"""
+PARTS = "policy.", "value."
+"""how the names of the parameters of a policy and of V(s) begin"""
 SEEN = 256
 """rows that the networks are asked about"""
 FEW = 40
@@ -54,8 +59,11 @@ def signals(
     """
     if rows is None or rows.valid.sum() < 2:
         return {}
-    chosen = rows[rows.valid]
-    found = of_networks(state, chosen) | of_critics(state, config, chosen) | of_values(state, config, rows, acted)
+    chosen, scaled = rows[rows.valid], rows
+    if getattr(config, "scale_rewards", False) and hasattr(state, "reward_scale"):
+        scaled = replace(rows, reward=state.reward_scale(rows.reward))
+    found = of_networks(state, chosen) | of_values(state, config, scaled) | of_update(state, config, scaled, acted)
+    found |= of_replay(state, rows) | of_critics(state, config, scaled[rows.valid])
     return of_environment(rows, spec) | {name: float(value) for name, value in found.items()}
 
 
@@ -281,11 +289,13 @@ def of_networks(state: Any, rows: Rollout) -> dict[str, Tensor]:
     modules = [module for module in state.policy.modules() if isinstance(module, UNITS)]
     hooks = [module.register_forward_hook(lambda _module, _inputs, output: layers.append(output)) for module in modules]
     try:
-        state.policy(obs)
+        distribution = state.policy(obs)
     finally:
         for hook in hooks:
             hook.remove()
     found = dict[str, Tensor]()
+    if hasattr(distribution, "sample"):  # a policy of one's own may say something else
+        found["action/off_mode"] = _off_mode(state.policy, distribution, obs, rows.action[-SEEN:])
     if units := [layer.flatten(1).float() for layer in layers if layer.ndim > 1 and len(layer) == len(obs)]:
         spread = [_spread(layer) for layer in units]
         inactive = [std < (std.mean() / 40).clamp(min=1e-3) for std in spread]
@@ -303,51 +313,80 @@ def of_networks(state: Any, rows: Rollout) -> dict[str, Tensor]:
     return found
 
 
-def of_values(
-    state: Any, config: RunConfig, rows: Rollout, acted: Mapping[str, Tensor] | None = None
-) -> dict[str, Tensor]:
-    """Of V and of the newest update, from rows [T, N, …], for algorithms with a V(s); of Q(s, ·) it is the largest.
+def _off_mode(policy: Any, distribution: Any, obs: Tensor, action: Tensor) -> Tensor:
+    """The distance of actions from the policy's mode over that of actions drawn from it; 0 for a mode that is not left.
+
+    Of a deterministic policy it is the distance itself, in units of half the action range.
+    """
+    drawn = distribution.sample(policy.draw_noise(obs.shape[:1], Generator(obs.device).manual_seed(0)))
+    away, usual = ((x - distribution.mode()).float().square().mean().sqrt() for x in (action, drawn))
+    return away / usual if usual > 0 else away
+
+
+def of_values(state: Any, config: RunConfig, rows: Rollout) -> dict[str, Tensor]:
+    """Of V, from rows [T, N, …], for algorithms with a V(s); of Q(s, ·) it is the largest.
 
     - value/missing: the mean of r + γ V(s') − V(s) over (1 − γ) |V|, above 0 where V is too small. That mean is 1 − γ
       times the difference of the policy's value and V. Where learning takes the value behind a time limit for 0, the
       share is that of the discounted steps which the limit cuts off.
     - value/at_ends: the mean of V(s) − r, or of V(s) where that is less, over |V| where an episode terminated: what V
       awaits beyond its end. Where V knows nothing of a large last reward, V(s) says so.
-    - advantage/followed: the correlation of A(s, a) and of the change of log π(a|s) in the newest update.
-    - network/moved and value/moved: the length of the way of the policy's parameters and of V's in that update, as a
-      share of the length of these.
     """
-    gamma = getattr(config, "gamma", 1.0)
+    gamma, valid, found = getattr(config, "gamma", 1.0), rows.valid, dict[str, Tensor]()
     if not hasattr(state.networks, "value"):
         return {}
-    if getattr(config, "scale_rewards", False) and hasattr(state, "reward_scale"):
-        rows = replace(rows, reward=state.reward_scale(rows.reward))
-    obs, next_obs, action = (x.flatten(0, 1) for x in (rows.obs, rows.next_obs, rows.action))  # as networks know them
-    value, after = (state.networks.value(x).view(rows.done.shape) for x in (obs, next_obs))
-    found, size, valid, ends = dict[str, Tensor](), value[rows.valid].abs().mean(), rows.valid, rows.terminated
+    value = state.networks.value(rows.obs.flatten(0, 1)).view(valid.shape)  # of rows, not of pieces
+    after = of_next(state.networks.value, value, rows.obs, rows.next_obs)
+    chosen, value, after = rows[valid], value[valid], after[valid]
     if gamma < 1:
-        target = td_target(rows.reward[valid], after[valid], ends[valid], gamma=gamma)
-        found["value/missing"] = _missing(target, value[valid], gamma)
-    if ends.any():
-        last, beyond = value[ends], (value - rows.reward)[ends]
-        awaited = torch.where(last.abs() < beyond.abs(), last, beyond)
-        found["value/at_ends"] = awaited.mean() * value[valid].mean().sign() / size
-    if acted is not None:
-        for name, beginning in (("network/moved", "policy."), ("value/moved", "value.")):
-            own = [(acted[key], now) for key, now in state.networks.named_parameters() if key.startswith(beginning)]
-            if own:
-                before, after_it = (torch.cat([x.flatten() for x in each]) for each in zip(*own, strict=True))
-                found[name] = (after_it - before).norm() / after_it.norm()
-    if acted is not None and isinstance(state.networks.value, nn.Module):  # not the largest of Q
-        advantage, _ = gae(rows.reward, value, after, ends, rows.done, gamma=gamma, lam=0.95)
-        of_policy = {key.removeprefix("policy."): x for key, x in acted.items() if key.startswith("policy.")}
-        old = functional_call(state.policy, of_policy, (obs,), tie_weights=False).log_prob(action)
-        change = (state.policy(obs).log_prob(action) - old).view(valid.shape)
-        steps = getattr(config, "num_steps", len(valid))  # REINFORCE collects whole episodes
-        newest = valid & (torch.arange(len(valid), device=valid.device) >= len(valid) - steps)[:, None]
-        both = torch.stack([advantage, change])[:, newest]
-        found["advantage/followed"] = torch.corrcoef(both)[0, 1].nan_to_num() if both.shape[1] > 1 else torch.zeros(())
+        found["value/missing"] = _missing(td_target(chosen.reward, after, chosen.terminated, gamma=gamma), value, gamma)
+    if chosen.terminated.any():
+        found["value/at_ends"] = _awaited(value, chosen.reward, chosen.terminated)
     return found
+
+
+def of_update(state: Any, config: RunConfig, rows: Rollout, acted: Mapping[str, Tensor] | None) -> dict[str, Tensor]:
+    """Of the newest update, from rows [T, N, …] and the networks before it, for algorithms with a V(s).
+
+    - network/moved and value/moved: the length of the way of the policy's parameters and of V's, as a share of the
+      length of these.
+    - advantage/followed: the correlation of A(s, a) and of the change of log π(a|s).
+    - value/explained: the explained variance of the targets of V, of γ and λ = 0.95, by V before the update.
+    """
+    found, networks = dict[str, Tensor](), state.networks
+    if acted is None or not hasattr(networks, "value"):
+        return {}
+    for name, beginning in zip(("network/moved", "value/moved"), PARTS, strict=True):
+        own = [(acted[key], now) for key, now in networks.named_parameters() if key.startswith(beginning)]
+        if own:
+            before, after = (torch.cat([x.flatten() for x in each]) for each in zip(*own, strict=True))
+            found[name] = (after - before).norm() / after.norm()
+    if not isinstance(networks.value, nn.Module):  # but the largest of Q
+        return found
+    parts = [{key.removeprefix(of): x for key, x in acted.items() if key.startswith(of)} for of in PARTS]
+    old, old_value = (partial(_of_old, *each) for each in zip((state.policy, networks.value), parts, strict=True))
+    obs, action, done, gamma = (
+        rows.obs.flatten(0, 1),
+        rows.action.flatten(0, 1),
+        rows.done,
+        getattr(config, "gamma", 1.0),
+    )
+    value = old_value(obs).view(done.shape)
+    next_value = of_next(old_value, value, rows.obs, rows.next_obs)
+    advantage, target = gae(rows.reward, value, next_value, rows.terminated, done, gamma=gamma, lam=0.95)
+    change = (state.policy(obs).log_prob(action) - old(obs).log_prob(action)).view(done.shape)
+    steps = getattr(config, "num_steps", len(done))  # REINFORCE collects whole episodes
+    newest = rows.valid & (torch.arange(len(done), device=done.device) >= len(done) - steps)[:, None]
+    if newest.sum() > 1:
+        found["advantage/followed"] = torch.corrcoef(torch.stack([advantage, change])[:, newest])[0, 1].nan_to_num()
+        if _spread(target[newest]) > 1e-3 * target[newest].abs().mean():  # else there is nothing to explain
+            found["value/explained"] = explained_variance(value[newest], target[newest])
+    return found
+
+
+def _of_old(module: nn.Module, tensors: Mapping[str, Tensor], obs: Tensor) -> Any:
+    """What a module says with other parameters and buffers."""
+    return functional_call(module, dict(tensors), (obs,), tie_weights=False)
 
 
 def acted_with(state: Any) -> dict[str, Tensor]:
@@ -356,43 +395,94 @@ def acted_with(state: Any) -> dict[str, Tensor]:
     return {name: tensor.clone() for name, tensor in parts.items()}
 
 
-def _missing(target: Tensor, value: Tensor, gamma: float) -> Tensor:
-    return (target - value).mean() * value.mean().sign() / ((1 - gamma) * value.abs().mean())
+def of_replay(state: Any, rows: Rollout) -> dict[str, Tensor]:
+    """How some of the newest rows [T, N, …], found by their observation, stand in the replay buffer, ends first.
+
+    - replay/other_actions, replay/other_next: the shares with another action, and with another next observation.
+    - replay/other_signs: that with a reward of another sign, of which 0 is one.
+    - replay/other_ends, replay/other_limits: of terminations and of truncations that which stands there as none, and as
+      one.
+    """
+    replay, newest = getattr(state, "replay", None), rows[rows.valid][-4 * SEEN :]
+    if not isinstance(replay, ReplayBuffer) or replay.mirror or newest.obs.shape[1] > 2 * MOST_NUMBERS:
+        return {}
+    last = torch.arange(len(newest.reward), device=newest.done.device) >= len(newest.reward) - SEEN // 4
+    given, stored = newest[newest.done | last], replay.transitions[replay.newest(2 * len(newest.reward))]
+    column = int(_spread(given.obs).argmax())
+    pairs = (given.obs[:, column, None] == stored.obs[:, column]).nonzero()
+    row, place = pairs[(given.obs[pairs[:, 0]] == stored.obs[pairs[:, 1]]).all(1)].unbind(1)
+    of_row, of_place = given[row], stored[place]
+    found = dict[str, Tensor]()
+    for name, agrees, which in (
+        ("actions", (of_row.action - of_place.action).abs().amax(-1) < 1e-5, torch.ones_like(given.done)),
+        ("next", (of_row.next_obs == of_place.next_obs).all(-1), torch.ones_like(given.done)),
+        ("signs", of_row.reward.sign() == of_place.reward.sign(), torch.ones_like(given.done)),
+        ("ends", of_place.terminated, given.terminated),
+        ("limits", ~of_place.terminated, given.truncated & ~given.terminated),
+    ):
+        there = which[row]
+        known, right = (set(row[each].tolist()) for each in (there, there & agrees))
+        if known:
+            found[f"replay/other_{name}"] = torch.tensor(1 - len(right) / len(known))
+    return found
 
 
 def of_critics(state: Any, config: RunConfig, rows: Rollout) -> dict[str, Tensor]:
     """The mean squared error of Q over one step, of the newest rows and of sampled ones, and the share that is missing.
 
-    For algorithms that learn Q from replay. Also the length of the target networks' weights, their distance from Q's as
-    a share of the length of these, and shares of the sampled transitions: of those that end where they began, and of
-    those in which Q of the policy's action is above that of one at random.
+    For algorithms that learn Q(s, a) of continuous actions; those that have no replay sample the newest rows. Also what
+    Q awaits where an episode terminated, beyond its reward, over |Q|; the length of the target networks' weights, their
+    distance from Q's as a share of the length of these; and the share of the sampled transitions in which Q of the
+    policy's action is above that of one at random.
     """
-    replay, updates = getattr(state, "replay", None), getattr(state, "updates", 0)
-    if replay is None or not updates or not hasattr(state.networks, "critics"):
+    replay, networks, gamma = getattr(state, "replay", None), state.networks, getattr(config, "gamma", 1.0)
+    if not hasattr(networks, "entropy_bonus") or not getattr(state, "updates", replay is None):
         return {}
-    generator = torch.Generator(replay.transitions.reward.device).manual_seed(updates)  # none of the run's own
-    columns = rows.obs, rows.action, rows.reward, rows.next_obs, rows.terminated
-    sampled = replay.transitions[replay.sample_indices(1, SEEN, generator)[0]]
-    critics, targets = state.networks.critics, getattr(state.targets, "critics", state.targets)
-    gamma = getattr(config, "gamma", 1.0)
+    generator = Generator(rows.reward.device).manual_seed(getattr(state, "updates", 0))  # none of the run's own
+    newest = sampled = Transition(rows.obs, rows.action, rows.reward, rows.next_obs, rows.terminated)[-SEEN:]
+    critics = targets = None
+    if replay is not None:
+        sampled = replay.transitions[replay.sample_indices(1, SEEN, generator)[0]]
+        critics, targets = networks.critics, getattr(state.targets, "critics", state.targets)
+
+    def critic(*pair: Tensor) -> Tensor:
+        return critics(*pair)[0] if critics else networks.q(*pair)
 
     def estimates(batch: Transition) -> tuple[Tensor, Tensor]:
-        value = targets(batch.next_obs, state.policy(batch.next_obs).mode()).amin(0)
-        value = value + state.networks.entropy_bonus(batch.next_obs, generator)
-        return td_target(batch.reward, value, batch.terminated, gamma=gamma), critics(batch.obs, batch.action)[0]
+        pair = batch.next_obs, state.policy(batch.next_obs).mode()
+        value = targets(*pair).amin(0) if targets else networks.q(*pair)
+        value = value + networks.entropy_bonus(batch.next_obs, generator)
+        return td_target(batch.reward, value, batch.terminated, gamma=gamma), critic(batch.obs, batch.action)
 
-    (target, q), (other_target, other_q) = map(estimates, (Transition(*columns)[-SEEN:], sampled))
-    chosen, chance = (
-        state.policy(sampled.obs).mode(),
-        torch.empty_like(sampled.action).uniform_(-1, 1, generator=generator),
+    (target, q), (other_target, other_q) = map(estimates, (newest, sampled))
+    chosen = state.policy(sampled.obs).mode()
+    better = critic(sampled.obs, chosen) - critic(
+        sampled.obs, torch.empty_like(chosen).uniform_(-1, 1, generator=generator)
     )
-    better = critics(sampled.obs, chosen)[0] - critics(sampled.obs, chance)[0]
-    found = {
-        "action/preferred": (0.5 + 0.5 * better.sign()).mean(),  # where Q is flat, neither
-        "td_error/newest": (q - target).square().mean(),
-        "td_error/sampled": (other_q - other_target).square().mean(),
-        "replay/repeated": (sampled.obs == sampled.next_obs).flatten(1).all(1).float().mean(),
-    }
-    own, behind = (torch.cat([p.flatten() for p in each.parameters()]) for each in (critics, targets))
-    found |= {"targets/behind": (own - behind).norm() / own.norm(), "targets/length": behind.norm()}
-    return found | ({"value/missing": _missing(target, q, gamma)} if gamma < 1 else {})
+    found = {"action/preferred": (0.5 + 0.5 * better.sign()).mean()}  # where Q is flat, neither
+    if gamma < 1:
+        found["value/missing"] = _missing(target, q, gamma)
+    ends = torch.cat([newest.terminated, sampled.terminated])
+    if ends.any():
+        found["value/at_ends"] = _awaited(torch.cat([q, other_q]), torch.cat([newest.reward, sampled.reward]), ends)
+    if critics and targets:
+        own, behind = (torch.cat([p.flatten() for p in each.parameters()]) for each in (critics, targets))
+        found |= {
+            "td_error/newest": (q - target).square().mean(),
+            "td_error/sampled": (other_q - other_target).square().mean(),
+            "replay/repeated": (sampled.obs == sampled.next_obs).flatten(1).all(1).float().mean(),
+            "targets/behind": (own - behind).norm() / own.norm(),
+            "targets/length": behind.norm(),
+        }
+    return found
+
+
+def _missing(target: Tensor, value: Tensor, gamma: float) -> Tensor:
+    return (target - value).mean() * value.mean().sign() / ((1 - gamma) * value.abs().mean())
+
+
+def _awaited(value: Tensor, reward: Tensor, ends: Tensor) -> Tensor:
+    """The mean of what values [B] await at ends beyond the reward, or of themselves where that is less, over |V|."""
+    last, beyond = value[ends], (value - reward)[ends]
+    awaited = torch.where(last.abs() < beyond.abs(), last, beyond)
+    return awaited.mean() * value.mean().sign() / value.abs().mean()
