@@ -594,10 +594,11 @@ def test_a_deterministic_policy_is_near_its_mode():
 
 
 def test_a_v_of_the_other_sign_is_named():
-    opposed = {"value__missing": [-2.0] * 8, "reward__mean": [-6.0] * 8}
+    opposed = {"value__mean": [3.0] * 8, "value__missing": [-2.0] * 8, "reward__mean": [-6.0] * 8}
     assert names(**opposed, reward__std=[3.0] * 8) == ["q-opposed"]
     assert names(**opposed, reward__std=[9.0] * 8) == []  # rewards of both signs
-    assert names(**opposed | {"value__missing": [-0.9] * 8}, reward__std=[3.0] * 8) == []  # V is too large
+    assert names(**opposed | {"value__mean": [3.0] * 7 + [-1.0]}, reward__std=[3.0] * 8) == []
+    assert names(**opposed | {"value__mean": [-3.0] * 8}, reward__std=[3.0] * 8) == []  # V is too large
 
 
 def test_a_value_is_judged_by_the_targets_of_gae_too():

@@ -594,9 +594,10 @@ def of_targets(e: Evidence) -> Seen:
     one_sign = abs(mean) > 2 * e.late("reward/std") and "initial_temperature" not in e.config  # entropies are positive
     if one_sign and len(q) >= 4 and (q * mean < 0).all() and abs(np.median(q)) > 0.2 * abs(mean):
         yield "q-opposed", f"Q is {np.median(q):.3g}, and the rewards are {mean:.3g} on average: of the other sign."
-    missing = e.last_half("value/missing") if "gae_lambda" in e.config else q[:0]
-    if abs(mean) > e.late("reward/std") and len(missing) >= 4 and missing.max() < -1.5:  # below -1 signs differ
-        yield "q-opposed", f"V has to move by {-np.median(missing):.1f} times itself, to the other side of 0."
+    value, missing = e.last_half("value/mean"), e.last_half("value/missing")
+    one_sign = abs(mean) > e.late("reward/std") and "gae_lambda" in e.config
+    if one_sign and len(value) >= 4 and missing.max(initial=-np.inf) < -1 and (value * mean < 0).all():
+        yield "q-opposed", f"V is {np.median(value):.3g}, and the rewards are {mean:.3g} on average: of the other sign."
 
 
 def of_what_stands_still(e: Evidence) -> Seen:

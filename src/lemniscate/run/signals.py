@@ -324,7 +324,7 @@ def _off_mode(policy: Any, distribution: Any, obs: Tensor, action: Tensor) -> Te
 
 
 def of_values(state: Any, config: RunConfig, rows: Rollout) -> dict[str, Tensor]:
-    """Of V, from rows [T, N, …], for algorithms with a V(s); of Q(s, ·) it is the largest.
+    """Of V, from rows [T, N, …], for algorithms with a V(s); of Q(s, ·) it is the largest. value/mean is its mean.
 
     - value/missing: the mean of r + γ V(s') − V(s) over (1 − γ) |V|, above 0 where V is too small. That mean is 1 − γ
       times the difference of the policy's value and V. Where learning takes the value behind a time limit for 0, the
@@ -338,6 +338,7 @@ def of_values(state: Any, config: RunConfig, rows: Rollout) -> dict[str, Tensor]
     value = state.networks.value(rows.obs.flatten(0, 1)).view(valid.shape)  # of rows, not of pieces
     after = of_next(state.networks.value, value, rows.obs, rows.next_obs)
     chosen, value, after = rows[valid], value[valid], after[valid]
+    found["value/mean"] = value.mean()
     if gamma < 1:
         found["value/missing"] = _missing(td_target(chosen.reward, after, chosen.terminated, gamma=gamma), value, gamma)
     if chosen.terminated.any():
