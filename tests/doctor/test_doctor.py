@@ -601,6 +601,12 @@ def test_a_v_of_the_other_sign_is_named():
     assert names(**opposed | {"value__mean": [-3.0] * 8}, reward__std=[3.0] * 8) == []  # V is too large
 
 
+def test_a_value_that_is_behind_by_ever_other_shares_lacks_no_bootstrap():
+    limited = {"episode__terminated": [0.0] * 8}
+    assert names(value__missing=[0.9, 1.0] * 4, **limited) == ["missing-bootstrap"]
+    assert names(value__missing=[0.5, 1.2] * 4, **limited) == []
+
+
 def test_a_value_is_judged_by_the_targets_of_gae_too():
     own = {"explained_variance": [0.95] * 8, "losses__value": [0.5] * 8}
     assert names(**own, value__explained=[0.6] * 8) == []

@@ -625,6 +625,7 @@ def _is_missing(late: np.ndarray) -> bool:
     """Whether a share of the value is missing, and not on its way; above 1.3 there is no value at all."""
     first, last = np.split(late, [len(late) // 2])
     some = 0.2 < np.median(late) < 1.3 and np.percentile(late, 10) > 0.1
+    some = some and late.std() < 0.35 * np.median(late)  # what a limit cuts off is the same share early and late
     return bool(some and last.mean() >= 0.75 * first.mean())
 
 
