@@ -579,6 +579,17 @@ def test_of_a_q_that_has_hardly_learned_no_bias_is_told():
 def test_returns_that_fall_while_q_begins_are_no_finding():
     assert "gets-worse" not in names("td3", returns=RISES[::-1], steps=19_000)
     assert "gets-worse" in names("td3", returns=RISES[::-1], steps=30_000)
+    assert "gets-worse" not in names("pqn", returns=RISES[::-1], steps=50_000)
+    assert "gets-worse" in names("pqn", returns=RISES[::-1], steps=500_000)
+
+
+def test_advantages_that_are_followed_by_chance_alone_are_unrelated_however_strongly():
+    assert names(advantage__followed=[0.4, -0.3] * 8, approx_kl=[0.01] * 16) == ["advantage-unrelated"]
+    assert names(advantage__followed=[0.4, 0.0] * 8, approx_kl=[0.01] * 16) == []
+
+
+def test_beside_steps_that_go_too_far_the_time_explains_rewards():
+    assert names("trpo", reward__by_time=[0.9] * 8, kl=[0.9] * 8) == ["kl-too-large"]
 
 
 @pytest.mark.parametrize("column", ["actions", "next", "signs", "ends", "limits"])

@@ -104,8 +104,9 @@ class Evidence:
 
     @property
     def begins(self) -> bool:
-        """Whether Q has hardly begun: with replay it comes slowly, and the first policies are worse than chance."""
-        return "tau" in self.config and bool(self.log) and self.log[-1]["step"] < 20_000
+        """Whether Q has hardly begun: it comes slowly, and the first policies are worse than chance."""
+        greedy = "final_epsilon" in self.config and self.q_steps < 5_000
+        return greedy or ("tau" in self.config and bool(self.log) and self.log[-1]["step"] < 20_000)
 
     @property
     def q_steps(self) -> float:

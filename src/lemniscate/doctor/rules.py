@@ -91,10 +91,11 @@ CONSEQUENCES = {
     "advantage-opposed": {"ratio-not-one"},
     "gradient-grows": {"value-runaway"},
     "policy-still": {"step-refused", "acts-at-mode"},
-    "advantage-unrelated": {"acts-at-mode"},
+    "advantage-unrelated": {"acts-at-mode", "kl-too-large"},
     "q-unfollowed": {"acts-at-mode"},
     "acts-at-mode": {"advantage-opposed"},
     "replay-repeated": {"replay-differs"},
+    "reward-by-time": {"kl-too-large"},
     "setting-entropy-coef": {"entropy-opposed"},
     "targets-of-others": {"critic-still", "replay-differs"},
     "critic-overfits": {"replay-differs"},
@@ -475,7 +476,7 @@ def of_advantages(e: Evidence) -> Seen:
             "advantage-opposed",
             f"The probabilities of actions fall with their advantage: the correlation is {followed.mean():.2f}.",
         )
-    elif errors <= 2 and not wrong and followed.mean() <= 0.04 and moves:
+    elif not wrong and moves and ((errors <= 2 and followed.mean() <= 0.04) or (len(followed) >= 8 and errors <= 1)):
         yield (
             "advantage-unrelated",
             f"Changes of log π and advantages have a correlation of {followed.mean():.2f}: none.",
