@@ -602,6 +602,8 @@ def test_what_is_stored_otherwise_is_named_by_its_column_and_before_what_follows
 
 def test_a_deterministic_policy_is_near_its_mode():
     assert "acts-at-mode" not in names("td3", action__off_mode=[0.1] * 8)
+    alone = {"action__off_mode": [0.003] * 8, "action__effect": [0.0] * 8}
+    assert names("td3", **alone) == ["acts-at-mode"]  # actions that are never varied show no effect
 
 
 def test_a_v_of_the_other_sign_is_named():

@@ -83,12 +83,13 @@ FAR = 3.0
 """the factor outside of its usual range from which on a setting is named"""
 
 CONSEQUENCES = {
-    "action-without-effect": {"observation-repeated"},
+    "action-without-effect": {"acts-at-mode", "observation-repeated"},
     "steps-short": {"observation-repeated", "exploding-observation"},
     "action-late": {"exploding-observation"},
     "reward-unexplained": {"exploding-observation"},
     "advantage-not-normalized": {"ratio-not-one"},
-    "advantage-opposed": {"ratio-not-one"},
+    "advantage-opposed": {"ratio-not-one", "targets-behind"},
+    "targets-alike": {"critic-still"},
     "gradient-grows": {"value-runaway"},
     "policy-still": {"step-refused", "acts-at-mode"},
     "advantage-unrelated": {"acts-at-mode", "kl-too-large"},
@@ -409,8 +410,9 @@ def of_exploration(e: Evidence) -> Seen:
     epsilon, final = e.values("epsilon"), last_number(e.config.get("final_epsilon"))
     if len(epsilon) >= 4 and np.ptp(epsilon) == 0 and final is not None and abs(epsilon[0] - final) > 0.01:
         yield "exploration-still", f"epsilon is {epsilon[0]:g} in each line, and is to end at {final:g}."
-    away, drawn = e.late("action/off_mode"), "losses/entropy"
-    if away < 0.25 and len(e.values(drawn)) and np.isfinite(e.late(drawn)):
+    away, tried = e.late("action/off_mode"), e.values("action/off_mode")
+    never = len(tried) >= 3 and tried[:3].max() < 0.01 and not e.rose  # of a deterministic policy there is no more
+    if (away < 0.25 and np.isfinite(e.late("losses/entropy"))) or never:
         yield (
             "acts-at-mode",
             f"Actions lie {away:.2f} times as far from the policy's mode as those that are drawn from it.",
