@@ -620,6 +620,12 @@ def test_a_value_that_is_behind_by_ever_other_shares_lacks_no_bootstrap():
     assert names(value__missing=[0.5, 1.2] * 4, **limited) == []
 
 
+def test_a_value_that_stays_a_tenth_of_what_follows_has_one_reward_in_it():
+    shown = {"explained_variance": [0.1] * 8, "losses__value": [0.5] * 8, "reward__explained": [0.9] * 8}
+    assert names(value__missing=[13.0, 14.0] * 4, **shown) == ["missing-bootstrap"]
+    assert names(value__missing=[13.0, 6.0] * 4, **shown) == []
+
+
 def test_a_value_is_judged_by_the_targets_of_gae_too():
     own = {"explained_variance": [0.95] * 8, "losses__value": [0.5] * 8}
     assert names(**own, value__explained=[0.6] * 8) == []

@@ -531,7 +531,8 @@ def of_values(e: Evidence) -> Seen:
     nothing = -1 < explained < 0.05 and np.percentile(shares, 90) <= 0.15 and (constant or not fits < 1e-4)
     above = np.median(missing) * (1 - (first_number(e.config.get("gamma")) or 0.0)) if len(missing) else 0.0
     away = np.abs(missing).min() if len(missing) >= 2 else 0.0  # healthy values come nearer than 5
-    one_reward = nothing and not settled and len(missing) >= 2 and missing.min() > 5
+    steady = len(missing) >= 3 and missing.std() < 0.1 * np.median(missing)
+    one_reward = (nothing or steady) and not settled and len(missing) >= 2 and missing.min() > 5
     paid = e.late("reward/explained") > 0.1 or e.late("reward/std") == 0  # by what is seen, or always the same
     few = (one_reward or (away > 40 and explained < 0.3)) if "gae_lambda" in e.config else away > 40 and fits < 1e-3
     few = few or ("td_lambda" in e.config and away > 7 and missing.min() > 0)
