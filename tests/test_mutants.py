@@ -1633,8 +1633,8 @@ MUTANTS = [
     (
         "an update is judged by the rows of others too",
         "run/signals.py",
-        "newest = rows.valid & (",
-        "newest = rows.valid | (",
+        "rows.done, rows.valid\n    value, gamma",
+        "rows.done, torch.ones_like(rows.valid)\n    value, gamma",
         "run/test_signals.py::test_the_correlation_of_advantages_and_of_what_an_update_did_to_the_policy",
     ),
     (

@@ -366,18 +366,12 @@ def of_update(state: Any, config: RunConfig, rows: Rollout, acted: Mapping[str, 
         return found
     parts = [{key.removeprefix(of): x for key, x in acted.items() if key.startswith(of)} for of in PARTS]
     old, old_value = (partial(_of_old, *each) for each in zip((state.policy, networks.value), parts, strict=True))
-    obs, action, done, gamma = (
-        rows.obs.flatten(0, 1),
-        rows.action.flatten(0, 1),
-        rows.done,
-        getattr(config, "gamma", 1.0),
-    )
-    value = old_value(obs).view(done.shape)
+    rows = rows[-getattr(config, "num_steps", len(rows.done)) :]  # REINFORCE collects whole episodes
+    obs, action, done, newest = rows.obs.flatten(0, 1), rows.action.flatten(0, 1), rows.done, rows.valid
+    value, gamma = old_value(obs).view(done.shape), getattr(config, "gamma", 1.0)
     next_value = of_next(old_value, value, rows.obs, rows.next_obs)
     advantage, target = gae(rows.reward, value, next_value, rows.terminated, done, gamma=gamma, lam=0.95)
     change = (state.policy(obs).log_prob(action) - old(obs).log_prob(action)).view(done.shape)
-    steps = getattr(config, "num_steps", len(done))  # REINFORCE collects whole episodes
-    newest = rows.valid & (torch.arange(len(done), device=done.device) >= len(done) - steps)[:, None]
     if newest.sum() > 1:
         found["advantage/followed"] = torch.corrcoef(torch.stack([advantage, change])[:, newest])[0, 1].nan_to_num()
         if _spread(target[newest]) > 1e-3 * target[newest].abs().mean():  # else there is nothing to explain
