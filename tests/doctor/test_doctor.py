@@ -142,8 +142,14 @@ CASES = {
         {"losses__entropy": [1.0, 0.9, 0.9, 0.9] * 2, "changed": {"entropy_coef": 0.5}},
     ),
     "q-opposed": (
-        {"algorithm": "td3", "q": [-1.0] * 8, "reward__mean": [1.0] * 8, "reward__std": [0.1] * 8},
-        {"algorithm": "td3", "q": [-1.0] * 7 + [1.0], "reward__mean": [1.0] * 8, "reward__std": [0.1] * 8},
+        {"algorithm": "td3", "steps": 30_000, "q": [-1.0] * 8, "reward__mean": [1.0] * 8, "reward__std": [0.1] * 8},
+        {
+            "algorithm": "td3",
+            "steps": 30_000,
+            "q": [-1.0] * 7 + [1.0],
+            "reward__mean": [1.0] * 8,
+            "reward__std": [0.1] * 8,
+        },
     ),
     "starts-alike": (
         {"observation__starts_alike": [1.0] * 8},
@@ -588,8 +594,9 @@ def test_advantages_that_are_followed_by_chance_alone_are_unrelated_however_stro
     assert names(advantage__followed=[0.4, 0.0] * 8, approx_kl=[0.01] * 16) == []
 
 
-def test_beside_steps_that_go_too_far_the_time_explains_rewards():
-    assert names("trpo", reward__by_time=[0.9] * 8, kl=[0.9] * 8) == ["kl-too-large"]
+def test_rewards_that_time_explains_later_are_what_the_policy_has_made_of_them():
+    assert names(reward__by_time=[0.9] * 8) == ["reward-by-time"]
+    assert names("trpo", reward__by_time=[0.1] + [0.9] * 7, kl=[0.9] * 8) == ["kl-too-large"]
 
 
 @pytest.mark.parametrize("column", ["actions", "next", "signs", "ends", "limits"])
@@ -604,6 +611,49 @@ def test_a_deterministic_policy_is_near_its_mode():
     assert "acts-at-mode" not in names("td3", action__off_mode=[0.1] * 8)
     alone = {"action__off_mode": [0.003] * 8, "action__effect": [0.0] * 8}
     assert names("td3", **alone) == ["acts-at-mode"]  # actions that are never varied show no effect
+
+
+AT_MODE = {"action__off_mode": [0.0] * 8, "losses__entropy": [1.0] * 8}
+UNRELATED = {"advantage__followed": [0.01, -0.01] * 4}
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "cause", "metrics"),
+    [
+        ("sac", "targets-behind", {"targets__behind": [0.1, 0.2, 0.5, 0.6], "action__preferred": [0.3] * 8}),
+        (
+            "ppo",
+            "critic-still",
+            {
+                "value__moved": [0.0] * 8,
+                "losses__value": [0.0] * 8,
+                "reward__mean": [1.0] * 8,
+                "reward__std": [1.0] * 8,
+            },
+        ),
+        ("ppo", "acts-at-mode", AT_MODE | {"approx_kl": [0.0] * 8}),
+        ("ppo", "acts-at-mode", AT_MODE | UNRELATED | {"approx_kl": [0.01] * 8}),
+        ("sac", "acts-at-mode", AT_MODE | {"action__preferred": [0.5] * 8, "reward__largest": [1.0] * 8}),
+        ("ppo", "advantage-opposed", AT_MODE | {"advantage__followed": [-0.2, -0.1] * 4}),
+        ("ppo", "kl-too-large", UNRELATED | {"approx_kl": [0.9] * 8}),
+    ],
+)
+def test_a_cause_in_the_learner_is_named_alone(algorithm, cause, metrics):
+    assert names(algorithm, **metrics, steps=30_000) == [cause]
+
+
+def test_rewards_that_are_centred_are_not_of_the_other_sign():
+    assert names("sac", replay__other_signs=[0.5] * 8) == []
+
+
+def test_a_value_without_targets_of_its_own_is_judged_by_those_of_gae():
+    assert names(value__explained=[0.0] * 8, losses__value=[0.5] * 8) == ["value-explains-nothing"]
+
+
+def test_a_new_q_of_the_other_sign_is_not_named():
+    opposed = {"q": [-1.0] * 8, "reward__mean": [1.0] * 8, "reward__std": [0.1] * 8}
+    assert "q-opposed" not in names("td3", **opposed, steps=1_500)
+    assert "q-opposed" in names("td3", **opposed, steps=12_000)
 
 
 def test_a_v_of_the_other_sign_is_named():

@@ -1,5 +1,6 @@
 """The signals of a run: oracles for what is measured, and that measuring changes nothing."""
 
+from dataclasses import replace
 from itertools import pairwise
 from types import SimpleNamespace
 from unittest.mock import patch
@@ -12,6 +13,7 @@ from torch import nn
 import lemniscate as lem
 from conftest import tiny_fields, tiny_off_policy
 from lemniscate.algos import ppo
+from lemniscate.data.hindsight import HindsightReplay
 from lemniscate.data.replay import ReplayBuffer
 from lemniscate.maths import Deterministic, explained_by, explained_by_each, gae
 from lemniscate.nn.actor_critic import ActorCritic
@@ -553,6 +555,28 @@ def test_the_correlation_of_advantages_and_of_what_an_update_did_to_the_policy(a
     assert of_update(state, config, rows, None) == {}
 
 
+def test_where_every_target_is_the_same_there_is_nothing_to_explain():
+    state, rows = stateful(None)
+    with torch.no_grad():
+        for parameter in state.networks.value.parameters():
+            parameter.zero_()
+    rows = replace(rows, reward=torch.ones(T, N), terminated=torch.ones(T, N).bool())
+    config = SimpleNamespace(gamma=0.9, num_steps=T)
+    assert "value/explained" not in of_update(state, config, rows, acted_with(state))
+
+
+def test_v_is_measured_in_units_of_scaled_rewards():
+    """V of 1 everywhere, rewards of 10 that are scaled to 1, γ = 0.5: half of the value that follows is missing."""
+    state = SimpleNamespace(
+        networks=Steady(1.0), policy=stateful(None)[0].policy, reward_scale=lambda reward: reward / 10
+    )
+    given = rows(reward=torch.full((B,), 10.0))[None]
+    config = SimpleNamespace(gamma=0.5, scale_rewards=True)
+    found = signals(state, config, spec_of(), given)
+    assert found["value/missing"] == pytest.approx(1.0)
+    assert found["reward/mean"] == 10
+
+
 def test_the_way_of_a_policy_is_that_of_its_parameters_alone():
     state, rows = stateful(Discrete(3))
     before = acted_with(state)
@@ -738,6 +762,25 @@ def test_the_distance_from_the_mode_is_one_for_actions_that_were_drawn():
     for action, away in ((networks.policy.act(obs, noise), 1.0), (networks.policy.act(obs, 0 * noise), 0.0)):
         found = of_networks(SimpleNamespace(policy=networks.policy), rows(obs=obs, action=action))
         assert found["action/off_mode"].item() == pytest.approx(away, abs=0.1)
+
+
+def test_a_choice_that_hardly_ever_leaves_the_mode_says_nothing():
+    networks = ActorCritic(spec_of(Discrete(3)), Layers((8,)), 0.0)
+    given = rows(action=torch.zeros(B, dtype=torch.int64))
+    state = SimpleNamespace(policy=networks.policy)
+    assert of_networks(state, given)["action/off_mode"] > 0.5
+    networks.policy.net[-1].bias.data[0] = 10.0
+    assert "action/off_mode" not in of_networks(state, given)
+
+
+def test_rows_that_were_written_over_and_episodes_under_way_are_not_looked_for():
+    given = rows(obs=torch.zeros(B, O), terminated=torch.arange(B) < 100)
+    full = ReplayBuffer(spec_of(), 50, torch.device("cpu"))
+    late = given[-50:]
+    full.extend(Transition(late.obs, late.action, late.reward, late.next_obs, late.terminated))
+    assert not any(of_replay(SimpleNamespace(replay=full), given[None]).values())
+    hindsight = object.__new__(HindsightReplay)
+    assert of_replay(SimpleNamespace(replay=hindsight), given[None]) == {}
 
 
 def test_before_there_are_rows_there_are_no_signals():

@@ -111,12 +111,10 @@ class Evidence:
     @property
     def q_steps(self) -> float:
         """The gradient steps that Q(s, a) has had, from replay or from epochs of rollouts."""
-        learned, size = (
-            self.log[-1]["step"] - self.config.get("learning_starts", 0) if self.log else 0,
-            "minibatch_size",
-        )
-        ratio = self.config["epochs"] / self.config[size] if {"epochs", size} <= set(self.config) else 0.0
-        return self.config.get("replay_ratio", ratio) * max(0, learned)
+        known = self.config
+        of_epochs = known["epochs"] / known["minibatch_size"] if {"epochs", "minibatch_size"} <= set(known) else 0.0
+        learned = self.log[-1]["step"] - known.get("learning_starts", 0) if self.log else 0
+        return known.get("replay_ratio", of_epochs) * max(0, learned)
 
     @cached_property
     def rose(self) -> bool:

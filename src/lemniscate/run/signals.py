@@ -295,7 +295,7 @@ def of_networks(state: Any, rows: Rollout) -> dict[str, Tensor]:
             hook.remove()
     found = dict[str, Tensor]()
     if hasattr(distribution, "sample"):  # a policy of one's own may say something else
-        found["action/off_mode"] = _off_mode(state.policy, distribution, obs, rows.action[-SEEN:])
+        found |= _off_mode(state.policy, distribution, obs, rows.action[-SEEN:])
     if units := [layer.flatten(1).float() for layer in layers if layer.ndim > 1 and len(layer) == len(obs)]:
         spread = [_spread(layer) for layer in units]
         inactive = [std < (std.mean() / 40).clamp(min=1e-3) for std in spread]
@@ -313,14 +313,17 @@ def of_networks(state: Any, rows: Rollout) -> dict[str, Tensor]:
     return found
 
 
-def _off_mode(policy: Any, distribution: Any, obs: Tensor, action: Tensor) -> Tensor:
-    """The distance of actions from the policy's mode over that of actions drawn from it; 0 for a mode that is not left.
+def _off_mode(policy: Any, distribution: Any, obs: Tensor, action: Tensor) -> dict[str, Tensor]:
+    """The distance of actions from the policy's mode over that of actions drawn from it.
 
-    Of a deterministic policy it is the distance itself, in units of half the action range.
+    Of a deterministic policy it is the distance itself, in units of half the action range. Nothing where so few choices
+    would leave the mode that it could be chance that none did.
     """
     drawn = distribution.sample(policy.draw_noise(obs.shape[:1], Generator(obs.device).manual_seed(0)))
     away, usual = ((x - distribution.mode()).float().square().mean().sqrt() for x in (action, drawn))
-    return away / usual if usual > 0 else away
+    if usual == 0 and action.is_floating_point():
+        return {"action/off_mode": away}
+    return {"action/off_mode": away / usual} if action.is_floating_point() or usual > 0.2 else {}
 
 
 def of_values(state: Any, config: RunConfig, rows: Rollout) -> dict[str, Tensor]:
@@ -391,15 +394,19 @@ def acted_with(state: Any) -> dict[str, Tensor]:
 
 
 def of_replay(state: Any, rows: Rollout) -> dict[str, Tensor]:
-    """How some of the newest rows [T, N, …], found by their observation, stand in the replay buffer, ends first.
+    """The shares of the ends, and of the last, of the newest rows [T, N, …] that the replay buffer has otherwise.
 
-    - replay/other_actions, replay/other_next: the shares with another action, and with another next observation.
-    - replay/other_signs: that with a reward of another sign, of which 0 is one.
-    - replay/other_ends, replay/other_limits: of terminations and of truncations that which stands there as none, and as
-      one.
+    They are found there by their observation.
+
+    - replay/other_actions, replay/other_next: rows that have another action, another next observation.
+    - replay/other_signs: rows whose reward has another sign, of which 0 is one.
+    - replay/other_ends: terminations that are stored as none; replay/other_limits: truncations stored as terminations.
     """
-    replay, newest = getattr(state, "replay", None), rows[rows.valid][-4 * SEEN :]
-    if not isinstance(replay, ReplayBuffer) or replay.mirror or newest.obs.shape[1] > 2 * MOST_NUMBERS:
+    replay = getattr(state, "replay", None)
+    if type(replay) is not ReplayBuffer or replay.mirror:  # hindsight stores an episode when it has ended
+        return {}
+    newest = rows[rows.valid][-min(4 * SEEN, len(replay)) :]  # what is older may have been written over
+    if newest.obs.shape[1] > 2 * MOST_NUMBERS:
         return {}
     last = torch.arange(len(newest.reward), device=newest.done.device) >= len(newest.reward) - SEEN // 4
     given, stored = newest[newest.done | last], replay.transitions[replay.newest(2 * len(newest.reward))]
@@ -407,11 +414,11 @@ def of_replay(state: Any, rows: Rollout) -> dict[str, Tensor]:
     pairs = (given.obs[:, column, None] == stored.obs[:, column]).nonzero()
     row, place = pairs[(given.obs[pairs[:, 0]] == stored.obs[pairs[:, 1]]).all(1)].unbind(1)
     of_row, of_place = given[row], stored[place]
-    found = dict[str, Tensor]()
+    found, every = dict[str, Tensor](), torch.ones_like(given.done)
     for name, agrees, which in (
-        ("actions", (of_row.action - of_place.action).abs().amax(-1) < 1e-5, torch.ones_like(given.done)),
-        ("next", (of_row.next_obs == of_place.next_obs).all(-1), torch.ones_like(given.done)),
-        ("signs", of_row.reward.sign() == of_place.reward.sign(), torch.ones_like(given.done)),
+        ("actions", (of_row.action - of_place.action).abs().amax(-1) < 1e-5, every),
+        ("next", (of_row.next_obs == of_place.next_obs).all(-1), every),
+        ("signs", of_row.reward.sign() == of_place.reward.sign(), every),
         ("ends", of_place.terminated, given.terminated),
         ("limits", ~of_place.terminated, given.truncated & ~given.terminated),
     ):
@@ -451,9 +458,8 @@ def of_critics(state: Any, config: RunConfig, rows: Rollout) -> dict[str, Tensor
 
     (target, q), (other_target, other_q) = map(estimates, (newest, sampled))
     chosen = state.policy(sampled.obs).mode()
-    better = critic(sampled.obs, chosen) - critic(
-        sampled.obs, torch.empty_like(chosen).uniform_(-1, 1, generator=generator)
-    )
+    chance = torch.empty_like(chosen).uniform_(-1, 1, generator=generator)
+    better = critic(sampled.obs, chosen) - critic(sampled.obs, chance)
     found = {"action/preferred": (0.5 + 0.5 * better.sign()).mean()}  # where Q is flat, neither
     if gamma < 1:
         found["value/missing"] = _missing(target, q, gamma)
