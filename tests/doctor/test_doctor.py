@@ -19,7 +19,8 @@ from lemniscate.doctor.rules import HINT, RULES, seeds_differ, settings_far_out
 from lemniscate.run.fields import field_help, read
 from lemniscate.system.files import write_json
 
-PAGE = (Path(__file__).parents[2] / "docs" / "doctor.md").read_text()
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs" / "doctor.md").read_text()
 NOISE = np.random.default_rng(0).normal(size=400)
 RISES = list(np.arange(400) + NOISE)
 FLAT = list(NOISE)
@@ -116,6 +117,10 @@ CASES = {
     "replay-differs": (
         {"algorithm": "sac", "replay__other_limits": [1.0] * 8},
         {"algorithm": "sac", "replay__other_limits": [0.4] * 8},
+    ),
+    "entropy-impossible": (
+        {"algorithm": "sac", "losses__entropy": [1.4] + [-1.0] * 7, "action__most_entropy": [0.69] * 8},
+        {"algorithm": "sac", "losses__entropy": [0.7] + [-1.0] * 7, "action__most_entropy": [0.69] * 8},
     ),
     "acts-at-mode": (
         {"action__off_mode": [0.1] * 8, "losses__entropy": [1.0] * 8},
@@ -827,6 +832,8 @@ def test_the_page_has_a_paragraph_for_each_rule_and_no_other():
     for rule in RULES:
         for part in (rule.means, rule.source, rule.remedy.split("; ")[0]):
             assert part in " ".join(PAGE.split())
+        for page in re.findall(r"^docs/[a-z_/]+\.md", rule.source):
+            assert (ROOT / page).exists()
 
 
 def test_the_page_has_a_row_for_each_setting():

@@ -1,5 +1,6 @@
 """The signals of a run: oracles for what is measured, and that measuring changes nothing."""
 
+import math
 from dataclasses import replace
 from itertools import pairwise
 from types import SimpleNamespace
@@ -699,8 +700,9 @@ def test_a_q_without_replay_is_measured_at_the_newest_rows():
     state = SimpleNamespace(networks=networks, policy=AtAnEnd(1.0))
     taken = rows(action=torch.full((B, 1), 0.5), reward=torch.full((B,), -2.0), terminated=ends)
     found = of_critics(state, SimpleNamespace(gamma=0.9), taken)
-    assert found.keys() == {"action/preferred", "value/missing", "value/at_ends"}
+    assert found.keys() == {"action/preferred", "action/most_entropy", "value/missing", "value/at_ends"}
     assert found["action/preferred"] == 1
+    assert found["action/most_entropy"] == pytest.approx(math.log(2))
     target = -2 + 0.9 * 1.5 / 2  # on average
     assert found["value/missing"] == pytest.approx((target - 0.5) / (0.1 * 0.5), rel=1e-5)
     assert found["value/at_ends"] == 1  # 0.5 is less than 0.5 + 2

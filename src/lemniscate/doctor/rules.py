@@ -436,6 +436,12 @@ def of_entropies(e: Evidence) -> Seen:
                 "entropy-opposed",
                 f"The entropy fell from {entropy[0]:.2g} to {entropy[0] - lost:.2g}, though its weight is {weight}.",
             )
+    greatest, most = e.greatest("losses/entropy"), e.last("action/most_entropy")
+    if greatest > most + 0.1:
+        yield (
+            "entropy-impossible",
+            f"An entropy of {greatest:.2g} nats is reported; actions within their bounds have {most:.2g} at most.",
+        )
     if target is not None and target >= 0 and not e.as_recommended("target_entropy"):
         yield (
             "entropy-unreachable",

@@ -79,6 +79,8 @@ def explained_by(features: Tensor, targets: Tensor, beside: Tensor) -> Tensor:
     many = few - features.shape[1]
     if many <= 0:
         return targets.new_full(targets.shape[1:], torch.nan)
+    if (targets == targets[:1]).all():  # a constant reward is common
+        return torch.zeros_like(targets[0])
     x, y, gram = _normal(torch.cat([beside, features], dim=-1), targets)
     left, after = (_residual(x[:, :n], y, gram[:n, :n]) for n in (beside.shape[1], len(gram)))
     share = 1 - (after / many) / (left / few)

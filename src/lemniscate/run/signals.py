@@ -59,21 +59,26 @@ def signals(
     """
     if rows is None or rows.valid.sum() < 2:
         return {}
-    chosen, scaled = rows[rows.valid], rows
+    scaled = rows
     if getattr(config, "scale_rewards", False) and hasattr(state, "reward_scale"):
         scaled = replace(rows, reward=state.reward_scale(rows.reward))
-    found = of_networks(state, chosen) | of_values(state, config, scaled) | of_update(state, config, scaled, acted)
-    found |= of_replay(state, rows) | of_critics(state, config, scaled[rows.valid])
+    found = of_networks(state, _valid(rows)) | of_values(state, config, scaled) | of_update(state, config, scaled, acted)
+    found |= of_replay(state, rows) | of_critics(state, config, _valid(scaled))
     return of_environment(rows, spec) | {name: float(value) for name, value in found.items()}
+
+
+def _valid(rows: Rollout) -> Rollout:
+    """The valid of rows [T, N, …], [B, …]: views where all are, which costs nothing."""
+    return rows.flatten() if rows.valid.all() else rows[rows.valid]
 
 
 def of_environment(rows: Rollout, spec: Spec) -> dict[str, float]:
     """The signals of rows [T, N, …] alone, two of which are valid at least."""
-    found = of_rows(rows[rows.valid], spec) | of_time(rows) | of_starts(rows, spec)
+    found = of_rows(_valid(rows), spec) | of_time(rows) | of_starts(rows, spec)
     if not spec.has_images and spec.observation_size <= MOST_NUMBERS:
         few = slice(max(2, MOST_ROWS // len(rows.done)))  # of the environments
         rows = rows[:, few]
-        found |= of_effects(rows[rows.valid], spec)
+        found |= of_effects(_valid(rows), spec)
         if found["reward/explained"] < 0.8 and found["reward/std"] > 0:  # else no other row has more to explain
             found["reward/before"] = paid_before(rows, spec, found["reward/explained"])
         if found["action/effect"] < 0.2:
@@ -434,8 +439,9 @@ def of_critics(state: Any, config: RunConfig, rows: Rollout) -> dict[str, Tensor
 
     For algorithms that learn Q(s, a) of continuous actions; those that have no replay sample the newest rows. Also what
     Q awaits where an episode terminated, beyond its reward, over |Q|; the length of the target networks' weights, their
-    distance from Q's as a share of the length of these; and the share of the sampled transitions in which Q of the
-    policy's action is above that of one at random.
+    distance from Q's as a share of the length of these; the share of the sampled transitions in which Q of the policy's
+    action is above that of one at random; and the entropy of uniform actions, which no other policy within the bounds
+    has.
     """
     replay, networks, gamma = getattr(state, "replay", None), state.networks, getattr(config, "gamma", 1.0)
     if not hasattr(networks, "entropy_bonus") or not getattr(state, "updates", replay is None):
@@ -460,7 +466,10 @@ def of_critics(state: Any, config: RunConfig, rows: Rollout) -> dict[str, Tensor
     chosen = state.policy(sampled.obs).mode()
     chance = torch.empty_like(chosen).uniform_(-1, 1, generator=generator)
     better = critic(sampled.obs, chosen) - critic(sampled.obs, chance)
-    found = {"action/preferred": (0.5 + 0.5 * better.sign()).mean()}  # where Q is flat, neither
+    found = {
+        "action/preferred": (0.5 + 0.5 * better.sign()).mean(),  # where Q is flat, neither
+        "action/most_entropy": torch.tensor(2.0).log() * chosen.shape[1],
+    }
     if gamma < 1:
         found["value/missing"] = _missing(target, q, gamma)
     ends = torch.cat([newest.terminated, sampled.terminated])
