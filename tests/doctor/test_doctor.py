@@ -118,6 +118,10 @@ CASES = {
         {"algorithm": "sac", "replay__other_limits": [1.0] * 8},
         {"algorithm": "sac", "replay__other_limits": [0.4] * 8},
     ),
+    "q-explains-nothing": (
+        {"algorithm": "ddpg", "steps": 30_000, "value__explained": [0.1] * 8, "reward__explained": [0.9] * 8},
+        {"algorithm": "ddpg", "steps": 30_000, "value__explained": [0.1] * 7 + [0.9], "reward__explained": [0.9] * 8},
+    ),
     "entropy-impossible": (
         {"algorithm": "sac", "losses__entropy": [1.4] + [-1.0] * 7, "action__most_entropy": [0.69] * 8},
         {"algorithm": "sac", "losses__entropy": [0.7] + [-1.0] * 7, "action__most_entropy": [0.69] * 8},
@@ -597,6 +601,23 @@ def test_returns_that_fall_while_q_begins_are_no_finding():
 def test_advantages_that_are_followed_by_chance_alone_are_unrelated_however_strongly():
     assert names(advantage__followed=[0.4, -0.3] * 8, approx_kl=[0.01] * 16) == ["advantage-unrelated"]
     assert names(advantage__followed=[0.4, 0.0] * 8, approx_kl=[0.01] * 16) == []
+
+
+@pytest.mark.parametrize(
+    ("moved", "changed", "found"), [(1e-5, {}, True), (0.1, {}, False), (1e-5, {"learning_rate": 1e-9}, False)]
+)
+def test_a_loss_of_the_mean_advantage_is_named_and_none_of_a_rate_that_moves_nothing(moved, changed, found):
+    """A policy's loss of 0 is that of shapes that broadcast; where the rate moves nothing, ratios of 1 say so too."""
+    seen = names(losses__policy=[1e-8, -1e-8] * 4, network__moved=[moved] * 8, changed=changed)
+    assert ("advantage-unrelated" in seen) == found
+
+
+def test_a_q_of_returns_explains_them():
+    """PQN's Q, of λ-returns; where every return is alike there is nothing left to explain."""
+    metrics = {"algorithm": "pqn", "steps": 50_000, "explained_variance": [0.05] * 8, "reward__explained": [0.9] * 8}
+    assert names(**metrics) == ["q-explains-nothing"]
+    assert "q-explains-nothing" not in names(**metrics | {"explained_variance": [0.05] * 7 + [0.6]})
+    assert "q-explains-nothing" not in names(**metrics | {"reward__explained": [0.0] * 8})
 
 
 def test_rewards_that_time_explains_later_are_what_the_policy_has_made_of_them():

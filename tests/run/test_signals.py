@@ -690,7 +690,23 @@ def test_the_policys_action_stands_beside_one_at_random(action, weight, share):
     networks.critics.weight.data.fill_(weight)
     state = SimpleNamespace(replay=replay, updates=1, networks=networks, targets=QIsTheAction(), policy=AtAnEnd(action))
     rows = Rollout(**vars(columns), truncated=columns.terminated, valid=~columns.terminated)
-    assert of_critics(state, SimpleNamespace(gamma=0.9), rows)["action/preferred"] == share
+    found = of_critics(state, SimpleNamespace(gamma=0.9), rows)
+    assert found["action/preferred"] == share
+    assert "value/explained" not in found  # targets that are all alike
+
+
+def test_of_the_sampled_targets_q_explains_its_share():
+    """Targets are the rewards, as every row ends; Q is the action, which is the reward and noise of a fourth of it."""
+    reward, noise = numbers(B).float(), numbers(B, seed=1).float()
+    ends = torch.ones(B, dtype=torch.bool)
+    taken = rows(action=(reward + 0.5 * noise)[:, None], reward=reward, terminated=ends)
+    columns = Transition(taken.obs, taken.action, taken.reward, taken.next_obs, taken.terminated)
+    replay = SimpleNamespace(transitions=columns, sample_indices=lambda *_: torch.arange(B)[None])
+    networks = SimpleNamespace(critics=QIsTheAction(), entropy_bonus=lambda *_: 0.0)
+    state = SimpleNamespace(replay=replay, updates=1, networks=networks, targets=QIsTheAction(), policy=AtAnEnd(1.0))
+    found = of_critics(state, SimpleNamespace(gamma=0.9), taken)
+    expected = 1 - 0.25 * noise.var() / reward.var()
+    assert found["value/explained"].item() == pytest.approx(expected.item(), rel=1e-5)
 
 
 def test_a_q_without_replay_is_measured_at_the_newest_rows():
@@ -700,8 +716,10 @@ def test_a_q_without_replay_is_measured_at_the_newest_rows():
     state = SimpleNamespace(networks=networks, policy=AtAnEnd(1.0))
     taken = rows(action=torch.full((B, 1), 0.5), reward=torch.full((B,), -2.0), terminated=ends)
     found = of_critics(state, SimpleNamespace(gamma=0.9), taken)
-    assert found.keys() == {"action/preferred", "action/most_entropy", "value/missing", "value/at_ends"}
+    names = {"action/preferred", "action/most_entropy", "value/missing", "value/at_ends", "value/explained"}
+    assert found.keys() == names
     assert found["action/preferred"] == 1
+    assert found["value/explained"].abs() < 1e-5  # Q is the same everywhere
     assert found["action/most_entropy"] == pytest.approx(math.log(2))
     target = -2 + 0.9 * 1.5 / 2  # on average
     assert found["value/missing"] == pytest.approx((target - 0.5) / (0.1 * 0.5), rel=1e-5)

@@ -501,6 +501,13 @@ def of_advantages(e: Evidence) -> Seen:
             f"In {preferred:.0%} of the sampled states Q of the policy's action is above that of one at random.",
         )
     neither = given is False and usual and not e.config.get("scale_rewards")
+    mean = np.abs(e.values("losses/policy")).max(initial=0.0)
+    still = e.greatest("network/moved") < 1e-3 and e.as_recommended("learning_rate")
+    if len(e.values("losses/policy")) >= 4 and mean < 1e-5 and still:  # healthy runs have 0.01 somewhere
+        yield (
+            "advantage-unrelated",
+            f"The policy's loss is at most {mean:.0e} in every line: the mean advantage, as if all actions shared it.",
+        )
     if neither and not e.as_recommended("normalize_advantage"):
         yield "advantage-not-normalized", "Neither advantages nor rewards are normalized."
     centred, weight = e.config.get("normalize_advantage", e.config.get("standardize")), e.values("losses/policy")
@@ -552,6 +559,20 @@ def of_values(e: Evidence) -> Seen:
             "value-explains-nothing",
             f"The value explains {max(0.0, explained):.0%} of the variance of its targets"
             f"{', no more than a constant would' if nothing else ', and is far from what follows'}.",
+        )
+
+
+def of_q(e: Evidence) -> Seen:
+    """Faults of Q(s, a): what it explains of its targets, of one step from replay, or of λ-returns."""
+    by_steps, by_returns = "tau" in e.config, "final_epsilon" in e.config
+    shares = e.last_half("value/explained" if by_steps else "explained_variance")
+    paid, last = e.late("reward/explained") > 0.1 or e.late("reward/std") == 0, e.ends[1]
+    settled = len(last) > 0 and last.std() <= 0.05 * abs(last.mean())
+    learns = (by_steps or by_returns) and e.q_steps >= 1_000 and len(shares) >= 2
+    if learns and paid and not settled and np.median(shares) > -1 and shares.max() < 0.3:  # healthy runs have 0.4 to 1
+        yield (
+            "q-explains-nothing",
+            f"Q explains {max(0.0, np.median(shares)):.0%} of the variance of its targets, as a constant would.",
         )
 
 
@@ -751,6 +772,7 @@ SUBJECTS = (
     of_entropies,
     of_advantages,
     of_values,
+    of_q,
     of_replay,
     of_targets,
     of_what_stands_still,

@@ -62,7 +62,9 @@ def signals(
     scaled = rows
     if getattr(config, "scale_rewards", False) and hasattr(state, "reward_scale"):
         scaled = replace(rows, reward=state.reward_scale(rows.reward))
-    found = of_networks(state, _valid(rows)) | of_values(state, config, scaled) | of_update(state, config, scaled, acted)
+    found = (
+        of_networks(state, _valid(rows)) | of_values(state, config, scaled) | of_update(state, config, scaled, acted)
+    )
     found |= of_replay(state, rows) | of_critics(state, config, _valid(scaled))
     return of_environment(rows, spec) | {name: float(value) for name, value in found.items()}
 
@@ -171,7 +173,7 @@ def of_effects(rows: Rollout, spec: Spec) -> dict[str, Tensor]:
         if action.shape[1] > 1:
             found["action/weakest"] = explained_by_each(known, change)[obs.shape[1] :].nan_to_num().amax(1).min()
         found |= _weaker_half(known, change, obs.shape[1])
-    elif isinstance(spec.action, Discrete) and spec.action.n <= MOST_CHOICES:
+    elif isinstance(spec.action, Discrete) and 2 < spec.action.n <= MOST_CHOICES:  # of two, the effect says as much
         found |= _choices_alike(action[inside], change, obs[inside])
     std = _spread(obs[inside])
     if (std > 1e-9).any():
@@ -438,10 +440,10 @@ def of_critics(state: Any, config: RunConfig, rows: Rollout) -> dict[str, Tensor
     """The mean squared error of Q over one step, of the newest rows and of sampled ones, and the share that is missing.
 
     For algorithms that learn Q(s, a) of continuous actions; those that have no replay sample the newest rows. Also what
-    Q awaits where an episode terminated, beyond its reward, over |Q|; the length of the target networks' weights, their
-    distance from Q's as a share of the length of these; the share of the sampled transitions in which Q of the policy's
-    action is above that of one at random; and the entropy of uniform actions, which no other policy within the bounds
-    has.
+    Q awaits where an episode terminated, beyond its reward, over |Q|; the explained variance of the sampled targets by
+    Q; the length of the target networks' weights, their distance from Q's as a share of the length of these; the share
+    of the sampled transitions in which Q of the policy's action is above that of one at random; and the entropy of
+    uniform actions, which no other policy within the bounds has.
     """
     replay, networks, gamma = getattr(state, "replay", None), state.networks, getattr(config, "gamma", 1.0)
     if not hasattr(networks, "entropy_bonus") or not getattr(state, "updates", replay is None):
@@ -470,6 +472,8 @@ def of_critics(state: Any, config: RunConfig, rows: Rollout) -> dict[str, Tensor
         "action/preferred": (0.5 + 0.5 * better.sign()).mean(),  # where Q is flat, neither
         "action/most_entropy": torch.tensor(2.0).log() * chosen.shape[1],
     }
+    if _spread(other_target) > 1e-3 * other_target.abs().mean():  # else there is nothing to explain
+        found["value/explained"] = explained_variance(other_q, other_target)
     if gamma < 1:
         found["value/missing"] = _missing(target, q, gamma)
     ends = torch.cat([newest.terminated, sampled.terminated])
