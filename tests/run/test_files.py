@@ -87,6 +87,8 @@ def test_a_damaged_config_is_taken_from_the_checkpoint_and_mended(tmp_path, caps
             file.write_bytes(damaged)
         assert read_config(tmp_path / "r")[1]["gamma"] == 0.99
         assert f"Taking the config in {tmp_path / 'r' / 'checkpoints' / 'step-128'}" in capsys.readouterr().err
+        read_config(tmp_path / "r")
+        assert not capsys.readouterr().err  # a command says so once
     assert lem.resume(tmp_path / "r", progress=False).policy.step == 256
     assert file.read_bytes() == whole
 

@@ -23,7 +23,7 @@ from lemniscate.nn.memory import Recall
 from lemniscate.nn.policies import Policy
 from lemniscate.run import checkpoint
 from lemniscate.run.config import RunConfig, checked
-from lemniscate.run.directory import difference, find_checkpoint
+from lemniscate.run.directory import difference, find_checkpoint, require_no_file_of_a_run
 from lemniscate.run.seeding import generator, torch_defaults
 from lemniscate.spec import Box, Discrete, MultiDiscrete, Spec
 from lemniscate.system.files import at_home, parsing
@@ -253,6 +253,7 @@ def load(run: Trained, *, checkpoint: str | int | None = None, trust: bool = Fal
     if checkpoint is None and isinstance(run, TrainedRun | TrainedPolicy):
         return run.policy if isinstance(run, TrainedRun) else run
     if isinstance(run, TrainedRun | TrainedPolicy) or not hub.is_address(run):
+        require_no_file_of_a_run(path_of(run))
         if path_of(run).is_file():
             raise UserError(
                 f"{run} is a file, and a policy of lemniscate is a folder: lem.evaluate('{run}', env=…) plays the"

@@ -30,7 +30,7 @@ from lemniscate.run import check as run_check
 from lemniscate.run import checkpoint
 from lemniscate.run.checkpoint import list_steps
 from lemniscate.run.config import Episodes, Natural, RunConfig, checked
-from lemniscate.run.directory import CONFIG, FINAL, read_config
+from lemniscate.run.directory import CONFIG, FINAL, read_config, require_no_file_of_a_run
 from lemniscate.run.environments import env_arguments, evaluation_env
 from lemniscate.run.evaluate import Evaluation, critic_of
 from lemniscate.run.evaluate import evaluate as evaluate_policy
@@ -217,6 +217,7 @@ def each_finding(
 ) -> Iterator[Finding]:
     """The findings of `check`, one by one."""
     path = path_of(what)
+    require_no_file_of_a_run(path)
     if run_check.is_stored(path):
         return run_check.each_finding(path)
     return env_check.each_finding(what, backend, env_kwargs, wrappers, _shown_by)

@@ -5,6 +5,7 @@ import json
 import math
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from functools import cache
 from itertools import count
 from pathlib import Path
 from typing import Any, Literal
@@ -62,11 +63,22 @@ def create_directory(path: Path, name: str, record: dict[str, Any]) -> None:
         raise UserError(f"{path} cannot be created: {error.strerror or error}.") from error
 
 
+def require_no_file_of_a_run(path: Path) -> None:
+    """Raise `UserError` for a file that lies in a run or in a checkpoint, which was meant."""
+    stored = any((path.parent / name).is_file() for name in (CONFIG, checkpoint.MANIFEST))
+    if stored and path.is_file() and path.suffix != ".pt":
+        raise UserError(f"{path} is a file of {path.parent}: name that directory.")
+
+
+_say_once = cache(say)  # a command reads a record several times
+
+
 def read_record(path: Path) -> dict[str, Any]:
     """The record of a run's `config.json`: algorithm and config; if damaged, that of the newest checkpoint.
 
     Raises `UserError` if it is not a run.
     """
+    require_no_file_of_a_run(path)
     if (path / SWEEP).exists():
         runs = sorted(file.parent for file in path.glob(f"*/{CONFIG}"))
         raise UserError(f"{path} is a sweep: name one of its runs, such as {runs[0] if runs else path / '…'}.")
@@ -77,9 +89,9 @@ def read_record(path: Path) -> dict[str, Any]:
         found = _newest(path, planned_only=False)
         if found is None:
             reason = str(error) if (path / CONFIG).is_file() else f"it holds no {CONFIG} that can be read."
-            reason = reason if path.exists() else "it does not exist."
+            reason = "it is a file." if path.is_file() else reason if path.exists() else "it does not exist."
             raise UserError(f"{path} is not a run directory: {reason}") from None
-        say(f"{error} Taking the config in {found.path}.")
+        _say_once(f"{error} Taking the config in {found.path}.")
         return found.record
 
 
@@ -140,7 +152,7 @@ def find_checkpoint(path: Path, which: str | int | None = None) -> checkpoint.Ch
     Raises:
         UserError: neither a run nor a checkpoint; a run without a whole one, or that one; a damaged checkpoint.
     """
-    if which is None and (path / "manifest.json").exists():
+    if which is None and (path / checkpoint.MANIFEST).exists():
         return checkpoint.read(path)
     read_config(path)
     if which is not None:
