@@ -305,14 +305,36 @@ def test_mistakes_are_one_sentence(tmp_path, capsys):
         ["in", "--exercises", "gaee"],
         ["in", "--to", str(tmp_path / "in" / "grades")],
         ["in", "--to", str(tmp_path / "taken")],
+        ["in", "--exercises", ","],
+        ["in", "--csv", "--json"],
     ):
         assert main(["grade", str(tmp_path / words[0]), *words[1:]]) == 2
         said.append(capsys.readouterr().err.strip())
     assert all(text and "\n" not in text.replace("1 of 1 hand-ins  0:00:00 left\n", "") for text in said)
     for text, words in zip(
-        said, ("is no folder", "has no hand-in", "did you mean gae", "choose another --to", "taken"), strict=True
+        said,
+        (
+            *("is no folder", "has no hand-in", "did you mean gae", "choose another --to", "taken"),
+            *("exercises names none", "--json and --csv print to one place"),
+        ),
+        strict=True,
     ):
         assert words in text
+
+
+def test_what_is_no_hand_in_is_named_and_an_empty_one_noted_without_a_traceback(tmp_path, capfd):
+    (tmp_path / "in" / "empty").mkdir(parents=True)
+    for name in ("anna.pdf", "b.PY", "c.txt"):
+        (tmp_path / "in" / name).touch()
+    (tmp_path / "in" / "cells.ipynb").write_text('{"cells": [{"cell_type": "code", "source": 3}]}')
+    found = course.grade(tmp_path / "in", to=tmp_path / "out")
+    assert [record["notes"] for record in found["hand_ins"]] == [
+        ["cells.ipynb cannot be read: it is no notebook with cells: save it once with a newer Jupyter."],
+        ["There is no .py and no .ipynb file."],
+    ]
+    said = capfd.readouterr().err
+    assert "Left out: anna.pdf, b.PY, c.txt; a hand-in is" in said
+    assert "Traceback" not in said
 
 
 @pytest.mark.parametrize("columns", [80, 120])

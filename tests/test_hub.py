@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import sys
 from urllib.parse import unquote
 
@@ -20,6 +21,7 @@ from forks import LEMNISCATE, Forks, command
 from lemniscate.cli import main, parse
 from lemniscate.hub import repository as hub
 from lemniscate.run import checkpoint
+from lemniscate.system.files import write_json
 
 pytestmark = pytest.mark.filterwarnings("ignore:Use 'content=:DeprecationWarning")  # huggingface_hub's own
 
@@ -42,6 +44,7 @@ def run(tmp_path_factory):
     for name in ("plots/learning_curve.png", "videos/my flight.gif", "export/policy.onnx", "export/c/policy.c"):
         (run.path / name).parent.mkdir(parents=True, exist_ok=True)
         (run.path / name).write_bytes(name.encode())
+    write_json(run.path / "export" / "manifest.json", {"export": 1, "step": run.policy.step})
     (run.path / "plots" / "report.html").write_text("with paths of this machine")
     (run.path / "export" / "link").symlink_to("/etc/hostname")
     return run
@@ -114,7 +117,7 @@ def test_a_policy_that_remembers_plays_the_same_episode_from_the_hub(server, tmp
 
 def test_all_is_in_one_commit_that_has_no_path_token_or_pickle(run, pushed):
     shown = {"README.md", "final.json", "plots/learning_curve.png", "videos/my flight.gif"}
-    export = {"export/policy.onnx", "export/c/policy.c"}
+    export = {"export/policy.onnx", "export/c/policy.c", "export/manifest.json"}
     assert set(pushed) == {".gitattributes", *hub.CHECKPOINT, *shown, *export}
     for content in pushed.values():
         assert hub_server.WRITER.encode() not in content
@@ -128,6 +131,30 @@ def test_an_upload_is_one_commit_and_deletes_the_figures_of_the_one_before(run, 
     commits = [*server.repositories[NAME].commits]
     assert commits[-2] == first
     assert set(before) - set(server.files(NAME)) == {"plots/old.png", "replay.mp4"}
+
+
+def test_an_export_of_another_step_is_left_out_and_named(run, server, tmp_path, capsys):
+    copy = shutil.copytree(run.path, tmp_path / "copy", symlinks=True)
+    write_json(copy / "export" / "manifest.json", {"export": 1, "step": 1})
+    lem.push(copy, "anna/older")
+    assert not [name for name in server.files("anna/older") if name.startswith("export/")]
+    assert f"it is left out; lemniscate export {copy}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"private": "yes"}, "private must be True or False, not 'yes'"),
+        ({"license": "MIT License\nfoo: bar"}, "license is written as on the Hub, such as 'mit'"),
+        ({"license": 3}, "license is written as on the Hub"),
+    ],
+)
+def test_what_a_repository_is_not_is_refused_before_the_hub_is_asked(run, server, options, said):
+    with pytest.raises(lem.UserError, match=said):
+        lem.push(run, NAME, **options)
+    with pytest.raises(lem.UserError, match="name must be a text, not None"):
+        lem.push(run, None)
+    assert not server.asked
 
 
 def test_the_card_has_the_scores_for_the_hub_and_for_people(run, pushed):

@@ -43,6 +43,11 @@ def test_a_stored_policy_is_replaced_and_nothing_else_is(run, tmp_path):
     policy.step = 5
     lem.save(policy, path)
     assert lem.load(path).step == 5
+    (tmp_path / "link").symlink_to(path)
+    policy.step = 6
+    lem.save(policy, tmp_path / "link")
+    assert (tmp_path / "link").is_symlink()
+    assert lem.load(path).step == 6
     with pytest.raises(lem.UserError, match="exists already, and is not a stored policy"):
         lem.save(policy, tmp_path)
     (tmp_path / "file").write_text("")

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from functools import partial
 from itertools import count
 
 import gymnasium as gym
@@ -84,6 +85,7 @@ WRONG = {
     "fractions of a byte": ({"reset": (SEEN, {}), "space": spaces.Box(0, 255, (2,), np.uint8)}, "of type float32, whose numbers are not all of type uint8"),
     "no such choice": ({"reset": (8, {}), "space": spaces.Discrete(3, start=5)}, r"with 8, which is not in its space, Discrete\(3, start=5\)"),
     "half a choice": ({"reset": (5.5, {}), "space": spaces.Discrete(3, start=5)}, "not all of type int64"),
+    "no bit": ({"step": after(np.array([2, 0], np.int8)), "reset": (np.zeros(2, np.int8), {}), "space": spaces.MultiBinary(2)}, r"with 2, which is not in its space, MultiBinary\(2\)"),
     "a key missing": ({"reset": ({"a": SEEN}, {}), "space": DICT}, "an observation without b; its space is a Dict with the keys a, b"),
     "an inner key": ({"reset": ({"a": SEEN, "b": {}}, {}), "space": DICT}, "an observation without c in b"),
     "no dictionary": ({"reset": (SEEN, {}), "space": DICT}, "its space is a Dict with the keys a, b"),
@@ -99,6 +101,39 @@ def test_what_is_returned_wrongly_is_said_with_the_place(told, sentence):
     with pytest.raises(UserError, match=sentence) as raised:
         played(**told)
     assert "\n" not in str(raised.value)
+
+
+class Needs(gym.Env):
+    """Its actions are as many as it does not know."""
+
+    observation_space = TWO
+
+    @property
+    def action_space(self):
+        return spaces.Discrete(self.count)
+
+
+@pytest.mark.parametrize(
+    ("env", "sentence"),
+    [
+        (Needs, "Needs has no action_space, as 'Needs' object has no attribute 'count': set self.action_space"),
+        (
+            partial(Told, space=spaces.Box),
+            "observation_space of Told is the class Box, and must be a space of gymnasium",
+        ),
+        (partial(Told, space=None), "observation_space of Told is None, and must be a space of gymnasium"),
+    ],
+)
+def test_what_is_no_space_is_said_with_its_reason(env, sentence):
+    with pytest.raises(UserError, match=sentence):
+        registry.make(env, 1, backend="gymnasium")
+
+
+def test_options_that_reset_refuses_are_named(tmp_path):
+    with pytest.raises(
+        UserError, match=r"reset with the options \{'low': 1, 'high': 0\} raised ValueError: Lower bound"
+    ):
+        lem.train("ppo", "CartPole-v1", backend="gymnasium", reset_options={"low": 1, "high": 0}, run=tmp_path / "r")
 
 
 def test_a_worker_says_the_same():

@@ -97,6 +97,8 @@ def test_it_is_in_the_run_by_default_and_replaces_an_export_only(run, same, tmp_
     (run / "export" / "policy.c").write_text("broken")
     lem.export(str(run))
     assert "broken" not in (run / "export" / "policy.c").read_text()
+    (checkpoint,) = list(run.glob("checkpoints/step-*"))[-1:]
+    assert lem.export(checkpoint) == run / "export"  # a checkpoint is removed, and all in it
     assert sorted(file.name for file in run.iterdir() if file.name.startswith("export")) == ["export"]
     assert not [finding for finding in lem.check(run) if finding.grade == BAD]
     for name in ("notes", "link"):

@@ -3,6 +3,7 @@
 import contextlib
 import io
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -82,6 +83,7 @@ def test_the_best_trial_is_the_preset_with_its_provenance(tuned):
     assert list(preset.config.hidden) == record["hidden"]
     assert f"trial {best.number} of 4" in preset.source
     assert "seeds 101, 102" in preset.source
+    assert preset.config.checkpoint_every == 0  # that of the search is its own
     assert f"Best of 4 trials: number {best.number}" in said
     assert "--seeds 1-10" in said
 
@@ -178,6 +180,46 @@ def test_a_trial_that_fails_is_told_and_the_search_goes_on(tmp_path, capsys):
     assert set(states) <= {"COMPLETE", "FAIL"}
     for number, state in enumerate(states):
         assert (f"trial {number}: failed, ppo-101: " in said) == (state == "FAIL")
+
+
+def test_values_that_do_not_go_together_fail_alone(tmp_path, capsys):
+    """Each is in its range, and rollouts of 16 steps of 4 environments are smaller than minibatches of 72."""
+    path = tmp_path / "search"
+    words = ["--search", "num_steps=16|20, minibatch_size=32|72", "--trials", "6", "--seeds", "101", "--run", str(path)]
+    flags = [*FLAGS, "--total-steps", "640", "--num-steps", "20"]
+    with in_this_process():
+        assert main(["tune", "ppo", *flags, *words, "--no-prune"]) == 0
+    said, trials = capsys.readouterr().err, trials_of(path).values()
+    failed = [t.number for t in trials if t.params == {"num_steps": "16", "minibatch_size": "72"}]
+    assert failed
+    for number in failed:
+        assert f"trial {number}: failed, minibatch_size 72 is above the 64 rows of a rollout" in said
+    assert {t.state.name for t in trials if t.number not in failed} == {"COMPLETE"}
+    assert main(["resume", str(path)]) == 0
+
+
+def test_a_journal_that_was_cut_off_goes_on_and_one_that_is_lost_or_damaged_is_named(tuned, tmp_path, capsys):
+    path = shutil.copytree(tuned[0], tmp_path / "search")
+    journal, whole = path / "study.journal", (tuned[0] / "study.journal").read_bytes()
+    lines = whole.splitlines(keepends=True)
+    journal.write_bytes(b"".join(lines[:-1]) + lines[-1][:20])
+    with in_this_process():
+        assert main(["resume", str(path)]) == 0  # the last trial is told again
+    assert all(map(json.loads, journal.read_text().splitlines()))
+    assert {n: t.value for n, t in trials_of(path).items()} == {n: t.value for n, t in trials_of(tuned[0]).items()}
+    journal.write_bytes(lines[0] + b"garbage\n" + lines[1])
+    assert main(["resume", str(path)]) == 2
+    journal.unlink()
+    assert main(["resume", str(path)]) == 2
+    said = capsys.readouterr().err
+    assert f"{journal} cannot be read: JSONDecodeError" in said
+    assert f"{path} has lost its study.journal, which says what was tried: begin a new search." in said
+
+
+def test_a_field_that_is_given_lies_in_the_range_that_is_searched(tmp_path):
+    with pytest.raises(lem.UserError, match=r"gamma is 0\.5, and is searched elsewhere: gamma=\.9:\.99\."):
+        lem.tune("ppo", env="CartPole-v1", search="gamma=.9:.99", gamma=0.5, run=tmp_path / "t")
+    assert not (tmp_path / "t").exists()
 
 
 def test_the_pictures_show_history_importance_and_settings(tuned):

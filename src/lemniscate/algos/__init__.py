@@ -40,6 +40,10 @@ def name_of(algorithm: str | ModuleType) -> str:
 
 
 def _import(name: str) -> Any:
+    if name.endswith(".py"):
+        raise UserError(f"{name} is a file: name its module, {Path(name).stem}.")
+    if not name or name.startswith("."):
+        raise unknown_name("algorithm", name, ALGORITHMS)
     if ":" in name:
         return named.find(name)
     if str(Path.cwd()) not in sys.path:

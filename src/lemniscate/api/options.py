@@ -14,7 +14,7 @@ from typing import Any
 
 from lemniscate.api.callbacks import Callback
 from lemniscate.errors import RankError, UserError, is_installed, missing_extra, shown, unknown_name
-from lemniscate.run.config import RunConfig
+from lemniscate.run.config import Count, RunConfig, checked
 from lemniscate.run.directory import CONFIG, create_directory
 from lemniscate.run.loggers import TRACKERS, JsonLines, LoggerClass, TensorBoard, require_logger
 from lemniscate.run.stopping import Stopped
@@ -47,7 +47,8 @@ class RunOptions:
         workers: int | None = None,
         storage: str | None = None,
     ) -> None:
-        self.track, self.report, self.progress, self.processes = track, report, progress, processes
+        self.track, self.processes = track, checked("processes", processes, Count)
+        self.report, self.progress = checked("report", report, bool), checked("progress", progress, bool)
         self.cluster: Any = None
         if not (cluster is workers is storage is None):
             from lemniscate.cluster.connection import find_cluster

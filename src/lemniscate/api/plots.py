@@ -43,7 +43,7 @@ def plot(*runs: Plotted | list[Plotted], by: str = "step") -> list[Path]:
     Raises:
         UserError: no runs, or without metrics; another axis.
     """
-    if by not in curves.BY:
+    if not isinstance(by, str) or by not in curves.BY:
         raise unknown_name("axis", by, curves.BY)
     given = [run for one in runs for run in (one if isinstance(one, list | tuple) else [one])]
     paths = [path_of(run) for run in given]

@@ -1,5 +1,6 @@
 """Trained policies, for those who have NumPy and an environment of their own; `load` and `save`."""
 
+import re
 import sys
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace
@@ -227,6 +228,8 @@ def path_of(run: object) -> Path:
     path = getattr(run, "path", run)
     if not isinstance(path, str | PathLike) or not str(path):
         raise UserError(f"A run is a directory, such as 'runs/lander', or what train returned, not {shown(run)}.")
+    if re.match(r"(?!hf:)[A-Za-z][\w+.-]+:/", str(path)):
+        raise UserError(f"{path} is an address, and a run is a directory of this machine: leave out the scheme.")
     if Path(path).parts[:1] == (hub.SCHEME,):
         address = hub.read_address(path)
         raise UserError(f"{address} is on the Hub, and no run directory: it can be loaded, evaluated and watched.")
@@ -301,7 +304,7 @@ def save(policy: Any, path: str | Path) -> Path:
     Args:
         policy: from `load`, or what `train` returned. It may begin another run (`warm_start=path`), but not resume
             its own: a run's checkpoints also hold optimizers and random generators.
-        path: a new directory, or a policy stored before, which is replaced.
+        path: a new directory, or a policy stored before, or a link to one, which is replaced.
 
     Raises:
         UserError: something else is at `path`, it has the ending of a file, or it cannot be written.
@@ -327,7 +330,7 @@ def save(policy: Any, path: str | Path) -> Path:
     record = {"algorithm": algorithm_of(policy), "config": policy.config.to_json()}
     record |= {"spec": checkpoint.spec_to_json(policy.spec), "planned": False, "stored": True}
     try:
-        checkpoint.write_fields(path, {"networks": policy.networks, "step": policy.step}, record)
+        checkpoint.write_fields(path.resolve(), {"networks": policy.networks, "step": policy.step}, record)
     except OSError as error:
         raise UserError(f"{path} cannot be written: {error}.") from error
     return path

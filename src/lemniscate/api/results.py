@@ -1,9 +1,10 @@
 """The verbs that look: evaluate, watch, check; and the final scores by which runs are compared."""
 
 import os
+import re
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from functools import partial
 from os import PathLike
 from pathlib import Path
@@ -30,7 +31,7 @@ from lemniscate.run import check as run_check
 from lemniscate.run import checkpoint
 from lemniscate.run.checkpoint import list_steps
 from lemniscate.run.config import Episodes, Natural, RunConfig, checked
-from lemniscate.run.directory import CONFIG, FINAL, read_config, require_no_file_of_a_run
+from lemniscate.run.directory import CONFIG, FINAL, read_config, require_no_part_of_a_run
 from lemniscate.run.environments import env_arguments, evaluation_env
 from lemniscate.run.evaluate import Evaluation, critic_of
 from lemniscate.run.evaluate import evaluate as evaluate_policy
@@ -97,9 +98,7 @@ def evaluate(
     chosen = agents.find(policy, checkpoint=checkpoint, trust=trust)
     episodes, seed, file = checked("episodes", episodes, Episodes), checked("seed", seed, Natural), _film(video)
     deterministic = checked("deterministic", deterministic, bool)
-    kwargs, folder = checked("env_kwargs", env_kwargs, dict | None), None if report is None else path_of(report)
-    if folder and (file_there := file_in_the_way(folder)):
-        raise UserError(f"report is a directory, such as 'runs/upright', and {file_there} is a file.")
+    kwargs, folder = checked("env_kwargs", env_kwargs, dict | None), _folder_of(report, chosen)
     how: dict[str, Any] = {"episodes": episodes, "seed": seed, "deterministic": deterministic}
     own = {"agent": agent, "normalized": checked("normalized_actions", normalized_actions, bool | None)}
     with _environments(chosen, env, own, how, env_kwargs=kwargs, backend=backend) as (player, vec, arguments):
@@ -122,6 +121,21 @@ def evaluate(
             for made in (*pictures, pages.write_evaluation(folder, str(policy), pictures, scores, seed)):
                 say(made)
         return scores
+
+
+def _folder_of(report: str | Path | None, chosen: Any) -> Path | None:
+    """The directory of a report. Raises `UserError` for a file, and for a run that `chosen`, a policy, is not of."""
+    if report is None:
+        return None
+    folder, path = path_of(report), getattr(chosen, "path", None)
+    if file_there := file_in_the_way(folder):
+        raise UserError(f"report is a directory, such as 'runs/upright', and {file_there} is a file.")
+    own = [] if path is None else [path.resolve(), *path.resolve().parents]
+    if (folder / CONFIG).exists() and folder.resolve() not in own:
+        raise UserError(
+            f"{folder} is another run, whose page this would replace: name another directory for the report."
+        )
+    return folder
 
 
 @torch_defaults()
@@ -208,7 +222,8 @@ def check(
     Raises:
         UserError: no such environment, backend or wrapper.
     """
-    name = str(path_of(what)) if isinstance(what, Path | TrainedRun) else registry.name_of(what)
+    is_path = isinstance(what, Path) or isinstance(getattr(what, "path", None), Path)
+    name = str(path_of(what)) if is_path else registry.name_of(what)
     return list(each_finding(name, backend, env_kwargs, registry.names_of(wrappers)))
 
 
@@ -217,9 +232,13 @@ def each_finding(
 ) -> Iterator[Finding]:
     """The findings of `check`, one by one."""
     path = path_of(what)
-    require_no_file_of_a_run(path)
+    require_no_part_of_a_run(path)
     if run_check.is_stored(path):
+        if backend or env_kwargs or wrappers:
+            raise UserError(f"{path} is a run, and has its own environment: leave out backend, env_args and wrappers.")
         return run_check.each_finding(path)
+    if path.is_dir():
+        raise UserError(f"{path} is a directory, and no run: it has no {CONFIG}.")
     return env_check.each_finding(what, backend, env_kwargs, wrappers, _shown_by)
 
 
@@ -429,14 +448,17 @@ def push(run: Trained, name: str, *, private: bool = False, license: str | None 
             that refuses or cannot be reached; a repository that holds something else, or is public in spite of
             `private`.
     """
-    hub.require_uploads(name)
+    hub.require_uploads(checked("name", name, str))
+    private = checked("private", private, bool)
+    if license is not None and not (isinstance(license, str) and re.fullmatch(r"[a-z0-9.-]+", license)):
+        raise UserError(f"license is written as on the Hub, such as 'mit' or 'apache-2.0', not {shown(license)}.")
     policy = load(run, trust=trust)
     with TemporaryDirectory() as temporary:
         folder = Path(temporary) / "policy"
         save(policy, folder)
         code = own_code(checkpoint.read(folder))
         path = policy.path if policy.path and (policy.path / CONFIG).is_file() else None
-        for place, file in _shown(path).items() if path else ():
+        for place, file in _shown(path, policy.step).items() if path else ():
             (folder / place).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(file, folder / place)
         if not (path and pages.newest_film(path)):
@@ -452,15 +474,19 @@ def push(run: Trained, name: str, *, private: bool = False, license: str | None 
         return hub.upload(folder, name, private)
 
 
-def _shown(run: Path) -> dict[str, Path]:
-    """The files of a run that are uploaded beside its policy, by their paths in the repository; no links.
+def _shown(run: Path, step: int) -> dict[str, Path]:
+    """The files of a run that are uploaded beside its policy of a step, by their paths in the repository; no links.
 
-    They are the figures, the export where there is a whole one, and the newest film: a video by the name that the Hub
-    plays, else in `videos/`.
+    They are the figures, the export where there is a whole one of that step, and the newest film: a video by the name
+    that the Hub plays, else in `videos/`.
     """
-    files = [*(run / "plots").glob("*.png")]
-    if (run / "export" / "policy.onnx").is_file():
-        files += (run / "export").rglob("*")
+    files, export = [*(run / "plots").glob("*.png")], run / "export"
+    if (export / "policy.onnx").is_file():
+        with suppress(DamagedFileError):
+            if read_json(export / checkpoint.MANIFEST).get("step") == step:
+                files += export.rglob("*")
+        if export / "policy.onnx" not in files:
+            say(f"{export} is not of the policy of step {step:,}: it is left out; lemniscate export {run}")
     own = [file for file in files if file.is_file() and file.resolve() == run.resolve() / file.relative_to(run)]
     shown = {file.relative_to(run).as_posix(): file for file in own}
     if film := pages.newest_film(run):

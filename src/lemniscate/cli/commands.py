@@ -220,6 +220,8 @@ def grade(json: bool, csv: bool, **options: Any) -> None:
     """Judge hand-ins: a table, and on standard output what a program reads."""
     from lemniscate.course.grading import as_csv, grade
 
+    if json and csv:
+        raise UserError("--json and --csv print to one place: choose one of them.")
     grades = grade(**options)
     if json:
         print(notation.dumps(grades))

@@ -53,7 +53,7 @@ def find_cluster(cluster: object, workers: object = None, storage: object = None
     if cluster is None:
         for name, value in (("workers", workers), ("storage", storage)):
             if value is not None:
-                raise UserError(f"{name} are of a cluster: add --cluster ray; on this machine, --processes.")
+                raise UserError(f"{name} is an option of a cluster: add --cluster ray; on this machine, --processes.")
         return None
     kind, _, address = cluster.partition("=") if isinstance(cluster, str) else ("", "", "")
     if kind != "ray":

@@ -50,8 +50,6 @@ READING, WHOLE = 60.0, 600.0
 """seconds in which a hand-in is to be read, and in which all of its exercises are to be tried"""
 MOST_COPIED, MOST_PRINTED = 2**26, 2_000
 """bytes of a file, and characters of what is printed that are kept"""
-PACKED = {".zip", ".tar", ".gz", ".7z", ".rar", *handin.SUFFIXES}
-"""endings of files that may hold a hand-in, and are not looked into"""
 IGNORED = {"venv", "env", "site-packages", "node_modules", "wandb"}
 
 
@@ -181,11 +179,7 @@ def grade(folder: str | Path, exercises: str | Sequence[str] = (), *, to: str | 
         Stopped: Ctrl-C; the same call goes on.
     """
     folder = at_home(folder)
-    named = exercises.split(",") if isinstance(exercises, str) else exercises
-    demanded = list(dict.fromkeys(name.strip() for name in named if name.strip()))
-    for name in demanded:
-        if name not in course.EXERCISES:
-            raise unknown_name("exercise", name, course.EXERCISES)
+    demanded = _demanded(exercises)
     if not folder.is_dir():
         raise UserError(f"{folder} is no folder: name the one that has the hand-ins.")
     visible = [path for path in sorted(folder.iterdir()) if not path.name.startswith((".", "__"))]
@@ -217,10 +211,23 @@ def grade(folder: str | Path, exercises: str | Sequence[str] = (), *, to: str | 
     return grades
 
 
+def _demanded(exercises: str | Sequence[str]) -> list[str]:
+    """The names of exercises, each once. Raises `UserError` for one that there is not, and where none is left."""
+    named = exercises.split(",") if isinstance(exercises, str) else exercises
+    demanded = list(dict.fromkeys(name.strip() for name in named if name.strip()))
+    if exercises and not demanded:
+        raise UserError("exercises names none: give some, such as gae,Agent, or leave it out.")
+    for name in demanded:
+        if name not in course.EXERCISES:
+            raise unknown_name("exercise", name, course.EXERCISES)
+    return demanded
+
+
 def _tell_left_out(visible: Sequence[Path], hand_ins: Sequence[Path]) -> None:
-    """Say which files that may hold a hand-in are not looked into."""
-    if packed := [path.name for path in visible if path.suffix.lower() in PACKED and path not in hand_ins]:
-        say(f"Left out: {', '.join(packed)}; a hand-in is a .py or .ipynb file, or a folder with several.")
+    """Say which files, of which a student may think as a hand-in, are not looked into."""
+    if others := [path.name for path in visible if path not in hand_ins]:
+        named = ", ".join(others[:12]) + f" and {len(others) - 12} more" * (len(others) > 12)
+        say(f"Left out: {named}; a hand-in is a .py or .ipynb file, or a folder with several.")
 
 
 def marks(record: Mapping[str, Any], names: Sequence[str]) -> list[str]:

@@ -202,7 +202,8 @@ def _root(file: Path) -> Path:
 def _cells(text: str) -> list[dict[str, Any]]:
     """The cells of a notebook. Raises `UserError` for another file."""
     try:
-        return json.loads(text)["cells"]
+        cells = [dict(cell) for cell in json.loads(text)["cells"]]
+        return [{**cell, "source": "".join(cell.get("source", ""))} for cell in cells]
     except (ValueError, LookupError, TypeError):
         why = "it is empty" if not text.strip() else "save it once with a newer Jupyter"
         raise UserError(f"it is no notebook with cells: {why}") from None
@@ -364,6 +365,7 @@ def _fenced(work: Path) -> bool:
         for handle in {int(each.name) for each in Path("/dev/fd").iterdir()} - kept:
             with suppress(OSError):  # these lead to the processes that judge and start
                 os.dup2(nothing, handle, inheritable=False)
+    (work / "hand-in").mkdir(exist_ok=True)  # an empty one has none
     os.chdir(work / "hand-in")
     for number, handle in enumerate((nothing, printed, printed)):
         os.dup2(handle, number)

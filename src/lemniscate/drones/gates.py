@@ -27,6 +27,7 @@ from crazyflow.utils import leaf_replace
 from scipy.spatial.transform import Rotation
 
 from lemniscate.errors import UserError, shown
+from lemniscate.system.files import at_home
 
 OPENING, FRAME = 0.40, 0.72
 """side of the square opening of a gate, and of its frame outside, m"""
@@ -126,8 +127,10 @@ def text_of_track(file: object) -> str:
     """The text of a track's file, with a line break at its end. Raises `UserError` where it cannot be read."""
     if not isinstance(file, str | Path):
         raise UserError(f"track of DroneGates-v0 must be the path of a file, not {shown(file)}.")
+    if not str(file):
+        raise UserError("'' is no track: name a file, or leave track out.")
     try:
-        return Path(file).read_text("utf-8") + "\n"
+        return at_home(file).read_text("utf-8-sig") + "\n"
     except (OSError, ValueError) as error:
         raise UserError(f"{file} is no track: {error}; one looks as lemniscate/drones/gates.toml does.") from error
 

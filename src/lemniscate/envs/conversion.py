@@ -51,7 +51,7 @@ class SingleEnv(gym.Wrapper):
         self._ask = _mask_of(env)
         seen, self._acts, self._declared = env.observation_space, env.action_space, measures_of(env.metadata)
         self._masked = bool(self._ask or (isinstance(seen, spaces.Dict) and seen.spaces.keys() & set(MASKS)))
-        self._shape = seen.shape if isinstance(seen, spaces.Box | spaces.MultiBinary) else None
+        self._shape = seen.shape if isinstance(seen, spaces.Box) else None
         self._dtype = seen.dtype
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:

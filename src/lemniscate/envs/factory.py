@@ -81,8 +81,14 @@ class ResetOptions(gym.Wrapper):
         self._options = options
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """The environment's."""
-        return self.env.reset(seed=seed, options={**fresh(self._options), **(options or {})})
+        """The environment's. Raises `UserError` for options that it refuses."""
+        given = {**fresh(self._options), **(options or {})}
+        try:
+            return self.env.reset(seed=seed, options=given)
+        except (ValueError, TypeError, KeyError, AssertionError) as error:
+            raise UserError(
+                f"reset with the options {given} raised {type(error).__name__}: {str(error).rstrip('.')}."
+            ) from error
 
 
 def make_one(maker: Maker, wrappers: Sequence[Callable[..., Any]] = (), **kwargs: Any) -> SingleEnv:

@@ -115,10 +115,15 @@ class CheckedVector(VectorWrapper):
 
 def require_form(env: Any, names: tuple[str, str]) -> None:
     """Raise `UserError` for an environment that lacks one of these spaces, or whose reset takes no seed or options."""
+    kind = type(env.unwrapped).__name__
     for name in names:
-        if not isinstance(getattr(env, name, None), gym.Space):
-            kind = type(env.unwrapped).__name__
-            raise UserError(f"{kind} has no {name}: set self.{name} in its __init__, such as a Box.")
+        try:
+            space = getattr(env, name)
+        except AttributeError as error:
+            why = "" if f"'{name}'" in str(error) else f", as {error}"  # it may be a property of its own
+            raise UserError(f"{kind} has no {name}{why}: set self.{name} in its __init__, such as a Box.") from error
+        if not isinstance(space, gym.Space):
+            raise UserError(f"{name} of {kind} is {shown(space)}, and must be a space of gymnasium, such as a Box.")
     for layer in layers(env):
         if not _takes_options(layer.reset):
             right = "reset(self, *, seed=None, options=None)"
@@ -195,7 +200,7 @@ def fitted(space: gym.Space, obs: Any, lead: tuple[int, ...] = (), where: str = 
 
 
 def _fitted_array(space: gym.Space, obs: Any, shape: tuple[int, ...], where: str) -> Any:
-    counted = isinstance(space, spaces.Discrete | spaces.MultiDiscrete)
+    counted = isinstance(space, spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary)
     if not counted and type(obs) is np.ndarray and obs.dtype == space.dtype and obs.shape == shape:
         return obs.copy()  # several environments may write into one array
     array, kind = as_array(obs), np.dtype(space.dtype)
@@ -206,8 +211,9 @@ def _fitted_array(space: gym.Space, obs: Any, shape: tuple[int, ...], where: str
         fitted = array.astype(kind)
     if kind.kind in "iub" and not np.array_equal(fitted, array):
         raise ValueError(f"of type {array.dtype}{where}, whose numbers are not all of type {kind}, as its space says")
-    if isinstance(space, spaces.Discrete | spaces.MultiDiscrete):
-        count, start = getattr(space, "nvec", getattr(space, "n", 0)), np.asarray(space.start, dtype=np.int64)
+    if counted:
+        count = 2 if isinstance(space, spaces.MultiBinary) else getattr(space, "nvec", getattr(space, "n", 0))
+        start = np.asarray(getattr(space, "start", 0), dtype=np.int64)
         outside = fitted[(fitted < start) | (fitted >= start + count)]  # a small type may not hold the first beyond it
         if outside.size:
             raise ValueError(f"with {outside.flat[0]}{where}, which is not in its space, {shown_space(space)}")

@@ -76,7 +76,7 @@ class RslRlBackend(Backend):
         groups = [*obs.keys()]
         group = next((name for name in ACTOR if name in groups), None)
         if group is None:
-            given = ", ".join(groups)
+            given = ", ".join(map(str, groups)) or "none"
             raise UserError(f"{env} has the groups of observations {given}; one must be actor or policy.")
         self._env_id, self._groups = env, [group, *([CRITIC] if CRITIC in groups else [])]
         self._sizes: list[int] = []

@@ -58,7 +58,8 @@ def export(
 
     Args:
         run: as in `load`.
-        to: the new directory; by default `export` in that of the run. An export that is there is replaced.
+        to: the new directory; by default `export` in that of the run, of a checkpoint too. An export that is there is
+            replaced.
         checkpoint: as in `load`; and so `trust`.
 
     Returns:
@@ -93,10 +94,15 @@ def _destination(run: Trained, policy: TrainedPolicy, to: str | Path | None) -> 
     """The directory of the export. Raises `UserError` where something else is in its place."""
     if to is None and (policy.path is None or is_address(run)):
         raise UserError("This policy is of no run here: name the directory of its export, with --to or `to`.")
-    folder = path_of(to) if to is not None else Path(policy.path or "") / "export"
+    folder = path_of(to) if to is not None else _run_of(Path(policy.path or "")) / "export"
     if folder.is_symlink() or (folder.exists() and not is_export(folder)):
         raise UserError(f"{folder} exists already, and is no export; choose another directory.")
     return folder
+
+
+def _run_of(path: Path) -> Path:
+    """The run of a checkpoint, whose own directory the run removes or replaces; another path as it is."""
+    return path.parents[1] if path.parent.name == "checkpoints" else path
 
 
 def is_export(folder: Path) -> bool:

@@ -16,6 +16,7 @@ import operator
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from threading import Lock
 from typing import Any, Literal
 
 import numpy as np
@@ -421,6 +422,10 @@ TRANSLATIONS: dict[str, Translation] = {
 """by the name of torch's operation; what is not here has no translation"""
 
 
+TRACING = Lock()
+"""`torch.export` traces one module at a time in a process"""
+
+
 def translate(module: nn.Module, inputs: int, memory: int = 0) -> Program:
     """The operations of a module from [B, inputs] to [B, …], for any B.
 
@@ -429,7 +434,8 @@ def translate(module: nn.Module, inputs: int, memory: int = 0) -> Program:
     Raises:
         UserError: an operation that has no translation, or a result that depends on more than one row.
     """
-    exported = _exported(module, [inputs, memory] if memory else [inputs])
+    with TRACING:
+        exported = _exported(module, [inputs, memory] if memory else [inputs])
     signature, constants = exported.graph_signature, {**exported.state_dict, **exported.constants}
     nodes = [node for node in exported.graph.nodes if node.name in signature.user_inputs]
     values = [Value(name, tuple(n.meta["val"].shape[1:])) for name, n in zip(("obs", "memory"), nodes, strict=False)]

@@ -102,6 +102,8 @@ def read_preset(file: Path, algorithm: str) -> Preset:
         reason = str(error) if file.exists() else f"{file} does not exist."
         raise UserError(f"There is no preset: {reason}") from None
     with parsing(file):
+        if "fields" not in record:
+            raise UserError(f"{file} is no preset, which `lemniscate tune` writes as preset.json.")
         if record["algorithm"] != algorithm:
             raise UserError(f"{file} is a preset of {record['algorithm']}, not of {algorithm}.")
         config = find(algorithm).Config().replace(**record["fields"])

@@ -70,6 +70,17 @@ def require_no_file_of_a_run(path: Path) -> None:
         raise UserError(f"{path} is a file of {path.parent}: name that directory.")
 
 
+def require_no_part_of_a_run(path: Path) -> None:
+    """Raise `UserError` for a checkpoint or an export too, where only a run will do."""
+    require_no_file_of_a_run(path)
+    if not (path / checkpoint.MANIFEST).is_file():
+        return
+    if path.parent.name == "checkpoints":
+        raise UserError(f"{path} is a checkpoint: name its run, {path.parents[1]}.")
+    kind = "an export" if (path / "policy.onnx").is_file() else "a stored policy"
+    raise UserError(f"{path} is {kind}: name the run that it is of.")
+
+
 _say_once = cache(say)  # a command reads a record several times
 
 
@@ -78,7 +89,7 @@ def read_record(path: Path) -> dict[str, Any]:
 
     Raises `UserError` if it is not a run.
     """
-    require_no_file_of_a_run(path)
+    require_no_part_of_a_run(path)
     if (path / SWEEP).exists():
         runs = sorted(file.parent for file in path.glob(f"*/{CONFIG}"))
         raise UserError(f"{path} is a sweep: name one of its runs, such as {runs[0] if runs else path / '…'}.")

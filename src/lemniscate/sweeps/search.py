@@ -12,6 +12,7 @@ A text such as
 says what is searched: a range whose orders of magnitude are equally likely, a range whose numbers are, a choice of two.
 """
 
+import json
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -31,7 +32,7 @@ from lemniscate.run.fields import kinds_of, read, unknown_field
 from lemniscate.run.metrics import read_metrics
 from lemniscate.run.places import Sweep
 from lemniscate.run.seeding import derive
-from lemniscate.system.files import DamagedFileError, parsing, read_json
+from lemniscate.system.files import DamagedFileError, parsing, read_json, replace_file
 
 if TYPE_CHECKING:
     import optuna
@@ -212,7 +213,7 @@ class Search:
         seeds = ", ".join(map(str, self.seeds))
         which = f"trial {best.number} of {self.trials}, {self.what}, seeds {seeds}, score {best.value:,.1f}"
         settings = draw(self.space, import_optuna().trial.FixedTrial(best.params))
-        config = self.config.replace(**settings, evaluate_every=0, evaluate_episodes=20)
+        config = self.config.replace(**settings, checkpoint_every=0, evaluate_every=0, evaluate_episodes=20)
         preset = Preset(self.path.name, config, f"lemniscate tune: {which}", f"{date.today():%Y-%m}")
         preset.write(self.path / PRESET, self.algorithm)
         return preset
@@ -226,16 +227,17 @@ class Search:
         return [*(ninths * self.config.checkpoint_every for ninths in RUNGS if self.prune), None]
 
     def study(self) -> "optuna.Study":
-        """Optuna's study, new or as the journal has it."""
+        """Optuna's study, new or as the journal has it. Raises `UserError` for one that is damaged."""
         optuna = import_optuna()
         backend = optuna.storages.journal.JournalFileBackend(str(self.path / JOURNAL))
-        return optuna.create_study(
-            storage=optuna.storages.JournalStorage(backend),
-            study_name="lemniscate",
-            direction="maximize",
-            pruner=optuna.pruners.SuccessiveHalvingPruner(min_resource=1, reduction_factor=REDUCTION),
-            load_if_exists=True,
-        )
+        with parsing(self.path / JOURNAL):
+            return optuna.create_study(
+                storage=optuna.storages.JournalStorage(backend),
+                study_name="lemniscate",
+                direction="maximize",
+                pruner=optuna.pruners.SuccessiveHalvingPruner(min_resource=1, reduction_factor=REDUCTION),
+                load_if_exists=True,
+            )
 
     def ask(self, study: "optuna.Study") -> "optuna.Trial":
         """A new trial. What is proposed depends on the trials that are known, not on the process that asks."""
@@ -243,6 +245,20 @@ class Search:
         seed = derive(self.seeds[0], len(study.trials))
         study.sampler = import_optuna().samplers.TPESampler(seed=seed, n_startup_trials=few)
         return study.ask()
+
+
+def mend(journal: Path) -> None:
+    """Cut off the line that a power cut has left half-written; one that is lost is empty. Raises if others are damaged.
+
+    Optuna would write on in that line.
+    """
+    content = journal.read_bytes() if journal.exists() else b""
+    whole = content[: content.rfind(b"\n") + 1]
+    with parsing(journal):
+        for line in whole.splitlines():
+            json.loads(line)
+    if whole != content or not whole:
+        replace_file(journal, whole)
 
 
 def import_optuna() -> Any:

@@ -22,13 +22,16 @@ from lemniscate.run.directory import is_finished, locked
 from lemniscate.run.metrics import progress_of, read_metrics
 from lemniscate.run.places import LOG, Sweep, failure_of, is_sweep
 from lemniscate.sweeps.search import (
+    JOURNAL,
     NINTHS,
     PRESET,
     RUNGS,
+    TRIALS,
     Search,
     Tuned,
     draw,
     import_optuna,
+    mend,
     read_search,
     read_space,
     read_texts,
@@ -99,7 +102,9 @@ def tune(
         evaluate_episodes=fields.get("evaluate_episodes") or EPISODES,
     )
     there, texts, numbers = find_cluster(cluster, workers), read_texts(search), seeds_of(seeds)
-    read_space(texts, config)
+    for name, values in read_space(texts, config).items():
+        if name in fields and values.key_of(getattr(config, name)) is None:
+            raise UserError(f"{name} is {fields[name]!r}, and is searched elsewhere: {name}={texts[name]}.")
     require_trainable({algorithm: config}, numbers)
     path = path_of(run) if run is not None else training.fresh_directory(config.env, f"{algorithm}-tune")
     what = Search(path, algorithm, config, texts, numbers, trials, prune)
@@ -117,6 +122,9 @@ def resume_tuning(
 ) -> Tuned:
     """Go on with an interrupted search. Each run of each trial ends in the same bits as if it had not been stopped."""
     search, there = read_search(path_of(path)), find_cluster(cluster, workers)
+    mend(search.path / JOURNAL)
+    if (search.path / TRIALS).exists() and not (search.path / JOURNAL).stat().st_size:
+        raise UserError(f"{search.path} has lost its {JOURNAL}, which says what was tried: begin a new search.")
     with locked(search.path):
         return _Tuner(search, progress, there).tune()
 
@@ -166,15 +174,21 @@ class _Tuner(SetOfRuns):
         """The number of trials that have not begun."""
         return self._search.trials - sum(trial.state.name != "WAITING" for trial in self._study.trials)
 
-    def _take_up(self, asked: "optuna.Trial", rung: int = 0) -> _Trial:
-        """Let the runs of a trial, which begins or was interrupted, wait for places."""
-        trial = _Trial(asked, self._search.sweep(f"{asked.number:03d}", draw(self._space, asked)), rung)
+    def _take_up(self, asked: "optuna.Trial", rung: int = 0) -> None:
+        """Let the runs of a trial, which begins or was interrupted, wait for places.
+
+        It fails where its values, each in its range, do not go together.
+        """
+        try:
+            trial = _Trial(asked, self._search.sweep(f"{asked.number:03d}", draw(self._space, asked)), rung)
+        except UserError as error:
+            self._end(asked, f"failed, {str(error).rstrip('.')}", state="FAIL")
+            return
         if not is_sweep(trial.sweep.path):
             trial.sweep.create()
         trial.sweep.create_runs()
         self._trials.append(trial)
         self._queue(trial)
-        return trial
 
     def _queue(self, trial: _Trial) -> None:
         """Let the runs of a trial wait for a place, in which they go on to its next rung, or to their end."""
@@ -191,7 +205,8 @@ class _Tuner(SetOfRuns):
             if trial is None:
                 if not self._missing:
                     break
-                trial = self._take_up(self._search.ask(self._study))
+                self._take_up(self._search.ask(self._study))
+                continue
             until = self._search.rungs[trial.rung]
             options = ["--callbacks", f"lemniscate.api.callbacks:StopAt(steps={until})"] if until else []
             run = trial.waiting.pop(0)
@@ -214,10 +229,10 @@ class _Tuner(SetOfRuns):
         """Decide whether a trial whose runs have all come to a rung goes on, or take its score at its end."""
         until = self._search.rungs[trial.rung]
         if trial.failure:
-            self._end(trial, f"failed, {trial.failure}", state="FAIL")
+            self._end(trial.asked, f"failed, {trial.failure}", state="FAIL")
         elif until is None:
             score = float(iqm([read_metrics(run)[-1]["evaluation/return"] for run in trial.sweep.runs]))
-            self._end(trial, f"score {score:,.1f}", score)
+            self._end(trial.asked, f"score {score:,.1f}", score)
             if self._study.best_trial.number == trial.asked.number:
                 self._search.write_preset(self._study.best_trial)
         else:
@@ -227,15 +242,15 @@ class _Tuner(SetOfRuns):
                 trial.asked.report(score, ninths)
             if score is not None and trial.asked.should_prune():
                 sentence = f"ended after {ninths} of {NINTHS} parts, where its return was {score:,.1f}"
-                self._end(trial, sentence, state="PRUNED")
+                self._end(trial.asked, sentence, state="PRUNED")
             else:
                 self._queue(trial)
 
-    def _end(self, trial: _Trial, sentence: str, score: float | None = None, state: str = "") -> None:
-        self._study.tell(trial.asked, score, import_optuna().trial.TrialState[state] if state else None)
-        self._trials.remove(trial)
-        shown = {name: f"{x:.3g}" if isinstance(x, float) else x for name, x in trial.asked.params.items()}
-        self._say(f"trial {trial.asked.number}: {sentence}; {', '.join(f'{name} {x}' for name, x in shown.items())}")
+    def _end(self, asked: "optuna.Trial", sentence: str, score: float | None = None, state: str = "") -> None:
+        self._study.tell(asked, score, import_optuna().trial.TrialState[state] if state else None)
+        self._trials = [trial for trial in self._trials if trial.asked is not asked]
+        shown = {name: f"{x:.3g}" if isinstance(x, float) else x for name, x in asked.params.items()}
+        self._say(f"trial {asked.number}: {sentence}; {', '.join(f'{name} {x}' for name, x in shown.items())}")
 
     def _result(self) -> Tuned:
         """The best trial, and pictures of all."""
