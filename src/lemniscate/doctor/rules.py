@@ -479,7 +479,8 @@ def of_advantages(e: Evidence) -> Seen:
             f"Where episodes terminate, the value still awaits {awaited:.0%} of what it awaits elsewhere.",
         )
     # Once hardly any entropy is left, the correlation is chance, and only its sign still tells.
-    if errors < -3 or (len(followed) >= 4 and followed.mean() < -0.06 and np.mean(followed < 0) > 0.8):
+    falls = errors < -3 or (errors < -2 and followed.mean() < -0.04)
+    if falls or (len(followed) >= 4 and followed.mean() < -0.06 and np.mean(followed < 0) > 0.8):
         yield (
             "advantage-opposed",
             f"The probabilities of actions fall with their advantage: the correlation is {followed.mean():.2f}.",
