@@ -416,6 +416,27 @@ def test_a_run_does_not_go_on_in_other_spaces(tmp_path, monkeypatch, now, space)
     assert {file: file.read_bytes() for file in (path / "checkpoints").rglob("*") if file.is_file()} == before
 
 
+class Drawn(environments.Graded):
+    """It is made of a file."""
+
+    def __init__(self, file=None, text=None, **kwargs):
+        super().__init__(**kwargs)
+
+
+def test_a_file_that_the_environment_is_made_of_and_that_has_changed_is_named(tmp_path, capsys):
+    file = tmp_path / "track.toml"
+    file.write_text("one")
+    kwargs = {"file": str(file), "text": "name = 1\n" * 1000}
+    fields = tiny_fields("CartPole-v1", checkpoint_every=64, keep_checkpoints=10)
+    path = lem.train("ppo", Drawn, run=tmp_path / "r", progress=False, **fields | {"env_kwargs": kwargs}).path
+    for content, told in (("one", False), ("two", True)):
+        shutil.rmtree(path / "checkpoints" / "step-256")
+        file.write_text(content)
+        assert lem.resume(path, progress=False).policy.step == 256
+        said = f"{file} has changed since step 192: the environment is another one from here on."
+        assert (said in capsys.readouterr().err) == told
+
+
 def test_a_damaged_checkpoint_is_named_and_the_one_before_is_taken(tmp_path, capsys):
     fields = {"checkpoint_every": 64, "keep_checkpoints": 10}
     train(tmp_path / "r", "CartPole-v1", **fields)

@@ -1,10 +1,11 @@
 """The run directory: its creation, its config, its lock, and the checkpoints in it, from which a run may begin."""
 
 import errno
+import hashlib
 import json
 import math
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from functools import cache
 from itertools import count
 from pathlib import Path
@@ -252,6 +253,16 @@ def difference(theirs: dict[str, Tensor], mine: dict[str, Tensor]) -> str:
     return ""
 
 
+def _files_of(kwargs: Mapping[str, Any]) -> dict[str, dict[str, str]]:
+    """The `files` that arguments of an environment name, such as a track or a model, by the sha256 of their content."""
+    named = {}
+    for value in kwargs.values():
+        with suppress(OSError, ValueError):  # what is no name of a file
+            if isinstance(value, str) and files.at_home(value).is_file():
+                named[value] = hashlib.sha256(files.at_home(value).read_bytes()).hexdigest()
+    return {"files": named} if named else {}
+
+
 class Saver:
     """Saves the state of a run into its directory, and restores it from there. One process at a time may do so."""
 
@@ -262,7 +273,7 @@ class Saver:
         """whether the run directory was there before this process"""
         self._config, self._checkpoints = config, path / "checkpoints"
         self._identity = {"algorithm": algorithm, "config": config.to_json()}
-        self._record = {**self._identity, "spec": checkpoint.spec_to_json(spec)}
+        self._record = {**self._identity, "spec": checkpoint.spec_to_json(spec), **_files_of(config.env_kwargs)}
         self._held = ExitStack()
         self.last_planned = 0
         """the step that `resume` would go on from"""
@@ -289,6 +300,13 @@ class Saver:
         elif not files.is_whole(self.path / CONFIG):
             files.write_json(self.path / CONFIG, self._identity)
 
+    def _tell_changed_files(self, found: checkpoint.Checkpoint) -> None:
+        """Say which files that the environment is made of are not as they were at a checkpoint."""
+        now, step = self._record.get("files", {}), found.numbers["step"]
+        for file, content in found.record.get("files", {}).items():
+            if self._world.is_first and now.get(file, content) != content:
+                say(f"{file} has changed since step {step:,}: the environment is another one from here on.")
+
     def restore(self, state: TrainState) -> bool:
         """Restore the newest whole planned checkpoint, if there is one, and delete those after it.
 
@@ -301,6 +319,7 @@ class Saver:
                 if json.dumps(before[what]) != json.dumps(now[what]):
                     space = f"another {what.removesuffix('_parts')} space than {now['env_id']} has now"
                     raise UserError(f"{self.path} was trained with {space}.")
+            self._tell_changed_files(found)
             found.restore(state)
             self.last_planned = state.step
             self.calls = dict(found.record.get("calls", {}))
