@@ -258,7 +258,7 @@ def test_what_would_fail_again_is_told_once(tmp_path, kind):
         (["--cluster", "ray", "--workers", "0"], "workers must be a whole number from 1 to 4,096, not 0."),
         (["--cluster", "ray", "--workers", "two"], "workers must be a whole number from 1 to 4,096, not 'two'."),
         (["--workers", "2"], "workers are of a cluster: add --cluster ray; on this machine, --processes."),
-        (["--storage", "here"], "storage are of a cluster"),
+        (["--storage", "here"], "storage is of a cluster"),
     ],
 )
 @pytest.mark.parametrize("several", [[], ["--seeds", "1-2"]])

@@ -121,7 +121,7 @@ class Needs(gym.Env):
             partial(Told, space=spaces.Box),
             "observation_space of Told is the class Box, and must be a space of gymnasium",
         ),
-        (partial(Told, space=None), "observation_space of Told is None, and must be a space of gymnasium"),
+        (partial(Told, space=None), "Told has no observation_space: set self.observation_space in its __init__"),
     ],
 )
 def test_what_is_no_space_is_said_with_its_reason(env, sentence):

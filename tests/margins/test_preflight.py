@@ -128,7 +128,7 @@ def test_a_missing_compiler_has_its_sentence(copy, monkeypatch):
 
 def test_only_runs_are_flown(copy, tmp_path):
     for wrong in (tmp_path / "nowhere", copy / "checkpoints" / "step-256"):
-        with pytest.raises(lem.UserError, match="is not a run directory"):
+        with pytest.raises(lem.UserError, match=r"is not a run directory|is a checkpoint: name its run"):
             preflight(wrong)
     with pytest.raises(lem.UserError, match="A run is a directory"):
         preflight(3)

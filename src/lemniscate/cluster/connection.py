@@ -51,9 +51,9 @@ def find_cluster(cluster: object, workers: object = None, storage: object = None
     Raises `UserError` for another name, or a number that is none; without Ray; where nobody listens at the address.
     """
     if cluster is None:
-        for name, value in (("workers", workers), ("storage", storage)):
+        for name, verb, value in (("workers", "are", workers), ("storage", "is", storage)):
             if value is not None:
-                raise UserError(f"{name} is an option of a cluster: add --cluster ray; on this machine, --processes.")
+                raise UserError(f"{name} {verb} of a cluster: add --cluster ray; on this machine, --processes.")
         return None
     kind, _, address = cluster.partition("=") if isinstance(cluster, str) else ("", "", "")
     if kind != "ray":

@@ -117,11 +117,13 @@ def require_form(env: Any, names: tuple[str, str]) -> None:
     """Raise `UserError` for an environment that lacks one of these spaces, or whose reset takes no seed or options."""
     kind = type(env.unwrapped).__name__
     for name in names:
+        space, why = None, ""
         try:
             space = getattr(env, name)
         except AttributeError as error:
             why = "" if f"'{name}'" in str(error) else f", as {error}"  # it may be a property of its own
-            raise UserError(f"{kind} has no {name}{why}: set self.{name} in its __init__, such as a Box.") from error
+        if space is None:
+            raise UserError(f"{kind} has no {name}{why}: set self.{name} in its __init__, such as a Box.")
         if not isinstance(space, gym.Space):
             raise UserError(f"{name} of {kind} is {shown(space)}, and must be a space of gymnasium, such as a Box.")
     for layer in layers(env):
