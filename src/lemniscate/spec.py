@@ -156,7 +156,7 @@ class Spec:
         if not all(map(math.isfinite, (*self.action.low, *self.action.high))):
             raise UserError(
                 f"{self.env_id} has actions without bounds, and this algorithm explores between bounds: give its Box a"
-                " finite low and high. ppo learns here."
+                " finite low and high, of everyday size. ppo learns here."
             )
         return self.action
 

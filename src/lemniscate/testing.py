@@ -55,7 +55,7 @@ def check_names(algorithm: str | ModuleType, folder: Path, **settings: Any) -> N
 
 def check_training(algorithm: str | ModuleType, folder: Path, **settings: Any) -> None:
     """A run reaches its last step with finite metrics, and its policy can be loaded and evaluated."""
-    run = training.train(algorithm, run=folder / "run", progress=False, **settings)
+    run = training.train(algorithm, run=Path(folder) / "run", progress=False, **settings)
     total = run.policy.config.total_steps
     assert run.policy.step >= total, f"The run ended at step {run.policy.step}, before its {total} steps."
     metrics = read_metrics(run.path)
@@ -69,19 +69,21 @@ def check_training(algorithm: str | ModuleType, folder: Path, **settings: Any) -
 def check_seeds(algorithm: str | ModuleType, folder: Path, **settings: Any) -> None:
     """The seed determines the run: the same one gives the same bits, another one others."""
     again = {"seed": 1, **settings}
-    runs = [training.train(algorithm, run=folder / f"run-{i}", progress=False, **again).path for i in range(2)]
+    runs = [training.train(algorithm, run=Path(folder) / f"run-{i}", progress=False, **again).path for i in range(2)]
     assert not _difference(*map(_last_checkpoint, runs)), "Two runs with the same seed end in different bits."
-    other = training.train(algorithm, run=folder / "other", progress=False, **{**again, "seed": again["seed"] + 1}).path
+    other = training.train(
+        algorithm, run=Path(folder) / "other", progress=False, **{**again, "seed": again["seed"] + 1}
+    ).path
     assert _difference(_last_checkpoint(runs[0]), _last_checkpoint(other)), "Another seed ends in the same bits."
 
 
 def check_resume(algorithm: str | ModuleType, folder: Path, **settings: Any) -> None:
     """A run that was stopped and resumed ends in the bits of one that was not."""
     quarter = training.config_for(algorithm, **settings).total_steps // 4
-    settings = {"checkpoint_every": max(1, quarter), **settings}  # without one on the way it would begin anew
-    whole = training.train(algorithm, run=folder / "whole", progress=False, **settings)
+    settings["checkpoint_every"] = settings.get("checkpoint_every") or max(1, quarter)  # else it would begin anew
+    whole = training.train(algorithm, run=Path(folder) / "whole", progress=False, **settings)
     half = whole.policy.config.total_steps // 2
-    stopped = folder / "stopped"
+    stopped = Path(folder) / "stopped"
     training.train(algorithm, run=stopped, progress=False, callbacks=[lambda step, *_: step >= half], **settings)
     first, seen = read_metrics(whole.path)[0]["step"], list[int]()
     training.resume(stopped, progress=False, callbacks=[lambda step, *_: seen.append(step)])
@@ -94,7 +96,9 @@ def check_compilation(algorithm: str | ModuleType, folder: Path, **settings: Any
     """A compiled run computes what one without compilation does, to rounding, for its first update."""
     rows = []
     for compile in ("off", "on"):
-        path = training.train(algorithm, run=folder / compile, progress=False, **{**settings, "compile": compile}).path
+        path = training.train(
+            algorithm, run=Path(folder) / compile, progress=False, **{**settings, "compile": compile}
+        ).path
         rows.append({name: x for name, x in read_metrics(path)[0].items() if name.startswith("losses/")})
     off, on = rows
     for name, value in off.items():
@@ -135,11 +139,15 @@ class Answers(gym.Env):
 def check_learning(algorithm: str | ModuleType, folder: Path, **settings: Any) -> None:
     """The policy gets better in `Answers`, not worse, and where an episode is cut off its value goes on.
 
-    The settings are to be those that learn it: some thousand steps, and a discount of 0.9.
+    The settings are to be those that learn it: some thousand steps, and a discount of 0.9. Of `env`, only the kind of
+    its actions is looked at: what wraps it, resets it or makes it harder is left out.
     """
-    with closing(registry.make(settings["env"], 1)) as env:
+    config = training.config_for(algorithm, **settings)
+    arguments = {"kwargs": config.env_kwargs, "wrappers": config.wrappers, "backend": config.backend}
+    with closing(registry.make(config.env, 1, **arguments)) as env:
         own = {"env": "lemniscate.testing:Answers", "env_kwargs": {"discrete": isinstance(env.spec.action, Discrete)}}
-    run = training.train(algorithm, run=folder / "run", progress=False, **{**settings, **own})
+    usual: dict[str, Any] = {"wrappers": (), "reset_options": {}, "curriculum": None, "backend": "gymnasium"}
+    run = training.train(algorithm, run=Path(folder) / "run", progress=False, **{**settings, **usual, **own})
     reached = results.evaluate(run.policy, episodes=20, seed=0).mean_return
     assert reached > 4, f"The policy has learned the opposite, a return of {reached:.2g} of 10: a sign is wrong."
     assert reached > 6, f"The policy has not learned: its return is {reached:.2g} of 10, and 5 without learning."

@@ -90,6 +90,13 @@ def learns(algorithm, folder):
     check_learning(algorithm, folder, **settings, gamma=0.9, evaluate_episodes=2)
 
 
+def test_what_wraps_the_environment_is_not_for_the_question(tmp_path):
+    limit = ("gymnasium.wrappers:TimeLimit(max_episode_steps=3)",)
+    settings = {**settings_of("ppo"), **LEARNING["ppo"], "env": "CartPole-v1", "wrappers": limit}
+    settings |= {"reset_options": {"low": -0.01, "high": 0.01}, "backend": "gymnasium"}
+    check_learning("ppo", str(tmp_path), **settings, gamma=0.9, evaluate_episodes=2)
+
+
 @pytest.mark.parametrize("algorithm", [*long("reinforce", "trpo", "reppo", "pqn", "td3", "sac"), "a2c", "ppo", "ddpg"])
 def test_every_algorithm_learns_what_is_right_and_the_value_beyond_a_cut(algorithm, tmp_path):
     learns(algorithm, tmp_path)

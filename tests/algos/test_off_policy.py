@@ -2,11 +2,12 @@
 
 import copy
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
 
-import environments  # noqa: F401  (registers Copy-box-v0)
+import environments
 import lemniscate as lem
 from conftest import tiny_off_policy
 from helpers import (
@@ -320,3 +321,16 @@ def test_impossible_settings_are_an_error_and_leave_nothing(tmp_path, algorithm,
     with pytest.raises(UserError, match=message):
         lem.train(algorithm, run=tmp_path / "run", progress=False, **{"env": "Pendulum-v1", **fields})
     assert not (tmp_path / "run").exists()
+
+
+class Sight(environments.Pictures):
+    """Pictures of a few bytes, which the signals look at as at numbers."""
+
+    action_space = gym.spaces.Box(-1, 1, (1,))
+
+
+@pytest.mark.parametrize("shape", [(4, 4, 3), (8, 8, 1)])
+def test_small_images_are_learned_from(tmp_path, shape):
+    fields = tiny_off_policy(total_steps=100) | {"env_kwargs": {"shape": shape}}
+    run = lem.train("ddpg", Sight, run=tmp_path / "r", progress=False, **fields)
+    assert run.policy.step >= 100

@@ -197,6 +197,21 @@ def test_checkpoints_that_cut_every_episode_are_refused(tmp_path):
     assert not (tmp_path / "r").exists()
 
 
+def test_episodes_of_unknown_length_that_every_checkpoint_cuts_are_told(tmp_path, capsys):
+    """Walk ends after 200 steps by itself, which nobody knows beforehand."""
+    fields = SMALL | {
+        "num_envs": 1,
+        "total_steps": 192,
+        "checkpoint_every": 64,
+        "env_kwargs": {"limit": 200, "ends": False},
+    }
+    lem.train("sac", "environments:Walk", run=tmp_path / "r", progress=False, **fields)
+    said = "No episode of environments:Walk has ended in 64 steps, up to a checkpoint, which cuts them"
+    assert capsys.readouterr().err.count(said) == 2
+    lem.train("sac", "environments:Walk", run=tmp_path / "s", progress=False, **fields | {"checkpoint_every": 192})
+    assert said not in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("algo", [ddpg, td3, sac], ids=["ddpg", "td3", "sac"])
 def test_each_algorithm_that_learns_from_replay_has_it(algo):
     spec = registry.make("environments:Walk", 2).spec

@@ -144,6 +144,26 @@ def test_what_cannot_be_asked_is_a_sentence(ask, said):
         ask(env)
 
 
+def test_what_is_closed_says_so():
+    env = lem.make_vec("CartPole-v1", 2)
+    env.reset(seed=0)
+    env.close()
+    for ask in (env.reset, lambda: env.step([0, 1])):
+        with pytest.raises(lem.UserError, match="These environments of CartPole-v1 are closed: make others"):
+            ask()
+
+
+@pytest.mark.parametrize("seed", [-1, None, "x", 1.5, True])
+def test_environments_of_a_run_begin_from_whole_numbers(seed):
+    env, other = lem.make_envs(lem.config_for("sac", "Pendulum-v1", total_steps=1000, learning_starts=100))
+    assert env.restart(np.int64(3)).equal(env.restart(3))
+    env.step(torch.zeros(1, 1, requires_grad=True))
+    with pytest.raises(lem.UserError, match=f"seed must be a whole number at least 0, not {seed!r}"):
+        env.restart(seed)
+    env.close()
+    other.close()
+
+
 @pytest.mark.parametrize(
     ("actions", "said"),
     [

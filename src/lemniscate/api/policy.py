@@ -167,7 +167,7 @@ class TrainedPolicy:
         kind: Any = self.spec.action
         given, several = as_array(action), (len(flat),) * batched
         shape = () if isinstance(kind, Discrete) else (kind.size,) if kind.shape is None else kind.shape
-        kinds, what = ("iu", "whole") if isinstance(kind, Discrete) else ("iuf", "finite")
+        kinds, what = ("iu", "whole") if isinstance(kind, Discrete) else ("biuf", "finite")
         if given.shape != several + shape or given.dtype.kind not in kinds or not np.isfinite(given).all():
             said = f"action must be {what} numbers of the shape {several + shape}, not {kind_of(action)}"
             raise UserError(f"{said}: as act returns it.")

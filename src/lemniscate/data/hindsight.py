@@ -12,6 +12,7 @@ from torch import Tensor
 from lemniscate.data.replay import Judge, ReplayBuffer
 from lemniscate.errors import UserError
 from lemniscate.spec import Spec
+from lemniscate.system.console import say
 from lemniscate.types import Step, Transition
 
 LONGEST = 1_000
@@ -49,6 +50,11 @@ class HindsightReplay(ReplayBuffer):
     def on_restart(self, judge: Judge) -> None:
         """Drop the episodes under way: the environments have been restarted, and `judge` is theirs."""
         self._judge = judge
+        if not len(self) and (steps := max(map(len, self._episodes))):
+            say(
+                f"No episode of {self._env_id} has ended in {steps:,} steps, up to a checkpoint, which cuts them, and"
+                " hindsight stores whole ones: before one has, nothing is learned. Raise checkpoint_every above that."
+            )
         for episode in self._episodes:
             episode.clear()
 

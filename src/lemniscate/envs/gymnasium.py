@@ -153,7 +153,7 @@ class GymnasiumBackend(Backend):
 
     def step(self, action: Tensor) -> Step:
         """Step, then find the true successor of each row and where to act next, as the mode demands."""
-        physical = physical_action(action.cpu().numpy(), self.spec.action)
+        physical = physical_action(action.detach().cpu().numpy(), self.spec.action)
         raw, reward, terminated, truncated, info = self._envs.step(physical)
         terminated, truncated = terminated.copy(), truncated & ~terminated  # new ones: a vector may write over its own
         obs = next_obs = self._observe(raw, info)

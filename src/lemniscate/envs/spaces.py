@@ -15,7 +15,7 @@ from torch import Generator, Tensor
 
 from lemniscate.envs.backend import Summary
 from lemniscate.envs.conversion import SUCCESS, flatten_observation, row_of
-from lemniscate.envs.returns import MASKS, flat_mask, mask_in, shown_space
+from lemniscate.envs.returns import MASKS, flat_mask, kind_of, mask_in, shown_space
 from lemniscate.errors import UserError
 from lemniscate.spec import Action, Box, Discrete, MultiBinary, MultiDiscrete, ObservationPart, Spec
 
@@ -375,6 +375,12 @@ def _unreadable(spec: Spec, obs: Any, error: Exception) -> UserError:
     shapes = ", ".join(f"{part.name} {part.own_shape or part.shape}" for part in spec.observation_parts)
     if isinstance(obs, tuple) and len(obs) > 1 and isinstance(obs[-1], dict):
         reason = "it is what `reset` or `step` returned, of which it is the first part"
+    elif (
+        isinstance(error, IndexError | TypeError)
+        and spec.observation_parts[0].path
+        and not isinstance(obs, dict | tuple)
+    ):
+        reason = f"it is {kind_of(obs)}, and its parts are to be in a dictionary or a tuple"
     else:
         reason = f"no {error} in it" if isinstance(error, KeyError) else str(error)
     return UserError(f"{spec.env_id} observes {shapes}, or a batch of these; this cannot be read: {reason}.")

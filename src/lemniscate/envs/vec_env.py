@@ -12,7 +12,7 @@ from torch import Tensor
 from lemniscate.envs.backend import Backend
 from lemniscate.envs.returns import kind_of
 from lemniscate.envs.symmetry import Mirror
-from lemniscate.errors import NonFiniteError, UserError, wrong_action
+from lemniscate.errors import NonFiniteError, UserError, shown, wrong_action
 from lemniscate.spec import Box, Discrete, MultiBinary, Spec
 from lemniscate.system.world import ALONE, World
 from lemniscate.types import Rollout, Step, wide_float
@@ -57,7 +57,13 @@ class VecEnv:
         self._is_own = not type(backend).__module__.startswith("lemniscate.")
 
     def restart(self, seed: int, steps: int = 0) -> Tensor:
-        """Begin again from a seed; also stored as `obs`, [N, O]. `steps` is what the run has taken."""
+        """Begin again from a seed; also stored as `obs`, [N, O]. `steps` is what the run has taken.
+
+        Raises `UserError` for a seed that is no whole number at least 0.
+        """
+        if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
+            raise UserError(f"seed must be a whole number at least 0, not {shown(seed)}.")
+        seed = int(seed)
         self.steps = steps
         self._recent.clear()
         self._statistics = EpisodeStatistics(self.num_envs, self.device)

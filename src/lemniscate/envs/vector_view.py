@@ -73,6 +73,7 @@ class VectorView(VectorEnv):
         Raises:
             UserError: a seed for each environment, or a reset of some of them.
         """
+        self._require_open()
         if options:
             raise UserError(f"All environments are reset together, without options such as {next(iter(options))}.")
         if isinstance(seed, bool) or not isinstance(seed, int | np.integer | None) or not 0 <= (seed or 0) < 2**32:
@@ -90,6 +91,7 @@ class VectorView(VectorEnv):
         Raises:
             UserError: actions of another shape, or that are no choices.
         """
+        self._require_open()
         actions, is_box = as_array(actions), isinstance(self.env.spec.action, Box)
         if actions.shape != self.action_space.shape:
             raise UserError(f"Actions have the shape {self.action_space.shape} here, not {actions.shape}.")
@@ -102,6 +104,10 @@ class VectorView(VectorEnv):
         reward = (step.reward * step.valid).numpy()  # that of an ignored action is 0, as in Gymnasium
         flags = step.terminated.numpy().copy(), step.truncated.numpy().copy()
         return self._shaped(step.obs), reward, *flags, self._info(step)
+
+    def _require_open(self) -> None:
+        if self.closed:
+            raise UserError(f"These environments of {self.env.spec.env_id} are closed: make others.")
 
     def close_extras(self, **kwargs: Any) -> None:
         """Give back processes and windows."""

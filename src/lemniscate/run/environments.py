@@ -83,6 +83,8 @@ def mirror_of(config: RunConfig) -> Mirror | None:
             raise UserError(f"symmetry is not for network {layers.kind}: a memory has no mirror image.")
         if getattr(config, "replay", "uniform") == "hindsight":
             raise UserError("symmetry is not for replay hindsight: its goals have no mirror image.")
+        if ":" in str(config.backend):
+            raise UserError(f"symmetry is of environments of Gymnasium, and not of the backend {config.backend}.")
         return find_mirror(config.env, config.env_kwargs, config.all_wrappers)
     return None
 

@@ -417,7 +417,7 @@ def of_replay(state: Any, rows: Rollout) -> dict[str, Tensor]:
         return {}
     last = torch.arange(len(newest.reward), device=newest.done.device) >= len(newest.reward) - SEEN // 4
     given, stored = newest[newest.done | last], replay.transitions[replay.newest(2 * len(newest.reward))]
-    column = int(_spread(given.obs).argmax())
+    column = int(_spread(given.obs.float()).argmax())  # an image has bytes
     pairs = (given.obs[:, column, None] == stored.obs[:, column]).nonzero()
     row, place = pairs[(given.obs[pairs[:, 0]] == stored.obs[pairs[:, 1]]).all(1)].unbind(1)
     of_row, of_place = given[row], stored[place]
