@@ -629,8 +629,9 @@ def test_rewards_that_time_explains_later_are_what_the_policy_has_made_of_them()
 def test_what_is_stored_otherwise_is_named_by_its_column_and_before_what_follows(column):
     metrics = {f"replay__other_{each}": [float(each == column)] * 8 for each in ("actions", "next", "signs", "ends")}
     metrics["replay__other_limits"] = [float(column == "limits")] * 8
-    follows = {"replay__repeated": [1.0] * 8, "td_error__newest": [20.0] * 8, "td_error__sampled": [1.0] * 8}
+    follows = {"td_error__newest": [20.0] * 8, "td_error__sampled": [1.0] * 8}
     assert names("sac", **metrics, **follows) == ["replay-differs"]
+    assert names("sac", **metrics, **follows, replay__repeated=[1.0] * 8) == ["replay-repeated"]  # which says more
 
 
 def test_a_deterministic_policy_is_near_its_mode():

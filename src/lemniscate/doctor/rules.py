@@ -93,7 +93,7 @@ CONSEQUENCES = {
     "gradient-grows": {"value-runaway"},
     "advantage-unrelated": {"kl-too-large"},
     "acts-at-mode": {"advantage-opposed"},
-    "replay-repeated": {"replay-differs"},
+    "replay-differs": {"replay-repeated"},
     "setting-entropy-coef": {"entropy-opposed"},
     "targets-of-others": {"critic-still", "replay-differs"},
     "q-opposed": {"replay-differs"},
