@@ -13,6 +13,7 @@ from unittest.mock import patch
 
 import gymnasium as gym
 import numpy as np
+import torch
 from faulty import WrongStep
 from unseen import BOX, CHANCE, OFF, ON, QUICK, QUICK_HANDS
 
@@ -91,10 +92,9 @@ def _same_array() -> Iterator[None]:
 def _column_and_row() -> Any:
     from lemniscate.algos import ppo
 
-    right = ppo.clipped_surrogate
-
     def wrong(log_ratio: Any, advantage: Any, clip: Any) -> Any:
-        return right(log_ratio[:, None], advantage, clip)  # [M, 1] and [M] make [M, M]
+        ratio = log_ratio.exp()[:, None]  # [M, 1] and [M] make [M, M], which the library's own function refuses
+        return -torch.minimum(ratio * advantage, ratio.clamp(1 - clip, 1 + clip) * advantage).mean()
 
     return patch.object(ppo, "clipped_surrogate", wrong)
 
