@@ -70,7 +70,7 @@ RUNS = {
     },
     "sac": {
         "Pendulum-v1": ((20_000,), 10),
-        "LunarLanderContinuous-v3": ((300_000,), 3),
+        "LunarLanderContinuous-v3": ((300_000,), 5),
         "HalfCheetah-v5": ((300_000,), 2),
     },
 }
