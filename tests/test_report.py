@@ -11,6 +11,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import lemniscate as lem
+from conftest import tiny_fields
 from lemniscate.api import plots
 from lemniscate.cli import parse
 from lemniscate.report import curves, pages
@@ -264,3 +265,16 @@ def test_a_notebook_shows_the_pictures_of_every_plot(tmp_path, monkeypatch, coun
     files = lem.plot(*map(without_policy, write_runs(tmp_path / "a")[:count]))
     assert shown == [str(file) for file in files[:-1]]
     assert len(shown) == 1 + count
+
+
+def test_the_report_of_an_evaluation_is_not_written_into_another_run(tmp_path):
+    fields = tiny_fields("CartPole-v1")
+    one, other = (
+        lem.train("ppo", "CartPole-v1", run=tmp_path / name, progress=False, **fields) for name in ("one", "other")
+    )
+    with pytest.raises(lem.UserError, match="other is another run, whose page this would replace"):
+        lem.evaluate(one, episodes=1, report=other.path)
+    assert not (other.path / "plots").exists()
+    for policy in (one, next(one.path.glob("checkpoints/step-*"))):
+        lem.evaluate(policy, episodes=1, report=one.path)
+    assert list(one.path.rglob("*.html"))
