@@ -259,7 +259,8 @@ def _files_of(kwargs: Mapping[str, Any]) -> dict[str, dict[str, str]]:
     for value in kwargs.values():
         with suppress(OSError, ValueError):  # what is no name of a file
             if isinstance(value, str) and files.at_home(value).is_file():
-                named[value] = hashlib.sha256(files.at_home(value).read_bytes()).hexdigest()
+                with files.at_home(value).open("rb") as file:
+                    named[value] = hashlib.file_digest(file, "sha256").hexdigest()
     return {"files": named} if named else {}
 
 

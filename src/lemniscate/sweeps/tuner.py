@@ -122,10 +122,10 @@ def resume_tuning(
 ) -> Tuned:
     """Go on with an interrupted search. Each run of each trial ends in the same bits as if it had not been stopped."""
     search, there = read_search(path_of(path)), find_cluster(cluster, workers)
-    mend(search.path / JOURNAL)
-    if (search.path / TRIALS).exists() and not (search.path / JOURNAL).stat().st_size:
-        raise UserError(f"{search.path} has lost its {JOURNAL}, which says what was tried: begin a new search.")
     with locked(search.path):
+        mend(search.path / JOURNAL)
+        if (search.path / TRIALS).exists() and not (search.path / JOURNAL).stat().st_size:
+            raise UserError(f"{search.path} has lost its {JOURNAL}, which says what was tried: begin a new search.")
         return _Tuner(search, progress, there).tune()
 
 
