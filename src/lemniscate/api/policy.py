@@ -258,14 +258,13 @@ def load(run: Trained, *, checkpoint: str | int | None = None, trust: bool = Fal
     if isinstance(run, TrainedRun | TrainedPolicy) or not hub.is_address(run):
         require_no_file_of_a_run(path_of(run))
         if path_of(run).is_file():
-            own = (
-                "lem.evaluate and lem.watch play"
-                if path_of(run).suffix == ".pt"
-                else "of files, evaluate and watch play"
+            weights = path_of(run).suffix == ".pt"
+            play = (
+                f"lem.evaluate('{run}', env=…) plays it" if weights else "of files, torch's weights, .pt, can be played"
             )
             raise UserError(
-                f"{run} is a file, and a policy of lemniscate is a folder: {own} the weights of a .pt file, with env=…;"
-                " that of another library is to be loaded by it."
+                f"{run} is a file, and a policy of lemniscate is a folder: {play}; that of another library is to be"
+                " loaded by it."
             )
         if (path_of(run) / "policy.onnx").is_file():
             raise UserError(f"{run} is an export, for other programs: load the run or the checkpoint that it is of.")
