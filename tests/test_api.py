@@ -323,6 +323,25 @@ def test_mean_and_std_are_in_the_units_of_the_environment(pendulum):
     np.testing.assert_allclose(found.mean.clip(-2, 2), policy.act(obs), rtol=1e-4, atol=1e-6)
 
 
+class Switches(gym.Env):
+    """Two switches, on or off."""
+
+    observation_space = gym.spaces.Dict({"o": gym.spaces.Box(-1, 1, (3,))})
+    action_space = gym.spaces.Box(0, 1, (2,), bool)
+
+
+def test_q_takes_the_switches_that_act_returns_and_an_array_is_no_dictionary():
+    config = lem.config_for("ddpg", "Pendulum-v1", hidden=(8,), critic_hidden=(8,))
+    env = registry.make(Switches, 1)
+    policy = lem.TrainedPolicy(config.networks(env.spec), env.spec, config, 0)
+    env.close()
+    obs = {"o": np.zeros(3, np.float32)}
+    assert policy.act(obs).dtype == bool
+    assert np.isfinite(policy.q_value(obs, policy.act(obs)))
+    with pytest.raises(lem.UserError, match="its parts are to be in a dictionary or a tuple"):
+        policy.act(np.zeros(5, np.float32))
+
+
 @pytest.mark.parametrize("algorithm", ["reppo", "sac", "ddpg"])
 def test_a_policy_says_the_q_of_an_action_in_the_units_of_the_environment(algorithm, tmp_path):
     config = lem.config_for(algorithm, "Pendulum-v1", hidden=(8,), critic_hidden=(8,))

@@ -612,6 +612,19 @@ def test_a_loss_of_the_mean_advantage_is_named_and_none_of_a_rate_that_moves_not
     assert ("advantage-unrelated" in seen) == found
 
 
+def test_what_chance_explains_of_the_first_look_is_no_late_action():
+    first = {"action__effect": [0.06, 0.01, 0.0] + [0.0] * 5}
+    assert "action-late" not in names(**first, action__late=[0.2] + [0.03] * 7)
+    assert "action-late" in names(**first, action__late=[0.7, 0.23, 0.21] + [0.2] * 5)
+
+
+def test_an_advantage_that_falls_by_two_standard_errors_is_opposed():
+    followed = [0.009, -0.141, -0.134, -0.057, 0.005, 0.016, -0.011, -0.074]
+    metrics = {"approx_kl": [0.01] * 8, "advantage__followed": followed}
+    assert names(**metrics) == ["advantage-opposed"]
+    assert "advantage-opposed" not in names(**metrics | {"advantage__followed": [x + 0.02 for x in followed]})
+
+
 def test_a_q_of_returns_explains_them():
     """PQN's Q, of λ-returns; where every return is alike there is nothing left to explain."""
     metrics = {"algorithm": "pqn", "steps": 50_000, "explained_variance": [0.05] * 8, "reward__explained": [0.9] * 8}

@@ -562,6 +562,9 @@ def test_a_track_is_what_its_file_holds_now(tmp_path, monkeypatch):
         with pytest.raises(UserError, match="that is all"):
             registry.make("DroneGates-v0", 2, kwargs={"track": str(file)})
     assert kept[0] == kept[1] != kept[2]
+    monkeypatch.setenv("HOME", str(file.parent))
+    file.write_bytes(b"\xef\xbb\xbf" + TRACK.encode())  # as Notepad writes it
+    assert gates.text_of_track(f"~/{file.name}") == TRACK + "\n"
     file.write_text(TRACK.replace("start = [-1.0", "start = [nan"))
     with pytest.raises(UserError, match=r"track\.toml is no track: start must be three numbers"):
         registry.make("DroneGates-v0", 2, kwargs={"track": str(file)})

@@ -229,6 +229,11 @@ def test_every_algorithm_with_a_q_learns_from_both_sides_and_goes_on_to_the_same
 def test_on_says_where_there_is_none_and_auto_does_without(tmp_path):
     with pytest.raises(UserError, match=r"Pendulum-v1 has no symmetry that could be used"):
         lem.train("sac", "Pendulum-v1", run=tmp_path / "on", progress=False, **tiny_off_policy(symmetry="on"))
+    own = tiny_off_policy(symmetry="on") | {"backend": "own_simulator:Glide"}
+    with pytest.raises(
+        UserError, match="symmetry is of environments of Gymnasium, and not of the backend own_simulator"
+    ):
+        lem.train("sac", "Glide-v0", run=tmp_path / "on", progress=False, **own)
     assert not (tmp_path / "on").exists()
     lem.train("sac", "Pendulum-v1", run=tmp_path / "auto", progress=False, **tiny_off_policy(symmetry="auto"))
 

@@ -1,5 +1,7 @@
 """The translated policy acts as the policy does: in C on this machine and in onnxruntime."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 import torch
@@ -227,3 +229,10 @@ def test_observations_are_seen_as_they_are_stored():
     policy = policy_for()
     obs = observations_for(policy)
     assert np.array_equal(exported(policy).obs, obs)
+
+
+def test_threads_translate_one_after_the_other():
+    policies = [policy_for(seed=seed) for seed in range(4)]
+    with ThreadPoolExecutor(4) as threads:
+        programs = list(threads.map(lambda policy: translate(Deployed(policy).eval(), 7), policies))
+    assert len(programs) == 4

@@ -266,8 +266,6 @@ def load(run: Trained, *, checkpoint: str | int | None = None, trust: bool = Fal
                 f"{run} is a file, and a policy of lemniscate is a folder: {play}; that of another library is to be"
                 " loaded by it."
             )
-        if (path_of(run) / "policy.onnx").is_file():
-            raise UserError(f"{run} is an export, for other programs: load the run or the checkpoint that it is of.")
         return _read(find_checkpoint(path_of(run), checkpoint), path_of(run))
     address = hub.read_address(run)
     if checkpoint is not None:

@@ -93,7 +93,8 @@ def evaluate(
     Raises:
         UserError: numbers out of range; an environment that cannot be made, or whose spaces differ; one without a
             baseline, if it is asked for; an episode that does not end in an environment without a time limit; with
-            `video`, an environment that renders no pictures, or another kind of file.
+            `video`, an environment that renders no pictures, or another kind of file; with `report`, a file or another
+            run.
     """
     chosen = agents.find(policy, checkpoint=checkpoint, trust=trust)
     episodes, seed, file = checked("episodes", episodes, Episodes), checked("seed", seed, Natural), _film(video)
@@ -211,7 +212,7 @@ def check(
 
     Args:
         what: an environment: an id, `module:Class`, a class, or a function that makes one. Or the directory of a run or
-            of a sweep, or what `train` returned.
+            of a sweep, what `train` returned, or a policy loaded from there.
         backend: of an environment, a simulation backend; by default the first that serves it.
         env_kwargs: arguments of the environment.
         wrappers: around each single environment, the first innermost.
@@ -220,7 +221,8 @@ def check(
         Everything found, each a sentence with a grade; what keeps an environment from being made is the last.
 
     Raises:
-        UserError: no such environment, backend or wrapper.
+        UserError: no such environment, backend or wrapper; a directory that is no run, or a part of one; what is for an
+            environment, with a run.
     """
     is_path = isinstance(what, Path) or isinstance(getattr(what, "path", None), Path)
     name = str(path_of(what)) if is_path else registry.name_of(what)
@@ -431,7 +433,7 @@ def push(run: Trained, name: str, *, private: bool = False, license: str | None 
     The files are those of `save`: raw tensors and JSON, each with its sha256. Beside them are a model card with the
     scores, the command that trains it again and the lines that load it; the final scores of the run, its figures
     (`plots/`), its newest film, or one that is made now if the environment can be rendered; and what
-    `lemniscate export` wrote (`export/`), if it did. `load("hf://user/name")` loads the policy.
+    `lemniscate export` wrote of that step (`export/`), if it did. `load("hf://user/name")` loads the policy.
 
     Args:
         run: its directory or a checkpoint's, what `train` returned, or a policy.

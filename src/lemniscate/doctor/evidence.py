@@ -103,6 +103,17 @@ class Evidence:
         return max(0.0, min(quarter, half)) if quarter < 0.1 or half < 0.01 else np.nan
 
     @property
+    def is_settled(self) -> bool:
+        """Whether the last fifth of the returns hardly vary, so that there is nothing left to explain."""
+        last = self.ends[1]
+        return len(last) > 0 and bool(last.std() <= 0.05 * abs(last.mean()))
+
+    @property
+    def is_paid(self) -> bool:
+        """Whether what is seen explains rewards, or they are always the same."""
+        return self.late("reward/explained") > 0.1 or self.late("reward/std") == 0
+
+    @property
     def begins(self) -> bool:
         """Whether Q has hardly begun: it comes slowly, and the first policies are worse than chance."""
         greedy = "final_epsilon" in self.config and self.q_steps < 5_000

@@ -504,12 +504,12 @@ def of_advantages(e: Evidence) -> Seen:
             f"In {preferred:.0%} of the sampled states Q of the policy's action is above that of one at random.",
         )
     neither = given is False and usual and not e.config.get("scale_rewards")
-    mean = np.abs(e.values("losses/policy")).max(initial=0.0)
+    largest = np.abs(e.values("losses/policy")).max(initial=0.0)
     still = e.greatest("network/moved") < 1e-3 and e.as_recommended("learning_rate")
-    if len(e.values("losses/policy")) >= 4 and mean < 1e-5 and still:  # healthy runs have 0.01 somewhere
+    if len(e.values("losses/policy")) >= 4 and largest < 1e-5 and still:  # healthy runs have 0.01 somewhere
         yield (
             "advantage-unrelated",
-            f"The policy's loss is at most {mean:.0e} in every line: the mean advantage, as if all actions shared it.",
+            f"The policy's loss is at most {largest:.0e} in every line: all actions share the mean advantage.",
         )
     if neither and not e.as_recommended("normalize_advantage"):
         yield "advantage-not-normalized", "Neither advantages nor rewards are normalized."
@@ -528,14 +528,13 @@ def _standard_errors(values: np.ndarray) -> float:
 
 def of_values(e: Evidence) -> Seen:
     """Faults of V: bootstraps, explained variance, targets that feed on themselves."""
-    missing, last = e.last_half("value/missing"), e.ends[1]
+    missing = e.last_half("value/missing")
     own, of_gae = map(e.last_half, ("explained_variance", "value/explained"))
     constant = len(own) and np.median(own) < -1
     shares = of_gae if len(of_gae) and (constant or not len(own) or np.median(of_gae) < np.median(own)) else own
     explained = float(np.median(shares)) if len(shares) else np.nan
     losses, fits = e.values("losses/value"), e.late("losses/value")
     grew = np.median(losses[len(losses) // 4 :]) / max(losses[0], 0.05) if len(losses) >= 4 else np.nan
-    settled = len(last) > 0 and last.std() <= 0.05 * abs(last.mean())  # there is nothing left to explain
     if _lacks_bootstrap(e):
         yield (
             "missing-bootstrap",
@@ -546,18 +545,17 @@ def of_values(e: Evidence) -> Seen:
     above = np.median(missing) * (1 - (first_number(e.config.get("gamma")) or 0.0)) if len(missing) else 0.0
     away = np.abs(missing).min() if len(missing) >= 2 else 0.0  # healthy values come nearer than 5
     steady = len(missing) >= 3 and missing.std() < 0.1 * np.median(missing)
-    one_reward = (nothing or steady) and not settled and len(missing) >= 2 and missing.min() > 5
-    paid = e.late("reward/explained") > 0.1 or e.late("reward/std") == 0  # by what is seen, or always the same
+    one_reward = (nothing or steady) and not e.is_settled and len(missing) >= 2 and missing.min() > 5
     few = (one_reward or (away > 40 and explained < 0.3)) if "gae_lambda" in e.config else away > 40 and fits < 1e-3
     few = few or ("td_lambda" in e.config and away > 7 and missing.min() > 0)
     if grew > (7 if e.config.get("scale_rewards") else 50) and not e.rose:
         yield "value-runaway", f"The loss of V grew to {grew:,.0f} times what it was, though returns did not rise."
-    elif few and paid and not e.early("value/moved") < 1e-3:  # else it has only not learned
+    elif few and e.is_paid and not e.early("value/moved") < 1e-3:  # else it has only not learned
         yield (
             "missing-bootstrap",
             f"The value has hardly more than one reward in it: r + γ V(s') lies {above:.0%} above V, early and late.",
         )
-    elif "gae_lambda" in e.config and ((nothing and (not settled or away > 5)) or (explained < 0.3 and away > 20)):
+    elif "gae_lambda" in e.config and ((nothing and (not e.is_settled or away > 5)) or (explained < 0.3 and away > 20)):
         yield (
             "value-explains-nothing",
             f"The value explains {max(0.0, explained):.0%} of the variance of its targets"
@@ -569,10 +567,9 @@ def of_q(e: Evidence) -> Seen:
     """Faults of Q(s, a): what it explains of its targets, of one step from replay, or of λ-returns."""
     by_steps, by_returns = "tau" in e.config, "final_epsilon" in e.config
     shares = e.last_half("value/explained" if by_steps else "explained_variance")
-    paid, last = e.late("reward/explained") > 0.1 or e.late("reward/std") == 0, e.ends[1]
-    settled = len(last) > 0 and last.std() <= 0.05 * abs(last.mean())
     learns = (by_steps or by_returns) and e.q_steps >= 1_000 and len(shares) >= 2
-    if learns and paid and not settled and np.median(shares) > -1 and shares.max() < 0.3:  # healthy runs have 0.4 to 1
+    varies = e.is_paid and not e.is_settled
+    if learns and varies and np.median(shares) > -1 and shares.max() < 0.3:  # healthy runs have 0.4 to 1
         yield (
             "q-explains-nothing",
             f"Q explains {max(0.0, np.median(shares)):.0%} of the variance of its targets, as a constant would.",

@@ -29,6 +29,7 @@ from lemniscate.exporting.onnx_model import onnx_act, onnx_model
 from lemniscate.exporting.parity import TESTS, fly, parity, self_tests, sentences
 from lemniscate.exporting.translation import Program, translate
 from lemniscate.hub.repository import is_address
+from lemniscate.run.directory import run_of
 from lemniscate.run.seeding import torch_defaults
 from lemniscate.spec import Action, Box, ObservationPart, Spec
 from lemniscate.system.console import say
@@ -94,15 +95,10 @@ def _destination(run: Trained, policy: TrainedPolicy, to: str | Path | None) -> 
     """The directory of the export. Raises `UserError` where something else is in its place."""
     if to is None and (policy.path is None or is_address(run)):
         raise UserError("This policy is of no run here: name the directory of its export, with --to or `to`.")
-    folder = path_of(to) if to is not None else _run_of(Path(policy.path or "")) / "export"
+    folder = path_of(to) if to is not None else run_of(Path(policy.path or "")) / "export"
     if folder.is_symlink() or (folder.exists() and not is_export(folder)):
         raise UserError(f"{folder} exists already, and is no export; choose another directory.")
     return folder
-
-
-def _run_of(path: Path) -> Path:
-    """The run of a checkpoint, whose own directory the run removes or replaces; another path as it is."""
-    return path.parents[1] if path.parent.name == "checkpoints" else path
 
 
 def is_export(folder: Path) -> bool:

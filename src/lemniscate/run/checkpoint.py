@@ -190,7 +190,7 @@ def _not_finite(tensors: Mapping[str, Tensor]) -> str | None:
 def _verify(path: Path) -> None:
     manifest = files.read_json(path / MANIFEST)
     if "export" in manifest:
-        raise UserError(f"{path} is an export, for other programs: name the run that it is of.")
+        raise UserError(f"{path} is an export, for other programs: load the run or the checkpoint that it is of.")
     if manifest.get("format") != FORMAT:
         raise UserError(f"{path} has format {manifest.get('format')!r}; this version of lemniscate reads {FORMAT}.")
     with parsing(path / MANIFEST):

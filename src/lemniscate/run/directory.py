@@ -71,13 +71,18 @@ def require_no_file_of_a_run(path: Path) -> None:
         raise UserError(f"{path} is a file of {path.parent}: name that directory.")
 
 
+def run_of(path: Path) -> Path:
+    """The run of a checkpoint, whose own directory the run removes or replaces; another path as it is."""
+    return path.parents[1] if path.parent.name == "checkpoints" else path
+
+
 def require_no_part_of_a_run(path: Path) -> None:
     """Raise `UserError` for a checkpoint or an export too, where only a run will do."""
     require_no_file_of_a_run(path)
     if not (path / checkpoint.MANIFEST).is_file():
         return
-    if path.parent.name == "checkpoints":
-        raise UserError(f"{path} is a checkpoint: name its run, {path.parents[1]}.")
+    if run_of(path) != path:
+        raise UserError(f"{path} is a checkpoint: name its run, {run_of(path)}.")
     kind = "an export" if (path / "policy.onnx").is_file() else "a stored policy"
     raise UserError(f"{path} is {kind}: name the run that it is of.")
 

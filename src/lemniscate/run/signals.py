@@ -59,12 +59,10 @@ def signals(
     """
     if rows is None or rows.valid.sum() < 2:
         return {}
-    scaled = rows
+    chosen, scaled = _valid(rows), rows
     if getattr(config, "scale_rewards", False) and hasattr(state, "reward_scale"):
         scaled = replace(rows, reward=state.reward_scale(rows.reward))
-    found = (
-        of_networks(state, _valid(rows)) | of_values(state, config, scaled) | of_update(state, config, scaled, acted)
-    )
+    found = of_networks(state, chosen) | of_values(state, config, scaled) | of_update(state, config, scaled, acted)
     found |= of_replay(state, rows) | of_critics(state, config, _valid(scaled))
     return of_environment(rows, spec) | {name: float(value) for name, value in found.items()}
 
