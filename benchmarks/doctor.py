@@ -140,7 +140,7 @@ UNSEEN = {
     "episodes that run into each other": ("ends-ignored",),
     "advantages of other steps": ("advantage-unrelated",),
     "no zero_grad": ("gradient-grows",),
-    "the best of single episodes": ("few-episodes",),
+    "the best of single episodes": ("too-few-episodes", "few-episodes"),
 }
 """names that are right for the faults of `unseen.py`"""
 UNSEEN_TOO = {

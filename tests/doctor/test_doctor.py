@@ -161,8 +161,16 @@ CASES = {
         },
     ),
     "starts-alike": (
-        {"observation__starts_alike": [1.0] * 8},
-        {"observation__starts_alike": [1.0] * 7 + [0.0]},
+        {"observation__starts_alike": [1.0] * 8, "observation__whole": [0.0] * 8},
+        {"observation__starts_alike": [1.0] * 8, "observation__whole": [1.0] * 8},
+    ),
+    "end-not-reported": (
+        {"observation__jumps_every": [25.0] * 4},
+        {"observation__jumps_every": [25.0] * 3 + [13.0]},
+    ),
+    "too-few-episodes": (
+        {"changed": {"evaluate_every": 1_000, "evaluate_episodes": 2}},
+        {"changed": {"evaluate_every": 1_000, "evaluate_episodes": 8}},
     ),
     "advantage-opposed": (
         {"advantage__followed": [-0.2, -0.1] * 4},
@@ -290,7 +298,7 @@ CASES = {
     "does-not-learn": ({}, {"returns": RISES}),
     "fell-back": ({"returns": [*range(300), *[20] * 100]}, {"returns": RISES}),
     "still-rising": ({"returns": RISES}, {"returns": list(np.minimum(np.arange(400), 200) + NOISE)}),
-    "few-episodes": ({"scores": {"returns": [1.0, 2.0]}}, {"scores": {"returns": [1.0] * 100}}),
+    "few-episodes": ({"scores": {"returns": [1.0, 2.0] * 4}}, {"scores": {"returns": [1.0] * 100}}),
 }
 
 
@@ -305,6 +313,36 @@ def test_a_value_that_has_learned_nothing_or_too_little_ignores_no_ends():
     assert "ends-ignored" not in names(**shown, explained_variance=[0.01] * 8, value__missing=[-1.0] * 8)
     assert "ends-ignored" in names(**shown, explained_variance=[-1.5] * 8, value__missing=[-7.0] * 8)
     assert "ends-ignored" not in names(**shown, explained_variance=[0.5] * 8, value__missing=[0.6] * 8)
+
+
+def test_an_evaluation_of_one_episode_is_of_chance():
+    assert names(scores={"returns": [1.0]}) == ["too-few-episodes"]
+    assert names(scores={"returns": [1.0]}, changed={"evaluate_every": 1_000}) == ["too-few-episodes"]
+
+
+def test_a_start_that_is_the_same_is_named_unless_observations_are_whole_numbers():
+    assert "starts-alike" not in names(observation__starts_alike=[1.0] * 7 + [0.0], observation__whole=[0.0] * 8)
+
+
+def test_rewards_that_their_age_explains_beyond_what_is_seen_tell_the_time():
+    assert names(reward__by_age=[0.1] * 3 + [0.9] * 5) == ["reward-by-time"]
+    assert "reward-by-time" not in names(reward__by_age=[0.9] * 3 + [0.1] * 5)
+
+
+def test_a_layer_of_one_unit_is_named_even_where_returns_rose():
+    assert "network-small" in names(returns=RISES, changed={"hidden": [64, 1]})
+    assert "network-small" not in names(returns=RISES, changed={"hidden": [8, 8]})
+
+
+def test_a_horizon_of_a_tenth_of_the_recommended_is_named_in_shorter_episodes():
+    assert "horizon-short" in names(changed={"gamma": 0.8}, lengths=[100] * 400)
+    assert "horizon-short" not in names(changed={"gamma": 0.8}, lengths=[60] * 400)
+    assert "horizon-short" not in names(changed={"gamma": 0.92}, lengths=[200] * 400)
+
+
+def test_a_policy_whose_units_are_inactive_stands_still_for_that():
+    shown = {"network__inactive": [1.0] * 8, "approx_kl": [1e-9] * 8}
+    assert names(**shown) == ["units-inactive"]
 
 
 def test_a_value_that_no_update_moves_is_named():

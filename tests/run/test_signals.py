@@ -193,6 +193,46 @@ def test_rewards_that_tell_the_time_do_so_within_each_episode():
     assert of_time(SimpleNamespace(done=done, **{**shape, "reward": torch.ones_like(reward)}))["reward/by_time"] == 0
 
 
+def aged(steps, ages):
+    """Rows [T, N] of episodes that go on, and the number of steps that each had before them, [T, N]."""
+    flags = dict.fromkeys(("terminated", "truncated"), torch.zeros(steps, len(ages), dtype=torch.bool))
+    start = ages - steps + torch.arange(steps)[:, None]
+    given = {name: numbers(steps, len(ages), size, seed=i).float() for i, (name, size) in enumerate(SIZES.items())}
+    reward, valid = numbers(steps, len(ages), seed=9).float(), torch.ones_like(flags["truncated"])
+    return Rollout(**given, **flags, reward=reward, valid=valid), start
+
+
+SIZES = {"obs": O, "action": A, "next_obs": O}
+
+
+def test_rewards_that_grow_with_the_age_of_an_episode_are_explained_by_it_alone():
+    ages = torch.tensor([50.0, 400.0, 800.0, 990.0])
+    rows, age = aged(40, ages)
+    grown = replace(rows, reward=rows.reward + 0.05 * age)
+    found, noise = (of_environment(each, spec_of(), ages)["reward/by_age"] for each in (grown, rows))
+    assert found > 0.9
+    assert noise < 0.1
+    seen = replace(grown, obs=torch.cat([age[..., None].float(), rows.obs[..., 1:]], -1))  # an observation tells it
+    assert "reward/by_age" not in of_environment(seen, spec_of(), ages)
+    assert "reward/by_age" not in of_environment(grown, spec_of())
+
+
+def test_observations_that_jump_at_the_same_ages_are_of_ends_that_nobody_reports():
+    ages = torch.tensor([97.0, 110.0, 83.0, 120.0])
+    rows, age = aged(80, ages)
+    places = numbers(80, 4, O, seed=3).float()
+
+    def moved(at):
+        place = places.gather(0, at.cumsum(0)[..., None].expand_as(places))  # another one from each of these steps on
+        obs = torch.cat([places[:1], place[:-1]]) + 0.01 * rows.obs
+        return of_environment(replace(rows, obs=obs, next_obs=place), spec_of(), ages)
+
+    every = moved((age + 1) % 25 == 0)
+    assert every["observation/jumps_every"] == 25
+    assert "observation/jumps_every" not in moved(numbers(80, 4, seed=5) > 1.5)
+    assert "observation/jumps_every" not in moved(torch.zeros(80, 4, dtype=torch.bool))
+
+
 def test_the_variance_of_rewards_within_episodes_is_what_their_means_leave():
     steps, envs = 40, 3
     done = torch.zeros(steps, envs, dtype=torch.bool)

@@ -91,6 +91,7 @@ CONSEQUENCES = {
     "advantage-opposed": {"ratio-not-one", "targets-behind"},
     "targets-alike": {"critic-still"},
     "gradient-grows": {"value-runaway"},
+    "policy-still": {"units-inactive"},
     "advantage-unrelated": {"kl-too-large"},
     "acts-at-mode": {"advantage-opposed"},
     "replay-differs": {"replay-repeated"},
@@ -275,10 +276,15 @@ def of_reward_sizes(e: Evidence) -> Seen:
 def of_rewards(e: Evidence) -> Seen:
     """Faults of what the rewards depend on."""
     by_time, explained, before = e.late("reward/by_time"), e.values("reward/explained"), e.values("reward/before")
-    std = e.late("reward/std")
+    std, by_age = e.late("reward/std"), e.late("reward/by_age")
     varies = std > 0.5 * abs(e.late("reward/mean"))  # not a reward that differs in the step of a goal alone
     if by_time > 0.8 and e.early("reward/by_time") > 0.5 and not e.is_slow:  # not what the policy has made of it
         yield "reward-by-time", f"Time alone explains {by_time:.0%} of the rewards within an episode."
+    elif by_age > 0.25:
+        yield (
+            "reward-by-time",
+            f"The steps since an episode began explain {by_age:.0%} more of the rewards' variance than what is seen.",
+        )
     if std > 1e-6 and e.greatest("reward/within") < 1e-6:
         yield "reward-by-episode", "The reward is the same in every step of an episode, and another in the next one."
     if len(before) >= 3 and np.median(before) > 0.2 and not e.sees_nothing:
@@ -323,8 +329,14 @@ def of_episodes(e: Evidence) -> Seen:
             f"{np.sum(late == longest):,} of the last {len(late):,} episodes terminated after exactly {longest:,.0f}"
             " steps.",
         )
-    if len(starts) > 2 and starts.min() == 1:
+    if len(starts) > 2 and starts.min() == 1 and e.late("observation/whole") < 0.9:  # a board begins alike
         yield "starts-alike", "Every episode began with the same observation."
+    again = e.values("observation/jumps_every")
+    if len(again) >= 3 and np.ptp(again) == 0:
+        yield (
+            "end-not-reported",
+            f"After every {again[0]:.0f} steps of an episode the observation jumps as if another one began.",
+        )
 
 
 def of_horizon(e: Evidence) -> Seen:
@@ -333,8 +345,9 @@ def of_horizon(e: Evidence) -> Seen:
     fifth = len(e.lengths) // 5
     if gamma is not None and recommended is not None and gamma < recommended:
         ahead, length = 1 / (1 - gamma), np.median(e.lengths) if len(e.lengths) else 0
-        named = e.beyond("gamma", *e.usual.get("gamma", (0.0, 1.0)))  # a setting far out is named as such
-        if length > 25 * ahead and not named and not e.as_recommended("gamma"):
+        named = abs(e.beyond("gamma", *e.usual.get("gamma", (0.0, 1.0)))) >= FAR  # as a setting far out
+        much = length > 25 * ahead or (length > 15 * ahead and 1 - gamma > 10 * (1 - recommended))
+        if much and not named and not e.as_recommended("gamma"):
             yield (
                 "horizon-short",
                 f"With gamma {gamma:g} some {ahead:.0f} steps ahead count, and episodes last {length:,.0f}.",
@@ -664,8 +677,9 @@ def of_networks(e: Evidence) -> Seen:
     inactive, saturated = e.late("network/inactive"), e.late("network/saturated")
     for field in ("hidden", "critic_hidden"):
         given, usual = (config.get(field) for config in (e.config, e.recommended))
-        small = usual and given is not None and 8 * min(given, default=0) <= min(usual)
-        if small and not e.as_recommended(field) and not e.rose:
+        least = min(given or (0,))
+        small = usual and given is not None and 8 * least <= min(usual)
+        if small and not e.as_recommended(field) and (least <= 2 or not e.rose):
             yield "network-small", f"{field} is {typed(given)}, and {typed(usual)} is recommended."
     norms, norm = e.values("gradient_norm"), e.late("gradient_norm")
     limit = first_number(e.config.get("max_grad_norm"))
@@ -747,7 +761,10 @@ def of_evaluations(e: Evidence) -> Seen:
         )
     if abs(bias) > 0.5 and not e.rose and e.q_steps >= 4_000:  # before, Q is only new
         yield "q-biased", f"Q {'over' if bias > 0 else 'under'}-estimates the return by {abs(bias):.0%}."
-    if e.config.get("evaluate_every") and each < 10:
+    if (e.config.get("evaluate_every") and each < 5) or 0 < len(returns) < 5:
+        few = each if e.config.get("evaluate_every") and each < 5 else len(returns)
+        yield "too-few-episodes", f"An evaluation has {few} {'episode' if few == 1 else 'episodes'}."
+    elif e.config.get("evaluate_every") and each < 10:
         episodes = "episode" if each == 1 else "episodes"
         yield "few-episodes", f"Each evaluation has {each} {episodes}, and the best may be one of luck."
     elif 0 < len(returns) < 20:

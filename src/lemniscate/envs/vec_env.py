@@ -169,6 +169,11 @@ class VecEnv:
         """The whole episodes that ended since the last call, and the means of all measures over its steps."""
         return self._statistics.take(self._world)
 
+    @property
+    def ages(self) -> Tensor:
+        """The steps that the present episode of each environment had at the last `take_episodes`, [N]."""
+        return self._statistics.ages
+
     def close(self) -> None:
         """Give back processes and windows."""
         self.backend.close()
@@ -242,6 +247,11 @@ class EpisodeStatistics:
         self._ended = []
         means = self._means(world) if self._sums or world.size > 1 else {}
         return Episodes(returns.tolist(), lengths.int().tolist(), means)
+
+    @property
+    def ages(self) -> Tensor:
+        """The length of each unfinished episode at the last `take`, [N]."""
+        return self._running[1]
 
     def _sum_up(self) -> None:
         reward, terminated, truncated, valid, counts = map(torch.stack, zip(*self._log, strict=True))

@@ -207,7 +207,7 @@ class Run:
             numbers["episode/return"] = sum(episodes.returns) / len(episodes.returns)
             numbers["episode/length"] = sum(episodes.lengths) / len(episodes.lengths)
         if self._body.acted is not None:
-            numbers |= signals(state, self.config, self.spec, self.env.recent(), self._body.acted)
+            numbers |= signals(state, self.config, self.spec, self.env.recent(), self._body.acted, self.env.ages)
         numbers |= {f"info/{name.removeprefix('info/')}": mean for name, mean in episodes.measures.items()}
         # The speed since the last line, everything included; the seconds of the loop's body by their use.
         now, (before, step_before), collect = time.monotonic(), self._last_line, self.env.collecting

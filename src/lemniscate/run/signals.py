@@ -51,11 +51,17 @@ UNITS = (*ACTIVATIONS.values(), nn.Tanh, nn.GELU, nn.LeakyReLU)
 
 @torch.no_grad()
 def signals(
-    state: Any, config: RunConfig, spec: Spec, rows: Rollout | None, acted: Mapping[str, Tensor] | None = None
+    state: Any,
+    config: RunConfig,
+    spec: Spec,
+    rows: Rollout | None,
+    acted: Mapping[str, Tensor] | None = None,
+    ages: Tensor | None = None,
 ) -> dict[str, float]:
     """The signals of a training state and of the newest rows [T, N, …] of its environments, by the glossary's names.
 
-    `acted` are the parameters and buffers of the networks before their newest update, where that is known.
+    `acted` are the parameters and buffers of the networks before their newest update, where that is known; `ages` [N]
+    are the steps that each environment's episode had after the last row.
     """
     if rows is None or rows.valid.sum() < 2:
         return {}
@@ -64,7 +70,7 @@ def signals(
         scaled = replace(rows, reward=state.reward_scale(rows.reward))
     found = of_networks(state, chosen) | of_values(state, config, scaled) | of_update(state, config, scaled, acted)
     found |= of_replay(state, rows) | of_critics(state, config, _valid(scaled))
-    return of_environment(rows, spec) | {name: float(value) for name, value in found.items()}
+    return of_environment(rows, spec, ages) | {name: float(value) for name, value in found.items()}
 
 
 def _valid(rows: Rollout) -> Rollout:
@@ -72,13 +78,14 @@ def _valid(rows: Rollout) -> Rollout:
     return rows.flatten() if rows.valid.all() else rows[rows.valid]
 
 
-def of_environment(rows: Rollout, spec: Spec) -> dict[str, float]:
-    """The signals of rows [T, N, …] alone, two of which are valid at least."""
+def of_environment(rows: Rollout, spec: Spec, ages: Tensor | None = None) -> dict[str, float]:
+    """The signals of rows [T, N, …] alone, two of which are valid at least; with `ages` [N] as in `signals`."""
     found = of_rows(_valid(rows), spec) | of_time(rows) | of_starts(rows, spec)
     if not spec.has_images and spec.observation_size <= MOST_NUMBERS:
         few = slice(max(2, MOST_ROWS // len(rows.done)))  # of the environments
         rows = rows[:, few]
         found |= of_effects(_valid(rows), spec)
+        found |= of_ages(rows, spec, ages[few], found["reward/explained"]) if ages is not None else {}
         if found["reward/explained"] < 0.8 and found["reward/std"] > 0:  # else no other row has more to explain
             found["reward/before"] = paid_before(rows, spec, found["reward/explained"])
         if found["action/effect"] < 0.2:
@@ -140,6 +147,33 @@ def of_time(rows: Rollout) -> dict[str, Tensor]:
         return {"reward/by_time": by_time}
     varies = (len(reward) * moments(rows.reward[rows.valid].cpu().double())[1]).clamp(min=1e-12)
     return {"reward/by_time": by_time, "reward/within": reward.square().sum() / varies}
+
+
+def of_ages(rows: Rollout, spec: Spec, ages: Tensor, explained: Tensor) -> dict[str, Tensor]:
+    """What recurs at the same steps of episodes, of rows [T, N, …] whose environments have had `ages` [N] steps since.
+
+    - reward/by_age: the share of the rewards' variance that a line over the steps since an episode's beginning explains
+      beyond the rows, which explain the share `explained`.
+    - observation/jumps_every: the steps after which, and after whose multiples alone, observations change as if
+      others were drawn, though no end is reported; nothing where there are none.
+    """
+    running = rows.valid & (_ended(rows) == rows.done.sum(0))
+    if running.sum() < FEW:
+        return {}
+    age, found = (ages - running.flip(0).cumsum(0).flip(0) + 1)[running], dict[str, Tensor]()  # after the row
+    rows = rows[running]
+    if explained < 0.8:
+        others = explained_by(age[:, None].cpu().double(), rows.reward[:, None].cpu().double(), _everything(rows, spec))
+        found["reward/by_age"] = (1 - explained.clamp(min=0)) * others.nan_to_num()[0]
+    obs, after = (x[:, : spec.observation_size].float() for x in (rows.obs, rows.next_obs))
+    std = _spread(obs)
+    change = ((after - obs) / std)[:, std > 1e-9].square().mean(1)
+    jumps = change > (10 * change.median()).clamp(min=0.5)
+    for period in age[jumps].unique()[:6] if jumps.sum() >= 8 else ():
+        due = age % period == 0
+        if period >= 5 and jumps[due].float().mean() > 0.5 and due[jumps].float().mean() > 0.9:
+            return found | {"observation/jumps_every": period}
+    return found
 
 
 def of_effects(rows: Rollout, spec: Spec) -> dict[str, Tensor]:
