@@ -319,6 +319,13 @@ def test_a_repository_can_be_private_and_have_a_license(run, server):
     assert "\nlicense: mit\n" in server.files("anna/secret")["README.md"].decode()
 
 
+@pytest.mark.parametrize("field", ["env", "backend", "network", "wrappers"])
+def test_each_field_that_names_code_is_looked_at(field):
+    named = "theirs:Own"
+    assert hub.own_code({"env": "CartPole-v1", field: [named] if field == "wrappers" else named}) == [named]
+    assert not hub.own_code({"env": "CartPole-v1", "backend": "envpool", "network": "mlp", "wrappers": []})
+
+
 def test_code_of_a_downloaded_policy_is_imported_only_with_trust(server, tmp_path, monkeypatch, capsys):
     """And a policy without pictures, film or figures is uploaded, with a line on why."""
     monkeypatch.chdir(tmp_path)

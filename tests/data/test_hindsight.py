@@ -17,6 +17,7 @@ from lemniscate.run.metrics import read_metrics
 from lemniscate.spec import Box, ObservationPart, Spec
 from lemniscate.testing import check_resume
 from lemniscate.types import Step
+from pretend_device import pretend, whole
 
 CPU = torch.device("cpu")
 ACHIEVED, DESIRED, TIME = 0, 1, 2  # the columns of `Walk`, whose keys Gymnasium sorts
@@ -159,6 +160,23 @@ def test_reset_rows_belong_to_no_episode():
         flags = torch.tensor([False]), torch.tensor([t % 3 == 1]), torch.tensor([t % 3 != 2])
         replay.add(at, torch.zeros(1, 1), Step(at + 1, at + 1, reward, *flags))
     assert replay.transitions.obs[: len(replay), 0].tolist() == [0, 1, 0, 1, 3, 4, 3, 4, 6, 7, 6, 7]
+
+
+def test_copies_are_made_on_the_device_of_the_rows():
+    def stored(device):
+        parts = tuple(ObservationPart((name,), (1,)) for name in ("achieved_goal", "desired_goal"))
+        replay = Noted(Spec("x", parts, Box((-1.0,), (1.0,)), 4), 100, device, num_envs=1, goals=2, seed=0)
+        replay.on_restart(lambda a, d: (-((a - d).abs() > 0.5).float()[:, 0], torch.zeros(len(a), device=device) > 0))
+        for t in range(4):
+            at = torch.tensor([[float(t), 9.0]], device=device)
+            flags = (torch.tensor([flag], device=device) for flag in (False, t == 3, True))
+            replay.add(at, torch.zeros(1, 1, device=device), Step(at + 1, at + 1, -torch.ones(1, device=device), *flags))
+        assert {x.device for rows in replay.stored for x in vars(rows).values()} == {whole(device)}
+        return [(name, x.tolist()) for name, x in vars(replay.stored[1]).items()]
+
+    with pretend():
+        there = stored(torch.device("cuda:1"))
+    assert there == stored(CPU)
 
 
 def test_a_vector_environment_judges_no_goals():
@@ -360,7 +378,7 @@ def test_a_buffer_that_holds_no_episode_with_its_copies_holds_pieces(tmp_path):
     assert len(replay) == 19
     for row in replay.transitions.obs:
         assert (row[[ACHIEVED, TIME]] == obs[:, [ACHIEVED, TIME]]).all(1).any()
-    with pytest.raises(UserError, match="is below hindsight_goals 32"):
+    with pytest.raises(UserError, match="is below the 32 rows of hindsight_goals 32"):
         lem.train("sac", Walk, run=tmp_path / "r", buffer_size=31, hindsight_goals=32, progress=False, **SMALL)
 
 

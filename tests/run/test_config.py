@@ -142,6 +142,19 @@ def test_every_learning_rate_may_have_a_schedule_with_an_end_of_its_own(algorith
 
 
 @pytest.mark.parametrize(
+    ("algorithm", "env", "fields"),
+    [
+        ("pqn", "CartPole-v1", {"learning_rate": "0.0005>0.0001", "final_epsilon": 0.01}),
+        ("ddpg", "Pendulum-v1", {"noise_std": "0.3>0.1", "final_learning_rate": 0.1}),
+        ("td3", "Pendulum-v1", {"noise_std": "0.3>0.1", "final_learning_rate": 0.1}),
+    ],
+)
+def test_a_schedule_goes_with_the_end_of_another_quantity(algorithm, env, fields):
+    config = config_for(algorithm, env, **fields)
+    assert {name: getattr(config, name) for name in fields} == fields
+
+
+@pytest.mark.parametrize(
     ("name", "value", "said"),
     [
         ("plain", "x", "plain must be a number, not 'x'."),

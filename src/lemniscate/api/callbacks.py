@@ -82,7 +82,7 @@ def call_callbacks(
                 said = function(step, MappingProxyType(dict(metrics)), policy)
                 if not isinstance(said, bool | np.bool_ | None):
                     raise UserError(
-                        f"A callback returns True to stop, or False or None; {function} returned {shown(said)}."
+                        f"A callback returns True to stop, or False or None; {shown(function)} returned {shown(said)}."
                     )
                 stop = bool(said) or stop
                 policy.expire()

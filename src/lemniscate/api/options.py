@@ -31,7 +31,7 @@ CAUGHT = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIG
 
 
 class RunOptions:
-    """The arguments of `train` and `resume` that are not saved with the run, which describes them; made at the door.
+    """The arguments of `train` and `resume` that are not saved with the run, which describes them; made by `train` and `resume`, which check them.
 
     Raises `UserError` for a tracker, a callback or a cluster that is not there, or what is none.
     """
@@ -80,8 +80,9 @@ class RunOptions:
 
 
 def own_names(config: RunConfig) -> list[Any]:
-    """The names in a Config that are of objects, where they are not the library's."""
-    return [config.env, *config.wrappers, getattr(config, "network", ""), config.curriculum or ""]
+    """The values of a Config that may name an object of the user's."""
+    own = config.env, config.backend or "", getattr(config, "network", ""), config.curriculum or ""
+    return [*own, *config.wrappers]
 
 
 def require_importable(*names: Any) -> None:

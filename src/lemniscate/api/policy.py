@@ -256,17 +256,14 @@ def load(run: Trained, *, checkpoint: str | int | None = None, trust: bool = Fal
     if checkpoint is None and isinstance(run, TrainedRun | TrainedPolicy):
         return run.policy if isinstance(run, TrainedRun) else run
     if isinstance(run, TrainedRun | TrainedPolicy) or not hub.is_address(run):
-        require_no_file_of_a_run(path_of(run))
-        if path_of(run).is_file():
-            weights = path_of(run).suffix == ".pt"
-            play = (
-                f"lem.evaluate('{run}', env=…) plays it" if weights else "of files, torch's weights, .pt, can be played"
-            )
+        path = path_of(run)
+        require_no_file_of_a_run(path)
+        if path.is_file():
             raise UserError(
-                f"{run} is a file, and a policy of lemniscate is a folder: {play}; that of another library is to be"
-                " loaded by it."
+                f"{path} is a file, and a policy of lemniscate is a folder. lem.evaluate('{path}', env=…) plays weights"
+                " of torch (.pt, .pth); the policy of another library is to be loaded with that library."
             )
-        return _read(find_checkpoint(path_of(run), checkpoint), path_of(run))
+        return _read(find_checkpoint(path, checkpoint), path)
     address = hub.read_address(run)
     if checkpoint is not None:
         raise UserError(f"{address} is one checkpoint: none of it can be chosen.")

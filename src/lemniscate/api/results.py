@@ -119,7 +119,8 @@ def evaluate(
         if folder:
             how["episodes"] = min(episodes, vec.num_envs, 20)
             pictures = _draw(player, vec, arguments, how, folder)
-            for made in (*pictures, pages.write_evaluation(folder, str(policy), pictures, scores, seed)):
+            name = str(policy) if isinstance(policy, str | PathLike) else str(getattr(chosen, "path", shown(policy)))
+            for made in (*pictures, pages.write_evaluation(folder, name, pictures, scores, seed)):
                 say(made)
         return scores
 
@@ -179,11 +180,9 @@ def watch(
     episodes, seed, file = checked("episodes", episodes, Episodes), checked("seed", seed, Natural), _film(video)
     if chosen is None and env is None:
         raise UserError("Watch what? Name a run, or an environment to act in at random.")
-    kwargs, deterministic = (
-        checked("env_kwargs", env_kwargs, dict | None),
-        checked("deterministic", deterministic, bool),
-    )
-    own = {"agent": agent, "normalized": normalized_actions}
+    kwargs = checked("env_kwargs", env_kwargs, dict | None)
+    deterministic = checked("deterministic", deterministic, bool)
+    own = {"agent": agent, "normalized": checked("normalized_actions", normalized_actions, bool | None)}
     how: dict[str, Any] = {"episodes": episodes, "seed": seed, "deterministic": deterministic}
     with _environments(chosen, env, own, how, env_kwargs=kwargs) as (player, vec, arguments):
         if file is None:
@@ -237,7 +236,7 @@ def each_finding(
     require_no_part_of_a_run(path)
     if run_check.is_stored(path):
         if backend or env_kwargs or wrappers:
-            raise UserError(f"{path} is a run, and has its own environment: leave out backend, env_args and wrappers.")
+            raise UserError(f"{path} is a run, and has its own environment: leave out backend, env_kwargs (--env-args) and wrappers.")
         return run_check.each_finding(path)
     if path.is_dir():
         raise UserError(f"{path} is a directory, and no run: it has no {CONFIG}.")

@@ -74,8 +74,9 @@ def choose_config(
         chosen, config = presets.choose(name, env, preset)
     config = config.replace(**{name: name_in_config(value) for name, value in fields.items()})
     for final in (name for name in fields if name.startswith("final_")):
-        rate = final.removeprefix("final_")  # where there is no such field, it is that of actor and critic
-        if ended := [name for name in config.schedules if name == rate or not hasattr(config, rate)]:
+        rate = final.removeprefix("final_")
+        of_both = () if hasattr(config, rate) else (f"actor_{rate}", f"critic_{rate}")
+        if ended := [name for name in config.schedules if name in (rate, *of_both)]:
             raise UserError(f"{ended[0]} {config.schedules[ended[0]]} has its own end: {final} does not go with it.")
     if chosen == "default" and env is None:
         raise UserError("Which environment? Name one with env; `lemniscate envs` lists them.")

@@ -85,17 +85,18 @@ def connected(cluster: Cluster) -> Iterator[None]:
         modules = os.pathsep.join([str(Path.cwd()), *filter(None, sys.path)])
         options |= {"num_cpus": max(cluster.workers or 1, os.cpu_count() or 1), "include_dashboard": False}
         options["runtime_env"] = {"env_vars": {"PYTHONPATH": modules}}
+    disabled = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:
         ray.init(cluster.address, **options)
     except (ConnectionError, RuntimeError, ValueError) as error:
-        logging.disable(logging.NOTSET)
+        logging.disable(disabled)
         raise _no_answer(cluster.address or os.environ.get("RAY_ADDRESS", "this machine"), error) from None
     try:
         yield
     finally:
         ray.shutdown()
-        logging.disable(logging.NOTSET)
+        logging.disable(disabled)
 
 
 def _require_answer(address: str) -> None:

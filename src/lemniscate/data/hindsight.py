@@ -80,7 +80,7 @@ class HindsightReplay(ReplayBuffer):
         later = np.random.default_rng((self._seed, self._written)).integers(times, length)
         goals, start = episode.next_obs[:, self._achieved], episode.obs[:1, self._achieved]
         new = (self._judge(start.expand_as(goals), goals)[0] != self._judge(goals, goals)[0]).cpu()
-        times, later = (torch.from_numpy(x)[new[later]] for x in (times, later))
+        times, later = (torch.from_numpy(x)[new[later]].to(goals.device) for x in (times, later))
         copies, goal = episode[times], goals[later]
         reward, ends = self._judge(copies.next_obs[:, self._achieved], goal)
         for obs in (copies.obs, copies.next_obs):

@@ -45,11 +45,12 @@ class MinAtar(gym.Env):
     ) -> None:
         if not is_installed("minatar"):
             raise missing_extra("minatar", "minatar")
+        disabled = logging.root.manager.disable
         logging.disable(logging.WARNING)  # that seaborn is not there, which draws their own windows
         try:
             from minatar import Environment  # pyright: ignore[reportMissingImports]
         finally:
-            logging.disable(logging.NOTSET)
+            logging.disable(disabled)
         self.render_mode, self._game = render_mode, Environment(game, sticky_action_prob, difficulty_ramping)
         self._actions = self._game.minimal_action_set()
         self.action_space = gym.spaces.Discrete(len(self._actions))

@@ -72,7 +72,7 @@ def local_path(place: str | PathLike[str]) -> Path:
 
 def own_code(config: Mapping[str, Any]) -> list[str]:
     """The names of the code in a run's config that is not lemniscate's, nor was passed in this process."""
-    names = [config.get("env"), config.get("network"), *(config.get("wrappers") or ())]
+    names = [*map(config.get, ("env", "backend", "network")), *(config.get("wrappers") or ())]
     return [str(name) for name in names if ":" in str(name) and not named.is_passed(str(name))]
 
 

@@ -1,7 +1,7 @@
 """Adam on one vector of parameters, and its learning rate over a run: Kingma & Ba 2015, arXiv:1412.6980.
 
 Small networks on a CPU are bound by the overhead of single operations, not by arithmetic. So all parameters lie in one
-vector: clipping and Adam are a few operations on one tensor. Inside a compiled call (`optim.learner`) the gradient is
+vector: clipping and Adam are a few operations on one tensor. Inside a compiled call (`optim.compiled`) the gradient is
 that of a pure function of the vector; elsewhere it comes from autograd. Both agree to rounding.
 """
 

@@ -10,7 +10,6 @@ from lemniscate.envs import registry
 from lemniscate.envs.symmetry import Mirror, find_mirror
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError, shown
-from lemniscate.nn.networks import NETWORKS
 from lemniscate.run.config import RunConfig, in_json
 from lemniscate.spec import Spec
 from lemniscate.system import named
@@ -55,6 +54,7 @@ def envs_of(config: RunConfig, world: World) -> tuple[VecEnv, VecEnv | None]:
                 failing.pop_all()
                 return eval_env, eval_env
         env = registry.make(num_envs=config.num_envs, device=str(device), stagger=True, world=world, **arguments)
+        failing.callback(env.close)
         env.mirror = mirror
         if config.differentiates:
             env.backend.prepare_gradient()
@@ -186,8 +186,8 @@ def require_memory(config: RunConfig, spec: Spec, device: torch.device) -> None:
 
 
 def _network_bytes(config: RunConfig, spec: Spec) -> int:
-    """The size of the networks, made without their numbers; 0 for those of one's own, which may need these."""
-    if getattr(config, "network", "") not in NETWORKS:
+    """The size of the networks, made on the meta device; 0 for those of one's own, which may need real numbers."""
+    if ":" in getattr(config, "network", ":"):
         return 0
     with torch.device("meta"):
         networks = config.networks(spec)

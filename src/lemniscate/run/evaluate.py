@@ -264,5 +264,5 @@ class QBiasMeter:
 
 
 def critic_of(networks: nn.Module, config: RunConfig) -> tuple[ActorQ, float] | None:
-    """The networks and γ of an algorithm that has a Q; None for the others."""
+    """The networks and γ of an algorithm that learns Q from a replay buffer; None for the others."""
     return (networks, config.gamma) if isinstance(networks, ActorQ) and isinstance(config, OffPolicyConfig) else None

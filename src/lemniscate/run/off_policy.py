@@ -87,11 +87,12 @@ class OffPolicyConfig(RunConfig):
             )
         self._require_divisible("batch_size")
         for name in ("batch_size", "num_envs", *["hindsight_goals"] * (self.replay == "hindsight")):
-            if self.capacity < (rows := getattr(self, name)):
+            rows = getattr(self, name) * (2 if name == "num_envs" and self.symmetry != "off" else 1)  # mirrored, too
+            if self.capacity < rows:
                 raise UserError(
                     f"The replay buffer must hold a batch, and a step of every environment: the smaller of buffer_size"
                     f" {self.buffer_size:,} and the {self.num_envs * self.steps_per_env:,} steps of the run is"
-                    f" below {name} {rows:,}."
+                    f" below the {rows:,} rows of {name} {getattr(self, name):,}."
                 )
 
     def memory(self, spec: Spec) -> dict[str, int]:
