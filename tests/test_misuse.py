@@ -309,7 +309,7 @@ def test_what_is_no_image_of_bytes_is_refused(obs, said):
 )
 def test_no_wrong_action_reaches_a_simulator(backend, action, said):
     env = registry.make("CartPole-v1", 4, backend=backend)
-    with pytest.raises(UserError, match="are to be restarted before their first step"):
+    with pytest.raises(UserError, match=r"call restart\(seed\) before the first step"):
         env.step(torch.zeros(4, dtype=torch.int64))
     env.restart(0)
     with pytest.raises(UserError, match=said):

@@ -43,7 +43,7 @@ MODULES = {
     "sweeps.sweep": ("TrainedSweep", "resume_sweep", "train_sweep"),
     "sweeps.tuner": ("Tuned", "resume_tuning", "tune"),
 }
-"""the public names by the module that defines each; a room is never named as one of them, or it would hide it"""
+"""the public names by the module that defines each; no subpackage may have one of these names, which it would hide"""
 
 __all__ = sorted(name for names in MODULES.values() for name in names)  # pyright: ignore[reportUnsupportedDunderAll]
 
@@ -61,4 +61,4 @@ def __getattr__(name: str) -> object:
 def __dir__() -> list[str]:
     from pkgutil import iter_modules
 
-    return sorted({*globals(), *__all__, *(room.name for room in iter_modules(__path__))})
+    return sorted({*globals(), *__all__, *(module.name for module in iter_modules(__path__))})

@@ -105,7 +105,7 @@ def _signature(function: Any) -> str:
 def wrong_action(env: str, action: Any, layout: tuple[Any, Any] | None) -> UserError:
     """The sentence for actions without the shape and the type in `layout`, which is None before a restart."""
     if layout is None:
-        return UserError(f"{env}: the environments are to be restarted before their first step.")
+        return UserError(f"{env}: call restart(seed) before the first step.")
     is_array = hasattr(action, "dtype")
     given = f"{type(action).__name__} {list(action.shape)} of {action.dtype}" if is_array else shown(action)
     return UserError(f"{env}: actions are a Tensor {list(layout[0])} of {layout[1]}, not {given}.")

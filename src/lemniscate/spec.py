@@ -9,7 +9,7 @@ from lemniscate.errors import UserError
 
 @dataclass(frozen=True)
 class Box:
-    """Continuous actions. A policy acts in [-1, 1]^A; the environment floor maps that onto [low, high].
+    """Continuous actions. A policy acts in [-1, 1]^A; the backend maps that onto [low, high].
 
     Where a bound is infinite the unit stays what it is: see `envs.conversion.scale_action`.
     `shape` is how the environment wants the A coordinates, if not in a row, and `dtype` in which numbers; whole ones
@@ -38,7 +38,7 @@ class Box:
 
 @dataclass(frozen=True)
 class Discrete:
-    """One of n actions. A policy chooses 0 … n-1; the environment floor adds `start`, and gives them as `dtype`.
+    """One of n actions. A policy chooses 0 … n-1; the backend adds `start`, and gives them as `dtype`.
 
     With `masked`, the environment says at each step which of them are valid, and the observation ends in that mask:
     n numbers, 1 or 0.
@@ -57,7 +57,7 @@ class Discrete:
 
 @dataclass(frozen=True)
 class MultiDiscrete:
-    """One of n_k actions for each of K components; the environment floor adds `start`.
+    """One of n_k actions for each of K components; the backend adds `start`.
 
     With `masked`, the observation ends in the masks of all components, Σ n_k numbers: see `Discrete`.
     """
@@ -85,6 +85,15 @@ class MultiBinary:
 
 
 Action = Box | Discrete | MultiDiscrete | MultiBinary
+
+
+def action_shape(action: Action) -> tuple[int, ...]:
+    """The shape of one action of a policy: (A,) of a Box, () of a Discrete, (K,) of a MultiDiscrete, else (n,)."""
+    if isinstance(action, Discrete):
+        return ()
+    if isinstance(action, MultiDiscrete):
+        return (len(action.nvec),)
+    return (action.size if isinstance(action, Box) else action.n,)
 
 
 @dataclass(frozen=True)

@@ -143,9 +143,6 @@ class Batch(Record):
     advantage: Tensor
     target: Tensor
 
-    def __len__(self) -> int:
-        return len(self.obs)
-
 
 @dataclass(frozen=True)
 class DrawnBatch(Batch):

@@ -17,7 +17,7 @@ from lemniscate.run.metrics import read_metrics
 from lemniscate.spec import Box, ObservationPart, Spec
 from lemniscate.testing import check_resume
 from lemniscate.types import Step
-from pretend_device import pretend, whole
+from pretend_device import pretend
 
 CPU = torch.device("cpu")
 ACHIEVED, DESIRED, TIME = 0, 1, 2  # the columns of `Walk`, whose keys Gymnasium sorts
@@ -170,8 +170,10 @@ def test_copies_are_made_on_the_device_of_the_rows():
         for t in range(4):
             at = torch.tensor([[float(t), 9.0]], device=device)
             flags = (torch.tensor([flag], device=device) for flag in (False, t == 3, True))
-            replay.add(at, torch.zeros(1, 1, device=device), Step(at + 1, at + 1, -torch.ones(1, device=device), *flags))
-        assert {x.device for rows in replay.stored for x in vars(rows).values()} == {whole(device)}
+            replay.add(
+                at, torch.zeros(1, 1, device=device), Step(at + 1, at + 1, -torch.ones(1, device=device), *flags)
+            )
+        assert {x.device for rows in replay.stored for x in vars(rows).values()} == {device}
         return [(name, x.tolist()) for name, x in vars(replay.stored[1]).items()]
 
     with pretend():

@@ -166,8 +166,8 @@ def count_calls(self):
         (kind(get_extra_state=lambda self: {"a": 1}), "must make a module"),
         (lambda inputs, outputs: lambda x: x[:, :outputs], "network must make a torch module, and .* makes lambda"),
         (kind(forward=lambda self, x: Own.forward(self, x) / 0), "has outputs that are not finite"),
-        (kind(forward=lambda self, x: Own.forward(self, x - x.mean(0))), "gives a row another output among other rows"),
-        (kind(forward=lambda self, x: Own.forward(self, x) + x[:1, :1]), "gives a row another output among other rows"),
+        (kind(forward=lambda self, x: Own.forward(self, x - x.mean(0))), "has an output at one row that depends on the other rows"),
+        (kind(forward=lambda self, x: Own.forward(self, x) + x[:1, :1]), "has an output at one row that depends on the other rows"),
         (
             changed(lambda self: setattr(self, "between", nn.BatchNorm1d(8, track_running_stats=False))),
             "cannot take one row: Expected more than 1 value.*; LayerNorm takes the place of batch normalization",
@@ -276,7 +276,7 @@ class Single(nn.Linear):
 
 
 def test_rows_are_no_sequence_and_what_is_made_is_made_again():
-    with pytest.raises(UserError, match="among other rows: it takes them for one sequence"):
+    with pytest.raises(UserError, match="on the other rows: it takes them for one sequence"):
         OwnNetwork("test_networks:Sequence", 3, 2)
     OwnNetwork("test_networks:Forgetful", 3, 2)
     with pytest.raises(UserError, match="cannot be made again, to be loaded: RuntimeError: in use"):

@@ -49,7 +49,7 @@ def test_the_gradient_of_each_shard_is_computed_with_its_rows_alone():
     sizes = []
 
     def loss(networks, batch, scale):
-        sizes.append(len(batch))
+        sizes.append(len(batch.obs))
         total, metrics = ppo.loss(config, networks, batch)
         return scale * total, metrics
 

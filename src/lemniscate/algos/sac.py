@@ -35,7 +35,7 @@ class Config(OffPolicyConfig):
     target_entropy: Finite | None = None
     """H̄ in nats, at which the temperature aims, over actions in [-1, 1]^A; none: −A"""
     value_range: Positive | None = None
-    """bins of Q reach so many std of the return, usually 5 to 20; none: Q is a number"""
+    """half-width of Q's bins in std of the return, usually 5 to 20; none: Q is a number"""
     unit_weights: bool = False
     """keep each unit's weights in Q at length 1"""
 

@@ -42,7 +42,7 @@ class Config(ActorCriticConfig):
     critic_learning_rate: Scheduled[Positive] = 3e-3
     """step size of the value's Adam; usually 1e-3 to 3e-3"""
     final_learning_rate: Fraction = 0.03
-    """final value of both as a share of the initial one, linearly; 1: constant"""
+    """fraction of both learning rates at the end, linearly; 1: constant"""
     max_grad_norm: Positive | None = 1.0
     """gradient clipping by global norm, usually 0.5 to 1; none: no clipping"""
     max_grad_ratio: Positive = 3.0

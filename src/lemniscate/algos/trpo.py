@@ -52,7 +52,7 @@ class Config(RecurrentConfig):
     critic_learning_rate: Scheduled[Positive] = 1e-3
     """initial step size of the value's Adam; usually 3e-4 to 3e-3"""
     final_critic_learning_rate: Fraction = 1.0
-    """final value of it as a fraction of the initial one, annealed linearly; 1: constant"""
+    """final critic learning rate as a fraction of the initial one, annealed linearly; 1: constant"""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -205,7 +205,9 @@ def function_of(policy: Any, deterministic: bool = True) -> partial[Any]:
     if isinstance(policy, type):
         raise UserError(f"{policy.__name__} is a class: give an object of it, with the weights that are to act.")
     if isinstance(policy, Policy):
-        raise UserError("This module of lemniscate's acts in [-1, 1]: give the policy that it is of, as load returns.")
+        raise UserError(
+            "This is the module of a policy, whose actions are in [-1, 1]: give the policy itself, as load returns it."
+        )
     function = next(filter(callable, (getattr(policy, name, None) for name in METHODS)), policy)
     if not callable(function):
         what = f"a run, a function, a torch module, or an object with {', '.join(METHODS[:-1])} or {METHODS[-1]}"

@@ -31,7 +31,7 @@ CAUGHT = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIG
 
 
 class RunOptions:
-    """The arguments of `train` and `resume` that are not saved with the run, which describes them; made by `train` and `resume`, which check them.
+    """The arguments of `train` and `resume` that are not saved with the run; both make these first, which checks them.
 
     Raises `UserError` for a tracker, a callback or a cluster that is not there, or what is none.
     """

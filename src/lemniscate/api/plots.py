@@ -45,8 +45,7 @@ def plot(*runs: Plotted | list[Plotted], by: str = "step") -> list[Path]:
     """
     if not isinstance(by, str) or by not in curves.BY:
         raise unknown_name("axis", by, curves.BY)
-    given = [run for one in runs for run in (one if isinstance(one, list | tuple) else [one])]
-    paths = [path_of(run) for run in given]
+    paths = [path_of(run) for one in runs for run in (one if isinstance(one, list | tuple) else [one])]
     if not paths:
         raise UserError("There is nothing to plot: name one run or several, such as plot('runs/lander').")
     found = [run for path in paths for run in _members(path)]

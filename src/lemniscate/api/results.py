@@ -236,7 +236,9 @@ def each_finding(
     require_no_part_of_a_run(path)
     if run_check.is_stored(path):
         if backend or env_kwargs or wrappers:
-            raise UserError(f"{path} is a run, and has its own environment: leave out backend, env_kwargs (--env-args) and wrappers.")
+            raise UserError(
+                f"{path} is a run, and has its own environment: leave out backend, env_kwargs (--env-args), wrappers."
+            )
         return run_check.each_finding(path)
     if path.is_dir():
         raise UserError(f"{path} is a directory, and no run: it has no {CONFIG}.")

@@ -54,7 +54,7 @@ class ReplayBuffer:
         self._written += count
 
     def on_restart(self, judge: Judge) -> None:
-        """Nothing here: rows need no episode. The environments have been restarted, and `judge` is theirs."""
+        """Nothing here, where rows need no episode: called when environments were restarted; `judge` is theirs."""
 
     def sample_indices(self, minibatches: int, size: int, generator: Generator) -> Tensor:
         """Rows of `transitions`, drawn uniformly with replacement: [minibatches, size] int64."""

@@ -1,1 +1,1 @@
-"""The env floor: torch in, torch out. NumPy, JAX, `info` dicts and autoreset modes stop here."""
+"""Environments: torch in, torch out. NumPy, JAX, `info` dicts and autoreset modes stop here."""

@@ -1,4 +1,4 @@
-"""The contract of the environment floor: what a backend provides."""
+"""The interface that a backend implements."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping, Sequence

@@ -3,6 +3,7 @@
 import math
 import traceback
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from inspect import signature
 from pathlib import Path
 from typing import Any
@@ -175,12 +176,10 @@ def kind_of(value: Any) -> str:
 
 def as_array(value: Any) -> np.ndarray:
     """The array that a value stands for; one of objects for lists of different lengths, masked numbers and the like."""
-    if np.ma.is_masked(value):
-        return np.full((), None, dtype=object)
-    try:
-        return np.asarray(value.detach().cpu() if isinstance(value, Tensor) else value)
-    except (ValueError, TypeError, RuntimeError):
-        return np.full((), None, dtype=object)
+    with suppress(ValueError, TypeError, RuntimeError):
+        if not np.ma.is_masked(value):
+            return np.asarray(value.detach().cpu() if isinstance(value, Tensor) else value)
+    return np.full((), None, dtype=object)
 
 
 def fitted(space: gym.Space, obs: Any, lead: tuple[int, ...] = (), where: str = "") -> Any:

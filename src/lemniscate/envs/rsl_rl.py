@@ -1,4 +1,4 @@
-"""The door to big simulators: environments that speak rsl_rl's `VecEnv`, as Isaac Lab's do; and ours as one.
+"""Environments with the `VecEnv` interface of rsl_rl, such as Isaac Lab's, as a backend; and ours with that interface.
 
 Neither needs rsl_rl; ours as one needs tensordict.
 """

@@ -1,4 +1,4 @@
-"""Parallel environments as the floors above see them, and the episodes that run in them."""
+"""Parallel environments as algorithms use them, and the episodes that run in them."""
 
 import math
 from collections import deque
@@ -13,7 +13,7 @@ from lemniscate.envs.backend import Backend
 from lemniscate.envs.returns import kind_of
 from lemniscate.envs.symmetry import Mirror
 from lemniscate.errors import NonFiniteError, UserError, shown, wrong_action
-from lemniscate.spec import Box, Discrete, MultiBinary, Spec
+from lemniscate.spec import Box, Spec, action_shape
 from lemniscate.system.world import ALONE, World
 from lemniscate.types import Rollout, Step, wide_float
 
@@ -195,12 +195,8 @@ def require_end(env_id: str, age: int, limit: int | None, can_wrap: bool = True)
 
 
 def _action_layout(spec: Spec, num_envs: int) -> tuple[torch.Size, torch.dtype]:
-    action = spec.action
-    if isinstance(action, Discrete):
-        return torch.Size((num_envs,)), torch.int64
-    if isinstance(action, Box):
-        return torch.Size((num_envs, action.size)), torch.float32
-    return torch.Size((num_envs, action.n if isinstance(action, MultiBinary) else len(action.nvec))), torch.int64
+    kind = torch.float32 if isinstance(spec.action, Box) else torch.int64
+    return torch.Size((num_envs, *action_shape(spec.action))), kind
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,7 @@ def coloured(normal: Float[Tensor, "*S L"], exponent: float) -> Float[Tensor, "*
 
     Each frequency k / L gets an amplitude and a phase that are Gaussian, of standard deviation s_k = max(k, 1)^(−β/2)
     before the whole is scaled; then back to time by an inverse Fourier transform. Exponent 0 is white noise, 1 is pink
-    (Eberhard et al. 2023, *Pink noise is all you need*), 2 red, the noise of a random walk that is held back.
+    (Eberhard et al. 2023, *Pink noise is all you need*), 2 is red.
 
     Args:
         normal: standard normal; L even.
@@ -58,5 +58,5 @@ def coloured(normal: Float[Tensor, "*S L"], exponent: float) -> Float[Tensor, "*
 
 
 def uniform(normal: Float[Tensor, "*S"]) -> Float[Tensor, "*S"]:
-    """2 Φ(x) − 1: standard normal numbers become uniform ones in [-1, 1], and those that went together still do."""
+    """2 Φ(x) − 1: standard normal numbers to uniform ones in [-1, 1], whose order and dependence stay."""
     return torch.erf(normal / math.sqrt(2))

@@ -62,7 +62,7 @@ def explained_variance(prediction: Tensor, target: Tensor) -> Tensor:
 
 
 def explained_by(features: Tensor, targets: Tensor, beside: Tensor) -> Tensor:
-    """The share of the targets' variance that a line in `features` explains beyond one in `beside`, less chance.
+    """The share of the targets' variance that a regression on `features` explains beyond one on `beside`, less chance.
 
     The adjusted coefficient of partial determination, 1 − (RSS₁ / (B − p₁)) / (RSS₀ / (B − p₀)): about 0, and sometimes
     below, for features that have nothing to do with the targets.

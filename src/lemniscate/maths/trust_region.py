@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.func import grad, jvp, vjp
 
 Product = Callable[[Tensor], Tensor]
-"""v [P] to A v [P], for a symmetric matrix A that nobody writes down"""
+"""v [P] to A v [P], for a symmetric matrix A that is never stored"""
 
 
 def fisher_product(
@@ -36,7 +36,7 @@ def fisher_product(
 def conjugate_gradient(
     product: Product, b: Float[Tensor, " P"], *, iterations: int = 10, tolerance: float = 1e-10
 ) -> Float[Tensor, " P"]:
-    """X ≈ A⁻¹ b for a symmetric positive definite A: Hestenes & Stiefel 1952; arXiv:1502.05477, appendix C.
+    """Solve A x = b for a symmetric positive definite A: Hestenes & Stiefel 1952; arXiv:1502.05477, appendix C.
 
         α = rᵀr / pᵀAp      x ← x + α p      r' = r − α A p      p ← r' + (r'ᵀr' / rᵀr) p
 
@@ -98,8 +98,7 @@ def backtrack(
 ) -> tuple[Float[Tensor, " P"], float]:
     """Backtracking line search: the farthest point start + shrinkʲ · step that meets both conditions.
 
-    Promised are a loss below that at the start, and a KL within δ (arXiv:1502.05477, appendix C). Nothing is moved and
-    nothing has to be put back: the caller goes where this says.
+    Its loss is below that at the start, and its KL within δ (arXiv:1502.05477, appendix C).
 
     Args:
         judge: a point to (its loss, its KL from the start), scalars.

@@ -154,7 +154,7 @@ def by_chunks(function: Callable[[Tensor], Tensor], rows: Tensor) -> Tensor:
 
 
 def of_next(function: Callable[[Tensor], Tensor], now: Tensor, obs: Tensor, next_obs: Tensor) -> Tensor:
-    """A function at s' [T, N, …]: what it says `now` [T, N] of the row after, where that begins with s'."""
+    """A function at s' [T, N, …]: its value `now` [T, N] at the row after, where that begins with s'; else computed."""
     if torch.compiler.is_compiling():  # a program has one shape
         return by_chunks(function, next_obs)
     others = torch.ones_like(now, dtype=torch.bool)

@@ -69,7 +69,7 @@ class ActorQ(nn.Module):
         return torch.zeros(len(obs), device=obs.device)
 
     def followed(self) -> nn.Module:
-        """All that has target networks."""
+        """Policy and critics, of which the target networks are copies."""
         return self
 
     def target(self) -> nn.Module:
@@ -89,7 +89,7 @@ class SoftActorQ(ActorQ):
         self.temperature = Temperature(initial_temperature)
 
     def followed(self) -> nn.Module:
-        """The critics alone."""
+        """The critics: SAC has no target policy."""
         return self.critics
 
     def entropy_bonus(self, obs: Tensor, generator: Generator) -> Tensor:

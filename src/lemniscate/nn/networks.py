@@ -215,8 +215,8 @@ class OwnNetwork(nn.Module):
             raise UserError(f"{self.name} takes one row, {shapes}.")
         if not all(torch.allclose(out[: len(x)], x, rtol=1e-3, atol=1e-4) for x in (alone, turned.flip(0))):
             raise UserError(
-                f"{self.name} gives a row another output among other rows: it takes them for one sequence, or"
-                " normalizes over them, as batch normalization does; LayerNorm does not."
+                f"{self.name} has an output at one row that depends on the other rows: it takes them for one sequence,"
+                " or normalizes over them, as batch normalization does; LayerNorm does not."
             )
 
     def _require_saved(self, out: Tensor, rows: Tensor) -> None:

@@ -18,7 +18,7 @@ from lemniscate.maths import (
 )
 from lemniscate.nn.memory import Carrier, Memory, remember
 from lemniscate.nn.normalizer import NoNorm
-from lemniscate.spec import Action, Box, Discrete, MultiDiscrete
+from lemniscate.spec import Action, Box, Discrete, MultiDiscrete, action_shape
 
 
 class Policy(nn.Module):
@@ -32,7 +32,7 @@ class Policy(nn.Module):
         self.memory: Memory | None = None
         """the columns of what it remembers, if it has a memory"""
         self._draw = torch.randn if isinstance(action, Box) else torch.rand
-        self._shape = _shape_of(action)
+        self._shape = action_shape(action)
 
     def remember(self, obs: Tensor) -> Tensor:
         """The memory of a policy that has one after rows [N, …], as the columns of that memory."""
@@ -76,15 +76,6 @@ class Policy(nn.Module):
         """The network's outputs, those of actions that the mask at the end of `obs` rules out at −10⁹."""
         size = self.action.mask_size
         return outputs.masked_fill(obs[..., -size:] == 0, -1e9) if size else outputs
-
-
-def _shape_of(action: Action) -> tuple[int, ...]:
-    """The shape of one action."""
-    if isinstance(action, Discrete):
-        return ()
-    if isinstance(action, MultiDiscrete):
-        return (len(action.nvec),)
-    return (action.size if isinstance(action, Box) else action.n,)
 
 
 class GaussianPolicy(Policy):
@@ -149,7 +140,7 @@ class BernoulliPolicy(Policy):
 
 
 class DeterministicPolicy(Policy):
-    """One action at each observation, tanh of a network: in [-1, 1]^A, which the env floor maps onto its bounds."""
+    """One action at each observation, tanh of a network: in [-1, 1]^A, which the backend maps onto the bounds."""
 
     def distribution_of(self, outputs: Tensor, obs: Tensor) -> Deterministic:
         """[B, A]."""

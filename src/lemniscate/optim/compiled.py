@@ -20,14 +20,15 @@ R = TypeVar("R")
 
 
 class Compiler:
-    """What a run and its compiled programs tell each other.
+    """What a run shares with its compiled functions.
 
     Args:
         busy: entered while a program is compiled, so that the other processes of a run know.
     """
 
     def __init__(self, busy: Callable[[], AbstractContextManager[None]] = nullcontext) -> None:
-        self.busy, self.stopping = busy, Event()
+        self.busy = busy
+        self.stopping = Event()
         """set while a run that was asked to stop ends its update: nothing more is compiled, and a compiler that Ctrl-C
         has reached, too, has not failed"""
 

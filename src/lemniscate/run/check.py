@@ -111,10 +111,9 @@ def _going_on(path: Path, whole: list[checkpoint.Checkpoint]) -> Finding:
     if not checkpoint.list_steps(path / "checkpoints"):
         if not read_metrics(path):
             return Finding(GOOD, "It has not begun.")
-        gone = lost(path) if is_whole(path / CONFIG) else None
-        return (
-            Finding(BAD, gone) if gone else Finding(NOTE, "There is no checkpoint yet: resume would begin at step 0.")
-        )
+        if is_whole(path / CONFIG) and (gone := lost(path)):
+            return Finding(BAD, gone)
+        return Finding(NOTE, "There is no checkpoint yet: resume would begin at step 0.")
     if not planned:
         return Finding(NOTE, "There is no whole planned checkpoint: resume would begin at step 0.")
     try:

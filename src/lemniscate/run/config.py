@@ -102,8 +102,7 @@ def _convert(value: Any, option: Any) -> Any:
         words = get_args(option)[0] is str
         if words and isinstance(value, str) and "," not in re.sub(r"\(.*\)", "", value):  # one alone
             return (value,)
-        example = ("name", "other") if words else (64, 64)
-        raise ValueError(f"several {'numbers' if example == (64, 64) else 'names'}, such as {example}")
+        raise ValueError("several names, such as ('name', 'other')" if words else "several numbers, such as (64, 64)")
     if kind in WANTED and not isinstance(value, kind):
         raise ValueError(WANTED[kind])
     if kind is dict:
@@ -207,7 +206,7 @@ class RunConfig:
     video_every: Natural = 0
     """steps between recordings of an episode into videos/step-N; 0: none"""
     video_every_episodes: Natural = 0
-    """training episodes between these; 0: none"""
+    """training episodes between videos; 0: none"""
     warm_start: str | None = None
     """run, checkpoint or hf://user/name whose networks this run begins with"""
     freeze: tuple[str, ...] = ()

@@ -77,7 +77,7 @@ class JsonLines:
         """Close the file."""
         self._flush()
         if self._unwritten:
-            say(f"{self._path} lacks its last {self._unwritten.count(10)} lines: the disk refused them.")
+            say(f"{self._path} lacks its last {len(self._unwritten.splitlines())} lines: the disk refused them.")
         self._file.close()
 
     def _flush(self) -> None:

@@ -47,7 +47,7 @@ class OffPolicyConfig(RunConfig):
     critic_learning_rate: Scheduled[Positive] = 3e-4
     """step size of the critics' Adam; usually 1e-4 to 1e-3"""
     final_learning_rate: Fraction = 1.0
-    """final value of both as a share of the initial one, linearly; 1: constant"""
+    """fraction of both learning rates at the end, linearly; 1: constant"""
     tau: Fraction = 0.005
     """τ, the share by which the target networks move at each update; usually 0.001 to 0.02"""
     policy_delay: Count = 1

@@ -62,7 +62,7 @@ class OnPolicyConfig(RunConfig):
     def gradient_steps(self) -> int:
         """The number of gradient steps of the whole run: passes over each rollout, in minibatches where it has them.
 
-        Where the value has passes of its own, it is those.
+        Where the value is learned apart, in passes of its own, those alone.
         """
         own = "critic_" if hasattr(self, "critic_epochs") else ""
         epochs, size = getattr(self, f"{own}epochs", 1), getattr(self, f"{own}minibatch_size", self.num_rows)

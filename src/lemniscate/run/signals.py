@@ -94,9 +94,9 @@ def of_environment(rows: Rollout, spec: Spec, ages: Tensor | None = None) -> dic
 
 
 def of_rows(rows: Rollout, spec: Spec) -> dict[str, Tensor]:
-    """Sizes of rewards and observations, and shares, of rows [B, …].
+    """Sizes of rewards and observations, and shares of rows [B, …].
 
-    These are of rewards that are 0, of numbers that never change, of observations that are as the one before, of
+    The shares are of rewards that are 0, of numbers that never change, of observations that are as the one before, of
     numbers that are the largest or the smallest of their column, of whole numbers, of actions at their bounds, and of
     ends that are terminations.
     """
@@ -177,14 +177,18 @@ def of_ages(rows: Rollout, spec: Spec, ages: Tensor, explained: Tensor) -> dict[
 
 
 def of_effects(rows: Rollout, spec: Spec) -> dict[str, Tensor]:
-    """The shares of the observations' changes that actions explain, and of the rewards that all of a row explains.
+    """How actions, observations and rewards depend on each other, by linear regression (`explained_by`).
 
-    Actions explain what a line fitted to them explains beyond one fitted to the observations alone, in that number of
-    the observation of which it is most: as a share of what those left to explain, and of all; and of the rewards the
-    same. A reward may be a square too, of a distance or of an action. Also the share of the next observations that
-    these explain, on average; what the signs of actions explain beyond all this; what that number of an action explains
-    of which it is least; what actions of one sign explain, over the other; what it explains which of two choices was
-    made, of those alike most; and the root mean square of a change over the standard deviation, where most.
+    - action/effect: the share of the observations' change that actions explain beyond the observations, where most.
+    - action/share: the same as a share of the whole change.
+    - action/paid: the share of the rewards that actions explain beyond the observations.
+    - action/by_sign: what the signs of actions explain of the change beyond observations and actions.
+    - action/weakest: what that number of an action explains of it that explains least.
+    - action/half, action/alike: see `_weaker_half` and `_choices_alike`.
+    - reward/explained: the share of the rewards that observations, actions, next observations and their squares
+      explain, as of a squared distance.
+    - observation/predicted: the share of the next observations that these explain, on average.
+    - observation/pace: the root mean square of a change over the standard deviation, where most.
     """
     obs, after = (x[:, : spec.observation_size].cpu().double() for x in (rows.obs, rows.next_obs))
     action, inside = _numbers(rows.action.cpu(), spec.action), ~rows.done.cpu()
