@@ -1605,8 +1605,8 @@ MUTANTS = [
     (
         "columns of chance explain",
         "maths/stats.py",
-        "share = 1 - (after / many) / (left / few)",
-        "share = 1 - after / left",
+        "share = 1 - (full_rss / full_dof) / (base_rss / base_dof)",
+        "share = 1 - full_rss / base_rss",
         "run/test_signals.py::test_noise_explains_nothing_and_too_few_rows_are_not_a_number",
     ),
     (

@@ -240,8 +240,8 @@ def test_each_algorithm_that_learns_from_replay_has_it(algo):
     assert isinstance(replay, HindsightReplay)
     assert replay.capacity == config.capacity == 5 * 512
     assert (
-        config.memory(spec)["buffer_size"]
-        == 5 * algo.Config(env="x", **SMALL | {"replay": "uniform"}).memory(spec)["buffer_size"]
+        config.memory_bytes(spec)["buffer_size"]
+        == 5 * algo.Config(env="x", **SMALL | {"replay": "uniform"}).memory_bytes(spec)["buffer_size"]
     )
 
 

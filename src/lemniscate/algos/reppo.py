@@ -146,7 +146,7 @@ def learn(config: Config, state: State, batch: SoftBatch, minibatches: Tensor, n
         actor = state.actor_optimizer.step(partial(actor_loss, config, state), minibatch, its_noise)
         reached = actor["losses/entropy"], actor["kl"], minibatch.action.shape[-1]
         multipliers = state.multiplier_optimizer.step(partial(multiplier_loss, config), *reached)
-        state.networks.multipliers.raise_first(config.min_temperature)
+        state.networks.multipliers.keep_temperature_above(config.min_temperature)
         metrics.append({**critic, **actor, **multipliers})
     return metrics
 

@@ -22,7 +22,7 @@ from torch import Tensor, nn
 
 from lemniscate.api.policy import TrainedPolicy, TrainedRun, load
 from lemniscate.envs.conversion import normalized_action, physical_action, row_of, unflatten_observation
-from lemniscate.envs.returns import MASKS, as_array, kind_of, shown_space
+from lemniscate.envs.returned import MASKS, as_array, kind_of, shown_space
 from lemniscate.envs.spaces import random_action, read_mask, read_observation
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.envs.vector_view import action_space, observation_space
@@ -308,10 +308,10 @@ class Agent:
 
     def _takes_batch(self, some: np.ndarray) -> bool:
         """Whether a batch is answered, and each row of it as it is alone, where that is answered."""
-        answers = dict[bool, np.ndarray | None]()
-        for self._batched in (True, False):
-            answers[self._batched] = self._try(some, [])
-        together, alone = answers[True], answers[False]
+        self._batched = True
+        together = self._try(some, [])
+        self._batched = False
+        alone = self._try(some, [])
         if together is None or alone is None:
             return alone is None
         return np.allclose(together, alone, rtol=1e-3, atol=1e-5)

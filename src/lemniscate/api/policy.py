@@ -15,7 +15,7 @@ from torch import Tensor
 
 from lemniscate import algos
 from lemniscate.envs.conversion import normalized_action, physical_action, scale_of
-from lemniscate.envs.returns import as_array, kind_of
+from lemniscate.envs.returned import as_array, kind_of
 from lemniscate.envs.spaces import read_mask, read_observation
 from lemniscate.errors import UserError, prefix_errors, shown
 from lemniscate.hub import repository as hub

@@ -242,10 +242,10 @@ def each_finding(
         return run_check.each_finding(path)
     if path.is_dir():
         raise UserError(f"{path} is a directory, and no run: it has no {CONFIG}.")
-    return env_check.each_finding(what, backend, env_kwargs, wrappers, _shown_by)
+    return env_check.each_finding(what, backend, env_kwargs, wrappers, _doctor_sentences)
 
 
-def _shown_by(rollouts: Sequence[Rollout], spec: Spec) -> list[str]:
+def _doctor_sentences(rollouts: Sequence[Rollout], spec: Spec) -> list[str]:
     """The doctor's sentences on rollouts [T, N, …] of random play, each looked at in two halves."""
     halves = [
         rows[half] for rows in rollouts for half in (slice(len(rows.done) // 2), slice(len(rows.done) // 2, None))
@@ -461,7 +461,7 @@ def push(run: Trained, name: str, *, private: bool = False, license: str | None 
         save(policy, folder)
         code = own_code(checkpoint.read(folder))
         path = policy.path if policy.path and (policy.path / CONFIG).is_file() else None
-        for place, file in _shown(path, policy.step).items() if path else ():
+        for place, file in _files_to_upload(path, policy.step).items() if path else ():
             (folder / place).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(file, folder / place)
         if not (path and pages.newest_film(path)):
@@ -477,7 +477,7 @@ def push(run: Trained, name: str, *, private: bool = False, license: str | None 
         return hub.upload(folder, name, private)
 
 
-def _shown(run: Path, step: int) -> dict[str, Path]:
+def _files_to_upload(run: Path, step: int) -> dict[str, Path]:
     """The files of a run that are uploaded beside its policy of a step, by their paths in the repository; no links.
 
     They are the figures, the export where there is a whole one of that step, and the newest film: a video by the name

@@ -147,7 +147,7 @@ def train(
 @torch_defaults()
 def begin(algorithm: str, config: RunConfig, run: str | Path | None, arguments: Mapping[str, Any]) -> TrainedRun:
     """Train by a Config that is chosen, with the `arguments` of `RunOptions`. Raises as `train`."""
-    with together() as world:
+    with join_world() as world:
         options = RunOptions(**arguments)
         path = path_of(run) if run is not None else fresh_directory(config.env, f"{algorithm}-{config.seed}")
         if world.is_first:
@@ -203,13 +203,13 @@ def resume(
     options |= {"processes": processes, "cluster": cluster, "workers": workers, "storage": storage}
     again = {"total_steps": total_steps, "env": None if env is None else registry.name_of(env), "wrappers": wrappers}
     again |= {"network": network, "curriculum": curriculum}
-    return go_on(run, options, {name: name_in_config(x) for name, x in again.items() if x is not None})
+    return resume_run(run, options, {name: name_in_config(x) for name, x in again.items() if x is not None})
 
 
 @torch_defaults()
-def go_on(run: object, arguments: Mapping[str, Any], changes: Mapping[str, object]) -> TrainedRun:
+def resume_run(run: object, arguments: Mapping[str, Any], changes: Mapping[str, object]) -> TrainedRun:
     """Go on with a run; `changes` are `total_steps` and objects passed again. Raises as `resume`."""
-    with together() as world:
+    with join_world() as world:
         options, path = RunOptions(**arguments), path_of(run)
         record = world.from_first(read_record(path) if world.is_first else {})
         with parsing(path):
@@ -239,16 +239,18 @@ def _annealed(config: RunConfig) -> list[str]:
     return [f"{name} {value}" for name, value in fields.items() if value != 1]
 
 
-def together() -> AbstractContextManager[World]:
+def join_world() -> AbstractContextManager[World]:
     """The world of this process: of those that `torchrun` or Ray has started, or its own."""
     leave_if_imported_again()
     if CLUSTER in os.environ:
-        from lemniscate.cluster.job import together
-    elif "WORLD_SIZE" in os.environ:
-        from lemniscate.system.processes import together
-    else:
-        return nullcontext(World())
-    return together()
+        from lemniscate.cluster import job
+
+        return job.join_world()
+    if "WORLD_SIZE" in os.environ:
+        from lemniscate.system import processes
+
+        return processes.join_world()
+    return nullcontext(World())
 
 
 def _train_elsewhere(path: Path, algorithm: str, config: RunConfig, options: RunOptions) -> TrainedRun:

@@ -82,7 +82,7 @@ def resume(run: Path, total_steps: float | None, score: bool, **options: Any) ->
         resume_sweep(run, **_only(OF_SWEEPS, options, "a sweep"))
     else:
         changes = {} if total_steps is None else {"total_steps": total_steps}
-        trained = training.go_on(run, options, changes)
+        trained = training.resume_run(run, options, changes)
         if score:
             _say_score(trained)
         if not trained.seconds:  # it was finished, which has been said

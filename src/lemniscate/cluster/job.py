@@ -224,6 +224,6 @@ class RayWorkers(RayWorker, Processes):
     """The workers of a job."""
 
 
-def together() -> AbstractContextManager[World]:
+def join_world() -> AbstractContextManager[World]:
     """The world of this worker's job."""
-    return nullcontext(RayWorker()) if os.environ["WORLD_SIZE"] == "1" else processes.together(RayWorkers)
+    return nullcontext(RayWorker()) if os.environ["WORLD_SIZE"] == "1" else processes.join_world(RayWorkers)

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from lemniscate.drones.vehicle import CONDITIONS, DYNAMICS, GAINS, PD, Ranges, interface_of, read_ranges
 from lemniscate.envs.backend import Backend, Scene, Summary
-from lemniscate.envs.factory import model_warnings_off, sentences
+from lemniscate.envs.factory import creation_errors, model_warnings_off
 from lemniscate.envs.spaces import action_kind
 from lemniscate.errors import UserError, missing_extra, shown, unknown_name
 from lemniscate.spec import Spec
@@ -199,7 +199,7 @@ class CrazyflowBackend(JaxBackend):
 
             read_track(kwargs["track"])  # says by the file's name what is wrong with it
             kwargs["track"] = text_of_track(kwargs["track"])
-        with sentences(env, kwargs):
+        with creation_errors(env, kwargs):
             hashable = {name: tuple(value) if isinstance(value, list) else value for name, value in kwargs.items()}
             shared, vectors = programs(env, num_envs, jax_device(device), tuple(sorted(hashable.items())))
         super().__init__(shared, num_envs, device, stagger=stagger)
@@ -242,7 +242,7 @@ class CrazyflowBackend(JaxBackend):
         if several := dynamics_of(kwargs):
             kwargs["dynamics"] = several[0]
         _check(env, starts, kwargs)
-        with sentences(env, kwargs):
+        with creation_errors(env, kwargs):
             return DroneProbe(env, starts, kwargs, DYNAMICS)
 
 

@@ -21,7 +21,7 @@ from torch import Tensor
 from lemniscate.envs import registry
 from lemniscate.envs.conversion import SingleEnv
 from lemniscate.envs.factory import make_one, maker_of
-from lemniscate.envs.returns import flat_mask, mask_in, shown_space
+from lemniscate.envs.returned import flat_mask, mask_in, shown_space
 from lemniscate.envs.spaces import observation_parts, random_action
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.envs.vector_view import action_space
@@ -159,7 +159,7 @@ def _random_play(env: VecEnv, judge: Callable[[Sequence[Rollout], Spec], Sequenc
         speed = env.num_envs * STEPS / (time.perf_counter() - started)
         repeated = _same(first, _play(env, seed=0)[0])
         other, more_lengths = _play(env, seed=1)
-        acted, _ = _play(env, seed=0, actions=8, steps=STEPS // 2)
+        acted, _ = _play(env, seed=0, action_seed=8, steps=STEPS // 2)
     except Exception as error:
         yield _raised(error, "It cannot be played with random actions")
         return
@@ -189,9 +189,9 @@ def _random_play(env: VecEnv, judge: Callable[[Sequence[Rollout], Spec], Sequenc
     yield good(f"{speed:,.0f} steps a second ({env.num_envs} parallel environments, random actions).")
 
 
-def _play(env: VecEnv, seed: int, actions: int = 7, steps: int = STEPS) -> tuple[Rollout, list[int]]:
-    """Random play from a seed, and the lengths of its episodes; `actions` is the seed of the actions, up to masks."""
-    rng = torch.Generator().manual_seed(actions)
+def _play(env: VecEnv, seed: int, action_seed: int = 7, steps: int = STEPS) -> tuple[Rollout, list[int]]:
+    """Random play from a seed, and the lengths of its episodes; `action_seed` is that of its actions, up to masks."""
+    rng = torch.Generator().manual_seed(action_seed)
     rows = []
     with warnings.catch_warnings(action="ignore"):  # Gymnasium's, of which we have told already
         env.restart(seed)

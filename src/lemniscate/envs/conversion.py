@@ -11,9 +11,9 @@ import torch
 from gymnasium import spaces
 from torch import Tensor
 
-from lemniscate.envs.returns import (
+from lemniscate.envs.returned import (
     MASKS,
-    Returns,
+    ReturnedValues,
     as_array,
     author,
     flat_mask,
@@ -47,7 +47,7 @@ class SingleEnv(gym.Wrapper):
     def __init__(self, env: gym.Env) -> None:
         super().__init__(env)
         require_form(env, ("observation_space", "action_space"))
-        self._returns = Returns(env, env.observation_space)
+        self._returns = ReturnedValues(env, env.observation_space)
         self._ask = _mask_of(env)
         seen, self._acts, self._declared = env.observation_space, env.action_space, measures_of(env.metadata)
         self._masked = bool(self._ask or (isinstance(seen, spaces.Dict) and seen.spaces.keys() & set(MASKS)))
@@ -68,7 +68,7 @@ class SingleEnv(gym.Wrapper):
         usual = two and self._is_usual(returned[0], 0.0, False, False, returned[1])
         obs, info = returned if usual else self._returns.of_reset(returned)
         obs = obs.copy() if usual else obs  # several environments may write into one array
-        return obs, self._told("reset", obs, info) if info or self._masked else info
+        return obs, self._reduced("reset", obs, info) if info or self._masked else info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Gymnasium's."""
@@ -79,7 +79,13 @@ class SingleEnv(gym.Wrapper):
         usual = type(returned) is tuple and len(returned) == 5 and self._is_usual(*returned)
         obs, reward, terminated, truncated, info = returned if usual else self._returns.of_step(returned)
         obs = obs.copy() if usual else obs  # as in reset
-        return obs, reward, terminated, truncated, self._told("step", obs, info) if info or self._masked else info
+        return (
+            obs,
+            reward,
+            terminated,
+            truncated,
+            self._reduced("step", obs, info) if info or self._masked else info,
+        )
 
     def _is_usual(self, obs: Any, reward: Any, terminated: Any, truncated: Any, info: Any) -> bool:
         """Whether each is of its type already, as mostly: this is asked at every step, and `of_step` is slower."""
@@ -119,7 +125,7 @@ class SingleEnv(gym.Wrapper):
         except Exception as error:
             say(f"{author(self.env, 'close')} raised {type(error).__name__}: {error}")
 
-    def _told(self, method: str, obs: Any, info: dict[str, Any]) -> dict[str, Any]:
+    def _reduced(self, method: str, obs: Any, info: dict[str, Any]) -> dict[str, Any]:
         numbers: dict[str, Any] = dict(scalars(info))
         for name in self._declared:
             if info.get(name) is not None and name not in numbers:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from lemniscate.envs.backend import Backend
 from lemniscate.envs.conversion import SUCCESS, flatten_observation, measured, physical_action, row_of
-from lemniscate.envs.registry import BEGINNINGS
+from lemniscate.envs.registry import ID_PREFIXES
 from lemniscate.envs.spaces import SUMMARIES, ActionMasks, action_kind, is_image, masked, observation_parts
 from lemniscate.envs.vec_env import Stagger
 from lemniscate.errors import UserError, is_installed, missing_extra, unknown_name
@@ -20,7 +20,7 @@ from lemniscate.spec import Spec
 from lemniscate.system.machine import cores
 from lemniscate.types import Step
 
-PREFIX, *GYMNASIUM_IDS = BEGINNINGS["envpool"]
+PREFIX, *GYMNASIUM_IDS = ID_PREFIXES["envpool"]
 """what an id of EnvPool's own begins with here, so that it is not mistaken for Gymnasium's of that name; and the ids
 that are the same in both: tests/envs/test_envpool.py compares them"""
 

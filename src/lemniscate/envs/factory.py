@@ -18,8 +18,8 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, VectorEnv
 
 from lemniscate.envs.conversion import SingleEnv
-from lemniscate.envs.registry import SPOKEN
-from lemniscate.envs.returns import CheckedVector
+from lemniscate.envs.registry import RSL_RL_METHOD
+from lemniscate.envs.returned import CheckedVector
 from lemniscate.envs.workers import WatchedVectorEnv, Worker, told_with_place
 from lemniscate.errors import UserError, WorkerError, shown, with_article
 from lemniscate.system import named
@@ -109,7 +109,7 @@ def make_one(maker: Maker, wrappers: Sequence[Callable[..., Any]] = (), **kwargs
 
 def _other(made: object, wanted: str) -> TypeError:
     """The words on something else than what is wanted."""
-    instead = "; what speaks rsl_rl's VecEnv is of the backend rsl_rl" if hasattr(made, SPOKEN) else ""
+    instead = "; what speaks rsl_rl's VecEnv is of the backend rsl_rl" if hasattr(made, RSL_RL_METHOD) else ""
     if isinstance(made, gym.Env):
         instead = "; what has an argument num_envs makes that many at once"
     return TypeError(f"it makes {with_article(type(made).__name__)}, not a {wanted}{instead}")
@@ -203,7 +203,7 @@ def model_warnings_off() -> Iterator[None]:
 
 
 @contextmanager
-def sentences(env: str, kwargs: Mapping[str, Any] | None, wrappers: Sequence[str] = ()) -> Iterator[None]:
+def creation_errors(env: str, kwargs: Mapping[str, Any] | None, wrappers: Sequence[str] = ()) -> Iterator[None]:
     """An error that the making of an environment raises, as a `UserError` that names the arguments and wrappers."""
     try:
         yield

@@ -14,8 +14,8 @@ from torch import Tensor
 from lemniscate.envs import spaces
 from lemniscate.envs.backend import Backend
 from lemniscate.envs.conversion import flatten_observation, measured, measures_of, physical_action, row_of
-from lemniscate.envs.factory import is_own, make_one, make_vector, maker_of, makes_vector, sentences
-from lemniscate.envs.returns import fitted, mask_in
+from lemniscate.envs.factory import creation_errors, is_own, make_one, make_vector, maker_of, makes_vector
+from lemniscate.envs.returned import fitted, mask_in
 from lemniscate.envs.vec_env import Stagger
 from lemniscate.envs.workers import WatchedVectorEnv, call_method
 from lemniscate.errors import UserError, shown
@@ -95,7 +95,7 @@ class GymnasiumBackend(Backend):
         wraps, given = tuple(map(find_callable, wrappers)), dict(kwargs or {})
         self._make = partial(make_vector, maker, num_envs, given, wraps, self.workers)
         self._make_judge, self._judge = partial(make_one, maker, wraps, **given), None
-        with sentences(env, kwargs, wrappers):
+        with creation_errors(env, kwargs, wrappers):
             self._envs, limit = self._build()
         try:
             self._read_form(env, limit)

@@ -27,7 +27,7 @@ BACKENDS = {
 }
 """each is imported when it is used; the first that serves an id runs it"""
 
-BEGINNINGS = {
+ID_PREFIXES = {
     "crazyflow": ("Drone",),
     "minatar": ("MinAtar/",),
     "robotics": ("AdroitHand", "AntMaze_", "Fetch", "FrankaKitchen", "HandManipulate", "HandReach", "PointMaze_"),
@@ -54,7 +54,7 @@ ARGUMENTS_OF_MAKE = {
 }
 """arguments of `gym.make` and its kin, and what takes their place; one's own environment may have all but two"""
 
-SPOKEN = "get_observations"
+RSL_RL_METHOD = "get_observations"
 """the method by which a vector of environments that speaks rsl_rl's `VecEnv` is known"""
 
 MOST_ENVS = 1_000_000
@@ -73,11 +73,11 @@ def backend_for(env: str, wrappers: Sequence[str] = ()) -> str:
     `UserError` with the nearest names if there is none.
     """
     with suppress(UserError):  # an id behind a module that registers it, or nothing
-        if ":" in env and hasattr(named.find(env), SPOKEN):
+        if ":" in env and hasattr(named.find(env), RSL_RL_METHOD):
             return "rsl_rl"
     serving = None
     for name in BACKENDS:
-        if env.startswith(BEGINNINGS.get(name, "")) and backend_class(name).serves(env):
+        if env.startswith(ID_PREFIXES.get(name, "")) and backend_class(name).serves(env):
             if not wrappers or backend_class(name).wraps(env):
                 return name
             serving = serving or name
@@ -146,7 +146,7 @@ def name_of(env: object) -> str:
     """
     if isinstance(env, str):
         return env
-    if not callable(env) and not hasattr(env, SPOKEN):
+    if not callable(env) and not hasattr(env, RSL_RL_METHOD):
         what, right = shown(env), "its class, its id, or a function that makes it"
         if hasattr(env, "step"):
             what, right = "an environment that is made already", f"{right}: training makes as many as it needs"
@@ -161,7 +161,7 @@ def name_of(env: object) -> str:
 def count_of(env: object) -> int | None:
     """The number of environments in an object that speaks rsl_rl's `VecEnv`; None of anything else."""
     number = getattr(env, "num_envs", None)
-    return None if isinstance(env, type) or not hasattr(env, SPOKEN) else number
+    return None if isinstance(env, type) or not hasattr(env, RSL_RL_METHOD) else number
 
 
 def names_of(wrappers: "Sequence[str | Callable[..., Any]]") -> tuple[str, ...]:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from lemniscate.envs import registry
 from lemniscate.envs.backend import Backend
-from lemniscate.envs.returns import kind_of
+from lemniscate.envs.returned import kind_of
 from lemniscate.errors import UserError
 from lemniscate.spec import Box, ObservationPart, Spec
 from lemniscate.system import named
@@ -42,7 +42,7 @@ class RslRlBackend(Backend):
     @classmethod
     def serves(cls, env: str) -> bool:
         """An object that speaks it, or a function of one's own, which may make one."""
-        return ":" in env and (speaks(found := named.find(env)) or callable(found))
+        return ":" in env and (is_rsl_rl_env(found := named.find(env)) or callable(found))
 
     @classmethod
     def exists_once(cls, env: str, num_envs: int) -> bool:
@@ -193,7 +193,7 @@ class RslRlBackend(Backend):
             self.notices = [*self.notices, sentence]
 
 
-def speaks(thing: object) -> bool:
+def is_rsl_rl_env(thing: object) -> bool:
     """Whether an object has what rsl_rl's `VecEnv` has."""
     needed = ("num_envs", "num_actions", "max_episode_length", "get_observations", "step")
     return not isinstance(thing, type) and all(hasattr(thing, name) for name in needed)
@@ -202,7 +202,7 @@ def speaks(thing: object) -> bool:
 def _made_once(env: str, num_envs: int, kwargs: Mapping[str, Any]) -> Any:
     """The object of that name: as it was passed, or made by its maker, once in a process."""
     found = named.find(env)
-    if speaks(found):
+    if is_rsl_rl_env(found):
         if kwargs:
             raise UserError(f"{env} is made already, so env_kwargs such as {next(iter(kwargs))} do not reach it.")
         return found
@@ -212,7 +212,7 @@ def _made_once(env: str, num_envs: int, kwargs: Mapping[str, Any]) -> Any:
             _made[key] = found(num_envs=num_envs, **kwargs)
         except TypeError as error:
             raise UserError(f"{env} cannot be made: {error}. It is called with num_envs and the env_kwargs.") from None
-        if not speaks(_made[key]):
+        if not is_rsl_rl_env(_made[key]):
             kind = type(_made.pop(key)).__name__
             raise UserError(f"{env} makes a {kind}, which does not speak rsl_rl's VecEnv: no get_observations.")
     return _made[key]

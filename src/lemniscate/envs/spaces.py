@@ -15,7 +15,7 @@ from torch import Generator, Tensor
 
 from lemniscate.envs.backend import Summary
 from lemniscate.envs.conversion import SUCCESS, flatten_observation, row_of
-from lemniscate.envs.returns import MASKS, flat_mask, kind_of, mask_in, shown_space
+from lemniscate.envs.returned import MASKS, flat_mask, kind_of, mask_in, shown_space
 from lemniscate.errors import UserError
 from lemniscate.spec import Action, Box, Discrete, MultiBinary, MultiDiscrete, ObservationPart, Spec
 

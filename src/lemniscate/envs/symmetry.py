@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from lemniscate.envs.conversion import SingleEnv, scale_action
-from lemniscate.envs.factory import make_one, maker_of, makes_vector, sentences
-from lemniscate.envs.returns import shown_space
+from lemniscate.envs.factory import creation_errors, make_one, maker_of, makes_vector
+from lemniscate.envs.returned import shown_space
 from lemniscate.envs.spaces import action_kind
 from lemniscate.errors import UserError, shown
 from lemniscate.system.named import find_callable
@@ -36,7 +36,7 @@ KINDS = {"obs": "observation", "next_obs": "observation", "action": "action"}
 
 
 @dataclass(frozen=True)
-class Order:
+class SignedPermutation:
     """The mirror image of a row of numbers: for each, which number it takes, and with which sign; [K] each."""
 
     source: np.ndarray
@@ -59,8 +59,8 @@ class Order:
 class Mirror:
     """The mirror image of observations [O] and actions [A]."""
 
-    observation: Order
-    action: Order
+    observation: SignedPermutation
+    action: SignedPermutation
 
     def both(self, rows: R, dim: int) -> R:
         """A record of transitions and, behind them along `dim`, their mirror images; rewards and ends are the same."""
@@ -80,7 +80,7 @@ def find_mirror(env: str, kwargs: Mapping[str, Any], wrappers: Sequence[str]) ->
         UserError: there is none, with the reason.
     """
     try:
-        with sentences(env, kwargs, wrappers):
+        with creation_errors(env, kwargs, wrappers):
             maker = maker_of(env)
             if makes_vector(maker):
                 raise UserError("it makes many environments at once.")
@@ -103,7 +103,7 @@ def find_mirror(env: str, kwargs: Mapping[str, Any], wrappers: Sequence[str]) ->
         raise UserError(f"{env} has no symmetry that could be used: {error}") from None
 
 
-def _require_own_image(order: Order, space: Any) -> None:
+def _require_own_image(order: SignedPermutation, space: Any) -> None:
     """Raise `UserError` where the bounds of actions are not their own mirror image, as those of a policy are."""
     bounds = np.stack([space.low, space.high])
     if not np.array_equal(np.where(order.sign < 0, -bounds[::-1], bounds)[:, order.source], bounds):
@@ -124,7 +124,7 @@ def _require_unchanged(env: SingleEnv) -> None:
 
 def _given(given: Any, sizes: Mapping[str, int]) -> Mirror:
     """The mirror of an attribute `mirror`. Raises `UserError` where it does not fit, or is not its own inverse."""
-    orders = list[Order]()
+    orders = list[SignedPermutation]()
     try:
         lists = [np.array([index(number) for number in numbers]) for numbers in given]
         pairs = list(zip(lists, sizes.items(), strict=True))
@@ -132,7 +132,10 @@ def _given(given: Any, sizes: Mapping[str, int]) -> Mirror:
         wanted = "two lists of whole numbers, such as ([-1, 3, 2], [2, 1])"
         raise UserError(f"its attribute mirror is {shown(given)}; it must be {wanted}.") from None
     for signed, (name, size) in pairs:
-        order, each = Order(np.abs(signed) - 1, np.sign(signed).astype(np.float64)), list(range(1, size + 1))
+        order, each = (
+            SignedPermutation(np.abs(signed) - 1, np.sign(signed).astype(np.float64)),
+            list(range(1, size + 1)),
+        )
         if sorted(np.abs(signed)) != each or order(signed).tolist() != each:
             wanted = f"each of 1 to {size} once, in pairs"
             raise UserError(f"mirror of its {name} is {shown(signed.tolist())}; it must have {wanted}.")
@@ -165,12 +168,12 @@ class _Body:
         """of each joint, the joint on the other side"""
         self.sign: dict[int, float] = {}
 
-    def orders(self) -> tuple[Order, Order, Order] | None:
+    def orders(self) -> tuple[SignedPermutation, SignedPermutation, SignedPermutation] | None:
         """The orders of qpos, of qvel and of the controls; None where the body is not its own image."""
         if not self._match(0, 0):
             return None
         model = self.model
-        pos, vel, controls = (Order(np.arange(n), np.ones(n)) for n in (model.nq, model.nv, model.nu))
+        pos, vel, controls = (SignedPermutation(np.arange(n), np.ones(n)) for n in (model.nq, model.nv, model.nu))
         for joint, image in self.image.items():
             free = model.jnt_type[joint] == FREE
             signs = [*self.polar, 1.0, *self.axial] if free else [self.sign[joint]]  # place, quaternion w x y z
@@ -220,7 +223,7 @@ class _Body:
         return [child for child in range(1, self.model.nbody) if self.model.body_parentid[child] == body]
 
 
-def _proved(env: SingleEnv, pos: Order, vel: Order, controls: Order) -> Mirror:
+def _proved(env: SingleEnv, pos: SignedPermutation, vel: SignedPermutation, controls: SignedPermutation) -> Mirror:
     """The mirror, with the order of the observation as stepping shows it. Raises `UserError` where both sides differ.
 
     It steps until no number of the observation could be the image of two, from `MOST` starts at most. Actions are those
@@ -231,7 +234,7 @@ def _proved(env: SingleEnv, pos: Order, vel: Order, controls: Order) -> Mirror:
     env.reset(seed=0)
     box: Any = action_kind(env.action_space, "it")
     here, there = list[np.ndarray](), list[np.ndarray]()
-    order, only, starts = Order(np.zeros(0, np.int64), np.zeros(0)), False, 0
+    order, only, starts = SignedPermutation(np.zeros(0, np.int64), np.zeros(0)), False, 0
     while not only and starts < MOST:
         starts += 1
         qpos, qvel = _pose(bare.model, rng), rng.normal(size=vel.source.shape)
@@ -250,7 +253,7 @@ def _proved(env: SingleEnv, pos: Order, vel: Order, controls: Order) -> Mirror:
             here.append(one[4])
             there.append(other[4])
         if starts % FEWEST == 0:
-            order, only = _order_of(np.array(here), np.array(there))
+            order, only = _signed_permutation_of(np.array(here), np.array(there))
     return Mirror(order, controls)
 
 
@@ -273,7 +276,7 @@ def _step(env: SingleEnv, qpos: np.ndarray, qvel: np.ndarray, action: np.ndarray
     return bare.data.qpos.copy(), bare.data.qvel.copy(), float(reward), float(terminated), obs
 
 
-def _order_of(here: np.ndarray, there: np.ndarray) -> tuple[Order, bool]:
+def _signed_permutation_of(here: np.ndarray, there: np.ndarray) -> tuple[SignedPermutation, bool]:
     """Which number of an observation here [K, O] is which there, with which sign; and whether it is the only order.
 
     Raises `UserError` where a number there is none of those here.
@@ -293,4 +296,4 @@ def _order_of(here: np.ndarray, there: np.ndarray) -> tuple[Order, bool]:
         j, factor = found
         source[[i, j]], sign[[i, j]] = (j, i), factor
         left -= {i, j}
-    return Order(source, sign), only
+    return SignedPermutation(source, sign), only

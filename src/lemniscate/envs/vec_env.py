@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from lemniscate.envs.backend import Backend
-from lemniscate.envs.returns import kind_of
+from lemniscate.envs.returned import kind_of
 from lemniscate.envs.symmetry import Mirror
 from lemniscate.errors import NonFiniteError, UserError, shown, wrong_action
 from lemniscate.spec import Box, Spec, action_shape

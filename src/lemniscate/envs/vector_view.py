@@ -14,7 +14,7 @@ from gymnasium.wrappers.utils import RunningMeanStd
 
 from lemniscate.envs import registry
 from lemniscate.envs.conversion import normalized_action
-from lemniscate.envs.returns import as_array
+from lemniscate.envs.returned import as_array
 from lemniscate.envs.vec_env import VecEnv
 from lemniscate.errors import UserError, shown
 from lemniscate.spec import Action, Box, Discrete, MultiDiscrete, Spec

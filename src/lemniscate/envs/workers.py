@@ -55,7 +55,7 @@ class Worker(gym.Wrapper):
             signal.signal(signal.SIGINT, signal.SIG_IGN)
             end_when_closed(process.sentinel)
             try:
-                super().__init__(_told(make))
+                super().__init__(_call(make))
             except (RaisedInWorkerError, UserError) as error:
                 super().__init__(Unmade(error))
         else:  # the owner makes one, too, to look at its spaces
@@ -63,11 +63,11 @@ class Worker(gym.Wrapper):
 
     def reset(self, **options: Any) -> Any:
         """The environment's. Raises `RaisedInWorkerError` for whatever it raises but a `UserError`."""
-        return _told(self.env.reset, **options)
+        return _call(self.env.reset, **options)
 
     def step(self, action: Any) -> Any:
         """The environment's. Raises `RaisedInWorkerError` for whatever it raises but a `UserError`."""
-        return _told(self.env.step, action)
+        return _call(self.env.step, action)
 
     def call_method(self, name: str, argument: Any) -> str | None:
         """The sentence of the `UserError` that the function `call_method` raises, which would end this process."""
@@ -90,7 +90,7 @@ def call_method(env: gym.Env | VectorEnv, name: str, argument: Any) -> None:
         raise UserError(f"{what}({argument!r}), which the curriculum calls, raised {_words_of(error)}.") from error
 
 
-def _told(call: Callable[..., Any], *args: Any, **options: Any) -> Any:
+def _call(call: Callable[..., Any], *args: Any, **options: Any) -> Any:
     try:
         return call(*args, **options)
     except UserError as error:

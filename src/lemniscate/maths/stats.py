@@ -75,16 +75,16 @@ def explained_by(features: Tensor, targets: Tensor, beside: Tensor) -> Tensor:
     Returns:
         [K]; 0 where `beside` leaves nothing to explain, NaN where there are no more rows than columns.
     """
-    few = len(targets) - beside.shape[1] - 1
-    many = few - features.shape[1]
-    if many <= 0:
+    base_dof = len(targets) - beside.shape[1] - 1
+    full_dof = base_dof - features.shape[1]
+    if full_dof <= 0:
         return targets.new_full(targets.shape[1:], torch.nan)
     if (targets == targets[:1]).all():  # a constant reward is common
         return torch.zeros_like(targets[0])
     x, y, gram = _normal(torch.cat([beside, features], dim=-1), targets)
-    left, after = (_residual(x[:, :n], y, gram[:n, :n]) for n in (beside.shape[1], len(gram)))
-    share = 1 - (after / many) / (left / few)
-    return torch.where(left > 1e-9 * targets.square().sum(0), share, 0.0)
+    base_rss, full_rss = (_residual(x[:, :n], y, gram[:n, :n]) for n in (beside.shape[1], len(gram)))
+    share = 1 - (full_rss / full_dof) / (base_rss / base_dof)
+    return torch.where(base_rss > 1e-9 * targets.square().sum(0), share, 0.0)
 
 
 def explained_by_each(features: Tensor, targets: Tensor) -> Tensor:
@@ -92,16 +92,16 @@ def explained_by_each(features: Tensor, targets: Tensor) -> Tensor:
 
     Without column i the sum of squares is larger by β_i² / (XᵀX)⁻¹_ii, where β is the solution with all of them.
     """
-    many = len(targets) - features.shape[1] - 1
-    if many <= 0:
+    full_dof = len(targets) - features.shape[1] - 1
+    if full_dof <= 0:
         return targets.new_full((features.shape[1], targets.shape[1]), torch.nan)
     x, y, gram = _normal(features, targets)
     inverse = torch.linalg.inv(gram)
     slopes = inverse @ (x.T @ y)
-    after = (y - x @ slopes).square().sum(0)
-    left = after + slopes.square() / inverse.diagonal()[:, None]
-    share = 1 - (after / many) / (left / (many + 1))
-    return torch.where(left > 1e-9 * targets.square().sum(0), share, 0.0)
+    full_rss = (y - x @ slopes).square().sum(0)
+    base_rss = full_rss + slopes.square() / inverse.diagonal()[:, None]
+    share = 1 - (full_rss / full_dof) / (base_rss / (full_dof + 1))
+    return torch.where(base_rss > 1e-9 * targets.square().sum(0), share, 0.0)
 
 
 def _residual(x: Tensor, y: Tensor, gram: Tensor) -> Tensor:

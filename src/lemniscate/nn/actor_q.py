@@ -114,7 +114,7 @@ class Multipliers(nn.Module):
         return self.log.exp()
 
     @torch.no_grad()
-    def raise_first(self, least: float) -> None:
+    def keep_temperature_above(self, least: float) -> None:
         """Set α to `least` where it is below, in place: the projection of projected gradient descent."""
         self.log[:1].clamp_(min=math.log(least) if least else -math.inf)
 

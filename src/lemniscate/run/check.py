@@ -52,7 +52,7 @@ def verdict(path: Path, found: list[Finding]) -> str:
     damaged = sum(finding.grade == BAD for finding in found)
     if not damaged:
         return f"{path} is whole."
-    planned = any(found.record.get("planned") for found in _checkpoints(path)[0])
+    planned = any(each.record.get("planned") for each in _checkpoints(path)[0])
     repairable = is_whole(path / SWEEP) if is_sweep(path) else planned
     files = f"{damaged} finding{'s' * (damaged > 1)} above, marked ✗"
     if not is_sweep(path) and _is_finished(path):

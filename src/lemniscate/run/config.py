@@ -283,7 +283,7 @@ class RunConfig:
                 named[name].requires_grad_(False)
         return networks
 
-    def memory(self, spec: Spec) -> dict[str, int]:
+    def memory_bytes(self, spec: Spec) -> dict[str, int]:
         """Bytes that training takes at least, beside networks and environments, by the field that they grow with."""
         return {}
 

@@ -181,7 +181,7 @@ def device_for(name: str) -> torch.device:
 
 def require_memory(config: RunConfig, spec: Spec, device: torch.device) -> None:
     """Raise `UserError` where a run takes more memory than is free, with the field that takes most, and its limit."""
-    parts = {"hidden": _network_bytes(config, spec), **config.memory(spec)}
+    parts = {"hidden": _network_bytes(config, spec), **config.memory_bytes(spec)}
     require_free("This run takes at least", parts, vars(config), device)
 
 

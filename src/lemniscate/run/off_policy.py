@@ -95,7 +95,7 @@ class OffPolicyConfig(RunConfig):
                     f" below the {rows:,} rows of {name} {getattr(self, name):,}."
                 )
 
-    def memory(self, spec: Spec) -> dict[str, int]:
+    def memory_bytes(self, spec: Spec) -> dict[str, int]:
         """The bytes of the replay buffer, the action noise, an update's minibatches, and the metrics of a line."""
         actions, length = spec.bounded_box().size, spec.max_episode_steps or 1000
         width = max((*self.hidden, *self.critic_hidden), default=0)

@@ -37,7 +37,7 @@ class OnPolicyConfig(RunConfig):
         super().__post_init__()
         self.layers.check()
 
-    def memory(self, spec: Spec) -> dict[str, int]:
+    def memory_bytes(self, spec: Spec) -> dict[str, int]:
         """The bytes of a rollout, and of its rows in the widest layer."""
         widths = *self.hidden, *(getattr(self, "critic_hidden", None) or ())
         rows = 4 * self.num_rows * max(widths, default=0)

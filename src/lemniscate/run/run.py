@@ -53,7 +53,7 @@ Observer = Callable[[Sequence[tuple[int, Mapping[str, float]]], TrainState], boo
 
 
 @dataclass
-class Body:
+class Iteration:
     """The present body of the loop: what was so when it began, and whether it is whole."""
 
     step: int = 0
@@ -94,12 +94,12 @@ class Run:
         self._visible, self._film, self._observer, self._locate = progress, film, observer, locate
         self._compiler = Compiler(world.busy)
         self._stop = StopRequest(world.size > 1, self._how_to_go_on, self._compiler.stopping)
-        self._body, self._lines, self._episodes = Body(), 0, 0
+        self._iteration, self._lines, self._episodes = Iteration(), 0, 0
         """the present body of the loop; lines logged by the loop and whole training episodes so far"""
         self._recent_returns = deque[float](maxlen=100)
         self._unobserved: list[tuple[int, dict[str, float]]] = []
         """logged lines that callbacks have not seen"""
-        self._told, self._restored, self._ended = 0, False, False
+        self._notices_said, self._restored, self._ended = 0, False, False
         """notices of the environments that have been said; whether the loop may begin, and has come to its end"""
         self._last_line = 0.0, 0
         """when the last line was logged, and at which step"""
@@ -156,14 +156,14 @@ class Run:
                     # Some LOOKS lines of a run have signals, of a short one a fourth: more would cost more than 1 %.
                     every = max(4, math.ceil(total_steps * self._lines / (LOOKS * max(1, state.step))))
                     looks = self.world.is_first and self._lines % every == 0
-                    self._body = Body(state.step, self._episodes, acted_with(state) if looks else None)
+                    self._iteration = Iteration(state.step, self._episodes, acted_with(state) if looks else None)
                     yield self.env
-                    if state.step <= self._body.step and not self._body.cut_short:
+                    if state.step <= self._iteration.step and not self._iteration.cut_short:
                         raise UserError(
                             f"An update of {self.algorithm} leaves state.step as it was: add its steps to it."
                         )
                     # What a body that was cut short would have had done, the process does that resumes the run.
-                    planned = not self._body.cut_short and self._do_what_is_due(state, total_steps)
+                    planned = not self._iteration.cut_short and self._do_what_is_due(state, total_steps)
                     going_on = not self._stopped(state, planned) and state.step < total_steps
                     if planned and going_on:
                         self._restart(state)
@@ -179,7 +179,7 @@ class Run:
             if self.world.size > 1:
                 asked = number % AGREED_EVERY == 0 and any(self.world.each(asked))
             if asked:
-                self._body.cut_short = True
+                self._iteration.cut_short = True
                 return
             yield number
 
@@ -206,21 +206,21 @@ class Run:
             self._recent_returns.extend(episodes.returns)
             numbers["episode/return"] = sum(episodes.returns) / len(episodes.returns)
             numbers["episode/length"] = sum(episodes.lengths) / len(episodes.lengths)
-        if self._body.acted is not None:
-            numbers |= signals(state, self.config, self.spec, self.env.recent(), self._body.acted, self.env.ages)
+        if self._iteration.acted is not None:
+            numbers |= signals(state, self.config, self.spec, self.env.recent(), self._iteration.acted, self.env.ages)
         numbers |= {f"info/{name.removeprefix('info/')}": mean for name, mean in episodes.measures.items()}
         # The speed since the last line, everything included; the seconds of the loop's body by their use.
         now, (before, step_before), collect = time.monotonic(), self._last_line, self.env.collecting
         self.env.collecting = 0.0
         numbers["time/steps_per_second"] = (state.step - step_before) / max(now - before, 1e-9)
-        numbers |= {"time/collect": collect, "time/learn": now - self._body.began - collect}
+        numbers |= {"time/collect": collect, "time/learn": now - self._iteration.began - collect}
         self._last_line = now, state.step
         self._lines += 1
         self._write(state.step, numbers, episodes)
         notices = self.env.backend.notices if self.world.is_first else ()
-        for notice in notices[self._told :]:
+        for notice in notices[self._notices_said :]:
             say(notice)
-        self._told = len(notices)
+        self._notices_said = len(notices)
         recent = self._recent_returns
         self._bar.update(state.step, sum(recent) / len(recent) if recent else None, learned=bool(metrics))
 
@@ -255,7 +255,7 @@ class Run:
 
     def _do_what_is_due(self, state: TrainState, total_steps: int) -> bool:
         """The work after a whole update; returns whether a planned checkpoint was part of it."""
-        config, before, step = self.config, self._body.step, state.step
+        config, before, step = self.config, self._iteration.step, state.step
         finished = step >= total_steps
         if config.average_last and step > (1 - config.average_last) * total_steps:
             state.mean.add(state.policy)
@@ -267,7 +267,7 @@ class Run:
             self._evaluate(state)
         if self._curriculum:
             self._advance_curriculum(self._curriculum, self._unobserved)
-        by_episodes = _passed(config.video_every_episodes, self._body.episodes, self._episodes)
+        by_episodes = _passed(config.video_every_episodes, self._iteration.episodes, self._episodes)
         if by_episodes or _passed(config.video_every, before, step):
             self._record(state)
         planned = finished or _passed(self._checkpoint_every, before, step)
@@ -357,7 +357,7 @@ class Run:
         return self.config.checkpoint_every or max(fifth, 3 * longest * self.config.num_envs)
 
     @contextmanager
-    def _aside(self, what: str, state: TrainState) -> Iterator[None]:
+    def _as_side_task(self, what: str, state: TrainState) -> Iterator[None]:
         """Inside is done what training does not notice; what fails there costs only itself."""
         try:
             with globals_undisturbed(), self.world.busy():
@@ -370,7 +370,7 @@ class Run:
 
     def _record(self, state: TrainState) -> None:
         if self.world.is_first:
-            with self._aside("recording", state):
+            with self._as_side_task("recording", state):
                 if self.env.backend.once:
                     self.env.close()
                 self._film(state)
@@ -378,7 +378,7 @@ class Run:
     def _evaluate(self, state: TrainState) -> None:
         config, scores = self.config, None
         if self.eval_env:
-            with self._aside("evaluation", state):
+            with self._as_side_task("evaluation", state):
                 critic = critic_of(state.networks, config)
                 scores = evaluate(state.policy, self.eval_env, config.evaluate_episodes, config.seed, critic=critic)
         if scores:

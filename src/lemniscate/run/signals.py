@@ -196,10 +196,10 @@ def of_effects(rows: Rollout, spec: Spec) -> dict[str, Tensor]:
     everything, nothing = _everything(rows, spec), obs[:, :0]
     change, effect = (after - obs)[inside], explained_by(action[inside], (after - obs)[inside], obs[inside])
     both = explained_by(obs[inside], torch.cat([change, after[inside]], dim=-1), nothing[inside])
-    of_changes, of_next = both.tensor_split(2)
+    explained_change, explained_next = both.tensor_split(2)
     found = {
         "action/effect": effect.max(),
-        "action/share": (effect * (1 - of_changes)).max(),
+        "action/share": (effect * (1 - explained_change)).max(),
         "action/paid": explained_by(action, reward, obs).max(),
         "reward/explained": explained_by(everything, reward, nothing).max(),
     }
@@ -215,7 +215,7 @@ def of_effects(rows: Rollout, spec: Spec) -> dict[str, Tensor]:
     if (std > 1e-9).any():
         found["observation/pace"] = (change.square().mean(0).sqrt() / std)[std > 1e-9].max()
     if not ((obs == 0) | (obs == 1)).all():  # one of n says nothing of the next
-        found["observation/predicted"] = of_next.mean()
+        found["observation/predicted"] = explained_next.mean()
     return found
 
 

@@ -208,7 +208,7 @@ class Processes(World):
 
 
 @contextmanager
-def together(kind: type[Processes] = Processes) -> Iterator[World]:
+def join_world(kind: type[Processes] = Processes) -> Iterator[World]:
     """The world that the environment variables of `torchrun` describe; what ends one process ends them all."""
     world = kind()
     try:

@@ -23,7 +23,7 @@ MASKS = ("action_mask", "action_masks", "legal_action_mask")
 VALUES = {"reset": "2 values, (observation, info)", "step": "5 values, (obs, reward, terminated, truncated, info)"}
 
 
-class Returns:
+class ReturnedValues:
     """The values that `reset` and `step` return, checked; where they are not as they must be, a `UserError` says so.
 
     `space` is that of one observation; `lead` is () for one environment, (N,) for a vector environment of N.
@@ -97,7 +97,7 @@ class CheckedVector(VectorWrapper):
     def __init__(self, env: VectorEnv) -> None:
         require_form(env, ("single_observation_space", "single_action_space"))
         super().__init__(env)
-        self._returns = Returns(env, env.single_observation_space, (env.num_envs,))
+        self._returns = ReturnedValues(env, env.single_observation_space, (env.num_envs,))
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Gymnasium's."""
