@@ -21,7 +21,7 @@ fly: setup  ## train a drone to fly the figure eight, fly it from unseen starts,
 	$(BIN)/lemniscate train ppo --env DroneFigureEightTrajectory-v0 --report
 
 RACE := runs/race-$(shell date +%Y%m%d-%H%M%S)
-race: setup  ## train a drone to race through gates, race from unseen starts, draw and film it
+race: setup  ## train a drone to race through gates, race from unseen starts, draw and record it
 	$(BIN)/lemniscate train shac --env DroneGates-v0 --run $(RACE)
 	$(BIN)/lemniscate train ppo --env DroneGates-v0 --preset gates-finish --warm-start $(RACE) --report
 

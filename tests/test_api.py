@@ -469,7 +469,7 @@ def test_what_the_caller_has_set_in_torch_changes_nothing_and_stays(tmp_path):
 
 @pytest.mark.long
 def test_what_the_caller_has_set_in_torch_does_not_reach_what_looks_at_a_policy(cartpole, pendulum, tmp_path):
-    """What a policy says of itself, a film, and the check of a whole environment, each under every setting."""
+    """What a policy says of itself, a video, and the check of a whole environment, each under every setting."""
     critic = lem.config_for("ddpg", "Pendulum-v1", hidden=(8,), critic_hidden=(8,))
     learned = lem.TrainedPolicy(critic.networks(pendulum.policy.spec), pendulum.policy.spec, critic, 0)
     obs, found = np.linspace(-1, 1, 6).reshape(2, 3), {}
@@ -477,11 +477,11 @@ def test_what_the_caller_has_set_in_torch_does_not_reach_what_looks_at_a_policy(
         with setting():
             before = settings_of_torch()
             said = pendulum.policy.distribution(obs), pendulum.policy.value(obs), learned.q_value(obs, np.ones((2, 1)))
-            film = lem.watch(cartpole.policy, seed=1, video=tmp_path / "film.gif")
+            video = lem.watch(cartpole.policy, seed=1, video=tmp_path / "video.gif")
             checked = [finding.sentence for finding in lem.check("Pendulum-v1", backend="gymnasium")]
             assert settings_of_torch() == before
         numbers = [said[0].mean, said[0].std, *said[1:]]
-        found[name] = [each.tolist() for each in numbers], [each.dtype for each in numbers], film.returns, checked
+        found[name] = [each.tolist() for each in numbers], [each.dtype for each in numbers], video.returns, checked
     first = found["nothing"]
     for name, each in found.items():
         assert each[1:3] == first[1:3], name

@@ -208,10 +208,10 @@ def test_the_home_folder_is_meant_wherever_a_path_is_taken(run, tmp_path, monkey
     lem.train("ppo", env="CartPole-v1", run="~/b", warm_start="~/a", **small)
     assert lem.load("~/b").path == tmp_path / "b"
     assert lem.resume("~/b", progress=False).path == tmp_path / "b"
-    for command in ("evaluate --episodes 1", "watch --video=~/film.gif", "plot", "doctor"):
+    for command in ("evaluate --episodes 1", "watch --video=~/video.gif", "plot", "doctor"):
         assert main([*command.split(), "~/b"]) == 0
     lem.save(lem.load("~/b"), "~/policy")
-    assert (tmp_path / "film.gif").exists()
+    assert (tmp_path / "video.gif").exists()
     assert (tmp_path / "policy").is_dir()
     assert not any(tmp_path.glob("*~*"))
 
@@ -485,7 +485,7 @@ def test_who_names_no_algorithm_gets_the_recommended_one_and_is_told_why(tmp_pat
         (["check", "CartPole-v1", "--backend", "foo"], "There is no backend 'foo'"),
         (["watch"], "Watch what? lemniscate watch RUN; before training, lemniscate watch --random --env ID."),
         (["watch", "--env", "CartPole-v1"], "Watch what?"),
-        (["watch", "--random", "--env", "CartPole-v1"], "There is no display for a window; record a film instead"),
+        (["watch", "--random", "--env", "CartPole-v1"], "There is no display for a window; record a video instead"),
         (["check", "test_cli:Broken", "--env-args", "x"], "--env-args must be a JSON object"),
     ],
 )  # fmt: skip
@@ -500,12 +500,12 @@ def test_a_mistake_is_one_line_and_exit_code_2(capsys, monkeypatch, arguments, s
 
 
 def test_the_film_of_an_evaluation_shows_the_episodes_whose_figures_are_printed(run, capsys, tmp_path):
-    evaluation = ["evaluate", str(run), "--episodes", "3", "--json", "--video", str(tmp_path / "film.gif")]
+    evaluation = ["evaluate", str(run), "--episodes", "3", "--json", "--video", str(tmp_path / "video.gif")]
     assert main(evaluation) == 0
     lengths = json.loads(capsys.readouterr().out)["lengths"]
     assert len(lengths) == 3
-    with Image.open(tmp_path / "film.gif") as film:  # equal frames are merged into longer ones
-        seconds = sum(film.seek(i) or film.info["duration"] for i in range(film.n_frames)) / 1000
+    with Image.open(tmp_path / "video.gif") as video:  # equal frames are merged into longer ones
+        seconds = sum(video.seek(i) or video.info["duration"] for i in range(video.n_frames)) / 1000
     assert seconds == pytest.approx((sum(lengths) + 3) / 50)
 
 
@@ -525,13 +525,13 @@ def test_a_measure_without_rows_is_null(tmp_path, capsys):
 
 
 def test_a_random_policy_needs_no_run(capsys, tmp_path):
-    words = ["watch", "--random", "--env", "CartPole-v1", "--episodes", "3", "--video", str(tmp_path / "film.gif")]
+    words = ["watch", "--random", "--env", "CartPole-v1", "--episodes", "3", "--video", str(tmp_path / "video.gif")]
     assert main(words) == 0
     said = capsys.readouterr().err.splitlines()
     lengths = [int(line.rpartition(" ")[2]) for line in said[:3]]
     assert said[:3] == [f"Episode {i + 1}: return {n:.1f}, length {n}" for i, n in enumerate(lengths)]
     assert said[3].startswith(f"{np.mean(lengths):.1f} ± {np.std(lengths):.1f} return over 3 episodes of CartPole-v1")
-    assert said[4] == f"Recorded in {tmp_path / 'film.gif'}."
+    assert said[4] == f"Recorded in {tmp_path / 'video.gif'}."
 
 
 def test_check_is_a_list_and_a_verdict(capsys):
@@ -550,9 +550,9 @@ def number():
 
 
 def test_an_episode_is_filmed(run, capsys):
-    film = run / "videos" / "episode.gif"
-    assert main(["watch", str(run), "--video", str(film)]) == 0
-    assert film.stat().st_size > 5000
+    video = run / "videos" / "episode.gif"
+    assert main(["watch", str(run), "--video", str(video)]) == 0
+    assert video.stat().st_size > 5000
 
 
 @pytest.mark.filterwarnings("ignore:.*NaN value")
@@ -583,13 +583,13 @@ def test_numbers_are_read_as_in_training(run, capsys):
 
 def test_a_folder_that_cannot_be_written_is_a_sentence(run, tmp_path, capsys):
     (tmp_path / "file").touch()
-    assert main(["watch", str(run), "--video", str(tmp_path / "file" / "film.gif")]) == 2
+    assert main(["watch", str(run), "--video", str(tmp_path / "file" / "video.gif")]) == 2
     said = capsys.readouterr().err
-    assert f"{tmp_path / 'file' / 'film.gif'} cannot be written: {tmp_path / 'file'} is a file." in said
+    assert f"{tmp_path / 'file' / 'video.gif'} cannot be written: {tmp_path / 'file'} is a file." in said
 
 
 def test_a_film_that_cannot_be_written_is_a_sentence(run, capsys):
-    assert main(["watch", str(run), "--video", str(run / "film.avi")]) == 2
+    assert main(["watch", str(run), "--video", str(run / "video.avi")]) == 2
     assert "must end in .gif, .webp or .mp4" in capsys.readouterr().err
 
 

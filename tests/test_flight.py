@@ -58,7 +58,7 @@ def run(tmp_path_factory):
 
 @pytest.fixture
 def drawn(monkeypatch):
-    """The flights that are drawn into films; nothing is rendered."""
+    """The flights that are drawn into videos; nothing is rendered."""
     flights = []
     monkeypatch.setattr(flight, "_frames", lambda tracks, model: (flights.append(tracks) or [], "Drawn."))
     monkeypatch.setattr(playback, "save_frames", lambda frames, file, fps: None)
@@ -66,9 +66,9 @@ def drawn(monkeypatch):
 
 
 def test_more_flights_than_environments_are_evaluated_as_without_a_film(run, drawn, capsys):
-    filmed, plain = lem.evaluate(run, episodes=5, video="film.gif"), lem.evaluate(run, episodes=5)
-    assert filmed.returns == plain.returns
-    assert filmed.episodes == 5
+    recorded, plain = lem.evaluate(run, episodes=5, video="video.gif"), lem.evaluate(run, episodes=5)
+    assert recorded.returns == plain.returns
+    assert recorded.episodes == 5
     (tracks,) = drawn
     assert [track.position.shape for track in tracks] == [(5, 3)] * 2  # one of each environment, to its end
     assert not any(np.isnan(track.position).any() for track in tracks)
@@ -77,8 +77,8 @@ def test_more_flights_than_environments_are_evaluated_as_without_a_film(run, dra
 
 def test_no_more_flights_are_shown_to_a_person_than_there_are(run, drawn):
     with pytest.raises(lem.UserError, match="At most 2 flights of this run can be shown, not 5"):
-        lem.watch(run, episodes=5, video="film.gif")
-    assert lem.watch(run, episodes=2, video="film.gif").episodes == 2
+        lem.watch(run, episodes=5, video="video.gif")
+    assert lem.watch(run, episodes=2, video="video.gif").episodes == 2
 
 
 def test_a_scene_that_is_known_when_environments_are_made_is_drawn_and_they_are_closed(run):
@@ -89,7 +89,7 @@ def test_a_scene_that_is_known_when_environments_are_made_is_drawn_and_they_are_
 
 def test_the_film_of_a_report_is_named_before_its_page(run, drawn, monkeypatch):
     monkeypatch.setattr(curves, "plot_runs", lambda *_, **__: [])
-    assert [file.name for file in plots.draw_run(run, film=True)[-2:]] == ["flight.gif", "report.html"]
+    assert [file.name for file in plots.draw_run(run, record_video=True)[-2:]] == ["flight.gif", "report.html"]
 
 
 def test_a_flight_is_drawn_wherever_it_is():

@@ -39,7 +39,7 @@ def train(path, env="CartPole-v1", **fields):
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """A run with figures, a film and an export."""
+    """A run with figures, a video and an export."""
     run = train(tmp_path_factory.mktemp("hub") / "run")
     for name in ("plots/learning_curve.png", "videos/my flight.gif", "export/policy.onnx", "export/c/policy.c"):
         (run.path / name).parent.mkdir(parents=True, exist_ok=True)
@@ -327,13 +327,13 @@ def test_each_field_that_names_code_is_looked_at(field):
 
 
 def test_code_of_a_downloaded_policy_is_imported_only_with_trust(server, tmp_path, monkeypatch, capsys):
-    """And a policy without pictures, film or figures is uploaded, with a line on why."""
+    """And a policy without pictures, video or figures is uploaded, with a line on why."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     (tmp_path / "theirs.py").write_text("from test_hub import Own\n")
     lem.push(train(tmp_path / "run", "theirs:Own"), "eve/own")
     del sys.modules["theirs"]
-    assert "No film: " in capsys.readouterr().err
+    assert "No video: " in capsys.readouterr().err
     files = server.files("eve/own")
     assert set(files) == {".gitattributes", "README.md", "final.json", *hub.CHECKPOINT}
     assert "loaded with `trust=True`: theirs:Own." in files["README.md"].decode()
@@ -371,14 +371,14 @@ def test_a_policy_without_a_run_is_filmed_and_evaluated_now(run, server, capsys)
 
 
 def test_a_video_has_the_name_that_the_hub_plays(run, server, tmp_path):
-    film = run.path / "videos" / "newer.mp4"
-    film.write_bytes(b"mp4")
+    video = run.path / "videos" / "newer.mp4"
+    video.write_bytes(b"mp4")
     try:
-        lem.push(run, "anna/film")
+        lem.push(run, "anna/video")
     finally:
-        film.unlink()
-    assert server.files("anna/film")["replay.mp4"] == b"mp4"
-    assert "[Film](replay.mp4)" in server.files("anna/film")["README.md"].decode()
+        video.unlink()
+    assert server.files("anna/video")["replay.mp4"] == b"mp4"
+    assert "[Video](replay.mp4)" in server.files("anna/video")["README.md"].decode()
 
 
 def test_a_run_begins_with_a_policy_on_the_hub(run, server, tmp_path, capsys):

@@ -73,7 +73,7 @@ stop = lambda step, metrics, policy: True
 run = lem.train("ppo", env="CartPole-v1", backend="gymnasium", run="r", callbacks=stop, progress=False, **small)
 assert run.policy.step == 64
 assert lem.resume("r", progress=False).policy.step == 128
-commands = ("evaluate r --episodes 2 --video film.gif", "plot r", "export r", "check r", "train ppo --lr 1")
+commands = ("evaluate r --episodes 2 --video video.gif", "plot r", "export r", "check r", "train ppo --lr 1")
 codes = [main(command.split()) for command in commands]
 print(codes)
 sys.exit(codes != [0, 0, 0, 0, 2])

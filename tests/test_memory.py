@@ -376,7 +376,7 @@ def test_what_cannot_have_a_memory_is_refused_in_a_sentence(algorithm, env, fiel
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     fields = tiny_fields("CartPole-v1", network="gru", num_steps=8, sequence_length=4, hidden=(8,), total_steps=512)
-    fields["backend"] = "gymnasium"  # whose episodes a film has too
+    fields["backend"] = "gymnasium"  # whose episodes a video has too
     return lem.train("ppo", "CartPole-v1", run=tmp_path_factory.mktemp("memory") / "r", progress=False, **fields)
 
 
@@ -445,9 +445,9 @@ def test_evaluation_carries_the_memory_as_act_does(trained):
 
 def test_a_film_and_a_preflight_begin_each_episode_without_memory(trained, tmp_path):
     pytest.importorskip("pygame")
-    scores = lem.evaluate(trained.policy, episodes=2, seed=4, video=tmp_path / "film.gif")
+    scores = lem.evaluate(trained.policy, episodes=2, seed=4, video=tmp_path / "video.gif")
     np.testing.assert_allclose(scores.returns, lem.evaluate(trained.policy, episodes=2, seed=4).returns)
-    assert (tmp_path / "film.gif").stat().st_size > 1000
+    assert (tmp_path / "video.gif").stat().st_size > 1000
 
 
 def test_a_stored_policy_and_a_warm_start_have_the_same_memory(trained, tmp_path):

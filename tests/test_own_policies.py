@@ -31,7 +31,7 @@ def policy(tmp_path_factory):
 
 @pytest.fixture
 def unwritten(monkeypatch):
-    """Films are drawn, and not written: that takes time."""
+    """Videos are drawn, and not written: that takes time."""
     monkeypatch.setattr("lemniscate.report.playback.save_frames", lambda frames, file, fps: [None for _ in frames])
 
 
@@ -120,7 +120,7 @@ def test_ours_as_a_function_has_the_returns_of_ours(policy):
 
 @pytest.mark.parametrize("kind", ["box", "discrete", "multi-discrete", "multi-binary", "tuple", "image"])
 def test_observations_of_every_space_come_as_the_environment_returns_them(kind):
-    """A film's single environment and parallel ones: what is seen is copied, in the units of the actions."""
+    """A video's single environment and parallel ones: what is seen is copied, in the units of the actions."""
 
     def copied(obs):
         if kind == "box":
@@ -211,7 +211,7 @@ WRONG = {
     "a class by name": ("test_own_policies:Net", "Net is a class"),
     "a number": (3, "A policy is a run, a function, a torch module, or an object with act, predict, .*; not 3"),
     "two arguments": (two, r"takes one observation; two\(obs, info\) does not"),
-    "our module": (None, "acts in .* give the policy that it is of"),
+    "our module": (None, "whose actions are in .* give the policy itself"),
     "another size": (
         nn.Linear(17, 2),
         r"raised RuntimeError.*3x4 and 17x2.*CartPole-v1 observes 4 numbers, obs \(4,\)",
@@ -377,8 +377,8 @@ def test_the_command_line_flies_a_file_and_what_a_module_has(files, unwritten, c
         == 0
     )
     assert '"env_id": "Pendulum-v1"' in capsys.readouterr().out
-    assert main(["watch", "test_own_policies:one", "--env", "CartPole-v1", "--video", "film.gif"]) == 0
-    assert "Recorded in film.gif" in capsys.readouterr().err
+    assert main(["watch", "test_own_policies:one", "--env", "CartPole-v1", "--video", "video.gif"]) == 0
+    assert "Recorded in video.gif" in capsys.readouterr().err
     assert (
         main(["evaluate", "agent.pt", "--env", "Pendulum-v1", "--episodes", "1", "--agent", "test_own_policies:Agent"])
         == 0

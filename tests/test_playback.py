@@ -93,7 +93,7 @@ def test_without_a_display_it_is_said_at_once(policy, monkeypatch):
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr(gym, "make", lambda *_, **__: pytest.fail("an environment was made"))
-    with pytest.raises(lem.UserError, match="There is no display for a window; record a film instead: --video"):
+    with pytest.raises(lem.UserError, match="There is no display for a window; record a video instead: --video"):
         lem.watch(policy)
 
 
@@ -101,7 +101,7 @@ NOISE = """
 import gymnasium as gym
 gym.register("Loud-v0", entry_point="test_playback:Loud", max_episode_steps=5)
 import lemniscate as lem
-lem.watch(env="Loud-v0", random=True, video="film.gif")
+lem.watch(env="Loud-v0", random=True, video="video.gif")
 """
 
 
@@ -138,31 +138,31 @@ def test_pygame_is_quiet_while_a_film_is_made(tmp_path):
     paths = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
     command = [sys.executable, "-W", "ignore", "-c", NOISE]
     done = subprocess.run(command, cwd=tmp_path, env=quiet | {"PYTHONPATH": paths}, capture_output=True, text=True)
-    assert done.stderr.splitlines() == ["Episode 1: return 0.0, length 5", "Recorded in film.gif."]
+    assert done.stderr.splitlines() == ["Episode 1: return 0.0, length 5", "Recorded in video.gif."]
     assert done.stdout == ""
 
 
 def delays_of(file):
     """The milliseconds that each frame of an animated picture is shown; equal frames are merged into longer ones."""
     delays = []
-    with Image.open(file) as film:
-        for i in range(film.n_frames):
-            film.seek(i)
-            film.load()
-            delays.append(film.info["duration"])
+    with Image.open(file) as video:
+        for i in range(video.n_frames):
+            video.seek(i)
+            video.load()
+            delays.append(video.info["duration"])
     return delays
 
 
 def test_a_film_lasts_as_long_as_its_episodes(policy, tmp_path):
-    scores = lem.watch(policy, seed=3, episodes=2, random=True, video=tmp_path / "film.gif")
-    assert sum(delays_of(tmp_path / "film.gif")) == pytest.approx(1000 * (sum(scores.lengths) + 2) / 50)
+    scores = lem.watch(policy, seed=3, episodes=2, random=True, video=tmp_path / "video.gif")
+    assert sum(delays_of(tmp_path / "video.gif")) == pytest.approx(1000 * (sum(scores.lengths) + 2) / 50)
 
 
 @pytest.mark.parametrize("kind", ["gif", "webp"])
 @pytest.mark.parametrize("fps", [20, 30, 60, 125])
 def test_a_picture_keeps_the_time_with_delays_that_a_browser_shows(fps, kind, tmp_path):
     """Browsers take a delay of less than 2 hundredths of a second for 10."""
-    file = tmp_path / f"film.{kind}"
+    file = tmp_path / f"video.{kind}"
     shades = np.random.default_rng(0).integers(0, 255, (2 * fps, 8, 8, 3), dtype=np.uint8)
     playback.save_frames(iter(shades), file, fps)
     delays = delays_of(file)
@@ -173,18 +173,18 @@ def test_a_picture_keeps_the_time_with_delays_that_a_browser_shows(fps, kind, tm
 def test_without_ffmpeg_the_extra_is_named_with_a_line_that_works(tmp_path, monkeypatch):
     monkeypatch.setattr("lemniscate.report.playback.is_installed", lambda package: False)
     with pytest.raises(lem.UserError, match=r"imageio_ffmpeg is not installed; .* pip install '\.\[video\]'"):
-        playback.save_frames([], tmp_path / "film.mp4", 30)
+        playback.save_frames([], tmp_path / "video.mp4", 30)
 
 
 @pytest.fixture
 def unwritten(monkeypatch):
-    """Films are drawn, and not written: that takes time."""
+    """Videos are drawn, and not written: that takes time."""
     monkeypatch.setattr(playback, "save_frames", lambda frames, file, fps: [None for _ in frames])
 
 
 def test_sampled_actions_come_from_the_seed_and_random_ones_are_another_policy(policy, unwritten):
     def lengths(**how):
-        return lem.watch(policy, episodes=2, video="film.gif", **how).lengths
+        return lem.watch(policy, episodes=2, video="video.gif", **how).lengths
 
     sampled = lengths(deterministic=False, seed=4)
     assert lengths(deterministic=False, seed=4) == sampled
@@ -196,8 +196,8 @@ def test_sampled_actions_come_from_the_seed_and_random_ones_are_another_policy(p
 def test_what_is_watched_is_what_is_evaluated(policy, unwritten):
     how = {"env": "CartPole-v1", "episodes": 3, "seed": 7}
     evaluated = lem.evaluate(policy, **how, backend="gymnasium")
-    assert lem.evaluate(policy, **how, video="film.gif").lengths == evaluated.lengths
-    assert lem.watch(policy, **how, video="film.gif").returns == evaluated.returns
+    assert lem.evaluate(policy, **how, video="video.gif").lengths == evaluated.lengths
+    assert lem.watch(policy, **how, video="video.gif").returns == evaluated.returns
 
 
 def test_an_episode_without_end_leaves_no_film(tmp_path, monkeypatch):
@@ -207,8 +207,8 @@ def test_an_episode_without_end_leaves_no_film(tmp_path, monkeypatch):
                        minibatch_size=32).policy  # fmt: skip
     for play in (lem.evaluate, lem.watch):
         with pytest.raises(lem.UserError, match=r"An episode of .*Loud has not ended after 30 steps"):
-            play(policy, episodes=1, video=tmp_path / "film.gif")
-    assert not (tmp_path / "film.gif").exists()
+            play(policy, episodes=1, video=tmp_path / "video.gif")
+    assert not (tmp_path / "video.gif").exists()
 
 
 class Unshown(Loud):
@@ -232,7 +232,7 @@ class Unshown(Loud):
 @pytest.mark.parametrize("picture", [None, [[0]]])
 def test_an_environment_that_cannot_be_shown_is_closed(unwritten, picture):
     with pytest.raises(lem.UserError, match=r"cannot be shown here: no display|renders no pictures"):
-        lem.watch(env=Unshown, random=True, video="film.gif", env_kwargs={"picture": picture})
+        lem.watch(env=Unshown, random=True, video="video.gif", env_kwargs={"picture": picture})
     assert Unshown.open == 0
 
 
@@ -257,29 +257,29 @@ class Shown(Loud):
 def test_pictures_that_change_their_size_are_no_film(ending, tmp_path):
     growing = type("Growing", (Shown,), {"size": 2})
     with pytest.raises(lem.UserError, match=r"after pictures of 16 × 16 render\(\) returns one of 16 × 18"):
-        lem.watch(env=growing, random=True, video=tmp_path / f"film{ending}")
+        lem.watch(env=growing, random=True, video=tmp_path / f"video{ending}")
     assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("fps", ["fast", math.nan, math.inf, -5, [30], 1e-6, None])
 def test_a_film_has_a_usual_speed_where_the_environment_says_none(fps, tmp_path):
     odd = type("Odd", (Shown,), {"metadata": {"render_modes": ["rgb_array"], "render_fps": fps}})
-    lem.watch(env=odd, random=True, video=tmp_path / "film.gif")
-    with Image.open(tmp_path / "film.gif") as film:
-        assert film.info["duration"] in (30, 40)
+    lem.watch(env=odd, random=True, video=tmp_path / "video.gif")
+    with Image.open(tmp_path / "video.gif") as video:
+        assert video.info["duration"] in (30, 40)
 
 
 def test_a_reward_beyond_float32_is_not_watched(tmp_path):
     with pytest.raises(lem.NonFiniteError, match=r"is 1e\+300 in step 1 of an episode"):
-        lem.watch(env=type("Rich", (Shown,), {"paid": 1e300}), random=True, video=tmp_path / "film.gif")
+        lem.watch(env=type("Rich", (Shown,), {"paid": 1e300}), random=True, video=tmp_path / "video.gif")
 
 
 def test_a_function_is_a_policy(policy, unwritten, capsys):
     how = {"env": "CartPole-v1", "episodes": 3, "seed": 7}
     scores = lem.evaluate(policy, **how, backend="gymnasium")
     assert lem.evaluate(lambda obs: policy.act(obs), **how, backend="gymnasium") == scores
-    assert lem.evaluate(lambda obs: policy.act(obs), **how, video="film.gif").returns == scores.returns
-    assert lem.watch(lambda obs: int(obs[2] > 0), **how, video="film.gif").episodes == 3
+    assert lem.evaluate(lambda obs: policy.act(obs), **how, video="video.gif").returns == scores.returns
+    assert lem.watch(lambda obs: int(obs[2] > 0), **how, video="video.gif").episodes == 3
     assert capsys.readouterr().err.count("Episode ") == 3
 
 
@@ -314,7 +314,7 @@ def test_a_reward_that_is_not_finite_is_no_score_of_a_function():
 
 def test_another_environment_must_fit(policy):
     with pytest.raises(lem.UserError, match="A policy for CartPole-v1 cannot act in Pendulum-v1"):
-        lem.watch(policy, "Pendulum-v1", video="film.gif")
+        lem.watch(policy, "Pendulum-v1", video="video.gif")
     with pytest.raises(lem.UserError, match="Watch what"):
         lem.watch(random=True)
 
@@ -371,7 +371,7 @@ def test_a_report_has_a_film_of_ones_own_model_without_a_display_or_says_why_not
     where = {"cwd": tmp_path, "capture_output": True, "text": True}
     done = subprocess.run([*train, "r", "--report"], env=environment, **where)
     assert done.returncode == 0, done.stderr
-    assert (tmp_path / "r" / "videos" / "step-64.gif").exists() or "No film: arm:Arm cannot be shown" in done.stderr
+    assert (tmp_path / "r" / "videos" / "step-64.gif").exists() or "No video: arm:Arm cannot be shown" in done.stderr
     assert (tmp_path / "r" / "videos" / "step-64.gif").exists() == has_egl()
     watch = [sys.executable, "-m", "lemniscate", "watch", "r", "--video", "a.gif"]
     done = subprocess.run(watch, env={**environment, "MUJOCO_GL": "glfw"}, **where)

@@ -16,7 +16,7 @@ def run(path, config, *steps):
 def test_a_new_place_gets_the_whole_run_but_what_is_only_of_its_machine(tmp_path):
     here = run(tmp_path / "here", "seed 1", 10, 20)
     (here / "videos").mkdir()
-    (here / "videos" / "film.gif").touch()
+    (here / "videos" / "video.gif").touch()
     (here / "checkpoints" / "step-30.tmp").touch()
     unpack(pack(here), tmp_path / "there")
     files = {file.relative_to(tmp_path / "there").as_posix() for file in (tmp_path / "there").rglob("*.j*")}

@@ -516,9 +516,9 @@ def test_a_race_is_drawn_and_filmed(race, tmp_path):
     env = registry.make("DroneGates-v0", 4, kwargs=race.policy.config.env_kwargs)
     env.restart(0)
     assert env.scene.boxes().shape == (4, 4 * 5 + 4, 15)
-    film = tmp_path / "race.gif"
-    lem.watch(race.policy, episodes=1, video=film)
-    assert film.stat().st_size > 10_000
+    video = tmp_path / "race.gif"
+    lem.watch(race.policy, episodes=1, video=video)
+    assert video.stat().st_size > 10_000
 
 
 NEAR = """

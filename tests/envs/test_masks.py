@@ -85,7 +85,7 @@ def test_a_mask_is_obeyed_wherever_it_stands(kind, place, tmp_path):
         eval_env.step(random_action(eval_env.spec, eval_env.obs, torch.Generator().manual_seed(1)))
     policy = lem.TrainedPolicy(state.networks, env.spec, config, 0)
     lem.evaluate(policy, episodes=3)
-    lem.evaluate(policy, episodes=2, deterministic=False, video=tmp_path / "film.gif")
+    lem.evaluate(policy, episodes=2, deterministic=False, video=tmp_path / "video.gif")
     arguments = {"env": config.env, "kwargs": config.env_kwargs, "wrappers": (), "backend": "gymnasium"}
     show_episodes(None, arguments, 2, 0, tmp_path / "random.gif", tell=lambda text: None)
     assert Board.taken == 0

@@ -63,7 +63,7 @@ def test_there_is_one_at_a_time(algorithm, backend, tmp_path):
     assert list((run.path / "videos").iterdir())
     assert "evaluation/return" in {name for line in read_metrics(run.path) for name in line}
     lem.evaluate(run.policy, episodes=3)
-    lem.evaluate(run.policy, episodes=2, video=tmp_path / "film.gif")
+    lem.evaluate(run.policy, episodes=2, video=tmp_path / "video.gif")
     lem.evaluate(lambda obs: np.zeros(1, np.float32), env=Robot, episodes=2)
     lem.watch(None, Robot, random=True, video=tmp_path / "random.gif")
     if backend == "gymnasium":

@@ -76,7 +76,7 @@ def test_it_flies_the_figure_eight_and_its_gains_matter():
 def test_of_a_baseline_there_is_neither_film_nor_page(tmp_path):
     pytest.importorskip("crazyflow")
     arguments = {"env": "DroneFigureEightTrajectory-v0", "episodes": 1, "baseline": True}
-    for more in ({"video": tmp_path / "film.gif"}, {"report": tmp_path / "page"}):
+    for more in ({"video": tmp_path / "video.gif"}, {"report": tmp_path / "page"}):
         with pytest.raises(lem.errors.UserError, match="leave out video and report"):
             lem.evaluate(lambda obs: np.array([0, 0, 0, 0.3], np.float32), **arguments, **more)
 

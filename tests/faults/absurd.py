@@ -140,8 +140,8 @@ def verbs(folder):
     for value in VALUES:
         yield lem.evaluate, (stop, "CartPole-v1"), {"episodes": value}
         yield lem.evaluate, (stop, "CartPole-v1"), {"seed": value}
-        yield lem.watch, (stop, "CartPole-v1"), {"episodes": value, "video": folder / "film.gif"}
-        yield lem.watch, (stop, "CartPole-v1"), {"seed": value, "video": folder / "film.gif"}
+        yield lem.watch, (stop, "CartPole-v1"), {"episodes": value, "video": folder / "video.gif"}
+        yield lem.watch, (stop, "CartPole-v1"), {"seed": value, "video": folder / "video.gif"}
         yield lem.set_seeds, (value,), {}
         yield lem.make_vec, ("Countdown-v0", value), {}
         yield lem.train_sweep, ("ppo", "Countdown-v0", value), {"run": folder / "there", "num_envs": 2}

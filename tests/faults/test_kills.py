@@ -18,7 +18,7 @@ FIELDS = {
     "ppo-sync": ("ppo", "CartPole-v1", {"backend": "gymnasium", "minibatch_size": 16}),
     "ppo-async": ("ppo", "CartPole-v1", {"backend": "gymnasium-async", "minibatch_size": 16}),
     "ppo-evaluated": ("ppo", "CartPole-v1", {"evaluate_every": 96, "minibatch_size": 16, "total_steps": 960}),
-    "ppo-filmed": ("ppo", "CartPole-v1", {"video_every": 320, "minibatch_size": 16, "total_steps": 960}),
+    "ppo-recorded": ("ppo", "CartPole-v1", {"video_every": 320, "minibatch_size": 16, "total_steps": 960}),
     "ppo-compiled": ("ppo", "CartPole-v1", {"compile": "on", "minibatch_size": 16}),
     "reinforce": ("reinforce", "CartPole-v1", ON_POLICY["reinforce"]),
     "a2c": ("a2c", "CartPole-v1", ON_POLICY["a2c"] | {"total_steps": 3_200}),
@@ -37,7 +37,7 @@ FIELDS = {
     "drone": ("ppo", "DroneFigureEightTrajectory-v0", {"num_envs": 64, "num_steps": 16, "total_steps": 64 * 16 * 60}),
 }
 KINDS = [*FIELDS, "sweep"]
-COSTLY = {"ppo-compiled": 12, "ddpg-compiled": 12, "sac-compiled": 12, "ppo-filmed": 12, "drone": 12, "sweep": 12}
+COSTLY = {"ppo-compiled": 12, "ddpg-compiled": 12, "sac-compiled": 12, "ppo-recorded": 12, "drone": 12, "sweep": 12}
 """how many processes are killed, where it is not 26"""
 
 
@@ -75,9 +75,9 @@ def points(folder):
 
 def outcome(path):
     """All of a finished run that must not differ."""
-    films = {film.name: film.read_bytes() for film in path.rglob("videos/*")}
+    videos = {video.name: video.read_bytes() for video in path.rglob("videos/*")}
     runs = {str(run.relative_to(path)): (final_hashes(run), history(run)) for run in runs_in(path)}
-    return runs, points(path), films
+    return runs, points(path), videos
 
 
 def check_kills(trials, folder, kind, wanted, names=("whole", "again"), each=4, **changes):

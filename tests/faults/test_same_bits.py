@@ -28,7 +28,7 @@ VARIANTS = {
     # what else the run does, or where it runs: words of the command, statements before it
     "again": ([], ""),
     "with evaluations": (["--evaluate-every", "96", "--evaluate-episodes", "3"], ""),
-    "with films": (["--video-every", "320"], ""),
+    "with videos": (["--video-every", "320"], ""),
     "with a report and a score": (["--report", "--score"], ""),
     "with a callback that draws numbers and pictures": (["--callbacks", "drawing:draw"], DRAWING),
     "with Weights & Biases": (["--track", "wandb"], "import os; os.environ['WANDB_MODE'] = 'offline'"),

@@ -23,7 +23,7 @@ KINDS = {
     "envpool": ("ppo", "HalfCheetah-v5", {**ON_POLICY, "minibatch_size": 128}),
     "envpool-compiled": ("ddpg", "Pendulum-v1", {**OFF_POLICY, "compile": "on"}),
     "crazyflow": ("ppo", "DroneFigureEightTrajectory-v0", {**ON_POLICY, "num_envs": 64, "minibatch_size": 512}),
-    "filmed": ("a2c", "CartPole-v1", {**ON_POLICY, "num_steps": 8, "video_every": 50_000, "keep_checkpoints": 1}),
+    "recorded": ("a2c", "CartPole-v1", {**ON_POLICY, "num_steps": 8, "video_every": 50_000, "keep_checkpoints": 1}),
     "sweep": ("a2c,ppo", "toy:Countdown-v0", {**ON_POLICY, "total_steps": 20_000}),
 }
 WARM_UP = 0.4

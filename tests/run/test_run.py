@@ -178,7 +178,7 @@ def test_films_by_the_number_of_training_episodes(tmp_path, monkeypatch):
     ended = np.cumsum([len(line.get("episode/returns", ())) for line in lines])
     due = [line["step"] for line, now, before in zip(lines, ended, [0, *ended], strict=False) if now // 3 > before // 3]
     assert 1 < len(due) < len(lines)
-    assert {film.name for film in (path / "videos").iterdir()} == {f"step-{step}.gif" for step in (0, *due)}
+    assert {video.name for video in (path / "videos").iterdir()} == {f"step-{step}.gif" for step in (0, *due)}
 
 
 def test_what_cannot_be_recorded_is_told_before_training(tmp_path):

@@ -4,7 +4,7 @@ from contextlib import closing
 from pathlib import Path
 
 from lemniscate.api.policy import TrainedPolicy, TrainedRun, load, path_of
-from lemniscate.api.results import diagnose, film_or_say, final_return, final_scores
+from lemniscate.api.results import diagnose, final_return, final_scores, record_or_say
 from lemniscate.errors import UserError, unknown_name
 from lemniscate.report import compare, curves, flight, pages
 from lemniscate.report.seeds import group
@@ -66,16 +66,16 @@ def plot(*runs: Plotted | list[Plotted], by: str = "step") -> list[Path]:
 
 def report_on(run: TrainedRun) -> list[Path]:
     """Evaluate a run's final policy, draw it, and name the files; returns the pictures."""
-    files = draw_run(run, film=True)
+    files = draw_run(run, record_video=True)
     for file in files:
         say(file)
     return _pictures(files)
 
 
-def draw_run(run: str | Path | TrainedRun, by: str = "step", *, film: bool = False) -> list[Path]:
+def draw_run(run: str | Path | TrainedRun, by: str = "step", *, record_video: bool = False) -> list[Path]:
     """Draw a run and its final scores into its `plots/`, and write its page; returns the files, the page last.
 
-    What cannot be evaluated here is left out, and a line says so. With `film` a flight or an episode is recorded too.
+    What cannot be evaluated here is left out, and a line says so. With `record_video` an episode is recorded too.
     """
     path, scores, flights = path_of(run), None, list[Path]()
     folder = path / "plots"
@@ -88,9 +88,9 @@ def draw_run(run: str | Path | TrainedRun, by: str = "step", *, film: bool = Fal
             episodes = policy.config.evaluate_episodes
             with closing(evaluation_env(policy.config, episodes)) as env:
                 scene = env.scene
-                flights = flight.draw_flights(policy.module, env, path, episodes, film) if scene else []
-            if film and not scene:
-                film_or_say(policy, path / "videos" / f"step-{policy.step}.gif")
+                flights = flight.draw_flights(policy.module, env, path, episodes, record_video) if scene else []
+            if record_video and not scene:
+                record_or_say(policy, path / "videos" / f"step-{policy.step}.gif")
         except UserError as error:
             say(f"{path} is drawn without an evaluation: {error}")
     files = curves.plot_runs([path], folder, by=by)
@@ -106,7 +106,7 @@ def draw_run(run: str | Path | TrainedRun, by: str = "step", *, film: bool = Fal
 
 
 def _pictures(files: list[Path]) -> list[Path]:
-    """The files without films and pages."""
+    """The files without videos and pages."""
     return [file for file in files if file.suffix == ".png"]
 
 

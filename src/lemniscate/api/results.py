@@ -81,9 +81,9 @@ def evaluate(
         baseline: play the same episodes by the classical controller that the environment has for comparison.
         video: a .gif, .webp or .mp4 to record all episodes into. They are then played one after the other in one
             rendered environment, without a measurement of the Q bias. The first 16 starts are the same; from the 17th
-            on, and in other backends than gymnasium, returns may differ from those without a film. Of flights in a
-            scene, which are those without a film, the first of each parallel environment is recorded.
-        report: a directory for a page of the evaluation, `plots/report.html`, with its pictures and a film.
+            on, and in other backends than gymnasium, returns may differ from those without a video. Of flights in a
+            scene, which are those without a video, the first of each parallel environment is recorded.
+        report: a directory for a page of the evaluation, `plots/report.html`, with its pictures and a video.
         agent: for a .pt file, the class of the module that it has the weights of, a function that makes it, or its
             name; not needed for the layouts of the courses.
         normalized_actions: of a policy of your own, whether its actions are in [-1, 1] between the bounds, and not in
@@ -97,7 +97,7 @@ def evaluate(
             run.
     """
     chosen = agents.find(policy, checkpoint=checkpoint, trust=trust)
-    episodes, seed, file = checked("episodes", episodes, Episodes), checked("seed", seed, Natural), _film(video)
+    episodes, seed, file = checked("episodes", episodes, Episodes), checked("seed", seed, Natural), _video_file(video)
     deterministic = checked("deterministic", deterministic, bool)
     kwargs, folder = checked("env_kwargs", env_kwargs, dict | None), _folder_of(report, chosen)
     how: dict[str, Any] = {"episodes": episodes, "seed": seed, "deterministic": deterministic}
@@ -156,7 +156,7 @@ def watch(
     checkpoint: str | int | None = None,
     trust: bool = False,
 ) -> Evaluation:
-    """Show episodes: below the cell in a notebook, in a window elsewhere, or recorded into a film.
+    """Show episodes: below the cell in a notebook, in a window elsewhere, or recorded into a video.
 
     Says return and length of each on standard error, then their means and standard deviations.
 
@@ -177,7 +177,7 @@ def watch(
             of file.
     """
     chosen = None if policy is None else agents.find(policy, checkpoint=checkpoint, trust=trust)
-    episodes, seed, file = checked("episodes", episodes, Episodes), checked("seed", seed, Natural), _film(video)
+    episodes, seed, file = checked("episodes", episodes, Episodes), checked("seed", seed, Natural), _video_file(video)
     if chosen is None and env is None:
         raise UserError("Watch what? Name a run, or an environment to act in at random.")
     kwargs = checked("env_kwargs", env_kwargs, dict | None)
@@ -342,21 +342,21 @@ def _known_scores(file: Path) -> dict[str, Any]:
         return {}
 
 
-def film_or_say(policy: TrainedPolicy, file: Path) -> None:
+def record_or_say(policy: TrainedPolicy, file: Path) -> None:
     """Record an episode, where the environment can be rendered; a line says why where it cannot."""
     try:
         evaluate(policy, episodes=1, video=file)
-    except Exception as error:  # whatever a renderer raises: a policy without a film is a policy
-        say(f"No film: {error}")
+    except Exception as error:  # whatever a renderer raises: a policy without a video is a policy
+        say(f"No video: {error}")
 
 
-def _film(video: str | Path | None) -> Path | None:
-    """The file of a film. Raises `UserError` for one that could not be written."""
+def _video_file(video: str | Path | None) -> Path | None:
+    """The file of a video. Raises `UserError` for one that could not be written."""
     if not isinstance(video, str | PathLike | None):
-        raise UserError(f"video must be a path, such as 'film.gif', not {shown(video)}.")
+        raise UserError(f"video must be a path, such as 'video.gif', not {shown(video)}.")
     file = None if video is None else at_home(video)
     if file:
-        playback.check_film(file)
+        playback.check_video(file)
     return file
 
 
@@ -419,12 +419,12 @@ def _draw(player: Any, vec: VecEnv, arguments: dict[str, Any], how: dict[str, An
     make_directory(folder / "plots")
     if vec.scene:
         act = player.module if isinstance(player, TrainedPolicy) else player
-        return flight.draw_flights(act, vec, folder, how["episodes"], film=True, seed=how["seed"])[:-1]
+        return flight.draw_flights(act, vec, folder, how["episodes"], record_video=True, seed=how["seed"])[:-1]
     try:
-        film = folder / "videos" / "episode.gif"
-        _show(player, vec, arguments, **{**how, "episodes": 1}, video=film, tell=str)
+        video = folder / "videos" / "episode.gif"
+        _show(player, vec, arguments, **{**how, "episodes": 1}, video=video, tell=str)
     except Exception as error:  # whatever a renderer raises
-        say(f"No film: {error}")
+        say(f"No video: {error}")
     return []
 
 
@@ -433,7 +433,7 @@ def push(run: Trained, name: str, *, private: bool = False, license: str | None 
 
     The files are those of `save`: raw tensors and JSON, each with its sha256. Beside them are a model card with the
     scores, the command that trains it again and the lines that load it; the final scores of the run, its figures
-    (`plots/`), its newest film, or one that is made now if the environment can be rendered; and what
+    (`plots/`), its newest video, or one that is made now if the environment can be rendered; and what
     `lemniscate export` wrote of that step (`export/`), if it did. `load("hf://user/name")` loads the policy.
 
     Args:
@@ -464,8 +464,8 @@ def push(run: Trained, name: str, *, private: bool = False, license: str | None 
         for place, file in _files_to_upload(path, policy.step).items() if path else ():
             (folder / place).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(file, folder / place)
-        if not (path and pages.newest_film(path)):
-            film_or_say(policy, folder / "videos" / "episode.gif")
+        if not (path and pages.newest_video(path)):
+            record_or_say(policy, folder / "videos" / "episode.gif")
         scores: dict[str, Any] | None = None
         try:
             scores = final_scores(path) if path else scores_of(policy)
@@ -480,7 +480,7 @@ def push(run: Trained, name: str, *, private: bool = False, license: str | None 
 def _files_to_upload(run: Path, step: int) -> dict[str, Path]:
     """The files of a run that are uploaded beside its policy of a step, by their paths in the repository; no links.
 
-    They are the figures, the export where there is a whole one of that step, and the newest film: a video by the name
+    They are the figures, the export where there is a whole one of that step, and the newest video: a video by the name
     that the Hub plays, else in `videos/`.
     """
     files, export = [*(run / "plots").glob("*.png")], run / "export"
@@ -492,6 +492,6 @@ def _files_to_upload(run: Path, step: int) -> dict[str, Path]:
             say(f"{export} is not of the policy of step {step:,}: it is left out; lemniscate export {run}")
     own = [file for file in files if file.is_file() and file.resolve() == run.resolve() / file.relative_to(run)]
     shown = {file.relative_to(run).as_posix(): file for file in own}
-    if film := pages.newest_film(run):
-        shown["replay.mp4" if film.suffix == ".mp4" else f"videos/{film.name}"] = film
+    if video := pages.newest_video(run):
+        shown["replay.mp4" if video.suffix == ".mp4" else f"videos/{video.name}"] = video
     return shown

@@ -296,7 +296,7 @@ def _train(world: World, path: Path, algorithm: str, config: RunConfig, options:
     envs = envs_of(config, world)
     path, spec = path if path.absolute() == home else home, envs[0].spec  # an environment may have gone to its files
 
-    def film(state: TrainState) -> None:
+    def record_video(state: TrainState) -> None:
         from lemniscate.api.results import evaluate
 
         file = home / "videos" / f"step-{state.step}.{'mp4' if is_installed('imageio_ffmpeg') else 'gif'}"
@@ -305,7 +305,12 @@ def _train(world: World, path: Path, algorithm: str, config: RunConfig, options:
 
     attend, callbacks = Attendance(config) if progress else None, options.callbacks
     observer = call_callbacks(callbacks, spec, config, attend) if callbacks or attend else None
-    surroundings = {"loggers": options.loggers, "progress": progress, "film": film, "observer": observer}
+    surroundings = {
+        "loggers": options.loggers,
+        "progress": progress,
+        "record_video": record_video,
+        "observer": observer,
+    }
     run = Run(path, algorithm, config, envs, world=world, locate=local_path, **surroundings)
     pictures: list[Path] = []
     try:

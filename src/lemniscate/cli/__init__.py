@@ -105,7 +105,7 @@ OPTIONS: list[tuple[str, str, str, Any]] = [
     ("evaluate watch preflight", "--env-args JSON", "arguments of the environment [as in training]", None),
     ("evaluate", "--backend NAME", "simulation backend [as in training]", None),
     ("evaluate", "--env ID", "environment [that of training]", None),
-    ("evaluate", "--report DIR", "directory for a page with pictures and a film, plots/report.html", None),
+    ("evaluate", "--report DIR", "directory for a page with pictures and a video, plots/report.html", None),
     ("evaluate", "--baseline", "play by the environment's classical controller instead", False),
     ("evaluate", "--video FILE", ".gif, .webp or .mp4 to record all episodes into", None),
     ("grade", "folder FOLDER", "a .py file, a .ipynb file or a folder for each hand-in", None),

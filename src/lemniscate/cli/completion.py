@@ -31,7 +31,7 @@ CASES
 }
 complete -o default -F _lemniscate lemniscate
 """
-"""what has no answer is completed as a file, since runs and films are paths"""
+"""what has no answer is completed as a file, since runs and videos are paths"""
 
 ZSH = """(( $+functions[compdef] )) || { autoload -Uz compinit && compinit }
 autoload -Uz bashcompinit && bashcompinit

@@ -121,7 +121,7 @@ class Backend(ABC):
             beginning it late or by cutting it early. Read before a step, it speaks of the episodes that the step may
             end.
         once: it steps an environment of one's own that may exist once at a time, such as a robot. While another is made
-            for evaluation or a film, it is closed; `restart` makes it again.
+            for evaluation or a video, it is closed; `restart` makes it again.
         notices: sentences on its spaces and on what was observed so far, for the one who trains.
         mode: what an environment does after an end, in Gymnasium's words. DISABLED is reset here, in the same step.
         summaries: the numbers that evaluation makes of the measures besides their means.

@@ -19,7 +19,7 @@ GAMES = {f"MinAtar/{module.title().replace('_', '')}-v1": module for module in M
 LIMIT = 10_000
 """steps of an episode at most, which the games have not"""
 PIXELS = 20
-"""the side of a field in a film"""
+"""the side of a field in a video"""
 
 
 class MinAtar(gym.Env):

@@ -1,4 +1,4 @@
-"""The flight of a body, along a reference or among what stands there: the path, the error, a film."""
+"""The flight of a body, along a reference or among what stands there: the path, the error, a video."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ from lemniscate.system.files import make_directory
 BLUE, ORANGE, GREY = "#1f5fa8", "#e07b1a", "#9aa0a6"
 
 STRIDE = 5
-"""a film has a frame for every so many-th step"""
+"""a video has a frame for every so many-th step"""
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ def show_flights(
     video: Path | None = None,
     tell: Tell = say,
 ) -> Evaluation:
-    """Show flights in their scene, in a window, a notebook or a film; returns their evaluation.
+    """Show flights in their scene, in a window, a notebook or a video; returns their evaluation.
 
     The flights are those of `evaluate`, and played together. Of more flights than there are environments, the first of
     each is shown.
@@ -123,15 +123,15 @@ def show_flights(
 
 
 def draw_flights(
-    policy: Policy | Baseline, env: VecEnv, run: Path, flights: int, film: bool, seed: int = 0
+    policy: Policy | Baseline, env: VecEnv, run: Path, flights: int, record_video: bool, seed: int = 0
 ) -> list[Path]:
-    """The paths of some flights in a scene, into the `plots/` of a run; with `film` one of them into `videos/`.
+    """The paths of some flights in a scene, into the `plots/` of a run; with `record_video` one of them into `videos/`.
 
-    Beside a path along a reference, the error. Returns the files, the film last.
+    Beside a path along a reference, the error. Returns the files, the video last.
     """
     flown = record(policy, env, flights, seed)
     folder, video = run / "plots", run / "videos" / "flight.gif"
-    if film:
+    if record_video:
         make_directory(video.parent)
         show_flights(policy, env, 1, seed, video=video, tell=lambda text: None)
     if len(flown[0].reference):
@@ -139,7 +139,7 @@ def draw_flights(
         drawn = [draw_path(flown, folder / "flight.png"), draw_error(flown, folder / "error.png", beside)]
     else:
         drawn = [draw_from_above(flown, folder / "flight.png")]
-    return [*drawn, video] if film else drawn
+    return [*drawn, video] if record_video else drawn
 
 
 def draw_from_above(flights: Sequence[Flight], file: Path) -> Path:

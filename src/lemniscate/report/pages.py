@@ -23,7 +23,7 @@ from lemniscate.doctor import Diagnosis
 from lemniscate.doctor.rules import seeds_differ
 from lemniscate.errors import UserError, resume_line
 from lemniscate.report import curves
-from lemniscate.report.playback import FILMS, embedded
+from lemniscate.report.playback import VIDEOS, embedded
 from lemniscate.report.seeds import Group, Scores, differing, written
 from lemniscate.run.config import RunConfig
 from lemniscate.run.directory import is_finished, read_config
@@ -33,7 +33,7 @@ from lemniscate.run.metrics import read_metrics
 from lemniscate.system.files import filled, replace_file
 
 MOST_BYTES = 5_000_000
-"""the largest film that is embedded; a larger one is linked"""
+"""the largest video that is embedded; a larger one is linked"""
 
 NOT_MEASURES = {field.name for field in fields(Evaluation)} | {"step", "seed"}
 """names among scores that are not measures of the environment"""
@@ -51,7 +51,7 @@ TASK = "reinforcement-learning"
 
 
 def write_run(run: Path, pictures: Sequence[Path], scores: Evaluated | None, found: Sequence[Diagnosis]) -> Path:
-    """Write the page of a run: curves, film, evaluation, settings, commands, and what the doctor has found."""
+    """Write the page of a run: curves, video, evaluation, settings, commands, and what the doctor has found."""
     algorithm, config = read_config(run)
     log = read_metrics(run)
     taken, total = (log[-1]["step"] if log else 0), config.get("total_steps", 0)
@@ -66,7 +66,7 @@ def write_run(run: Path, pictures: Sequence[Path], scores: Evaluated | None, fou
         minutes=curves.training_minutes(run)[1][-1],
         found=found,
         pictures=pictures,
-        film=newest_film(run),
+        video=newest_video(run),
         scores=scores,
         rows=score_rows(scores) if scores else [],
         histogram=_histogram(scores["returns"]) if scores else None,
@@ -77,24 +77,24 @@ def write_run(run: Path, pictures: Sequence[Path], scores: Evaluated | None, fou
 
 
 def write_evaluation(folder: Path, name: str, pictures: Sequence[Path], scores: Evaluation, seed: int) -> Path:
-    """Write the page of an evaluation of the policy `name`, which need not be of a run: film, scores, pictures."""
+    """Write the page of an evaluation of the policy `name`, which need not be of a run: video, scores, pictures."""
     return write_page(
         folder / "plots" / "report.html",
         "evaluation.html.j2",
         title=f"{name} in {scores.env_id}",
         subtitle=f"{scores.episodes:,} episodes · seed {seed}",
         pictures=pictures,
-        film=newest_film(folder),
+        video=newest_video(folder),
         rows=score_rows({**scores.to_json(), "seed": seed}),
         histogram=_histogram(scores.returns),
     )
 
 
-def newest_film(run: Path) -> Path | None:
-    """The newest film of a run, if it has any."""
-    films = [file for file in (run / "videos").glob("*") if file.suffix in FILMS]
+def newest_video(run: Path) -> Path | None:
+    """The newest video of a run, if it has any."""
+    videos = [file for file in (run / "videos").glob("*") if file.suffix in VIDEOS]
     # Not a link, which could lead to any file of this machine, and what is found is embedded and uploaded.
-    own = [file for file in films if file.is_file() and not file.is_symlink()]
+    own = [file for file in videos if file.is_file() and not file.is_symlink()]
     return max(own, key=lambda file: file.stat().st_mtime, default=None)
 
 

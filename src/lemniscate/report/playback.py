@@ -1,4 +1,4 @@
-"""Episodes played for a person: in a window, in a notebook, or into a film."""
+"""Episodes played for a person: in a window, in a notebook, or into a video."""
 
 import io
 import math
@@ -39,8 +39,8 @@ Tell = Callable[[str], object]
 
 ONE, LARGEST = torch.ones(1, dtype=torch.bool), torch.finfo(torch.float32).max
 
-FILMS = {".gif": "image/gif", ".webp": "image/webp", ".mp4": "video/mp4"}
-"""the endings of a film's file, and what it is to a browser"""
+VIDEOS = {".gif": "image/gif", ".webp": "image/webp", ".mp4": "video/mp4"}
+"""the endings of a video's file, and what it is to a browser"""
 
 PICTURE_FPS = 50
 """frames a second that an animated picture has at most: browsers show one with shorter delays far too slowly"""
@@ -91,7 +91,7 @@ def require_display() -> None:
     displays = ("DISPLAY", "WAYLAND_DISPLAY", "SDL_VIDEODRIVER")
     if sys.platform == "linux" and not in_notebook() and not any(map(os.environ.get, displays)):
         raise UserError(
-            'There is no display for a window; record a film instead: --video film.gif, in Python video="film.gif".'
+            'There is no display for a window; record a video instead: --video video.gif, in Python video="video.gif".'
         )
 
 
@@ -144,7 +144,7 @@ def _play(
 
 
 def _pace(env: gym.Env) -> float:
-    """The frames a second that an environment says it has; 30 where it says nothing that a film can have."""
+    """The frames a second that an environment says it has; 30 where it says nothing that a video can have."""
     try:
         fps = float((env.metadata or {}).get("render_fps") or 30)
     except (TypeError, ValueError):
@@ -225,16 +225,16 @@ def _quiet_sdl(in_window: bool) -> Iterator[None]:
 
 
 def give(frames: Iterable[np.ndarray], fps: float, video: Path | None) -> None:
-    """Record frames [H, W, 3] uint8 into a film, or show them below the cell."""
+    """Record frames [H, W, 3] uint8 into a video, or show them below the cell."""
     if video is None:
         send_frames(frames, fps)
     else:
         save_frames(frames, video, fps)
 
 
-def check_film(file: Path) -> None:
-    """Raise `UserError` for a film that could not be written, before anything is played for it."""
-    if file.suffix not in FILMS:
+def check_video(file: Path) -> None:
+    """Raise `UserError` for a video that could not be written, before anything is played for it."""
+    if file.suffix not in VIDEOS:
         raise UserError(f"{file} must end in .gif, .webp or .mp4.")
     if file.is_dir():
         raise UserError(f"{file} is a folder; name a file in it.")
@@ -246,7 +246,7 @@ def check_film(file: Path) -> None:
 
 def save_frames(frames: Iterable[np.ndarray], file: Path, fps: float) -> None:
     """Write frames [H, W, 3] uint8 as an animated picture (.gif, .webp) or a video (.mp4, extra `video`)."""
-    check_film(file)
+    check_video(file)
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -254,7 +254,7 @@ def save_frames(frames: Iterable[np.ndarray], file: Path, fps: float) -> None:
     remove(file)  # writing would follow a link
     try:
         _write(_of_one_size(frames, file), file, fps)
-    except BaseException:  # what draws the frames may fail: no half of a film is left
+    except BaseException:  # what draws the frames may fail: no half of a video is left
         file.unlink(missing_ok=True)
         raise
 
@@ -274,10 +274,10 @@ def _write(frames: Iterable[np.ndarray], file: Path, fps: float) -> None:
     if file.suffix == ".mp4":
         from imageio import v2 as imageio
 
-        film: Any = imageio.get_writer(file, fps=fps, macro_block_size=2)
-        with film:
+        video: Any = imageio.get_writer(file, fps=fps, macro_block_size=2)
+        with video:
             for frame in frames:
-                film.append_data(frame)
+                video.append_data(frame)
         return
     stride = max(1, math.ceil(fps / PICTURE_FPS))
     images = _timed(islice(frames, 0, None, stride), fps / stride)
@@ -309,7 +309,7 @@ def send_frames(frames: Iterable[Any], fps: float) -> None:
         time.sleep(max(0.0, started + i / fps - time.monotonic()))
 
 
-def show_film(file: str | Path) -> None:
+def show_video(file: str | Path) -> None:
     """Show an animated picture (.gif, .webp) below the cell; the notebook then holds it without the file."""
     from IPython.display import HTML, display
 
@@ -317,5 +317,5 @@ def show_film(file: str | Path) -> None:
 
 
 def embedded(file: Path) -> str:
-    """A picture or a film as an address that holds all of it, for a page that stands alone."""
-    return f"data:{FILMS.get(file.suffix, 'image/png')};base64,{b64encode(file.read_bytes()).decode()}"
+    """A picture or a video as an address that holds all of it, for a page that stands alone."""
+    return f"data:{VIDEOS.get(file.suffix, 'image/png')};base64,{b64encode(file.read_bytes()).decode()}"

@@ -79,7 +79,7 @@ class Run:
         world: World,
         loggers: Sequence[LoggerClass],
         progress: bool,
-        film: Callable[[TrainState], None],
+        record_video: Callable[[TrainState], None],
         observer: Observer | None,
         locate: Callable[[str], Path],
     ) -> None:
@@ -91,7 +91,7 @@ class Run:
         """how long the training loop took"""
         self._saver = Saver(self._home, algorithm, config, self.spec, world)
         self._logger_classes, self._loggers = loggers if world.is_first else (), list[Logger]()
-        self._visible, self._film, self._observer, self._locate = progress, film, observer, locate
+        self._visible, self._record_video, self._observer, self._locate = progress, record_video, observer, locate
         self._compiler = Compiler(world.busy)
         self._stop = StopRequest(world.size > 1, self._how_to_go_on, self._compiler.stopping)
         self._iteration, self._lines, self._episodes = Iteration(), 0, 0
@@ -373,7 +373,7 @@ class Run:
             with self._as_side_task("recording", state):
                 if self.env.backend.once:
                     self.env.close()
-                self._film(state)
+                self._record_video(state)
 
     def _evaluate(self, state: TrainState) -> None:
         config, scores = self.config, None
