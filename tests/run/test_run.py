@@ -22,8 +22,10 @@ import toy
 from conftest import tiny_fields, tiny_off_policy
 from forks import command
 from helpers import long
+from lemniscate.api import training
 from lemniscate.api.callbacks import StopAt
 from lemniscate.nn.normalizer import RewardScale
+from lemniscate.report import playback
 from lemniscate.run import checkpoint
 from lemniscate.run.directory import Saver
 from lemniscate.run.evaluate import EVALUATION
@@ -155,7 +157,7 @@ def test_evaluation_changes_no_bit_of_training(tmp_path, env):
 @pytest.mark.parametrize("env", ["CartPole-v1", pytest.param("sac", marks=pytest.mark.long)])
 @pytest.mark.long
 def test_recordings_change_no_bit_of_training_and_survive_a_resume(tmp_path, env, monkeypatch):
-    monkeypatch.setattr(lem.api.training, "is_installed", lambda name: name != "imageio_ffmpeg")
+    monkeypatch.setattr(training, "is_installed", lambda name: name != "imageio_ffmpeg")
     train(tmp_path / "without", env, checkpoint_every=64)
     path = tmp_path / "with"
     train(path, env, checkpoint_every=64, video_every=96)
@@ -171,7 +173,7 @@ def test_recordings_change_no_bit_of_training_and_survive_a_resume(tmp_path, env
 
 
 def test_films_by_the_number_of_training_episodes(tmp_path, monkeypatch):
-    monkeypatch.setattr(lem.api.training, "is_installed", lambda name: name != "imageio_ffmpeg")
+    monkeypatch.setattr(training, "is_installed", lambda name: name != "imageio_ffmpeg")
     path = tmp_path / "r"
     train(path, "CartPole-v1", video_every_episodes=3)
     lines = read_metrics(path)
@@ -191,7 +193,7 @@ def test_what_can_no_longer_be_recorded_costs_no_step(tmp_path, monkeypatch, cap
     def full(*_args, **_):
         raise OSError("No space left on device")
 
-    monkeypatch.setattr(lem.report.playback, "save_frames", full)
+    monkeypatch.setattr(playback, "save_frames", full)
     path = tmp_path / "r"
     train(path, "CartPole-v1", checkpoint_every=64, video_every=96)
     assert "No recording at step 96: No space left on device" in capsys.readouterr().err
@@ -202,7 +204,7 @@ def test_what_can_no_longer_be_recorded_costs_no_step(tmp_path, monkeypatch, cap
     def blind(*_args):
         raise lem.UserError("there is no display")
 
-    monkeypatch.setattr(lem.report.playback, "_rendered", blind)
+    monkeypatch.setattr(playback, "_rendered", blind)
     lem.resume(path, progress=False)  # where nobody can see, a run goes on all the same
     assert "No recording at step 192: there is no display" in capsys.readouterr().err
     assert final_hashes(path) == done
