@@ -85,7 +85,7 @@ def of_environment(rows: Rollout, spec: Spec, ages: Tensor | None = None) -> dic
         few = slice(max(2, MOST_ROWS // len(rows.done)))  # of the environments
         rows = rows[:, few]
         found |= of_effects(_valid(rows), spec)
-        found |= of_ages(rows, spec, ages[few], found["reward/explained"]) if ages is not None else {}
+        found |= of_ages(rows, spec, ages[few], found) if ages is not None else {}
         if found["reward/explained"] < 0.8 and found["reward/std"] > 0:  # else no other row has more to explain
             found["reward/before"] = paid_before(rows, spec, found["reward/explained"])
         if found["action/effect"] < 0.2:
@@ -149,31 +149,38 @@ def of_time(rows: Rollout) -> dict[str, Tensor]:
     return {"reward/by_time": by_time, "reward/within": reward.square().sum() / varies}
 
 
-def of_ages(rows: Rollout, spec: Spec, ages: Tensor, explained: Tensor) -> dict[str, Tensor]:
+def of_ages(rows: Rollout, spec: Spec, ages: Tensor, known: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """What recurs at the same steps of episodes, of rows [T, N, …] whose environments have had `ages` [N] steps since.
 
     - reward/by_age: the share of the rewards' variance that a line over the steps since an episode's beginning explains
-      beyond the rows, which explain the share `explained`.
+      beyond the rows; not where these explain most of it, by the signals that are `known`.
     - observation/jumps_every: the steps after which, and after whose multiples alone, observations change as if
       others were drawn, though no end is reported; nothing where there are none.
     """
-    running = rows.valid & (_ended(rows) == rows.done.sum(0))
-    if running.sum() < FEW:
+    explained, jumps, found = known["reward/explained"].clamp(min=0), _jumps(rows, spec), dict[str, Tensor]()
+    pays, recur = explained < 0.8 and known["reward/std"] > 0, jumps.sum() >= 8
+    if not (pays or recur):
         return {}
-    age, found = (ages - running.flip(0).cumsum(0).flip(0) + 1)[running], dict[str, Tensor]()  # after the row
-    rows = rows[running]
-    if explained < 0.8:
-        others = explained_by(age[:, None].cpu().double(), rows.reward[:, None].cpu().double(), _everything(rows, spec))
-        found["reward/by_age"] = (1 - explained.clamp(min=0)) * others.nan_to_num()[0]
-    obs, after = (x[:, : spec.observation_size].float() for x in (rows.obs, rows.next_obs))
-    std = _spread(obs)
-    change = ((after - obs) / std)[:, std > 1e-9].square().mean(1)
-    jumps = change > (10 * change.median()).clamp(min=0.5)
+    running = rows.valid & (_ended(rows) == rows.done.sum(0))
+    age = (ages - running.flip(0).cumsum(0).flip(0) + 1)[running]  # after the row
+    if pays and running.sum() >= FEW:
+        present = rows[running]
+        line, reward = age[:, None].cpu().double(), present.reward[:, None].cpu().double()
+        others = explained_by(line, reward, _everything(present, spec))
+        found["reward/by_age"] = (1 - explained) * others.nan_to_num()[0]
+    jumps = jumps[running]
     for period in age[jumps].unique()[:6] if jumps.sum() >= 8 else ():
         due = age % period == 0
         if period >= 5 and jumps[due].float().mean() > 0.5 and due[jumps].float().mean() > 0.9:
             return found | {"observation/jumps_every": period}
     return found
+
+
+def _jumps(rows: Rollout, spec: Spec) -> Tensor:
+    """Whether an observation of rows [T, N, …] changes within an episode as if another one were drawn, [T, N]."""
+    obs, after = (x[..., : spec.observation_size].float() for x in (rows.obs, rows.next_obs))
+    change = ((after - obs).square() / obs.var((0, 1)).clamp(min=1e-12)).mean(-1)
+    return (change > (10 * change.median()).clamp(min=0.5)) & ~rows.done & rows.valid
 
 
 def of_effects(rows: Rollout, spec: Spec) -> dict[str, Tensor]:
