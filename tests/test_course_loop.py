@@ -288,3 +288,11 @@ def test_the_skeleton_is_the_solution_with_its_gaps(tmp_path):
         course.skeleton("ppo", file)
     with pytest.raises(UserError, match="There is no skeleton 'sac'"):
         course.skeleton("sac", tmp_path / "sac.py")
+
+
+def test_the_home_folder_is_found(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.chdir(tmp_path / "..")
+    assert course.skeleton("ppo", "~/mine.py") == tmp_path / "mine.py"
+    assert course.start("~/course") == tmp_path / "course" / "README.md"
+    assert (tmp_path / "course" / "README.md").exists()

@@ -12,7 +12,7 @@ import torch
 import lemniscate as lem
 from forks import forks
 from lemniscate.errors import UserError
-from lemniscate.system import files, machine
+from lemniscate.system import files, machine, watchdog
 
 CPU = torch.device("cpu")
 
@@ -161,3 +161,12 @@ print(faults())
 """
     said = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert int(said.stdout) < 1_000
+
+
+@pytest.mark.parametrize("text", ["30s", "0", "-1", "nan", "inf", ""])
+def test_a_patience_that_is_no_number_of_seconds_is_a_sentence(text, monkeypatch):
+    monkeypatch.setenv(watchdog.PATIENCE, text)
+    with pytest.raises(UserError, match=f"LEMNISCATE_PATIENCE must be a number of seconds above 0, not '{text}'"):
+        watchdog.patience()
+    monkeypatch.setenv(watchdog.PATIENCE, "0.5")
+    assert watchdog.patience() == 0.5

@@ -152,6 +152,7 @@ def test_a_callable_with_arguments():
         ("test_named:Mine(x=1", "cannot be read; it has the form"),
         ("test_named:Mine(x=1).__class__", "cannot be read; it has the form"),
         ("test_named:Mine(**{'x': 1})", "cannot be read; it has the form"),
+        ("test_named:Mine(x=1)(x=2)", "cannot be read; it has the form"),
         ("test_named:Mine(1)", "need their names"),
         ("math:pi", "math:pi is neither a function nor a class"),
     ],

@@ -170,6 +170,20 @@ def test_a_picture_keeps_the_time_with_delays_that_a_browser_shows(fps, kind, tm
     assert min(delays) >= 20
 
 
+def test_a_video_that_is_there_stays_until_another_one_is_whole(tmp_path):
+    def broken():
+        yield np.zeros((8, 8, 3), np.uint8)
+        raise RuntimeError("the renderer")
+
+    file = tmp_path / "video.gif"
+    playback.save_frames([np.zeros((8, 8, 3), np.uint8)] * 3, file, 30)
+    first = file.read_bytes()
+    with pytest.raises(RuntimeError, match="the renderer"):
+        playback.save_frames(broken(), file, 30)
+    assert file.read_bytes() == first
+    assert list(tmp_path.iterdir()) == [file]
+
+
 def test_without_ffmpeg_the_extra_is_named_with_a_line_that_works(tmp_path, monkeypatch):
     monkeypatch.setattr("lemniscate.report.playback.is_installed", lambda package: False)
     with pytest.raises(lem.UserError, match=r"imageio_ffmpeg is not installed; .* pip install '\.\[video\]'"):

@@ -12,7 +12,9 @@ import signal
 import subprocess
 import time
 
+import numpy as np
 import pytest
+import torch
 from filelock import FileLock
 
 import lemniscate as lem
@@ -296,6 +298,8 @@ def test_seeds_are_given_as_ranges_and_lists():
     assert sweep.seeds_of("7,1-2, 7") == [7, 1, 2]
     assert sweep.seeds_of(range(2)) == [0, 1]
     assert sweep.seeds_of(5) == [5]
+    assert sweep.seeds_of(np.arange(1, 4)) == sweep.seeds_of(list(np.arange(1, 4))) == [1, 2, 3]
+    assert sweep.seeds_of([torch.tensor(7), np.int64(8)]) == [7, 8]
 
 
 @pytest.mark.parametrize(("cores", "threads", "runs"), [(8, 1, 8), (8, 3, 2), (2, 4, 1)])

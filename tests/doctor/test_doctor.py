@@ -29,7 +29,15 @@ OTHER_METRICS = {"approx_kl", "clip_fraction", "learning_rate", "policy_std", "e
 
 
 def evidence(
-    algorithm="ppo", returns=FLAT, lengths=None, scores=None, repeats=None, steps=4_000, changed=(), **metrics
+    algorithm="ppo",
+    returns=FLAT,
+    lengths=None,
+    scores=None,
+    repeats=None,
+    varies=None,
+    steps=4_000,
+    changed=(),
+    **metrics,
 ):
     """Evidence with a line for each value of the metrics, and the same returns in equal parts."""
     kind = algos.find(algorithm).Config
@@ -44,7 +52,7 @@ def evidence(
         line |= {"episode/returns": list(part), "episode/lengths": list(its)}
     tried = {name: {str(value)} for name, value in config.items()}
     given = with_ratios({**kind().to_json(), "total_steps": steps, **dict(changed)})
-    return Evidence(given, config, tried, usual, lines, scores or {}, repeats)
+    return Evidence(given, config, tried, usual, lines, scores or {}, repeats, varies)
 
 
 def names(*args, **kwargs):
@@ -121,6 +129,10 @@ CASES = {
     "q-explains-nothing": (
         {"algorithm": "ddpg", "steps": 30_000, "value__explained": [0.1] * 8, "reward__explained": [0.9] * 8},
         {"algorithm": "ddpg", "steps": 30_000, "value__explained": [0.1] * 7 + [0.9], "reward__explained": [0.9] * 8},
+    ),
+    "replay-part": (
+        {"algorithm": "td3", "replay__drawn": [1.0] * 4 + [0.5] * 4},
+        {"algorithm": "td3", "replay__drawn": [0.5] * 4 + [0.99] * 4},
     ),
     "entropy-impossible": (
         {"algorithm": "sac", "losses__entropy": [1.4] + [-1.0] * 7, "action__most_entropy": [0.69] * 8},
@@ -343,6 +355,26 @@ def test_a_horizon_of_a_tenth_of_the_recommended_is_named_in_shorter_episodes():
 def test_a_policy_whose_units_are_inactive_stands_still_for_that():
     shown = {"network__inactive": [1.0] * 8, "approx_kl": [1e-9] * 8}
     assert names(**shown) == ["units-inactive"]
+
+
+def test_a_start_that_no_seed_changes_is_named_though_no_episode_has_ended():
+    whole = {"observation__whole": [0.0] * 8}
+    assert "starts-alike" in names(**whole, varies=False)
+    assert "starts-alike" not in names(**whole, varies=True)
+    assert "starts-alike" not in names(observation__whole=[1.0] * 8, varies=False)
+
+
+def test_a_policy_without_a_gradient_stands_still():
+    shown = {"algorithm": "td3", "steps": 30_000, "reward__largest": [1.0] * 8, "action__preferred": [0.5] * 8}
+    assert names(**shown, gradient_norm__actor=[0.1] * 4 + [0.0] * 4) == ["policy-still"]
+    assert names(**shown, gradient_norm__actor=[0.0] * 4 + [0.1] * 4) == ["q-unfollowed"]
+
+
+def test_a_value_whose_targets_are_not_those_of_gae_and_that_goes_on_behind_ends_ignores_them():
+    shown = {"episode__terminated": [1.0] * 8, "value__missing": [0.5] * 8, "explained_variance": [0.7] * 8}
+    assert "ends-ignored" in names(**shown, value__at_ends=[1.6] * 8, value__explained=[-0.3] * 8)
+    assert "ends-ignored" not in names(**shown, value__at_ends=[1.6] * 8, value__explained=[0.7] * 8)
+    assert "ends-ignored" not in names(**shown, value__at_ends=[0.5] * 8, value__explained=[-0.3] * 8)
 
 
 def test_a_value_that_no_update_moves_is_named():

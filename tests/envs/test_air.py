@@ -7,6 +7,7 @@ starts, with the same random numbers.
 import math
 import os
 import re
+from contextlib import closing
 from functools import cache
 from pathlib import Path
 
@@ -202,6 +203,20 @@ def test_observations_that_are_late_are_the_states_of_then():
         then = (torch.arange(9) * SUBSTEPS - substeps).clamp(min=0)
         torch.testing.assert_close(obs[:, point, :, :13], by_hand[then], rtol=1e-4, atol=2e-5)
     torch.testing.assert_close(told[:, :, 1], told[:, :, 0])  # rewards and errors are of the truth
+
+
+@pytest.mark.parametrize("delay", [0.0191, 0.0199, 0.0201, 0.0395])
+def test_a_delay_between_steps_of_the_simulation_is_rounded_to_one(delay):
+    env = registry.make("DroneFigureEightTrajectory-v0", 2, kwargs={"observation_delay": delay})
+    env.restart(0)
+    for _ in range(4):
+        assert env.step(torch.zeros(2, 4)).obs.isfinite().all()
+    env.close()
+
+
+def test_the_delay_of_an_interface_has_the_jitter_in_it():
+    with closing(registry.make("DroneFigureEightTrajectory-v0", 2, kwargs={"action_delay": 0.01, "jitter": 1})) as env:
+        assert env.backend.interface.delay == pytest.approx((0.01, 0.03))
 
 
 def test_noise_and_bias_have_their_sizes_and_rewards_are_of_the_truth():

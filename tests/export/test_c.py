@@ -10,7 +10,7 @@ import pytest
 from exported import BOX, exported, needs_compiler, plain, policy_for
 
 from lemniscate.errors import UserError
-from lemniscate.exporting.c_code import c_files, functions
+from lemniscate.exporting.c_code import c_files, comment, functions
 from lemniscate.exporting.compiled import FLAGS, HostPolicy, host_compiler, run_tool
 from lemniscate.exporting.deployed import difference_units
 from lemniscate.exporting.parity import compare
@@ -166,6 +166,12 @@ def test_a_header_of_cpp_too(tmp_path):
             pytest.skip("there is no C++ compiler")
         raise
     assert subprocess.run([tmp_path / "use"]).returncode == 0
+
+
+@pytest.mark.parametrize("text", ["*/", "*\\/", "*/*", "/*/", "*\\/*", "**//", "*\n/", "/\\*"])
+def test_no_text_ends_or_begins_a_comment(text):
+    assert "*/" not in comment(text)
+    assert "/*" not in comment(text)
 
 
 def test_a_run_cannot_write_code_into_a_comment():

@@ -2,6 +2,8 @@
 
 import hashlib
 import json
+import re
+import sys
 from functools import partial
 from types import SimpleNamespace
 
@@ -153,6 +155,31 @@ def test_without_a_compiler_onnx_acts(run, tmp_path, few, monkeypatch):
     monkeypatch.setattr(exporting, "host_compiler", lambda: None)
     record = json.loads((lem.export(run, tmp_path / "e") / "parity.json").read_text())
     assert record["acting"] == "policy.onnx"
+
+
+def compiler(folder, does):
+    """A program that stands in for the C compiler, and does what its text says in Python."""
+    file = folder / "mycc"
+    file.write_text(f"#!{sys.executable}\nimport sys\n{does}\n")
+    file.chmod(0o755)
+    return str(file)
+
+
+@pytest.mark.parametrize(
+    ("does", "said"),
+    [
+        ("sys.exit('stdint.h: No such file')", "policy.c is not compared on this machine: .*stdint.h"),
+        ("open('policy.so', 'w').write('of another machine')", "What mycc made cannot be loaded here"),
+    ],
+)
+def test_a_compiler_that_makes_nothing_for_this_machine_is_said_and_all_else_is_exported(
+    run, tmp_path, few, monkeypatch, does, said
+):
+    monkeypatch.setenv("CC", compiler(tmp_path, does))
+    record = json.loads((lem.export(run, tmp_path / "e") / "parity.json").read_text())
+    assert record["c_host"] is None
+    assert any(re.search(said, line) for line in record["missing"])
+    assert (tmp_path / "e" / "policy.c").exists()
 
 
 def test_images_and_policies_of_no_run_are_refused(tmp_path):

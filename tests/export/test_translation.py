@@ -116,6 +116,7 @@ class Odd(nn.Module):
         self.register_buffer("frequencies", torch.randn(inputs, 6))
         self.first, self.last = nn.Linear(12, 12), nn.Linear(24, outputs)
         self.queries, self.norm = nn.Linear(4, 4), nn.LayerNorm(4, elementwise_affine=False)
+        self.token = nn.Parameter(torch.randn(1, 2))
 
     def forward(self, x):
         phases = x @ self.frequencies
@@ -138,6 +139,8 @@ class Odd(nn.Module):
         e = torch.stack([a[:, 0], b.sum(-1), b.argmax(-1).float()], dim=1) * 0.1
         e = torch.cat([e, ((a[:, :3] >= 0) & ~(b[:, :3] == 0)).float()], dim=-1)
         e = torch.cat([e[:, :3], x.new_full((x.shape[0], 1), 0.5), e[:, 3:5]], dim=-1)
+        e = e + torch.cat([self.token.expand(x.shape[0], -1), x.new_zeros(x.shape[0], 2, 4).sum(1)], dim=-1)
+        e = torch.addcmul(e, nn.functional.hardtanh(3 * e), e.detach(), value=2)
         return self.last(torch.cat([c, d, e, nn.functional.elu(a)], dim=-1).tanh())
 
 

@@ -78,7 +78,7 @@ def test_no_word_promises_safety():
 def test_the_table_has_a_row_for_each_axis():
     found = [margins_of(DELAY, flown(64, 62, 3, 0), None), margins_of(MASS, flown(*[64] * 5), None)]
     assert rows(found) == [
-        ["", "tried", "within margins", "mean return there", "alive beyond"],
+        ["", "tried", "within margins", "least mean return", "alive beyond"],
         ["action delay", "0 … 30 ms", "0 … 10 ms", "62", "3 of 64 at 20 ms"],
         ["mass", "−30 … +30 %", "−30 … +30 %", "64", "–"],
     ]

@@ -720,12 +720,25 @@ class QIsTheAction(nn.Module):
         return self.weight * action.T
 
 
+class Drawn:
+    """A replay buffer of B rows, of which these are drawn."""
+
+    def __init__(self, transitions, rows):
+        self.transitions, self.rows = transitions, rows
+
+    def __len__(self):
+        return B
+
+    def sample_indices(self, *_):
+        return self.rows[None]
+
+
 @pytest.mark.parametrize(("action", "weight", "share"), [(1.0, 1.0, 1.0), (-1.0, 1.0, 0.0), (1.0, 0.0, 0.5)])
 def test_the_policys_action_stands_beside_one_at_random(action, weight, share):
     columns = Transition(
         numbers(B, O).float(), torch.zeros(B, 1), torch.zeros(B), numbers(B, O).float(), torch.zeros(B).bool()
     )
-    replay = SimpleNamespace(transitions=columns, sample_indices=lambda *_: torch.arange(B)[None])
+    replay = Drawn(columns, torch.arange(B))
     networks = SimpleNamespace(critics=QIsTheAction(), entropy_bonus=lambda *_: 0.0)
     networks.critics.weight.data.fill_(weight)
     state = SimpleNamespace(replay=replay, updates=1, networks=networks, targets=QIsTheAction(), policy=AtAnEnd(action))
@@ -735,13 +748,23 @@ def test_the_policys_action_stands_beside_one_at_random(action, weight, share):
     assert "value/explained" not in found  # targets that are all alike
 
 
+@pytest.mark.parametrize(("drawn", "share"), [(range(B), 1.0), (range(B // 4), 0.25), (range(B - 10, B), 10 / B)])
+def test_the_share_of_the_buffer_that_is_drawn_from_is_told(drawn, share):
+    taken = rows(action=numbers(B, 1).float())
+    columns = Transition(taken.obs, taken.action, taken.reward, taken.next_obs, taken.terminated)
+    networks = SimpleNamespace(critics=QIsTheAction(), entropy_bonus=lambda *_: 0.0)
+    of = {"networks": networks, "targets": QIsTheAction(), "policy": AtAnEnd(1.0)}
+    state = SimpleNamespace(replay=Drawn(columns, torch.tensor(drawn)), updates=1, **of)
+    assert of_critics(state, SimpleNamespace(gamma=0.9), taken)["replay/drawn"].item() == pytest.approx(share)
+
+
 def test_of_the_sampled_targets_q_explains_its_share():
     """Targets are the rewards, as every row ends; Q is the action, which is the reward and noise of a fourth of it."""
     reward, noise = numbers(B).float(), numbers(B, seed=1).float()
     ends = torch.ones(B, dtype=torch.bool)
     taken = rows(action=(reward + 0.5 * noise)[:, None], reward=reward, terminated=ends)
     columns = Transition(taken.obs, taken.action, taken.reward, taken.next_obs, taken.terminated)
-    replay = SimpleNamespace(transitions=columns, sample_indices=lambda *_: torch.arange(B)[None])
+    replay = Drawn(columns, torch.arange(B))
     networks = SimpleNamespace(critics=QIsTheAction(), entropy_bonus=lambda *_: 0.0)
     state = SimpleNamespace(replay=replay, updates=1, networks=networks, targets=QIsTheAction(), policy=AtAnEnd(1.0))
     found = of_critics(state, SimpleNamespace(gamma=0.9), taken)

@@ -95,6 +95,7 @@ def test_the_settings_of_a_config_are_a_point_of_the_space_where_they_lie_in_it(
         ("learning_rate=log:0:1", "learning_rate"),
         ("value_coef=log:0:1", "above 0 and below"),
         ("gamma=.9", "is no range"),
+        ("learning_rate=log:1e-4", "learning_rate=log:1e-4 is no range: write learning_rate=low:high"),
         ("clip=.1|0.10", "is no range"),
         (
             {"gamma": (0.9, 0.99)},

@@ -296,20 +296,24 @@ def diagnose(run: Trained) -> list[Diagnosis]:
     config = kind.from_json(fields)
     own = [preset.config for preset in presets.of(algorithm) if preset.config.env == config.env]
     known = _known_scores(path / FINAL)
-    return doctor.diagnose(doctor.evidence_of(path, config, [*own, kind()], known, _repeats(config)))
+    return doctor.diagnose(doctor.evidence_of(path, config, [*own, kind()], known, *_begins(config)))
 
 
-def _repeats(config: RunConfig) -> bool | None:
-    """Whether a run's environment begins alike from one seed; None where that is not found out in a moment."""
+def _begins(config: RunConfig) -> tuple[bool | None, bool | None]:
+    """Whether a run's environment begins alike from one seed, and otherwise from another one.
+
+    None where that is not found out in a moment.
+    """
     arguments = env_arguments(config)
     try:
         cls = registry.backend_class(arguments["backend"] or registry.backend_for(config.env, config.all_wrappers))
         if cls.compiled or cls.exists_once(config.env, config.num_envs):
-            return None
+            return None, None
         with closing(registry.make(num_envs=2, **arguments)) as env:
-            return torch.equal(env.restart(1).clone(), env.restart(1))
+            one, again, other = (env.restart(seed).clone() for seed in (1, 1, 2))
+            return torch.equal(one, again), not torch.equal(one, other)
     except Exception:  # whatever an environment raises that is no longer as it was in training
-        return None
+        return None, None
 
 
 def scores_of(policy: TrainedPolicy) -> dict[str, Any]:

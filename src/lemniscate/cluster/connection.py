@@ -117,7 +117,9 @@ def pack(path: Path) -> bytes:
     """A run directory, which another process may be writing to: its checkpoints first, then all that is after them."""
     packed = io.BytesIO()
     with tarfile.open(fileobj=packed, mode="w") as archive:
-        for file in sorted(path.rglob("*"), key=lambda file: "checkpoints" not in file.parts):
+        # Not by rglob, which fails at a folder that is renamed meanwhile.
+        files = [Path(folder) / name for folder, _, names in os.walk(path) for name in names]
+        for file in sorted(files, key=lambda file: "checkpoints" not in file.parts):
             own = file.relative_to(path)
             if own.parts[0] not in LEFT and file.suffix != ".tmp":
                 with suppress(FileNotFoundError):  # the process deletes what it needs no longer

@@ -8,6 +8,7 @@ the job's storage, which all machines reach; whoever replaces a worker, or all o
 # Ray is an extra that no check of types needs.
 
 import os
+import shlex
 import signal
 import socket
 import tempfile
@@ -28,7 +29,7 @@ from lemniscate.run.metrics import progress_of
 from lemniscate.run.stopping import Stopped, stop_signals_to
 from lemniscate.system import named, processes
 from lemniscate.system.console import ProgressBar
-from lemniscate.system.files import write_json
+from lemniscate.system.files import remove, write_json
 from lemniscate.system.processes import Processes
 from lemniscate.system.world import CLUSTER, World
 
@@ -84,15 +85,20 @@ def train_on_ray(
             with stop_signals_to(stop), shown:
                 result = trainer.fit()
         except (KeyboardInterrupt, SystemExit):
-            again = f"{resume_line(path)} --cluster ray --workers {workers}"
+            place = f"ray={cluster.address}" if cluster.address else "ray"
+            kept = ["--storage", cluster.storage] if cluster.storage else []
+            again = f"{resume_line(path)} {shlex.join(['--cluster', place, '--workers', str(workers), *kept])}"
             sentence = f"Stopped; the last checkpoint is kept. Go on with: {again}"
             raise Stopped(sentence, asked[0] if asked else signal.SIGINT) from None  # Ray has Ctrl-C for itself
         except TrainingFailedError as error:
             raise RankError(f"The workers failed {FAILURES} times; the last time: {error}") from None
         if result.checkpoint is not None:
             with result.checkpoint.as_directory() as stored:  # the config of the directory stays
-                rmtree(path / "checkpoints", ignore_errors=True)
                 copytree(stored, path, dirs_exist_ok=True, ignore=ignore_patterns(CONFIG, LOCK))
+                newest = {each.name for each in (Path(stored) / "checkpoints").iterdir()}
+            for each in (path / "checkpoints").iterdir():  # last, so that there always is one
+                if each.name not in newest:
+                    remove(each)
         if result.return_value:
             raise RankError(result.return_value)
         rmtree(path / STORAGE, ignore_errors=True)
@@ -149,6 +155,7 @@ def _shown_progress(storage: Path, total_steps: int) -> Iterator[None]:
 def _work(given: dict[str, Any]) -> str | None:
     """The program of each worker. Returns the sentence of what ended the run, if that would end it again."""
     import ray.train
+    import ray.util
     import torch.distributed as dist
     from ray.train.collective import broadcast_from_rank_zero
 
@@ -159,7 +166,7 @@ def _work(given: dict[str, Any]) -> str | None:
     size = next(n for n in range(workers, 0, -1) if shards % n == 0)  # the most that can share the shards equally
     with socket.socket() as free:
         free.bind(("", 0))
-        here = socket.gethostbyname(socket.gethostname()), free.getsockname()[1]
+        here = ray.util.get_node_ip_address(), free.getsockname()[1]  # a host may know itself as 127.0.1.1
     host, port = broadcast_from_rank_zero(here)
     local = {"LOCAL_RANK": context.get_local_rank(), "LOCAL_WORLD_SIZE": min(size, context.get_local_world_size())}
     ranks = {"RANK": rank, "WORLD_SIZE": size, **local, "MASTER_ADDR": host, "MASTER_PORT": port}

@@ -129,11 +129,11 @@ class RayTasks(Places):
                 elif sent:
                     replace_file(run / METRICS, sent)
         except self._ray.exceptions.RayTaskError as error:  # a mistake, which another task would make again
-            (run / LOG).write_text(str(error))
+            (run / LOG).write_text(str(error), "utf-8")
             return 1
         except (self._ray.exceptions.RayError, StopIteration) as error:
             if running.lost == MOST_LOSSES:
-                (run / LOG).write_text(f"{MOST_LOSSES + 1} tasks of this run were lost; the last: {error}")
+                (run / LOG).write_text(f"{MOST_LOSSES + 1} tasks of this run were lost; the last: {error}", "utf-8")
                 return 1
             self.start(run, running.options, running.lost + 1)
         return code

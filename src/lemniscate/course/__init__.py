@@ -11,11 +11,10 @@ compared with those of well-known mistakes, and the mistake that agrees is named
 is judged by what it does; a whole training loop (`skeleton`) by what it learns. `start` lays out the notebooks.
 """
 
-from importlib.machinery import SourceFileLoader
-from types import FunctionType, ModuleType
+from types import FunctionType
 
 from lemniscate.course import functions, loop, parts, setup
-from lemniscate.course.exercise import TEMPLATES, Exercise, Finding, Inspection
+from lemniscate.course.exercise import Exercise, Finding, Inspection
 from lemniscate.course.grading import grade
 from lemniscate.course.loop import skeleton, start
 from lemniscate.course.solution import Function, owner_of
@@ -75,14 +74,3 @@ def check(function: Function, name: str | None = None) -> Finding:
     finding = exercise.judge(name, exercise.observe(function))
     say(finding)
     return finding
-
-
-def __getattr__(name: str) -> ModuleType:
-    """`ppo_from_scratch`: the solution of `skeleton("ppo")`, a text for the reader's own file, as a module."""
-    if name != "ppo_from_scratch":
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}", name=name)
-    loader = SourceFileLoader(f"{__name__}.{name}", str(TEMPLATES / "ppo.py.txt"))
-    module = ModuleType(loader.name)
-    module.__file__ = loader.path
-    loader.exec_module(module)
-    return module

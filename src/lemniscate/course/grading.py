@@ -253,7 +253,7 @@ def as_csv(grades: Mapping[str, Any]) -> str:
 
 def _records(hand_ins: list[Path], demanded: list[str], to: Path) -> Iterator[dict[str, Any]]:
     """The record of each hand-in, which is judged and stored where none is there of what it now contains."""
-    judge, digests, waiting = [*Path(__file__).parent.glob("*.py"), *TEMPLATES.iterdir()], {}, []
+    judge, digests, waiting = [*Path(__file__).parent.glob("*.py"), *filter(Path.is_file, TEMPLATES.iterdir())], {}, []
     for path in hand_ins:
         digest = sha256(json.dumps([version(), demanded, path.name]).encode())
         for file in (*sorted(judge), *files_of(path)):

@@ -27,6 +27,7 @@ from lemniscate.envs.vector_view import VectorView, make_vec
 from lemniscate.errors import UserError, unknown_name
 from lemniscate.run.evaluate import evaluate
 from lemniscate.system.console import say
+from lemniscate.system.files import at_home
 
 SKELETONS = ("ppo",)
 SOLUTION = re.compile(r"^( *)# <solution>\n(.*?) *# </solution>\n", re.DOTALL | re.MULTILINE)
@@ -53,7 +54,7 @@ def skeleton(name: str = "ppo", path: str | Path | None = None) -> Path:
     """
     if name not in SKELETONS:
         raise unknown_name("skeleton", name, SKELETONS)
-    path = Path(path or f"{name}.py")
+    path = at_home(path or f"{name}.py")
     with_gaps = SOLUTION.sub(GAPS, solution(name))
     _write({path: with_gaps.replace(f"python {name}.py", f"python {path.name}")})
     return path
@@ -75,17 +76,18 @@ def start(folder: str | Path, *, solutions: bool = False) -> Path:
     Raises:
         UserError: a file that exists already, and then none is written; a folder that cannot be written.
     """
+    folder = at_home(folder)
     texts = {"README.md": (NOTEBOOKS / "README.md").read_text("utf-8"), **_files(GAPS)}
     if solutions:
         texts |= {f"solutions/{name}": text for name, text in _files(SOLVED).items()}
-    _write({Path(folder) / name: text for name, text in texts.items()})
-    return Path(folder) / "README.md"
+    _write({folder / name: text for name, text in texts.items()})
+    return folder / "README.md"
 
 
 def _write(files: dict[Path, str]) -> None:
     """Write new files: `UserError` where one exists, and then none is written, or cannot be written."""
-    for file in filter(Path.exists, files):
-        raise UserError(f"{file} exists already, and nothing is overwritten; name another place.")
+    if there := list(filter(Path.exists, files)):
+        raise UserError(f"{there[0]} exists already, and nothing is overwritten; name another place.")
     for file, text in files.items():
         try:
             file.parent.mkdir(parents=True, exist_ok=True)

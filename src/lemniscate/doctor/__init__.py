@@ -124,6 +124,7 @@ def evidence_of(
     recommended: Sequence[RunConfig],
     scores: Mapping[str, Any],
     repeats: bool | None,
+    varies: bool | None,
 ) -> Evidence:
     """The evidence on the run in a directory.
 
@@ -134,10 +135,11 @@ def evidence_of(
             nearest to the run's is what it is compared with.
         scores: of its final evaluation; empty where there is none.
         repeats: whether its environment begins alike from one seed; None where that was not tried.
+        varies: whether it begins otherwise from another one; None as well.
     """
     given = with_ratios(config.to_json())
     known = [with_ratios(one.to_json()) for one in recommended]
     nearest = min(known, key=lambda one: sum(one[name] != value for name, value in given.items()))
     tried = {name: {str(one[name]) for one in (nearest, known[-1])} for name in nearest}
     usual = usual_ranges(field_help(type(config)))
-    return Evidence(given, nearest, tried, usual, read_metrics(run), scores, repeats)
+    return Evidence(given, nearest, tried, usual, read_metrics(run), scores, repeats, varies)

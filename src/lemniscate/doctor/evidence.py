@@ -26,6 +26,7 @@ class Evidence:
         log: the lines of its metrics.
         scores: of its final evaluation; empty where there is none.
         repeats: whether its environment begins alike from one seed; None where that was not tried.
+        varies: whether it begins otherwise from another seed; None where that was not tried.
     """
 
     config: Mapping[str, Any]
@@ -35,6 +36,7 @@ class Evidence:
     log: Sequence[Mapping[str, Any]]
     scores: Mapping[str, Any]
     repeats: bool | None = None
+    varies: bool | None = None
 
     @cached_property
     def returns(self) -> np.ndarray:

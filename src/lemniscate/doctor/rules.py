@@ -93,6 +93,7 @@ CONSEQUENCES = {
     "gradient-grows": {"value-runaway"},
     "policy-still": {"units-inactive"},
     "advantage-unrelated": {"kl-too-large"},
+    "q-unfollowed": {"policy-still"},
     "acts-at-mode": {"advantage-opposed"},
     "replay-differs": {"replay-repeated"},
     "setting-entropy-coef": {"entropy-opposed"},
@@ -134,10 +135,7 @@ def of_observations(e: Evidence) -> Seen:
             " at.",
         )
     elif repeated > 0.5 and not cut > 0.5 and not e.returns_alike:  # else the environment itself stands still
-        yield (
-            "observation-repeated",
-            f"After {repeated:.0%} of the steps the observation was the same as before.",
-        )
+        yield "observation-repeated", f"After {repeated:.0%} of the steps the observation was the same as before."
     elif predicted < 0.25 and whole > 0.95:
         yield (
             "observation-repeated",
@@ -212,10 +210,7 @@ def of_actions(e: Evidence) -> Seen:
         none = np.median(effects[first]) < 0.02 and most < 0.1  # of a hundred rows chance explains 0.07
         paid = e.early("action/paid") > 0.1  # as where each step is a task of its own
         if not paid and (none or (len(shares) and explained < 0.001)):
-            yield (
-                "action-without-effect",
-                f"Actions explain {max(0.0, explained):.2%} of how observations change.",
-            )
+            yield "action-without-effect", f"Actions explain {max(0.0, explained):.2%} of how observations change."
 
 
 def of_parts_of_actions(e: Evidence) -> Seen:
@@ -311,10 +306,7 @@ def of_episodes(e: Evidence) -> Seen:
     if e.log and not len(e.returns):
         yield "no-episode", "No whole episode ended in training."
     if short:
-        yield (
-            "short-episodes",
-            f"Nine of ten episodes took {np.percentile(e.lengths, 90):.0f} or fewer steps.",
-        )
+        yield "short-episodes", f"Nine of ten episodes took {np.percentile(e.lengths, 90):.0f} or fewer steps."
     elif e.returns_alike and e.returns.any():
         cut = terminated == 0 and np.ptp(e.lengths) == 0
         yield (
@@ -329,7 +321,8 @@ def of_episodes(e: Evidence) -> Seen:
             f"{np.sum(late == longest):,} of the last {len(late):,} episodes terminated after exactly {longest:,.0f}"
             " steps.",
         )
-    if len(starts) > 2 and starts.min() == 1 and e.late("observation/whole") < 0.9:  # a board begins alike
+    alike = e.varies is False or (len(starts) > 2 and starts.min() == 1)
+    if alike and e.late("observation/whole") < 0.9:  # a board begins alike
         yield "starts-alike", "Every episode began with the same observation."
     again = e.values("observation/jumps_every")
     if len(again) >= 3 and np.ptp(again) == 0:
@@ -406,6 +399,8 @@ def of_updates(e: Evidence) -> Seen:
         yield "policy-still", f"The KL divergence of the late updates is {kl:.1g}: the policy hardly moves."
     elif e.greatest("network/moved") == 0:
         yield "policy-still", "No update that was looked at changed a parameter of the policy."
+    elif len(flat := e.last_half("gradient_norm/actor")) >= 3 and not flat.any():
+        yield "policy-still", "The gradient of the policy is 0 in each of the late lines."
 
 
 def of_exploration(e: Evidence) -> Seen:
@@ -484,7 +479,9 @@ def of_advantages(e: Evidence) -> Seen:
     missing = e.late("value/missing")
     learned = (missing < -2 or not e.late("explained_variance") < 0.1) and not missing > 0
     most = 2.0 if missing < -2 else 1.2  # below, V is only behind; above, it has no scale yet, or feeds on itself
-    ignored = learned and 0.8 < awaited < most and not e.beyond("gamma", *e.usual.get("gamma", (0.0, 1.0)))
+    others = e.late("value/explained") < 0.1 and e.late("explained_variance") > 0.5  # targets than those of GAE
+    near = not e.beyond("gamma", *e.usual.get("gamma", (0.0, 1.0)))
+    ignored = near and ((learned and 0.8 < awaited < most) or (others and awaited > 1.2))
     wrong = ignored or abs(missing) > 40 or _lacks_bootstrap(e)  # the value, and so the advantages
     if ignored:
         yield (
@@ -597,7 +594,10 @@ def _lacks_bootstrap(e: Evidence) -> bool:
 
 
 def of_replay(e: Evidence) -> Seen:
-    """Faults of what stands in the replay buffer."""
+    """Faults of what stands in the replay buffer, and of what is drawn from it."""
+    drawn = e.last_half("replay/drawn")
+    if len(drawn) >= 3 and drawn.max() < 0.8:
+        yield "replay-part", f"The transitions that are drawn are from {drawn.max():.0%} of the replay buffer alone."
     for name, least, what in (
         ("actions", 0.5, "the stored transitions the action is not the one that was taken."),
         ("next", 0.01, "the stored transitions the next observation is not the one that followed."),
@@ -689,15 +689,9 @@ def of_networks(e: Evidence) -> Seen:
     if len(alike) >= 3 and alike.min() == 1:
         yield "units-alike", "At every observation all hidden units of the policy's last layer say the same."
     if inactive > 0.6:
-        yield (
-            "units-inactive",
-            f"{inactive:.0%} of the policy's hidden units are the same at every observation.",
-        )
+        yield "units-inactive", f"{inactive:.0%} of the policy's hidden units are the same at every observation."
     if saturated > 0.6:
-        yield (
-            "units-saturated",
-            f"{saturated:.0%} of what the policy's hidden units say is at a bound of tanh.",
-        )
+        yield "units-saturated", f"{saturated:.0%} of what the policy's hidden units say is at a bound of tanh."
     if len(norms) >= 8 and norm > times * norms[0]:
         yield "gradient-grows", f"The norm of the gradient rose from {norms[0]:.3g} to {norms[-1]:.3g}."
     if limit and norm > 30 * limit:
@@ -761,13 +755,12 @@ def of_evaluations(e: Evidence) -> Seen:
         )
     if abs(bias) > 0.5 and not e.rose and e.q_steps >= 4_000:  # before, Q is only new
         yield "q-biased", f"Q {'over' if bias > 0 else 'under'}-estimates the return by {abs(bias):.0%}."
-    if (e.config.get("evaluate_every") and each < 5) or 0 < len(returns) < 5:
-        few = each if e.config.get("evaluate_every") and each < 5 else len(returns)
+    asked, played = each if e.config.get("evaluate_every") else np.inf, len(returns) or np.inf
+    if (few := min(asked, played)) < 5:
         yield "too-few-episodes", f"An evaluation has {few} {'episode' if few == 1 else 'episodes'}."
-    elif e.config.get("evaluate_every") and each < 10:
-        episodes = "episode" if each == 1 else "episodes"
-        yield "few-episodes", f"Each evaluation has {each} {episodes}, and the best may be one of luck."
-    elif 0 < len(returns) < 20:
+    elif asked < 10:
+        yield "few-episodes", f"Each evaluation has {each} episodes, and the best may be one of luck."
+    elif played < 20:
         yield (
             "few-episodes",
             f"The evaluation has {len(returns)} episodes, of standard deviation {np.std(returns):,.3g}.",

@@ -65,7 +65,8 @@ class Air:
     def delay(self) -> tuple[float, float]:
         """Seconds from an observation to its action's effect, the least and the most."""
         late = [self.ranges.get(name, (0.0, 0.0)) for name in ("action_delay", "observation_delay")]
-        return sum(least for least, _ in late), sum(most for _, most in late)
+        jitter = self._most("jitter") / self.frequency
+        return sum(least for least, _ in late), sum(most for _, most in late) + jitter
 
     def empty(self, key: jax.Array) -> dict[str, Any]:
         """The air before the first episode."""
@@ -80,8 +81,8 @@ class Air:
         if self.is_windy:
             air |= {"wind": jnp.zeros((n, 3)), "gust": jnp.zeros((n, 3))}
         if self.is_blurred:
-            entries = math.floor(self._most("observation_delay") * self.frequency + 1e-6) + 1
-            air |= {"states": jnp.zeros((n, entries, STATE_SIZE)), "bias": jnp.zeros((n, 12))}
+            steps = self._most("observation_delay") * self.frequency + 0.5 / self.substeps  # as `steps_behind` rounds
+            air |= {"states": jnp.zeros((n, math.floor(steps + 1e-6) + 1, STATE_SIZE)), "bias": jnp.zeros((n, 12))}
         if self.is_blurred or self.history:
             air["seen"] = jnp.zeros((n, STATE_SIZE))
         if self.history:

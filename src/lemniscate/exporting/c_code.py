@@ -79,7 +79,7 @@ def c_files(
 
 def comment(text: str) -> str:
     """Text that cannot end the comment in C in which it stands; anyone may have written the run that it comes from."""
-    return " ".join(text.replace("*/", "* /").replace("\\", "/").split())
+    return " ".join(text.replace("\\", "/").replace("*/", "* /").replace("/*", "/ *").split())
 
 
 def functions(text: str) -> str:
@@ -133,7 +133,7 @@ class Body:
         if program.after:
             self._write(program.after, "memory")
         self.places = self._places()
-        self.scratch = max((self.places[name] + size for name, size in self._sizes.items()), default=1)
+        self.scratch = max((self.places[name] + size for name, size in self._sizes.items()), default=0)
 
     def _places(self) -> dict[str, int]:
         """First fit, the largest first; an array lives from the first statement that names it to the last."""
@@ -357,7 +357,9 @@ def crazyflie_files(
     """
     if tuple(quantity.name for quantity in interface.action) != COMMANDS or not isinstance(action, Box):
         raise UserError("its actions are not roll, pitch, yaw and thrust")
-    rate = round(1 / interface.period) if interface.period else 0
+    if not interface.period:
+        raise UserError("the time between its actions is not known")
+    rate = round(1 / interface.period)
     if not rate or LOOP % rate:
         raise UserError(f"its {rate} actions a second do not divide the firmware's {LOOP}")
     names = [quantity.name for quantity in quantities]

@@ -24,7 +24,7 @@ SECTIONS = ("-ffunction-sections", "-fdata-sections", "-fstack-usage")
 
 def host_compiler() -> str | None:
     """The C compiler of this machine: that of the variable CC, or the first of cc, gcc and clang that is installed."""
-    names = [*filter(None, [os.environ.get("CC")]), "cc", "gcc", "clang"]
+    names = os.environ.get("CC") or "cc", "cc", "gcc", "clang"
     return next(filter(None, map(shutil.which, names)), None)
 
 
@@ -37,14 +37,17 @@ class HostPolicy:
         flags: besides `FLAGS`, which ask for warnings as errors.
 
     Raises:
-        UserError: the compiler refuses.
+        UserError: the compiler refuses, or makes what cannot be loaded here.
     """
 
     def __init__(self, files: Mapping[str, str], compiler: str, flags: tuple[str, ...] = ("-O2",)) -> None:
         with _written(files, "rows.c") as folder:
             command = [compiler, *FLAGS, *flags, "-fPIC", "-shared", "-o", "policy.so", "policy.c", "rows.c"]
             run_tool(command, folder)
-            self._library = ctypes.CDLL(str(folder / "policy.so"))
+            try:
+                self._library = ctypes.CDLL(str(folder / "policy.so"))
+            except OSError as error:  # of another machine, or on a disk from which nothing may be executed
+                raise UserError(f"What {Path(compiler).name} made cannot be loaded here: {error}.") from None
         self._library.policy_self_test.restype = ctypes.c_float
         sizes = re.findall(r"^#define POLICY_(?:ACTIONS|MEMORY) (\d+)$", files["policy.h"], re.MULTILINE)
         self.columns = sum(map(int, sizes))
@@ -115,7 +118,7 @@ def simulate(files: Mapping[str, str], obs: np.ndarray, columns: int) -> tuple[n
         UserError: compiler or emulator fails.
     """
     with _written(files, "runner.c", "runner.ld") as folder:
-        linked = ["-nostartfiles", "--specs=nano.specs", "-T", "runner.ld", "-Wl,--no-warn-rwx-segments"]
+        linked = ["-nostartfiles", "--specs=nano.specs", "-T", "runner.ld"]
         run_tool([TARGET_COMPILER, *CORE, "-std=gnu99", *linked, "policy.c", "runner.c", "-o", "runner.elf"], folder)
         obs.astype("<f4").tofile(folder / "observations.bin")
         machine = ["-M", "mps2-an386", "-cpu", "cortex-m4", "-display", "none", "-serial", "none", "-monitor", "none"]

@@ -115,19 +115,24 @@ def _contents(policy: TrainedPolicy, program: Program) -> tuple[dict[str, bytes]
     wrappers = list(policy.config.wrappers)
     facts = {"title": named, "environment": policy.spec.env_id, "wrappers": wrappers, "step": policy.step}
     model = onnx_model(program, facts) if is_installed("onnx") else None
-    acting, act = _actor(policy, program, model, compiler)
+    absent = "There is no C compiler here (cc, gcc, clang or CC): policy.c is not compared on this machine."
+    try:
+        acting, act = _actor(policy, program, model, compiler)
+    except UserError as error:  # one that makes nothing for this machine
+        compiler, absent = None, f"policy.c is not compared on this machine: {error}"
+        acting, act = _actor(policy, program, model, None)
     flights, interface = fly(policy, act)
     tests = self_tests(policy, flights.rows(true, program.memory_size))
     edges = f", and {len(tests) - TESTS} with one number far outside of them" if len(tests) > TESTS else ""
     origin = f"{TESTS} of episodes of {policy.spec.env_id}{edges}"
     about = {"title": named, "origin": origin, "period": interface.period, "wrappers": wrappers}
     texts = c_files(program, action, tests, true(tests), **about)
-    found = parity(program, action, true, flights, texts, model, HostPolicy(texts, compiler) if compiler else None)
+    found = parity(program, action, true, flights, texts, model, HostPolicy(texts, compiler) if compiler else absent)
     record = {"environment": policy.spec.env_id, "acting": acting, "reference": "torch", **found}
     said, vehicle = sentences(record), dict[str, str]()
     if wrappers:
         said.append(
-            f"NOT in the files: the wrappers {', '.join(wrappers)}; what they do is to be done around the policy."
+            f"NOT in the files: the wrappers {', '.join(wrappers)}; what they do, the caller of the policy has to do."
         )
     if interface.vehicle == CRAZYFLIE:
         try:

@@ -111,6 +111,7 @@ def self_tests(policy: TrainedPolicy, obs: np.ndarray) -> np.ndarray:
     edges = real[:: TESTS // EDGES].copy()
     for row, column in enumerate(np.linspace(0, size - 1, EDGES).round().astype(int)):
         edges[row, column] = (mean + (-1) ** row * far)[column]
+    edges = edges if isinstance(action, Box) else edges[_clear(policy, edges)]
     return np.concatenate([real, edges]).astype(np.float32)
 
 
@@ -129,13 +130,13 @@ def parity(
     flights: Flights,
     files: Mapping[str, str],
     model: bytes | None,
-    host: HostPolicy | None,
+    host: HostPolicy | str,
 ) -> dict[str, Any]:
     """The record; `missing` has a sentence for everything that could not be compared.
 
     Compared with `act`, the policy itself with its kind of actions, at the observations of `flights`: `model`, which is
-    `policy.onnx`, and the C in `files`, which is compiled here as `host`. Of a policy with a memory, each carries its
-    own through the flights too, `over_episodes`.
+    `policy.onnx`, and the C in `files`, which is compiled here as `host`; else that is the sentence on why not. Of a
+    policy with a memory, each carries its own through the flights too, `over_episodes`.
     """
     obs = flights.rows(act, program.memory_size)
     true, tolerance = act(obs), BFLOAT16_TOLERANCE if program.is_rounded else TOLERANCE
@@ -157,8 +158,8 @@ def parity(
         run, version = onnx_act(model)
         record["onnx"] = {**compared_with(run(obs), true), **carries(run), "onnxruntime": version}
         costs["onnxruntime"] = nanoseconds(lambda: run(obs[:1]))
-    if host is None:
-        missing.append("There is no C compiler here (cc, gcc, clang or CC): policy.c is not compared on this machine.")
+    if isinstance(host, str):
+        missing.append(host)
     else:
         compared = compared_with(host.act(obs), true)
         record["c_host"] = {**compared, **carries(host.act), "self_test": host.self_test(), "compiler": host.compiler}
@@ -194,10 +195,14 @@ def _on_target(
     absent = compiled.missing_target_tools()
     if TARGET_COMPILER in absent:
         return None, [
-            f"{TARGET_COMPILER} is not installed: nothing is known of the target (Debian: gcc-arm-none-eabi)."
+            f"{TARGET_COMPILER} is not installed: nothing is measured on the target"
+            " (Debian: gcc-arm-none-eabi and libnewlib-arm-none-eabi)."
         ]
     command = " ".join((TARGET_COMPILER, *CORE))
-    record: dict[str, Any] = {**compiled.target_sizes(files), "compiled_with": command}
+    try:
+        record: dict[str, Any] = {**compiled.target_sizes(files), "compiled_with": command}
+    except UserError as error:
+        return None, [f"Nothing is measured on the target: {error}"]
     if absent:
         missing = f"{EMULATOR} is not installed: policy.c is not run on the target (Debian: qemu-system-arm)."
         return record, [missing]

@@ -341,7 +341,12 @@ def _split(walk: Walk, x: Value, _sizes: Any, axis: int = 0) -> list[Value]:
 
 
 def _shaped(name: str) -> Translation:
-    return lambda walk, x, *_, **__: x if x.shape == walk.shape else walk.add(name, x)
+    def translation(walk: Walk, x: Any, *_: Any, **__: Any) -> Any:
+        if not isinstance(x, Value):  # a constant: with a batch axis of length 1, as `_full`
+            return (x.expand if name == "Expand" else x.reshape)(1, *walk.shape)
+        return x if x.shape == walk.shape else walk.add(name, x)
+
+    return translation
 
 
 def _permute(walk: Walk, x: Value, axes: list[int]) -> Value:
@@ -367,7 +372,7 @@ def _in_batch(walk: Walk, numbers: np.ndarray, x: Value, own: int) -> Value:
 
 
 def _full(walk: Walk, _size: Any, number: float = 0.0, **_: Any) -> Tensor:
-    return torch.full(walk.shape, number, dtype=walk.fake.dtype)
+    return torch.full((1, *walk.shape), number, dtype=walk.fake.dtype)
 
 
 TRANSLATIONS: dict[str, Translation] = {
@@ -388,7 +393,8 @@ TRANSLATIONS: dict[str, Translation] = {
     **dict.fromkeys(("_to_copy", "to"), lambda walk, x, *_, **__: walk.rounded(walk.as_kind(x))),
     "relu": lambda walk, x: walk.add("Max", x, np.float32(0)),
     "silu": lambda walk, x: walk.add("Mul", x, walk.add("Sigmoid", x)),
-    **dict.fromkeys(("clamp", "hardtanh", "clamp_min"), _clamp),
+    **dict.fromkeys(("clamp", "clamp_min"), _clamp),
+    "hardtanh": lambda walk, x, low=-1.0, high=1.0: _clamp(walk, x, low, high),
     "pow": _power,
     "square": lambda walk, x: _power(walk, x, 2),
     "reciprocal": lambda walk, x: _power(walk, x, -1),
@@ -414,7 +420,7 @@ TRANSLATIONS: dict[str, Translation] = {
     **dict.fromkeys(("full", "full_like", "zeros", "zeros_like"), _full),
     "ones_like": lambda walk, x, **_: _full(walk, x, 1.0),
     "lerp": lambda walk, a, b, weight: walk.add("Add", a, walk.add("Mul", weight, walk.add("Sub", b, a))),
-    "addcmul": lambda walk, x, a, b: walk.add("Add", x, walk.add("Mul", a, b)),
+    "addcmul": lambda walk, x, a, b, value=1: TRANSLATIONS["add"](walk, x, walk.add("Mul", a, b), alpha=value),
     "sym_size": lambda walk, *_: BATCH,
     **dict.fromkeys(("alias", "clone", "detach", "contiguous"), lambda walk, x, *_, **__: x),
     "getitem": lambda walk, parts, index: parts[index],

@@ -15,7 +15,15 @@ from lemniscate.envs import probe as probes
 from lemniscate.envs import registry
 from lemniscate.errors import UserError
 from lemniscate.exporting.compiled import HostPolicy, host_compiler
-from lemniscate.exporting.deployed import Act, act_with, carried, for_policy, input_size, memory_size
+from lemniscate.exporting.deployed import (
+    Act,
+    act_with,
+    carried,
+    difference_units,
+    for_policy,
+    input_size,
+    memory_size,
+)
 from lemniscate.exporting.export import MANIFEST, commit
 from lemniscate.margins.presentation import FAILS, FALLS_SHORT, draw, rows, sentences, smoothness_sentence
 from lemniscate.margins.record import AxisMargins, margins_of, smoothness, worst_accepted
@@ -159,14 +167,16 @@ def _compiled(policy: TrainedPolicy, run: Path) -> Act:
         files = {name: (folder / name).read_text("utf-8") for name in ("policy.c", "policy.h")}
         if any(sha256(text.encode()).hexdigest() != digests[name] for name, text in files.items()):
             raise UserError(f"{folder} has been changed since it was written: lemniscate export {run}")
-    except (DamagedFileError, OSError, KeyError, TypeError):
+    except (DamagedFileError, OSError, KeyError, TypeError, UnicodeDecodeError):
         raise UserError(f"There is no whole export of {run}: lemniscate export {run}") from None
     if step != policy.step:
         raise UserError(f"{folder} is of step {step:,}, the policy of step {policy.step:,}: lemniscate export {run}")
     act = HostPolicy(files, compiler).act
     inputs = input_size(policy.spec) + memory_size(policy)
     rows = np.random.default_rng(0).standard_normal((64, inputs)).astype(np.float32)
-    if not np.allclose(act(rows), act_with(policy)(rows), rtol=1e-2, atol=1e-2):
+    true = act_with(policy)(rows)
+    apart = (np.abs(act(rows) - true) / difference_units(policy.spec.action, true)).max(1)
+    if np.quantile(apart, 0.9) > 1e-2:  # products in bfloat16 round a few rows the other way
         raise UserError(f"{folder} is of another policy: lemniscate export {run}")
     return act
 
@@ -188,6 +198,8 @@ def _probe(policy: TrainedPolicy, episodes: int, given: Mapping[str, Any]) -> pr
     if probe is None:
         arguments["kwargs"] |= given
         probe = VectorProbe(starts=episodes, **arguments)
+        if not (probe.axes and probe.spec.fits(policy.spec)):
+            probe.close()
     if not probe.spec.fits(policy.spec):
         raise UserError(f"{policy.spec.env_id} has other spaces here than in training.")
     if not probe.axes:

@@ -26,7 +26,7 @@ ALIVE, RETURN, BEYOND = COLORS[0], COLORS[1], COLORS[3]
 
 def rows(found: Sequence[AxisMargins]) -> list[list[str]]:
     """The cells of the table, its heading first: what was tried, what is within the margins, what is beyond."""
-    cells = [["", "tried", "within margins", "mean return there", "alive beyond"]]
+    cells = [["", "tried", "within margins", "least mean return", "alive beyond"]]
     for one in found:
         axis, inside, episodes = one.axis, one.within(), one.episodes
         least = min(map(one.return_at, inside), default=None)

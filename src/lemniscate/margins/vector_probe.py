@@ -128,7 +128,11 @@ class VectorProbe:
                 points[axis.name] = list(flown)
             return nominal, points
         finally:
-            self._env.close()
+            self.close()
+
+    def close(self) -> None:
+        """Close the environments."""
+        self._env.close()
 
     def _at(self, axis: Axis, value: Value, scale: Tensor | None, act: Act, seed: int) -> Flown:
         rng = generator(seed, CPU, 1)

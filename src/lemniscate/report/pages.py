@@ -159,7 +159,10 @@ def comparison_part(
 
 def _from(page: Path, file: Path) -> str:
     """The path from a page to a file, which holds as long as both are moved together; none where it is not there."""
-    return Path(os.path.relpath(file, page.parent)).as_posix() if file.exists() else ""
+    try:
+        return Path(os.path.relpath(file, page.parent)).as_posix() if file.exists() else ""
+    except ValueError:  # Windows has no path from one drive to another
+        return file.resolve().as_uri()
 
 
 def write_card(

@@ -251,11 +251,13 @@ def save_frames(frames: Iterable[np.ndarray], file: Path, fps: float) -> None:
         file.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UserError(f"{file} cannot be written: {error.strerror}.") from error
-    remove(file)  # writing would follow a link
+    aside = file.with_name(f"{file.stem}.tmp{file.suffix}")
+    remove(aside)  # writing would follow a link
     try:
-        _write(_of_one_size(frames, file), file, fps)
-    except BaseException:  # what draws the frames may fail: no half of a video is left
-        file.unlink(missing_ok=True)
+        _write(_of_one_size(frames, file), aside, fps)
+        aside.replace(file)
+    except BaseException:  # what draws the frames may fail: an older video stays, and no half of one is left
+        aside.unlink(missing_ok=True)
         raise
 
 

@@ -484,18 +484,20 @@ def of_critics(state: Any, config: RunConfig, rows: Rollout) -> dict[str, Tensor
 
     For algorithms that learn Q(s, a) of continuous actions; those that have no replay sample the newest rows. Also what
     Q awaits where an episode terminated, beyond its reward, over |Q|; the explained variance of the sampled targets by
-    Q; the length of the target networks' weights, their distance from Q's as a share of the length of these; the share
-    of the sampled transitions in which Q of the policy's action is above that of one at random; and the entropy of
-    uniform actions, which no other policy within the bounds has.
+    Q; the share of the buffer that the sampled rows are from; the length of the target networks' weights, their
+    distance from Q's as a share of the length of these; the share of the sampled transitions in which Q of the policy's
+    action is above that of one at random; and the entropy of uniform actions, which no other policy within the bounds
+    has.
     """
     replay, networks, gamma = getattr(state, "replay", None), state.networks, getattr(config, "gamma", 1.0)
     if not hasattr(networks, "entropy_bonus") or not getattr(state, "updates", replay is None):
         return {}
     generator = Generator(rows.reward.device).manual_seed(getattr(state, "updates", 0))  # none of the run's own
     newest = sampled = Transition(rows.obs, rows.action, rows.reward, rows.next_obs, rows.terminated)[-SEEN:]
-    critics = targets = None
+    critics, targets, share = None, None, torch.ones(())
     if replay is not None:
-        sampled = replay.transitions[replay.sample_indices(1, SEEN, generator)[0]]
+        drawn = replay.sample_indices(1, SEEN, generator)[0]
+        sampled, share = replay.transitions[drawn], (drawn.max() - drawn.min() + 1) / len(replay)
         critics, targets = networks.critics, getattr(state.targets, "critics", state.targets)
 
     def critic(*pair: Tensor) -> Tensor:
@@ -527,6 +529,7 @@ def of_critics(state: Any, config: RunConfig, rows: Rollout) -> dict[str, Tensor
         found |= {
             "td_error/newest": (q - target).square().mean(),
             "td_error/sampled": (other_q - other_target).square().mean(),
+            "replay/drawn": share,
             "replay/repeated": (sampled.obs == sampled.next_obs).flatten(1).all(1).float().mean(),
             "targets/behind": (own - behind).norm() / own.norm(),
             "targets/length": behind.norm(),

@@ -136,7 +136,7 @@ def draw(space: Space, trial: Any) -> dict[str, Any]:
 
 def _range(name: str, text: str, hint: Any, config: RunConfig) -> Interval | Choice:
     """The range that a text stands for; every end of it is a value that the Config has room for."""
-    ends = re.fullmatch(r"(log:)?([^:|]+):([^:|]+)", text)
+    ends = re.fullmatch(r"(log:)?(?!log:)([^:|]+):([^:|]+)", text)
     if not ends:
         known = f"write {name}=low:high, {name}=log:low:high or {name}=a|b"
         if ":" in text and kinds_of(hint).keys() & {int, float}:

@@ -284,7 +284,8 @@ def seeds_of(seeds: str | int | Iterable[int]) -> list[int]:
     if not isinstance(seeds, str):
         seeds = getattr(seeds, "tolist", lambda: seeds)()  # of NumPy's and torch's arrays
         given = islice(seeds, MOST_SEEDS + 1) if isinstance(seeds, Iterable) else [seeds]
-        seeds = ",".join(seed if isinstance(seed, str) else shown(seed) for seed in given)
+        numbers_of = [getattr(seed, "item", lambda seed=seed: seed)() for seed in given]  # of NumPy's and torch's
+        seeds = ",".join(seed if isinstance(seed, str) else shown(seed) for seed in numbers_of)
     numbers: dict[int, None] = {}
     for part in seeds.split(","):
         ends = re.fullmatch(r"([0-9]{1,20})(?:-([0-9]{1,20}))?", part.strip())

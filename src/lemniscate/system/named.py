@@ -153,8 +153,10 @@ def find_callable(text: str) -> Callable[..., Any]:
         return found
     try:
         call = ast.parse(f"f({rest}", mode="eval").body
-        if not isinstance(call, ast.Call) or any(keyword.arg is None for keyword in call.keywords):
+        if not isinstance(call, ast.Call) or not isinstance(call.func, ast.Name):  # such as f(a=1)(b=2)
             raise ValueError("not a call")
+        if any(keyword.arg is None for keyword in call.keywords):
+            raise ValueError("keywords without names")
         keywords = {str(keyword.arg): ast.literal_eval(keyword.value) for keyword in call.keywords}
         positional = [ast.literal_eval(value) for value in call.args]
     except (SyntaxError, ValueError) as error:

@@ -7,6 +7,7 @@ such as the worker of an environment, ends with it, however that ends.
 
 import faulthandler
 import json
+import math
 import os
 import select
 import signal
@@ -19,6 +20,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any
 
+from lemniscate.errors import UserError
 from lemniscate.system.console import say
 
 PATIENCE = "LEMNISCATE_PATIENCE"
@@ -43,6 +45,15 @@ class Beat:
     steps_at: float
 
 
+def patience() -> float:
+    """The seconds in the variable `PATIENCE`. Raises `UserError` where it is no such number."""
+    text = os.environ.get(PATIENCE, "8")
+    with suppress(ValueError):
+        if 0 < float(text) < math.inf:
+            return float(text)
+    raise UserError(f"{PATIENCE} must be a number of seconds above 0, not {text!r}.")
+
+
 class Watch:
     """One process's part of the watch; the `store` is a connection of its own to what the processes share."""
 
@@ -51,7 +62,7 @@ class Watch:
         """counts whatever this process does"""
         self._more: Callable[[], int] = int
         self._store, self._rank, self._size = store, rank, size
-        self._doing, self._patience = "busy", float(os.environ.get(PATIENCE, 8))
+        self._doing, self._patience = "busy", patience()
         self._others: dict[int, Beat] = {}
         self._closed, self._nowhere = threading.Event(), open(os.devnull, "w")  # noqa: SIM115, PTH123
         self._thread = threading.Thread(target=self._run, daemon=True)

@@ -11,7 +11,9 @@
 
 static const float safe_action[POLICY_ACTIONS] = {{ safe | braces }};
 
+{% if body.scratch %}
 static float scratch[{{ body.scratch }}];
+{% endif %}
 
 {{ body.statements | join("\n") | functions }}
 static int is_finite(float x)
