@@ -215,7 +215,7 @@ def test_what_is_not_finished_is_in_the_curves_alone(tmp_path, monkeypatch, caps
     ends = sorted(line.get_xdata()[-1] for line in figure.axes[0].lines if len(line.get_xdata()) > 2)
     assert ends == [4_000, 10_000]
     said = capsys.readouterr().err
-    assert f"Not finished, so in the curves alone: {runs[-1]}." in said
+    assert f"Not finished, and so only in the curves: {runs[-1]}." in said
     assert "3 of 4" in said
     assert "101.0" in said
 

@@ -237,9 +237,9 @@ def test_a_repository_of_something_else_is_a_sentence(server):
         ("hf://anna/secret", "", "no such repository on the Hub, or you may not read it; `hf auth login`"),
         (f"{ADDRESS}@v9", hub_server.WRITER, f"{ADDRESS}@v9: The repository on the Hub has no such revision."),
         (ADDRESS, "hf_old", "The Hub refuses: it does not know your token; log in again with `hf auth login`"),
-        ("hf://anna", hub_server.WRITER, "hf://anna is no policy on the Hub: hf://user/name, or hf://user/name@revision"),
-        ("hf://anna/a/b", hub_server.WRITER, "hf://anna/a/b is no policy on the Hub"),
-        (f"{ADDRESS}@", hub_server.WRITER, f"{ADDRESS}@ is no policy on the Hub"),
+        ("hf://anna", hub_server.WRITER, "hf://anna is no address of a policy, such as hf://user/name or hf://user/name@revision"),
+        ("hf://anna/a/b", hub_server.WRITER, "hf://anna/a/b is no address of a policy"),
+        (f"{ADDRESS}@", hub_server.WRITER, f"{ADDRESS}@ is no address of a policy"),
         ("hf://anna/a..b", hub_server.WRITER, "hf://anna/a..b: Cannot have -- or .."),
     ],
 )  # fmt: skip

@@ -429,7 +429,7 @@ def test_margins_need_nothing_that_is_privileged():
 @pytest.mark.parametrize(
     ("kwargs", "sentence"),
     [
-        ({"mass": [1.2, 0.8]}, "mass is a range upside down: 1.2 is above 0.8."),
+        ({"mass": [1.2, 0.8]}, "mass has a range whose low end 1.2 is above its high end 0.8."),
         ({"mass": "heavy"}, "mass must be a number or a range [low, high], not 'heavy'."),
         ({"mass": [1, 2, 3]}, "mass must be a number or a range"),
         ({"mass": True}, "mass must be a number or a range"),

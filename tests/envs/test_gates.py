@@ -425,7 +425,7 @@ def test_what_is_wrong_is_said(kwargs, said):
         (("start = [-1.0, 0.0, 0.5]", ""), "lacks 'start'"),
         (("[[gates]]", "[gates"), "is no track"),
         (("[[gates]]", "[gates]"), r"gates are tables, each below \[\[gates\]\], not {'position"),
-        (("order = [1, -1]", "order = 1"), "order names gates from 1 to 1, in reverse with a minus, not 1"),
+        (("order = [1, -1]", "order = 1"), "order names gates from 1 to 1, with a minus if in reverse, not 1"),
         (("order = [1, -1]", "order = [1.0]"), r"not \[1.0\]"),
         (("order = [1, -1]", "order = [true]"), r"not \[True\]"),
         (("order = [1, -1]", "order = [[1], [1]]"), r"not \[\[1\], \[1\]\]"),

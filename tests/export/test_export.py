@@ -187,7 +187,7 @@ def test_images_and_policies_of_no_run_are_refused(tmp_path):
     config = ppo.Config(env="Copy-image-v0", hidden=(8,))
     policy = TrainedPolicy(config.networks(image.spec), image.spec, config, 0)
     image.close()
-    with pytest.raises(lem.UserError, match="A policy for Copy-image-v0 looks at images; what can be exported"):
+    with pytest.raises(lem.UserError, match="A policy for Copy-image-v0 observes images; an export"):
         lem.export(policy, tmp_path / "e")
     steps = Spec("Steps-v0", (ObservationPart((), (3,)),), Box((0.0,), (4.0,), dtype="int64"))
     whole = TrainedPolicy(config.networks(steps), steps, config, 0)

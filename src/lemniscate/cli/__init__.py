@@ -74,7 +74,7 @@ OPTIONS: list[tuple[str, str, str, Any]] = [
     ("tune", "--preset NAME", "settings that are not searched [those of the environment]", None),
     ("tune", "--search RANGES", "fields as 'learning_rate=log:1e-4:1e-2, gamma=.9:.999, clip=0.1|0.2'", None),
     ("tune", "--trials INT", "number of settings that are tried [40]", 40),
-    ("tune", "--seeds LIST", "of each trial [101-103]", "101-103"),
+    ("tune", "--seeds LIST", "seeds of each trial [101-103]", "101-103"),
     ("tune", "--[no-]prune", "end a trial after 1/9 or 1/3 of its steps if it is not among the best third [on]", True),
     ("resume", "run RUN", "a run, a sweep or a search", None),
     ("resume", "--total-steps INT", "go on to so many steps of the whole run [as it was to be]", None),
@@ -87,14 +87,14 @@ OPTIONS: list[tuple[str, str, str, Any]] = [
     ("train resume tune", "--quiet", "no progress on standard error", True),
     ("train resume", "--report", "evaluate the policy, draw plots and videos", False),
     ("train resume", "--score", "store the final return over 100 episodes", False),
-    ("evaluate watch", "--stochastic", "draw actions from the policy [the most likely ones]", True),
+    ("evaluate watch", "--stochastic", "sample the policy's actions [take the most likely ones]", True),
     ("evaluate watch export", "--trust", "import the code (module:name) that a policy from hf:// names", False),
     ("evaluate watch export", "--checkpoint STEP", "best (see --keep-best), or a step [the newest]", None),
     ("export", "run RUN", "a run, a checkpoint or hf://user/name", None),
     ("evaluate", "policy RUN", POLICY, None),
     ("watch", "policy [RUN]", POLICY, None),
     ("evaluate watch", "--agent NAME", "module:Class that the weights of a .pt file are of [a course's]", None),
-    ("evaluate watch", "--[no-]normalized-actions", "a .pt file acts in [-1, 1] [as it flies better]", None),
+    ("evaluate watch", "--[no-]normalized-actions", "a .pt file acts in [-1, 1] [whichever returns more]", None),
     ("preflight", "run RUN", "a run", None),
     ("push", "run RUN", "a run or a checkpoint", None),
     ("export", "--to DIR", "new directory, or an export [RUN/export]", None),
@@ -109,7 +109,7 @@ OPTIONS: list[tuple[str, str, str, Any]] = [
     ("evaluate", "--baseline", "play by the environment's classical controller instead", False),
     ("evaluate", "--video FILE", ".gif, .webp or .mp4 to record all episodes into", None),
     ("grade", "folder FOLDER", "a .py file, a .ipynb file or a folder for each hand-in", None),
-    ("grade", "--exercises LIST", "those that are asked for: gae,Agent [those that are found]", ""),
+    ("grade", "--exercises LIST", "exercises that each hand-in must have: gae,Agent [those found]", ""),
     ("grade", "--to DIR", "where findings, pages and results go [FOLDER-grades]", None),
     ("grade", "--csv", "print the table as CSV on standard output", False),
     ("evaluate grade doctor", "--json", "print one JSON object on standard output", False),
@@ -219,7 +219,7 @@ class Parser(argparse.ArgumentParser):
         super().__init__(allow_abbrev=False, formatter_class=_Help, **options)
 
     def error(self, message: str) -> NoReturn:
-        """Raise the `UserError` for a value that is missing."""
+        """Raise what argparse has to say as a `UserError`."""
         raise UserError(f"{message[0].upper()}{message[1:]}; --help lists what there is.")
 
     def add(self, written: str, text: str, default: Any) -> None:

@@ -27,7 +27,7 @@ Workers = Annotated[int, Range(1, 4096)]
 STORAGE = "ray"
 """the folder of a run directory that has Ray's storage, where no other is named"""
 LEFT = (LOCK, STORAGE, "plots", "videos")
-"""what is only of the machine where it is"""
+"""what stays on its own machine, and is not sent"""
 
 
 @dataclass(frozen=True)

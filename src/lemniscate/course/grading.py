@@ -128,7 +128,7 @@ class Trial:
             hint = f"; did you mean {' or '.join(near)}?" if near else "."
             sentence = f"there is no function or class {name}{hint}"
             return {"right": False, "found": False, "file": None, "sentence": sentence}
-        right, sentence = False, "what was seen of it is not what was asked for."
+        right, sentence = False, "its results could not be read."
         with suppress(Exception):  # a hand-in may have put there what it likes
             if seen := self._content(f"seen/{name}.pt"):
                 finding = course.EXERCISES[name].judge(name, torch.load(io.BytesIO(seen), weights_only=True))

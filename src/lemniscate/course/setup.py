@@ -278,7 +278,7 @@ def save_model(seen: Seen) -> Iterator[str]:
     if opens["whole"]:
         yield "the agent or the optimizer is pickled whole, with its code. Likely: .state_dict() is missing."
     if not opens["safe"]:
-        yield Note("the file needs weights_only=False, which runs its code; torch.as_tensor(array) mends that.")
+        yield Note("the file needs weights_only=False, which may run code; store torch.as_tensor(array).")
     if not isinstance(saved, dict):
         yield f"the file holds a {type(saved).__name__}; it should hold a dictionary."
     flat = dict(_flat(saved))

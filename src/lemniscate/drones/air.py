@@ -1,4 +1,4 @@
-"""The air between a policy and drones: late actions, wind, noisy observations, by the conditions of `vehicle`."""
+"""The disturbances of a flight: late actions, wind, noisy observations, as the conditions of `vehicle` say."""
 
 import math
 from collections.abc import Callable, Mapping

@@ -113,11 +113,11 @@ def read_track(file: str | Path | None = None) -> Track:
             raise ValueError("roll, pitch and yaw are radians, at most 2 π")
     except (KeyError, ValueError, OverflowError) as error:
         what = f"it lacks {error}" if isinstance(error, KeyError) else str(error)
-        raise UserError(f"{name} is no track: {what}; one looks as lemniscate/drones/gates.toml does.") from error
+        raise UserError(f"{name} is no track: {what}; lemniscate/drones/gates.toml is an example.") from error
     right = isinstance(order, list) and all(type(gate) is int and 0 < abs(gate) <= len(gates) for gate in order)
     if not right or not order:
         raise UserError(
-            f"{name}: order names gates from 1 to {len(gates)}, in reverse with a minus, not {shown(order)}."
+            f"{name}: order names gates from 1 to {len(gates)}, with a minus if in reverse, not {shown(order)}."
         )
     flown = np.array(order)
     return Track(gates, obstacles, np.abs(flown) - 1, flown < 0, start, np.stack([low, high]))

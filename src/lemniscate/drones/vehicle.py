@@ -73,7 +73,7 @@ def _range(name: str, value: Any) -> tuple[float, float]:
         raise UserError(f"{name} must be a number or a range [low, high], not {shown(value)}.")
     condition, (low, high) = CONDITIONS[name], ends
     if low > high:
-        raise UserError(f"{name} is a range upside down: {low:g} is above {high:g}.")
+        raise UserError(f"{name} has a range whose low end {low:g} is above its high end {high:g}.")
     if not condition.low <= low <= high <= condition.high:
         limits = f"from {condition.low:g} to {condition.high:g}"
         raise UserError(f"{name} must be {limits} ({condition.meaning}), not {shown(value)}.")

@@ -73,9 +73,9 @@ def export(
     policy = load(run, checkpoint=checkpoint, trust=trust)
     folder = _destination(run, policy, to)
     if policy.spec.has_images:
-        raise UserError(f"A policy for {policy.spec.env_id} looks at images; what can be exported looks at vectors.")
+        raise UserError(f"A policy for {policy.spec.env_id} observes images; an export takes vectors.")
     if isinstance(policy.spec.action, Box) and not policy.spec.action.dtype.startswith("float"):
-        raise UserError(f"{policy.spec.env_id} takes a Box of whole numbers; what can be exported acts by fractions.")
+        raise UserError(f"{policy.spec.env_id} has a Box of integers as actions; an export has one of real numbers.")
     program = translate(Deployed(policy).eval(), input_size(policy.spec), memory_size(policy))
     contents, record, said = _contents(policy, program)
     try:

@@ -31,7 +31,7 @@ EDGES = 8
 TOLERANCE, BFLOAT16_TOLERANCE = 1e-5, 0.05
 """of `difference_units`; with bfloat16 a sum in another order is sometimes rounded the other way, to the next number"""
 INSTRUCTIONS = 10**9
-"""of a simulation of the target, at most: it takes some ten seconds"""
+"""the most instructions that a simulation of the target executes, in some ten seconds"""
 
 
 @dataclass(frozen=True)
@@ -234,5 +234,6 @@ def sentences(record: Mapping[str, Any]) -> list[str]:
         )
     for name, each in compared.items():
         if each["above_tolerance"]:
-            said.append(f"{name} is beyond {record['tolerance']:g}{share} at {each['above_tolerance']:,} of them.")
+            above = f"At {each['above_tolerance']:,} of these observations"
+            said.append(f"{above} {name} differs by more than {record['tolerance']:g}{share}, the tolerance.")
     return [*said, *record["missing"]]

@@ -61,7 +61,7 @@ def read_address(place: str | PathLike[str]) -> Address:
     given = "/".join(Path(place).parts[1:])  # where it is a `Path`, one slash has been made of two
     name, _, revision = given.partition("@")
     if name.count("/") != 1 or given.endswith("@"):
-        raise UserError(f"hf://{given} is no policy on the Hub: hf://user/name, or hf://user/name@revision.")
+        raise UserError(f"hf://{given} is no address of a policy, such as hf://user/name or hf://user/name@revision.")
     return Address(name, revision or None)
 
 

@@ -203,5 +203,7 @@ def _probe(policy: TrainedPolicy, episodes: int, given: Mapping[str, Any]) -> pr
     if not probe.spec.fits(policy.spec):
         raise UserError(f"{policy.spec.env_id} has other spaces here than in training.")
     if not probe.axes:
-        raise UserError(f"{policy.spec.env_id} has nothing that could be changed: masked choices, and no numbers.")
+        raise UserError(
+            f"{policy.spec.env_id} has nothing that could be changed: masked actions, and no numbers to observe."
+        )
     return probe

@@ -105,7 +105,7 @@ def remarks(groups: list[Group], scores: Scores) -> list[str]:
         said.append(f"They have not taken the same number of steps: {each}.")
     unfinished = [run for one in groups for run in one.runs if not is_finished(run)]
     if unfinished:
-        said.append(f"Not finished, so in the curves alone: {', '.join(map(str, unfinished))}.")
+        said.append(f"Not finished, and so only in the curves: {', '.join(map(str, unfinished))}.")
     if unranked := _why_unranked(groups, scores):
         return [*said, unranked]
     said += [_improvement(*pair, scores) for pair in combinations(groups, 2)]

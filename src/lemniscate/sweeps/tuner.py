@@ -92,7 +92,7 @@ def tune(
     if "seed" in fields:
         raise UserError("A search has several seeds: they are given as seeds, not as seed.")
     for name in sorted({"checkpoint_every", "evaluate_every"} & set(fields)):
-        raise UserError(f"{name} follows from the search: at the end of each part of a run trials are compared.")
+        raise UserError(f"{name} is set by the search, which compares trials after a ninth and a third of a run.")
     algorithm = name_of(algorithm)
     config = training.config_for(algorithm, env, preset, **fields)
     trials, prune = checked("trials", trials, Annotated[int, Range(1, 10_000)]), checked("prune", prune, bool)
