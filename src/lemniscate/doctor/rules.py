@@ -88,7 +88,7 @@ CONSEQUENCES = {
     "action-late": {"exploding-observation"},
     "reward-unexplained": {"exploding-observation"},
     "advantage-not-normalized": {"ratio-not-one"},
-    "advantage-opposed": {"ratio-not-one", "targets-behind"},
+    "advantage-opposed": {"ratio-not-one", "targets-behind", "policy-still"},
     "targets-alike": {"critic-still"},
     "gradient-grows": {"value-runaway"},
     "policy-still": {"units-inactive"},

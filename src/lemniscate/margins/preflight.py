@@ -204,6 +204,6 @@ def _probe(policy: TrainedPolicy, episodes: int, given: Mapping[str, Any]) -> pr
         raise UserError(f"{policy.spec.env_id} has other spaces here than in training.")
     if not probe.axes:
         raise UserError(
-            f"{policy.spec.env_id} has nothing that could be changed: masked actions, and no numbers to observe."
+            f"{policy.spec.env_id} has nothing that could be changed: masked actions, no numbers to observe."
         )
     return probe
