@@ -364,6 +364,13 @@ def test_a_start_that_no_seed_changes_is_named_though_no_episode_has_ended():
     assert "starts-alike" not in names(observation__whole=[1.0] * 8, varies=False)
 
 
+def test_rewards_that_stop_for_good_where_no_episode_ends_are_of_failures_that_go_on():
+    shown = {"reward__zero": [0.96] * 8, "reward__largest": [1.0] * 8, "reward__mean": [0.01] * 8}
+    assert names(**shown, episode__terminated=[0.0] * 8, reward__age=[0.02] * 8) == ["failure-goes-on"]
+    assert names(**shown, episode__terminated=[0.0] * 8, reward__age=[0.9] * 8) == ["reward-rare"]
+    assert names(**shown, episode__terminated=[0.5] * 8, reward__age=[0.02] * 8) == ["reward-rare"]
+
+
 def test_a_policy_without_a_gradient_stands_still():
     shown = {"algorithm": "td3", "steps": 30_000, "reward__largest": [1.0] * 8, "action__preferred": [0.5] * 8}
     assert names(**shown, gradient_norm__actor=[0.1] * 4 + [0.0] * 4) == ["policy-still"]

@@ -191,7 +191,9 @@ def test_images_and_policies_of_no_run_are_refused(tmp_path):
         lem.export(policy, tmp_path / "e")
     steps = Spec("Steps-v0", (ObservationPart((), (3,)),), Box((0.0,), (4.0,), dtype="int64"))
     whole = TrainedPolicy(config.networks(steps), steps, config, 0)
-    with pytest.raises(lem.UserError, match="Steps-v0 has a Box of integers as actions; an export has one of real numbers"):
+    with pytest.raises(
+        lem.UserError, match="Steps-v0 has a Box of integers as actions; an export has one of real numbers"
+    ):
         lem.export(whole, tmp_path / "e")
     with pytest.raises(lem.UserError, match="This policy is of no run here: name the directory"):
         lem.export(policy_for())

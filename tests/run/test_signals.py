@@ -217,6 +217,15 @@ def test_rewards_that_grow_with_the_age_of_an_episode_are_explained_by_it_alone(
     assert "reward/by_age" not in of_environment(grown, spec_of())
 
 
+def test_the_age_at_which_rare_rewards_are_paid_is_a_share_of_that_of_all_rows():
+    ages = torch.tensor([80.0, 80.0, 80.0])
+    rows, age = aged(80, ages)
+    early, late = ((replace(rows, reward=(at).float())) for at in (age < 4, age >= 76))
+    assert of_environment(early, spec_of(), ages)["reward/age"] == pytest.approx(2.5 / 40.5)
+    assert of_environment(late, spec_of(), ages)["reward/age"] == pytest.approx(78.5 / 40.5)
+    assert "reward/age" not in of_environment(rows, spec_of(), ages)
+
+
 def test_observations_that_jump_at_the_same_ages_are_of_ends_that_nobody_reports():
     ages = torch.tensor([97.0, 110.0, 83.0, 120.0])
     rows, age = aged(80, ages)

@@ -154,12 +154,13 @@ def of_ages(rows: Rollout, spec: Spec, ages: Tensor, known: Mapping[str, Tensor]
 
     - reward/by_age: the share of the rewards' variance that a line over the steps since an episode's beginning explains
       beyond the rows; not where these explain most of it, by the signals that are `known`.
+    - reward/age: where hardly any reward is not 0, the mean of the steps since then of those, over that of all rows.
     - observation/jumps_every: the steps after which, and after whose multiples alone, observations change as if
       others were drawn, though no end is reported; nothing where there are none.
     """
     explained, jumps, found = known["reward/explained"].clamp(min=0), _jumps(rows, spec), dict[str, Tensor]()
     pays, recur = explained < 0.8 and known["reward/std"] > 0, jumps.sum() >= 8
-    if not (pays or recur):
+    if not (pays or recur or known["reward/zero"] > 0.9):
         return {}
     running = rows.valid & (_ended(rows) == rows.done.sum(0))
     age = (ages - running.flip(0).cumsum(0).flip(0) + 1)[running]  # after the row
@@ -168,7 +169,9 @@ def of_ages(rows: Rollout, spec: Spec, ages: Tensor, known: Mapping[str, Tensor]
         line, reward = age[:, None].cpu().double(), present.reward[:, None].cpu().double()
         others = explained_by(line, reward, _everything(present, spec))
         found["reward/by_age"] = (1 - explained) * others.nan_to_num()[0]
-    jumps = jumps[running]
+    jumps, paid = jumps[running], rows.reward[running] != 0
+    if 0 < paid.float().mean() < 0.1:
+        found["reward/age"] = age[paid].mean() / age.mean()
     for period in age[jumps].unique()[:6] if jumps.sum() >= 8 else ():
         due = age % period == 0
         if period >= 5 and jumps[due].float().mean() > 0.5 and due[jumps].float().mean() > 0.9:
