@@ -165,9 +165,9 @@ if __name__ == "__main__":
 
 EXCHANGE = """
 import json, statistics, sys, time, torch
-from lemniscate.system.processes import together
+from lemniscate.system.processes import join_world
 rounds, sizes, spent = int(sys.argv[1]), map(int, sys.argv[2:]), {}
-with together() as world:
+with join_world() as world:
     for size in sizes:
         mine, times = torch.randn(1, size), []
         for _ in range(20 * rounds):

@@ -100,7 +100,7 @@ def begin(algorithm, config):
     env.close()
     require_memory(config, env.spec, device)
     widths = (*config.hidden, *(getattr(config, "critic_hidden", None) or ()))
-    if config.num_envs <= 16 and max(widths, default=0) <= 500 and sum(config.memory(env.spec).values()) < 10**8:
+    if config.num_envs <= 16 and max(widths, default=0) <= 500 and sum(config.memory_bytes(env.spec).values()) < 10**8:
         envs = make_envs(config)
         find(algorithm).init(config, env.spec, device)
         for made in envs:
