@@ -182,7 +182,7 @@ def of_ages(rows: Rollout, spec: Spec, ages: Tensor, known: Mapping[str, Tensor]
 def _jumps(rows: Rollout, spec: Spec) -> Tensor:
     """Whether an observation of rows [T, N, …] changes within an episode as if another one were drawn, [T, N]."""
     obs, after = (x[..., : spec.observation_size].float() for x in (rows.obs, rows.next_obs))
-    change = ((after - obs).square() / obs.var((0, 1)).clamp(min=1e-12)).mean(-1)
+    change = ((after - obs) / _spread(obs.flatten(0, 1)).clamp(min=1e-6)).square().mean(-1)
     return (change > (10 * change.median()).clamp(min=0.5)) & ~rows.done & rows.valid
 
 
