@@ -330,6 +330,8 @@ def test_a_value_that_has_learned_nothing_or_too_little_ignores_no_ends():
 def test_an_evaluation_of_one_episode_is_of_chance():
     assert names(scores={"returns": [1.0]}) == ["too-few-episodes"]
     assert names(scores={"returns": [1.0]}, changed={"evaluate_every": 1_000}) == ["too-few-episodes"]
+    one = {"returns": RISES, "scores": {"mean_return": 20.0, "returns": [20.0]}}
+    assert names(**one) == ["too-few-episodes"]  # and not evaluated otherwise
 
 
 def test_a_start_that_is_the_same_is_named_unless_observations_are_whole_numbers():

@@ -94,6 +94,7 @@ CONSEQUENCES = {
     "policy-still": {"units-inactive"},
     "advantage-unrelated": {"kl-too-large"},
     "q-unfollowed": {"policy-still"},
+    "evaluated-otherwise": {"too-few-episodes"},
     "acts-at-mode": {"advantage-opposed"},
     "replay-differs": {"replay-repeated"},
     "setting-entropy-coef": {"entropy-opposed"},
