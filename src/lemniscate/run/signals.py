@@ -11,7 +11,7 @@ from itertools import combinations
 from typing import Any
 
 import torch
-from torch import Generator, Tensor, nn
+from torch import Tensor, nn
 from torch.func import functional_call
 from torch.nn.functional import one_hot
 
@@ -372,7 +372,7 @@ def _off_mode(policy: Any, distribution: Any, obs: Tensor, action: Tensor) -> di
     Of a deterministic policy it is the distance itself, in units of half the action range. Nothing where so few choices
     would leave the mode that it could be chance that none did.
     """
-    drawn = distribution.sample(policy.draw_noise(obs.shape[:1], Generator(obs.device).manual_seed(0)))
+    drawn = distribution.sample(policy.draw_noise(obs.shape[:1], torch.Generator(obs.device).manual_seed(0)))
     away, usual = ((x - distribution.mode()).float().square().mean().sqrt() for x in (action, drawn))
     if usual == 0 and action.is_floating_point():
         return {"action/off_mode": away}
@@ -495,7 +495,7 @@ def of_critics(state: Any, config: RunConfig, rows: Rollout) -> dict[str, Tensor
     replay, networks, gamma = getattr(state, "replay", None), state.networks, getattr(config, "gamma", 1.0)
     if not hasattr(networks, "entropy_bonus") or not getattr(state, "updates", replay is None):
         return {}
-    generator = Generator(rows.reward.device).manual_seed(getattr(state, "updates", 0))  # none of the run's own
+    generator = torch.Generator(rows.reward.device).manual_seed(getattr(state, "updates", 0))  # none of the run's own
     newest = sampled = Transition(rows.obs, rows.action, rows.reward, rows.next_obs, rows.terminated)[-SEEN:]
     critics, targets, share = None, None, torch.ones(())
     if replay is not None:
