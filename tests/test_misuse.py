@@ -195,6 +195,7 @@ def test_runs_are_plotted_one_by_one_or_in_a_list(run):
         (lambda run: lem.watch(run, deterministic=1, video="video.gif"), "deterministic must be True or False, not 1"),
         (lambda run: run.policy.act(np.zeros(4), deterministic="no"), "deterministic must be True or False, not 'no'"),
         (lambda run: lem.evaluate(run, normalized_actions="yes"), "normalized_actions must be True or False or None, not 'yes'"),
+        (lambda run: lem.watch(run, normalized_actions="no"), "normalized_actions must be True or False or None, not 'no'"),
         (lambda run: lem.train("ppo", "CartPole-v1", track=Closing), "the class Closing is no logger: that has write"),
         (lambda run: lem.train("ppo", "CartPole-v1", track=lambda path: None), r"track must be made as Class\(path, config, step\), which lambda"),
         (lambda run: lem.load(""), "A run is a directory, .* not ''"),

@@ -1,6 +1,12 @@
 """A run directory as bytes: what is sent, and what stays where it is."""
 
-from lemniscate.cluster.connection import pack, unpack
+import threading
+from pathlib import Path
+
+import pytest
+
+from lemniscate.cluster.connection import Cluster, pack, unpack
+from lemniscate.cluster.job import line_to_resume, take_back
 
 
 def run(path, config, *steps):
@@ -32,3 +38,40 @@ def test_a_run_that_is_there_gets_what_is_new_and_keeps_its_config(tmp_path):
     assert (there / "metrics.jsonl").read_text() == "up to 30"
     assert {path.name for path in (there / "checkpoints").iterdir()} == {"step-20", "step-30"}
     assert (there / "checkpoints" / "step-20" / "mark").exists(), "a checkpoint that is there is not sent again"
+
+
+def test_a_run_whose_checkpoints_are_renamed_meanwhile_is_packed(tmp_path):
+    here, done = run(tmp_path / "here", "seed 1", *range(40)), threading.Event()
+    folder = here / "checkpoints"
+
+    def rename():
+        while not done.is_set():
+            for step in range(40):
+                (folder / f"step-{step}").rename(folder / f"step-{step}.old")
+            for step in range(40):
+                (folder / f"step-{step}.old").rename(folder / f"step-{step}")
+
+    thread = threading.Thread(target=rename)
+    thread.start()
+    try:
+        for _ in range(100):
+            pack(here)
+    finally:
+        done.set()
+        thread.join()
+
+
+def test_what_a_job_has_stored_is_taken_back_before_anything_is_removed(tmp_path):
+    here, stored = run(tmp_path / "here", "seed 1", 10, 20), run(tmp_path / "stored", "another", 20, 30)
+    with pytest.raises(OSError, match="gone"):
+        take_back(tmp_path / "gone", here)
+    assert {file.name for file in (here / "checkpoints").iterdir()} == {"step-10", "step-20"}
+    take_back(stored, here)
+    assert {file.name for file in (here / "checkpoints").iterdir()} == {"step-20", "step-30"}
+    assert (here / "config.json").read_text() == "seed 1"
+
+
+def test_a_stopped_job_goes_on_in_its_own_place():
+    line = line_to_resume(Path("runs/it"), Cluster("10.0.0.1:6379", 2, "/mnt/my disk"), 2)
+    assert line == "lemniscate resume runs/it --cluster ray=10.0.0.1:6379 --workers 2 --storage '/mnt/my disk'"
+    assert line_to_resume(Path("runs/it"), Cluster(None, 2, None), 2).endswith("runs/it --cluster ray --workers 2")

@@ -11,6 +11,7 @@ import environments  # noqa: F401  (registers the environments)
 import lemniscate as lem
 from conftest import tiny_fields
 from lemniscate.cli import main
+from lemniscate.envs.vec_env import VecEnv
 from lemniscate.exporting import export as exporting
 from lemniscate.exporting.compiled import host_compiler
 from lemniscate.margins import preflight as preflights
@@ -95,6 +96,9 @@ def test_the_exported_c_acts_as_the_policy_does(copy, monkeypatch):
         policy.module.net[-1].bias += torch.arange(2) * 100.0
     with pytest.raises(lem.UserError, match="is of another policy: lemniscate export"):
         preflight(policy, compiled=True)
+    (copy / "export" / "policy.c").write_bytes("of another kind: ü".encode("latin-1"))
+    with pytest.raises(lem.UserError, match=r"There is no whole export of .*: lemniscate export "):
+        preflight(copy, compiled=True)
     (copy / "export" / "policy.c").unlink()
     with pytest.raises(lem.UserError, match=r"There is no whole export of .*: lemniscate export "):
         preflight(copy, compiled=True)
@@ -136,10 +140,13 @@ def test_only_runs_are_flown(copy, tmp_path):
         preflight("hf://user/name")
 
 
-def test_an_environment_without_any_axis_is_refused(tmp_path):
-    run = train(tmp_path / "masked", env="Copy-masked-v0")
+def test_an_environment_without_any_axis_is_refused_and_closed(tmp_path, monkeypatch):
+    run, closed = train(tmp_path / "masked", env="Copy-masked-v0"), []
+    close = VecEnv.close
+    monkeypatch.setattr(VecEnv, "close", lambda env: closed.append(env) or close(env))
     with pytest.raises(lem.UserError, match="Copy-masked-v0 has nothing that could be changed"):
         preflight(run)
+    assert len(closed) == 1
     assert is_untouched(run)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+import lemniscate as lem
 from lemniscate.algos import ALGORITHMS, find, ppo
 from lemniscate.api.training import config_for
 from lemniscate.errors import UserError
@@ -187,3 +188,9 @@ def test_fields_of_every_kind_are_the_same_after_json():
 def test_a_config_of_another_version_is_refused():
     with pytest.raises(UserError, match="written by another version of lemniscate: there is no field engine now"):
         ppo.Config.from_json({**ppo.Config().to_json(), "engine": "auto"})
+
+
+def test_networks_with_a_memory_are_counted_before_they_are_made(tmp_path):
+    with pytest.raises(UserError, match=r"This run takes at least .* MB are for hidden .*: choose a smaller hidden"):
+        lem.train("ppo", env="CartPole-v1", network="gru", hidden=(200_000,), run=tmp_path / "run", progress=False)
+    assert not (tmp_path / "run").exists()

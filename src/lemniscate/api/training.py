@@ -305,13 +305,8 @@ def _train(world: World, path: Path, algorithm: str, config: RunConfig, options:
 
     attend, callbacks = Attendance(config) if progress else None, options.callbacks
     observer = call_callbacks(callbacks, spec, config, attend) if callbacks or attend else None
-    surroundings = {
-        "loggers": options.loggers,
-        "progress": progress,
-        "record_video": record_video,
-        "observer": observer,
-    }
-    run = Run(path, algorithm, config, envs, world=world, locate=local_path, **surroundings)
+    told = {"progress": progress, "record_video": record_video, "observer": observer}
+    run = Run(path, algorithm, config, envs, world=world, loggers=options.loggers, locate=local_path, **told)
     pictures: list[Path] = []
     try:
         if world.is_first and (config.video_every or config.video_every_episodes) and not path.exists():

@@ -85,20 +85,13 @@ def train_on_ray(
             with stop_signals_to(stop), shown:
                 result = trainer.fit()
         except (KeyboardInterrupt, SystemExit):
-            place = f"ray={cluster.address}" if cluster.address else "ray"
-            kept = ["--storage", cluster.storage] if cluster.storage else []
-            again = f"{resume_line(path)} {shlex.join(['--cluster', place, '--workers', str(workers), *kept])}"
-            sentence = f"Stopped; the last checkpoint is kept. Go on with: {again}"
+            sentence = f"Stopped; the last checkpoint is kept. Go on with: {line_to_resume(path, cluster, workers)}"
             raise Stopped(sentence, asked[0] if asked else signal.SIGINT) from None  # Ray has Ctrl-C for itself
         except TrainingFailedError as error:
             raise RankError(f"The workers failed {FAILURES} times; the last time: {error}") from None
         if result.checkpoint is not None:
             with result.checkpoint.as_directory() as stored:  # the config of the directory stays
-                copytree(stored, path, dirs_exist_ok=True, ignore=ignore_patterns(CONFIG, LOCK))
-                newest = {each.name for each in (Path(stored) / "checkpoints").iterdir()}
-            for each in (path / "checkpoints").iterdir():  # last, so that there always is one
-                if each.name not in newest:
-                    remove(each)
+                take_back(Path(stored), path)
         if result.return_value:
             raise RankError(result.return_value)
         rmtree(path / STORAGE, ignore_errors=True)
@@ -126,6 +119,22 @@ def _trainer(given: dict[str, Any], config: RunConfig, workers: int, name: str, 
             failure_config=FailureConfig(max_failures=FAILURES),
         ),
     )
+
+
+def line_to_resume(path: Path, cluster: Cluster, workers: int) -> str:
+    """The command that goes on with a job from its own storage, which another address or place would not have."""
+    place = f"ray={cluster.address}" if cluster.address else "ray"
+    kept = ["--storage", cluster.storage] if cluster.storage else []
+    return f"{resume_line(path)} {shlex.join(['--cluster', place, '--workers', str(workers), *kept])}"
+
+
+def take_back(stored: Path, path: Path) -> None:
+    """Copy what a job has stored into its run; older checkpoints are removed last, so that there always is one."""
+    copytree(stored, path, dirs_exist_ok=True, ignore=ignore_patterns(CONFIG, LOCK))
+    newest = {checkpoint.name for checkpoint in (stored / "checkpoints").iterdir()}
+    for checkpoint in (path / "checkpoints").iterdir():
+        if checkpoint.name not in newest:
+            remove(checkpoint)
 
 
 @contextmanager

@@ -256,10 +256,7 @@ def of_reward_sizes(e: Evidence) -> Seen:
         yield "reward-zero", "Every reward was 0."
     fades = e.late("reward/age") < 0.2 and mean > 0 and ends == 0  # what is paid is so at the beginning of episodes
     if fades and unpaid > 0.9:
-        yield (
-            "failure-goes-on",
-            f"No episode terminates, and {unpaid:.0%} of the rewards, all but the first, are 0.",
-        )
+        yield "failure-goes-on", f"No episode terminates, and {unpaid:.0%} of the rewards, all but the first, are 0."
     elif zero > 0.9 and largest > 0:
         yield "reward-rare", f"{zero:.1%} of the rewards at the beginning were 0."
     elif unpaid > 0.9 and ends == 0 and mean > 0 and not e.returns_alike:  # where rewards are costs, 0 is a success

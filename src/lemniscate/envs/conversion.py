@@ -79,13 +79,8 @@ class SingleEnv(gym.Wrapper):
         usual = type(returned) is tuple and len(returned) == 5 and self._is_usual(*returned)
         obs, reward, terminated, truncated, info = returned if usual else self._returns.of_step(returned)
         obs = obs.copy() if usual else obs  # as in reset
-        return (
-            obs,
-            reward,
-            terminated,
-            truncated,
-            self._reduced("step", obs, info) if info or self._masked else info,
-        )
+        info = self._reduced("step", obs, info) if info or self._masked else info
+        return obs, reward, terminated, truncated, info
 
     def _is_usual(self, obs: Any, reward: Any, terminated: Any, truncated: Any, info: Any) -> bool:
         """Whether each is of its type already, as mostly: this is asked at every step, and `of_step` is slower."""

@@ -46,7 +46,7 @@ ID_PREFIXES = {
 EnvPool's own ids begin with `EnvPool/`; the others are Gymnasium's, which behave there as in Gymnasium"""
 
 ARGUMENTS_OF_MAKE = {
-    "render_mode": "videos are made with a video (--video FILE) by watch and evaluate, in training with video_every",
+    "render_mode": "videos are made by watch and evaluate with video (--video FILE), in training with video_every",
     "num_envs": "the number of parallel environments is the field num_envs",
     "seed": "the seed of a run is the field seed",
     "vectorization_mode": "the backend gymnasium-async gives each environment a process",

@@ -132,10 +132,8 @@ def _given(given: Any, sizes: Mapping[str, int]) -> Mirror:
         wanted = "two lists of whole numbers, such as ([-1, 3, 2], [2, 1])"
         raise UserError(f"its attribute mirror is {shown(given)}; it must be {wanted}.") from None
     for signed, (name, size) in pairs:
-        order, each = (
-            SignedPermutation(np.abs(signed) - 1, np.sign(signed).astype(np.float64)),
-            list(range(1, size + 1)),
-        )
+        order = SignedPermutation(np.abs(signed) - 1, np.sign(signed).astype(np.float64))
+        each = list(range(1, size + 1))
         if sorted(np.abs(signed)) != each or order(signed).tolist() != each:
             wanted = f"each of 1 to {size} once, in pairs"
             raise UserError(f"mirror of its {name} is {shown(signed.tolist())}; it must have {wanted}.")

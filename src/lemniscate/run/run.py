@@ -54,7 +54,7 @@ Observer = Callable[[Sequence[tuple[int, Mapping[str, float]]], TrainState], boo
 
 @dataclass
 class Iteration:
-    """The present body of the loop: what was so when it began, and whether it is whole."""
+    """The present iteration of the loop: what was so when it began, and whether it is whole."""
 
     step: int = 0
     episodes: int = 0
@@ -95,7 +95,7 @@ class Run:
         self._compiler = Compiler(world.busy)
         self._stop = StopRequest(world.size > 1, self._how_to_go_on, self._compiler.stopping)
         self._iteration, self._lines, self._episodes = Iteration(), 0, 0
-        """the present body of the loop; lines logged by the loop and whole training episodes so far"""
+        """the present iteration; lines logged by the loop and whole training episodes so far"""
         self._recent_returns = deque[float](maxlen=100)
         self._unobserved: list[tuple[int, dict[str, float]]] = []
         """logged lines that callbacks have not seen"""
