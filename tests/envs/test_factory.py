@@ -68,7 +68,7 @@ def test_ones_own_environment_may_have_a_seed_among_its_arguments():
         return Reach(reward=seed)
 
     assert reward_of(seeded, kwargs={"seed": 5}) == 5
-    with pytest.raises(UserError, match=r"render_mode is no argument .* with a video"):
+    with pytest.raises(UserError, match=r"render_mode is no argument .* with video \(--video FILE\)"):
         reward_of(Reach, kwargs={"render_mode": "human"})
 
 
