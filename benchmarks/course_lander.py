@@ -35,19 +35,24 @@ def one(settings, variant, seed, steps):
     import lemniscate as lem
     from lemniscate.algos import ppo
     from lemniscate.report.curves import episode_returns
+    from lemniscate.run.metrics import read_metrics
 
     env = "course_lander:WithoutEnd" if variant == VARIANTS[1] else "LunarLander-v3"
     fields = {**vars(lem.config_for("ppo", "LunarLander-v3", "course")), "backend": "gymnasium"}
     fields |= {"env": env, "seed": seed, "total_steps": steps, **SETTINGS[settings]}
-    # The batch that was estimated again, with its new log-probabilities, in the place of the old ones.
-    keep_new = patch.object(ppo, "replace", lambda batch, **_: batch)
+    # The rows that are estimated again get their new log-probabilities, in the place of the old ones.
+    estimate = ppo.advantages
+    again = patch.object(ppo, "advantages", lambda config, networks, rollout, *_: estimate(config, networks, rollout))
     with tempfile.TemporaryDirectory() as folder:
         if variant == VARIANTS[2]:
-            keep_new.start()
+            again.start()
         try:
             run = lem.train("ppo", run=Path(folder) / "run", progress=False, **fields)
         finally:
             patch.stopall()
+        most = max(line.get("clip_fraction", 0) for line in read_metrics(run.path))
+        if (most == 0) != (variant == VARIANTS[2]):
+            raise SystemExit(f"{variant}: {most} of the ratios are beyond the clip, so it is another variant.")
         at, returns = episode_returns(run.path)
         mode, sample = (lem.evaluate(run.policy, "LunarLander-v3", deterministic=which) for which in (True, False))
     average = np.convolve(returns, np.ones(20) / 20, mode="valid")

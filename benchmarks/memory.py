@@ -108,7 +108,7 @@ if __name__ == "__main__":
             play = theirs if given.network == "sb3" else ours
             returns, seconds = play(env, seed, steps, {**settings, **given.settings, "network": given.network})
             found.append((round(float(np.mean(returns)), 1), round(seconds, 1)))
-            if not given.trial:
+            if not (given.trial or given.settings):
                 row = {"env": env, "network": given.network, "steps": steps, "seed": seed}
                 append("memory", row | {"returns": list(map(float, returns)), "seconds": seconds, **provenance()})
         print(env, steps, given.settings, f"{np.mean([f[0] for f in found]):.1f}", found, flush=True)

@@ -100,7 +100,7 @@ def one(library, algorithm, env, seed, core):
     """A run in this process, and its row."""
     os.sched_setaffinity(0, [core])
     row = train(algorithm, env, seed) if library == "lemniscate" else peer(library, algorithm, env, seed)
-    row["curve"] = [[round(x, 3) for x in point] for point in row["curve"][:: -(-len(row["curve"]) // POINTS)]]
+    row["curve"] = [[round(x, 3) for x in point] for point in row["curve"][:: len(row["curve"]) // POINTS + 1]]
     names = {"library": library, "algorithm": algorithm, "env": env, "seed": seed}
     append("minutes", names | row | provenance())
     print(

@@ -30,7 +30,7 @@ from scipy.interpolate import CubicSpline
 from lemniscate.drones import gates
 from lemniscate.drones.drones import Drones
 
-PRESETS = {0: ("gates", "gates-finish"), 1: ("gates", "gates-finish"), 2: ("gates-moved", "gates-moved-finish")}
+PRESETS = {0: ("gates", "gates-finish"), 2: ("gates-moved", "gates-moved-finish")}
 """of each level: the first, and that of an algorithm that goes on from there"""
 NAMES = ("success", "lap_seconds", "gates_passed", "crashed")
 
@@ -144,10 +144,12 @@ def levels(file: Path) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=["train", "controller", "table", "levels"])
-    parser.add_argument("--levels", nargs="+", type=int, default=[0, 2, 3])
+    parser.add_argument("--levels", nargs="+", type=int, default=[0, 2])
     parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3, 4, 5])
     parser.add_argument("--algorithm", default="ppo")
     given = parser.parse_args()
+    if given.what == "train" and (others := set(given.levels) - set(PRESETS)):
+        parser.error(f"level {min(others)} has no presets; levels {' and '.join(map(str, PRESETS))} have")
     for level in given.levels if given.what in ("train", "controller") else ():
         for seed in given.seeds if given.what == "train" else ():
             train(given.algorithm, level, seed)

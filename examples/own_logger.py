@@ -15,11 +15,16 @@ from lemniscate.envs.vec_env import Episodes
 
 
 class Csv:
-    """`metrics.csv`, one row for each metric of each update: step, name, value."""
+    """`metrics.csv`, one row for each metric of each update: step, name, value; after a resume no step twice."""
 
     def __init__(self, path: Path, config: Mapping[str, Any], step: int) -> None:
-        self._file = (path / "metrics.csv").open("a", newline="")
+        file = path / "metrics.csv"
+        text = file.read_text().splitlines() if file.exists() else []
+        rows = [row for row in csv.reader(text) if len(row) == 3 and int(row[0]) <= step]
+        self._file = file.open("w", newline="")
         self._writer = csv.writer(self._file)
+        self._writer.writerows(rows)
+        self._file.flush()
 
     def write(self, step: int, metrics: Mapping[str, float], episodes: Episodes | None = None) -> None:
         """Append the metrics of one update."""

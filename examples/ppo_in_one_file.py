@@ -115,7 +115,7 @@ def loss(c: Config, networks: nn.ModuleDict, rows: list[Tensor]) -> Tensor:
     weight = (advantage - advantage.mean()) / (std + 1e-8)
     logits = networks["policy"](obs)
     log_prob = logits.log_softmax(-1).gather(-1, action.unsqueeze(-1)).squeeze(-1)
-    ratio = (log_prob - old_log_prob).exp()  # r_t(θ), below eq. 6
+    ratio = (log_prob - old_log_prob).exp()  # r_t(θ), above eq. 6
     surrogate = torch.min(ratio * weight, ratio.clamp(1 - c.clip, 1 + c.clip) * weight).mean()  # L^CLIP, eq. 7
     value_loss = 0.5 * (networks["value"](obs).squeeze(-1) - target).square().mean()  # L^VF
     log_p = logits.log_softmax(-1)

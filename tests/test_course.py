@@ -5,6 +5,7 @@ import inspect
 import re
 import sys
 import time
+import warnings
 from functools import partial
 
 import pytest
@@ -115,6 +116,37 @@ def test_the_value_loss_is_given_an_old_value_without_a_clip_as_the_algorithm_gi
     says(value_loss, "value_loss", "case 3 of 3, with an old value, and None for the clip: it raised TypeError")
 
 
+@pytest.mark.parametrize("kept", [0, 2])
+def test_cases_that_were_not_tried_are_not_right(kept):
+    """As where a hand-in ends its process, and leaves what was seen so far, or nothing."""
+    exercise = course.EXERCISES["gae"]
+    seen = [exercise.answer(exercise.right, case) for case in exercise.cases]
+    assert exercise.judge("gae", {"cases": seen})
+    finding = exercise.judge("gae", {"cases": seen[:kept]})
+    assert not finding
+    assert finding.sentence == f"it ended in case {kept + 1} of 5."
+
+
+def test_a_constant_in_place_of_tau_is_found():
+    def polyak(target, online, tau):
+        with torch.no_grad():
+            for mine, other in zip(target, online, strict=True):
+                mine.lerp_(other, 0.1)
+
+    says(polyak, "polyak", "case 2 of 2, another τ: ")
+
+
+def test_no_warning_stands_above_a_finding():
+    """The causes of a wrong surrogate are tried on one row too, whose standard deviation torch warns of."""
+
+    def clipped_surrogate(log_ratio, advantage, clip):
+        return -1.3 * (log_ratio.exp() * advantage).clamp(1 - clip, 1 + clip).mean()
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert not course.check(clipped_surrogate)
+
+
 def test_what_the_skeleton_promises_to_judge_passes_in_its_solution():
     written = {"__name__": "ppo"}
     exec(compile(solved("ppo"), "ppo.py", "exec"), written)
@@ -122,7 +154,8 @@ def test_what_the_skeleton_promises_to_judge_passes_in_its_solution():
     assert names == ["gae", "clipped_surrogate", "value_loss"]
     assert all(course.check(written[name]) for name in names)
     assert str(course.check(written["value_loss"])).endswith(
-        "right in 1 of 3 cases; the others give it more arguments."
+        "right in 1 of 3 cases; it takes too few arguments for the others: "
+        "with a clip, with an old value, and None for the clip."
     )
     says(lambda value, target: (value - target).square().mean(), "value_loss", "Likely: the conventional half")
 

@@ -2,6 +2,7 @@
 
 import re
 import shlex
+from collections import Counter
 from pathlib import Path
 
 import gymnasium as gym
@@ -10,6 +11,7 @@ import pytest
 import torch
 
 import lemniscate as lem
+import zoo_files
 from lemniscate import course
 from lemniscate.api import results
 from lemniscate.cli import parse
@@ -40,6 +42,16 @@ def test_the_python_of_the_page_runs(tmp_path, monkeypatch):
     (tmp_path / "my_ppo.py").write_text(loop.solution("ppo"))
     exec(compile(filled_in + after, "courses.md", "exec"), scope)
     assert scope["agent"].act(np.zeros((16, 105), np.float32)).shape == (16, 8)
+
+
+def test_the_table_of_errors_counts_the_solutions_of_the_zoo():
+    counts = {name: Counter() for name in course.EXERCISES}
+    for file in zoo_files.ZOO.glob("*.py"):
+        counts[file.name.split(".")[0]].update(solution.kind for solution in zoo_files.load(file))
+    rows = re.findall(r"^\| `?(\w+|\*\*all\*\*)`? \| (\d+) \| 0 \| (\d+) \|", PAGE, re.MULTILINE)
+    assert {name: (int(right), int(wrong)) for name, right, wrong in rows} == {
+        name: (of["right"], of["wrong"]) for name, of in {**counts, "**all**": sum(counts.values(), Counter())}.items()
+    }
 
 
 def test_the_environments_of_the_page_give_tensors_beyond_the_end_of_an_episode():

@@ -36,6 +36,9 @@ def test_it_takes_a_run_a_resumed_one_and_one_with_nothing_left_to_do(name, logg
     before = size()
     logger(tmp_path, {"algorithm": "ppo", "seed": 1}, 32).close([])
     assert size() == before
+    if name == "metrics.csv":
+        steps = [line.partition(",")[0] for line in (tmp_path / name).read_text().splitlines()]
+        assert steps == ["16", "16", "32"], "what is done again stands once"
 
 
 def test_a_tracker_gets_every_line_of_the_run_and_then_the_end(tmp_path):

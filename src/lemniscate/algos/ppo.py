@@ -114,7 +114,7 @@ def advantages(config: Config, networks: ActorCritic, rollout: Rollout, log_prob
 def loss(config: Config, networks: ActorCritic, batch: DrawnBatch) -> Loss:
     """The loss of a minibatch [M, …], the negative of eq. 9, and its metrics."""
     distribution, value = networks(batch.obs)
-    log_ratio = distribution.log_prob(batch.action) - batch.log_prob  # log r_t(θ), below eq. 6
+    log_ratio = distribution.log_prob(batch.action) - batch.log_prob  # log r_t(θ), above eq. 6
     policy_loss = clipped_surrogate(log_ratio, batch.advantage, config.clip)  # −L^CLIP, eq. 7
     critic_loss = value_loss(value, batch.target, batch.value, config.clip_value)  # L^VF, eq. 9
     entropy = distribution.entropy().mean()  # S, eq. 9

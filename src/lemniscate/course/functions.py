@@ -284,7 +284,8 @@ CASES: dict[str, list[Case]] = {
         Case(
             "three tensors",
             ([_drawn(3), _drawn(2, 2), _drawn(2)], [_drawn(3) + 1, _drawn(2, 2) - 1, _drawn(2) / 2], 0.1),
-        )
+        ),
+        Case("another τ", ([_drawn(3), _drawn(2, 2), _drawn(2)], [_drawn(3) - 1, _drawn(2, 2), _drawn(2) + 1], 0.25)),
     ],
     "select_at_index": [
         Case("three rows of four", (_drawn(3, 4), torch.tensor([2, 0, 3]))),
