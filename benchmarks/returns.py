@@ -2,7 +2,7 @@
 
     .venv/bin/python benchmarks/returns.py ppo                       every environment of docs/results.md, every seed
     .venv/bin/python benchmarks/returns.py ppo --envs Hopper-v5 --seeds 1 2
-    .venv/bin/python benchmarks/returns.py reppo --envs HalfCheetah-v5 --steps 1_300_000
+    .venv/bin/python benchmarks/returns.py reppo --envs HalfCheetah-v5 --steps 4_000_000 --threads 2
     .venv/bin/python benchmarks/returns.py ddpg --runs DIR           keep the runs there, and go on with unfinished ones
     .venv/bin/python benchmarks/returns.py ppo trpo --table          the table of what has been run, and the pictures
     .venv/bin/python benchmarks/returns.py minutes                   which algorithm after 1, 3, 10 and 30 minutes
@@ -79,13 +79,13 @@ PRESETS = {("sac", "HalfCheetah-v5"): "half-cheetah-large"}
 """where it is not the preset that the environment gets"""
 
 
-def one(algorithm, env, seed, marks, runs):
+def one(algorithm, env, seed, marks, runs, threads=1):
     """Train once, or to the end; evaluate at each mark."""
     import lemniscate as lem
 
     with tempfile.TemporaryDirectory() if runs is None else nullcontext(runs) as folder:
         path = Path(folder) / f"{algorithm}-{Path(env).name}-{marks[-1]}-{seed}"
-        fields = {"total_steps": marks[-1], "keep_checkpoints": 50}
+        fields = {"total_steps": marks[-1], "keep_checkpoints": 50, "threads": threads}
         if any(mark % -(-marks[-1] // 5) for mark in marks):  # not at a fifth of the run, where checkpoints lie
             fields["checkpoint_every"] = 250_000
         if path.exists():
@@ -111,6 +111,7 @@ def one(algorithm, env, seed, marks, runs):
                 "env": env,
                 "steps": mark,
                 "seed": seed,
+                "threads": threads,
                 "mean_return": scores.mean_return,
                 "std_return": scores.std_return,
                 "mean_length": sum(scores.lengths) / scores.episodes,
@@ -230,6 +231,7 @@ def main():
     parser.add_argument("--envs", nargs="+")
     parser.add_argument("--seeds", nargs="+", type=int)
     parser.add_argument("--steps", nargs="+", type=int, help="instead of those of RUNS")
+    parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--runs", type=Path)
     parser.add_argument("--table", action="store_true", help="run nothing")
     given = parser.parse_args()
@@ -240,7 +242,7 @@ def main():
         for env in given.envs or RUNS[algorithm]:
             marks, seeds = RUNS[algorithm][env]
             for seed in given.seeds or range(1, seeds + 1):
-                one(algorithm, env, seed, given.steps or marks, given.runs)
+                one(algorithm, env, seed, given.steps or marks, given.runs, given.threads)
     print("| algorithm | environment | steps | mean ± std over seeds | IQM [95 %] | worst seed | seeds | training |")
     print("|---|---|---|---|---|---|---|---|")
     for algorithm in given.algorithms:

@@ -234,6 +234,43 @@ def harder(step, metrics):
     return {"set_level": np.float64(1 + step // 32 + min(metrics.get("episode/return", 0.0), 64.0) / 128)}
 
 
+class Near(gym.Env):
+    """A number is to be brought near a goal: reward 0 within a tolerance, else −1; an episode is 20 steps."""
+
+    action_space = spaces.Box(-1, 1, (1,), np.float32)
+    observation_space = spaces.Dict(
+        {name: spaces.Box(-9, 9, (1,), np.float32) for name in ("observation", "achieved_goal", "desired_goal")}
+    )
+    tolerance = 0.5
+
+    def set_tolerance(self, tolerance):
+        self.tolerance = tolerance
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t, self.x = 0, np.zeros(1, np.float32)
+        self.goal = self.np_random.uniform(-1, 1, 1).astype(np.float32)
+        return self._see(), {}
+
+    def step(self, action):
+        self.t, self.x = self.t + 1, np.clip(self.x + np.float32(0.3) * action, -9, 9).astype(np.float32)
+        return self._see(), self.compute_reward(self.x, self.goal, {}), False, self.t == 20, {}
+
+    def compute_reward(self, achieved, desired, info):
+        return -float(np.abs(achieved - desired)[0] > self.tolerance)
+
+    def _see(self):
+        return {"observation": self.x.copy(), "achieved_goal": self.x.copy(), "desired_goal": self.goal.copy()}
+
+
+def nearer(step, metrics):
+    return {"set_tolerance": 0.5 if step < 150 else 0.1}
+
+
+def near(step, metrics):
+    return {"set_tolerance": 0.1}
+
+
 class Walk(gym.Env):
     """A walk to a goal on a line, in a plane or in space, at most 1 m a step: reward 0 within 0.5 m of it, else −1.
 

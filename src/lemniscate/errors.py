@@ -116,6 +116,11 @@ def resume_line(path: Path) -> str:
     return f"lemniscate resume {quote(str(path))}"
 
 
+def export_line(path: Path) -> str:
+    """The command that exports the policy of a run."""
+    return f"lemniscate export {quote(str(path))}"
+
+
 def is_installed(package: str) -> bool:
     """Whether an optional package can be imported."""
     try:

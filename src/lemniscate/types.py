@@ -87,7 +87,9 @@ class Step:
 
     def detach(self) -> Self:
         """The same, of which nothing can be differentiated."""
-        return replace(self, obs=self.obs.detach(), next_obs=self.next_obs.detach(), reward=self.reward.detach())
+        names = ("obs", "next_obs", "reward")
+        measures = {name: values.detach() for name, values in self.measures.items()}
+        return replace(self, **{name: getattr(self, name).detach() for name in names}, measures=measures)
 
 
 @dataclass(frozen=True)

@@ -36,6 +36,10 @@ def find(algorithm: str | ModuleType) -> Any:
 def name_of(algorithm: str | ModuleType) -> str:
     """The name under which `find` returns an algorithm. Raises `UserError` as `find` does."""
     found = find(algorithm)
+    theirs = found.Config.__module__
+    if theirs.startswith(f"{__name__}.") and theirs != found.__name__:
+        given = theirs.rpartition(".")[2]
+        raise UserError(f"The Config of {found.__name__} is that of {given}: write class Config({given}.Config) in it.")
     return algorithm if isinstance(algorithm, str) else found.__name__.removeprefix(f"{__name__}.")
 
 
@@ -55,3 +59,5 @@ def _import(name: str) -> Any:
             said = unknown_name("algorithm", name, ALGORITHMS)
             raise UserError(f"{said} A module of your own is not {named.WHERE}.") from None
         raise UserError(f"The algorithm {name} cannot be imported: {error}.") from error
+    except SystemExit:
+        raise named.ends_program(name) from None

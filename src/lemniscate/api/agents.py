@@ -208,7 +208,9 @@ def function_of(policy: Any, deterministic: bool = True) -> partial[Any]:
         raise UserError(
             "This is the module of a policy, whose actions are in [-1, 1]: give the policy itself, as load returns it."
         )
-    function = next(filter(callable, (getattr(policy, name, None) for name in METHODS)), policy)
+    found = (getattr(policy, name, None) for name in METHODS)
+    # Modules and classes are parts of a policy, as `self.act = nn.ReLU()` is.
+    function = next((one for one in found if callable(one) and not isinstance(one, nn.Module | type)), policy)
     if not callable(function):
         what = f"a run, a function, a torch module, or an object with {', '.join(METHODS[:-1])} or {METHODS[-1]}"
         raise UserError(f"A policy is {what}; not {shown(policy)}.")
@@ -276,8 +278,7 @@ class Agent:
         network gets one at a time first: a batch might spoil what it remembers. Batches are given where each row has
         the answer that it has alone.
         """
-        parts, holder = self._spec.observation_parts, getattr(self._policy, "__self__", self._policy)
-        network = any(isinstance(part, nn.Module) for part in (holder, *getattr(holder, "__dict__", {}).values()))
+        parts, network = self._spec.observation_parts, bool(_modules(self._policy))
         sizes = {self._spec.observation_size, len(parts), getattr(self._space, "n", 0), *self._space.shape}
         sizes |= {length for part in parts for length in part.own_shape + part.shape}
         size = next(number for number in range(3, 1000, 2) if number not in sizes)
@@ -327,9 +328,9 @@ class Agent:
     def _forms(self) -> Iterator[Callable[[np.ndarray], Any]]:
         """The ways in which flat observations [B, O] can be given."""
         kinds: list[Any] = [np.float32, np.float64, torch.zeros(0), torch.zeros(0, dtype=torch.float64)]
-        if isinstance(self._policy, nn.Module):
-            tensors = (*self._policy.parameters(), *self._policy.buffers())
-            kinds.insert(0, next((tensor for tensor in tensors if tensor.is_floating_point()), torch.zeros(0)))
+        tensors = (each for one in _modules(self._policy) for each in (*one.parameters(), *one.buffers()))
+        if (like := next((tensor for tensor in tensors if tensor.is_floating_point()), None)) is not None:
+            kinds.insert(0 if isinstance(self._policy, nn.Module) else len(kinds), like)
         own = partial(unflatten_observation, self._spec.observation_parts)
         for layout, kind in product((own, lambda flat: flat[:, : self._spec.observation_size]), kinds):
             yield lambda flat, layout=layout, kind=kind: _copied(layout(flat), kind)
@@ -387,6 +388,12 @@ class Agent:
         return bool(((array == np.rint(array)) & (array >= start) & (array < start + count)).all())
 
 
+def _modules(policy: Any) -> list[nn.Module]:
+    """The torch modules that a policy is, whose method it is, or that it holds."""
+    holder = getattr(policy, "__self__", policy)
+    return [part for part in (holder, *getattr(holder, "__dict__", {}).values()) if isinstance(part, nn.Module)]
+
+
 def _memory(policy: Any) -> bytes:
     """The pickled attributes of an object or a method's, and a function's closure; empty where pickle refuses."""
     cells = getattr(policy, "__closure__", None) or ()
@@ -441,7 +448,7 @@ def playing(
         made, moments, scales, said = read_weights(policy, vec.spec, agent)
         normalized = False if scales and normalized is None else normalized
         policy = _Normalized(made, moments, deterministic)
-    modes = {module: module.training for module in (policy.modules() if isinstance(policy, nn.Module) else ())}
+    modes = {module: module.training for one in _modules(policy) for module in one.modules()}
     try:
         with globals_undisturbed():
             for module in modes:

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,6 +13,9 @@ from lemniscate.run.config import RunConfig
 from lemniscate.run.run import Observer
 from lemniscate.run.state import TrainState
 from lemniscate.spec import Spec
+
+if TYPE_CHECKING:
+    from lemniscate.doctor import Attendance
 
 Callback = Callable[[int, Mapping[str, float], TrainedPolicy], object]
 """(step, metrics, policy) of a logged line; a true result stops the run"""
@@ -65,7 +68,7 @@ def call_callbacks(
     functions: Sequence[Callback],
     spec: Spec,
     config: RunConfig,
-    attend: Callable[[int, Mapping[str, float]], None] | None,
+    attend: "Attendance | None",
 ) -> Observer:
     """The function that a run calls after each logged line: every callback in turn, each with a policy of its own.
 
@@ -75,6 +78,8 @@ def call_callbacks(
     def observe(lines: Sequence[tuple[int, Mapping[str, float]]], state: TrainState) -> bool:
         stop = False
         for step, metrics in lines:
+            if attend and metrics.get("episode/return"):
+                attend.was_paid = True
             if attend and "reward/largest" in metrics:
                 attend(step, metrics)
             for function in functions:

@@ -56,6 +56,7 @@ class RunOptions:
             self.cluster = find_cluster(cluster, workers, storage)
         self.loggers = (JsonLines, TensorBoard, *([] if track is None else [_tracker(track)]))
         several: Any = callbacks if isinstance(callbacks, list | tuple) else [callbacks] if callbacks else []
+        several = [callbacks] if callable(callbacks) else several  # also one that is a list, or is empty
         self._names = list(several)
         self.callbacks: list[Callback] = [_by_name(one) if isinstance(one, str) else one for one in several]
         for function in self.callbacks:

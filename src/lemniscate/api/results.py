@@ -23,14 +23,14 @@ from lemniscate.envs import check as env_check
 from lemniscate.envs import registry
 from lemniscate.envs.check import Finding
 from lemniscate.envs.vec_env import VecEnv
-from lemniscate.errors import UserError, shown
+from lemniscate.errors import UserError, export_line, shown
 from lemniscate.hub import repository as hub
 from lemniscate.report import flight, pages, playback
 from lemniscate.report.seeds import group
 from lemniscate.run import check as run_check
 from lemniscate.run import checkpoint
 from lemniscate.run.checkpoint import list_steps
-from lemniscate.run.config import Episodes, Natural, RunConfig, checked
+from lemniscate.run.config import Episodes, RunConfig, Seed, checked
 from lemniscate.run.directory import CONFIG, FINAL, read_config, require_no_part_of_a_run
 from lemniscate.run.environments import env_arguments, evaluation_env
 from lemniscate.run.evaluate import Evaluation, critic_of
@@ -97,7 +97,7 @@ def evaluate(
             run.
     """
     chosen = agents.find(policy, checkpoint=checkpoint, trust=trust)
-    episodes, seed, file = checked("episodes", episodes, Episodes), checked("seed", seed, Natural), _video_file(video)
+    episodes, seed, file = checked("episodes", episodes, Episodes), checked("seed", seed, Seed), _video_file(video)
     deterministic = checked("deterministic", deterministic, bool)
     kwargs, folder = checked("env_kwargs", env_kwargs, dict | None), _folder_of(report, chosen)
     how: dict[str, Any] = {"episodes": episodes, "seed": seed, "deterministic": deterministic}
@@ -129,7 +129,7 @@ def _folder_of(report: str | Path | None, chosen: Any) -> Path | None:
     """The directory of a report. Raises `UserError` for a file, and for a run that `chosen`, a policy, is not of."""
     if report is None:
         return None
-    folder, path = path_of(report), getattr(chosen, "path", None)
+    folder, path = path_of(report), chosen.path if isinstance(chosen, TrainedPolicy) else None
     if file_there := file_in_the_way(folder):
         raise UserError(f"report is a directory, such as 'runs/upright', and {file_there} is a file.")
     own = [] if path is None else [path.resolve(), *path.resolve().parents]
@@ -177,7 +177,7 @@ def watch(
             of file.
     """
     chosen = None if policy is None else agents.find(policy, checkpoint=checkpoint, trust=trust)
-    episodes, seed, file = checked("episodes", episodes, Episodes), checked("seed", seed, Natural), _video_file(video)
+    episodes, seed, file = checked("episodes", episodes, Episodes), checked("seed", seed, Seed), _video_file(video)
     if chosen is None and env is None:
         raise UserError("Watch what? Name a run, or an environment to act in at random.")
     kwargs = checked("env_kwargs", env_kwargs, dict | None)
@@ -223,7 +223,7 @@ def check(
         UserError: no such environment, backend or wrapper; a directory that is no run, or a part of one; what is for an
             environment, with a run.
     """
-    is_path = isinstance(what, Path) or isinstance(getattr(what, "path", None), Path)
+    is_path = isinstance(what, Path | TrainedRun | TrainedPolicy)
     name = str(path_of(what)) if is_path else registry.name_of(what)
     return list(each_finding(name, backend, env_kwargs, registry.names_of(wrappers)))
 
@@ -333,7 +333,10 @@ def final_scores(run: str | Path | TrainedRun) -> dict[str, Any]:
     known = _known_scores(path / FINAL)
     if known.get("step") not in list_steps(path / "checkpoints")[-1:]:
         known = scores_of(load(run))
-        write_json(path / FINAL, known)
+        try:
+            write_json(path / FINAL, known)
+        except OSError as error:  # somebody else's run, or a full disk: the scores are known all the same
+            say(f"{path / FINAL} cannot be written, so the scores are not kept: {error.strerror or error}.")
     return known
 
 
@@ -472,7 +475,8 @@ def push(run: Trained, name: str, *, private: bool = False, license: str | None 
             record_or_say(policy, folder / "videos" / "episode.gif")
         scores: dict[str, Any] | None = None
         try:
-            scores = final_scores(path) if path else scores_of(policy)
+            is_newest = path and list_steps(path / "checkpoints")[-1:] == [policy.step]
+            scores = final_scores(path) if path and is_newest else scores_of(policy)
             write_json(folder / FINAL, scores)
         except UserError as error:
             say(f"No scores: {error}")
@@ -488,12 +492,12 @@ def _files_to_upload(run: Path, step: int) -> dict[str, Path]:
     that the Hub plays, else in `videos/`.
     """
     files, export = [*(run / "plots").glob("*.png")], run / "export"
-    if (export / "policy.onnx").is_file():
+    if (export / "policy.c").is_file():
         with suppress(DamagedFileError):
             if read_json(export / checkpoint.MANIFEST).get("step") == step:
                 files += export.rglob("*")
-        if export / "policy.onnx" not in files:
-            say(f"{export} is not of the policy of step {step:,}: it is left out; lemniscate export {run}")
+        if export / "policy.c" not in files:
+            say(f"{export} is not of the policy of step {step:,}: it is left out; {export_line(run)}")
     own = [file for file in files if file.is_file() and file.resolve() == run.resolve() / file.relative_to(run)]
     shown = {file.relative_to(run).as_posix(): file for file in own}
     if video := pages.newest_video(run):

@@ -73,16 +73,24 @@ def choose_config(
         name = algos.name_of(algorithm)
         chosen, config = presets.choose(name, env, preset)
     config = config.replace(**{name: name_in_config(value) for name, value in fields.items()})
-    for final in (name for name in fields if name.startswith("final_")):
-        rate = final.removeprefix("final_")
-        of_both = () if hasattr(config, rate) else (f"actor_{rate}", f"critic_{rate}")
-        if ended := [name for name in config.schedules if name in (rate, *of_both)]:
-            raise UserError(f"{ended[0]} {config.schedules[ended[0]]} has its own end: {final} does not go with it.")
+    _require_followed(config, [name for name in fields if name.startswith("final_")])
     if chosen == "default" and env is None:
         raise UserError("Which environment? Name one with env; `lemniscate envs` lists them.")
     if not config.backend:
         config = config.replace(backend=registry.backend_for(config.env, config.all_wrappers))
     return name, chosen, config
+
+
+def _require_followed(config: RunConfig, finals: Sequence[str]) -> None:
+    """Raise `UserError` where one of these ends of other fields, which were given, is followed by nothing."""
+    for final in finals:
+        rate = final.removeprefix("final_")
+        of_both = () if hasattr(config, rate) else (f"actor_{rate}", f"critic_{rate}")
+        if ended := [name for name in config.schedules if name in (rate, *of_both)]:
+            raise UserError(f"{ended[0]} {config.schedules[ended[0]]} has its own end: {final} does not go with it.")
+        is_default = getattr(config, final) == getattr(type(config), final)
+        if rate == "learning_rate" and getattr(config, "desired_kl", None) is not None and not is_default:
+            raise UserError(f"desired_kl adapts the learning rate: {final} needs desired_kl none.")
 
 
 def name_in_config(value: object) -> object:
@@ -214,7 +222,9 @@ def resume_run(run: object, arguments: Mapping[str, Any], changes: Mapping[str, 
         record = world.from_first(read_record(path) if world.is_first else {})
         with parsing(path):
             algorithm, fields = record["algorithm"], record["config"]
-        config = algos.find(algorithm).Config.from_json(fields).replace(**changes)
+        stored = algos.find(algorithm).Config.from_json(fields)
+        config = stored.replace(**changes)
+        _require_the_same(path, stored, config)
         world.divide(config.shards)
         if "total_steps" in changes and world.is_first:
             extend(path, config.total_steps)
@@ -228,6 +238,18 @@ def resume_run(run: object, arguments: Mapping[str, Any], changes: Mapping[str, 
         if options.report and world.is_first:
             _report_on(trained)
         return trained
+
+
+def _require_the_same(path: Path, stored: RunConfig, config: RunConfig) -> None:
+    """Raise `UserError` where an object is passed again that the run has by a name, and is another one."""
+    for name in ("env", "wrappers", "network", "curriculum"):
+        before, now = (getattr(each, name, None) for each in (stored, config))
+        names = before if isinstance(before, tuple) else (before or "",)
+        if before != now and not any("<" in each or each.startswith("__main__:") for each in names):
+            raise UserError(
+                f"{name} of {path} is {shown(before)}: leave {name} out; with another one it is a run of its own, which"
+                " may begin with warm_start."
+            )
 
 
 def _annealed(config: RunConfig) -> list[str]:
@@ -303,7 +325,7 @@ def _train(world: World, path: Path, algorithm: str, config: RunConfig, options:
         make_directory(file.parent)
         evaluate(PolicySnapshot(state, spec, config, state.step), episodes=1, video=file)
 
-    attend, callbacks = Attendance(config) if progress else None, options.callbacks
+    attend, callbacks = Attendance(config) if progress else None, options.callbacks if world.is_first else ()
     observer = call_callbacks(callbacks, spec, config, attend) if callbacks or attend else None
     told = {"progress": progress, "record_video": record_video, "observer": observer}
     run = Run(path, algorithm, config, envs, world=world, loggers=options.loggers, locate=local_path, **told)
@@ -322,9 +344,11 @@ def _train(world: World, path: Path, algorithm: str, config: RunConfig, options:
         path = path if path.absolute() == home else home
         if envs[0].backend.once:
             envs[0].close()  # before a report makes another one
+        state.release()
         trained = TrainedRun(path, TrainedPolicy(state.networks.cpu(), spec, config, state.step, path), run.seconds)
         if options.reports and world.is_first:
-            pictures = _report_on(trained)
+            with world.busy():
+                pictures = _report_on(trained)
     finally:
         run.close(pictures)
     try:

@@ -9,25 +9,28 @@ import os
 import socket
 import sys
 import tarfile
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from shutil import copytree
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 from urllib.parse import urlsplit
 
 from lemniscate.errors import UserError, is_installed, missing_extra, shown
 from lemniscate.run.config import Range, checked
-from lemniscate.run.directory import CONFIG, LOCK
-from lemniscate.system.files import make_directory, remove
+from lemniscate.run.directory import BEST, CONFIG, LOCK
+from lemniscate.system.files import at_home, make_directory, remove
 from lemniscate.system.machine import require_linux
 
 Workers = Annotated[int, Range(1, 4096)]
 STORAGE = "ray"
 """the folder of a run directory that has Ray's storage, where no other is named"""
-LEFT = (LOCK, STORAGE, "plots", "videos")
-"""what stays on its own machine, and is not sent"""
+ITS_OWN = (LOCK, STORAGE)
+"""what stays on its own machine, and is never sent"""
+LEFT = (*ITS_OWN, "plots", "videos")
+"""what is not sent before the end"""
 
 
 @dataclass(frozen=True)
@@ -63,7 +66,9 @@ def find_cluster(cluster: object, workers: object = None, storage: object = None
     if not is_installed("ray"):
         raise missing_extra("ray", "ray")
     _require_answer(address or os.environ.get("RAY_ADDRESS", ""))
-    place = None if storage is None else os.path.expanduser(str(storage))  # noqa: PTH111 (it may be an address)
+    place = None if storage is None else str(storage)
+    if place and "://" not in place:  # a folder: Ray takes no relative one
+        place = str(at_home(place).absolute())
     return Cluster(address or None, most, place)
 
 
@@ -113,15 +118,18 @@ def _no_answer(address: str, error: Exception) -> UserError:
     return UserError(f"No Ray cluster answers at {address}: {str(error).partition(chr(10))[0]}")
 
 
-def pack(path: Path) -> bytes:
-    """A run directory, which another process may be writing to: its checkpoints first, then all that is after them."""
+def pack(path: Path, left: Collection[str] = LEFT) -> bytes:
+    """A run directory, which another process may be writing to: its checkpoints first, then all that is after them.
+
+    What has a name in `left` is not sent: by default also the pictures, which are made anew.
+    """
     packed = io.BytesIO()
     with tarfile.open(fileobj=packed, mode="w") as archive:
         # Not by rglob, which fails at a folder that is renamed meanwhile.
         files = [Path(folder) / name for folder, _, names in os.walk(path) for name in names]
         for file in sorted(files, key=lambda file: "checkpoints" not in file.parts):
             own = file.relative_to(path)
-            if own.parts[0] not in LEFT and file.suffix != ".tmp":
+            if own.parts[0] not in left and not any(part.endswith(".tmp") for part in own.parts):
                 with suppress(FileNotFoundError):  # the process deletes what it needs no longer
                     archive.add(file, str(own), recursive=False)
     return packed.getvalue()
@@ -140,12 +148,16 @@ def unpack(packed: bytes, path: Path) -> None:
         for file in new.iterdir():
             if file.is_file() and not (file.name == CONFIG and (path / CONFIG).exists()):
                 file.replace(path / file.name)
+        for name in ("plots", "videos"):
+            if (new / name).exists():
+                copytree(new / name, path / name, dirs_exist_ok=True)
         ours, theirs = path / "checkpoints", new / "checkpoints"
         if not theirs.exists():
             return
         make_directory(ours)
         sent = {checkpoint.name for checkpoint in theirs.iterdir()}
-        for name in sent - {checkpoint.name for checkpoint in ours.iterdir()}:
+        for name in sent - {checkpoint.name for checkpoint in ours.iterdir() if checkpoint.name != BEST}:
+            remove(ours / name)
             (theirs / name).rename(ours / name)
         for checkpoint in ours.iterdir():
             if checkpoint.name not in sent:

@@ -62,6 +62,7 @@ def train_on_ray(
         from ray.train.v2.api.exceptions import TrainingFailedError
 
         if not (path / CONFIG).exists():
+            require_no_other_job(cluster.storage, path.name)
             config = config.replace(shards=max(config.shards, workers))
             create_directory(path, CONFIG, {"algorithm": algorithm, "config": config.to_json()})
         name = path.name if cluster.storage else JOB
@@ -119,6 +120,21 @@ def _trainer(given: dict[str, Any], config: RunConfig, workers: int, name: str, 
             failure_config=FailureConfig(max_failures=FAILURES),
         ),
     )
+
+
+def require_no_other_job(storage: str | None, name: str) -> None:
+    """Raise `UserError` where a storage has a job of that name, from whose checkpoint Ray would begin a new run."""
+    if storage is None:
+        return
+    from pyarrow import fs
+
+    try:
+        files, folder = fs.FileSystem.from_uri(f"{storage}/{name}")
+        found = files.get_file_info(folder).type
+    except (OSError, ValueError) as error:
+        raise UserError(f"The storage {storage} cannot be reached: {error}.") from error
+    if found is not fs.FileType.NotFound:
+        raise UserError(f"{storage} has a job {name} of another run: choose another --run, or another --storage.")
 
 
 def line_to_resume(path: Path, cluster: Cluster, workers: int) -> str:

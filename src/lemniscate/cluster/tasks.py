@@ -16,7 +16,7 @@ from signal import SIGTERM
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from lemniscate.cluster.connection import Cluster, connected, pack, unpack
+from lemniscate.cluster.connection import ITS_OWN, Cluster, connected, pack, unpack
 from lemniscate.run.checkpoint import list_steps
 from lemniscate.run.metrics import METRICS
 from lemniscate.run.places import LOG, Places, Processes
@@ -49,7 +49,7 @@ class Task:
                     yield None, pack(run), True
                 elif (run / METRICS).exists():
                     yield None, (run / METRICS).read_bytes(), False
-            yield codes[run], pack(run), True
+            yield codes[run], pack(run, ITS_OWN), True
 
     def stop(self) -> None:
         """Ask the process to save and stop."""
@@ -65,6 +65,8 @@ class _Running:
     options: Sequence[str]
     lost: int
     begun: bool = False
+    asked: bool = False
+    """to stop"""
 
 
 class RayTasks(Places):
@@ -106,6 +108,7 @@ class RayTasks(Places):
             self._connection.close()
 
     def _ask_to_stop(self, trainer: _Running) -> None:
+        trainer.asked = True
         if trainer.begun:
             trainer.task.stop.remote()
         else:  # it waits for room: nothing is lost
@@ -132,6 +135,8 @@ class RayTasks(Places):
             (run / LOG).write_text(str(error), "utf-8")
             return 1
         except (self._ray.exceptions.RayError, StopIteration) as error:
+            if running.asked:
+                return -SIGTERM
             if running.lost == MOST_LOSSES:
                 (run / LOG).write_text(f"{MOST_LOSSES + 1} tasks of this run were lost; the last: {error}", "utf-8")
                 return 1

@@ -336,6 +336,8 @@ class Exercise:
     def _difference(self, got: Results, right: Results) -> str | None:
         """A sentence on the first difference between what was seen and what is right."""
         for what, output, wanted in zip(self.outputs, got["outputs"], right["outputs"], strict=True):
+            if output.is_complex():
+                return f"{what} is of complex numbers; its real part is asked for."
             if output.shape != wanted.shape:
                 return f"{what} has shape {list(output.shape)}; it should be {list(wanted.shape)}."
             if "gradient" not in got:

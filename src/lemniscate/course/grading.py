@@ -50,7 +50,7 @@ READING, WHOLE = 60.0, 600.0
 """seconds in which a hand-in is to be read, and in which all of its exercises are to be tried"""
 MOST_COPIED, MOST_PRINTED = 2**26, 2_000
 """bytes of a file, and characters of what is printed that are kept"""
-IGNORED = {"venv", "env", "site-packages", "node_modules", "wandb"}
+IGNORED = {"venv", "site-packages", "node_modules", "wandb"}
 
 
 class Trial:
@@ -151,11 +151,14 @@ def files_of(path: Path, large: bool = False) -> dict[Path, Path]:
     """
     root, every = (path, path.rglob("*")) if path.is_dir() else (path.parent, path.parent.iterdir())
     found = {file: file.relative_to(root) for file in sorted(every) if file.is_file()}
+    installed = {file.parent for file in found if file.name == "pyvenv.cfg"}  # whatever the folder's name
+    installed |= {file.parent.parent for file in found if file.parent.name == "conda-meta"}
     return {
         file: name
         for file, name in found.items()
         if (file == path or root == path or file.suffix not in handin.SUFFIXES)
         and not any(part.startswith((".", "__")) or part in IGNORED for part in name.parts if part != "__init__.py")
+        and not (installed - {root}).intersection(file.parents)
         and (file.stat().st_size > MOST_COPIED) is large
         and (file.suffix in handin.SUFFIXES or not large)
     }

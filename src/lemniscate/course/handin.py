@@ -142,11 +142,14 @@ class Reader:
         except TooLong:
             self.notes.append(f"{where}: left out, since it did not end within {seconds:.2g} s.")
         except BaseException as error:  # what ends a program, too, ends this statement alone
-            absent = isinstance(error, ModuleNotFoundError) and f"the package {error.name} is not installed here"
-            reason = absent or f"{type(error).__name__}: {error}".rstrip(".: ")
-            self.notes.append(f"{where}: {reason}.")
+            said = type(error).__name__
+            with suppress(Exception):  # of an exception of the student's
+                said = f"{said}: {error}".rstrip(".: ")
+            if isinstance(error, ModuleNotFoundError):
+                said = f"the package {error.name} is not installed here"
+            self.notes.append(f"{where}: {said}.")
             for each in imports[0].names if imports and imports[0] is node else ():
-                scope.setdefault(each.asname or each.name.partition(".")[0], Missing(absent or str(error)))
+                scope.setdefault(each.asname or each.name.partition(".")[0], Missing(said))
         self._time_to_fill -= filling * (time.monotonic() - began)
 
     def _trees(self, file: Path) -> Iterator[tuple[Path, ast.Module]]:
@@ -218,10 +221,16 @@ def _parsed(source: str) -> ast.Module:
 
 def _bound(node: ast.AST) -> set[str]:
     """The names that a statement at the top level assigns or defines."""
-    if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
-        return {node.name}
-    own = {node.id} if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store) else set()
-    return own.union(*map(_bound, ast.iter_child_nodes(node)))
+    found, waiting = set[str](), [node]
+    while waiting:  # no recursion: a long sum is a deep tree
+        each = waiting.pop()
+        if isinstance(each, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            found.add(each.name)
+            continue
+        if isinstance(each, ast.Name) and isinstance(each.ctx, ast.Store):
+            found.add(each.id)
+        waiting += ast.iter_child_nodes(each)
+    return found
 
 
 def _filled(node: ast.AST) -> set[str]:
@@ -245,10 +254,9 @@ def _global(function: ast.AST) -> set[str]:
 
 def _is_empty(thing: Any) -> bool:
     """Whether there is nothing, or nothing in it."""
-    try:
+    with suppress(Exception):  # a class of the student's has a length of its own making
         return thing is None or len(thing) == 0
-    except TypeError:
-        return False
+    return False
 
 
 def _called(node: ast.AST) -> str:
@@ -272,7 +280,8 @@ def solutions(reader: Reader, demanded: list[str]) -> dict[str, tuple[Any, str]]
     for name, modules in reader.defined.items():
         file, module = [*modules.items()][-1]
         thing = module.__dict__.get(name)
-        methods = {each: getattr(thing, each) for each in vars(thing)} if isinstance(thing, type) else {}
+        own = [each for each in vars(thing) if each in course.EXERCISES] if isinstance(thing, type) else []
+        methods = {each: getattr(thing, each, None) for each in own}
         for each, answer in {**methods, name: thing}.items():
             if each not in course.EXERCISES or not callable(answer) or isinstance(answer, Missing):
                 continue

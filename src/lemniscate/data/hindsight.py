@@ -55,6 +55,10 @@ class HindsightReplay(ReplayBuffer):
                 f"No episode of {self._env_id} has ended in {steps:,} steps, up to a checkpoint, which cuts them, and"
                 " hindsight stores whole ones: before one has, nothing is learned. Raise checkpoint_every above that."
             )
+        self.drop()
+
+    def drop(self) -> None:
+        """Drop the episodes under way."""
         for episode in self._episodes:
             episode.clear()
 

@@ -56,6 +56,9 @@ class ReplayBuffer:
     def on_restart(self, judge: Judge) -> None:
         """Nothing here, where rows need no episode: called when environments were restarted; `judge` is theirs."""
 
+    def drop(self) -> None:
+        """Nothing here: called where a curriculum changed the rules of the episodes under way."""
+
     def sample_indices(self, minibatches: int, size: int, generator: Generator) -> Tensor:
         """Rows of `transitions`, drawn uniformly with replacement: [minibatches, size] int64."""
         return torch.randint(len(self), (minibatches, size), generator=generator, device=generator.device)
@@ -126,13 +129,11 @@ class ActionNoise:
         self._position.fill_(self._length)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """The sequences, and the position in each."""
-        return {"sequences": self._sequences, "position": self._position}
+        """Nothing: a run is resumed where its environments restart, and all sequences with them."""
+        return {}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Restore what `state_dict` returned."""
-        self._sequences.copy_(state["sequences"])
-        self._position.copy_(state["position"])
+        """Nothing is restored."""
 
 
 @torch.no_grad()

@@ -172,7 +172,7 @@ def of_normalization(e: Evidence) -> Seen:
     few = len(e.values("observation/predicted")) > 0  # of many numbers, as a Humanoid's, some are healthily large
     if not normalized and late > (200 if e.config.get("activation") == "tanh" else 500 if few else 20_000):
         yield "large-observation", f"Observations reach {late:.3g}, and are not normalized."
-    if normalized and count <= 0.5 * steps:
+    if normalized and not e.config.get("episodes") and count < 0.45 * steps:  # reset rows are not seen
         yield "normalizer-frozen", f"The normalizer has seen {count:,.0f} observations of {steps:,} steps."
     if offset > 4:
         yield (
@@ -399,6 +399,8 @@ def of_updates(e: Evidence) -> Seen:
         yield "kl-too-large", f"The KL divergence of the late updates is {kl:.2g}, {beside}."
     if e.greatest("step_fraction") == 0 and e.late("gradient_norm") > 0:
         yield "step-refused", "The line search took no step in any update."
+    if "policy" in e.config.get("freeze", ()):
+        return
     if kl < 1e-6 and not e.rose and not e.spread_left >= 0:
         yield "policy-still", f"The KL divergence of the late updates is {kl:.1g}: the policy hardly moves."
     elif e.greatest("network/moved") == 0:
@@ -813,7 +815,8 @@ def settings_far_out(e: Evidence) -> list[tuple[Rule, str]]:
             continue
         size = "far" if field in HORIZONS or np.isinf(factor) else f"{abs(factor):,.0f} times"
         side = "below" if factor < 0 else "above"
-        change = [name for name in OF_RATIOS.get(field, (field,)) if e.config[name] != e.recommended.get(name)]
+        named = [name for name in OF_RATIOS.get(field, (field,)) if name in e.config]
+        change = [name for name in named if e.config[name] != e.recommended.get(name)]
         seen = f"{field} is {e.config[field]}, {size} {side} its usual range, {low:g} to {high:g}."
         remedy = f"{' '.join(f'{flag(name)} {typed(e.recommended.get(name))}' for name in change)}, as recommended"
         sure = POSSIBLE if e.rose else LIKELY

@@ -288,7 +288,7 @@ class Joined(Backend):
     """
 
     def __init__(self, backends: Sequence[Backend]) -> None:
-        self._backends, one = backends, backends[0]
+        self.parts, one = backends, backends[0]
         self.num_envs = len(backends) * one.num_envs
         self.spec, self.device, self.mode, self.notices = one.spec, one.device, one.mode, one.notices
         self.summaries, self.scene, self.baseline = one.summaries, one.scene, one.baseline
@@ -296,14 +296,14 @@ class Joined(Backend):
 
     def restart(self, seed: int, first: int = 0) -> Tensor:
         """Begin again; see `Backend.restart`."""
-        size = self._backends[0].num_envs
-        obs = torch.cat([backend.restart(seed, first + i * size) for i, backend in enumerate(self._backends)])
+        size = self.parts[0].num_envs
+        obs = torch.cat([backend.restart(seed, first + i * size) for i, backend in enumerate(self.parts)])
         self._look()
         return obs
 
     def step(self, action: Tensor) -> Step:
         """The step of all parts; see `Backend.step`. A measure that some of them lack is NaN there."""
-        parts = zip(self._backends, action.chunk(len(self._backends)), strict=True)
+        parts = zip(self.parts, action.chunk(len(self.parts)), strict=True)
         steps = [backend.step(part) for backend, part in parts]
         self._look()
         columns = ("obs", "next_obs", "reward", "terminated", "truncated", "valid")
@@ -315,18 +315,18 @@ class Joined(Backend):
 
     def call(self, calls: Mapping[str, Any]) -> None:
         """Call methods of all of them; see `Backend.call`."""
-        for backend in self._backends:
+        for backend in self.parts:
             backend.call(calls)
 
     def judge_goals(self, achieved: Tensor, desired: Tensor) -> tuple[Tensor, Tensor]:
         """The judgement of the first; see `Backend.judge_goals`."""
-        return self._backends[0].judge_goals(achieved, desired)
+        return self.parts[0].judge_goals(achieved, desired)
 
     def close(self) -> None:
         """Close them all."""
-        for backend in self._backends:
+        for backend in self.parts:
             backend.close()
 
     def _look(self) -> None:
-        self.counts = torch.cat([backend.counts for backend in self._backends])
-        self.notices = self._backends[0].notices  # the others observe the same
+        self.counts = torch.cat([backend.counts for backend in self.parts])
+        self.notices = self.parts[0].notices  # the others observe the same

@@ -12,10 +12,11 @@ from gymnasium import spaces
 from torch import Tensor
 
 from lemniscate.envs.returned import (
+    EXPLAINED,
     MASKS,
     ReturnedValues,
     as_array,
-    author,
+    close_or_say,
     flat_mask,
     kind_of,
     layers,
@@ -26,7 +27,6 @@ from lemniscate.envs.returned import (
 )
 from lemniscate.errors import UserError
 from lemniscate.spec import Action, Box, Discrete, MultiDiscrete, ObservationPart
-from lemniscate.system.console import say
 
 SUCCESS = ("is_success", "success")
 """what robotics environments call their success: 1 or 0, or True and False"""
@@ -57,8 +57,9 @@ class SingleEnv(gym.Wrapper):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Gymnasium's."""
         try:
-            returned: Any = self.env.reset(seed=seed, options=options)
-        except (TypeError, ValueError, SystemExit) as error:
+            # Gymnasium's vectors leave {} of the options by which they reset some of their environments.
+            returned: Any = self.env.reset(seed=seed, options=options or None)
+        except EXPLAINED as error:
             raise self._returns.explained("reset", error) from error.__cause__
         now = self.env.action_space
         if now is not self._acts and now != self._acts:
@@ -74,7 +75,7 @@ class SingleEnv(gym.Wrapper):
         """Gymnasium's."""
         try:
             returned: Any = self.env.step(action)
-        except (TypeError, ValueError, SystemExit) as error:
+        except EXPLAINED as error:
             raise self._returns.explained("step", error) from error.__cause__
         usual = type(returned) is tuple and len(returned) == 5 and self._is_usual(*returned)
         obs, reward, terminated, truncated, info = returned if usual else self._returns.of_step(returned)
@@ -115,10 +116,7 @@ class SingleEnv(gym.Wrapper):
 
     def close(self) -> None:
         """Gymnasium's. An exception in it is said, and costs nothing that was learned."""
-        try:
-            self.env.close()
-        except Exception as error:
-            say(f"{author(self.env, 'close')} raised {type(error).__name__}: {error}")
+        close_or_say(self.env)
 
     def _reduced(self, method: str, obs: Any, info: dict[str, Any]) -> dict[str, Any]:
         numbers: dict[str, Any] = dict(scalars(info))
@@ -255,7 +253,7 @@ def _with_tuples(tree: Any) -> Any:
     if not isinstance(tree, dict):
         return tree
     inside = {key: _with_tuples(value) for key, value in tree.items()}
-    return tuple(inside.values()) if all(isinstance(key, int) for key in inside) else inside
+    return tuple(inside.values()) if list(inside) == list(range(len(inside))) else inside
 
 
 def _one_hot(part: ObservationPart, obs: Any) -> np.ndarray:

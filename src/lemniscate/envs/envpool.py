@@ -13,6 +13,7 @@ from torch import Tensor
 from lemniscate.envs.backend import Backend
 from lemniscate.envs.conversion import SUCCESS, flatten_observation, measured, physical_action, row_of
 from lemniscate.envs.registry import ID_PREFIXES
+from lemniscate.envs.returned import mask_in
 from lemniscate.envs.spaces import SUMMARIES, ActionMasks, action_kind, is_image, masked, observation_parts
 from lemniscate.envs.vec_env import Stagger
 from lemniscate.errors import UserError, is_installed, missing_extra, unknown_name
@@ -163,12 +164,19 @@ class SingleEnv(gym.Env):
         """Build it again from `seed`: EnvPool seeds at no other time."""
         self._pool.close()
         self._pool = self._make(seed or 0)
-        return row_of(self._pool.reset()[0], 0), {}
+        obs, info = self._pool.reset()
+        return row_of(obs, 0), self._mask(info)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """One step."""
-        obs, reward, terminated, truncated, _ = self._pool.step(np.asarray(action)[None])
-        return row_of(obs, 0), float(reward[0]), bool(terminated[0]), bool(truncated[0]), {}
+        obs, reward, terminated, truncated, info = self._pool.step(np.asarray(action)[None])
+        late = bool(info["elapsed_step"][0] >= self._pool.config["max_episode_steps"])  # not every family ends there
+        return row_of(obs, 0), float(reward[0]), bool(terminated[0]), bool(truncated[0]) or late, self._mask(info)
+
+    def _mask(self, info: Mapping[str, Any]) -> dict[str, Any]:
+        """The info of one environment, with its mask of actions if it has one."""
+        mask = mask_in(None, info)[1]
+        return {} if mask is None else {"action_mask": np.asarray(mask)[0] if np.any(mask) else np.ones_like(mask)[0]}
 
     def render(self) -> Any:
         """The picture [H, W, 3] uint8, or None in a window."""

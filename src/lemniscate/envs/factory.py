@@ -19,8 +19,8 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, SyncVectorEnv, Vecto
 
 from lemniscate.envs.conversion import SingleEnv
 from lemniscate.envs.registry import RSL_RL_METHOD
-from lemniscate.envs.returned import CheckedVector
-from lemniscate.envs.workers import WatchedVectorEnv, Worker, told_with_place
+from lemniscate.envs.returned import CheckedVector, told_with_place
+from lemniscate.envs.workers import WatchedVectorEnv, Worker
 from lemniscate.errors import UserError, WorkerError, shown, with_article
 from lemniscate.system import named
 
@@ -57,7 +57,9 @@ def makes_vector(maker: Maker) -> bool:
 
 def is_own(maker: Maker) -> bool:
     """Whether an environment is the user's own: neither of an installed package nor of the standard library."""
-    made_by = getattr(maker, "entry_point", maker)
+    made_by: Any = getattr(maker, "entry_point", maker)
+    while isinstance(made_by, partial):
+        made_by = made_by.func
     name = made_by.partition(":")[0] if isinstance(made_by, str) else getattr(made_by, "__module__", "")
     package = name.partition(".")[0]  # to look for what is inside of it would import it
     found = sys.modules.get(package) or (package and find_spec(package))
@@ -132,11 +134,12 @@ def make_vector(
             )
         envs = one = CheckedVector(made)
     elif workers:
-        multiprocessing.get_context("forkserver").set_forkserver_preload([__name__])  # imported once, for all
+        method = "forkserver" if "forkserver" in multiprocessing.get_all_start_methods() else "spawn"  # Windows
+        multiprocessing.get_context(method).set_forkserver_preload([__name__])  # imported once, for all
         one = makers[0]()
         one.close()
         in_workers = [partial(Worker, make, os.getpid()) for make in makers]
-        envs = WatchedVectorEnv(in_workers, context="forkserver", autoreset_mode=AutoresetMode.DISABLED)
+        envs = WatchedVectorEnv(in_workers, context=method, autoreset_mode=AutoresetMode.DISABLED)
     else:
         envs = SyncVectorEnv(makers, copy=False, autoreset_mode=AutoresetMode.DISABLED)
         one = envs.envs[0]
@@ -167,7 +170,8 @@ def require_no_statistics(env: Any, vector: VectorEnv) -> None:
                 " train with normalize_observations, for rewards with scale_rewards (--normalize-observations,"
                 " --scale-rewards)."
             )
-        env = held.get("env", next(iter(held.get("envs") or ()), None))
+        several = held.get("envs")
+        env = held.get("env", several[0] if isinstance(several, list | tuple) and several else None)
 
 
 def _is_running(value: object) -> bool:

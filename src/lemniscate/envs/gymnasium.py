@@ -187,9 +187,11 @@ class GymnasiumBackend(Backend):
         for name, argument in calls.items():
             if isinstance(vector, WatchedVectorEnv):
                 vector.call_method(name, argument)
+                called = [self._judge] if self._judge else []
             else:
-                for env in vector.envs if isinstance(vector, SyncVectorEnv) else [vector.env]:
-                    call_method(env, name, argument)
+                called = vector.envs if isinstance(vector, SyncVectorEnv) else [vector.env]
+            for env in called:
+                call_method(env, name, argument)
 
     def judge_goals(self, achieved: Tensor, desired: Tensor) -> tuple[Tensor, Tensor]:
         """By the environment's own `compute_reward` and `compute_terminated`, row by row, as they are called in a step.
@@ -199,7 +201,11 @@ class GymnasiumBackend(Backend):
         if isinstance(self._envs, SyncVectorEnv):
             judge: Any = self._envs.envs[0]
         elif self.wraps(self.spec.env_id):
-            judge = self._judge = self._judge or self._make_judge()
+            if self._judge is None:
+                self._judge = self._make_judge()
+                for name, argument in self._calls.items():
+                    call_method(self._judge, name, argument)
+            judge = self._judge
         else:
             raise UserError(f"{self.spec.env_id} makes {self.num_envs} environments at once; goals are judged by one.")
         reward, ended = judge.judge_goals(achieved.cpu().numpy(), desired.cpu().numpy())
@@ -210,6 +216,7 @@ class GymnasiumBackend(Backend):
         self._envs.close()
         if self._judge:
             self._judge.close()
+            self._judge = None
 
     def _require_going_on(self, moved: np.ndarray, done: np.ndarray) -> None:
         """Raise `UserError` where a reset by mask moves the other rows nearly as far, too; noise moves them less."""

@@ -73,7 +73,7 @@ def backend_for(env: str, wrappers: Sequence[str] = ()) -> str:
     `UserError` with the nearest names if there is none.
     """
     with suppress(UserError):  # an id behind a module that registers it, or nothing
-        if ":" in env and hasattr(named.find(env), RSL_RL_METHOD):
+        if ":" in env and hasattr(found := named.find(env), RSL_RL_METHOD) and not _is_of_gymnasium(found):
             return "rsl_rl"
     serving = None
     for name in BACKENDS:
@@ -84,6 +84,11 @@ def backend_for(env: str, wrappers: Sequence[str] = ()) -> str:
     if serving is None:
         raise unknown_env(env)
     return serving
+
+
+def _is_of_gymnasium(found: object) -> bool:
+    """Whether it is a class of Gymnasium's environments, which may have a method of that name too."""
+    return isinstance(found, type) and any(each.__module__.startswith("gymnasium.") for each in found.__mro__)
 
 
 def unknown_env(env: str) -> UserError:

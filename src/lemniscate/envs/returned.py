@@ -14,11 +14,18 @@ from gymnasium import spaces
 from gymnasium.vector import VectorEnv, VectorWrapper
 from torch import Tensor
 
-from lemniscate.errors import UserError, shown
+from lemniscate.errors import UserError, WorkerError, shown
 from lemniscate.spec import Action, Discrete, MultiDiscrete
+from lemniscate.system.console import say
 
 MASKS = ("action_mask", "action_masks", "legal_action_mask")
 """what environments call their action mask in `info`, as a key of a Dict observation, or as a method"""
+
+EXPLAINED = (TypeError, ValueError, SystemExit, OSError)
+"""what an environment raises that is said in other words: see `ReturnedValues.explained`"""
+
+MOST_LETTERS = 500
+"""of what an exception says"""
 
 VALUES = {"reset": "2 values, (observation, info)", "step": "5 values, (obs, reward, terminated, truncated, info)"}
 
@@ -47,8 +54,10 @@ class ReturnedValues:
     def explained(self, method: str, error: BaseException) -> BaseException:
         """The sentence where a wrapper of Gymnasium could not unpack what `method` returned, or it ended the program.
 
-        Else the error itself.
+        Also where a pipe or a file of the environment's failed, which is not one of ours. Else the error itself.
         """
+        if isinstance(error, OSError):
+            return WorkerError(f"{author(self._env, method)} raised {told_with_place(error)}.")
         if isinstance(error, SystemExit):
             code = "" if error.code is None else shown(error.code)
             return self.wrong(method, f"called sys.exit({code}), which would end the whole program")
@@ -103,15 +112,42 @@ class CheckedVector(VectorWrapper):
         """Gymnasium's."""
         try:
             return self._returns.of_reset(self.env.reset(seed=seed, options=options))
-        except SystemExit as error:
+        except (SystemExit, OSError) as error:
             raise self._returns.explained("reset", error) from None
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Gymnasium's."""
         try:
             return self._returns.of_step(self.env.step(actions))
-        except SystemExit as error:
+        except (SystemExit, OSError) as error:
             raise self._returns.explained("step", error) from None
+
+    def close(self, **kwargs: Any) -> None:
+        """Gymnasium's. An exception in it is said, and costs nothing that was learned."""
+        close_or_say(self.env, **kwargs)
+
+
+def close_or_say(env: Any, **kwargs: Any) -> None:
+    """Close an environment; what it raises, or that it would end the program, is said."""
+    try:
+        env.close(**kwargs)
+    except (Exception, SystemExit) as error:
+        say(f"{author(env, 'close')} raised {type(error).__name__}: {error}")
+
+
+def told_with_place(error: BaseException) -> str:
+    """The words of an error, and the place where it was raised."""
+    place = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{words_of(error)} ({Path(place.filename).name}, line {place.lineno})"
+
+
+def words_of(error: BaseException) -> str:
+    """The kind of an error, and the beginning of what it says."""
+    said = ""
+    with suppress(Exception):  # it may fail to say anything
+        said = " ".join(str(error).split())
+    said = f"{said[:MOST_LETTERS]}…" if len(said) > MOST_LETTERS else said.rstrip(".")
+    return f"{type(error).__name__}: {said}" if said else type(error).__name__
 
 
 def require_form(env: Any, names: tuple[str, str]) -> None:

@@ -15,8 +15,8 @@ from torch import Generator, Tensor
 
 from lemniscate.envs.backend import Summary
 from lemniscate.envs.conversion import SUCCESS, flatten_observation, row_of
-from lemniscate.envs.returned import MASKS, flat_mask, kind_of, mask_in, shown_space
-from lemniscate.errors import UserError
+from lemniscate.envs.returned import MASKS, as_array, flat_mask, kind_of, mask_in, shown_space
+from lemniscate.errors import UserError, shown
 from lemniscate.spec import Action, Box, Discrete, MultiBinary, MultiDiscrete, ObservationPart, Spec
 
 IMAGE_CHANNELS = 16
@@ -71,6 +71,9 @@ def _parts(space: gym.Space, env_id: str, path: tuple[str | int, ...]) -> tuple[
         return (ObservationPart(path, tuple(space.shape), _whole(space.nvec), _whole(space.start)),)
     if isinstance(space, spaces.Dict | spaces.Tuple):
         named = space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces)
+        named = [(key.item() if isinstance(key, np.generic) else key, part) for key, part in named]
+        if odd := [key for key, _ in named if type(key) not in (str, int)]:  # of another type none would be stored
+            raise UserError(f"{env_id} observes a Dict with the key {shown(odd[0])}; keys must be texts.")
         inside = [_parts(part, env_id, (*path, name)) for name, part in named]
         return tuple(part for parts in inside for part in parts)
     raise UserError(
@@ -286,9 +289,10 @@ def read_mask(mask: Any, spec: Spec, flat: np.ndarray) -> np.ndarray:
     batch, size = len(flat), spec.action.mask_size
     if mask is None:
         mask = _mask_in_flat(spec, flat)
-    several = isinstance(mask, np.ndarray) and mask.ndim > 1 and mask.shape == (batch, size)
+    array = as_array(mask)
+    several = array.ndim > 1 and array.shape == (batch, size)
     try:
-        rows = np.stack([flat_mask(row, spec.action) for row in (mask if several else [mask])])
+        rows = np.stack([flat_mask(row, spec.action) for row in (array if several else [mask])])
     except ValueError as error:
         raise UserError(f"{spec.env_id} has action masks of {size} numbers; this is one {error}.") from None
     if isinstance(spec.action, Discrete | MultiDiscrete) and not _permits(rows, spec.action).all():
@@ -330,7 +334,7 @@ def read_observation(spec: Spec, obs: Any) -> tuple[np.ndarray, bool]:
         batched = _is_batch(parts, obs)
         with np.errstate(over="ignore"):  # to infinity, which is said below
             flat = flatten_observation(parts, obs, image=spec.image)
-    except (KeyError, IndexError, TypeError, ValueError, OverflowError) as error:
+    except (KeyError, IndexError, TypeError, ValueError, OverflowError, RuntimeError) as error:
         raise _unreadable(spec, obs, error) from None
     if not np.isfinite(flat).all():
         number = flat[~np.isfinite(flat)][0]

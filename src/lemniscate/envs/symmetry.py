@@ -101,6 +101,8 @@ def find_mirror(env: str, kwargs: Mapping[str, Any], wrappers: Sequence[str]) ->
             one.close()
     except UserError as error:
         raise UserError(f"{env} has no symmetry that could be used: {error}") from None
+    except Exception as error:  # of a robot whose model and data are another simulator's
+        raise UserError(f"{env} has no symmetry that could be used: {type(error).__name__}, {error}") from error
 
 
 def _require_own_image(order: SignedPermutation, space: Any) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lemniscate.envs.backend import Backend
+from lemniscate.envs.backend import Backend, Joined
 from lemniscate.envs.returned import kind_of
 from lemniscate.envs.symmetry import Mirror
 from lemniscate.errors import NonFiniteError, UserError, shown, wrong_action
@@ -54,7 +54,8 @@ class VecEnv:
         self._recent: deque[tuple[Tensor, Tensor, Step]] = deque(maxlen=max(4, kept))
         self._statistics = EpisodeStatistics(self.num_envs, self.device)
         self._actions: tuple[torch.Size, torch.dtype] | None = None  # before it is restarted, none is right
-        self._is_own = not type(backend).__module__.startswith("lemniscate.")
+        self._kind = type(backend.parts[0] if isinstance(backend, Joined) else backend)
+        self._is_own = not self._kind.__module__.startswith("lemniscate.")
 
     def restart(self, seed: int, steps: int = 0) -> Tensor:
         """Begin again from a seed; also stored as `obs`, [N, O]. `steps` is what the run has taken.
@@ -95,9 +96,9 @@ class VecEnv:
         self._require_finite(observation=step.next_obs, reward=step.reward)
         if step.obs is not step.next_obs:
             self._require_finite(observation=step.obs)
-        own = step
+        own = step.detach() if step.reward.requires_grad else step
         if self._world.size > 1:
-            step, counts = self._of_all(own, counts)
+            step, counts = self._of_all(step, counts)
         if self.carrier:
             step = self.carrier.follow(self.obs, step)
         seen = step.detach() if step.reward.requires_grad else step
@@ -110,7 +111,7 @@ class VecEnv:
     def _copied(self, step: Step) -> Step:
         """The step of a backend of one's own, copied, since it may be written over. Raises `UserError` for no step."""
         if not isinstance(step, Step):
-            who = type(self.backend).__name__
+            who = self._kind.__name__
             raise UserError(f"{who}.step() returns {kind_of(step)}; it must be a Step of lemniscate.types.")
         flags, names = ("terminated", "truncated", "valid"), ("obs", "next_obs", "reward")
         copies = {name: self._copy("step", name, getattr(step, name), torch.bool) for name in flags}
@@ -125,7 +126,7 @@ class VecEnv:
         shape = (self.backend.num_envs, columns) if "obs" in name else (self.backend.num_envs,)
         kind = kind or (torch.uint8 if self.spec.image and "obs" in name else torch.get_default_dtype())
         if not isinstance(value, Tensor) or (value.shape, value.dtype) != (shape, kind):
-            said = f"{type(self.backend).__name__}.{method}() returns {kind_of(value)} as {name}"
+            said = f"{self._kind.__name__}.{method}() returns {kind_of(value)} as {name}"
             raise UserError(f"{said}; it must be a Tensor {list(shape)} of {kind}.")
         return value.clone()
 

@@ -5,24 +5,22 @@ import os
 import queue
 import signal
 import time
-import traceback
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from functools import partial
-from pathlib import Path
+from multiprocessing import connection
 from typing import Any
 
 import gymnasium as gym
 from gymnasium.vector import AsyncVectorEnv, VectorEnv
 from gymnasium.vector.async_vector_env import AsyncState
 
+from lemniscate.envs.returned import told_with_place, words_of
 from lemniscate.errors import UserError, WorkerError
 from lemniscate.system.watchdog import end_when_closed
 
 CLOSING_SECONDS = 2.0
 """how long workers may take to close their environments before they are killed"""
-MOST_LETTERS = 500
-"""of what an exception says"""
 
 
 class RaisedInWorkerError(RuntimeError):
@@ -87,7 +85,7 @@ def call_method(env: gym.Env | VectorEnv, name: str, argument: Any) -> None:
     try:
         method(argument)
     except Exception as error:
-        raise UserError(f"{what}({argument!r}), which the curriculum calls, raised {_words_of(error)}.") from error
+        raise UserError(f"{what}({argument!r}), which the curriculum calls, raised {words_of(error)}.") from error
 
 
 def _call(call: Callable[..., Any], *args: Any, **options: Any) -> Any:
@@ -95,23 +93,10 @@ def _call(call: Callable[..., Any], *args: Any, **options: Any) -> Any:
         return call(*args, **options)
     except UserError as error:
         raise UserError(str(error)) from None
+    except WorkerError as error:
+        raise RaisedInWorkerError(str(error).rstrip(".")) from None
     except BaseException as error:  # also what ends a process: this one ends with its owner
         raise RaisedInWorkerError(told_with_place(error)) from None
-
-
-def told_with_place(error: BaseException) -> str:
-    """The words of an error, and the place where it was raised."""
-    place = traceback.extract_tb(error.__traceback__)[-1]
-    return f"{_words_of(error)} ({Path(place.filename).name}, line {place.lineno})"
-
-
-def _words_of(error: BaseException) -> str:
-    """The kind of an error, and the beginning of what it says."""
-    said = ""
-    with suppress(Exception):  # it may fail to say anything
-        said = " ".join(str(error).split())
-    said = f"{said[:MOST_LETTERS]}…" if len(said) > MOST_LETTERS else said.rstrip(".")
-    return f"{type(error).__name__}: {said}" if said else type(error).__name__
 
 
 class WatchedVectorEnv(AsyncVectorEnv):
@@ -159,15 +144,16 @@ class WatchedVectorEnv(AsyncVectorEnv):
         if failed:
             said = f"Environment {failed[0]} failed"
             with suppress(queue.Empty):
-                index, kind, error, _ = self.error_queue.get(timeout=1.0)
+                index, kind, error, _ = self.error_queue.get(timeout=5.0)
                 if issubclass(kind, UserError):
                     raise error
                 said = f"Environment {index} raised {error}"
             raise WorkerError(f"{said}.")
 
     def _diagnosis(self) -> str:
+        # One that has just closed its pipe may not be dead yet.
+        connection.wait([process.sentinel for process in self.processes], timeout=1.0)
         for i, process in enumerate(self.processes):
-            process.join(timeout=0.1)  # one that has just closed its pipe may not be dead yet
             if not process.is_alive():
                 guard = " A script needs `if __name__ == '__main__':` before it." if process.exitcode == 1 else ""
                 return f"The process of environment {i} died (exit code {process.exitcode}).{guard}"

@@ -96,6 +96,8 @@ def _destination(run: Trained, policy: TrainedPolicy, to: str | Path | None) -> 
     if to is None and (policy.path is None or is_address(run)):
         raise UserError("This policy is of no run here: name the directory of its export, with --to or `to`.")
     folder = path_of(to) if to is not None else run_of(Path(policy.path or "")) / "export"
+    if not folder.name:
+        raise UserError(f"An export gets a directory of its own: name one in {folder}, such as {folder / 'export'}.")
     if folder.is_symlink() or (folder.exists() and not is_export(folder)):
         raise UserError(f"{folder} exists already, and is no export; choose another directory.")
     return folder

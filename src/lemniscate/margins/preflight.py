@@ -13,7 +13,7 @@ import torch
 from lemniscate.api.policy import Trained, TrainedPolicy, load, path_of
 from lemniscate.envs import probe as probes
 from lemniscate.envs import registry
-from lemniscate.errors import UserError
+from lemniscate.errors import UserError, export_line
 from lemniscate.exporting.compiled import HostPolicy, host_compiler
 from lemniscate.exporting.deployed import (
     Act,
@@ -29,7 +29,7 @@ from lemniscate.margins.presentation import FAILS, FALLS_SHORT, draw, rows, sent
 from lemniscate.margins.record import AxisMargins, margins_of, smoothness, worst_accepted
 from lemniscate.margins.vector_probe import VectorProbe
 from lemniscate.report.compare import table
-from lemniscate.run.config import Natural, Range, checked
+from lemniscate.run.config import Range, Seed, checked
 from lemniscate.run.directory import read_config
 from lemniscate.run.environments import env_arguments
 from lemniscate.run.evaluate import EVALUATION
@@ -110,7 +110,7 @@ def preflight(
         UserError: no run; numbers out of range; an environment that cannot be made, is another now, or has no axis;
             with `compiled`, no export of this policy or no compiler. Nothing is written then.
     """
-    episodes, seed = checked("episodes", episodes, Starts), checked("seed", seed, Natural)
+    episodes, seed = checked("episodes", episodes, Starts), checked("seed", seed, Seed)
     given = checked("env_kwargs", env_kwargs, dict | None) or {}
     folder = path_of(run)
     read_config(folder)
@@ -166,18 +166,18 @@ def _compiled(policy: TrainedPolicy, run: Path) -> Act:
         step, digests = manifest["step"], manifest["files"]
         files = {name: (folder / name).read_text("utf-8") for name in ("policy.c", "policy.h")}
         if any(sha256(text.encode()).hexdigest() != digests[name] for name, text in files.items()):
-            raise UserError(f"{folder} has been changed since it was written: lemniscate export {run}")
+            raise UserError(f"{folder} has been changed since it was written: {export_line(run)}")
     except (DamagedFileError, OSError, KeyError, TypeError, UnicodeDecodeError):
-        raise UserError(f"There is no whole export of {run}: lemniscate export {run}") from None
+        raise UserError(f"There is no whole export of {run}: {export_line(run)}") from None
     if step != policy.step:
-        raise UserError(f"{folder} is of step {step:,}, the policy of step {policy.step:,}: lemniscate export {run}")
+        raise UserError(f"{folder} is of step {step:,}, the policy of step {policy.step:,}: {export_line(run)}")
     act = HostPolicy(files, compiler).act
     inputs = input_size(policy.spec) + memory_size(policy)
     rows = np.random.default_rng(0).standard_normal((64, inputs)).astype(np.float32)
     true = act_with(policy)(rows)
     apart = (np.abs(act(rows) - true) / difference_units(policy.spec.action, true)).max(1)
     if np.quantile(apart, 0.9) > 1e-2:  # products in bfloat16 round a few rows the other way
-        raise UserError(f"{folder} is of another policy: lemniscate export {run}")
+        raise UserError(f"{folder} is of another policy: {export_line(run)}")
     return act
 
 

@@ -120,8 +120,8 @@ class VectorProbe:
         """All episodes, see `Probe.fly`; afterwards the environments are closed."""
         numbers, seen = _is_number(self.spec), list[Tensor]()
         try:
-            nominal = _fly(self._env, begin(), seed, seen if numbers.any() else None)
-            scale = torch.cat(seen).std(0, correction=0) * numbers if seen else None
+            nominal = _fly(self._env, begin(), seed, numbers, seen)
+            scale = torch.zeros(len(numbers)).masked_scatter(numbers, torch.cat(seen).std(0, correction=0))
             points: dict[str, list[Flown]] = {}
             for axis in self.axes:
                 flown = (nominal if v == axis.nominal else self._at(axis, v, scale, begin(), seed) for v in axis.values)
@@ -159,14 +159,14 @@ def _is_number(spec: Spec) -> Tensor:
     return torch.tensor([*own, *[False] * spec.action.mask_size])
 
 
-def _fly(env: VecEnv, act: Act, seed: int, seen: list[Tensor] | None = None) -> Flown:
-    """The first episode of each environment; with `seen`, the observations of those that had not ended."""
+def _fly(env: VecEnv, act: Act, seed: int, numbers: Tensor | None = None, seen: list[Tensor] | None = None) -> Flown:
+    """The first episode of each environment; `seen` gets these `numbers` [O] bool of those that had not ended."""
     tally, age = Tally(env.num_envs), 0
     env.restart(derive(seed, 0))
     while tally.going.any():
         env.require_end(age)
         if seen is not None:
-            seen.append(env.obs[tally.going].clone())
+            seen.append(env.obs[tally.going][:, numbers])
         step = env.step(act(env.obs))
         tally.add(step.reward, step.terminated, step.truncated)
         age += 1

@@ -20,6 +20,9 @@ from lemniscate.nn.memory import Carrier, Memory, remember
 from lemniscate.nn.normalizer import NoNorm
 from lemniscate.spec import Action, Box, Discrete, MultiDiscrete, action_shape
 
+SAC_LOG_STD = -1.5
+"""log σ of SAC's policy, before its tanh, as it begins"""
+
 
 class Policy(nn.Module):
     """Base of all policies: `normalizer`, `net`, and `distribution_of` its outputs, over an `action`."""
@@ -161,7 +164,7 @@ class SquashedGaussianPolicy(Policy):
         initial_log_std: log σ, inside (-5, 2), where the network says 0, as it does at first.
     """
 
-    def __init__(self, normalizer: NoNorm, net: nn.Module, action: Box, initial_log_std: float = -1.5) -> None:
+    def __init__(self, normalizer: NoNorm, net: nn.Module, action: Box, initial_log_std: float = SAC_LOG_STD) -> None:
         super().__init__(normalizer, net, action)
         self._offset = math.atanh((initial_log_std + 5) / 3.5 - 1)
 

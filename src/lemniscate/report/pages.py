@@ -93,6 +93,7 @@ def write_evaluation(folder: Path, name: str, pictures: Sequence[Path], scores: 
 def newest_video(run: Path) -> Path | None:
     """The newest video of a run, if it has any."""
     videos = [file for file in (run / "videos").glob("*") if file.suffix in VIDEOS]
+    videos = [file for file in videos if not file.stem.endswith(".tmp")]  # one that is being written
     # Not a link, which could lead to any file of this machine, and what is found is embedded and uploaded.
     own = [file for file in videos if file.is_file() and not file.is_symlink()]
     return max(own, key=lambda file: file.stat().st_mtime, default=None)

@@ -26,7 +26,7 @@ from lemniscate.errors import NonFiniteError, UserError, shown, with_article
 from lemniscate.run.state import TrainState
 from lemniscate.spec import Action, ObservationPart, Spec
 from lemniscate.system import files
-from lemniscate.system.files import DamagedFileError, parsing
+from lemniscate.system.files import DamagedFileError, UnreadableFileError, parsing
 
 FORMAT = 5
 TENSORS, STATE, MANIFEST = "tensors.safetensors", "state.json", "manifest.json"
@@ -135,8 +135,8 @@ def read(path: Path) -> Checkpoint:
     _verify(path)
     try:
         tensors = load_file(path / TENSORS)
-    except (SafetensorError, OSError, RuntimeError) as error:  # the last two: it has been deleted meanwhile
-        raise DamagedFileError(f"{path / TENSORS} cannot be read: {error}.") from error
+    except (SafetensorError, OSError, RuntimeError) as error:  # its content was right a moment ago
+        raise UnreadableFileError(f"{path / TENSORS} cannot be read: {error}.") from error
     if name := _not_finite(tensors):
         raise DamagedFileError(f"{path / TENSORS} has a value that is not finite in {name}.")
     state = files.read_json(path / STATE)

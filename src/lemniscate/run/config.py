@@ -231,6 +231,11 @@ class RunConfig:
         self._require_divisible("num_envs")
         if self.keep_best and not self.evaluate_every:
             raise UserError("keep_best needs evaluations in training: give evaluate_every, such as 10_000 steps.")
+        if self.keep_best and self.evaluate_every > self.total_steps:
+            raise UserError(
+                f"keep_best needs evaluations in training: evaluate_every {self.evaluate_every:,} is beyond the"
+                f" {self.total_steps:,} of total_steps."
+            )
 
     def _require_divisible(self, name: str) -> None:
         """Raise `UserError` if `shards` does not divide the field `name`."""

@@ -4,8 +4,9 @@ import errno
 import hashlib
 import json
 import math
+import re
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from functools import cache
 from itertools import count
 from pathlib import Path
@@ -15,6 +16,7 @@ from filelock import FileLock, Timeout
 from torch import Tensor, nn
 
 from lemniscate.errors import UserError, resume_line
+from lemniscate.nn.policies import SAC_LOG_STD, SquashedGaussianPolicy
 from lemniscate.run import checkpoint
 from lemniscate.run.config import Natural, RunConfig, checked
 from lemniscate.run.metrics import METRICS, damage, read_metrics
@@ -22,7 +24,7 @@ from lemniscate.run.state import TrainState
 from lemniscate.spec import Spec
 from lemniscate.system import files
 from lemniscate.system.console import say
-from lemniscate.system.files import DamagedFileError, parsing
+from lemniscate.system.files import DamagedFileError, UnreadableFileError, parsing
 from lemniscate.system.world import World
 
 CONFIG, LOCK, FINAL = "config.json", ".lock", "final.json"
@@ -32,8 +34,8 @@ SWEEP = "sweep.json"
 """the file that the directory of a sweep has in the place of a `config.json`"""
 TUNE = "tune.json"
 """that of a search"""
-UNFINISHED = {LOCK, *(f"{name}.tmp" for name in (CONFIG, SWEEP, TUNE))}
-"""what the creation of a directory leaves where it fails half-way"""
+UNFINISHED = re.compile(rf"{re.escape(LOCK)}|({CONFIG}|{SWEEP}|{TUNE})\..*tmp")
+"""the files that the creation of a directory leaves where it fails half-way"""
 FUNCTION = ("network", "activation", "normalize_observations")
 """fields of a Config that change what networks of the same shapes compute"""
 
@@ -44,7 +46,7 @@ def require_absent(path: Path) -> None:
         raise UserError(f"{file} is a file, and a run is a directory: choose another --run.")
     if path == Path():
         raise UserError("A run needs a directory of its own: name one that is new, such as --run runs/first.")
-    if path.exists() and (not path.is_dir() or {file.name for file in path.iterdir()} - UNFINISHED):
+    if path.exists() and (not path.is_dir() or not all(UNFINISHED.fullmatch(file.name) for file in path.iterdir())):
         raise UserError(f"{path} exists already; go on with it ({resume_line(path)}) or choose another --run.")
 
 
@@ -83,7 +85,7 @@ def require_no_part_of_a_run(path: Path) -> None:
         return
     if run_of(path) != path:
         raise UserError(f"{path} is a checkpoint: name its run, {run_of(path)}.")
-    kind = "an export" if (path / "policy.onnx").is_file() else "a stored policy"
+    kind = "an export" if (path / "policy.c").is_file() else "a stored policy"
     raise UserError(f"{path} is {kind}: name the run that it is of.")
 
 
@@ -120,10 +122,16 @@ def read_config(path: Path) -> tuple[str, dict[str, Any]]:
 
 
 def is_finished(path: Path) -> bool:
-    """Whether a run has taken all its steps, and its last checkpoint is whole."""
+    """Whether a run has taken all its steps, and its last checkpoint is whole, and planned: its last update was too."""
     _, config = read_config(path)
     steps = checkpoint.list_steps(path / "checkpoints")
-    return steps[-1:] >= [config["total_steps"]] and checkpoint.is_whole(path / "checkpoints" / f"step-{steps[-1]}")
+    if steps[-1:] < [config["total_steps"]]:
+        return False
+    newest = path / "checkpoints" / f"step-{steps[-1]}"
+    if not checkpoint.is_whole(newest):
+        return False
+    with parsing(newest):
+        return bool(files.read_json(newest / checkpoint.STATE)["record"].get("planned"))
 
 
 def lost(path: Path) -> str | None:
@@ -178,7 +186,9 @@ def find_checkpoint(path: Path, which: str | int | None = None) -> checkpoint.Ch
         if not chosen.is_dir():
             there = ", ".join(map(str, checkpoint.list_steps(path / "checkpoints"))) or "none"
             raise UserError(f"{path} has no checkpoint {which}; those at steps: {there}; best is kept with keep_best.")
-        return checkpoint.read(chosen)
+        with suppress(DamagedFileError) if which == BEST else nullcontext():
+            return checkpoint.read(chosen)
+        return checkpoint.read(chosen)  # the process that trains may have replaced it meanwhile
     found = _newest(path, planned_only=False)
     if found is None:
         raise UserError(f"{path} has no checkpoint that can be read yet.")
@@ -195,6 +205,9 @@ def _newest(path: Path, planned_only: bool) -> checkpoint.Checkpoint | None:
             if found.record.get("planned") or not planned_only:
                 return found
         except DamagedFileError as error:
+            if planned_only and isinstance(error, UnreadableFileError):  # a run would remove what it passes over
+                remedy = f"resume once it can be read, or remove {folder}"
+                raise UserError(f"{error} Nothing is changed: {remedy}.") from None
             if folder.exists():
                 say(f"{error} Taking the one before.")
     return None if steps == checkpoint.list_steps(path / "checkpoints") else _newest(path, planned_only)
@@ -243,6 +256,10 @@ def load_networks(networks: nn.Module, config: RunConfig, spec: Spec, locate: Ca
         raise UserError(
             f"freeze keeps {kept[0]}, which warm_start cannot take from {name}{elsewhere}: it would stay as drawn."
         )
+    if isinstance(networks.policy, SquashedGaussianPolicy) and not any(key.startswith("policy.") for key in new):
+        there, here = (fields.get("initial_log_std", SAC_LOG_STD) for fields in (theirs, ours))
+        if there != here:  # a constant of the network, and no parameter
+            elsewhere += f"; initial_log_std is {there} there and {here} here, so σ is another"
     if not new:
         return f"Warm start: all networks of {name}{elsewhere}."
     some = ", ".join(new[:3]) + ", …" * (len(new) > 3)
@@ -335,7 +352,7 @@ class Saver:
         if found:
             self._keep_metrics(damage(self.path, found.record.get("logged", 0)))
         elif steps:
-            say(f"{self.path} has no planned checkpoint to go on from; it begins again at step 0.")
+            self._keep_metrics(f"{self.path} has no planned checkpoint to go on from; it begins again at step 0.")
         else:
             self._keep_metrics(lost(self.path))
         for step in steps:
@@ -347,6 +364,9 @@ class Saver:
     def _restore_best(self, step: int) -> None:
         """Know the best checkpoint again; remove one that is damaged or later: the run comes there again."""
         best = self._checkpoints / BEST
+        before = best.with_name(f"{BEST}.old.tmp")
+        if before.is_dir() and not best.exists():  # the process was killed while it was replaced
+            before.rename(best)
         if checkpoint.is_whole(best):
             found = files.read_json(best / checkpoint.STATE)
             with parsing(best):

@@ -49,10 +49,13 @@ def envs_of(config: RunConfig, world: World) -> tuple[VecEnv, VecEnv | None]:
             failing.callback(eval_env.close)
             if world.size == 1:
                 require_memory(config, eval_env.spec, device)
-            if eval_env.backend.once:
+            if eval_env.backend.once and eval_env.num_envs == config.num_envs:
                 eval_env.mirror = mirror
+                if config.differentiates:
+                    eval_env.backend.prepare_gradient()
                 failing.pop_all()
                 return eval_env, eval_env
+            eval_env.backend.once = False  # one of several, which may be made again
         env = registry.make(num_envs=config.num_envs, device=str(device), stagger=True, world=world, **arguments)
         failing.callback(env.close)
         env.mirror = mirror
@@ -107,7 +110,8 @@ def evaluation_env(
     served_by = registry.backend_class(arguments["backend"] or registry.backend_for(name, config.all_wrappers))
     own_vector = ":" in name and not served_by.wraps(name)  # which may make no other number
     as_in_training = served_by.compiled or served_by.exists_once(name, config.num_envs) or own_vector
-    return registry.make(num_envs=config.num_envs if as_in_training else min(episodes, 16), device=device, **arguments)
+    number = registry.count_of(env) or config.num_envs  # an object has its own
+    return registry.make(num_envs=number if as_in_training else min(episodes, 16), device=device, **arguments)
 
 
 def env_arguments(

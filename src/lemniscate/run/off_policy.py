@@ -147,7 +147,9 @@ class OffPolicyConfig(RunConfig):
             return ReplayBuffer(spec, self.capacity, device)
         least = self.num_envs * min(spec.max_episode_steps or 0, LONGEST)
         once = self.backend and registry.backend_class(self.backend).exists_once(self.env, self.num_envs)
-        cuts = {"checkpoint_every": "a checkpoint"} | ({"evaluate_every": "an evaluation"} if once else {})
+        cuts = {"checkpoint_every": "a checkpoint"} | (
+            {"evaluate_every": "an evaluation", "video_every": "a video"} if once else {}
+        )
         for field, what in cuts.items():
             if 0 < (every := getattr(self, field)) < least:
                 raise UserError(
@@ -180,6 +182,10 @@ class OffPolicyState(TrainState[Networks]):
         self.action_noise.on_restart()
         self.replay.mirror = env.mirror
         self.replay.on_restart(env.backend.judge_goals)
+
+    def on_change(self) -> None:
+        """Drop the episodes under way where goals are judged: other rules paid them."""
+        self.replay.drop()
 
     def on_warm_start(self) -> None:
         """Copy the loaded networks into the targets."""

@@ -15,14 +15,23 @@ import sys
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from lemniscate.envs.registry import file_name
 from lemniscate.errors import UserError
-from lemniscate.run.directory import CONFIG, SWEEP, create_directory
-from lemniscate.system.files import DamagedFileError, open_log, open_regular, parsing, read_json
+from lemniscate.run.directory import CONFIG, SWEEP, create_directory, read_record
+from lemniscate.system.files import (
+    DamagedFileError,
+    is_whole,
+    open_log,
+    open_regular,
+    parsing,
+    read_json,
+    write_json,
+)
 from lemniscate.system.machine import cores
 from lemniscate.system.watchdog import OWNED
 
@@ -52,10 +61,14 @@ class Sweep:
         create_directory(self.path, SWEEP, {"seeds": self.seeds, "configs": self.configs})
 
     def create_runs(self) -> None:
-        """Create the run directories that do not exist yet."""
+        """Create the run directories that do not exist yet, and a `config.json` that is lost or damaged."""
         for path, record in self.runs.items():
-            if not (path / CONFIG).exists():
+            if not path.is_dir():
                 create_directory(path, CONFIG, record)
+            elif not is_whole(path / CONFIG):
+                with suppress(UserError):  # of its newest checkpoint, in which the run may have been extended
+                    record = read_record(path)
+                write_json(path / CONFIG, record)
 
 
 def is_sweep(path: Path) -> bool:

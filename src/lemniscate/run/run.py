@@ -14,7 +14,7 @@ import random
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -99,6 +99,8 @@ class Run:
         self._recent_returns = deque[float](maxlen=100)
         self._unobserved: list[tuple[int, dict[str, float]]] = []
         """logged lines that callbacks have not seen"""
+        self._refused: Exception | None = None
+        """what a logger raised"""
         self._notices_said, self._restored, self._ended = 0, False, False
         """notices of the environments that have been said; whether the loop may begin, and has come to its end"""
         self._last_line = 0.0, 0
@@ -198,6 +200,8 @@ class Run:
             raise UserError(f"{said}: {error}.") from error
         if type(state.step) is not int:
             raise UserError(f"state.step of {self.algorithm} is {state.step!r}; it must be a whole number of Python's.")
+        if self._iteration.cut_short and state.step == self._iteration.step:
+            return  # not a step was taken: the run that is resumed writes this line
         require_finite(state, numbers)
         if self.world.size > 1:
             require_agreement(self.world, state)
@@ -246,12 +250,12 @@ class Run:
     def close(self, pictures: list[Path]) -> None:
         """Close the loggers, which may take the pictures, and the environments; unlock the directory."""
         self._stop.end()
-        for logger in self._loggers:
-            logger.close(pictures)
-        for env in (self.env, self.eval_env):
-            if env:
-                env.close()
-        self._saver.close()
+        with ExitStack() as closing:  # each, whatever another one raises
+            closing.callback(self._saver.close)
+            for env in filter(None, (self.eval_env, self.env)):
+                closing.callback(env.close)
+            for logger in reversed(self._loggers):
+                closing.callback(logger.close, pictures)
 
     def _do_what_is_due(self, state: TrainState, total_steps: int) -> bool:
         """The work after a whole update; returns whether a planned checkpoint was part of it."""
@@ -266,13 +270,13 @@ class Run:
         if _passed(config.evaluate_every, before, step):
             self._evaluate(state)
         if self._curriculum:
-            self._advance_curriculum(self._curriculum, self._unobserved)
+            self._advance_curriculum(self._curriculum, self._unobserved, state)
         by_episodes = _passed(config.video_every_episodes, self._iteration.episodes, self._episodes)
-        if by_episodes or _passed(config.video_every, before, step):
+        if not self._iteration.cut_short and (by_episodes or _passed(config.video_every, before, step)):
             self._record(state)
-        planned = finished or _passed(self._checkpoint_every, before, step)
+        planned = not self._iteration.cut_short and (finished or _passed(self._checkpoint_every, before, step))
         if planned:
-            with self.world.busy():
+            with self._stop.storing(), self.world.busy():
                 self._saver.save(state, planned=True)
             self.world.saved(self._home)
         return planned
@@ -282,11 +286,13 @@ class Run:
 
         Raises `Stopped` where a signal does, after the same.
         """
-        stop = self._observer is not None
+        stop = self._observer is not None or self._refused is not None
         try:
+            if self._refused:
+                raise self._refused
             lines, self._unobserved = self._unobserved, []
             if self._observer:
-                with globals_undisturbed():
+                with globals_undisturbed(), self.world.busy():
                     stop = self._observer(lines, state)
             signum = self._stop.signum  # one that comes from here on counts at the next update
             if self.world.size > 1:
@@ -321,7 +327,8 @@ class Run:
         seed_globals(seed)  # nothing here draws from them, but a user's environment may
         if memory := getattr(state.networks, "memory", None):
             self.env.carrier = Carrier(memory, state.networks.remember)
-        self.env.restart(seed, state.step)
+        with self.world.busy():  # it may make them all again
+            self.env.restart(seed, state.step)
         state.on_restart(self.env)
 
     def _begin(self, state: TrainState) -> None:
@@ -332,19 +339,24 @@ class Run:
             if self._visible:
                 say(sentence)
         if self._curriculum:
-            self._advance_curriculum(self._curriculum, [(0, {})])
+            self._advance_curriculum(self._curriculum, [(0, {})], state)
 
     @cached_property
     def _curriculum(self) -> Curriculum | None:
         name = self.config.curriculum
         return Curriculum(name, self.world) if name else None
 
-    def _advance_curriculum(self, curriculum: Curriculum, lines: Sequence[tuple[int, Mapping[str, float]]]) -> None:
+    def _advance_curriculum(
+        self, curriculum: Curriculum, lines: Sequence[tuple[int, Mapping[str, float]]], state: TrainState
+    ) -> None:
         with globals_undisturbed():
             decided = curriculum.decide(lines)
+        before = dict(self._saver.calls)
         for calls in decided:
             self.env.backend.call(calls)
             self._saver.calls |= calls
+        if self._saver.calls != before:
+            state.on_change()
 
     @cached_property
     def _checkpoint_every(self) -> int:
@@ -362,8 +374,13 @@ class Run:
         try:
             with globals_undisturbed(), self.world.busy():
                 yield
-        except (UserError, OSError) as error:  # no display any more, a full disk, an endless episode
-            say(f"No {what} at step {state.step:,}: {error}")
+        except Exception as error:  # no display any more, a full disk, whatever an environment's picture raises
+            say(f"No {what} at step {state.step:,}: {error or type(error).__name__}")
+        except Stopped:
+            if self.world.size > 1:
+                raise
+            self._stop.end()
+            self._iteration.cut_short = True  # the process that resumes the run does what was due
         finally:
             if self.env.backend.once:
                 self._restart(state)
@@ -388,8 +405,14 @@ class Run:
                 self._saver.save_if_best(state, scores.mean_return)
 
     def _write(self, step: int, numbers: dict[str, float], episodes: Episodes = NO_EPISODES) -> None:
-        for logger in self._loggers:
-            logger.write(step, dict(numbers), episodes)  # it may change its own
+        if "step" in numbers:
+            raise UserError(f"run.log of {self.algorithm} is given a metric named step, which each line has already.")
+        with self.world.busy():
+            for logger in self._loggers:
+                try:
+                    logger.write(step, dict(numbers), episodes)  # it may change its own
+                except Exception as error:  # raised where the state can be saved
+                    self._refused = self._refused or error
         self._saver.logged = step
         self._unobserved.append((step, numbers))
 

@@ -427,7 +427,10 @@ def of_update(state: Any, config: RunConfig, rows: Rollout, acted: Mapping[str, 
     value, gamma = old_value(obs).view(done.shape), getattr(config, "gamma", 1.0)
     next_value = of_next(old_value, value, rows.obs, rows.next_obs)
     advantage, target = gae(rows.reward, value, next_value, rows.terminated, done, gamma=gamma, lam=0.95)
-    change = (state.policy(obs).log_prob(action) - old(obs).log_prob(action)).view(done.shape)
+    now = state.policy(obs)
+    if not hasattr(now, "log_prob"):  # of a squashed or a deterministic policy there is none
+        return found
+    change = (now.log_prob(action) - old(obs).log_prob(action)).view(done.shape)
     if newest.sum() > 1:
         found["advantage/followed"] = torch.corrcoef(torch.stack([advantage, change])[:, newest])[0, 1].nan_to_num()
         if _spread(target[newest]) > 1e-3 * target[newest].abs().mean():  # else there is nothing to explain

@@ -102,6 +102,9 @@ class TrainState(Generic[Networks]):
     def on_restart(self, env: VecEnv) -> None:
         """Forget the running episodes: the environments have been restarted."""
 
+    def on_change(self) -> None:
+        """Drop what a change of the environments, by a curriculum, makes wrong."""
+
     def on_warm_start(self) -> None:
         """Follow `networks`, whose parameters have been loaded from another run."""
 
@@ -126,6 +129,11 @@ class TrainState(Generic[Networks]):
                 self.networks.estimates = estimates_over_shards(self.networks.estimates, world)
         elif compiler:
             self.learn = Learner(self.learn, self.optimizers(), compiler)
+
+    def release(self) -> None:
+        """Take back what `prepare` put over methods, which is for the shapes and the processes of training alone."""
+        for owner, name in [*self.per_step_methods(), (self.networks, "estimates")]:
+            vars(owner).pop(name, None)
 
 
 @dataclass(kw_only=True)

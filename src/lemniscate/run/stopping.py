@@ -40,6 +40,7 @@ class StopRequest:
         self._asked_at, self._ended = 0.0, threading.Event()
         self._hurry = threading.Timer(self._patience, self._ask_again)
         self._hurry.daemon = True
+        self._is_storing = False
 
     @contextmanager
     def heard(self) -> Iterator[None]:
@@ -49,6 +50,17 @@ class StopRequest:
                 yield
         finally:
             self.end()
+
+    @contextmanager
+    def storing(self) -> Iterator[None]:
+        """Inside, the disk may take its time: nothing but a second signal interrupts it."""
+        self._is_storing = True
+        if self.signum:
+            self._hurry.cancel()
+        try:
+            yield
+        finally:
+            self._is_storing = False
 
     def settle(self) -> None:
         """No more hurry: the update has ended, and the disk may take its time."""
@@ -69,7 +81,8 @@ class StopRequest:
             raise Stopped(f"Stopped in the middle of an update, which is not saved. {self._go_on()}", self.signum)
         self.signum, self._asked_at = signum, time.monotonic()
         self._stopping.set()
-        self._hurry.start()
+        if not self._is_storing:
+            self._hurry.start()
 
     def _ask_again(self) -> None:
         """In a thread: send the signal again; where even that is not heard, end the process."""

@@ -229,7 +229,8 @@ class Search:
     def study(self) -> "optuna.Study":
         """Optuna's study, new or as the journal has it. Raises `UserError` for one that is damaged."""
         optuna = import_optuna()
-        backend = optuna.storages.journal.JournalFileBackend(str(self.path / JOURNAL))
+        journal, file = optuna.storages.journal, str(self.path / JOURNAL)
+        backend = journal.JournalFileBackend(file, journal.JournalFileOpenLock(file))  # the other takes symbolic links
         with parsing(self.path / JOURNAL):
             return optuna.create_study(
                 storage=optuna.storages.JournalStorage(backend),

@@ -261,7 +261,9 @@ class _Training(SetOfRuns):
         step = progress_of(run)[0]
         self._steps[run] = min(step, self._totals[run])
         self._ended += 1
-        if code == 0:
+        if code == 0 and not is_finished(run):
+            sentence = f"stopped by a callback at step {step:,}; go on with: {resume_line(self.path)}"
+        elif code == 0:
             sentence = f"done, final return {final_return(run):.1f}"
         elif self._stop_signal:
             sentence = f"stopped at step {step:,}"

@@ -8,6 +8,7 @@ among the best third of all that have come so far. The score of a trial is the i
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated
 
 from lemniscate.algos import name_of
@@ -161,7 +162,10 @@ class _Tuner(SetOfRuns):
         for frozen in known:
             if frozen.state.name == "RUNNING":
                 asked = optuna.trial.Trial(self._study, frozen._trial_id)
-                self._take_up(asked, rung=len(frozen.intermediate_values))
+                if frozen.intermediate_values and asked.should_prune():  # the process was killed before it was told
+                    self._end(asked, "ended, since its return was low", state="PRUNED")
+                else:
+                    self._take_up(asked, rung=len(frozen.intermediate_values))
         self._say(
             f"{self._search.path}: {len(self._trials) + self._missing} of {self._search.trials} trials to run, with"
             f" {len(self._search.seeds)} seeds each, {self._places.count} runs at a time: {self._search.what}"
@@ -231,7 +235,12 @@ class _Tuner(SetOfRuns):
         if trial.failure:
             self._end(trial.asked, f"failed, {trial.failure}", state="FAIL")
         elif until is None:
-            score = float(iqm([read_metrics(run)[-1]["evaluation/return"] for run in trial.sweep.runs]))
+            lasts = {run: line for run in trial.sweep.runs for line in read_metrics(run)[-1:]}
+            if lacking := [run for run in trial.sweep.runs if "evaluation/return" not in lasts.get(run, {})]:
+                said = f"failed, {lacking[0].name} has no evaluation at its end ({lacking[0] / LOG} says more)"
+                self._end(trial.asked, said, state="FAIL")
+                return
+            score = float(iqm([line["evaluation/return"] for line in lasts.values()]))
             self._end(trial.asked, f"score {score:,.1f}", score)
             if self._study.best_trial.number == trial.asked.number:
                 self._search.write_preset(self._study.best_trial)
@@ -266,7 +275,7 @@ class _Tuner(SetOfRuns):
             self._say(str(picture))
         self._say(
             f"Evaluate it with seeds that the search has not seen: lemniscate train {self._search.algorithm} --preset"
-            f" {path / PRESET} --seeds 1-10"
+            f" {quote(str(path / PRESET))} --seeds 1-10"
         )
         records = [{"number": t.number, "state": t.state.name, "score": t.value, **t.params} for t in trials]
         return Tuned(path, preset, best.value, records)

@@ -11,6 +11,7 @@ import json
 import os
 import shutil
 import stat
+import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from io import BufferedReader, FileIO
@@ -30,6 +31,10 @@ HASH = "sha256"
 
 class DamagedFileError(UserError):
     """A file that is missing, or is not what was written: names it."""
+
+
+class UnreadableFileError(DamagedFileError):
+    """A file that the system does not open at the moment: it may be whole."""
 
 
 def at_home(path: str | os.PathLike[str]) -> Path:
@@ -67,9 +72,10 @@ def read_json(path: Path) -> dict[str, Any]:
 
 def replace_file(path: Path, content: bytes) -> None:
     """Write a file whole or not at all. Raises `OSError`, and leaves nothing behind then."""
-    temporary = path.with_name(f"{path.name}.tmp")
-    remove(temporary)
+    # Of this thread alone: two may write the same file at a time.
+    temporary = path.with_name(f"{path.name}.{os.getpid()}-{threading.get_ident()}.tmp")
     try:
+        remove(temporary)
         with temporary.open("xb") as file:  # "x" does not follow a link
             file.write(content)
             file.flush()
@@ -135,8 +141,9 @@ def _open(path: Path, flags: int) -> int:
     except FileNotFoundError:
         raise DamagedFileError(f"{path} is missing.") from None
     except OSError as error:
+        kind = DamagedFileError if error.errno in (errno.ELOOP, errno.ENXIO) else UnreadableFileError
         reason = "it is a link" if error.errno == errno.ELOOP else error.strerror
-        raise DamagedFileError(f"{path} cannot be opened: {reason}.") from None
+        raise kind(f"{path} cannot be opened: {reason}.") from None
     if not stat.S_ISREG(os.fstat(handle).st_mode):
         os.close(handle)
         raise DamagedFileError(f"{path} cannot be opened: it is no regular file.")

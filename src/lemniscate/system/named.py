@@ -40,12 +40,17 @@ class PassedName(str):
 def name_of(thing: object) -> str:
     """The name by which `find` returns an object: `module:qualname`. A string is taken to be a name already.
 
-    A lambda or a local class gets a name too, with a number where another has it; it is of use in this process only.
+    A lambda, a local class, a method of an object, and what a decorator has made of a function get a name too, with a
+    number where another has it; it is of use in this process only.
     """
     if isinstance(thing, str):
         return thing
     module = getattr(thing, "__module__", type(thing).__module__)
     qualname = getattr(thing, "__qualname__", f"<{type(thing).__name__}>")
+    if isinstance(owner := getattr(thing, "__self__", None), type):  # a method of a class, which may inherit it
+        module, qualname = owner.__module__, f"{owner.__qualname__}.{getattr(thing, '__name__', '')}"
+    if "<" not in qualname and not isinstance(thing, type) and not _stands(module, qualname, thing):
+        qualname = f"<{qualname}>"
     name, number = f"{module}:{qualname}", 1
     while "<" in qualname and _PASSED.get(name, thing) is not thing:
         number += 1
@@ -54,6 +59,16 @@ def name_of(thing: object) -> str:
     passed = PassedName(name)
     passed.thing = thing
     return passed
+
+
+def _stands(module: str, qualname: str, thing: object) -> bool:
+    """Whether an object, or a function of the same code, stands in its module under this name."""
+    found: Any = sys.modules.get(module)
+    for part in qualname.split("."):
+        found = getattr(found, part, None)
+    code, bound = (getattr(found, name, None) for name in ("__code__", "__self__"))
+    alike = code is not None and code is getattr(thing, "__code__", None)
+    return found == thing or (alike and bound is getattr(thing, "__self__", None))
 
 
 def is_passed(name: str) -> bool:
@@ -116,6 +131,13 @@ def module_of(name: str) -> ModuleType:
         if missing and f"{module_name}.".startswith(f"{missing}."):
             raise UserError(f"{name} cannot be found: there is no module {missing} {WHERE}.") from None
         raise UserError(f"{name} cannot be found: {error}.") from error
+    except SystemExit:
+        raise ends_program(module_name) from None
+
+
+def ends_program(module: str) -> UserError:
+    """The sentence on a module that calls sys.exit() when it is imported."""
+    return UserError(f'{module} ends the program when it is imported: put that below if __name__ == "__main__":')
 
 
 class WithArguments(partial[Any]):

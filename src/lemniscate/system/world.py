@@ -26,6 +26,9 @@ class World:
     S shards are divided among the W processes, the `size` of the world, which divides S; a rank is 0 … W − 1.
     """
 
+    busy: Callable[[], AbstractContextManager[Any]] = nullcontext
+    """makes a context in which this process may take as long as it likes"""
+
     def __init__(self, shards: int = 1, rank: int = 0, size: int = 1) -> None:
         self.rank, self.size, self.is_first = rank, size, rank == 0
         self.divide(shards)
@@ -58,10 +61,6 @@ class World:
 
     def begin(self, steps: Callable[[], int]) -> None:
         """From here on every process is to come further every few seconds, by these steps or by what it sends."""
-
-    def busy(self) -> AbstractContextManager[None]:
-        """A context in which this process may take as long as it likes."""
-        return nullcontext()
 
     def saved(self, path: Path) -> None:
         """The hook after a planned checkpoint in a run directory, called in every process."""
