@@ -335,3 +335,14 @@ def test_what_a_solution_leaves_behind_does_not_reach_the_next():
     assert torch.equal(torch.rand(()), expected)
     assert course.check(maths.value_loss, "value_loss")
     assert torch.get_default_dtype() == torch.float32
+
+
+def test_complex_numbers_are_named():
+    def discounted_returns(rewards, gamma):
+        return maths.reward_to_go(*given(rewards), gamma=gamma) + 0j
+
+    def given(rewards):
+        no = torch.zeros_like(rewards, dtype=torch.bool)
+        return rewards, torch.zeros_like(rewards), no, no
+
+    says(discounted_returns, "discounted_returns", "is of complex numbers; its real part is asked for")

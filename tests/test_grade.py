@@ -480,3 +480,40 @@ def test_what_is_left_out_is_said(in_other_forms, hand_in, words):
     said = notes(in_other_forms, hand_in)
     assert words in said if words else said == ""
     assert said.count("did not end") <= 1  # all loops share the time of one
+
+
+RIGHT = RETURNS.format(before="{before}", one="{one}", behind="")
+UNUSUAL = {
+    "a length that raises.py": (
+        "class Buffer:\n    def __len__(self):\n        raise NotImplementedError('to be written')\n"
+        "buffer = Buffer()\nbuffer.scale = 1.0",
+        "buffer.scale",
+    ),
+    "a property of a class that raises.py": (
+        "class Agent:\n    @classmethod\n    @property\n    def device(cls):\n        return cls.settings['device']\n",
+        "1.0",
+    ),
+    "a long sum.py": (f"TOTAL = {' + '.join(['1'] * 1_500)}", "1.0"),
+    "an exception without words.py": (
+        "class Mine(Exception):\n    def __str__(self):\n        return self.nothing\nx = 1\n"
+        "def fail():\n    raise Mine\ny = fail()",
+        "1.0",
+    ),
+}
+
+
+def test_whatever_stands_beside_a_right_solution_costs_it_no_mark(tmp_path):
+    for name, (before, one) in UNUSUAL.items():
+        (tmp_path / "in").mkdir(exist_ok=True)
+        (tmp_path / "in" / name).write_text(RIGHT.format(before=before, one=one))
+    inside = tmp_path / "in" / "ben" / "env"
+    inside.mkdir(parents=True)
+    (inside / "quad.py").write_text("SCALE = 1.0")
+    (inside.parent / "main.py").write_text(RIGHT.format(before="from env.quad import SCALE", one="SCALE"))
+    (inside.parent / "mine" / "lib").mkdir(parents=True)
+    (inside.parent / "mine" / "pyvenv.cfg").touch()
+    (inside.parent / "mine" / "lib" / "installed.py").write_text("raise SystemExit")
+    found = course.grade(tmp_path / "in", "discounted_returns", to=tmp_path / "out")
+    assert marks(found) == {name: {"discounted_returns": True} for name in (*UNUSUAL, "ben")}
+    (ben,) = (record for record in found["hand_ins"] if record["hand_in"] == "ben")
+    assert ben["notes"] == []

@@ -41,7 +41,7 @@ def train(path, env="CartPole-v1", **fields):
 def run(tmp_path_factory):
     """A run with figures, a video and an export."""
     run = train(tmp_path_factory.mktemp("hub") / "run")
-    for name in ("plots/learning_curve.png", "videos/my flight.gif", "export/policy.onnx", "export/c/policy.c"):
+    for name in ("plots/learning_curve.png", "videos/my flight.gif", "export/policy.onnx", "export/policy.c"):
         (run.path / name).parent.mkdir(parents=True, exist_ok=True)
         (run.path / name).write_bytes(name.encode())
     write_json(run.path / "export" / "manifest.json", {"export": 1, "step": run.policy.step})
@@ -117,7 +117,7 @@ def test_a_policy_that_remembers_plays_the_same_episode_from_the_hub(server, tmp
 
 def test_all_is_in_one_commit_that_has_no_path_token_or_pickle(run, pushed):
     shown = {"README.md", "final.json", "plots/learning_curve.png", "videos/my flight.gif"}
-    export = {"export/policy.onnx", "export/c/policy.c", "export/manifest.json"}
+    export = {"export/policy.onnx", "export/policy.c", "export/manifest.json"}
     assert set(pushed) == {".gitattributes", *hub.CHECKPOINT, *shown, *export}
     for content in pushed.values():
         assert hub_server.WRITER.encode() not in content
@@ -412,3 +412,22 @@ def test_the_commands_speak_with_the_hub_that_the_environment_names(run, server,
         forks.close()
     assert err == ""
     assert json.loads(out)["returns"] == lem.evaluate(run, episodes=3).returns
+
+
+def test_a_policy_that_is_not_the_newest_is_uploaded_with_its_own_scores(tmp_path, server, monkeypatch):
+    monkeypatch.setattr("lemniscate.api.results.FINAL_EPISODES", 5)
+    run = train(tmp_path / "run", checkpoint_every=128)
+    older = lem.load(run, checkpoint=128)
+    lem.push(older, "anna/older")
+    scores = json.loads(server.files("anna/older")["final.json"])
+    assert scores["step"] == 128
+    assert scores["mean_return"] == lem.evaluate(older, episodes=5).mean_return
+
+
+def test_an_export_without_onnx_is_uploaded_too(tmp_path, server):
+    run = train(tmp_path / "run", total_steps=32)
+    (run.path / "export").mkdir()
+    (run.path / "export" / "policy.c").touch()
+    write_json(run.path / "export" / "manifest.json", {"export": 1, "step": run.policy.step})
+    lem.push(run, "anna/c")
+    assert "export/policy.c" in server.files("anna/c")

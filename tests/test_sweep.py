@@ -306,3 +306,24 @@ def test_seeds_are_given_as_ranges_and_lists():
 def test_as_many_runs_at_once_as_cores_serve(monkeypatch, cores, threads, runs):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)))
     assert places.at_once(threads) == runs
+
+
+def test_a_run_that_has_lost_its_config_gets_it_from_the_sweep(trained, tmp_path):
+    path = tmp_path / "both"
+    shutil.copytree(trained[0], path)
+    before = final_hash(path / "ppo-1")
+    (path / "ppo-1" / "config.json").unlink()
+    (path / "ppo-2" / "config.json").write_text("{")
+    with in_this_process():
+        assert main(["resume", str(path)]) == 0
+    assert read_json(path / "ppo-1" / "config.json")["config"]["seed"] == 1
+    assert read_json(path / "ppo-2" / "config.json")["config"]["seed"] == 2
+    assert final_hash(path / "ppo-1") == before
+
+
+def test_a_run_that_a_callback_stopped_is_not_said_to_be_done(tmp_path, capsys):
+    stop = ["--callbacks", "lemniscate.api.callbacks:StopAt(steps=64)", "--run", str(tmp_path / "sweep")]
+    with in_this_process():
+        main(["train", "ppo", "--env", ENV, "--seeds", "1", "--total-steps", "640", *SMALL, *stop])
+    said = capsys.readouterr().err
+    assert f"ppo-1: stopped by a callback at step 64; go on with: lemniscate resume {tmp_path / 'sweep'}" in said

@@ -13,7 +13,7 @@ import lemniscate as lem
 from conftest import tiny_fields, tiny_off_policy
 from lemniscate import algos
 from lemniscate.cli import main
-from lemniscate.doctor import Evidence, diagnose, rules
+from lemniscate.doctor import Attendance, Evidence, diagnose, rules
 from lemniscate.doctor.evidence import usual_ranges, with_ratios
 from lemniscate.doctor.rules import HINT, RULES, seeds_differ, settings_far_out
 from lemniscate.run.fields import field_help, read
@@ -1049,3 +1049,34 @@ def test_final_returns_of_a_sweep_that_differ_much_are_pointed_at(tmp_path, caps
     write_json(tmp_path / "sweep.json", {"seeds": [1, 2], "configs": {"ppo": run.policy.config.to_json()}})
     main(["doctor", str(tmp_path)])
     assert "final returns of its seeds lie from 10 to 100" in capsys.readouterr().err
+
+
+def test_reset_rows_that_no_normalizer_sees_are_no_frozen_one():
+    """REINFORCE with whole episodes counts more steps than it learns from; so do episodes of one step."""
+    seen = {"normalizer__count": list(np.linspace(250, 1_900, 8))}
+    assert "normalizer-frozen" in names(**seen | {"normalizer__count": list(np.linspace(250, 1_000, 8))})
+    assert "normalizer-frozen" not in names(**seen)
+    assert "normalizer-frozen" not in names(
+        algorithm="reinforce", changed={"episodes": 1}, normalizer__count=[250.0] * 8
+    )
+
+
+def test_a_policy_that_is_frozen_is_to_stand_still():
+    assert "policy-still" in names(approx_kl=[0.0] * 8)
+    assert "policy-still" not in names(approx_kl=[0.0] * 8, changed={"freeze": ["policy"]})
+
+
+@pytest.mark.parametrize("was_paid", [False, True])
+def test_what_is_said_of_rewards_in_training_is_of_all_episodes(was_paid, capsys):
+    """A look sees the newest steps alone, of which none may have been paid."""
+    attend = Attendance(algos.find("ppo").Config(env="CartPole-v1"))
+    attend.was_paid = was_paid
+    for step in range(6):
+        attend(step, {"reward/largest": 0.0, "reward/std": 0.0, "reward/zero": 1.0})
+    assert ("Every reward was 0" in capsys.readouterr().err) != was_paid
+
+
+def test_a_ratio_of_fields_of_which_an_algorithm_of_ones_own_lacks_one_is_told_of_the_others():
+    given = {"num_updates": 64, "num_envs": 1}
+    found = settings_far_out(Evidence(with_ratios(given), {"num_updates": 1, "replay_ratio": 1.0}, {}, {}, [], {}))
+    assert [rule.name for rule, _ in found] == ["setting-replay-ratio"]

@@ -22,6 +22,7 @@ from lemniscate.drones.vehicle import interface_of
 from lemniscate.envs import registry
 from lemniscate.envs.backend import Interface
 from lemniscate.envs.check import BAD
+from lemniscate.errors import UserError
 from lemniscate.exporting import compiled, parity
 from lemniscate.exporting import export as exporting
 from lemniscate.exporting.c_code import c_files
@@ -282,3 +283,9 @@ def test_drones_have_units_and_frames():
     assert {name: len(part) for name, part in interface.parts.items()}["local_samples"] == 30
     assert interface.parts["local_samples"][5].name == "to_reference_in_0.1s_z"
     assert [quantity.unit for quantity in interface.action] == ["rad", "rad", "rad", "N"]
+
+
+def test_an_export_gets_a_directory_of_its_own(run, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(UserError, match=r"An export gets a directory of its own: name one in ., such as export"):
+        lem.export(run, to=".")

@@ -3,6 +3,9 @@
 import json
 import pickle
 import signal
+import threading
+import time
+import traceback
 
 import gymnasium as gym
 import numpy as np
@@ -262,9 +265,12 @@ def test_a_best_policy_of_no_evaluation_is_refused():
 
 
 @pytest.mark.parametrize("video", [False, True])
-def test_a_seed_beyond_those_of_numpy_is_refused_with_and_without_a_video(video, tmp_path):
-    with pytest.raises(UserError, match="seed must be a whole number from 0 to 4,294,967,295"):
-        lem.evaluate(lambda obs: 0, "CartPole-v1", seed=2**33, video=tmp_path / "a.gif" if video else None)
+def test_any_seed_will_do_with_and_without_a_video(video, tmp_path):
+    run = lem.train("ppo", "CartPole-v1", run=tmp_path / "run", progress=False, **tiny_fields(total_steps=32))
+    for policy in (run, lambda obs: 0):
+        file = tmp_path / "a.gif" if video else None
+        env = "CartPole-v1" if callable(policy) else None
+        assert lem.evaluate(policy, env, seed=2**33, episodes=1, video=file).episodes == 1
 
 
 def test_a_warm_start_says_that_the_noise_is_another_one(tmp_path, capsys):
@@ -275,3 +281,52 @@ def test_a_warm_start_says_that_the_noise_is_another_one(tmp_path, capsys):
         more = {"warm_start": run.path, "initial_log_std": value, "run": tmp_path / f"next{value}"}
         lem.train("reppo", Steady, **more, **fields)
         assert f"{said}\n" in capsys.readouterr().err
+
+
+def test_a_signal_while_a_planned_checkpoint_is_written_does_not_break_it_off(tmp_path, monkeypatch):
+    """The disk may take longer than an update may after a signal."""
+    from lemniscate.run import checkpoint, stopping
+
+    write = checkpoint.write_fields
+
+    def slow(final, fields, record):
+        if record["planned"] and final.name == "step-64":
+            signal.raise_signal(signal.SIGINT)
+            time.sleep(3 * stopping.PATIENCE)
+        write(final, fields, record)
+
+    monkeypatch.setattr(stopping, "PATIENCE", 0.1)
+    monkeypatch.setattr(checkpoint, "write_fields", slow)
+    fields = tiny_fields(total_steps=256, checkpoint_every=64)
+    with pytest.raises(KeyboardInterrupt, match=r"(?s)Stopped at step 64; the policy is saved.*resumes at step 64"):
+        lem.train("ppo", Steady, run=tmp_path / "run", progress=False, **fields)
+    assert [path.name for path in (tmp_path / "run" / "checkpoints").iterdir()] == ["step-64"]
+
+
+class Watched(Steady):
+    """Asks its process to stop in the middle of an evaluation, twice as long as an update may take then."""
+
+    at, steps = 0, 0
+
+    def step(self, action):
+        if threading.current_thread() is threading.main_thread() and "evaluate" in {
+            frame.name for frame in traceback.extract_stack()
+        }:
+            Watched.steps += 1
+            if Watched.steps == Watched.at:
+                signal.raise_signal(signal.SIGINT)
+                time.sleep(0.4)
+        return super().step(action)
+
+
+def test_a_signal_in_an_evaluation_saves_the_policy(tmp_path, monkeypatch):
+    from lemniscate.run import stopping
+
+    monkeypatch.setattr(stopping, "PATIENCE", 0.1)
+    Watched.at, Watched.steps = 5, 0
+    fields = tiny_fields(total_steps=256, evaluate_every=64, checkpoint_every=128)
+    with pytest.raises(KeyboardInterrupt, match="Stopped at step 64; the policy is saved"):
+        lem.train("ppo", Watched, run=tmp_path / "run", progress=False, **fields)
+    assert [path.name for path in (tmp_path / "run" / "checkpoints").iterdir()] == ["step-64"]
+    Watched.at = 0
+    assert lem.resume(tmp_path / "run", progress=False).policy.step == 256

@@ -273,3 +273,22 @@ def test_the_words_of_tune_are_understood():
     given = parse(["tune", "ppo", *FLAGS, *SEARCH, "--no-prune"])
     assert (given.command, given.algorithm, given.seeds, given.prune) == ("tune", "ppo", "101-102", False)
     assert given.fields["num_steps"] == 16
+
+
+def test_a_trial_whose_last_evaluation_is_missing_fails_alone(tmp_path, monkeypatch, capsys):
+    """As that of a policy whose episodes do not end."""
+    path, trained = tmp_path / "search", lem.api.training._train
+
+    def without_the_last_evaluation(world, run, *given):
+        done = trained(world, run, *given)
+        if "/000/" in str(run):
+            file = run / "metrics.jsonl"
+            file.write_text("".join(file.read_text().splitlines(keepends=True)[:-1]))
+        return done
+
+    monkeypatch.setattr(lem.api.training, "_train", without_the_last_evaluation)
+    words = ["--search", "learning_rate=1e-3|3e-4", "--trials", "2", "--seeds", "101", "--no-prune", "--run", str(path)]
+    with in_this_process():
+        assert main(["tune", "ppo", *FLAGS, *words, "--total-steps", "1_152"]) == 0
+    assert "trial 0: failed, ppo-101 has no evaluation at its end (" in capsys.readouterr().err
+    assert [trial.state.name for trial in trials_of(path).values()] == ["FAIL", "COMPLETE"]

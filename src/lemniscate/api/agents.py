@@ -465,6 +465,7 @@ def playing(
 
 def _seen(vec: VecEnv, seed: int) -> np.ndarray:
     """The first observations from a seed, [T, N, O], of random play; of what may be a robot, the first alone."""
+    seed %= 2**32  # of JAX it must be one of these
     rows, drawn = [vec.restart(seed).numpy()], torch.Generator().manual_seed(seed)
     for _ in range(0 if vec.backend.once else LOOKS):
         vec.step(random_action(vec.spec, vec.obs, drawn))

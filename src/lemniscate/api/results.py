@@ -30,7 +30,7 @@ from lemniscate.report.seeds import group
 from lemniscate.run import check as run_check
 from lemniscate.run import checkpoint
 from lemniscate.run.checkpoint import list_steps
-from lemniscate.run.config import Episodes, RunConfig, Seed, checked
+from lemniscate.run.config import Episodes, Natural, RunConfig, checked
 from lemniscate.run.directory import CONFIG, FINAL, read_config, require_no_part_of_a_run
 from lemniscate.run.environments import env_arguments, evaluation_env
 from lemniscate.run.evaluate import Evaluation, critic_of
@@ -97,7 +97,7 @@ def evaluate(
             run.
     """
     chosen = agents.find(policy, checkpoint=checkpoint, trust=trust)
-    episodes, seed, file = checked("episodes", episodes, Episodes), checked("seed", seed, Seed), _video_file(video)
+    episodes, seed, file = checked("episodes", episodes, Episodes), checked("seed", seed, Natural), _video_file(video)
     deterministic = checked("deterministic", deterministic, bool)
     kwargs, folder = checked("env_kwargs", env_kwargs, dict | None), _folder_of(report, chosen)
     how: dict[str, Any] = {"episodes": episodes, "seed": seed, "deterministic": deterministic}
@@ -177,7 +177,7 @@ def watch(
             of file.
     """
     chosen = None if policy is None else agents.find(policy, checkpoint=checkpoint, trust=trust)
-    episodes, seed, file = checked("episodes", episodes, Episodes), checked("seed", seed, Seed), _video_file(video)
+    episodes, seed, file = checked("episodes", episodes, Episodes), checked("seed", seed, Natural), _video_file(video)
     if chosen is None and env is None:
         raise UserError("Watch what? Name a run, or an environment to act in at random.")
     kwargs = checked("env_kwargs", env_kwargs, dict | None)
@@ -414,7 +414,9 @@ def _show(player: Any, vec: VecEnv, arguments: dict[str, Any], *, deterministic:
         return flight.show_flights(player.module if trained else player, vec, deterministic=deterministic, **how)
     vec.close()  # of some environments there can be one at a time
     if trained:
-        drawn = TrainedPolicy(player.networks, player.spec, player.config.replace(seed=how["seed"]), player.step)
+        drawn = TrainedPolicy(
+            player.networks, player.spec, player.config.replace(seed=how["seed"] % 2**32), player.step
+        )
         masked = partial(drawn.act, deterministic=deterministic)
         act = masked if drawn.is_masked else lambda obs, action_mask: masked(obs)
         return playback.show_episodes(act, arguments, begin=drawn.reset, **how)

@@ -129,11 +129,14 @@ class ActionNoise:
         self._position.fill_(self._length)
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Nothing: a run is resumed where its environments restart, and all sequences with them."""
-        return {}
+        """The sequences, and the position in each."""
+        return {"sequences": self._sequences, "position": self._position}
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
-        """Nothing is restored."""
+        """Restore what `state_dict` returned, unless episodes have another length now: a restart begins them anew."""
+        if state["sequences"].shape == self._sequences.shape:
+            self._sequences.copy_(state["sequences"])
+            self._position.copy_(state["position"])
 
 
 @torch.no_grad()

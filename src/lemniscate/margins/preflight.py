@@ -29,7 +29,7 @@ from lemniscate.margins.presentation import FAILS, FALLS_SHORT, draw, rows, sent
 from lemniscate.margins.record import AxisMargins, margins_of, smoothness, worst_accepted
 from lemniscate.margins.vector_probe import VectorProbe
 from lemniscate.report.compare import table
-from lemniscate.run.config import Range, Seed, checked
+from lemniscate.run.config import Natural, Range, checked
 from lemniscate.run.directory import read_config
 from lemniscate.run.environments import env_arguments
 from lemniscate.run.evaluate import EVALUATION
@@ -110,7 +110,7 @@ def preflight(
         UserError: no run; numbers out of range; an environment that cannot be made, is another now, or has no axis;
             with `compiled`, no export of this policy or no compiler. Nothing is written then.
     """
-    episodes, seed = checked("episodes", episodes, Starts), checked("seed", seed, Seed)
+    episodes, seed = checked("episodes", episodes, Starts), checked("seed", seed, Natural)
     given = checked("env_kwargs", env_kwargs, dict | None) or {}
     folder = path_of(run)
     read_config(folder)
