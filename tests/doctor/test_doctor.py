@@ -61,6 +61,18 @@ def names(*args, **kwargs):
 
 CASES = {
     # rule: evidence in which it fires, evidence just beside it
+    "targets-differ": ({"targets__unexplained": [0.02] * 8}, {"targets__unexplained": [0.009] * 8}),
+    "discount-differs": (
+        {"targets__discount": [1.0101] * 8, "targets__unexplained": [0.0] * 8},
+        {"targets__discount": [0.9905] * 8, "targets__unexplained": [0.0] * 8},
+    ),
+    "ends-continued": ({"targets__beyond_ends": [0.02] * 3}, {"targets__beyond_ends": [0.02] * 2}),
+    "baseline-differs": ({"advantage__own": [0.9] * 8}, {"advantage__own": [0.96] * 8}),
+    "advantage-of-others": ({"advantage__used": [0.3] * 8}, {"advantage__used": [0.96] * 8}),
+    "loss-of-others": (
+        {"algorithm": "a2c", "losses__value": list(np.linspace(1, 3, 8)), "value__loss": [1.0] * 8},
+        {"algorithm": "a2c", "losses__value": [2.0] * 8, "value__loss": [1.0] * 8},
+    ),
     "seed-ignored": ({"repeats": False}, {"repeats": True}),
     "constant-observation": ({"observation__constant": [1.0] * 8}, {"observation__constant": [0.99] * 8}),
     "exploding-observation": (
@@ -1080,3 +1092,19 @@ def test_a_ratio_of_fields_of_which_an_algorithm_of_ones_own_lacks_one_is_told_o
     given = {"num_updates": 64, "num_envs": 1}
     found = settings_far_out(Evidence(with_ratios(given), {"num_updates": 1, "replay_ratio": 1.0}, {}, {}, [], {}))
     assert [rule.name for rule, _ in found] == ["setting-replay-ratio"]
+
+
+def test_an_advantage_that_is_turned_round_is_opposed_whatever_it_is_compared_with():
+    for name in ("advantage__own", "advantage__used"):
+        assert names(**{name: [-1.0] * 8}) == ["advantage-opposed"]
+
+
+def test_what_an_update_learns_from_is_judged_by_equations_that_it_has():
+    """REINFORCE may weigh by the return of the episode, or without a baseline; others have no λ."""
+    off = {"targets__unexplained": [0.5] * 8, "advantage__own": [0.5] * 8}
+    assert names(algorithm="reinforce", **off) == ["targets-differ", "baseline-differs"]
+    assert names(algorithm="reinforce", changed={"returns": "episode"}, **off) == []
+    assert names(algorithm="reinforce", changed={"baseline": "none"}, advantage__own=[0.5] * 8) == []
+    assert names(algorithm="reppo", **off) == []
+    several = {"losses__value": list(np.linspace(1, 3, 8)), "value__loss": [1.0] * 8}
+    assert names(algorithm="ppo", **several) == []

@@ -13,6 +13,7 @@ from torch import nn
 
 import lemniscate as lem
 from conftest import tiny_fields, tiny_off_policy
+from lemniscate import algos
 from lemniscate.algos import ppo
 from lemniscate.data.hindsight import HindsightReplay
 from lemniscate.data.replay import ReplayBuffer
@@ -896,3 +897,105 @@ def test_signals_are_drawn_beside_findings_and_not_among_the_diagnostics(tmp_pat
         curves.plot_runs([run.path], tmp_path / "plots")
     assert titles
     assert not signals_of & set(titles)
+
+
+def of_update_of(algorithm, tmp_path, **fields):
+    """The signals of what the updates of a run learned from: their greatest and least values."""
+    given = {"num_envs": 4, "num_steps": 16, "total_steps": 640, "hidden": (8,), "progress": False, **fields}
+    if algorithm != "a2c":
+        given |= {"minibatch_size" if algorithm == "ppo" else "critic_minibatch_size": 16}
+    lines = read_metrics(lem.train(algorithm, "CartPole-v1", run=tmp_path / algorithm, **given).path)
+    found = {name for line in lines for name in line if name.startswith(("targets/", "advantage/", "value/loss"))}
+    return {name: [line[name] for line in lines if name in line] for name in found}
+
+
+@pytest.mark.parametrize("algorithm", ["ppo", "a2c", "trpo", "reinforce"])
+@pytest.mark.parametrize("backend", ["envpool", "gymnasium"])
+def test_what_an_update_learns_from_follows_from_its_rows(algorithm, backend, tmp_path):
+    found = of_update_of(algorithm, tmp_path, backend=backend)
+    gamma = algos.find(algorithm).Config.gamma
+    assert found["targets/discount"] == pytest.approx([gamma] * len(found["targets/discount"]), abs=1e-5)
+    assert max(found["targets/unexplained"]) < 1e-10
+    assert max(found["targets/beyond_ends"]) < 1e-10
+    assert min(found["advantage/own"]) > 0.9999
+    assert ("advantage/used" in found) == (algorithm in ("ppo", "a2c"))
+    assert min(found.get("advantage/used", [1.0])) > 0.9999
+
+
+def wrongly(change):
+    """GAE with a mistake."""
+
+    def mistaken(reward, value, next_value, terminated, done, *, gamma, lam):
+        return change(reward, value, next_value, terminated, done, gamma, lam)
+
+    return mistaken
+
+
+def advantages(reward, value, *rest):
+    *rest, gamma, lam = rest
+    return gae(reward, value, *rest, gamma=gamma, lam=lam)
+
+
+MISTAKES = {
+    "1 / gamma": (
+        lambda *given: advantages(*given[:-2], 1 / given[-2], given[-1]),
+        lambda found: found["targets/discount"] == pytest.approx([1 / 0.99] * len(found["targets/discount"]), abs=1e-4),
+    ),
+    "rewards of another row": (
+        lambda reward, *given: advantages(reward + torch.arange(len(reward))[:, None] % 3, *given),
+        lambda found: min(found["targets/unexplained"]) > 0.01,
+    ),
+    "a value at terminations": (
+        lambda reward, value, next_value, terminated, *given: advantages(
+            reward, value, next_value + 1, torch.zeros_like(terminated), *given
+        ),
+        lambda found: min(found["targets/beyond_ends"]) > 0.01,
+    ),
+    "no baseline": (
+        lambda reward, value, *given: (lambda target: (target + 3 * value, target))(
+            advantages(reward, value, *given)[1]
+        ),
+        lambda found: max(found["advantage/own"]) < 0.95,
+    ),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_targets_that_do_not_follow_show(mistake, tmp_path, monkeypatch):
+    change, shows = MISTAKES[mistake]
+    monkeypatch.setattr(ppo, "gae", wrongly(change))
+    assert shows(of_update_of("ppo", tmp_path))
+
+
+def test_advantages_in_another_order_than_their_rows_show(tmp_path, monkeypatch):
+    learn = ppo.learn
+    monkeypatch.setattr(
+        ppo, "learn", lambda config, state, batch, rows, advantage: learn(config, state, batch, rows, advantage.flip(1))
+    )
+    assert max(of_update_of("ppo", tmp_path)["advantage/used"]) > 0.9999, "what is given is right there"
+
+
+def test_the_loss_of_a_single_step_is_half_the_mean_squared_error(tmp_path):
+    lines = read_metrics(
+        lem.train(
+            "a2c", "CartPole-v1", run=tmp_path / "run", num_envs=4, num_steps=16, total_steps=640, progress=False
+        ).path
+    )
+    pairs = [(line["losses/value"], line["value/loss"]) for line in lines if "value/loss" in line]
+    assert len(pairs) >= 3
+    for loss, own in pairs:
+        assert loss == pytest.approx(own, rel=1e-4)
+
+
+def test_watching_ends_with_the_update(tmp_path):
+    """The gradient steps of an update that is not looked at are the algorithm's own."""
+    seen = []
+    update = ppo.update
+
+    def noted(config, state, rollout):
+        seen.append(type(state.learn).__name__)
+        return update(config, state, rollout)
+
+    with patch.object(ppo, "update", noted):
+        lem.train("ppo", "CartPole-v1", run=tmp_path / "run", progress=False, **tiny_fields(total_steps=32 * 8))
+    assert seen == ["Watched", *["function"] * 3, "Watched", *["function"] * 3]

@@ -100,6 +100,7 @@ CONSEQUENCES = {
     "setting-entropy-coef": {"entropy-opposed"},
     "targets-of-others": {"critic-still", "replay-differs"},
     "q-opposed": {"replay-differs"},
+    "ends-ignored": {"ends-continued"},
 }
 """faults that are not named beside one of these, which brings them about"""
 
@@ -537,6 +538,39 @@ def of_advantages(e: Evidence) -> Seen:
         )
 
 
+def of_batches(e: Evidence) -> Seen:
+    """Whether an update learned from what follows from its rows: equations that every healthy run fulfils."""
+    if not {"gae_lambda", "returns"} & e.config.keys() or e.config.get("returns", "to_go") != "to_go":
+        return
+    names = ("targets/unexplained", "targets/discount", "targets/beyond_ends", "advantage/own", "advantage/used")
+    rest, discount, beyond, own, used = map(e.median, names)
+    gamma = e.config.get("gamma")
+    if rest > 0.01:
+        yield "targets-differ", f"{rest:.0%} of the squares of the targets follow from no row behind."
+    elif isinstance(gamma, float) and abs(discount - gamma) > max(1e-3, 0.1 * (1 - gamma)):
+        yield "discount-differs", f"Targets follow from those behind by a discount of {discount:.4g}, not {gamma:g}."
+    if beyond > 0.01:
+        yield "ends-continued", f"{beyond:.0%} of the squares of the targets at terminations are not the reward's."
+    if (least := np.fmin(own, used)) < -0.5:
+        yield "advantage-opposed", f"Advantages have a correlation of {least:.2f} with what they should be."
+    elif used < 0.95:
+        yield "advantage-of-others", f"In a gradient step advantages have a correlation of {used:.2f} with their rows'."
+    elif own < 0.95 and e.config.get("baseline", "value") == "value":
+        yield "baseline-differs", f"Advantages have a correlation of {own:.2f} with targets less values."
+
+
+def of_losses(e: Evidence) -> Seen:
+    """The loss of V in a single gradient step, beside half the mean squared error of its rows."""
+    names = {"losses/value", "value/loss"}
+    pairs = [(line["losses/value"], line["value/loss"]) for line in e.log if names <= line.keys()]
+    times = np.array([loss / right for loss, right in pairs if right > 0])
+    if len(times) < 3 or {"epochs", "critic_epochs"} & e.config.keys():
+        return
+    if times.std() > 0.1 * abs(times.mean()):  # else it is one of another factor
+        said = f"The loss of V is from {times.min():.2g} to {times.max():.2g} times half the mean squared error."
+        yield "loss-of-others", said
+
+
 def _standard_errors(values: np.ndarray) -> float:
     """The mean of some values in its standard errors."""
     return float(values.mean() / max(values.std(ddof=1) / np.sqrt(len(values)), 1e-9))
@@ -787,6 +821,8 @@ SUBJECTS = (
     of_exploration,
     of_entropies,
     of_advantages,
+    of_batches,
+    of_losses,
     of_values,
     of_q,
     of_replay,

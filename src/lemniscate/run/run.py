@@ -35,7 +35,7 @@ from lemniscate.run.evaluate import critic_of, evaluate
 from lemniscate.run.loggers import NO_EPISODES, Logger, LoggerClass, require_logger
 from lemniscate.run.metrics import read_metrics
 from lemniscate.run.seeding import derive, seed_globals
-from lemniscate.run.signals import LOOKS, acted_with, signals
+from lemniscate.run.signals import LOOKS, Watched, acted_with, signals
 from lemniscate.run.state import TrainState, require_agreement
 from lemniscate.run.stopping import Stopped, StopRequest
 from lemniscate.system.console import ProgressBar, say
@@ -61,6 +61,8 @@ class Iteration:
     """whole training episodes of the run so far"""
     acted: dict[str, torch.Tensor] | None = None
     """what the policy was made of, where its update is looked at"""
+    watched: Watched | None = None
+    """what its gradient steps were given, there too"""
     began: float = field(default_factory=time.monotonic)
     cut_short: bool = False
     """whether it takes fewer steps than it was to: its state is nobody's to resume from"""
@@ -158,8 +160,11 @@ class Run:
                     # Some LOOKS lines of a run have signals, of a short one a fourth: more would cost more than 1 %.
                     every = max(4, math.ceil(total_steps * self._lines / (LOOKS * max(1, state.step))))
                     looks = self.world.is_first and self._lines % every == 0
-                    self._iteration = Iteration(state.step, self._episodes, acted_with(state) if looks else None)
+                    before = (acted_with(state), Watched(state)) if looks else (None, None)
+                    self._iteration = Iteration(state.step, self._episodes, *before)
                     yield self.env
+                    if watched := self._iteration.watched:
+                        watched.end()
                     if state.step <= self._iteration.step and not self._iteration.cut_short:
                         raise UserError(
                             f"An update of {self.algorithm} leaves state.step as it was: add its steps to it."
@@ -211,7 +216,8 @@ class Run:
             numbers["episode/return"] = sum(episodes.returns) / len(episodes.returns)
             numbers["episode/length"] = sum(episodes.lengths) / len(episodes.lengths)
         if self._iteration.acted is not None:
-            numbers |= signals(state, self.config, self.spec, self.env.recent(), self._iteration.acted, self.env.ages)
+            of_update = self._iteration.acted, self.env.ages, self._iteration.watched and self._iteration.watched.given
+            numbers |= signals(state, self.config, self.spec, self.env.recent(), *of_update)
         numbers |= {f"info/{name.removeprefix('info/')}": mean for name, mean in episodes.measures.items()}
         # The speed since the last line, everything included; the seconds of the loop's body by their use.
         now, (before, step_before), collect = time.monotonic(), self._last_line, self.env.collecting

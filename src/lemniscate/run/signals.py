@@ -22,7 +22,7 @@ from lemniscate.nn.networks import ACTIVATIONS
 from lemniscate.nn.normalizer import RunningNorm
 from lemniscate.run.config import RunConfig
 from lemniscate.spec import Action, Box, Discrete, MultiDiscrete, Spec
-from lemniscate.types import Rollout, Transition
+from lemniscate.types import Batch, Rollout, Transition
 
 LOOKS = 24
 """how often in a run the signals are measured"""
@@ -57,11 +57,13 @@ def signals(
     rows: Rollout | None,
     acted: Mapping[str, Tensor] | None = None,
     ages: Tensor | None = None,
+    given: tuple[Any, tuple[Tensor, ...]] | None = None,
 ) -> dict[str, float]:
     """The signals of a training state and of the newest rows [T, N, …] of its environments, by the glossary's names.
 
-    `acted` are the parameters and buffers of the networks before their newest update, where that is known; `ages` [N]
-    are the steps that each environment's episode had after the last row.
+    `acted` are the parameters and buffers of the networks before their newest update, where that is known, and `given`
+    is what its gradient steps were (`Watched`); `ages` [N] are the steps that each environment's episode had after the
+    last row.
     """
     if rows is None or rows.valid.sum() < 2:
         return {}
@@ -69,7 +71,7 @@ def signals(
     if getattr(config, "scale_rewards", False) and hasattr(state, "reward_scale"):
         scaled = replace(rows, reward=state.reward_scale(rows.reward))
     found = of_networks(state, chosen) | of_values(state, config, scaled) | of_update(state, config, scaled, acted)
-    found |= of_replay(state, rows) | of_critics(state, config, _valid(scaled))
+    found |= of_replay(state, rows) | of_critics(state, config, _valid(scaled)) | of_batch(config, given, scaled)
     return of_environment(rows, spec, ages) | {name: float(value) for name, value in found.items()}
 
 
@@ -447,6 +449,63 @@ def acted_with(state: Any) -> dict[str, Tensor]:
     """Copies of the parameters and buffers of a policy and of the V(s) beside it; none for others."""
     parts = state.networks.state_dict() if hasattr(state.networks, "value") else {}
     return {name: tensor.clone() for name, tensor in parts.items()}
+
+
+class Watched:
+    """The gradient steps of an algorithm, in an update that is looked at: what the first call was given is kept."""
+
+    def __init__(self, state: Any) -> None:
+        self._state, self._learn = state, state.learn
+        self.given: tuple[Any, tuple[Tensor, ...]] | None = None
+        state.learn = self
+
+    def __call__(self, config: Any, state: Any, data: Any, *by_step: Tensor, **flags: Any) -> Any:
+        """The gradient steps."""
+        self.given = self.given or (data, by_step)
+        return self._learn(config, state, data, *by_step, **flags)
+
+    def end(self) -> None:
+        """Watch no more."""
+        self._state.learn = self._learn
+
+
+def of_batch(config: RunConfig, given: tuple[Any, tuple[Tensor, ...]] | None, rows: Rollout) -> dict[str, Tensor]:
+    """Of the rows that an update learned from, where they are the newest, [T, N, …]: whether they follow from these.
+
+    - targets/discount: the factor by which targets follow from the values and the targets of the row after.
+    - targets/unexplained: the share of their squares that does not follow so.
+    - targets/beyond_ends: the share of the squares of the targets where an episode terminated that is not the reward's.
+    - advantage/own: the correlation of the advantages with what the targets are above the values.
+    - advantage/used: that of the advantages in the first gradient step with those of its rows.
+    - value/loss: half the mean of the squared differences of values and targets in the first gradient step.
+    """
+    data, by_step = given or (None, ())
+    envs, found = rows.done.shape[1], dict[str, Tensor]()
+    if not isinstance(data, Batch) or len(data.target) % envs:
+        return found
+    value, advantage, target = (x.double().view(-1, envs) for x in (data.value, data.advantage, data.target))
+    steps = min(len(value), len(rows.done))
+    if steps < 3 or not torch.equal(data.obs.unflatten(0, (-1, envs))[-steps:], rows.obs[-steps:]):
+        return found  # mirror images, pieces of a memory, rows of other processes
+    v, a, g, newest = value[-steps:], advantage[-steps:], target[-steps:], rows[-steps:]
+    beyond = g - newest.reward.double()
+    on, ends = ~newest.done[:-1] & newest.valid[:-1] & newest.valid[1:], newest.terminated & newest.valid
+    ahead, rest = torch.lerp(v[1:], g[1:], getattr(config, "gae_lambda", 1.0))[on], beyond[:-1][on]
+    if ahead.square().mean() > 0:
+        found["targets/discount"] = (ahead * rest).sum() / ahead.square().sum()
+        found["targets/unexplained"] = (rest - found["targets/discount"] * ahead).square().mean() / g.square().mean()
+    if ends.any():
+        found["targets/beyond_ends"] = beyond[ends].square().mean() / g.square().mean()
+    pairs = {"advantage/own": (a[newest.valid], (g - v)[newest.valid])}
+    if by_step:
+        chosen = by_step[0][0].flatten()
+        found["value/loss"] = 0.5 * (value - target).flatten()[chosen].square().mean()
+        if len(by_step) > 1 and by_step[1].shape == by_step[0].shape:
+            pairs["advantage/used"] = by_step[1][0].flatten().double(), advantage.flatten()[chosen]
+    for name, pair in pairs.items():
+        if all(_spread(x) > 1e-4 * g.abs().mean() for x in pair[1:]):  # else they are of rounding
+            found[name] = torch.corrcoef(torch.stack(pair))[0, 1].nan_to_num()
+    return found
 
 
 def of_replay(state: Any, rows: Rollout) -> dict[str, Tensor]:
