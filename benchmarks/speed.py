@@ -351,9 +351,10 @@ def lander(rounds, stamp):
                 process.poll() is None and max((x.get("evaluation/return", 0) for x in lines(folder)), default=0) < 250
             ):
                 time.sleep(0.1)
-            mine, steps, ended = time.monotonic() - started, lines(folder)[-1]["step"], process.poll()
+            mine, ended = time.monotonic() - started, process.poll()
             if ended is not None:
                 raise SystemExit(process.stderr.read() if ended else f"Seed {seed} ends below 250.")
+            steps = lines(folder)[-1]["step"]
             say(f"lemniscate, seed {seed}: {mine:.0f} s, {steps:,} steps")
             process.terminate()
             process.wait()

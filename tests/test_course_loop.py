@@ -296,3 +296,10 @@ def test_the_home_folder_is_found(tmp_path, monkeypatch):
     assert course.skeleton("ppo", "~/mine.py") == tmp_path / "mine.py"
     assert course.start("~/course") == tmp_path / "course" / "README.md"
     assert (tmp_path / "course" / "README.md").exists()
+
+
+def test_the_environments_of_a_loop_may_be_called_train_envs_and_a_number_of_them_not():
+    called = loop._called(lambda train_envs, total_steps: (train_envs, total_steps), "E", 5)
+    assert called == ("E", 5)
+    with pytest.raises(TypeError, match="its parameter n_envs is not known"):
+        loop._called(lambda n_envs, total_steps: None, "E", 5)

@@ -15,6 +15,8 @@ from conftest import tiny_fields
 from lemniscate.api import plots
 from lemniscate.cli import parse
 from lemniscate.report import curves, pages
+from lemniscate.report.curves import run_styles
+from lemniscate.report.flight import Flight, draw_from_above
 from lemniscate.run.metrics import to_line
 from lemniscate.system.files import read_json, write_json
 from test_compare import without_layout, write_run, write_runs
@@ -278,3 +280,13 @@ def test_the_report_of_an_evaluation_is_not_written_into_another_run(tmp_path):
     for policy in (one, next(one.path.glob("checkpoints/step-*"))):
         lem.evaluate(policy, episodes=1, report=one.path)
     assert list(one.path.rglob("*.html"))
+
+
+def test_a_flight_that_ends_in_its_first_step_is_drawn(tmp_path):
+    flight = Flight(np.zeros((1, 3)), np.zeros((0, 3)), np.array([[0.0, 0, 0, 1]]), 0.02, np.zeros((0, 15)))
+    assert draw_from_above([flight], tmp_path / "flight.png").exists()
+
+
+def test_names_that_matplotlib_takes_for_something_else_are_shown(tmp_path):
+    names = [label for _, _, label in run_styles([tmp_path / "_old", tmp_path / "a$1$"])]
+    assert names == [" _old", r"a\$1\$"]

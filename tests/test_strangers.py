@@ -2,6 +2,7 @@
 
 import functools
 import json
+import os
 import sys
 from pathlib import Path
 
@@ -140,7 +141,7 @@ def test_a_pipe_that_breaks_in_an_environment_is_said():
 def test_a_picture_that_fails_in_the_middle_costs_the_video_alone(tmp_path, capsys):
     run = lem.train("ppo", Drawn, run=tmp_path / "run", **FAST | {"video_every": 32})
     assert run.policy.step == 64
-    assert "No recording at step 32: beyond the map" in capsys.readouterr().err
+    assert "No recording at step 32: IndexError: beyond the map (test_strangers.py, line" in capsys.readouterr().err
 
 
 def test_a_gymnasium_environment_with_a_method_of_rsl_rls_is_one_of_gymnasium():
@@ -225,6 +226,23 @@ def test_what_no_file_holds_under_its_name_is_not_mistaken_for_what_does():
     assert named.name_of(Hard.easy) == f"{__name__}:Hard.easy"
     assert named.name_of(plainly) == f"{__name__}:plainly"
     assert "<" in named.name_of(twice(plainly))
+    assert named.name_of(windy) == f"{__name__}:windy"
+    assert "<" in named.name_of(blown(5.0)(plainly)), "of the code of another one that stands there"
+
+
+def blown(by):
+    def decorate(function):
+        @functools.wraps(function)
+        def make():
+            return function() if by else None
+
+        make.__qualname__ = "windy"
+        return make
+
+    return decorate
+
+
+windy = blown(1.0)(plainly)
 
 
 class Net(nn.Module):
@@ -449,3 +467,25 @@ def test_episodes_of_a_run_off_policy_that_is_cut_short_in_its_last_update_are_m
     assert done.policy.step == 240
     assert read_metrics(tmp_path / "run")[-1]["step"] == 240
     assert json.loads((tmp_path / "run" / "config.json").read_text())["config"]["total_steps"] == 200
+
+
+def test_what_is_of_a_policy_is_refused_without_one(capsys):
+    assert main(["watch", "--random", "--env", "CartPole-v1", "--checkpoint", "best"]) == 2
+    assert "are of a policy, and there is none" in capsys.readouterr().err
+
+
+def test_the_value_of_an_option_is_no_algorithm(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    words = ["--total-steps", "64", "--num-envs", "4", "--num-steps", "8", "--minibatch-size", "16", "--quiet"]
+    assert main(["train", "--env", "CartPole-v1", "--run", "ppo", *words]) == 0
+    assert (tmp_path / "ppo" / "config.json").exists()
+
+
+def test_a_page_has_no_video_of_another_evaluation(tmp_path):
+    """Drawn fails in its third picture, so that there is none of this one."""
+    videos = tmp_path / "report" / "videos"
+    videos.mkdir(parents=True)
+    (videos / "episode.gif").write_bytes(b"older")
+    os.utime(videos / "episode.gif", (0, 0))
+    lem.evaluate(lambda obs: 0, Drawn, episodes=1, report=tmp_path / "report")
+    assert "A video of" not in (tmp_path / "report" / "plots" / "report.html").read_text()

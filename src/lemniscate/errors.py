@@ -30,7 +30,7 @@ class NotStoredError(RuntimeError):
 
 
 class WorkerError(RuntimeError):
-    """The process of an environment died, or does not answer: names which."""
+    """The process of an environment died, or does not answer, or a pipe or a file of it failed: names which."""
 
 
 class RankError(RuntimeError):

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from matplotlib.figure import Figure
 
 from lemniscate.envs.probe import Axis, Flown, Tally
 from lemniscate.margins import presentation
@@ -105,12 +106,12 @@ def test_what_follows_an_end_does_not_count():
 def test_smoothness_of_waves_is_known():
     t = torch.arange(500) / 50
     slow, fast = 0.6 * torch.sin(2 * math.pi * 2 * t), 0.3 * torch.sin(2 * math.pi * 15 * t)
-    found = smoothness((slow + fast + 0.05)[:, None, None], 1 / 50)  # the mean is no motion
+    found = smoothness([(slow + fast + 0.05)[:, None]], 1 / 50)  # the mean is no motion
     assert found["fast_share"] == pytest.approx(0.3**2 / (0.3**2 + 0.6**2), abs=1e-3)
     steps = np.sqrt(0.5 * sum((size * 2 * math.sin(math.pi * f / 50)) ** 2 for size, f in ((0.6, 2), (0.3, 15)))) * 50
     assert found["action_rate"] == pytest.approx(steps, rel=1e-2)
     assert found["saturated_share"] == 0
-    assert smoothness(torch.tensor([1.0, -1.0, 0.0, 1.0])[:, None, None], 0.02)["saturated_share"] == 0.75
+    assert smoothness([torch.tensor([1.0, -1.0, 0.0, 1.0])[:, None]], 0.02)["saturated_share"] == 0.75
 
 
 def test_the_picture_has_a_panel_for_each_axis(tmp_path, monkeypatch):
@@ -134,3 +135,20 @@ def test_the_picture_has_a_panel_for_each_axis(tmp_path, monkeypatch):
 def bands(axes):
     """The ends of each band by its label."""
     return {band.get_label(): (band.get_x(), band.get_x() + band.get_width()) for band in axes.patches}
+
+
+def test_the_side_that_is_red_is_the_one_that_fails():
+    """The first value below the nominal one fails, and all above it fly."""
+    one = margins_of(MASS, flown(64, 3, 64, 64, 64), None)
+    axes = Figure().subplots()
+    presentation._draw(axes, axes.twinx(), one)
+    (beyond,) = (patch for patch in axes.patches if patch.get_label() == "beyond it")
+    assert beyond.get_x() + beyond.get_width() <= presentation._place(MASS, 1.0) + 1e-9
+
+
+def test_episodes_of_other_lengths_count_by_their_steps():
+    still, one = torch.zeros(30, 1), torch.tensor([[1.0]])
+    found = smoothness([still, one], 0.02)
+    assert (found["action_rate"], found["fast_share"]) == (0, 0)
+    assert found["saturated_share"] == pytest.approx(1 / 31)
+    assert smoothness([one], 0.02)["action_rate"] == 0

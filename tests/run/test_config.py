@@ -14,6 +14,7 @@ from lemniscate.algos import ALGORITHMS, find, ppo
 from lemniscate.api.training import config_for
 from lemniscate.errors import UserError
 from lemniscate.run.config import RunConfig
+from lemniscate.run.fields import read
 from lemniscate.types import Schedule
 
 
@@ -194,3 +195,10 @@ def test_networks_with_a_memory_are_counted_before_they_are_made(tmp_path):
     with pytest.raises(UserError, match=r"This run takes at least .* MB are for hidden .*: choose a smaller hidden"):
         lem.train("ppo", env="CartPole-v1", network="gru", hidden=(200_000,), run=tmp_path / "run", progress=False)
     assert not (tmp_path / "run").exists()
+
+
+def test_none_is_none_where_a_field_of_several_may_be_so():
+    """`--critic-hidden none` is as hidden, and `--hidden none` no hidden layer."""
+    assert read("critic_hidden", tuple[int, ...] | None, ["none"]) is None
+    assert read("hidden", tuple[int, ...], ["none"]) == ()
+    assert read("critic_hidden", tuple[int, ...] | None, ["[]"]) == ()

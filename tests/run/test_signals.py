@@ -25,9 +25,11 @@ from lemniscate.run.metrics import read_metrics
 from lemniscate.run.signals import (
     KINDS,
     LOOKS,
+    Watched,
     acted_with,
     effect_beside,
     late_effect,
+    of_batch,
     of_critics,
     of_effects,
     of_environment,
@@ -42,7 +44,7 @@ from lemniscate.run.signals import (
     signals,
 )
 from lemniscate.spec import Box, Discrete, MultiDiscrete, ObservationPart, Spec
-from lemniscate.types import Rollout, Step, Transition
+from lemniscate.types import Batch, Rollout, Step, Transition
 
 B, O, A = 400, 3, 2
 
@@ -999,3 +1001,38 @@ def test_watching_ends_with_the_update(tmp_path):
     with patch.object(ppo, "update", noted):
         lem.train("ppo", "CartPole-v1", run=tmp_path / "run", progress=False, **tiny_fields(total_steps=32 * 8))
     assert seen == ["Watched", *["function"] * 3, "Watched", *["function"] * 3]
+
+
+class OwnSteps:
+    """Gradient steps of algorithms of one's own, which take other arguments than those of the library."""
+
+    def __init__(self, **kept):
+        self.learn, self.kept = lambda *args, **flags: (args, flags), kept
+
+
+@pytest.mark.parametrize("given", [((1, 2), {"batch": 3}), ((1, 2, 3), {}), ((1, 2, 3, 8), {}), ((), {})])
+def test_gradient_steps_of_ones_own_are_given_what_they_are_given(given):
+    state = OwnSteps()
+    watched = Watched(state)
+    assert state.learn(*given[0], **given[1]) == given
+    data, by_step, is_one = watched.given
+    assert (data, by_step, is_one) == (given[0][2] if len(given[0]) > 2 else None, (), False)
+    assert of_batch(SimpleNamespace(), watched.given, time_rows()) == {}
+    watched.end()
+    assert state.learn() == ((), {})
+
+
+def time_rows(steps=8, envs=2):
+    """Rows of one number each, that go on."""
+    obs = torch.arange(steps * envs, dtype=torch.float32).view(steps, envs, 1)
+    no = torch.zeros(steps, envs, dtype=torch.bool)
+    return Rollout(obs, obs, torch.zeros(steps, envs), obs + envs, no, no, ~no)
+
+
+def test_targets_that_are_all_zero_say_nothing_of_a_discount():
+    newest = time_rows()
+    batch = Batch(newest.obs.flatten(0, 1), newest.action.flatten(0, 1), *torch.zeros(3, 16))
+    found = of_batch(SimpleNamespace(gae_lambda=0.95), (batch, (), False), newest)
+    assert not any(name.startswith("targets/") for name in found)
+    whole = of_batch(SimpleNamespace(episodes=1), (batch, (), False), newest)
+    assert whole == {}, "of whole episodes the rows have been moved together"

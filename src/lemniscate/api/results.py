@@ -3,6 +3,7 @@
 import os
 import re
 import shutil
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from functools import partial
@@ -106,8 +107,8 @@ def evaluate(
         if baseline:
             if vec.baseline is None:
                 raise UserError(f"{vec.spec.env_id} has no baseline to compare with.")
-            if file or folder:
-                raise UserError("Of a baseline there are the scores alone: leave out video and report.")
+            if file or folder or not deterministic:
+                raise UserError("Of a baseline there are the scores alone: leave out video, report and stochastic.")
             return evaluate_policy(vec.baseline, vec, episodes, seed)
         if file:
             scores = _show(player, vec, arguments, **how, video=file, tell=str)
@@ -118,9 +119,10 @@ def evaluate(
             scores = evaluate_policy(player, vec, episodes, seed)
         if folder:
             how["episodes"] = min(episodes, vec.num_envs, 20)
+            since = time.time() - 2  # a disk's times may be of seconds
             pictures = _draw(player, vec, arguments, how, folder)
             name = str(policy) if isinstance(policy, str | PathLike) else str(getattr(chosen, "path", shown(policy)))
-            for made in (*pictures, pages.write_evaluation(folder, name, pictures, scores, seed)):
+            for made in (*pictures, pages.write_evaluation(folder, name, pictures, scores, seed, since)):
                 say(made)
         return scores
 
@@ -180,6 +182,8 @@ def watch(
     episodes, seed, file = checked("episodes", episodes, Episodes), checked("seed", seed, Natural), _video_file(video)
     if chosen is None and env is None:
         raise UserError("Watch what? Name a run, or an environment to act in at random.")
+    if chosen is None and not (checkpoint is agent is normalized_actions is None):
+        raise UserError("checkpoint, agent and normalized_actions are of a policy, and there is none.")
     kwargs = checked("env_kwargs", env_kwargs, dict | None)
     deterministic = checked("deterministic", deterministic, bool)
     own = {"agent": agent, "normalized": checked("normalized_actions", normalized_actions, bool | None)}

@@ -5,7 +5,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from itertools import count
 from pathlib import Path
 from types import ModuleType
@@ -88,8 +88,8 @@ def _require_followed(config: RunConfig, finals: Sequence[str]) -> None:
         of_both = () if hasattr(config, rate) else (f"actor_{rate}", f"critic_{rate}")
         if ended := [name for name in config.schedules if name in (rate, *of_both)]:
             raise UserError(f"{ended[0]} {config.schedules[ended[0]]} has its own end: {final} does not go with it.")
-        is_default = getattr(config, final) == getattr(type(config), final)
-        if rate == "learning_rate" and getattr(config, "desired_kl", None) is not None and not is_default:
+        adapted = rate == "learning_rate" and getattr(config, "desired_kl", None) is not None
+        if adapted and getattr(config, final) != getattr(type(config), final):
             raise UserError(f"desired_kl adapts the learning rate: {final} needs desired_kl none.")
 
 
@@ -143,7 +143,7 @@ def train(
         UserError: see `config_for`; a run directory that exists; an environment that cannot be made, or that the
             algorithm cannot learn; a device, tracker or callback that is not there.
         NonFiniteError: an observation, a reward or a loss is NaN or infinite; the last checkpoint is as it was.
-        WorkerError: the process of an environment died.
+        WorkerError: the process of an environment died, or a pipe or a file of it failed.
         Stopped: Ctrl-C or SIGTERM, when the run has saved itself; go on with `resume`.
     """
     name, _, config = choose_config(algorithm, env, preset, fields)
@@ -204,7 +204,7 @@ def resume(
         UserError: no run directory, or one that another process trains in or another version wrote; an object that no
             file holds and that was not passed again; a tracker or a callback that is not there.
         NonFiniteError: an observation, a reward or a loss is NaN or infinite; the last checkpoint is as it was.
-        WorkerError: the process of an environment died.
+        WorkerError: the process of an environment died, or a pipe or a file of it failed.
         Stopped: Ctrl-C or SIGTERM, when the run has saved itself.
     """
     options = {"track": track, "callbacks": callbacks, "report": report, "progress": progress}
@@ -245,11 +245,20 @@ def _require_the_same(path: Path, stored: RunConfig, config: RunConfig) -> None:
     for name in ("env", "wrappers", "network", "curriculum"):
         before, now = (getattr(each, name, None) for each in (stored, config))
         names = before if isinstance(before, tuple) else (before or "",)
-        if before != now and not any("<" in each or each.startswith("__main__:") for each in names):
+        if before != now and not any(map(_is_lost, names)):
             raise UserError(
                 f"{name} of {path} is {shown(before)}: leave {name} out; with another one it is a run of its own, which"
                 " may begin with warm_start."
             )
+
+
+def _is_lost(name: str) -> bool:
+    """Whether no object can be found by a name any more, since no file holds it, or its module has moved."""
+    if "<" in name or name.startswith("__main__:"):
+        return True
+    with suppress(UserError):
+        return ":" in name and not named.find_callable(name)
+    return True
 
 
 def _annealed(config: RunConfig) -> list[str]:

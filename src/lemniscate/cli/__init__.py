@@ -15,7 +15,7 @@ import re
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from itertools import takewhile
+from itertools import pairwise, takewhile
 from pathlib import Path
 from shutil import get_terminal_size
 from typing import Any, NoReturn
@@ -349,7 +349,8 @@ def _parse_algorithm(command: str, words: list[str]) -> argparse.Namespace:
     if command == "tune" and len(names) > 1:
         raise UserError(f"A search is for one algorithm: {verb} {names[0]} …")
     strangers = [name for name in names if name not in ALGORITHMS and not _is_own(name)]
-    misplaced = [word for word in words if word in ALGORITHMS]
+    pairs = pairwise(["", *words])  # what follows an option is its value
+    misplaced = [word for before, word in pairs if word in ALGORITHMS and not before.startswith("--")]
     if misplaced and (strangers or not names):
         raise UserError(f"The algorithm comes first, then its fields: {verb} {misplaced[0]} …")
     unnamed = command == "train" and not names and any(re.match("--env(=|$)", word) for word in words)

@@ -75,7 +75,7 @@ def resume(run: Path, total_steps: float | None, score: bool, **options: Any) ->
     if (run / TUNE).exists():
         from lemniscate.sweeps.tuner import resume_tuning
 
-        resume_tuning(run, **_only(OF_SEARCHES, options, "a search"))
+        resume_tuning(run, **_only(OF_SEARCHES, {**options, "score": score}, "a search"))
     elif (run / SWEEP).exists():
         from lemniscate.sweeps.sweep import resume_sweep
 

@@ -23,7 +23,7 @@ FILES = {
 
 BASH = """_lemniscate() {
   local here=${COMP_WORDS[COMP_CWORD]} before=${COMP_WORDS[COMP_CWORD-1]} command=${COMP_WORDS[1]} known=""
-  [ "$command" = train ] && command=${COMP_WORDS[2]}
+  case $command in train|tune) command=${COMP_WORDS[2]} ;; esac
   case "$COMP_CWORD $command $before $here" in
 CASES
   esac
@@ -82,7 +82,8 @@ def _parsers() -> dict[str, Parser]:
 def _followers() -> dict[str, Iterable[str]]:
     """The words that may follow a command or an option, where they are few."""
     ids, presets = registry.known_ids(), {preset: None for name in ALGORITHMS for preset in names(name)}
-    found: dict[str, Iterable[str]] = {"train": ALGORITHMS, "completion": SHELLS, "course": ["start"]}
+    found: dict[str, Iterable[str]] = {"completion": SHELLS, "course": ["start"]}
+    found |= dict.fromkeys(("train", "tune"), ALGORITHMS)
     found |= dict.fromkeys(("doctor", "check", "--env"), ids)
     found |= {"--preset": presets, "--backend": registry.BACKENDS, "--track": TRACKERS, "--network": NETWORKS}
     for name in ALGORITHMS:

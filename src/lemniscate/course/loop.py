@@ -252,7 +252,8 @@ def _called(function: Function, envs: VectorView, steps: int) -> Any:
     known: dict[str, Any] = {}
     for name, parameter in inspect.signature(function).parameters.items():
         is_required, word = parameter.default is parameter.empty, name.lower()
-        if "env" in word and "num" not in word and "n_" not in word and is_required:
+        counts = "num" in word or re.search(r"(^|_)n_", word)  # how many there are
+        if "env" in word and not counts and is_required:
             known[name] = envs
         elif "seed" in word:
             known[name] = 1

@@ -219,7 +219,8 @@ class CrazyflowBackend(JaxBackend):
             reference, preview = slice(first, first + 3 * drones.env.n_samples), drones.env.samples_dt
             action = self.spec.bounded_box()
             each = [GAINS[one] for one in flown], [one.mass for one in vectors]
-            self.baseline = PD(*each, action, reference, slice(7, 10), preview)
+            if drones.env.n_samples >= 3:  # of which it makes the reference's acceleration
+                self.baseline = PD(*each, action, reference, slice(7, 10), preview)
 
     def _boxes(self, env: Any) -> np.ndarray:
         """The boxes of a `Scene`, of each drone's present episode."""
@@ -239,11 +240,12 @@ class CrazyflowBackend(JaxBackend):
 
         kwargs = {name: value for name, value in trained.items() if name not in (*CONDITIONS, "privileged")}
         kwargs |= given
+        attitude = kwargs.get("control", "attitude") == "attitude"  # body rates need the dynamics that have motors
         if several := dynamics_of(kwargs):
             kwargs["dynamics"] = several[0]
         _check(env, starts, kwargs)
         with creation_errors(env, kwargs):
-            return DroneProbe(env, starts, kwargs, DYNAMICS)
+            return DroneProbe(env, starts, kwargs, DYNAMICS if attitude else ("first_principles",))
 
 
 def _import() -> None:

@@ -410,7 +410,8 @@ class DroneGates(DroneEnv):
             if i < len(track.gates):
                 place = choose(one, APART["gates"], APART["obstacle_gate"], off_the_ways)
                 turn = jax.random.uniform(two, (n,), minval=-APART["yaw"], maxval=APART["yaw"])
-                yaws.append(jnp.arctan2(*(place - at).T[::-1]) + turn)
+                back = math.pi * bool(track.reverse[track.order == i][:1].any())  # it is flown through from +x
+                yaws.append(jnp.arctan2(*(place - at).T[::-1]) + turn + back)
                 ways.append((at, place))
                 at = place
             if i < len(track.obstacles):
@@ -501,7 +502,8 @@ class DroneGates(DroneEnv):
         low, high = self.track.room
         grounded = pos[:, 2] < 0
         away = (jnp.abs(pos[:, :2] - self._start[:, :2]) > AT_START).any(-1)
-        return (pos[:, :2] < low[:2]).any(-1) | (pos > high).any(-1) | (grounded & away)
+        sinks = (low[2] > 0) & (pos[:, 2] < low[2])
+        return (pos[:, :2] < low[:2]).any(-1) | (pos > high).any(-1) | (grounded & away) | sinks
 
     def _touches(self, pos: jax.Array, turned: jax.Array) -> jax.Array:
         """Whether the drone's box touches a gate's frame or stand, or an obstacle."""

@@ -103,18 +103,20 @@ def _fly(drones: Drones, restart: Callable, step: Callable, begin: Begin, seed: 
     No flight is reset, so what follows a crash means nothing. A drone whose state is not finite has crashed.
     """
     starts, kept = drones.num_envs, list[torch.Tensor]()
-    tally, act = Tally(len(ends) * starts), begin()
+    tally, act, lengths = Tally(len(ends) * starts), begin(), torch.zeros(drones.num_envs, dtype=torch.int64)
     state, obs = restart(np.uint32(seed), ends)
     for _ in range(drones.episode_steps):
         action = act(torch.nan_to_num(torch.from_dlpack(obs))).clamp(-1, 1)
         kept.append(action[:starts].clone())
+        lengths += tally.going[:starts]
         state, obs, *out = step(state, jax.dlpack.from_dlpack(action.contiguous()))
         reward, crashed, finished = map(torch.from_dlpack, out)
         tally.add(torch.nan_to_num(reward), crashed, finished)
         if not tally.going.any():
             break
     first, *others = zip(tally.returns.split(starts), tally.terminated.split(starts), strict=True)
-    return [Flown(*first, torch.stack(kept)), *(Flown(*one) for one in others)]
+    actions = [torch.stack(kept[:length])[:, i] for i, length in enumerate(lengths.tolist())]
+    return [Flown(*first, actions), *(Flown(*one) for one in others)]
 
 
 def _lowered(drones: Drones, points: int) -> tuple[Any, Any]:

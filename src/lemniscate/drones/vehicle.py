@@ -114,7 +114,6 @@ ACTION = (
 )
 RATES = (*_vector("body_rate", "rad/s", BODY), ACTION[-1])
 """the action where body rates are controlled"""
-PAST_ACTION = tuple(Quantity(q.name, "1", "-1 and 1 are the bounds of the action") for q in ACTION)
 
 
 def interface_of(
@@ -131,16 +130,18 @@ def interface_of(
         seconds = [f"{offset / env.freq:g}s" for offset in offsets]
         ahead = [_vector(f"to_reference_in_{text}", "m", WORLD) for text in seconds]
         parts["local_samples"] = tuple(quantity for vector in ahead for quantity in vector)
-    seen = [*(quantity for name in STATE_PARTS for quantity in PARTS[name]), *PAST_ACTION]
+    action = {"attitude": ACTION, "body_rate": RATES}.get(str(env.sim.control), ())
+    past = tuple(Quantity(q.name, "1", "-1 and 1 are the bounds of the action") for q in action)
+    seen = [*(quantity for name in STATE_PARTS for quantity in PARTS[name]), *past]
     parts["history"] = tuple(
-        Quantity(f"{q.name}_{ago}_steps_ago{'' if q in PAST_ACTION else '_less_now'}", q.unit, q.frame)
+        Quantity(f"{q.name}_{ago}_steps_ago{'' if q in past else '_less_now'}", q.unit, q.frame)
         for ago in range(1, history + 1)
         for q in seen
     )
     drone = str(env.sim.drone)
     return Interface(
         parts=parts,
-        action={"attitude": ACTION, "body_rate": RATES}.get(str(env.sim.control), ()),
+        action=action,
         period=1 / env.freq,
         delay=delay,
         history=history,

@@ -60,7 +60,8 @@ class SingleEnv(gym.Wrapper):
             # Gymnasium's vectors leave {} of the options by which they reset some of their environments.
             returned: Any = self.env.reset(seed=seed, options=options or None)
         except EXPLAINED as error:
-            raise self._returns.explained("reset", error) from error.__cause__
+            said = self._returns.explained("reset", error)
+            raise said from said.__cause__
         now = self.env.action_space
         if now is not self._acts and now != self._acts:
             was = f"it was {shown_space(self._acts)}, and must stay what __init__ set"
@@ -76,7 +77,8 @@ class SingleEnv(gym.Wrapper):
         try:
             returned: Any = self.env.step(action)
         except EXPLAINED as error:
-            raise self._returns.explained("step", error) from error.__cause__
+            said = self._returns.explained("step", error)
+            raise said from said.__cause__
         usual = type(returned) is tuple and len(returned) == 5 and self._is_usual(*returned)
         obs, reward, terminated, truncated, info = returned if usual else self._returns.of_step(returned)
         obs = obs.copy() if usual else obs  # as in reset

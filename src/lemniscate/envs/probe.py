@@ -88,12 +88,12 @@ class Flown:
     Attributes:
         returns: [E].
         terminated: [E], the episodes that ended by the environment's rules.
-        actions: [T, E, A] in [-1, 1], of episodes that all took the same time and were asked for; else None.
+        actions: [T, A] in [-1, 1] of each episode, as long as it lasted, where they were asked for; else None.
     """
 
     returns: Tensor
     terminated: Tensor
-    actions: Tensor | None = field(default=None, compare=False)
+    actions: list[Tensor] | None = field(default=None, compare=False)
 
 
 Act = Callable[[Tensor], Tensor]

@@ -57,7 +57,9 @@ class ReturnedValues:
         Also where a pipe or a file of the environment's failed, which is not one of ours. Else the error itself.
         """
         if isinstance(error, OSError):
-            return WorkerError(f"{author(self._env, method)} raised {told_with_place(error)}.")
+            said = WorkerError(f"{author(self._env, method)} raised {told_with_place(error)}.")
+            said.__cause__ = error
+            return said
         if isinstance(error, SystemExit):
             code = "" if error.code is None else shown(error.code)
             return self.wrong(method, f"called sys.exit({code}), which would end the whole program")
@@ -113,14 +115,16 @@ class CheckedVector(VectorWrapper):
         try:
             return self._returns.of_reset(self.env.reset(seed=seed, options=options))
         except (SystemExit, OSError) as error:
-            raise self._returns.explained("reset", error) from None
+            said = self._returns.explained("reset", error)
+            raise said from said.__cause__
 
     def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
         """Gymnasium's."""
         try:
             return self._returns.of_step(self.env.step(actions))
         except (SystemExit, OSError) as error:
-            raise self._returns.explained("step", error) from None
+            said = self._returns.explained("step", error)
+            raise said from said.__cause__
 
     def close(self, **kwargs: Any) -> None:
         """Gymnasium's. An exception in it is said, and costs nothing that was learned."""

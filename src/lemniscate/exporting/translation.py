@@ -240,6 +240,8 @@ def _elementwise(name: str, kind: Kind | None = None) -> Translation:
     def translation(walk: Walk, *operands: Any, alpha: float = 1, rounding_mode: str | None = None) -> Value:
         if rounding_mode is not None:
             raise UntranslatableError(f"{walk.name} with rounding has no translation")
+        if walk.name.startswith("bitwise_") and walk.fake.dtype != torch.bool:
+            raise UntranslatableError(f"{walk.name} of whole numbers has no translation")
         own = [walk.as_kind(operand, kind) for operand in operands]
         if alpha != 1:
             own[1] = walk.add("Mul", own[1], walk.as_kind(alpha))

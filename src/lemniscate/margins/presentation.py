@@ -132,11 +132,11 @@ def _draw(axes: Axes, right: Axes, one: AxisMargins) -> None:
     if inside and not is_named:
         ends = _place(axis, inside[0]), _place(axis, inside[-1])
         axes.axvspan(*ends, color=ALIVE, alpha=0.1, linewidth=0, label="within the margin")
-        for side in one.sides.values():
+        for name, side in one.sides.items():
             if side.first is not None and side.last is not None:
                 edge = _place(axis, side.last)
                 axes.axvline(edge, color=ALIVE, linewidth=1, linestyle="--")
-                end = min(values) if edge < nominal else max(values)
+                end = min(values) if name == "below" else max(values)
                 axes.axvspan(edge, end, color=BEYOND, alpha=0.06, linewidth=0, label="beyond it")
     axes.axvline(nominal, color="0.6", linewidth=0.8, linestyle=":", label="nominal")
     right.plot(values, one.mean_returns, "s", color=RETURN, label="mean return", alpha=0.8, **style)

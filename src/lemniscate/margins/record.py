@@ -115,11 +115,11 @@ def margins_of(axis: Axis, flown: Sequence[Flown], least: float | None) -> AxisM
     return AxisMargins(axis, episodes, counts, returns)
 
 
-def smoothness(actions: Tensor, period: float) -> dict[str, float]:
+def smoothness(episodes: Sequence[Tensor], period: float) -> dict[str, float]:
     """The smoothness of a policy's actions.
 
     Args:
-        actions: [T, E, A] in [-1, 1], one every `period`.
+        episodes: actions [T, A] in [-1, 1] of each, one every `period`.
         period: in seconds.
 
     Returns:
@@ -127,11 +127,14 @@ def smoothness(actions: Tensor, period: float) -> dict[str, float]:
         2; `fast_share`, the share of the power of the actions, without their means, at frequencies above 10 Hz;
         `saturated_share`, the share of the actions at a bound.
     """
-    rate = actions.diff(dim=0).square().mean().sqrt() / period
-    power = torch.fft.rfft(actions - actions.mean(0), dim=0).abs().square().sum((1, 2))
-    fast = torch.fft.rfftfreq(len(actions), period) > FAST
+    changes = torch.cat([actions.diff(dim=0).square() for actions in episodes])
+    total = fast = 0.0
+    for actions in episodes:
+        power = torch.fft.rfft(actions - actions.mean(0), dim=0).abs().square().sum(1) / len(actions)
+        total += power.sum().item()
+        fast += power[torch.fft.rfftfreq(len(actions), period) > FAST].sum().item()
     return {
-        "action_rate": rate.item(),
-        "fast_share": (power[fast].sum() / power.sum().clamp(min=1e-12)).item(),
-        "saturated_share": (actions.abs() >= EDGE).float().mean().item(),
+        "action_rate": (changes.sum() / max(1, changes.numel())).sqrt().item() / period,
+        "fast_share": fast / max(total, 1e-12),
+        "saturated_share": (torch.cat([*episodes]).abs() >= EDGE).float().mean().item(),
     }

@@ -120,8 +120,10 @@ class VectorProbe:
         """All episodes, see `Probe.fly`; afterwards the environments are closed."""
         numbers, seen = _is_number(self.spec), list[Tensor]()
         try:
-            nominal = _fly(self._env, begin(), seed, numbers, seen)
-            scale = torch.zeros(len(numbers)).masked_scatter(numbers, torch.cat(seen).std(0, correction=0))
+            nominal = _fly(self._env, begin(), seed, numbers, seen if numbers.any() else None)
+            scale = torch.zeros(len(numbers))
+            if seen:
+                scale.masked_scatter_(numbers, torch.cat(seen).std(0, correction=0))
             points: dict[str, list[Flown]] = {}
             for axis in self.axes:
                 flown = (nominal if v == axis.nominal else self._at(axis, v, scale, begin(), seed) for v in axis.values)

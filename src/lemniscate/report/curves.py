@@ -315,10 +315,15 @@ def _by_optuna(study: Any, settings: int, folder: Path) -> list[Path]:
 
 def run_styles(runs: list[Path], labels: Sequence[str] | None = None) -> Iterator[tuple[Path, object, str]]:
     """(run, colour, label) of each; one colour for one label, which is the run's name by default."""
-    names = list(labels or (run.name for run in runs))
+    names = [_plain(name) for name in labels or (run.name for run in runs)]
     different = list(dict.fromkeys(names))
     for run, name in zip(runs, names, strict=True):
         yield run, COLORS[different.index(name) % 10], name
+
+
+def _plain(name: str) -> str:
+    """A name as a legend shows it: matplotlib leaves out those with _ before them, and takes dollars for formulas."""
+    return f" {name}".replace("$", r"\$") if name.startswith("_") else name.replace("$", r"\$")
 
 
 def finish(axes: Axes, ticks: int = 5) -> None:

@@ -151,12 +151,12 @@ def draw_from_above(flights: Sequence[Flight], file: Path) -> Path:
         axes.plot(*other.position[:, :2].T, color=GREY, linewidth=0.5, alpha=0.4)
     _draw_boxes(axes, first.boxes)
     path = first.position
-    speed = np.linalg.norm(np.gradient(path, first.time_step, axis=0), axis=1)
     pieces = list(np.stack([path[:-1, :2], path[1:, :2]], axis=1))
-    points = LineCollection(pieces, array=speed[1:], linewidths=2.2, zorder=3)
-    axes.add_collection(points)
     axes.plot(*path[0, :2], "o", color=BLUE, markersize=5, zorder=4)
-    figure.colorbar(points, ax=axes, label="speed / (m/s)", shrink=0.85)
+    if pieces:  # not of a flight that ended in its first step
+        speed = np.linalg.norm(np.diff(path, axis=0), axis=1) / first.time_step
+        points = axes.add_collection(LineCollection(pieces, array=speed, linewidths=2.2, zorder=3))
+        figure.colorbar(points, ax=axes, label="speed / (m/s)", shrink=0.85)
     axes.set_title(f"One flight of {first.time[-1]:.2f} s, and {len(others)} others", loc="left")
     axes.set(xlabel="x / m", ylabel="y / m", aspect="equal")
     finish(axes)

@@ -76,26 +76,31 @@ def write_run(run: Path, pictures: Sequence[Path], scores: Evaluated | None, fou
     )
 
 
-def write_evaluation(folder: Path, name: str, pictures: Sequence[Path], scores: Evaluation, seed: int) -> Path:
-    """Write the page of an evaluation of the policy `name`, which need not be of a run: video, scores, pictures."""
+def write_evaluation(
+    folder: Path, name: str, pictures: Sequence[Path], scores: Evaluation, seed: int, since: float
+) -> Path:
+    """Write the page of an evaluation of the policy `name`, which need not be of a run: video, scores, pictures.
+
+    A video from before the time `since` is of another evaluation.
+    """
     return write_page(
         folder / "plots" / "report.html",
         "evaluation.html.j2",
         title=f"{name} in {scores.env_id}",
         subtitle=f"{scores.episodes:,} episodes · seed {seed}",
         pictures=pictures,
-        video=newest_video(folder),
+        video=newest_video(folder, since),
         rows=score_rows({**scores.to_json(), "seed": seed}),
         histogram=_histogram(scores.returns),
     )
 
 
-def newest_video(run: Path) -> Path | None:
-    """The newest video of a run, if it has any."""
+def newest_video(run: Path, since: float = 0.0) -> Path | None:
+    """The newest video of a run, if it has any from that time on."""
     videos = [file for file in (run / "videos").glob("*") if file.suffix in VIDEOS]
     videos = [file for file in videos if not file.stem.endswith(".tmp")]  # one that is being written
     # Not a link, which could lead to any file of this machine, and what is found is embedded and uploaded.
-    own = [file for file in videos if file.is_file() and not file.is_symlink()]
+    own = [file for file in videos if file.is_file() and not file.is_symlink() and file.stat().st_mtime >= since]
     return max(own, key=lambda file: file.stat().st_mtime, default=None)
 
 
@@ -296,7 +301,7 @@ def _option(name: str, value: Any) -> list[str]:
     if isinstance(value, bool):
         return [flag(name) if value else flag(name).replace("--", "--no-", 1)]
     if isinstance(value, list):
-        return [flag(name), *map(str, value or ["none"])]
+        return [flag(name), *map(str, value or ["[]"])]
     if isinstance(value, dict):
         return [flag(name), json.dumps(value)]
     return [flag(name), "none" if value is None else str(value)]

@@ -88,7 +88,9 @@ def read(name: str, hint: Any, text: Any) -> Any:
         joined = ",".join(text).strip()
         inner = joined[1:-1] if joined[:1] + joined[-1:] in ("[]", "()") else joined  # as Python writes several
         parts = [part.strip("'\"") for part in _split(inner)]
-        return () if parts == ["none"] else tuple(read(name, kinds[tuple][0], part) for part in parts)
+        if parts == ["none"]:
+            return None if NoneType in kinds else ()
+        return tuple(read(name, kinds[tuple][0], part) for part in parts)
     if NoneType in kinds and text == "none":
         return None
     if dict in kinds:

@@ -23,6 +23,7 @@ from typing import TypeVar
 import numpy as np
 import torch
 
+from lemniscate.envs.returned import told_with_place
 from lemniscate.envs.vec_env import Episodes, VecEnv
 from lemniscate.errors import NonFiniteError, NotStoredError, UserError, resume_line, shown
 from lemniscate.nn.memory import Carrier
@@ -380,15 +381,17 @@ class Run:
         try:
             with globals_undisturbed(), self.world.busy():
                 yield
-        except Exception as error:  # no display any more, a full disk, whatever an environment's picture raises
-            say(f"No {what} at step {state.step:,}: {error or type(error).__name__}")
+        except (UserError, OSError) as error:  # no display any more, a full disk, an endless episode
+            say(f"No {what} at step {state.step:,}: {error}")
+        except Exception as error:  # whatever an environment or its picture raises
+            say(f"No {what} at step {state.step:,}: {told_with_place(error)}.")
         except Stopped:
-            if self.world.size > 1:
+            if self.world.size > 1 or state.step == self._iteration.step:  # nothing has been learned since
                 raise
             self._stop.end()
             self._iteration.cut_short = True  # the process that resumes the run does what was due
         finally:
-            if self.env.backend.once:
+            if self.env.backend.once and not self._stop.signum:  # a run that stops takes no step more
                 self._restart(state)
 
     def _record(self, state: TrainState) -> None:

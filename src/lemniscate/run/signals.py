@@ -22,8 +22,10 @@ from lemniscate.nn.networks import ACTIVATIONS
 from lemniscate.nn.normalizer import RunningNorm
 from lemniscate.run.config import RunConfig
 from lemniscate.spec import Action, Box, Discrete, MultiDiscrete, Spec
-from lemniscate.types import Batch, Rollout, Transition
+from lemniscate.types import Batch, Rollout, Transition, wide_float
 
+Given = tuple[Any, tuple[Tensor, ...], bool]
+"""what the gradient steps of an update were given: see `Watched.given`"""
 LOOKS = 24
 """how often in a run the signals are measured"""
 KINDS = (
@@ -57,7 +59,7 @@ def signals(
     rows: Rollout | None,
     acted: Mapping[str, Tensor] | None = None,
     ages: Tensor | None = None,
-    given: tuple[Any, tuple[Tensor, ...]] | None = None,
+    given: Given | None = None,
 ) -> dict[str, float]:
     """The signals of a training state and of the newest rows [T, N, …] of its environments, by the glossary's names.
 
@@ -455,21 +457,30 @@ class Watched:
     """The gradient steps of an algorithm, in an update that is looked at: what the first call was given is kept."""
 
     def __init__(self, state: Any) -> None:
-        self._state, self._learn = state, state.learn
-        self.given: tuple[Any, tuple[Tensor, ...]] | None = None
+        self._state, self._learn, self._calls = state, state.learn, 0
+        self._given: tuple[Any, ...] = ()
         state.learn = self
 
-    def __call__(self, config: Any, state: Any, data: Any, *by_step: Tensor, **flags: Any) -> Any:
-        """The gradient steps."""
-        self.given = self.given or (data, by_step)
-        return self._learn(config, state, data, *by_step, **flags)
+    def __call__(self, *args: Any, **flags: Any) -> Any:
+        """The gradient steps; of an algorithm of one's own they may take other arguments than those of ours."""
+        self._calls += 1
+        self._given = self._given or args[2:]
+        return self._learn(*args, **flags)
+
+    @property
+    def given(self) -> Given:
+        """The data, the tensors for each gradient step, the rows first; and whether there was one step alone."""
+        data, *by_step = self._given or (None,)
+        known = all(isinstance(each, Tensor) and each.dim() > 1 for each in by_step)
+        tensors = tuple(by_step) if by_step and known and by_step[0].dtype == torch.int64 else ()
+        return data, tensors, self._calls == 1 and len(tensors) > 0 and len(tensors[0]) == 1
 
     def end(self) -> None:
         """Watch no more."""
         self._state.learn = self._learn
 
 
-def of_batch(config: RunConfig, given: tuple[Any, tuple[Tensor, ...]] | None, rows: Rollout) -> dict[str, Tensor]:
+def of_batch(config: RunConfig, given: Given | None, rows: Rollout) -> dict[str, Tensor]:
     """Of the rows that an update learned from, where they are the newest, [T, N, …]: whether they follow from these.
 
     - targets/discount: the factor by which targets follow from the values and the targets of the row after.
@@ -477,35 +488,47 @@ def of_batch(config: RunConfig, given: tuple[Any, tuple[Tensor, ...]] | None, ro
     - targets/beyond_ends: the share of the squares of the targets where an episode terminated that is not the reward's.
     - advantage/own: the correlation of the advantages with what the targets are above the values.
     - advantage/used: that of the advantages in the first gradient step with those of its rows.
-    - value/loss: half the mean of the squared differences of values and targets in the first gradient step.
+    - value/loss: half the mean of the squared differences of values and targets, in an update of one gradient step.
     """
-    data, by_step = given or (None, ())
-    envs, found = rows.done.shape[1], dict[str, Tensor]()
-    if not isinstance(data, Batch) or len(data.target) % envs:
+    data, by_step, is_one = given or (None, (), False)
+    columns, found = _columns_of(config, data, rows), dict[str, Tensor]()
+    if not columns:
         return found
-    value, advantage, target = (x.double().view(-1, envs) for x in (data.value, data.advantage, data.target))
-    steps = min(len(value), len(rows.done))
-    if steps < 3 or not torch.equal(data.obs.unflatten(0, (-1, envs))[-steps:], rows.obs[-steps:]):
-        return found  # mirror images, pieces of a memory, rows of other processes
-    v, a, g, newest = value[-steps:], advantage[-steps:], target[-steps:], rows[-steps:]
-    beyond = g - newest.reward.double()
+    steps = min(len(columns[0]), len(rows.done))
+    (v, a, g), newest = (x[-steps:] for x in columns), rows[-steps:]
+    beyond, size = g - newest.reward.to(g.dtype), g.square().mean()
     on, ends = ~newest.done[:-1] & newest.valid[:-1] & newest.valid[1:], newest.terminated & newest.valid
     ahead, rest = torch.lerp(v[1:], g[1:], getattr(config, "gae_lambda", 1.0))[on], beyond[:-1][on]
-    if ahead.square().mean() > 0:
+    if size > 0 and ahead.any():
         found["targets/discount"] = (ahead * rest).sum() / ahead.square().sum()
-        found["targets/unexplained"] = (rest - found["targets/discount"] * ahead).square().mean() / g.square().mean()
-    if ends.any():
-        found["targets/beyond_ends"] = beyond[ends].square().mean() / g.square().mean()
+        found["targets/unexplained"] = (rest - found["targets/discount"] * ahead).square().mean() / size
+    if size > 0 and ends.any():
+        found["targets/beyond_ends"] = beyond[ends].square().mean() / size
     pairs = {"advantage/own": (a[newest.valid], (g - v)[newest.valid])}
     if by_step:
-        chosen = by_step[0][0].flatten()
-        found["value/loss"] = 0.5 * (value - target).flatten()[chosen].square().mean()
+        value, advantage, target = (x.flatten()[by_step[0][0].flatten()] for x in columns)
+        found |= {"value/loss": 0.5 * (value - target).square().mean()} if is_one else {}
         if len(by_step) > 1 and by_step[1].shape == by_step[0].shape:
-            pairs["advantage/used"] = by_step[1][0].flatten().double(), advantage.flatten()[chosen]
-    for name, pair in pairs.items():
-        if all(_spread(x) > 1e-4 * g.abs().mean() for x in pair[1:]):  # else they are of rounding
-            found[name] = torch.corrcoef(torch.stack(pair))[0, 1].nan_to_num()
+            pairs["advantage/used"] = by_step[1][0].flatten().to(g.dtype), advantage
+    for name, (one, right) in pairs.items():
+        if _spread(right) > 1e-4 * g.abs().mean():  # else it is of rounding
+            found[name] = torch.corrcoef(torch.stack([one, right]))[0, 1].nan_to_num()
     return found
+
+
+def _columns_of(config: RunConfig, data: Any, rows: Rollout) -> list[Tensor]:
+    """Value, advantage and target [T, N] of a batch, where its last rows are the newest; else nothing."""
+    envs = rows.done.shape[1]
+    if not isinstance(data, Batch) or getattr(config, "episodes", 0) or len(data.obs) % envs:
+        return []
+    columns = data.value, data.advantage, data.target
+    if any(not isinstance(x, Tensor) or x.shape != data.obs.shape[:1] for x in columns):
+        return []
+    obs = data.obs.unflatten(0, (-1, envs))
+    steps = min(len(obs), len(rows.done))
+    if steps < 3 or not torch.equal(obs[-steps:], rows.obs[-steps:]):
+        return []  # mirror images, pieces of a memory, rows of other processes
+    return [x.to(wide_float(x.device)).reshape(-1, envs) for x in columns]
 
 
 def of_replay(state: Any, rows: Rollout) -> dict[str, Tensor]:

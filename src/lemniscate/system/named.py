@@ -67,7 +67,8 @@ def _stands(module: str, qualname: str, thing: object) -> bool:
     for part in qualname.split("."):
         found = getattr(found, part, None)
     code, bound = (getattr(found, name, None) for name in ("__code__", "__self__"))
-    alike = code is not None and code is getattr(thing, "__code__", None)
+    # The functions that a decorator makes share their code, and differ in what is closed over.
+    alike = code is not None and code is getattr(thing, "__code__", None) and not code.co_freevars
     return found == thing or (alike and bound is getattr(thing, "__self__", None))
 
 
