@@ -20,7 +20,13 @@ from hypothesis import settings
 
 import toy  # noqa: F401  (registers Countdown-v0 and Matching-v0)
 
-settings.register_profile("lemniscate", deadline=None, report_multiple_bugs=False)  # no test waits for a clock
+settings.register_profile(
+    "lemniscate",
+    deadline=None,  # no test waits for a clock
+    report_multiple_bugs=False,
+    derandomize="HYPOTHESIS_RANDOM" not in os.environ,  # HYPOTHESIS_RANDOM=1 make test looks further
+    database=None,
+)
 settings.load_profile("lemniscate")
 
 
@@ -37,6 +43,7 @@ def pytest_collection_modifyitems(items):
 @pytest.fixture(autouse=True)
 def _one_thread():
     torch.set_num_threads(1)
+    torch.manual_seed(0)  # what a test draws does not hang on those before it
 
 
 @pytest.fixture

@@ -4,6 +4,7 @@
 """
 
 import json
+import os
 import random
 
 RIGHT = {
@@ -112,17 +113,19 @@ def only(name, code, right=False):
 
 
 PG = RIGHT["calculate_pg_loss"]
+STRAY = str(10**6 + os.getpid())
+"""the seconds that what a hand-in leaves behind sleeps; each process of the tests has its own"""
 SPAWNS = """
 import os, subprocess, sys
 
 def td_target(reward, next_value, terminated, *, gamma):
     for _ in range(20):
-        subprocess.Popen([sys.executable, "-c", "import time; time.sleep(987654)"], start_new_session=True)
+        subprocess.Popen([sys.executable, "-c", "import time; time.sleep(STRAY)"], start_new_session=True)
     if os.fork() == 0:
         while True:
             pass
     return reward
-"""
+""".replace("STRAY", STRAY)
 PATCHES = """
 import builtins, sys
 import lemniscate.course

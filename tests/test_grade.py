@@ -52,7 +52,7 @@ def strays():
     """Processes that a hand-in has started, and left."""
     found = []
     for process in psutil.process_iter(["cmdline"]):
-        found += [process.pid] if "time.sleep(987654)" in " ".join(process.info["cmdline"] or ()) else []
+        found += [process.pid] if f"time.sleep({hand_ins.STRAY})" in " ".join(process.info["cmdline"] or ()) else []
     return found
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 import lemniscate as lem
-from zoo_files import ZOO, load, solution_of
+from zoo_files import ZOO, execute, find, load
 
 
 class Follow(gym.Env):
@@ -53,13 +53,15 @@ def follow(act):
 def main(kind="right", words=""):
     torch.set_num_threads(1)
     for path in sorted(ZOO.glob("train.*.py")):
-        for a_kind, title, _, code, name in load(path):
-            if a_kind != kind or words not in title:
+        for solution in load(path):
+            title = solution.title
+            if solution.kind != kind or words not in title:
                 continue
             begun, reached = time.time(), []
             for env, steps, judge in (("CartPole-v1", 60_000, cartpole), (Follow, 30_000, follow)):
                 try:
-                    agent = solution_of(code, title, name)(lem.make_vec(env, 8), steps, 1)
+                    train = find(execute(solution, "zoo_of_returns"), solution.name)
+                    agent = train(lem.make_vec(env, 8), steps, 1)
                     reached.append(judge(getattr(agent, "act", agent)))
                 except Exception as error:
                     reached.append(repr(error))

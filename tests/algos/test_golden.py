@@ -1,4 +1,4 @@
-"""Golden numbers: five updates of every algorithm in float64. A change of any digit shows here.
+"""Golden numbers: five updates of every algorithm in float64. A change of the eighth digit shows here.
 
 Renew them, where a change of the mathematics is meant: python tests/algos/test_golden.py
 """

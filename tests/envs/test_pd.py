@@ -77,7 +77,7 @@ def test_of_a_baseline_there_is_neither_film_nor_page(tmp_path):
     pytest.importorskip("crazyflow")
     arguments = {"env": "DroneFigureEightTrajectory-v0", "episodes": 1, "baseline": True}
     for more in ({"video": tmp_path / "video.gif"}, {"report": tmp_path / "page"}):
-        with pytest.raises(lem.errors.UserError, match="leave out video and report"):
+        with pytest.raises(lem.errors.UserError, match="leave out video, report and stochastic"):
             lem.evaluate(lambda obs: np.array([0, 0, 0, 0.3], np.float32), **arguments, **more)
 
 

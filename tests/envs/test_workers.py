@@ -20,7 +20,7 @@ from lemniscate.errors import WorkerError
 @pytest.mark.parametrize(
     ("name", "patience", "sentence"),
     [
-        ("NeverThere", 4.0, r"Environment 0, 1 has not answered for 4 s\."),
+        ("NeverThere", 1.0, r"Environment 0, 1 has not answered for 1 s\."),
         ("Gone", 60.0, r"The process of environment \d died \(exit code 3\)"),
     ],
 )

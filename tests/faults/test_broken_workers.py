@@ -8,6 +8,7 @@ import re
 import signal
 import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import gymnasium as gym
@@ -28,17 +29,26 @@ SHORT = ("segfault", "exception that no pipe takes", "exception without words")
 
 def left(before):
     """The processes that were started since, less the two that multiprocessing keeps."""
-    kept = ("forkserver", "resource_tracker")
-    started = [child for child in psutil.Process().children(recursive=True) if child not in before]
-    return [child for child in started if not any(name in " ".join(child.cmdline()) for name in kept)]
+    found = []
+    for child in psutil.Process().children(recursive=True):
+        with suppress(psutil.NoSuchProcess):  # it may end meanwhile
+            words = " ".join(child.cmdline())
+            if child not in before and "forkserver" not in words and "resource_tracker" not in words:
+                found.append(child)
+    return found
 
 
-def use(**kwargs):
+def use(monkeypatch, **kwargs):
     """Make two environments, and take a step; (when, what is said of the one that breaks)."""
     env = None
+    if kwargs["place"] != "step":  # there it is the start that breaks
+        monkeypatch.setattr(WatchedVectorEnv, "patience", PATIENCE)
     try:
         env = registry.make("broken:Broken", 2, kwargs=kwargs, backend="gymnasium-async")
         env.restart(0)
+        monkeypatch.setattr(
+            WatchedVectorEnv, "patience", PATIENCE
+        )  # not before: to start takes longer on a busy machine
         env.step(torch.zeros(2, dtype=torch.int64))
     except (WorkerError, UserError) as error:  # sys.exit in reset or step is the environment's mistake
         return time.time(), str(error)
@@ -57,9 +67,8 @@ def use(**kwargs):
     ],
 )
 def test_a_worker_that_breaks_is_named_in_time(monkeypatch, tmp_path, capfd, way, place):
-    monkeypatch.setattr(WatchedVectorEnv, "patience", PATIENCE)
     before = set(psutil.Process().children(recursive=True))
-    when, said = use(way=way, place=place, told=str(tmp_path / "broken"))
+    when, said = use(monkeypatch, way=way, place=place, told=str(tmp_path / "broken"))
     took = when - (tmp_path / "broken").stat().st_mtime
     assert re.search(WAYS[way][1], said), said
     assert re.search(r"nvironment |Broken\.", said), said

@@ -1,3 +1,6 @@
+import math
+
+import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
@@ -9,6 +12,7 @@ from lemniscate.maths import (
     kl_k3,
     merge_moments,
     moments,
+    ratio_statistics,
     standardize,
 )
 
@@ -76,3 +80,11 @@ def test_merged_moments_are_those_of_the_union(a, b, seed):
     torch.testing.assert_close(merged[0], union.mean(0))
     torch.testing.assert_close(merged[1], union.var(0, correction=0))
     assert merged[2] == a + b
+
+
+def test_the_statistics_of_a_ratio_have_their_usual_names():
+    log_ratio = torch.tensor([0.0, 0.3, -0.5], dtype=torch.float64)
+    found = ratio_statistics(log_ratio, 0.2)
+    assert found["approx_kl"].item() == pytest.approx(sum(math.exp(x) - 1 - x for x in (0.0, 0.3, -0.5)) / 3)
+    assert found["old_approx_kl"].item() == pytest.approx(0.2 / 3)
+    assert found["clip_fraction"].item() == pytest.approx(2 / 3)

@@ -37,8 +37,9 @@ def test_a_run_in_an_environment_of_ones_own_is_resumed_and_evaluated_unasked(tm
     assert set(read_json(run.path / "config.json")) == {"algorithm", "config"}
 
 
-@pytest.mark.parametrize("name", ["../outside", "/tmp/outside", "a/b", ".."])
+@pytest.mark.parametrize("name", ["../outside", "ABSOLUTE", "a/b", ".."])
 def test_a_sweep_makes_no_directory_outside_itself(tmp_path, name):
+    name = str(tmp_path / "outside") if name == "ABSOLUTE" else name
     (tmp_path / "s").mkdir()
     write_json(tmp_path / "s" / "sweep.json", {"seeds": [1], "configs": {name: {"env": "CartPole-v1"}}})
     with pytest.raises(lem.UserError, match="no name of an algorithm"):
