@@ -10,6 +10,8 @@ from lemniscate.api import plots
 from lemniscate.envs.backend import Scene
 from lemniscate.envs.gymnasium import GymnasiumBackend
 from lemniscate.report import curves, flight, playback
+from lemniscate.run.environments import evaluation_env
+from lemniscate.run.evaluate import EpisodeTable
 
 MODEL = """<mujoco><worldbody><body mocap="true"><geom size="0.1"/></body></worldbody></mujoco>"""
 
@@ -100,3 +102,23 @@ def test_a_flight_is_drawn_wherever_it_is():
     last = flight.animate(flight.Flight(there, beside, attitude, 0.1, np.zeros((0, 15))), every=1)[-1]
     blue = np.array([0x1F, 0x5F, 0xA8])
     assert (np.abs(last.astype(int) - blue).max(axis=-1) < 40).any()
+
+
+@pytest.mark.long
+def test_the_distance_in_pictures_is_the_true_one_however_late_the_observation():
+    pytest.importorskip("crazyflow")
+    config = lem.config_for("ppo", "DroneFigureEightTrajectory-v0", num_envs=4, env_kwargs={"observation_delay": 0.1})
+    env = evaluation_env(config, 4)
+    table = EpisodeTable(env.num_envs, env.device)
+    flights = flight.record(env.baseline, env, 4, 0, table=table)
+    scores = table.evaluation(env.spec.env_id, env.summaries)
+    after = np.concatenate([one.error_mm[50:] for one in flights])
+    assert scores.measures["rmse_after_1s_mm"] == pytest.approx(np.sqrt(np.mean(after**2)), rel=1e-3)
+    observed = np.concatenate([1000 * np.linalg.norm(one.position - one.reference, axis=-1)[50:] for one in flights])
+    assert np.abs(observed - after).max() > 5, "late by a tenth of a second"
+
+
+def test_a_measured_distance_takes_the_place_of_the_observed_one():
+    there = np.zeros((3, 3))
+    one = flight.Flight(there, there + 1, np.tile([0.0, 0, 0, 1], (3, 1)), 0.1, np.zeros((0, 15)), np.full(3, 0.002))
+    assert one.error_mm.tolist() == [2.0, 2.0, 2.0]

@@ -61,6 +61,7 @@ def names(*args, **kwargs):
 
 CASES = {
     # rule: evidence in which it fires, evidence just beside it
+    "reset-without-effect": ({"observation__goes_on": [1.0] * 8}, {"observation__goes_on": [0.9] * 8}),
     "targets-differ": ({"targets__unexplained": [0.02] * 8}, {"targets__unexplained": [0.009] * 8}),
     "discount-differs": (
         {"targets__discount": [1.0101] * 8, "targets__unexplained": [0.0] * 8},

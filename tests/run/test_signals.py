@@ -1036,3 +1036,22 @@ def test_targets_that_are_all_zero_say_nothing_of_a_discount():
     assert not any(name.startswith("targets/") for name in found)
     whole = of_batch(SimpleNamespace(episodes=1), (batch, (), False), newest)
     assert whole == {}, "of whole episodes the rows have been moved together"
+
+
+@pytest.mark.parametrize("resets", [True, False])
+def test_an_episode_that_begins_where_the_last_one_ended_goes_on(resets):
+    """Walks of two environments that end every ten steps; a reset brings them back, or does not."""
+    steps = torch.randn(40, 2, O, generator=torch.Generator().manual_seed(0))
+    obs, next_obs, place = torch.zeros(40, 2, O), torch.zeros(40, 2, O), torch.zeros(2, O)
+    ends = torch.zeros(40, 2, dtype=torch.bool)
+    ends[9::10] = True
+    for t in range(40):
+        obs[t], next_obs[t] = place, place + steps[t] + 1
+        place = torch.zeros(2, O) if resets and ends[t, 0] else next_obs[t]
+    no = torch.zeros_like(ends)
+    found = of_starts(Rollout(obs, torch.zeros(40, 2, A), torch.zeros(40, 2), next_obs, ends, no, ~no), spec_of())
+    assert found["observation/goes_on"] == float(not resets)
+    behind = of_starts(
+        Rollout(obs, torch.zeros(40, 2, A), torch.zeros(40, 2), next_obs, ends, no, ~ends.roll(1, 0)), spec_of()
+    )
+    assert "observation/goes_on" not in behind, "between them stands the row of a reset"

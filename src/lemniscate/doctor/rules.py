@@ -337,6 +337,12 @@ def of_episodes(e: Evidence) -> Seen:
         )
 
 
+def of_resets(e: Evidence) -> Seen:
+    """Whether a reset begins an episode anew."""
+    if (share := e.median("observation/goes_on")) > 0.9 and not e.is_slow:
+        yield "reset-without-effect", f"After {share:.0%} of the ends the next episode begins where the last one ended."
+
+
 def of_horizon(e: Evidence) -> Seen:
     """Faults of the horizon: the discount against the length of episodes."""
     gamma, recommended = (first_number(config.get("gamma")) for config in (e.config, e.recommended))
@@ -815,6 +821,7 @@ SUBJECTS = (
     of_reward_sizes,
     of_rewards,
     of_episodes,
+    of_resets,
     of_horizon,
     of_ratios,
     of_updates,

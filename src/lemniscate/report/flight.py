@@ -34,7 +34,8 @@ class Flight:
     """A flight of T steps: `position` [T, 3] in metres, `attitude` [T, 4] (xyzw).
 
     What it flies along or among: `reference` [T, 3] in metres, [0, 3] where none is followed; the boxes [B, 15] of a
-    `Scene`.
+    `Scene`. All of these are as observed, which may be noisy and late; `measured` [T] is the true distance to the
+    reference in metres, where the environment tells it.
     """
 
     position: np.ndarray
@@ -42,10 +43,13 @@ class Flight:
     attitude: np.ndarray
     time_step: float
     boxes: np.ndarray
+    measured: np.ndarray | None = None
 
     @property
     def error_mm(self) -> np.ndarray:
         """Distance to the reference, [T]."""
+        if self.measured is not None:
+            return 1000 * self.measured
         return 1000 * np.linalg.norm(self.position - self.reference, axis=-1)
 
     @property
@@ -69,7 +73,7 @@ def record(
     """
     scene = env.scene
     assert scene is not None
-    rows, first = [], torch.ones(env.num_envs, dtype=torch.bool, device=env.device)
+    rows, errors, first = [], [], torch.ones(env.num_envs, dtype=torch.bool, device=env.device)
     boxes = np.zeros((env.num_envs, 0, 15))
     for _, _, step, counts in play_episodes(policy, env, flights, seed, deterministic):
         if not rows and scene.boxes:
@@ -79,13 +83,16 @@ def record(
         if (first & counts).any():
             row = torch.where((first & counts)[:, None], step.next_obs, torch.nan)[:flights]
             rows.append(row.cpu().numpy())
+            errors.append(step.measures.get("tracking_error", torch.full_like(step.reward, torch.nan)).cpu().numpy())
         first = first & ~((step.terminated | step.truncated) & counts)
     found = []
-    for flown, standing in zip(np.stack(rows, axis=1), boxes, strict=False):
-        track = flown[~np.isnan(flown[:, 0])]
+    for flown, standing, distances in zip(np.stack(rows, axis=1), boxes, np.stack(errors, axis=1), strict=False):
+        own = ~np.isnan(flown[:, 0])
+        track, measured = flown[own], distances[own]
         position = track[:, scene.position]
         reference = position + track[:, scene.error] if scene.error else position[:0]
-        found.append(Flight(position, reference, track[:, scene.attitude], scene.time_step, standing))
+        told = None if np.isnan(measured).any() else measured
+        found.append(Flight(position, reference, track[:, scene.attitude], scene.time_step, standing, told))
     return found
 
 

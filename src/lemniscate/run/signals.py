@@ -127,10 +127,21 @@ def of_rows(rows: Rollout, spec: Spec) -> dict[str, Tensor]:
 
 
 def of_starts(rows: Rollout, spec: Spec) -> dict[str, Tensor]:
-    """Whether episodes begin with the same observation, of rows [T, N, …] with three beginnings or more."""
-    begins = rows.valid[1:] & (rows.done | ~rows.valid)[:-1]
-    first = rows.obs[1:][begins][:, : spec.observation_size]
-    return {"observation/starts_alike": (first == first[:1]).all().float()} if len(first) > 2 else {}
+    """Whether episodes begin alike, and where the ones before have ended, of rows [T, N, …] with three beginnings.
+
+    The second is the share of the ends, where one row follows the other, after which the observation is as far from the
+    last one as a tenth of its standard deviation at most.
+    """
+    begins, size, found = rows.valid[1:] & (rows.done | ~rows.valid)[:-1], spec.observation_size, dict[str, Tensor]()
+    first = rows.obs[1:][begins][:, :size]
+    if len(first) > 2:
+        found["observation/starts_alike"] = (first == first[:1]).all().float()
+    ended = (rows.done & rows.valid)[:-1] & rows.valid[1:]
+    spread = _spread(rows.obs[..., :size].flatten(0, 1).float())
+    if ended.sum() > 2 and (moves := spread > 0).any() and not spec.has_images:
+        away = (rows.obs[1:][ended] - rows.next_obs[:-1][ended])[:, :size][:, moves] / spread[moves]
+        found["observation/goes_on"] = (away.square().mean(1).sqrt() < 0.1).float().mean()
+    return found
 
 
 def of_time(rows: Rollout) -> dict[str, Tensor]:
