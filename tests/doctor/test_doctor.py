@@ -61,6 +61,8 @@ def names(*args, **kwargs):
 
 CASES = {
     # rule: evidence in which it fires, evidence just beside it
+    "rate-zero": ({"learning_rate": [1e-3] + [0.0] * 7}, {"learning_rate": [1e-3] * 7 + [0.0]}),
+    "loss-below-zero": ({"losses__value": [-1.0] * 8}, {"losses__value": [0.0] * 8}),
     "reset-without-effect": ({"observation__goes_on": [1.0] * 8}, {"observation__goes_on": [0.9] * 8}),
     "targets-differ": ({"targets__unexplained": [0.02] * 8}, {"targets__unexplained": [0.009] * 8}),
     "discount-differs": (
@@ -1109,3 +1111,14 @@ def test_what_an_update_learns_from_is_judged_by_equations_that_it_has():
     assert names(algorithm="reppo", **off) == []
     several = {"losses__value": list(np.linspace(1, 3, 8)), "value__loss": [1.0] * 8}
     assert names(algorithm="ppo", **several) == []
+
+
+def test_a_share_of_random_actions_that_moves_away_from_its_end_does_not_follow_its_schedule():
+    given = {"algorithm": "pqn", "changed": {"final_epsilon": 0.05}}
+    assert names(epsilon=list(np.linspace(0.05, 1.0, 8)), **given) == ["exploration-still"]
+    assert names(epsilon=list(np.linspace(1.0, 0.05, 8)), **given) == []
+
+
+def test_rows_that_nobody_has_stored_are_a_part_of_the_buffer():
+    rows = {"replay__empty": [0.99] * 8, "replay__repeated": [0.99] * 8, "replay__drawn": [1.0] * 8}
+    assert names(algorithm="ddpg", **rows) == ["replay-part"]

@@ -100,6 +100,9 @@ CONSEQUENCES = {
     "setting-entropy-coef": {"entropy-opposed"},
     "targets-of-others": {"critic-still", "replay-differs"},
     "q-opposed": {"replay-differs"},
+    "replay-repeated": {"replay-part"},
+    "gradient-clipped": {"loss-below-zero"},
+    "missing-bootstrap": {"rate-zero"},
     "ends-ignored": {"ends-continued"},
 }
 """faults that are not named beside one of these, which brings them about"""
@@ -427,8 +430,14 @@ def of_exploration(e: Evidence) -> Seen:
             f"In the first half of the run the policy's {name} fell to {e.spread_left:.0%} of what it was.",
         )
     epsilon, final = e.values("epsilon"), last_number(e.config.get("final_epsilon"))
-    if len(epsilon) >= 4 and np.ptp(epsilon) == 0 and final is not None and abs(epsilon[0] - final) > 0.01:
-        yield "exploration-still", f"epsilon is {epsilon[0]:g} in each line, and is to end at {final:g}."
+    if len(epsilon) >= 4 and final is not None and abs(epsilon[-1] - final) > 0.01:
+        if np.ptp(epsilon) == 0:
+            yield "exploration-still", f"epsilon is {epsilon[0]:g} in each line, and is to end at {final:g}."
+        elif abs(epsilon[-1] - final) > abs(epsilon[0] - final) + 0.01:
+            yield (
+                "exploration-still",
+                f"epsilon went from {epsilon[0]:g} to {epsilon[-1]:g}; it is to end at {final:g}.",
+            )
     away, tried = e.late("action/off_mode"), e.values("action/off_mode")
     never = len(tried) >= 3 and tried[:3].max() < 0.01 and not e.rose  # of a deterministic policy there is no more
     if away < 0.25 and np.isfinite(e.late("losses/entropy")):
@@ -566,7 +575,14 @@ def of_batches(e: Evidence) -> Seen:
 
 
 def of_losses(e: Evidence) -> Seen:
-    """The loss of V in a single gradient step, beside half the mean squared error of its rows."""
+    """The loss of V or Q, which is a square, beside half the mean squared error of its rows; and the learning rate."""
+    losses = e.last_half("losses/value"), e.last_half("losses/critic")
+    least = min((float(np.median(each)) for each in losses if len(each) >= 3), default=0.0)
+    if least < -1e-3:
+        yield "loss-below-zero", f"The loss of the value is {least:.2g} in half of the late lines."
+    rates = e.last_half("learning_rate")
+    if len(rates) >= 4 and np.mean(rates == 0) > 0.5:
+        yield "rate-zero", f"The learning rate is 0 in {np.mean(rates == 0):.0%} of the late lines."
     names = {"losses/value", "value/loss"}
     pairs = [(line["losses/value"], line["value/loss"]) for line in e.log if names <= line.keys()]
     times = np.array([loss / right for loss, right in pairs if right > 0])
@@ -641,8 +657,13 @@ def _lacks_bootstrap(e: Evidence) -> bool:
 
 def of_replay(e: Evidence) -> Seen:
     """Faults of what stands in the replay buffer, and of what is drawn from it."""
-    drawn = e.last_half("replay/drawn")
-    if len(drawn) >= 3 and drawn.max() < 0.8:
+    drawn, empty = e.last_half("replay/drawn"), e.median("replay/empty")
+    if empty > 0.5:
+        yield (
+            "replay-part",
+            f"{empty:.0%} of the transitions that are drawn are of zeros alone: nothing was stored there.",
+        )
+    elif len(drawn) >= 3 and drawn.max() < 0.8:
         yield "replay-part", f"The transitions that are drawn are from {drawn.max():.0%} of the replay buffer alone."
     for name, least, what in (
         ("actions", 0.5, "the stored transitions the action is not the one that was taken."),

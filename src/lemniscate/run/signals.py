@@ -624,12 +624,14 @@ def of_critics(state: Any, config: RunConfig, rows: Rollout) -> dict[str, Tensor
     if ends.any():
         found["value/at_ends"] = _awaited(torch.cat([q, other_q]), torch.cat([newest.reward, sampled.reward]), ends)
     if critics and targets:
+        everything = torch.cat([x.flatten(1) for x in (sampled.obs, sampled.next_obs, sampled.action)], 1)
         own, behind = (torch.cat([p.flatten() for p in each.parameters()]) for each in (critics, targets))
         found |= {
             "td_error/newest": (q - target).square().mean(),
             "td_error/sampled": (other_q - other_target).square().mean(),
             "replay/drawn": share,
             "replay/repeated": (sampled.obs == sampled.next_obs).flatten(1).all(1).float().mean(),
+            "replay/empty": (everything == 0).all(1).float().mean(),
             "targets/behind": (own - behind).norm() / own.norm(),
             "targets/length": behind.norm(),
         }
