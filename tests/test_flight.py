@@ -107,7 +107,8 @@ def test_a_flight_is_drawn_wherever_it_is():
 @pytest.mark.long
 def test_the_distance_in_pictures_is_the_true_one_however_late_the_observation():
     pytest.importorskip("crazyflow")
-    config = lem.config_for("ppo", "DroneFigureEightTrajectory-v0", num_envs=4, env_kwargs={"observation_delay": 0.1})
+    kwargs = {"observation_delay": 0.1}
+    config = lem.config_for("ppo", "DroneFigureEightTrajectory-v0", num_envs=4, minibatch_size=128, env_kwargs=kwargs)
     env = evaluation_env(config, 4)
     table = EpisodeTable(env.num_envs, env.device)
     flights = flight.record(env.baseline, env, 4, 0, table=table)
