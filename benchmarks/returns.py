@@ -2,15 +2,15 @@
 
     .venv/bin/python benchmarks/returns.py ppo                       every environment of docs/results.md, every seed
     .venv/bin/python benchmarks/returns.py ppo --envs Hopper-v5 --seeds 1 2
-    .venv/bin/python benchmarks/returns.py reppo --envs HalfCheetah-v5 --steps 4_000_000 --threads 2
+    .venv/bin/python benchmarks/returns.py reppo --envs HalfCheetah-v5 --steps 3_800_000 --threads 2
     .venv/bin/python benchmarks/returns.py ddpg --runs DIR           keep the runs there, and go on with unfinished ones
     .venv/bin/python benchmarks/returns.py ppo trpo --table          the table of what has been run, and the pictures
     .venv/bin/python benchmarks/returns.py minutes                   which algorithm after 1, 3, 10 and 30 minutes
 
 Each row of `benchmarks/results/returns.jsonl` is one policy: 100 episodes from starts that training never saw; the
 drone's in crazyflow. Where RUNS has several numbers of steps, one run serves all: nothing in those presets depends on
-how long the run is to be, so the policy at the first is the one that a shorter run would have ended with. Where a
-learning rate falls, a run of another length is another run: `--steps`.
+how long the run is to be, but for its checkpoints, at which environments restart. Where a learning rate falls, a run
+of another length is another run: `--steps`.
 """
 
 import argparse

@@ -234,6 +234,24 @@ def harder(step, metrics):
     return {"set_level": np.float64(1 + step // 32 + min(metrics.get("episode/return", 0.0), 64.0) / 128)}
 
 
+class Noise(gym.Env):
+    """Observations are noise, rewards actions; an episode is `length` steps."""
+
+    observation_space, action_space, length = spaces.Box(-1, 1, (2,), np.float32), spaces.Discrete(2), 5
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        return self._see(), {}
+
+    def step(self, action):
+        self.t += 1
+        return self._see(), float(np.sum(action)), False, self.t == self.length, {}
+
+    def _see(self):
+        return self.np_random.uniform(-1, 1, self.observation_space.shape).astype(np.float32)
+
+
 class Near(gym.Env):
     """A number is to be brought near a goal: reward 0 within a tolerance, else −1; an episode is 20 steps."""
 
@@ -264,7 +282,7 @@ class Near(gym.Env):
 
 
 def nearer(step, metrics):
-    return {"set_tolerance": 0.5 if step < 150 else 0.1}
+    return {"set_tolerance": 20.0 if step < 150 else 0.1}
 
 
 def near(step, metrics):

@@ -16,6 +16,7 @@ from torch import nn
 
 import lemniscate as lem
 from conftest import tiny_fields, tiny_off_policy
+from environments import Noise
 from lemniscate.api.options import RunOptions
 from lemniscate.cli import ending, main
 from lemniscate.envs import registry
@@ -31,22 +32,8 @@ from lemniscate.system import named
 FAST = tiny_fields(total_steps=64) | {"progress": False}
 
 
-class Plain(gym.Env):
-    """Observations are noise; an episode is 5 steps."""
-
-    observation_space, action_space = spaces.Box(-1, 1, (2,), np.float32), spaces.Discrete(2)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.t = 0
-        return self._see(), {}
-
-    def step(self, action):
-        self.t += 1
-        return self._see(), float(action), False, self.t == 5, {}
-
-    def _see(self):
-        return self.np_random.uniform(-1, 1, self.observation_space.shape).astype(np.float32)
+class Plain(Noise):
+    """An environment of this module."""
 
 
 class Quits(Plain):

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from lemniscate.envs import registry
-from lemniscate.envs.envpool import GYMNASIUM_IDS, EnvpoolBackend
+from lemniscate.envs.envpool import GYMNASIUM_IDS, EnvpoolBackend, SingleEnv
 from lemniscate.errors import UserError
 
 CPU = torch.device("cpu")
@@ -120,3 +120,16 @@ def test_bits_do_not_depend_on_workers():
 def test_a_time_limit_is_a_number_of_steps(steps):
     with pytest.raises(UserError, match="max_episode_steps of EnvPool's CartPole-v1 must be from 1 to 2,147,483,647"):
         registry.make("EnvPool/CartPole-v1", 2, kwargs={"max_episode_steps": steps})
+
+
+def test_one_that_is_shown_ends_at_its_limit_and_has_its_mask():
+    """As the environments of training do, in whose families not every one does so by itself."""
+    shown = SingleEnv("LaneKeeping-v0", "rgb_array", {"max_episode_steps": 5})
+    shown.reset(seed=0)
+    ends = [shown.step(shown.action_space.sample())[2:4] for _ in range(5)]
+    shown.close()
+    assert [truncated for _, truncated in ends] == [False] * 4 + [True]
+    masked = SingleEnv("Play2048-v1", "rgb_array", {})
+    assert masked.reset(seed=0)[1]["action_mask"].shape == (4,)
+    assert masked.step(0)[4]["action_mask"].shape == (4,)
+    masked.close()

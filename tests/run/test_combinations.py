@@ -14,7 +14,7 @@ import torch
 
 import lemniscate as lem
 from conftest import tiny_fields, tiny_off_policy
-from environments import Near
+from environments import Near, Noise
 from lemniscate.algos import find
 from lemniscate.envs import registry
 from lemniscate.envs.backend import Backend
@@ -31,23 +31,9 @@ LIMIT = ("gymnasium.wrappers:TimeLimit(max_episode_steps=20)",)
 HINDSIGHT = tiny_off_policy(replay="hindsight", log_every=25, wrappers=LIMIT, total_steps=400, checkpoint_every=400)
 
 
-class Steady(gym.Env):
-    """Rewards are actions, observations noise; an episode is 10 steps."""
-
-    observation_space = gym.spaces.Box(-1, 1, (3,), np.float32)
-    action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.t = 0
-        return self._see(), {}
-
-    def step(self, action):
-        self.t += 1
-        return self._see(), float(action[0]), False, self.t >= 10, {}
-
-    def _see(self):
-        return self.np_random.uniform(-1, 1, 3).astype(np.float32)
+class Steady(Noise):
+    observation_space, action_space = gym.spaces.Box(-1, 1, (3,), np.float32), gym.spaces.Box(-1, 1, (1,), np.float32)
+    length = 10
 
 
 class Other(Steady):
@@ -101,7 +87,12 @@ def test_what_shares_estimates_is_taken_off_too():
 
 
 @pytest.mark.parametrize(
-    ("backend", "curriculum"), [("gymnasium", "environments:nearer"), ("gymnasium-async", "environments:near")]
+    ("backend", "curriculum"),
+    [
+        ("gymnasium", "environments:nearer"),
+        ("gymnasium-async", "environments:near"),
+        ("gymnasium-async", "environments:nearer"),
+    ],
 )
 def test_goals_are_judged_by_the_rules_that_a_curriculum_has_set(backend, curriculum, tmp_path):
     """An episode under way when they change is dropped; the judge beside workers hears of the calls too."""

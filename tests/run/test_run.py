@@ -660,7 +660,7 @@ def test_an_update_that_hangs_is_interrupted(tmp_path, signum):
     asked = time.monotonic()
     process.send_signal(signum)
     said = process.communicate()[1]
-    assert time.monotonic() - asked < 30  # two seconds, and as long as a busy machine takes to end a process
+    assert time.monotonic() - asked < 6  # two seconds, and as long as a busy machine takes to end a process
     assert process.returncode == 128 + signum
     assert "Stopped in the middle of an update" in said
     assert "Traceback" not in said

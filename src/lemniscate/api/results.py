@@ -121,7 +121,8 @@ def evaluate(
             how["episodes"] = min(episodes, vec.num_envs, 20)
             since = time.time() - 2  # a disk's times may be of seconds
             pictures = _draw(player, vec, arguments, how, folder)
-            name = str(policy) if isinstance(policy, str | PathLike) else str(getattr(chosen, "path", shown(policy)))
+            trained = isinstance(chosen, TrainedPolicy)
+            name = str(policy) if isinstance(policy, str | PathLike) else str(chosen.path if trained else shown(policy))
             for made in (*pictures, pages.write_evaluation(folder, name, pictures, scores, seed, since)):
                 say(made)
         return scores

@@ -121,7 +121,7 @@ def _no_answer(address: str, error: Exception) -> UserError:
 def pack(path: Path, left: Collection[str] = LEFT) -> bytes:
     """A run directory, which another process may be writing to: its checkpoints first, then all that is after them.
 
-    What has a name in `left` is not sent: by default also the pictures, which are made anew.
+    What has a name in `left` at its root is not sent.
     """
     packed = io.BytesIO()
     with tarfile.open(fileobj=packed, mode="w") as archive:

@@ -561,9 +561,12 @@ def of_batches(e: Evidence) -> Seen:
     rest, discount, beyond, own, used = map(e.median, names)
     gamma = e.config.get("gamma")
     if rest > 0.01:
-        yield "targets-differ", f"{rest:.0%} of the squares of the targets follow from no row behind."
+        yield "targets-differ", f"{rest:.0%} of the squares of the targets do not follow from the rows after them."
     elif isinstance(gamma, float) and abs(discount - gamma) > max(1e-3, 0.1 * (1 - gamma)):
-        yield "discount-differs", f"Targets follow from those behind by a discount of {discount:.4g}, not {gamma:g}."
+        yield (
+            "discount-differs",
+            f"From row to row targets are discounted by {discount:.4g}, not by {gamma:g}.",
+        )
     if beyond > 0.01:
         yield "ends-continued", f"{beyond:.0%} of the squares of the targets at terminations are not the reward's."
     if (least := np.fmin(own, used)) < -0.5:

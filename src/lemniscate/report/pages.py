@@ -97,8 +97,8 @@ def write_evaluation(
 
 def newest_video(run: Path, since: float = 0.0) -> Path | None:
     """The newest video of a run, if it has any from that time on."""
-    videos = [file for file in (run / "videos").glob("*") if file.suffix in VIDEOS]
-    videos = [file for file in videos if not file.stem.endswith(".tmp")]  # one that is being written
+    found = (file for file in (run / "videos").glob("*") if file.suffix in VIDEOS)
+    videos = [file for file in found if not file.stem.endswith(".tmp")]  # which is being written
     # Not a link, which could lead to any file of this machine, and what is found is embedded and uploaded.
     own = [file for file in videos if file.is_file() and not file.is_symlink() and file.stat().st_mtime >= since]
     return max(own, key=lambda file: file.stat().st_mtime, default=None)
