@@ -71,7 +71,7 @@ bench-returns: setup  ## the tables of docs/results.md, seed by seed: a day; ret
 	$(BIN)/python -m pip install --quiet --constraint requirements.lock --no-build-isolation --editable '.[bench]'
 	touch $@
 
-tutorials: setup  ## the notebooks with their outputs, from docs/tutorial/*.py: some ten minutes
+tutorials: setup  ## the notebooks with their outputs, from src/lemniscate/course/notebooks: some ten minutes
 	$(BIN)/python docs/tutorial/execute.py
 
 lock: setup  ## renew requirements.lock from pyproject.toml

@@ -1,4 +1,4 @@
-"""A callback: it sees the step, the metrics and the policy after every update, and may stop the run.
+"""A callback: it sees the step, the metrics and the policy of every line of metrics, and may stop the run.
 
 cd examples
 lemniscate train ppo --env CartPole-v1 --callbacks 'callback:StopWhenSolved(threshold=400)'

@@ -593,8 +593,8 @@ def test_a_film_that_cannot_be_written_is_a_sentence(run, capsys):
     assert "must end in .gif, .webp or .mp4" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("busy", "set_to"), [(0.0, None), (60.0, "100")])
-def test_threads_give_way_where_the_cores_are_busy(busy, set_to, monkeypatch):
+@pytest.mark.parametrize(("busy", "set_to"), [(0.0, "10000"), (60.0, "100")])
+def test_threads_wait_briefly_and_hardly_where_the_cores_are_busy(busy, set_to, monkeypatch):
     monkeypatch.setenv("GOMP_SPINCOUNT", "of a moment")  # so that it is taken away afterwards
     monkeypatch.delenv("GOMP_SPINCOUNT")
     monkeypatch.setattr("psutil.cpu_percent", lambda interval, percpu: [100.0, busy, busy])

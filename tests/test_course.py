@@ -2,6 +2,7 @@
 
 import importlib
 import inspect
+import json
 import re
 import sys
 import time
@@ -11,6 +12,7 @@ from functools import partial
 import pytest
 import torch
 
+import lemniscate as lem
 from course_findings import says
 from lemniscate import UserError, course, maths
 from lemniscate.course.exercise import Exercise
@@ -113,7 +115,7 @@ def test_the_value_loss_is_given_an_old_value_without_a_clip_as_the_algorithm_gi
         near = old_value + (value - old_value).clamp(-clip, clip)
         return 0.5 * torch.max((value - target) ** 2, (near - target) ** 2).mean()
 
-    says(value_loss, "value_loss", "case 3 of 3, with an old value, and None for the clip: it raised TypeError")
+    says(value_loss, "value_loss", "case 3 of 4, with an old value, and None for the clip: it raised TypeError")
 
 
 @pytest.mark.parametrize("kept", [0, 2])
@@ -136,6 +138,85 @@ def test_a_constant_in_place_of_tau_is_found():
     says(polyak, "polyak", "case 2 of 2, another τ: ")
 
 
+NUMBERS = [
+    (name, option)
+    for name, exercise in COMPARED.items()
+    if "self" not in inspect.signature(exercise.right).parameters
+    for option in exercise.cases[0].options
+    if option in ("gamma", "lam", "clip", "clip_coef")
+]
+
+
+@pytest.mark.parametrize(("name", "option"), NUMBERS)
+def test_a_number_in_place_of_an_argument_is_found(name, option):
+    exercise = COMPARED[name]
+
+    signature, number = inspect.signature(exercise.right), exercise.cases[0].options[option]
+
+    def mine(*args, **options):
+        bound = signature.bind(*args, **options)
+        bound.arguments[option] = number
+        return exercise.right(*bound.args, **bound.kwargs)
+
+    mine.__signature__ = signature
+    assert not course.check(mine, name)
+
+
+class Constant:
+    """Discounts that are not those of the course."""
+
+    def calculate_advantages(self, next_value):
+        following = torch.cat([self.values_buffer[1:], next_value.reshape(1, -1)])
+        ends = self.terminated_buffer.bool()
+        both = maths.gae(self.rewards_buffer, self.values_buffer, following, ends, ends, gamma=0.99, lam=0.95)
+        return both[1], both[0]
+
+    def compute_advantages(self, states, rewards, next_states, ended):
+        values = self.compute_values(states), self.compute_values(next_states)
+        columns = [each.reshape(-1, self.num_steps).T for each in (rewards, *values, ended, ended)]
+        both = maths.gae(*columns, gamma=0.9, lam=self.lmbda)
+        return tuple(each.T.reshape(-1).detach() for each in both)
+
+
+@pytest.mark.parametrize("name", ["calculate_advantages", "compute_advantages"])
+def test_a_number_in_place_of_a_setting_is_found(name):
+    assert not course.check(getattr(Constant, name), name)
+
+
+def test_a_constant_clip_is_found():
+    def value_loss(value, target, old_value=None, clip=None):
+        return maths.value_loss(value, target, old_value, None if clip is None else 0.2)
+
+    says(value_loss, "value_loss", "case 4 of 4, with another clip: ")
+
+
+def two_passes(target, online, tau):
+    with torch.no_grad():
+        for mine in target:
+            mine.mul_(1 - tau)
+        for mine, other in zip(target, online, strict=True):
+            mine.add_(tau * other)
+
+
+def by_number(target, online, tau):
+    with torch.no_grad():
+        for i in range(len(target)):
+            target[i].lerp_(online[i], tau)
+
+
+@pytest.mark.parametrize("solution", [two_passes, by_number])
+@pytest.mark.parametrize("name", ["ddpg", "td3", "sac"])
+def test_a_polyak_that_takes_lists_is_right_and_trains(solution, name, monkeypatch, tmp_path):
+    assert course.check(solution, "polyak")
+    settings = dict(num_envs=2, total_steps=64, learning_starts=16, batch_size=8, hidden=(8,), progress=False)
+    ends = []
+    for number, function in enumerate((maths.polyak, solution)):
+        monkeypatch.setattr(importlib.import_module(f"lemniscate.algos.{name}"), "polyak", function)
+        run = lem.train(name, "Pendulum-v1", seed=1, run=tmp_path / str(number), **settings)
+        ends.append(json.loads((run.path / "metrics.jsonl").read_text().splitlines()[-1])["losses/critic"])
+    assert ends[0] == pytest.approx(ends[1], rel=1e-4)
+
+
 def test_no_warning_stands_above_a_finding():
     """The causes of a wrong surrogate are tried on one row too, whose standard deviation torch warns of."""
 
@@ -154,8 +235,8 @@ def test_what_the_skeleton_promises_to_judge_passes_in_its_solution():
     assert names == ["gae", "clipped_surrogate", "value_loss"]
     assert all(course.check(written[name]) for name in names)
     assert str(course.check(written["value_loss"])).endswith(
-        "right in 1 of 3 cases; it takes too few arguments for the others: "
-        "with a clip, with an old value, and None for the clip."
+        "right in 1 of 4 cases; it takes too few arguments for the others: "
+        "with a clip, with an old value, and None for the clip, with another clip."
     )
     says(lambda value, target: (value - target).square().mean(), "value_loss", "Likely: the conventional half")
 

@@ -191,6 +191,21 @@ def test_the_solution_finds_the_better_action_of_the_hardest_worlds(number):
     assert better_action(program(), number, 1_024)
 
 
+@pytest.mark.parametrize(("rollout", "tried"), [(130, [256, 1_024, 8_192]), (32, [256, 1_024])])
+def test_a_loop_with_long_rollouts_has_the_steps_that_it_needs(rollout, tried, monkeypatch):
+    """130 steps of 8 environments are more than four times the usual steps, so that it makes no update within them."""
+    train, steps = program([("num_steps: int = 32", f"num_steps: int = {rollout}")]), []
+    monkeypatch.setattr(loop, "STEPS", 256)
+
+    def counted(envs, total_steps, seed):
+        steps.append(total_steps)
+        return train(envs, total_steps, seed)
+
+    with closing(make_vec(loop.WorldEnv, loop.NUM_ENVS, env_kwargs={"world": 0})) as envs:
+        loop._trained(counted, envs, lambda action: False)
+    assert steps == tried
+
+
 def test_what_is_not_understood_inside_is_judged_by_worlds_and_by_returns():
     unclear = {"inside": {"steps": {}, "events": [], "stays": []}}
     worlds = {f"world {number}": 0.0 for number in range(len(loop.WORLDS))}

@@ -424,6 +424,32 @@ FILLED = {
         "while True:\n    seen.append(1)\nwhile True:\n    more.append(1)",
     ),
     "global.py": ("def set_up():\n    global SCALE\n    SCALE = 1.0", "SCALE", "set_up()"),
+    "arguments.py": (
+        "import argparse\nparser = argparse.ArgumentParser()\n"
+        "parser.add_argument('--scale', type=float, default=1.0)\nargs = parser.parse_args()",
+        "args.scale",
+        "",
+    ),
+    "main.py": ("", "SCALE", "if __name__ == '__main__':\n    SCALE = 1.0\n    print(SCALE)"),
+    "not the main one.py": ("SCALE = 1.0", "SCALE", "if __name__ == '__main__':\n    SCALE = 5.0"),
+}
+METHOD = """
+class Agent:
+    def after(self, reward, gamma, returns): return reward + gamma * returns
+"""
+IN_CLASSES = {
+    "two cells.ipynb": (
+        METHOD + "    def discounted_returns(self, rewards, gamma):\n        returns, after = 0 * rewards, 0.0\n"
+        "        for t in reversed(range(len(rewards))):\n"
+        "            returns[t] = after = self.after(rewards[t], gamma, after)\n        return returns",
+        "class Agent(Agent):\n    def act(self): ...",
+    ),
+    "put there.ipynb": (
+        METHOD,
+        RETURNS.format(before="", one="1.0", behind="Agent.discounted_returns = discounted_returns")
+        .replace("(rewards, ", "(self, rewards, ")
+        .replace("rewards[t] * 1.0 + gamma * after", "self.after(rewards[t], gamma, after)"),
+    ),
 }
 
 
@@ -446,21 +472,50 @@ def in_other_forms(tmp_path_factory):
     (folder / "package" / "mine" / "helper.py").write_text(plain.replace("discounted_returns", "their_returns"))
     uses = "from .helper import their_returns\n\ndef discounted_returns(rewards, gamma):\n    return their_returns(rewards, gamma)\n"
     (folder / "package" / "mine" / "main.py").write_text(uses)
+    for name, cells in IN_CLASSES.items():
+        (folder / name).write_text(hand_ins.notebook(*cells))
+    beside, reads = folder / "beside" / "week 6", RETURNS.format(before="", one="SCALE", behind="")
+    beside.mkdir(parents=True)
+    (beside / "scale.json").write_text("1.0")
+    (beside / "helpers.py").write_text("TWO = 2.0")
+    cells = "import json\nSCALE = json.load(open('scale.json'))", "%run ./helpers.py", "SCALE *= TWO / 2", reads
+    (beside / "work.ipynb").write_text(hand_ins.notebook(*cells))
+    (folder / "half a letter.py").write_text("def discounted_returns(rewards, gamma):\n    raise ValueError('\\ud83d')")
+    if sys.platform == "linux":
+        (folder / os.fsdecode(b"M\xfcller.py")).write_text(plain)
     (folder / "empty.ipynb").touch()
     (folder / "old.ipynb").write_text(json.dumps({"nbformat": 3, "worksheets": []}))
     (folder / "nul.py").write_bytes(b"x = 1\0")
     (folder / "large.ipynb").write_text(hand_ins.notebook(plain)[:-2] + ', "x": "' + "0" * grading.MOST_COPIED + '"}')
     grades = course.grade(folder, "discounted_returns", to=folder.parent / "out")
-    return SimpleNamespace(grades=grades)
+    return SimpleNamespace(grades=grades, to=folder.parent / "out")
 
 
 @pytest.mark.parametrize(
-    "name", [*FILLED, "draft.ipynb", "writes.ipynb", "writes and runs.ipynb", "profiles.ipynb", "package"]
+    "name",
+    [
+        *FILLED,
+        *IN_CLASSES,
+        "draft.ipynb",
+        "writes.ipynb",
+        "writes and runs.ipynb",
+        "profiles.ipynb",
+        "package",
+        "beside",
+    ],
 )
 def test_right_solutions_in_other_forms_are_right(in_other_forms, name):
     assert marks(in_other_forms.grades)[name] == {"discounted_returns": True}, sentence(
         in_other_forms, name, "discounted_returns"
     )
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names of bytes are Linux's")
+def test_a_name_and_a_message_that_are_no_utf_8_cost_nobody_a_mark(in_other_forms):
+    assert marks(in_other_forms.grades)[os.fsdecode(b"M\xfcller.py")] == {"discounted_returns": True}
+    assert "it raised ValueError: \ud83d" in sentence(in_other_forms, "half a letter.py", "discounted_returns")
+    (written,) = in_other_forms.to.glob("findings.json")
+    assert json.loads(written.read_text())["hand_ins"]
 
 
 @pytest.mark.parametrize(

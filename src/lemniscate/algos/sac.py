@@ -128,7 +128,7 @@ def learn(
             actor = state.actor_optimizer.step(partial(actor_loss, state), batch, noise[k, 1])
             entropy, size = actor["losses/entropy"], batch.action.shape[-1]
             metrics += [actor, state.temperature_optimizer.step(partial(temperature_loss, config), entropy, size)]
-            polyak(state.targets.parameters(), state.networks.critics.parameters(), config.tau)
+            polyak([*state.targets.parameters()], [*state.networks.critics.parameters()], config.tau)
     return metrics
 
 

@@ -91,7 +91,7 @@ def learn(
         metrics.append(state.critic_optimizer.step(partial(critic_loss, config, state), batch, noise[k]))
         if update_actor[k]:
             metrics.append(state.actor_optimizer.step(partial(actor_loss, state), batch))
-            polyak(state.targets.parameters(), state.networks.parameters(), config.tau)
+            polyak([*state.targets.parameters()], [*state.networks.parameters()], config.tau)
     return metrics
 
 

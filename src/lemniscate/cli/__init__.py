@@ -177,17 +177,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def give_way() -> None:
-    """Have threads that wait for each other sleep at once, and not spin, where other programs keep the cores busy.
+    """Have torch's threads wait for each other briefly, then sleep: at once where other programs keep the cores busy.
 
-    Called before torch is imported, whose OpenMP reads it then. One of two threads would spin for a millisecond at each
-    operation while the other waits for a core. On free cores to spin is twice as fast.
+    Called before torch is imported, whose OpenMP reads it then. By itself a thread spins for milliseconds after each
+    operation: longer than the next one takes to come, on a core that the environments need meanwhile.
     """
     import psutil  # takes as long as all of the help
 
     busy = psutil.cpu_percent(interval=0.1, percpu=True)
     mine = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(len(busy))
-    if sum(1 - busy[core] / 100 for core in mine) < 1.5:
-        os.environ.setdefault("GOMP_SPINCOUNT", "100")
+    free = sum(1 - busy[core] / 100 for core in mine)
+    os.environ.setdefault("GOMP_SPINCOUNT", "100" if free < 1.5 else "10000")
 
 
 def ending(error: BaseException, command: str | None) -> tuple[int, str] | None:

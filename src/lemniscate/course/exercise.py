@@ -181,12 +181,11 @@ KINDS: Mapping[str, Change] = {
 }
 """what a solution may want its arguments to be, by what is then said of it"""
 PARAMETERS: Sequence[Change] = (
-    # Iterators, which can be gone through once, since that is what `module.parameters()` returns.
-    lambda value: iter(value) if isinstance(value, list) else value,
     lambda value: value,
+    lambda value: iter(value) if isinstance(value, list) else value,
     lambda value: nn.ParameterList(value) if isinstance(value, list) else value,
 )
-"""what a solution that moves parameters may want: an iterator, a list, or a module"""
+"""what a solution that moves parameters may want: a list, an iterator, or a module"""
 
 Results = dict[str, Any]
 """what a function returned in one case: see `Exercise._results`"""
@@ -271,7 +270,8 @@ class Exercise:
         kinds = [("", convert) for convert in PARAMETERS] if moves else [*KINDS.items()]
         for note, convert in kinds if self.gradient_in is None else kinds[:1]:
             try:
-                return self._results(called.call, case, partial(self._converted, convert)) | {"note": note}
+                results = self._results(called.call, case, partial(self._converted, convert))
+                return results | {"note": note or results.get("note", "")}
             except (Exception, SystemExit) as error:  # what the solution raises is a finding too
                 misfit = isinstance(error, MisfitError)
                 first = first or {"raised": f"{error}." if misfit else raised(error), "misfit": misfit}
@@ -309,6 +309,8 @@ class Exercise:
         if not len(tensors) == len(outputs) == len(self.outputs):
             return {"kinds": ", ".join(type(output).__name__ for output in outputs)}
         seen: Results = {"outputs": [tensor.detach().clone() for tensor in tensors]}
+        if any(isinstance(output, np.ndarray) for output in outputs):
+            seen["note"] = "it returns arrays of NumPy, where training with it needs tensors"
         if leaf is None:
             seen["gradient"] = []
         elif all(tensor.requires_grad for tensor in tensors):

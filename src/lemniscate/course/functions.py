@@ -122,6 +122,8 @@ TWO_DONE = TWO_ENDS | torch.tensor([[0, 1], [0, 0], [0, 0], [0, 0], [1, 0]]).boo
 """the deaths, and a time-out in each of the two environments"""
 TWO_N = _following(TWO_V, TWO_DONE, TWO_V + 1)
 GAMMA, DISCOUNTS, CLIP, CLIP_COEF = {"gamma": 0.9}, {"gamma": 0.9, "lam": 0.8}, {"clip": 0.2}, {"clip_coef": 0.2}
+OTHERS = {"gamma": 0.7, "lam": 0.6}
+"""for one case of each exercise: a solution may have a number of its own in the place of the argument"""
 
 TRAIN_CONFIG = Settings(
     {
@@ -161,12 +163,12 @@ INDS = torch.tensor([4, 1, 13, 5, 0, 7, 11, 9, 2, 14, 8, 3])
 SHUFFLED = (_drawn(12), _drawn(15, seed=2), torch.zeros(15).index_put((INDS,), OLD), INDS)
 
 
-def _drone_case(about: str, *given: Tensor, done: Tensor | None = None) -> Case:
+def _drone_case(about: str, *given: Tensor, done: Tensor | None = None, discounts: tuple = (0.99, 0.95)) -> Case:
     """Given are next_value, rewards, values and flags of deaths; those of all ends where there are others."""
     next_value, rewards, values, ended = given
     done = (ended if done is None else done).float()
     held = {"rewards_buffer": rewards, "values_buffer": values, "terminated_buffer": ended.float()}
-    held |= {"n_steps": len(rewards), "gamma": 0.99, "gae_lambda": 0.95}
+    held |= {"n_steps": len(rewards), "gamma": discounts[0], "gae_lambda": discounts[1]}
     more = {"dones_buffer": done, "truncated_buffer": done - ended.float(), "n_envs": rewards.shape[1]}
     return Case(about, (next_value,), held, TRAINER | more)
 
@@ -190,21 +192,22 @@ ACTOR = _layer(torch.tensor([[1.0, 0.0], [-1.0, 0.5], [0.5, 1.0]]))
 NETWORKS = {"actor": ACTOR, "critic": _layer(_column(0.5, -1.0, 0.25))}
 
 
-def _lander_case(about: str, num_envs: int, steps: int, *ends: int) -> Case:
+def _lander_case(about: str, num_envs: int, steps: int, *ends: int, gamma: float = 0.9) -> Case:
     rows = num_envs * steps
     ended = torch.tensor([row in ends for row in range(rows)])
-    held = {"gamma": 0.9, "lmbda": 0.8, "num_steps": steps, "compute_values": _values}
+    held = {"gamma": gamma, "lmbda": 0.8, "num_steps": steps, "compute_values": _values}
     states, last = _drawn(rows, 3), torch.arange(1, rows + 1) % steps == 0
     following = torch.where((ended | last)[:, None], _drawn(rows, 3, seed=1), states.roll(-1, 0))
     return Case(about, (states, _drawn(rows), following, ended), held, NETWORKS)
 
 
 def _of_tails(options: dict[str, float]) -> list[Case]:
+    others = {name: OTHERS[name] for name in options}
     return [
         Case("no end", (R, N, NEVER, NEVER), options),
         Case("a death at row 1", (R, N, AT_1, AT_1), options),
         Case("a time-out at row 1", (R, N, NEVER, AT_1), options),
-        Case("two environments, ends of both kinds", (TWO_R, TWO_V + 1, TWO_ENDS, TWO_DONE), options),
+        Case("two environments, ends of both kinds", (TWO_R, TWO_V + 1, TWO_ENDS, TWO_DONE), others),
     ]
 
 
@@ -219,12 +222,14 @@ CASES: dict[str, list[Case]] = {
         Case("a death at the last row", (R, V, N, AT_3, AT_3), DISCOUNTS),
         Case("a death at row 1", (R, V, N_1, AT_1, AT_1), DISCOUNTS),
         Case("a time-out at row 1", (R, V, N_1, NEVER, AT_1), DISCOUNTS),
-        Case("two environments, ends of both kinds", (TWO_R, TWO_V, TWO_N, TWO_ENDS, TWO_DONE), DISCOUNTS),
+        Case("two environments, ends of both kinds", (TWO_R, TWO_V, TWO_N, TWO_ENDS, TWO_DONE), OTHERS),
     ],
     "calculate_advantages": [
         _drone_case("no end", _column(0.9), *FOUR, NEVER),
         _drone_case("a death at the last row", _column(0.0), *FOUR, AT_3),
-        _drone_case("two environments", _drawn(1, 2), _drawn(5, 2), _drawn(5, 2, seed=1), TWO_ENDS),
+        _drone_case(
+            "two environments", _drawn(1, 2), _drawn(5, 2), _drawn(5, 2, seed=1), TWO_ENDS, discounts=(0.9, 0.8)
+        ),
         _drone_case("a time-out, which the loop does not look at", _column(0.9), *FOUR, NEVER, done=AT_1),
     ],
     "compute_advantages": [
@@ -232,13 +237,13 @@ CASES: dict[str, list[Case]] = {
         _lander_case("four steps of one environment", 1, 4),
         _lander_case("a death in between", 1, 4, 1),
         _lander_case("two environments of three steps", 2, 3),
-        _lander_case("two environments, a death at a border", 2, 3, 2, 4),
+        _lander_case("two environments, a death at a border", 2, 3, 2, 4, gamma=0.7),
     ],
     "reward_to_go": _of_tails(GAMMA),
     "q_lambda": _of_tails(DISCOUNTS),
     "discounted_returns": [
         Case("one step", (torch.tensor([2.0]),), GAMMA),
-        Case("five steps", (_drawn(5) + 1,), GAMMA),
+        Case("five steps", (_drawn(5) + 1,), {"gamma": 0.7}),
     ],
     "td_target": [
         Case("nothing ends", (_drawn(6), _drawn(6) + 1, torch.zeros(6).bool()), GAMMA),
@@ -272,6 +277,7 @@ CASES: dict[str, list[Case]] = {
         Case("without a clip", (_drawn(6), _drawn(6) + 1)),
         Case("with a clip", (_drawn(12), _drawn(12, seed=2), OLD, 0.2)),
         Case("with an old value, and None for the clip", (_drawn(12), _drawn(12, seed=2), OLD, None)),
+        Case("with another clip", (_drawn(12), _drawn(12, seed=2), OLD, 0.3)),
     ],
     "calculate_v_loss": [
         Case("without a clip", (*FOUR_VALUES, torch.arange(4), False), CLIP_COEF, TRAINER),

@@ -51,6 +51,8 @@ READING, WHOLE = 60.0, 600.0
 MOST_COPIED, MOST_PRINTED = 2**26, 2_000
 """bytes of a file, and characters of what is printed that are kept"""
 IGNORED = {"venv", "site-packages", "node_modules", "wandb"}
+DOCUMENTS = (".pdf", ".docx", ".html", ".zip", ".gz", ".mp4", ".gif", ".png", ".jpg")
+"""what beside a single file is another's hand-in rather than what the file reads"""
 
 
 class Trial:
@@ -64,7 +66,8 @@ class Trial:
         for file, name in files_of(path).items():
             copy = self._work / "hand-in" / name
             copy.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(file, copy)
+            with suppress(PermissionError):  # the record says so
+                shutil.copyfile(file, copy)
         forks = "forkserver" in multiprocessing.get_all_start_methods()
         context: Any = multiprocessing.get_context("forkserver" if forks else "spawn")
         if forks:  # these are imported once, for all
@@ -109,6 +112,8 @@ class Trial:
             notes = [f"While it was read, {handin.ending(self.process.exitcode)}."]
         if not any(file.suffix in handin.SUFFIXES for file in files_of(self.path)):
             notes = ["There is no .py and no .ipynb file."]
+        closed = [file.name for file in files_of(self.path) if not os.access(file, os.R_OK)]
+        notes = [*notes, *(f"{name} cannot be read: you may not open it." for name in closed)]
         for file in files_of(self.path, large=True):
             size = f"{file.stat().st_size / 2**20:,.0f} MB; at most {MOST_COPIED / 2**20:.0f} are read"
             notes = [*notes, f"{file.name} has {size}: clear the outputs of a notebook."]
@@ -156,7 +161,7 @@ def files_of(path: Path, large: bool = False) -> dict[Path, Path]:
     return {
         file: name
         for file, name in found.items()
-        if (file == path or root == path or file.suffix not in handin.SUFFIXES)
+        if (file == path or root == path or file.suffix not in (*handin.SUFFIXES, *DOCUMENTS))
         and not any(part.startswith((".", "__")) or part in IGNORED for part in name.parts if part != "__init__.py")
         and not (installed - {root}).intersection(file.parents)
         and (file.stat().st_size > MOST_COPIED) is large
@@ -198,7 +203,10 @@ def grade(folder: str | Path, exercises: str | Sequence[str] = (), *, to: str | 
         found = {name for record in records for name in record["exercises"]}
         names = [name for name in course.EXERCISES if name in found]
         grades = {"folder": str(folder), "lemniscate": version(), "exercises": names, "hand_ins": records}
-        replace_file(path / "findings.json", json.dumps(grades, indent=1, ensure_ascii=False).encode())
+        text = json.dumps(grades, indent=1, ensure_ascii=False)
+        replace_file(
+            path / "findings.json", text.encode(errors="backslashreplace")
+        )  # half a character is none of UTF-8
         make_directory(path / "otter")
         for name in names:
             replace_file(path / "otter" / f"{name}.py", filled(TEMPLATES / "otter.py.j2", {}, name=name).encode())
@@ -260,7 +268,9 @@ def _records(hand_ins: list[Path], demanded: list[str], to: Path) -> Iterator[di
     for path in hand_ins:
         digest = sha256(json.dumps([version(), demanded, path.name]).encode())
         for file in (*sorted(judge), *files_of(path)):
-            digest.update(f"\0{file}\0{file.stat().st_size}\0".encode() + file.read_bytes())
+            digest.update(os.fsencode(f"\0{file}\0{file.stat().st_size}\0"))
+            with suppress(PermissionError):
+                digest.update(file.read_bytes())
         digests[path] = digest.hexdigest()
         with suppress(DamagedFileError):
             if read_json(to / path.name / "record.json")["digest"] == digests[path]:

@@ -45,10 +45,14 @@ MAGIC = re.compile(
     r"^(\s*)(?:(?:%{1,2}[A-Za-z_]|!(?!=)|\?)(?:.*\\\n)*.*|[\w.]+\?+|[\w, ]+=\s*(?:%[A-Za-z_]|!(?!=)).*)$", re.MULTILINE
 )
 """a line of a notebook that is not Python, with those that a backslash adds to it"""
+RUN = re.compile(r"^(\s*)%run\s+(?:-\w+\s+)*(?:\./)?([A-Za-z_]\w*)\.(?:py|ipynb)[ \t]*$", re.MULTILINE)
+"""a line of a notebook that executes another file there, whose names the notebook has then"""
 PYTHON = ("%%time", "%%timeit", "%%capture", "%%prun", "%%memit")
 """the magics at the head of a cell that is Python"""
 FILLING = ("update", "setdefault", "append", "extend", "insert", "add", "appendleft")
 """the methods that put something into a collection"""
+PREPARING = ("add_argument", "set_defaults", "register", "register_envs")
+"""the methods that are called for what comes after them"""
 UNREADABLE = (SyntaxError, ValueError, LookupError, TypeError, RecursionError, MemoryError)
 
 
@@ -115,9 +119,14 @@ class Reader:
         """Execute a module or a notebook, one statement after the other."""
         file, flags = Path(str(module.__file__)), 0
         module.__dict__.setdefault("display", print)
+        sys.argv = [str(file)]  # not what the teacher has written
+        with suppress(OSError):
+            os.chdir(_home(file, self._work / "hand-in"))
         parsed = [(code, node) for code, tree in self._trees(file) for node in tree.body]
         functions = [node for _, node in parsed if isinstance(node, ast.FunctionDef | ast.ClassDef)]
         used = set().union(*map(_free, functions))
+        bound = set().union(*(_bound(node) for _, node in parsed if not _settings(node)))
+        parsed += [(code, each) for code, node in parsed for each in _settings(node) if _bound(each) & used - bound]
         fills = {node.name: (_filled(node) & _free(node)) | _global(node) for node in functions}
         for code, node in parsed:
             if isinstance(node, ast.ImportFrom) and node.module == "__future__":
@@ -125,7 +134,7 @@ class Reader:
             filled = _filled(node) | fills.get(_called(node), set())
             if not isinstance(node, ast.Expr):  # a loop may fill what is empty, and not set a setting anew
                 filled = {name for name in filled if _is_empty(module.__dict__.get(name))}
-            if not isinstance(node, LEFT_OUT) or (_bound(node) | filled) & used:
+            if not isinstance(node, LEFT_OUT) or (_bound(node) | filled) & used or _prepares(node):
                 self._run(node, code, flags, module.__dict__)
                 self.defined |= {each: {**self.defined.get(each, {}), file.name: module} for each in _bound(node)}
 
@@ -194,6 +203,13 @@ class Reader:
             self.notes.append(f"{cell}: left out, since {magic} makes it another language.")
 
 
+def _home(file: Path, root: Path) -> Path:
+    """The folder in which a file was executed: a notebook's own; of a module the one where the files begin."""
+    while file.suffix == ".py" and len(inside := [*root.iterdir()]) == 1 and inside[0].is_dir():
+        root = inside[0]
+    return root if file.suffix == ".py" else file.parent
+
+
 def _root(file: Path) -> Path:
     """The folder that the outermost package of a module is in, or that of the module."""
     folder = file.parent
@@ -216,7 +232,23 @@ def _parsed(source: str) -> ast.Module:
     """The statements of a cell, without magics."""
     with suppress(SyntaxError):
         return ast.parse(source)
-    return ast.parse(MAGIC.sub(r"\1pass", source))
+    return ast.parse(MAGIC.sub(r"\1pass", RUN.sub(r"\1from \2 import *", source)))
+
+
+def _settings(node: ast.stmt) -> list[ast.stmt]:
+    """Of a block for the main program the assignments, which functions may use."""
+    match node:
+        case ast.If(ast.Compare(ast.Name("__name__"))):
+            return [each for each in node.body if isinstance(each, ast.Assign | ast.AnnAssign)]
+    return []
+
+
+def _prepares(node: ast.stmt) -> bool:
+    """Whether a bare expression calls a method for what comes after it, as `parser.add_argument("--seed")`."""
+    match node:
+        case ast.Expr(ast.Call(ast.Attribute(_, method))):
+            return method in PREPARING
+    return False
 
 
 def _bound(node: ast.AST) -> set[str]:
@@ -274,13 +306,15 @@ def _free(function: ast.AST) -> set[str]:
     return {each.id for each in names} - {each.id for each in names if isinstance(each.ctx, ast.Store)} - arguments
 
 
-def solutions(reader: Reader, demanded: list[str]) -> dict[str, tuple[Any, str]]:
+def solutions(reader: Reader, demanded: list[str]) -> dict[str, tuple[Any, Path]]:
     """The answers to exercises among what was defined, each with its file: the last one that has the name."""
-    found: dict[str, tuple[Any, str]] = {}
+    found: dict[str, tuple[Any, Path]] = {}
     for name, modules in reader.defined.items():
         file, module = [*modules.items()][-1]
         thing = module.__dict__.get(name)
-        own = [each for each in vars(thing) if each in course.EXERCISES] if isinstance(thing, type) else []
+        every = thing.__mro__ if isinstance(thing, type) else ()
+        mine = [cls for cls in every if cls.__module__ == module.__name__]  # a cell may have class A(A)
+        own = [each for cls in mine for each in vars(cls) if each in course.EXERCISES]
         methods = {each: getattr(thing, each, None) for each in own}
         for each, answer in {**methods, name: thing}.items():
             if each not in course.EXERCISES or not callable(answer) or isinstance(answer, Missing):
@@ -290,7 +324,7 @@ def solutions(reader: Reader, demanded: list[str]) -> dict[str, tuple[Any, str]]
             if str(getattr(answer, "__module__", "")).startswith("lemniscate."):
                 reader.notes.append(f"{file}: {each} is lemniscate's own, so there is nothing to judge.")
             elif each in demanded or (not demanded and _is_meant(each, answer, each in methods)):
-                found[each] = answer, file
+                found[each] = answer, Path(str(module.__file__))
                 if len(modules) > 1:
                     reader.notes.append(f"{name} is defined in {' and '.join(modules)}; the one in {file} counts.")
     return found
@@ -321,7 +355,7 @@ def run(work: Path, demanded: list[str]) -> None:
     reader.read()
     sys.settrace(None)
     found = solutions(reader, demanded)
-    files = {name: found[name][1] for name in course.EXERCISES if name in found}
+    files = {name: found[name][1].name for name in course.EXERCISES if name in found}
     things = [module.__dict__.get(name) for name, modules in reader.defined.items() for module in modules.values()]
     names = {*reader.defined, *(name for each in things if isinstance(each, type) for name in vars(each))}
     about = {"files": files, "names": sorted(names), "notes": [*dict.fromkeys(reader.notes)][:20], "alone": alone}
@@ -330,7 +364,7 @@ def run(work: Path, demanded: list[str]) -> None:
         exercise, to = course.EXERCISES[name], work / "seen" / f"{name}.txt"
         pid = os.fork() if hasattr(os, "fork") else 0
         if pid:
-            code = _exit_code(pid, getattr(exercise, "limit", LIMIT) + GRACE)
+            code = _exit_code(pid, 4 * getattr(exercise, "limit", LIMIT) + GRACE)  # as `limited` has it by the clock
             if not to.exists() and not to.with_suffix(".pt").exists():
                 to.write_text(f"{ending(code)}.", "utf-8")
             continue
@@ -338,6 +372,7 @@ def run(work: Path, demanded: list[str]) -> None:
             set_parent_death_signal = 1
             ctypes.CDLL(None).prctl(set_parent_death_signal, signal.SIGKILL)
         try:
+            os.chdir(_home(found[name][1], work / "hand-in"))
             save(dict(exercise.observe(found[name][0])), work / name)
             (work / name).rename(to.with_suffix(".pt"))  # whole, or not there
         except BaseException as error:

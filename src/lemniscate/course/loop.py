@@ -9,7 +9,7 @@ import inspect
 import json
 import re
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, closing
 from functools import partial
 from pathlib import Path
@@ -18,6 +18,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch
+from torch.optim.optimizer import register_optimizer_step_pre_hook
 
 from lemniscate.api.agents import Agent, playing
 from lemniscate.course import inside
@@ -181,9 +182,7 @@ def observe_train(function: Function, seen: dict[str, Any]) -> None:
     verdict = inside.judged(seen["inside"])
     for number in range(len(_worlds(verdict))):
         with closing(make_vec(WorldEnv, NUM_ENVS, env_kwargs={"world": number})) as envs:
-            action = _mean_action(function, envs, STEPS)
-            if action > 0.5:  # a right loop may only be slow
-                action = _mean_action(function, envs, 4 * STEPS)
+            action = _trained(function, envs, lambda action: float(action) <= 0.5)
         seen[f"world {number}"] = float(action)
         if action > 0.5:
             return
@@ -192,9 +191,7 @@ def observe_train(function: Function, seen: dict[str, Any]) -> None:
     taken: list[np.ndarray] = []
     with closing(make_vec(partial(BoxEnv, taken), NUM_ENVS)) as envs:
         try:
-            first, second = _mean_action(function, envs, STEPS)
-            if min(first, -second) < LEARNED:
-                first, second = _mean_action(function, envs, 4 * STEPS)
+            first, second = _trained(function, envs, lambda both: min(both[0], -both[1]) >= LEARNED)
             seen["box"] = [float(first), float(second)]
         except Exception as error:  # what it raises is a finding, which has to say that it is not of Discrete actions
             seen["box raised"] = {"sentence": raised(error), "steps": len(taken)}
@@ -262,6 +259,21 @@ def _called(function: Function, envs: VectorView, steps: int) -> Any:
         elif is_required and parameter.kind not in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
             raise TypeError(f"its parameter {name} is not known; a training loop takes envs, total_steps and seed")
     return function(**known)
+
+
+def _trained(function: Function, envs: VectorView, is_right: Callable[[np.ndarray], bool]) -> np.ndarray:
+    """The mean action after training; of a loop that is slow, or whose rollouts are long, after more of it."""
+    made = list[Any]()
+    watch = register_optimizer_step_pre_hook(lambda *_: made.append(None))
+    try:
+        action = _mean_action(function, envs, STEPS)
+        for factor in (4, 32):
+            if is_right(action) or (factor == 32 and made):
+                break
+            action = _mean_action(function, envs, factor * STEPS)
+        return action
+    finally:
+        watch.remove()
 
 
 def _mean_action(function: Function, envs: VectorView, steps: int) -> np.ndarray:

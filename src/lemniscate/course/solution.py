@@ -293,7 +293,7 @@ def owner_of(function: Function) -> tuple[type, str] | None:
     """The class in whose text a function stands, or the last one that inherits it, and its name there."""
     found, seen, waiting = None, {object}, [object]
     is_wrapper = function.__qualname__.rpartition(".")[0].endswith("<locals>")  # it may be of any file
-    while waiting and "." in function.__qualname__:
+    while waiting and ("." in function.__qualname__ or _has_one_more(function)):  # or put there: A.method = function
         below = set(type.__subclasses__(waiting.pop())) - seen
         seen |= below
         waiting += below

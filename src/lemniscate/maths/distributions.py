@@ -19,13 +19,13 @@ class Distribution(Protocol):
         ...
 
     def mode(self) -> Tensor:
-        """The most probable action each."""
+        """The action without noise: the most probable one, of a squashed Gaussian the median."""
         ...
 
 
 @dataclass(frozen=True)
 class Gaussian:
-    """Independent normals, N(mean, exp(log_std)²): mean [B, A], log_std [A]."""
+    """Independent normals, N(mean, exp(log_std)²): mean [B, A], log_std [A] or [B, A]."""
 
     mean: Tensor
     log_std: Tensor
@@ -44,7 +44,7 @@ class Gaussian:
         return -0.5 * z.square().sum(-1) - (self.log_std.sum(-1) + 0.5 * LOG_2PI * action.shape[-1])
 
     def entropy(self) -> Tensor:
-        """[]: Σ_i [ log σ_i + ½ log 2πe ], the same for every observation."""
+        """[] or [B], as log_std: Σ_i [ log σ_i + ½ log 2πe ]."""
         return (self.log_std + 0.5 * (1 + LOG_2PI)).sum(-1)
 
     def kl(self, other: "Gaussian") -> Tensor:

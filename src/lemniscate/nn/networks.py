@@ -72,7 +72,8 @@ class Layers:
         """A new network, […, inputs] to […, outputs]; orthogonal weights, zero biases.
 
         The last layer has gain `last_gain`: 0.01 for a policy, so that it starts near the centre of its range whatever
-        it observes (Andrychowicz et al. 2021, arXiv:2006.05990, section 3.2), 1 for a value; the others have √2.
+        it observes (Andrychowicz et al. 2021, arXiv:2006.05990, section 3.2), 1 for a value; the others have √2,
+        SimBa's first one 1.
         """
         if self.remembers:
             raise UserError(f"{self.kind} has a memory, with which a2c, ppo, trpo and reppo learn.")
