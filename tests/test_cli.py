@@ -593,20 +593,32 @@ def test_a_film_that_cannot_be_written_is_a_sentence(run, capsys):
     assert "must end in .gif, .webp or .mp4" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("busy", "set_to"), [(0.0, "10000"), (60.0, "100")])
-def test_threads_wait_briefly_and_hardly_where_the_cores_are_busy(busy, set_to, monkeypatch):
+CHEETAH, DRONE = (["train", "ppo", "--env", name] for name in ("HalfCheetah-v5", "DroneFigureEightTrajectory-v0"))
+
+
+@pytest.mark.parametrize(
+    ("words", "busy", "set_to"),
+    [
+        (CHEETAH, 0.0, "20000"),
+        (CHEETAH, 60.0, "100"),
+        (DRONE, 0.0, None),
+        (DRONE, 60.0, "100"),
+        (["resume", "x"], 0.0, None),
+    ],
+)
+def test_threads_wait_briefly_and_hardly_where_the_cores_are_busy(words, busy, set_to, monkeypatch):
     monkeypatch.setenv("GOMP_SPINCOUNT", "of a moment")  # so that it is taken away afterwards
     monkeypatch.delenv("GOMP_SPINCOUNT")
     monkeypatch.setattr("psutil.cpu_percent", lambda interval, percpu: [100.0, busy, busy])
     monkeypatch.setattr("os.sched_getaffinity", lambda pid: {1, 2})
-    give_way()
+    give_way(words)
     assert os.environ.get("GOMP_SPINCOUNT") == set_to
 
 
 def test_what_a_user_says_of_waiting_threads_stays(monkeypatch):
     monkeypatch.setenv("GOMP_SPINCOUNT", "7")
     monkeypatch.setattr("psutil.cpu_percent", lambda interval, percpu: [100.0] * 512)
-    give_way()
+    give_way(CHEETAH)
     assert os.environ["GOMP_SPINCOUNT"] == "7"
 
 

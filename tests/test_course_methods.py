@@ -1,5 +1,7 @@
 """Methods as they stand in a course's classes: what they use of `self` is there, and their mistakes are named."""
 
+from functools import partial
+
 import pytest
 import torch
 
@@ -65,6 +67,24 @@ METHODS = [
 def test_a_method_is_judged_as_it_stands_in_its_class(method):
     assert course.check(method)
     assert course.check(getattr(object.__new__(Trainer if method in METHODS[:3] else PPO), method.__name__))
+
+
+@pytest.mark.parametrize("converted", [torch.Tensor.detach, torch.Tensor.clone, lambda x: torch.tensor(x.numpy())])
+def test_the_gradient_of_a_loss_is_that_in_the_networks(converted):
+    class Mine(PPO):
+        def compute_loss(self, states, *rows):
+            return PPO.compute_loss(self, converted(states), *rows)
+
+    class Theirs(PPO):
+        def compute_loss(self, states, actions, *rows):
+            self.compute_log_probs = partial(cut, self.compute_log_probs)
+            return PPO.compute_loss(self, converted(states), actions, *rows)
+
+    def cut(log_probs, *arguments):
+        return log_probs(*arguments).detach()
+
+    assert course.check(Mine.compute_loss)
+    assert "no gradient" in course.check(Theirs.compute_loss).sentence
 
 
 def given_loop(delta):

@@ -158,7 +158,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         words = sys.argv[1:] if arguments is None else list(arguments)
         if words[:1] in (["train"], ["resume"]) and "torch" not in sys.modules and "RANK" not in os.environ:
             with suppress(Exception):  # a sandbox may not tell
-                give_way()
+                give_way(words)
         options = vars(parse(words))
         command = options.pop("command")
         from lemniscate.cli import commands  # imports torch
@@ -176,18 +176,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def give_way() -> None:
+def give_way(words: Sequence[str]) -> None:
     """Have torch's threads wait for each other briefly, then sleep: at once where other programs keep the cores busy.
 
     Called before torch is imported, whose OpenMP reads it then. By itself a thread spins for milliseconds after each
-    operation: longer than the next one takes to come, on a core that the environments need meanwhile.
+    operation, on a core that the environments' threads need meanwhile; drones are simulated by no such threads.
     """
     import psutil  # takes as long as all of the help
 
     busy = psutil.cpu_percent(interval=0.1, percpu=True)
     mine = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(len(busy))
-    free = sum(1 - busy[core] / 100 for core in mine)
-    os.environ.setdefault("GOMP_SPINCOUNT", "100" if free < 1.5 else "10000")
+    if sum(1 - busy[core] / 100 for core in mine) < 1.5:
+        os.environ.setdefault("GOMP_SPINCOUNT", "100")
+    elif words[0] == "train" and not any(word.startswith("Drone") for word in words):
+        os.environ.setdefault("GOMP_SPINCOUNT", "20000")
 
 
 def ending(error: BaseException, command: str | None) -> tuple[int, str] | None:

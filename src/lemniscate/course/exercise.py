@@ -206,7 +206,7 @@ class Exercise:
     accepted: Mapping[str, Function] = field(default_factory=dict)
     """by note: a function that differs from the reference, but is what a course asks for"""
     gradient_in: int | None = None
-    """the argument in which the gradient of the outputs counts too"""
+    """the argument in which the gradient of the outputs counts too; of a method with networks that in their weights"""
     value_is_free: bool = False
     """only the gradient of what it returns counts"""
     detached: bool = False
@@ -290,17 +290,20 @@ class Exercise:
         """
         values: dict[str, Any] = dict(zip(self.arguments, copy.deepcopy(case.args), strict=False))
         values |= {name: [*map(nn.Parameter, value)] for name, value in values.items() if isinstance(value, list)}
-        networks, leaf = [value for value in values.values() if isinstance(value, list)], None
-        if self.gradient_in is not None:
+        networks, leaves = [value for value in values.values() if isinstance(value, list)], list[Tensor]()
+        attributes = copy.deepcopy(case.attributes)
+        if self.gradient_in is not None:  # a method may use its own networks, or call those of the case
+            leaves = [weight for held in (case.attributes, attributes) for weight in _weights(held)]
+        if self.gradient_in is not None and not leaves:
             name = self.arguments[self.gradient_in]
-            leaf = values[name].requires_grad_()
-            values[name] = leaf * 1  # as from a network: what is no leaf may be changed in place
+            leaves = [values[name].requires_grad_()]
+            values[name] = leaves[0] * 1  # as from a network: what is no leaf may be changed in place
         values |= copy.deepcopy(dict(case.options))
         values |= change(values)
         before = {name: value.detach().clone() for name, value in values.items() if isinstance(value, Tensor)}
         options = {name: values[name] for name in case.options}
         given = {name: value for name, value in values.items() if name not in options}
-        returned = call(given, options, copy.deepcopy(case.attributes))
+        returned = call(given, options, attributes)
         if networks:
             return {"outputs": [parameter.detach() for network in networks for parameter in network], "gradient": []}
         several = isinstance(returned, tuple) or (isinstance(returned, list) and len(self.outputs) > 1)
@@ -311,12 +314,13 @@ class Exercise:
         seen: Results = {"outputs": [tensor.detach().clone() for tensor in tensors]}
         if any(isinstance(output, np.ndarray) for output in outputs):
             seen["note"] = "it returns arrays of NumPy, where training with it needs tensors"
-        if leaf is None:
+        if not leaves:
             seen["gradient"] = []
         elif all(tensor.requires_grad for tensor in tensors):
             total = torch.stack([tensor.sum() for tensor in tensors]).sum()
-            slope = torch.autograd.grad(total, leaf, allow_unused=True)[0]
-            seen["gradient"] = [torch.zeros_like(leaf) if slope is None else slope]
+            slopes = torch.autograd.grad(total, leaves, allow_unused=True, materialize_grads=True)
+            count = len(leaves) // 2 or 1
+            seen["gradient"] = [sum(slopes[i::count]) for i in range(count)]
         seen["attached"] = any(tensor.requires_grad for tensor in tensors)
         if changed := [name for name, value in before.items() if not close(value, values[name])]:
             seen["changed"] = changed[0]
@@ -441,6 +445,12 @@ def close(mine: Any, right: Any, rtol: float = RTOL, atol: float = ATOL) -> bool
     if isinstance(mine, int | float) and isinstance(right, int | float):
         return abs(mine - right) <= atol + rtol * abs(right)
     return False
+
+
+def _weights(attributes: Mapping[str, Any] | None) -> list[Tensor]:
+    """The parameters of the networks among the attributes of an object."""
+    networks = [each for each in (attributes or {}).values() if isinstance(each, nn.Module)]
+    return [weight for network in networks for weight in network.parameters()]
 
 
 def _apart(what: str, mine: Tensor, right: Tensor) -> str:
