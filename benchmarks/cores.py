@@ -1,17 +1,24 @@
-"""What a second core can give PPO: EnvPool in two halves that take turns, and the gradient step on two threads.
+"""What a second core can give: EnvPool in two halves that take turns, the gradient step on two threads, short waits.
 
-    .venv/bin/python benchmarks/cores.py              both, five rounds
+    .venv/bin/python benchmarks/cores.py              all, five rounds
     .venv/bin/python benchmarks/cores.py halves       steps per second with a policy between the steps
     .venv/bin/python benchmarks/cores.py threads      milliseconds of a compiled gradient step
+    .venv/bin/python benchmarks/cores.py waiting      steps per second of whole runs, by how long threads wait
 
 In halves one half of the environments steps while the policy acts in the other. What is printed are medians over
 rounds in which the ways take turns, and the median ratio to the first way. docs/speed.md has the figures.
 """
 
 import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
 import time
 import warnings
 from functools import partial
+from pathlib import Path
 from statistics import median
 
 import numpy as np
@@ -123,9 +130,50 @@ def threads(rounds):
         table(ways, rounds, 3)
 
 
+LONG, SHORT = "300000", "20000"
+"""what OpenMP's threads wait by themselves, in turns of a loop, and what `lemniscate train` has them wait"""
+TRAINED = (("reppo", "HalfCheetah-v5", 200_000), ("reppo", "Walker2d-v5", 200_000), ("trpo", "Walker2d-v5", 160_000))
+
+
+def pace(algorithm, env, steps, count, spin):
+    """The median steps per second of the last two thirds of a run of `lemniscate train`."""
+    with tempfile.TemporaryDirectory() as folder:
+        words = [
+            "train",
+            algorithm,
+            "--env",
+            env,
+            "--total-steps",
+            str(steps),
+            "--threads",
+            str(count),
+            "--seed",
+            "101",
+        ]
+        words += ["--compile", "on"] if algorithm == "reppo" else []
+        words += ["--run", f"{folder}/run", "--quiet"]
+        command = [sys.executable, "-m", "lemniscate", *words]
+        subprocess.run(command, env=os.environ | {"GOMP_SPINCOUNT": spin}, check=True, stderr=subprocess.DEVNULL)
+        lines = map(json.loads, (Path(folder) / "run" / "metrics.jsonl").read_text().splitlines())
+        paces = [line["time/steps_per_second"] for line in lines if "time/steps_per_second" in line]
+    return median(paces[len(paces) // 3 :])
+
+
+def waiting(rounds):
+    """Steps per second of runs on one thread, and on two that wait for each other long or briefly."""
+    for run in TRAINED:
+        ways = {
+            "one thread": partial(pace, *run, 1, LONG),
+            "two threads, as OpenMP has them wait": partial(pace, *run, 2, LONG),
+            "two threads that wait briefly": partial(pace, *run, 2, SHORT),
+        }
+        print(f"{run[0]} on {run[1]}, steps per second")
+        table(ways, rounds, 0)
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    measures = {"halves": halves, "threads": threads}
+    measures = {"halves": halves, "threads": threads, "waiting": waiting}
     parser.add_argument("measures", nargs="*", metavar="MEASURE", help=", ".join(measures))
     parser.add_argument("--rounds", type=int, default=5)
     given = parser.parse_args()

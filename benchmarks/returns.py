@@ -15,6 +15,7 @@ of another length is another run: `--steps`.
 
 import argparse
 import json
+import os
 import tempfile
 from contextlib import nullcontext
 from itertools import pairwise
@@ -235,6 +236,7 @@ def main():
     parser.add_argument("--runs", type=Path)
     parser.add_argument("--table", action="store_true", help="run nothing")
     given = parser.parse_args()
+    os.environ.setdefault("GOMP_SPINCOUNT", "20000")  # as `lemniscate train` has threads wait; before torch is imported
     if given.algorithms == ["minutes"]:
         by_minutes()
         return

@@ -75,6 +75,18 @@ def test_what_is_off_is_said(spoil, said):
     assert re.search(said, finding.sentence), finding.sentence
 
 
+def test_what_takes_the_rest_is_given_all_of_it_in_its_order():
+    def first(reward, *rest):
+        return gae(reward, *rest[:4], gamma=rest[4], lam=rest[5])
+
+    def with_an_option(reward, debug=False, *args, **options):
+        assert debug is False
+        return gae(reward, *args, **options)
+
+    assert course.check(first, "gae")
+    assert course.check(with_an_option, "gae")
+
+
 def test_several_tensors_may_come_as_a_list():
     assert course.check(lambda *args, **options: list(maths.gae(*args, **options)), "gae")
     says(lambda rewards, gamma: list(rewards), "discounted_returns", "returns[0] is ")
@@ -202,6 +214,14 @@ def by_number(target, online, tau):
     with torch.no_grad():
         for i in range(len(target)):
             target[i].lerp_(online[i], tau)
+
+
+def test_a_polyak_that_replaces_the_items_of_a_list_moves_no_network():
+    def polyak(target, online, tau):
+        for i in range(len(target)):
+            target[i] = (1 - tau) * target[i] + tau * online[i]
+
+    says(polyak, "polyak", "case 1 of 2, three tensors: ")
 
 
 @pytest.mark.parametrize("solution", [two_passes, by_number])

@@ -196,6 +196,7 @@ def test_a_loop_with_long_rollouts_has_the_steps_that_it_needs(rollout, tried, m
     """130 steps of 8 environments are more than four times the usual steps, so that it makes no update within them."""
     train, steps = program([("num_steps: int = 32", f"num_steps: int = {rollout}")]), []
     monkeypatch.setattr(loop, "STEPS", 256)
+    monkeypatch.setattr(loop, "FEW_GRADIENT_STEPS", 10)
 
     def counted(envs, total_steps, seed):
         steps.append(total_steps)

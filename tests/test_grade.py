@@ -16,7 +16,7 @@ from rich.cells import cell_len
 import hand_ins
 from lemniscate import course
 from lemniscate.cli import main
-from lemniscate.course import grading
+from lemniscate.course import grading, handin
 from lemniscate.system.files import filled
 
 SLOW = ("endless", "endless and deaf", "sleeps", "fills the memory")
@@ -385,6 +385,21 @@ def test_one_that_kills_the_server_of_all_costs_nobody_else_a_mark(tmp_path, cap
     assert "Left out: carol.zip; a hand-in is a .py or .ipynb file" in capsys.readouterr().err
 
 
+def test_beside_a_single_file_lies_what_it_may_read(tmp_path):
+    for name in ("a.py", "b.ipynb", "data.json", "table.csv.gz", "report.pdf", "Scan.JPG"):
+        (tmp_path / name).touch()
+    assert {file.name for file in grading.files_of(tmp_path / "a.py")} == {"a.py", "data.json", "table.csv.gz"}
+    assert len(grading.files_of(tmp_path)) == 6
+
+
+def test_a_module_of_a_package_begins_above_it_and_others_where_the_files_do(tmp_path):
+    inner = tmp_path / "week 6" / "mine"
+    inner.mkdir(parents=True)
+    assert [handin._home(inner / name, tmp_path) for name in ("main.py", "work.ipynb")] == [inner, inner]
+    (inner / "__init__.py").touch()
+    assert handin._home(inner / "main.py", tmp_path) == tmp_path / "week 6"
+
+
 def test_what_functions_need_is_read_and_a_function_counts_before_a_method(tmp_path):
     text = "cfg = {}\ncfg.update(one=1)\n\ndef gae():\n    return cfg['one']\n\nclass T:\n    def gae(self): ...\n"
     for number, cell in enumerate(
@@ -431,13 +446,27 @@ FILLED = {
         "",
     ),
     "main.py": ("", "SCALE", "if __name__ == '__main__':\n    SCALE = 1.0\n    print(SCALE)"),
-    "not the main one.py": ("SCALE = 1.0", "SCALE", "if __name__ == '__main__':\n    SCALE = 5.0"),
+    "not the main one.py": ("from os import X_OK as SCALE", "SCALE", "if __name__ == '__main__':\n    SCALE = 5.0"),
+    "not a builtin.py": ("", "sum([1.0])", "if __name__ == '__main__':\n    sum = 5.0"),
+    "arguments of the main one.py": (
+        "",
+        "args.scale",
+        "if __name__ == '__main__':\n    import argparse\n    parser = argparse.ArgumentParser()\n"
+        "    parser.add_argument('--scale', type=float, default=1.0)\n    args = parser.parse_args()",
+    ),
 }
 METHOD = """
 class Agent:
     def after(self, reward, gamma, returns): return reward + gamma * returns
 """
+BASE = "class Base:\n    def discounted_returns(self, rewards, gamma):\n        raise NotImplementedError"
 IN_CLASSES = {
+    "a base.ipynb": (
+        BASE,
+        RETURNS.format(before="", one="1.0", behind="").replace("(rewards, ", "(self, rewards, "),
+        "class Mine(Base):\n    pass\nMine.discounted_returns = discounted_returns\ndel discounted_returns",
+        "class Other(Base):\n    def act(self): ...",
+    ),
     "two cells.ipynb": (
         METHOD + "    def discounted_returns(self, rewards, gamma):\n        returns, after = 0 * rewards, 0.0\n"
         "        for t in reversed(range(len(rewards))):\n"
@@ -478,7 +507,14 @@ def in_other_forms(tmp_path_factory):
     beside.mkdir(parents=True)
     (beside / "scale.json").write_text("1.0")
     (beside / "helpers.py").write_text("TWO = 2.0")
-    cells = "import json\nSCALE = json.load(open('scale.json'))", "%run ./helpers.py", "SCALE *= TWO / 2", reads
+    inside = "def set_up():\n    %run ./helpers.py\n    return 1", "%run nothing.py"
+    cells = (
+        *inside,
+        "import json\nSCALE = json.load(open('scale.json'))",
+        "%run ./helpers.py",
+        "SCALE *= TWO / 2",
+        reads,
+    )
     (beside / "work.ipynb").write_text(hand_ins.notebook(*cells))
     (folder / "half a letter.py").write_text("def discounted_returns(rewards, gamma):\n    raise ValueError('\\ud83d')")
     if sys.platform == "linux":
@@ -528,6 +564,8 @@ def test_a_name_and_a_message_that_are_no_utf_8_cost_nobody_a_mark(in_other_form
         ("large.ipynb", "large.ipynb has 64 MB; at most 64 are read: clear the outputs of a notebook."),
         ("package", ""),
         ("draft.ipynb", ""),
+        ("beside", ""),
+        ("arguments of the main one.py", ""),
         ("long.py", "left out, since it did not end within 3 s."),
     ],
 )

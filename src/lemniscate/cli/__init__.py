@@ -188,7 +188,7 @@ def give_way(words: Sequence[str]) -> None:
     mine = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(len(busy))
     if sum(1 - busy[core] / 100 for core in mine) < 1.5:
         os.environ.setdefault("GOMP_SPINCOUNT", "100")
-    elif words[0] == "train" and not any(word.startswith("Drone") for word in words):
+    elif words[0] == "train" and not any(word.removeprefix("--env=").startswith("Drone") for word in words):
         os.environ.setdefault("GOMP_SPINCOUNT", "20000")
 
 

@@ -181,7 +181,7 @@ KINDS: Mapping[str, Change] = {
 }
 """what a solution may want its arguments to be, by what is then said of it"""
 PARAMETERS: Sequence[Change] = (
-    lambda value: value,
+    lambda value: [*value] if isinstance(value, list) else value,  # what replaces an item moves no network
     lambda value: iter(value) if isinstance(value, list) else value,
     lambda value: nn.ParameterList(value) if isinstance(value, list) else value,
 )

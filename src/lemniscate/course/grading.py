@@ -51,7 +51,7 @@ READING, WHOLE = 60.0, 600.0
 MOST_COPIED, MOST_PRINTED = 2**26, 2_000
 """bytes of a file, and characters of what is printed that are kept"""
 IGNORED = {"venv", "site-packages", "node_modules", "wandb"}
-DOCUMENTS = (".pdf", ".docx", ".html", ".zip", ".gz", ".mp4", ".gif", ".png", ".jpg")
+DOCUMENTS = (".pdf", ".doc", ".docx", ".pptx", ".html", ".mp4", ".gif", ".png", ".jpg", ".jpeg")
 """what beside a single file is another's hand-in rather than what the file reads"""
 
 
@@ -161,7 +161,7 @@ def files_of(path: Path, large: bool = False) -> dict[Path, Path]:
     return {
         file: name
         for file, name in found.items()
-        if (file == path or root == path or file.suffix not in (*handin.SUFFIXES, *DOCUMENTS))
+        if (file == path or root == path or file.suffix.lower() not in (*handin.SUFFIXES, *DOCUMENTS))
         and not any(part.startswith((".", "__")) or part in IGNORED for part in name.parts if part != "__init__.py")
         and not (installed - {root}).intersection(file.parents)
         and (file.stat().st_size > MOST_COPIED) is large

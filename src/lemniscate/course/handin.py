@@ -8,6 +8,7 @@ unless a function uses a name that they assign or fill.
 import __future__
 
 import ast
+import builtins
 import ctypes
 import importlib.util
 import inspect
@@ -18,7 +19,7 @@ import signal
 import socket
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from importlib.machinery import FileFinder, SourceFileLoader
 from multiprocessing import parent_process
@@ -45,7 +46,7 @@ MAGIC = re.compile(
     r"^(\s*)(?:(?:%{1,2}[A-Za-z_]|!(?!=)|\?)(?:.*\\\n)*.*|[\w.]+\?+|[\w, ]+=\s*(?:%[A-Za-z_]|!(?!=)).*)$", re.MULTILINE
 )
 """a line of a notebook that is not Python, with those that a backslash adds to it"""
-RUN = re.compile(r"^(\s*)%run\s+(?:-\w+\s+)*(?:\./)?([A-Za-z_]\w*)\.(?:py|ipynb)[ \t]*$", re.MULTILINE)
+RUN = re.compile(r"^%run\s+(?:-\w+\s+)*(?:\./)?([A-Za-z_]\w*)\.(?:py|ipynb)[ \t]*$", re.MULTILINE)
 """a line of a notebook that executes another file there, whose names the notebook has then"""
 PYTHON = ("%%time", "%%timeit", "%%capture", "%%prun", "%%memit")
 """the magics at the head of a cell that is Python"""
@@ -116,17 +117,23 @@ class Reader:
         self._execute(module)
 
     def _execute(self, module: ModuleType) -> None:
-        """Execute a module or a notebook, one statement after the other."""
-        file, flags = Path(str(module.__file__)), 0
+        """Execute a module or a notebook, in its folder and with a command line of its own."""
+        file, folder, arguments = Path(str(module.__file__)), Path.cwd(), sys.argv
+        sys.argv = [str(file)]
+        os.chdir(_home(file, self._work / "hand-in"))
+        try:
+            self._execute_all(file, module)
+        finally:
+            sys.argv = arguments
+            os.chdir(folder)
+
+    def _execute_all(self, file: Path, module: ModuleType) -> None:
+        """Execute one statement after the other."""
+        flags = 0
         module.__dict__.setdefault("display", print)
-        sys.argv = [str(file)]  # not what the teacher has written
-        with suppress(OSError):
-            os.chdir(_home(file, self._work / "hand-in"))
         parsed = [(code, node) for code, tree in self._trees(file) for node in tree.body]
         functions = [node for _, node in parsed if isinstance(node, ast.FunctionDef | ast.ClassDef)]
         used = set().union(*map(_free, functions))
-        bound = set().union(*(_bound(node) for _, node in parsed if not _settings(node)))
-        parsed += [(code, each) for code, node in parsed for each in _settings(node) if _bound(each) & used - bound]
         fills = {node.name: (_filled(node) & _free(node)) | _global(node) for node in functions}
         for code, node in parsed:
             if isinstance(node, ast.ImportFrom) and node.module == "__future__":
@@ -135,14 +142,21 @@ class Reader:
             if not isinstance(node, ast.Expr):  # a loop may fill what is empty, and not set a setting anew
                 filled = {name for name in filled if _is_empty(module.__dict__.get(name))}
             if not isinstance(node, LEFT_OUT) or (_bound(node) | filled) & used or _prepares(node):
-                self._run(node, code, flags, module.__dict__)
+                notes, is_left_out = [*self.notes], isinstance(node, LEFT_OUT) and not _prepares(node)
+                self._run(node, code, flags, module.__dict__, is_left_out)
+                self.notes = notes if _prepares(node) else self.notes
                 self.defined |= {each: {**self.defined.get(each, {}), file.name: module} for each in _bound(node)}
+        notes = [*self.notes]
+        for code, node in parsed:
+            for each in _settings(node, used, module.__dict__):
+                self._run(each, code, flags, module.__dict__, is_left_out=True)
+        self.notes = notes  # what a reader does not expect to be executed may fail
 
-    def _run(self, node: ast.stmt, file: Path, flags: int, scope: dict[str, Any]) -> None:
+    def _run(self, node: ast.stmt, file: Path, flags: int, scope: dict[str, Any], is_left_out: bool) -> None:
         imports = [each for each in ast.walk(node) if isinstance(each, ast.Import | ast.ImportFrom)]
         seconds, where = IMPORTING if imports else ASSIGNING, f"{file.name}, line {node.lineno}"
-        began, filling = time.monotonic(), isinstance(node, LEFT_OUT)
-        seconds = min(seconds, self._time_to_fill) if filling else seconds
+        began = time.monotonic()
+        seconds = min(seconds, self._time_to_fill) if is_left_out else seconds
         if seconds <= 0:
             return
         try:
@@ -159,7 +173,7 @@ class Reader:
             self.notes.append(f"{where}: {said}.")
             for each in imports[0].names if imports and imports[0] is node else ():
                 scope.setdefault(each.asname or each.name.partition(".")[0], Missing(said))
-        self._time_to_fill -= filling * (time.monotonic() - began)
+        self._time_to_fill -= is_left_out * (time.monotonic() - began)
 
     def _trees(self, file: Path) -> Iterator[tuple[Path, ast.Module]]:
         """The statements of a module, or of each cell, with the file that Python names in a traceback."""
@@ -181,7 +195,7 @@ class Reader:
                 self._set_aside(file, code.name, source.lstrip())
                 continue
             try:
-                yield code, _parsed(source)
+                yield code, _parsed(source, file.parent)
             except UNREADABLE as error:
                 line = f", line {error.lineno}" if isinstance(error, SyntaxError) and error.lineno else ""
                 self.notes.append(f"{code.name}{line}: {type(error).__name__}: {getattr(error, 'msg', error)}.")
@@ -206,6 +220,8 @@ class Reader:
 def _home(file: Path, root: Path) -> Path:
     """The folder in which a file was executed: a notebook's own; of a module the one where the files begin."""
     while file.suffix == ".py" and len(inside := [*root.iterdir()]) == 1 and inside[0].is_dir():
+        if (inside[0] / "__init__.py").exists():
+            break
         root = inside[0]
     return root if file.suffix == ".py" else file.parent
 
@@ -228,18 +244,30 @@ def _cells(text: str) -> list[dict[str, Any]]:
         raise UserError(f"it is no notebook with cells: {why}") from None
 
 
-def _parsed(source: str) -> ast.Module:
-    """The statements of a cell, without magics."""
+def _parsed(source: str, folder: Path) -> ast.Module:
+    """The statements of a cell of a notebook in `folder`, without magics."""
     with suppress(SyntaxError):
         return ast.parse(source)
-    return ast.parse(MAGIC.sub(r"\1pass", RUN.sub(r"\1from \2 import *", source)))
+
+    def names_of(run: re.Match) -> str:
+        there = any((folder / f"{run[1]}{suffix}").exists() for suffix in SUFFIXES)
+        return f"from {run[1]} import *" if there else "pass"
+
+    return ast.parse(MAGIC.sub(r"\1pass", RUN.sub(names_of, source)))
 
 
-def _settings(node: ast.stmt) -> list[ast.stmt]:
-    """Of a block for the main program the assignments, which functions may use."""
+def _settings(node: ast.stmt, used: set[str], scope: Mapping[str, Any]) -> list[ast.stmt]:
+    """What a block for the main program assigns of the names that functions use and nothing else has, and its needs."""
     match node:
         case ast.If(ast.Compare(ast.Name("__name__"))):
-            return [each for each in node.body if isinstance(each, ast.Assign | ast.AnnAssign)]
+            wanted, kept = set(used), list[ast.stmt]()
+            for each in reversed(node.body):
+                wanted -= {*scope, *vars(builtins)}
+                sets = isinstance(each, ast.Assign | ast.AnnAssign) and _bound(each) & wanted
+                if sets or (_prepares(each) and _free(each) & wanted):
+                    kept, wanted = [each, *kept], wanted | _free(each)
+            imports = [each for each in node.body if isinstance(each, ast.Import | ast.ImportFrom)]
+            return [*imports, *kept] if kept else []
     return []
 
 
@@ -312,8 +340,8 @@ def solutions(reader: Reader, demanded: list[str]) -> dict[str, tuple[Any, Path]
     for name, modules in reader.defined.items():
         file, module = [*modules.items()][-1]
         thing = module.__dict__.get(name)
-        every = thing.__mro__ if isinstance(thing, type) else ()
-        mine = [cls for cls in every if cls.__module__ == module.__name__]  # a cell may have class A(A)
+        every, of = thing.__mro__ if isinstance(thing, type) else (), (module.__name__, getattr(thing, "__name__", ""))
+        mine = [cls for cls in every if (cls.__module__, cls.__name__) == of]  # a cell may have class A(A)
         own = [each for cls in mine for each in vars(cls) if each in course.EXERCISES]
         methods = {each: getattr(thing, each, None) for each in own}
         for each, answer in {**methods, name: thing}.items():
@@ -364,7 +392,8 @@ def run(work: Path, demanded: list[str]) -> None:
         exercise, to = course.EXERCISES[name], work / "seen" / f"{name}.txt"
         pid = os.fork() if hasattr(os, "fork") else 0
         if pid:
-            code = _exit_code(pid, 4 * getattr(exercise, "limit", LIMIT) + GRACE)  # as `limited` has it by the clock
+            limit = getattr(exercise, "limit", LIMIT)  # of the processor's time; by the clock it may be longer
+            code = _exit_code(pid, min(4 * limit, limit + 60) + GRACE)
             if not to.exists() and not to.with_suffix(".pt").exists():
                 to.write_text(f"{ending(code)}.", "utf-8")
             continue

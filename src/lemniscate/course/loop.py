@@ -40,6 +40,8 @@ NOTEBOOKS = Path(__file__).parent / "notebooks"
 STEPS, NUM_ENVS = 2_048, 8
 LEARNED = 0.25
 """the least that each of two actions has moved where it pays, in the small world of Box actions; 0.7 is usual"""
+FEW_GRADIENT_STEPS = 100
+"""a loop that has made fewer in a small world may have long rollouts"""
 CARTPOLE_STEPS, CARTPOLE_RETURN, EPISODES = 60_000, 150, 24
 
 
@@ -268,7 +270,7 @@ def _trained(function: Function, envs: VectorView, is_right: Callable[[np.ndarra
     try:
         action = _mean_action(function, envs, STEPS)
         for factor in (4, 32):
-            if is_right(action) or (factor == 32 and made):
+            if is_right(action) or (factor == 32 and len(made) >= FEW_GRADIENT_STEPS):
                 break
             action = _mean_action(function, envs, factor * STEPS)
         return action

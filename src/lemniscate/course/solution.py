@@ -194,15 +194,19 @@ def arranged(
             if name.lower() not in SETTINGS:
                 raise TypeError(f"its parameter {name} is none of those that this exercise has: {', '.join(given)}")
             chosen[name] = OwnSettings(options)
-    takes_rest = inspect.Parameter.VAR_POSITIONAL in kinds
-    rest = [left.pop(name) for name in [*left] if name in given and takes_rest]
+    leading = [*takewhile(lambda name: name in chosen and named[name].kind is not named[name].KEYWORD_ONLY, named)]
+    rest = []
+    if inspect.Parameter.VAR_POSITIONAL in kinds and all(
+        name in leading or each.kind is each.KEYWORD_ONLY for name, each in named.items()
+    ):
+        are_named = inspect.Parameter.VAR_KEYWORD in kinds or are_held
+        rest = [left.pop(name) for name in [*left] if name in given or not are_named]
     if inspect.Parameter.VAR_KEYWORD in kinds and not are_held:
         chosen, left = {**chosen, **left}, {}
     if unused := [name for name in left if name in given]:
         raise MisfitError(f"it takes too few arguments, no {', '.join(unused)}; there are {', '.join(given)}")
     # Options by name, as a course calls them; the rest as they stand, which a wrapper may expect.
-    leading = takewhile(lambda name: name in chosen and named[name].kind is not named[name].KEYWORD_ONLY, named)
-    return [*(chosen.pop(name) for name in [*leading]), *rest], chosen
+    return [*(chosen.pop(name) for name in leading), *rest], chosen
 
 
 def _chosen(named: Mapping[str, inspect.Parameter], left: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
