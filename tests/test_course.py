@@ -75,6 +75,15 @@ def test_what_is_off_is_said(spoil, said):
     assert re.search(said, finding.sentence), finding.sentence
 
 
+def test_arrays_that_training_could_not_use_are_noted():
+    def arrays(*args, **options):
+        return tuple(each.numpy() for each in gae(*args, **options))
+
+    assert course.check(arrays, "gae").sentence.endswith(
+        "right in all 5 cases. Note: it returns arrays of NumPy, where training with it needs tensors."
+    )
+
+
 def test_what_takes_the_rest_is_given_all_of_it_in_its_order():
     def first(reward, *rest):
         return gae(reward, *rest[:4], gamma=rest[4], lam=rest[5])

@@ -441,7 +441,8 @@ FILLED = {
     "global.py": ("def set_up():\n    global SCALE\n    SCALE = 1.0", "SCALE", "set_up()"),
     "arguments.py": (
         "import argparse\nparser = argparse.ArgumentParser()\n"
-        "parser.add_argument('--scale', type=float, default=1.0)\nargs = parser.parse_args()",
+        "parser.add_argument('--scale', type=float, default=2.0)\nparser.set_defaults(scale=1.0)\n"
+        "args = parser.parse_args()",
         "args.scale",
         "",
     ),
@@ -544,6 +545,19 @@ def test_right_solutions_in_other_forms_are_right(in_other_forms, name):
     assert marks(in_other_forms.grades)[name] == {"discounted_returns": True}, sentence(
         in_other_forms, name, "discounted_returns"
     )
+
+
+@pytest.mark.parametrize("name", IN_CLASSES)
+def test_the_test_file_for_otter_finds_a_method_in_whatever_cell_it_stands(name, monkeypatch):
+    module = ModuleType("otter.test_files")
+    module.test_case = lambda: lambda function: function
+    monkeypatch.setitem(sys.modules, "otter", ModuleType("otter"))
+    monkeypatch.setitem(sys.modules, "otter.test_files", module)
+    scope, env = {}, {"__name__": "__main__"}
+    exec(filled(grading.TEMPLATES / "otter.py.j2", {}, name="discounted_returns"), scope)
+    for cell in IN_CLASSES[name]:
+        exec(cell, env)
+    scope["test_discounted_returns"](env)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="names of bytes are Linux's")
