@@ -615,6 +615,16 @@ def test_threads_wait_briefly_and_hardly_where_the_cores_are_busy(words, busy, s
     assert os.environ.get("GOMP_SPINCOUNT") == set_to
 
 
+def test_what_ends_in_a_moment_does_not_count_as_busy(monkeypatch):
+    monkeypatch.setenv("GOMP_SPINCOUNT", "of a moment")
+    monkeypatch.delenv("GOMP_SPINCOUNT")
+    looks = iter([[90.0, 90.0], [80.0, 60.0], [5.0, 10.0]])
+    monkeypatch.setattr("psutil.cpu_percent", lambda interval, percpu: next(looks))
+    monkeypatch.setattr("os.sched_getaffinity", lambda pid: {0, 1})
+    give_way(CHEETAH)
+    assert os.environ["GOMP_SPINCOUNT"] == "20000"
+
+
 def test_what_a_user_says_of_waiting_threads_stays(monkeypatch):
     monkeypatch.setenv("GOMP_SPINCOUNT", "7")
     monkeypatch.setattr("psutil.cpu_percent", lambda interval, percpu: [100.0] * 512)

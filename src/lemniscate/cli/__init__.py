@@ -184,9 +184,12 @@ def give_way(words: Sequence[str]) -> None:
     """
     import psutil  # takes as long as all of the help
 
-    busy = psutil.cpu_percent(interval=0.1, percpu=True)
-    mine = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(len(busy))
-    if sum(1 - busy[core] / 100 for core in mine) < 1.5:
+    def free() -> float:
+        busy = psutil.cpu_percent(interval=0.1, percpu=True)
+        mine = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(len(busy))
+        return sum(1 - busy[core] / 100 for core in mine)
+
+    if all(free() < 1.5 for _ in range(8)):  # what ends in a moment is not to slow down a run of minutes
         os.environ.setdefault("GOMP_SPINCOUNT", "100")
     elif words[0] == "train" and not any(word.removeprefix("--env=").startswith("Drone") for word in words):
         os.environ.setdefault("GOMP_SPINCOUNT", "20000")
