@@ -135,11 +135,17 @@ def test_the_files_are_there_for_teachers_gradescope_and_students(graded):
         assert f"{sum(map(bool, expected.values()))} of 8 exercises are right." in page
 
 
-def test_the_test_file_for_otter_checks_in_the_notebook(graded, monkeypatch):
+@pytest.fixture
+def otter(monkeypatch):
+    """Otter-Grader calls a test with the notebook's names as `env`."""
     module = ModuleType("otter.test_files")
-    module.test_case = lambda: lambda function: function  # as Otter calls it: with the notebook's names as `env`
+    module.test_case = lambda: lambda function: function
     monkeypatch.setitem(sys.modules, "otter", ModuleType("otter"))
     monkeypatch.setitem(sys.modules, "otter.test_files", module)
+
+
+@pytest.mark.usefixtures("otter")
+def test_the_test_file_for_otter_checks_in_the_notebook(graded):
     for exercise in EIGHT:
         scope, right, wrong = {}, {}, {}
         exec((graded.to / "otter" / f"{exercise}.py").read_text(), scope)
@@ -504,7 +510,10 @@ def in_other_forms(tmp_path_factory):
     (folder / "package" / "mine" / "main.py").write_text(uses)
     for name, cells in IN_CLASSES.items():
         (folder / name).write_text(hand_ins.notebook(*cells))
-    beside, reads = folder / "beside" / "week 6", RETURNS.format(before="", one="SCALE", behind="")
+    beside, reads = (
+        folder / "beside" / "week 6",
+        RETURNS.format(before="", one="SCALE * json.load(open('scale.json'))", behind=""),
+    )
     beside.mkdir(parents=True)
     (beside / "scale.json").write_text("1.0")
     (beside / "helpers.py").write_text("TWO = 2.0")
@@ -547,12 +556,9 @@ def test_right_solutions_in_other_forms_are_right(in_other_forms, name):
     )
 
 
+@pytest.mark.usefixtures("otter")
 @pytest.mark.parametrize("name", IN_CLASSES)
-def test_the_test_file_for_otter_finds_a_method_in_whatever_cell_it_stands(name, monkeypatch):
-    module = ModuleType("otter.test_files")
-    module.test_case = lambda: lambda function: function
-    monkeypatch.setitem(sys.modules, "otter", ModuleType("otter"))
-    monkeypatch.setitem(sys.modules, "otter.test_files", module)
+def test_the_test_file_for_otter_finds_a_method_in_whatever_cell_it_stands(name):
     scope, env = {}, {"__name__": "__main__"}
     exec(filled(grading.TEMPLATES / "otter.py.j2", {}, name="discounted_returns"), scope)
     for cell in IN_CLASSES[name]:

@@ -206,7 +206,7 @@ class Exercise:
     accepted: Mapping[str, Function] = field(default_factory=dict)
     """by note: a function that differs from the reference, but is what a course asks for"""
     gradient_in: int | None = None
-    """the argument in which the gradient of the outputs counts too; of a method with networks that in their weights"""
+    """the argument in which the gradient of the outputs counts too; in a method with networks it is their weights"""
     value_is_free: bool = False
     """only the gradient of what it returns counts"""
     detached: bool = False
@@ -292,12 +292,12 @@ class Exercise:
         values |= {name: [*map(nn.Parameter, value)] for name, value in values.items() if isinstance(value, list)}
         networks, leaves = [value for value in values.values() if isinstance(value, list)], list[Tensor]()
         attributes = copy.deepcopy(case.attributes)
-        if self.gradient_in is not None:  # a method may use its own networks, or call those of the case
-            leaves = [weight for held in (case.attributes, attributes) for weight in _weights(held)]
-        if self.gradient_in is not None and not leaves:
-            name = self.arguments[self.gradient_in]
-            leaves = [values[name].requires_grad_()]
-            values[name] = leaves[0] * 1  # as from a network: what is no leaf may be changed in place
+        if self.gradient_in is not None:
+            leaves = [*_weights(case.attributes), *_weights(attributes)]  # a method calls those of the case, or its own
+            if not leaves:
+                name = self.arguments[self.gradient_in]
+                leaves = [values[name].requires_grad_()]
+                values[name] = leaves[0] * 1  # as from a network: what is no leaf may be changed in place
         values |= copy.deepcopy(dict(case.options))
         values |= change(values)
         before = {name: value.detach().clone() for name, value in values.items() if isinstance(value, Tensor)}
@@ -319,7 +319,7 @@ class Exercise:
         elif all(tensor.requires_grad for tensor in tensors):
             total = torch.stack([tensor.sum() for tensor in tensors]).sum()
             slopes = torch.autograd.grad(total, leaves, allow_unused=True, materialize_grads=True)
-            count = len(leaves) // 2 or 1
+            count = len(leaves) // 2 or 1  # of a network and its copy the sum
             seen["gradient"] = [sum(slopes[i::count]) for i in range(count)]
         seen["attached"] = any(tensor.requires_grad for tensor in tensors)
         if changed := [name for name, value in before.items() if not close(value, values[name])]:

@@ -257,7 +257,7 @@ def _parsed(source: str, folder: Path) -> ast.Module:
 
 
 def _settings(node: ast.stmt, used: set[str], scope: Mapping[str, Any]) -> list[ast.stmt]:
-    """What a block for the main program assigns of the names that functions use and nothing else has, and its needs."""
+    """The statements of a block for the main program that set names which functions use and nothing else sets."""
     match node:
         case ast.If(ast.Compare(ast.Name("__name__"))):
             wanted, kept = set(used), list[ast.stmt]()
@@ -340,8 +340,8 @@ def solutions(reader: Reader, demanded: list[str]) -> dict[str, tuple[Any, Path]
     for name, modules in reader.defined.items():
         file, module = [*modules.items()][-1]
         thing = module.__dict__.get(name)
-        every, of = thing.__mro__ if isinstance(thing, type) else (), (module.__name__, getattr(thing, "__name__", ""))
-        mine = [cls for cls in every if (cls.__module__, cls.__name__) == of]  # a cell may have class A(A)
+        every = thing.__mro__ if isinstance(thing, type) else ()
+        mine = [cls for cls in every if (cls.__module__, cls.__name__) == (module.__name__, name)]  # or class A(A)
         own = [each for cls in mine for each in vars(cls) if each in course.EXERCISES]
         methods = {each: getattr(thing, each, None) for each in own}
         for each, answer in {**methods, name: thing}.items():

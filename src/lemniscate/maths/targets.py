@@ -1,6 +1,6 @@
 """The targets of Q, for a transition and for a rollout, as numbers and over bins; and the target networks."""
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Bool, Float
@@ -34,7 +34,7 @@ def td_target(
 
 
 @torch.no_grad()
-def polyak(target: Iterable[Tensor], online: Iterable[Tensor], tau: float) -> None:
+def polyak(target: Sequence[Tensor], online: Sequence[Tensor], tau: float) -> None:
     """Move a target network towards the online one, in place: arXiv:1509.02971, section 3.
 
         θ' ← (1 − τ) θ' + τ θ

@@ -199,8 +199,8 @@ def linear(start: float, final_fraction: float, progress: float) -> float:
 def adapt_to_kl(learning_rate: float, kl: float, desired_kl: float) -> float:
     """A smaller rate after an epoch that went twice too far, a larger one after one that went half as far.
 
-    The form of the rule that Schulman et al. 2017, arXiv:1707.06347, section 4, have for the penalty β, applied to the
-    step size: there by a factor of 2 where 1.5 times too far, here by 1.5; within [1e-6, 1e-2].
+    The rule for the penalty β of Schulman et al. 2017, arXiv:1707.06347, section 4, applied to the step size: with
+    thresholds of 2 and ½ and a factor of 1.5, where theirs are 1.5 and 1/1.5 and a factor of 2; within [1e-6, 1e-2].
     """
     factor = 1 / 1.5 if kl > 2 * desired_kl else 1.5 if kl < desired_kl / 2 else 1.0
     return min(max(learning_rate * factor, 1e-6), 1e-2)
