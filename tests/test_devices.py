@@ -206,7 +206,7 @@ MUTANTS = [
     ("Adam's scalars stay on the CPU", "optim/adam.py", ".log().to(device, wide_float(device))", ".log()", "a2c box"),
     ("the first GPU, whichever was asked for", "run/seeding.py", "torch.Generator(device)", "torch.Generator(device.type)", "ppo box"),
     ("what ended is counted on the CPU", "data/rollout.py", "dtype=torch.int64, device=env.device)", "dtype=torch.int64)", "reinforce episodes"),
-    ("frequencies on the CPU", "maths/noise.py", ", dtype=normal.dtype, device=normal.device)", ", dtype=normal.dtype)", "td3 box"),
+    ("frequencies on the CPU", "maths/actions.py", ", dtype=normal.dtype, device=normal.device)", ", dtype=normal.dtype)", "td3 box"),
     ("float64 on mps", "types.py", 'device.type == "mps"', "False", "a2c box"),
 ]  # fmt: skip
 

@@ -64,18 +64,20 @@ CASES = {
     "rate-zero": ({"learning_rate": [1e-3] + [0.0] * 7}, {"learning_rate": [1e-3] * 7 + [0.0]}),
     "loss-below-zero": ({"losses__value": [-1.0] * 8}, {"losses__value": [0.0] * 8}),
     "reset-without-effect": ({"observation__goes_on": [1.0] * 8}, {"observation__goes_on": [0.9] * 8}),
-    "targets-differ": ({"targets__unexplained": [0.02] * 8}, {"targets__unexplained": [0.009] * 8}),
+    "targets-differ": ({"targets__unexplained": [0.02] * 8}, {"targets__unexplained": [1e-9] * 8}),
     "discount-differs": (
         {"targets__discount": [1.0101] * 8, "targets__unexplained": [0.0] * 8},
         {"targets__discount": [0.9905] * 8, "targets__unexplained": [0.0] * 8},
     ),
     "ends-continued": ({"targets__beyond_ends": [0.02] * 3}, {"targets__beyond_ends": [0.02] * 2}),
-    "baseline-differs": ({"advantage__own": [0.9] * 8}, {"advantage__own": [0.96] * 8}),
-    "advantage-of-others": ({"advantage__used": [0.3] * 8}, {"advantage__used": [0.96] * 8}),
+    "baseline-differs": ({"advantage__own": [0.9] * 8}, {"advantage__own": [0.995] * 8}),
+    "advantage-of-others": ({"advantage__used": [0.3] * 8}, {"advantage__used": [0.995] * 8}),
     "loss-of-others": (
         {"algorithm": "a2c", "losses__value": list(np.linspace(1, 3, 8)), "value__loss": [1.0] * 8},
         {"algorithm": "a2c", "losses__value": [2.0] * 8, "value__loss": [1.0] * 8},
     ),
+    "rows-of-others": ({"gradient__other_rows": [0.5] * 3}, {"gradient__other_rows": [0.0] * 3}),
+    "loss-differs": ({"gradient__policy_rest": [1e-5] * 3}, {"gradient__policy_rest": [1e-9] * 3}),
     "seed-ignored": ({"repeats": False}, {"repeats": True}),
     "constant-observation": ({"observation__constant": [1.0] * 8}, {"observation__constant": [0.99] * 8}),
     "exploding-observation": (

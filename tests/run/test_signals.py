@@ -25,11 +25,8 @@ from lemniscate.run.metrics import read_metrics
 from lemniscate.run.signals import (
     KINDS,
     LOOKS,
-    Watched,
-    acted_with,
     effect_beside,
     late_effect,
-    of_batch,
     of_critics,
     of_effects,
     of_environment,
@@ -38,11 +35,11 @@ from lemniscate.run.signals import (
     of_rows,
     of_starts,
     of_time,
-    of_update,
     of_values,
     paid_before,
     signals,
 )
+from lemniscate.run.updates import Watched, acted_with, of_batch, of_update
 from lemniscate.spec import Box, Discrete, MultiDiscrete, ObservationPart, Spec
 from lemniscate.types import Batch, Rollout, Step, Transition
 
@@ -476,9 +473,11 @@ def test_there_are_signals_some_thirty_times_in_a_run_and_in_its_first_line(tmp_
     ].keys()
 
 
-@pytest.mark.parametrize("algorithm", ["ppo", "sac", "pqn", "reinforce"])
+@pytest.mark.parametrize(
+    ("algorithm", "compiled"), [("ppo", "off"), ("sac", "off"), ("sac", "on"), ("pqn", "off"), ("reinforce", "off")]
+)
 @pytest.mark.one_in(2)
-def test_measuring_changes_no_bit_of_a_run(tmp_path, monkeypatch, algorithm):
+def test_measuring_changes_no_bit_of_a_run(tmp_path, monkeypatch, algorithm, compiled):
     env = "Pendulum-v1" if algorithm == "sac" else "Matching-v0"
     fields = tiny_off_policy() if algorithm == "sac" else {"num_envs": 2, "num_steps": 8, "total_steps": 128}
     fields |= {
@@ -486,8 +485,10 @@ def test_measuring_changes_no_bit_of_a_run(tmp_path, monkeypatch, algorithm):
         "pqn": {"minibatch_size": 8},
         "reinforce": {"critic_minibatch_size": 8},
     }.get(algorithm, {})
+    fields |= {"compile": compiled}
     looking = lem.train(algorithm, env, run=tmp_path / "a", progress=False, **fields)
     monkeypatch.setattr("lemniscate.run.run.signals", lambda *_: {})
+    monkeypatch.setattr("lemniscate.run.run.Watched", lambda *_: None)
     blind = lem.train(algorithm, env, run=tmp_path / "b", progress=False, **fields)
     assert "reward/mean" in read_metrics(looking.path)[0]
     assert "reward/mean" not in read_metrics(blind.path)[0]
@@ -977,6 +978,137 @@ def test_advantages_in_another_order_than_their_rows_show(tmp_path, monkeypatch)
     assert max(of_update_of("ppo", tmp_path)["advantage/used"]) > 0.9999, "what is given is right there"
 
 
+def looked_at(algorithm, tmp_path, env="CartPole-v1", **fields):
+    """The signals of what gradients are made of, and of targets, in a short run: their values by name."""
+    small = {"num_envs": 4, "num_steps": 16, "total_steps": 1280, "hidden": (8,)}
+    if algorithm in ("sac", "td3", "ddpg"):
+        env, small = "Pendulum-v1", {"total_steps": 1000, "learning_starts": 100, "batch_size": 32, "log_every": 50}
+    small |= {"minibatch_size": 16} if algorithm in ("ppo", "reppo", "pqn") else {}
+    small |= {"critic_minibatch_size": 16} if algorithm in ("trpo", "reinforce") else {}
+    env = "Pendulum-v1" if algorithm == "reppo" else env
+    lines = read_metrics(
+        lem.train(algorithm, env, run=tmp_path / "run", progress=False, **{"compile": "off", **small, **fields}).path
+    )
+    names = {name for line in lines for name in line if name.startswith(("gradient/", "targets/"))}
+    return {name: np.array([line[name] for line in lines if name in line]) for name in names}
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "fields"),
+    [
+        ("ppo", {"entropy_coef": 0.01}),
+        ("ppo", {"network": "gru", "sequence_length": 8, "clip_value": 0.2}),
+        ("ppo", {"compile": "on", "env": "Pendulum-v1"}),
+        ("a2c", {"entropy_coef": "0.1>0.01"}),
+        ("trpo", {}),
+        ("reinforce", {}),
+        ("reppo", {}),
+        ("pqn", {}),
+        ("sac", {}),
+        ("sac", {"value_range": 10.0}),
+        ("sac", {"compile": "on"}),
+        ("td3", {}),
+        ("ddpg", {"compile": "on"}),
+    ],
+)
+def test_a_gradient_is_of_the_terms_of_its_loss(algorithm, fields, tmp_path):
+    found = looked_at(algorithm, tmp_path, **fields)
+    assert found["gradient/other_rows"].max() == 0
+    heads = {"trpo": ("value",), "pqn": ("value",)}.get(algorithm, ("policy", "value"))
+    for head in heads:
+        weight = 0.5 if (algorithm, head) in (("ppo", "value"), ("a2c", "value")) and "env" not in fields else 1.0
+        assert len(found[f"gradient/{head}"]) >= 2
+        assert found[f"gradient/{head}"] == pytest.approx(weight, rel=1e-4)
+        assert found[f"gradient/{head}_rest"].max() < 1e-9
+    if algorithm in ("sac", "reppo") or "entropy_coef" in fields:
+        assert found["gradient/entropy"].max() > 1e-3
+        assert found["gradient/entropy"].min() > -1e-5
+    if algorithm == "pqn":
+        assert found["targets/unexplained"].max() < 1e-10
+        assert found["targets/discount"] == pytest.approx(0.99, abs=1e-5)
+
+
+def entropy_punished(right):
+    def wrong(config, networks, batch):
+        total, metrics = right(config, networks, batch)
+        return total + 2 * config.entropy_coef * networks.policy(batch.obs).entropy().mean(), metrics
+
+    return wrong
+
+
+def actions_of_others(right):
+    return lambda config, networks, batch: right(config, networks, replace(batch, action=batch.action.roll(1, 0)))
+
+
+def rewards_of_others(right):
+    return lambda config, state, critics, batch, *noise: right(
+        config, state, critics, replace(batch, reward=batch.reward.flip(0)), *noise
+    )
+
+
+def a_row_further(right):
+    def wrong(config, state, batch, minibatches, advantage):
+        return right(config, state, replace(batch, action=batch.action.roll(1, 0)), minibatches, advantage)
+
+    return wrong
+
+
+def next_values(right):
+    def wrong(reward, next_value, *ends, **rest):
+        return right(reward, next_value.roll(1, 0), *ends, **rest)
+
+    return wrong
+
+
+LOSSES = {
+    "entropy punished": ("ppo", "loss", entropy_punished, {"entropy_coef": 0.01}, ("entropy", lambda x: x.max() < 0)),
+    "actions of other rows": ("a2c", "loss", actions_of_others, {}, ("policy_rest", lambda x: x.min() > 1e-4)),
+    "log π that is none": (
+        "a2c",
+        "policy_gradient",
+        lambda _: lambda log_prob, weight: -(log_prob.exp() * weight).mean(),
+        {},
+        ("policy_rest", lambda x: np.median(x) > 1e-6),
+    ),
+    "values of other rows": (
+        "trpo",
+        "value_loss",
+        lambda right: lambda value, target: right(value, target.flip(0)),
+        {},
+        ("value_rest", lambda x: np.median(x) > 1e-4),
+    ),
+    "a loss that is climbed": (
+        "ppo",
+        "value_loss",
+        lambda right: lambda *given: -right(*given),
+        {},
+        ("value", lambda x: x.max() < 0),
+    ),
+    "rewards of other rows": ("td3", "critic_loss", rewards_of_others, {}, ("value_rest", lambda x: x.min() > 1e-4)),
+    "the same, compiled": (
+        "td3",
+        "critic_loss",
+        rewards_of_others,
+        {"compile": "on"},
+        ("value_rest", lambda x: x.min() > 1e-4),
+    ),
+    "actions of the row before": ("a2c", "learn", a_row_further, {}, ("other_rows", lambda x: x.min() > 0.1)),
+}
+
+
+@pytest.mark.parametrize("mistake", LOSSES)
+def test_a_mistake_in_a_loss_shows_in_its_gradient(mistake, tmp_path, monkeypatch):
+    algorithm, name, wrong, fields, (signal, shows) = LOSSES[mistake]
+    module = algos.find(algorithm)
+    monkeypatch.setattr(module, name, wrong(getattr(module, name)))
+    assert shows(looked_at(algorithm, tmp_path, **fields)[f"gradient/{signal}"])
+
+
+def test_the_largest_q_follows_in_the_targets_of_q(tmp_path, monkeypatch):
+    monkeypatch.setattr(algos.find("pqn"), "q_lambda", next_values(algos.find("pqn").q_lambda))
+    assert looked_at("pqn", tmp_path)["targets/unexplained"].max() > 1e-9
+
+
 def test_the_loss_of_a_single_step_is_half_the_mean_squared_error(tmp_path):
     lines = read_metrics(
         lem.train(
@@ -1033,7 +1165,7 @@ def test_targets_that_are_all_zero_say_nothing_of_a_discount():
     newest = time_rows()
     batch = Batch(newest.obs.flatten(0, 1), newest.action.flatten(0, 1), *torch.zeros(3, 16))
     found = of_batch(SimpleNamespace(gae_lambda=0.95), (batch, (), False), newest)
-    assert not any(name.startswith("targets/") for name in found)
+    assert not {"targets/discount", "targets/unexplained"} & found.keys()
     whole = of_batch(SimpleNamespace(episodes=1), (batch, (), False), newest)
     assert whole == {}, "of whole episodes the rows have been moved together"
 

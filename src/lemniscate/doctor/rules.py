@@ -96,6 +96,7 @@ CONSEQUENCES = {
     "q-unfollowed": {"policy-still"},
     "evaluated-otherwise": {"too-few-episodes"},
     "acts-at-mode": {"advantage-opposed"},
+    "entropy-opposed": {"acts-at-mode", "entropy-collapsed"},
     "replay-differs": {"replay-repeated"},
     "setting-entropy-coef": {"entropy-opposed"},
     "targets-of-others": {"critic-still", "replay-differs"},
@@ -104,6 +105,8 @@ CONSEQUENCES = {
     "gradient-clipped": {"loss-below-zero"},
     "missing-bootstrap": {"rate-zero"},
     "ends-ignored": {"ends-continued"},
+    "rows-of-others": {"ratio-not-one", "advantage-unrelated", "loss-differs"},
+    "loss-of-others": {"loss-differs"},
 }
 """faults that are not named beside one of these, which brings them about"""
 
@@ -555,13 +558,19 @@ def of_advantages(e: Evidence) -> Seen:
 
 def of_batches(e: Evidence) -> Seen:
     """Whether an update learned from what follows from its rows: equations that every healthy run fulfils."""
-    if not {"gae_lambda", "returns"} & e.config.keys() or e.config.get("returns", "to_go") != "to_go":
+    learned = {"gae_lambda", "returns", "final_epsilon"} & e.config.keys()
+    if not learned or e.config.get("returns", "to_go") != "to_go":
         return
     names = ("targets/unexplained", "targets/discount", "targets/beyond_ends", "advantage/own", "advantage/used")
     rest, discount, beyond, own, used = map(e.median, names)
+    if (other := e.median("targets/other_actions")) > 0.01:
+        yield "rows-of-others", f"In {other:.0%} of the rows of an update the action is not the one that was taken."
     gamma = e.config.get("gamma")
-    if rest > 0.01:
-        yield "targets-differ", f"{rest:.0%} of the squares of the targets do not follow from the rows after them."
+    if rest > 1e-8:
+        yield (
+            "targets-differ",
+            f"{100 * rest:.2g} % of the targets' squares do not follow from the rows after them.",
+        )
     elif isinstance(gamma, float) and abs(discount - gamma) > max(1e-3, 0.1 * (1 - gamma)):
         yield (
             "discount-differs",
@@ -571,10 +580,31 @@ def of_batches(e: Evidence) -> Seen:
         yield "ends-continued", f"{beyond:.0%} of the squares of the targets at terminations are not the reward's."
     if (least := np.fmin(own, used)) < -0.5:
         yield "advantage-opposed", f"Advantages have a correlation of {least:.2f} with what they should be."
-    elif used < 0.95:
+    elif used < 0.99:
         yield "advantage-of-others", f"In a gradient step advantages have a correlation of {used:.2f} with their rows'."
-    elif own < 0.95 and e.config.get("baseline", "value") == "value":
+    elif own < 0.99 and e.config.get("baseline", "value") == "value":
         yield "baseline-differs", f"Advantages have a correlation of {own:.2f} with targets less values."
+
+
+def of_gradients(e: Evidence) -> Seen:
+    """Whether gradients are of the terms of the equations' loss, and of the rows that were drawn: to rounding."""
+    other, entropy = e.values("gradient/other_rows"), e.values("gradient/entropy")
+    if len(other) >= 2 and other.min() > 0.01:
+        yield "rows-of-others", f"{np.median(other):.0%} of the rows of a gradient step are not as they were collected."
+    for part, whose in (("policy", "the policy"), ("value", "V or Q")):
+        weights, rest = e.values(f"gradient/{part}"), e.values(f"gradient/{part}_rest")
+        weight, share = (float(np.median(each)) if len(each) >= 2 else np.nan for each in (weights, rest))
+        right = (first_number(e.config.get("value_coef")) if part == "value" else None) or 1.0
+        if weight < 0 and weights.max() < 0 and share < 0.5:
+            name = "advantage-opposed" if part == "policy" else "loss-differs"
+            yield name, f"The loss of {whose} is climbed: its weight in the gradient is {weight:.2g}."
+        elif share > 1e-6:
+            of = f"{100 * share:.2g} % of the squares of the gradient of {whose}"
+            yield "loss-differs", f"{of} are of no term of its loss."
+        elif weight > FAR * right or weight < right / FAR:
+            yield "loss-differs", f"The loss of {whose} has the weight {weight:.2g} in its gradient, not {right:g}."
+    if len(entropy) >= 2 and entropy.max() < 1e-5 and np.median(entropy) < -1e-4:
+        yield "entropy-opposed", f"The gradient lowers the entropy: that is {-np.median(entropy):.1%} of its length."
 
 
 def of_losses(e: Evidence) -> Seen:
@@ -853,6 +883,7 @@ SUBJECTS = (
     of_entropies,
     of_advantages,
     of_batches,
+    of_gradients,
     of_losses,
     of_values,
     of_q,

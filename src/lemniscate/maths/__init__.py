@@ -2,6 +2,7 @@
 
 # ruff: noqa: F401  all that is imported here is offered
 
+from lemniscate.maths.actions import clip_inward, coloured, ornstein_uhlenbeck, uniform
 from lemniscate.maths.discrete import Bernoulli, Categorical, EpsilonGreedy, MultiCategorical
 from lemniscate.maths.distributions import (
     Deterministic,
@@ -11,9 +12,7 @@ from lemniscate.maths.distributions import (
     mean_and_std,
     tanh,
 )
-from lemniscate.maths.gradients import clip_inward
 from lemniscate.maths.losses import clipped_surrogate, policy_gradient, surrogate, value_loss
-from lemniscate.maths.noise import coloured, ornstein_uhlenbeck, uniform
 from lemniscate.maths.returns import episode_return, gae, q_lambda, reward_to_go
 from lemniscate.maths.stats import (
     clip_fraction,

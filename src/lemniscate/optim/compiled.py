@@ -128,6 +128,16 @@ class Learner:
             metrics.append(self._programs[key](config, state, data, *chunk, **here))
         return metrics
 
+    def rehearse(self, *args: Any, **flags: Any) -> None:
+        """`learn` once, without the compiler, while its optimizers move nothing."""
+        try:
+            for optimizer in self._optimizers:
+                vars(optimizer)["descend"] = torch.norm
+            self._learn(*args, **flags)
+        finally:
+            for optimizer in self._optimizers:
+                vars(optimizer).pop("descend", None)
+
     def _eager(self, *args: Any, **flags: Any) -> Metrics:
         return means(self._learn(*args, **flags))
 

@@ -36,9 +36,10 @@ from lemniscate.run.evaluate import critic_of, evaluate
 from lemniscate.run.loggers import NO_EPISODES, Logger, LoggerClass, require_logger
 from lemniscate.run.metrics import read_metrics
 from lemniscate.run.seeding import derive, seed_globals
-from lemniscate.run.signals import LOOKS, Watched, acted_with, signals
+from lemniscate.run.signals import LOOKS, signals
 from lemniscate.run.state import TrainState, require_agreement
 from lemniscate.run.stopping import Stopped, StopRequest
+from lemniscate.run.updates import Watched, acted_with
 from lemniscate.system.console import ProgressBar, say
 from lemniscate.system.world import World
 
@@ -161,7 +162,9 @@ class Run:
                     # Some LOOKS lines of a run have signals, of a short one a fourth: more would cost more than 1 %.
                     every = max(4, math.ceil(total_steps * self._lines / (LOOKS * max(1, state.step))))
                     looks = self.world.is_first and self._lines % every == 0
-                    before = (acted_with(state), Watched(state)) if looks else (None, None)
+                    look = self._lines // every
+                    closely = look < 4 or look % 6 == 0
+                    before = (acted_with(state), Watched(state, closely)) if looks else (None, None)
                     self._iteration = Iteration(state.step, self._episodes, *before)
                     yield self.env
                     if watched := self._iteration.watched:
@@ -217,8 +220,8 @@ class Run:
             numbers["episode/return"] = sum(episodes.returns) / len(episodes.returns)
             numbers["episode/length"] = sum(episodes.lengths) / len(episodes.lengths)
         if self._iteration.acted is not None:
-            of_update = self._iteration.acted, self.env.ages, self._iteration.watched and self._iteration.watched.given
-            numbers |= signals(state, self.config, self.spec, self.env.recent(), *of_update)
+            update = self._iteration.acted, self.env.ages, self._iteration.watched
+            numbers |= signals(state, self.config, self.spec, self.env.recent(), *update)
         numbers |= {f"info/{name.removeprefix('info/')}": mean for name, mean in episodes.measures.items()}
         # The speed since the last line, everything included; the seconds of the loop's body by their use.
         now, (before, step_before), collect = time.monotonic(), self._last_line, self.env.collecting

@@ -6,37 +6,32 @@ learns from them.
 
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 from itertools import combinations
 from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.func import functional_call
 from torch.nn.functional import one_hot
 
 from lemniscate.data.replay import ReplayBuffer
-from lemniscate.maths import explained_by, explained_by_each, explained_variance, gae, moments, td_target
+from lemniscate.maths import explained_by, explained_by_each, explained_variance, moments, td_target
 from lemniscate.nn.actor_critic import of_next
 from lemniscate.nn.networks import ACTIVATIONS
 from lemniscate.nn.normalizer import RunningNorm
 from lemniscate.run.config import RunConfig
+from lemniscate.run.updates import Watched, of_batch, of_update, spread
 from lemniscate.spec import Action, Box, Discrete, MultiDiscrete, Spec
-from lemniscate.types import Batch, Rollout, Transition, wide_float
+from lemniscate.types import Rollout, Transition
 
-Given = tuple[Any, tuple[Tensor, ...], bool]
-"""what the gradient steps of an update were given: see `Watched.given`"""
 LOOKS = 24
 """how often in a run the signals are measured"""
 KINDS = (
     *("reward/", "observation/", "action/", "value/", "advantage/"),
-    *("network/", "normalizer/", "td_error/", "replay/", "targets/"),
+    *("network/", "normalizer/", "td_error/", "replay/", "targets/", "gradient/"),
 )
 """how the names of signals begin"""
 LATEST = 6
 """steps until an action that is late takes effect, up to which it is looked for"""
-PARTS = "policy.", "value."
-"""how the names of the parameters of a policy and of V(s) begin"""
 SEEN = 256
 """rows that the networks are asked about"""
 FEW = 40
@@ -59,13 +54,12 @@ def signals(
     rows: Rollout | None,
     acted: Mapping[str, Tensor] | None = None,
     ages: Tensor | None = None,
-    given: Given | None = None,
+    watched: Watched | None = None,
 ) -> dict[str, float]:
     """The signals of a training state and of the newest rows [T, N, …] of its environments, by the glossary's names.
 
-    `acted` are the parameters and buffers of the networks before their newest update, where that is known, and `given`
-    is what its gradient steps were (`Watched`); `ages` [N] are the steps that each environment's episode had after the
-    last row.
+    `acted` are the parameters and buffers of the networks before their newest update, where that is known; `watched`
+    has seen its gradient steps; `ages` [N] are the steps that each environment's episode had after the last row.
     """
     if rows is None or rows.valid.sum() < 2:
         return {}
@@ -73,7 +67,9 @@ def signals(
     if getattr(config, "scale_rewards", False) and hasattr(state, "reward_scale"):
         scaled = replace(rows, reward=state.reward_scale(rows.reward))
     found = of_networks(state, chosen) | of_values(state, config, scaled) | of_update(state, config, scaled, acted)
-    found |= of_replay(state, rows) | of_critics(state, config, _valid(scaled)) | of_batch(config, given, scaled)
+    found |= of_replay(state, rows) | of_critics(state, config, _valid(scaled))
+    if watched:
+        found |= of_batch(config, watched.given, scaled) | watched.found
     return of_environment(rows, spec, ages) | {name: float(value) for name, value in found.items()}
 
 
@@ -137,9 +133,9 @@ def of_starts(rows: Rollout, spec: Spec) -> dict[str, Tensor]:
     if len(first) > 2:
         found["observation/starts_alike"] = (first == first[:1]).all().float()
     ended = (rows.done & rows.valid)[:-1] & rows.valid[1:]
-    spread = _spread(rows.obs[..., :size].flatten(0, 1).float())
-    if ended.sum() > 2 and (moves := spread > 0).any() and not spec.has_images:
-        away = (rows.obs[1:][ended] - rows.next_obs[:-1][ended])[:, :size][:, moves] / spread[moves]
+    wide = spread(rows.obs[..., :size].flatten(0, 1).float())
+    if ended.sum() > 2 and (moves := wide > 0).any() and not spec.has_images:
+        away = (rows.obs[1:][ended] - rows.next_obs[:-1][ended])[:, :size][:, moves] / wide[moves]
         found["observation/goes_on"] = (away.square().mean(1).sqrt() < 0.1).float().mean()
     return found
 
@@ -197,7 +193,7 @@ def of_ages(rows: Rollout, spec: Spec, ages: Tensor, known: Mapping[str, Tensor]
 def _jumps(rows: Rollout, spec: Spec) -> Tensor:
     """Whether an observation of rows [T, N, …] changes within an episode as if another one were drawn, [T, N]."""
     obs, after = (x[..., : spec.observation_size].float() for x in (rows.obs, rows.next_obs))
-    change = ((after - obs) / _spread(obs.flatten(0, 1)).clamp(min=1e-6)).square().mean(-1)
+    change = ((after - obs) / spread(obs.flatten(0, 1)).clamp(min=1e-6)).square().mean(-1)
     return (change > (10 * change.median()).clamp(min=0.5)) & ~rows.done & rows.valid
 
 
@@ -236,7 +232,7 @@ def of_effects(rows: Rollout, spec: Spec) -> dict[str, Tensor]:
         found |= _weaker_half(known, change, obs.shape[1])
     elif isinstance(spec.action, Discrete) and 2 < spec.action.n <= MOST_CHOICES:  # of two, the effect says as much
         found |= _choices_alike(action[inside], change, obs[inside])
-    std = _spread(obs[inside])
+    std = spread(obs[inside])
     if (std > 1e-9).any():
         found["observation/pace"] = (change.square().mean(0).sqrt() / std)[std > 1e-9].max()
     if not ((obs == 0) | (obs == 1)).all():  # one of n says nothing of the next
@@ -341,11 +337,6 @@ def _numbers(action: Tensor, kind: Action) -> Tensor:
     return action.double()
 
 
-def _spread(x: Tensor) -> Tensor:
-    """The standard deviation of each column of rows [B, K]."""
-    return (x - x.mean(0)).square().mean(0).sqrt()  # `Tensor.std` takes five times as long
-
-
 def of_networks(state: Any, rows: Rollout) -> dict[str, Tensor]:
     """Of the policy: shares of units that never change, are at ±1, and are alike; its rank, its normalizer's state.
 
@@ -365,13 +356,13 @@ def of_networks(state: Any, rows: Rollout) -> dict[str, Tensor]:
     if hasattr(distribution, "sample"):  # a policy of one's own may say something else
         found |= _off_mode(state.policy, distribution, obs, rows.action[-SEEN:])
     if units := [layer.flatten(1).float() for layer in layers if layer.ndim > 1 and len(layer) == len(obs)]:
-        spread = [_spread(layer) for layer in units]
-        inactive = [std < (std.mean() / 40).clamp(min=1e-3) for std in spread]
+        stds = [spread(layer) for layer in units]
+        inactive = [std < (std.mean() / 40).clamp(min=1e-3) for std in stds]
         sizes = torch.linalg.svdvals(units[-1].cpu()).cumsum(0)
         found["network/saturated"] = (
             torch.cat([(unit.abs() > 0.97) & (unit.abs() <= 1) for unit in units], 1).float().mean()
         )
-        if units[-1].shape[1] > 3 and spread[-1].max() > 0:
+        if units[-1].shape[1] > 3 and stds[-1].max() > 0:
             found["network/alike"] = (units[-1] - units[-1][:, :1]).abs().amax(0).le(1e-5).float().mean()
         found["network/inactive"] = torch.cat(inactive).float().mean()
         found["network/rank"] = ((sizes < 0.99 * sizes[-1]).sum() + 1) / min(units[-1].shape)
@@ -417,131 +408,6 @@ def of_values(state: Any, config: RunConfig, rows: Rollout) -> dict[str, Tensor]
     return found
 
 
-def of_update(state: Any, config: RunConfig, rows: Rollout, acted: Mapping[str, Tensor] | None) -> dict[str, Tensor]:
-    """Of the newest update, from rows [T, N, …] and the networks before it, for algorithms with a V(s).
-
-    - network/moved and value/moved: the length of the way of the policy's parameters and of V's, as a share of the
-      length of these.
-    - advantage/followed: the correlation of A(s, a) and of the change of log π(a|s).
-    - value/explained: the explained variance of the targets of V, of γ and λ = 0.95, by V before the update.
-    """
-    found, networks = dict[str, Tensor](), state.networks
-    if acted is None or not hasattr(networks, "value"):
-        return {}
-    for name, beginning in zip(("network/moved", "value/moved"), PARTS, strict=True):
-        own = [(acted[key], now) for key, now in networks.named_parameters() if key.startswith(beginning)]
-        if own:
-            before, after = (torch.cat([x.flatten() for x in each]) for each in zip(*own, strict=True))
-            found[name] = (after - before).norm() / after.norm()
-    if not isinstance(networks.value, nn.Module):  # but the largest of Q
-        return found
-    parts = [{key.removeprefix(of): x for key, x in acted.items() if key.startswith(of)} for of in PARTS]
-    old, old_value = (partial(_of_old, *each) for each in zip((state.policy, networks.value), parts, strict=True))
-    rows = rows[-getattr(config, "num_steps", len(rows.done)) :]  # REINFORCE collects whole episodes
-    obs, action, done, newest = rows.obs.flatten(0, 1), rows.action.flatten(0, 1), rows.done, rows.valid
-    value, gamma = old_value(obs).view(done.shape), getattr(config, "gamma", 1.0)
-    next_value = of_next(old_value, value, rows.obs, rows.next_obs)
-    advantage, target = gae(rows.reward, value, next_value, rows.terminated, done, gamma=gamma, lam=0.95)
-    now = state.policy(obs)
-    if not hasattr(now, "log_prob"):  # of a squashed or a deterministic policy there is none
-        return found
-    change = (now.log_prob(action) - old(obs).log_prob(action)).view(done.shape)
-    if newest.sum() > 1:
-        found["advantage/followed"] = torch.corrcoef(torch.stack([advantage, change])[:, newest])[0, 1].nan_to_num()
-        if _spread(target[newest]) > 1e-3 * target[newest].abs().mean():  # else there is nothing to explain
-            found["value/explained"] = explained_variance(value[newest], target[newest])
-    return found
-
-
-def _of_old(module: nn.Module, tensors: Mapping[str, Tensor], obs: Tensor) -> Any:
-    """What a module says with other parameters and buffers."""
-    return functional_call(module, dict(tensors), (obs,), tie_weights=False)
-
-
-def acted_with(state: Any) -> dict[str, Tensor]:
-    """Copies of the parameters and buffers of a policy and of the V(s) beside it; none for others."""
-    parts = state.networks.state_dict() if hasattr(state.networks, "value") else {}
-    return {name: tensor.clone() for name, tensor in parts.items()}
-
-
-class Watched:
-    """The gradient steps of an algorithm, in an update that is looked at: what the first call was given is kept."""
-
-    def __init__(self, state: Any) -> None:
-        self._state, self._learn, self._calls = state, state.learn, 0
-        self._given: tuple[Any, ...] = ()
-        state.learn = self
-
-    def __call__(self, *args: Any, **flags: Any) -> Any:
-        """The gradient steps; of an algorithm of one's own they may take other arguments than those of ours."""
-        self._calls += 1
-        self._given = self._given or args[2:]
-        return self._learn(*args, **flags)
-
-    @property
-    def given(self) -> Given:
-        """The data, the tensors for each gradient step, the rows first; and whether there was one step alone."""
-        data, *by_step = self._given or (None,)
-        known = all(isinstance(each, Tensor) and each.dim() > 1 for each in by_step)
-        tensors = tuple(by_step) if by_step and known and by_step[0].dtype == torch.int64 else ()
-        return data, tensors, self._calls == 1 and len(tensors) > 0 and len(tensors[0]) == 1
-
-    def end(self) -> None:
-        """Watch no more."""
-        self._state.learn = self._learn
-
-
-def of_batch(config: RunConfig, given: Given | None, rows: Rollout) -> dict[str, Tensor]:
-    """Of the rows that an update learned from, where they are the newest, [T, N, …]: whether they follow from these.
-
-    - targets/discount: the factor by which targets follow from the values and the targets of the row after.
-    - targets/unexplained: the share of their squares that does not follow so.
-    - targets/beyond_ends: the share of the squares of the targets where an episode terminated that is not the reward's.
-    - advantage/own: the correlation of the advantages with what the targets are above the values.
-    - advantage/used: that of the advantages in the first gradient step with those of its rows.
-    - value/loss: half the mean of the squared differences of values and targets, in an update of one gradient step.
-    """
-    data, by_step, is_one = given or (None, (), False)
-    columns, found = _columns_of(config, data, rows), dict[str, Tensor]()
-    if not columns:
-        return found
-    steps = min(len(columns[0]), len(rows.done))
-    (v, a, g), newest = (x[-steps:] for x in columns), rows[-steps:]
-    beyond, size = g - newest.reward.to(g.dtype), g.square().mean()
-    on, ends = ~newest.done[:-1] & newest.valid[:-1] & newest.valid[1:], newest.terminated & newest.valid
-    ahead, rest = torch.lerp(v[1:], g[1:], getattr(config, "gae_lambda", 1.0))[on], beyond[:-1][on]
-    if size > 0 and ahead.any():
-        found["targets/discount"] = (ahead * rest).sum() / ahead.square().sum()
-        found["targets/unexplained"] = (rest - found["targets/discount"] * ahead).square().mean() / size
-    if size > 0 and ends.any():
-        found["targets/beyond_ends"] = beyond[ends].square().mean() / size
-    pairs = {"advantage/own": (a[newest.valid], (g - v)[newest.valid])}
-    if by_step:
-        value, advantage, target = (x.flatten()[by_step[0][0].flatten()] for x in columns)
-        found |= {"value/loss": 0.5 * (value - target).square().mean()} if is_one else {}
-        if len(by_step) > 1 and by_step[1].shape == by_step[0].shape:
-            pairs["advantage/used"] = by_step[1][0].flatten().to(g.dtype), advantage
-    for name, (one, right) in pairs.items():
-        if _spread(right) > 1e-4 * g.abs().mean():  # else it is of rounding
-            found[name] = torch.corrcoef(torch.stack([one, right]))[0, 1].nan_to_num()
-    return found
-
-
-def _columns_of(config: RunConfig, data: Any, rows: Rollout) -> list[Tensor]:
-    """Value, advantage and target [T, N] of a batch, where its last rows are the newest; else nothing."""
-    envs = rows.done.shape[1]
-    if not isinstance(data, Batch) or getattr(config, "episodes", 0) or len(data.obs) % envs:
-        return []
-    columns = data.value, data.advantage, data.target
-    if any(not isinstance(x, Tensor) or x.shape != data.obs.shape[:1] for x in columns):
-        return []
-    obs = data.obs.unflatten(0, (-1, envs))
-    steps = min(len(obs), len(rows.done))
-    if steps < 3 or not torch.equal(obs[-steps:], rows.obs[-steps:]):
-        return []  # mirror images, pieces of a memory, rows of other processes
-    return [x.to(wide_float(x.device)).reshape(-1, envs) for x in columns]
-
-
 def of_replay(state: Any, rows: Rollout) -> dict[str, Tensor]:
     """The shares of the ends, and of the last, of the newest rows [T, N, …] that the replay buffer has otherwise.
 
@@ -559,7 +425,7 @@ def of_replay(state: Any, rows: Rollout) -> dict[str, Tensor]:
         return {}
     last = torch.arange(len(newest.reward), device=newest.done.device) >= len(newest.reward) - SEEN // 4
     given, stored = newest[newest.done | last], replay.transitions[replay.newest(2 * len(newest.reward))]
-    column = int(_spread(given.obs.float()).argmax())  # an image has bytes
+    column = int(spread(given.obs.float()).argmax())  # an image has bytes
     pairs = (given.obs[:, column, None] == stored.obs[:, column]).nonzero()
     row, place = pairs[(given.obs[pairs[:, 0]] == stored.obs[pairs[:, 1]]).all(1)].unbind(1)
     of_row, of_place = given[row], stored[place]
@@ -616,7 +482,7 @@ def of_critics(state: Any, config: RunConfig, rows: Rollout) -> dict[str, Tensor
         "action/preferred": (0.5 + 0.5 * better.sign()).mean(),  # where Q is flat, neither
         "action/most_entropy": torch.tensor(2.0).log() * chosen.shape[1],
     }
-    if _spread(other_target) > 1e-3 * other_target.abs().mean():  # else there is nothing to explain
+    if spread(other_target) > 1e-3 * other_target.abs().mean():  # else there is nothing to explain
         found["value/explained"] = explained_variance(other_q, other_target)
     if gamma < 1:
         found["value/missing"] = _missing(target, q, gamma)

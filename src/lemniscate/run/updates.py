@@ -1,0 +1,335 @@
+"""What the update of a run that is looked at was made of, beside the equations: its rows, its targets, its gradients.
+
+`Watched` stands in the place of an algorithm's `learn` meanwhile. A healthy update fulfils the equations to rounding;
+one with a mistake in a loss, in the targets or in the order of rows does not, whatever the environment.
+"""
+
+import math
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.func import functional_call
+
+from lemniscate.data.rollout import QBatch, SoftBatch
+from lemniscate.maths import clipped_surrogate, explained_variance, gae, policy_gradient, td_target, value_loss
+from lemniscate.nn.actor_critic import ActorCritic, Value, of_next
+from lemniscate.nn.critics import CategoricalQ, Critics
+from lemniscate.nn.policies import Policy
+from lemniscate.optim.adam import Adam, LossFunction
+from lemniscate.optim.compiled import Learner
+from lemniscate.run.config import RunConfig
+from lemniscate.types import Batch, DrawnBatch, Metrics, Rollout, Transition, wide_float
+
+Given = tuple[Any, tuple[Tensor, ...], bool]
+"""what the gradient steps of an update were given: see `Watched.given`"""
+PARTS = "policy.", "value."
+"""how the names of the parameters of a policy and of V(s) begin"""
+
+
+def acted_with(state: Any) -> dict[str, Tensor]:
+    """Copies of the parameters and buffers of a policy and of the V(s) beside it; none for others."""
+    parts = state.networks.state_dict() if hasattr(state.networks, "value") else {}
+    return {name: tensor.clone() for name, tensor in parts.items()}
+
+
+class Watched:
+    """The gradient steps of an algorithm, in an update that is looked at: what the first call was given is kept.
+
+    Where it is looked at `closely`, `found` has the signals of the first gradient of each optimizer: `of_gradient`.
+    """
+
+    def __init__(self, state: Any, closely: bool = False) -> None:
+        self._state, self._learn, self._closely, self._calls = state, state.learn, closely, 0
+        self._given: tuple[Any, ...] = ()
+        self._now: tuple[Any, ...] = ()
+        self._unseen = [each for each in state.optimizers() if not each.over_shards] if closely else []
+        self.found: dict[str, Tensor] = {}
+        state.learn = self
+
+    def __call__(self, *args: Any, **flags: Any) -> Any:
+        """The gradient steps; of an algorithm of one's own they may take other arguments than those of ours."""
+        self._calls += 1
+        if not self._given and len(args) > 2:
+            self._given = self._with_values(args[2]), *args[3:]
+        if not self._unseen:
+            return self._learn(*args, **flags)
+        self._now, watched = args, [*self._unseen]
+        for optimizer in watched:
+            vars(optimizer)["gradient"] = partial(self._gradient, optimizer)
+        try:
+            if not isinstance(self._learn, Learner):
+                return self._learn(*args, **flags)
+            self._rehearse(self._learn, *args, **flags)
+        finally:
+            for optimizer in watched:
+                vars(optimizer).pop("gradient", None)
+        return self._learn(*args, **flags)
+
+    def _with_values(self, data: Any) -> Any:
+        """The data of an update; of Q, with the largest Q(s, ·) of the networks before it as the value."""
+        if type(data) is not QBatch:
+            return data
+        return replace(data, value=self._state.networks.value(data.obs).detach()) if self._closely else None
+
+    def _rehearse(self, learner: Learner, config: Any, state: Any, data: Any, *by_step: Tensor, **flags: Any) -> None:
+        """The first gradient step without the compiler, whose programs nobody can look into; it moves nothing."""
+        first = {name: flag[:1] if isinstance(flag, tuple) else flag for name, flag in flags.items()}
+        modules = state.networks, getattr(state, "targets", None)
+        tensors = [each for module in modules if module for each in (*module.parameters(), *module.buffers())]
+        before = [each.detach().clone() for each in tensors]
+        learner.rehearse(config, state, data, *(tensor[:1] for tensor in by_step), **first)
+        for tensor, was in zip(tensors, before, strict=True):
+            tensor.data.copy_(was)
+
+    def _gradient(self, optimizer: Adam, loss: LossFunction, *args: Any) -> tuple[Tensor, Metrics]:
+        """The gradient of an optimizer, which is looked at once."""
+        is_first = not self.found
+        del vars(optimizer)["gradient"]
+        self._unseen.remove(optimizer)
+        gradient, metrics = optimizer.gradient(loss, *args)
+        with suppress(Exception):  # a loss of one's own may be given anything; then nothing is said of it
+            if is_first and isinstance(rows := self._now[3], Tensor):
+                self.found |= of_minibatch(self._now[2], rows[0], args[0])
+            self.found |= of_gradient(self._now[0], self._state, optimizer, gradient, args)
+        return gradient, metrics
+
+    @property
+    def given(self) -> Given:
+        """The data, the tensors for each gradient step, the rows first; and whether there was one step alone."""
+        data, *by_step = self._given or (None,)
+        known = all(isinstance(each, Tensor) and each.dim() > 1 for each in by_step)
+        tensors = tuple(by_step) if by_step and known and by_step[0].dtype == torch.int64 else ()
+        return data, tensors, self._calls == 1 and len(tensors) > 0 and len(tensors[0]) == 1
+
+    def end(self) -> None:
+        """Watch no more."""
+        self._state.learn = self._learn
+
+
+def spread(x: Tensor) -> Tensor:
+    """The standard deviation of each column of rows [B, K]."""
+    return (x - x.mean(0)).square().mean(0).sqrt()  # `Tensor.std` takes five times as long
+
+
+def of_update(state: Any, config: RunConfig, rows: Rollout, acted: Mapping[str, Tensor] | None) -> dict[str, Tensor]:
+    """Of the newest update, from rows [T, N, …] and the networks before it, for algorithms with a V(s).
+
+    - network/moved and value/moved: the length of the way of the policy's parameters and of V's, as a share of the
+      length of these.
+    - advantage/followed: the correlation of A(s, a) and of the change of log π(a|s).
+    - value/explained: the explained variance of the targets of V, of γ and λ = 0.95, by V before the update.
+    """
+    found, networks = dict[str, Tensor](), state.networks
+    if acted is None or not hasattr(networks, "value"):
+        return {}
+    for name, beginning in zip(("network/moved", "value/moved"), PARTS, strict=True):
+        own = [(acted[key], now) for key, now in networks.named_parameters() if key.startswith(beginning)]
+        if own:
+            before, after = (torch.cat([x.flatten() for x in each]) for each in zip(*own, strict=True))
+            found[name] = (after - before).norm() / after.norm()
+    if not isinstance(networks.value, nn.Module):  # but the largest of Q
+        return found
+    parts = [{key.removeprefix(of): x for key, x in acted.items() if key.startswith(of)} for of in PARTS]
+    old, old_value = (partial(_of_old, *each) for each in zip((state.policy, networks.value), parts, strict=True))
+    rows = rows[-getattr(config, "num_steps", len(rows.done)) :]  # REINFORCE collects whole episodes
+    obs, action, done, newest = rows.obs.flatten(0, 1), rows.action.flatten(0, 1), rows.done, rows.valid
+    value, gamma = old_value(obs).view(done.shape), getattr(config, "gamma", 1.0)
+    next_value = of_next(old_value, value, rows.obs, rows.next_obs)
+    advantage, target = gae(rows.reward, value, next_value, rows.terminated, done, gamma=gamma, lam=0.95)
+    now = state.policy(obs)
+    if not hasattr(now, "log_prob"):  # of a squashed or a deterministic policy there is none
+        return found
+    change = (now.log_prob(action) - old(obs).log_prob(action)).view(done.shape)
+    if newest.sum() > 1:
+        found["advantage/followed"] = torch.corrcoef(torch.stack([advantage, change])[:, newest])[0, 1].nan_to_num()
+        if spread(target[newest]) > 1e-3 * target[newest].abs().mean():  # else there is nothing to explain
+            found["value/explained"] = explained_variance(value[newest], target[newest])
+    return found
+
+
+def _of_old(module: nn.Module, tensors: Mapping[str, Tensor], obs: Tensor) -> Any:
+    """What a module says with other parameters and buffers."""
+    return functional_call(module, dict(tensors), (obs,), tie_weights=False)
+
+
+def of_batch(config: RunConfig, given: Given, rows: Rollout) -> dict[str, Tensor]:
+    """Of the rows that an update learned from, where they are the newest, [T, N, …]: whether they follow from these.
+
+    - targets/discount: the factor by which targets follow from the values and the targets of the row after.
+    - targets/unexplained: the share of their squares that does not follow so.
+    - targets/beyond_ends: the share of the squares of the targets where an episode terminated that is not the reward's.
+    - advantage/own: the correlation of the advantages with what the targets are above the values.
+    - advantage/used: that of the advantages in the first gradient step with those of its rows.
+    - value/loss: half the mean of the squared differences of values and targets, in an update of one gradient step.
+    - targets/other_actions: the share of the rows whose action is not the one that was taken.
+
+    Of PQN the value is the largest Q(s, ·), and there are no advantages.
+    """
+    data, by_step, is_one = given
+    columns, found = _columns_of(config, data, rows), dict[str, Tensor]()
+    if not columns:
+        return found
+    steps = min(len(columns[0]), len(rows.done))
+    (v, g, *a), newest = (x[-steps:] for x in columns), rows[-steps:]
+    other = (data.action.view(-1, *newest.action.shape[1:])[-steps:] != newest.action).reshape(*g.shape, -1).any(-1)
+    found["targets/other_actions"] = other[newest.valid].float().mean()
+    beyond, size = g - newest.reward.to(g.dtype), g.square().mean()
+    lam = getattr(config, "gae_lambda", getattr(config, "td_lambda", 1.0))
+    on, ends = ~newest.done[:-1] & newest.valid[:-1] & newest.valid[1:], newest.terminated & newest.valid
+    ahead, rest = torch.lerp(v[1:], g[1:], lam)[on], beyond[:-1][on]
+    if size > 0 and ahead.any():
+        found["targets/discount"] = (ahead * rest).sum() / ahead.square().sum()
+        found["targets/unexplained"] = (rest - found["targets/discount"] * ahead).square().mean() / size
+    if size > 0 and ends.any():
+        found["targets/beyond_ends"] = beyond[ends].square().mean() / size
+    pairs = {"advantage/own": (a[0][newest.valid], (g - v)[newest.valid])} if a else {}
+    if by_step and a:
+        value, target, advantage = (x.flatten()[by_step[0][0].flatten()] for x in columns)
+        found |= {"value/loss": 0.5 * (value - target).square().mean()} if is_one else {}
+        if len(by_step) > 1 and by_step[1].shape == by_step[0].shape:
+            pairs["advantage/used"] = by_step[1][0].flatten().to(g.dtype), advantage
+    for name, (one, right) in pairs.items():
+        if spread(right) > 1e-4 * g.abs().mean():  # else it is of rounding
+            found[name] = torch.corrcoef(torch.stack([one, right]))[0, 1].nan_to_num()
+    return found
+
+
+def _columns_of(config: RunConfig, data: Any, rows: Rollout) -> list[Tensor]:
+    """Value, target and, where there are any, advantage [T, N] of a batch whose last rows are the newest; else none."""
+    envs = rows.done.shape[1]
+    known = isinstance(data, Batch) or type(data) is QBatch
+    if not known or getattr(config, "episodes", 0) or len(data.obs) % envs:
+        return []
+    columns = [getattr(data, name) for name in ("value", "target", "advantage") if hasattr(data, name)]
+    if any(not isinstance(x, Tensor) or x.shape != data.obs.shape[:1] for x in columns):
+        return []
+    obs = data.obs.unflatten(0, (-1, envs))
+    steps = min(len(obs), len(rows.done))
+    if steps < 3 or not torch.equal(obs[-steps:], rows.obs[-steps:]):
+        return []  # mirror images, pieces of a memory, rows of other processes
+    return [x.to(wide_float(x.device)).reshape(-1, envs) for x in columns]
+
+
+def of_minibatch(data: Any, rows: Tensor, batch: Any) -> dict[str, Tensor]:
+    """The share of the rows of a gradient step, [M, …], that are not those of the data that it was to take.
+
+    Advantages are left out, which are standardized on the way.
+    """
+    if type(data) is not type(batch):
+        return {}
+    right, size = data[rows], rows.shape
+    others = [
+        (getattr(batch, name) != column).reshape(*size, -1).any(-1)
+        for name, column in vars(right).items()
+        if name != "advantage"
+    ]
+    return {"gradient/other_rows": torch.stack(others).any(0).float().mean()}
+
+
+def of_gradient(
+    config: RunConfig, state: Any, optimizer: Adam, gradient: Tensor, args: tuple[Any, ...]
+) -> dict[str, Tensor]:
+    """What a gradient [P] is made of: the gradients of the terms in the equations' loss, by least squares.
+
+    - gradient/policy, gradient/value: the weights of the terms in which actions, and V or Q, are judged.
+    - gradient/entropy: the part that raises the entropy, as a signed share of the length of the policy's gradient.
+    - gradient/policy_rest, gradient/value_rest: the share of the squares that is of no term, among the parameters that
+      the terms move.
+    """
+    with torch.enable_grad():
+        terms = terms_of(config, state, optimizer.networks, *args)
+        parameters, found = optimizer.parameters, dict[str, Tensor]()
+        slopes = {
+            name: torch.autograd.grad(term, parameters, retain_graph=True, allow_unused=True, materialize_grads=True)
+            for name, term in terms.items()
+        }
+    columns = {name: torch.cat([each.flatten() for each in slope]).cpu().double() for name, slope in slopes.items()}
+    for part in (("policy", "entropy", "kl"), ("value",)):
+        own = {name: columns[name] for name in part if name in columns and columns[name].any()}
+        if {"policy", "entropy"} <= own.keys() and _are_parallel(own["policy"], own["entropy"]):
+            del own["entropy"]
+        moved = torch.stack([*own.values()]).any(0) if own else torch.zeros(len(gradient), dtype=torch.bool)
+        whole = gradient.cpu().double()[moved]
+        if whole.any():
+            its = torch.stack([column[moved] for column in own.values()], 1)
+            weights = torch.linalg.lstsq(its, whole[:, None], driver="gelsd").solution[:, 0]
+            found[f"gradient/{part[0]}_rest"] = (whole - its @ weights).square().sum() / whole.square().sum()
+            known = dict(zip(own, weights, strict=True))
+            found |= {f"gradient/{part[0]}": known[part[0]]} if part[0] in own else {}
+            if "entropy" in own:
+                found["gradient/entropy"] = known["entropy"] * own["entropy"].norm() / whole.norm()
+    return found
+
+
+def _are_parallel(one: Tensor, other: Tensor) -> bool:
+    """Whether two vectors cannot be told apart, as the terms of a policy that has seen one observation alone."""
+    return bool(torch.cosine_similarity(one, other, 0).abs() > 0.999)
+
+
+def terms_of(config: Any, state: Any, networks: Any, batch: Any, *noise: Tensor) -> dict[str, Tensor]:
+    """The terms of the equations' loss for these networks and rows, each a scalar to descend; none where it is unknown.
+
+    "policy" judges actions, "value" V or Q, "entropy" is that of the policy with a minus, "kl" what holds it back.
+    """
+    if isinstance(batch, Batch):
+        return _of_advantages(config, networks, batch)
+    if isinstance(batch, SoftBatch) and isinstance(networks, Policy):
+        distribution = networks(batch.obs)
+        action, log_prob = distribution.sample_with_log_prob(*noise)
+        kl, alpha = batch.kl_to(distribution), state.networks.multipliers().detach()[0]
+        near, q = kl < config.max_kl, state.networks.critic(batch.obs, action)
+        parts = {"policy": -q * near, "entropy": alpha * log_prob * near, "kl": kl * ~near}
+        return {name: part.mean() for name, part in parts.items()}
+    if isinstance(batch, QBatch):
+        soft = isinstance(networks, CategoricalQ)
+        pair = batch.action, batch.target
+        loss = networks.loss(batch.obs, *pair)[0] if soft else value_loss(networks.q(batch.obs, pair[0]), pair[1])
+        return {"value": loss}
+    if isinstance(batch, Transition) and isinstance(networks, Critics):
+        target = _target_of_q(config, state, batch, *noise)
+        return {"value": torch.stack([q.loss(batch.obs, batch.action, target)[0] for q in networks.members]).sum()}
+    if isinstance(batch, Transition) and isinstance(networks, Policy):
+        policy, critics = networks(batch.obs), state.networks.critics
+        if not hasattr(state.networks, "temperature"):
+            return {"policy": -critics.first(batch.obs, policy.mode()).mean()}
+        action, log_prob = policy.sample_with_log_prob(*noise)
+        alpha = state.networks.temperature().detach()
+        return {"policy": -critics(batch.obs, action).amin(0).mean(), "entropy": (alpha * log_prob).mean()}
+    return {}
+
+
+def _of_advantages(config: Any, networks: Any, batch: Batch) -> dict[str, Tensor]:
+    """The terms of a policy that follows advantages, and of the V(s) beside it, where there are both."""
+    of_both = networks(batch.obs)
+    distribution, value = of_both if isinstance(networks, ActorCritic) else (of_both, of_both)
+    terms = dict[str, Tensor]()
+    if not isinstance(networks, Value):
+        log_prob, advantage = distribution.log_prob(batch.action), batch.advantage
+        if isinstance(batch, DrawnBatch):
+            clip = getattr(config, "clip", math.inf)
+            terms["policy"] = clipped_surrogate(log_prob - batch.log_prob, advantage, clip)
+        else:
+            terms["policy"] = policy_gradient(log_prob, advantage)
+        terms["entropy"] = -distribution.entropy().mean()
+    if not isinstance(networks, Policy):
+        terms["value"] = value_loss(value, batch.target, batch.value, getattr(config, "clip_value", None))
+    return terms
+
+
+@torch.no_grad()
+def _target_of_q(config: Any, state: Any, batch: Transition, *noise: Tensor) -> Tensor:
+    """What Q(s, a) is to say in DDPG, TD3 and SAC, [M]."""
+    if hasattr(state.networks, "temperature"):
+        action, log_prob = state.networks.policy(batch.next_obs).sample_with_log_prob(*noise)
+        next_value = state.targets(batch.next_obs, action).amin(0) - state.networks.temperature() * log_prob
+    else:
+        policy, limit = state.targets.policy(batch.next_obs), getattr(config, "target_noise_clip", 0.0)
+        smoothing = [(config.target_noise * each).clamp(-limit, limit) for each in noise]
+        action = policy.sample(*smoothing) if smoothing else policy.mode()
+        next_value = state.targets.critics(batch.next_obs, action).amin(0)
+    return td_target(batch.reward, next_value, batch.terminated, gamma=config.gamma)
