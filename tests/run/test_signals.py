@@ -982,7 +982,10 @@ def looked_at(algorithm, tmp_path, env="CartPole-v1", **fields):
     """The signals of what gradients are made of, and of targets, in a short run: their values by name."""
     small = {"num_envs": 4, "num_steps": 16, "total_steps": 1280, "hidden": (8,)}
     if algorithm in ("sac", "td3", "ddpg"):
-        env, small = "Pendulum-v1", {"total_steps": 1000, "learning_starts": 100, "batch_size": 32, "log_every": 50}
+        env, small = (
+            "InvertedPendulum-v5",
+            {"total_steps": 1000, "learning_starts": 100, "batch_size": 32, "log_every": 50},
+        )
     small |= {"minibatch_size": 16} if algorithm in ("ppo", "reppo", "pqn") else {}
     small |= {"critic_minibatch_size": 16} if algorithm in ("trpo", "reinforce") else {}
     env = "Pendulum-v1" if algorithm == "reppo" else env
@@ -1014,6 +1017,10 @@ def looked_at(algorithm, tmp_path, env="CartPole-v1", **fields):
 def test_a_gradient_is_of_the_terms_of_its_loss(algorithm, fields, tmp_path):
     found = looked_at(algorithm, tmp_path, **fields)
     assert found["gradient/other_rows"].max() == 0
+    if algorithm in ("ppo", "reppo"):
+        assert found["gradient/old_policy"].max() < 1e-5
+    if algorithm in ("ppo", "a2c", "trpo", "reinforce") and fields.get("network") != "gru":
+        assert abs(found["targets/missing"]).max() < 1e-5
     heads = {"trpo": ("value",), "pqn": ("value",)}.get(algorithm, ("policy", "value"))
     for head in heads:
         weight = 0.5 if (algorithm, head) in (("ppo", "value"), ("a2c", "value")) and "env" not in fields else 1.0
@@ -1102,6 +1109,65 @@ def test_a_mistake_in_a_loss_shows_in_its_gradient(mistake, tmp_path, monkeypatc
     module = algos.find(algorithm)
     monkeypatch.setattr(module, name, wrong(getattr(module, name)))
     assert shows(looked_at(algorithm, tmp_path, **fields)[f"gradient/{signal}"])
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "name", "wrong", "signal"),
+    [
+        (
+            "ddpg",
+            "td_target",
+            lambda right: lambda reward, after, ends, *, gamma: right(reward, after, ends & False, gamma=gamma),
+            "ends_ignored",
+        ),
+        (
+            "a2c",
+            "value_loss",
+            lambda right: lambda value, target: right(*torch.broadcast_tensors(value[:, None], target)),
+            "mean_target",
+        ),
+    ],
+)
+def test_two_mistakes_are_known_by_the_gradients_that_they_make(algorithm, name, wrong, signal, tmp_path, monkeypatch):
+    module = algos.find(algorithm)
+    monkeypatch.setattr(module, name, wrong(getattr(module, name)))
+    found = looked_at(algorithm, tmp_path)
+    assert found["gradient/value_rest"].max() > 1e-4
+    assert found[f"gradient/if_{signal}"].max() < 1e-9
+
+
+@pytest.mark.parametrize("algorithm", ["ppo", "a2c", "trpo"])
+def test_a_bootstrap_that_targets_lack_is_told(algorithm, tmp_path, monkeypatch):
+    module = algos.find(algorithm)
+    monkeypatch.setattr(module, "gae", wrongly(without_the_last))
+    found = looked_at(algorithm, tmp_path)
+    assert found["targets/missing"] == pytest.approx(1.0, abs=0.05)
+    assert found["targets/unexplained"].max() < 1e-10, "within the rollout they follow"
+
+
+def without_the_last(reward, value, next_value, *given):
+    """Advantages that take the value behind the last row, and behind time limits, for 0."""
+    terminated, done = given[:2]
+    after = next_value * ~(done & ~terminated)
+    after[-1] = 0
+    return advantages(reward, value, after, *given)
+
+
+@pytest.mark.parametrize("algorithm", ["ppo", "reppo"])
+def test_a_policy_that_is_not_the_one_that_acted_is_told(algorithm, tmp_path, monkeypatch):
+    """It is moved before the first gradient step."""
+    module = algos.find(algorithm)
+    name = {"ppo": "advantages", "reppo": "targets"}[algorithm]
+    right = getattr(module, name)
+
+    def then_moved(config, networks, *rest):
+        batch = right(config, networks, *rest)
+        for parameter in networks.policy.parameters():
+            parameter.data += 0.1
+        return batch
+
+    monkeypatch.setattr(module, name, then_moved)
+    assert looked_at(algorithm, tmp_path)["gradient/old_policy"].min() > 1e-4
 
 
 def test_the_largest_q_follows_in_the_targets_of_q(tmp_path, monkeypatch):

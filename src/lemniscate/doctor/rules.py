@@ -83,30 +83,31 @@ FAR = 3.0
 """the factor outside of its usual range from which on a setting is named"""
 
 CONSEQUENCES = {
-    "action-without-effect": {"acts-at-mode", "observation-repeated"},
+    "action-without-effect": {"acts-at-mode", "observation-repeated", "setting-initial-log-std"},
     "steps-short": {"observation-repeated", "exploding-observation"},
     "action-late": {"exploding-observation"},
     "reward-unexplained": {"exploding-observation"},
-    "advantage-not-normalized": {"ratio-not-one"},
-    "advantage-opposed": {"ratio-not-one", "targets-behind", "policy-still"},
+    "advantage-not-normalized": {"ratio-not-one", "loss-differs"},
+    "advantage-opposed": {"ratio-not-one", "targets-behind", "policy-still", "loss-differs"},
     "targets-alike": {"critic-still"},
     "gradient-grows": {"value-runaway"},
     "policy-still": {"units-inactive"},
-    "advantage-unrelated": {"kl-too-large"},
+    "advantage-unrelated": {"kl-too-large", "loss-differs", "rows-of-others"},
     "q-unfollowed": {"policy-still"},
     "evaluated-otherwise": {"too-few-episodes"},
-    "acts-at-mode": {"advantage-opposed"},
-    "entropy-opposed": {"acts-at-mode", "entropy-collapsed"},
+    "acts-at-mode": {"advantage-opposed", "entropy-opposed"},
     "replay-differs": {"replay-repeated"},
     "setting-entropy-coef": {"entropy-opposed"},
-    "targets-of-others": {"critic-still", "replay-differs"},
+    "targets-of-others": {"critic-still", "replay-differs", "ends-continued", "loss-differs"},
     "q-opposed": {"replay-differs"},
     "replay-repeated": {"replay-part"},
     "gradient-clipped": {"loss-below-zero"},
     "missing-bootstrap": {"rate-zero"},
     "ends-ignored": {"ends-continued"},
-    "rows-of-others": {"ratio-not-one", "advantage-unrelated", "loss-differs"},
-    "loss-of-others": {"loss-differs"},
+    "entropy-collapsed": {"entropy-opposed"},
+    "ratio-not-one": {"rows-of-others"},
+    "loss-differs": {"ends-continued", "loss-of-others", "rows-of-others"},
+    "reward-small": {"setting-initial-log-std"},
 }
 """faults that are not named beside one of these, which brings them about"""
 
@@ -557,27 +558,33 @@ def of_advantages(e: Evidence) -> Seen:
 
 
 def of_batches(e: Evidence) -> Seen:
-    """Whether an update learned from what follows from its rows: equations that every healthy run fulfils."""
-    learned = {"gae_lambda", "returns", "final_epsilon"} & e.config.keys()
-    if not learned or e.config.get("returns", "to_go") != "to_go":
+    """Whether targets follow from the rows of an update: equations that every healthy run fulfils."""
+    if not _has_targets(e):
         return
-    names = ("targets/unexplained", "targets/discount", "targets/beyond_ends", "advantage/own", "advantage/used")
-    rest, discount, beyond, own, used = map(e.median, names)
-    if (other := e.median("targets/other_actions")) > 0.01:
-        yield "rows-of-others", f"In {other:.0%} of the rows of an update the action is not the one that was taken."
+    names = ("unexplained", "discount", "beyond_ends", "missing", "other_actions")
+    rest, discount, beyond, missing, other = (e.median(f"targets/{name}") for name in names)
     gamma = e.config.get("gamma")
+    if other > 0.01:
+        yield "rows-of-others", f"In {other:.0%} of the rows of an update the action is not the one that was taken."
     if rest > 1e-8:
-        yield (
-            "targets-differ",
-            f"{100 * rest:.2g} % of the targets' squares do not follow from the rows after them.",
-        )
+        yield "targets-differ", f"{100 * rest:.2g} % of the targets' squares do not follow from the rows after them."
     elif isinstance(gamma, float) and abs(discount - gamma) > max(1e-3, 0.1 * (1 - gamma)):
         yield (
             "discount-differs",
             f"From row to row targets are discounted by {discount:.4g}, not by {gamma:g}.",
         )
+    if abs(missing) > 0.01:
+        said = f"targets lack {missing:.0%} of the value that follows"
+        yield "missing-bootstrap", f"Where a time limit or a rollout's end cuts an episode, {said}."
     if beyond > 0.01:
         yield "ends-continued", f"{beyond:.0%} of the squares of the targets at terminations are not the reward's."
+
+
+def of_used_advantages(e: Evidence) -> Seen:
+    """Whether the advantages in a gradient step are those of its rows, and targets less values."""
+    own, used = map(e.median, ("advantage/own", "advantage/used"))
+    if not _has_targets(e):
+        return
     if (least := np.fmin(own, used)) < -0.5:
         yield "advantage-opposed", f"Advantages have a correlation of {least:.2f} with what they should be."
     elif used < 0.99:
@@ -586,25 +593,47 @@ def of_batches(e: Evidence) -> Seen:
         yield "baseline-differs", f"Advantages have a correlation of {own:.2f} with targets less values."
 
 
-def of_gradients(e: Evidence) -> Seen:
-    """Whether gradients are of the terms of the equations' loss, and of the rows that were drawn: to rounding."""
-    other, entropy = e.values("gradient/other_rows"), e.values("gradient/entropy")
-    if len(other) >= 2 and other.min() > 0.01:
+def _has_targets(e: Evidence) -> bool:
+    """Whether its targets are the returns of GAE, of what is to come, or of Q(λ)."""
+    known = {"gae_lambda", "returns", "final_epsilon"} & e.config.keys()
+    return bool(known) and e.config.get("returns", "to_go") == "to_go"
+
+
+def of_first_steps(e: Evidence) -> Seen:
+    """Faults of what the first gradient step of an update is given, and of its targets: exact, as `of_gradients`."""
+    if len(other := e.values("gradient/other_rows")) >= 2 and other.min() > 0.01:
         yield "rows-of-others", f"{np.median(other):.0%} of the rows of a gradient step are not as they were collected."
+    if (apart := e.median("gradient/old_policy")) > 1e-4:
+        yield "ratio-not-one", f"Before the first gradient step log π is already {apart:.2g} away from log π_old."
+    if e.late("gradient/if_ends_ignored") < 1e-6:
+        yield "ends-continued", "The gradient of Q is that of targets with a value behind terminations."
+    if e.late("gradient/if_mean_target") < 1e-6:
+        yield "loss-of-others", "The gradient of V or Q is that of one target for all rows, their mean."
+
+
+def of_gradients(e: Evidence) -> Seen:
+    """Whether gradients are of the terms of the equations' loss: a healthy run's are to rounding."""
     for part, whose in (("policy", "the policy"), ("value", "V or Q")):
-        weights, rest = e.values(f"gradient/{part}"), e.values(f"gradient/{part}_rest")
-        weight, share = (float(np.median(each)) if len(each) >= 2 else np.nan for each in (weights, rest))
+        weight, share = _weight_and_rest(e, part)
         right = (first_number(e.config.get("value_coef")) if part == "value" else None) or 1.0
-        if weight < 0 and weights.max() < 0 and share < 0.5:
-            name = "advantage-opposed" if part == "policy" else "loss-differs"
-            yield name, f"The loss of {whose} is climbed: its weight in the gradient is {weight:.2g}."
-        elif share > 1e-6:
+        if share > 1e-6:
             of = f"{100 * share:.2g} % of the squares of the gradient of {whose}"
             yield "loss-differs", f"{of} are of no term of its loss."
+        elif weight < 0:
+            name = "advantage-opposed" if part == "policy" else "loss-differs"
+            yield name, f"The loss of {whose} is climbed: its weight in the gradient is {weight:.2g}."
         elif weight > FAR * right or weight < right / FAR:
             yield "loss-differs", f"The loss of {whose} has the weight {weight:.2g} in its gradient, not {right:g}."
+    entropy = e.values("gradient/entropy")
     if len(entropy) >= 2 and entropy.max() < 1e-5 and np.median(entropy) < -1e-4:
         yield "entropy-opposed", f"The gradient lowers the entropy: that is {-np.median(entropy):.1%} of its length."
+
+
+def _weight_and_rest(e: Evidence, part: str) -> tuple[float, float]:
+    """The weight of a term in its gradient, and the share of no term; NaN where fewer than two were looked at."""
+    both = e.values(f"gradient/{part}"), e.values(f"gradient/{part}_rest")
+    weight, rest = (float(np.median(each)) if len(each) >= 2 else np.nan for each in both)
+    return weight, rest
 
 
 def of_losses(e: Evidence) -> Seen:
@@ -847,8 +876,8 @@ def of_evaluations(e: Evidence) -> Seen:
     last, mean = e.ends[1], e.scores.get("mean_return", e.last("evaluation/return"))
     returns, each = e.scores.get("returns", ()), e.config.get("evaluate_episodes", 20)
     bias = (e.scores.get("q_bias") or {}).get("bias", e.late("evaluation/q_bias"))
-    enough = len(last) >= 10
-    if enough and last.mean() - mean > max(0.3 * np.ptp(e.returns), 3 * last.std() / np.sqrt(len(last))):
+    enough, usual = len(last) >= 10, np.percentile(e.returns, (5, 95)) if len(e.returns) else np.zeros(2)
+    if enough and last.mean() - mean > max(0.3 * np.ptp(usual), 3 * last.std() / np.sqrt(len(last))):
         yield (
             "evaluated-otherwise",
             f"Training ends at {last.mean():,.4g}, and the deterministic policy has {mean:,.4g} in the evaluation.",
@@ -883,6 +912,8 @@ SUBJECTS = (
     of_entropies,
     of_advantages,
     of_batches,
+    of_used_advantages,
+    of_first_steps,
     of_gradients,
     of_losses,
     of_values,

@@ -95,7 +95,12 @@ class Watched:
         with suppress(Exception):  # a loss of one's own may be given anything; then nothing is said of it
             if is_first and isinstance(rows := self._now[3], Tensor):
                 self.found |= of_minibatch(self._now[2], rows[0], args[0])
-            self.found |= of_gradient(self._now[0], self._state, optimizer, gradient, args)
+            with torch.no_grad():
+                self.found |= of_old_policy(optimizer.networks, args[0])
+            of_it = self._now[0], self._state, optimizer, gradient
+            self.found |= of_gradient(*of_it, args)
+            if self.found.get("gradient/value_rest", torch.zeros(())) > 1e-6:
+                self.found |= of_mistakes(*of_it, args)
         return gradient, metrics
 
     @property
@@ -199,6 +204,28 @@ def of_batch(config: RunConfig, given: Given, rows: Rollout) -> dict[str, Tensor
     return found
 
 
+def of_cuts(
+    state: Any, config: RunConfig, rows: Rollout, acted: Mapping[str, Tensor] | None, given: Given
+) -> dict[str, Tensor]:
+    """The share of γ V(s') that targets lack where a time limit, or the end of the newest rows, cuts an episode.
+
+    Of rows [T, N, …] and of V before the update, whose targets they are.
+    """
+    columns, value = _columns_of(config, given[0], rows), getattr(state.networks, "value", None)
+    if not columns or acted is None or not isinstance(value, nn.Module):
+        return {}
+    steps = min(len(columns[0]), len(rows.done))
+    newest, beyond = rows[-steps:], columns[1][-steps:] - rows.reward[-steps:]
+    cut = newest.done.clone()
+    cut[-1] = True
+    cut &= newest.valid & ~newest.terminated
+    own = {key.removeprefix(PARTS[1]): x for key, x in acted.items() if key.startswith(PARTS[1])}
+    ahead = getattr(config, "gamma", 1.0) * _of_old(value, own, newest.next_obs[cut]).to(beyond.dtype)
+    if not ahead.any():
+        return {}
+    return {"targets/missing": 1 - (beyond[cut] * ahead).sum() / ahead.square().sum()}
+
+
 def _columns_of(config: RunConfig, data: Any, rows: Rollout) -> list[Tensor]:
     """Value, target and, where there are any, advantage [T, N] of a batch whose last rows are the newest; else none."""
     envs = rows.done.shape[1]
@@ -229,6 +256,20 @@ def of_minibatch(data: Any, rows: Tensor, batch: Any) -> dict[str, Tensor]:
         if name != "advantage"
     ]
     return {"gradient/other_rows": torch.stack(others).any(0).float().mean()}
+
+
+def of_old_policy(networks: Any, batch: Any) -> dict[str, Tensor]:
+    """How far the policy is from the one that acted, before its first gradient step: the mean of |log π − log π_old|.
+
+    Of REPPO it is the KL divergence, of which the policy's μ and log σ are stored.
+    """
+    policy = getattr(networks, "policy", networks)
+    if isinstance(batch, DrawnBatch):
+        distribution = networks(batch.obs)[0] if isinstance(networks, ActorCritic) else policy(batch.obs)
+        return {"gradient/old_policy": (distribution.log_prob(batch.action) - batch.log_prob).abs().mean()}
+    if isinstance(batch, SoftBatch) and isinstance(policy, Policy):
+        return {"gradient/old_policy": batch.kl_to(policy(batch.obs)).abs().mean()}
+    return {}
 
 
 def of_gradient(
@@ -264,6 +305,24 @@ def of_gradient(
             if "entropy" in own:
                 found["gradient/entropy"] = known["entropy"] * own["entropy"].norm() / whole.norm()
     return found
+
+
+def of_mistakes(
+    config: RunConfig, state: Any, optimizer: Adam, gradient: Tensor, args: tuple[Any, ...]
+) -> dict[str, Tensor]:
+    """What is of no term in the gradient of V or Q if one of two well-known mistakes is made, a share of its squares.
+
+    - gradient/if_ends_ignored: Q awaits something behind terminations, too.
+    - gradient/if_mean_target: each value has the mean of all targets, as where [B, 1] less [B] is [B, B].
+    """
+    batch, *noise = args
+    wrong = dict[str, Any]()
+    if isinstance(batch, Transition) and batch.terminated.any():
+        wrong["ends_ignored"] = replace(batch, terminated=torch.zeros_like(batch.terminated))
+    if isinstance(batch, Batch | QBatch):
+        wrong["mean_target"] = replace(batch, target=batch.target.mean().expand_as(batch.target))
+    left = {name: of_gradient(config, state, optimizer, gradient, (rows, *noise)) for name, rows in wrong.items()}
+    return {f"gradient/if_{name}": found["gradient/value_rest"] for name, found in left.items()}
 
 
 def _are_parallel(one: Tensor, other: Tensor) -> bool:
