@@ -77,6 +77,10 @@ CASES = {
         {"algorithm": "a2c", "losses__value": [2.0] * 8, "value__loss": [1.0] * 8},
     ),
     "rows-of-others": ({"gradient__other_rows": [0.5] * 3}, {"gradient__other_rows": [0.0] * 3}),
+    "targets-copied": (
+        {"algorithm": "td3", "targets__behind": [0.0] * 4, "targets__length": [1.0, 2.0, 3.0, 4.0]},
+        {"algorithm": "td3", "targets__behind": [0.1] * 4, "targets__length": [1.0, 2.0, 3.0, 4.0]},
+    ),
     "loss-differs": ({"gradient__policy_rest": [1e-5] * 3}, {"gradient__policy_rest": [1e-9] * 3}),
     "seed-ignored": ({"repeats": False}, {"repeats": True}),
     "constant-observation": ({"observation__constant": [1.0] * 8}, {"observation__constant": [0.99] * 8}),

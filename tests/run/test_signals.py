@@ -17,10 +17,11 @@ from lemniscate import algos
 from lemniscate.algos import ppo
 from lemniscate.data.hindsight import HindsightReplay
 from lemniscate.data.replay import ReplayBuffer
-from lemniscate.maths import Deterministic, explained_by, explained_by_each, gae
+from lemniscate.maths import Deterministic, explained_by, explained_by_each, gae, td_target, value_loss
 from lemniscate.nn.actor_critic import ActorCritic
 from lemniscate.nn.networks import Layers
 from lemniscate.nn.normalizer import NoNorm, RunningNorm
+from lemniscate.optim.adam import Adam
 from lemniscate.run.metrics import read_metrics
 from lemniscate.run.signals import (
     KINDS,
@@ -1111,29 +1112,60 @@ def test_a_mistake_in_a_loss_shows_in_its_gradient(mistake, tmp_path, monkeypatc
     assert shows(looked_at(algorithm, tmp_path, **fields)[f"gradient/{signal}"])
 
 
-@pytest.mark.parametrize(
-    ("algorithm", "name", "wrong", "signal"),
-    [
-        (
-            "ddpg",
-            "td_target",
-            lambda right: lambda reward, after, ends, *, gamma: right(reward, after, ends & False, gamma=gamma),
-            "ends_ignored",
-        ),
-        (
-            "a2c",
-            "value_loss",
-            lambda right: lambda value, target: right(*torch.broadcast_tensors(value[:, None], target)),
-            "mean_target",
-        ),
-    ],
-)
-def test_two_mistakes_are_known_by_the_gradients_that_they_make(algorithm, name, wrong, signal, tmp_path, monkeypatch):
+def online(follows):
+    """The loss of DDPG's Q, whose targets are of Q itself."""
+
+    def wrong(_):
+        def critic_loss(config, state, critics, batch):
+            action = state.networks.policy(batch.next_obs).mode()
+            target = td_target(batch.reward, critics.first(batch.next_obs, action), batch.terminated, gamma=0.99)
+            loss = value_loss(critics.first(batch.obs, batch.action), target if follows else target.detach())
+            return loss, {"losses/critic": loss.detach()}
+
+        return critic_loss
+
+    return wrong
+
+
+KNOWN = {
+    "ends_ignored": (
+        "ddpg",
+        "td_target",
+        lambda right: lambda reward, after, ends, *, gamma: right(reward, after, ends & False, gamma=gamma),
+    ),
+    "mean_target": (
+        "a2c",
+        "value_loss",
+        lambda right: lambda value, target: right(*torch.broadcast_tensors(value[:, None], target)),
+    ),
+    "other_rows": ("a2c", "loss", actions_of_others),
+    "other_action": ("pqn", "loss", lambda right: lambda q, batch: right(q, replace(batch, action=1 - batch.action))),
+    "online_target": ("ddpg", "critic_loss", online(False)),
+    "followed_target": ("ddpg", "critic_loss", online(True)),
+}
+
+
+@pytest.mark.parametrize("mistake", KNOWN)
+def test_a_well_known_mistake_is_told_by_the_gradient_that_it_makes(mistake, tmp_path, monkeypatch):
+    algorithm, name, wrong = KNOWN[mistake]
     module = algos.find(algorithm)
     monkeypatch.setattr(module, name, wrong(getattr(module, name)))
     found = looked_at(algorithm, tmp_path)
-    assert found["gradient/value_rest"].max() > 1e-4
-    assert found[f"gradient/if_{signal}"].max() < 1e-9
+    assert found[f"gradient/if_{mistake}"].max() < 1e-9
+    others = KNOWN.keys() - {mistake, "other_action"}  # of which one may be right by chance, where there are two
+    assert all(found[other].max() > 1e-6 for each in others if (other := f"gradient/if_{each}") in found)
+
+
+def test_a_gradient_that_is_added_up_is_told(tmp_path, monkeypatch):
+    right = Adam.gradient
+
+    def added(optimizer, loss, *args):
+        before = optimizer._gradient.clone()
+        gradient, metrics = right(optimizer, loss, *args)
+        return gradient.add_(before), metrics
+
+    monkeypatch.setattr(Adam, "gradient", added)
+    assert looked_at("a2c", tmp_path)["gradient/if_not_zeroed"].max() < 1e-9
 
 
 @pytest.mark.parametrize("algorithm", ["ppo", "a2c", "trpo"])

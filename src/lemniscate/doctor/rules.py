@@ -21,6 +21,7 @@ import numpy as np
 
 from lemniscate.doctor.evidence import HORIZONS, Evidence, first_number, last_number
 from lemniscate.run.fields import field_of, flag, typed
+from lemniscate.run.updates import ROUNDING
 
 Seen = Iterator[tuple[str, str]]
 """names of faults, each with what was seen of it"""
@@ -92,7 +93,8 @@ CONSEQUENCES = {
     "targets-alike": {"critic-still"},
     "gradient-grows": {"value-runaway"},
     "policy-still": {"units-inactive"},
-    "advantage-unrelated": {"kl-too-large", "loss-differs", "rows-of-others"},
+    "ends-continued": {"targets-differ"},
+    "advantage-unrelated": {"setting-learning-rate", "kl-too-large", "loss-differs", "rows-of-others"},
     "q-unfollowed": {"policy-still"},
     "evaluated-otherwise": {"too-few-episodes"},
     "acts-at-mode": {"advantage-opposed", "entropy-opposed"},
@@ -246,7 +248,7 @@ def of_parts_of_actions(e: Evidence) -> Seen:
             f"Which of two choices is made explains {max(0.0, np.median(alike[:3])):.2%} of how observations change,"
             f" all together {np.median(effects[:3]):.0%}.",
         )
-    if by_sign > 0.5:
+    if by_sign > 0.5 and not at_bounds > 0.5:  # else a policy at its bounds has signs alone
         yield (
             "action-by-sign",
             f"Of what actions do not explain of how observations change, their signs explain {by_sign:.0%}.",
@@ -465,7 +467,7 @@ def of_entropies(e: Evidence) -> Seen:
     entropy, temperature = e.values("losses/entropy"), e.values("temperature")
     weight, target = e.config.get("entropy_coef"), first_number(e.config.get("target_entropy"))
     far = e.beyond("entropy_coef", *e.usual.get("entropy_coef", (0.0, np.inf))) > FAR and ">" not in str(weight)
-    if far and len(entropy) >= 4:
+    if far and len(entropy) >= 4 and not len(e.values("gradient/entropy")):  # which knows
         lost = entropy[0] - np.median(entropy[len(entropy) // 2 :])
         if lost > max(0.2, 0.3 * abs(entropy[0])):
             yield (
@@ -567,7 +569,8 @@ def of_batches(e: Evidence) -> Seen:
     if other > 0.01:
         yield "rows-of-others", f"In {other:.0%} of the rows of an update the action is not the one that was taken."
     if rest > 1e-8:
-        yield "targets-differ", f"{100 * rest:.2g} % of the targets' squares do not follow from the rows after them."
+        said = f"{100 * rest:.2g} % of the targets' squares do not follow from the rows after them"
+        yield "targets-differ", f"{said}; rounding leaves 1e-12."
     elif isinstance(gamma, float) and abs(discount - gamma) > max(1e-3, 0.1 * (1 - gamma)):
         yield (
             "discount-differs",
@@ -599,16 +602,27 @@ def _has_targets(e: Evidence) -> bool:
     return bool(known) and e.config.get("returns", "to_go") == "to_go"
 
 
+MISTAKES = {
+    "not_zeroed": ("gradient-grows", "has the one before in it: it is never set to zero"),
+    "mean_target": ("loss-of-others", "is that of one target for all rows, their mean"),
+    "ends_ignored": ("ends-continued", "of Q is that of targets with a value behind terminations"),
+    "online_target": ("targets-copied", "of Q is that of targets of Q itself, without target networks"),
+    "followed_target": ("loss-differs", "of Q goes through its own targets: these need a detach()"),
+    "other_action": ("rows-of-others", "is that of Q(s, ·) at other actions than were taken"),
+    "other_rows": ("rows-of-others", "is that of an action, a target or a next observation of another row"),
+}
+"""mistakes that `run/updates.py` tries where a gradient is of no term; each with its rule and what is seen"""
+
+
 def of_first_steps(e: Evidence) -> Seen:
     """Faults of what the first gradient step of an update is given, and of its targets: exact, as `of_gradients`."""
     if len(other := e.values("gradient/other_rows")) >= 2 and other.min() > 0.01:
         yield "rows-of-others", f"{np.median(other):.0%} of the rows of a gradient step are not as they were collected."
     if (apart := e.median("gradient/old_policy")) > 1e-4:
         yield "ratio-not-one", f"Before the first gradient step log π is already {apart:.2g} away from log π_old."
-    if e.late("gradient/if_ends_ignored") < 1e-6:
-        yield "ends-continued", "The gradient of Q is that of targets with a value behind terminations."
-    if e.late("gradient/if_mean_target") < 1e-6:
-        yield "loss-of-others", "The gradient of V or Q is that of one target for all rows, their mean."
+    for mistake, (name, what) in MISTAKES.items():
+        if e.late(f"gradient/if_{mistake}") < ROUNDING:
+            yield name, f"To rounding, the gradient {what}."
 
 
 def of_gradients(e: Evidence) -> Seen:
@@ -616,7 +630,7 @@ def of_gradients(e: Evidence) -> Seen:
     for part, whose in (("policy", "the policy"), ("value", "V or Q")):
         weight, share = _weight_and_rest(e, part)
         right = (first_number(e.config.get("value_coef")) if part == "value" else None) or 1.0
-        if share > 1e-6:
+        if share > ROUNDING:
             of = f"{100 * share:.2g} % of the squares of the gradient of {whose}"
             yield "loss-differs", f"{of} are of no term of its loss."
         elif weight < 0:
@@ -780,7 +794,8 @@ def of_what_stands_still(e: Evidence) -> Seen:
     if len(moved) >= 2 and not moved.any() and "gae_lambda" in e.config and learns:
         yield "critic-still", "No update that was looked at changed a parameter of V."
     if len(behind) >= 3 and not behind.any() and first_number(e.config.get("tau")) != 1:
-        yield "critic-still", "The weights of Q are those of its target networks, each time that they were looked at."
+        name = "targets-copied" if len(set(length)) > 1 else "critic-still"
+        yield name, "The weights of Q are those of its target networks, each time that they were looked at."
     flat, losses = e.last_half("gradient_norm/critic"), e.last_half("losses/critic")
     if len(flat) >= 3 and not flat.any() and len(losses) and losses.all():
         yield "critic-still", f"The gradient of Q is 0, and its loss {np.median(losses):.3g}."
@@ -882,6 +897,12 @@ def of_evaluations(e: Evidence) -> Seen:
             "evaluated-otherwise",
             f"Training ends at {last.mean():,.4g}, and the deterministic policy has {mean:,.4g} in the evaluation.",
         )
+    longest, evaluated = np.max(e.lengths[-max(20, len(e.lengths) // 5) :], initial=0), e.late("evaluation/length")
+    if evaluated > 1.5 * longest > 0:
+        yield (
+            "evaluated-otherwise",
+            f"Episodes last {longest:,.0f} steps at most in training, and {evaluated:,.0f} on average in evaluations.",
+        )
     if abs(bias) > 0.5 and not e.rose and e.q_steps >= 4_000:  # before, Q is only new
         yield "q-biased", f"Q {'over' if bias > 0 else 'under'}-estimates the return by {abs(bias):.0%}."
     asked, played = each if e.config.get("evaluate_every") else np.inf, len(returns) or np.inf
@@ -913,8 +934,8 @@ SUBJECTS = (
     of_advantages,
     of_batches,
     of_used_advantages,
-    of_first_steps,
     of_gradients,
+    of_first_steps,
     of_losses,
     of_values,
     of_q,

@@ -5,11 +5,11 @@ one with a mistake in a loss, in the targets or in the order of rows does not, w
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -27,6 +27,8 @@ from lemniscate.types import Batch, DrawnBatch, Metrics, Rollout, Transition, wi
 
 Given = tuple[Any, tuple[Tensor, ...], bool]
 """what the gradient steps of an update were given: see `Watched.given`"""
+ROUNDING = 1e-6
+"""the share of the squares of a gradient from which on it is not of rounding; a healthy one has 1e-12"""
 PARTS = "policy.", "value."
 """how the names of the parameters of a policy and of V(s) begin"""
 
@@ -91,6 +93,7 @@ class Watched:
         is_first = not self.found
         del vars(optimizer)["gradient"]
         self._unseen.remove(optimizer)
+        before = torch.cat([each.grad.flatten() for each in optimizer.parameters if each.grad is not None])
         gradient, metrics = optimizer.gradient(loss, *args)
         with suppress(Exception):  # a loss of one's own may be given anything; then nothing is said of it
             if is_first and isinstance(rows := self._now[3], Tensor):
@@ -98,9 +101,9 @@ class Watched:
             with torch.no_grad():
                 self.found |= of_old_policy(optimizer.networks, args[0])
             of_it = self._now[0], self._state, optimizer, gradient
-            self.found |= of_gradient(*of_it, args)
-            if self.found.get("gradient/value_rest", torch.zeros(())) > 1e-6:
-                self.found |= of_mistakes(*of_it, args)
+            self.found |= (found := of_gradient(*of_it, args))
+            if max(float(value) for name, value in found.items() if name.endswith("_rest")) > ROUNDING:
+                self.found |= of_mistakes(*of_it, before, args)
         return gradient, metrics
 
     @property
@@ -307,22 +310,56 @@ def of_gradient(
     return found
 
 
-def of_mistakes(
-    config: RunConfig, state: Any, optimizer: Adam, gradient: Tensor, args: tuple[Any, ...]
-) -> dict[str, Tensor]:
-    """What is of no term in the gradient of V or Q if one of two well-known mistakes is made, a share of its squares.
+class Online(NamedTuple):
+    """A training state whose target networks are the networks that learn, with a gradient or without one."""
 
-    - gradient/if_ends_ignored: Q awaits something behind terminations, too.
-    - gradient/if_mean_target: each value has the mean of all targets, as where [B, 1] less [B] is [B, B].
+    networks: Any
+    targets: Any
+    follows: bool
+
+
+def of_mistakes(
+    config: RunConfig, state: Any, optimizer: Adam, gradient: Tensor, before: Tensor, args: tuple[Any, ...]
+) -> dict[str, Tensor]:
+    """The most of a gradient that is of no term if a well-known mistake was made: shares of squares, "gradient/if_…".
+
+    - ends_ignored: Q awaits something behind terminations, too.
+    - mean_target: each value has the mean of all targets, as where [B, 1] less [B] is [B, B].
+    - other_rows: an action, a target, a reward or a next observation is of the row beside, or of the reverse order.
+    - other_action: Q(s, ·) of another action is moved.
+    - online_target, followed_target: y is of Q itself; and the gradient goes through it.
+    - not_zeroed: the gradient is added to the one `before`.
     """
     batch, *noise = args
-    wrong = dict[str, Any]()
-    if isinstance(batch, Transition) and batch.terminated.any():
-        wrong["ends_ignored"] = replace(batch, terminated=torch.zeros_like(batch.terminated))
+    left = {"not_zeroed": [of_gradient(config, state, optimizer, gradient - before, args)]}
+    for name, its_state, rows in _mistaken(state, batch):
+        left.setdefault(name, []).append(of_gradient(config, its_state, optimizer, gradient, (rows, *noise)))
+    none, found = torch.ones(()), dict[str, Tensor]()
+    for name, variants in left.items():
+        rests = [[each.get(f"gradient/{part}_rest", none * 0) for part in ("policy", "value")] for each in variants]
+        found[f"gradient/if_{name}"] = torch.stack([torch.stack(pair).max() for pair in rests]).min()
+    return found
+
+
+def _mistaken(state: Any, batch: Any) -> Iterator[tuple[str, Any, Any]]:
+    """Names of mistakes, with the state and the rows of which they would be right."""
+    if isinstance(batch, Transition):
+        targets = state.networks if hasattr(state.targets, "critics") else state.networks.critics
+        yield "online_target", Online(state.networks, targets, False), batch
+        yield "followed_target", Online(state.networks, targets, True), batch
+        if batch.terminated.any():
+            yield "ends_ignored", state, replace(batch, terminated=torch.zeros_like(batch.terminated))
     if isinstance(batch, Batch | QBatch):
-        wrong["mean_target"] = replace(batch, target=batch.target.mean().expand_as(batch.target))
-    left = {name: of_gradient(config, state, optimizer, gradient, (rows, *noise)) for name, rows in wrong.items()}
-    return {f"gradient/if_{name}": found["gradient/value_rest"] for name, found in left.items()}
+        yield "mean_target", state, replace(batch, target=batch.target.mean().expand_as(batch.target))
+    if type(batch) is QBatch:
+        choices = int(batch.action.max()) + 1
+        yield from (
+            ("other_action", state, replace(batch, action=(batch.action + k) % choices)) for k in range(1, choices)
+        )
+    for column in {"action", "target", "reward", "next_obs"} & vars(batch).keys():
+        x = getattr(batch, column)
+        for moved in (x.roll(1, 0), x.roll(-1, 0), x.flip(0)):
+            yield "other_rows", state, replace(batch, **{column: moved})
 
 
 def _are_parallel(one: Tensor, other: Tensor) -> bool:
@@ -350,7 +387,8 @@ def terms_of(config: Any, state: Any, networks: Any, batch: Any, *noise: Tensor)
         loss = networks.loss(batch.obs, *pair)[0] if soft else value_loss(networks.q(batch.obs, pair[0]), pair[1])
         return {"value": loss}
     if isinstance(batch, Transition) and isinstance(networks, Critics):
-        target = _target_of_q(config, state, batch, *noise)
+        with torch.set_grad_enabled(getattr(state, "follows", False)):
+            target = _target_of_q(config, state, batch, *noise)
         return {"value": torch.stack([q.loss(batch.obs, batch.action, target)[0] for q in networks.members]).sum()}
     if isinstance(batch, Transition) and isinstance(networks, Policy):
         policy, critics = networks(batch.obs), state.networks.critics
@@ -380,7 +418,6 @@ def _of_advantages(config: Any, networks: Any, batch: Batch) -> dict[str, Tensor
     return terms
 
 
-@torch.no_grad()
 def _target_of_q(config: Any, state: Any, batch: Transition, *noise: Tensor) -> Tensor:
     """What Q(s, a) is to say in DDPG, TD3 and SAC, [M]."""
     if hasattr(state.networks, "temperature"):
