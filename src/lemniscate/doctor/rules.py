@@ -108,7 +108,7 @@ CONSEQUENCES = {
     "ends-ignored": {"ends-continued"},
     "entropy-collapsed": {"entropy-opposed"},
     "ratio-not-one": {"rows-of-others"},
-    "loss-differs": {"ends-continued", "loss-of-others", "rows-of-others"},
+    "loss-differs": {"ends-continued", "loss-of-others", "rows-of-others", "targets-copied", "gradient-grows"},
     "reward-small": {"setting-initial-log-std"},
 }
 """faults that are not named beside one of these, which brings them about"""
