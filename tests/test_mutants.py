@@ -1771,6 +1771,27 @@ MUTANTS = [
         "run/test_signals.py::test_measuring_changes_no_bit_of_a_run",
     ),
     (
+        "the end of a rollout has no bootstrap to compare",
+        "run/updates.py",
+        "    cut[-1] = True\n",
+        "",
+        "run/test_signals.py::test_a_bootstrap_that_targets_lack_is_told",
+    ),
+    (
+        "of the variants of a mistake the worst counts",
+        "run/updates.py",
+        "torch.stack(pair).max() for pair in rests]).min()",
+        "torch.stack(pair).max() for pair in rests]).max()",
+        "run/test_signals.py::test_a_well_known_mistake_is_told_by_the_gradient_that_it_makes",
+    ),
+    (
+        "the policy that acted is the one that learns",
+        "run/updates.py",
+        "(distribution.log_prob(batch.action) - batch.log_prob).abs()",
+        "(distribution.log_prob(batch.action) * 0).abs()",
+        "run/test_signals.py::test_a_policy_that_is_not_the_one_that_acted_is_told",
+    ),
+    (
         "rows count as others where all their columns are",
         "run/updates.py",
         "torch.stack(others).any(0)",
