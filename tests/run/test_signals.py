@@ -1173,6 +1173,7 @@ def test_a_bootstrap_that_targets_lack_is_told(algorithm, tmp_path, monkeypatch)
     module = algos.find(algorithm)
     monkeypatch.setattr(module, "gae", wrongly(without_the_last))
     found = looked_at(algorithm, tmp_path)
+    assert "targets/missing" in found, "each rollout has an end"
     assert found["targets/missing"] == pytest.approx(1.0, abs=0.05)
     assert found["targets/unexplained"].max() < 1e-10, "within the rollout they follow"
 

@@ -102,7 +102,7 @@ class Watched:
                 self.found |= of_old_policy(optimizer.networks, args[0])
             of_it = self._now[0], self._state, optimizer, gradient
             self.found |= (found := of_gradient(*of_it, args))
-            if max(float(value) for name, value in found.items() if name.endswith("_rest")) > ROUNDING:
+            if any(name.endswith("_rest") and share > ROUNDING for name, share in found.items()):
                 self.found |= of_mistakes(*of_it, before, args)
         return gradient, metrics
 
